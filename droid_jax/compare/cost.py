@@ -1,0 +1,141 @@
+"""The vmapped cost: parameter vectors in, disagreement with the recordings out.
+
+cost = make_cost(scene, space, [recording])
+cost(values)            # [P, D] -> [P]   N m
+cost.whitened(values)   # [P, D] -> [P, M] residuals in noise units
+cost.rollouts(values)   # [P, D] -> one Rollout per recording
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from droid_jax import runtime
+from droid_jax.compare.population import blocks, over_block
+from droid_jax.compare.replay import Drive, Replay, make_drive, servo_replay, torque_offset_effect
+from droid_jax.compare.residuals import CompareConfig, Comparison, make_comparison
+from droid_jax.compare.twin import twin_replay
+from droid_jax.measure.recording import Recording
+from droid_jax.model.parameters import Space
+from droid_jax.model.physics import make_physics
+from droid_jax.model.scene import Scene
+from droid_jax.model.seam import Effect, Rollout
+
+ENGINES = ("mjx", "mujoco")
+
+
+@dataclass(frozen=True, eq=False)
+class Cost:
+    """A cost over a space. Call it with [P, D] physical values; everything returns host arrays."""
+
+    scene: Scene
+    space: Space
+    comparisons: tuple[Comparison, ...]
+    _replays: tuple[Callable[[np.ndarray], Rollout], ...]
+    _distances: tuple[Callable[[Rollout], jax.Array], ...]
+    _whitened: tuple[Callable[[Rollout], jax.Array], ...]
+    _failed: tuple[Callable[[Rollout], jax.Array], ...]
+
+    def __call__(self, values: Any) -> np.ndarray:
+        """[P, D] -> [P] cost, the mean over the recordings; never NaN."""
+        return np.mean(self.distances(values), axis=1)
+
+    def distances(self, values: Any) -> np.ndarray:
+        """[P, D] -> [P, R] cost of each recording."""
+        return self._blockwise(values, self._distances, lambda parts: np.stack(parts, axis=1))
+
+    def whitened(self, values: Any) -> np.ndarray:
+        """[P, D] -> [P, M] residuals of all recordings, in units of the noise of the repeats' mean."""
+        return self._blockwise(values, self._whitened, lambda parts: np.concatenate(parts, axis=1))
+
+    def failed(self, values: Any) -> np.ndarray:
+        """[P, D] -> [P] bool: the grasp was lost, the door stayed shut, or the replay blew up."""
+        return self._blockwise(values, self._failed, lambda parts: np.any(np.stack(parts), axis=0))
+
+    def rollouts(self, values: Any) -> tuple[Rollout, ...]:
+        """[P, D] -> for each recording a Rollout of host arrays [P, T, ...]."""
+        identity = tuple((lambda r: r) for _ in self._replays)
+        return self._blockwise(values, identity, tuple)
+
+    def _blockwise(self, values: Any, functions: Sequence[Callable], join: Callable) -> Any:
+        pieces = []
+        for block, count in blocks(self.space.check(values)):
+            parts = [f(replay(block)) for f, replay in zip(functions, self._replays, strict=True)]
+            parts = jax.tree.map(lambda a, n=count: np.asarray(a)[:n], parts)
+            pieces.append(join(parts))
+        return jax.tree.map(lambda *p: np.concatenate(p), *pieces)
+
+
+def make_cost(
+    scene: Scene,
+    space: Space,
+    recordings: Sequence[Recording],
+    *,
+    engine: str = "mjx",
+    config: CompareConfig | None = None,
+    effects: Sequence[Effect] = (),
+) -> Cost:
+    """The servo cost of a scene over one or more recordings.
+
+    engine: "mjx" (compiled, all devices) or "mujoco" (plain C, all cores; the parity oracle).
+    effects: extra physics or observation models whose parameters are part of the space.
+    Raises ValueError for unknown engines, joints, channels, or gains that do not match.
+    """
+    config = config or CompareConfig()
+    if not recordings:
+        raise ValueError("a cost needs at least one recording")
+    drives = [make_drive(scene, r) for r in recordings]
+    effects = (*effects, torque_offset_effect(scene.joints))
+    replays = tuple(_engine(engine, scene, space, d, effects) for d in drives)
+    comparisons = tuple(
+        make_comparison(scene, r, d.timestep, len(d.command), config) for r, d in zip(recordings, drives, strict=True)
+    )
+    return assemble(scene, space, comparisons, replays)
+
+
+def assemble(
+    scene: Scene,
+    space: Space,
+    comparisons: Sequence[Comparison],
+    replays: Sequence[Callable[[np.ndarray], Rollout]],
+) -> Cost:
+    """A Cost from batch replays ([B, D] -> Rollout) and what each is compared with."""
+    return Cost(
+        scene=scene,
+        space=space,
+        comparisons=tuple(comparisons),
+        _replays=tuple(replays),
+        _distances=tuple(_compiled(c.distance) for c in comparisons),
+        _whitened=tuple(_compiled(c.whitened) for c in comparisons),
+        _failed=tuple(_compiled(lambda r, c=c: c.failed(r) | ~r.finite) for c in comparisons),
+    )
+
+
+def batch_replay(scene: Scene, space: Space, replay: Replay) -> Callable[[np.ndarray], Rollout]:
+    """One compiled, sharded block of a per-sample replay: [B, D] -> Rollout [B, ...]."""
+    return over_block(lambda values: replay(make_physics(scene, space, values)))
+
+
+def _engine(
+    engine: str, scene: Scene, space: Space, drive: Drive, effects: Sequence[Effect]
+) -> Callable[[np.ndarray], Rollout]:
+    if engine not in ENGINES:
+        raise ValueError(f"unknown engine {engine!r}; valid: {', '.join(ENGINES)}")
+    if engine == "mjx":
+        return batch_replay(scene, space, servo_replay(scene, drive, effects))
+    twin = twin_replay(scene, space, drive, [e for e in effects if e.name != "torque offset"])
+    return lambda values: jax.tree.map(_single, twin(values))
+
+
+def _single(array: np.ndarray) -> jax.Array:
+    return jnp.asarray(array, jnp.float32) if np.issubdtype(array.dtype, np.floating) else jnp.asarray(array)
+
+
+def _compiled(function: Callable[[Rollout], jax.Array]) -> Callable[[Rollout], jax.Array]:
+    return jax.jit(jax.vmap(function), compiler_options=runtime.compiler_options())

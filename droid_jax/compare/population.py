@@ -1,0 +1,75 @@
+"""A function of one parameter vector, made into a compiled batch over all devices.
+
+Rows are processed in blocks of one fixed size, so that a program compiles once however many rows
+a stage asks for.  A block is split over the devices with shard_map; only what is wrapped here is
+sharded, search and statistics stay on one device.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import PartitionSpec
+
+from droid_jax import runtime
+
+AXIS = "population"
+CPU_BLOCK = 32  # rows; on a CPU larger blocks run no faster and take more memory
+GPU_BLOCK = 4096  # rows at most in one piece on an accelerator
+
+
+def block_size(rows: int) -> int:
+    """Rows of a block: fixed on a CPU, the next power of two up to GPU_BLOCK elsewhere."""
+    if jax.default_backend() == "cpu":
+        smallest = CPU_BLOCK
+    else:
+        smallest = min(GPU_BLOCK, 1 << max(5, (rows - 1).bit_length()))
+    devices = runtime.devices_mesh().size
+    return -(-smallest // devices) * devices
+
+
+def blocks(values: Any) -> Iterator[tuple[np.ndarray, int]]:
+    """Cut [P, D] into (block [B, D], rows that count); the last block repeats its last row.
+
+    Raises ValueError for an array that is not [P, D] with P >= 1.
+    """
+    values = np.asarray(values)
+    if values.ndim != 2 or len(values) == 0:
+        raise ValueError(f"expected parameter vectors [P, D] with P >= 1, got shape {values.shape}")
+    size = block_size(len(values))
+    for start in range(0, len(values), size):
+        block = values[start : start + size]
+        # Repeating a row keeps the padding inside the valid range.
+        yield np.concatenate([block, np.repeat(block[-1:], size - len(block), axis=0)]), len(block)
+
+
+def over_block(function: Callable[[jax.Array], Any]) -> Callable[[Any], Any]:
+    """Compile `function` ([D] -> pytree) for whole blocks: [B, D] -> the same with a leading [B].
+
+    B must be a multiple of the number of devices (see `block_size`).  The result lives on the
+    devices, sharded by rows.
+    """
+    rows = PartitionSpec(AXIS)
+    # check_vma: mjx's own loops mix sharded and constant carries, which the check refuses.
+    mapped = jax.shard_map(
+        jax.vmap(function), mesh=runtime.devices_mesh(), in_specs=rows, out_specs=rows, check_vma=False
+    )
+    compiled = jax.jit(mapped, compiler_options=runtime.compiler_options())
+    return lambda values: compiled(jnp.asarray(values, jnp.float32))
+
+
+def over_population(function: Callable[[jax.Array], Any]) -> Callable[[Any], Any]:
+    """Compile `function` ([D] -> pytree) for any number of rows: [P, D] -> the same on the host, [P, ...]."""
+    compiled = over_block(function)
+
+    def batch(values: Any) -> Any:
+        pieces = [
+            jax.tree.map(lambda a, n=count: np.asarray(a)[:n], compiled(block)) for block, count in blocks(values)
+        ]
+        return jax.tree.map(lambda *parts: np.concatenate(parts), *pieces)
+
+    return batch

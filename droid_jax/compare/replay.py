@@ -1,0 +1,278 @@
+"""Replay one recording in simulation: the servo mode (a scan) and the inverse mode (a vmap over time).
+
+`servo_replay` follows the recorded command through grasp and pull, as the paper does.
+`inverse_replay` prescribes a measured motion and returns the torques it takes; it serves
+recordings that hold no commands.  Both return a function Physics -> Rollout for ONE sample;
+`compare.population` makes a compiled, sharded batch of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from mujoco import mjx
+
+from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide, check_joints
+from droid_jax.model.physics import Physics
+from droid_jax.model.scene import Scene
+from droid_jax.model.seam import Effect, Rollout, State, Theta
+from droid_jax.model.step import step as simulate_step
+
+Replay = Callable[[Physics], Rollout]
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """A recording's command on the simulation's clock.
+
+    command: [T, U] rad or m, in the scene's actuator order, at times k * timestep.
+    qpos0:   [nq] start pose.
+    timestep: s.
+    torque:  convention of the measured torque.
+    stiffness: [U] servo gains stated by the recording, or None: the scene's own.
+    """
+
+    command: np.ndarray
+    qpos0: np.ndarray
+    timestep: float
+    torque: TorqueConvention
+    stiffness: np.ndarray | None = None
+
+    @property
+    def time(self) -> np.ndarray:
+        """[T] s, from 0."""
+        return np.arange(len(self.command)) * self.timestep
+
+
+def make_drive(scene: Scene, recording: Recording) -> Drive:
+    """Resample a recording's command onto the simulation's clock and order its columns.
+
+    Raises ValueError where the recording has no commands or its joints do not fit the scene.
+    """
+    if recording.command.size == 0:
+        raise ValueError(
+            f"recording {recording.name!r} holds no commands, so its servo cannot be replayed; use the inverse mode"
+        )
+    columns = scene.command_index(recording.command_names)
+    check_joints(recording, scene.command_names)
+    timestep = float(scene.model.opt.timestep)
+    start, end = float(recording.time[0]), float(recording.time[-1])
+    steps = int(np.floor((end - start) / timestep + 1e-6)) + 1
+    clock = start + np.arange(steps) * timestep
+    command = np.stack([np.interp(clock, recording.time, recording.command[:, c]) for c in columns], axis=1)
+    gains = recording.gains
+    return Drive(
+        command=command,
+        qpos0=scene.initial_qpos(dict(recording.qpos0)),
+        timestep=timestep,
+        torque=recording.torque,
+        stiffness=None if gains is None else np.asarray(gains.stiffness, dtype=float)[columns],
+    )
+
+
+def check_gains(scene: Scene, drive: Drive) -> None:
+    """Raise ValueError where the recording states servo gains that the scene does not have."""
+    if drive.stiffness is None:
+        return
+    own = scene.model.actuator_gainprm[:, 0]
+    for name, stated, has in zip(scene.command_names, drive.stiffness, own, strict=True):
+        if not np.isclose(stated, has, rtol=1e-3):
+            raise ValueError(
+                f"the recording states a servo gain of {stated:g} for {name}, the scene has {has:g}; "
+                "build the scene with the recording's gains"
+            )
+
+
+def servo_replay(scene: Scene, drive: Drive, effects: Sequence[Effect] = ()) -> Replay:
+    """The scan over time steps that follows the command. Torques carry the time of the state they act on.
+
+    The scan carries only position, velocity and the solver's warm start: everything else in
+    mjx.Data is rebuilt each step, so that XLA drops what nobody reads.
+    """
+    check_gains(scene, drive)
+    template = mjx.make_data(scene.mjx)
+    fingers = _finger_geoms(scene)
+    table = jnp.asarray(drive.command, jnp.float32)
+    start = jnp.asarray(drive.qpos0, jnp.float32)
+    joints, positions = scene.joint_dofs, scene.joint_qpos
+    hinge = scene.qpos(scene.object_joint) if scene.object_joint else None
+
+    def replay(physics: Physics) -> Rollout:
+        model, theta = physics.model, physics.theta
+
+        def step(carry, k):
+            qpos, qvel, warm, load = carry
+            state = State(k * drive.timestep, qpos, qvel, load)
+            ctrl = _command(table, drive.timestep, k, theta, effects)
+            before = template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm, ctrl=ctrl)
+            after = simulate_step(_friction(model, theta, state, effects), _applied(before, theta, state, effects))
+            out = (
+                _joint_torque(model, after, joints, drive),
+                qpos[positions] + 0.5 * drive.timestep * qvel[joints],
+                qvel[joints],
+                qpos[hinge] + 0.5 * drive.timestep * qvel[hinge] if hinge is not None else jnp.zeros(()),
+                _touching(after, fingers),
+            )
+            return (after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator), out
+
+        zero = jnp.zeros(scene.model.nv, jnp.float32)
+        steps = jnp.arange(len(drive.command), dtype=jnp.int32)
+        _, (torque, position, velocity, angle, contact) = jax.lax.scan(step, (start, zero, zero, zero), steps)
+        time = jnp.asarray(drive.time, jnp.float32)
+        rollout = Rollout(time, torque, position, velocity, angle, contact, jnp.array(True))
+        return _observe(rollout, theta, effects)
+
+    return replay
+
+
+def _command(table: jax.Array, timestep: float, k: jax.Array, theta: Theta, effects: Sequence[Effect]) -> jax.Array:
+    """[U] the command of step k, half a step late.
+
+    The integrator damps with the velocity half a step ahead of the position it computes torques
+    from; half a step of delay takes that first-order error out (docs/architecture.md).
+    A `time_offset` in theta delays the command further.
+    """
+    last = table.shape[0] - 1
+
+    def look(time: jax.Array) -> jax.Array:
+        at = jnp.clip(time / timestep, 0.0, float(last))
+        low = jnp.minimum(at.astype(jnp.int32), last - 1)
+        part = at - low
+        return table[low] * (1 - part) + table[low + 1] * part
+
+    # In steps first: float32 seconds would lose a tenth of a step after ten seconds.
+    late = 0.5 + theta.get("time_offset", 0.0) / timestep
+    whole = jnp.floor(late)
+    low = jnp.clip(k - whole.astype(jnp.int32) - 1, 0, last)
+    high = jnp.clip(k - whole.astype(jnp.int32), 0, last)
+    part = late - whole
+    ctrl = table[high] * (1 - part) + table[low] * part
+    for effect in effects:
+        if effect.command is not None:
+            ctrl = effect.command(theta, (k - late) * timestep, look)
+    return ctrl
+
+
+def _friction(model, theta: Theta, state: State, effects: Sequence[Effect]):
+    loss = model.dof_frictionloss
+    for effect in effects:
+        if effect.frictionloss is not None:
+            loss = effect.frictionloss(theta, state, loss)
+    return model if loss is model.dof_frictionloss else model.replace(dof_frictionloss=loss)
+
+
+def _applied(data, theta: Theta, state: State, effects: Sequence[Effect]):
+    forces = [effect.force(theta, state) for effect in effects if effect.force is not None]
+    return data.replace(qfrc_applied=sum(forces)) if forces else data
+
+
+def _observe(rollout: Rollout, theta: Theta, effects: Sequence[Effect]) -> Rollout:
+    """Effects of the sensor, constant torque offsets, and the verdict on finiteness."""
+    for effect in effects:
+        if effect.observe is not None:
+            rollout = effect.observe(theta, rollout)
+    finite = jnp.all(jnp.isfinite(rollout.torque)) & jnp.all(jnp.isfinite(rollout.position))
+    return replace(rollout, finite=finite & jnp.all(jnp.isfinite(rollout.object_angle)))
+
+
+def torque_offset_effect(joints: Sequence[str]) -> Effect:
+    """Constant torque-sensor errors: reads `torque_offset[joint]` from theta, N m; absent means zero."""
+
+    def observe(theta: Theta, rollout: Rollout) -> Rollout:
+        offset = jnp.stack([jnp.asarray(theta.get(f"torque_offset[{j}]", 0.0), jnp.float32) for j in joints])
+        return replace(rollout, torque=rollout.torque + offset)
+
+    return Effect("torque offset", observe=observe)
+
+
+def _joint_torque(model, data, joints: np.ndarray, drive: Drive) -> jax.Array:
+    """[J] what the torque sensor reads: the motor's torque, or what reaches the link.
+
+    Between the two lie rotor inertia (armature) and the damping and dry friction of the joint.
+    """
+    torque = data.qfrc_actuator[joints]
+    if drive.torque.side is TorqueSide.LINK:
+        inertia = model.dof_armature[joints] * data.qacc[joints]
+        torque = torque - inertia - model.dof_damping[joints] * data.qvel[joints]
+    if drive.torque.gravity:
+        torque = torque + data.qfrc_gravcomp[joints]
+    return torque
+
+
+def _finger_geoms(scene: Scene) -> list[np.ndarray]:
+    """For each finger, [pairs, 2] the sorted geom ids of its contact pairs."""
+    model = scene.model
+    both = np.sort(np.stack([model.pair_geom1, model.pair_geom2], axis=1), axis=1) if model.npair else None
+    return [both[pairs] for pairs in scene.finger_pairs] if both is not None else []
+
+
+def _touching(data, fingers: list[np.ndarray]) -> jax.Array:
+    """[F] bool: does any contact of a finger's pairs penetrate?"""
+    if not fingers:
+        return jnp.zeros((0,), bool)
+    contact = data._impl.contact
+    geoms = jnp.sort(contact.geom, axis=1)  # [contacts, 2]
+    of_finger = [jnp.any(jnp.all(geoms[:, None] == pairs[None], axis=-1), axis=1) for pairs in fingers]
+    return jnp.stack([jnp.any(mine & (contact.dist < 0)) for mine in of_finger])
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A measured motion of the scene's joints, for the inverse mode.
+
+    time: [T] s.  position, velocity, acceleration: [T, J], in the order of `scene.joints`.
+    torque: convention of the measured torque.
+    """
+
+    time: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+    acceleration: np.ndarray
+    torque: TorqueConvention
+
+
+def inverse_replay(scene: Scene, motion: Motion, effects: Sequence[Effect] = ()) -> Replay:
+    """Torques of a prescribed motion, vectorised over time.
+
+    tau = M(q) qdd + c(q, qd) [+ g(q)] and, on the motor side, + armature qdd + damping qd + dry
+    friction sgn(qd).  On the link side none of the motor's own terms appear; what the joint adds
+    there (Coulomb and viscous friction, offset) is an observation effect.
+    """
+    joints, positions = scene.joint_dofs, scene.joint_qpos
+    base = jnp.asarray(scene.model.qpos0, jnp.float32)
+    q, qd, qdd = (jnp.asarray(a, jnp.float32) for a in (motion.position, motion.velocity, motion.acceleration))
+    motor = motion.torque.side is TorqueSide.MOTOR
+
+    def replay(physics: Physics) -> Rollout:
+        model, theta = physics.model, physics.theta
+        link_model = model if motor else model.replace(dof_armature=jnp.zeros_like(model.dof_armature))
+
+        def at(position, velocity, acceleration):
+            full = jnp.zeros(scene.model.nv, jnp.float32)
+            velocity = full.at[joints].set(velocity)
+            data = mjx.make_data(link_model).replace(qpos=base.at[positions].set(position), qvel=velocity)
+            data = mjx.fwd_velocity(link_model, mjx.fwd_position(link_model, data))
+            torque = mjx.full_m(link_model, data) @ full.at[joints].set(acceleration) + data.qfrc_bias
+            if not motion.torque.gravity:
+                torque = torque - data.qfrc_gravcomp
+            if motor:
+                torque = torque + model.dof_damping * velocity + model.dof_frictionloss * jnp.sign(velocity)
+            return torque[joints]
+
+        torque = jax.vmap(at)(q, qd, qdd)
+        rollout = Rollout(
+            time=jnp.asarray(motion.time, jnp.float32),
+            torque=torque,
+            position=q,
+            velocity=qd,
+            object_angle=jnp.zeros(len(motion.time)),
+            contact=jnp.zeros((len(motion.time), 0), bool),
+            finite=jnp.array(True),
+        )
+        return _observe(rollout, theta, effects)
+
+    return replay

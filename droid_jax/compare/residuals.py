@@ -1,0 +1,222 @@
+"""Simulation against measurement: what of a recording is compared, and the residuals.
+
+A `Comparison` holds a recording's measured channels on the host and two traceable functions of a
+`Rollout` of one sample: the distance in units (equation 1 of the paper) and the whitened
+residuals, in units of the noise of the repeats' mean.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from droid_jax.measure.noise import Noise, coarse_clock, estimate_noise, lowpass, smooth
+from droid_jax.measure.recording import Channel, Recording
+from droid_jax.model.scene import Scene
+from droid_jax.model.seam import Rollout
+
+# Deviation below which a channel's noise is never believed, in the channel's unit.
+MINIMUM_NOISE = {"torque": 0.01, "position": 2e-5, "velocity": 5e-4, "object_angle": 2e-4}
+
+
+@dataclass(frozen=True)
+class CompareConfig:
+    """How simulation and measurement are compared.
+
+    channels: weight of each compared channel in the distance (per unit of the channel).
+    failure_cost: c of equation 1, N m, added where the grasp is lost or the door stays shut.
+    non_finite_cost: N m, the cost of a replay that blew up.
+    shut_angle: rad; a door that never opens this far (or half as far as the measured one) stayed shut.
+    grip_share: share of the gripping time that all fingers must touch.
+    whitened: the cost is the root mean square of the whitened residuals instead of N m.
+    """
+
+    channels: Mapping[str, float] = field(default_factory=lambda: {"torque": 1.0})
+    failure_cost: float = 10.0
+    non_finite_cost: float = 1000.0
+    shut_angle: float = 0.0873
+    grip_share: float = 0.95
+    whitened: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """One channel ready to be compared.
+
+    at: [Tc] fractional rows of the simulated trace; values [N,Tc,C], mask [N,Tc,C]; columns [C]
+    of the simulated channel; kernel [K,T] and noise for the whitened form; weight in the distance.
+    """
+
+    name: str
+    at: np.ndarray
+    values: np.ndarray
+    mask: np.ndarray
+    columns: np.ndarray
+    kernel: np.ndarray
+    noise: Noise
+    weight: float
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Everything measured in one recording that a replay is compared with."""
+
+    name: str
+    channels: tuple[Measured, ...]
+    grip_rows: tuple[int, int] | None
+    shut_angle: float | None
+    config: CompareConfig
+
+    def distance(self, rollout: Rollout) -> jax.Array:
+        """[] N m: equation 1, mean over repeats of ||tau_s - tau_r|| + c beta; finite always.
+
+        The norm is the time mean of the Euclidean norm over the joints.
+        """
+        if self.config.whitened:
+            z = self.whitened(rollout)
+            total = jnp.sqrt(jnp.mean(z**2))
+        else:
+            total = sum(c.weight * _distance(c, _trace(rollout, c)) for c in self.channels)
+        cost = total + self.config.failure_cost * self.failed(rollout)
+        return jnp.where(rollout.finite & jnp.isfinite(cost), cost, self.config.non_finite_cost)
+
+    def failed(self, rollout: Rollout) -> jax.Array:
+        """[] bool, beta of equation 1: the grasp was lost or the door stayed shut."""
+        failed = jnp.array(False)
+        if self.grip_rows is not None and rollout.contact.shape[-1]:
+            held = jnp.all(rollout.contact[self.grip_rows[0] : self.grip_rows[1]], axis=-1)
+            failed = failed | (jnp.mean(held) < self.config.grip_share) | ~held[-1]
+        if self.shut_angle is not None:
+            failed = failed | (jnp.max(rollout.object_angle) < self.shut_angle)
+        return failed
+
+    def whitened(self, rollout: Rollout) -> jax.Array:
+        """[M] residuals of the repeats' mean in noise units; zeros where a replay blew up."""
+        parts = [
+            jnp.einsum(
+                "ckl,lc->ck",
+                jnp.asarray(c.noise.whitener, jnp.float32),
+                jnp.asarray(c.kernel, jnp.float32) @ _trace(rollout, c) - jnp.asarray(c.noise.mean, jnp.float32),
+            ).ravel()
+            for c in self.channels
+        ]
+        residual = jnp.concatenate(parts)
+        return jnp.where(rollout.finite & jnp.isfinite(residual), residual, 0.0)
+
+    def smoothed(self, rollout: Rollout, channel: str = "torque") -> jax.Array:
+        """[K, C] a channel of the rollout through the filter the data went through."""
+        c = next(c for c in self.channels if c.name == channel)
+        return jnp.asarray(c.kernel, jnp.float32) @ _trace(rollout, c)
+
+    def noise(self, channel: str = "torque") -> Noise:
+        """The measured noise of a channel."""
+        return next(c for c in self.channels if c.name == channel).noise
+
+
+def _trace(rollout: Rollout, channel: Measured) -> jax.Array:
+    """[T, C] the simulated channel that a measured one is compared with."""
+    trace = getattr(rollout, channel.name)
+    trace = trace[:, None] if trace.ndim == 1 else trace
+    return trace[:, channel.columns]
+
+
+def _distance(channel: Measured, trace: jax.Array) -> jax.Array:
+    """[] mean over repeats and time of the Euclidean norm over columns, masked samples left out."""
+    last = trace.shape[0] - 1
+    low = np.clip(np.floor(channel.at).astype(int), 0, last)
+    part = jnp.asarray((channel.at - low)[:, None], jnp.float32)
+    simulated = trace[low] * (1 - part) + trace[np.minimum(low + 1, last)] * part
+    mask = jnp.asarray(channel.mask)
+    error = jnp.where(mask, simulated[None] - jnp.asarray(np.where(channel.mask, channel.values, 0), jnp.float32), 0)
+    norm = jnp.sqrt(jnp.sum(error**2, axis=-1) + 1e-20)  # [N, Tc]
+    measured = jnp.any(mask, axis=-1)
+    return jnp.mean(jnp.sum(norm * measured, axis=1) / jnp.maximum(jnp.sum(measured, axis=1), 1))
+
+
+def make_comparison(
+    scene: Scene, recording: Recording, timestep: float, steps: int, config: CompareConfig
+) -> Comparison:
+    """Prepare a recording's channels for comparison with a replay of `steps` rows of `timestep` s.
+
+    Raises ValueError for a channel the recording does not have, one that no replay produces, or a
+    constant (dead) channel.
+    """
+    start = float(recording.time[0]) if len(recording.time) else recording.span[0]
+    clock = start + np.arange(steps) * timestep
+    channels = tuple(
+        _measure(scene, recording.channel(name), clock, weight) for name, weight in config.channels.items()
+    )
+    grip = _grip_window(recording) if scene.grip else None
+    shut = None
+    if scene.object_joint and scene.grip:
+        shut = config.shut_angle
+        if "object_angle" in recording.channels:
+            angle = recording.channels["object_angle"]
+            shut = max(shut, 0.5 * float(np.max(np.where(angle.mask, angle.values, -np.inf))))
+    rows = None if grip is None else tuple(int(np.clip(round((t - start) / timestep), 0, steps)) for t in grip)
+    return Comparison(recording.name, channels, rows, shut, config)
+
+
+def _grip_window(recording: Recording) -> tuple[float, float] | None:
+    """From the end of the grasp to the beginning of the release, s; None where no phases are stated."""
+    named = {p.name: p for p in recording.phases}
+    if "grasp" not in named:
+        return None
+    end = named["release"].start if "release" in named else recording.time[-1]
+    return named["grasp"].end, float(end)
+
+
+def _measure(scene: Scene, channel: Channel, clock: np.ndarray, weight: float) -> Measured:
+    if channel.name not in MINIMUM_NOISE:
+        raise ValueError(f"channel {channel.name!r} has no simulated counterpart; known: {', '.join(MINIMUM_NOISE)}")
+    _refuse_constant(channel)
+    if channel.name == "object_angle":
+        columns = np.zeros(1, dtype=int)
+    else:
+        unknown = [c for c in channel.columns if c not in scene.joints]
+        if unknown:
+            raise ValueError(
+                f"channel {channel.name!r}: unknown joints {', '.join(unknown)}; valid: {', '.join(scene.joints)}"
+            )
+        columns = np.array([scene.joints.index(c) for c in channel.columns], dtype=int)
+    inside = (channel.time >= clock[0] - 1e-9) & (channel.time <= clock[-1] + 1e-9)
+    time, values, mask = channel.time[inside], channel.values[:, inside], channel.mask[:, inside]
+    coarse = coarse_clock(float(time[0]), float(time[-1]))
+    repeats = smooth(values, mask, lowpass(time, coarse))
+    repeats = _fill(repeats, channel.name)
+    noise = estimate_noise(repeats, minimum=MINIMUM_NOISE[channel.name])
+    step = clock[1] - clock[0]
+    return Measured(
+        name=channel.name,
+        at=(time - clock[0]) / step,
+        values=values,
+        mask=mask,
+        columns=columns,
+        kernel=lowpass(clock, coarse),
+        noise=noise,
+        weight=weight,
+    )
+
+
+def _refuse_constant(channel: Channel) -> None:
+    for c, column in enumerate(channel.columns):
+        measured = channel.values[:, :, c][channel.mask[:, :, c]]
+        if measured.size and np.ptp(measured) == 0:
+            raise ValueError(
+                f"channel {channel.name!r}, column {column!r} never changes ({measured[0]:g} {channel.unit}): "
+                "a dead sensor? mask it out or leave the column away"
+            )
+
+
+def _fill(repeats: np.ndarray, name: str) -> np.ndarray:
+    """Gaps in one repeat take the other repeats' mean there; a gap in all is an error."""
+    mean = np.nanmean(repeats, axis=0) if np.isnan(repeats).any() else None
+    if mean is None:
+        return repeats
+    if np.isnan(mean).any():
+        raise ValueError(f"channel {name!r} has a stretch that no repeat measured")
+    return np.where(np.isnan(repeats), mean[None], repeats)

@@ -1,0 +1,73 @@
+"""The C twin of the servo replay: the same commands, values and outputs through plain C MuJoCo.
+
+It is the parity oracle, the CPU benchmark, and the engine of `--engine mujoco`.  It knows no
+effects that depend on the state (forces, friction laws): a scene with those needs MJX.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from droid_jax.compare.replay import Drive, check_gains
+from droid_jax.measure.engine import instrument, simulate
+from droid_jax.measure.recording import TorqueSide
+from droid_jax.model.parameters import Space
+from droid_jax.model.physics import make_c_model, theta_of
+from droid_jax.model.scene import Scene
+from droid_jax.model.seam import Effect, Rollout
+
+
+def twin_replay(
+    scene: Scene, space: Space, drive: Drive, effects: Sequence[Effect] = (), *, chunk: int = 64
+) -> Callable[[np.ndarray], Rollout]:
+    """values [P, D] -> Rollout with a leading [P], float64, on all cores.
+
+    Only effects that observe are possible; others raise ValueError, as does a recording whose
+    torque is on the link side or contains gravity (the C batch interface returns neither).
+    """
+    check_gains(scene, drive)
+    stateful = [e.name for e in effects if e.force or e.frictionloss or e.command]
+    if stateful:
+        raise ValueError(f"the C engine cannot run effects that depend on the state: {', '.join(stateful)}; use MJX")
+    if drive.torque.side is TorqueSide.LINK or drive.torque.gravity:
+        raise ValueError("the C engine replays motor-side torque without gravity only; use MJX for this recording")
+    base = instrument(scene)
+    plain = Scene(scene.name, scene.spec, base, scene.joints, scene.command_names, scene.object_joint, scene.grip)
+
+    def piece(values: np.ndarray) -> Rollout:
+        models = [make_c_model(plain, space, row) for row in values]
+        thetas = [theta_of(space, row) for row in values]
+        control = np.stack([_control(drive, t.get("time_offset", 0.0)) for t in thetas])
+        trace = simulate(plain, models, drive.qpos0[None], control)
+        half = 0.5 * drive.timestep
+        rollout = Rollout(
+            time=np.broadcast_to(drive.time, trace.object_angle.shape),
+            torque=trace.torque + _offsets(scene, thetas)[:, None],
+            position=trace.position + half * trace.velocity,
+            velocity=trace.velocity,
+            object_angle=trace.object_angle + half * trace.object_velocity,
+            contact=trace.contact,
+            finite=np.isfinite(trace.torque).all(axis=(1, 2)) & np.isfinite(trace.position).all(axis=(1, 2)),
+        )
+        return rollout
+
+    def replay(values: np.ndarray) -> Rollout:
+        values = np.atleast_2d(np.asarray(values, dtype=np.float64))
+        pieces = [piece(values[i : i + chunk]) for i in range(0, len(values), chunk)]
+        fields = Rollout.__dataclass_fields__
+        return Rollout(**{f: np.concatenate([getattr(p, f) for p in pieces]) for f in fields})
+
+    return replay
+
+
+def _control(drive: Drive, time_offset: float) -> np.ndarray:
+    """[T, U] the command half a step (and the time offset) late, as the MJX replay applies it."""
+    at = drive.time - 0.5 * drive.timestep - time_offset
+    return np.stack([np.interp(at, drive.time, c) for c in drive.command.T], axis=1)
+
+
+def _offsets(scene: Scene, thetas: Sequence[dict[str, float]]) -> np.ndarray:
+    """[P, J] N m constant torque-sensor errors."""
+    return np.array([[t.get(f"torque_offset[{j}]", 0.0) for j in scene.joints] for t in thetas])

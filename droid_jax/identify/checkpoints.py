@@ -1,0 +1,131 @@
+"""Numbered checkpoints of a loop that may be killed: save every few steps, resume from the newest good one.
+
+Any loop whose state is a nested dictionary of numpy arrays can use them.  A checkpoint is a folder,
+written by orbax under a temporary name and renamed when complete.  Beside the arrays it holds a
+fingerprint, what the state belongs to, and a digest over both, because a damaged file is not always
+one that cannot be read.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import warnings
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import orbax.checkpoint as ocp
+
+Tree = dict[str, Any]  # nested dictionary whose leaves are numpy arrays, none of them empty
+
+# what orbax and the store below it raise on files that are missing, cut short or changed
+_DAMAGE = (ValueError, KeyError, TypeError, OSError, RuntimeError)
+
+
+class Checkpoints:
+    """The checkpoints of one loop in one folder; use as a context manager, or close().
+
+    folder:      created when missing; belongs to this loop alone.
+    keep:        how many of the newest checkpoints stay on disk.
+    fingerprint: named texts that say what the loop's state belongs to (its configuration, its data);
+                 a checkpoint with other texts is refused.
+    """
+
+    def __init__(self, folder: str | Path, *, keep: int = 3, fingerprint: Mapping[str, str] | None = None):
+        if keep < 1:
+            raise ValueError(f"keep must be at least 1, got {keep}")
+        self.folder = Path(folder).resolve()
+        self.fingerprint = dict(fingerprint or {})
+        options = ocp.CheckpointManagerOptions(max_to_keep=keep, enable_async_checkpointing=False)
+        self._manager = ocp.CheckpointManager(self.folder, options=options)
+
+    def __enter__(self) -> Checkpoints:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Release the folder; no save or restore afterwards."""
+        self._manager.close()
+
+    def steps(self) -> list[int]:
+        """Steps that have a checkpoint on disk, oldest first; some may turn out to be damaged."""
+        return sorted(self._manager.all_steps())
+
+    def save(self, step: int, tree: Tree) -> None:
+        """Write the state after `step` steps.
+
+        Checkpoints of this step or a later one are removed first: they are damaged ones that a
+        resumed loop has passed over, and would otherwise count as the newest.
+        """
+        for old in self.steps():
+            if old >= step:
+                self._manager.delete(old)
+        meta = {"fingerprint": self.fingerprint, "digest": _digest(self.fingerprint, tree)}
+        items = ocp.args.Composite(state=ocp.args.StandardSave(tree), meta=ocp.args.JsonSave(meta))
+        self._manager.save(step, args=items, force=True)
+
+    def restore(self) -> tuple[int, Tree] | None:
+        """(step, tree) of the newest checkpoint that is whole; None when there is none.
+
+        Warns about every damaged checkpoint it passes over, with its path and what is wrong.
+        Raises ValueError when the newest whole checkpoint has another fingerprint.
+        """
+        for step in reversed(self.steps()):
+            try:
+                found, tree = self._read(step)
+            except _DAMAGE as error:
+                warnings.warn(
+                    f"checkpoint {self.folder / str(step)} is damaged and was passed over: {_first_line(error)}",
+                    stacklevel=2,
+                )
+                continue
+            self._check_fingerprint(step, found)
+            return step, tree
+        return None
+
+    def _read(self, step: int) -> tuple[dict[str, str], Tree]:
+        """Fingerprint and tree of one checkpoint; raises one of _DAMAGE when it is not as written."""
+        items = ocp.args.Composite(state=ocp.args.StandardRestore(), meta=ocp.args.JsonRestore())
+        read = self._manager.restore(step, args=items)
+        fingerprint, digest = read["meta"]["fingerprint"], read["meta"]["digest"]
+        if _digest(fingerprint, read["state"]) != digest:
+            raise ValueError("its content does not match its digest")
+        return fingerprint, read["state"]
+
+    def _check_fingerprint(self, step: int, found: dict[str, str]) -> None:
+        """ValueError that names the texts in which a checkpoint differs from this loop."""
+        keys = sorted(set(found) | set(self.fingerprint))
+        other = [k for k in keys if found.get(k) != self.fingerprint.get(k)]
+        if other:
+            raise ValueError(
+                f"checkpoint {self.folder / str(step)} belongs to another run: it differs in "
+                f"{', '.join(other)}; use another folder, or remove this one to start over"
+            )
+
+
+def _digest(fingerprint: Mapping[str, str], tree: Tree) -> str:
+    """sha256 over the fingerprint and every array's path, type, shape and bytes."""
+    sha = hashlib.sha256(json.dumps(dict(fingerprint), sort_keys=True).encode())
+    for path, leaf in _leaves(tree):
+        array = np.ascontiguousarray(leaf)
+        sha.update(f"{path} {array.dtype.str} {np.shape(leaf)}".encode())
+        sha.update(array.tobytes())
+    return sha.hexdigest()
+
+
+def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """(path, array) of every leaf, in the order of the names."""
+    if not isinstance(tree, Mapping):
+        yield path, tree
+        return
+    for name in sorted(tree):
+        yield from _leaves(tree[name], f"{path}/{name}")
+
+
+def _first_line(error: BaseException) -> str:
+    """Kind and first line of an error, for a message of one line."""
+    return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0][:300]}"

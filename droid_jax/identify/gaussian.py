@@ -1,0 +1,333 @@
+"""The Gaussian over parameters: what identification hands to training and to the report.
+
+A `Gaussian` is a normal distribution in one of two coordinates: `search` coordinates (see
+`droid_jax.model.parameters`), where a log-scaled parameter is log-normal in its unit, or `physical`
+ones.  It carries the rule that set its width, because a covariance without its origin cannot be
+judged: the one CMA-ES ends with shrinks with every generation and is no posterior.
+
+Bounds.  Draws of a linearly scaled parameter (and of every parameter in physical coordinates) that
+fall outside the bounds are drawn again, whole rows at a time, as the paper redraws negative values.
+A log-scaled parameter in search coordinates is clipped by its map instead, so that a bound of
+exactly zero keeps the probability that lies beyond it.
+
+File format (JSON, version 1)::
+
+    {"format": "droid_jax.gaussian", "version": 1, "coordinates": "search" | "physical",
+     "rule": str, "mean": [D], "cov": [D][D],
+     "space": [{"name", "unit", "mean", "std", "low", "high", "nuisance", "group",
+                "scaling": "linear" | "log", "floor", "width": number | null,
+                "writes": [{"field", "index": [...], "mode", "gain"}]}]}
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import tempfile
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+from scipy import stats
+
+from droid_jax.model.parameters import Mode, Parameter, Scaling, Space, Write
+
+Coordinates = Literal["search", "physical"]
+
+FORMAT = "droid_jax.gaussian"
+VERSION = 1
+MIN_ACCEPTANCE = 1e-3  # below this share of draws inside the bounds, sampling gives up
+MOMENT_POINTS = 20_001  # equal-probability points behind physical_mean and physical_std
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussian:
+    """A normal distribution over the parameters of a space.
+
+    space:       meaning of the entries.
+    mean:        [D] in `coordinates`.
+    cov:         [D, D] in `coordinates`, symmetric and positive semi-definite.
+    rule:        how the width was set, e.g. "prior", "cma-es covariance".
+    coordinates: "search" (unitless) or "physical" (each entry in its parameter's unit).
+
+    Raises ValueError on a wrong shape, a number that is not finite, or a cov that is no covariance.
+    """
+
+    space: Space
+    mean: np.ndarray
+    cov: np.ndarray
+    rule: str
+    coordinates: Coordinates = "search"
+
+    def __post_init__(self) -> None:
+        if self.coordinates not in get_args(Coordinates):
+            raise ValueError(f"coordinates must be 'search' or 'physical', got {self.coordinates!r}")
+        d = len(self.space)
+        mean, cov = _numbers("mean", self.mean, (d,)), _numbers("cov", self.cov, (d, d))
+        _check_covariance(cov)
+        for name, array in (("mean", mean), ("cov", (cov + cov.T) / 2)):
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    def sample(self, seed: int | np.random.Generator, n: int) -> np.ndarray:
+        """[n, D] physical values, all inside the bounds; the same seed gives the same rows.
+
+        Raises ValueError when fewer than one draw in a thousand falls inside the bounds.
+        """
+        rng = np.random.default_rng(seed)
+        low, high = self._box()
+        out, filled, drawn = np.empty((n, len(self.space))), 0, 0
+        while filled < n:
+            draws = self._draw(rng, max(n - filled, 256))
+            kept = draws[np.all((draws >= low) & (draws <= high), axis=-1)][: n - filled]
+            out[filled : filled + len(kept)] = kept
+            filled, drawn = filled + len(kept), drawn + len(draws)
+            if drawn >= 20_000 and filled < MIN_ACCEPTANCE * drawn:
+                raise ValueError(
+                    f"only {filled} of {drawn} draws fell inside the bounds; the mean lies too far "
+                    f"outside for: {', '.join(self._far_outside()) or 'several parameters together'}"
+                )
+        return self._to_physical(out)
+
+    def log_density(self, values: np.ndarray) -> np.ndarray:
+        """[...] log density at physical values [..., D], per unit of every parameter.
+
+        -inf outside the bounds.  It is the density of the normal itself: not renormalised for what
+        the bounds cut off.  Raises ValueError when cov is singular.
+        """
+        values = np.asarray(values, dtype=np.float64)
+        if values.shape[-1:] != (len(self.space),):
+            raise ValueError(f"values must have shape [..., {len(self.space)}], got {values.shape}")
+        try:
+            root = np.linalg.cholesky(self.cov)
+        except np.linalg.LinAlgError:
+            raise ValueError("cov is singular and has no density; take marginal() of what varies") from None
+        inside = np.all((values >= self.space.low) & (values <= self.space.high), axis=-1)
+        safe = np.clip(values, self.space.low, self.space.high)
+        y, log_slope = (safe, 0.0) if self.coordinates == "physical" else self._search_and_slope(safe)
+        white = np.linalg.solve(root, (y - self.mean)[..., None])[..., 0]
+        constant = np.log(np.diag(root)).sum() + 0.5 * len(self.space) * math.log(2 * math.pi)
+        return np.where(inside, -0.5 * (white**2).sum(axis=-1) - constant + log_slope, -np.inf)
+
+    def quantiles(self, q: Sequence[float] | np.ndarray) -> np.ndarray:
+        """[len(q), D] marginal quantiles in physical units, for levels q [Q] between 0 and 1.
+
+        A marginal is truncated (or clipped) at its own bounds only: exact unless the bounds of
+        another, strongly correlated parameter cut rows away too.
+        """
+        q = np.asarray(q, dtype=np.float64)
+        if q.ndim != 1 or not np.all((q >= 0) & (q <= 1)):
+            raise ValueError(f"q must be a list of levels between 0 and 1, got {q}")
+        low, high = self._box()
+        columns = [
+            _truncated_quantiles(q, m, s, a, b)
+            for m, s, a, b in zip(self.mean, np.sqrt(np.diag(self.cov)), low, high, strict=True)
+        ]
+        return self._to_physical(np.stack(columns, axis=-1))
+
+    def interval(self, level: float = 0.9) -> tuple[np.ndarray, np.ndarray]:
+        """Equal-tailed marginal interval that holds `level` of the mass: (low [D], high [D])."""
+        if not 0 < level < 1:
+            raise ValueError(f"level must lie between 0 and 1, got {level}")
+        low, high = self.quantiles([(1 - level) / 2, (1 + level) / 2])
+        return low, high
+
+    @cached_property
+    def physical_mean(self) -> np.ndarray:
+        """[D] marginal means in physical units, over a fixed grid of equal-probability quantiles."""
+        return self._grid.mean(axis=0)
+
+    @cached_property
+    def physical_std(self) -> np.ndarray:
+        """[D] marginal deviations in physical units, over the same grid as `physical_mean`."""
+        return self._grid.std(axis=0)
+
+    def marginal(self, names: Iterable[str]) -> Gaussian:
+        """The Gaussian of these parameters alone, in the order given."""
+        names = list(names)
+        index = [self.space.index(n) for n in names]
+        cov = self.cov[np.ix_(index, index)]
+        return Gaussian(self.space.select(names), self.mean[index], cov, self.rule, self.coordinates)
+
+    def save(self, path: str | Path) -> None:
+        """Write the JSON file described in the module's text, atomically."""
+        content = {
+            "format": FORMAT,
+            "version": VERSION,
+            "coordinates": self.coordinates,
+            "rule": self.rule,
+            "mean": self.mean.tolist(),
+            "cov": self.cov.tolist(),
+            "space": space_to_json(self.space),
+        }
+        _write_atomically(Path(path), json.dumps(content, indent=1, allow_nan=False))
+
+    @cached_property
+    def _grid(self) -> np.ndarray:
+        """[MOMENT_POINTS, D] physical values that each stand for an equal share of a marginal."""
+        return self.quantiles((np.arange(MOMENT_POINTS) + 0.5) / MOMENT_POINTS)
+
+    def _draw(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """[n, D] draws in `coordinates`, bounds ignored."""
+        variances, axes = np.linalg.eigh(self.cov)
+        return self.mean + (rng.standard_normal((n, len(self.mean))) * np.sqrt(variances.clip(0))) @ axes.T
+
+    def _box(self) -> tuple[np.ndarray, np.ndarray]:
+        """Region that draws must lie in, (low [D], high [D]) in `coordinates`; infinite where clipped."""
+        if self.coordinates == "physical":
+            return self.space.low, self.space.high
+        return redraw_box(self.space)
+
+    def _to_physical(self, y: np.ndarray) -> np.ndarray:
+        """[..., D] in `coordinates` -> [..., D] physical values inside the bounds."""
+        if self.coordinates == "search":
+            return self.space.from_search(y)
+        return np.clip(y, self.space.low, self.space.high)
+
+    def _search_and_slope(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Search coordinates [..., D] of physical values, and log |dx/dv| summed over D, [...]."""
+        slopes = [
+            np.full(values.shape[:-1], -math.log(p.std))
+            if p.scaling is Scaling.LINEAR
+            else -np.log((values[..., i] + p.floor) * p.log_width)
+            for i, p in enumerate(self.space.parameters)
+        ]
+        return self.space.to_search(values), np.sum(slopes, axis=0)
+
+    def _far_outside(self) -> list[str]:
+        """Names of the parameters whose own marginal leaves the bounds nearly always."""
+        low, high = self._box()
+        std = np.sqrt(np.diag(self.cov)).clip(1e-300)
+        kept = stats.norm.cdf((high - self.mean) / std) - stats.norm.cdf((low - self.mean) / std)
+        return [n for n, k in zip(self.space.names, kept, strict=True) if k < 0.05]
+
+
+def prior(space: Space) -> Gaussian:
+    """The initial Gaussian of a space: one deviation per parameter, uncorrelated, search coordinates."""
+    return Gaussian(space, space.to_search(space.mean), np.eye(len(space)), rule="prior")
+
+
+def load(path: str | Path) -> Gaussian:
+    """Read a file written by `Gaussian.save`; ValueError names the file and what is wrong in it."""
+    path = Path(path)
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(content, dict) or content.get("format") != FORMAT:
+            raise ValueError(f"expected a JSON object with format {FORMAT!r}")
+        if content.get("version") != VERSION:
+            raise ValueError(f"expected version {VERSION}, got {content.get('version')!r}")
+        space = space_from_json(_entry(content, "space", "the file"))
+        mean, cov, rule, coordinates = (
+            _entry(content, key, "the file") for key in ("mean", "cov", "rule", "coordinates")
+        )
+        return Gaussian(space, mean, cov, rule, coordinates)
+    except FileNotFoundError:
+        raise ValueError(f"{path}: there is no such file") from None
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def space_to_json(space: Space) -> list[dict[str, Any]]:
+    """A space as JSON values: one object per parameter, writes included."""
+    out = []
+    for p in space.parameters:
+        entry = asdict(p) | {"scaling": p.scaling.value}
+        entry["writes"] = [asdict(w) | {"mode": w.mode.value, "index": list(w.index)} for w in p.writes]
+        out.append(entry)
+    return out
+
+
+def space_from_json(entries: Any) -> Space:
+    """The space that `space_to_json` described; ValueError names the parameter and entry that is wrong."""
+    if not isinstance(entries, list):
+        raise ValueError(f"space must be a list of parameters, got {type(entries).__name__}")
+    return Space(tuple(_parameter_from_json(i, e) for i, e in enumerate(entries)))
+
+
+def redraw_box(space: Space) -> tuple[np.ndarray, np.ndarray]:
+    """(low [D], high [D]) in search coordinates outside of which a draw is drawn again.
+
+    The bounds where a parameter is scaled linearly, infinite where its logarithmic map clips.
+    """
+    linear = np.array([p.scaling is Scaling.LINEAR for p in space.parameters])
+    low, high = space.to_search(space.low), space.to_search(space.high)
+    return np.where(linear, low, -np.inf), np.where(linear, high, np.inf)
+
+
+def _parameter_from_json(position: int, entry: Any) -> Parameter:
+    """One parameter of `space_from_json`."""
+    if not isinstance(entry, dict):
+        raise ValueError(f"parameter {position} must be an object, got {type(entry).__name__}")
+    where = f"parameter {entry.get('name', position)!r}"
+    get: dict[str, Any] = {key: _entry(entry, key, where) for key in Parameter.__dataclass_fields__}
+    try:
+        get["writes"] = tuple(_write_from_json(w) for w in get["writes"])
+        get["scaling"] = Scaling(get["scaling"])
+        get["width"] = None if get["width"] is None else float(get["width"])
+        for key in ("mean", "std", "low", "high", "floor"):
+            get[key] = float(get[key])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{where}: an entry has the wrong form ({error!r})") from error
+    return Parameter(**get)
+
+
+def _write_from_json(entry: dict[str, Any]) -> Write:
+    """One write of a parameter."""
+    index = tuple(int(i) for i in entry["index"])
+    return Write(str(entry["field"]), index, Mode(entry["mode"]), float(entry["gain"]))
+
+
+def _entry(content: dict[str, Any], key: str, where: str) -> Any:
+    """content[key], or a ValueError that says where it is missing."""
+    if key not in content:
+        raise ValueError(f"{where} has no entry {key!r}")
+    return content[key]
+
+
+def _numbers(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """A float64 copy of an array of this shape, or ValueError."""
+    try:
+        array = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be an array of numbers of shape {shape} ({error})") from error
+    if array.shape != shape:
+        raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} has {int((~np.isfinite(array)).sum())} entries that are not finite")
+    return array
+
+
+def _check_covariance(cov: np.ndarray) -> None:
+    """ValueError unless cov [D, D] is symmetric and positive semi-definite to rounding."""
+    scale = np.sqrt(np.abs(np.diag(cov)))
+    tolerance = 1e-6 * np.outer(scale, scale) + 1e-300
+    if not np.all(np.abs(cov - cov.T) <= tolerance):
+        raise ValueError("cov must be symmetric")
+    # judged as a correlation matrix: variances of parameters in different units differ by decades
+    unit = np.where(scale > 0, scale, 1.0)
+    lowest = float(np.linalg.eigvalsh((cov + cov.T) / 2 / np.outer(unit, unit))[0])
+    if lowest < -1e-6 * len(cov):
+        raise ValueError(f"cov must be positive semi-definite; its correlation has an eigenvalue {lowest:.3g}")
+
+
+def _truncated_quantiles(q: np.ndarray, mean: float, std: float, low: float, high: float) -> np.ndarray:
+    """[Q] quantiles of a normal truncated to [low, high]; a std of 0 is a point."""
+    if std == 0:
+        return np.full(q.shape, mean)
+    return stats.truncnorm.ppf(q, (low - mean) / std, (high - mean) / std, loc=mean, scale=std)
+
+
+def _write_atomically(path: Path, text: str) -> None:
+    """Write text to path so that a reader sees the old file or the new one, never a part."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(text + "\n")
+        os.replace(temporary, path)
+    finally:
+        Path(temporary).unlink(missing_ok=True)

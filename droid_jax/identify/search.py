@@ -1,0 +1,577 @@
+"""CMA-ES over the parameters of a space: the search of the paper's section III-B.
+
+Each generation draws a population from the current Gaussian, asks the cost of every row in one
+batch, and moves the Gaussian towards the best rows.  The algebra is evosax's; the recombination
+weights are ours, because evosax gives half of the population a positive weight whatever
+`elite_ratio` says, and gives rows with equal costs the weight of their average rank.
+
+The search moves in search coordinates x (one unit is about one prior deviation), the cost sees
+physical values.  Independent restarts are rows of the same batch.  Everything random comes from
+fold_in(key(seed), generation), so a resumed search repeats an uninterrupted one bit for bit.
+References "Tutorial" are to Hansen, The CMA Evolution Strategy: A Tutorial, arXiv 1604.00772.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from evosax.algorithms import CMA_ES
+
+from droid_jax.identify.checkpoints import Checkpoints, Tree
+from droid_jax.identify.gaussian import Gaussian, redraw_box, space_to_json
+from droid_jax.model.parameters import Space
+
+Cost = Callable[[np.ndarray], Any]  # [rows, D] float64 physical values -> [rows]; +inf is a failed row
+
+REDRAWS = 64  # draws per row among which one inside the bounds is looked for
+BOUND_SHARE = 0.01  # a best value this close to a bound, as a share of the range in x, counts as on it
+_REASONS = ("", "tol_cost", "tol_sigma")  # why a restart stopped, by the code kept in checkpoints
+
+
+@dataclass(frozen=True)
+class SearchConfig:
+    """Settings of a search; the defaults are the paper's population with stated stops.
+
+    population: rows per generation and restart.
+    parents:    rows with positive weight; None takes half of the population, CMA-ES's own default.
+    generations: most generations.
+    restarts:   independent searches, evaluated in one batch of restarts * population rows; restart r
+                draws what a single search with seed + r would draw.
+    sigma:      initial step in search coordinates; 1 starts from the prior.
+    bounds:     "resample" redraws rows in which a linearly scaled parameter is out of bounds and clips
+                what is still outside after REDRAWS draws; "clip" clips.  Log-scaled ones always clip.
+    active:     negative weights for the worst rows; None: only when `parents` is None.
+    tol_cost:   a restart stops when its best cost fell by less than this share over `patience`
+                generations; 0 never.
+    patience:   generations, see tol_cost.
+    tol_sigma:  a restart stops when the longest axis of its Gaussian (a deviation, in search
+                coordinates) is below this; 0 never.  float32 resolves about 1e-5.
+    max_seconds: stop after this many seconds of wall time, resumed parts included; None never.
+    seed:       of all randomness.
+    checkpoint_every: generations between checkpoints.
+    """
+
+    population: int = 30
+    parents: int | None = 5
+    generations: int = 100
+    restarts: int = 1
+    sigma: float = 1.0
+    bounds: Literal["resample", "clip"] = "resample"
+    active: bool | None = None
+    tol_cost: float = 1e-4
+    patience: int = 20
+    tol_sigma: float = 1e-3
+    max_seconds: float | None = None
+    seed: int = 0
+    checkpoint_every: int = 5
+
+    def __post_init__(self) -> None:
+        for name in ("generations", "restarts", "patience", "checkpoint_every"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.population < 2:
+            raise ValueError(f"population must be at least 2, got {self.population}")
+        if self.parents is not None and not 1 <= self.parents < self.population:
+            raise ValueError(
+                f"parents must lie between 1 and population - 1 = {self.population - 1}, got {self.parents}"
+            )
+        if not (math.isfinite(self.sigma) and self.sigma > 0):
+            raise ValueError(f"sigma must be positive, got {self.sigma}")
+        for name in ("tol_cost", "tol_sigma"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must be 0 or more, got {getattr(self, name)}")
+        if self.max_seconds is not None and not self.max_seconds > 0:
+            raise ValueError(f"max_seconds must be positive or None, got {self.max_seconds}")
+        if not 0 <= self.seed < 2**31 - self.restarts:
+            raise ValueError(f"seed must lie between 0 and 2^31 - restarts, got {self.seed}")
+        if self.bounds not in ("resample", "clip"):
+            raise ValueError(f"bounds must be 'resample' or 'clip', got {self.bounds!r}")
+
+    @property
+    def elite(self) -> int:
+        """Number of parents."""
+        return self.population // 2 if self.parents is None else self.parents
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """One restart, generation by generation (G of them, P rows each); search state is after the update.
+
+    mean:        [G, D] physical units.
+    std:         [G, D] marginal deviations, search coordinates.
+    sigma:       [G] step size.
+    best_cost:   [G] lowest cost found so far.
+    mean_cost, median_cost: [G] over the rows of the generation that did not fail; inf if all did.
+    costs:       [G, P] cost of every row, inf where it failed.
+    seconds:     [G] wall time of the generation, cost included (the first one compiles).
+    """
+
+    mean: np.ndarray
+    std: np.ndarray
+    sigma: np.ndarray
+    best_cost: np.ndarray
+    mean_cost: np.ndarray
+    median_cost: np.ndarray
+    costs: np.ndarray
+    seconds: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Restart:
+    """One of the independent searches: its seed, where it ended, why it stopped and its history.
+
+    best, mean: [D] physical units; cov: [D, D] sigma^2 C in search coordinates.
+    """
+
+    seed: int
+    best: np.ndarray
+    best_cost: float
+    mean: np.ndarray
+    cov: np.ndarray
+    stop: str
+    history: History
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Result of a search: the restart with the lowest cost, and all of them in `restarts`.
+
+    best:     [D] physical values with the lowest cost, best_cost.
+    mean:     [D] physical values of the final Gaussian's centre.
+    cov:      [D, D] of the final Gaussian in search coordinates, sigma^2 C.
+    evaluations: rows given to the cost; failed: those that came back NaN or infinite.
+    stop:     "generations", "tol_cost", "tol_sigma" or "max_seconds".
+    on_bound: names of parameters whose best value lies within 1 % of the range of a bound.
+    """
+
+    space: Space
+    best: np.ndarray
+    best_cost: float
+    mean: np.ndarray
+    cov: np.ndarray
+    history: History
+    evaluations: int
+    failed: int
+    stop: str
+    on_bound: tuple[str, ...]
+    restarts: tuple[Restart, ...]
+
+    def gaussian(self) -> Gaussian:
+        """The search distribution.  Its width depends on when the search stopped: it is no posterior."""
+        return Gaussian(self.space, self.space.to_search(self.mean), self.cov, rule="cma-es covariance")
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a progress display needs after each generation; costs over all running restarts.
+
+    seconds: wall time so far; seconds_left: at most, at the pace of the latest generations.
+    """
+
+    generation: int
+    generations: int
+    best_cost: float
+    median_cost: float
+    sigma: float
+    seconds: float
+    seconds_left: float
+
+
+def search(
+    cost: Cost,
+    space: Space,
+    config: SearchConfig,
+    *,
+    start: np.ndarray | None = None,
+    checkpoint_dir: Path | None = None,
+    fingerprint: str = "",
+    progress: Callable[[Progress], None] | None = None,
+) -> Fit:
+    """Minimise cost over a space.
+
+    cost:        [restarts * population, D] float64 physical values inside the bounds -> [same] costs on
+                 host or device; NaN and infinite costs are failed rows, never chosen as parents.
+    start:       [D] or [restarts, D] physical values to start from; None starts at the prior mean.
+    checkpoint_dir: saves there and resumes from the newest whole checkpoint; a finished search can be
+                 continued with more generations.
+    fingerprint: says what the cost was made from (recording, scene, ...); a checkpoint made with another
+                 space, configuration, start or fingerprint is refused.
+
+    Raises ValueError when a whole generation failed, on a cost of the wrong shape, a start out of
+    bounds, or somebody else's checkpoint.
+    """
+    strategy = _Strategy(space, config)
+    centre = _start(space, config, start)
+    with _checkpoints(checkpoint_dir, space, config, centre, fingerprint) as checkpoints:
+        run = _restored(checkpoints, strategy, centre) or _Run.fresh(strategy.init(centre), config, len(space))
+        while _unfinished(run, config):
+            _generation(run, cost, strategy)
+            if checkpoints and (run.generation % config.checkpoint_every == 0 or not _unfinished(run, config)):
+                checkpoints.save(run.generation, run.tree())
+            if progress:
+                progress(_progress(run, config))
+    return _fit(run, space, config)
+
+
+class Recombination(NamedTuple):
+    """Weights of the ranked rows, and the learning rates that follow from them (Tutorial, Table 1)."""
+
+    weights: np.ndarray  # [P], best row first; the positive ones sum to 1
+    mu_eff: float
+    c_1: float
+    c_mu: float
+    c_std: float
+    d_std: float
+    c_c: float
+
+
+def recombination(population: int, parents: int, dims: int, active: bool) -> Recombination:
+    """Weights log(parents + 1/2) - log(rank): exactly the `parents` best rows have a positive one.
+
+    active gives the other rows negative weights (Tutorial, eqs. 50-53) in place of zero.
+    """
+    raw = math.log(parents + 0.5) - np.log(np.arange(1, population + 1))  # [P]
+    mu_eff = raw[:parents].sum() ** 2 / (raw[:parents] ** 2).sum()
+    mu_eff_minus = raw[parents:].sum() ** 2 / (raw[parents:] ** 2).sum()
+    c_c = (4 + mu_eff / dims) / (dims + 4 + 2 * mu_eff / dims)
+    c_1 = 2 / ((dims + 1.3) ** 2 + mu_eff)
+    c_mu = min(1 - c_1 - 1e-8, 2 * (mu_eff - 2 + 1 / mu_eff) / ((dims + 2) ** 2 + mu_eff))
+    c_std = (mu_eff + 2) / (dims + mu_eff + 5)
+    d_std = 1 + 2 * max(0.0, math.sqrt((mu_eff - 1) / (dims + 1)) - 1) + c_std
+    weights = np.zeros(population)
+    weights[:parents] = raw[:parents] / raw[:parents].sum()
+    if active and c_mu > 0:
+        alpha = min(1 + c_1 / c_mu, 1 + 2 * mu_eff_minus / (mu_eff + 2), (1 - c_1 - c_mu) / (dims * c_mu))
+        weights[parents:] = alpha * raw[parents:] / -raw[parents:].sum()
+    return Recombination(weights, float(mu_eff), c_1, float(c_mu), float(c_std), float(d_std), float(c_c))
+
+
+class _Strategy:
+    """evosax's CMA-ES for all restarts at once, on one device; leading axis [R] of restarts.
+
+    That device is a CPU where there is one: the matrices are tiny, and the draws are then the same on
+    every machine.
+    """
+
+    def __init__(self, space: Space, config: SearchConfig):
+        self.space, self.config, dims = space, config, len(space)
+        self._device = _one_device()
+        box = redraw_box(space) if config.bounds == "resample" else (np.full(dims, -np.inf), np.full(dims, np.inf))
+        with jax.default_device(self._device):
+            self._kernels = _kernels(config.population, dims, REDRAWS if np.isfinite(box).any() else 1)
+        active = config.parents is None if config.active is None else config.active
+        weights = recombination(config.population, config.elite, dims, active)
+        params = self._kernels.params.replace(std_init=config.sigma, **weights._asdict())
+        self._params = self._put(jax.tree.map(lambda a: np.asarray(a, np.float32), params))
+        self._box = self._put(np.asarray(box, np.float32))
+        self._bounds = self._put(np.asarray([space.to_search(space.low), space.to_search(space.high)], np.float32))
+        self._seeds = self._put(np.arange(config.restarts) + config.seed)
+
+    def init(self, centre: np.ndarray) -> Any:
+        """State of every restart at its start [R, D], physical values."""
+        x = self._put(np.asarray(self.space.to_search(centre), np.float32))
+        return self._kernels.init(self._seeds, x, self._params)
+
+    def ask(self, state: Any, generation: int) -> tuple[np.ndarray, Any]:
+        """Populations [R, P, D] in search coordinates, and the state with its axes brought up to date."""
+        number = self._put(np.int32(generation))
+        x, state = self._kernels.ask(self._seeds, number, state, self._params, self._box)
+        return np.asarray(x), state
+
+    def tell(self, state: Any, x: np.ndarray, costs: np.ndarray, running: np.ndarray) -> Any:
+        """State after costs [R, P] of x [R, P, D]; unchanged where a restart is not running [R]."""
+        # ranks, not costs: float64 costs that float32 cannot tell apart keep their order
+        ranks = np.argsort(np.argsort(costs, axis=1, kind="stable"), axis=1)
+        fitness = np.where(np.isfinite(costs), ranks, np.inf).astype(np.float32)
+        told = (self._put(a) for a in (x, fitness, running & np.isfinite(costs).any(axis=1)))
+        return self._kernels.tell(state, *told, self._params, self._bounds)
+
+    def put_state(self, state: Any, arrays: Tree) -> Any:
+        """A copy of a state with its arrays replaced."""
+        return state.replace(**{name: self._put(a) for name, a in arrays.items()})
+
+    def _put(self, tree: Any) -> Any:
+        return jax.device_put(tree, self._device)
+
+
+class _Kernels(NamedTuple):
+    """Jitted functions over all restarts, and evosax's default parameters for them."""
+
+    init: Callable[..., Any]
+    ask: Callable[..., Any]
+    tell: Callable[..., Any]
+    params: Any
+
+
+@cache  # a study runs many searches of one size: compile them once
+def _kernels(population: int, dims: int, redraws: int) -> _Kernels:
+    """The compiled algebra for P rows of D parameters, `redraws` draws per row."""
+    evosax = CMA_ES(population, jnp.zeros(dims), fitness_shaping_fn=_ranked_weights)
+
+    def init(seed: Any, x: Any, params: Any) -> Any:
+        return evosax.init(jax.random.key(seed), x, params)
+
+    def ask(seed: Any, generation: Any, state: Any, params: Any, box: Any) -> tuple[Any, Any]:
+        """One restart's rows [P, D]: per row, its first draw inside the box [2, D]."""
+        keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), generation), redraws)
+        draw = jax.vmap(lambda key: evosax.ask(key, state, params), out_axes=(0, None))
+        draws, state = draw(keys)  # [K, P, D]
+        inside = jnp.all((draws >= box[0]) & (draws <= box[1]), axis=-1)  # [K, P]
+        first = jnp.argmax(inside, axis=0)  # 0 where none is inside: that one is clipped
+        x = jnp.take_along_axis(draws, first[None, :, None], axis=0)[0]
+        return jnp.clip(x, box[0], box[1]), state
+
+    def tell(state: Any, x: Any, fitness: Any, running: Any, params: Any, bounds: Any) -> Any:
+        """One restart's update, its mean held inside the bounds [2, D]."""
+        new, _ = evosax.tell(jax.random.key(0), x, fitness, state, params)  # evosax draws nothing here
+        # beyond the bounds a clipped cost is flat and the mean would wander off for good
+        new = new.replace(mean=jnp.clip(new.mean, bounds[0], bounds[1]))
+        return jax.tree.map(lambda a, b: jnp.where(running, a, b), new, state)
+
+    return _Kernels(
+        init=jax.jit(jax.vmap(init, in_axes=(0, 0, None))),
+        ask=jax.jit(jax.vmap(ask, in_axes=(0, None, 0, None, None))),
+        tell=jax.jit(jax.vmap(tell, in_axes=(0, 0, 0, 0, None, None))),
+        params=jax.tree.map(np.asarray, evosax.default_params),
+    )
+
+
+def _ranked_weights(population: jax.Array, fitness: jax.Array, state: Any, params: Any) -> Any:
+    """Weights [P] by rank; a failed row (inf) is no parent, and the other parents share its weight."""
+    weights = params.weights[jnp.argsort(jnp.argsort(fitness))]
+    positive = jnp.where(jnp.isinf(fitness), 0.0, jnp.maximum(weights, 0.0))
+    return jnp.where(weights > 0, positive / jnp.sum(positive), weights)
+
+
+@dataclass(eq=False)
+class _Run:
+    """Everything that changes while a search runs; what a checkpoint holds."""
+
+    state: Any  # evosax's, leading axis [R]
+    generation: int
+    best: np.ndarray  # [R, D] physical
+    best_cost: np.ndarray  # [R]
+    stopped: np.ndarray  # [R] index into _REASONS
+    ended: np.ndarray  # [R] generations the restart ran
+    failed: int
+    records: dict[str, list[np.ndarray]] = field(default_factory=dict)  # per generation [R, ...]
+
+    @staticmethod
+    def fresh(state: Any, config: SearchConfig, dims: int) -> _Run:
+        r = config.restarts
+        none = np.zeros(r, np.int64)
+        return _Run(state, 0, np.full((r, dims), np.nan), np.full(r, np.inf), none, none.copy(), 0)
+
+    @property
+    def cov(self) -> np.ndarray:
+        """[R, D, D] sigma^2 C, search coordinates."""
+        c = np.asarray(self.state.C, np.float64)
+        sigma = np.asarray(self.state.std, np.float64)
+        return sigma[:, None, None] ** 2 * (c + c.swapaxes(1, 2)) / 2
+
+    @property
+    def seconds(self) -> float:
+        """Wall time of all generations so far."""
+        return float(sum(float(s[0]) for s in self.records.get("seconds", [])))
+
+    def tree(self) -> Tree:
+        """As nested dictionaries of arrays."""
+        return {
+            "state": {name: np.asarray(getattr(self.state, name)) for name in self.state.__dataclass_fields__},
+            "records": {name: np.stack(rows) for name, rows in self.records.items()},
+            "best": self.best,
+            "best_cost": self.best_cost,
+            "stopped": self.stopped,
+            "ended": self.ended,
+            "failed": np.array(self.failed),
+        }
+
+    @staticmethod
+    def of_tree(generation: int, tree: Tree, state: Any) -> _Run:
+        """Inverse of tree(), with the state already on its device."""
+        records = {name: list(rows) for name, rows in tree["records"].items()}
+        best, best_cost, stopped, ended = (np.array(tree[k]) for k in ("best", "best_cost", "stopped", "ended"))
+        return _Run(state, generation, best, best_cost, stopped, ended, int(tree["failed"]), records)
+
+
+def _generation(run: _Run, cost: Cost, strategy: _Strategy) -> None:
+    """One generation of every restart: draw, evaluate, update, record, judge."""
+    started = time.perf_counter()
+    space, config = strategy.space, strategy.config
+    running = run.stopped == 0
+    x, state = strategy.ask(run.state, run.generation)  # [R, P, D]
+    values = space.from_search(np.asarray(x, np.float64))
+    costs = _evaluate(cost, values)  # [R, P]
+    if not np.isfinite(costs[running]).any():
+        raise ValueError(
+            f"generation {run.generation}: all {costs.size} rows of the cost are infinite or NaN; evaluate "
+            "the cost at space.mean to see why it fails, then start nearer to values that work (a smaller "
+            "sigma, another start, tighter bounds) or shorten the time step"
+        )
+    run.failed += int((~np.isfinite(costs)).sum())
+    run.state = strategy.tell(state, x, costs, running)
+    _keep_best(run, values, costs, running)
+    run.generation += 1
+    run.ended[running] = run.generation
+    _record(run, costs, space.from_search(np.asarray(run.state.mean, np.float64)))
+    run.records["seconds"].append(np.full(config.restarts, time.perf_counter() - started))
+    _judge(run, config)
+
+
+def _evaluate(cost: Cost, values: np.ndarray) -> np.ndarray:
+    """Costs [R, P] float64 of values [R, P, D] in one batch; +inf where NaN or infinite."""
+    rows = values.reshape(-1, values.shape[-1])
+    costs = np.asarray(cost(rows), np.float64)
+    if costs.shape != rows.shape[:1]:
+        raise ValueError(f"cost must return shape {rows.shape[:1]} for values {rows.shape}, got {costs.shape}")
+    return np.where(np.isfinite(costs), costs, np.inf).reshape(values.shape[:2])
+
+
+def _keep_best(run: _Run, values: np.ndarray, costs: np.ndarray, running: np.ndarray) -> None:
+    """Bring every running restart's best row up to date."""
+    for r in np.flatnonzero(running):
+        i = int(np.argmin(costs[r]))
+        if costs[r, i] < run.best_cost[r]:
+            run.best[r], run.best_cost[r] = values[r, i], costs[r, i]
+
+
+def _record(run: _Run, costs: np.ndarray, mean: np.ndarray) -> None:
+    """Append this generation to the records; costs [R, P], mean [R, D] physical."""
+    finite = [row[np.isfinite(row)] for row in costs]
+    entries = {
+        "mean": mean,
+        "std": np.sqrt(np.diagonal(run.cov, axis1=1, axis2=2)),
+        "sigma": np.asarray(run.state.std, np.float64),
+        "best_cost": run.best_cost.copy(),
+        "mean_cost": np.array([f.mean() if f.size else np.inf for f in finite]),
+        "median_cost": np.array([np.median(f) if f.size else np.inf for f in finite]),
+        "costs": costs,
+    }
+    for name, entry in entries.items():
+        run.records.setdefault(name, []).append(entry)
+    run.records.setdefault("seconds", [])
+
+
+def _judge(run: _Run, config: SearchConfig) -> None:
+    """Mark the restarts that have converged; a marked one stays as it is from then on."""
+    widest = np.sqrt(np.linalg.eigvalsh(run.cov)[:, -1])  # [R]
+    narrow = widest < config.tol_sigma
+    stalled = np.zeros_like(narrow)
+    if run.generation > config.patience:
+        before = run.records["best_cost"][-1 - config.patience]
+        with np.errstate(invalid="ignore"):  # inf - inf while a restart has not found a finite row
+            stalled = before - run.best_cost < config.tol_cost * np.abs(before)
+    running = run.stopped == 0
+    run.stopped[running & stalled] = _REASONS.index("tol_cost")
+    run.stopped[running & narrow] = _REASONS.index("tol_sigma")
+
+
+def _unfinished(run: _Run, config: SearchConfig) -> bool:
+    """Whether another generation is due."""
+    in_time = config.max_seconds is None or run.seconds < config.max_seconds
+    return bool((run.stopped == 0).any()) and run.generation < config.generations and in_time
+
+
+def _progress(run: _Run, config: SearchConfig) -> Progress:
+    """Numbers for a display; the pace is the median of ten generations, so that compilation drops out."""
+    pace = float(np.median([s[0] for s in run.records["seconds"][-10:]]))
+    left = pace * (config.generations - run.generation) if _unfinished(run, config) else 0.0
+    if config.max_seconds is not None:
+        left = min(left, max(0.0, config.max_seconds - run.seconds))
+    leader = int(np.argmin(run.best_cost))
+    median = float(np.min(run.records["median_cost"][-1][run.ended == run.generation]))
+    sigma = float(run.records["sigma"][-1][leader])
+    return Progress(run.generation, config.generations, float(run.best_cost[leader]), median, sigma, run.seconds, left)
+
+
+def _fit(run: _Run, space: Space, config: SearchConfig) -> Fit:
+    """The result, led by the restart with the lowest cost."""
+    overall = "max_seconds" if run.generation < config.generations else "generations"
+    covs, means = run.cov, run.records["mean"][-1]
+    restarts = tuple(
+        Restart(
+            seed=config.seed + r,
+            best=run.best[r],
+            best_cost=float(run.best_cost[r]),
+            mean=means[r],
+            cov=covs[r],
+            stop=_REASONS[run.stopped[r]] or overall,
+            history=History(**{k: np.stack([e[r] for e in v[: run.ended[r]]]) for k, v in run.records.items()}),
+        )
+        for r in range(config.restarts)
+    )
+    winner = min(restarts, key=lambda r: r.best_cost)
+    return Fit(
+        space=space,
+        best=winner.best,
+        best_cost=winner.best_cost,
+        mean=winner.mean,
+        cov=winner.cov,
+        history=winner.history,
+        evaluations=run.generation * config.restarts * config.population,
+        failed=run.failed,
+        stop=winner.stop,
+        on_bound=_on_bound(space, winner.best),
+        restarts=restarts,
+    )
+
+
+def _on_bound(space: Space, best: np.ndarray) -> tuple[str, ...]:
+    """Names of the parameters whose value lies within BOUND_SHARE of the range, in x, of a bound."""
+    low, x, high = (space.to_search(v) for v in (space.low, best, space.high))
+    near = np.minimum(x - low, high - x) <= BOUND_SHARE * (high - low)
+    return tuple(n for n, on in zip(space.names, near, strict=True) if on)
+
+
+def _start(space: Space, config: SearchConfig, start: np.ndarray | None) -> np.ndarray:
+    """[R, D] physical values that the restarts begin at."""
+    values = space.check(space.mean if start is None else start)
+    if values.shape not in ((len(space),), (config.restarts, len(space))):
+        raise ValueError(
+            f"start must have shape ({len(space)},) or ({config.restarts}, {len(space)}), got {values.shape}"
+        )
+    return np.broadcast_to(values, (config.restarts, len(space))).copy()
+
+
+def _checkpoints(folder: Path | None, space: Space, config: SearchConfig, centre: np.ndarray, fingerprint: str) -> Any:
+    """Checkpoints of this search as a context manager; of None when no folder is given."""
+    if folder is None:
+        return nullcontext(None)
+    # what may change between two parts of one search without changing its path
+    free = ("generations", "max_seconds", "checkpoint_every")
+    texts = {
+        "fingerprint": fingerprint,
+        "space": json.dumps(space_to_json(space)),
+        "config": json.dumps({k: v for k, v in asdict(config).items() if k not in free}),
+        "start": json.dumps(centre.tolist()),
+    }
+    return Checkpoints(folder, fingerprint=texts)
+
+
+def _restored(checkpoints: Checkpoints | None, strategy: _Strategy, centre: np.ndarray) -> _Run | None:
+    """The search as its newest whole checkpoint left it, or None."""
+    found = checkpoints.restore() if checkpoints else None
+    if found is None:
+        return None
+    generation, tree = found
+    state = strategy.put_state(strategy.init(centre), tree["state"])
+    return _Run.of_tree(generation, tree, state)
+
+
+def _one_device() -> Any:
+    """A CPU device of this process, or its first device where jax was told to leave the CPU out."""
+    try:
+        return jax.local_devices(backend="cpu")[0]
+    except RuntimeError:
+        return jax.local_devices()[0]

@@ -1,0 +1,117 @@
+"""Plain C MuJoCo, many rollouts at once on all cores: used by the stand-in robot and by the C twin."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from mujoco import rollout
+
+from droid_jax.model.scene import LOOK_GROUP, Scene
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """What a batch of C rollouts measured, at the times the states had before each step.
+
+    torque [P,T,J] N m motor side; position [P,T,J]; velocity [P,T,J]; object_angle, object_velocity
+    [P,T]; contact [P,T,F] bool, per finger.
+    """
+
+    torque: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+    object_angle: np.ndarray
+    object_velocity: np.ndarray
+    contact: np.ndarray
+
+
+def instrument(scene: Scene) -> mujoco.MjModel:
+    """The scene's C model with sensors for everything in `Trace`.
+
+    Recompiled from the scene's spec, then given the scene's own numbers, so that options and
+    fields changed after compilation are kept.
+    """
+    spec = scene.spec.copy()
+    for geom in list(spec.geoms):
+        if geom.group == LOOK_GROUP:
+            spec.delete(geom)
+    for kind in ("JOINTACTFRC", "JOINTPOS", "JOINTVEL"):
+        for joint in scene.joints:
+            _add(spec, kind, joint)
+    if scene.object_joint:
+        for kind in ("JOINTPOS", "JOINTVEL"):
+            _add(spec, kind, scene.object_joint)
+    for pairs in scene.grip.fingers if scene.grip else ():
+        for pair in pairs:
+            found = spec.pair(pair)
+            spec.add_sensor(
+                type=mujoco.mjtSensor.mjSENS_CONTACT,
+                objtype=mujoco.mjtObj.mjOBJ_GEOM,
+                objname=found.geomname1,
+                reftype=mujoco.mjtObj.mjOBJ_GEOM,
+                refname=found.geomname2,
+                intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND), 0, 1],
+            )
+    model = spec.compile()
+    _copy_numbers(scene.model, model)
+    return model
+
+
+def _add(spec: mujoco.MjSpec, kind: str, joint: str) -> None:
+    spec.add_sensor(type=getattr(mujoco.mjtSensor, f"mjSENS_{kind}"), objtype=mujoco.mjtObj.mjOBJ_JOINT, objname=joint)
+
+
+def _copy_numbers(source: mujoco.MjModel, target: mujoco.MjModel) -> None:
+    for name in ("timestep", "integrator", "cone", "solver", "iterations", "ls_iterations", "impratio",
+                 "tolerance", "ls_tolerance", "disableflags", "enableflags", "jacobian"):  # fmt: skip
+        setattr(target.opt, name, getattr(source.opt, name))
+    for name in dir(source):
+        if name.startswith(("body_", "jnt_", "dof_", "geom_", "pair_", "actuator_")):
+            array = getattr(source, name)
+            if isinstance(array, np.ndarray) and array.size and np.issubdtype(array.dtype, np.number):
+                mine = getattr(target, name)
+                if mine.shape == array.shape and not name.endswith(("adr", "id", "num")):
+                    mine[:] = array
+    target.jnt_limited[:] = source.jnt_limited
+
+
+def simulate(
+    scene: Scene,
+    models: Sequence[mujoco.MjModel],
+    qpos0: np.ndarray,
+    control: np.ndarray,
+    *,
+    threads: int | None = None,
+) -> Trace:
+    """Roll out instrumented models [P] from qpos0 [P or 1, nq] under control [P or 1, T, U]."""
+    threads = min(threads or os.cpu_count() or 1, len(models))
+    kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
+    states = np.zeros((len(models), mujoco.mj_stateSize(models[0], kind)))
+    data = mujoco.MjData(models[0])
+    for i, model in enumerate(models):
+        data.qpos[:] = qpos0[i % len(qpos0)]
+        data.qvel[:] = 0
+        mujoco.mj_getState(model, data, states[i], kind)
+    with rollout.Rollout(nthread=threads) as pool:
+        datas = [mujoco.MjData(models[0]) for _ in range(threads)]
+        _, sensors = pool.rollout(list(models), datas, states, np.ascontiguousarray(control))
+    return _split(scene, sensors)
+
+
+def _split(scene: Scene, sensors: np.ndarray) -> Trace:
+    count = len(scene.joints)
+    torque, position, velocity = (sensors[..., k * count : (k + 1) * count] for k in range(3))
+    rest = sensors[..., 3 * count :]
+    nothing = np.zeros(sensors.shape[:2])
+    angle, speed = (rest[..., 0], rest[..., 1]) if scene.object_joint else (nothing, nothing)
+    rest = rest[..., 2:] if scene.object_joint else rest
+    fingers, start = [], 0
+    for pairs in scene.grip.fingers if scene.grip else ():
+        fingers.append(np.any(rest[..., start : start + len(pairs)] > 0, axis=-1))
+        start += len(pairs)
+    contact = np.stack(fingers, axis=-1) if fingers else np.zeros((*sensors.shape[:2], 0), bool)
+    return Trace(torque, position, velocity, angle, speed, contact)

@@ -1,0 +1,89 @@
+"""Repeat-to-repeat noise: one low-pass filter for data and simulation alike, its covariance, whitening.
+
+The filter is a linear map from a channel's clock to a coarse clock, so data of any rate and any
+mask and simulated traces pass through the same kernel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+CUTOFF = 8.0  # Hz; real Panda residuals double between 8 and 20 Hz
+RATE = 20.0  # Hz of the coarse clock
+
+
+def coarse_clock(start: float, end: float, rate: float = RATE) -> np.ndarray:
+    """[K] s from start to end at about `rate`."""
+    return np.linspace(start, end, max(2, round((end - start) * rate) + 1))
+
+
+def lowpass(clock: np.ndarray, coarse: np.ndarray, cutoff: float = CUTOFF) -> np.ndarray:
+    """[K, T] matrix from samples at `clock` to smoothed values at `coarse`.
+
+    A windowed sinc (Hann, 1.5 periods of the cutoff to each side), cut and renormalised at the
+    ends so that a constant stays that constant.  Source: windowed-sinc design, Oppenheim and
+    Schafer, ch. 7.
+    """
+    half = 1.5 / cutoff
+    lag = coarse[:, None] - clock[None, :]
+    spacing = np.gradient(clock) if len(clock) > 1 else np.ones_like(clock)
+    kernel = np.sinc(2 * cutoff * lag) * (0.5 + 0.5 * np.cos(np.pi * np.clip(lag / half, -1, 1)))
+    kernel *= spacing[None, :]
+    total = kernel.sum(axis=1, keepdims=True)
+    if np.any(np.abs(total) < 1e-12):
+        raise ValueError(
+            f"a clock with steps of {np.median(np.diff(clock)):.3g} s is too coarse to be smoothed at {cutoff} Hz"
+        )
+    return kernel / total
+
+
+def smooth(values: np.ndarray, mask: np.ndarray, kernel: np.ndarray) -> np.ndarray:
+    """[N, T, C] with mask -> [N, K, C], each output renormalised over the samples that were measured.
+
+    NaN where less than a fifth of the kernel's weight was measured.
+    """
+    filled = np.where(mask, values, 0.0)
+    top = np.einsum("kt,ntc->nkc", kernel, filled)
+    weight = np.einsum("kt,ntc->nkc", kernel, mask.astype(float))
+    return np.where(np.abs(weight) > 0.2, top / np.where(weight == 0, 1, weight), np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Noise of the mean of the repeats, per column, over the coarse clock.
+
+    mean: [K, C] of the smoothed repeats.  whitener: [C, K, K]; whitener @ (x - mean) has unit
+    covariance when x is the truth.  repeats: [N, K, C], smoothed.
+    """
+
+    mean: np.ndarray
+    whitener: np.ndarray
+    repeats: np.ndarray
+
+
+def estimate_noise(repeats: np.ndarray, *, minimum: float, shrink: float = 0.1) -> Noise:
+    """Noise of smoothed repeats [N, K, C], whole in time.
+
+    The autocovariance of the repeats about their mean is estimated per column (biased, hence
+    positive semi-definite), shrunk towards white noise of the same variance, and never less than
+    `minimum` (a deviation in the channel's unit: what one repeat alone would have).  With one
+    repeat only `minimum` is used, as white noise.
+    """
+    count, length, columns = repeats.shape
+    mean = repeats.mean(axis=0)
+    whitener = np.empty((columns, length, length))
+    for c in range(columns):
+        lags = np.zeros(length)
+        if count > 1:
+            error = repeats[:, :, c] - mean[:, c]
+            spectrum = np.abs(np.fft.rfft(error, 2 * length, axis=1)) ** 2
+            lags = np.fft.irfft(spectrum.sum(axis=0), 2 * length)[:length] / (length * (count - 1))
+        variance = max(lags[0], minimum**2)
+        lags = (1 - shrink) * lags
+        lags[0] = variance
+        covariance = scipy.linalg.toeplitz(lags) / count
+        whitener[c] = np.linalg.inv(np.linalg.cholesky(covariance))
+    return Noise(mean, whitener, repeats)

@@ -1,0 +1,365 @@
+"""Recordings from ROS bags: one bag per repeat, ROS 1 or ROS 2.
+
+The joint state topic gives torque (effort), position and velocity; an optional command topic
+gives the position command.  Every bag starts at its first command (at its first joint state
+when there is no command topic), and all are interpolated onto one uniform clock.  Nothing is
+invented: samples that fall into a gap of the log are masked out.
+"""
+
+from __future__ import annotations
+
+import enum
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags.rosbag1 import ReaderError as Ros1Error
+from rosbags.rosbag2 import ReaderError as Ros2Error
+from rosbags.typesys import Stores, get_typestore
+
+from droid_jax.measure.recording import (
+    Channel,
+    Phase,
+    Recording,
+    ServoGains,
+    TorqueConvention,
+    check_clock,
+    validate,
+)
+
+# channel -> field of sensor_msgs/JointState and unit
+_FIELDS = {"torque": ("effort", "N m"), "position": ("position", "rad"), "velocity": ("velocity", "rad/s")}
+_GAP = 5.0  # usual steps; a longer silence of a topic counts as unmeasured
+
+
+class Stamps(enum.Enum):
+    """Which time stamp of a message counts."""
+
+    AUTO = "auto"  # header stamps where all messages used have one, else BAG
+    HEADER = "header"  # when the message was made
+    BAG = "bag"  # when the recorder received it
+
+
+@dataclass(frozen=True, eq=False)
+class _Track:
+    """One topic of one bag: bag and header stamps [M] ns, and values [M, J] by field.
+
+    A field that the messages leave empty is absent.  Header stamps are None without headers.
+    Stamps stay integers: nanoseconds since 1970 do not fit a float64.
+    """
+
+    received: np.ndarray
+    stamped: np.ndarray | None
+    fields: dict[str, np.ndarray]
+
+
+_Timed = tuple[np.ndarray, dict[str, np.ndarray]]  # stamps [M] s, and values [M, J] by field
+
+
+def read_bags(
+    paths: Sequence[str | os.PathLike[str]],
+    *,
+    joints: Sequence[str],
+    torque: TorqueConvention,
+    state_topic: str = "/joint_states",
+    command_topic: str | None = None,
+    command_joints: Sequence[str] | None = None,
+    rate: float | None = None,
+    stamps: Stamps = Stamps.AUTO,
+    command_tolerance: float = 5e-3,
+    name: str | None = None,
+    qpos0: Mapping[str, float] | None = None,
+    gains: ServoGains | None = None,
+    phases: Sequence[Phase] = (),
+    allow_jitter: bool = False,
+) -> Recording:
+    """Reads one bag per repeat into a Recording.
+
+    joints:            measured joints, in the order wanted.
+    torque:            what the efforts are; a bag does not say.
+    state_topic:       sensor_msgs/JointState.
+    command_topic:     JointState, JointTrajectory, JointTrajectoryPoint or Float64MultiArray;
+                       None reads a log without commands.
+    command_joints:    commanded joints, and the order of numbers in messages without names;
+                       `joints` by default.
+    rate:              Hz of the common clock; the usual rate of the first bag's joint states
+                       by default.
+    stamps:            which time stamps count.
+    command_tolerance: rad or m by which the repeats' commands may differ (jitter of arrival).
+    qpos0:             initial positions to add to, or put in place of, the measured ones.
+    gains, phases:     passed on; phases count from each bag's start.
+    allow_jitter:      accept stamps at an irregular rate.
+
+    Raises FileNotFoundError for a missing bag and ValueError, naming the bag, for a missing
+    topic or joint, a topic without messages, efforts that are not finite, stamps that do not
+    increase, commands that differ between repeats, or bags without a common part.
+    """
+    bags = [Path(p) for p in paths]
+    if not bags:
+        raise ValueError("expected one ROS bag per repeat, got none")
+    if command_topic == state_topic:
+        raise ValueError(f"command and joint states need topics of their own, got {state_topic!r} for both")
+    command_joints = tuple(joints if command_joints is None else command_joints)
+    topics = {state_topic: tuple(joints)}
+    if command_topic is not None:
+        topics[command_topic] = command_joints
+    tracks = [_read_bag(bag, topics) for bag in bags]
+    use_header = _use_header(tracks, stamps, bags)
+
+    timed = [
+        _timed(track, use_header, bag, command_topic or state_topic, state_topic, allow_jitter)
+        for track, bag in zip(tracks, bags, strict=True)
+    ]
+    states = [topics[state_topic] for topics in timed]
+    commands = [] if command_topic is None else [topics[command_topic] for topics in timed]
+    clock = _clock(states, rate, bags)
+
+    channels = _channels(states, clock, tuple(joints), bags)
+    command = np.zeros((0, 0))
+    if commands:
+        command = _command(commands, clock, command_joints, command_tolerance, bags)
+    recording = Recording(
+        name=name or bags[0].stem,
+        time=clock if commands else np.zeros(0),
+        command=command,
+        command_names=command_joints if commands else (),
+        channels=channels,
+        torque=torque,
+        qpos0={**_initial(channels), **(qpos0 or {})},
+        gains=gains,
+        phases=tuple(phases),
+        meta={
+            "bags": ", ".join(bag.name for bag in bags),
+            "stamps": "header" if use_header else "bag",
+            "state_topic": state_topic,
+            "command_topic": command_topic or "",
+        },
+    )
+    return validate(recording, source=", ".join(str(bag) for bag in bags))
+
+
+def _read_bag(bag: Path, topics: Mapping[str, tuple[str, ...]]) -> dict[str, _Track]:
+    """topic -> track of one bag."""
+    if not bag.exists():
+        raise FileNotFoundError(f"no ROS bag at {bag}: there is no such file or folder")
+    try:
+        # Bags of ROS 2 before Iron in sqlite3 hold no message definitions of their own.
+        with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+            return {topic: _read_topic(reader, bag, topic, joints) for topic, joints in topics.items()}
+    except (AnyReaderError, Ros1Error, Ros2Error, OSError) as error:
+        raise ValueError(f"{bag}: not a readable ROS bag, or one that was cut off: {error}") from error
+
+
+def _read_topic(reader: AnyReader, bag: Path, topic: str, joints: tuple[str, ...]) -> _Track:
+    connections = [c for c in reader.connections if c.topic == topic]
+    if not connections:
+        have = ", ".join(sorted({c.topic for c in reader.connections})) or "none"
+        raise ValueError(f"{bag}: no topic {topic!r}; the bag has: {have}")
+    received, stamped, rows = [], [], []
+    seen: set[str] = set()
+    for number, (connection, nanoseconds, data) in enumerate(reader.messages(connections)):
+        message = reader.deserialize(data, connection.msgtype)
+        where = f"{bag}, topic {topic!r}, message {number}"
+        for offset, names, fields in _samples(message, joints, connection.msgtype, where):
+            seen.update(names)
+            picked = _pick(fields, names, joints, where)
+            if picked is None:
+                continue
+            rows.append(picked)
+            received.append(nanoseconds + offset)
+            stamped.append(_header_stamp(message, offset))
+    if not rows and seen:
+        raise ValueError(f"{bag}, topic {topic!r}: no joint of {', '.join(joints)}; it has: {', '.join(sorted(seen))}")
+    if not rows:
+        raise ValueError(f"{bag}, topic {topic!r}: no messages")
+    fields = {key: np.array([row[key] for row in rows]) for key in rows[0] if all(key in row for row in rows)}
+    header = None if None in stamped else np.array(stamped, dtype=np.int64)
+    return _Track(np.array(received, dtype=np.int64), header, fields)
+
+
+def _header_stamp(message: Any, offset: int) -> int | None:
+    """Nanoseconds of the header's stamp plus offset; None when there is none or it is zero."""
+    stamp = getattr(getattr(message, "header", None), "stamp", None)
+    if stamp is None or not (stamp.sec or stamp.nanosec):
+        return None
+    return stamp.sec * 10**9 + stamp.nanosec + offset
+
+
+def _samples(
+    message: Any, joints: tuple[str, ...], kind: str, where: str
+) -> list[tuple[int, tuple[str, ...], dict[str, np.ndarray]]]:
+    """The (offset in ns, joint names, field -> numbers) that one message holds."""
+    if hasattr(message, "name") and hasattr(message, "position"):  # JointState
+        fields = {field: np.asarray(getattr(message, field), dtype=np.float64) for field, _ in _FIELDS.values()}
+        return [(0, tuple(message.name), fields)]
+    if hasattr(message, "joint_names") and hasattr(message, "points"):  # JointTrajectory
+        names = tuple(message.joint_names)
+        return [(_nanoseconds(p.time_from_start), names, {"position": np.asarray(p.positions)}) for p in message.points]
+    if hasattr(message, "positions"):  # JointTrajectoryPoint
+        numbers = np.asarray(message.positions, dtype=np.float64)
+    elif hasattr(message, "data") and np.ndim(message.data) == 1:  # Float64MultiArray
+        numbers = np.asarray(message.data, dtype=np.float64)
+    else:
+        raise ValueError(
+            f"{where}: cannot read {kind}; expected JointState, JointTrajectory, JointTrajectoryPoint "
+            "or Float64MultiArray"
+        )
+    if len(numbers) != len(joints):
+        raise ValueError(f"{where}: expected {len(joints)} numbers ({', '.join(joints)}), got {len(numbers)}")
+    return [(0, joints, {"position": numbers})]
+
+
+def _nanoseconds(duration: Any) -> int:
+    return duration.sec * 10**9 + duration.nanosec
+
+
+def _pick(
+    fields: Mapping[str, np.ndarray], names: tuple[str, ...], joints: tuple[str, ...], where: str
+) -> dict[str, np.ndarray] | None:
+    """field -> [J] numbers of the joints wanted, without empty fields.
+
+    None when the message has none of them: arm and gripper often share a topic.
+    """
+    missing = [j for j in joints if j not in names]
+    if len(missing) == len(joints):
+        return None
+    if missing:
+        raise ValueError(f"{where}: no joint {', '.join(missing)}; the message has: {', '.join(names)}")
+    order = [names.index(j) for j in joints]
+    picked = {}
+    for field, numbers in fields.items():
+        if not len(numbers):
+            continue
+        if len(numbers) != len(names):
+            raise ValueError(f"{where}: expected {len(names)} numbers in {field!r}, got {len(numbers)}")
+        bad = [j for j, i in zip(joints, order, strict=True) if not np.isfinite(numbers[i])]
+        if bad:
+            raise ValueError(f"{where}: {field} of joint {bad[0]!r} is {numbers[names.index(bad[0])]}, not finite")
+        picked[field] = numbers[order]
+    return picked
+
+
+def _use_header(tracks: Sequence[Mapping[str, _Track]], stamps: Stamps, bags: Sequence[Path]) -> bool:
+    """Whether header stamps count: one choice for all, two clocks would shift the topics."""
+    bare = [(bag, topic) for bag, t in zip(bags, tracks, strict=True) for topic in t if t[topic].stamped is None]
+    if stamps is Stamps.HEADER and bare:
+        raise ValueError(f"{bare[0][0]}, topic {bare[0][1]!r}: messages have no header stamp; use Stamps.BAG")
+    return stamps is not Stamps.BAG and not bare
+
+
+def _timed(
+    tracks: Mapping[str, _Track],
+    use_header: bool,
+    bag: Path,
+    first_topic: str,
+    state_topic: str,
+    allow_jitter: bool,
+) -> dict[str, _Timed]:
+    """topic -> checked stamps [M] s since the first message of first_topic, and the fields."""
+
+    def stamps(track: _Track) -> np.ndarray:
+        return track.stamped if use_header and track.stamped is not None else track.received
+
+    start = stamps(tracks[first_topic])[0]
+    timed = {}
+    for topic, track in tracks.items():
+        time = 1e-9 * (stamps(track) - start)
+        where = f"{bag}, topic {topic!r} ({'header' if use_header else 'bag'} stamps)"
+        # Commands may pause while the robot holds still: their rate is not checked.
+        lenient = allow_jitter or topic != state_topic
+        check_clock(time, where, allow_jitter=lenient, label=lambda i: f"message {i}")
+        timed[topic] = (time, track.fields)
+    return timed
+
+
+def _clock(states: Sequence[_Timed], rate: float | None, bags: Sequence[Path]) -> np.ndarray:
+    """[T] s, uniform, a multiple of its step, over the part that all repeats cover from 0 on."""
+    short = [bag for bag, (t, _) in zip(bags, states, strict=True) if len(t) < 2 or t[-1] <= 0]
+    if short:
+        raise ValueError(f"{short[0]}: needs two joint states or more after the first command")
+    if rate is not None and not rate > 0:
+        raise ValueError(f"rate must be positive, got {rate} Hz")
+    step = 1.0 / rate if rate else float(np.median(np.diff(states[0][0])))
+    ends = [float(t[-1]) for t, _ in states]
+    if min(ends) < 0.5 * max(ends):
+        i = int(np.argmin(ends))
+        raise ValueError(
+            f"{bags[i]}: lasts {ends[i]:.3f} s, less than half of the longest repeat's {max(ends):.3f} s; "
+            "was it cut off?"
+        )
+    first = max(0.0, *(float(t[0]) for t, _ in states))
+    # A sample that misses the end by rounding still counts.
+    low, high = int(np.ceil(first / step - 1e-6)), int(np.floor(min(ends) / step + 1e-6))
+    if high - low < 1:
+        raise ValueError(f"the repeats have no common part: {', '.join(str(b) for b in bags)}")
+    return step * np.arange(low, high + 1)
+
+
+def _channels(
+    states: Sequence[_Timed],
+    clock: np.ndarray,
+    joints: tuple[str, ...],
+    bags: Sequence[Path],
+) -> dict[str, Channel]:
+    """torque, position and velocity on the common clock, those of them that all bags hold."""
+    lacking = [bag for bag, (_, fields) in zip(bags, states, strict=True) if "effort" not in fields]
+    if lacking:
+        raise ValueError(f"{lacking[0]}: the joint states hold no effort, so there is no torque to compare")
+    channels = {}
+    for name, (field, unit) in _FIELDS.items():
+        if not all(field in fields for _, fields in states):
+            continue
+        values = np.stack([_interpolate(clock, t, fields[field]) for t, fields in states])
+        seen = np.stack([~_in_gap(clock, t) for t, _ in states])
+        mask = np.repeat(seen[:, :, None], len(joints), axis=2)
+        channels[name] = Channel(name, unit, joints, clock, values, mask)
+    return channels
+
+
+def _interpolate(clock: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """values [M, J] at time [M] -> [T, J] at clock [T]; beyond the ends the last value holds."""
+    return np.stack([np.interp(clock, time, column) for column in values.T], axis=-1)
+
+
+def _in_gap(clock: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """[T] bool, True strictly between two stamps that lie further apart than _GAP usual steps."""
+    steps = np.diff(time)
+    i = np.clip(np.searchsorted(time, clock, side="right") - 1, 0, len(steps) - 1)
+    inside = (clock > time[i] + 1e-9) & (clock < time[i + 1] - 1e-9)
+    return inside & (steps[i] > _GAP * np.median(steps))
+
+
+def _command(
+    commands: Sequence[_Timed],
+    clock: np.ndarray,
+    joints: tuple[str, ...],
+    tolerance: float,
+    bags: Sequence[Path],
+) -> np.ndarray:
+    """[T, U] the first bag's command; ValueError when another bag's differs by more than tolerance."""
+    for bag, (_, fields) in zip(bags, commands, strict=True):
+        if "position" not in fields:
+            raise ValueError(f"{bag}: the command messages hold no positions")
+    every = [_interpolate(clock, t, fields["position"]) for t, fields in commands]
+    for bag, command in zip(bags[1:], every[1:], strict=True):
+        gap = np.abs(command - every[0])
+        i, j = np.unravel_index(int(np.argmax(gap)), gap.shape)
+        if gap[i, j] > tolerance:
+            raise ValueError(
+                f"{bag}: its command is not that of {bags[0]}, joint {joints[j]!r} differs by "
+                f"{gap[i, j]:.4g} at {clock[i]:.3f} s (command_tolerance is {tolerance:g}); "
+                "repeats must replay one motion"
+            )
+    return every[0]
+
+
+def _initial(channels: Mapping[str, Channel]) -> dict[str, float]:
+    """Joint -> first measured position, mean over repeats; nothing without positions."""
+    if "position" not in channels:
+        return {}
+    position = channels["position"]
+    return {joint: float(position.values[:, 0, c].mean()) for c, joint in enumerate(position.columns)}

@@ -1,0 +1,209 @@
+"""Make any quantity of an MJCF a parameter, in a line.
+
+    space = Space((
+        joint_damping(scene, "elbow", mean=1.0, std=0.5),
+        body_mass(scene, "forearm", std=0.3),
+        model_parameter(scene, "pair_friction", "left_near", 0, name="grip", unit="-", std=0.2, high=4),
+    ))
+
+Every function resolves names to ids once and raises ValueError, listing the valid names, for
+one that the scene does not have.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from droid_jax.model.parameters import Mode, Parameter, Scaling, Write
+from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
+
+_KIND = {
+    "dof": "joint",
+    "jnt": "joint",
+    "body": "body",
+    "geom": "geom",
+    "pair": "pair",
+    "actuator": "actuator",
+}
+
+
+def element_index(scene: Scene, field: str, element: str) -> int:
+    """First index into a model field, e.g. ("dof_damping", "hinge") -> the hinge's dof address."""
+    kind = _KIND.get(field.split("_")[0])
+    if kind is None or not hasattr(scene.model, field):
+        raise ValueError(
+            f"{field!r} is not a model field that a parameter can write; "
+            f"fields start with {', '.join(f'{k}_' for k in _KIND)} and are arrays of mujoco.MjModel"
+        )
+    return scene.dof(element) if field.startswith("dof_") else scene.id(kind, element)
+
+
+def model_parameter(
+    scene: Scene,
+    field: str,
+    element: str,
+    column: int | None = None,
+    *,
+    name: str | None = None,
+    unit: str,
+    std: float,
+    mean: float | None = None,
+    low: float = 0.0,
+    high: float,
+    mode: Mode = Mode.SET,
+    **options: Any,
+) -> Parameter:
+    """A parameter that is one number of a model field.
+
+    field, element, column: e.g. "dof_damping", "hinge", None or "geom_size", "knob", 0.
+    mean: default is the model's own number (mode SET) or the mode's neutral value.
+    options: further fields of `Parameter` (nuisance, group, scaling, floor, width).
+    """
+    first = element_index(scene, field, element)
+    index = (first,) if column is None else (first, column)
+    if mean is None:
+        neutral = {Mode.SCALE: 1.0, Mode.DIVIDE: 1.0, Mode.ADD: 0.0}
+        nominal = np.asarray(getattr(scene.model, field))[index]
+        mean = neutral.get(mode, float(nominal))
+    return Parameter(
+        name or f"{element}_{field.split('_', 1)[1]}",
+        unit,
+        float(mean),
+        std,
+        low,
+        high,
+        writes=(Write(field, index, mode),),
+        **options,
+    )
+
+
+def joint_damping(scene: Scene, joint: str, *, std: float, high: float, **options: Any) -> Parameter:
+    """Viscous damping of a joint, N m s/rad; log-scaled unless told otherwise."""
+    options = {"unit": "N m s/rad", "scaling": Scaling.LOG, "floor": 0.05, **options}
+    return model_parameter(scene, "dof_damping", joint, std=std, high=high, **options)
+
+
+def joint_stiffness(scene: Scene, joint: str, *, std: float, high: float, **options: Any) -> Parameter:
+    """Spring stiffness of a joint about its `springref`, N m/rad; log-scaled unless told otherwise."""
+    options = {"unit": "N m/rad", "scaling": Scaling.LOG, "floor": 0.05, **options}
+    return model_parameter(scene, "jnt_stiffness", joint, std=std, high=high, **options)
+
+
+def joint_frictionloss(scene: Scene, joint: str, *, std: float, high: float, **options: Any) -> Parameter:
+    """Dry friction of a joint, N m; log-scaled unless told otherwise.
+
+    Raises ValueError where the model was compiled with friction loss 0: MJX lays the constraint
+    row out at compilation, so it could never be raised (see `load_scene(friction_joints=...)`).
+    """
+    if scene.model.dof_frictionloss[scene.dof(joint)] < TINY_FRICTIONLOSS:
+        raise ValueError(
+            f"joint {joint!r} was compiled with friction loss 0, which MJX can never raise; "
+            f"give it {TINY_FRICTIONLOSS:g} in the MJCF or name it in load_scene(friction_joints=...)"
+        )
+    options = {"unit": "N m", "scaling": Scaling.LOG, "floor": 0.05, **options}
+    return model_parameter(scene, "dof_frictionloss", joint, std=std, high=high, **options)
+
+
+def body_mass(
+    scene: Scene,
+    body: str,
+    *,
+    std: float,
+    mean: float | None = None,
+    low: float = 0.01,
+    high: float,
+    **options: Any,
+) -> Parameter:
+    """Mass of one body, kg; its inertia scales with it, as for a body of one material."""
+    index = scene.id("body", body)
+    nominal = float(scene.model.body_mass[index])
+    if nominal <= 0:
+        raise ValueError(f"body {body!r} has no mass of its own in this scene")
+    options = {"name": f"{body}_mass", "unit": "kg", "scaling": Scaling.LOG, **options}
+    writes = (Write("body_mass", (index,)), *_inertia(index, Mode.SCALE, 1.0 / nominal))
+    return Parameter(mean=nominal if mean is None else mean, std=std, low=low, high=high, writes=writes, **options)
+
+
+def body_mass_scale(scene: Scene, body: str, *, std: float = 0.03, **options: Any) -> Parameter:
+    """Factor on a body's mass and inertia, 1 at nominal.
+
+    The robot's controller goes on compensating the gravity of the nominal mass (gravcomp is
+    divided by the factor), so an error of the factor is felt as gravity torque.
+    """
+    index = scene.id("body", body)
+    writes = (Write("body_mass", (index,), Mode.SCALE), *_inertia(index, Mode.SCALE, 1.0))
+    if scene.model.body_gravcomp[index] != 0:
+        writes += (Write("body_gravcomp", (index,), Mode.DIVIDE),)
+    options = {"name": f"{body}_mass_scale", "unit": "-", "mean": 1.0, "low": 0.5, "high": 1.5, **options}
+    return Parameter(std=std, writes=writes, **options)
+
+
+def servo_scale(scene: Scene, joint: str, *, std: float = 0.03, **options: Any) -> Parameter:
+    """Factor on the position gain of a joint's servo, 1 at nominal."""
+    if joint not in scene.command_names:
+        raise ValueError(f"no actuator drives {joint!r}; driven joints: {', '.join(scene.command_names)}")
+    actuator = scene.command_names.index(joint)
+    writes = (
+        Write("actuator_gainprm", (actuator, 0), Mode.SCALE),
+        Write("actuator_biasprm", (actuator, 1), Mode.SCALE),
+    )
+    options = {"name": f"{joint}_servo_scale", "unit": "-", "mean": 1.0, "low": 0.5, "high": 1.5, **options}
+    return Parameter(std=std, writes=writes, **options)
+
+
+def body_position(scene: Scene, body: str, axis: int, *, std: float, limit: float, **options: Any) -> Parameter:
+    """Displacement of a body in its parent along axis 0, 1 or 2, m; 0 at nominal."""
+    index = scene.id("body", body)
+    options = {
+        "name": f"{body}_{'xyz'[axis]}",
+        "unit": "m",
+        "mean": 0.0,
+        "low": -limit,
+        "high": limit,
+        **options,
+    }
+    return Parameter(std=std, writes=(Write("body_pos", (index, axis), Mode.ADD),), **options)
+
+
+def body_yaw(scene: Scene, body: str, *, std: float, limit: float, **options: Any) -> Parameter:
+    """Small rotation of a body about its z axis, rad; 0 at nominal.
+
+    First order in the angle (the quaternion's norm is off by angle^2 / 8, 1e-5 at half a degree).
+    Raises ValueError unless the body is upright in its parent.
+    """
+    index = scene.id("body", body)
+    if not np.allclose(scene.model.body_quat[index], [1, 0, 0, 0]):
+        raise ValueError(f"body {body!r} is rotated in its parent; its yaw cannot be a parameter")
+    options = {"name": f"{body}_yaw", "unit": "rad", "mean": 0.0, "low": -limit, "high": limit, **options}
+    return Parameter(std=std, writes=(Write("body_quat", (index, 3), Mode.SET, gain=0.5),), **options)
+
+
+def capsule_radius(scene: Scene, geom: str, *, std: float, limit: float, **options: Any) -> Parameter:
+    """Change of a capsule's radius, m; 0 at nominal. Mass and inertia stay."""
+    index = scene.id("geom", geom)
+    fields = [("geom_size", (index, 0)), ("geom_rbound", (index,))]
+    fields += [("geom_aabb", (index, k)) for k in (3, 4, 5)]
+    writes = tuple(Write(f, i, Mode.ADD) for f, i in fields)
+    options = {"name": f"{geom}_radius", "unit": "m", "mean": 0.0, "low": -limit, "high": limit, **options}
+    return Parameter(std=std, writes=writes, **options)
+
+
+def pair_friction(
+    scene: Scene, pairs: Sequence[str], columns: Sequence[int], *, std: float, **options: Any
+) -> Parameter:
+    """Friction of explicit contact pairs (MJX reads pair_friction for these, never geom_friction).
+
+    columns: 0 and 1 sliding (-), 2 torsional (m).
+    """
+    ids = [scene.id("pair", p) for p in pairs]
+    writes = tuple(Write("pair_friction", (i, c)) for i in ids for c in columns)
+    nominal = float(scene.model.pair_friction[ids[0], columns[0]])
+    options = {"mean": nominal, "low": 0.01, "high": 6.0, "scaling": Scaling.LOG, **options}
+    return Parameter(std=std, writes=writes, **options)
+
+
+def _inertia(body: int, mode: Mode, gain: float) -> tuple[Write, ...]:
+    return tuple(Write("body_inertia", (body, k), mode, gain) for k in range(3))

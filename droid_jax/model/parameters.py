@@ -1,0 +1,270 @@
+"""Physics parameters as one named vector: `Parameter` and `Space`.
+
+A `Parameter` says what it is (name, unit, bounds, initial mean and deviation) and what it
+writes: fields of the MuJoCo model (`writes`), or one entry of `theta`, the dictionary of
+quantities that live outside the model (a time offset, a torque offset, an effect's
+amplitude).  A `Space` is an ordered tuple of them; a parameter vector is an array [..., D]
+of physical values in that order.
+
+Search coordinates: the search and the Gaussian move in coordinates x [..., D] in which one
+unit is about one prior deviation.  `Scaling.LINEAR` is x = (v - mean) / std.
+`Scaling.LOG` is x = (log(v + floor) - log(mean + floor)) / width: positive parameters stay
+positive, and with a floor > 0 a value of exactly zero is still reachable (a door without
+friction loss).
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+
+class Mode(enum.Enum):
+    """How a value enters a model field, given the field's nominal number."""
+
+    SET = "set"  # field = value
+    NEGATIVE = "negative"  # field = -value
+    SCALE = "scale"  # field = nominal * value
+    DIVIDE = "divide"  # field = nominal / value
+    ADD = "add"  # field = nominal + value
+
+
+@dataclass(frozen=True)
+class Write:
+    """One assignment of a parameter's value to entries of a model field.
+
+    field: name of an MjModel / mjx.Model array, e.g. "dof_damping".
+    index: numpy index into it, a tuple of integers (ids are resolved once, from names).
+    mode:  how value and nominal number combine.
+    gain:  the value is multiplied by this first (mode SET of a mass uses 1; the inertia that
+           scales with it uses SCALE with gain 1 / nominal mass).
+    """
+
+    field: str
+    index: tuple[int, ...]
+    mode: Mode = Mode.SET
+    gain: float = 1.0
+
+    def new(self, nominal: Any, value: Any) -> Any:
+        """The field's new number(s) for a value; works on numpy and jax arrays alike."""
+        value = value * self.gain
+        if self.mode is Mode.SET:
+            return value
+        if self.mode is Mode.NEGATIVE:
+            return -value
+        if self.mode is Mode.SCALE:
+            return nominal * value
+        if self.mode is Mode.DIVIDE:
+            return nominal / value
+        return nominal + value
+
+
+class Scaling(enum.Enum):
+    """Search coordinate of a parameter, see the module's text."""
+
+    LINEAR = "linear"
+    LOG = "log"
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One physics parameter.
+
+    name:   unique within a space, e.g. "hinge_stiffness".
+    unit:   for tables and axes, e.g. "N m/rad".
+    mean, std: initial Gaussian, in `unit` (Table I of the paper for the door).
+    low, high: bounds, in `unit`; low <= mean <= high and low < high.
+    writes: model fields it sets; empty for a parameter that lives in theta.
+    nuisance: fitted and marginalised, of no interest by itself.
+    group:  heading in tables ("Door", "Robot", "Gripper", "Nuisance").
+    scaling, floor: search coordinate.
+    width:  units of the search coordinate per prior deviation when scaling is LOG; None takes
+            it from mean and std.
+    """
+
+    name: str
+    unit: str
+    mean: float
+    std: float
+    low: float
+    high: float
+    writes: tuple[Write, ...] = ()
+    nuisance: bool = False
+    group: str = "Model"
+    scaling: Scaling = Scaling.LINEAR
+    floor: float = 0.0
+    width: float | None = None
+
+    def __post_init__(self) -> None:
+        numbers = (self.mean, self.std, self.low, self.high)
+        if not all(math.isfinite(n) for n in numbers):
+            raise ValueError(f"parameter {self.name!r}: mean, std and bounds must be finite, got {numbers}")
+        if not self.low < self.high:
+            raise ValueError(f"parameter {self.name!r}: low {self.low} must be below high {self.high}")
+        if not self.low <= self.mean <= self.high:
+            raise ValueError(
+                f"parameter {self.name!r}: the start {self.mean} {self.unit} lies outside its "
+                f"bounds [{self.low}, {self.high}]"
+            )
+        if self.std <= 0:
+            raise ValueError(f"parameter {self.name!r}: std must be positive, got {self.std}")
+        if self.scaling is Scaling.LOG and self.low + self.floor <= 0:
+            raise ValueError(f"parameter {self.name!r}: log scaling needs low + floor > 0")
+
+    @property
+    def log_width(self) -> float:
+        """Deviation of log(v + floor) that counts as one unit of the search coordinate."""
+        if self.width is not None:
+            return self.width
+        return math.log1p(self.std / (self.mean + self.floor))
+
+    def to_search(self, value: Any) -> Any:
+        """Physical value(s) -> search coordinate(s); numpy or jax."""
+        if self.scaling is Scaling.LINEAR:
+            return (value - self.mean) / self.std
+        xp = _namespace(value)
+        return (xp.log(value + self.floor) - math.log(self.mean + self.floor)) / self.log_width
+
+    def from_search(self, x: Any) -> Any:
+        """Search coordinate(s) -> physical value(s), clipped to the bounds; numpy or jax."""
+        xp = _namespace(x)
+        if self.scaling is Scaling.LINEAR:
+            value = self.mean + self.std * x
+        else:
+            value = xp.exp(math.log(self.mean + self.floor) + self.log_width * x) - self.floor
+        return xp.clip(value, self.low, self.high)
+
+
+@dataclass(frozen=True)
+class Space:
+    """An ordered set of parameters: the meaning of a vector's entries.
+
+    Raises ValueError when two parameters share a name or none is given.
+    """
+
+    parameters: tuple[Parameter, ...]
+    _index: dict[str, int] = field(init=False, repr=False, compare=False, hash=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        names = [p.name for p in self.parameters]
+        if not names:
+            raise ValueError("a space needs at least one parameter")
+        twice = sorted({n for n in names if names.count(n) > 1})
+        if twice:
+            raise ValueError(f"parameter names must be unique; repeated: {', '.join(twice)}")
+        self._index.update({n: i for i, n in enumerate(names)})
+
+    def __len__(self) -> int:
+        return len(self.parameters)
+
+    def __getitem__(self, name: str) -> Parameter:
+        return self.parameters[self.index(name)]
+
+    def __add__(self, other: Space) -> Space:
+        return Space(self.parameters + other.parameters)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(self._index)
+
+    def index(self, name: str) -> int:
+        """Position of a parameter; an unknown name raises and lists the valid ones."""
+        try:
+            return self._index[name]
+        except KeyError:
+            raise ValueError(f"unknown parameter {name!r}; this space has: {', '.join(self.names)}") from None
+
+    def _array(self, attribute: str) -> np.ndarray:
+        return np.array([getattr(p, attribute) for p in self.parameters], dtype=np.float64)
+
+    @property
+    def mean(self) -> np.ndarray:
+        """[D] initial mean, physical units."""
+        return self._array("mean")
+
+    @property
+    def std(self) -> np.ndarray:
+        """[D] initial deviation, physical units."""
+        return self._array("std")
+
+    @property
+    def low(self) -> np.ndarray:
+        """[D] lower bounds, physical units."""
+        return self._array("low")
+
+    @property
+    def high(self) -> np.ndarray:
+        """[D] upper bounds, physical units."""
+        return self._array("high")
+
+    @property
+    def nuisance(self) -> np.ndarray:
+        """[D] bool, True where a parameter is a nuisance."""
+        return np.array([p.nuisance for p in self.parameters], dtype=bool)
+
+    def select(self, names: Iterable[str]) -> Space:
+        """The sub-space of these names, in the order given."""
+        return Space(tuple(self[n] for n in names))
+
+    def with_prior(self, **prior: tuple[float, float]) -> Space:
+        """A copy in which some parameters start from another (mean, std)."""
+        changed = list(self.parameters)
+        for name, (mean, std) in prior.items():
+            i = self.index(name)
+            changed[i] = replace(changed[i], mean=mean, std=std)
+        return Space(tuple(changed))
+
+    def linear(self) -> Space:
+        """A copy that searches in linear coordinates, as the paper does."""
+        return Space(tuple(replace(p, scaling=Scaling.LINEAR) for p in self.parameters))
+
+    def values(self, values: dict[str, float] | None = None) -> np.ndarray:
+        """[D] the means, with some entries replaced by name."""
+        out = self.mean
+        for name, value in (values or {}).items():
+            out[self.index(name)] = value
+        return out
+
+    def check(self, values: np.ndarray) -> np.ndarray:
+        """values [..., D] as float64, or ValueError that says which entry is wrong and how."""
+        values = np.asarray(values, dtype=np.float64)
+        if values.shape[-1:] != (len(self),):
+            raise ValueError(
+                f"expected parameter vectors [..., {len(self)}] ({', '.join(self.names)}), got shape {values.shape}"
+            )
+        rows = values.reshape(-1, len(self))
+        for i, p in enumerate(self.parameters):
+            bad = rows[:, i][~((rows[:, i] >= p.low) & (rows[:, i] <= p.high))]
+            if bad.size:
+                raise ValueError(
+                    f"parameter {p.name!r}: {bad[0]} {p.unit} is not inside its bounds [{p.low}, {p.high}]"
+                )
+        return values
+
+    def to_search(self, values: Any) -> Any:
+        """[..., D] physical values -> [..., D] search coordinates (numpy or jax)."""
+        return self._columns(values, Parameter.to_search)
+
+    def from_search(self, x: Any) -> Any:
+        """[..., D] search coordinates -> [..., D] physical values inside the bounds."""
+        return self._columns(x, Parameter.from_search)
+
+    def _columns(self, array: Any, function: Callable[[Parameter, Any], Any]) -> Any:
+        xp = _namespace(array)
+        array = xp.asarray(array)
+        columns = [function(p, array[..., i]) for i, p in enumerate(self.parameters)]
+        return xp.stack(columns, axis=-1)
+
+
+def _namespace(array: Any) -> Any:
+    """numpy for host values, jax.numpy for anything jax holds or traces."""
+    if isinstance(array, (np.ndarray, np.generic, float, int, Sequence)):
+        return np
+    import jax.numpy as jnp
+
+    return jnp

@@ -1,0 +1,333 @@
+"""The machine: settings to make before jax starts, and what to write down about a run.
+
+Importing this module neither imports jax nor sets anything.  A program calls `tune()` first;
+a library user may do without it and pass `compiler_options()` to their own `jax.jit`.
+
+Why the fusion emitters are switched off: XLA's CPU backend fuses the kinematic chain of a
+seven-joint arm into one expression that recomputes its producers again and again, thousands of
+times slower than without (jax-ml/jax#33761, google-deepmind/mujoco#2957).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import importlib
+import importlib.metadata
+import io
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from jax.sharding import Mesh
+
+EMITTERS = "xla_cpu_use_fusion_emitters"
+CACHE_VARIABLE = "DROID_JAX_CACHE"
+PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "evosax", "brax", "numpy", "scipy")
+_EMITTERS_OFF = f"--{EMITTERS}=false"
+_DEVICE_COUNT = "--xla_force_host_platform_device_count="
+_NO_WARP = (
+    "Failed to import warp: No module named 'warp'",
+    "Failed to import mujoco_warp: No module named 'warp'",
+)
+
+
+@dataclass(frozen=True)
+class Runtime:
+    """What `tune` settled.
+
+    devices: virtual CPU devices.
+    emitters_off: whether every CPU compilation leaves the fusion emitters out.
+    cache: folder of the persistent compilation cache; None when there is none.
+    """
+
+    devices: int
+    emitters_off: bool
+    cache: Path | None
+
+
+def tune(devices: int | None = None, cache_dir: str | Path | None = None) -> Runtime:
+    """Prepare jax for many replays on this machine; call it before jax computes anything.
+
+    devices: virtual CPU devices; None keeps a number set by JAX_NUM_CPU_DEVICES or XLA_FLAGS, else
+        takes one per core that this process may use.  On a GPU they only concern CPU work.
+    cache_dir: folder for compiled programs and the flag probe's answer; None takes DROID_JAX_CACHE,
+        else droid_jax in the user's cache folder.
+    Calling it again with the same settings is harmless.
+
+    Raises ValueError for devices < 1, RuntimeError when jax is already running on the CPU with
+    other settings, and OSError for a chosen cache folder that cannot be written.
+    """
+    if devices is not None and devices < 1:
+        raise ValueError(f"devices: expected at least 1 virtual CPU device, got {devices}")
+    root = _cache_root(cache_dir)
+    if "jax" not in sys.modules:
+        # Loading a cached CPU program prints an error of several kB about two tuning preferences
+        # that no host can report (openxla/xla#44565); jax reads this variable when it is imported.
+        os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    import jax
+
+    count = devices or _configured_devices() or _cores()
+    flags = _with_emitters_off(os.environ.get("XLA_FLAGS", ""), root)
+    try:
+        jax.config.update("jax_num_cpu_devices", count)
+    except RuntimeError:  # jax refuses this setting from the moment its backends exist
+        _check_running(count, flags)
+    else:
+        os.environ["XLA_FLAGS"] = flags
+    return Runtime(count, _EMITTERS_OFF in flags.split(), _use_cache(root, cache_dir))
+
+
+def compiler_options() -> dict[str, bool]:
+    """Options for an outermost `jax.jit(..., compiler_options=...)` of MJX code; {} on a GPU.
+
+    They work with and without `tune` and change no global state.  jax refuses them on a jitted
+    function that is called from inside another one.  Starts jax's backend.
+    """
+    import jax
+
+    if jax.default_backend() != "cpu" or not _option_known():
+        return {}
+    return {EMITTERS: False}
+
+
+def devices_mesh() -> Mesh:
+    """All devices of this process on one axis named 'population'."""
+    import jax
+    import numpy as np
+
+    auto = (jax.sharding.AxisType.Auto,)
+    return jax.sharding.Mesh(np.array(jax.local_devices()), ("population",), axis_types=auto)
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python, this package and what computes for it, and the git commit of a checkout.
+
+    A package that is not installed has no entry.  A commit with uncommitted changes to tracked
+    files ends in "-dirty".
+    """
+    found = {"python": platform.python_version()}
+    for name in ("droid_jax", *PACKAGES):
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            found[name] = importlib.metadata.version(name)
+    commit = _git_commit(Path(__file__).resolve().parents[1])
+    if commit:
+        found["git"] = commit
+    return found
+
+
+def device() -> str:
+    """What jax computes on, for people: "AMD EPYC, 2 cores" or "2 x NVIDIA H200"."""
+    import jax
+
+    if jax.default_backend() == "cpu":
+        cores = _cores()
+        return f"{_cpu_model()}, {cores} core{'s' if cores != 1 else ''}"
+    kinds = [d.device_kind for d in jax.local_devices()]
+    return ", ".join(f"{kinds.count(k)} x {k}" if kinds.count(k) > 1 else k for k in dict.fromkeys(kinds))
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Leave out the two lines that the first import of mujoco.mjx prints where warp is not installed.
+
+    Everything else printed inside the block appears when the block ends.
+    """
+    printed = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(printed):
+            yield
+    finally:
+        lines = printed.getvalue().splitlines(keepends=True)
+        sys.stdout.write("".join(line for line in lines if line.rstrip() not in _NO_WARP))
+
+
+def import_mjx() -> ModuleType:
+    """mujoco.mjx, imported without its two lines about warp."""
+    with quiet():
+        return importlib.import_module("mujoco.mjx")
+
+
+def _cores() -> int:
+    """Cores this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _setting(name: str) -> Any:
+    """A jax setting; type checkers do not see them as attributes."""
+    import jax
+
+    return getattr(jax.config, name)
+
+
+def _configured_devices() -> int | None:
+    """Virtual CPU devices that are chosen already, in jax's settings or in XLA_FLAGS; None for no choice."""
+    configured = _setting("jax_num_cpu_devices")
+    if configured > 0:
+        return configured
+    chosen = [f for f in os.environ.get("XLA_FLAGS", "").split() if f.startswith(_DEVICE_COUNT)]
+    return int(chosen[-1].removeprefix(_DEVICE_COUNT)) if chosen else None
+
+
+def _with_emitters_off(flags: str, root: Path | None) -> str:
+    """XLA_FLAGS with the emitters off, unless the user decided or this jaxlib lacks the flag."""
+    if any(f.startswith(f"--{EMITTERS}") for f in flags.split()) or not _flag_known(root):
+        return flags
+    return f"{flags} {_EMITTERS_OFF}".strip()
+
+
+def _check_running(devices: int, flags: str) -> None:
+    """RuntimeError unless a jax that is already running has these settings (they matter on a CPU only)."""
+    import jax
+
+    if jax.default_backend() != "cpu":
+        return
+    running = jax.local_device_count("cpu")
+    wrong = [f"it has {running} CPU device(s) instead of {devices}"] if running != devices else []
+    if os.environ.get("XLA_FLAGS", "") != flags:
+        wrong.append(f"XLA_FLAGS lacks {_EMITTERS_OFF}")
+    if wrong:
+        raise RuntimeError(
+            f"jax is already running and can no longer be tuned: {' and '.join(wrong)}; call "
+            "droid_jax.runtime.tune() before the first jax array or jax.devices() of the program"
+        )
+
+
+def _flag_known(root: Path | None) -> bool:
+    """Whether this jaxlib knows the flag; asked once per jaxlib version and cache folder."""
+    version = importlib.metadata.version("jaxlib")
+    answers = root / f"flag-{EMITTERS}-jaxlib-{version}.json" if root else None
+    if answers and answers.is_file():
+        with contextlib.suppress(ValueError, OSError):
+            return json.loads(answers.read_text()) is True
+    known = _probe_flag(_EMITTERS_OFF)
+    if known is None:
+        warnings.warn(f"could not find out whether jaxlib {version} knows {_EMITTERS_OFF}", stacklevel=4)
+        return False
+    if answers:
+        _write_atomically(answers, json.dumps(known))
+    return known
+
+
+def _probe_flag(flag: str) -> bool | None:
+    """Start jax with one XLA flag in a process of its own, since an unknown flag aborts it.
+
+    None when the process failed for another reason.
+    """
+    environment = {**os.environ, "XLA_FLAGS": flag, "JAX_PLATFORMS": "cpu"}
+    command = [sys.executable, "-c", "import jax; jax.devices()"]
+    try:
+        probe = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    if probe.returncode == 0:
+        return True
+    return False if "Unknown flag" in probe.stderr else None
+
+
+@functools.cache
+def _option_known() -> bool:
+    """Whether this jaxlib's compiler takes the option; an unknown one is an ordinary error here."""
+    import jax
+
+    try:
+        jax.jit(lambda x: x, compiler_options={EMITTERS: False}).lower(0.0).compile()
+    except jax.errors.JaxRuntimeError as error:
+        if "No such compile option" in str(error):
+            return False
+        raise
+    return True
+
+
+def _cache_root(cache_dir: str | Path | None) -> Path | None:
+    """The cache folder, made if needed; None where the default one cannot be made."""
+    chosen = cache_dir or os.environ.get(CACHE_VARIABLE)
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
+    root = Path(chosen).expanduser().resolve() if chosen else home / "droid_jax"
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        if not os.access(root, os.W_OK):
+            raise PermissionError(f"the cache folder {root} is not writable")
+    except OSError as error:
+        if chosen:
+            raise
+        warnings.warn(f"working without a compilation cache: {error}", stacklevel=3)
+        return None
+    return root
+
+
+def _use_cache(root: Path | None, cache_dir: str | Path | None) -> Path | None:
+    """Switch the persistent compilation cache on; a folder that jax was given already stays."""
+    import jax
+    from jax.experimental.compilation_cache import compilation_cache
+
+    before = _setting("jax_compilation_cache_dir")
+    if root is None or (before and cache_dir is None):
+        return Path(before) if before else None
+    # Compiled CPU programs hold this processor's instructions, and jax's key does not name it.
+    folder = root / "xla" / _processor_key()
+    folder.mkdir(parents=True, exist_ok=True)
+    if before and before != str(folder):
+        compilation_cache.reset_cache()
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+    return folder
+
+
+def _cpuinfo(key: str) -> str:
+    """First value of a key in Linux's /proc/cpuinfo; "" where there is none."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return ""
+    return next((line.split(":", 1)[1].strip() for line in lines if line.split(":")[0].strip() == key), "")
+
+
+def _cpu_model() -> str:
+    """Name of the processor."""
+    return _cpuinfo("model name") or platform.processor() or platform.machine()
+
+
+def _processor_key() -> str:
+    """Short name that differs between processors with different instructions."""
+    features = f"{platform.machine()} {_cpu_model()} {_cpuinfo('flags') or _cpuinfo('Features')}"
+    return hashlib.sha256(features.encode()).hexdigest()[:12]
+
+
+def _git_commit(checkout: Path) -> str | None:
+    """Commit of a checkout; None for an installed package or where git is missing."""
+    if not (checkout / ".git").exists():
+        return None
+    try:
+        commit = _git(checkout, "rev-parse", "HEAD")
+        changed = _git(checkout, "status", "--porcelain", "--untracked-files=no")
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return f"{commit}-dirty" if changed else commit
+
+
+def _git(checkout: Path, *arguments: str) -> str:
+    """Output of a read-only git command."""
+    command = ["git", "--no-optional-locks", "-C", str(checkout), *arguments]
+    run = subprocess.run(command, capture_output=True, text=True, check=True, timeout=30)
+    return run.stdout.strip()
+
+
+def _write_atomically(path: Path, text: str) -> None:
+    """Write a small file that another process may be reading or writing."""
+    with tempfile.NamedTemporaryFile("w", dir=path.parent, prefix=path.name, delete=False) as file:
+        file.write(text)
+    os.replace(file.name, path)

@@ -1,0 +1,82 @@
+"""What all tests share: two virtual CPU devices, a cache of compiled programs, OpenGL, real data."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from droid_jax import runtime
+
+ROOT = Path(__file__).resolve().parents[1]
+# Kept between sessions: a second run finds its programs compiled.
+CACHE = ROOT / ".cache" / "tests"
+DATA_VARIABLE = "DROID_JAX_DATA"
+_DRAW = """
+import mujoco
+model = mujoco.MjModel.from_xml_string('<mujoco><worldbody><geom size="1"/></worldbody></mujoco>')
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+with mujoco.Renderer(model, 32, 32) as renderer:
+    renderer.update_scene(data)
+    assert renderer.render().std() > 0
+"""
+
+
+def _draws(backend: str) -> bool:
+    """Whether MuJoCo can draw with this OpenGL backend, tried in a process of its own."""
+    environment = {**os.environ, "MUJOCO_GL": backend}
+    try:
+        run = subprocess.run([sys.executable, "-c", _DRAW], env=environment, capture_output=True, timeout=60)
+    except subprocess.TimeoutExpired:
+        return False
+    return run.returncode == 0
+
+
+def _choose_gl() -> bool:
+    """Set MUJOCO_GL to a backend that draws, as it must be before mujoco is first imported."""
+    chosen = os.environ.get("MUJOCO_GL")
+    for backend in [chosen] if chosen else ["egl", "osmesa", "glfw"]:
+        if _draws(backend):
+            os.environ["MUJOCO_GL"] = backend
+            return True
+    return False
+
+
+HAS_GL = _choose_gl()
+runtime.tune(devices=2, cache_dir=os.environ.get(runtime.CACHE_VARIABLE) or CACHE)
+
+
+@pytest.fixture
+def gl() -> str:
+    """The OpenGL backend; skips the test where nothing can draw."""
+    if not HAS_GL:
+        pytest.skip("no OpenGL: MuJoCo draws with none of egl, osmesa and glfw here")
+    return os.environ["MUJOCO_GL"]
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """A test marked `gl` is skipped like one that asks for the fixture."""
+    if HAS_GL:
+        return
+    for item in items:
+        if item.get_closest_marker("gl"):
+            item.add_marker(pytest.mark.skip(reason="no OpenGL: MuJoCo draws with none of egl, osmesa, glfw"))
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Callable[[str], Path]:
+    """Finder of a real-data folder: DROID_JAX_DATA/<name>, else ../shared/real/<name> beside the checkout."""
+
+    def find(name: str) -> Path:
+        chosen = os.environ.get(DATA_VARIABLE)
+        folder = (Path(chosen) if chosen else ROOT.parent / "shared" / "real") / name
+        if not folder.is_dir():
+            pytest.skip(f"real data {name!r} not found: {folder} is no folder (set {DATA_VARIABLE})")
+        return folder
+
+    return find

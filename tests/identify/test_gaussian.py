@@ -1,0 +1,233 @@
+"""The Gaussian over parameters against scipy, numpy and closed forms."""
+
+import dataclasses
+import json
+import math
+import os
+
+import numpy as np
+import pytest
+from scipy import integrate, stats
+
+from droid_jax.identify.gaussian import Gaussian, load, prior, space_from_json, space_to_json
+from droid_jax.model.parameters import Mode, Parameter, Scaling, Space, Write
+
+
+def wide(name, mean=0.0, std=1.0, **kw):
+    return Parameter(name, "N m", mean, std, -1000.0, 1000.0, **kw)
+
+
+def log_parameter(name="stiffness", low=0.0, high=100.0, floor=0.01, **kw):
+    return Parameter(name, "N m/rad", 1.0, 0.5, low, high, scaling=Scaling.LOG, floor=floor, **kw)
+
+
+COV = np.array([[1.0, 0.6, 0.0], [0.6, 2.0, -0.5], [0.0, -0.5, 0.7]])
+
+
+@pytest.fixture
+def free():
+    """Three linear parameters whose bounds cut nothing off, in physical coordinates."""
+    space = Space((wide("a"), wide("b"), wide("c")))
+    return Gaussian(space, np.array([1.0, -2.0, 0.5]), COV, "test", "physical")
+
+
+def test_prior_is_the_space_s_own_gaussian():
+    g = prior(Space((wide("a", 3.0, 2.0), log_parameter())))
+    assert g.rule == "prior" and g.coordinates == "search"
+    np.testing.assert_allclose(g.quantiles([0.5])[0], [3.0, 1.0])
+    one_deviation_up = float(stats.norm.cdf(1.0))
+    np.testing.assert_allclose(g.quantiles([one_deviation_up])[0], [5.0, 1.5], rtol=1e-9)
+
+
+def test_sample_moments(free):
+    draws = free.sample(0, 200_000)
+    np.testing.assert_allclose(draws.mean(0), free.mean, atol=0.02)
+    np.testing.assert_allclose(np.cov(draws.T), COV, atol=0.03)
+
+
+def test_sample_is_a_function_of_the_seed(free):
+    np.testing.assert_array_equal(free.sample(3, 50), free.sample(3, 50))
+    assert not np.array_equal(free.sample(3, 50), free.sample(4, 50))
+    assert free.sample(np.random.default_rng(3), 0).shape == (0, 3)
+
+
+@pytest.mark.parametrize("coordinates", ["search", "physical"])
+def test_rows_out_of_bounds_are_drawn_again(coordinates):
+    """A door's damping of 0.10 with deviation 0.19: rows redrawn, never piled up at zero."""
+    space = Space((Parameter("damping", "N m s/rad", 0.10, 0.19, 0.0, 5.0), wide("other")))
+    mean, cov = (np.zeros(2), np.eye(2))
+    if coordinates == "physical":
+        mean, cov = np.array([0.10, 0.0]), np.diag([0.19**2, 1.0])
+    g = Gaussian(space, mean, cov, "test", coordinates)
+    damping = g.sample(1, 20_000)[:, 0]
+    oracle = stats.truncnorm((0 - 0.10) / 0.19, np.inf, loc=0.10, scale=0.19)
+    assert damping.min() > 0.0
+    assert stats.kstest(damping, oracle.cdf).pvalue > 1e-3
+    np.testing.assert_allclose(g.quantiles([0.1, 0.5, 0.9])[:, 0], oracle.ppf([0.1, 0.5, 0.9]), rtol=1e-6)
+
+
+def test_whole_rows_are_drawn_again():
+    """Cutting one of two correlated parameters moves the other: scipy's conditional mean."""
+    space = Space((Parameter("a", "u", 0.0, 1.0, 0.0, 50.0), wide("b")))
+    g = Gaussian(space, np.zeros(2), np.array([[1.0, 0.8], [0.8, 1.0]]), "test", "physical")
+    draws = g.sample(0, 50_000)
+    half_normal = math.sqrt(2 / math.pi)
+    np.testing.assert_allclose(draws.mean(0), [half_normal, 0.8 * half_normal], atol=0.02)
+
+
+def test_log_scaled_parameters_are_clipped_and_reach_zero():
+    """Log-scaled draws beyond a bound of zero become zero, with the normal's own probability."""
+    p = log_parameter(floor=0.1, width=1.0)
+    draws = prior(Space((p,))).sample(0, 50_000)[:, 0]
+    expected = stats.norm.cdf(math.log(0.1 / 1.1))
+    assert abs((draws == 0.0).mean() - expected) < 3 * math.sqrt(expected / 50_000)
+
+
+def test_hopeless_bounds_raise_and_name_the_parameter():
+    space = Space((Parameter("good", "u", 0.0, 1.0, -9.0, 9.0), Parameter("bad", "u", 0.5, 1.0, 0.0, 1.0)))
+    g = Gaussian(space, np.array([0.0, -30.0]), np.eye(2), "test", "physical")
+    with pytest.raises(ValueError, match=r"draws fell inside.*: bad$"):
+        g.sample(0, 10)
+
+
+def test_log_density_against_scipy(free):
+    points = np.random.default_rng(0).normal(size=(4, 5, 3))
+    oracle = stats.multivariate_normal.logpdf(points, free.mean, COV)
+    np.testing.assert_allclose(free.log_density(points), oracle, rtol=1e-10)
+
+
+def test_log_density_in_search_coordinates_integrates_to_one_in_physical_units():
+    space = Space((log_parameter(low=0.0, high=1e6, width=0.7),))
+    g = Gaussian(space, np.array([0.3]), np.array([[0.5]]), "test")
+    # v + floor is log-normal: scipy's closed form
+    scale = 1.01 * math.exp(0.7 * 0.3)
+    oracle = stats.lognorm(s=0.7 * math.sqrt(0.5), loc=-0.01, scale=scale)
+    for v in (0.2, 1.0, 5.0):
+        assert g.log_density(np.array([v])) == pytest.approx(oracle.logpdf(v), rel=1e-9)
+    mass, _ = integrate.quad(lambda v: math.exp(float(g.log_density(np.array([v])))), 0, 200, limit=200)
+    assert mass == pytest.approx(1.0, abs=1e-3)
+
+
+def test_log_density_outside_the_bounds_and_singular(free):
+    assert free.log_density(np.array([0.0, 0.0, 1001.0])) == -np.inf
+    with pytest.raises(ValueError, match="shape"):
+        free.log_density(np.zeros(2))
+    singular = dataclasses.replace(free, cov=np.diag([1.0, 0.0, 1.0]))
+    with pytest.raises(ValueError, match="singular"):
+        singular.log_density(np.zeros(3))
+    assert np.isfinite(singular.marginal(["a", "c"]).log_density(np.zeros(2)))
+
+
+def test_quantiles_and_interval_against_scipy(free):
+    q = [0.05, 0.5, 0.95]
+    oracle = stats.norm(free.mean, np.sqrt(np.diag(COV))).ppf(np.array(q)[:, None])
+    np.testing.assert_allclose(free.quantiles(q), oracle, atol=1e-9)
+    low, high = free.interval(0.9)
+    np.testing.assert_allclose((low, high), oracle[[0, 2]], atol=1e-9)
+    with pytest.raises(ValueError, match="level"):
+        free.interval(1.0)
+    with pytest.raises(ValueError, match="q must"):
+        free.quantiles([1.5])
+
+
+def test_physical_moments_against_the_log_normal():
+    space = Space((log_parameter(low=0.0, high=1e6, width=0.4), wide("b", 2.0, 3.0)))
+    g = prior(space)
+    oracle = stats.lognorm(s=0.4, loc=-0.01, scale=1.01)
+    np.testing.assert_allclose(g.physical_mean, [oracle.mean(), 2.0], rtol=1e-4)
+    np.testing.assert_allclose(g.physical_std, [oracle.std(), 3.0], rtol=2e-3)
+
+
+def test_marginal_follows_the_names(free):
+    m = free.marginal(["c", "a"])
+    assert m.space.names == ("c", "a")
+    np.testing.assert_array_equal(m.mean, [0.5, 1.0])
+    np.testing.assert_array_equal(m.cov, [[0.7, 0.0], [0.0, 1.0]])
+    with pytest.raises(ValueError, match="unknown parameter 'z'"):
+        free.marginal(["z"])
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("mean", [0.0, 1.0], "mean must have shape"),
+        ("mean", [0.0, 1.0, math.nan], "not finite"),
+        ("cov", np.eye(2), "cov must have shape"),
+        ("cov", COV + np.diag([0.3, 0.0], k=1), "symmetric"),
+        ("cov", np.array([[1.0, 2, 0], [2, 1, 0], [0, 0, 1]]), "semi-definite"),
+        ("coordinates", "log", "coordinates"),
+    ],
+)
+def test_what_is_no_gaussian_is_refused(free, field, value, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(free, **{field: value})
+
+
+def test_units_decades_apart_are_no_reason_to_refuse():
+    space = Space((wide("tiny"), wide("huge")))
+    Gaussian(space, np.zeros(2), np.array([[1e-14, 0.9e-5], [0.9e-5, 1e4]]), "test", "physical")
+    with pytest.raises(ValueError, match="semi-definite"):
+        Gaussian(space, np.zeros(2), np.array([[1e-14, 1.2e-5], [1.2e-5, 1e4]]), "test", "physical")
+
+
+WRITES = (Write("body_mass", (3,)), Write("dof_damping", (2, 1), Mode.SCALE, 0.5))
+
+
+@pytest.fixture
+def saved(tmp_path):
+    space = Space((wide("a", nuisance=True, group="Nuisance"), log_parameter(width=0.3, writes=WRITES)))
+    g = Gaussian(space, np.array([0.1, 1 / 3]), np.array([[1.0, 0.1], [0.1, 0.2]]), "cma-es covariance")
+    path = tmp_path / "folder" / "gaussian.json"
+    g.save(path)
+    return g, path
+
+
+def test_save_and_load_give_the_same_gaussian(saved):
+    g, path = saved
+    back = load(path)
+    assert back.space == g.space and back.space["stiffness"].writes == WRITES
+    assert (back.rule, back.coordinates) == (g.rule, g.coordinates)
+    np.testing.assert_array_equal(back.mean, g.mean)
+    np.testing.assert_array_equal(back.cov, g.cov)
+    np.testing.assert_array_equal(back.sample(5, 20), g.sample(5, 20))
+    assert os.listdir(path.parent) == [path.name]
+
+
+def test_the_space_survives_json_text():
+    space = Space((wide("a"), log_parameter(writes=WRITES)))
+    assert space_from_json(json.loads(json.dumps(space_to_json(space)))) == space
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c: c.pop("cov"), "no entry 'cov'"),
+        (lambda c: c.update(version=2), "version 1, got 2"),
+        (lambda c: c.update(format="other"), "format"),
+        (lambda c: c.update(mean=[0.0]), "mean must have shape"),
+        (lambda c: c.update(mean=["x", 0.0]), "array of numbers"),
+        (lambda c: c["cov"][0].__setitem__(1, math.nan), "not finite"),
+        (lambda c: c["cov"][0].__setitem__(1, 0.2), "symmetric"),
+        (lambda c: c["space"][1].pop("unit"), "'stiffness' has no entry 'unit'"),
+        (lambda c: c["space"][1].update(scaling="cubic"), "'stiffness'.*wrong form"),
+        (lambda c: c["space"][0].update(low=2000.0), "must be below high"),
+        (lambda c: c.update(space={}), "list of parameters"),
+    ],
+)
+def test_bad_files_are_named(saved, change, message):
+    _, path = saved
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=message) as error:
+        load(path)
+    assert str(path) in str(error.value)
+
+
+def test_missing_and_truncated_files_are_named(saved):
+    _, path = saved
+    path.write_text(path.read_text()[:-20])
+    with pytest.raises(ValueError, match=r"gaussian\.json"):
+        load(path)
+    with pytest.raises(ValueError, match=r"nowhere\.json: there is no such file"):
+        load(path.parent / "nowhere.json")

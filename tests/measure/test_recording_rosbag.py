@@ -1,0 +1,325 @@
+"""ROS bags, written here with the rosbags writers, against the motion they were made from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rosbags")
+
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_typestore
+
+from droid_jax.measure.formats import load, save
+from droid_jax.measure.recording import TorqueConvention, TorqueSide
+from droid_jax.measure.rosbag import Stamps, read_bags
+
+JOINTS = ("j1", "j2")
+TORQUE = TorqueConvention(TorqueSide.LINK, gravity=True)
+EPOCH = 1_700_000_000 * 10**9  # ns
+KINDS = ("ros1", "sqlite3", "mcap")
+
+
+def position(t: np.ndarray) -> np.ndarray:
+    return np.stack([0.1 + 0.2 * t, 1.0 - 0.3 * t], axis=-1)
+
+
+def torque(t: np.ndarray) -> np.ndarray:
+    return np.stack([3.0 * t - 1.0, 5.0 - 2.0 * t], axis=-1)
+
+
+class Bag:
+    """Collects messages and writes them as one bag of any kind.
+
+    delay: ns between a header's stamp and the recorder's; header 0 where there is no stamp.
+    """
+
+    def __init__(self, folder: Path, kind: str, stem: str = "run", delay: int = 0, headers: bool = True) -> None:
+        self.kind, self.delay, self.headers = kind, delay, headers
+        self.path = folder / (f"{stem}.bag" if kind == "ros1" else stem)
+        self.store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
+        self.messages: list[tuple[str, str, int, object]] = []
+
+    def add(self, topic: str, kind: str, t: float, **fields) -> None:
+        types = self.store.types
+        nanoseconds = EPOCH + round(t * 1e9)
+        if kind in ("sensor_msgs/msg/JointState", "trajectory_msgs/msg/JointTrajectory"):
+            sec, nano = divmod(nanoseconds, 10**9) if self.headers else (0, 0)
+            stamp = types["builtin_interfaces/msg/Time"](sec=sec, nanosec=nano)
+            seq = {"seq": 0} if self.kind == "ros1" else {}
+            fields["header"] = types["std_msgs/msg/Header"](stamp=stamp, frame_id="", **seq)
+        self.messages.append((topic, kind, nanoseconds + self.delay, types[kind](**fields)))
+
+    def state(self, t: float, topic: str = "/joint_states", names: tuple[str, ...] = JOINTS, **changes) -> None:
+        one = np.array([t])
+        fields = {"position": position(one)[0], "velocity": np.array([0.2, -0.3]), "effort": torque(one)[0]}
+        fields |= changes
+        self.add(topic, "sensor_msgs/msg/JointState", t, name=list(names), **fields)
+
+    def write(self) -> Path:
+        if self.kind == "ros1":
+            writer, serialize = Writer1(self.path), self.store.serialize_ros1
+        else:
+            plugin = StoragePlugin.MCAP if self.kind == "mcap" else StoragePlugin.SQLITE3
+            writer, serialize = Writer2(self.path, version=9, storage_plugin=plugin), self.store.serialize_cdr
+        with writer:
+            connections = {}
+            for topic, kind, nanoseconds, message in sorted(self.messages, key=lambda m: m[2]):
+                if topic not in connections:
+                    connections[topic] = writer.add_connection(topic, kind, typestore=self.store)
+                writer.write(connections[topic], nanoseconds, serialize(message, kind))
+        return self.path
+
+
+def grid(start: float, end: float, rate: float = 100.0) -> np.ndarray:
+    return start + np.arange(round((end - start) * rate) + 1) / rate
+
+
+def joint_state(bag: Bag, t: float, q: np.ndarray) -> None:
+    empty = np.zeros(0)
+    bag.add(
+        "/command",
+        "sensor_msgs/msg/JointState",
+        t,
+        name=["j2", "j1"],
+        position=q[::-1].copy(),
+        velocity=empty,
+        effort=empty,
+    )
+
+
+def point_fields(bag: Bag, q: np.ndarray, t: float) -> dict:
+    empty = np.zeros(0)
+    since = bag.store.types["builtin_interfaces/msg/Duration"](sec=int(t), nanosec=round((t % 1) * 1e9))
+    return {
+        "positions": q,
+        "velocities": empty,
+        "accelerations": empty,
+        "effort": empty,
+        "time_from_start": since,
+    }
+
+
+def point(bag: Bag, t: float, q: np.ndarray) -> None:
+    bag.add("/command", "trajectory_msgs/msg/JointTrajectoryPoint", t, **point_fields(bag, q, 0.0))
+
+
+def multi_array(bag: Bag, t: float, q: np.ndarray) -> None:
+    layout = bag.store.types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
+    bag.add("/command", "std_msgs/msg/Float64MultiArray", t, layout=layout, data=q)
+
+
+def pulled(
+    folder: Path,
+    kind: str,
+    stem: str = "run",
+    command: Callable[[Bag, float, np.ndarray], None] = joint_state,
+    lead: float = 0.5,
+) -> Path:
+    """States at 100 Hz from 0 s; a command ramp at 50 Hz that begins after `lead` s."""
+    bag = Bag(folder, kind, stem)
+    for t in grid(0.0, lead + 1.0):
+        bag.state(t)
+    for t in grid(lead, lead + 1.0, 50.0):
+        command(bag, t, np.array([t - lead, 2.0 * (t - lead)]))
+    return bag.write()
+
+
+def fails(paths: list[Path], *parts: str, **options) -> None:
+    with pytest.raises(ValueError) as caught:
+        read_bags(paths, **{"joints": JOINTS, "torque": TORQUE, **options})
+    for part in parts:
+        assert part in str(caught.value), f"{part!r} is not in {str(caught.value)!r}"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_states_and_commands_come_back(tmp_path: Path, kind: str) -> None:
+    leads = (0.5, 0.503)  # the second repeat's states miss the common clock by 3 ms
+    paths = [pulled(tmp_path, kind, f"run{i}", lead=lead) for i, lead in enumerate(leads)]
+    recording = read_bags(paths, joints=JOINTS, torque=TORQUE, command_topic="/command")
+    t = recording.time
+    np.testing.assert_allclose(np.diff(t), 0.01, atol=1e-8)
+    assert t[0] == 0.0 and t[-1] >= 0.99
+    np.testing.assert_allclose(recording.command, np.stack([t, 2 * t], axis=-1), atol=1e-7)
+    for r, lead in enumerate(leads):
+        np.testing.assert_allclose(recording.channel("torque").values[r], torque(t + lead), atol=1e-7)
+        np.testing.assert_allclose(recording.channel("position").values[r], position(t + lead), atol=1e-7)
+    assert recording.channel("torque").mask.all()
+    assert recording.qpos0 == pytest.approx(dict(zip(JOINTS, position(np.array([0.5015]))[0], strict=True)))
+    assert recording.torque == TORQUE
+    assert recording.meta["stamps"] == "header"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("command", [joint_state, point, multi_array])
+def test_command_messages(tmp_path: Path, kind: str, command: Callable) -> None:
+    recording = read_bags(
+        [pulled(tmp_path, kind, command=command)], joints=JOINTS, torque=TORQUE, command_topic="/command"
+    )
+    t = recording.time
+    np.testing.assert_allclose(recording.command, np.stack([t, 2 * t], axis=-1), atol=1e-7)
+
+
+def test_a_whole_trajectory_in_one_message(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "sqlite3")
+    for t in grid(0.0, 2.5):
+        bag.state(t)
+    make = bag.store.types["trajectory_msgs/msg/JointTrajectoryPoint"]
+    points = [make(**point_fields(bag, np.array([t, -t]), t)) for t in (0.0, 0.5, 1.0, 1.5)]
+    bag.add("/plan", "trajectory_msgs/msg/JointTrajectory", 0.5, joint_names=list(JOINTS), points=points)
+    recording = read_bags([bag.write()], joints=JOINTS, torque=TORQUE, command_topic="/plan", allow_jitter=True)
+    held = np.minimum(recording.time, 1.5)  # the controller holds the last command
+    assert recording.time[-1] == pytest.approx(2.0)
+    np.testing.assert_allclose(recording.command, np.stack([held, -held], axis=-1), atol=1e-7)
+
+
+def test_without_commands(tmp_path: Path) -> None:
+    recording = read_bags([pulled(tmp_path, "mcap")], joints=["j2"], torque=TORQUE, rate=50.0)
+    assert recording.command.shape == (0, 0)
+    channel = recording.channel("torque")
+    assert channel.columns == ("j2",)
+    np.testing.assert_allclose(channel.time, grid(0.0, 1.5, 50.0), atol=1e-9)
+    np.testing.assert_allclose(channel.values[0, :, 0], torque(channel.time)[:, 1], atol=1e-6)
+
+
+def test_header_and_bag_stamps(tmp_path: Path) -> None:
+    """States arrive 40 ms late, the command (no header) at once: only one clock is used."""
+    bag = Bag(tmp_path, "sqlite3", delay=40_000_000)
+    for t in grid(0.0, 1.0):
+        bag.state(t)
+    bag.delay = 0
+    for t in grid(0.2, 1.0):
+        multi_array(bag, t, np.array([t, t]))
+    path = bag.write()
+    options = {"joints": JOINTS, "torque": TORQUE, "command_topic": "/command"}
+    recording = read_bags([path], **options)
+    assert recording.meta["stamps"] == "bag"
+    np.testing.assert_allclose(recording.channel("torque").values[0], torque(recording.time + 0.16), atol=1e-6)
+    fails([path], "topic '/command'", "no header stamp", stamps=Stamps.HEADER, command_topic="/command")
+    alone = read_bags([path], joints=JOINTS, torque=TORQUE, stamps=Stamps.BAG)
+    assert alone.meta["stamps"] == "bag"
+
+
+def test_zero_header_stamps_are_not_used(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "ros1", headers=False)
+    for t in grid(0.0, 1.0):
+        bag.state(t)
+    recording = read_bags([bag.write()], joints=JOINTS, torque=TORQUE)
+    assert recording.meta["stamps"] == "bag"
+    assert recording.duration == pytest.approx(1.0)
+
+
+def test_messages_of_another_publisher_are_passed_over(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "sqlite3")
+    for t in grid(0.0, 1.0):
+        bag.state(t)
+        bag.state(t + 0.005, names=("finger",), position=np.ones(1), velocity=np.ones(1), effort=np.full(1, np.nan))
+    recording = read_bags([bag.write()], joints=JOINTS, torque=TORQUE)
+    assert recording.channel("torque").time.shape == (101,)
+
+
+def test_gaps_are_masked_not_filled(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "mcap")
+    for t in grid(0.0, 1.0):
+        if not 0.405 < t < 0.595:
+            bag.state(t)
+    path = bag.write()
+    fails([path], "irregular rate", "allow_jitter=True", "message 41")
+    mask = read_bags([path], joints=JOINTS, torque=TORQUE, allow_jitter=True).channel("torque").mask
+    np.testing.assert_array_equal(np.flatnonzero(~mask[0, :, 0]), np.arange(41, 60))
+
+
+def test_topic_errors(tmp_path: Path) -> None:
+    path = pulled(tmp_path, "ros1")
+    fails([path], "run.bag", "no topic '/joints'", "the bag has: /command, /joint_states", state_topic="/joints")
+    fails([path], "no topic '/cmd'", "/command, /joint_states", command_topic="/cmd")
+    fails([path], "topics of their own", command_topic="/joint_states")
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with Writer2(tmp_path / "silent", version=9) as writer:
+        writer.add_connection("/joint_states", "sensor_msgs/msg/JointState", typestore=store)
+    fails([tmp_path / "silent"], "silent, topic '/joint_states': no messages")
+    bag = Bag(tmp_path, "sqlite3", "text")
+    bag.add("/joint_states", "std_msgs/msg/String", 0.0, data="hello")
+    fails([bag.write()], "cannot read std_msgs/msg/String", "expected JointState")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_joint_errors(tmp_path: Path, kind: str) -> None:
+    path = pulled(tmp_path, kind, command=multi_array)
+    fails([path], "message 0: no joint elbow", "the message has: j1, j2", joints=("j1", "elbow"))
+    fails([path], "no joint of elbow, wrist", "it has: j1, j2", joints=("elbow", "wrist"))
+    fails([path], "expected 1 numbers (j1), got 2", command_topic="/command", command_joints=["j1"])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_effort_errors(tmp_path: Path, kind: str) -> None:
+    bag = Bag(tmp_path, kind, "nan")
+    for i, t in enumerate(grid(0.0, 0.2)):
+        bag.state(t, **({"effort": np.array([1.0, np.nan])} if i == 7 else {}))
+    fails([bag.write()], "nan", "message 7: effort of joint 'j2' is nan")
+    bag = Bag(tmp_path, kind, "without")
+    for t in grid(0.0, 0.2):
+        bag.state(t, effort=np.zeros(0))
+    fails([bag.write()], "without", "hold no effort")
+    bag = Bag(tmp_path, kind, "short")
+    bag.state(0.0, effort=np.ones(1))
+    fails([bag.write()], "message 0: expected 2 numbers in 'effort', got 1")
+
+
+def test_repeats_must_replay_one_motion(tmp_path: Path) -> None:
+    one = pulled(tmp_path, "ros1", "one")
+    other = pulled(tmp_path, "ros1", "other", command=lambda b, t, q: joint_state(b, t, q * 1.1))
+    fails([one, other], "other.bag", "one.bag", "joint 'j2' differs by 0.2 at 1.000 s", command_topic="/command")
+    kept = read_bags([one, other], joints=JOINTS, torque=TORQUE, command_topic="/command", command_tolerance=0.3)
+    assert kept.repeats == 2
+
+
+def test_a_repeat_that_was_cut_off(tmp_path: Path) -> None:
+    one = pulled(tmp_path, "ros1", "one")
+    bag = Bag(tmp_path, "ros1", "short")
+    for t in grid(0.0, 0.3):
+        bag.state(t)
+    fails([one, bag.write()], "short.bag", "lasts 0.300 s", "1.500 s")
+
+
+def test_stamps_must_increase(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "sqlite3")
+    for t in (0.0, 0.01, 0.02, 0.02, 0.03):
+        bag.state(t)
+    fails([bag.write()], "message 3", "header stamps", "time must increase, it repeats")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_files_that_are_no_bags(tmp_path: Path, kind: str) -> None:
+    with pytest.raises(FileNotFoundError, match="no ROS bag at"):
+        read_bags([tmp_path / "gone.bag"], joints=JOINTS, torque=TORQUE)
+    with pytest.raises(ValueError, match="one ROS bag per repeat, got none"):
+        read_bags([], joints=JOINTS, torque=TORQUE)
+    path = pulled(tmp_path, kind)
+    file = path if kind == "ros1" else next(p for p in path.iterdir() if p.suffix in (".db3", ".mcap"))
+    whole = file.read_bytes()
+    for content in (b"", b"not a bag at all", whole[: len(whole) // 2]):
+        file.write_bytes(content)
+        fails([path], str(path), "not a readable ROS bag")
+        fails([file], str(file), "not a readable ROS bag")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_load_finds_bags(tmp_path: Path, kind: str) -> None:
+    (tmp_path / "runs").mkdir()
+    paths = [pulled(tmp_path / "runs", kind, f"run{i}") for i in range(2)]
+    options = {"joints": JOINTS, "torque": TORQUE, "command_topic": "/command"}
+    expected = read_bags(paths, **options)
+    both = load(tmp_path / "runs", name="door", **options)
+    assert both.repeats == 2
+    assert both.name == "door"
+    assert both.sha256 == expected.sha256
+    assert load(paths[0], **options).repeats == 1
+    file = paths[0] if kind == "ros1" else next(p for p in paths[0].iterdir() if p.suffix != ".yaml")
+    assert load(file, **options).repeats == 1
+    assert load(save(both, tmp_path / "door.npz")).sha256 == both.sha256

@@ -1,0 +1,117 @@
+"""The page in a real browser: it renders without complaints, its pictures load, nothing overflows.
+
+Skipped where no Chromium is on the path.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from droid_jax.report import page
+
+BROWSER = next((b for b in ("chromium", "chromium-browser", "google-chrome") if shutil.which(b)), None)
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(BROWSER is None, reason="no chromium or google-chrome on the path"),
+]
+
+# The page itself runs no script and forbids it; the probe is a copy with the policy opened for this one.
+PROBE = """<script>
+addEventListener('load', () => {
+  const images = [...document.images], seen = e => e.getClientRects().length > 0;
+  const set = (k, v) => document.documentElement.setAttribute('data-' + k, v);
+  set('images', images.length);
+  set('loaded', images.filter(i => i.complete && i.naturalWidth > 0).length);
+  set('wide', [...document.querySelectorAll('figure .wide')].filter(seen).length);
+  set('narrow', [...document.querySelectorAll('figure .narrow')].filter(seen).length);
+  set('drawn', [...document.querySelectorAll('svg')].filter(s => seen(s) && s.getBBox().width > 50).length);
+  set('overflow', document.documentElement.scrollWidth - document.documentElement.clientWidth);
+});
+</script></body>"""
+
+
+def _builder() -> ModuleType:
+    """The made-up run of the neighbouring test file, under any of pytest's import modes."""
+    spec = importlib.util.spec_from_file_location("report_run", Path(__file__).with_name("test_report.py"))
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return page.write_report(_builder().make_run(tmp_path_factory.mktemp("browser") / "run"))
+
+
+def _browse(url: Path, *options: str, size: tuple[int, int]) -> subprocess.CompletedProcess[str]:
+    command = [
+        str(BROWSER), "--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars",
+        "--enable-logging=stderr", f"--user-data-dir={url.parent / 'profile'}",
+        f"--window-size={size[0]},{size[1]}", *options, url.resolve().as_uri(),
+    ]  # fmt: skip
+    return subprocess.run(command, capture_output=True, text=True, timeout=90, check=True)
+
+
+def _console(stderr: str) -> list[str]:
+    """What the page itself complained of; a headless machine's own grumbling is not of interest."""
+    return [line for line in stderr.splitlines() if "CONSOLE" in line]
+
+
+@pytest.mark.parametrize(("size", "shown", "hidden"), [((1200, 900), "wide", "narrow"), ((500, 900), "narrow", "wide")])
+def test_everything_is_drawn_and_nothing_overflows(
+    report: Path, size: tuple[int, int], shown: str, hidden: str
+) -> None:
+    probe = report.with_name(f"probe_{shown}.html")
+    text = report.read_text(encoding="utf-8")
+    probe.write_text(
+        text.replace("default-src 'none';", "default-src 'none'; script-src 'unsafe-inline';").replace(
+            "</body>", PROBE
+        ),
+        encoding="utf-8",
+    )
+    done = _browse(probe, "--dump-dom", size=size)
+    found = {k: int(v) for k, v in re.findall(r'data-(\w+)="(-?\d+)"', done.stdout[:2000])}
+    assert not _console(done.stderr)
+    assert found["images"] == found["loaded"] == 4
+    assert found[shown] == 7 and found[hidden] == 0
+    assert found["drawn"] == 7
+    assert found["overflow"] == 0
+
+
+def test_the_page_as_it_is_renders_without_a_complaint(report: Path) -> None:
+    picture = report.with_name("page.png")
+    done = _browse(report, f"--screenshot={picture}", size=(1200, 1600))
+    assert not _console(done.stderr)
+    from matplotlib.image import imread
+
+    pixels = imread(picture)[..., :3]
+    assert pixels.shape == (1600, 1200, 3)
+    assert pixels.mean() > 0.8 and (pixels.min(axis=2) < 0.3).mean() > 0.005  # a light page with dark text
+    colourful = np.ptp(pixels, axis=2) > 0.3
+    assert colourful.mean() > 0.002  # the figures' colours
+
+
+def test_the_console_is_really_read(report: Path) -> None:
+    """The check above can fail: a page that breaks its own policy is reported."""
+    broken = report.with_name("broken.html")
+    text = report.read_text(encoding="utf-8")
+    broken.write_text(text.replace("</body>", "<script>1</script></body>"), encoding="utf-8")
+    assert _console(_browse(broken, "--dump-dom", size=(800, 600)).stderr)
+
+
+def test_it_prints(report: Path) -> None:
+    paper = report.with_name("report.pdf")
+    _browse(report, f"--print-to-pdf={paper}", "--no-pdf-header-footer", size=(1200, 900))
+    content = paper.read_bytes()
+    assert content.startswith(b"%PDF") and 3 <= len(re.findall(rb"/Type\s*/Page\b", content)) <= 14

@@ -1,0 +1,466 @@
+"""The report: what the page says equals what the run's files hold, and it says what is missing."""
+
+from __future__ import annotations
+
+import html.parser
+import json
+import re
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from droid_jax.report import figures, page, render
+
+JOINTS = [f"panda_joint{i}" for i in range(1, 8)]
+# Everything the demonstration tells, off its bounds, unless SPECIAL says otherwise.
+KEYS = ("name", "unit", "group", "initial_mean", "initial_std", "low", "high", "best", "mean", "std", "truth")
+ROWS = [
+    ("hinge_stiffness", "N m/rad", "Door", 0.8, 0.4, 0.0, 5.0, 1.049, 1.052, 0.0213, 1.06),
+    ("hinge_damping", "N m s/rad", "Door", 2.0, 1.0, 0.0, 9.0, 1.402, 1.41, 0.0731, 1.35),
+    ("hinge_friction_loss", "N m", "Door", 0.05, 0.02, 0.0, 4.0, 0.0, 0.004, 0.0061, 0.0),
+    ("door_mass", "kg", "Door", 1.144, 0.5, 0.1, 9.0, 1.2, 1.21, 0.49, 2.0),
+    ("joint_damping_1", "N m s/rad", "Robot", 40.0, 10.0, 0.0, 200.0, 52.3, 52.31, 0.83, 51.9),
+    ("joint_damping_4", "N m s/rad", "Robot", 40.0, 10.0, 0.0, 200.0, 47.1, 47.0, 1.1, 44.0),
+    ("pad_friction", "", "Gripper", 1.0, 0.5, 0.05, 3.0, 1.3, 1.34, 0.21, 1.2),
+    ("torsional_friction", "m", "Gripper", 0.005, 0.0025, 0.0001, 0.05, 0.0091, 0.0093, 0.0012, 0.0089),
+    ("door_x", "m", "Nuisance", 0.0, 0.002, -0.01, 0.01, -0.00131, -0.0013, 0.00021, None),
+    ("time_offset", "s", "Nuisance", 0.0, 0.001, -0.005, 0.005, 0.00099, 0.001, 0.00008, None),
+]
+SPECIAL = {
+    "hinge_friction_loss": {"on_bound": True},
+    "door_mass": {
+        "identifiable": False,
+        "reason": "the robot's torques change by less than their noise",
+        "partners": [{"name": "hinge_damping", "correlation": -0.93}],
+    },
+}
+
+
+def parameters() -> list[dict]:
+    """The synthetic fit's parameters, as fit.json holds them."""
+    out = []
+    for row in ROWS:
+        p = dict(zip(KEYS, row, strict=True))
+        p |= {"nuisance": p["group"] == "Nuisance", "identifiable": True, "reason": "", "on_bound": False}
+        p |= {"interval": [p["mean"] - 1.645 * p["std"], p["mean"] + 1.645 * p["std"]], "partners": []}
+        p |= SPECIAL.get(p["name"], {})
+        out.append(p)
+    return out
+
+
+def make_run(folder: Path, stand_in: bool = True, recordings: tuple[str, ...] = ("open_close",)) -> Path:
+    """A run's folder with every file of the schema, filled with plausible made-up numbers."""
+    folder.mkdir(parents=True, exist_ok=True)
+    rng = np.random.default_rng(0)
+    ps = parameters()
+    gap = {
+        name: {
+            "before": 1.2234, "after": 0.1187, "floor": 0.1012, "closed": 0.98440,
+            "per_joint_before": [1.9, 2.1, 0.9, 0.8, 0.4, 0.3, 0.1],
+            "per_joint_after": [0.2, 0.18, 0.12, 0.1, 0.06, 0.05, 0.04],
+        }
+        for name in recordings
+    }  # fmt: skip
+    config = {
+        "command": "identify", "preset": "quick", "scene": "panda_door", "engine": "mjx", "seed": 7,
+        "recordings": [
+            {"name": n, "sha256": "ab12" * 16, "repeats": 10, "heldout": [7, 8, 9], "duration": 7.68}
+            for n in recordings
+        ],
+        "versions": {"mujoco": "3.17.0", "jax": "0.9.2"}, "device": "2 CPU cores",
+        "started": "2026-11-21T06:00:00Z", "stand_in": stand_in,
+    }  # fmt: skip
+    fit = {
+        "parameters": ps, "cost": {"initial": 1.22, "best": 0.119, "floor": 0.101}, "gap": gap,
+        "stop": "the cost did not change for 20 generations", "generations": 80, "evaluations": 2560,
+        "seconds": {"search": 61.2, "refine": 12.5, "total": 90.1},
+        "rule": "Gauss-Newton, widened to the held-out gap", "notes": ["the robot was cold <1 h"],
+    }  # fmt: skip
+    (folder / "config.json").write_text(json.dumps(config))
+    (folder / "fit.json").write_text(json.dumps(fit))
+    (folder / "gaussian.json").write_text("{}")
+    _write_history(folder, ps, rng)
+    _write_traces(folder, recordings, rng)
+    names = [p["name"] for p in ps]
+    mixed = rng.normal(size=(len(ps), 14))
+    np.savez(folder / "correlation.npz", names=names, correlation=np.corrcoef(mixed))
+    initial, fitted = np.exp(rng.normal(0.3, 0.6, 200)), np.exp(rng.normal(-2.1, 0.1, 200))
+    initial[:3] = 100.0
+    np.savez(folder / "distribution.npz", initial_cost=initial, fitted_cost=fitted, names=names)
+    (folder / "frames").mkdir(exist_ok=True)
+    for i, (kind, grey) in enumerate((("before", 90), ("after", 160))):
+        picture = np.full((48, 64, 3), grey, dtype=np.uint8)
+        render.save_frames(folder / "frames", [picture, picture + 20], [0.0, 3.5 + i], kind)
+    return folder
+
+
+def _write_history(folder: Path, ps: list[dict], rng: np.random.Generator) -> None:
+    generation = np.arange(80)
+    decay = np.exp(-generation / 18)[:, None]
+    start, end = (np.array([p[k] for p in ps]) for k in ("initial_mean", "mean"))
+    wide, narrow = (np.array([p[k] for p in ps]) for k in ("initial_std", "std"))
+    best = 0.119 + 0.9 * np.exp(-generation / 12)
+    np.savez(
+        folder / "history.npz",
+        names=[p["name"] for p in ps],
+        generation=generation,
+        mean=end + (start - end) * decay + 0.03 * wide * rng.normal(size=(80, len(ps))) * decay,
+        std=narrow + wide * decay,
+        best_cost=best,
+        median_cost=best * (1.15 + np.exp(-generation / 9)),
+        sigma=np.exp(-generation / 25),
+    )
+
+
+def _write_traces(folder: Path, recordings: tuple[str, ...], rng: np.random.Generator) -> None:
+    arrays: dict[str, np.ndarray] = {}
+    time = np.arange(3840) * 0.002
+    spans = (("reach", 0, 1.5), ("grasp", 1.5, 2.5), ("open", 2.5, 5.0), ("close", 5.0, 7.68))
+    phases = [{"name": name, "start": start, "end": end} for name, start, end in spans]
+    for r in recordings:
+        j = np.arange(7)
+        mean = (6 - 0.7 * j) * np.sin(2 * np.pi * time[:, None] / (4 + 0.4 * j)) * (time[:, None] > 1.0)
+        arrays |= {
+            f"{r}/time": time, f"{r}/measured_mean": mean, f"{r}/measured_low": mean - 0.3,
+            f"{r}/measured_high": mean + 0.3, f"{r}/before": 1.25 * mean + 0.4,
+            f"{r}/after": mean + 0.08 * rng.normal(size=mean.shape), f"{r}/joints": np.array(JOINTS),
+            f"{r}/phases": np.array(json.dumps(phases)),
+        }  # fmt: skip
+    np.savez(folder / "traces.npz", **arrays)
+
+
+class Page(html.parser.HTMLParser):
+    """A page's visible text, the cells of its parameter tables, and what it would load or link."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.words: list[str] = []
+        self.cells: dict[tuple[str, str], dict] = {}
+        self.loads: list[str] = []
+        self.links: list[str] = []
+        self._row = self._field = ""
+        self._silent = 0
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list) -> None:
+        a = dict(attrs)
+        self._silent += tag in ("style", "title")
+        if tag in ("img", "script", "iframe", "source"):
+            self.loads.append(a.get("src") or "")
+        if tag == "link":
+            self.loads.append(a.get("href") or "")
+        if tag == "a":
+            self.links.append(a["href"] or "")
+        if tag == "tr":
+            self._row = a.get("data-name") or ""
+        if tag == "td" and self._row:
+            self._field = a.get("data-field") or ""
+            self.cells[self._row, self._field] = {"text": "", "values": []}
+        if tag == "data":
+            self.cells[self._row, self._field]["values"].append(float(a["value"] or "nan"))
+
+    def handle_endtag(self, tag: str) -> None:
+        self._silent -= tag in ("style", "title")
+        if tag == "td":
+            self._field = ""
+
+    def handle_data(self, data: str) -> None:
+        if self._silent:
+            return
+        self.words.append(data)
+        if self._field:
+            self.cells[self._row, self._field]["text"] += data
+
+    @property
+    def text(self) -> str:
+        return re.sub(r"\s+", " ", " ".join(self.words))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = make_run(tmp_path_factory.mktemp("report") / "run")
+    page.write_report(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def written(run: Path) -> Page:
+    return Page((run / "report.html").read_text(encoding="utf-8"))
+
+
+def test_the_table_holds_the_numbers_of_the_fit(written: Page) -> None:
+    for p in parameters():
+        for field in ("initial_mean", "initial_std", "mean", "std"):
+            cell = written.cells[p["name"], field]
+            assert cell["values"] == [p[field]]
+            shown = float(cell["text"].strip().replace("−", "-"))
+            assert shown == pytest.approx(p[field], rel=0.05, abs=0.05 * p["std"])
+        assert written.cells[p["name"], "interval"]["values"] == p["interval"]
+        assert written.cells[p["name"], "initial_mean"]["values"] == [p["initial_mean"]]
+
+
+def test_truth_and_verdict_columns(written: Page) -> None:
+    assert written.cells["hinge_stiffness", "truth"]["values"] == [1.06]
+    assert "inside" in written.cells["hinge_stiffness", "truth"]["text"]
+    assert "outside" in written.cells["joint_damping_4", "truth"]["text"]
+    assert "identifiable" in written.cells["hinge_stiffness", "verdict"]["text"]
+    untold = written.cells["door_mass", "verdict"]["text"]
+    assert "this demonstration does not tell" in untold and "less than their noise" in untold
+    assert "Hinge damping (−0.93)" in untold
+    assert "on lower bound 0 N m" in written.cells["hinge_friction_loss", "verdict"]["text"]
+    assert ("door_x", "truth") not in written.cells  # nobody knows a nuisance's truth here
+
+
+def test_groups_come_in_the_order_of_the_papers_table(written: Page) -> None:
+    names = list(dict.fromkeys(name for name, _ in written.cells))
+    assert names == [row[0] for row in ROWS]
+
+
+def test_summary_is_made_from_the_numbers(run: Path) -> None:
+    text = " ".join(page.summary(page.read_run(run)))
+    assert "8 parameters (4 of the door, 2 of the stand-in robot and 2 of the gripper)" in text
+    assert "2 nuisances" in text and "1.22 N m before the fit" in text and "0.119 N m after it" in text
+    assert "98 % of what can be closed" in text
+    assert "does not tell door mass;" in text
+    assert "known for 7 of the parameters" in text and "for 6 of them" in text
+    assert "hinge friction loss (lower bound 0 N m)" in text
+    assert "Next:" in text and "droid_jax.run gap" not in text
+
+
+def test_summary_says_when_the_fit_made_it_worse(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run")
+    fit = json.loads((run / "fit.json").read_text())
+    fit["gap"]["open_close"] |= {"after": 2.5, "closed": -1.1}
+    (run / "fit.json").write_text(json.dumps(fit))
+    text = " ".join(page.summary(page.read_run(run)))
+    assert "the fit made it worse" in text and "do not train on this fit" in text
+    assert "look for it with python -m droid_jax.run gap" in text
+
+
+def test_a_stand_in_is_never_called_a_robot(written: Page) -> None:
+    assert len(re.findall("stand-in robot", written.text, flags=re.I)) > 5
+    assert not re.findall(r"(?<!stand-in )robot", written.text, flags=re.I)
+
+
+def test_a_robot_is_not_called_a_stand_in(tmp_path: Path) -> None:
+    run = page.read_run(make_run(tmp_path / "run", stand_in=False))
+    assert "which the robot measured" in page.summary(run)[0]
+    assert "stand-in" not in " ".join(page.summary(run))
+
+
+def test_the_page_loads_nothing_and_every_link_is_there(run: Path, written: Page) -> None:
+    assert written.loads and all(source.startswith("data:") for source in written.loads)
+    missing = [link for link in written.links if not (run / link).is_file()]
+    assert not missing
+    assert "gaussian.json" in written.links and "fitted.xml" not in written.links
+
+
+def test_ids_in_the_page_are_unique_and_references_resolve(run: Path) -> None:
+    text = (run / "report.html").read_text(encoding="utf-8")
+    ids = re.findall(r'\bid="([^"]+)"', text)
+    assert len(ids) == len(set(ids))
+    used = set(re.findall(r'(?:url\(#|href="#)([^")]+)', text))
+    assert used and used <= set(ids)
+
+
+def test_texts_of_the_run_are_escaped(run: Path) -> None:
+    text = (run / "report.html").read_text(encoding="utf-8")
+    assert "cold &lt;1 h" in text and "cold <1 h" not in text
+
+
+def test_several_recordings_each_have_their_own_gap_and_figure(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", recordings=("slow", "fast"))
+    text = page.write_report(run).read_text(encoding="utf-8")
+    assert "In “slow”, on repeats" in text and "In “fast”, on repeats" in text
+    assert (run / "figures" / "torque_0.pdf").read_bytes().startswith(b"%PDF")
+    assert (run / "figures" / "torque_1.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_what_is_optional_is_left_out_and_said(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run")
+    (run / "distribution.npz").unlink()
+    for picture in (run / "frames").glob("*"):
+        picture.unlink()
+    text = Page(page.write_report(run).read_text(encoding="utf-8")).text
+    assert "distribution.npz is not there" in text and "frames/ holds no pictures" in text
+    assert "The two Gaussians, replayed" not in text
+
+
+def test_drawing_leaves_the_callers_matplotlib_alone() -> None:
+    import matplotlib
+
+    before = dict(matplotlib.rcParams)
+    figures.gap_per_joint(JOINTS, np.ones(7), np.ones(7), None)
+    assert dict(matplotlib.rcParams) == before
+
+
+@pytest.mark.parametrize("name", ["config.json", "fit.json", "history.npz", "traces.npz", "correlation.npz"])
+@pytest.mark.parametrize("content", [None, b"", b"{broken"])
+def test_a_required_file_that_is_missing_or_broken_is_named(tmp_path: Path, name: str, content: bytes | None) -> None:
+    run = make_run(tmp_path / "run")
+    (run / name).unlink()
+    if content is not None:
+        (run / name).write_bytes(content)
+    with pytest.raises(ValueError, match=rf"{re.escape(name)}.*droid_jax\.run identify"):
+        page.write_report(run)
+    assert not (run / "report.html").exists()
+
+
+def test_a_missing_key_and_a_wrong_shape_are_named(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run")
+    fit = json.loads((run / "fit.json").read_text())
+    del fit["parameters"][2]["truth"]
+    (run / "fit.json").write_text(json.dumps(fit))
+    with pytest.raises(ValueError, match=r"hinge_friction_loss.*'truth'"):
+        page.read_run(run)
+    run = make_run(tmp_path / "other")
+    arrays = dict(np.load(run / "traces.npz"))
+    arrays["open_close/after"] = arrays["open_close/after"][:-1]
+    np.savez(run / "traces.npz", **arrays)
+    with pytest.raises(ValueError, match=r"open_close/after must be .*\(3840, 7\).*\(3839, 7\)"):
+        page.read_run(run)
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [(1.0, "1.00"), (-0.05, "−0.0500"), (0.0, "0"), (12345.6, "12346"), (2e-6, "2.00·10^−6"),
+     (None, "–"), (float("nan"), "–")],
+)  # fmt: skip
+def test_numbers_are_written_with_three_digits(value: float | None, shown: str) -> None:
+    assert page.number(value) == shown
+
+
+def test_numbers_follow_their_deviation() -> None:
+    assert page.like(1.23456, 0.021) == "1.235"
+    assert page.like(52.31, 0.83) == "52.31"
+    assert page.like(-1234.5, 40.0) == "−1234"  # half to even, and no digits that mean nothing
+    assert page.percent(0.999) == "99 %" and page.percent(1.0) == "100 %"
+
+
+def test_long_traces_are_thinned_without_losing_a_spike() -> None:
+    time = np.arange(20_000) * 0.001
+    value = np.sin(time)
+    value[7_777] = 50.0
+    thin_time, thin = figures._thin(time, value)
+    assert len(thin) < 500 and thin.max() == 50.0 and (np.diff(thin_time) > 0).all()
+    _, low, high = figures._band(time, value - 1, value + 1)
+    assert low.min() == (value - 1).min() and high.max() == 51.0
+
+
+def test_torque_figure_draws_the_given_traces(run: Path) -> None:
+    traces = page.read_run(run).traces["open_close"]
+    figure = figures.torque_traces(traces, traces["phases"])
+    panels = [a for a in figure.axes if a.get_visible()]
+    assert [a.get_title("left") for a in panels] == [f"Joint {i}" for i in range(1, 8)]
+    for j, axes in enumerate(panels):
+        drawn = {line.get_label(): line for line in axes.lines}
+        for name, key in (("before the fit", "before"), ("after the fit", "after")):
+            line = drawn[name]
+            rows = np.searchsorted(traces["time"], line.get_xdata())
+            np.testing.assert_array_equal(line.get_ydata(), traces[key][rows, j])
+
+
+def test_figures_survive_failed_replays() -> None:
+    history = {"generation": np.arange(4), "best_cost": [np.inf, 2.0, 1.0, 0.5], "median_cost": [np.inf] * 4}
+    assert isinstance(figures.cost_history(history, {"best": 0.5, "floor": None}), Figure)
+    costs = np.array([np.inf, 1.0, 2.0])
+    legend = figures.cost_histograms(costs, costs[1:]).legends[0]
+    assert any("1 without a finite cost" in t.get_text() for t in legend.get_texts())
+    with pytest.raises(ValueError, match="no finite cost"):
+        figures.cost_histograms(np.array([np.inf]), np.array([np.nan]))
+
+
+def test_the_best_told_parameters_are_chosen() -> None:
+    chosen = figures.most_identifiable(parameters(), {p["name"]: 0 for p in parameters()})
+    ratio = {p["name"]: p["std"] / p["initial_std"] for p in parameters()}
+    assert chosen[0] == "hinge_stiffness" and "door_mass" not in chosen and "door_x" not in chosen
+    assert [ratio[n] for n in chosen] == sorted(ratio[n] for n in chosen) and 3 <= len(chosen) <= 6
+    assert len(figures.most_identifiable(parameters()[3:4] + parameters()[8:], {"door_mass": 0, "door_x": 1})) == 2
+
+
+def test_inline_svg_is_well_formed_and_follows_the_pages_colours() -> None:
+    figure = figures.gap_per_joint(JOINTS, np.ones(7), 0.1 * np.ones(7), 0.05)
+    svg = figures.inline_svg(figure, "x")
+    root = ElementTree.fromstring(svg)
+    assert root.tag.endswith("svg") and "var(--before)" in svg and "var(--after)" in svg
+    assert figures.BEFORE not in svg
+    assert svg == figures.inline_svg(figures.gap_per_joint(JOINTS, np.ones(7), 0.1 * np.ones(7), 0.05), "x")
+
+
+XML = """<mujoco><visual><global offwidth="64" offheight="48"/></visual><worldbody>
+<light pos="0 0 3"/><camera name="front" pos="0 -2 0" xyaxes="1 0 0 0 0 1"/>
+<body><joint name="slide" type="slide" axis="1 0 0"/><geom type="sphere" size="0.2" rgba="1 0 0 1"/></body>
+</worldbody></mujoco>"""
+
+
+def _backend() -> str:
+    try:
+        return render.working_backend()
+    except render.NoOpenGL as error:
+        pytest.skip(str(error))
+
+
+@pytest.mark.gl
+def test_frames_show_where_the_body_is() -> None:
+    import mujoco
+
+    _backend()
+    model = mujoco.MjModel.from_xml_string(XML)
+    qpos = np.array([[-0.5], [0.0], [0.5]])
+    images = render.frames(model, qpos, [0, 1, -1], size=(48, 64))
+    centres = []
+    for image in images:
+        assert image.shape == (48, 64, 3) and image.dtype == np.uint8
+        red = image[..., 0].astype(int) - image[..., 1] > 60
+        centres.append(np.flatnonzero(red.any(axis=0)).mean())
+    assert centres[0] < centres[1] - 10 and centres[2] > centres[1] + 10
+    assert centres[1] == pytest.approx(31.5, abs=1.5)
+
+
+def test_frames_refuse_what_does_not_fit_the_model() -> None:
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_string(XML)
+    with pytest.raises(ValueError, match=r"\[T, 1\].*\(3, 2\)"):
+        render.frames(model, np.zeros((3, 2)), [0], size=(48, 64))
+    with pytest.raises(ValueError, match="index 3 is outside"):
+        render.frames(model, np.zeros((3, 1)), [3], size=(48, 64))
+    with pytest.raises(ValueError, match="row 1 is not finite"):
+        render.frames(model, np.array([[0.0], [np.nan]]), [0, 1], size=(48, 64))
+    with pytest.raises(ValueError, match="no camera 'back'; this model has: front"):
+        render.frames(model, np.zeros((1, 1)), [0], camera="back", size=(48, 64))
+    with pytest.raises(ValueError, match=r"\(48, 64\), got \(480, 640\)"):
+        render.frames(model, np.zeros((1, 1)), [0])
+
+
+def test_without_opengl_the_message_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    render.working_backend.cache_clear()
+    monkeypatch.setattr(render, "_child", lambda *_: "the process died with signal 11")
+    with pytest.raises(render.NoOpenGL, match=r"egl \(the process died with signal 11\).*libosmesa6"):
+        render.working_backend()
+    render.working_backend.cache_clear()
+    monkeypatch.setenv("MUJOCO_GL", "off")
+    with pytest.raises(render.NoOpenGL, match="turns drawing off"):
+        render.working_backend()
+
+
+def test_a_backend_that_cannot_draw_is_a_message_not_a_crash() -> None:
+    assert "invalid value" in render._child("nonsense", None, 60.0)
+    assert render._candidates("glfw", "linux") == ["glfw", "egl", "osmesa"]
+    assert render._candidates("", "linux") == ["egl", "osmesa"]
+
+
+def test_writing_is_all_or_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    target = tmp_path / "page.html"
+    target.write_bytes(b"old")
+
+    def fail(*_: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr(figures.os, "replace", fail)
+    with pytest.raises(OSError, match="disk full"):
+        figures.write_atomically(target, b"new")
+    assert target.read_bytes() == b"old" and list(tmp_path.iterdir()) == [target]

@@ -1,0 +1,125 @@
+"""The folder list is the data flow: imports point only to rooms further up."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / "droid_jax"
+ORDER = ("model", "measure", "compare", "identify", "gap", "policy", "report", "run")
+FOR_ALL = ("runtime", "errors")
+# Third-party package -> the only file or folder of droid_jax that may import it.
+ONLY_IN = {
+    "evosax": "identify/search.py",
+    "brax": "policy",
+    "matplotlib": "report",
+    "jinja2": "report",
+    "PIL": "report",
+    "imageio": "report",
+}
+
+
+def imports(source: str, module: tuple[str, ...], is_package: bool) -> Iterator[str]:
+    """Dotted names a module imports, at any depth of its code, relative ones made absolute.
+
+    module: the dotted name as a tuple, e.g. ("droid_jax", "model", "scene"); `from a import b`
+    yields "a.b", which may name a module or something inside one.
+    """
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base: tuple[str, ...] = ()
+            if node.level:
+                base = module[: len(module) - node.level + is_package]
+            start = [*base, *([node.module] if node.module else [])]
+            yield from (".".join([*start, alias.name]) for alias in node.names)
+
+
+def room_fault(path: str, imported: str) -> str | None:
+    """What is wrong with a file (relative to the package, "model/scene.py") importing a name, if anything."""
+    parts = imported.split(".")
+    if parts[0] != "droid_jax":
+        home = ONLY_IN.get(parts[0])
+        allowed = home is None or path == home or path.startswith(f"{home}/")
+        return None if allowed else f"{path} imports {imported}, which belongs in {home}"
+    here = path.removesuffix(".py").split("/")[0]
+    there = parts[1] if len(parts) > 1 else ""
+    if here == "__init__" or there in FOR_ALL:
+        return None
+    if here in FOR_ALL:
+        return f"{path} imports {imported}, but every room may import {path}"
+    if there not in ORDER:
+        return f"{path} imports {imported}, which is in no room"
+    if here == "__main__" or ORDER.index(there) <= ORDER.index(here):
+        return None
+    return f"{path} imports {imported}, but {there} comes after {here}"
+
+
+def faults(folder: Path) -> list[str]:
+    """All faults of a package folder."""
+    found = []
+    for file in sorted(folder.rglob("*.py")):
+        relative = file.relative_to(folder)
+        module = ("droid_jax", *relative.with_suffix("").parts)
+        is_package = file.name == "__init__.py"
+        names = imports(file.read_text(), module[:-1] if is_package else module, is_package)
+        found += [fault for name in names if (fault := room_fault(relative.as_posix(), name))]
+    return found
+
+
+def test_imports_point_only_to_rooms_further_up():
+    assert faults(PACKAGE) == []
+
+
+def test_every_folder_and_file_of_the_package_is_a_room():
+    names = {p.stem for p in PACKAGE.iterdir() if p.suffix == ".py" or (p.is_dir() and any(p.glob("*.py")))}
+    assert names <= {*ORDER, *FOR_ALL, "__init__", "__main__"}
+
+
+@pytest.mark.parametrize(
+    ("path", "source"),
+    [
+        ("model/scene.py", "from droid_jax.compare import cost"),
+        ("model/scene.py", "from ..compare import cost"),
+        ("model/__init__.py", "from ..compare import cost"),
+        ("model/effects/delay.py", "from ...measure.recording import Recording"),
+        ("compare/cost.py", "def late():\n    import droid_jax.report.page"),
+        ("compare/cost.py", "from droid_jax import run"),
+        ("compare/cost.py", "from droid_jax import Parameter"),
+        ("runtime.py", "from droid_jax.model import parameters"),
+        ("identify/gaussian.py", "import evosax"),
+        ("identify/refine.py", "from evosax.algorithms import CMA_ES"),
+        ("gap/screen.py", "import brax.envs"),
+        ("gap/screen.py", "import matplotlib.pyplot as plt"),
+        ("run.py", "from PIL import Image"),
+    ],
+)
+def test_a_wrong_import_is_found(tmp_path, path, source):
+    file = tmp_path / path
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(source)
+    assert len(faults(tmp_path)) == 1
+
+
+@pytest.mark.parametrize(
+    ("path", "source"),
+    [
+        ("compare/cost.py", "from droid_jax.model.parameters import Space"),
+        ("compare/cost.py", "from .replay import make_replay\nfrom ..model import scene"),
+        ("compare/__init__.py", "from .replay import make_replay"),
+        ("compare/cost.py", "from droid_jax.runtime import compiler_options\nfrom droid_jax import errors"),
+        ("identify/search.py", "from evosax.algorithms import CMA_ES"),
+        ("policy/train.py", "from brax.training.agents.ppo import train"),
+        ("run.py", "from droid_jax.report import page\nimport numpy, pathlib"),
+        ("__init__.py", "from droid_jax.report.page import write"),
+    ],
+)
+def test_a_right_import_passes(tmp_path, path, source):
+    file = tmp_path / path
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(source)
+    assert faults(tmp_path) == []

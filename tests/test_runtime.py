@@ -1,0 +1,251 @@
+"""Settings before jax starts: seen from fresh processes, since each can be tuned only once."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import io
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.sharding import PartitionSpec
+
+from droid_jax import runtime
+
+ROOT = Path(__file__).resolve().parents[1]
+PLAIN = ("XLA_FLAGS", "JAX_NUM_CPU_DEVICES", "JAX_COMPILATION_CACHE_DIR", "TF_CPP_MIN_LOG_LEVEL")
+# With the fusion emitters XLA compiles a fused expression to a kernel called "..._fusion_kernel".
+COMPILE = """
+def compiled(**options):
+    import jax, jax.numpy as jnp
+    f = jax.jit(lambda x: jnp.sin(x) * jnp.cos(x) + jnp.tanh(x[::-1]), **options)
+    return f.lower(jnp.ones(64)).compile()
+def fused(**options):
+    return b"fusion_kernel" in compiled(**options).runtime_executable().serialize()
+"""
+
+
+def fresh(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run code in a new Python without this session's jax settings, on the CPU."""
+    kept = {k: v for k, v in os.environ.items() if k not in PLAIN}
+    kept |= {"JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT), **environment}
+    return subprocess.run([sys.executable, "-c", code], env=kept, capture_output=True, text=True, timeout=120)
+
+
+def answer(code: str, **environment: str) -> dict:
+    """The JSON object that code prints in a new Python."""
+    run = fresh(code, **environment)
+    assert run.returncode == 0, run.stderr
+    return json.loads(run.stdout)
+
+
+def test_importing_sets_nothing():
+    seen = answer(
+        "import os, sys, json; before = dict(os.environ); import droid_jax.runtime\n"
+        "print(json.dumps({'jax': 'jax' in sys.modules, 'same': before == dict(os.environ)}))"
+    )
+    assert seen == {"jax": False, "same": True}
+
+
+def test_tune_settles_devices_flag_and_cache(tmp_path):
+    code = f"""{COMPILE}
+import json, os
+from droid_jax.runtime import tune
+first = tune(devices=3, cache_dir={str(tmp_path)!r})
+import jax
+seen = dict(count=jax.device_count(), fused=fused(), folder=jax.config.jax_compilation_cache_dir)
+seen |= dict(again=tune(devices=3, cache_dir={str(tmp_path)!r}) == first, settled=first.devices)
+seen |= dict(kept=tune() == first, off=first.emitters_off, cache=str(first.cache))
+try:
+    tune(devices=2)
+except RuntimeError as error:
+    seen["error"] = str(error)
+print(json.dumps(seen))
+"""
+    seen = answer(code)
+    assert (seen["count"], seen["settled"]) == (3, 3)
+    assert seen["off"] and not seen["fused"]
+    assert seen["again"] and seen["kept"]
+    assert Path(seen["folder"]).is_relative_to(tmp_path) and seen["folder"] == seen["cache"]
+    assert "3 CPU device(s) instead of 2" in seen["error"] and "before the first jax array" in seen["error"]
+
+
+def test_untuned_jax_keeps_the_emitters_and_the_option_drops_them(tmp_path):
+    code = f"""{COMPILE}
+import json
+from droid_jax.runtime import compiler_options, tune
+seen = dict(plain=fused(), option=fused(compiler_options=compiler_options()), options=compiler_options())
+try:
+    tune(devices=1, cache_dir={str(tmp_path)!r})
+except RuntimeError as error:
+    seen["error"] = str(error)
+print(json.dumps(seen))
+"""
+    seen = answer(code)
+    assert seen["plain"] and not seen["option"]
+    assert seen["options"] == {"xla_cpu_use_fusion_emitters": False}
+    assert "XLA_FLAGS lacks --xla_cpu_use_fusion_emitters=false" in seen["error"]
+
+
+def test_the_users_own_choices_stay(tmp_path):
+    code = """
+import json
+from droid_jax.runtime import tune
+settled = tune()
+import jax
+folder = jax.config.jax_compilation_cache_dir
+print(json.dumps([jax.device_count(), settled.devices, settled.emitters_off, folder]))
+"""
+    flags = "--xla_force_host_platform_device_count=5 --xla_cpu_use_fusion_emitters=true"
+    mine = str(tmp_path / "mine")
+    variables = {"DROID_JAX_CACHE": str(tmp_path), "JAX_COMPILATION_CACHE_DIR": mine, "XLA_FLAGS": flags}
+    assert answer(code, **variables) == [5, 5, False, mine]
+
+
+def test_a_second_process_finds_the_program_compiled(tmp_path):
+    code = f"""{COMPILE}
+import json
+from droid_jax.runtime import compiler_options, tune
+tune(cache_dir={str(tmp_path)!r})
+import jax
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+options, seen = compiler_options(), []
+jax.monitoring.register_event_listener(lambda name, **_: seen.append(name))
+compiled(compiler_options=options)
+print(json.dumps(dict(hits=seen.count("/jax/compilation_cache/cache_hits"))))
+"""
+    first, second = fresh(code), fresh(code)
+    assert json.loads(first.stdout)["hits"] == 0
+    assert json.loads(second.stdout)["hits"] > 0
+    assert second.stderr == ""
+
+
+def test_an_unknown_flag_is_recognised_without_harm():
+    assert runtime._probe_flag("--xla_no_such_flag_at_all=false") is False
+
+
+def test_the_flag_is_probed_once_per_cache(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(runtime, "_probe_flag", lambda flag: asked.append(flag) or False)
+    assert [runtime._flag_known(tmp_path) for _ in range(3)] == [False] * 3
+    assert asked == ["--xla_cpu_use_fusion_emitters=false"]
+    assert runtime._with_emitters_off("--a=1", tmp_path) == "--a=1"
+    monkeypatch.setattr(importlib.metadata, "version", lambda name: "another")
+    runtime._flag_known(tmp_path)
+    assert len(asked) == 2
+
+
+def test_an_unclear_probe_is_not_remembered(tmp_path, monkeypatch):
+    monkeypatch.setattr(runtime, "_probe_flag", lambda flag: None)
+    with pytest.warns(UserWarning, match="could not find out"):
+        assert runtime._flag_known(tmp_path) is False
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_cache_folder_from_argument_variable_and_home(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    monkeypatch.delenv("DROID_JAX_CACHE", raising=False)
+    assert runtime._cache_root(None) == tmp_path / "home" / "droid_jax"
+    monkeypatch.setenv("DROID_JAX_CACHE", str(tmp_path / "variable"))
+    assert runtime._cache_root(None) == tmp_path / "variable"
+    assert runtime._cache_root(tmp_path / "argument") == tmp_path / "argument"
+
+
+def test_a_cache_that_cannot_be_made(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError):
+        runtime._cache_root(tmp_path / "file" / "cache")
+    monkeypatch.delenv("DROID_JAX_CACHE", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    with pytest.warns(UserWarning, match="without a compilation cache"):
+        assert runtime._cache_root(None) is None
+
+
+def test_no_devices_is_refused():
+    with pytest.raises(ValueError, match=r"devices: expected at least 1 .* got 0"):
+        runtime.tune(devices=0)
+
+
+def test_mesh_spans_all_devices_of_the_process():
+    mesh = runtime.devices_mesh()
+    assert mesh.axis_names == ("population",)
+    assert list(mesh.devices) == jax.local_devices()
+    assert mesh.axis_types == (jax.sharding.AxisType.Auto,)
+    rows = PartitionSpec("population")
+    total = jax.shard_map(
+        lambda x: jax.lax.psum(x.sum(), "population"), mesh=mesh, in_specs=rows, out_specs=PartitionSpec()
+    )
+    x = jnp.arange(4.0 * len(mesh.devices))
+    np.testing.assert_allclose(jax.jit(total)(x), x.sum())
+
+
+def test_no_cpu_options_on_another_backend(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert runtime.compiler_options() == {}
+
+
+def test_versions_name_what_is_installed():
+    found = runtime.versions()
+    assert found["python"] == sys.version.split()[0]
+    assert found["jax"] == jax.__version__
+    assert found["numpy"] == np.__version__
+    assert found["mujoco"] == found["mujoco-mjx"]
+    assert "no-such-package" not in found
+
+
+def test_git_commit_of_a_checkout(tmp_path):
+    assert runtime._git_commit(tmp_path) is None
+
+    def git(*arguments: str) -> str:
+        who = ("-c", "user.name=n", "-c", "user.email=n@example.org", "-c", "commit.gpgsign=false")
+        run = subprocess.run(["git", *who, *arguments], cwd=tmp_path, capture_output=True, text=True, check=True)
+        return run.stdout.strip()
+
+    try:
+        git("init", "--quiet")
+    except FileNotFoundError:
+        pytest.skip("git is not installed")
+    assert runtime._git_commit(tmp_path) is None  # no commit yet
+    (tmp_path / "file").write_text("1")
+    git("add", "file")
+    git("commit", "--quiet", "--no-verify", "-m", "one")
+    commit = runtime._git_commit(tmp_path)
+    assert commit == git("rev-parse", "HEAD") and re.fullmatch(r"[0-9a-f]{40,64}", commit)
+    (tmp_path / "file").write_text("2")
+    assert runtime._git_commit(tmp_path) == f"{commit}-dirty"
+
+
+def test_device_has_a_name(monkeypatch):
+    class Card:
+        device_kind = "NVIDIA H200"
+
+    monkeypatch.setattr(jax, "local_devices", lambda: [Card(), Card()])
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert runtime.device() == "2 x NVIDIA H200"
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+    monkeypatch.setattr(runtime, "_cores", lambda: 1)
+    assert re.fullmatch(r".+, 1 core", runtime.device())
+
+
+def test_quiet_drops_only_the_two_lines():
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), pytest.raises(KeyError), runtime.quiet():
+        print("kept")
+        print("Failed to import warp: No module named 'warp'")
+        print("Failed to import mujoco_warp: No module named 'warp'")
+        print("Failed to import warp: a driver is too old")
+        raise KeyError
+    assert printed.getvalue() == "kept\nFailed to import warp: a driver is too old\n"
+
+
+def test_mjx_is_imported_without_a_word():
+    run = fresh("from droid_jax.runtime import import_mjx; assert import_mjx().put_model")
+    assert (run.returncode, run.stdout) == (0, "")
