@@ -24,10 +24,8 @@ GPU_BLOCK = 4096  # rows at most in one piece on an accelerator
 
 def block_size(rows: int) -> int:
     """Rows of a block: fixed on a CPU, the next power of two up to GPU_BLOCK elsewhere."""
-    if jax.default_backend() == "cpu":
-        smallest = CPU_BLOCK
-    else:
-        smallest = min(GPU_BLOCK, 1 << max(5, (rows - 1).bit_length()))
+    power = 1 << max(5, (rows - 1).bit_length())
+    smallest = CPU_BLOCK if jax.default_backend() == "cpu" else min(GPU_BLOCK, power)
     devices = runtime.devices_mesh().size
     return -(-smallest // devices) * devices
 

@@ -87,11 +87,12 @@ def check_gains(scene: Scene, drive: Drive) -> None:
             )
 
 
-def servo_replay(scene: Scene, drive: Drive, effects: Sequence[Effect] = ()) -> Replay:
+def servo_replay(scene: Scene, drive: Drive, effects: Sequence[Effect] = (), *, parity: bool = False) -> Replay:
     """The scan over time steps that follows the command. Torques carry the time of the state they act on.
 
     The scan carries only position, velocity and the solver's warm start: everything else in
     mjx.Data is rebuilt each step, so that XLA drops what nobody reads.
+    parity: step exactly as the C engine does (see `droid_jax.model.step`), for comparisons with it.
     """
     check_gains(scene, drive)
     template = mjx.make_data(scene.mjx)
@@ -100,6 +101,7 @@ def servo_replay(scene: Scene, drive: Drive, effects: Sequence[Effect] = ()) -> 
     start = jnp.asarray(drive.qpos0, jnp.float32)
     joints, positions = scene.joint_dofs, scene.joint_qpos
     hinge = scene.qpos(scene.object_joint) if scene.object_joint else None
+    late = 0.5 if parity else 0.0  # steps; see `_command`
 
     def replay(physics: Physics) -> Rollout:
         model, theta = physics.model, physics.theta
@@ -107,14 +109,16 @@ def servo_replay(scene: Scene, drive: Drive, effects: Sequence[Effect] = ()) -> 
         def step(carry, k):
             qpos, qvel, warm, load = carry
             state = State(k * drive.timestep, qpos, qvel, load)
-            ctrl = _command(table, drive.timestep, k, theta, effects)
+            ctrl = _command(table, drive.timestep, k, late, theta, effects)
             before = template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm, ctrl=ctrl)
-            after = simulate_step(_friction(model, theta, state, effects), _applied(before, theta, state, effects))
+            after = simulate_step(
+                _friction(model, theta, state, effects), _applied(before, theta, state, effects), parity=parity
+            )
             out = (
                 _joint_torque(model, after, joints, drive),
-                qpos[positions] + 0.5 * drive.timestep * qvel[joints],
-                qvel[joints],
-                qpos[hinge] + 0.5 * drive.timestep * qvel[hinge] if hinge is not None else jnp.zeros(()),
+                qpos[positions] + late * drive.timestep * qvel[joints],
+                0.5 * (qvel + after.qvel)[joints],
+                qpos[hinge] + late * drive.timestep * qvel[hinge] if hinge is not None else jnp.zeros(()),
                 _touching(after, fingers),
             )
             return (after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator), out
@@ -129,12 +133,14 @@ def servo_replay(scene: Scene, drive: Drive, effects: Sequence[Effect] = ()) -> 
     return replay
 
 
-def _command(table: jax.Array, timestep: float, k: jax.Array, theta: Theta, effects: Sequence[Effect]) -> jax.Array:
-    """[U] the command of step k, half a step late.
+def _command(
+    table: jax.Array, timestep: float, k: jax.Array, late: float, theta: Theta, effects: Sequence[Effect]
+) -> jax.Array:
+    """[U] the command of step k, `late` steps late, and by `time_offset` of theta [s] on top.
 
-    The integrator damps with the velocity half a step ahead of the position it computes torques
-    from; half a step of delay takes that first-order error out (docs/architecture.md).
-    A `time_offset` in theta delays the command further.
+    C MuJoCo's implicitfast damps with a velocity half a step ahead of the position it computes
+    torques from; half a step of delay takes most of that first-order error out.  The replay's own
+    second-order step needs none.
     """
     last = table.shape[0] - 1
 
@@ -145,15 +151,15 @@ def _command(table: jax.Array, timestep: float, k: jax.Array, theta: Theta, effe
         return table[low] * (1 - part) + table[low + 1] * part
 
     # In steps first: float32 seconds would lose a tenth of a step after ten seconds.
-    late = 0.5 + theta.get("time_offset", 0.0) / timestep
-    whole = jnp.floor(late)
+    delay = late + jnp.asarray(theta.get("time_offset", 0.0), jnp.float32) / timestep
+    whole = jnp.floor(delay)
     low = jnp.clip(k - whole.astype(jnp.int32) - 1, 0, last)
     high = jnp.clip(k - whole.astype(jnp.int32), 0, last)
-    part = late - whole
+    part = delay - whole
     ctrl = table[high] * (1 - part) + table[low] * part
     for effect in effects:
         if effect.command is not None:
-            ctrl = effect.command(theta, (k - late) * timestep, look)
+            ctrl = effect.command(theta, (k - delay) * timestep, look)
     return ctrl
 
 

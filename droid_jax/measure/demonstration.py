@@ -79,7 +79,7 @@ PLANS = {
             Segment("hold", 0.4, 50 * _DEG, 0.0, CLOSED),
             Segment("closing", 3.2, 15 * _DEG, 0.0, CLOSED),
             Segment("closing", 1.6, 6 * _DEG, 0.0, CLOSED),
-            Segment("hold", 0.4, 6 * _DEG, 0.0, CLOSED),
+            Segment("rest", 0.4, 6 * _DEG, 0.0, CLOSED),
         ),
     ),
 }

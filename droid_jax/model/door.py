@@ -7,6 +7,8 @@ standard deviations.
 
 from __future__ import annotations
 
+from typing import Any
+
 from droid_jax.model.fields import (
     body_mass,
     body_mass_scale,
@@ -26,7 +28,7 @@ PAPER_DAMPING_STD = (2.0, 2.0, 2.0, 2.0, 2.0, 1.0, 0.2)  # Table I, N m s/rad
 JOINT_DAMPING = tuple(f"joint_damping_{i}" for i in range(1, 8))
 
 # Table I, fitted means of door and fingers (left, right), by number of springs.
-_TABLE_I = {
+_TABLE_I: dict[int, dict[str, Any]] = {
     0: dict(door_mass=1.50, knob_mass=1.98, hinge_frictionloss=0.10, hinge_stiffness=0.002, hinge_damping=0.10,
             sliding=(0.47, 1.78), torsional=(1.38, 1.84)),
     1: dict(door_mass=0.92, knob_mass=2.31, hinge_frictionloss=0.0, hinge_stiffness=1.06, hinge_damping=0.71,
@@ -97,7 +99,7 @@ def door_nuisances(scene: Scene) -> Space:
     gains, timing and torque offsets.  Deviations: 2 mm and 0.5 degree of door pose, 1 mm at the
     knob, 3 % of link masses and servo gains, 1 ms, 0.1 N m (0.03 at the wrist).
     """
-    note = dict(nuisance=True, group="Nuisance")
+    note: dict[str, Any] = dict(nuisance=True, group="Nuisance")
     pose = [
         body_position(scene, "cabinet", k, std=0.002, limit=0.02, name=f"door_{'xyz'[k]}", **note) for k in range(3)
     ]

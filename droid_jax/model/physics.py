@@ -21,8 +21,18 @@ from droid_jax.model.parameters import Space, Write
 from droid_jax.model.scene import Scene
 
 # Writing one of these changes what the compiler derives.
-_SOURCES = {"body_mass", "body_inertia", "body_pos", "body_quat", "body_ipos", "body_iquat", "dof_armature"}
-DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "stat")
+_SOURCES = {"body_mass", "body_inertia", "body_pos", "body_quat", "body_ipos", "body_iquat", "dof_armature",
+            "jnt_pos", "jnt_axis"}  # fmt: skip
+DERIVED = (
+    "body_subtreemass",
+    "body_invweight0",
+    "dof_invweight0",
+    "dof_M0",
+    "tendon_length0",
+    "tendon_invweight0",
+    "stat",
+)
+_SLIDES_ONLY = 2  # MjModel.body_simple of a body whose inertia is its mass alone
 
 
 @jax.tree_util.register_dataclass
@@ -79,8 +89,9 @@ def make_physics(scene: Scene, space: Space, values: jax.Array) -> Physics:
 def derive(model: Any) -> Any:
     """Recompute what mj_setConst derives from masses, inertias and geometry at the pose qpos0.
 
-    body_subtreemass, body_invweight0 [nbody,2], dof_invweight0 [nv], dof_M0 [nv], stat.meaninertia
-    and stat.meanmass.  Free and ball joints average over their degrees of freedom, as C does.
+    body_subtreemass, body_invweight0 [nbody,2], dof_invweight0 [nv], dof_M0 [nv], tendon_length0 and
+    tendon_invweight0 [ntendon], stat.meaninertia and stat.meanmass.  As in C, free and ball joints
+    average over their degrees of freedom, and a lone body on slides counts with its mass alone.
     """
     data = mjx.make_data(model).replace(qpos=model.qpos0)
     data = mjx.kinematics(model, data)
@@ -91,13 +102,23 @@ def derive(model: Any) -> Any:
     diagonal = jnp.diagonal(inertia)
     subtree = _subtree_mass(model)
     stat = model.stat.replace(meaninertia=jnp.mean(diagonal), meanmass=subtree[0] / (model.nbody - 1))
-    return model.replace(
+    slides = model.body_simple == _SLIDES_ONLY
+    of_mass = 1.0 / jnp.where(slides, model.body_mass, 1.0)
+    of_body = jnp.stack([of_mass, jnp.zeros_like(of_mass)], axis=-1)
+    bodies = jnp.where(slides[:, None], of_body, _body_invweight(model, data, inverse))
+    dofs = _dof_average(model) @ jnp.diagonal(inverse)
+    derived = dict(
         body_subtreemass=subtree,
-        body_invweight0=_body_invweight(model, data, inverse),
-        dof_invweight0=_dof_average(model) @ jnp.diagonal(inverse),
+        body_invweight0=bodies,
+        dof_invweight0=jnp.where(slides[model.dof_bodyid], of_mass[model.dof_bodyid], dofs),
         dof_M0=diagonal,
         stat=stat,
     )
+    if model.ntendon:
+        data = mjx.tendon(model, data)
+        pull = data._impl.ten_J
+        derived.update(tendon_length0=data.ten_length, tendon_invweight0=jnp.einsum("ti,ij,tj->t", pull, inverse, pull))
+    return model.replace(**derived)
 
 
 def _ancestors(model: Any) -> np.ndarray:

@@ -35,7 +35,7 @@ PAPER_STIFFNESS = (4500.0, 4500.0, 3500.0, 3500.0, 2000.0, 2000.0, 2000.0)
 PAPER_DAMPING = (100.0, 100.0, 100.0, 100.0, 100.0, 10.0, 0.4)  # Table I
 
 # C MuJoCo's model arrays that MJX accepts in a file and then leaves out (mujoco-mjx 3.17.0):
-# field, what it is, and whether the whole array or only entries after the first count.
+# field, and what it is.
 _IGNORED = (
     ("jnt_stiffnesspoly", "polynomial joint stiffness"),
     ("dof_dampingpoly", "polynomial joint damping"),
@@ -46,6 +46,10 @@ _IGNORED = (
     ("actuator_dampingpoly", "polynomial actuator damping"),
     ("actuator_armature", "actuator armature"),
     ("sensor_delay", "sensor delay"),
+    ("actuator_actearly", "early activation of actuators"),
+    ("geom_adhesion", "adhesion of geoms"),
+    ("pair_adhesion", "adhesion of contact pairs"),
+    ("geom_surfacevel", "surface velocity"),
 )
 
 
@@ -176,6 +180,8 @@ def refuse_ignored(model: mujoco.MjModel, name: str) -> None:
     found = [what for field, what in _IGNORED if _used(model, field)]
     if np.any(model.opt.disableactuator != 0):
         found.append("disabled actuator groups")
+    if model.opt.noslip_iterations > 0:
+        found.append("the noslip solver")
     if found:
         raise ValueError(
             f"scene {name!r} uses features that MJX accepts and then ignores: {', '.join(found)}; "

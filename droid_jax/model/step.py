@@ -12,6 +12,7 @@ with elliptic cones goes through mjx.solve.
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any
 
 import jax
@@ -19,45 +20,71 @@ import jax.numpy as jnp
 import mujoco
 from mujoco import mjx
 
-from droid_jax.model.exact_contact import exact_segments
+from droid_jax.model.patches import exact_segments, midpoint_constraints
 
 ITERATIONS = 8  # at most; two or three are usual from a warm start
 LINE_SEARCH = 5  # corners of the piecewise linear slope followed in one step
 _TOLERANCE = 3e-6  # of the acceleration's scale: what float32 can still tell apart
 
 
-def step(model: Any, data: Any) -> Any:
+def step(model: Any, data: Any, *, parity: bool = False) -> Any:
     """Advance mjx.Data by one time step; integrators Euler and implicitfast.
 
+    parity=False: second order in the time step.  Positions belong to the time of the step,
+      velocities to half a step before (leapfrog); joint damping and constraint damping use the mean
+      velocity of the step, and constraints are solved with the inertia that follows, M + h/2 D.
+    parity=True: what C MuJoCo's implicitfast and Euler do, first order, for comparisons step by step.
     Leaves out what no replay reads: sensors, cameras, lights.
+    Raises ValueError for other integrators, and for elliptic cones unless parity.
     """
-    with exact_segments():
+    _check_options(model, parity)
+    with exact_segments(), contextlib.nullcontext() if parity else midpoint_constraints():
         data = mjx.fwd_position(model, data)
     data = mjx.fwd_velocity(model, data)
     data = mjx.fwd_actuation(model, data)
     data = mjx.fwd_acceleration(model, data)
+    inertia = mjx.full_m(model, data)
+    if not parity:
+        slope = mjx.deriv_smooth_vel(model, data)
+        inertia = inertia if slope is None else inertia - 0.5 * model.opt.timestep * slope
     if data._impl.efc_J.size == 0:
-        data = data.replace(qacc=data.qacc_smooth)
+        data = data.replace(qacc=jax.scipy.linalg.solve(inertia, data.qfrc_smooth, assume_a="pos"))
     elif model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
         data = mjx.solve(model, data)
     else:
-        data = solve(model, data)
-    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER:
-        return mjx.euler(model, data)
-    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
-        return mjx.implicit(model, data)
-    raise ValueError("a replay integrates with Euler or implicitfast; set <option integrator=...> to one of them")
+        data = solve(inertia, data)
+    if not parity:
+        return mjx.euler(_undamped(model), data)
+    return mjx.euler(model, data) if _is_euler(model) else mjx.implicit(model, data)
 
 
-def solve(model: Any, data: Any) -> Any:
+def _is_euler(model: Any) -> bool:
+    return model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+
+
+def _check_options(model: Any, parity: bool) -> None:
+    if not _is_euler(model) and model.opt.integrator != mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
+        raise ValueError("a replay integrates with Euler or implicitfast; set <option integrator=...> to one of them")
+    if model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC and not parity:
+        raise ValueError("a replay needs pyramidal friction cones; set <option cone='pyramidal'>")
+
+
+def _undamped(model: Any) -> Any:
+    """The model with Euler's own implicit damping off: the acceleration already contains it."""
+    flags = model.opt.disableflags | mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+    return model.replace(opt=model.opt.replace(disableflags=flags))
+
+
+def solve(inertia: jax.Array, data: Any) -> Any:
     """Newton's method on the primal problem of MuJoCo's solver, from the warm start.
 
-    min over a: (a - a0)^T M (a - a0) / 2 + sum_i s_i(J_i a - aref_i), s_i quadratic while a row is
-    active (equality: always; dry friction: inside its bounds; the rest: while negative).
+    min over a: a^T M a / 2 - a^T f + sum_i s_i(J_i a - aref_i), with the smooth forces f and s_i
+    quadratic while a row is active (equality: always; dry friction: inside its bounds; the rest:
+    while negative).  inertia: [nv, nv] M, or what the integrator will use in its place.
     Source: MuJoCo documentation, "Computation", section "Solver" (primal problem).
     """
     rows = data._impl
-    inertia = mjx.full_m(model, data)
+    weight: jax.Array = rows.efc_D
     equalities = rows.ne
     dry = slice(rows.ne, rows.ne + rows.nf)
     bound = rows.efc_frictionloss
@@ -65,20 +92,20 @@ def solve(model: Any, data: Any) -> Any:
     def forces(residual: jax.Array) -> tuple[jax.Array, jax.Array]:
         """[rows] forces and curvatures at J a - aref."""
         active = residual < 0
-        force = jnp.where(active, -rows.efc_D * residual, 0.0)
+        force = jnp.where(active, -weight * residual, 0.0)
         if equalities:
             active = active.at[:equalities].set(True)
-            force = force.at[:equalities].set((-rows.efc_D * residual)[:equalities])
+            force = force.at[:equalities].set((-weight * residual)[:equalities])
         if rows.nf:
-            free = (-rows.efc_D * residual)[dry]
+            free = (-weight * residual)[dry]
             active = active.at[dry].set(jnp.abs(free) < bound[dry])
             force = force.at[dry].set(jnp.clip(free, -bound[dry], bound[dry]))
-        return force, jnp.where(active, rows.efc_D, 0.0)
+        return force, jnp.where(active, weight, 0.0)
 
     def iterate(carry):
         qacc, residual, count, _ = carry
         force, curvature = forces(residual)
-        pull = inertia @ (qacc - data.qacc_smooth)
+        pull = inertia @ qacc - data.qfrc_smooth
         hessian = inertia + (rows.efc_J.T * curvature) @ rows.efc_J
         factor = jax.scipy.linalg.cho_factor(hessian)
         change = jax.scipy.linalg.cho_solve(factor, rows.efc_J.T @ force - pull)

@@ -1,0 +1,112 @@
+"""What the benchmark scripts share: fair timing, processes of their own, and results with their origin."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from droid_jax import runtime
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def cores() -> int:
+    """Cores that this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def origin(seed: int) -> dict[str, Any]:
+    """Where a result comes from: commit, versions, device, cores, seed, date.  Starts jax's backend."""
+    import jax
+
+    versions = runtime.versions()
+    return {
+        "commit": versions.pop("git", None),
+        "versions": versions,
+        "device": runtime.device(),
+        "platform": jax.default_backend(),
+        "jax_devices": jax.local_device_count(),
+        "cores": cores(),
+        "seed": seed,
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    }
+
+
+def write_json(path: Path, result: Mapping[str, Any]) -> None:
+    """Write a result, whole or not at all; makes the folder.
+
+    Raises ValueError for a number that is NaN or infinite, which JSON has no word for.
+    """
+    text = json.dumps(result, indent=2, allow_nan=False) + "\n"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile("w", dir=path.parent, prefix=path.name, delete=False) as file:
+        file.write(text)
+    os.replace(file.name, path)
+
+
+def interleave(
+    runs: Mapping[str, Callable[[], Any]],
+    repeats: int,
+    done: Callable[[], Any] = lambda: None,
+    clock: Callable[[], float] = time.perf_counter,
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Time several things in turn, so that a machine that slows down slows all of them.
+
+    Every run is called once to warm up and then `repeats` times: a b c, a b c, ...  Each must only
+    return when its work is done.  done: called after every single call, for a progress bar.
+    Returns (s of the first call, median s of the later ones), each by name.
+    Raises ValueError for repeats < 1.
+    """
+    if repeats < 1:
+        raise ValueError(f"repeats: expected at least 1 timed call, got {repeats}")
+    seconds: dict[str, list[float]] = {name: [] for name in runs}
+    for _ in range(repeats + 1):
+        for name, run in runs.items():
+            start = clock()
+            run()
+            seconds[name].append(clock() - start)
+            done()
+    first = {name: taken[0] for name, taken in seconds.items()}
+    return first, {name: statistics.median(taken[1:]) for name, taken in seconds.items()}
+
+
+def peak_memory_gib() -> float:
+    """Most memory that this process held at once, GiB: on the accelerator where jax uses one, else resident."""
+    import jax
+
+    if jax.default_backend() != "cpu":
+        stats = [device.memory_stats() or {} for device in jax.local_devices()]
+        return sum(s.get("peak_bytes_in_use", 0) for s in stats) / 2**30
+    unit = 1 if sys.platform == "darwin" else 1024  # bytes there, KiB elsewhere
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**30
+
+
+def in_process(
+    script: str | Path, arguments: Sequence[str], timeout: float, environment: Mapping[str, str] | None = None
+) -> dict[str, Any]:
+    """Run a benchmark script in a process of its own and return the JSON object on its last line.
+
+    timeout: s.  environment: replaces this process's own.
+    What goes wrong is a result too: {"error": ...} says that it took too long or how it failed.
+    """
+    command = [sys.executable, str(script), *arguments]
+    where = dict(os.environ if environment is None else environment)
+    where["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), where.get("PYTHONPATH")]))
+    try:
+        run = subprocess.run(command, env=where, capture_output=True, text=True, timeout=timeout)
+    except subprocess.TimeoutExpired:
+        return {"error": f"not done after {timeout:g} s"}
+    if run.returncode != 0:
+        lines = run.stderr.strip().splitlines() or ["no message"]
+        return {"error": f"exit status {run.returncode}: {lines[-1]}"}
+    return json.loads(run.stdout.splitlines()[-1])

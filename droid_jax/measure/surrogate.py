@@ -1,0 +1,225 @@
+"""The stand-in robot: plain C MuJoCo with hidden physics, in place of a real Panda and a real door.
+
+It runs at another time step and integrator than the analysis, with values the analysis does not
+know, small errors from repeat to repeat, and sensor noise at the levels of a real Panda.  Its
+torque is the motor's, as the simulated servo's damping (Table I) cannot be seen on the link side;
+`SurrogateConfig.side` asks for the link side.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+import scipy.signal
+
+from droid_jax.measure.engine import Trace, instrument, simulate
+from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide, validate
+from droid_jax.model.door import door_nuisances, door_space
+from droid_jax.model.parameters import Space
+from droid_jax.model.physics import make_c_model
+from droid_jax.model.scene import Scene
+
+
+@dataclass(frozen=True)
+class SurrogateConfig:
+    """How the stand-in robot moves and measures.
+
+    repeats: N.
+    timestep: s; the integrator is semi-implicit Euler (the analysis uses implicitfast).
+    rate: Hz of torque and position samples.
+    torque_noise: N m, white, joints 1-4 and 5-7 (a real Panda: 0.03 to 0.08 at 1 kHz).
+    torque_drift: N m, first-order noise with a correlation time of 0.15 s, joints 1-4 and 5-7.
+    position_noise: rad.
+    angle_noise: rad, angle_rate: Hz: a camera on the door.
+    start_noise: rad, error of the start pose in each repeat.
+    pose_noise: m, error of the door's position in each repeat.
+    side: side of the joints at which the torque is measured.
+    """
+
+    repeats: int = 10
+    timestep: float = 0.0005
+    rate: float = 500.0
+    torque_noise: tuple[float, float] = (0.05, 0.03)
+    torque_drift: tuple[float, float] = (0.03, 0.015)
+    position_noise: float = 2e-5
+    angle_noise: float = 0.0035
+    angle_rate: float = 30.0
+    start_noise: float = 2e-4
+    pose_noise: float = 1e-4
+    side: TorqueSide = TorqueSide.MOTOR
+
+
+DRIFT_TIME = 0.15  # s
+_WRIST = 4  # joints from here on have the smaller noise
+
+
+def draw_nuisances(scene: Scene, seed: int, *, scale: float = 1.0) -> dict[str, float]:
+    """One draw from the nuisances' priors: the same robot and door for all recordings made with it."""
+    space = door_nuisances(scene)
+    draw = np.random.default_rng([seed, 1]).normal(space.mean, scale * space.std)
+    return dict(zip(space.names, np.clip(draw, space.low, space.high).tolist(), strict=True))
+
+
+def record(
+    scene: Scene,
+    demonstration: Recording,
+    truth: Mapping[str, float],
+    *,
+    seed: int,
+    config: SurrogateConfig | None = None,
+    name: str | None = None,
+) -> Recording:
+    """Repeat a demonstration N times on the stand-in robot and record it.
+
+    truth: hidden values by parameter name, of the door space and of its nuisances; what it does
+      not name has the scene's own value.
+    Raises ValueError for unknown names, and where a repeat blows up or loses the door (a
+    demonstration is safe by definition: choose another truth).
+    """
+    config = config or SurrogateConfig()
+    rng = np.random.default_rng([seed, 2])
+    hidden = _hidden_scene(scene, config)
+    models, qpos0 = _repeats(hidden, truth, demonstration, config, rng)
+    clock, control = _control(hidden, demonstration, config.timestep, truth.get("time_offset", 0.0))
+    trace = simulate(hidden, models, qpos0, control[None])
+    _check_opened(demonstration, clock, trace)
+    every = round(1.0 / (config.rate * config.timestep))
+    time = clock[::every]
+    torque = _torque(hidden, models, trace, config)[:, ::every] + _offset(scene, truth)
+    channels = {
+        "torque": _channel("torque", "N m", scene.joints, time, torque + _torque_noise(torque.shape, config, rng)),
+        "position": _channel(
+            "position",
+            "rad",
+            scene.joints,
+            time,
+            trace.position[:, ::every] + rng.normal(0, config.position_noise, torque.shape),
+        ),
+        "object_angle": _camera(scene, clock, trace.object_angle, config, rng),
+    }
+    return validate(
+        replace(
+            demonstration,
+            name=name or demonstration.name,
+            channels=channels,
+            torque=TorqueConvention(config.side, gravity=False),
+            meta={"source": "stand-in robot (plain C MuJoCo), not a real one", "seed": str(seed)},
+        )
+    )
+
+
+def _hidden_scene(scene: Scene, config: SurrogateConfig) -> Scene:
+    """The scene instrumented, at the stand-in's own time step, integrator and solver effort."""
+    model = copy.copy(scene.model)
+    model.opt.timestep = config.timestep
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    model.opt.iterations, model.opt.ls_iterations = 100, 50
+    hidden = replace(scene, model=model)
+    return replace(hidden, model=instrument(hidden))
+
+
+def _repeats(
+    hidden: Scene,
+    truth: Mapping[str, float],
+    demonstration: Recording,
+    config: SurrogateConfig,
+    rng: np.random.Generator,
+) -> tuple[list[mujoco.MjModel], np.ndarray]:
+    """Models [N] and start poses [N, nq], each with its own small errors."""
+    space = _space(hidden, truth)
+    nominal = hidden.initial_qpos(dict(demonstration.qpos0))
+    models, poses = [], []
+    for _ in range(config.repeats):
+        values = space.values(dict(truth))
+        for axis in ("door_x", "door_y"):
+            values[space.index(axis)] += rng.normal(0, config.pose_noise)
+        models.append(make_c_model(hidden, space, values))
+        pose = nominal.copy()
+        pose[hidden.joint_qpos] += rng.normal(0, config.start_noise, len(hidden.joints))
+        poses.append(pose)
+    return models, np.array(poses)
+
+
+def _space(hidden: Scene, truth: Mapping[str, float]) -> Space:
+    """Every parameter the stand-in can have, around the scene's own values."""
+    space = door_space(hidden) + door_nuisances(hidden)
+    own = {p.name: (_own_value(hidden, p), p.std) for p in space.parameters if p.writes and not p.nuisance}
+    for name in truth:
+        space.index(name)
+    return space.with_prior(**own)
+
+
+def _own_value(scene: Scene, parameter) -> float:
+    first = parameter.writes[0]
+    return float(getattr(scene.model, first.field)[first.index])
+
+
+def _control(hidden: Scene, demonstration: Recording, timestep: float, delay: float) -> tuple[np.ndarray, np.ndarray]:
+    """Clock [T] and commands [T, U] of the stand-in's own time step."""
+    columns = hidden.command_index(demonstration.command_names)
+    start, end = demonstration.time[0], demonstration.time[-1]
+    clock = start + np.arange(int((end - start) / timestep + 1e-6) + 1) * timestep
+    command = [np.interp(clock - delay, demonstration.time, demonstration.command[:, c]) for c in columns]
+    return clock, np.stack(command, axis=1)
+
+
+def _check_opened(demonstration: Recording, clock: np.ndarray, trace: Trace) -> None:
+    if not np.isfinite(trace.torque).all():
+        raise ValueError("the stand-in robot's simulation became unstable with these values")
+    grasp = [p for p in demonstration.phases if p.name == "grasp"]
+    if not grasp or trace.contact.shape[-1] == 0:
+        return
+    held = trace.contact[:, clock >= grasp[0].end].all(axis=-1)
+    lost = np.flatnonzero(held.mean(axis=1) < 0.99)
+    if lost.size:
+        raise ValueError(f"the stand-in robot lost its grasp in repeat {lost[0]} (too little friction for this door?)")
+
+
+def _torque(hidden: Scene, models: list[mujoco.MjModel], trace: Trace, config: SurrogateConfig) -> np.ndarray:
+    """[N, T, J] N m at the motor, or at the link: without rotor inertia and joint damping."""
+    if config.side is TorqueSide.MOTOR:
+        return trace.torque
+    acceleration = np.gradient(trace.velocity, config.timestep, axis=1)
+    armature = np.array([m.dof_armature[hidden.joint_dofs] for m in models])[:, None]
+    damping = np.array([m.dof_damping[hidden.joint_dofs] for m in models])[:, None]
+    return trace.torque - armature * acceleration - damping * trace.velocity
+
+
+def _offset(scene: Scene, truth: Mapping[str, float]) -> np.ndarray:
+    """[J] N m constant sensor errors."""
+    return np.array([truth.get(f"torque_offset[{j}]", 0.0) for j in scene.joints])
+
+
+def _torque_noise(shape: tuple[int, ...], config: SurrogateConfig, rng: np.random.Generator) -> np.ndarray:
+    """White noise and slow first-order noise, [N, T, J] N m."""
+    wrist = np.arange(shape[-1]) >= _WRIST
+    white = np.where(wrist, config.torque_noise[1], config.torque_noise[0])
+    slow = np.where(wrist, config.torque_drift[1], config.torque_drift[0])
+    keep = np.exp(-1.0 / (config.rate * DRIFT_TIME))
+    innovation = rng.normal(size=shape) * np.sqrt(1 - keep**2)
+    innovation[:, 0] = rng.normal(size=(shape[0], shape[2]))
+    drift = scipy.signal.lfilter([1.0], [1.0, -keep], innovation, axis=1)
+    return white * rng.normal(size=shape) + slow * drift
+
+
+def _camera(
+    scene: Scene, clock: np.ndarray, angle: np.ndarray, config: SurrogateConfig, rng: np.random.Generator
+) -> Channel:
+    """The door's angle on the camera's own clock, [N, Tc, 1] rad."""
+    time = np.arange(clock[0], clock[-1], 1.0 / config.angle_rate)
+    values = np.stack([np.interp(time, clock, row) for row in angle])[..., None]
+    return _channel(
+        "object_angle",
+        "rad",
+        (str(scene.object_joint),),
+        time,
+        values + rng.normal(0, config.angle_noise, values.shape),
+    )
+
+
+def _channel(name: str, unit: str, columns: tuple[str, ...], time: np.ndarray, values: np.ndarray) -> Channel:
+    return Channel(name, unit, columns, time, values.astype(np.float32), np.ones(values.shape, bool))
