@@ -3,6 +3,8 @@
     python benchmarks/throughput.py                # everything; 20 to 40 minutes on two cores
     python benchmarks/throughput.py --quick        # does it all work?  about two minutes
 
+Needs the package installed (`pip install -e .`), or the checkout on PYTHONPATH.
+
 A step is 2 ms of one sample.  Every engine replays demonstration A (a whole opening, with grasp
 contact) for the same random samples with the same cone, time step and solver options; MJX and C
 take turns.  Writes OUT/throughput.json, prints a table and, as the last line, one line of JSON.
@@ -35,8 +37,8 @@ HEADLINE = 256  # samples behind the numbers of the last line
 MEMORY_POPULATION = 1024
 BARE_POPULATION = 32
 UNTUNED_STEPS = 20  # as it comes, MJX on a CPU takes half a minute for these
-OWN, WHOLE, C = "own blocks", "one block", "C, all cores"
-UNTUNED, OPTION, SHARDED = "mjx.step as it comes", "mjx.step, compiler option", "mjx.step, all devices"
+OWN, WHOLE, C = "replay, own blocks", "replay, one block", "C, all cores"
+UNTUNED, OPTION, SHARDED = "MJX as it comes", "mjx.step, option", "mjx.step, sharded"
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,8 @@ def time_rows(
 
 def untuned_part(config: Throughput) -> dict[str, Any]:
     """MJX as it comes, for a process in which nothing was tuned."""
-    import replays
+    with runtime.quiet():
+        import replays
 
     case = replays.make_case(config.seed, UNTUNED_STEPS)
     runs = {UNTUNED: replays.mjx_as_it_comes(case, BARE_POPULATION)}
@@ -121,7 +124,8 @@ def untuned_part(config: Throughput) -> dict[str, Any]:
 def memory_part(config: Throughput) -> dict[str, Any]:
     """Peak memory of one population in a process of its own, with compilation and results."""
     tune()
-    import replays
+    with runtime.quiet():
+        import replays
 
     case = replays.make_case(config.seed, config.length)
     rollout = replays.in_blocks(case)(case.values(config.populations[0]))
@@ -153,13 +157,13 @@ def alternate(case: Any, populations: Sequence[int], repeats: int, progress: Pro
     task = progress.add_task("", total=3 * (len(populations) + 1) * (repeats + 1))
     rows: list[Row] = []
 
-    def measure(runs: dict[str, Callable[[], Any]], population: int) -> None:
+    def take(runs: dict[str, Callable[[], Any]], population: int) -> None:
         progress.update(task, description=f"{', '.join(runs)}: {population} samples")
         rows.extend(time_rows(runs, population, case.steps, repeats, lambda: progress.advance(task)))
 
     for population in populations:
         values = case.values(population)
-        measure(
+        take(
             {
                 OWN: lambda values=values: search(values),
                 WHOLE: replays.as_one_block(case, population),
@@ -167,7 +171,7 @@ def alternate(case: Any, populations: Sequence[int], repeats: int, progress: Pro
             },
             population,
         )
-    measure(
+    take(
         {
             OPTION: replays.mjx_with_option(case, BARE_POPULATION),
             SHARDED: replays.mjx_on_all_devices(case, BARE_POPULATION),
@@ -211,7 +215,7 @@ def headline(rows: Sequence[Row], untuned: dict[str, Any] | None, memory: dict[s
     """The numbers of the last line: this program's own blocks against C, at 256 samples where measured."""
     measured = [row.population for row in rows if row.engine == OWN]
     population = HEADLINE if HEADLINE in measured else max(measured)
-    # The last block of rows measures C once more, beside mjx.step: the first of each name counts.
+    # C is measured once more beside mjx.step: the first row of a name is the replay's partner.
     at = {row.engine: row for row in reversed(rows) if row.population == population}
     bare = {row.engine: row.rate for row in rows}
     return {
@@ -228,16 +232,17 @@ def headline(rows: Sequence[Row], untuned: dict[str, Any] | None, memory: dict[s
     }
 
 
-def table_of(rows: Sequence[Row], c_rate: float) -> Table:
-    """All rows; the last column compares with the C engine at the headline's population."""
+def table_of(rows: Sequence[Row]) -> Table:
+    """All rows; the last column compares with the C engine at the same number of samples."""
     table = Table(title="Physics steps per second")
     for name in ("engine", "samples", "steps", "compile s", "run s", "steps/s", "of C"):
         table.add_column(name, justify="left" if name == "engine" else "right")
-    for row in sorted(rows, key=lambda row: row.population):
+    c = {row.population: row.rate for row in rows if row.engine == C}
+    for row in rows:
         compiling = "" if row.compile_s is None else f"{row.compile_s:.1f}"
-        share = f"{row.rate / c_rate:.3g}"
-        numbers = (f"{row.seconds:.2f}", f"{row.rate:,.0f}", share)
-        table.add_row(row.engine, str(row.population), str(row.steps), compiling, *numbers)
+        share = f"{row.rate / c[row.population]:.2g}" if row.population in c else ""
+        counts = (str(row.population), str(row.steps))
+        table.add_row(row.engine, *counts, compiling, f"{row.seconds:.2f}", f"{row.rate:,.0f}", share)
     return table
 
 
@@ -258,8 +263,9 @@ def measure(config: Throughput) -> dict[str, Any]:
 
         tune()
         import jax
-        import replays
 
+        with runtime.quiet():
+            import replays
         standard = CPU_POPULATIONS if jax.default_backend() == "cpu" else GPU_POPULATIONS
         populations = config.populations or (QUICK_POPULATIONS if config.quick else standard)
         case = replays.make_case(config.seed, config.length)
@@ -289,7 +295,7 @@ def main(config: Throughput) -> None:
         result = measure(config)
         write_json(config.out / "throughput.json", result)
         rows = [Row(**{k: v for k, v in row.items() if k != "steps_per_s"}) for row in result["rows"]]
-        Console().print(table_of(rows, result["c_steps_per_s"]))
+        Console().print(table_of(rows))
     print(json.dumps(result))
 
 

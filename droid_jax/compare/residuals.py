@@ -20,6 +20,7 @@ from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Rollout
 
 # Deviation below which a channel's noise is never believed, in the channel's unit.
+BLOWN_UP = 1e3  # noise units: worse than any replay that kept its numbers
 MINIMUM_NOISE = {"torque": 0.01, "position": 2e-5, "velocity": 5e-4, "object_angle": 2e-4}
 
 
@@ -95,7 +96,7 @@ class Comparison:
         return failed
 
     def whitened(self, rollout: Rollout) -> jax.Array:
-        """[M] residuals of the repeats' mean in noise units; zeros where a replay blew up."""
+        """[M] residuals of the repeats' mean in noise units; BLOWN_UP throughout where a replay blew up."""
         parts = [
             jnp.einsum(
                 "ckl,lc->ck",
@@ -105,7 +106,7 @@ class Comparison:
             for c in self.channels
         ]
         residual = jnp.concatenate(parts)
-        return jnp.where(rollout.finite & jnp.isfinite(residual), residual, 0.0)
+        return jnp.where(rollout.finite & jnp.all(jnp.isfinite(residual)), residual, BLOWN_UP)
 
     def smoothed(self, rollout: Rollout, channel: str = "torque") -> jax.Array:
         """[K, C] a channel of the rollout through the filter the data went through."""

@@ -29,7 +29,8 @@ class SurrogateConfig:
     """How the stand-in robot moves and measures.
 
     repeats: N.
-    timestep: s; the integrator is semi-implicit Euler (the analysis uses implicitfast).
+    timestep: s; C MuJoCo's semi-implicit Euler, first order, so fine enough to stand for continuous time
+      (the analysis takes steps forty times as long, second order).
     rate: Hz of torque and position samples.
     torque_noise: N m, white, joints 1-4 and 5-7 (a real Panda: 0.03 to 0.08 at 1 kHz).
     torque_drift: N m, first-order noise with a correlation time of 0.15 s, joints 1-4 and 5-7.
@@ -41,7 +42,7 @@ class SurrogateConfig:
     """
 
     repeats: int = 10
-    timestep: float = 0.0005
+    timestep: float = 0.0001
     rate: float = 500.0
     torque_noise: tuple[float, float] = (0.05, 0.03)
     torque_drift: tuple[float, float] = (0.03, 0.015)

@@ -127,13 +127,17 @@ class Scene:
     @functools.cached_property
     def mjx(self) -> Any:
         """The mjx.Model on the default device."""
+        import jax
         from mujoco import mjx
 
-        return mjx.put_model(self.model)
+        with jax.ensure_compile_time_eval():  # else a first use inside jit would keep that trace's values
+            return mjx.put_model(self.model)
 
     def visual_model(self) -> mujoco.MjModel:
         """The same scene with its looks, for rendering."""
-        return self.spec.compile()
+        with warnings.catch_warnings():  # see _attach
+            warnings.simplefilter("ignore", UserWarning)
+            return self.spec.compile()
 
     def initial_qpos(self, positions: dict[str, float] | Any) -> np.ndarray:
         """[nq] the model's reference pose with named joints set; unknown names raise."""

@@ -138,5 +138,7 @@ def _line_search(forces, residual: jax.Array, along: jax.Array, linear: jax.Arra
         low, high = jnp.where(slope < 0, share, low), jnp.where(slope < 0, high, share)
         newton = share - slope / (quadratic + curvature @ (along * along) + 1e-30)
         middle = jnp.where(jnp.isinf(high), 2.0 * low, 0.5 * (low + high))
-        share = jnp.where((newton > low) & (newton < high), newton, middle)
+        # Where Newton stands still it has arrived; bisecting there would lose the root again.
+        inside = (newton > low) & (newton < high) | (newton == share)
+        share = jnp.where(inside, newton, middle)
     return share

@@ -1,0 +1,299 @@
+"""Applying parameter values equals compiling an MJCF that has them, in C and in MJX."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from typing import Any
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+from mujoco import mjx
+
+from droid_jax.model.door import door_nuisances, door_space
+from droid_jax.model.fields import body_mass, model_parameter
+from droid_jax.model.parameters import Mode, Space
+from droid_jax.model.physics import derive, make_c_model, make_physics, theta_of, written_fields
+from droid_jax.model.scene import ARM, LOOK_GROUP, Scene, compile_scene, door_scene
+
+# The compiler's bounding-volume tree: explicit contact pairs never look at it.
+NOT_DERIVED = {"bvh_aabb", "oct_aabb"}
+# Body sizes, the scene's extent, cameras and lights: for the eye only.
+EYE_ONLY = {"meansize", "extent", "center", "dof_length"}
+# Boxes and radii, which MJX does not read for the door's pairs, and the scale of muscles.
+C_ONLY = {"geom_rbound", "geom_aabb", "geom_rbound_hfield", "actuator_acc0"}
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return door_scene(springs=1)
+
+
+@pytest.fixture(scope="module")
+def space(scene: Scene) -> Space:
+    return door_space(scene) + door_nuisances(scene)
+
+
+@pytest.fixture(scope="module")
+def vectors(space: Space) -> np.ndarray:
+    """Draws of twice the prior's width."""
+    rng = np.random.default_rng(7)
+    x = np.array([2.0 * rng.normal(size=len(space)) for _ in range(3)])
+    return space.from_search(x)
+
+
+def edited(scene: Scene, space: Space, values: np.ndarray) -> mujoco.MjModel:
+    """The same values written into the MJCF by its own attributes, and compiled."""
+    v = dict(zip(space.names, values.tolist(), strict=True))
+    spec = scene.spec.copy()
+    for geom in list(spec.geoms):
+        if geom.group == LOOK_GROUP:
+            spec.delete(geom)
+    for name in ARM:
+        spec.joint(name).limited = False
+    spec.geom("panel").mass = v["door_mass"]
+    knob = spec.body("knob")
+    knob.inertia = np.array(knob.inertia) * v["knob_mass"] / knob.mass
+    knob.mass = v["knob_mass"]
+    hinge = spec.joint("hinge")
+    hinge.frictionloss = v["hinge_frictionloss"]
+    hinge.stiffness = [v["hinge_stiffness"], 0, 0]
+    hinge.damping = [v["hinge_damping"], 0, 0]
+    for side in ("left", "right"):
+        for rail in ("near", "far"):
+            slide, twist = v[f"sliding_friction_{side}"], v[f"torsional_friction_{side}"]
+            spec.pair(f"{side}_{rail}").friction = [slide, slide, twist, 1e-4, 1e-4]
+    cabinet = spec.body("cabinet")
+    cabinet.pos = np.array(cabinet.pos) + [v["door_x"], v["door_y"], v["door_z"]]
+    cabinet.quat = [np.cos(v["door_yaw"] / 2), 0, 0, np.sin(v["door_yaw"] / 2)]
+    knob.pos = np.array(knob.pos) + [0, v["knob_lever"], 0]
+    knob_geom = spec.geom("knob")
+    knob_geom.size = np.array(knob_geom.size) + [v["knob_radius"], 0, 0]
+    for i in range(2, 8):
+        link, scale = spec.body(f"link{i}"), v[f"link_mass_scale_{i}"]
+        link.mass *= scale
+        link.fullinertia = np.array(link.fullinertia) * scale
+        link.gravcomp /= scale
+    for i, name in enumerate(ARM, 1):
+        spec.joint(name).damping = [v[f"joint_damping_{i}"], 0, 0]
+        actuator = spec.actuator(name)
+        gain = actuator.gainprm[0] * v[f"servo_scale_{i}"]
+        actuator.gainprm[0], actuator.biasprm[1] = gain, -gain
+    return spec.compile()
+
+
+def float_fields(model: mujoco.MjModel) -> dict[str, np.ndarray]:
+    out = {}
+    for name in dir(model):
+        value = getattr(model, name, None) if not name.startswith("_") else None
+        if isinstance(value, np.ndarray) and np.issubdtype(value.dtype, np.floating):
+            out[name] = value
+    for part in ("opt", "stat"):
+        for name in dir(getattr(model, part)):
+            value = getattr(getattr(model, part), name) if not name.startswith("_") else None
+            if isinstance(value, float) or (isinstance(value, np.ndarray) and value.dtype.kind == "f"):
+                out[f"{part}.{name}"] = np.asarray(value)
+    return out
+
+
+def skipped(name: str) -> bool:
+    return name in NOT_DERIVED or name.split(".")[-1] in EYE_ONLY or name.startswith(("cam_", "light_"))
+
+
+def test_c_model_equals_compilation_field_by_field(scene: Scene, space: Space, vectors: np.ndarray):
+    for values in vectors:
+        applied = float_fields(make_c_model(scene, space, values))
+        compiled = float_fields(edited(scene, space, values))
+        assert len(applied) > 100 and applied.keys() == compiled.keys()
+        # The yaw's quaternion is of first order: its norm is off by angle^2 / 8.
+        yaw = values[space.index("door_yaw")]
+        for name, array in compiled.items():
+            if skipped(name):
+                continue
+            if name in ("body_ipos", "body_iquat"):  # the compiler writes anything there where there is no mass
+                heavy = scene.model.body_mass > 0
+                array, applied[name] = array[heavy], applied[name][heavy]
+            atol = 1e-12 + (yaw**2 / 7 if name == "body_quat" else 0.0)
+            # Geometry enters the derived fields at yaw^2 too, as everything hangs on the cabinet.
+            rtol = 1e-9 + (yaw**2 if "invweight" in name or "M0" in name or "inertia" in name else 0.0)
+            np.testing.assert_allclose(applied[name], array, rtol=rtol, atol=atol, err_msg=name)
+
+
+def test_the_oracle_really_changes_the_model(scene: Scene, space: Space, vectors: np.ndarray):
+    """The comparison above would pass on two unchanged models: every declared field differs here."""
+    nominal, compiled = float_fields(scene.model), float_fields(edited(scene, space, vectors[0]))
+    for name in written_fields(space):
+        if name in ("stat", "tendon_length0", "tendon_invweight0"):
+            continue
+        assert np.abs(compiled[name] - nominal[name]).max() > 0, name
+    assert compiled["stat.meaninertia"] != nominal["stat.meaninertia"]
+
+
+def mjx_fields(model: Any, path: str = "") -> dict[str, np.ndarray]:
+    """Every floating array of an mjx.Model, parts included."""
+    out = {}
+    for field in dataclasses.fields(model):
+        value = getattr(model, field.name)
+        if dataclasses.is_dataclass(value):
+            out.update(mjx_fields(value, f"{path}{field.name}."))
+        elif isinstance(value, (np.ndarray, jax.Array, float)) and np.issubdtype(np.asarray(value).dtype, np.floating):
+            out[f"{path}{field.name}"] = np.asarray(value, dtype=float)
+    return out
+
+
+@pytest.fixture(scope="module")
+def apply(scene: Scene, space: Space):
+    return jax.jit(lambda values: make_physics(scene, space, values))
+
+
+def test_mjx_model_equals_compilation_field_by_field(scene: Scene, space: Space, vectors: np.ndarray, apply):
+    for values in vectors:
+        applied = mjx_fields(apply(values.astype(np.float32)).model)
+        compiled = mjx_fields(mjx.put_model(edited(scene, space, values)))
+        yaw = values[space.index("door_yaw")]
+        compared = 0
+        for name, array in compiled.items():
+            short = name.split(".")[-1]
+            if skipped(short) or short in C_ONLY:
+                continue
+            if short in ("body_ipos", "body_iquat"):
+                heavy = scene.model.body_mass > 0
+                array, applied[name] = array[heavy], applied[name][heavy]
+            # float32: 6e-8 in each number, times the conditioning of M's inverse in the inverse weights.
+            rtol = 5e-4 if "invweight" in short else 3e-6
+            atol = 1e-7 + (yaw**2 / 7 if short == "body_quat" else 0.0)
+            np.testing.assert_allclose(applied[name], array, rtol=rtol + yaw**2, atol=atol, err_msg=name)
+            compared += 1
+        assert compared > 60
+
+
+def test_only_declared_fields_change(scene: Scene, space: Space, vectors: np.ndarray, apply):
+    declared = set(written_fields(space))
+    nominal, applied = float_fields(scene.model), float_fields(make_c_model(scene, space, vectors[0]))
+    changed = {n.split(".")[0] for n in nominal if not np.array_equal(nominal[n], applied[n])}
+    # mj_setConst refreshes quantities that no replay reads: camera offsets and the scale of muscles.
+    assert {c for c in changed if not skipped(c)} - {"actuator_acc0"} <= declared
+    before, after = mjx_fields(scene.mjx), mjx_fields(apply(vectors[0].astype(np.float32)).model)
+    changed = {n.split(".")[0] for n in before if not np.array_equal(before[n], after[n])}
+    assert changed <= declared
+    assert {"body_mass", "dof_damping", "pair_friction", "body_quat", "dof_invweight0"} <= changed
+
+
+def test_the_scene_is_left_alone_and_twice_is_once(scene: Scene, space: Space, vectors: np.ndarray, apply):
+    before = {k: v.copy() for k, v in float_fields(scene.model).items()}
+    once = float_fields(make_c_model(scene, space, vectors[0]))
+    make_c_model(scene, space, vectors[1])
+    again = float_fields(make_c_model(scene, space, vectors[0]))
+    for name, array in before.items():
+        np.testing.assert_array_equal(float_fields(scene.model)[name], array, err_msg=name)
+        np.testing.assert_array_equal(again[name], once[name], err_msg=name)
+    first, second = (mjx_fields(apply(vectors[0].astype(np.float32)).model) for _ in range(2))
+    for name in first:
+        np.testing.assert_array_equal(first[name], second[name], err_msg=name)
+
+
+def test_the_means_give_the_scene_back(scene: Scene):
+    """The nuisances' means are neutral: nothing moves, in C to the last digits."""
+    space = door_nuisances(scene)
+    applied, nominal = float_fields(make_c_model(scene, space, space.mean)), float_fields(scene.model)
+    for name, array in nominal.items():
+        if not skipped(name):
+            np.testing.assert_allclose(applied[name], array, rtol=1e-12, atol=1e-14, err_msg=name)
+
+
+def test_a_first_use_inside_jit_leaves_the_scene_usable():
+    """The mjx.Model is made once and kept: it must not be made of a trace's values."""
+    fresh = door_scene()
+    space = door_space(fresh).select(["hinge_damping"])
+    traced = jax.jit(lambda values: make_physics(fresh, space, values).model.dof_damping)
+    assert float(traced(np.array([3.0], np.float32))[fresh.dof("hinge")]) == 3.0
+    np.testing.assert_allclose(np.asarray(fresh.mjx.dof_damping), fresh.model.dof_damping, rtol=1e-6)
+
+
+def test_values_outside_the_model_are_handed_on(scene: Scene, space: Space, vectors: np.ndarray, apply):
+    expected = {"time_offset", *(f"torque_offset[{j}]" for j in ARM)}
+    theta = apply(vectors[0].astype(np.float32)).theta
+    assert set(theta) == set(theta_of(space, vectors[0])) == expected
+    for name, value in theta_of(space, vectors[0]).items():
+        assert float(theta[name]) == pytest.approx(value, rel=1e-6)
+        assert value == vectors[0][space.index(name)]
+
+
+# ----- what the compiler derives, on mechanisms with other joints
+
+MECHANISMS = {
+    "free and ball": """
+      <body name="a" pos="0 0 1"><freejoint/><geom size=".1 .2 .3" type="box" mass="2"/>
+        <body name="b" pos=".3 0 0" quat="1 .2 .1 0"><joint type="ball" armature=".01"/>
+          <geom size=".05 .2" type="capsule" pos=".1 .1 0" mass="1"/>
+          <body name="c" pos="0 .3 .1"><joint axis="0 1 1" armature=".02"/>
+            <geom size=".04 .06 .05" type="box" pos=".02 .03 .1" mass=".5"/></body></body></body>
+      <body name="fixed" pos="3 0 0"><geom size=".1" mass="1"/></body>""",
+    "lone slide": '<body name="a"><joint type="slide" axis="1 0 0"/><geom size=".1" mass="2"/></body>',
+    "slide with armature": '<body name="a"><joint type="slide" armature="3"/><geom size=".1" mass="2"/></body>',
+    "two slides": """<body name="a"><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0"/>
+      <geom size=".1" mass="2"/></body>""",
+    "slide and hinge": """<body name="a"><joint type="slide" axis="1 0 0"/><joint axis="0 0 1"/>
+      <geom size=".1 .2 .3" type="box" mass="2"/></body>""",
+    "hinge through the centre": '<body name="a"><joint axis="0 0 1"/><geom size=".1 .2 .3" type="box" mass="2"/></body>',
+    "finger": """<body name="a"><joint axis="0 1 0"/><geom size=".1 .2 .3" type="box" pos=".2 0 0" mass="2"/>
+      <body name="b" pos=".3 0 0"><joint type="slide" axis="0 1 0" armature=".3"/><geom size=".1" mass=".2"/></body>
+      </body>""",
+    "tendons": """<body name="a" pos="0 0 1"><joint name="a" axis="0 1 0"/>
+      <geom size=".1 .2 .3" type="box" pos=".3 .1 0" mass="2"/><site name="sa" pos=".2 0 .1"/>
+      <body name="b" pos=".3 0 0"><joint axis="0 1 1" name="b"/><geom size=".05 .2" type="capsule" mass="1"/>
+      <site name="sb" pos=".2 0 .1"/></body></body></worldbody>
+      <tendon><fixed><joint joint="a" coef=".7"/><joint joint="b" coef="-1.2"/></fixed>
+      <spatial><site site="sa"/><site site="sb"/></spatial></tendon><worldbody>""",
+}
+DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "tendon_length0", "tendon_invweight0")
+
+
+def compiled(name: str, *, scale: float = 1.0, move: float = 0.0) -> mujoco.MjModel:
+    """A mechanism whose geoms have `scale` times their mass, and whose bodies are moved."""
+    spec = mujoco.MjSpec.from_string(f"<mujoco><worldbody>{MECHANISMS[name]}</worldbody></mujoco>")
+    for geom in spec.geoms:
+        geom.mass *= scale
+    for body in spec.bodies[1:]:
+        body.pos = np.array(body.pos) + [0.0, move, 0.0]
+    return spec.compile()
+
+
+@pytest.mark.parametrize("name", MECHANISMS)
+def test_derived_quantities_equal_the_compiler(name: str):
+    target = compiled(name, scale=2.5, move=0.07)
+    changed = copy.copy(compiled(name))
+    changed.body_mass[:] *= 2.5
+    changed.body_inertia[:] *= 2.5
+    changed.body_pos[1:, 1] += 0.07
+    model = derive(mjx.put_model(changed))
+    for field in DERIVED:
+        # float32 inverse of an inertia matrix of a few rows
+        np.testing.assert_allclose(getattr(model, field), getattr(target, field), rtol=2e-4, atol=1e-5, err_msg=field)
+    assert float(model.stat.meaninertia) == pytest.approx(target.stat.meaninertia, rel=1e-5)
+    assert float(model.stat.meanmass) == pytest.approx(target.stat.meanmass, rel=1e-5)
+
+
+def test_a_moved_joint_axis_is_derived_too():
+    """jnt_pos and jnt_axis change the inertia that a joint feels."""
+    xml = """<mujoco><worldbody><body><joint name="j" axis="0 0 1"/><geom size=".1 .2 .3" type="box" pos=".1 0 0"/>
+      </body></worldbody><actuator><position joint="j" kp="1"/></actuator></mujoco>"""
+    scene = compile_scene(mujoco.MjSpec.from_string(xml), "rod")
+    space = Space((model_parameter(scene, "jnt_pos", "j", 0, unit="m", std=0.1, low=-1, high=1),))
+    applied = make_c_model(scene, space, np.array([0.4]))
+    spec = mujoco.MjSpec.from_string(xml)
+    spec.joint("j").pos = [0.4, 0, 0]
+    expected = spec.compile()
+    assert expected.dof_M0[0] != pytest.approx(scene.model.dof_M0[0])
+    assert applied.dof_M0[0] == pytest.approx(expected.dof_M0[0])
+    model = make_physics(scene, space, np.array([0.4], np.float32)).model
+    np.testing.assert_allclose(model.dof_M0, expected.dof_M0, rtol=1e-6)
+    np.testing.assert_allclose(model.dof_invweight0, expected.dof_invweight0, rtol=1e-6)
+
+
+def test_parameters_without_masses_derive_nothing(scene: Scene):
+    space = Space((model_parameter(scene, "dof_damping", "hinge", unit="-", std=1.0, high=5.0, mode=Mode.SET),))
+    assert written_fields(space) == ("dof_damping",)
+    assert "dof_M0" in written_fields(Space((body_mass(scene, "door", std=1.0, high=5.0),)))
