@@ -36,11 +36,11 @@ from droid_jax.measure import noise
 from droid_jax.measure.recording import Channel, Recording, TorqueConvention, validate
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect, Rollout
+from droid_jax.model.seam import Effect
 from droid_jax.report import figures
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-from common import origin, write_json
+from common import origin, write_json  # pyright: ignore[reportMissingImports]
 
 RESULTS = Path(__file__).parent / "results"
 LEVEL = 0.9  # of all intervals
@@ -150,7 +150,7 @@ class Stated:
 
     def whitened(self, values: np.ndarray) -> np.ndarray:
         """[P, D] -> [P, M] residuals in units of the stated noise."""
-        assumed = self.cost.comparisons[0].noise().whitener  # [C, K, K]: one repeat makes it diagonal
+        assumed = self.cost.comparisons[0].channel("torque").noise.whitener  # [C, K, K]: one repeat makes it diagonal
         scale = 1 / (self.deviation * assumed[:, 0, 0])
         return self.cost.whitened(values) * np.repeat(scale, assumed.shape[1])
 
@@ -159,12 +159,20 @@ class Stated:
         return np.sqrt(np.mean(self.whitened(values) ** 2, axis=1))
 
 
+def measured_torque(cost: Cost) -> np.ndarray:
+    """[K, C] measured torque, filtered, in the channel's unit."""
+    return cost.comparisons[0].channel("torque").noise.mean
+
+
+def clock_of(cost: Cost) -> np.ndarray:
+    """[K] s of `measured_torque` and `residual`."""
+    return noise.coarse_clock(*cost.comparisons[0].channel("torque").span)
+
+
 def residual(cost: Cost, values: np.ndarray) -> np.ndarray:
     """[K, C] measured minus simulated torque of one vector [D], filtered, in the channel's unit."""
-    (comparison,) = cost.comparisons
-    (rollout,) = cost.rollouts(values[None])
-    one = Rollout(**{name: array[0] for name, array in vars(rollout).items()})
-    return comparison.noise().mean - np.asarray(comparison.smoothed(one), dtype=np.float64)
+    (simulated,) = cost.smoothed(values[None])
+    return measured_torque(cost) - simulated[0].astype(np.float64)
 
 
 def rms(residuals: np.ndarray) -> np.ndarray:

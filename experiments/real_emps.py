@@ -28,6 +28,7 @@ from inverse_fit import (
     LEVEL,
     RESULTS,
     Estimate,
+    clock_of,
     correlation_time,
     draw_fit,
     estimate,
@@ -36,6 +37,7 @@ from inverse_fit import (
     inverse_cost,
     make_recording,
     make_stretch,
+    measured_torque,
     publish,
     read_npz,
     residual,
@@ -48,7 +50,7 @@ from inverse_fit import (
 from droid_jax.compare.cost import Cost
 from droid_jax.compare.replay import torque_offset_effect
 from droid_jax.identify.search import SearchConfig
-from droid_jax.measure.noise import CUTOFF, coarse_clock
+from droid_jax.measure.noise import CUTOFF
 from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.model.fields import body_mass, joint_damping, joint_frictionloss
 from droid_jax.model.parameters import Parameter, Space
@@ -125,7 +127,7 @@ def make_costs(scene: Scene, space: Space, folder: Path) -> tuple[Cost, Cost]:
 
 def accuracy(cost: Cost, values: np.ndarray) -> dict[str, float]:
     """RMS of the force residual [N], and the residual's size relative to the measured force."""
-    left, measured = residual(cost, values), cost.comparisons[0].noise().mean
+    left, measured = residual(cost, values), measured_torque(cost)
     relative = float(np.linalg.norm(left) / np.linalg.norm(measured))
     return {"rms_N": round(float(rms(left)[0]), 3), "relative_error": round(relative, 4)}
 
@@ -144,14 +146,12 @@ def against_published(found: Estimate) -> dict[str, dict[str, Any]]:
 
 def trace_figure(cost: Cost, before: np.ndarray, after: np.ndarray) -> Any:
     """Force of the judged file, measured and simulated, before and after the fit."""
-    measured = cost.comparisons[0].noise().mean
-    first, last = cost.comparisons[0].channels[0].at[[0, -1]] / RATE
-    time = EDGE + coarse_clock(first, last)
+    measured = measured_torque(cost)
     lines = {
         "before the fit": (measured - residual(cost, before), figures.BEFORE),
         "after the fit": (measured - residual(cost, after), figures.AFTER),
     }
-    return draw_fit(time, [f"{JUDGE} (not fitted)"], measured, lines, f"Force below {CUTOFF:g} Hz [N]")
+    return draw_fit(clock_of(cost), [f"{JUDGE} (not fitted)"], measured, lines, f"Force below {CUTOFF:g} Hz [N]")
 
 
 def main(config: RealEmps) -> None:

@@ -66,6 +66,7 @@ from inverse_fit import (
     table,
 )
 
+from droid_jax.compare.cost import Cost
 from droid_jax.compare.replay import torque_offset_effect
 from droid_jax.identify.search import SearchConfig
 from droid_jax.measure.noise import CUTOFF, coarse_clock
@@ -93,7 +94,8 @@ RATE = 50.0  # Hz of the simulation
 EDGE = 0.3  # s left out at both ends, where a zero-phase filter has no neighbours
 SHARE = 2 / 3  # of the log that is fitted
 BLOCK = 2.5  # s, contiguous blocks behind the intervals
-SCALE_STD, COM_STD = 0.03, 0.005  # prior of a link's mass (-) and centre of mass (m)
+SCALE_STD, COM_STD, COM_LIMIT = 0.03, 0.005, 0.05  # prior of a link's mass (-) and centre of mass (m)
+OTHER_COM_STD = (0.002, 0.010)  # m, to see how much hangs on that prior
 NOT_FRICTION = ("panda_joint2",)  # its residual is gravity and inertia before it is friction
 
 
@@ -164,10 +166,9 @@ def link_nuisances(scene: Scene) -> Space:
     """Mass and centre of mass of every link, with a prior about the nominal ones."""
     note: dict[str, Any] = dict(nuisance=True, group="Nuisance")
     masses = [body_mass_scale(scene, link, std=SCALE_STD, **note) for link in LINKS]
-    limit = 10 * COM_STD
     centres = [
         model_parameter(scene, "body_ipos", link, axis, name=f"{link}_com_{'xyz'[axis]}", unit="m", std=COM_STD,
-                        low=-limit, high=limit, mode=Mode.ADD, **note)
+                        low=-COM_LIMIT, high=COM_LIMIT, mode=Mode.ADD, **note)
         for link in LINKS
         for axis in range(3)
     ]  # fmt: skip
@@ -200,9 +201,9 @@ def stretches(scene: Scene, recording: Recording) -> tuple[Stretch, Stretch]:
     return fitted, make_stretch(scene, recording, motion, (split, last - EDGE), RATE)
 
 
-def fit_models(scene: Scene, parts: tuple[Stretch, Stretch], config: RealPanda) -> dict[str, dict[str, Any]]:
-    """For every model its estimate, and its residuals [K, J] on both parts at the start and at the best."""
-    out: dict[str, dict[str, Any]] = {}
+def fit_models(scene: Scene, parts: tuple[Stretch, Stretch], config: RealPanda) -> dict[str, Any]:
+    """For every model its estimate and its residuals [K, J] on both parts, before and after; and how the search went."""
+    out: dict[str, Any] = {}
     friction = np.empty(0)
     for model in MODELS[:1] if config.quick else MODELS:
         space = model_space(scene, model)
@@ -224,7 +225,23 @@ def fit_models(scene: Scene, parts: tuple[Stretch, Stretch], config: RealPanda) 
             "before": {k: residual(cost, space.mean) for k, cost in names.items()},
             "after": {k: residual(cost, found.best) for k, cost in names.items()},
         }
+        if model == "links":
+            out["other_priors"] = other_priors(fitted, judge, space, friction)
     return out
+
+
+def other_priors(fitted: Cost, judge: Cost, space: Space, friction: np.ndarray) -> list[dict[str, Any]]:
+    """The links model under other priors of the centres of mass: held-out ratio and Coulomb friction."""
+    start = np.r_[friction, space.mean[len(friction) :]]
+    before = rms(residual(judge, space.mean))
+    rows = []
+    for std in OTHER_COM_STD:
+        other = space.with_prior(**{n: (0.0, std) for n in space.names if "_com_" in n})
+        best = estimate(fitted, other, start, BLOCK).best
+        coulomb = [best[other.index(f"coulomb[{j}]")] for j in ARM]
+        ratio = rms(residual(judge, best)) / before
+        rows.append({"com_std_m": std, "held_out_ratio": rounded(ratio, 3), "coulomb_Nm": rounded(coulomb)})
+    return rows
 
 
 # Result ------------------------------------------------------------------------------------
@@ -284,8 +301,7 @@ def show(model: str, result: dict[str, Any]) -> None:
 def residual_figure(part: Stretch, models: dict[str, dict[str, Any]], leading: str) -> Any:
     """Held-out torque that the rigid body leaves unexplained, and what each model makes of it."""
     measured = models[leading]["before"]["held_out"]
-    clock = part.motion.time
-    time = coarse_clock(clock[0], clock[0] + part.comparison.channels[0].at[-1] / RATE)
+    time = coarse_clock(*part.comparison.channel("torque").span)
     plain = models["friction"]
     lines = {"friction": (measured - plain["after"]["held_out"], figures.BEFORE)}
     if leading != "friction":
@@ -301,7 +317,7 @@ def main(config: RealPanda) -> None:
     scene = panda_arm_scene()
     parts = stretches(scene, recording)
     fits = fit_models(scene, parts, config)
-    search = fits.pop("search")
+    search, others = fits.pop("search"), fits.pop("other_priors", [])
     results = {model: summary(fit, published) for model, fit in fits.items()}
     for model, result in results.items():
         show(model, result)
@@ -324,9 +340,14 @@ def main(config: RealPanda) -> None:
         "caveat": "the commanded motion has a period of 13.3 s: the held-out part repeats a fitted motion",
         "rigid_body_rms_whole_Nm": rounded(rms(rigid)),
         "search": search,
-        "intervals": {"level": LEVEL, "block_s": BLOCK},
+        "intervals": {
+            "level": LEVEL,
+            "block_s": BLOCK,
+            "noise": "RMS that the friction model leaves, times the root of the samples it stays correlated for",
+        },
         "leading_model": leading,
         "models": results,
+        "links_under_other_priors": others,
         "targets": {
             "held_out_halved_on_most_joints": lead["joints_halved"] >= 4,
             "coulomb_within_40_percent_but_joint_2": lead["coulomb_close_but_joint_2"],

@@ -41,6 +41,8 @@ class Cost:
     _distances: tuple[Callable[[Rollout], jax.Array], ...]
     _whitened: tuple[Callable[[Rollout], jax.Array], ...]
     _failed: tuple[Callable[[Rollout], jax.Array], ...]
+    _beta: tuple[Callable[[Rollout], jax.Array], ...]
+    _smoothed: tuple[Callable[[Rollout], jax.Array], ...]
 
     def __call__(self, values: Any) -> np.ndarray:
         """[P, D] -> [P] cost, the mean over the recordings; never NaN."""
@@ -57,6 +59,15 @@ class Cost:
     def failed(self, values: Any) -> np.ndarray:
         """[P, D] -> [P] bool: the grasp was lost, the door stayed shut, or the replay blew up."""
         return self._blockwise(values, self._failed, lambda parts: np.any(np.stack(parts), axis=0))
+
+    def penalties(self, values: Any) -> np.ndarray:
+        """[P, D] -> [P, R] N m: the part c beta of each recording's cost."""
+        failed = self._blockwise(values, self._beta, lambda parts: np.stack(parts, axis=1))
+        return failed * np.array([c.config.failure_cost for c in self.comparisons])
+
+    def smoothed(self, values: Any) -> tuple[np.ndarray, ...]:
+        """[P, D] -> for each recording the torques through the data's filter, [P, K, J] N m."""
+        return self._blockwise(values, self._smoothed, tuple)
 
     def rollouts(self, values: Any) -> tuple[Rollout, ...]:
         """[P, D] -> for each recording a Rollout of host arrays [P, T, ...]."""
@@ -114,6 +125,8 @@ def assemble(
         _distances=tuple(_compiled(c.distance) for c in comparisons),
         _whitened=tuple(_compiled(c.whitened) for c in comparisons),
         _failed=tuple(_compiled(lambda r, c=c: c.failed(r) | ~r.finite) for c in comparisons),
+        _beta=tuple(_compiled(c.failed) for c in comparisons),
+        _smoothed=tuple(_compiled(c.smoothed) for c in comparisons),
     )
 
 

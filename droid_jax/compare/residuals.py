@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from droid_jax.measure.noise import Noise, coarse_clock, estimate_noise, lowpass, smooth
-from droid_jax.measure.recording import Channel, Recording
+from droid_jax.measure.recording import Channel, Phase, Recording
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Rollout
 
@@ -49,7 +49,8 @@ class Measured:
     """One channel ready to be compared.
 
     at: [Tc] fractional rows of the simulated trace; values [N,Tc,C], mask [N,Tc,C]; columns [C]
-    of the simulated channel; kernel [K,T] and noise for the whitened form; weight in the distance.
+    of the simulated channel; kernel [K,T] and noise for the whitened form; span [2] s of the
+    coarse clock; weight in the distance.
     """
 
     name: str
@@ -59,6 +60,7 @@ class Measured:
     columns: np.ndarray
     kernel: np.ndarray
     noise: Noise
+    span: tuple[float, float]
     weight: float
 
 
@@ -70,6 +72,7 @@ class Comparison:
     channels: tuple[Measured, ...]
     grip_rows: tuple[int, int] | None
     shut_angle: float | None
+    phases: tuple[Phase, ...]
     config: CompareConfig
 
     def distance(self, rollout: Rollout) -> jax.Array:
@@ -110,12 +113,15 @@ class Comparison:
 
     def smoothed(self, rollout: Rollout, channel: str = "torque") -> jax.Array:
         """[K, C] a channel of the rollout through the filter the data went through."""
-        c = next(c for c in self.channels if c.name == channel)
+        c = self.channel(channel)
         return jnp.asarray(c.kernel, jnp.float32) @ _trace(rollout, c)
 
-    def noise(self, channel: str = "torque") -> Noise:
-        """The measured noise of a channel."""
-        return next(c for c in self.channels if c.name == channel).noise
+    def channel(self, name: str) -> Measured:
+        """A compared channel by name; an unknown one lists those compared."""
+        for channel in self.channels:
+            if channel.name == name:
+                return channel
+        raise ValueError(f"channel {name!r} is not compared; compared: {', '.join(c.name for c in self.channels)}")
 
 
 def _trace(rollout: Rollout, channel: Measured) -> jax.Array:
@@ -159,7 +165,7 @@ def make_comparison(
             angle = recording.channels["object_angle"]
             shut = max(shut, 0.5 * float(np.max(np.where(angle.mask, angle.values, -np.inf))))
     rows = None if grip is None else tuple(int(np.clip(round((t - start) / timestep), 0, steps)) for t in grip)
-    return Comparison(recording.name, channels, rows, shut, config)
+    return Comparison(recording.name, channels, rows, shut, recording.phases, config)
 
 
 def _grip_window(recording: Recording) -> tuple[float, float] | None:
@@ -199,6 +205,7 @@ def _measure(scene: Scene, channel: Channel, clock: np.ndarray, weight: float) -
         columns=columns,
         kernel=lowpass(clock, coarse),
         noise=noise,
+        span=(float(coarse[0]), float(coarse[-1])),
         weight=weight,
     )
 

@@ -103,9 +103,9 @@ def refine(
     ended = np.full(len(x), np.inf)
     alive = np.arange(len(x))
     state = _State(x, residual, objective, np.full(len(x), 1e-3), np.full(x.shape, config.step))
-    scans, central, converged, iteration = config.scans, False, False, 0
+    scans, converged, iteration = config.scans, False, 0
     for iteration in range(1, config.iterations + 1):
-        state, gain = _step(batch, state, box, prior, config, central)
+        state, gain = _step(batch, state, box, prior, config)
         ended[alive] = state.objective
         best = float(state.objective.min())
         if progress is not None:
@@ -114,10 +114,6 @@ def refine(
         state, gain, alive = state.rows(keep), gain[keep], alive[keep]
         leader = int(np.argmin(state.objective))
         if gain[leader] > config.tolerance:
-            central = central or gain[leader] < 0.1
-            continue
-        if not central:
-            central = True
             continue
         state = state.rows(np.arange(len(alive)) == leader)
         alive = alive[[leader]]
@@ -159,13 +155,10 @@ class _State:
 
 
 def _step(
-    batch: _Batch, state: _State, box: np.ndarray, prior: np.ndarray, config: RefineConfig, central: bool
+    batch: _Batch, state: _State, box: np.ndarray, prior: np.ndarray, config: RefineConfig
 ) -> tuple[_State, np.ndarray]:
     """One iteration of all live starts; also the share by which each objective fell."""
-    if central:
-        jacobian = _jacobian(batch, state.x, state.widths, box)
-    else:
-        jacobian = _forward_jacobian(batch, state, box)
+    jacobian = _jacobian(batch, state.x, state.widths, box)
     x, residual, objective, damping, gain = _try_steps(
         batch, state.x, state.residual, state.objective, jacobian, state.damping, box
     )
@@ -209,17 +202,6 @@ class _Batch:
         residual = self.raw(x)
         value = 0.5 * np.sum(residual**2, axis=1) + 0.5 * np.sum((x / self.prior) ** 2, axis=1)
         return residual, np.where(np.isfinite(value), value, np.inf)
-
-
-def _forward_jacobian(batch: _Batch, state: _State, box: np.ndarray) -> np.ndarray:
-    """[S, M, D] one-sided differences, away from the nearer bound: half the price, for the first iterations."""
-    starts, dims = state.x.shape
-    inside = state.x + state.widths <= box[1]
-    points = state.x[:, None, :] + np.eye(dims)[None] * np.where(inside, state.widths, -state.widths)[:, None, :]
-    points = np.clip(points, *box)
-    residual = batch.raw(points.reshape(-1, dims)).reshape(starts, dims, -1)
-    span = np.einsum("sii->si", points) - state.x
-    return np.swapaxes((residual - state.residual[:, None]) / span[..., None], 1, 2)
 
 
 def _jacobian(batch: _Batch, x: np.ndarray, widths: np.ndarray, box: np.ndarray) -> np.ndarray:

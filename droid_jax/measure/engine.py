@@ -115,3 +115,15 @@ def _split(scene: Scene, sensors: np.ndarray) -> Trace:
         start += len(pairs)
     contact = np.stack(fingers, axis=-1) if fingers else np.zeros((*sensors.shape[:2], 0), bool)
     return Trace(torque, position, velocity, angle, speed, contact)
+
+
+def poses(model: mujoco.MjModel, qpos0: np.ndarray, control: np.ndarray) -> np.ndarray:
+    """[T, nq] every joint position of one C rollout, for drawing."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos0
+    out = np.empty((len(control), model.nq))
+    for k, ctrl in enumerate(control):
+        out[k] = data.qpos
+        data.ctrl[:] = ctrl
+        mujoco.mj_step(model, data)
+    return out

@@ -18,7 +18,8 @@ import scipy.signal
 
 from droid_jax.measure.engine import Trace, instrument, simulate
 from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide, validate
-from droid_jax.model.door import door_nuisances, door_space
+from droid_jax.model.door import JOINT_DAMPING, door_nuisances, door_space
+from droid_jax.model.door import truth as table_i
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene
@@ -224,3 +225,12 @@ def _camera(
 
 def _channel(name: str, unit: str, columns: tuple[str, ...], time: np.ndarray, values: np.ndarray) -> Channel:
     return Channel(name, unit, columns, time, values.astype(np.float32), np.ones(values.shape, bool))
+
+
+def stand_in_truth(scene: Scene, springs: int, seed: int, *, nuisances: bool = True) -> dict[str, float]:
+    """Hidden values of a stand-in robot and door: a fitted column of Table I, joint dampings up to
+    some 15 % off the scene's, and (optionally) one draw of the nuisances."""
+    rng = np.random.default_rng([seed, 3])
+    space = door_space(scene)
+    damping = {n: float(space[n].mean * np.exp(rng.normal(0, 0.07))) for n in JOINT_DAMPING}
+    return {**table_i(springs), **damping, **(draw_nuisances(scene, seed) if nuisances else {})}

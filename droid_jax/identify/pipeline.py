@@ -1,0 +1,284 @@
+"""Identification from recordings to a Gaussian: split, search, refine, calibrate, judge on held-out repeats."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from droid_jax.compare.cost import Cost, make_cost
+from droid_jax.compare.residuals import CompareConfig
+from droid_jax.identify.gaussian import Gaussian, prior
+from droid_jax.identify.refine import RefineConfig, Refined, refine
+from droid_jax.identify.search import Fit, SearchConfig, search
+from droid_jax.identify.uncertainty import Identifiability, calibrated, identifiability, time_blocks
+from droid_jax.measure.recording import Recording
+from droid_jax.model.parameters import Space
+from droid_jax.model.scene import Scene
+
+
+@dataclass(frozen=True)
+class IdentifyConfig:
+    """Settings of an identification.
+
+    engine: "mjx" or "mujoco" (plain C, all cores).
+    heldout: share of each recording's repeats that the fit does not see (at least one where there are two).
+    search: CMA-ES settings.
+    refine: refinement settings, or None: the search's own covariance is the distribution, as in the paper.
+    samples: replays drawn from the initial and from the fitted Gaussian to compare their costs.
+    seed: of the split and of those samples (the search has its own).
+    compare: how simulation and measurement are compared.
+    """
+
+    engine: str = "mjx"
+    heldout: float = 0.3
+    search: SearchConfig = field(default_factory=SearchConfig)
+    refine: RefineConfig | None = field(default_factory=RefineConfig)
+    samples: int = 200
+    seed: int = 0
+    compare: CompareConfig = field(default_factory=CompareConfig)
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Disagreement with held-out repeats of one recording, N m, before and after the fit.
+
+    before, after, floor: equation 1 without penalty terms; floor is what a perfect model would
+    leave, estimated from the repeats' scatter about their mean.  closed: share of the way from
+    before to floor.  per_joint_*: [J] root mean square of the smoothed traces' difference.
+    """
+
+    before: float
+    after: float
+    floor: float
+    closed: float
+    per_joint_before: tuple[float, ...]
+    per_joint_after: tuple[float, ...]
+    per_joint_floor: tuple[float, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """Everything an identification found.
+
+    space: what was searched; full: with the nuisances (the same where nothing was refined).
+    best: [F] physical values over `full`.  gaussian: over `space`, the one to hand on; full_gaussian
+    over `full`.  search: the CMA-ES part.  refined: or None.  tells: per parameter of `full`.
+    gaps: by recording name.  fit, heldout: costs over `full` on the fitted and the held-out repeats.
+    heldout_repeats: by recording name.  seconds: by stage.
+    """
+
+    scene: Scene
+    space: Space
+    full: Space
+    best: np.ndarray
+    gaussian: Gaussian
+    full_gaussian: Gaussian
+    search: Fit
+    refined: Refined | None
+    tells: tuple[Identifiability, ...]
+    gaps: dict[str, Gap]
+    fit: Cost
+    heldout: Cost
+    heldout_repeats: dict[str, tuple[int, ...]]
+    seconds: dict[str, float]
+
+    @property
+    def start(self) -> np.ndarray:
+        """[F] the initial means over `full`."""
+        return self.full.mean
+
+
+Progress = Callable[[str, Any], None]
+
+
+def split(recording: Recording, share: float) -> tuple[Recording, Recording, tuple[int, ...]]:
+    """Fitted and held-out repeats (the last ones), and the latter's indices; one repeat serves as both."""
+    count = recording.repeats
+    held = min(count - 1, max(1, round(share * count))) if count > 1 else 0
+    if held == 0:
+        return recording, recording, tuple(range(count))
+    rows = tuple(range(count - held, count))
+    return recording.repeats_subset(range(count - held)), recording.repeats_subset(rows), rows
+
+
+def identify(
+    scene: Scene,
+    space: Space,
+    recordings: Sequence[Recording],
+    *,
+    nuisances: Space | None = None,
+    config: IdentifyConfig | None = None,
+    checkpoints: Path | None = None,
+    progress: Progress | None = None,
+) -> Identified:
+    """Fit `space` to one or several recordings of the same robot and object.
+
+    nuisances: fitted and marginalised beside it in the refinement; None for none.
+    checkpoints: folder where the search saves itself and from which it resumes.
+    progress: called with a stage's name and its progress value.
+    """
+    config = config or IdentifyConfig()
+    report = progress or (lambda stage, value: None)
+    names = [r.name for r in recordings]
+    if len(set(names)) != len(names):
+        raise ValueError(f"recordings need different names, got {', '.join(names)}")
+    parts = [split(r, config.heldout) for r in recordings]
+    fitted, held = [p[0] for p in parts], [p[1] for p in parts]
+    full = space if nuisances is None or config.refine is None else space + nuisances
+    seconds: dict[str, float] = {}
+
+    began = time.monotonic()
+    base = make_cost(scene, full, fitted, engine=config.engine, config=config.compare)
+    found = search(
+        _embed(base, space),
+        space,
+        config.search,
+        checkpoint_dir=checkpoints,
+        fingerprint="+".join(r.sha256 for r in fitted) + config.engine,
+        progress=lambda p: report("search", p),
+    )
+    seconds["search"] = time.monotonic() - began
+
+    began = time.monotonic()
+    refined = None
+    if config.refine is not None:
+        refined = refine(
+            base.whitened, full, starts(full, space, found), config.refine, progress=lambda p: report("refine", p)
+        )
+    best, full_gaussian = _distribution(full, space, found, refined, base)
+    seconds["refine"] = time.monotonic() - began
+
+    began = time.monotonic()
+    report("judge", None)
+    heldout = make_cost(scene, full, held, engine=config.engine, config=config.compare)
+    gaps = _gaps(heldout, full.mean, best)
+    seconds["judge"] = time.monotonic() - began
+    return Identified(
+        scene=scene,
+        space=space,
+        full=full,
+        best=best,
+        gaussian=full_gaussian.marginal(space.names),
+        full_gaussian=full_gaussian,
+        search=found,
+        refined=refined,
+        tells=identifiability(full_gaussian, _prior_widths(full, refined), best),
+        gaps=dict(zip(names, gaps, strict=True)),
+        fit=base,
+        heldout=heldout,
+        heldout_repeats={n: p[2] for n, p in zip(names, parts, strict=True)},
+        seconds=seconds,
+    )
+
+
+def starts(full: Space, space: Space, found: Fit) -> np.ndarray:
+    """[2, F] where the refinement begins: the search's best, and the initial means with a firm grip.
+
+    A grip that never slips is the smooth side of the problem: from there the pose and the hinge are
+    found first and friction comes down after, while a start with too little friction explains
+    everything else by slip.
+    """
+    searched = full.values(dict(zip(space.names, found.best.tolist(), strict=True)))
+    firm = full.values({n: _firm(full, n) for n in full.names if "friction" in n and "loss" not in n})
+    return np.stack([searched, firm])
+
+
+def _firm(space: Space, name: str) -> float:
+    parameter = space[name]
+    return min(parameter.high, 4.0 * parameter.mean)
+
+
+def _embed(cost: Cost, space: Space) -> Callable[[Any], np.ndarray]:
+    """The cost over the full space as one over its first part, the rest at its means."""
+    full = cost.space
+    columns = [full.index(n) for n in space.names]
+
+    def embedded(values: Any) -> np.ndarray:
+        rows = np.tile(full.mean, (len(values), 1))
+        rows[:, columns] = np.asarray(values)
+        return cost(rows)
+
+    return embedded
+
+
+def _distribution(
+    full: Space, space: Space, found: Fit, refined: Refined | None, cost: Cost
+) -> tuple[np.ndarray, Gaussian]:
+    if refined is None:
+        return found.best, found.gaussian()
+    channels = [c for comparison in cost.comparisons for c in comparison.channels]
+    shapes = [(len(c.columns), c.noise.mean.shape[0]) for c in channels]
+    durations = [c.span[1] - c.span[0] for c in channels]
+    return refined.best, calibrated(refined, time_blocks(shapes, durations))
+
+
+def _prior_widths(full: Space, refined: Refined | None) -> np.ndarray:
+    return np.ones(len(full)) if refined is None else refined.prior
+
+
+def _gaps(cost: Cost, before: np.ndarray, after: np.ndarray) -> list[Gap]:
+    """The gap of each recording's held-out repeats at two parameter vectors."""
+    penalty_free = cost.distances(np.stack([before, after])) - cost.penalties(np.stack([before, after]))
+    smoothed = cost.smoothed(np.stack([before, after]))
+    out = []
+    for i, comparison in enumerate(cost.comparisons):
+        torque = comparison.channel("torque")
+        mean = torque.noise.mean
+        rms = np.sqrt(np.mean((smoothed[i] - mean) ** 2, axis=1))
+        floor = _floor(torque.values, torque.mask)
+        first, last = penalty_free[0, i], penalty_free[1, i]
+        out.append(
+            Gap(
+                before=float(first),
+                after=float(last),
+                floor=floor,
+                closed=float(1 - (last - floor) / max(first - floor, 1e-12)),
+                per_joint_before=tuple(rms[0].tolist()),
+                per_joint_after=tuple(rms[1].tolist()),
+                per_joint_floor=tuple(_smooth_floor(torque.noise.repeats).tolist()),
+            )
+        )
+    return out
+
+
+def _floor(values: np.ndarray, mask: np.ndarray) -> float:
+    """Equation 1 of a perfect model: the repeats' distance to their mean, corrected for the mean's own noise."""
+    count = len(values)
+    if count < 2:
+        return 0.0
+    filled = np.where(mask, values, np.nan)
+    error = np.nan_to_num(filled - np.nanmean(filled, axis=0))
+    return float(np.mean(np.linalg.norm(error, axis=-1)) / np.sqrt(1 - 1 / count))
+
+
+def _smooth_floor(repeats: np.ndarray) -> np.ndarray:
+    """[J] what the noise of the repeats' mean leaves of a smoothed difference, N m."""
+    count = len(repeats)
+    if count < 2:
+        return np.zeros(repeats.shape[-1])
+    variance = np.var(repeats, axis=0, ddof=1).mean(axis=0)
+    return np.sqrt(variance / count)
+
+
+def cost_samples(found: Identified, count: int, seed: int) -> dict[str, np.ndarray]:
+    """Costs on held-out repeats of samples from the initial and from the fitted Gaussian.
+
+    initial, fitted: [n, D] values; initial_cost, fitted_cost: [n] N m, failed replays carry their penalty.
+    """
+    first = prior(found.space).sample(seed, count)
+    last = found.full_gaussian.sample(seed, count)
+    rows = np.tile(found.full.mean, (count, 1))
+    rows[:, [found.full.index(n) for n in found.space.names]] = first
+    columns = [found.full.index(n) for n in found.space.names]
+    return {
+        "initial": first,
+        "fitted": last[:, columns],
+        "initial_cost": found.heldout(rows),
+        "fitted_cost": found.heldout(last),
+        "names": np.array(found.space.names),
+    }

@@ -1,0 +1,267 @@
+"""A run's folder: everything an identification found, as JSON, npz, CSV, MJCF. No pickle.
+
+config.json, fit.json, gaussian.json, history.npz/.csv, samples.csv, traces.npz, distribution.npz,
+correlation.npz, fitted.xml; docs/file-formats.md documents them, `report` turns them into a page.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+import json
+import os
+import tempfile
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from droid_jax.identify.pipeline import Identified
+from droid_jax.model.parameters import Space
+from droid_jax.model.physics import make_c_model
+from droid_jax.model.scene import Scene
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file whole or not at all."""
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+        os.chmod(name, 0o644)
+        os.replace(name, path)
+    except BaseException:
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(name)
+        raise
+
+
+def write_json(path: Path, content: Any) -> None:
+    """JSON, indented; NaN and infinities are refused (they are not JSON)."""
+    write_bytes(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
+
+
+def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
+    """A compressed npz."""
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    write_bytes(path, buffer.getvalue())
+
+
+def write_csv(path: Path, header: Iterable[str], rows: np.ndarray) -> None:
+    """A table with one header line."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer)
+    writer.writerow(list(header))
+    writer.writerows(np.asarray(rows).tolist())
+    write_bytes(path, buffer.getvalue().encode())
+
+
+def prepare_folder(folder: Path) -> Path:
+    """Make a results folder and see that it can be written; OSError becomes one clear ValueError."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise ValueError(f"the results folder {folder} cannot be written: {error.strerror or error}") from None
+    return folder
+
+
+def write_run(
+    folder: Path,
+    found: Identified,
+    config: Mapping[str, Any],
+    *,
+    truth: Mapping[str, float] | None = None,
+    samples: Mapping[str, np.ndarray] | None = None,
+    notes: Iterable[str] = (),
+) -> None:
+    """Write all files of a run into `folder` (see the module's text).
+
+    truth: hidden values where they are known (the stand-in robot); samples: see `cost_samples`.
+    """
+    write_json(folder / "fit.json", fit_json(found, truth or {}, list(notes)))
+    found.gaussian.save(folder / "gaussian.json")
+    found.full_gaussian.save(folder / "gaussian_full.json")
+    _write_history(folder, found)
+    write_npz(folder / "traces.npz", traces(found))
+    correlation = found.full_gaussian.cov / np.sqrt(
+        np.outer(np.diag(found.full_gaussian.cov), np.diag(found.full_gaussian.cov))
+    )
+    write_npz(folder / "correlation.npz", {"names": np.array(found.full.names), "correlation": correlation})
+    if samples is not None:
+        write_npz(folder / "distribution.npz", samples)
+        write_csv(folder / "samples.csv", found.space.names, samples["fitted"])
+    write_bytes(folder / "fitted.xml", fitted_mjcf(found.scene, found.full, found.best).encode())
+    write_json(folder / "config.json", dict(config))  # last: its presence says that the run is whole
+
+
+def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) -> dict[str, Any]:
+    """The fit as plain data: parameters with intervals, gaps, costs, why it stopped."""
+    low, high = found.full_gaussian.interval(0.9)
+    mean, std = found.full_gaussian.physical_mean, found.full_gaussian.physical_std
+    parameters = []
+    for i, p in enumerate(found.full.parameters):
+        tells = found.tells[i]
+        span = found.full.to_search(np.stack([found.full.low, found.full.high]))[:, i]
+        at = (found.full.to_search(found.best)[i] - span[0]) / (span[1] - span[0])
+        parameters.append(
+            {
+                "name": p.name,
+                "unit": p.unit,
+                "group": p.group,
+                "nuisance": p.nuisance,
+                "initial_mean": p.mean,
+                "initial_std": p.std,
+                "low": p.low,
+                "high": p.high,
+                "best": float(found.best[i]),
+                "mean": float(mean[i]),
+                "std": float(std[i]),
+                "interval": [float(low[i]), float(high[i])],
+                "identifiable": tells.identifiable,
+                "reason": tells.reason,
+                "truth": truth.get(p.name),
+                "on_bound": bool(at < 0.01 or at > 0.99),
+                "partners": [{"name": n, "correlation": c} for n, c in tells.partners],
+            }
+        )
+    costs = found.fit(np.stack([found.start, found.best]))
+    gaps = {
+        name: {
+            "before": g.before,
+            "after": g.after,
+            "floor": g.floor,
+            "closed": g.closed,
+            "per_joint_before": list(g.per_joint_before),
+            "per_joint_after": list(g.per_joint_after),
+            "per_joint_floor": list(g.per_joint_floor),
+        }
+        for name, g in found.gaps.items()
+    }
+    evaluations = found.search.evaluations + (found.refined.evaluations if found.refined else 0)
+    return {
+        "parameters": parameters,
+        "cost": {
+            "initial": float(costs[0]),
+            "best": float(costs[1]),
+            "floor": float(np.mean([g.floor for g in found.gaps.values()])),
+        },
+        "gap": gaps,
+        "stop": found.search.stop,
+        "converged": None if found.refined is None else found.refined.converged,
+        "generations": len(found.search.history.best_cost),
+        "evaluations": int(evaluations),
+        "seconds": {**found.seconds, "total": sum(found.seconds.values())},
+        "rule": found.gaussian.rule,
+        "notes": notes,
+    }
+
+
+def _write_history(folder: Path, found: Identified) -> None:
+    history = found.search.history
+    names = found.space.names
+    arrays = {
+        "names": np.array(names),
+        "generation": np.arange(1, len(history.best_cost) + 1),
+        "mean": history.mean,
+        "std": _physical_deviation(found.space, history.mean, history.std),
+        "best_cost": history.best_cost,
+        "median_cost": history.median_cost,
+        "sigma": history.sigma,
+    }
+    write_npz(folder / "history.npz", arrays)
+    table = np.column_stack([arrays[k] for k in ("generation", "best_cost", "median_cost", "sigma", "mean", "std")])
+    header = ["generation", "best_cost", "median_cost", "sigma", *(f"mean_{n}" for n in names)]
+    write_csv(folder / "history.csv", [*header, *(f"std_{n}" for n in names)], table)
+
+
+def _physical_deviation(space: Space, mean: np.ndarray, std: np.ndarray) -> np.ndarray:
+    """[G, D] half the spread of one search deviation to each side, physical units."""
+    x = space.to_search(mean)
+    return 0.5 * (space.from_search(x + std) - space.from_search(x - std))
+
+
+def traces(found: Identified) -> dict[str, np.ndarray]:
+    """Smoothed joint torques of each recording: held-out repeats, before and after the fit."""
+    both = found.heldout.smoothed(np.stack([found.start, found.best]))
+    out: dict[str, np.ndarray] = {}
+    for i, comparison in enumerate(found.heldout.comparisons):
+        channel = comparison.channel("torque")
+        repeats = channel.noise.repeats
+        rollout_time = np.linspace(0.0, 1.0, repeats.shape[1])
+        name = comparison.name
+        out[f"{name}/time"] = channel.span[0] + rollout_time * (channel.span[1] - channel.span[0])
+        out[f"{name}/measured_mean"] = channel.noise.mean
+        out[f"{name}/measured_low"] = np.quantile(repeats, 0.05, axis=0)
+        out[f"{name}/measured_high"] = np.quantile(repeats, 0.95, axis=0)
+        out[f"{name}/before"], out[f"{name}/after"] = both[i]
+        out[f"{name}/joints"] = np.array([found.scene.joints[c] for c in channel.columns])
+        phases = [{"name": p.name, "start": p.start, "end": p.end} for p in comparison.phases]
+        out[f"{name}/phases"] = np.array(json.dumps(phases))
+    return out
+
+
+def fitted_mjcf(scene: Scene, space: Space, values: np.ndarray) -> str:
+    """The scene as MJCF with the fitted values written in.
+
+    Model entries that MJCF has an attribute for are set on the spec; what lives outside the model
+    (offsets) is not in it.  Bodies of one geom get their mass through it.
+    """
+    spec = scene.spec.copy()
+    model = make_c_model(scene, space, values)
+    fields = {w.field for p in space.parameters for w in p.writes}
+    for joint in spec.joints:
+        dof, index = scene.dof(joint.name), scene.id("joint", joint.name)
+        if "dof_damping" in fields:
+            joint.damping = [float(model.dof_damping[dof]), 0, 0]
+        if "jnt_stiffness" in fields:
+            joint.stiffness = [float(model.jnt_stiffness[index]), 0, 0]
+        if "dof_frictionloss" in fields:
+            joint.frictionloss = float(model.dof_frictionloss[dof])
+    for body in spec.bodies[1:]:
+        _write_body(scene, model, body, fields)
+    for pair in spec.pairs:
+        if "pair_friction" in fields:
+            pair.friction = model.pair_friction[scene.id("pair", pair.name)].tolist()
+    for index, actuator in enumerate(spec.actuators):
+        if "actuator_gainprm" in fields:
+            actuator.gainprm = model.actuator_gainprm[index].tolist()
+            actuator.biasprm = model.actuator_biasprm[index].tolist()
+    for geom in spec.geoms:
+        if "geom_size" in fields and geom.name and _has(scene, geom.name):
+            geom.size[0] += (
+                model.geom_size[scene.id("geom", geom.name), 0] - scene.model.geom_size[scene.id("geom", geom.name), 0]
+            )
+    spec.compile()
+    return spec.to_xml()
+
+
+def _has(scene: Scene, geom: str) -> bool:
+    try:
+        scene.id("geom", geom)
+    except ValueError:
+        return False
+    return True
+
+
+def _write_body(scene: Scene, model: Any, body: Any, fields: set[str]) -> None:
+    index = scene.id("body", body.name)
+    if {"body_pos", "body_quat"} & fields:
+        body.pos = model.body_pos[index].tolist()
+        body.quat = model.body_quat[index].tolist()
+    if "body_gravcomp" in fields:
+        body.gravcomp = float(model.body_gravcomp[index])
+    scale = model.body_mass[index] / scene.model.body_mass[index] if scene.model.body_mass[index] > 0 else 1.0
+    if abs(scale - 1) < 1e-12:
+        return
+    if body.explicitinertial:
+        body.mass *= scale
+        body.fullinertia = (np.asarray(body.fullinertia) * scale).tolist()
+        body.inertia = (np.asarray(body.inertia) * scale).tolist()
+    for geom in body.geoms:
+        if geom.mass > 0:
+            geom.mass *= scale

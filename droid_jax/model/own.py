@@ -1,0 +1,61 @@
+"""Parameters of a user's own scene, from a JSON file.
+
+    [{"field": "dof_damping", "element": "elbow", "unit": "N m s/rad", "std": 0.5, "high": 10, "scaling": "log"},
+     {"field": "body_mass", "element": "forearm", "std": 0.2, "high": 5}]
+
+Every entry needs field, element, std and high; optional: column, name, unit, mean, low, mode
+(set, scale, divide, add, negative), scaling (linear, log), floor, width, nuisance, group.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from droid_jax.model.fields import body_mass, model_parameter
+from droid_jax.model.parameters import Mode, Parameter, Scaling, Space
+from droid_jax.model.scene import Scene
+
+_NEEDED = ("field", "element", "std", "high")
+_KNOWN = (
+    *_NEEDED, "column", "name", "unit", "mean", "low", "mode", "scaling", "floor", "width", "nuisance", "group",
+)  # fmt: skip
+
+
+def load_parameters(path: str | Path, scene: Scene) -> Space:
+    """The space described in a JSON file; ValueError names the file, the entry and what is wrong with it."""
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"no parameter file at {path}")
+    try:
+        entries = json.loads(path.read_text())
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path}: not JSON ({error})") from None
+    if not isinstance(entries, list) or not entries:
+        raise ValueError(f"{path}: expected a list of parameters, got {type(entries).__name__}")
+    return Space(tuple(_parameter(scene, entry, f"{path}, entry {i + 1}") for i, entry in enumerate(entries)))
+
+
+def _parameter(scene: Scene, entry: Any, where: str) -> Parameter:
+    if not isinstance(entry, dict):
+        raise ValueError(f"{where}: expected an object, got {type(entry).__name__}")
+    missing = [k for k in _NEEDED if k not in entry]
+    unknown = [k for k in entry if k not in _KNOWN]
+    if missing or unknown:
+        raise ValueError(
+            f"{where}: missing {', '.join(missing) or 'nothing'}; unknown {', '.join(unknown) or 'nothing'}; "
+            f"known keys: {', '.join(_KNOWN)}"
+        )
+    options = dict(entry)
+    field, element = options.pop("field"), options.pop("element")
+    try:
+        if "scaling" in options:
+            options["scaling"] = Scaling(options["scaling"])
+        if "mode" in options:
+            options["mode"] = Mode(options["mode"])
+        if field == "body_mass" and "mode" not in options:
+            return body_mass(scene, element, **options)
+        return model_parameter(scene, field, element, options.pop("column", None), **{"unit": "", **options})
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{where}: {error}") from None

@@ -1,0 +1,54 @@
+"""Progress bars of a run, one per stage, with cost and time left."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+Report = Callable[[str, Any], None]
+
+
+@contextlib.contextmanager
+def stages(names: Sequence[str]) -> Iterator[Report]:
+    """Show one bar per stage; yields the function that stages report to: (stage, its progress value)."""
+    columns = (
+        TextColumn("{task.description:>8}"),
+        BarColumn(bar_width=30),
+        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+        TextColumn("{task.fields[text]}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns) as bars:
+        tasks = {n: bars.add_task(n, total=1, text="", start=False) for n in names}
+        current: list[str] = []
+
+        def report(stage: str, value: Any) -> None:
+            if stage not in current:
+                for done in current:
+                    bars.update(tasks[done], completed=bars.tasks[tasks[done]].total)
+                    bars.stop_task(tasks[done])
+                current.append(stage)
+                bars.start_task(tasks[stage])
+            if value is not None:
+                bars.update(tasks[stage], **_line(value))
+
+        yield report
+        for name in current:
+            bars.update(tasks[name], completed=bars.tasks[tasks[name]].total)
+
+
+def _line(value: Any) -> dict[str, Any]:
+    """What to show of a stage's progress value."""
+    if hasattr(value, "generation"):
+        text = f"cost {value.best_cost:.4g} N m  sigma {value.sigma:.2g}"
+        return {"completed": value.generation, "total": value.generations, "text": text}
+    return {
+        "completed": value.iteration,
+        "total": value.iterations,
+        "text": f"mean square {value.mean_square:.3g} (noise: 1)",
+    }
