@@ -1,6 +1,6 @@
 """A real Panda: friction of its joints from one measured motion, judged on the part that was not fitted.
 
-    python experiments/real_panda.py --data DIR            # about two minutes on two cores
+    python experiments/real_panda.py --data DIR            # one to two minutes on two cores
     python experiments/real_panda.py --data DIR --quick    # does it all work?
 
 The measured motion is replayed in inverse mode through the bare arm (link side, gravity in) and viscous
@@ -202,7 +202,7 @@ def stretches(scene: Scene, recording: Recording) -> tuple[Stretch, Stretch]:
 
 
 def fit_models(scene: Scene, parts: tuple[Stretch, Stretch], config: RealPanda) -> dict[str, Any]:
-    """For every model its estimate and its residuals [K, J] on both parts, before and after; and how the search went."""
+    """For every model its estimate and its residuals [K, J] on both parts, before and after; how the search went."""
     out: dict[str, Any] = {}
     friction = np.empty(0)
     for model in MODELS[:1] if config.quick else MODELS:
@@ -346,6 +346,7 @@ def main(config: RealPanda) -> None:
             "noise": "RMS that the friction model leaves, times the root of the samples it stays correlated for",
         },
         "leading_model": leading,
+        "joints_halved_by_model": {model: r["joints_halved"] for model, r in results.items()},
         "models": results,
         "links_under_other_priors": others,
         "targets": {

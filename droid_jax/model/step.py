@@ -23,7 +23,7 @@ from mujoco import mjx
 from droid_jax.model.patches import exact_segments, midpoint_constraints
 
 ITERATIONS = 8  # at most; two or three are usual from a warm start
-LINE_SEARCH = 8  # corners of the piecewise linear slope followed in one step; 5 leave one state in 500 unsolved
+LINE_SEARCH = 6  # corners of the piecewise linear slope followed in one step
 _TOLERANCE = 3e-6  # of the acceleration's scale: what float32 can still tell apart
 
 

@@ -137,7 +137,10 @@ EXPECTED_KINDS = {
 }
 
 
-@pytest.fixture(scope="module", params=EQUALITIES)
+@pytest.fixture(
+    scope="module",
+    params=["joint", pytest.param("none", marks=pytest.mark.slow), pytest.param("connect", marks=pytest.mark.slow)],
+)
 def case(request) -> tuple:
     model = arm(request.param)
     qpos, qvel = states(model, 200, seed=5)
@@ -266,7 +269,7 @@ def rollout_mjx(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, steps
     return np.asarray(jax.jit(lambda d: jax.lax.scan(advance, d, None, length=steps)[1])(data))
 
 
-@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+@pytest.mark.parametrize("integrator", [pytest.param("Euler", marks=pytest.mark.slow), "implicitfast"])
 def test_parity_steps_are_those_of_the_c_engine(integrator: str):
     """A second of falling, hitting the post and sliding over it."""
     model = arm("joint")

@@ -1,0 +1,370 @@
+"""The servo replay on a small arm: commands, offsets, conventions and refusals against closed forms."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from droid_jax import runtime
+from droid_jax.compare.cost import make_cost
+from droid_jax.compare.population import over_population
+from droid_jax.compare.replay import Drive, check_gains, make_drive, servo_replay, torque_offset_effect
+from droid_jax.compare.twin import twin_replay
+from droid_jax.measure.recording import Channel, Recording, ServoGains, TorqueConvention, TorqueSide
+from droid_jax.model.door import time_offset, torque_offsets
+from droid_jax.model.fields import joint_damping
+from droid_jax.model.parameters import Scaling, Space
+from droid_jax.model.physics import make_physics
+from droid_jax.model.scene import Scene, compile_scene, with_options
+from droid_jax.model.seam import Effect, Rollout
+
+JOINTS = ("shoulder", "elbow")
+KP = {"shoulder": 60.0, "elbow": 25.0}
+# The actuators stand in the other order than the joints, and one sensor is the file's own.
+ARM = """<mujoco><compiler angle="radian"/><option timestep="0.002" integrator="implicitfast" iterations="100"/>
+<worldbody>
+  <body name="upper" {gravcomp}><joint name="shoulder" axis="0 1 0" armature="0.12" damping="3" {friction}/>
+    <geom type="capsule" size=".03" fromto="0 0 0 .3 0 0" mass="2" contype="0" conaffinity="0"/>
+    <body name="fore" pos=".3 0 0" {gravcomp}><joint name="elbow" axis="0 1 0" armature="0.05" damping="1" {friction}/>
+      <geom type="capsule" size=".02" fromto="0 0 0 .25 0 0" mass="1" contype="0" conaffinity="0"/></body></body>
+</worldbody>
+<actuator><position name="e" joint="elbow" kp="25"/><position name="s" joint="shoulder" kp="60"/></actuator>
+<sensor>{sensor}</sensor></mujoco>"""
+MOTOR = TorqueConvention(TorqueSide.MOTOR, gravity=False)
+
+
+def arm(*, gravcomp: bool = True, friction: float = 0.0, sensor: str = "") -> Scene:
+    xml = ARM.format(
+        gravcomp='gravcomp="1"' if gravcomp else "", friction=f'frictionloss="{friction}"', sensor=sensor
+    )
+    return compile_scene(mujoco.MjSpec.from_string(xml), "arm", joints=JOINTS)
+
+
+def motion(seconds: float = 1.0, rate: float = 500.0) -> tuple[np.ndarray, np.ndarray]:
+    time = np.arange(round(seconds * rate) + 1) / rate
+    ramp = np.clip(time / 0.3, 0, 1) ** 3
+    return time, np.stack([0.4 * ramp * np.sin(5 * time), -0.3 + 0.5 * ramp * np.sin(8 * time)], axis=1)
+
+
+def recording(**changes) -> Recording:
+    time, command = motion()
+    torque = np.random.default_rng(0).normal(size=(2, len(time), 2))
+    start = dict(
+        name="wave",
+        time=time,
+        command=command,
+        command_names=JOINTS,
+        channels={"torque": Channel("torque", "N m", JOINTS, time, torque, np.ones(torque.shape, bool))},
+        torque=MOTOR,
+        qpos0={"shoulder": 0.0, "elbow": -0.3},
+        gains=ServoGains(np.array([60.0, 25.0]), np.array([3.0, 1.0])),
+    )
+    return Recording(**{**start, **changes})
+
+
+SPACE = Space(
+    (time_offset(), *torque_offsets(JOINTS), joint_damping(arm(), "elbow", name="elbow_damping", std=0.1, high=50.0))
+)
+
+
+def run(scene: Scene, drive: Drive, rows: list[dict[str, float]], **options) -> Rollout:
+    replay = servo_replay(scene, drive, (torque_offset_effect(scene.joints),), **options)
+    batch = over_population(lambda values: replay(make_physics(scene, SPACE, values)))
+    return batch(np.array([SPACE.values(row) for row in rows]))
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return arm()
+
+
+@pytest.fixture(scope="module")
+def drive(scene: Scene) -> Drive:
+    return make_drive(scene, recording())
+
+
+ROWS = [
+    {},
+    {"time_offset": 0.0137},
+    {"time_offset": -0.0071},
+    {"torque_offset[elbow]": 0.5, "torque_offset[shoulder]": -0.25},
+    {"elbow_damping": 4.0},
+]
+
+
+@pytest.fixture(scope="module")
+def rollout(scene: Scene, drive: Drive) -> Rollout:
+    return run(scene, drive, ROWS)
+
+
+def servo_torque(position: np.ndarray, delay: float) -> np.ndarray:
+    """kp (command(t - delay) - q), the command held at its ends."""
+    time, command = motion()
+    late = np.stack([np.interp(time - delay, time, c) for c in command.T], axis=1)
+    return np.array([KP[j] for j in JOINTS]) * (late - position)
+
+
+def test_torque_is_the_servos_law(rollout: Rollout):
+    np.testing.assert_allclose(rollout.torque[0], servo_torque(rollout.position[0], 0.0), atol=2e-5)
+    assert np.abs(rollout.torque[0]).max() > 1.0
+
+
+@pytest.mark.parametrize("row", [1, 2])
+def test_a_time_offset_delays_the_command(rollout: Rollout, row: int):
+    delay = ROWS[row]["time_offset"]
+    expected = servo_torque(rollout.position[row], delay)
+    np.testing.assert_allclose(rollout.torque[row], expected, atol=5e-5)
+    assert np.abs(expected - servo_torque(rollout.position[row], 0.0)).max() > 0.1
+
+
+def test_a_delayed_command_gives_a_delayed_motion(rollout: Rollout):
+    """Seven whole steps: the same trajectory, 14 ms later (the arm rests at the start)."""
+    shifted = run(arm(), make_drive(arm(), recording()), [{"time_offset": 0.014}])
+    np.testing.assert_allclose(shifted.position[0, 7:], rollout.position[0, :-7], atol=1e-5)
+
+
+def test_torque_offsets_are_added_to_their_own_joint(rollout: Rollout):
+    np.testing.assert_array_equal(rollout.position[3], rollout.position[0])
+    np.testing.assert_allclose(rollout.torque[3] - rollout.torque[0], np.tile([-0.25, 0.5], (501, 1)), atol=1e-6)
+
+
+def test_parameters_reach_the_model(rollout: Rollout):
+    assert np.abs(rollout.position[4] - rollout.position[0]).max() > 0.01
+    assert rollout.finite.all()
+
+
+def test_columns_are_matched_by_name(scene: Scene, drive: Drive, rollout: Rollout):
+    time, command = motion()
+    swapped = make_drive(
+        scene,
+        recording(
+            command=command[:, ::-1],
+            command_names=JOINTS[::-1],
+            gains=ServoGains(np.array([25.0, 60.0]), np.array([1.0, 3.0])),
+        ),
+    )
+    np.testing.assert_array_equal(swapped.command, drive.command)
+    np.testing.assert_array_equal(swapped.stiffness, drive.stiffness)
+    np.testing.assert_array_equal(drive.command[:, 0], command[:, 1])  # actuators: elbow first
+
+
+def test_a_coarse_late_command_is_resampled_onto_the_steps(scene: Scene):
+    """100 Hz from t = 3 s becomes 500 Hz from 0, on the straight line between commands."""
+    time, command = motion(1.0, 100.0)
+    coarse = make_drive(scene, recording(time=time + 3.0, command=command, channels={}))
+    assert len(coarse.time) == 501 and coarse.time[0] == 0.0
+    np.testing.assert_allclose(coarse.command[::5, 1], command[:, 0], atol=1e-12)
+    np.testing.assert_allclose(coarse.command[2, 1], 0.6 * command[0, 0] + 0.4 * command[1, 0], atol=1e-12)
+
+
+# ----- parity with plain C
+
+
+def c_rollout(scene: Scene, drive: Drive, *, delay: float, **options) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Position, velocity and actuator torque before each step, by mj_step."""
+    model = with_options(scene, **options).model
+    data = mujoco.MjData(model)
+    data.qpos[:] = drive.qpos0
+    sub = round(drive.timestep / model.opt.timestep)
+    clock = np.arange(len(drive.command) * sub) * model.opt.timestep - delay
+    out = np.empty((3, len(clock), 2))
+    for k, at in enumerate(clock):
+        data.ctrl[:] = [np.interp(at, drive.time, c) for c in drive.command.T]
+        out[0, k], out[1, k] = data.qpos[scene.joint_qpos], data.qvel[scene.joint_dofs]
+        mujoco.mj_step(model, data)
+        out[2, k] = data.qfrc_actuator[scene.joint_dofs]
+    return out[0, ::sub], out[1, ::sub], out[2, ::sub]
+
+
+def test_parity_replay_is_mj_step(scene: Scene, drive: Drive):
+    got = run(scene, drive, [{}], parity=True)
+    position, velocity, torque = c_rollout(scene, drive, delay=0.001)
+    np.testing.assert_allclose(got.torque[0], torque, atol=5e-5)
+    np.testing.assert_allclose(got.position[0], position + 0.001 * velocity, atol=2e-6)
+
+
+def test_the_twin_is_mj_step(scene: Scene, drive: Drive):
+    got = twin_replay(scene, SPACE, drive)(SPACE.mean[None])
+    position, velocity, torque = c_rollout(scene, drive, delay=0.001)
+    np.testing.assert_allclose(got.torque[0], torque, atol=1e-12)
+    np.testing.assert_allclose(got.position[0], position + 0.001 * velocity, atol=1e-12)
+    np.testing.assert_allclose(got.velocity[0], velocity, atol=1e-12)
+
+
+def test_the_replay_is_closer_to_the_continuous_arm_than_the_c_engine(scene: Scene, drive: Drive, rollout: Rollout):
+    """Against C at 20 microseconds; the half-step delay of the twin already takes most of C's error out."""
+    _, _, truth = c_rollout(scene, drive, delay=0.0, timestep=2e-5, integrator=mujoco.mjtIntegrator.mjINT_RK4)
+    plain = c_rollout(scene, drive, delay=0.0)[2]
+    late = c_rollout(scene, drive, delay=0.001)[2]
+    off = {k: float(np.sqrt(np.mean((v - truth) ** 2))) for k, v in dict(plain=plain, late=late, own=rollout.torque[0]).items()}
+    assert off["late"] < 0.5 * off["plain"]
+    assert off["own"] < 0.1 * off["late"]
+
+
+def test_a_files_own_sensors_do_not_disturb_the_twin(scene: Scene, drive: Drive):
+    busy = arm(sensor='<jointpos joint="elbow"/><actuatorfrc actuator="s"/>')
+    expected = twin_replay(scene, SPACE, drive)(SPACE.mean[None])
+    got = twin_replay(busy, SPACE, drive)(SPACE.mean[None])
+    np.testing.assert_array_equal(got.torque, expected.torque)
+    np.testing.assert_array_equal(got.position, expected.position)
+
+
+def test_the_twin_keeps_every_option(drive: Drive):
+    light = with_options(arm(gravcomp=False), gravity=[0.0, 0.0, -1.6])
+    got = twin_replay(light, SPACE, drive)(SPACE.mean[None])
+    np.testing.assert_allclose(got.torque[0], c_rollout(light, drive, delay=0.001)[2], atol=1e-12)
+
+
+# ----- torque conventions
+
+
+def inverse(scene: Scene, q: np.ndarray, v: np.ndarray, a: np.ndarray, *, armature: bool, gravity: bool) -> np.ndarray:
+    """[T, 2] N m that rigid links ask for, from C: M(q) a + c(q, v) [+ g(q)]."""
+    model = scene.model.__copy__()
+    if not armature:
+        model.dof_armature[:] = 0
+    if not gravity:
+        model.opt.gravity[:] = 0
+    data, out, M = mujoco.MjData(model), np.empty_like(q), np.zeros((2, 2))
+    for k in range(len(q)):
+        data.qpos[:], data.qvel[:] = q[k], v[k]
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, M)
+        out[k] = M @ a[k] + data.qfrc_bias
+    return out
+
+
+@pytest.mark.parametrize("gravity", [False, True])
+@pytest.mark.parametrize("friction", [0.0, 0.4])
+def test_link_side_torque_is_what_moves_the_links(gravity: bool, friction: float):
+    """Without rotor inertia, joint damping and the joint's dry friction; with gravity where stated."""
+    scene = arm(friction=friction)
+    convention = TorqueConvention(TorqueSide.LINK, gravity)
+    drive = make_drive(scene, recording(torque=convention))
+    got = run(scene, drive, [{}])
+    h = drive.timestep
+    q = got.position[0].astype(float)
+    acceleration = (q[2:] - 2 * q[1:-1] + q[:-2]) / h**2
+    velocity = (q[2:] - q[:-2]) / (2 * h)
+    expected = inverse(scene, q[1:-1], velocity, acceleration, armature=False, gravity=gravity)
+    off = got.torque[0, 1:-1] - expected
+    # Second differences of float32 positions: 6e-8 / h^2 = 0.015 rad/s^2, on 0.3 kg m^2.
+    assert np.sqrt(np.mean(off**2)) < 0.01, np.sqrt(np.mean(off**2, axis=0))
+    motor = run(scene, make_drive(scene, recording()), [{}])
+    assert np.sqrt(np.mean((motor.torque[0, 1:-1] - expected) ** 2)) > 0.3
+
+
+def test_motor_side_with_gravity_adds_the_compensated_weight(scene: Scene, drive: Drive, rollout: Rollout):
+    heavy = run(scene, make_drive(scene, recording(torque=TorqueConvention(TorqueSide.MOTOR, True))), [{}])
+    np.testing.assert_array_equal(heavy.position[0], rollout.position[0])
+    q = heavy.position[0].astype(float)
+    weight = inverse(scene, q, 0 * q, 0 * q, armature=True, gravity=True)
+    np.testing.assert_allclose(heavy.torque[0] - rollout.torque[0], weight, atol=1e-4)
+
+
+# ----- effects
+
+
+def test_effects_enter_where_they_say(scene: Scene, drive: Drive):
+    """A constant force, a command law and an observation, each against what it must do."""
+    seen = {}
+
+    def force(theta, state):
+        seen["shapes"] = (state.qpos.shape, state.qvel.shape, state.load.shape)
+        return jnp.array([0.0, 1.5])
+
+    kick = Effect("kick", force=force)
+    hold = Effect("hold", command=lambda theta, time, look: 0.5 * (look(time) + look(time - 0.01)))
+    scale = Effect("scale", observe=lambda theta, r: replace(r, torque=2.0 * r.torque))
+    physics = make_physics(scene, SPACE, jnp.asarray(SPACE.mean, jnp.float32))
+
+    def compiled(*effects: Effect) -> Rollout:
+        return jax.jit(servo_replay(scene, drive, effects), compiler_options=runtime.compiler_options())(physics)
+
+    plain, kicked, held, scaled = compiled(), compiled(kick), compiled(hold), compiled(scale)
+    assert seen["shapes"] == ((2,), (2,), (2,))
+    np.testing.assert_array_equal(scaled.torque, 2.0 * plain.torque)
+    # at rest the servo gives way until kp dq = 1.5 N m
+    assert float(kicked.torque[-1, 1] - plain.torque[-1, 1]) < -0.5
+    q, (time, command) = np.asarray(held.position), motion()
+    expected = 0.5 * (servo_torque(q, 0.0) + servo_torque(q, 0.01))
+    np.testing.assert_allclose(held.torque, expected, atol=2e-4)
+
+
+def test_the_twin_refuses_what_it_cannot_run(scene: Scene, drive: Drive):
+    kick = Effect("kick", force=lambda theta, state: state.qvel)
+    with pytest.raises(ValueError, match="cannot run effects that depend on the state: kick"):
+        twin_replay(scene, SPACE, drive, [kick])
+    for convention in (TorqueConvention(TorqueSide.LINK, False), TorqueConvention(TorqueSide.MOTOR, True)):
+        with pytest.raises(ValueError, match="motor-side torque without gravity only"):
+            twin_replay(scene, SPACE, replace(drive, torque=convention))
+
+
+# ----- what is refused
+
+
+def test_gains_must_match(scene: Scene):
+    wrong = make_drive(scene, recording(gains=ServoGains(np.array([60.0, 30.0]), np.array([3.0, 1.0]))))
+    for check in (check_gains, servo_replay):
+        with pytest.raises(ValueError, match="servo gain of 30 for elbow, the scene has 25"):
+            check(scene, wrong)
+    with pytest.raises(ValueError, match="servo gain of 30 for elbow"):
+        twin_replay(scene, SPACE, wrong)
+    check_gains(scene, make_drive(scene, recording(gains=None)))
+
+
+def test_a_recording_without_commands_is_refused(scene: Scene):
+    log = recording(time=np.zeros(0), command=np.zeros((0, 0)), command_names=())
+    with pytest.raises(ValueError, match="'wave' holds no commands.*inverse mode"):
+        make_drive(scene, log)
+
+
+def test_missing_and_foreign_columns_are_named(scene: Scene):
+    time, command = motion()
+    with pytest.raises(ValueError, match="missing: elbow; given: shoulder"):
+        make_drive(scene, recording(command=command[:, :1], command_names=("shoulder",), gains=None))
+    with pytest.raises(ValueError, match="unknown: wrist"):
+        more = np.concatenate([command, command[:, :1]], axis=1)
+        make_drive(scene, recording(command=more, command_names=(*JOINTS, "wrist"), gains=None))
+    with pytest.raises(ValueError, match="unknown joint 'wrist'.*shoulder, elbow"):
+        make_drive(scene, recording(qpos0={"wrist": 0.0}))
+
+
+# ----- replays that blow up
+
+
+UNSTABLE = Space(
+    (joint_damping(arm(), "elbow", name="elbow_damping", std=1.0, low=-2000.0, high=50.0, scaling=Scaling.LINEAR),)
+)
+
+
+@pytest.mark.parametrize("engine", ["mjx", "mujoco"])
+def test_a_replay_that_blows_up_costs_the_penalty_and_harms_no_other(engine: str):
+    """Negative damping of 1500 N m s/rad flings the arm to infinity within a few steps."""
+    scene = arm()
+    cost = make_cost(scene, UNSTABLE, [recording()], engine=engine)
+    good = np.array([[1.0], [2.0]])
+    mixed = np.array([[1.0], [-1500.0], [2.0]])
+    np.testing.assert_array_equal(cost(mixed)[[0, 2]], cost(good))
+    assert cost(mixed)[1] == cost.comparisons[0].config.non_finite_cost == 1000.0
+    np.testing.assert_array_equal(cost.failed(mixed), [False, True, False])
+    np.testing.assert_array_equal(cost.rollouts(mixed)[0].finite, [True, False, True])
+    z = cost.whitened(mixed)
+    assert np.isfinite(z).all() and np.mean(z[1] ** 2) > 100 * np.mean(z[0] ** 2)
+
+
+def test_actuators_with_a_state_of_their_own_are_refused(tmp_path: Path):
+    """The scan does not carry activations: a filtered actuator would be reset at every step."""
+    xml = ARM.format(gravcomp="", friction="", sensor="").replace(
+        '<position name="s" joint="shoulder" kp="60"/>',
+        '<position name="s" joint="shoulder" kp="60" timeconst="0.1"/>',
+    )
+    with pytest.raises(ValueError, match="activation|state"):
+        filtered = compile_scene(mujoco.MjSpec.from_string(xml), "arm", joints=JOINTS)
+        servo_replay(filtered, make_drive(filtered, recording()))
