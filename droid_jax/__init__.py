@@ -1,0 +1,110 @@
+"""Physics parameters from one demonstration: MuJoCo MJX replays, joint torques, CMA-ES.
+
+    import droid_jax
+
+    droid_jax.tune()
+    scene = droid_jax.load_scene("my_robot.xml")
+
+Each public name is loaded when it is first asked for (PEP 562): importing the package starts neither
+jax nor mujoco, so `tune` can come first, and asking for the cost loads neither evosax nor brax.
+docs/own-robot.md shows the names at work.
+"""
+
+from __future__ import annotations
+
+import importlib
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from droid_jax.compare.cost import make_cost as make_cost
+    from droid_jax.identify.gaussian import Gaussian as Gaussian
+    from droid_jax.identify.pipeline import IdentifyConfig as IdentifyConfig
+    from droid_jax.identify.pipeline import identify as identify
+    from droid_jax.measure.formats import load as load_recording
+    from droid_jax.measure.formats import save as save_recording
+    from droid_jax.measure.recording import Recording as Recording
+    from droid_jax.model.door import door_nuisances as door_nuisances
+    from droid_jax.model.door import door_space as door_space
+    from droid_jax.model.parameters import Parameter as Parameter
+    from droid_jax.model.parameters import Scaling as Scaling
+    from droid_jax.model.parameters import Space as Space
+    from droid_jax.model.scene import Scene as Scene
+    from droid_jax.model.scene import door_scene as door_scene
+    from droid_jax.model.scene import load_scene as load_scene
+    from droid_jax.runtime import tune as tune
+
+__all__ = [
+    "tune",
+    "Parameter",
+    "Space",
+    "Scaling",
+    "Scene",
+    "door_scene",
+    "load_scene",
+    "door_space",
+    "door_nuisances",
+    "Recording",
+    "load_recording",
+    "save_recording",
+    "make_cost",
+    "identify",
+    "IdentifyConfig",
+    "Gaussian",
+]
+
+# Public name -> (module, name in it).  `identify` is missing: see `_Room`.
+_HOMES = {
+    "tune": ("runtime", "tune"),
+    "Parameter": ("model.parameters", "Parameter"),
+    "Space": ("model.parameters", "Space"),
+    "Scaling": ("model.parameters", "Scaling"),
+    "Scene": ("model.scene", "Scene"),
+    "door_scene": ("model.scene", "door_scene"),
+    "load_scene": ("model.scene", "load_scene"),
+    "door_space": ("model.door", "door_space"),
+    "door_nuisances": ("model.door", "door_nuisances"),
+    "Recording": ("measure.recording", "Recording"),
+    "load_recording": ("measure.formats", "load"),
+    "save_recording": ("measure.formats", "save"),
+    "make_cost": ("compare.cost", "make_cost"),
+    "IdentifyConfig": ("identify.pipeline", "IdentifyConfig"),
+    "Gaussian": ("identify.gaussian", "Gaussian"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    """A public name, loaded now and kept; AttributeError lists them for an unknown one."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}; public: {', '.join(__all__)}")
+    found = _load(*_HOMES[name])
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+def _load(module: str, name: str) -> Any:
+    """A name out of a module of this package."""
+    from droid_jax.runtime import quiet
+
+    with quiet():
+        return getattr(importlib.import_module(f"{__name__}.{module}"), name)
+
+
+class _Room(ModuleType):
+    """The room `droid_jax.identify`, which can be called like the function of that name in it.
+
+    Importing anything from the room hangs the room here under its name, so the public name
+    `identify` would be a function before and a module after; a module that can be called is both.
+    """
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """`droid_jax.identify.pipeline.identify`."""
+        return _load("identify.pipeline", "identify")(*args, **kwargs)
+
+
+# The room's own file is empty: importing it loads nothing.
+importlib.import_module(f"{__name__}.identify").__class__ = _Room

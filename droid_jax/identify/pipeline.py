@@ -148,7 +148,12 @@ def identify(
     refined = None
     if config.refine is not None:
         refined = refine(
-            base.whitened, full, starts(full, space, found), config.refine, progress=lambda p: report("refine", p)
+            base.whitened,
+            full,
+            starts(full, space, found),
+            config.refine,
+            hypotheses=grip_hypotheses(space),
+            progress=lambda p: report("refine", p),
         )
     best, full_gaussian = _distribution(full, space, found, refined, base)
     seconds["refine"] = time.monotonic() - began
@@ -186,6 +191,16 @@ def starts(full: Space, space: Space, found: Fit) -> np.ndarray:
     searched = full.values(dict(zip(space.names, found.best.tolist(), strict=True)))
     firm = full.values({n: _firm(full, n) for n in full.names if "friction" in n and "loss" not in n})
     return np.stack([searched, firm])
+
+
+def grip_hypotheses(space: Space) -> list[dict[str, float]]:
+    """Which fingers slip: each sliding friction alone, and all, at its initial mean.
+
+    Slip is a basin of its own: from a sticking finger no derivative sees it.
+    """
+    sliding = {p.name: p.mean for p in space.parameters if p.name.startswith("sliding_friction")}
+    alone = [{name: mean} for name, mean in sliding.items()]
+    return [*alone, sliding] if len(sliding) > 1 else alone
 
 
 def _firm(space: Space, name: str) -> float:

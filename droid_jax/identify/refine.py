@@ -8,7 +8,7 @@ one batch: the central differences of all starts, then one batch of trial steps.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,7 @@ import numpy as np
 from droid_jax.model.parameters import Space
 
 Residuals = Callable[[np.ndarray], np.ndarray]
+Hypotheses = Sequence[Mapping[str, float]]
 
 
 @dataclass(frozen=True)
@@ -28,8 +29,9 @@ class RefineConfig:
     smallest_step: and of later ones at least, search units (below it solver noise would show).
     main_prior: prior deviation of parameters of interest, search units.
     tolerance: stop when an iteration lowers the objective by less than this share.
-    prune_after, keep: after so many iterations only starts within `keep` times the best go on.
-    scans: how often a finished start may look far along each parameter for something better.
+    keep: after iteration i only starts within keep[i] times the best objective go on (the last
+      number holds from there on).
+    hold: iterations for which the values of a hypothesis are held while all else settles.
     """
 
     iterations: int = 20
@@ -37,9 +39,8 @@ class RefineConfig:
     smallest_step: float = 0.03
     main_prior: float = 4.0
     tolerance: float = 2e-3
-    prune_after: int = 4
-    keep: float = 1.5
-    scans: int = 3
+    keep: tuple[float, ...] = (10.0, 4.0, 2.0, 1.3, 1.3, 1.0)
+    hold: int = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,11 +86,14 @@ def refine(
     starts: Any,
     config: RefineConfig | None = None,
     *,
+    hypotheses: Hypotheses = (),
     progress: Callable[[RefineProgress], None] | None = None,
 ) -> Refined:
     """Refine one or several starts [D] or [S, D] (physical values).
 
     residuals: [P, D] physical values -> [P, M] whitened residuals (rows are independent).
+    hypotheses: assignments {name: value} that may lie in another basin (a finger that slips, say),
+      each tried once from where the starts converged.
     Raises ValueError where no start gives finite residuals.
     """
     config = config or RefineConfig()
@@ -103,26 +107,26 @@ def refine(
     ended = np.full(len(x), np.inf)
     alive = np.arange(len(x))
     state = _State(x, residual, objective, np.full(len(x), 1e-3), np.full(x.shape, config.step))
-    scans, converged, iteration = config.scans, False, 0
+    converged, iteration = False, 0
     for iteration in range(1, config.iterations + 1):
         state, gain = _step(batch, state, box, prior, config)
         ended[alive] = state.objective
         best = float(state.objective.min())
         if progress is not None:
             progress(RefineProgress(iteration, config.iterations, 2 * best / residual.shape[1]))
-        keep = state.objective <= config.keep * best if iteration >= config.prune_after else np.full(len(alive), True)
+        keep = state.objective <= config.keep[min(iteration, len(config.keep)) - 1] * best
         state, gain, alive = state.rows(keep), gain[keep], alive[keep]
         leader = int(np.argmin(state.objective))
         if gain[leader] > config.tolerance:
             continue
         state = state.rows(np.arange(len(alive)) == leader)
         alive = alive[[leader]]
-        scans -= 1
-        scanned = _scan(batch, state, box, prior) if scans >= 0 else None
-        if scanned is None or scanned.objective[0] > (1 - config.tolerance) * state.objective[0]:
+        branched = _explore(batch, state, box, prior, config, hypotheses) if hypotheses else state
+        hypotheses = ()
+        if branched.objective[0] > (1 - config.tolerance) * state.objective[0]:
             converged = True
             break
-        state = scanned
+        state = branched
     winner = state.rows(np.arange(len(alive)) == int(np.argmin(state.objective)))
     ended[alive] = np.minimum(ended[alive], state.objective)
     return Refined(
@@ -155,35 +159,43 @@ class _State:
 
 
 def _step(
-    batch: _Batch, state: _State, box: np.ndarray, prior: np.ndarray, config: RefineConfig
+    batch: _Batch,
+    state: _State,
+    box: np.ndarray,
+    prior: np.ndarray,
+    config: RefineConfig,
+    held: np.ndarray | None = None,
 ) -> tuple[_State, np.ndarray]:
-    """One iteration of all live starts; also the share by which each objective fell."""
+    """One iteration of all live starts; also the share by which each objective fell. held: [S, D] bool, stay put."""
     jacobian = _jacobian(batch, state.x, state.widths, box)
     x, residual, objective, damping, gain = _try_steps(
-        batch, state.x, state.residual, state.objective, jacobian, state.damping, box
+        batch, state.x, state.residual, state.objective, jacobian, state.damping, box, held
     )
     return _State(x, residual, objective, damping, _next_widths(jacobian, prior, config)), gain
 
 
-_SCAN = np.array([-4.0, -3.0, -2.0, -1.0, -0.5, 0.5, 1.0, 2.0, 3.0, 4.0])  # search units
+def _explore(
+    batch: _Batch, state: _State, box: np.ndarray, prior: np.ndarray, config: RefineConfig, hypotheses: Hypotheses
+) -> _State:
+    """Follow each hypothesis from a converged start: hold its values while all else settles, then free them.
 
-
-def _scan(batch: _Batch, state: _State, box: np.ndarray, prior: np.ndarray) -> _State:
-    """The best point when each parameter of interest alone moves far: one batch, a way out of local minima.
-
-    Where a grasp starts to slip the residuals have corners that no derivative sees from afar.
+    Returns the better of what was found and `state`, as one start.
     """
-    interest = np.flatnonzero(prior > 1.0)
-    points = np.repeat(state.x, len(interest) * len(_SCAN), axis=0)
-    columns = np.repeat(interest, len(_SCAN))
-    points[np.arange(len(points)), columns] += np.tile(_SCAN, len(interest))
-    points = np.clip(points, *box)
-    residual, objective = batch(points)
-    pick = int(np.argmin(objective))
-    if objective[pick] >= state.objective[0]:
-        return state
-    chosen = slice(pick, pick + 1)
-    return _State(points[chosen], residual[chosen], objective[chosen], np.full(1, 1e-3), state.widths)
+    space = batch.space
+    x = np.repeat(state.x, len(hypotheses), axis=0)
+    held = np.zeros(x.shape, bool)
+    for row, hypothesis in enumerate(hypotheses):
+        for name, value in hypothesis.items():
+            column = space.index(name)
+            x[row, column] = space[name].to_search(value)
+            held[row, column] = True
+    residual, objective = batch(np.clip(x, *box))
+    widths = np.repeat(state.widths, len(x), axis=0)
+    branches = _State(np.clip(x, *box), residual, objective, np.full(len(x), 1e-3), widths)
+    for iteration in range(config.hold + 1):
+        branches, _ = _step(batch, branches, box, prior, config, held if iteration < config.hold else None)
+    found = branches.rows(np.arange(len(x)) == int(np.argmin(branches.objective)))
+    return found if found.objective[0] < state.objective[0] else state
 
 
 class _Batch:
@@ -228,6 +240,7 @@ def _try_steps(
     jacobian: np.ndarray,
     damping: np.ndarray,
     box: np.ndarray,
+    held: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """All dampings of all starts in one batch; each start takes its best step, or stays.
 
@@ -239,6 +252,7 @@ def _try_steps(
         hessian = jacobian[s].T @ jacobian[s] + np.diag(batch.prior**-2)
         slope = jacobian[s].T @ residual[s] + x[s] / batch.prior**2
         free = ~(((x[s] <= box[0]) & (slope > 0)) | ((x[s] >= box[1]) & (slope < 0)))
+        free &= True if held is None else ~held[s]
         for k, factor in enumerate(_DAMPINGS):
             damped = hessian + damping[s] * factor * np.diag(np.diag(hessian))
             step = np.zeros(dims)

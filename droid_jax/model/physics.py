@@ -103,7 +103,7 @@ def derive(model: Any) -> Any:
     subtree = _subtree_mass(model)
     stat = model.stat.replace(meaninertia=jnp.mean(diagonal), meanmass=subtree[0] / (model.nbody - 1))
     slides = model.body_simple == _SLIDES_ONLY
-    of_mass = 1.0 / jnp.where(slides, model.body_mass, 1.0)
+    of_mass = 1.0 / jnp.where(slides, jnp.asarray(model.body_mass), 1.0)
     of_body = jnp.stack([of_mass, jnp.zeros_like(of_mass)], axis=-1)
     bodies = jnp.where(slides[:, None], of_body, _body_invweight(model, data, inverse))
     dofs = _dof_average(model) @ jnp.diagonal(inverse)

@@ -13,6 +13,7 @@ with elliptic cones goes through mjx.solve.
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -125,13 +126,21 @@ def solve(inertia: jax.Array, data: Any) -> Any:
     return data.tree_replace({"_impl.efc_force": force})
 
 
-def _line_search(forces, residual: jax.Array, along: jax.Array, linear: jax.Array, quadratic: jax.Array) -> jax.Array:
+def _line_search(
+    forces: Callable[[jax.Array], tuple[jax.Array, jax.Array]],
+    residual: jax.Array,
+    along: jax.Array,
+    linear: jax.Array,
+    quadratic: jax.Array,
+) -> jax.Array:
     """Root of the cost's slope along a step: Newton's method on the share taken, kept in a bracket.
 
     The slope at share t is linear + t * quadratic - forces(residual + t * along) . along; it rises
     with t (the cost is convex) and is piecewise linear, so Newton ends after a few corners.
     """
-    low, high, share = jnp.zeros(()), jnp.full((), jnp.inf), jnp.ones(())
+    low: jax.Array = jnp.zeros(())
+    high: jax.Array = jnp.full((), jnp.inf)
+    share: jax.Array = jnp.ones(())
     for _ in range(LINE_SEARCH):
         force, curvature = forces(residual + share * along)
         slope = linear + share * quadratic - force @ along

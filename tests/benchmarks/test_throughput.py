@@ -166,8 +166,8 @@ def test_a_quick_run_ends_in_one_line_of_json(tmp_path):
         assert result["commit"].removesuffix("-dirty") == git.stdout.strip()
     assert 0.1 < result["peak_memory_gib"] < 8.0
     assert result["untuned_steps_per_s"] is None
-    # Free motion: both engines compute the same torque to what float32 and the integrators leave.
-    assert result["finite"] == 1.0 and result["torque_difference_n_m"] < 0.01
+    # Free motion: what is left is the C engine's first order in the time step, 0.005 N m of tens.
+    assert result["finite"] == 1.0 and result["torque_difference_n_m"] < 0.03
 
     rows = result["rows"]
     measured = {(row["engine"], row["population"]) for row in rows}

@@ -91,12 +91,12 @@ def test_a_bad_parameter_is_refused(changes: dict, says: str):
 
 
 def test_log_scaling_needs_a_positive_range():
-    with pytest.raises(ValueError, match="low \\+ floor > 0"):
+    with pytest.raises(ValueError, match=r"low \+ floor > 0"):
         log(floor=0.0)
 
 
 def test_a_prior_outside_the_bounds_is_refused_by_name():
-    with pytest.raises(ValueError, match="'damping'.*outside its bounds"):
+    with pytest.raises(ValueError, match=r"'damping'.*outside its bounds"):
         SPACE.with_prior(damping=(25.0, 1.0))
 
 
@@ -110,7 +110,7 @@ def test_a_prior_outside_the_bounds_is_refused_by_name():
     ],
 )
 def test_unknown_names_list_the_valid_ones(ask):
-    with pytest.raises(ValueError, match="unknown parameter 'dampin'.*offset, damping, stiffness"):
+    with pytest.raises(ValueError, match=r"unknown parameter 'dampin'.*offset, damping, stiffness"):
         ask()
 
 
@@ -125,12 +125,12 @@ def test_names_are_unique_and_some_are_given():
 def test_check_says_which_value_is_outside(bad: float):
     values = random_values(4)
     values[2, 1] = bad
-    with pytest.raises(ValueError, match="'damping'.*N m s/rad is not inside its bounds \\[0.0, 20.0\\]"):
+    with pytest.raises(ValueError, match=r"'damping'.*N m s/rad is not inside its bounds \[0.0, 20.0\]"):
         SPACE.check(values)
 
 
 def test_check_refuses_other_lengths():
-    with pytest.raises(ValueError, match="\\[\\.\\.\\., 3\\].*\\(5, 2\\)"):
+    with pytest.raises(ValueError, match=r"\[\.\.\., 3\].*\(5, 2\)"):
         SPACE.check(np.zeros((5, 2)))
 
 

@@ -24,9 +24,11 @@ ARM = """
   <worldbody>
     <geom name="post" size=".03" fromto=".25 -.3 .22 .25 .3 .22"/>
     <geom name="rail" size=".05" fromto=".42 -.3 .05 .42 .3 .05"/>
-    <body name="a" pos="0 0 .5"><joint name="a" axis="0 1 0" range="-.4 1.5" limited="true" frictionloss=".8" damping=".5"/>
+    <body name="a" pos="0 0 .5">
+      <joint name="a" axis="0 1 0" range="-.4 1.5" limited="true" frictionloss=".8" damping=".5"/>
       <geom name="ga" size=".03" fromto="0 0 0 .3 0 0"/>
-      <body name="b" pos=".3 0 0"><joint name="b" axis="0 1 0" range="-1 1" limited="true" frictionloss=".3" damping=".2"/>
+      <body name="b" pos=".3 0 0">
+        <joint name="b" axis="0 1 0" range="-1 1" limited="true" frictionloss=".3" damping=".2"/>
         <geom name="gb" size=".025" fromto="0 0 0 .25 0 0"/>
         <body name="c" pos=".25 0 0"><joint name="c" axis="0 0 1" damping=".1" armature=".01"/>
           <geom name="gc" size=".02" fromto="0 0 0 .2 0 0"/>{tip}</body></body></body>
@@ -201,13 +203,16 @@ def test_the_warm_start_of_the_answer_stays_there(case):
 
 # ----- single rows, against what can be written on paper
 
-SPINNER = """<mujoco><compiler angle="radian"/><option timestep="0.002" gravity="0 0 0" integrator="implicitfast"/><worldbody>
+SPINNER = """<mujoco><compiler angle="radian"/>
+<option timestep="0.002" gravity="0 0 0" integrator="implicitfast"/><worldbody>
   <body><joint name="j" axis="0 0 1" frictionloss="0.5" {joint}/>
   <inertial mass="1" pos="0 0 0" diaginertia="0.1 0.1 0.1"/><geom size=".1" contype="0" conaffinity="0"/></body>
 </worldbody><actuator><motor joint="j"/></actuator></mujoco>"""
 
 
-def run_spinner(joint: str, *, torque: float, speed: float, steps: int, parity: bool = True) -> tuple[np.ndarray, np.ndarray]:
+def run_spinner(
+    joint: str, *, torque: float, speed: float, steps: int, parity: bool = True
+) -> tuple[np.ndarray, np.ndarray]:
     model = mujoco.MjModel.from_xml_string(SPINNER.format(joint=joint))
     on_device = mjx.put_model(model)
     data = mjx.make_data(on_device).replace(ctrl=jnp.array([torque]), qvel=jnp.array([speed]))
@@ -247,6 +252,7 @@ def test_a_limit_holds():
 
 
 # ----- the step
+
 
 def rollout_c(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, steps: int) -> np.ndarray:
     data = mujoco.MjData(model)

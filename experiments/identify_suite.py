@@ -1,0 +1,280 @@
+"""What identification reaches on the stand-in robot: doors of Table I, calibration, second arm pose, C parity.
+
+    python experiments/identify_suite.py [--quick] [--out DIR] [--parts doors calibration pose parity]
+
+Every case is one JSON file under DIR/identify_cases/ and is not run again, so the suite can be
+stopped and goes on where it was.  DIR/identify.json sums them up.  Truths and seeds of a case
+derive from its number alone.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
+
+import tuned  # noqa: E402, F401  (before jax starts)
+
+# isort: split
+import json  # noqa: E402
+
+import numpy as np  # noqa: E402
+import scipy.stats  # noqa: E402
+import tyro  # noqa: E402
+
+from benchmarks.common import origin, write_json  # noqa: E402
+from droid_jax.compare.cost import make_cost  # noqa: E402
+from droid_jax.identify.gaussian import prior  # noqa: E402
+from droid_jax.identify.pipeline import Identified, IdentifyConfig, cost_samples, identify  # noqa: E402
+from droid_jax.identify.refine import RefineConfig  # noqa: E402
+from droid_jax.identify.search import SearchConfig  # noqa: E402
+from droid_jax.measure.demonstration import demonstration_path  # noqa: E402
+from droid_jax.measure.formats import load  # noqa: E402
+from droid_jax.measure.recording import Recording  # noqa: E402
+from droid_jax.measure.surrogate import draw_nuisances, record, stand_in_truth  # noqa: E402
+from droid_jax.model.door import JOINT_DAMPING, door_nuisances, door_space  # noqa: E402
+from droid_jax.model.door import truth as table_i  # noqa: E402
+from droid_jax.model.scene import Scene, door_scene  # noqa: E402
+
+Part = Literal["doors", "calibration", "pose", "parity"]
+MUST_BE_KNOWN = ("hinge_stiffness", "hinge_frictionloss", "hinge_damping", *JOINT_DAMPING)
+TIMESTEP = 0.004  # s: the replay's second-order step is as good here as at 2 ms (docs/architecture.md)
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Options of the suite."""
+
+    quick: bool = False
+    """One case of each part with a small budget: shows that it runs, says nothing about quality."""
+    out: Path = ROOT / "benchmarks" / "results"
+    """Folder of identify.json and of the cases."""
+    parts: tuple[Part, ...] = ("doors", "calibration", "pose", "parity")
+    """Which parts to run."""
+    calibration: int = 20
+    """Doors of the calibration part."""
+
+
+def settings(quick: bool, seed: int) -> IdentifyConfig:
+    """The budget of a case."""
+    search = SearchConfig(population=30, parents=None, generations=3 if quick else 20, seed=seed)
+    return IdentifyConfig(search=search, refine=RefineConfig(iterations=2 if quick else 20), seed=seed)
+
+
+def recordings(scene: Scene, truth: dict[str, float], names: str, seed: int) -> list[Recording]:
+    """Ten repeats of each demonstration on the stand-in robot."""
+    return [record(scene, load(demonstration_path(n)), truth, seed=100 * seed + i, name=n) for i, n in enumerate(names)]
+
+
+def describe(found: Identified, truth: dict[str, float]) -> dict[str, Any]:
+    """A case's figures: gap closed, every parameter with truth, interval and verdict."""
+    low, high = found.full_gaussian.interval(0.9)
+    parameters = {
+        p.name: {
+            "truth": truth[p.name],
+            "best": float(found.best[i]),
+            "interval": [float(low[i]), float(high[i])],
+            "inside": bool(low[i] <= truth[p.name] <= high[i]),
+            "identifiable": found.tells[i].identifiable,
+            "shrinkage": found.tells[i].shrinkage,
+            "nuisance": p.nuisance,
+        }
+        for i, p in enumerate(found.full.parameters)
+    }
+    refined = found.refined
+    return {
+        "gap": {n: {k: getattr(g, k) for k in ("before", "after", "floor", "closed")} for n, g in found.gaps.items()},
+        "parameters": parameters,
+        "mean_square": None if refined is None else float(np.mean(refined.residual**2)),
+        "converged": None if refined is None else refined.converged,
+        "evaluations": found.search.evaluations + (refined.evaluations if refined else 0),
+        "seconds": found.seconds,
+        "rule": found.gaussian.rule,
+    }  # fmt: skip
+
+
+def fit(truth: dict[str, float], names: str, seed: int, quick: bool) -> tuple[Identified, dict[str, Any]]:
+    """Record, identify, describe."""
+    scene = door_scene(timestep=TIMESTEP)
+    found = identify(
+        scene,
+        door_space(scene),
+        recordings(scene, truth, names, seed),
+        nuisances=door_nuisances(scene),
+        config=settings(quick, seed),
+    )
+    return found, describe(found, truth)
+
+
+def door_case(springs: int, quick: bool) -> dict[str, Any]:
+    """A door of Table I from demonstrations A and C, with 200 samples of the initial and fitted Gaussian."""
+    truth = stand_in_truth(door_scene(), springs, springs)
+    found, result = fit(truth, "A" if quick else "AC", springs, quick)
+    samples = cost_samples(found, 20 if quick else 200, springs)
+    for key in ("initial_cost", "fitted_cost"):
+        result[key] = {
+            "median": float(np.median(samples[key])),
+            "quantiles_5_95": np.quantile(samples[key], [0.05, 0.95]).tolist(),
+        }
+    return result
+
+
+def calibration_case(number: int, quick: bool) -> dict[str, Any]:
+    """A random door: hinge log-uniform, the rest around Table I, nuisances on.
+
+    Doors whose grip fails on the stand-in are drawn again: a demonstration opens the door.
+    """
+    scene = door_scene()
+    space = door_space(scene)
+    rng = np.random.default_rng([number, 77])
+    while True:
+        truth = {p.name: float(np.clip(rng.normal(p.mean, p.std), p.low, p.high)) for p in space.parameters}
+        hinge = {"hinge_stiffness": (0.01, 3), "hinge_frictionloss": (0.01, 1.5), "hinge_damping": (0.1, 6)}
+        for name, (low, high) in hinge.items():
+            truth[name] = float(np.exp(rng.uniform(np.log(low), np.log(high))))
+        truth |= draw_nuisances(scene, 1000 + number)
+        try:
+            _, result = fit(truth, "A" if quick else "AC", 500 + number, quick)
+            return result
+        except ValueError as error:
+            if "grasp" not in str(error):
+                raise
+
+
+def pose_case(demonstration: str, quick: bool) -> dict[str, Any]:
+    """The one-spring door from one opening alone, with the arm pose of A or of B (paper, section IV-C)."""
+    truth = stand_in_truth(door_scene(), 1, 1)
+    _, result = fit(truth, demonstration, 900 + ord(demonstration), quick)
+    return result
+
+
+def parity_case(_: int, quick: bool) -> dict[str, Any]:
+    """MJX against the C engine over the whole opening: traces, and the rank correlation of the cost."""
+    scene = door_scene(timestep=0.002)
+    space = door_space(scene)
+    truth = stand_in_truth(scene, 1, 1)
+    data = recordings(scene, truth, "A", 1)
+    values = prior(space).sample(0, 8 if quick else 200)
+    costs, torques = {}, {}
+    for engine in ("mjx", "mujoco"):
+        cost = make_cost(scene, space, data, engine=engine)
+        costs[engine] = cost(values)
+        torques[engine] = cost.rollouts(values[:8])[0].torque
+    error = torques["mjx"] - torques["mujoco"]
+    grasp = next(p for p in data[0].phases if p.name == "grasp")
+    contact = int(grasp.start / 0.002)
+    tables = np.stack([space.values(table_i(k)) for k in (0, 1, 2)])
+    return {
+        "rank_correlation": float(scipy.stats.spearmanr(costs["mjx"], costs["mujoco"]).statistic),
+        "samples": len(values),
+        "rms_before_contact": np.sqrt(np.mean(error[:, :contact] ** 2, axis=(0, 1))).tolist(),
+        "rms_whole": np.sqrt(np.mean(error**2, axis=(0, 1))).tolist(),
+        "table_i_costs": {e: make_cost(scene, space, data, engine=e)(tables).tolist() for e in ("mjx", "mujoco")},
+    }
+
+
+def run_cases(arguments: Arguments) -> dict[str, dict[str, Any]]:
+    """Run what is missing; returns all cases by name."""
+    quick = arguments.quick
+    cases: dict[str, Callable[[], dict[str, Any]]] = {}
+    if "doors" in arguments.parts:
+        for k in (1,) if quick else (0, 1, 2):
+            cases[f"door_{k}"] = lambda k=k: door_case(k, quick)
+    if "parity" in arguments.parts:
+        cases["parity"] = lambda: parity_case(0, quick)
+    if "pose" in arguments.parts:
+        for name in "A" if quick else "AB":
+            cases[f"pose_{name}"] = lambda name=name: pose_case(name, quick)
+    if "calibration" in arguments.parts:
+        for k in range(1 if quick else arguments.calibration):
+            cases[f"calibration_{k:02d}"] = lambda k=k: calibration_case(k, quick)
+    folder = arguments.out / ("identify_cases_quick" if quick else "identify_cases")
+    results = {}
+    for number, (name, run) in enumerate(cases.items(), 1):
+        path = folder / f"{name}.json"
+        if not path.is_file():
+            print(f"[{number}/{len(cases)}] {name} ...", flush=True)
+            write_json(path, {**run(), "origin": origin(0)})
+        results[name] = json.loads(path.read_text())
+    return results
+
+
+def summarise(cases: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """The figures of issue and paper: gap closed, errors, coverage, agreement of the poses."""
+    out: dict[str, Any] = {}
+    doors = {n: c for n, c in cases.items() if n.startswith("door_")}
+    if doors:
+        out["doors"] = {n: _door_summary(c) for n, c in doors.items()}
+    calibration = [c for n, c in cases.items() if n.startswith("calibration_")]
+    if calibration:
+        out["calibration"] = _coverage(calibration)
+    if {"pose_A", "pose_B"} <= set(cases):
+        out["pose_agreement"] = _agreement(cases["pose_A"], cases["pose_B"])
+    if "parity" in cases:
+        out["parity"] = {k: v for k, v in cases["parity"].items() if k != "origin"}
+    return out
+
+
+def _door_summary(case: dict[str, Any]) -> dict[str, Any]:
+    main = {n: p for n, p in case["parameters"].items() if not p["nuisance"]}
+    known = [p for p in main.values() if p["identifiable"]]
+    damping = [abs(main[n]["best"] / main[n]["truth"] - 1) for n in JOINT_DAMPING]
+    return {
+        "gap_closed": {n: g["closed"] for n, g in case["gap"].items()},
+        "stiffness_error": main["hinge_stiffness"]["best"] - main["hinge_stiffness"]["truth"],
+        "frictionloss_error": main["hinge_frictionloss"]["best"] - main["hinge_frictionloss"]["truth"],
+        "largest_joint_damping_error": max(damping),
+        "identifiable": sum(p["identifiable"] for p in main.values()),
+        "identifiable_inside_90": sum(p["inside"] for p in known) / max(len(known), 1),
+        "not_called_identifiable": [n for n in MUST_BE_KNOWN if not main[n]["identifiable"]],
+        "converged": case["converged"],
+        "mean_square": case["mean_square"],
+        "seconds": sum(case["seconds"].values()),
+    }
+
+
+def _coverage(cases: list[dict[str, Any]]) -> dict[str, Any]:
+    """Share of identifiable parameters whose 90 % interval holds the truth, with a bootstrap over doors."""
+    known = [[p["inside"] for p in c["parameters"].values() if p["identifiable"] and not p["nuisance"]] for c in cases]
+    rng = np.random.default_rng(0)
+    draws = [
+        np.mean(np.concatenate([known[i] for i in rng.integers(len(known), size=len(known))])) for _ in range(2000)
+    ]
+    return {
+        "doors": len(cases),
+        "converged": sum(bool(c["converged"]) for c in cases),
+        "parameters": int(sum(len(k) for k in known)),
+        "coverage": float(np.mean(np.concatenate(known))),
+        "coverage_interval_95": np.quantile(draws, [0.025, 0.975]).tolist(),
+    }
+
+
+def _agreement(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
+    """Do the two poses' 90 % intervals overlap for what both identify?"""
+    names = [
+        n for n, p in a["parameters"].items()
+        if not p["nuisance"] and p["identifiable"] and b["parameters"][n]["identifiable"]
+    ]  # fmt: skip
+    overlap = [
+        max(a["parameters"][n]["interval"][0], b["parameters"][n]["interval"][0])
+        <= min(a["parameters"][n]["interval"][1], b["parameters"][n]["interval"][1])
+        for n in names
+    ]
+    return {"parameters": names, "overlapping": float(np.mean(overlap)) if names else None}
+
+
+def main() -> None:
+    arguments = tyro.cli(Arguments, description=__doc__)
+    cases = run_cases(arguments)
+    result = {**origin(0), **summarise(cases)}
+    write_json(arguments.out / ("identify_quick.json" if arguments.quick else "identify.json"), result)
+    print(json.dumps(summarise(cases)))
+
+
+if __name__ == "__main__":
+    main()

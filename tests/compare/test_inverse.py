@@ -1,0 +1,151 @@
+"""The inverse replay against mj_inverse and closed forms from the C engine."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from droid_jax import runtime
+from droid_jax.compare.replay import Motion, inverse_replay, torque_offset_effect
+from droid_jax.measure.recording import TorqueConvention, TorqueSide
+from droid_jax.model.door import torque_offsets
+from droid_jax.model.fields import body_mass, joint_damping
+from droid_jax.model.parameters import Space
+from droid_jax.model.physics import make_c_model, make_physics
+from droid_jax.model.scene import ARM, Scene, compile_scene, door_scene
+from droid_jax.model.seam import Effect, Rollout
+
+MOTOR, LINK = TorqueSide.MOTOR, TorqueSide.LINK
+PLANAR = """<mujoco><compiler angle="radian"/><worldbody>
+  <body {gravcomp}><joint name="a" axis="0 1 0" armature="0.1" damping="2" {spring}/>
+    <geom type="capsule" size=".03" fromto="0 0 0 .3 0 0" mass="2"/>
+    <body pos=".3 0 0" {gravcomp}><joint name="b" axis="0 1 0" armature="0.05" damping="1"/>
+      <geom type="capsule" size=".02" fromto="0 0 0 .2 0 .1" mass="1" contype="0"/></body></body>
+</worldbody><actuator><position joint="a" kp="9"/><position joint="b" kp="9"/></actuator></mujoco>"""
+
+
+def motion(scene: Scene, side: TorqueSide, gravity: bool, count: int = 40) -> Motion:
+    rng = np.random.default_rng(2)
+    ids = [scene.id("joint", j) for j in scene.joints]
+    low, high = scene.model.jnt_range[ids].T if scene.model.jnt_range[ids].any() else (-1.0, 1.0)
+    size = (count, len(scene.joints))
+    return Motion(
+        time=0.01 * np.arange(count),
+        position=rng.uniform(low, high, size),
+        velocity=rng.normal(0, 1.0, size),
+        acceleration=rng.normal(0, 3.0, size),
+        torque=TorqueConvention(side, gravity),
+    )
+
+
+def replayed(scene: Scene, space: Space, values: np.ndarray, given: Motion, *effects: Effect) -> Rollout:
+    replay = inverse_replay(scene, given, effects)
+    compiled = jax.jit(lambda v: replay(make_physics(scene, space, v)), compiler_options=runtime.compiler_options())
+    return jax.tree.map(np.asarray, compiled(jnp.asarray(values, jnp.float32)))
+
+
+def expected(model: mujoco.MjModel, scene: Scene, given: Motion) -> np.ndarray:
+    """[T, J] N m by mj_inverse, with the parts that the convention leaves out taken out of the model."""
+    model = model.__copy__()
+    model.body_gravcomp[:] = 0
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    if not given.torque.gravity:
+        model.opt.gravity[:] = 0
+    friction = model.dof_frictionloss[scene.joint_dofs] * np.sign(given.velocity)
+    if given.torque.side is LINK:
+        model.dof_armature[scene.joint_dofs] = 0
+        model.dof_damping[scene.joint_dofs] = 0
+        friction = 0 * friction
+    data, out = mujoco.MjData(model), []
+    for q, v, a in zip(given.position, given.velocity, given.acceleration, strict=True):
+        mujoco.mj_resetData(model, data)
+        data.qpos[scene.joint_qpos], data.qvel[scene.joint_dofs], data.qacc[scene.joint_dofs] = q, v, a
+        mujoco.mj_inverse(model, data)
+        out.append(data.qfrc_inverse[scene.joint_dofs].copy())
+    return np.array(out) + friction
+
+
+@pytest.fixture(scope="module")
+def panda() -> tuple[Scene, Space]:
+    scene = door_scene()
+    names = [joint_damping(scene, j, name=f"damping_{j}", std=1.0, high=100.0) for j in ARM]
+    return scene, Space((*names, body_mass(scene, "link3", std=0.5, high=10.0), *torque_offsets(ARM)))
+
+
+# float32 dynamics: 6e-8 of inertias times accelerations and of 60 N m of weight
+TOLERANCE = 3e-4
+
+
+@pytest.mark.parametrize(
+    ("side", "gravity"),
+    [
+        (MOTOR, False),
+        (LINK, True),
+        pytest.param(MOTOR, True, marks=pytest.mark.slow),
+        pytest.param(LINK, False, marks=pytest.mark.slow),
+    ],
+)
+def test_the_panda_against_mj_inverse(panda: tuple[Scene, Space], side: TorqueSide, gravity: bool):
+    scene, space = panda
+    values = space.values({"damping_panda_joint2": 3.0, "link3_mass": 4.5})
+    given = motion(scene, side, gravity)
+    got = replayed(scene, space, values, given)
+    np.testing.assert_allclose(got.torque, expected(make_c_model(scene, space, values), scene, given), atol=TOLERANCE)
+    assert got.finite
+    np.testing.assert_allclose(got.position, given.position, rtol=1e-6)
+    np.testing.assert_allclose(got.velocity, given.velocity, rtol=1e-6)
+
+
+def planar(*, gravcomp: bool = True, spring: str = "") -> Scene:
+    xml = PLANAR.format(gravcomp='gravcomp="1"' if gravcomp else "", spring=spring)
+    return compile_scene(mujoco.MjSpec.from_string(xml), "planar")
+
+
+def check_planar(scene: Scene, side: TorqueSide, gravity: bool) -> None:
+    space = Space(torque_offsets(scene.joints))
+    given = motion(scene, side, gravity)
+    got = replayed(scene, space, space.mean, given)
+    np.testing.assert_allclose(got.torque, expected(scene.model, scene, given), atol=5e-5)
+
+
+@pytest.mark.parametrize("side", [MOTOR, LINK])
+@pytest.mark.parametrize("gravity", [True, False])
+def test_gravity_is_the_recordings_choice_not_the_files(side: TorqueSide, gravity: bool):
+    """Whether the MJCF compensates its weight must not change what a log with gravity is compared with."""
+    for gravcomp in (True, False):
+        check_planar(planar(gravcomp=gravcomp), side, gravity)
+
+
+def test_springs_pull_on_either_side():
+    for side in (MOTOR, LINK):
+        check_planar(planar(spring='stiffness="5" springref="0.3"'), side, False)
+
+
+def test_dry_friction_opposes_the_motion_on_the_motor_side():
+    scene = planar(spring='frictionloss="0.7"')
+    space = Space(torque_offsets(scene.joints))
+    given = motion(scene, MOTOR, False)
+    got = replayed(scene, space, space.mean, given).torque
+    without = replayed(planar(), space, space.mean, given).torque
+    np.testing.assert_allclose(got[:, 0] - without[:, 0], 0.7 * np.sign(given.velocity[:, 0]), atol=1e-5)
+
+
+def test_observation_effects_are_applied(panda: tuple[Scene, Space]):
+    scene = planar()
+    space = Space(torque_offsets(scene.joints))
+    given = motion(scene, LINK, True)
+    plain = replayed(scene, space, space.mean, given).torque
+    values = space.values({"torque_offset[b]": 0.3})
+    shifted = replayed(scene, space, values, given, torque_offset_effect(scene.joints)).torque
+    np.testing.assert_allclose(shifted - plain, np.tile([0.0, 0.3], (40, 1)), atol=1e-5)
+
+
+@pytest.mark.parametrize("part", ["force", "command", "frictionloss"])
+def test_effects_that_a_prescribed_motion_cannot_have_are_refused(part: str):
+    scene = planar()
+    effect = Effect("backlash", **{part: lambda *_: None})
+    with pytest.raises(ValueError, match="backlash"):
+        inverse_replay(scene, motion(scene, MOTOR, False), [effect])

@@ -1,0 +1,260 @@
+"""The public names: loaded when asked for, and the code in the documents runs as it is printed."""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+import droid_jax as dj
+from droid_jax import runtime
+from droid_jax.identify.pipeline import identify as identify_function
+from droid_jax.identify.refine import RefineConfig
+from droid_jax.identify.search import SearchConfig
+from droid_jax.model.own import load_parameters
+from droid_jax.run import main
+
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLE = ROOT / "docs" / "examples" / "two_link.py"
+HEAVY = ("jax", "mujoco", "evosax", "brax", "flax", "matplotlib", "tyro")
+SMALL = dj.IdentifyConfig(
+    search=SearchConfig(population=10, parents=None, generations=3), refine=RefineConfig(iterations=8)
+)
+
+
+def loaded(code: str) -> set[str]:
+    """Which of HEAVY a new Python has loaded after running code."""
+    probe = f"{code}\nimport sys, json; print(json.dumps([m for m in {HEAVY!r} if m in sys.modules]))"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
+    run = subprocess.run([sys.executable, "-c", probe], env=environment, capture_output=True, text=True, timeout=120)
+    assert run.returncode == 0, run.stderr
+    assert "warp" not in run.stdout
+    return set(json.loads(run.stdout.splitlines()[-1]))
+
+
+# ----- what is loaded when
+
+
+@pytest.mark.parametrize(
+    ("code", "expected"),
+    [
+        ("import droid_jax", set()),
+        ("import droid_jax; dir(droid_jax)", set()),
+        ("from droid_jax import Parameter, Space, Scaling, Recording, load_recording, save_recording", set()),
+        ("from droid_jax import identify, Gaussian", set()),
+        ("from droid_jax import load_scene, door_scene, Scene, door_space, door_nuisances", {"mujoco"}),
+        ("from droid_jax import make_cost", {"jax", "mujoco"}),
+    ],
+)
+def test_a_name_loads_no_more_than_it_needs(code: str, expected: set[str]):
+    assert loaded(code) == expected
+
+
+def test_tune_can_follow_any_import_that_does_not_start_jax():
+    """`import droid_jax`, scene and parameters first, then tune: what the documents do."""
+    code = (
+        "import droid_jax as dj\nfrom droid_jax.model.fields import joint_damping\n"
+        "from droid_jax.measure.recording import Channel\ndj.load_scene, dj.Space\n"
+        "assert dj.tune(devices=2).devices == 2\nimport jax; assert jax.local_device_count() == 2"
+    )
+    assert "jax" in loaded(code)
+
+
+def test_every_public_name_is_there_and_kept():
+    assert len(set(dj.__all__)) == len(dj.__all__) == 16
+    for name in dj.__all__:
+        assert getattr(dj, name) is getattr(dj, name)
+        assert name in dir(dj)
+    assert dj.load_recording is importlib.import_module("droid_jax.measure.formats").load
+    assert dj.tune is runtime.tune
+
+
+def test_static_and_lazy_names_are_the_same():
+    """What type checkers see in the TYPE_CHECKING block is what __getattr__ gives."""
+    source = inspect.getsource(dj)
+    seen = {
+        new: (module, old) for module, old, new in re.findall(r"from droid_jax\.(\S+) import (\w+) as (\w+)", source)
+    }
+    assert seen.pop("identify") == ("identify.pipeline", "identify")
+    assert seen == dj._HOMES
+    assert {*seen, "identify"} == set(dj.__all__)
+
+
+def test_an_unknown_name_is_refused():
+    with pytest.raises(AttributeError, match=r"no attribute 'make_coast'; public: .*make_cost"):
+        dj.make_coast  # noqa: B018
+    with pytest.raises(ImportError, match="make_coast"):
+        exec("from droid_jax import make_coast")
+
+
+@pytest.mark.parametrize("before", ["", "from droid_jax import Gaussian\n", "import droid_jax.identify.search as s\n"])
+def test_identify_is_callable_and_a_room_whatever_came_first(before: str):
+    code = (
+        f"{before}from droid_jax import identify\nimport droid_jax\nassert callable(identify)\n"
+        "assert identify is droid_jax.identify\nimport droid_jax.identify.gaussian as g\n"
+        "assert droid_jax.identify.gaussian is g"
+    )
+    loaded(code)
+
+
+def test_identify_passes_everything_on():
+    with pytest.raises(ValueError, match="different names"):
+        dj.identify(None, None, [TINY, TINY])
+    with pytest.raises(TypeError, match="colour"):
+        dj.identify(None, None, [TINY], colour="red")
+
+
+TINY = dj.Recording("twice", np.zeros(0), np.zeros((0, 0)), (), {}, None, {})  # type: ignore[arg-type]
+
+
+# ----- the example
+
+
+@pytest.fixture(scope="module")
+def example() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("two_link", EXAMPLE)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def recording(example: ModuleType) -> dj.Recording:
+    return example.record()
+
+
+def test_the_example_is_short(example: ModuleType):
+    lines = inspect.getsource(example.fit).splitlines()
+    assert len(lines) < 20
+
+
+def test_the_example_recovers_the_arm(example: ModuleType, recording: dj.Recording):
+    """A small budget, far from the truth: the guesses are off by 27, 35, 67 and 71 percent."""
+    found = example.fit(recording, SMALL)
+    truth = np.array([example.TRUTH[name] for name in found.space.names])
+    assert np.abs(found.space.mean / truth - 1).min() > 0.2
+    np.testing.assert_allclose(found.best, truth, rtol=0.01)
+    assert [t.name for t in found.tells if not t.identifiable] == []
+    (gap,) = found.gaps.values()
+    # two joints with 0.02 N m each: sqrt(pi / 2) times that is the mean norm
+    assert gap.after == pytest.approx(0.0251, rel=0.05)
+    assert gap.before > 0.5
+
+
+@pytest.mark.slow
+def test_the_example_runs_as_a_script(example: ModuleType, tmp_path: Path):
+    """A process of its own, with the default settings."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
+    run = subprocess.run(
+        [sys.executable, str(EXAMPLE)], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300
+    )
+    assert run.returncode == 0, run.stderr
+    assert (tmp_path / "runs" / "two_link.npz").is_file()
+    rows = re.findall(r"^(\w+) +(\S+) \[(\S+), (\S+)\].*truth (\S+)$", run.stdout, re.MULTILINE)
+    assert [r[0] for r in rows] == list(example.TRUTH)
+    for name, best, low, high, truth in rows:
+        assert float(best) == pytest.approx(example.TRUTH[name], rel=0.01)
+        assert float(low) < float(best) < float(high)
+        assert float(truth) == pytest.approx(example.TRUTH[name], abs=1e-3)
+
+
+# ----- the documents
+
+
+def blocks(document: str, language: str) -> list[str]:
+    """Fenced code blocks of one language, in order."""
+    text = (ROOT / document).read_text()
+    found = re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    assert found, f"{document} has no {language} block"
+    return found
+
+
+@pytest.fixture
+def workplace(tmp_path: Path, recording: dj.Recording, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with what the documents call my_robot.xml and my_log.npz; small budgets, jax tuned already."""
+    shutil.copy(EXAMPLE.with_suffix(".xml"), tmp_path / "my_robot.xml")
+    dj.save_recording(recording, tmp_path / "my_log.npz")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(dj, "tune", lambda: None)
+    monkeypatch.setattr(runtime, "tune", lambda: None)
+    monkeypatch.setattr(dj, "identify", lambda *a, **options: identify_function(*a, config=SMALL, **options))
+    return tmp_path
+
+
+def test_the_readme_identifies_a_robot_in_ten_lines(workplace: Path, capsys: pytest.CaptureFixture[str]):
+    (code,) = blocks("README.md", "python")
+    assert len(code.splitlines()) <= 11
+    exec(compile(code, "README.md", "exec"), {})
+    printed = dict(line.split(": ") for line in capsys.readouterr().out.splitlines())
+    assert list(printed) == ["elbow_damping", "forearm_mass"]
+    content = json.loads((workplace / "gaussian.json").read_text())
+    assert [p["name"] for p in content["space"]] == list(printed)
+
+
+@pytest.mark.slow
+def test_the_code_of_own_robot_runs(workplace: Path, capsys: pytest.CaptureFixture[str]):
+    names: dict[str, object] = {}
+    for code in blocks("docs/own-robot.md", "python"):
+        exec(compile(code, "own-robot.md", "exec"), names)
+    out = capsys.readouterr().out
+    assert "of the gap closed" in out and "(64, 1500, 2)" in out
+    assert dj.load_recording("wave.npz").repeats == 10
+    assert np.shape(names["samples"]) == (1000, 4)
+    assert names["space"].names[-1] == "elbow_rotor"  # type: ignore[attr-defined]
+
+
+def test_the_json_of_own_robot_is_a_space(workplace: Path):
+    (text,) = blocks("docs/own-robot.md", "json")
+    (workplace / "parameters.json").write_text(text)
+    space = load_parameters("parameters.json", dj.load_scene("my_robot.xml"))
+    assert space.names == ("forearm_mass", "shoulder_damping", "elbow_damping", "elbow_frictionloss")
+    np.testing.assert_allclose(space.mean, [0.8, 2.0, 1.0, 0.1])
+
+
+@pytest.mark.slow
+def test_the_command_of_own_robot_runs(workplace: Path):
+    (text,) = blocks("docs/own-robot.md", "json")
+    (workplace / "parameters.json").write_text(text)
+    (command,) = blocks("docs/own-robot.md", "sh")
+    words = shlex.split(command)
+    assert words[:3] == ["python", "-m", "droid_jax.run"]
+    assert main([*words[3:], "--generations", "4", "--population", "10"]) == 0
+    files = {p.name for p in (workplace / "runs" / "mine").iterdir()}
+    assert {"report.html", "fit.json", "gaussian.json", "fitted.xml", "config.json", "checkpoints"} <= files
+    found = {p["name"]: p["best"] for p in json.loads((workplace / "runs/mine/fit.json").read_text())["parameters"]}
+    assert found["forearm_mass"] == pytest.approx(1.1, rel=0.01)
+    fitted = dj.load_scene(workplace / "runs" / "mine" / "fitted.xml")
+    assert fitted.model.body("forearm").mass[0] == pytest.approx(found["forearm_mass"], rel=1e-4)
+
+
+@pytest.mark.parametrize("document", ["README.md", *(f"docs/{p.name}" for p in sorted((ROOT / "docs").glob("*.md")))])
+def test_links_between_documents_lead_somewhere(document: str):
+    path = ROOT / document
+    targets = re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", path.read_text())
+    missing = [t for t in targets if "://" not in t and not (path.parent / t).exists()]
+    assert missing == []
+
+
+def test_the_documents_name_only_files_that_exist():
+    """Paths of this repository in backticks."""
+    text = "".join((ROOT / d).read_text() for d in ("README.md", "docs/paper.md", "docs/own-robot.md"))
+    named = set(re.findall(r"`((?:experiments|benchmarks|mjcf|tests|docs)/[\w./]+\.\w+)`", text))
+    assert named and [n for n in sorted(named) if not (ROOT / n).exists()] == []
+
+
+def test_the_tree_of_the_architecture_is_the_packages():
+    text = (ROOT / "docs" / "architecture.md").read_text()
+    tree = text.split("```")[1]
+    files = {p.name for p in (ROOT / "droid_jax").rglob("*.py")} - {"__init__.py"}
+    assert sorted(files - set(re.findall(r"[\w]+\.py", tree))) == []
