@@ -19,6 +19,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from mujoco import mjx
 
 from droid_jax.model.patches import exact_segments, midpoint_constraints
@@ -85,45 +86,72 @@ def solve(inertia: jax.Array, data: Any) -> Any:
     Source: MuJoCo documentation, "Computation", section "Solver" (primal problem).
     """
     rows = data._impl
-    weight: jax.Array = rows.efc_D
-    equalities = rows.ne
-    dry = slice(rows.ne, rows.ne + rows.nf)
-    bound = rows.efc_frictionloss
+    jacobian, weight = rows.efc_J, rows.efc_D
+    low, high = _force_bounds(rows)
+    products = jnp.concatenate([jacobian[:, i:] * jacobian[:, i : i + 1] for i in range(inertia.shape[0])], axis=1)
+    entry = _packed_index(inertia.shape[0])
 
     def forces(residual: jax.Array) -> tuple[jax.Array, jax.Array]:
         """[rows] forces and curvatures at J a - aref."""
-        active = residual < 0
-        force = jnp.where(active, -weight * residual, 0.0)
-        if equalities:
-            active = active.at[:equalities].set(True)
-            force = force.at[:equalities].set((-weight * residual)[:equalities])
-        if rows.nf:
-            free = (-weight * residual)[dry]
-            active = active.at[dry].set(jnp.abs(free) < bound[dry])
-            force = force.at[dry].set(jnp.clip(free, -bound[dry], bound[dry]))
-        return force, jnp.where(active, weight, 0.0)
+        free = -weight * residual
+        force = jnp.clip(free, low, high)
+        return force, jnp.where(force == free, weight, 0.0)
 
     def iterate(carry):
-        qacc, residual, count, _ = carry
-        force, curvature = forces(residual)
-        pull = inertia @ qacc - data.qfrc_smooth
-        hessian = inertia + (rows.efc_J.T * curvature) @ rows.efc_J
-        factor = jax.scipy.linalg.cho_factor(hessian)
-        change = jax.scipy.linalg.cho_solve(factor, rows.efc_J.T @ force - pull)
-        along = rows.efc_J @ change
-        share = _line_search(forces, residual, along, pull @ change, change @ (inertia @ change))
-        moved = jnp.max(jnp.abs(change)) > _TOLERANCE * (1.0 + jnp.max(jnp.abs(qacc)))
-        return qacc + share * change, residual + share * along, count + 1, moved
+        qacc, residual, force, curvature, count, _ = carry
+        pull = _times(inertia, qacc) - data.qfrc_smooth
+        hessian = inertia + (curvature @ products)[entry]
+        factor = jax.lax.linalg.cholesky(hessian, symmetrize_input=False)
+        change = _solve_factored(factor, _times(jacobian.T, force) - pull)
+        along = _times(jacobian, change)
+        share = _line_search(forces, residual, along, _dot(pull, change), _dot(change, _times(inertia, change)))
+        qacc, residual = qacc + share * change, residual + share * along
+        force, new_curvature = forces(residual)
+        # A full step that leaves every row where it was has solved a quadratic problem exactly.
+        exact = jnp.all(new_curvature == curvature) & (jnp.abs(share - 1.0) < 1e-3)
+        moved = jnp.max(jnp.abs(share * change)) > _TOLERANCE * (1.0 + jnp.max(jnp.abs(qacc)))
+        return qacc, residual, force, new_curvature, count + 1, moved & ~exact
 
     def unfinished(carry):
-        return carry[3] & (carry[2] < ITERATIONS)
+        return carry[5] & (carry[4] < ITERATIONS)
 
-    qacc = data.qacc_warmstart
-    start = (qacc, rows.efc_J @ qacc - rows.efc_aref, jnp.zeros((), jnp.int32), jnp.array(True))
-    qacc, _, _, _ = jax.lax.while_loop(unfinished, iterate, start)
-    force, _ = forces(rows.efc_J @ qacc - rows.efc_aref)
-    data = data.replace(qacc=qacc, qfrc_constraint=rows.efc_J.T @ force)
+    residual = _times(jacobian, data.qacc_warmstart) - rows.efc_aref
+    start = (data.qacc_warmstart, residual, *forces(residual), jnp.zeros((), jnp.int32), jnp.array(True))
+    qacc, _, force, _, _, _ = jax.lax.while_loop(unfinished, iterate, start)
+    data = data.replace(qacc=qacc, qfrc_constraint=_times(jacobian.T, force))
     return data.tree_replace({"_impl.efc_force": force})
+
+
+# Sums of products in place of small matrix products: XLA fuses them with what stands beside them,
+# where each `dot` of a batch would be a call of its own.
+def _times(matrix: jax.Array, vector: jax.Array) -> jax.Array:
+    return jnp.sum(matrix * vector, axis=-1)
+
+
+def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
+    return jnp.sum(a * b)
+
+
+def _force_bounds(rows: Any) -> tuple[jax.Array, jax.Array]:
+    """[rows] the range of each row's force: any (equality), +- friction loss, or pushing only."""
+    kind = np.arange(rows.efc_D.shape[0])
+    equality, dry = kind < rows.ne, (kind >= rows.ne) & (kind < rows.ne + rows.nf)
+    low = jnp.where(equality, -jnp.inf, jnp.where(dry, -rows.efc_frictionloss, 0.0))
+    return low, jnp.where(dry, rows.efc_frictionloss, jnp.inf)
+
+
+def _packed_index(size: int) -> np.ndarray:
+    """[size, size] place of each entry in a symmetric matrix's packed upper triangle."""
+    entry = np.zeros((size, size), dtype=int)
+    row, column = np.triu_indices(size)
+    entry[row, column] = entry[column, row] = np.arange(len(row))
+    return entry
+
+
+def _solve_factored(factor: jax.Array, right: jax.Array) -> jax.Array:
+    """x of L L^T x = right, from the lower factor L."""
+    half = jax.lax.linalg.triangular_solve(factor, right[:, None], left_side=True, lower=True)
+    return jax.lax.linalg.triangular_solve(factor, half, left_side=True, lower=True, transpose_a=True)[:, 0]
 
 
 def _line_search(
@@ -143,9 +171,9 @@ def _line_search(
     share: jax.Array = jnp.ones(())
     for _ in range(LINE_SEARCH):
         force, curvature = forces(residual + share * along)
-        slope = linear + share * quadratic - force @ along
+        slope = linear + share * quadratic - _dot(force, along)
         low, high = jnp.where(slope < 0, share, low), jnp.where(slope < 0, high, share)
-        newton = share - slope / (quadratic + curvature @ (along * along) + 1e-30)
+        newton = share - slope / (quadratic + _dot(curvature, along * along) + 1e-30)
         middle = jnp.where(jnp.isinf(high), 2.0 * low, 0.5 * (low + high))
         # Where Newton stands still it has arrived; bisecting there would lose the root again.
         inside = (newton > low) & (newton < high) | (newton == share)

@@ -291,7 +291,7 @@ def test_effects_enter_where_they_say(scene: Scene, drive: Drive):
     np.testing.assert_array_equal(scaled.torque, 2.0 * plain.torque)
     # at rest the servo gives way until kp dq = 1.5 N m
     assert float(kicked.torque[-1, 1] - plain.torque[-1, 1]) < -0.5
-    q, (time, command) = np.asarray(held.position), motion()
+    q = np.asarray(held.position)
     expected = 0.5 * (servo_torque(q, 0.0) + servo_torque(q, 0.01))
     np.testing.assert_allclose(held.torque, expected, atol=2e-4)
 
@@ -333,7 +333,7 @@ def test_a_recording_without_commands_is_refused(scene: Scene):
 
 
 def test_missing_and_foreign_columns_are_named(scene: Scene):
-    time, command = motion()
+    _, command = motion()
     with pytest.raises(ValueError, match="missing: elbow; given: shoulder"):
         make_drive(scene, recording(command=command[:, :1], command_names=("shoulder",), gains=None))
     with pytest.raises(ValueError, match="unknown: wrist"):

@@ -66,11 +66,11 @@ def edited(scene: Scene, space: Space, values: np.ndarray) -> mujoco.MjModel:
             slide, twist = v[f"sliding_friction_{side}"], v[f"torsional_friction_{side}"]
             spec.pair(f"{side}_{rail}").friction = [slide, slide, twist, 1e-4, 1e-4]
     cabinet = spec.body("cabinet")
-    cabinet.pos = np.array(cabinet.pos) + [v["door_x"], v["door_y"], v["door_z"]]
+    cabinet.pos = np.add(cabinet.pos, [v["door_x"], v["door_y"], v["door_z"]])
     cabinet.quat = [np.cos(v["door_yaw"] / 2), 0, 0, np.sin(v["door_yaw"] / 2)]
-    knob.pos = np.array(knob.pos) + [0, v["knob_lever"], 0]
+    knob.pos = np.add(knob.pos, [0, v["knob_lever"], 0])
     knob_geom = spec.geom("knob")
-    knob_geom.size = np.array(knob_geom.size) + [v["knob_radius"], 0, 0]
+    knob_geom.size = np.add(knob_geom.size, [v["knob_radius"], 0, 0])
     for i in range(2, 8):
         link, scale = spec.body(f"link{i}"), v[f"link_mass_scale_{i}"]
         link.mass *= scale
@@ -257,7 +257,7 @@ def compiled(name: str, *, scale: float = 1.0, move: float = 0.0) -> mujoco.MjMo
     for geom in spec.geoms:
         geom.mass *= scale
     for body in spec.bodies[1:]:
-        body.pos = np.array(body.pos) + [0.0, move, 0.0]
+        body.pos = np.add(body.pos, [0.0, move, 0.0])
     return spec.compile()
 
 
