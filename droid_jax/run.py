@@ -245,7 +245,7 @@ def _config(command: Identify) -> IdentifyConfig:
     from droid_jax.identify.search import SearchConfig
 
     search = {
-        "quick": SearchConfig(population=30, parents=None, generations=30),
+        "quick": SearchConfig(population=30, parents=None, generations=20),
         "standard": SearchConfig(population=30, parents=None, generations=100),
         "paper": SearchConfig(population=30, parents=5, generations=100),
         "gpu": SearchConfig(population=1024, parents=None, generations=60, restarts=2),

@@ -63,7 +63,7 @@ class Arguments:
 def settings(quick: bool, seed: int) -> IdentifyConfig:
     """The budget of a case."""
     search = SearchConfig(population=30, parents=None, generations=3 if quick else 20, seed=seed)
-    return IdentifyConfig(search=search, refine=RefineConfig(iterations=2 if quick else 20), seed=seed)
+    return IdentifyConfig(search=search, refine=RefineConfig(iterations=2 if quick else 30), seed=seed)
 
 
 def recordings(scene: Scene, truth: dict[str, float], names: str, seed: int) -> list[Recording]:

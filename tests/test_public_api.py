@@ -23,7 +23,7 @@ from droid_jax.identify.pipeline import identify as identify_function
 from droid_jax.identify.refine import RefineConfig
 from droid_jax.identify.search import SearchConfig
 from droid_jax.model.own import load_parameters
-from droid_jax.run import main
+from droid_jax.run import Identify, _config, _model, main
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLE = ROOT / "docs" / "examples" / "two_link.py"
@@ -208,7 +208,7 @@ def test_the_code_of_own_robot_runs(workplace: Path, capsys: pytest.CaptureFixtu
     for code in blocks("docs/own-robot.md", "python"):
         exec(compile(code, "own-robot.md", "exec"), names)
     out = capsys.readouterr().out
-    assert "of the gap closed" in out and "(64, 1500, 2)" in out
+    assert "of the gap closed" in out and "(64, 600, 2)" in out
     assert dj.load_recording("wave.npz").repeats == 10
     assert np.shape(names["samples"]) == (1000, 4)
     assert names["space"].names[-1] == "elbow_rotor"  # type: ignore[attr-defined]
@@ -251,6 +251,24 @@ def test_the_documents_name_only_files_that_exist():
     text = "".join((ROOT / d).read_text() for d in ("README.md", "docs/paper.md", "docs/own-robot.md"))
     named = set(re.findall(r"`((?:experiments|benchmarks|mjcf|tests|docs)/[\w./]+\.\w+)`", text))
     assert named and [n for n in sorted(named) if not (ROOT / n).exists()] == []
+
+
+def test_the_presets_are_those_of_the_command_line():
+    """The table in docs/method.md, row by row."""
+    rows = re.findall(
+        r"^\| (quick|standard|paper|gpu) \| (\d+) \| (\d+) \| (\d+) \| (\d+) \| (\d) ms \| (yes|no) \|$",
+        (ROOT / "docs" / "method.md").read_text(),
+        re.MULTILINE,
+    )
+    assert [r[0] for r in rows] == ["quick", "standard", "paper", "gpu"]
+    for preset, *numbers, step, refined in rows:
+        command = Identify(preset=preset)
+        config, search = _config(command), _config(command).search
+        assert [search.population, search.elite, search.generations, search.restarts] == [int(n) for n in numbers]
+        assert (config.refine is not None) == (refined == "yes")
+        scene, _, nuisances = _model(command)
+        assert scene.model.opt.timestep == pytest.approx(int(step) / 1000)
+        assert (nuisances is not None) == (preset != "paper")
 
 
 def test_the_tree_of_the_architecture_is_the_packages():

@@ -34,7 +34,7 @@ class RefineConfig:
     hold: iterations for which the values of a hypothesis are held while all else settles.
     """
 
-    iterations: int = 20
+    iterations: int = 30
     step: float = 0.3
     smallest_step: float = 0.03
     main_prior: float = 4.0

@@ -27,6 +27,7 @@ from droid_jax.model.patches import exact_segments, midpoint_constraints
 ITERATIONS = 8  # at most; two or three are usual from a warm start
 LINE_SEARCH = 6  # corners of the piecewise linear slope followed in one step
 _TOLERANCE = 3e-6  # of the acceleration's scale: what float32 can still tell apart
+_ROUNDING = 1e-5  # of a Newton step: how exactly float32 solves for it
 
 
 def step(model: Any, data: Any, *, parity: bool = False) -> Any:
@@ -107,10 +108,12 @@ def solve(inertia: jax.Array, data: Any) -> Any:
         share = _line_search(forces, residual, along, _dot(pull, change), _dot(change, _times(inertia, change)))
         qacc, residual = qacc + share * change, residual + share * along
         force, new_curvature = forces(residual)
-        # A full step that leaves every row where it was has solved a quadratic problem exactly.
-        exact = jnp.all(new_curvature == curvature) & (jnp.abs(share - 1.0) < 1e-3)
-        moved = jnp.max(jnp.abs(share * change)) > _TOLERANCE * (1.0 + jnp.max(jnp.abs(qacc)))
-        return qacc, residual, force, new_curvature, count + 1, moved & ~exact
+        # What is left of the way: all of it, but where no row changed sides the problem was quadratic
+        # and the share missing to a full step is left, or what the factorisation rounds off.
+        unchanged = jnp.all(new_curvature == curvature)
+        left = jnp.where(unchanged, jnp.maximum(jnp.abs(share - 1.0), _ROUNDING), 1.0) * jnp.max(jnp.abs(change))
+        moved = left > _TOLERANCE * (1.0 + jnp.max(jnp.abs(qacc)))
+        return qacc, residual, force, new_curvature, count + 1, moved
 
     def unfinished(carry):
         return carry[5] & (carry[4] < ITERATIONS)

@@ -237,7 +237,7 @@ MECHANISMS = {
       <geom size=".1" mass="2"/></body>""",
     "slide and hinge": """<body name="a"><joint type="slide" axis="1 0 0"/><joint axis="0 0 1"/>
       <geom size=".1 .2 .3" type="box" mass="2"/></body>""",
-    "hinge through the centre": '<body name="a"><joint axis="0 0 1"/><geom size=".1 .2 .3" type="box" mass="2"/></body>',
+    "central hinge": '<body name="a"><joint axis="0 0 1"/><geom size=".1 .2 .3" type="box" mass="2"/></body>',
     "finger": """<body name="a"><joint axis="0 1 0"/><geom size=".1 .2 .3" type="box" pos=".2 0 0" mass="2"/>
       <body name="b" pos=".3 0 0"><joint type="slide" axis="0 1 0" armature=".3"/><geom size=".1" mass=".2"/></body>
       </body>""",
