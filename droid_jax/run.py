@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import json
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -104,7 +105,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     actions: dict[type, Callable[[Any], None]] = {Identify: run_identify, Record: run_record, Report: run_report}
     try:
         actions[type(command)](command)
-    except (ValueError, FileNotFoundError, NotADirectoryError, PermissionError) as error:
+    except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
@@ -119,6 +120,7 @@ def run_identify(command: Identify) -> None:
     from droid_jax import runtime
 
     runtime.tune()
+    runtime.import_mjx()
     from droid_jax.identify.pipeline import cost_samples, identify
     from droid_jax.identify.results import prepare_folder, write_run
     from droid_jax.report.progress import stages
@@ -131,6 +133,7 @@ def run_identify(command: Identify) -> None:
     scene, space, nuisances = _model(command)
     recordings, truth = _recordings(command, scene, out)
     config = _config(command)
+    _begin(out, setup, command.again)
     started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     with stages(("search", "refine", "judge", "sample")) as progress:
         found = identify(
@@ -162,7 +165,7 @@ def run_identify(command: Identify) -> None:
         "setup": setup,
     }
     write_run(out, found, description, truth=truth, samples=samples)
-    _draw(out, found)
+    _draw(out, found, recordings[0])
     run_report(Report(out))
     _summary(found)
 
@@ -193,14 +196,17 @@ def run_report(command: Report) -> None:
 def _model(command: Identify) -> tuple[Scene, Space, Space | None]:
     """The scene, what is fitted, and the nuisances beside it."""
     from droid_jax.model.door import door_nuisances, door_space
-    from droid_jax.model.own import load_parameters
+    from droid_jax.model.own import friction_joints, load_parameters
     from droid_jax.model.scene import door_scene, load_scene
 
     if command.scene is not None:
         if command.parameters is None:
             raise ValueError("--scene needs --parameters FILE.json, the list of what to fit (docs/own-robot.md)")
         scene = load_scene(
-            command.scene, joints=command.joints or None, object_joint=command.object_joint, friction_joints=()
+            command.scene,
+            joints=command.joints or None,
+            object_joint=command.object_joint,
+            friction_joints=friction_joints(command.parameters),
         )
         return scene, load_parameters(command.parameters, scene), None
     timestep = {"quick": 0.004, "standard": 0.002, "paper": 0.002, "gpu": 0.002}[command.preset]
@@ -228,7 +234,7 @@ def _recordings(command: Identify, scene: Scene, out: Path) -> tuple[list[Record
     truth = stand_in_truth(scene, command.springs, command.seed, nuisances=command.preset != "paper")
     recordings = []
     for index, name in enumerate(names):
-        path = out / "recordings" / f"{name}.npz"
+        path = out / "recordings" / f"{name}_springs{command.springs}_seed{command.seed}.npz"
         if command.again or not path.is_file():
             print(f"recording the stand-in robot: demonstration {name}, 10 repeats ...", flush=True)
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -269,43 +275,48 @@ def _plain(value: Any) -> Any:
 
 
 def _finished(out: Path, setup: dict[str, Any], again: bool) -> bool:
-    """True where the folder holds this very run, whole; an interrupted or other one is said so."""
-    import json
-    import shutil
-
-    if again:
-        for name in ("config.json", "checkpoints", "recordings"):
-            path = out / name
-            shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
-        return False
-    path = out / "config.json"
-    if not path.is_file():
+    """True where the folder holds this very run, whole. A folder with another run in it is refused."""
+    path = out / "setup.json"
+    if again or not path.is_file():
         return False
     try:
-        before = json.loads(path.read_text())["setup"]
-    except (json.JSONDecodeError, KeyError, UnicodeDecodeError):
-        raise ValueError(f"{path} is damaged; choose another --out, or start over with --again") from None
-    if before != setup:
+        before = json.loads(path.read_text())
         changed = sorted(k for k in {*before, *setup} if before.get(k) != setup.get(k))
+    except (json.JSONDecodeError, UnicodeDecodeError, AttributeError, TypeError):
+        raise ValueError(f"{path} is damaged; choose another --out, or start over with --again") from None
+    if changed:
         raise ValueError(
-            f"{out} holds a finished run with other settings ({', '.join(changed)}); choose another --out, or --again"
+            f"{out} holds a run with other settings ({', '.join(changed)}); choose another --out, or --again"
         )
+    if not (out / "config.json").is_file():
+        print(f"{out} holds this run unfinished; going on")
+        return False
     print(f"{out} holds this run already; its report is built again (start over with --again)")
     return True
 
 
-def _draw(out: Path, found: Any) -> None:
+def _begin(out: Path, setup: dict[str, Any], again: bool) -> None:
+    """Only now, with all input read, forget an earlier run where that was asked for, and say what runs here."""
+    import shutil
+
+    from droid_jax.identify.results import write_json
+
+    if again:
+        shutil.rmtree(out / "checkpoints", ignore_errors=True)
+        (out / "config.json").unlink(missing_ok=True)
+    write_json(out / "setup.json", setup)
+
+
+def _draw(out: Path, found: Any, recording: Recording) -> None:
     """Frames of the fitted replay; without OpenGL the report says that there are none."""
     from droid_jax.compare.replay import make_drive
     from droid_jax.measure.engine import poses
-    from droid_jax.measure.formats import load
     from droid_jax.model.physics import make_c_model
     from droid_jax.report.render import NoOpenGL, frames, save_frames
 
-    first = out / "recordings" / f"{found.heldout.comparisons[0].name}.npz"
-    if not first.is_file() or found.scene.grip is None:
+    if found.scene.grip is None:
         return
-    drive = make_drive(found.scene, load(first))
+    drive = make_drive(found.scene, recording)
     qpos = poses(make_c_model(found.scene, found.full, found.best), drive.qpos0, drive.command)
     rows = [int(f * (len(qpos) - 1)) for f in (0.0, 0.33, 0.6, 1.0)]
     try:

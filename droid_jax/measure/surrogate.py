@@ -83,6 +83,8 @@ def record(
     demonstration is safe by definition: choose another truth).
     """
     config = config or SurrogateConfig()
+    if config.repeats < 1:
+        raise ValueError(f"the stand-in robot needs at least one repeat, got {config.repeats}")
     rng = np.random.default_rng([seed, 2])
     hidden = _hidden_scene(scene, config)
     models, qpos0 = _repeats(hidden, truth, demonstration, config, rng)

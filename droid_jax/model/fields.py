@@ -62,6 +62,8 @@ def model_parameter(
     mean: default is the model's own number (mode SET) or the mode's neutral value.
     options: further fields of `Parameter` (nuisance, group, scaling, floor, width).
     """
+    if field == "dof_frictionloss":
+        _check_frictionloss(scene, element)
     first = element_index(scene, field, element)
     index = (first,) if column is None else (first, column)
     if mean is None:
@@ -78,6 +80,14 @@ def model_parameter(
         writes=(Write(field, index, mode),),
         **options,
     )
+
+
+def _check_frictionloss(scene: Scene, joint: str) -> None:
+    if scene.model.dof_frictionloss[scene.dof(joint)] < TINY_FRICTIONLOSS:
+        raise ValueError(
+            f"joint {joint!r} was compiled with friction loss 0, which MJX can never raise; "
+            f"give it {TINY_FRICTIONLOSS:g} in the MJCF or name it in load_scene(friction_joints=...)"
+        )
 
 
 def joint_damping(scene: Scene, joint: str, *, std: float, high: float, **options: Any) -> Parameter:
@@ -98,11 +108,6 @@ def joint_frictionloss(scene: Scene, joint: str, *, std: float, high: float, **o
     Raises ValueError where the model was compiled with friction loss 0: MJX lays the constraint
     row out at compilation, so it could never be raised (see `load_scene(friction_joints=...)`).
     """
-    if scene.model.dof_frictionloss[scene.dof(joint)] < TINY_FRICTIONLOSS:
-        raise ValueError(
-            f"joint {joint!r} was compiled with friction loss 0, which MJX can never raise; "
-            f"give it {TINY_FRICTIONLOSS:g} in the MJCF or name it in load_scene(friction_joints=...)"
-        )
     options = {"unit": "N m", "scaling": Scaling.LOG, "floor": 0.05, **options}
     return model_parameter(scene, "dof_frictionloss", joint, std=std, high=high, **options)
 

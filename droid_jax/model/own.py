@@ -25,7 +25,17 @@ _KNOWN = (
 
 def load_parameters(path: str | Path, scene: Scene) -> Space:
     """The space described in a JSON file; ValueError names the file, the entry and what is wrong with it."""
-    path = Path(path)
+    entries = _entries(Path(path))
+    return Space(tuple(_parameter(scene, entry, f"{path}, entry {i + 1}") for i, entry in enumerate(entries)))
+
+
+def friction_joints(path: str | Path) -> tuple[str, ...]:
+    """Joints whose friction loss the file asks for: the scene must be compiled with a row for them."""
+    entries = [e for e in _entries(Path(path)) if isinstance(e, dict)]
+    return tuple(str(e["element"]) for e in entries if e.get("field") == "dof_frictionloss" and "element" in e)
+
+
+def _entries(path: Path) -> list[Any]:
     if not path.is_file():
         raise FileNotFoundError(f"no parameter file at {path}")
     try:
@@ -34,7 +44,7 @@ def load_parameters(path: str | Path, scene: Scene) -> Space:
         raise ValueError(f"{path}: not JSON ({error})") from None
     if not isinstance(entries, list) or not entries:
         raise ValueError(f"{path}: expected a list of parameters, got {type(entries).__name__}")
-    return Space(tuple(_parameter(scene, entry, f"{path}, entry {i + 1}") for i, entry in enumerate(entries)))
+    return entries
 
 
 def _parameter(scene: Scene, entry: Any, where: str) -> Parameter:

@@ -287,9 +287,17 @@ def load_scene(
 
 
 def _attach(spec: mujoco.MjSpec, file: Path, site: str) -> None:
-    with warnings.catch_warnings():  # our three files share no names, so no prefix is needed
-        warnings.simplefilter("ignore", UserWarning)
-        spec.attach(mujoco.MjSpec.from_file(str(file)), site=spec.site(site), prefix="")
+    """Attach a file's model without a prefix: our three files share no names.
+
+    MuJoCo warns of an empty prefix twice, through Python and on stderr with a log file; both are silenced.
+    """
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            spec.attach(mujoco.MjSpec.from_file(str(file)), site=spec.site(site), prefix="")
+    finally:
+        mujoco.set_mju_user_warning(None)
 
 
 def _set_gains(spec: mujoco.MjSpec, stiffness: Sequence[float], damping: Sequence[float]) -> None:

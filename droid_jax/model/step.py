@@ -87,7 +87,8 @@ def solve(inertia: jax.Array, data: Any) -> Any:
     Source: MuJoCo documentation, "Computation", section "Solver" (primal problem).
     """
     rows = data._impl
-    jacobian, weight = rows.efc_J, rows.efc_D
+    jacobian: jax.Array = rows.efc_J
+    weight: jax.Array = rows.efc_D
     low, high = _force_bounds(rows)
     products = jnp.concatenate([jacobian[:, i:] * jacobian[:, i : i + 1] for i in range(inertia.shape[0])], axis=1)
     entry = _packed_index(inertia.shape[0])
@@ -139,8 +140,9 @@ def _force_bounds(rows: Any) -> tuple[jax.Array, jax.Array]:
     """[rows] the range of each row's force: any (equality), +- friction loss, or pushing only."""
     kind = np.arange(rows.efc_D.shape[0])
     equality, dry = kind < rows.ne, (kind >= rows.ne) & (kind < rows.ne + rows.nf)
-    low = jnp.where(equality, -jnp.inf, jnp.where(dry, -rows.efc_frictionloss, 0.0))
-    return low, jnp.where(dry, rows.efc_frictionloss, jnp.inf)
+    loss: jax.Array = rows.efc_frictionloss
+    low = jnp.where(equality, -jnp.inf, jnp.where(dry, -loss, 0.0))
+    return low, jnp.where(dry, loss, jnp.inf)
 
 
 def _packed_index(size: int) -> np.ndarray:

@@ -177,14 +177,14 @@ def test_accelerations_are_those_of_the_c_engine(case):
 
 
 def test_the_minimum_is_that_of_a_float64_newton(case):
-    """On MJX's own rows, so that nothing but the solver is tested: float32 keeps six digits."""
+    """On MJX's own rows, so that nothing but the solver is tested: float32 keeps five digits."""
     _, model, qpos, qvel, run, (qacc, _, _) = case
     rows = mjx.make_data(mjx.put_model(model))._impl
     (got, _), problems = run(qpos, qvel, np.zeros_like(qvel))
     exact = np.array(
         [minimum({k: v[i] for k, v in problems.items()}, rows.ne, rows.nf, qacc[i]) for i in range(len(qpos))]
     )
-    assert error(np.asarray(got), exact).max() < 5e-6
+    assert error(np.asarray(got), exact).max() < 1e-5
 
 
 def test_any_warm_start_ends_at_the_same_place(case):
