@@ -87,6 +87,15 @@ def check_gains(scene: Scene, drive: Drive) -> None:
             )
 
 
+def check_stateless(scene: Scene) -> None:
+    """Raise ValueError for actuators with an activation of their own, which the scan does not carry."""
+    if scene.model.na:
+        raise ValueError(
+            f"scene {scene.name!r} has actuators with a state of their own (activation); a replay needs plain "
+            "position servos or motors: remove dyntype or timeconst"
+        )
+
+
 def servo_replay(scene: Scene, drive: Drive, effects: Sequence[Effect] = (), *, parity: bool = False) -> Replay:
     """The scan over time steps that follows the command. Torques carry the time of the state they act on.
 
@@ -95,6 +104,7 @@ def servo_replay(scene: Scene, drive: Drive, effects: Sequence[Effect] = (), *, 
     parity: step exactly as the C engine does (see `droid_jax.model.step`), for comparisons with it.
     """
     check_gains(scene, drive)
+    check_stateless(scene)
     template = mjx.make_data(scene.mjx)
     fingers = _finger_geoms(scene)
     table = jnp.asarray(drive.command, jnp.float32)
@@ -115,7 +125,7 @@ def servo_replay(scene: Scene, drive: Drive, effects: Sequence[Effect] = (), *, 
                 _friction(model, theta, state, effects), _applied(before, theta, state, effects), parity=parity
             )
             out = (
-                _joint_torque(model, after, joints, drive),
+                _joint_torque(model, before, after, joints, drive, parity),
                 qpos[positions] + late * drive.timestep * qvel[joints],
                 0.5 * (qvel + after.qvel)[joints],
                 qpos[hinge] + late * drive.timestep * qvel[hinge] if hinge is not None else jnp.zeros(()),
@@ -157,10 +167,14 @@ def _command(
     high = jnp.clip(k - whole.astype(jnp.int32), 0, last)
     part = delay - whole
     ctrl = table[high] * (1 - part) + table[low] * part
-    for effect in effects:
-        if effect.command is not None:
-            ctrl = effect.command(theta, (k - delay) * timestep, look)
-    return ctrl
+    laws = [effect.command for effect in effects if effect.command is not None]
+    for law in laws:  # each law sees what the one before it made of the command
+        look = _through(law, theta, look)
+    return look((k - delay) * timestep) if laws else ctrl
+
+
+def _through(law: Callable, theta: Theta, look: Callable) -> Callable:
+    return lambda time: law(theta, time, look)
 
 
 def _friction(model, theta: Theta, state: State, effects: Sequence[Effect]):
@@ -195,17 +209,23 @@ def torque_offset_effect(joints: Sequence[str]) -> Effect:
     return Effect("torque offset", observe=observe)
 
 
-def _joint_torque(model, data, joints: np.ndarray, drive: Drive) -> jax.Array:
+def _joint_torque(model, before, after, joints: np.ndarray, drive: Drive, parity: bool) -> jax.Array:
     """[J] what the torque sensor reads: the motor's torque, or what reaches the link.
 
-    Between the two lie rotor inertia (armature) and the damping and dry friction of the joint.
+    Between the two lie rotor inertia (armature) and the damping and dry friction of the joint, as
+    the step integrated them: with the velocity's difference over the step, and its mean (the C
+    engine: its end).
     """
-    torque = data.qfrc_actuator[joints]
+    torque = after.qfrc_actuator[joints]
     if drive.torque.side is TorqueSide.LINK:
-        inertia = model.dof_armature[joints] * data.qacc[joints]
-        torque = torque - inertia - model.dof_damping[joints] * data.qvel[joints]
+        gain = (after.qvel - before.qvel)[joints]
+        velocity = after.qvel[joints] - (0.0 if parity else 0.5) * gain
+        torque = torque - model.dof_armature[joints] * gain / drive.timestep - model.dof_damping[joints] * velocity
+        rows = after._impl
+        dry = slice(rows.ne, rows.ne + rows.nf)
+        torque = torque + (rows.efc_J[dry].T @ rows.efc_force[dry])[joints]
     if drive.torque.gravity:
-        torque = torque + data.qfrc_gravcomp[joints]
+        torque = torque + after.qfrc_gravcomp[joints]
     return torque
 
 
@@ -244,11 +264,17 @@ class Motion:
 def inverse_replay(scene: Scene, motion: Motion, effects: Sequence[Effect] = ()) -> Replay:
     """Torques of a prescribed motion, vectorised over time.
 
-    tau = M(q) qdd + c(q, qd) [+ g(q)] and, on the motor side, + armature qdd + damping qd + dry
-    friction sgn(qd).  On the link side none of the motor's own terms appear; what the joint adds
-    there (Coulomb and viscous friction, offset) is an observation effect.
+    tau = M(q) qdd + c(q, qd) + k (q - q_spring) [+ g(q)] and, on the motor side, + armature qdd +
+    damping qd + dry friction sgn(qd).  On the link side none of the motor's own terms appear; what
+    the joint adds there (Coulomb and viscous friction, offset) is an observation effect.
+    Whether g(q) is there is the recording's word alone, not the MJCF's gravcomp.
+    Raises ValueError for effects that change the motion: a prescribed one cannot have them.
     """
+    moving = [e.name for e in effects if e.force or e.frictionloss or e.command]
+    if moving:
+        raise ValueError(f"a prescribed motion cannot have effects that change it: {', '.join(moving)}")
     joints, positions = scene.joint_dofs, scene.joint_qpos
+    springs = np.array([scene.id("joint", j) for j in scene.joints])
     base = jnp.asarray(scene.model.qpos0, jnp.float32)
     q, qd, qdd = (jnp.asarray(a, jnp.float32) for a in (motion.position, motion.velocity, motion.acceleration))
     motor = motion.torque.side is TorqueSide.MOTOR
@@ -256,6 +282,8 @@ def inverse_replay(scene: Scene, motion: Motion, effects: Sequence[Effect] = ())
     def replay(physics: Physics) -> Rollout:
         model, theta = physics.model, physics.theta
         link_model = model if motor else model.replace(dof_armature=jnp.zeros_like(model.dof_armature))
+        if not motion.torque.gravity:
+            link_model = link_model.replace(opt=link_model.opt.replace(gravity=jnp.zeros(3)))
 
         def at(position, velocity, acceleration):
             full = jnp.zeros(scene.model.nv, jnp.float32)
@@ -263,11 +291,10 @@ def inverse_replay(scene: Scene, motion: Motion, effects: Sequence[Effect] = ())
             data = mjx.make_data(link_model).replace(qpos=base.at[positions].set(position), qvel=velocity)
             data = mjx.fwd_velocity(link_model, mjx.fwd_position(link_model, data))
             torque = mjx.full_m(link_model, data) @ full.at[joints].set(acceleration) + data.qfrc_bias
-            if not motion.torque.gravity:
-                torque = torque - data.qfrc_gravcomp
             if motor:
                 torque = torque + model.dof_damping * velocity + model.dof_frictionloss * jnp.sign(velocity)
-            return torque[joints]
+            stretch = position - model.qpos_spring[positions]
+            return torque[joints] + model.jnt_stiffness[springs] * stretch
 
         torque = jax.vmap(at)(q, qd, qdd)
         rollout = Rollout(

@@ -49,7 +49,7 @@ class Measured:
     """One channel ready to be compared.
 
     at: [Tc] fractional rows of the simulated trace; values [N,Tc,C], mask [N,Tc,C]; columns [C]
-    of the simulated channel; kernel [K,T] and noise for the whitened form; span [2] s of the
+    of the simulated channel; kernel [C or 1,K,T] and noise for the whitened form; span [2] s of the
     coarse clock; weight in the distance.
     """
 
@@ -104,7 +104,7 @@ class Comparison:
             jnp.einsum(
                 "ckl,lc->ck",
                 jnp.asarray(c.noise.whitener, jnp.float32),
-                jnp.asarray(c.kernel, jnp.float32) @ _trace(rollout, c) - jnp.asarray(c.noise.mean, jnp.float32),
+                _smooth(c, _trace(rollout, c)) - jnp.asarray(c.noise.mean, jnp.float32),
             ).ravel()
             for c in self.channels
         ]
@@ -114,7 +114,7 @@ class Comparison:
     def smoothed(self, rollout: Rollout, channel: str = "torque") -> jax.Array:
         """[K, C] a channel of the rollout through the filter the data went through."""
         c = self.channel(channel)
-        return jnp.asarray(c.kernel, jnp.float32) @ _trace(rollout, c)
+        return _smooth(c, _trace(rollout, c))
 
     def channel(self, name: str) -> Measured:
         """A compared channel by name; an unknown one lists those compared."""
@@ -129,6 +129,14 @@ def _trace(rollout: Rollout, channel: Measured) -> jax.Array:
     trace = getattr(rollout, channel.name)
     trace = trace[:, None] if trace.ndim == 1 else trace
     return trace[:, channel.columns]
+
+
+def _smooth(channel: Measured, trace: jax.Array) -> jax.Array:
+    """[K, C] a simulated trace [T, C] through exactly what the channel's data went through."""
+    kernel = jnp.asarray(channel.kernel, jnp.float32)
+    if len(kernel) == 1:
+        return kernel[0] @ trace
+    return jnp.einsum("ckt,tc->kc", kernel, trace)
 
 
 def _distance(channel: Measured, trace: jax.Array) -> jax.Array:
@@ -164,7 +172,10 @@ def make_comparison(
         if "object_angle" in recording.channels:
             angle = recording.channels["object_angle"]
             shut = max(shut, 0.5 * float(np.max(np.where(angle.mask, angle.values, -np.inf))))
-    rows = None if grip is None else tuple(int(np.clip(round((t - start) / timestep), 0, steps)) for t in grip)
+    rows = None
+    if grip is not None:
+        first, end = (int(np.clip(round((t - start) / timestep), 0, steps)) for t in grip)
+        rows = (min(first, steps - 1), max(end, first + 1))
     return Comparison(recording.name, channels, rows, shut, recording.phases, config)
 
 
@@ -182,6 +193,11 @@ def _measure(scene: Scene, channel: Channel, clock: np.ndarray, weight: float) -
         raise ValueError(f"channel {channel.name!r} has no simulated counterpart; known: {', '.join(MINIMUM_NOISE)}")
     _refuse_constant(channel)
     if channel.name == "object_angle":
+        if scene.object_joint is None or len(channel.columns) != 1:
+            raise ValueError(
+                f"channel 'object_angle' needs a scene with an object joint and one column; scene {scene.name!r} has "
+                f"{scene.object_joint or 'none'}, the channel {', '.join(channel.columns)}"
+            )
         columns = np.zeros(1, dtype=int)
     else:
         unknown = [c for c in channel.columns if c not in scene.joints]
@@ -191,9 +207,16 @@ def _measure(scene: Scene, channel: Channel, clock: np.ndarray, weight: float) -
             )
         columns = np.array([scene.joints.index(c) for c in channel.columns], dtype=int)
     inside = (channel.time >= clock[0] - 1e-9) & (channel.time <= clock[-1] + 1e-9)
+    if inside.sum() < 2:
+        raise ValueError(
+            f"channel {channel.name!r} runs {channel.time[0]:g} .. {channel.time[-1]:g} s, "
+            f"outside the motion that is replayed, {clock[0]:g} .. {clock[-1]:g} s"
+        )
     time, values, mask = channel.time[inside], channel.values[:, inside], channel.mask[:, inside]
     coarse = coarse_clock(float(time[0]), float(time[-1]))
-    repeats = smooth(values, mask, lowpass(time, coarse))
+    kernel = lowpass(time, coarse)
+    repeats = smooth(values, mask, kernel)
+    seen = _same_filter(kernel, mask, ~np.isnan(repeats)) @ _resampling(clock, time)
     repeats = _fill(repeats, channel.name)
     noise = estimate_noise(repeats, minimum=MINIMUM_NOISE[channel.name])
     step = clock[1] - clock[0]
@@ -203,11 +226,34 @@ def _measure(scene: Scene, channel: Channel, clock: np.ndarray, weight: float) -
         values=values,
         mask=mask,
         columns=columns,
-        kernel=lowpass(clock, coarse),
+        kernel=seen,
         noise=noise,
         span=(float(coarse[0]), float(coarse[-1])),
         weight=weight,
     )
+
+
+def _resampling(clock: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """[Tc, T] linear interpolation from the replay's clock to a channel's."""
+    at = np.clip((time - clock[0]) / (clock[1] - clock[0]), 0, len(clock) - 1)
+    low = np.minimum(at.astype(int), len(clock) - 2)
+    rows, out = np.arange(len(time)), np.zeros((len(time), len(clock)))
+    out[rows, low], out[rows, low + 1] = 1 - (at - low), at - low
+    return out
+
+
+def _same_filter(kernel: np.ndarray, mask: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """[C or 1, K, Tc] what smoothing with a mask and averaging over the repeats does to a trace.
+
+    kernel [K, Tc]; mask [N, Tc, C]; kept [N, K, C], the outputs that enter the mean.
+    """
+    if mask.all():
+        return kernel[None]
+    weights = kernel[None, None] * mask.transpose(0, 2, 1)[:, :, None]  # [N, C, K, Tc]
+    total = weights.sum(axis=-1, keepdims=True)
+    kept = kept.transpose(0, 2, 1)[..., None]
+    weights = np.where(kept, weights / np.where(kept, total, 1.0), 0.0)
+    return weights.sum(axis=0) / np.maximum(kept.sum(axis=0), 1)
 
 
 def _refuse_constant(channel: Channel) -> None:

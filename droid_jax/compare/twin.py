@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from droid_jax.compare.replay import Drive, check_gains
+from droid_jax.compare.replay import Drive, check_gains, check_stateless
 from droid_jax.measure.engine import instrument, simulate
 from droid_jax.measure.recording import TorqueSide
 from droid_jax.model.parameters import Space
@@ -28,6 +28,7 @@ def twin_replay(
     torque is on the link side or contains gravity (the C batch interface returns neither).
     """
     check_gains(scene, drive)
+    check_stateless(scene)
     stateful = [e.name for e in effects if e.force or e.frictionloss or e.command]
     if stateful:
         raise ValueError(f"the C engine cannot run effects that depend on the state: {', '.join(stateful)}; use MJX")

@@ -112,7 +112,7 @@ def grasp_pose(scene: Scene, angle: float, standoff: float, roll: int) -> tuple[
     The hand looks along the door's inward normal; its fingers close horizontally.
     """
     data = mujoco.MjData(scene.model)
-    data.qpos[scene.qpos(scene.object_joint)] = angle
+    data.qpos[scene.qpos(str(scene.object_joint))] = angle
     mujoco.mj_kinematics(scene.model, data)
     knob = data.site("knob")
     forward = knob.xmat.reshape(3, 3)[:, 0]

@@ -39,6 +39,8 @@ def instrument(scene: Scene) -> mujoco.MjModel:
     for geom in list(spec.geoms):
         if geom.group == LOOK_GROUP:
             spec.delete(geom)
+    for sensor in list(spec.sensors):  # the file's own would stand before ours
+        spec.delete(sensor)
     for kind in ("JOINTACTFRC", "JOINTPOS", "JOINTVEL"):
         for joint in scene.joints:
             _add(spec, kind, joint)
@@ -66,17 +68,17 @@ def _add(spec: mujoco.MjSpec, kind: str, joint: str) -> None:
 
 
 def _copy_numbers(source: mujoco.MjModel, target: mujoco.MjModel) -> None:
-    for name in ("timestep", "integrator", "cone", "solver", "iterations", "ls_iterations", "impratio",
-                 "tolerance", "ls_tolerance", "disableflags", "enableflags", "jacobian"):  # fmt: skip
+    for name in (n for n in dir(source.opt) if not n.startswith("_")):
         setattr(target.opt, name, getattr(source.opt, name))
     for name in dir(source):
-        if name.startswith(("body_", "jnt_", "dof_", "geom_", "pair_", "actuator_")):
+        if name.startswith(("body_", "jnt_", "dof_", "geom_", "pair_", "actuator_", "eq_", "tendon_", "qpos")):
             array = getattr(source, name)
             if isinstance(array, np.ndarray) and array.size and np.issubdtype(array.dtype, np.number):
                 mine = getattr(target, name)
                 if mine.shape == array.shape and not name.endswith(("adr", "id", "num")):
                     mine[:] = array
     target.jnt_limited[:] = source.jnt_limited
+    target.stat.meaninertia, target.stat.meanmass = source.stat.meaninertia, source.stat.meanmass
 
 
 def simulate(
@@ -87,7 +89,10 @@ def simulate(
     *,
     threads: int | None = None,
 ) -> Trace:
-    """Roll out instrumented models [P] from qpos0 [P or 1, nq] under control [P or 1, T, U]."""
+    """Roll out instrumented models [P] from qpos0 [P or 1, nq] under control [P or 1, T, U].
+
+    Where a rollout blows up, everything from there on is NaN (and no contact).
+    """
     threads = min(threads or os.cpu_count() or 1, len(models))
     kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
     states = np.zeros((len(models), mujoco.mj_stateSize(models[0], kind)))
@@ -98,8 +103,11 @@ def simulate(
         mujoco.mj_getState(model, data, states[i], kind)
     with rollout.Rollout(nthread=threads) as pool:
         datas = [mujoco.MjData(models[0]) for _ in range(threads)]
-        _, sensors = pool.rollout(list(models), datas, states, np.ascontiguousarray(control))
-    return _split(scene, sensors)
+        after, sensors = pool.rollout(list(models), datas, states, np.ascontiguousarray(control))
+    # MuJoCo repeats the last good state to the end, or starts over: in either case its clock is wrong.
+    steps = np.array([m.opt.timestep for m in models])[:, None]
+    late = np.abs(after[..., 0] - np.arange(1, after.shape[1] + 1) * steps) > 0.5 * steps
+    return _split(scene, np.where(np.logical_or.accumulate(late, axis=1)[..., None], np.nan, sensors))
 
 
 def _split(scene: Scene, sensors: np.ndarray) -> Trace:

@@ -30,6 +30,7 @@ def lowpass(clock: np.ndarray, coarse: np.ndarray, cutoff: float = CUTOFF) -> np
     half = 1.5 / cutoff
     lag = coarse[:, None] - clock[None, :]
     spacing = np.gradient(clock) if len(clock) > 1 else np.ones_like(clock)
+    spacing[[0, -1]] *= 0.5  # trapezoidal rule: the same result at every sampling rate
     kernel = np.sinc(2 * cutoff * lag) * (0.5 + 0.5 * np.cos(np.pi * np.clip(lag / half, -1, 1)))
     kernel *= spacing[None, :]
     total = kernel.sum(axis=1, keepdims=True)
