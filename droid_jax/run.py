@@ -335,7 +335,7 @@ def _summary(found: Any) -> None:
             f"(a perfect model: {gap.floor:.3f}), {gap.closed:.0%} of the gap closed"
         )
     silent = [t.name for t in found.tells if not t.identifiable and not found.full[t.name].nuisance]
-    if silent:
+    if silent and found.refined is not None:
         print(f"this demonstration tells little about: {', '.join(silent)}")
     print(f"search stopped: {found.search.stop}; {sum(found.seconds.values()):.0f} s")
 

@@ -15,7 +15,7 @@ from droid_jax.compare.residuals import CompareConfig
 from droid_jax.identify.gaussian import Gaussian, prior
 from droid_jax.identify.refine import RefineConfig, Refined, refine
 from droid_jax.identify.search import Fit, SearchConfig, search
-from droid_jax.identify.uncertainty import Identifiability, calibrated, identifiability, time_blocks
+from droid_jax.identify.uncertainty import Identifiability, calibrated, identifiability, not_judged, time_blocks
 from droid_jax.measure.recording import Recording
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
@@ -172,7 +172,7 @@ def identify(
         full_gaussian=full_gaussian,
         search=found,
         refined=refined,
-        tells=identifiability(full_gaussian, _prior_widths(full, refined), best),
+        tells=not_judged(full_gaussian) if refined is None else identifiability(full_gaussian, refined.prior),
         gaps=dict(zip(names, gaps, strict=True)),
         fit=base,
         heldout=heldout,
@@ -230,10 +230,6 @@ def _distribution(
     shapes = [(len(c.columns), c.noise.mean.shape[0]) for c in channels]
     durations = [c.span[1] - c.span[0] for c in channels]
     return refined.best, calibrated(refined, time_blocks(shapes, durations))
-
-
-def _prior_widths(full: Space, refined: Refined | None) -> np.ndarray:
-    return np.ones(len(full)) if refined is None else refined.prior
 
 
 def _gaps(cost: Cost, before: np.ndarray, after: np.ndarray) -> list[Gap]:

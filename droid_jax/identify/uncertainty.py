@@ -73,10 +73,16 @@ def time_blocks(shapes: Sequence[tuple[int, int]], seconds: Sequence[float], blo
     return np.concatenate(ids)
 
 
-def identifiability(gaussian: Gaussian, prior: np.ndarray, best: np.ndarray) -> tuple[Identifiability, ...]:
+def not_judged(gaussian: Gaussian) -> tuple[Identifiability, ...]:
+    """For a search's own covariance, which is no posterior: nothing is called identifiable from it."""
+    reason = "not judged: the search's covariance depends on when it stopped"
+    return tuple(Identifiability(name, False, 1.0, (), reason) for name in gaussian.space.names)
+
+
+def identifiability(gaussian: Gaussian, prior: np.ndarray) -> tuple[Identifiability, ...]:
     """What the demonstration tells about each parameter of a calibrated Gaussian.
 
-    prior: [D] prior deviations, search units; best: [D] physical values.
+    prior: [D] prior deviations, search units.
     """
     deviation = np.sqrt(np.diag(gaussian.cov))
     correlation = gaussian.cov / np.outer(deviation, deviation)
