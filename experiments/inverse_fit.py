@@ -237,7 +237,7 @@ def estimate(cost: Cost, space: Space, start: np.ndarray, block: float) -> Estim
 def table(result: Estimate) -> list[dict[str, Any]]:
     """One entry per parameter: value, interval, and what this recording tells about it."""
     low, high = result.gaussian.interval(LEVEL)
-    told = identifiability(result.gaussian, np.ones(len(result.space)), result.best)
+    told = identifiability(result.gaussian, np.ones(len(result.space)))
     return [
         {
             "name": p.name,
