@@ -133,7 +133,7 @@ def calibration_case(number: int, quick: bool) -> dict[str, Any]:
     space = door_space(scene)
     rng = np.random.default_rng([number, 77])
     while True:
-        truth = {p.name: float(np.clip(rng.normal(p.mean, p.std), p.low, p.high)) for p in space.parameters}
+        truth = dict(zip(space.names, prior(space.linear()).sample(rng, 1)[0].tolist(), strict=True))
         hinge = {"hinge_stiffness": (0.01, 3), "hinge_frictionloss": (0.01, 1.5), "hinge_damping": (0.1, 6)}
         for name, (low, high) in hinge.items():
             truth[name] = float(np.exp(rng.uniform(np.log(low), np.log(high))))

@@ -37,6 +37,7 @@ class Cost:
     scene: Scene
     space: Space
     comparisons: tuple[Comparison, ...]
+    drives: tuple[Drive, ...]
     _replays: tuple[Callable[[np.ndarray], Rollout], ...]
     _distances: tuple[Callable[[Rollout], jax.Array], ...]
     _whitened: tuple[Callable[[Rollout], jax.Array], ...]
@@ -74,6 +75,25 @@ class Cost:
         identity = tuple((lambda r: r) for _ in self._replays)
         return self._blockwise(values, identity, tuple)
 
+    def first(self) -> Cost:
+        """The cost of the first recording alone, on the same compiled replay."""
+        return assemble(self.scene, self.space, self.comparisons[:1], self._replays[:1], self.drives[:1])
+
+    def against(self, recordings: Sequence[Recording]) -> Cost:
+        """The same compiled replays compared with other repeats of the same recordings.
+
+        Raises ValueError unless these are as many, with the same commands on the same clock.
+        """
+        if len(recordings) != len(self.drives):
+            raise ValueError(f"expected repeats of {len(self.drives)} replayed recordings, got {len(recordings)}")
+        made = []
+        for recording, old, drive in zip(recordings, self.comparisons, self.drives, strict=True):
+            new = make_drive(self.scene, recording)
+            if new.command.shape != drive.command.shape or not np.array_equal(new.command, drive.command):
+                raise ValueError(f"recording {recording.name!r} holds other commands than {old.name!r} had")
+            made.append(make_comparison(self.scene, recording, new.timestep, len(new.command), old.config))
+        return assemble(self.scene, self.space, made, self._replays, self.drives)
+
     def _blockwise(self, values: Any, functions: Sequence[Callable], join: Callable) -> Any:
         pieces = []
         for block, count in blocks(self.space.check(values)):
@@ -107,7 +127,7 @@ def make_cost(
     comparisons = tuple(
         make_comparison(scene, r, d.timestep, len(d.command), config) for r, d in zip(recordings, drives, strict=True)
     )
-    return assemble(scene, space, comparisons, replays)
+    return assemble(scene, space, comparisons, replays, drives)
 
 
 def assemble(
@@ -115,12 +135,14 @@ def assemble(
     space: Space,
     comparisons: Sequence[Comparison],
     replays: Sequence[Callable[[np.ndarray], Rollout]],
+    drives: Sequence[Drive] = (),
 ) -> Cost:
-    """A Cost from batch replays ([B, D] -> Rollout) and what each is compared with."""
+    """A Cost from batch replays ([B, D] -> Rollout), what each is compared with, and what drove it (servo mode)."""
     return Cost(
         scene=scene,
         space=space,
         comparisons=tuple(comparisons),
+        drives=tuple(drives),
         _replays=tuple(replays),
         _distances=tuple(_compiled(c.distance) for c in comparisons),
         _whitened=tuple(_compiled(c.whitened) for c in comparisons),

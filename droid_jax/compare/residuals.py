@@ -111,6 +111,14 @@ class Comparison:
         residual = jnp.concatenate(parts)
         return jnp.where(rollout.finite & jnp.all(jnp.isfinite(residual)), residual, BLOWN_UP)
 
+    def deviations(self) -> np.ndarray:
+        """[N, M] deviations of the repeats from their mean, whitened as the residuals are."""
+        parts = []
+        for c in self.channels:
+            apart = c.noise.repeats - c.noise.mean  # [N, K, C]
+            parts.append(np.einsum("ckl,nlc->nck", c.noise.whitener, apart).reshape(len(apart), -1))
+        return np.concatenate(parts, axis=1)
+
     def smoothed(self, rollout: Rollout, channel: str = "torque") -> jax.Array:
         """[K, C] a channel of the rollout through the filter the data went through."""
         c = self.channel(channel)

@@ -27,7 +27,7 @@ class IdentifyConfig:
 
     engine: "mjx" or "mujoco" (plain C, all cores).
     heldout: share of each recording's repeats that the fit does not see (at least one where there are two).
-    search: CMA-ES settings.
+    search: CMA-ES settings; it sees the first recording alone, the refinement sees all of them.
     refine: refinement settings, or None: the search's own covariance is the distribution, as in the paper.
     samples: replays drawn from the initial and from the fitted Gaussian to compare their costs.
     seed: of the split and of those samples (the search has its own).
@@ -134,12 +134,13 @@ def identify(
 
     began = time.monotonic()
     base = make_cost(scene, full, fitted, engine=config.engine, config=config.compare)
+    first = base.first()
     found = search(
-        _embed(base, space),
+        _embed(first, space),
         space,
         config.search,
         checkpoint_dir=checkpoints,
-        fingerprint="+".join(r.sha256 for r in fitted) + config.engine,
+        fingerprint=fitted[0].sha256 + config.engine,
         progress=lambda p: report("search", p),
     )
     seconds["search"] = time.monotonic() - began
@@ -152,6 +153,7 @@ def identify(
             full,
             starts(full, space, found),
             config.refine,
+            first=first.whitened,
             hypotheses=grip_hypotheses(space),
             progress=lambda p: report("refine", p),
         )
@@ -160,7 +162,7 @@ def identify(
 
     began = time.monotonic()
     report("judge", None)
-    heldout = make_cost(scene, full, held, engine=config.engine, config=config.compare)
+    heldout = base.against(held)
     gaps = _gaps(heldout, full.mean, best)
     seconds["judge"] = time.monotonic() - began
     return Identified(
@@ -229,7 +231,8 @@ def _distribution(
     channels = [c for comparison in cost.comparisons for c in comparison.channels]
     shapes = [(len(c.columns), c.noise.mean.shape[0]) for c in channels]
     durations = [c.span[1] - c.span[0] for c in channels]
-    return refined.best, calibrated(refined, time_blocks(shapes, durations))
+    deviations = [comparison.deviations() for comparison in cost.comparisons]
+    return refined.best, calibrated(refined, deviations, time_blocks(shapes, durations))
 
 
 def _gaps(cost: Cost, before: np.ndarray, after: np.ndarray) -> list[Gap]:

@@ -1,9 +1,15 @@
 """Batched Gauss-Newton (Levenberg-Marquardt) on whitened residuals, from several starts at once.
 
-Works in search coordinates x. The objective is |r(x)|^2 / 2 + |(x - x0) / w|^2 / 2 with a prior
-of deviation w: one unit for nuisances (their own prior), `main_prior` units for the parameters of
-interest, so that what the data do not tell stays put instead of drifting.  Every iteration is
-one batch: the central differences of all starts, then one batch of trial steps.
+Works in search coordinates x. The objective is |r(x)|^2 / 2 + |(x - x0) / w|^2 / 2, a negative log
+posterior, with a prior of deviation w: one unit for nuisances (their own prior), `main_prior` units
+for the parameters of interest, so that what the data do not tell stays put instead of drifting.
+
+Replays come in batches, so an iteration is: one batch of central differences, then batches of
+trial steps with that Jacobian for as long as they pay.  A trial differs from the next in its
+damping, its length and its path: straight in search coordinates, or straight in physical units.
+Residuals are close to linear in masses, springs and damping, whose search coordinate is their
+logarithm; where two of them trade with each other (door and knob turn about the same hinge), the
+valley between them is straight in physical units alone.
 """
 
 from __future__ import annotations
@@ -14,7 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.model.parameters import Space
+from droid_jax.identify.search import SearchConfig, search
+from droid_jax.model.parameters import Parameter, Scaling, Space
 
 Residuals = Callable[[np.ndarray], np.ndarray]
 Hypotheses = Sequence[Mapping[str, float]]
@@ -24,23 +31,31 @@ Hypotheses = Sequence[Mapping[str, float]]
 class RefineConfig:
     """Settings of the refinement.
 
-    iterations: at most.
+    iterations: Jacobians at most.
     step: half-width of the first central differences, search units.
     smallest_step: and of later ones at least, search units (below it solver noise would show).
     main_prior: prior deviation of parameters of interest, search units.
-    tolerance: stop when an iteration lowers the objective by less than this share.
+    tolerance: stop when an iteration lowers the objective (a log likelihood) by less than this.
+    rough: while starts and hypotheses are sorted out, already when it lowers it by less than this share.
+    chord: a Jacobian serves another batch of trials while the last lowered the objective by this share.
     keep: after iteration i only starts within keep[i] times the best objective go on (the last
       number holds from there on).
     hold: iterations for which the values of a hypothesis are held while all else settles.
+    hops: searches at most for a better basin around where the iterations stood still.
+    hop_generations: generations of each.
     """
 
     iterations: int = 30
     step: float = 0.3
     smallest_step: float = 0.03
     main_prior: float = 4.0
-    tolerance: float = 2e-3
-    keep: tuple[float, ...] = (10.0, 4.0, 2.0, 1.3, 1.3, 1.0)
-    hold: int = 3
+    tolerance: float = 0.5
+    rough: float = 5e-3
+    chord: float = 0.03
+    keep: tuple[float, ...] = (4.0, 2.0, 1.3, 1.0)
+    hold: int = 2
+    hops: int = 4
+    hop_generations: int = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,61 +101,48 @@ def refine(
     starts: Any,
     config: RefineConfig | None = None,
     *,
+    first: Residuals | None = None,
     hypotheses: Hypotheses = (),
     progress: Callable[[RefineProgress], None] | None = None,
 ) -> Refined:
     """Refine one or several starts [D] or [S, D] (physical values).
 
     residuals: [P, D] physical values -> [P, M] whitened residuals (rows are independent).
+    first: the same for a part of the data that is cheaper to replay; starts and hypotheses are sorted
+      out there, and only the best goes on to all of it.
     hypotheses: assignments {name: value} that may lie in another basin (a finger that slips, say),
       each tried once from where the starts converged.
     Raises ValueError where no start gives finite residuals.
     """
     config = config or RefineConfig()
-    box = np.stack([space.to_search(space.low), space.to_search(space.high)])
-    x = np.clip(space.to_search(space.check(np.atleast_2d(starts))), *box)
-    prior = np.where(space.nuisance, 1.0, config.main_prior)
-    batch = _Batch(residuals, space, prior)
-    residual, objective = batch(x)
-    if not np.isfinite(objective).any():
+    rough = _Problem(residuals if first is None else first, space, config, progress)
+    state = rough.start(rough.inside(space.to_search(space.check(np.atleast_2d(starts)))))
+    if not np.isfinite(state.objective).any():
         raise ValueError("none of the starts could be replayed; widen the bounds or start nearer to the truth")
-    ended = np.full(len(x), np.inf)
-    alive = np.arange(len(x))
-    state = _State(x, residual, objective, np.full(len(x), 1e-3), np.full(x.shape, config.step))
-    converged, iteration = False, 0
-    for iteration in range(1, config.iterations + 1):
-        state, gain = _step(batch, state, box, prior, config)
-        ended[alive] = state.objective
-        best = float(state.objective.min())
-        if progress is not None:
-            progress(RefineProgress(iteration, config.iterations, 2 * best / residual.shape[1]))
-        keep = state.objective <= config.keep[min(iteration, len(config.keep)) - 1] * best
-        state, gain, alive = state.rows(keep), gain[keep], alive[keep]
-        leader = int(np.argmin(state.objective))
-        if gain[leader] > config.tolerance:
-            continue
-        state = state.rows(np.arange(len(alive)) == leader)
-        alive = alive[[leader]]
-        branched = _explore(batch, state, box, prior, config, hypotheses) if hypotheses else state
-        hypotheses = ()
-        if branched.objective[0] > (1 - config.tolerance) * state.objective[0]:
-            converged = True
+    state, ended = rough.descend(state, config.rough)
+    if hypotheses:
+        state, _ = rough.descend(rough.explore(state, hypotheses), config.rough)
+    problem = _Problem(residuals, space, config, progress, rough)
+    state, _ = problem.descend(problem.start(state.x))
+    settled = config.hops == 0
+    for number in range(config.hops):
+        hopped = problem.hop(state, number)
+        settled = bool(state.objective[0] - hopped.objective[0] <= HOP_TOLERANCE)
+        if settled:
             break
-        state = branched
-    winner = state.rows(np.arange(len(alive)) == int(np.argmin(state.objective)))
-    ended[alive] = np.minimum(ended[alive], state.objective)
+        state, _ = problem.descend(hopped)
     return Refined(
         space=space,
-        x=winner.x[0],
-        best=space.from_search(winner.x[0]),
-        objective=float(winner.objective[0]),
-        residual=winner.residual[0],
-        jacobian=_jacobian(batch, winner.x, winner.widths, box)[0],
-        prior=prior,
+        x=state.x[0],
+        best=space.from_search(state.x[0]),
+        objective=float(state.objective[0]),
+        residual=state.residual[0],
+        jacobian=problem.wide_jacobian(state),
+        prior=problem.prior,
         starts=ended,
-        evaluations=batch.rows,
-        iterations=iteration,
-        converged=converged,
+        evaluations=problem.evaluations,
+        iterations=problem.iterations,
+        converged=settled and problem.iterations < config.iterations,
     )
 
 
@@ -154,128 +156,212 @@ class _State:
     damping: np.ndarray
     widths: np.ndarray
 
-    def rows(self, keep: np.ndarray) -> _State:
+    def rows(self, keep: Any) -> _State:
         return _State(*(getattr(self, f)[keep] for f in _State.__dataclass_fields__))
 
 
-def _step(
-    batch: _Batch,
-    state: _State,
-    box: np.ndarray,
-    prior: np.ndarray,
-    config: RefineConfig,
-    held: np.ndarray | None = None,
-) -> tuple[_State, np.ndarray]:
-    """One iteration of all live starts; also the share by which each objective fell. held: [S, D] bool, stay put."""
-    jacobian = _jacobian(batch, state.x, state.widths, box)
-    x, residual, objective, damping, gain = _try_steps(
-        batch, state.x, state.residual, state.objective, jacobian, state.damping, box, held
-    )
-    return _State(x, residual, objective, damping, _next_widths(jacobian, prior, config)), gain
+# A batch of trials for each start: damping factors x lengths x paths, 32 in all, the block of a CPU.
+_DAMPINGS = 10.0 ** np.arange(-3.0, 5.0)
+_LENGTHS = (1.0, 0.5)
+_LONGEST = 2.0  # search units: a trial step never moves a parameter further
+CHORDS = 3  # batches of trials at most with one Jacobian
+SPREADS = 2  # times that the posterior's axes are improved
+WIDE = 1.5  # posterior deviations: half-width of those differences
+SPREAD_LONGEST = 1.0  # search units
+HOP_POPULATION = 32
+HOP_SIGMA = 1.5  # posterior deviations
+HOP_TOLERANCE = 2.0  # of the objective: a hop that finds less ends the refinement
+HOP_LONGEST = 1.0  # search units: what the data do not tell is not searched far
+_SHORTEST = 0.05  # a straight path in physical units never takes a parameter below this share of itself
 
 
-def _explore(
-    batch: _Batch, state: _State, box: np.ndarray, prior: np.ndarray, config: RefineConfig, hypotheses: Hypotheses
-) -> _State:
-    """Follow each hypothesis from a converged start: hold its values while all else settles, then free them.
+class _Problem:
+    """Residuals and prior in search coordinates, with what an iteration does; counts replays."""
 
-    Returns the better of what was found and `state`, as one start.
-    """
-    space = batch.space
-    x = np.repeat(state.x, len(hypotheses), axis=0)
-    held = np.zeros(x.shape, bool)
-    for row, hypothesis in enumerate(hypotheses):
-        for name, value in hypothesis.items():
-            column = space.index(name)
-            x[row, column] = space[name].to_search(value)
-            held[row, column] = True
-    residual, objective = batch(np.clip(x, *box))
-    widths = np.repeat(state.widths, len(x), axis=0)
-    branches = _State(np.clip(x, *box), residual, objective, np.full(len(x), 1e-3), widths)
-    for iteration in range(config.hold + 1):
-        branches, _ = _step(batch, branches, box, prior, config, held if iteration < config.hold else None)
-    found = branches.rows(np.arange(len(x)) == int(np.argmin(branches.objective)))
-    return found if found.objective[0] < state.objective[0] else state
+    def __init__(
+        self,
+        residuals: Residuals,
+        space: Space,
+        config: RefineConfig,
+        progress: Callable[[RefineProgress], None] | None = None,
+        before: _Problem | None = None,
+    ) -> None:
+        self.residuals, self.space, self.config, self.progress = residuals, space, config, progress
+        self.prior = np.where(space.nuisance, 1.0, config.main_prior)
+        self.low, self.high = space.to_search(space.low), space.to_search(space.high)
+        self.log_width = np.array([p.log_width if p.scaling is Scaling.LOG else 0.0 for p in space.parameters])
+        self.evaluations = before.evaluations if before else 0
+        self.iterations = before.iterations if before else 0
 
+    def inside(self, x: np.ndarray) -> np.ndarray:
+        """x clipped to the bounds."""
+        return np.clip(x, self.low, self.high)
 
-class _Batch:
-    """Residuals and objective in search coordinates, counting rows."""
-
-    def __init__(self, residuals: Residuals, space: Space, prior: np.ndarray) -> None:
-        self.residuals, self.space, self.prior, self.rows = residuals, space, prior, 0
-
-    def raw(self, x: np.ndarray) -> np.ndarray:
-        """[P, D] -> [P, M]."""
-        self.rows += len(x)
+    def replay(self, x: np.ndarray) -> np.ndarray:
+        """[P, D] -> residuals [P, M]."""
+        self.evaluations += len(x)
         return np.asarray(self.residuals(self.space.from_search(x)), dtype=np.float64)
 
-    def __call__(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """[P, D] -> residuals [P, M] and objectives [P]."""
-        residual = self.raw(x)
-        value = 0.5 * np.sum(residual**2, axis=1) + 0.5 * np.sum((x / self.prior) ** 2, axis=1)
-        return residual, np.where(np.isfinite(value), value, np.inf)
+    def objective(self, x: np.ndarray, residual: np.ndarray) -> np.ndarray:
+        """[P]; infinite where a replay gave no numbers."""
+        value = 0.5 * np.sum(residual**2, axis=-1) + 0.5 * np.sum((x / self.prior) ** 2, axis=-1)
+        return np.where(np.isfinite(value), value, np.inf)
 
+    def start(self, x: np.ndarray) -> _State:
+        """The state of fresh starts [S, D]."""
+        residual = self.replay(x)
+        widths = np.full(x.shape, self.config.step)
+        return _State(x, residual, self.objective(x, residual), np.full(len(x), 1e-3), widths)
 
-def _jacobian(batch: _Batch, x: np.ndarray, widths: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """[S, M, D] differences of every start in one batch; one-sided where a bound is in the way."""
-    starts, dims = x.shape
-    steps = np.eye(dims)[None] * widths[:, None, :]
-    up = np.clip(x[:, None, :] + steps, *box)
-    down = np.clip(x[:, None, :] - steps, *box)
-    both = np.concatenate([up, down], axis=1).reshape(-1, dims)
-    residual = batch.raw(both).reshape(starts, 2 * dims, -1)
-    span = np.einsum("sii->si", up - down)
-    return np.swapaxes((residual[:, :dims] - residual[:, dims:]) / span[..., None], 1, 2)
+    def descend(self, state: _State, rough: float = 0.0) -> tuple[_State, np.ndarray]:
+        """Iterate until the best start stands still; that start, and the objective [S] each one ended at.
 
+        rough: a share of the objective that is not worth an iteration either.
+        """
+        ended, alive = state.objective.copy(), np.arange(len(state.x))
+        keep = self.config.keep
+        for number in range(self.config.iterations - self.iterations):
+            state, gain = self.step(state)
+            ended[alive] = state.objective
+            leader = int(np.argmin(state.objective))
+            self._report(state.objective[leader], state.residual.shape[1])
+            if gain[leader] <= max(self.config.tolerance, rough * state.objective[leader]):
+                break
+            good = state.objective <= keep[min(number, len(keep) - 1)] * state.objective[leader]
+            state, alive = state.rows(good), alive[good]
+        return state.rows([int(np.argmin(state.objective))]), ended
 
-_DAMPINGS = np.array([0.1, 1.0, 10.0, 100.0, 1000.0])  # times the current damping
-_LONGEST = 2.0  # search units: a trial step never moves a parameter further
+    def hop(self, state: _State, seed: int) -> _State:
+        """Leave a small basin: CMA-ES in the metric of the posterior, from a start that stands still.
 
+        In x = x0 + L u, L L^T the posterior's covariance, the objective is about |u|^2 / 2 and what
+        remains are the steps where a finger begins to stick or to slip, which no derivative sees.
+        """
+        factor = self.axes(self.jacobian(state)[0], HOP_LONGEST)
 
-def _try_steps(
-    batch: _Batch,
-    x: np.ndarray,
-    residual: np.ndarray,
-    objective: np.ndarray,
-    jacobian: np.ndarray,
-    damping: np.ndarray,
-    box: np.ndarray,
-    held: np.ndarray | None,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """All dampings of all starts in one batch; each start takes its best step, or stays.
+        def around(u: np.ndarray) -> np.ndarray:
+            return self.inside(state.x + u @ factor.T)
 
-    Returns x, residual, objective, damping and the share by which each objective fell.
-    """
-    starts, dims = x.shape
-    trials = np.empty((starts, len(_DAMPINGS), dims))
-    for s in range(starts):
-        hessian = jacobian[s].T @ jacobian[s] + np.diag(batch.prior**-2)
-        slope = jacobian[s].T @ residual[s] + x[s] / batch.prior**2
-        free = ~(((x[s] <= box[0]) & (slope > 0)) | ((x[s] >= box[1]) & (slope < 0)))
-        free &= True if held is None else ~held[s]
+        def cost(u: np.ndarray) -> np.ndarray:
+            x = around(u)
+            return self.objective(x, self.replay(x))
+
+        unit = Space(tuple(Parameter(f"u{i}", "-", 0.0, 1.0, -50.0, 50.0) for i in range(len(self.space))))
+        settings = SearchConfig(
+            population=HOP_POPULATION, parents=None, generations=self.config.hop_generations, sigma=HOP_SIGMA, seed=seed
+        )
+        return self.start(around(search(cost, unit, settings).best[None]))
+
+    def _report(self, objective: float, residuals: int) -> None:
+        if self.progress is not None:
+            self.progress(RefineProgress(self.iterations, self.config.iterations, 2 * objective / residuals))
+
+    def step(self, state: _State, held: np.ndarray | None = None) -> tuple[_State, np.ndarray]:
+        """One iteration of all starts, and by how much each objective fell. held: [S, D] bool, stay put."""
+        jacobian = self.jacobian(state)
+        before = state.objective
+        self.iterations += 1
+        for _ in range(CHORDS):
+            last = state.objective
+            state = self._try(state, jacobian, held)
+            if np.all(last - state.objective <= self.config.chord * state.objective):
+                break
+        curvature = np.einsum("sdd->sd", self.curvature(jacobian))
+        # About one deviation wide, the others given; a start that stood still looks from elsewhere.
+        widths = np.where((state.objective < before)[:, None], 1.0, 3.0) / np.sqrt(curvature)
+        widths = np.clip(widths, self.config.smallest_step, self.config.step)
+        state = _State(state.x, state.residual, state.objective, state.damping, widths)
+        return state, before - state.objective
+
+    def curvature(self, jacobian: np.ndarray) -> np.ndarray:
+        """[S, D, D] Gauss-Newton curvature of the objective."""
+        return np.einsum("smd,sme->sde", jacobian, jacobian) + np.diag(self.prior**-2)
+
+    def jacobian(self, state: _State) -> np.ndarray:
+        """[S, M, D] differences of every start in one batch; one-sided where a bound is in the way."""
+        starts, dims = state.x.shape
+        steps = np.eye(dims)[None] * state.widths[:, None, :]
+        up, down = self.inside(state.x[:, None, :] + steps), self.inside(state.x[:, None, :] - steps)
+        both = np.concatenate([up, down], axis=1).reshape(-1, dims)
+        residual = self.replay(both).reshape(starts, 2 * dims, -1)
+        span = np.einsum("sii->si", up - down)
+        return np.swapaxes((residual[:, :dims] - residual[:, dims:]) / span[..., None], 1, 2)
+
+    def axes(self, jacobian: np.ndarray, longest: float) -> np.ndarray:
+        """[D, D] columns: the posterior's principal axes, one deviation long, no entry beyond `longest`."""
+        variance, axes = np.linalg.eigh(np.linalg.inv(jacobian.T @ jacobian + np.diag(self.prior**-2)))
+        return axes * np.minimum(np.sqrt(np.maximum(variance, 0.0)), longest / np.max(np.abs(axes), axis=0))
+
+    def wide_jacobian(self, state: _State) -> np.ndarray:
+        """[M, D] slopes of one start over the width of its posterior, along the posterior's own axes.
+
+        Differences of one parameter at a time carry the solver's rounding, which looks like
+        information where two parameters trade with each other: their slopes cancel, its does not.
+        Along the axes each difference is WIDE deviations of the result; as the first axes suffer from
+        that rounding themselves, they are improved SPREADS times.
+        """
+        jacobian = self.jacobian(state)[0]
+        for _ in range(SPREADS):
+            steps = WIDE * self.axes(jacobian, SPREAD_LONGEST).T
+            up, down = self.inside(state.x + steps), self.inside(state.x - steps)
+            above, below = np.split(self.replay(np.concatenate([up, down])), 2)
+            jacobian = np.linalg.lstsq(up - down, above - below)[0].T
+        return jacobian
+
+    def explore(self, state: _State, hypotheses: Hypotheses) -> _State:
+        """Follow each hypothesis from a converged start: hold its values while all else settles, then free them.
+
+        Returns the better of what was found and `state`, as one start.
+        """
+        x = np.repeat(state.x, len(hypotheses), axis=0)
+        held = np.zeros(x.shape, bool)
+        for row, hypothesis in enumerate(hypotheses):
+            for name, value in hypothesis.items():
+                column = self.space.index(name)
+                x[row, column] = self.space[name].to_search(value)
+                held[row, column] = True
+        branches = self.start(self.inside(x))
+        for iteration in range(self.config.hold + 1):
+            branches, _ = self.step(branches, held if iteration < self.config.hold else None)
+        found = branches.rows([int(np.argmin(branches.objective))])
+        return found if found.objective[0] < state.objective[0] else state
+
+    def _try(self, state: _State, jacobian: np.ndarray, held: np.ndarray | None) -> _State:
+        """All trials of all starts in one batch; each start takes its best, or stays with more damping."""
+        starts, dims = state.x.shape
+        steps = np.stack([self._steps(state.rows([s]), jacobian[s], held, s) for s in range(starts)])
+        paths = [self.inside(state.x[:, None] + steps), self.inside(self._straight(state.x[:, None], steps))]
+        trials = np.concatenate(paths, axis=1)
+        residual = self.replay(trials.reshape(-1, dims)).reshape(*trials.shape[:2], -1)
+        objective = self.objective(trials, residual)
+        rows, pick = np.arange(starts), np.argmin(objective, axis=1)
+        better = objective[rows, pick] < state.objective
+        factor = np.tile(np.repeat(_DAMPINGS, len(_LENGTHS)), len(paths))[pick]
+        return _State(
+            x=np.where(better[:, None], trials[rows, pick], state.x),
+            residual=np.where(better[:, None], residual[rows, pick], state.residual),
+            objective=np.where(better, objective[rows, pick], state.objective),
+            damping=np.clip(np.where(better, state.damping * factor, state.damping), 1e-8, 1e4),
+            widths=state.widths,
+        )
+
+    def _steps(self, state: _State, jacobian: np.ndarray, held: np.ndarray | None, row: int) -> np.ndarray:
+        """[dampings * lengths, D] Levenberg-Marquardt steps of one start, along the bounds it sits on."""
+        x = state.x[0]
+        hessian = jacobian.T @ jacobian + np.diag(self.prior**-2)
+        slope = jacobian.T @ state.residual[0] + x / self.prior**2
+        free = ~(((x <= self.low) & (slope > 0)) | ((x >= self.high) & (slope < 0)))
+        free &= True if held is None else ~held[row]
+        out = np.zeros((len(_DAMPINGS), len(_LENGTHS), len(x)))
         for k, factor in enumerate(_DAMPINGS):
-            damped = hessian + damping[s] * factor * np.diag(np.diag(hessian))
-            step = np.zeros(dims)
-            step[free] = -np.linalg.solve(damped[np.ix_(free, free)], slope[free])
-            step *= min(1.0, _LONGEST / max(np.max(np.abs(step)), 1e-12))
-            trials[s, k] = np.clip(x[s] + step, *box)
-    new_residual, new_objective = batch(trials.reshape(-1, dims))
-    new_objective = new_objective.reshape(starts, -1)
-    pick = np.argmin(new_objective, axis=1)
-    rows = np.arange(starts)
-    better = new_objective[rows, pick] < objective
-    gain = np.where(better, 1 - new_objective[rows, pick] / np.maximum(objective, 1e-300), 0.0)
-    chosen = new_residual.reshape(starts, len(_DAMPINGS), -1)[rows, pick]
-    return (
-        np.where(better[:, None], trials[rows, pick], x),
-        np.where(better[:, None], chosen, residual),
-        np.where(better, new_objective[rows, pick], objective),
-        np.clip(np.where(better, damping * _DAMPINGS[pick], damping * 100), 1e-8, 1e4),
-        gain,
-    )
+            damped = hessian + state.damping[0] * factor * np.diag(np.diag(hessian))
+            step = -np.linalg.solve(damped[np.ix_(free, free)], slope[free])
+            step *= min(1.0, _LONGEST / max(np.max(np.abs(step), initial=0.0), 1e-12))
+            out[k][:, free] = np.outer(_LENGTHS, step)
+        return out.reshape(-1, len(x))
 
-
-def _next_widths(jacobian: np.ndarray, prior: np.ndarray, config: RefineConfig) -> np.ndarray:
-    """[S, D] difference steps of about one posterior deviation, within the configured limits."""
-    curvature = np.einsum("smd,smd->sd", jacobian, jacobian) + prior**-2
-    return np.clip(1.0 / np.sqrt(curvature), config.smallest_step, config.step)
+    def _straight(self, x: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """x moved by `step` along straight lines in physical units instead of search coordinates."""
+        width = np.where(self.log_width > 0, self.log_width, 1.0)
+        path = np.log(np.maximum(1.0 + width * step, _SHORTEST)) / width
+        return x + np.where(self.log_width > 0, path, step)

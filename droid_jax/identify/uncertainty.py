@@ -1,11 +1,16 @@
 """From a refined fit to a calibrated Gaussian, and what the demonstration tells about each parameter.
 
 Rule of the width.  Gauss-Newton around the best gives the covariance H^-1 with nuisances
-marginalised; it believes that the residuals are nothing but the noise of the repeats.  What is
-left over is more than that (discretisation, small unmodelled effects) and correlated in time, so
-the scores J^T r of contiguous blocks of time, per column, are compared with what noise alone would
-give: the sandwich H^-1 (sum_b g_b g_b^T + P) H^-1 (Huber 1967; blocks as in Kuensch 1989).  Each
-deviation becomes the larger of the two, correlations stay those of H^-1.
+marginalised.  It believes that the residuals are noise which is independent from joint to joint and
+stationary in time.  Two sandwiches H^-1 S H^-1 (Huber 1967) ask the data what the scores J^T r really do:
+
+* between repeats: every repeat has its own errors of pose and grasp, which stay for a whole opening and
+  pull at all joints together.  S is the scatter of the repeats' scores.  Ten repeats say little about one
+  parameter, so each parameter's ratio to H^-1 is drawn towards the ratio over all of them;
+* within the residual: what the model leaves over is more than noise, and correlated.  S is the
+  scatter of the scores of contiguous blocks of time (Kuensch 1989), per column.
+
+Each deviation becomes the largest of the three; correlations stay those of H^-1.
 """
 
 from __future__ import annotations
@@ -19,6 +24,7 @@ from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.refine import Refined
 
 IDENTIFIABLE = 0.25  # posterior deviation over prior deviation below which the data have spoken
+POOL = 12  # degrees of freedom with which the ratio over all parameters counts in each one's own
 PARTNER = 0.7  # absolute correlation from which two parameters are called partners
 
 
@@ -33,21 +39,43 @@ class Identifiability:
     reason: str
 
 
-def calibrated(refined: Refined, block_ids: np.ndarray) -> Gaussian:
+def calibrated(refined: Refined, deviations: Sequence[np.ndarray], block_ids: np.ndarray) -> Gaussian:
     """The calibrated Gaussian in search coordinates over the refined space.
 
-    block_ids: [M] integer block of each residual (see `time_blocks`).
+    deviations: per recording [N, M_i] whitened deviations of its repeats from their mean (see
+      `Comparison.deviations`); block_ids: [M] integer block of each residual (see `time_blocks`).
     """
     plain = np.linalg.inv(refined.hessian)
-    wide = np.sqrt(np.maximum(np.diag(_sandwich(refined, plain, block_ids)), np.diag(plain)))
-    factor = wide / np.sqrt(np.diag(plain))
+    variance = np.diag(plain)
+    repeats = variance * np.maximum(1.0, _repeat_ratio(refined.jacobian, plain, deviations))
+    blocks = np.diag(_sandwich(refined, plain, block_ids))
+    factor = np.sqrt(np.maximum(repeats, blocks) / variance)
     cov = plain * np.outer(factor, factor)
     main = ~refined.space.nuisance
     rule = (
-        "Gauss-Newton around the best, nuisances marginalised, deviations widened to the block scores of the "
-        f"residuals (x{np.median(factor[main]):.2f} in the median)"
+        "Gauss-Newton around the best, nuisances marginalised, deviations widened to the scatter between repeats and "
+        f"to the block scores of the residuals (x{np.median(factor[main]):.2f} in the median)"
     )
     return Gaussian(refined.space, refined.x, 0.5 * (cov + cov.T), rule, "search")
+
+
+def _repeat_ratio(jacobian: np.ndarray, inverse: np.ndarray, deviations: Sequence[np.ndarray]) -> np.ndarray:
+    """[D] variance that the repeats' scatter gives each parameter, over the one that whitened noise would give."""
+    assumed = jacobian.T @ jacobian
+    scatter, freedom, start = np.zeros_like(inverse), 0, 0
+    for deviation in deviations:
+        count, size = deviation.shape
+        part = jacobian[start : start + size]
+        start += size
+        if count < 2:  # one repeat says nothing about scatter
+            scatter += part.T @ part
+            continue
+        scores = deviation @ part
+        scatter += scores.T @ scores / (count * (count - 1))
+        freedom += count - 1
+    pooled = np.trace(inverse @ scatter) / np.trace(inverse @ assumed)
+    own = np.einsum("ij,jk,ki->i", inverse, scatter, inverse) / np.einsum("ij,jk,ki->i", inverse, assumed, inverse)
+    return (freedom * own + POOL * pooled) / (freedom + POOL)
 
 
 def _sandwich(refined: Refined, inverse: np.ndarray, block_ids: np.ndarray) -> np.ndarray:

@@ -122,14 +122,19 @@ def body_mass(
     high: float,
     **options: Any,
 ) -> Parameter:
-    """Mass of one body, kg; its inertia scales with it, as for a body of one material."""
+    """Mass of one body, kg; its inertia scales with it, as for a body of one material.
+
+    The search coordinate is logarithmic above the initial mean and linear below: what a mass does
+    is linear in it, and in a plain logarithm nothing would lead away from a mass near zero.
+    """
     index = scene.id("body", body)
     nominal = float(scene.model.body_mass[index])
     if nominal <= 0:
         raise ValueError(f"body {body!r} has no mass of its own in this scene")
-    options = {"name": f"{body}_mass", "unit": "kg", "scaling": Scaling.LOG, **options}
+    mean = nominal if mean is None else mean
+    options = {"name": f"{body}_mass", "unit": "kg", "scaling": Scaling.LOG, "floor": mean, **options}
     writes = (Write("body_mass", (index,)), *_inertia(index, Mode.SCALE, 1.0 / nominal))
-    return Parameter(mean=nominal if mean is None else mean, std=std, low=low, high=high, writes=writes, **options)
+    return Parameter(mean=mean, std=std, low=low, high=high, writes=writes, **options)
 
 
 def body_mass_scale(scene: Scene, body: str, *, std: float = 0.03, **options: Any) -> Parameter:
@@ -176,7 +181,8 @@ def body_position(scene: Scene, body: str, axis: int, *, std: float, limit: floa
 def body_yaw(scene: Scene, body: str, *, std: float, limit: float, **options: Any) -> Parameter:
     """Small rotation of a body about its z axis, rad; 0 at nominal.
 
-    First order in the angle (the quaternion's norm is off by angle^2 / 8, 1e-5 at half a degree).
+    Written as the quaternion (1, 0, 0, yaw / 2), which is normalised where it is applied: right to third
+    order in the angle.
     Raises ValueError unless the body is upright in its parent.
     """
     index = scene.id("body", body)
@@ -202,11 +208,12 @@ def pair_friction(
     """Friction of explicit contact pairs (MJX reads pair_friction for these, never geom_friction).
 
     columns: 0 and 1 sliding (-), 2 torsional (m).
+    Below 0.05 a pyramidal cone is too steep for float32 (its rows scale with the friction squared).
     """
     ids = [scene.id("pair", p) for p in pairs]
     writes = tuple(Write("pair_friction", (i, c)) for i in ids for c in columns)
     nominal = float(scene.model.pair_friction[ids[0], columns[0]])
-    options = {"mean": nominal, "low": 0.01, "high": 6.0, "scaling": Scaling.LOG, **options}
+    options = {"mean": nominal, "low": 0.05, "high": 6.0, "scaling": Scaling.LOG, **options}
     return Parameter(std=std, writes=writes, **options)
 
 

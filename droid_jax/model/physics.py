@@ -79,6 +79,8 @@ def make_physics(scene: Scene, space: Space, values: jax.Array) -> Physics:
         index = tuple(np.array(axis) for axis in zip(*(w.index for _, w in writes), strict=True))
         new = [w.new(nominal[w.index], values[column]) for column, w in writes]
         changed[field] = nominal.at[index].set(jnp.stack(new).astype(nominal.dtype))
+    if "body_quat" in changed:  # a write sets one component; engines differ in what they do with the norm
+        changed["body_quat"] /= jnp.linalg.norm(changed["body_quat"], axis=1, keepdims=True)
     model = model.replace(**changed)
     if _SOURCES & set(by_field):
         model = derive(model)
@@ -168,6 +170,7 @@ def make_c_model(scene: Scene, space: Space, values: np.ndarray) -> mujoco.MjMod
     for column, write in model_writes(space):
         array = getattr(model, write.field)
         array[write.index] = write.new(getattr(scene.model, write.field)[write.index], float(values[column]))
+    model.body_quat /= np.linalg.norm(model.body_quat, axis=1, keepdims=True)
     if _SOURCES & {w.field for _, w in model_writes(space)}:
         mujoco.mj_setConst(model, mujoco.MjData(model))
         # mj_setConst leaves the statistics alone; the solver scales its tolerance with them.
