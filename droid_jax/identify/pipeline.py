@@ -184,15 +184,8 @@ def identify(
 
 
 def starts(full: Space, space: Space, found: Fit) -> np.ndarray:
-    """[2, F] where the refinement begins: the search's best, and the initial means with a firm grip.
-
-    A grip that never slips is the smooth side of the problem: from there the pose and the hinge are
-    found first and friction comes down after, while a start with too little friction explains
-    everything else by slip.
-    """
-    searched = full.values(dict(zip(space.names, found.best.tolist(), strict=True)))
-    firm = full.values({n: _firm(full, n) for n in full.names if "friction" in n and "loss" not in n})
-    return np.stack([searched, firm])
+    """[2, F] where the refinement begins: the search's best, and the initial means."""
+    return np.stack([full.values(dict(zip(space.names, found.best.tolist(), strict=True))), full.mean])
 
 
 def grip_hypotheses(space: Space) -> list[dict[str, float]]:
@@ -203,11 +196,6 @@ def grip_hypotheses(space: Space) -> list[dict[str, float]]:
     sliding = {p.name: p.mean for p in space.parameters if p.name.startswith("sliding_friction")}
     alone = [{name: mean} for name, mean in sliding.items()]
     return [*alone, sliding] if len(sliding) > 1 else alone
-
-
-def _firm(space: Space, name: str) -> float:
-    parameter = space[name]
-    return min(parameter.high, 4.0 * parameter.mean)
 
 
 def _embed(cost: Cost, space: Space) -> Callable[[Any], np.ndarray]:

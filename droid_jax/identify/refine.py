@@ -40,6 +40,7 @@ class RefineConfig:
     chord: a Jacobian serves another batch of trials while the last lowered the objective by this share.
     keep: after iteration i only starts within keep[i] times the best objective go on (the last
       number holds from there on).
+    doubt: hypotheses are tried where the residuals' mean square stays above this.
     hold: iterations for which the values of a hypothesis are held while all else settles.
     hops: searches at most for a better basin around where the iterations stood still.
     hop_generations: generations of each.
@@ -52,7 +53,8 @@ class RefineConfig:
     tolerance: float = 0.5
     rough: float = 5e-3
     chord: float = 0.03
-    keep: tuple[float, ...] = (4.0, 2.0, 1.3, 1.0)
+    keep: tuple[float, ...] = (100.0, 20.0, 3.0, 1.3, 1.0)
+    doubt: float = 1.1
     hold: int = 2
     hops: int = 4
     hop_generations: int = 20
@@ -111,7 +113,7 @@ def refine(
     first: the same for a part of the data that is cheaper to replay; starts and hypotheses are sorted
       out there, and only the best goes on to all of it.
     hypotheses: assignments {name: value} that may lie in another basin (a finger that slips, say),
-      each tried once from where the starts converged.
+      each tried once from where the starts converged, if that leaves doubt.
     Raises ValueError where no start gives finite residuals.
     """
     config = config or RefineConfig()
@@ -120,7 +122,7 @@ def refine(
     if not np.isfinite(state.objective).any():
         raise ValueError("none of the starts could be replayed; widen the bounds or start nearer to the truth")
     state, ended = rough.descend(state, config.rough)
-    if hypotheses:
+    if hypotheses and np.mean(state.residual**2) > config.doubt:
         state, _ = rough.descend(rough.explore(state, hypotheses), config.rough)
     problem = _Problem(residuals, space, config, progress, rough)
     state, _ = problem.descend(problem.start(state.x))

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from droid_jax.identify.refine import HOP_TOLERANCE, RefineConfig, _Problem, refine
+from droid_jax.identify.refine import HOP_POPULATION, RefineConfig, _Problem, refine
 from droid_jax.model.parameters import Parameter, Scaling, Space
 
 
@@ -90,6 +90,17 @@ def test_logarithmic_parameters_that_trade_reach_the_truth_along_a_curved_valley
     assert fit.converged
 
 
+def test_among_the_first_trials_is_the_whole_way_straight_in_physical_units():
+    """Residuals linear in kg leave nothing to do after one Gauss-Newton step straight in kg."""
+    matrix = np.array([[20.0, 50.0], [10.0, -30.0]])
+    recorder = Recorder(linear(matrix, matrix @ [3.5, 0.1]))
+    space = Space((positive("m1", 3.0), positive("m2", 0.3)))
+    refine(recorder, space, [3.0, 0.3], dataclasses.replace(FLAT, step=1e-3))
+    start, differences, first = recorder.asked[:3]
+    assert (len(start), len(differences)) == (1, 4)
+    assert np.min(np.max(np.abs(first / [3.5, 0.1] - 1), axis=1)) < 1e-4
+
+
 def test_a_parameter_on_its_bound_leaves_the_others_their_constrained_optimum():
     """The free optimum lies beyond a's bound, and b and c trade with a."""
     matrix = np.array([[3.0, 2.5, 0.0], [2.5, 3.0, 1.0], [0.0, 1.0, 2.0], [1.0, 1.0, 1.0]])
@@ -99,7 +110,19 @@ def test_a_parameter_on_its_bound_leaves_the_others_their_constrained_optimum():
     others = np.linalg.lstsq(matrix[:, 1:], target - 1.5 * matrix[:, 0])[0]
     assert fit.best[0] == 1.5
     np.testing.assert_allclose(fit.best[1:], others, atol=1e-5)
-    np.testing.assert_allclose(fit.jacobian, matrix, atol=1e-7)  # one-sided differences at the bound
+    np.testing.assert_allclose(fit.jacobian, matrix, atol=1e-7)
+
+
+@pytest.mark.parametrize("a", [0.0, 0.1, 8.8, 9.0])
+def test_differences_at_a_bound_are_divided_by_what_is_left_of_their_span(a):
+    space = Space((line("a", low=0.0, mean=1.0, high=9.0), line("b")))
+    matrix = np.array([[3.0, 2.5], [2.5, 3.0], [1.0, -1.0]])
+    recorder = Recorder(linear(matrix, [1.0, 2.0, 3.0]))
+    problem = _Problem(recorder, space, EXACT)
+    state = problem.start(space.to_search(np.array([[a, 0.0]])))
+    np.testing.assert_allclose(problem.jacobian(state)[0], matrix, atol=1e-9)
+    np.testing.assert_allclose(problem.wide_jacobian(state), matrix, atol=1e-9)
+    space.check(recorder.rows)
 
 
 def test_a_start_on_the_wrong_bound_leaves_it():
@@ -118,7 +141,7 @@ def two_basins(values):
     return np.stack([2.0 * (s**2 - 9.0), 0.5 * (s + 3.0), 3.0 * (g - 4.0 * s)], axis=1)
 
 
-BASINS = Space((line("s"), line("g")))
+BASINS = Space((line("s"), line("g", std=5.0)))
 
 
 def test_a_hypothesis_finds_the_lower_basin_that_descent_misses():
@@ -127,16 +150,30 @@ def test_a_hypothesis_finds_the_lower_basin_that_descent_misses():
     assert plain.best[0] == pytest.approx(3.0, abs=0.1) and plain.objective > 4.0
     there = 0.5 * np.sum(two_basins(np.array([[-3.0, plain.best[1]]])) ** 2)
     assert there > 100 * plain.objective
-    fit = refine(two_basins, BASINS, [3.2, 12.0], FLAT, hypotheses=[{"s": 20.0}, {"s": -2.8}])
+    recorder = Recorder(two_basins)
+    fit = refine(recorder, BASINS, [3.2, 12.0], FLAT, hypotheses=[{"s": 20.0}, {"s": -2.8}])
+    held = recorder.rows[np.isclose(recorder.rows[:, 0], -2.8, rtol=0, atol=1e-9)]
+    assert np.min(np.abs(held[:, 1] + 4 * 2.8)) < 0.01  # g has settled while s was held
     np.testing.assert_allclose(fit.best, [-3.0, -12.0], atol=1e-4)
     assert fit.objective < 1e-6
 
 
 def test_a_hypothesis_that_is_worse_changes_nothing():
     plain = refine(two_basins, BASINS, [-3.1, -12.0], FLAT)
-    fit = refine(two_basins, BASINS, [-3.1, -12.0], FLAT, hypotheses=[{"s": 3.0}])
+    tried = dataclasses.replace(FLAT, doubt=-1.0)
+    fit = refine(two_basins, BASINS, [-3.1, -12.0], tried, hypotheses=[{"s": 3.0}])
+    assert fit.evaluations > plain.evaluations
     np.testing.assert_allclose(fit.best, plain.best, atol=1e-6)
     np.testing.assert_allclose(fit.best, [-3.0, -12.0], atol=1e-4)
+
+
+def test_hypotheses_are_tried_only_where_the_residuals_leave_doubt():
+    plain = refine(two_basins, BASINS, [3.2, 12.0], FLAT)
+    mean_square = np.mean(plain.residual**2)
+    for doubt, end in ((1.01 * mean_square, plain.best), (0.99 * mean_square, [-3.0, -12.0])):
+        config = dataclasses.replace(FLAT, doubt=doubt)
+        fit = refine(two_basins, BASINS, [3.2, 12.0], config, hypotheses=[{"s": -2.8}])
+        np.testing.assert_allclose(fit.best, end, atol=1e-4)
 
 
 def test_the_best_of_several_starts_wins_and_each_says_where_it_ended():
@@ -146,24 +183,53 @@ def test_the_best_of_several_starts_wins_and_each_says_where_it_ended():
     np.testing.assert_allclose(fit.starts, [upper, 0.0], atol=1e-3)
 
 
-def rugged(values):
-    """A bowl whose unit is one deviation, and steps: each cell 0.4 wide has its own offset up to 12 / 2."""
-    cell = np.floor(values / 0.4)
-    noise = np.modf(43758.5453 * np.sin(cell @ [12.9898, 78.233]))[0] ** 2
-    return np.column_stack([values - [0.7, -0.4], np.sqrt(12.0 * noise)])
+def test_starts_far_worse_than_the_best_are_dropped():
+    """The second start begins two hundred times as high; it takes part in the iterations that allow for that."""
+    starts = [[-8.0, -12.0], [20.0, 0.0]]
+    heights = 0.5 * np.sum(two_basins(np.array(starts)) ** 2, axis=1)
+    assert heights[1] > 20 * heights[0]
+
+    def iterations_of_the_second(keep):
+        recorder = Recorder(two_basins)
+        refine(recorder, BASINS, starts, dataclasses.replace(FLAT, keep=keep))
+        differences = [rows for rows in recorder.asked if len(rows) == 8]  # of two starts; four rows for one
+        return len(differences)
+
+    assert iterations_of_the_second((1.0,)) == 1
+    assert iterations_of_the_second((1e9, 1e9, 1.0)) == 3
 
 
-def test_hops_get_below_where_steps_stop_the_descent():
-    """The lowest objective on a grid far finer than the cells is the oracle."""
+def stepped(values):
+    """A bowl about (0.7, -0.4), a unit being one deviation, with 8 on top where a < 1.9 and 6 where b > -1.6."""
+    a, b = values[:, 0], values[:, 1]
+    on_top = np.where(a < 1.9, 8.0, 0.0) + np.where(b > -1.6, 6.0, 0.0)
+    return np.stack([a - 0.7, b + 0.4, np.sqrt(2 * on_top)], axis=1)
+
+
+def test_hops_get_past_steps_beside_the_optimum_that_no_derivative_sees():
+    """The lowest point is the corner (1.9, -1.6): 1.2 deviations from the bowl's bottom in either direction."""
+    space, config = Space((line("a"), line("b"))), dataclasses.replace(FLAT, tolerance=0.5)
+    stuck = refine(stepped, space, [-1.0, 1.0], config)
+    np.testing.assert_allclose(stuck.best, [0.7, -0.4], atol=1e-3)
+    assert stuck.objective == pytest.approx(14.0, abs=1e-3)
+    hopped = refine(stepped, space, [-1.0, 1.0], dataclasses.replace(config, hops=4))
+    assert 1.44 <= hopped.objective < 1.44 + 0.2
+    np.testing.assert_allclose(hopped.best, [1.9, -1.6], atol=0.1)
+    assert hopped.converged
+
+
+def test_a_hop_that_finds_nothing_is_the_last():
+    matrix, target = np.array([[2.0, 1.0], [1.0, 3.0], [1.0, -1.0]]), np.array([1.0, 2.0, 3.0])
     space = Space((line("a"), line("b")))
-    side = np.arange(-4.0, 4.0, 0.02) + 0.01
-    grid = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
-    lowest = np.min(0.5 * np.sum(rugged(grid) ** 2, axis=1))
-    config = dataclasses.replace(FLAT, tolerance=0.5)
-    stuck = refine(rugged, space, [3.5, -3.5], config)
-    assert stuck.objective > lowest + HOP_TOLERANCE  # a hop is worth it
-    hopped = refine(rugged, space, [3.5, -3.5], dataclasses.replace(config, hops=4))
-    assert hopped.objective < lowest + 0.25
+
+    def fit(hops):
+        config = dataclasses.replace(FLAT, hops=hops, hop_generations=3)
+        return refine(linear(matrix, target), space, [5.0, 5.0], config)
+
+    none, one, four = fit(0), fit(1), fit(4)
+    assert four.evaluations == one.evaluations > none.evaluations + 3 * HOP_POPULATION
+    np.testing.assert_allclose(four.best, np.linalg.lstsq(matrix, target)[0], atol=1e-6)
+    assert four.converged
 
 
 # ---------------------------------------------------------------- solver noise
@@ -176,7 +242,7 @@ APART, TOGETHER = 8.0 * np.sin(ANGLE), 0.08 * np.cos(2 * ANGLE)
 def rounded(values):
     """Two parameters whose difference is seen well and whose sum is not; each replay rounds anew."""
     a, b = values[:, :1], values[:, 1:]
-    rounding = ROUNDING * np.sin(1e7 * ((1.0 + ANGLE) * a + (2.0 - 0.1 * ANGLE) * b) + 100.0 * ANGLE)
+    rounding = ROUNDING * np.sin(1e7 * (np.sqrt(2.0 + ANGLE) * a + np.sqrt(3.0 + ANGLE) * b))
     return APART * (a - b) + TOGETHER * (a + b) + rounding
 
 
@@ -213,22 +279,23 @@ def test_the_wide_slopes_of_a_smooth_residual_are_its_derivatives_averaged_over_
 
 
 def test_the_cheap_part_sorts_the_starts_and_all_data_give_the_result():
-    """On all data the wrong basin has the lower objective at its start, but only the cheap part judges starts."""
+    """d = g - 4 s is 2 on the cheap part (3 deviations strong), -1 on the rest (4 strong): 2 / 25 on all data."""
+
+    def part(values):
+        return two_basins(values - [0.0, 2.0])
 
     def whole(values):
-        return np.concatenate([two_basins(values), 2.0 * (values[:, 1:] + [11.0, 10.0])], axis=1)
+        rest = 4.0 * (values[:, 1] - 4.0 * values[:, 0] + 1.0)
+        return np.concatenate([part(values), rest[:, None]], axis=1)
 
-    cheap, full = Recorder(two_basins), Recorder(whole)
-    fit = refine(full, BASINS, [[3.2, 12.0], [-3.2, -12.0]], FLAT, first=cheap)
-    # s and g on all data, with s^2 - 9 linear about its end: one Gauss-Newton step goes nowhere
-    residual = whole(fit.best[None])[0]
-    slopes = np.array([[4 * fit.best[0], 0], [0.5, 0], [-12.0, 3.0], [0, 2.0], [0, 2.0]])
-    np.testing.assert_allclose(np.linalg.lstsq(slopes, residual)[0], 0.0, atol=1e-3)
-    assert -3.0 < fit.best[0] < -2.8 and -11.9 < fit.best[1] < -11.0
-    np.testing.assert_array_equal(full.asked[0].round(3), [[-3.0, -12.0]])  # one row: the cheap part's winner
+    cheap, full = Recorder(part), Recorder(whole)
+    fit = refine(full, BASINS, [[3.2, 14.0], [-3.2, -10.0]], FLAT, first=cheap)
+    np.testing.assert_allclose(fit.best, [-3.0, -12.0 + 2 / 25], atol=1e-4)
+    np.testing.assert_allclose(
+        full.asked[0], [[-3.0, -10.0]], atol=1e-3
+    )  # one row: where the cheap part's winner ended
     assert np.all(full.rows[:, 0] < 0)
-    assert fit.residual.shape == (5,)
-    assert fit.evaluations == len(cheap.rows) + len(full.rows)
+    assert fit.residual.shape == (4,) and fit.jacobian.shape == (4, 2)
 
 
 # ---------------------------------------------------------------- failed replays
@@ -246,17 +313,15 @@ def test_a_start_that_fails_is_dropped_while_another_wins():
     fit = refine(recorder, BASINS, [[100.0, 0.0], [0.0, 0.0]], FLAT)
     np.testing.assert_allclose(fit.best, [1.0, 2.0], atol=1e-6)
     assert np.isinf(fit.starts[0]) and fit.starts[1] == pytest.approx(fit.objective, abs=1e-6)
-    tried = [bool(np.any(rows[:, 0] > 50.0)) for rows in recorder.asked]
-    assert tried[0] and not any(tried[len(tried) // 2 :])  # replayed at first, no longer at the end
+    assert len(recorder.asked[0]) == 2 and len(recorder.asked[1]) == 8  # both starts and their differences,
+    assert [len(rows) for rows in recorder.asked if len(rows) < 32].count(8) == 1  # then one start alone
 
 
 def test_a_trial_that_fails_is_not_taken():
-    """The full step would land at 10, beyond which nothing can be replayed; the optimum is at 8."""
-
-    def cliff(values):
-        return np.where(values > 9.0, np.nan, np.arctan(0.2 * (values - 8.0)) * 30.0)
-
-    fit = refine(cliff, Space((line("a"),)), [-8.0], FLAT)
+    """The first full step leads from -8 to 12; beyond 9 nothing can be replayed, the optimum is at 8."""
+    cliff = Recorder(lambda v: np.where(v > 9.0, np.nan, 30.0 * np.arctan(0.2 * (v - 8.0))))
+    fit = refine(cliff, Space((line("a", std=10.0),)), [-8.0], dataclasses.replace(FLAT, step=0.05))
+    assert np.any(cliff.rows > 9.0)
     assert fit.best[0] == pytest.approx(8.0, abs=1e-3)
 
 
@@ -281,15 +346,16 @@ def test_progress_rises_and_every_replay_is_counted():
 
 
 def test_iterations_are_limited_and_then_nothing_has_converged():
-    """Rosenbrock's valley takes more than three Jacobians of one batch each."""
+    """Rosenbrock's valley takes more than one Jacobian."""
 
     def rosenbrock(values):
-        return np.stack([100.0 * (values[:, 1] - values[:, 0] ** 2), 1.0 - values[:, 0]], axis=1)
+        return np.stack([10.0 * (values[:, 1] - values[:, 0] ** 2), 1.0 - values[:, 0]], axis=1)
 
     seen = []
     start, few = [-1.2, 1.0], dataclasses.replace(FLAT, iterations=1)
     fit = refine(rosenbrock, BASINS, start, few, progress=seen.append)
     assert fit.iterations == 1 and len(seen) == 1 and not fit.converged
+    assert fit.objective > 0.1 and seen[0].mean_square == pytest.approx(np.mean(fit.residual**2), rel=1e-6)
     long = refine(rosenbrock, BASINS, start, FLAT)
     assert long.converged and 1 < long.iterations < FLAT.iterations
     np.testing.assert_allclose(long.best, 1.0, atol=1e-3)
