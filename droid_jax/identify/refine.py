@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from droid_jax.compare.residuals import BLOWN_UP
 from droid_jax.identify.search import SearchConfig, search
 from droid_jax.model.parameters import Parameter, Scaling, Space
 
@@ -130,9 +131,10 @@ def refine(
     for number in range(config.hops):
         hopped = problem.hop(state, number)
         settled = bool(state.objective[0] - hopped.objective[0] <= HOP_TOLERANCE)
+        state = hopped if hopped.objective[0] < state.objective[0] else state
         if settled:
             break
-        state, _ = problem.descend(hopped)
+        state, _ = problem.descend(state)
     return Refined(
         space=space,
         x=state.x[0],
@@ -165,7 +167,7 @@ class _State:
 # A batch of trials for each start: damping factors x lengths x paths, 32 in all, the block of a CPU.
 _DAMPINGS = 10.0 ** np.arange(-3.0, 5.0)
 _LENGTHS = (1.0, 0.5)
-_LONGEST = 2.0  # search units: a trial step never moves a parameter further
+_LONGEST = 2.0  # search units: the longest component of a step
 CHORDS = 3  # batches of trials at most with one Jacobian
 SPREADS = 2  # times that the posterior's axes are improved
 WIDE = 1.5  # posterior deviations: half-width of those differences
@@ -175,6 +177,11 @@ HOP_SIGMA = 1.5  # posterior deviations
 HOP_TOLERANCE = 2.0  # of the objective: a hop that finds less ends the refinement
 HOP_LONGEST = 1.0  # search units: what the data do not tell is not searched far
 _SHORTEST = 0.05  # a straight path in physical units never takes a parameter below this share of itself
+
+
+def _fall(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """[S] by how much the objectives fell; 0 for a start that could not be replayed and still cannot."""
+    return np.where(np.isinf(after), 0.0, before - np.where(np.isinf(after), 0.0, after))
 
 
 class _Problem:
@@ -200,9 +207,23 @@ class _Problem:
         return np.clip(x, self.low, self.high)
 
     def replay(self, x: np.ndarray) -> np.ndarray:
-        """[P, D] -> residuals [P, M]."""
+        """[P, D] -> residuals [P, M]; NaN throughout where a replay failed."""
         self.evaluations += len(x)
-        return np.asarray(self.residuals(self.space.from_search(x)), dtype=np.float64)
+        residual = np.asarray(self.residuals(self.space.from_search(x)), dtype=np.float64)
+        failed = ~np.isfinite(residual).all(axis=1) | (residual == BLOWN_UP).all(axis=1)
+        return np.where(failed[:, None], np.nan, residual)
+
+    def differences(self, up: np.ndarray, down: np.ndarray, state: _State) -> tuple[np.ndarray, np.ndarray]:
+        """Spans [S, N, D] and residual differences [S, N, M] between up and down, both [S, N, D].
+
+        The start itself takes the place of a replay that failed.
+        """
+        points = np.stack([up, down])
+        residual = self.replay(points.reshape(-1, points.shape[-1])).reshape(*points.shape[:3], -1)
+        failed = np.isnan(residual[..., :1])
+        points = np.where(failed, state.x[:, None], points)
+        residual = np.where(failed, state.residual[:, None], residual)
+        return points[0] - points[1], residual[0] - residual[1]
 
     def objective(self, x: np.ndarray, residual: np.ndarray) -> np.ndarray:
         """[P]; infinite where a replay gave no numbers."""
@@ -266,14 +287,14 @@ class _Problem:
         for _ in range(CHORDS):
             last = state.objective
             state = self._try(state, jacobian, held)
-            if np.all(last - state.objective <= self.config.chord * state.objective):
+            if np.all(_fall(last, state.objective) <= self.config.chord * state.objective):
                 break
         curvature = np.einsum("sdd->sd", self.curvature(jacobian))
         # About one deviation wide, the others given; a start that stood still looks from elsewhere.
         widths = np.where((state.objective < before)[:, None], 1.0, 3.0) / np.sqrt(curvature)
         widths = np.clip(widths, self.config.smallest_step, self.config.step)
         state = _State(state.x, state.residual, state.objective, state.damping, widths)
-        return state, before - state.objective
+        return state, _fall(before, state.objective)
 
     def curvature(self, jacobian: np.ndarray) -> np.ndarray:
         """[S, D, D] Gauss-Newton curvature of the objective."""
@@ -281,13 +302,11 @@ class _Problem:
 
     def jacobian(self, state: _State) -> np.ndarray:
         """[S, M, D] differences of every start in one batch; one-sided where a bound is in the way."""
-        starts, dims = state.x.shape
-        steps = np.eye(dims)[None] * state.widths[:, None, :]
-        up, down = self.inside(state.x[:, None, :] + steps), self.inside(state.x[:, None, :] - steps)
-        both = np.concatenate([up, down], axis=1).reshape(-1, dims)
-        residual = self.replay(both).reshape(starts, 2 * dims, -1)
-        span = np.einsum("sii->si", up - down)
-        return np.swapaxes((residual[:, :dims] - residual[:, dims:]) / span[..., None], 1, 2)
+        steps = np.eye(state.x.shape[1]) * state.widths[:, None, :]
+        up, down = self.inside(state.x[:, None] + steps), self.inside(state.x[:, None] - steps)
+        spans, apart = self.differences(up, down, state)
+        span = np.einsum("sii->si", spans)[..., None]
+        return np.swapaxes(np.where(span > 0, apart / np.where(span > 0, span, 1.0), 0.0), 1, 2)
 
     def axes(self, jacobian: np.ndarray, longest: float) -> np.ndarray:
         """[D, D] columns: the posterior's principal axes, one deviation long, no entry beyond `longest`."""
@@ -305,9 +324,12 @@ class _Problem:
         jacobian = self.jacobian(state)[0]
         for _ in range(SPREADS):
             steps = WIDE * self.axes(jacobian, SPREAD_LONGEST).T
-            up, down = self.inside(state.x + steps), self.inside(state.x - steps)
-            above, below = np.split(self.replay(np.concatenate([up, down])), 2)
-            jacobian = np.linalg.lstsq(up - down, above - below)[0].T
+            spans, apart = self.differences(
+                self.inside(state.x[:, None] + steps), self.inside(state.x[:, None] - steps), state
+            )
+            if np.any(np.all(spans[0] == 0, axis=1)):  # failed on both sides: the narrow differences are all there is
+                return jacobian
+            jacobian = np.linalg.lstsq(spans[0], apart[0])[0].T
         return jacobian
 
     def explore(self, state: _State, hypotheses: Hypotheses) -> _State:
@@ -329,7 +351,7 @@ class _Problem:
         return found if found.objective[0] < state.objective[0] else state
 
     def _try(self, state: _State, jacobian: np.ndarray, held: np.ndarray | None) -> _State:
-        """All trials of all starts in one batch; each start takes its best, or stays with more damping."""
+        """All trials of all starts in one batch; each start takes its best, or stays."""
         starts, dims = state.x.shape
         steps = np.stack([self._steps(state.rows([s]), jacobian[s], held, s) for s in range(starts)])
         paths = [self.inside(state.x[:, None] + steps), self.inside(self._straight(state.x[:, None], steps))]

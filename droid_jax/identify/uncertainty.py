@@ -47,7 +47,7 @@ def calibrated(refined: Refined, deviations: Sequence[np.ndarray], block_ids: np
     """
     plain = np.linalg.inv(refined.hessian)
     variance = np.diag(plain)
-    repeats = variance * np.maximum(1.0, _repeat_ratio(refined.jacobian, plain, deviations))
+    repeats = variance * np.maximum(1.0, _repeat_ratio(refined, plain, deviations))
     blocks = np.diag(_sandwich(refined, plain, block_ids))
     factor = np.sqrt(np.maximum(repeats, blocks) / variance)
     cov = plain * np.outer(factor, factor)
@@ -59,13 +59,16 @@ def calibrated(refined: Refined, deviations: Sequence[np.ndarray], block_ids: np
     return Gaussian(refined.space, refined.x, 0.5 * (cov + cov.T), rule, "search")
 
 
-def _repeat_ratio(jacobian: np.ndarray, inverse: np.ndarray, deviations: Sequence[np.ndarray]) -> np.ndarray:
-    """[D] variance that the repeats' scatter gives each parameter, over the one that whitened noise would give."""
-    assumed = jacobian.T @ jacobian
+def _repeat_ratio(refined: Refined, inverse: np.ndarray, deviations: Sequence[np.ndarray]) -> np.ndarray:
+    """[D] variance that the repeats' scatter gives each parameter, over the one that whitened noise would give.
+
+    Both hold the prior's share, so that what the data do not see stays at ratio 1.
+    """
+    prior = np.diag(refined.prior**-2)
     scatter, freedom, start = np.zeros_like(inverse), 0, 0
     for deviation in deviations:
         count, size = deviation.shape
-        part = jacobian[start : start + size]
+        part = refined.jacobian[start : start + size]
         start += size
         if count < 2:  # one repeat says nothing about scatter
             scatter += part.T @ part
@@ -73,9 +76,10 @@ def _repeat_ratio(jacobian: np.ndarray, inverse: np.ndarray, deviations: Sequenc
         scores = deviation @ part
         scatter += scores.T @ scores / (count * (count - 1))
         freedom += count - 1
-    pooled = np.trace(inverse @ scatter) / np.trace(inverse @ assumed)
-    own = np.einsum("ij,jk,ki->i", inverse, scatter, inverse) / np.einsum("ij,jk,ki->i", inverse, assumed, inverse)
-    return (freedom * own + POOL * pooled) / (freedom + POOL)
+    seen = refined.jacobian.T @ refined.jacobian
+    pooled = np.trace(inverse @ scatter) / max(np.trace(inverse @ seen), 1e-12)
+    shared = freedom * scatter + POOL * pooled * seen
+    return np.diag(inverse @ (shared / (freedom + POOL) + prior) @ inverse) / np.diag(inverse)
 
 
 def _sandwich(refined: Refined, inverse: np.ndarray, block_ids: np.ndarray) -> np.ndarray:

@@ -359,3 +359,29 @@ def test_iterations_are_limited_and_then_nothing_has_converged():
     long = refine(rosenbrock, BASINS, start, FLAT)
     assert long.converged and 1 < long.iterations < FLAT.iterations
     np.testing.assert_allclose(long.best, 1.0, atol=1e-3)
+
+
+def test_a_failed_replay_within_the_posterior_does_not_end_the_refinement():
+    matrix = np.array([[5.0, 1.0], [1.0, 4.0], [2.0, 2.0]])
+    solved = linear(matrix, matrix @ [0.0, 1.0])
+    fit = refine(lambda v: np.where(v[:, :1] > 0.05, np.nan, solved(v)), BASINS, [-1.0, 0.0], FLAT)
+    np.testing.assert_allclose(fit.best, [0.0, 1.0], atol=1e-3)
+
+
+def test_blown_up_replays_next_door_are_no_information():
+    matrix = np.array([[5.0, 1.0], [1.0, 4.0], [2.0, 2.0]])
+    solved = linear(matrix, matrix @ [0.0, 1.0])
+    fit = refine(lambda v: np.where(v[:, :1] > 0.03, 1e3, solved(v)), BASINS, [-1.0, 0.0], FLAT)
+    truth = matrix * [1, 5]
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(np.linalg.inv(fit.hessian))), np.sqrt(np.diag(np.linalg.inv(truth.T @ truth))), rtol=0.3
+    )
+
+
+def test_what_a_hop_has_found_is_kept():
+    def step(v):
+        return np.stack([v[:, 0] - 0.7, v[:, 1] + 0.4, np.sqrt(2 * np.where(v[:, 0] < 1.9, 2.0, 0.0))], axis=1)
+
+    space = Space((line("a"), line("b")))
+    fit = refine(step, space, [-1.0, 1.0], RefineConfig(main_prior=1e6))
+    assert fit.objective < 1.9  # 0.72 is found by the hop, 2.0 returned

@@ -82,7 +82,8 @@ def test_repeats_with_the_assumed_noise_leave_the_gauss_newton_covariance():
 def test_repeats_that_scatter_twice_as_far_double_every_deviation():
     fit = fitted(SKEW, nuisances=1)
     gaussian = calibrated(fit, [exactly(2.0, 40, 30)], one_block(SKEW))
-    np.testing.assert_allclose(gaussian.cov, 4.0 * np.linalg.inv(fit.hessian), rtol=1e-9)
+    # the share of the prior is not widened, hence the tolerance
+    np.testing.assert_allclose(gaussian.cov, 4.0 * np.linalg.inv(fit.hessian), rtol=2e-3)
     assert "(x2.00 in the median)" in gaussian.rule
 
 
@@ -104,7 +105,7 @@ def test_a_pattern_shared_by_all_residuals_widens_the_parameter_that_it_looks_li
     own = (shifts @ shifts) / (count * (count - 1)) / assumed
     weight = (count - 1) / (count - 1 + POOL)
     ratio = np.array([weight * own, 0.0]) + (1 - weight) * own / 2  # the pool: half of the two parameters' spread
-    np.testing.assert_allclose(np.diag(gaussian.cov), plain * ratio, rtol=1e-9)
+    np.testing.assert_allclose(np.diag(gaussian.cov), plain * ratio, rtol=2e-3)
 
 
 def test_own_ratio_outweighs_the_pool_with_many_repeats():
@@ -129,7 +130,7 @@ def test_each_recording_s_repeats_speak_for_its_own_residuals():
     gaussian = calibrated(fitted(SQUARE), recordings, one_block(SQUARE))
     weight = (count - 1) / (count - 1 + POOL)
     ratio = weight * np.array([1.0, 9.0]) + (1 - weight) * 5.0  # the pool: the mean of 1 and 9
-    np.testing.assert_allclose(np.diag(gaussian.cov) * (200.0 + 1 / 16), ratio, rtol=1e-9)
+    np.testing.assert_allclose(np.diag(gaussian.cov) * (200.0 + 1 / 16), ratio, rtol=2e-3)
 
 
 # ---------------------------------------------------------------- scatter of the blocks
@@ -317,3 +318,15 @@ def test_a_search_s_own_covariance_is_not_judged():
     assert [v.name for v in verdicts] == list(space.names)
     assert not any(v.identifiable for v in verdicts) and all(v.partners == () for v in verdicts)
     assert {v.reason for v in verdicts} == {"not judged: the search's covariance depends on when it stopped"}
+
+
+def test_a_parameter_without_any_effect_keeps_its_prior():
+    fit = fitted(SQUARE * [1.0, 0.0])
+    g = calibrated(fit, [exactly(2.0, 20, 16)], one_block(SQUARE))
+    np.testing.assert_allclose(np.sqrt(np.diag(g.cov)), [2 / np.sqrt(200), 4.0], rtol=1e-3)
+
+
+def test_loud_repeats_never_leave_more_than_the_prior_of_what_is_not_seen():
+    fit = fitted(SQUARE * [1.0, 1e-5])
+    g = calibrated(fit, [exactly(3.0, 20, 16)], one_block(SQUARE))
+    assert identifiability(g, fit.prior)[1].shrinkage <= 1.001
