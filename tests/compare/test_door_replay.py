@@ -169,12 +169,12 @@ def test_both_engines_rank_samples_alike(scene: Scene, demonstration: Recording,
 def test_the_replay_moves_smoothly_with_the_grip(space: Space, demonstration: Recording):
     """No cliffs: a touch that moves to the next time step must not change all that follows.
 
-    With a contact that is hard from the first touch, the largest step along this line is ten and more times the
-    median one.
+    With a contact that is hard from the first touch, the largest step along this line is three times the median
+    one; here it is 1.3 times.
     """
     scene = door_scene(timestep=0.004)
     rows = np.tile(space.values(truth(1)), (32, 1))
     rows[:, space.index("knob_radius")] = np.linspace(-4e-4, 4e-4, 32)
     torque = replayed(scene, space, make_drive(scene, demonstration), rows, parity=False).torque
     steps = np.sqrt(np.mean(np.diff(torque, axis=0) ** 2, axis=(1, 2)))
-    assert steps.max() < 3 * np.median(steps)
+    assert steps.max() < 2 * np.median(steps)
