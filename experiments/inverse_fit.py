@@ -231,7 +231,7 @@ def estimate(cost: Cost, space: Space, start: np.ndarray, block: float) -> Estim
     refined = refine(Stated(cost, discrepancy(left)).whitened, space, start)
     samples, columns = left.shape
     blocks = time_blocks([(columns, samples)], [samples / noise.RATE], block)
-    return Estimate(space, refined.best, calibrated(refined, blocks), refined)
+    return Estimate(space, refined.best, calibrated(refined, (), blocks), refined)  # one repeat: no scatter
 
 
 def table(result: Estimate) -> list[dict[str, Any]]:
