@@ -184,8 +184,13 @@ def identify(
 
 
 def starts(full: Space, space: Space, found: Fit) -> np.ndarray:
-    """[2, F] where the refinement begins: the search's best, and the initial means."""
-    return np.stack([full.values(dict(zip(space.names, found.best.tolist(), strict=True))), full.mean])
+    """[3, F] where the refinement begins: the search's best, the initial means, and these with a firm grip.
+
+    A grip that slips and one that never does are different basins, and neither start finds the other's.
+    """
+    searched = full.values(dict(zip(space.names, found.best.tolist(), strict=True)))
+    firm = {p.name: min(p.high, 4.0 * p.mean) for p in space.parameters if p.name.startswith(("sliding", "torsional"))}
+    return np.stack([searched, full.mean, full.values(firm)])
 
 
 def grip_hypotheses(space: Space) -> list[dict[str, float]]:
