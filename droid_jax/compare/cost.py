@@ -9,7 +9,7 @@ cost.rollouts(values)   # [P, D] -> one Rollout per recording
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import jax
@@ -76,8 +76,9 @@ class Cost:
         return self._blockwise(values, identity, tuple)
 
     def first(self) -> Cost:
-        """The cost of the first recording alone, on the same compiled replay."""
-        return assemble(self.scene, self.space, self.comparisons[:1], self._replays[:1], self.drives[:1])
+        """The cost of the first recording alone, on the same compiled functions."""
+        each = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("scene", "space")}
+        return replace(self, **{name: of_recordings[:1] for name, of_recordings in each.items()})
 
     def against(self, recordings: Sequence[Recording]) -> Cost:
         """The same compiled replays compared with other repeats of the same recordings.

@@ -15,7 +15,7 @@ valley between them is straight in physical units alone.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -86,7 +86,7 @@ class Refined:
     @property
     def hessian(self) -> np.ndarray:
         """[D, D] Gauss-Newton curvature, prior included."""
-        return self.jacobian.T @ self.jacobian + np.diag(self.prior**-2)
+        return _curvature(self.jacobian, self.prior)
 
 
 @dataclass(frozen=True)
@@ -177,6 +177,11 @@ HOP_SIGMA = 1.5  # posterior deviations
 HOP_TOLERANCE = 2.0  # of the objective: a hop that finds less ends the refinement
 HOP_LONGEST = 1.0  # search units: what the data do not tell is not searched far
 _SHORTEST = 0.05  # a straight path in physical units never takes a parameter below this share of itself
+
+
+def _curvature(jacobian: np.ndarray, prior: np.ndarray) -> np.ndarray:
+    """[D, D] Gauss-Newton curvature of the objective from slopes [M, D] and prior deviations [D]."""
+    return jacobian.T @ jacobian + np.diag(prior**-2)
 
 
 def _fall(before: np.ndarray, after: np.ndarray) -> np.ndarray:
@@ -289,16 +294,11 @@ class _Problem:
             state = self._try(state, jacobian, held)
             if np.all(_fall(last, state.objective) <= self.config.chord * state.objective):
                 break
-        curvature = np.einsum("sdd->sd", self.curvature(jacobian))
+        curvature = np.einsum("smd,smd->sd", jacobian, jacobian) + self.prior**-2
         # About one deviation wide, the others given; a start that stood still looks from elsewhere.
         widths = np.where((state.objective < before)[:, None], 1.0, 3.0) / np.sqrt(curvature)
         widths = np.clip(widths, self.config.smallest_step, self.config.step)
-        state = _State(state.x, state.residual, state.objective, state.damping, widths)
-        return state, _fall(before, state.objective)
-
-    def curvature(self, jacobian: np.ndarray) -> np.ndarray:
-        """[S, D, D] Gauss-Newton curvature of the objective."""
-        return np.einsum("smd,sme->sde", jacobian, jacobian) + np.diag(self.prior**-2)
+        return replace(state, widths=widths), _fall(before, state.objective)
 
     def jacobian(self, state: _State) -> np.ndarray:
         """[S, M, D] differences of every start in one batch; one-sided where a bound is in the way."""
@@ -310,7 +310,7 @@ class _Problem:
 
     def axes(self, jacobian: np.ndarray, longest: float) -> np.ndarray:
         """[D, D] columns: the posterior's principal axes, one deviation long, no entry beyond `longest`."""
-        variance, axes = np.linalg.eigh(np.linalg.inv(jacobian.T @ jacobian + np.diag(self.prior**-2)))
+        variance, axes = np.linalg.eigh(np.linalg.inv(_curvature(jacobian, self.prior)))
         return axes * np.minimum(np.sqrt(np.maximum(variance, 0.0)), longest / np.max(np.abs(axes), axis=0))
 
     def wide_jacobian(self, state: _State) -> np.ndarray:
@@ -372,7 +372,7 @@ class _Problem:
     def _steps(self, state: _State, jacobian: np.ndarray, held: np.ndarray | None, row: int) -> np.ndarray:
         """[dampings * lengths, D] Levenberg-Marquardt steps of one start, along the bounds it sits on."""
         x = state.x[0]
-        hessian = jacobian.T @ jacobian + np.diag(self.prior**-2)
+        hessian = _curvature(jacobian, self.prior)
         slope = jacobian.T @ state.residual[0] + x / self.prior**2
         free = ~(((x <= self.low) & (slope > 0)) | ((x >= self.high) & (slope < 0)))
         free &= True if held is None else ~held[row]
