@@ -1,4 +1,4 @@
-"""What the benchmark scripts share: fair timing, processes of their own, and results with their origin."""
+"""What the benchmark scripts share: fair timing, processes of their own, and where a result comes from."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import resource
 import statistics
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -40,18 +39,6 @@ def origin(seed: int) -> dict[str, Any]:
         "seed": seed,
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
-
-
-def write_json(path: Path, result: Mapping[str, Any]) -> None:
-    """Write a result, whole or not at all; makes the folder.
-
-    Raises ValueError for a number that is NaN or infinite, which JSON has no word for.
-    """
-    text = json.dumps(result, indent=2, allow_nan=False) + "\n"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile("w", dir=path.parent, prefix=path.name, delete=False) as file:
-        file.write(text)
-    os.replace(file.name, path)
 
 
 def interleave(

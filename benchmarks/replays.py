@@ -24,9 +24,10 @@ from droid_jax.measure.demonstration import demonstration_path
 from droid_jax.measure.engine import instrument, simulate
 from droid_jax.measure.formats import load
 from droid_jax.model.door import door_space
+from droid_jax.model.door_scene import door_scene
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_c_model, make_physics
-from droid_jax.model.scene import Scene, door_scene
+from droid_jax.model.scene import Scene
 
 C_CHUNK = 64  # samples of which the C engine holds traces at once
 Run = Callable[[], Any]

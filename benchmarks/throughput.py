@@ -22,12 +22,13 @@ from typing import Any, Literal
 import mujoco
 import numpy as np
 import tyro
-from common import in_process, interleave, origin, peak_memory_gib, write_json
+from common import in_process, interleave, origin, peak_memory_gib
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from droid_jax import runtime
+from droid_jax.storage import write_json
 
 CPU_POPULATIONS = tuple(2**k for k in range(11))  # 1 to 1024
 GPU_POPULATIONS = tuple(2**k for k in range(15))  # 1 to 16384
@@ -294,7 +295,7 @@ def main(config: Throughput) -> None:
         result = untuned_part(config) if config.part == "untuned" else memory_part(config)
     else:
         result = measure(config)
-        write_json(config.out / "throughput.json", result)
+        write_json(config.out / "throughput.json", result, indent=2)
         rows = [Row(**{k: v for k, v in row.items() if k != "steps_per_s"}) for row in result["rows"]]
         Console().print(table_of(rows))
     print(json.dumps(result))

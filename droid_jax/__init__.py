@@ -26,11 +26,11 @@ if TYPE_CHECKING:
     from droid_jax.measure.recording import Recording as Recording
     from droid_jax.model.door import door_nuisances as door_nuisances
     from droid_jax.model.door import door_space as door_space
+    from droid_jax.model.door_scene import door_scene as door_scene
     from droid_jax.model.parameters import Parameter as Parameter
     from droid_jax.model.parameters import Scaling as Scaling
     from droid_jax.model.parameters import Space as Space
     from droid_jax.model.scene import Scene as Scene
-    from droid_jax.model.scene import door_scene as door_scene
     from droid_jax.model.scene import load_scene as load_scene
     from droid_jax.runtime import tune as tune
 
@@ -60,7 +60,7 @@ _HOMES = {
     "Space": ("model.parameters", "Space"),
     "Scaling": ("model.parameters", "Scaling"),
     "Scene": ("model.scene", "Scene"),
-    "door_scene": ("model.scene", "door_scene"),
+    "door_scene": ("model.door_scene", "door_scene"),
     "load_scene": ("model.scene", "load_scene"),
     "door_space": ("model.door", "door_space"),
     "door_nuisances": ("model.door", "door_nuisances"),

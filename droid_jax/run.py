@@ -58,7 +58,10 @@ class Identify:
     restarts: int | None = None
     """Independent searches in one batch; default: the preset's."""
     nuisances: bool = True
-    """Fit and marginalise pose, link masses, servo gains, timing and offsets too (never in the paper preset)."""
+    """Fit and marginalise pose, link masses, servo gains, timing and offsets too (never in the paper preset).
+    In your own scene: those of your parameters that say "nuisance": true."""
+    whitened: bool = False
+    """The search counts torques in units of their noise instead of N m (the refinement always does)."""
     seed: int = 0
     """Seed of the search, of the stand-in robot and of the samples."""
     out: Path = Path("runs/identify")
@@ -93,7 +96,38 @@ class Report:
     """The run's folder."""
 
 
-Command = Identify | Record | Report
+@dataclass(frozen=True)
+class Convert:
+    """Read ROS bags or a CSV folder, check them, and write a recording that identify takes.
+
+    Bags do not say what their efforts are, nor the servo's gains: say it here.
+    """
+
+    source: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """ROS 1 .bag or ROS 2 bags, one per repeat (or a folder of them), a CSV folder, or an npz file."""
+    out: Path = Path("runs/recording.npz")
+    """File (npz) or folder (CSV) to write."""
+    joints: tuple[str, ...] = ()
+    """Bags: measured joints, in the order wanted."""
+    torque: Literal["motor", "link"] | None = None
+    """Bags: motor (current, actuator force) or link (a sensor behind the gear, a Panda's tau_J)."""
+    gravity: bool = False
+    """Bags: the torque contains what carries the arm's weight."""
+    state_topic: str = "/joint_states"
+    """Bags: topic of sensor_msgs/JointState."""
+    command_topic: str | None = None
+    """Bags: topic of the position commands; without one the log is replayed by inverse dynamics."""
+    stiffness: tuple[float, ...] = ()
+    """Bags: servo gains of the commanded joints, N m/rad."""
+    damping: tuple[float, ...] = ()
+    """Bags: servo damping of the commanded joints, N m s/rad."""
+    start: float | None = None
+    """Keep the part from here, s."""
+    end: float | None = None
+    """Keep the part up to here, s."""
+
+
+Command = Identify | Record | Convert | Report
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -102,7 +136,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not arguments or (arguments[0].startswith("-") and arguments[0] not in ("-h", "--help")):
         arguments = ["identify", *arguments]
     command = tyro.cli(Command, args=arguments, prog="python -m droid_jax.run", description=__doc__)
-    actions: dict[type, Callable[[Any], None]] = {Identify: run_identify, Record: run_record, Report: run_report}
+    actions: dict[type, Callable[[Any], None]] = {
+        Identify: run_identify, Record: run_record, Convert: run_convert, Report: run_report,
+    }  # fmt: skip
     try:
         actions[type(command)](command)
     except (ValueError, OSError) as error:
@@ -175,7 +211,7 @@ def run_record(command: Record) -> None:
     from droid_jax.measure.demonstration import demonstration_path
     from droid_jax.measure.formats import load, save
     from droid_jax.measure.surrogate import SurrogateConfig, record, stand_in_truth
-    from droid_jax.model.scene import door_scene
+    from droid_jax.model.door_scene import door_scene
 
     scene = door_scene(springs=command.springs, gains=command.gains)
     demonstration = load(demonstration_path(command.demonstration, gains=command.gains))
@@ -184,6 +220,48 @@ def run_record(command: Record) -> None:
     command.out.parent.mkdir(parents=True, exist_ok=True)
     path = save(recording, command.out)
     print(f"stand-in robot recorded {recording.repeats} repeats of {recording.duration:.1f} s: {path}")
+
+
+def run_convert(command: Convert) -> None:
+    """Load whatever it is, validate, cut, and save."""
+    from droid_jax.measure.formats import load, save
+
+    if not command.source:
+        raise ValueError("convert needs the files or folders to read")
+    path, *others = command.source
+    if others:
+        from droid_jax.measure.rosbag import read_bags
+
+        recording = read_bags(command.source, **_bag_options(command))
+    else:
+        recording = load(path, **(_bag_options(command) if command.joints else {}))
+    if command.start is not None or command.end is not None:
+        first, last = recording.span
+        start, end = command.start, command.end
+        recording = recording.window(first if start is None else start, last if end is None else end)
+    path = save(recording, command.out)
+    channels = ", ".join(f"{n} ({len(c.columns)} x {len(c.time)})" for n, c in recording.channels.items())
+    print(f"{recording.repeats} repeats of {recording.duration:.1f} s, channels {channels}: {path}")
+
+
+def _bag_options(command: Convert) -> dict[str, Any]:
+    """What bags do not say; ValueError names what is missing."""
+    import numpy as np
+
+    from droid_jax.measure.recording import ServoGains, TorqueConvention, TorqueSide
+
+    if not command.joints or command.torque is None:
+        raise ValueError("a ROS bag does not say which joints to read or what its efforts are: give --joints, --torque")
+    if len(command.stiffness) != len(command.damping):
+        raise ValueError(f"got {len(command.stiffness)} --stiffness and {len(command.damping)} --damping")
+    gains = ServoGains(np.array(command.stiffness), np.array(command.damping)) if command.stiffness else None
+    return {
+        "joints": command.joints,
+        "torque": TorqueConvention(TorqueSide(command.torque), command.gravity),
+        "state_topic": command.state_topic,
+        "command_topic": command.command_topic,
+        "gains": gains,
+    }
 
 
 def run_report(command: Report) -> None:
@@ -196,8 +274,9 @@ def run_report(command: Report) -> None:
 def _model(command: Identify) -> tuple[Scene, Space, Space | None]:
     """The scene, what is fitted, and the nuisances beside it."""
     from droid_jax.model.door import door_nuisances, door_space
+    from droid_jax.model.door_scene import door_scene
     from droid_jax.model.own import friction_joints, load_parameters
-    from droid_jax.model.scene import door_scene, load_scene
+    from droid_jax.model.scene import load_scene
 
     if command.scene is not None:
         if command.parameters is None:
@@ -208,7 +287,10 @@ def _model(command: Identify) -> tuple[Scene, Space, Space | None]:
             object_joint=command.object_joint,
             friction_joints=friction_joints(command.parameters),
         )
-        return scene, load_parameters(command.parameters, scene), None
+        listed = load_parameters(command.parameters, scene)
+        main = listed.select(p.name for p in listed.parameters if not p.nuisance)
+        extra = [p.name for p in listed.parameters if p.nuisance]
+        return scene, main, listed.select(extra) if command.nuisances and extra else None
     timestep = {"quick": 0.004, "standard": 0.002, "paper": 0.002, "gpu": 0.002}[command.preset]
     if command.preset == "paper":
         scene = door_scene(gains="paper", timestep=timestep)
@@ -246,6 +328,7 @@ def _recordings(command: Identify, scene: Scene, out: Path) -> tuple[list[Record
 
 def _config(command: Identify) -> IdentifyConfig:
     """The preset with the command's own numbers."""
+    from droid_jax.compare.residuals import CompareConfig
     from droid_jax.identify.pipeline import IdentifyConfig
     from droid_jax.identify.refine import RefineConfig
     from droid_jax.identify.search import SearchConfig
@@ -259,7 +342,8 @@ def _config(command: Identify) -> IdentifyConfig:
     changes = {k: getattr(command, k) for k in ("population", "generations", "restarts")}
     search = dataclasses.replace(search, seed=command.seed, **{k: v for k, v in changes.items() if v is not None})
     refine = None if command.preset == "paper" else RefineConfig()
-    return IdentifyConfig(engine=command.engine, search=search, refine=refine, seed=command.seed)
+    compare = CompareConfig(whitened=command.whitened)
+    return IdentifyConfig(engine=command.engine, search=search, refine=refine, seed=command.seed, compare=compare)
 
 
 def _setup(command: Identify) -> dict[str, Any]:
@@ -299,7 +383,7 @@ def _begin(out: Path, setup: dict[str, Any], again: bool) -> None:
     """Only now, with all input read, forget an earlier run where that was asked for, and say what runs here."""
     import shutil
 
-    from droid_jax.identify.results import write_json
+    from droid_jax.storage import write_json
 
     if again:
         shutil.rmtree(out / "checkpoints", ignore_errors=True)
@@ -330,9 +414,10 @@ def _draw(out: Path, found: Any, recording: Recording) -> None:
 def _summary(found: Any) -> None:
     """Five lines that say how it went."""
     for name, gap in found.gaps.items():
+        way = f"a perfect model: {gap.floor:.3f}), {gap.closed:.0%} of the gap closed"
         print(
             f"{name}: held-out torque distance {gap.before:.3f} -> {gap.after:.3f} N m "
-            f"(a perfect model: {gap.floor:.3f}), {gap.closed:.0%} of the gap closed"
+            f"({way if gap.floor else 'one repeat: what noise alone would leave is not known)'}"
         )
     silent = [t.name for t in found.tells if not t.identifiable and not found.full[t.name].nuisance]
     if silent and found.refined is not None:

@@ -21,13 +21,14 @@ import os
 import platform
 import subprocess
 import sys
-import tempfile
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
+
+from droid_jax.storage import write_json
 
 if TYPE_CHECKING:
     from jax.sharding import Mesh
@@ -218,7 +219,7 @@ def _flag_known(root: Path | None) -> bool:
         warnings.warn(f"could not find out whether jaxlib {version} knows {_EMITTERS_OFF}", stacklevel=4)
         return False
     if answers:
-        _write_atomically(answers, json.dumps(known))
+        write_json(answers, known)
     return known
 
 
@@ -324,10 +325,3 @@ def _git(checkout: Path, *arguments: str) -> str:
     command = ["git", "--no-optional-locks", "-C", str(checkout), *arguments]
     run = subprocess.run(command, capture_output=True, text=True, check=True, timeout=30)
     return run.stdout.strip()
-
-
-def _write_atomically(path: Path, text: str) -> None:
-    """Write a small file that another process may be reading or writing."""
-    with tempfile.NamedTemporaryFile("w", dir=path.parent, prefix=path.name, delete=False) as file:
-        file.write(text)
-    os.replace(file.name, path)

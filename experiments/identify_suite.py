@@ -27,7 +27,7 @@ import numpy as np  # noqa: E402
 import scipy.stats  # noqa: E402
 import tyro  # noqa: E402
 
-from benchmarks.common import origin, write_json  # noqa: E402
+from benchmarks.common import origin  # noqa: E402
 from droid_jax.compare.cost import make_cost  # noqa: E402
 from droid_jax.identify.gaussian import prior  # noqa: E402
 from droid_jax.identify.pipeline import Identified, IdentifyConfig, cost_samples, identify  # noqa: E402
@@ -39,7 +39,9 @@ from droid_jax.measure.recording import Recording  # noqa: E402
 from droid_jax.measure.surrogate import draw_nuisances, record, stand_in_truth  # noqa: E402
 from droid_jax.model.door import JOINT_DAMPING, door_nuisances, door_space  # noqa: E402
 from droid_jax.model.door import truth as table_i  # noqa: E402
-from droid_jax.model.scene import Scene, door_scene  # noqa: E402
+from droid_jax.model.door_scene import door_scene  # noqa: E402
+from droid_jax.model.scene import Scene  # noqa: E402
+from droid_jax.storage import write_json  # noqa: E402
 
 Part = Literal["doors", "calibration", "pose", "parity"]
 MUST_BE_KNOWN = ("hinge_stiffness", "hinge_frictionloss", "hinge_damping", *JOINT_DAMPING)
@@ -199,7 +201,7 @@ def run_cases(arguments: Arguments) -> dict[str, dict[str, Any]]:
         path = folder / f"{name}.json"
         if not path.is_file():
             print(f"[{number}/{len(cases)}] {name} ...", flush=True)
-            write_json(path, {**run(), "origin": origin(0)})
+            write_json(path, {**run(), "origin": origin(0)}, indent=2)
         results[name] = json.loads(path.read_text())
     return results
 
@@ -272,7 +274,7 @@ def main() -> None:
     arguments = tyro.cli(Arguments, description=__doc__)
     cases = run_cases(arguments)
     result = {**origin(0), **summarise(cases)}
-    write_json(arguments.out / ("identify_quick.json" if arguments.quick else "identify.json"), result)
+    write_json(arguments.out / ("identify_quick.json" if arguments.quick else "identify.json"), result, indent=2)
     print(json.dumps(summarise(cases)))
 
 

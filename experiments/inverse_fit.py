@@ -3,8 +3,8 @@
 A log without commands is replayed in inverse mode: its measured motion is prescribed and the torque
 that this takes is compared with the measured one.  One filter chain, fixed beforehand:
 
-1. Motion: the measured position, zero-phase Butterworth of order 4 at the experiment's `cutoff`, then
-   central differences at the log's own rate.  Measured velocities are not used.
+1. Motion: the measured position, zero-phase Butterworth of order 4 at the experiment's cutoff, then
+   central differences at the log's own rate (`droid_jax.measure.motion`).
 2. Torque: measured and simulated pass through the program's own low-pass (`droid_jax.measure.noise`,
    windowed sinc, 8 Hz, read off at 20 Hz), the same kernel for both.
 """
@@ -23,24 +23,26 @@ import tuned  # noqa: F401  before anything that imports jax
 # isort: split
 import numpy as np
 from matplotlib.figure import Figure
-from scipy import signal
 
-from droid_jax.compare.cost import Cost, assemble, batch_replay
-from droid_jax.compare.replay import Motion, inverse_replay
-from droid_jax.compare.residuals import CompareConfig, Comparison, make_comparison
+from droid_jax.compare.cost import Cost, make_cost
+from droid_jax.compare.residuals import CompareConfig
+from droid_jax.identify.fit import Fit
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.refine import Refined, refine
-from droid_jax.identify.search import Fit, SearchConfig, search
+from droid_jax.identify.search import SearchConfig, search
 from droid_jax.identify.uncertainty import calibrated, identifiability, time_blocks
 from droid_jax.measure import noise
-from droid_jax.measure.recording import Channel, Recording, TorqueConvention, validate
+from droid_jax.measure.checks import validate
+from droid_jax.measure.recording import Channel, Recording, TorqueConvention
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
-from droid_jax.report import figures
+from droid_jax.report import style
+from droid_jax.report.export import png_bytes
+from droid_jax.storage import write_bytes, write_json
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-from common import origin, write_json  # pyright: ignore[reportMissingImports]
+from common import origin  # pyright: ignore[reportMissingImports]
 
 RESULTS = Path(__file__).parent / "results"
 LEVEL = 0.9  # of all intervals
@@ -96,67 +98,15 @@ def make_recording(
     return validate(Recording(name, np.zeros(0), none, (), channels, convention, qpos0={}))
 
 
-def filtered_motion(recording: Recording, cutoff: float) -> Motion:
-    """The recording's motion at its own rate: position [T, J] low-passed at `cutoff` Hz, and its differences."""
-    channel = recording.channel("position")
-    rate = (len(channel.time) - 1) / (channel.time[-1] - channel.time[0])
-    sections = signal.butter(4, cutoff, fs=rate, output="sos")
-    q = signal.sosfiltfilt(sections, channel.values[0], axis=0)
-    qd = np.gradient(q, 1 / rate, axis=0)
-    return Motion(channel.time, q, qd, np.gradient(qd, 1 / rate, axis=0), recording.torque)
-
-
 # Comparison --------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class Stretch:
-    """A part of a recording ready to be replayed: motion on the simulation's clock and what was measured."""
-
-    motion: Motion
-    comparison: Comparison
-
-
-def make_stretch(
-    scene: Scene, recording: Recording, motion: Motion, window: tuple[float, float], rate: float
-) -> Stretch:
-    """The stretch from window[0] to window[1] s, simulated at `rate` Hz."""
-    part = recording.window(*window)
-    first, last = part.span
-    clock = first + np.arange(int(np.floor((last - first) * rate + 1e-6)) + 1) / rate
-    moved = {
-        key: np.stack([np.interp(clock, motion.time, column) for column in getattr(motion, key).T], axis=1)
-        for key in ("position", "velocity", "acceleration")
-    }
-    comparison = make_comparison(scene, part, 1 / rate, len(clock), CompareConfig(whitened=True))
-    return Stretch(Motion(time=clock, torque=recording.torque, **moved), comparison)
-
-
-def inverse_cost(scene: Scene, space: Space, stretch: Stretch, effects: Sequence[Effect]) -> Cost:
-    """The inverse-mode cost of one stretch: root mean square of the residuals in noise units."""
-    replay = batch_replay(scene, space, inverse_replay(scene, stretch.motion, effects))
-    return assemble(scene, space, (stretch.comparison,), (replay,))
-
-
-@dataclass(frozen=True, eq=False)
-class Stated:
-    """A cost whose noise is stated: `deviation` [C], in the channel's unit, of each torque column.
-
-    One repeat does not tell its own noise, and what the model cannot explain is far larger anyway.
-    """
-
-    cost: Cost
-    deviation: np.ndarray
-
-    def whitened(self, values: np.ndarray) -> np.ndarray:
-        """[P, D] -> [P, M] residuals in units of the stated noise."""
-        assumed = self.cost.comparisons[0].channel("torque").noise.whitener  # [C, K, K]: one repeat makes it diagonal
-        scale = 1 / (self.deviation * assumed[:, 0, 0])
-        return self.cost.whitened(values) * np.repeat(scale, assumed.shape[1])
-
-    def __call__(self, values: np.ndarray) -> np.ndarray:
-        """[P, D] -> [P] root mean square of the residuals in units of the stated noise."""
-        return np.sqrt(np.mean(self.whitened(values) ** 2, axis=1))
+def inverse_cost(
+    scene: Scene, space: Space, recording: Recording, motion_cutoff: float, effects: Sequence[Effect] = ()
+) -> Cost:
+    """The inverse-mode cost of a log: root mean square of the residuals in units of the noise stated."""
+    config = CompareConfig(whitened=True, motion_cutoff=motion_cutoff)
+    return make_cost(scene, space, [recording], config=config, effects=effects)
 
 
 def measured_torque(cost: Cost) -> np.ndarray:
@@ -180,25 +130,6 @@ def rms(residuals: np.ndarray) -> np.ndarray:
     return np.sqrt(np.mean(residuals**2, axis=0))
 
 
-def correlation_time(residuals: np.ndarray) -> np.ndarray:
-    """[C] s, how long the residuals [K, C] stay correlated: sum of the autocorrelation up to its first zero.
-
-    Two-sided, so that K / (RATE * this) is about the number of independent samples.
-    """
-    times = []
-    for column in (residuals - residuals.mean(axis=0)).T:
-        lags = np.correlate(column, column, "full")[len(column) - 1 :]
-        lags = lags / lags[0]
-        end = int(np.argmax(lags <= 0)) or len(lags)
-        times.append((2 * lags[:end].sum() - 1) / noise.RATE)
-    return np.array(times)
-
-
-def discrepancy(residuals: np.ndarray) -> np.ndarray:
-    """[C] deviation to state as noise so that correlated residuals [K, C] count as often as they are independent."""
-    return rms(residuals) * np.sqrt(np.maximum(1.0, correlation_time(residuals) * noise.RATE))
-
-
 # Fit ---------------------------------------------------------------------------------------
 
 
@@ -213,8 +144,8 @@ class Estimate:
 
 
 def find(cost: Cost, space: Space, config: SearchConfig) -> Fit:
-    """CMA-ES from the prior, each torque column counted in units of its residual before the fit."""
-    fit = search(Stated(cost, rms(residual(cost, space.mean))), space, config)
+    """CMA-ES from the prior, the noise stated from what the prior's mean leaves unexplained."""
+    fit = search(cost.restated(space.mean), space, config)
     print(f"  CMA-ES: cost {fit.best_cost:.4f} after {len(fit.history.sigma)} generations ({fit.stop})", flush=True)
     return fit
 
@@ -226,9 +157,10 @@ def estimate(cost: Cost, space: Space, start: np.ndarray, block: float) -> Estim
     where that correlation outlasts a block.
     """
     left = residual(cost, start)
-    if correlation_time(left).max() > block:
-        raise ValueError(f"block: residuals stay correlated for {correlation_time(left).max():.2f} s, got {block} s")
-    refined = refine(Stated(cost, discrepancy(left)).whitened, space, start)
+    longest = noise.correlation_time(left).max()
+    if longest > block:
+        raise ValueError(f"block: residuals stay correlated for {longest:.2f} s, got {block} s")
+    refined = refine(cost.restated(start).whitened, space, start)
     samples, columns = left.shape
     blocks = time_blocks([(columns, samples)], [samples / noise.RATE], block)
     return Estimate(space, refined.best, calibrated(refined, (), blocks), refined)  # one repeat: no scatter
@@ -273,17 +205,17 @@ def draw_fit(
     """One panel per column: measured [T, C] in black and every line [T, C] in its colour over time [T] s."""
     columns = 2 if len(titles) > 1 else 1
     rows = -(-len(titles) // columns)
-    figure = Figure(figsize=(figures.WIDE, 0.7 + (1.8 if columns > 1 else 2.8) * rows), layout="constrained")
+    figure = Figure(figsize=(style.WIDE, 0.7 + (1.8 if columns > 1 else 2.8) * rows), layout="constrained")
     panels = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
     for unused in panels[len(titles) :]:
         unused.set_visible(False)
     for c, (axes, title) in enumerate(zip(panels, titles, strict=False)):
-        axes.plot(time, measured[:, c], color=figures.MEASURED, linewidth=1.8, label="measured")
+        axes.plot(time, measured[:, c], color=style.MEASURED, linewidth=1.8, label="measured")
         for name, (line, colour) in lines.items():
             axes.plot(time, line[:, c], color=colour, linewidth=1.1, label=name)
         axes.set(title=title, xlim=(time[0], time[-1]))
         axes.set_ylabel(ylabel if c % columns == 0 else "")
-        axes.grid(color=figures.LINE, linewidth=0.6)
+        axes.grid(color=style.LINE, linewidth=0.6)
         if c >= len(titles) - columns:
             axes.set_xlabel("Time [s]")
             axes.tick_params(labelbottom=True)
@@ -295,8 +227,8 @@ def draw_fit(
 def publish(folder: Path, stem: str, seed: int, result: Mapping[str, Any], figure: Figure) -> None:
     """Write folder/stem.json, with its origin, and folder/stem.png; print the JSON as one last line."""
     whole = {**origin(seed), **result}
-    write_json(folder / f"{stem}.json", whole)
-    figures.write_atomically(folder / f"{stem}.png", figures.png_bytes(figure))
+    write_json(folder / f"{stem}.json", whole, indent=2)
+    write_bytes(folder / f"{stem}.png", png_bytes(figure))
     print(f"  wrote {folder / stem}.json and .png")
     print(json.dumps(whole))
 

@@ -30,14 +30,11 @@ from inverse_fit import (
     RESULTS,
     Estimate,
     clock_of,
-    correlation_time,
     draw_fit,
     estimate,
-    filtered_motion,
     find,
     inverse_cost,
     make_recording,
-    make_stretch,
     measured_torque,
     publish,
     read_npz,
@@ -49,14 +46,14 @@ from inverse_fit import (
 )
 
 from droid_jax.compare.cost import Cost
-from droid_jax.compare.replay import torque_offset_effect
 from droid_jax.identify.search import SearchConfig
-from droid_jax.measure.noise import CUTOFF
+from droid_jax.measure.motion import OVERSAMPLING
+from droid_jax.measure.noise import CUTOFF, correlation_time
 from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.model.fields import body_mass, joint_damping, joint_frictionloss
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import Scene, load_scene
-from droid_jax.report import figures
+from droid_jax.report import style
 
 SLIDE = "slide"
 FIT, JUDGE = "DATA_EMPS", "DATA_EMPS_PULSES"
@@ -64,8 +61,6 @@ SOURCE = "The EMPS benchmark (nonlinearbenchmark.org), converted from mat to npz
 PUBLISHED = {"carriage_mass": 95.1089, "slide_damping": 203.5034, "slide_frictionloss": 20.3935,
              f"torque_offset[{SLIDE}]": -3.1648}  # fmt: skip
 MOTION_CUTOFF = 40.0  # Hz
-RATE = 250.0  # Hz of the simulation
-EDGE = 0.5  # s left out at both ends, where a zero-phase filter has no neighbours
 BLOCK = 1.0  # s, contiguous blocks behind the intervals
 
 
@@ -116,14 +111,8 @@ def load_emps(folder: Path, name: str) -> Recording:
 
 def make_costs(scene: Scene, space: Space, folder: Path) -> tuple[Cost, Cost]:
     """Costs of the file to fit and of the file to judge by."""
-    recordings = [load_emps(folder, name) for name in (FIT, JUDGE)]
-    costs = []
-    for recording in recordings:
-        first, last = recording.span
-        motion = filtered_motion(recording, MOTION_CUTOFF)
-        stretch = make_stretch(scene, recording, motion, (first + EDGE, last - EDGE), RATE)
-        costs.append(inverse_cost(scene, space, stretch, [torque_offset_effect(scene.joints)]))
-    return costs[0], costs[1]
+    fit, judge = (inverse_cost(scene, space, load_emps(folder, name), MOTION_CUTOFF) for name in (FIT, JUDGE))
+    return fit, judge
 
 
 def accuracy(cost: Cost, values: np.ndarray) -> dict[str, float]:
@@ -149,8 +138,8 @@ def trace_figure(cost: Cost, before: np.ndarray, after: np.ndarray) -> Any:
     """Force of the judged file, measured and simulated, before and after the fit."""
     measured = measured_torque(cost)
     lines = {
-        "before the fit": (measured - residual(cost, before), figures.BEFORE),
-        "after the fit": (measured - residual(cost, after), figures.AFTER),
+        "before the fit": (measured - residual(cost, before), style.BEFORE),
+        "after the fit": (measured - residual(cost, after), style.AFTER),
     }
     return draw_fit(clock_of(cost), [f"{JUDGE} (not fitted)"], measured, lines, f"Force below {CUTOFF:g} Hz [N]")
 
@@ -174,7 +163,7 @@ def main(config: RealEmps) -> None:
         "filter": {
             "position": f"zero-phase Butterworth, order 4, {MOTION_CUTOFF:g} Hz, then central differences at 1 kHz",
             "force": f"windowed sinc, {CUTOFF:g} Hz, measured and simulated alike",
-            "simulated_at_hz": RATE,
+            "simulated_at_hz": OVERSAMPLING * MOTION_CUTOFF,
         },
         "search": {"generations": len(search.history.sigma), "stop": search.stop, "best": rounded(search.best)},
         "intervals": {

@@ -47,15 +47,12 @@ from inverse_fit import (
     LEVEL,
     RESULTS,
     Estimate,
-    Stretch,
-    correlation_time,
+    clock_of,
     draw_fit,
     estimate,
-    filtered_motion,
     find,
     inverse_cost,
     make_recording,
-    make_stretch,
     publish,
     read_npz,
     resampled,
@@ -67,18 +64,19 @@ from inverse_fit import (
 )
 
 from droid_jax.compare.cost import Cost
-from droid_jax.compare.replay import torque_offset_effect
 from droid_jax.identify.search import SearchConfig
-from droid_jax.measure.noise import CUTOFF, coarse_clock
+from droid_jax.measure.motion import OVERSAMPLING
+from droid_jax.measure.noise import CUTOFF, correlation_time
 from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.model.arm import panda_arm_scene
+from droid_jax.model.builtin import ARM
 from droid_jax.model.fields import body_mass_scale, model_parameter
-from droid_jax.model.joint_friction import SMOOTHING, joint_friction_effect, joint_friction_space
+from droid_jax.model.joint_friction import SMOOTHING, joint_friction_space
 from droid_jax.model.parameters import Mode, Parameter, Space
-from droid_jax.model.scene import ARM, Scene
+from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, Rollout, Theta
-from droid_jax.report import figures
-from droid_jax.report.figures import label
+from droid_jax.report import style
+from droid_jax.report.words import label
 
 FILE, REFERENCE = "panda_exciting_traj1.npz", "reference_values.json"
 SOURCE = (
@@ -90,8 +88,6 @@ MODELS = ("friction", "inertia", "links")
 LEADING = "links"
 MOTION_CUTOFF = 8.0  # Hz
 LOG_RATE = 1000.0  # Hz
-RATE = 50.0  # Hz of the simulation
-EDGE = 0.3  # s left out at both ends, where a zero-phase filter has no neighbours
 SHARE = 2 / 3  # of the log that is fitted
 BLOCK = 2.5  # s, contiguous blocks behind the intervals
 SCALE_STD, COM_STD, COM_LIMIT = 0.03, 0.005, 0.05  # prior of a link's mass (-) and centre of mass (m)
@@ -183,31 +179,24 @@ def model_space(scene: Scene, model: str) -> Space:
     return friction + link_nuisances(scene) if model == "links" else friction
 
 
-def model_effects(scene: Scene) -> list[Effect]:
-    """Effects of all models: one whose parameters are absent changes nothing."""
-    make = (joint_friction_effect, inertia_effect, torque_offset_effect)
-    return [effect(scene.joints) for effect in make]
-
-
 # Fit ---------------------------------------------------------------------------------------
 
 
-def stretches(scene: Scene, recording: Recording) -> tuple[Stretch, Stretch]:
+def cut(recording: Recording) -> tuple[Recording, Recording]:
     """The part to fit and the part to judge by."""
     first, last = recording.span
     split = first + SHARE * (last - first)
-    motion = filtered_motion(recording, MOTION_CUTOFF)
-    fitted = make_stretch(scene, recording, motion, (first + EDGE, split), RATE)
-    return fitted, make_stretch(scene, recording, motion, (split, last - EDGE), RATE)
+    return recording.window(first, split), recording.window(split, last)
 
 
-def fit_models(scene: Scene, parts: tuple[Stretch, Stretch], config: RealPanda) -> dict[str, Any]:
+def fit_models(scene: Scene, parts: tuple[Recording, Recording], config: RealPanda) -> dict[str, Any]:
     """For every model its estimate and its residuals [K, J] on both parts, before and after; how the search went."""
     out: dict[str, Any] = {}
     friction = np.empty(0)
     for model in MODELS[:1] if config.quick else MODELS:
         space = model_space(scene, model)
-        fitted, judge = (inverse_cost(scene, space, part, model_effects(scene)) for part in parts)
+        inertia = inertia_effect(scene.joints)
+        fitted, judge = (inverse_cost(scene, space, part, MOTION_CUTOFF, [inertia]) for part in parts)
         print(f"{model}: {len(space)} parameters", flush=True)
         if model == "friction":
             search = SearchConfig(
@@ -220,6 +209,7 @@ def fit_models(scene: Scene, parts: tuple[Stretch, Stretch], config: RealPanda) 
         if model == "friction":
             friction = found.best
         names = {"fitted": fitted, "held_out": judge}
+        out["held_out_clock"] = clock_of(judge)
         out[model] = {
             "estimate": found,
             "before": {k: residual(cost, space.mean) for k, cost in names.items()},
@@ -298,15 +288,14 @@ def show(model: str, result: dict[str, Any]) -> None:
     )
 
 
-def residual_figure(part: Stretch, models: dict[str, dict[str, Any]], leading: str) -> Any:
+def residual_figure(time: np.ndarray, models: dict[str, dict[str, Any]], leading: str) -> Any:
     """Held-out torque that the rigid body leaves unexplained, and what each model makes of it."""
     measured = models[leading]["before"]["held_out"]
-    time = coarse_clock(*part.comparison.channel("torque").span)
     plain = models["friction"]
-    lines = {"friction": (measured - plain["after"]["held_out"], figures.BEFORE)}
+    lines = {"friction": (measured - plain["after"]["held_out"], style.BEFORE)}
     if leading != "friction":
         name = "friction, link masses marginalised"
-        lines[name] = (measured - models[leading]["after"]["held_out"], figures.AFTER)
+        lines[name] = (measured - models[leading]["after"]["held_out"], style.AFTER)
     return draw_fit(time, [label(j) for j in ARM], measured, lines, "Torque beyond\nrigid body [N m]")
 
 
@@ -315,9 +304,9 @@ def main(config: RealPanda) -> None:
     published = load_published(config.data)
     recording = load_panda(config.data)
     scene = panda_arm_scene()
-    parts = stretches(scene, recording)
+    parts = cut(recording)
     fits = fit_models(scene, parts, config)
-    search, others = fits.pop("search"), fits.pop("other_priors", [])
+    search, others, clock = fits.pop("search"), fits.pop("other_priors", []), fits.pop("held_out_clock")
     results = {model: summary(fit, published) for model, fit in fits.items()}
     for model, result in results.items():
         show(model, result)
@@ -332,11 +321,11 @@ def main(config: RealPanda) -> None:
         "filter": {
             "position": f"zero-phase Butterworth, order 4, {MOTION_CUTOFF:g} Hz, then central differences at 1 kHz",
             "torque": f"windowed sinc, {CUTOFF:g} Hz, measured and simulated alike",
-            "simulated_at_hz": RATE,
+            "simulated_at_hz": OVERSAMPLING * MOTION_CUTOFF,
             "sign_smoothed_over_rad_s": SMOOTHING,
         },
-        "fitted_s": rounded(parts[0].motion.time[[0, -1]], 3),
-        "held_out_s": rounded(parts[1].motion.time[[0, -1]], 3),
+        "fitted_s": rounded(parts[0].span, 3),
+        "held_out_s": rounded(parts[1].span, 3),
         "caveat": "the commanded motion has a period of 13.3 s: the held-out part repeats a fitted motion",
         "rigid_body_rms_whole_Nm": rounded(rms(rigid)),
         "search": search,
@@ -354,7 +343,7 @@ def main(config: RealPanda) -> None:
             "coulomb_within_40_percent_but_joint_2": lead["coulomb_close_but_joint_2"],
         },
     }
-    publish(config.out, "real_panda", config.seed, result, residual_figure(parts[1], fits, leading))
+    publish(config.out, "real_panda", config.seed, result, residual_figure(clock, fits, leading))
 
 
 if __name__ == "__main__":

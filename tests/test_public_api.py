@@ -226,7 +226,7 @@ def test_the_json_of_own_robot_is_a_space(workplace: Path):
 def test_the_command_of_own_robot_runs(workplace: Path):
     (text,) = blocks("docs/own-robot.md", "json")
     (workplace / "parameters.json").write_text(text)
-    (command,) = blocks("docs/own-robot.md", "sh")
+    _, command = blocks("docs/own-robot.md", "sh")
     words = shlex.split(command)
     assert words[:3] == ["python", "-m", "droid_jax.run"]
     assert main([*words[3:], "--generations", "4", "--population", "10"]) == 0

@@ -10,10 +10,10 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "droid_jax"
 ORDER = ("model", "measure", "compare", "identify", "gap", "policy", "report", "run")
-FOR_ALL = ("runtime", "errors")
+FOR_ALL = ("storage", "runtime", "errors")
 # Third-party package -> the only file or folder of droid_jax that may import it.
 ONLY_IN = {
-    "evosax": "identify/search.py",
+    "evosax": "identify/cma.py",
     "brax": "policy",
     "matplotlib": "report",
     "jinja2": "report",
@@ -91,6 +91,7 @@ def test_every_folder_and_file_of_the_package_is_a_room():
         ("compare/cost.py", "from droid_jax import run"),
         ("compare/cost.py", "from droid_jax import Parameter"),
         ("runtime.py", "from droid_jax.model import parameters"),
+        ("storage.py", "from droid_jax.measure import recording"),
         ("identify/gaussian.py", "import evosax"),
         ("identify/refine.py", "from evosax.algorithms import CMA_ES"),
         ("gap/screen.py", "import brax.envs"),
@@ -112,7 +113,8 @@ def test_a_wrong_import_is_found(tmp_path, path, source):
         ("compare/cost.py", "from .replay import make_replay\nfrom ..model import scene"),
         ("compare/__init__.py", "from .replay import make_replay"),
         ("compare/cost.py", "from droid_jax.runtime import compiler_options\nfrom droid_jax import errors"),
-        ("identify/search.py", "from evosax.algorithms import CMA_ES"),
+        ("model/own.py", "from droid_jax.storage import write_json"),
+        ("identify/cma.py", "from evosax.algorithms import CMA_ES"),
         ("policy/train.py", "from brax.training.agents.ppo import train"),
         ("run.py", "from droid_jax.report import page\nimport numpy, pathlib"),
         ("__init__.py", "from droid_jax.report.page import write"),

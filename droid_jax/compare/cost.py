@@ -17,11 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from droid_jax import runtime
+from droid_jax.compare.inverse import inverse_replay
 from droid_jax.compare.population import blocks, over_block
 from droid_jax.compare.replay import Drive, Replay, make_drive, servo_replay, torque_offset_effect
 from droid_jax.compare.residuals import CompareConfig, Comparison, make_comparison
 from droid_jax.compare.twin import twin_replay
+from droid_jax.measure.motion import Motion, measured_motion
 from droid_jax.measure.recording import Recording
+from droid_jax.model.joint_friction import joint_friction_effect
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_physics
 from droid_jax.model.scene import Scene
@@ -37,7 +40,7 @@ class Cost:
     scene: Scene
     space: Space
     comparisons: tuple[Comparison, ...]
-    drives: tuple[Drive, ...]
+    drives: tuple[Drive | Motion, ...]
     _replays: tuple[Callable[[np.ndarray], Rollout], ...]
     _distances: tuple[Callable[[Rollout], jax.Array], ...]
     _whitened: tuple[Callable[[Rollout], jax.Array], ...]
@@ -80,19 +83,29 @@ class Cost:
         each = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("scene", "space")}
         return replace(self, **{name: of_recordings[:1] for name, of_recordings in each.items()})
 
+    def restated(self, values: np.ndarray) -> Cost:
+        """The same replays, with the noise of single repeats restated from what `values` [D] leaves unexplained."""
+        simulated = self.smoothed(values[None])
+        made = [
+            c.restated(torque[0]) if c.repeats == 1 else c
+            for c, torque in zip(self.comparisons, simulated, strict=True)
+        ]
+        return assemble(self.scene, self.space, made, self._replays, self.drives)
+
     def against(self, recordings: Sequence[Recording]) -> Cost:
         """The same compiled replays compared with other repeats of the same recordings.
 
-        Raises ValueError unless these are as many, with the same commands on the same clock.
+        Raises ValueError unless these are as many, with the same commands (where there are none, the
+        same motion) on the same clock.
         """
         if len(recordings) != len(self.drives):
             raise ValueError(f"expected repeats of {len(self.drives)} replayed recordings, got {len(recordings)}")
         made = []
         for recording, old, drive in zip(recordings, self.comparisons, self.drives, strict=True):
-            new = make_drive(self.scene, recording)
-            if new.command.shape != drive.command.shape or not np.array_equal(new.command, drive.command):
+            new = followed(self.scene, recording, old.config)
+            if type(new) is not type(drive) or not np.array_equal(_path(new), _path(drive)):
                 raise ValueError(f"recording {recording.name!r} holds other commands than {old.name!r} had")
-            made.append(make_comparison(self.scene, recording, new.timestep, len(new.command), old.config))
+            made.append(make_comparison(self.scene, recording, _clock(recording, new), old.config))
         return assemble(self.scene, self.space, made, self._replays, self.drives)
 
     def _blockwise(self, values: Any, functions: Sequence[Callable], join: Callable) -> Any:
@@ -113,20 +126,23 @@ def make_cost(
     config: CompareConfig | None = None,
     effects: Sequence[Effect] = (),
 ) -> Cost:
-    """The servo cost of a scene over one or more recordings.
+    """The cost of a scene over one or more recordings.
 
+    A recording with commands is replayed by its servo, one without by inverse dynamics of its
+    measured motion.
     engine: "mjx" (compiled, all devices) or "mujoco" (plain C, all cores; the parity oracle).
-    effects: extra physics or observation models whose parameters are part of the space.
+    effects: extra physics or observation models whose parameters are part of the space; torque
+      offsets, and joint friction behind the sensor where the space holds any, are there already.
     Raises ValueError for unknown engines, joints, channels, or gains that do not match.
     """
     config = config or CompareConfig()
     if not recordings:
         raise ValueError("a cost needs at least one recording")
-    drives = [make_drive(scene, r) for r in recordings]
-    effects = (*effects, torque_offset_effect(scene.joints))
+    drives = [followed(scene, r, config) for r in recordings]
+    effects = (*effects, *_sensor_effects(scene, space))
     replays = tuple(_engine(engine, scene, space, d, effects) for d in drives)
     comparisons = tuple(
-        make_comparison(scene, r, d.timestep, len(d.command), config) for r, d in zip(recordings, drives, strict=True)
+        make_comparison(scene, r, _clock(r, d), config) for r, d in zip(recordings, drives, strict=True)
     )
     return assemble(scene, space, comparisons, replays, drives)
 
@@ -136,9 +152,9 @@ def assemble(
     space: Space,
     comparisons: Sequence[Comparison],
     replays: Sequence[Callable[[np.ndarray], Rollout]],
-    drives: Sequence[Drive] = (),
+    drives: Sequence[Drive | Motion] = (),
 ) -> Cost:
-    """A Cost from batch replays ([B, D] -> Rollout), what each is compared with, and what drove it (servo mode)."""
+    """A Cost from batch replays ([B, D] -> Rollout), what each is compared with, and what each follows."""
     return Cost(
         scene=scene,
         space=space,
@@ -158,11 +174,38 @@ def batch_replay(scene: Scene, space: Space, replay: Replay) -> Callable[[np.nda
     return over_block(lambda values: replay(make_physics(scene, space, values)))
 
 
+def followed(scene: Scene, recording: Recording, config: CompareConfig) -> Drive | Motion:
+    """What a replay follows: the recording's commands or, where it holds none, its measured motion."""
+    if recording.command.size:
+        return make_drive(scene, recording)
+    return measured_motion(recording, scene.joints, cutoff=config.motion_cutoff)
+
+
+def _path(follows: Drive | Motion) -> np.ndarray:
+    return follows.position if isinstance(follows, Motion) else follows.command
+
+
+def _clock(recording: Recording, follows: Drive | Motion) -> np.ndarray:
+    """[T] s of a replay's rows, on the recording's clock."""
+    return follows.time if isinstance(follows, Motion) else float(recording.time[0]) + follows.time
+
+
+def _sensor_effects(scene: Scene, space: Space) -> tuple[Effect, ...]:
+    """What the torque sensors add: always the offsets, friction behind them where the space asks for it."""
+    friction = any(name.startswith(("viscous[", "coulomb[")) for name in space.names)
+    offsets = torque_offset_effect(scene.joints)
+    return (joint_friction_effect(scene.joints), offsets) if friction else (offsets,)
+
+
 def _engine(
-    engine: str, scene: Scene, space: Space, drive: Drive, effects: Sequence[Effect]
+    engine: str, scene: Scene, space: Space, drive: Drive | Motion, effects: Sequence[Effect]
 ) -> Callable[[np.ndarray], Rollout]:
     if engine not in ENGINES:
         raise ValueError(f"unknown engine {engine!r}; valid: {', '.join(ENGINES)}")
+    if isinstance(drive, Motion):
+        if engine != "mjx":
+            raise ValueError("a recording without commands is replayed by inverse dynamics, which needs engine 'mjx'")
+        return batch_replay(scene, space, inverse_replay(scene, drive, effects))
     if engine == "mjx":
         return batch_replay(scene, space, servo_replay(scene, drive, effects))
     twin = twin_replay(scene, space, drive, [e for e in effects if e.name != "torque offset"])

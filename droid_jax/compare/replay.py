@@ -1,9 +1,8 @@
-"""Replay one recording in simulation: the servo mode (a scan) and the inverse mode (a vmap over time).
+"""Replay one recording in simulation: the servo mode, a scan over time steps.
 
-`servo_replay` follows the recorded command through grasp and pull, as the paper does.
-`inverse_replay` prescribes a measured motion and returns the torques it takes; it serves
-recordings that hold no commands.  Both return a function Physics -> Rollout for ONE sample;
-`compare.population` makes a compiled, sharded batch of it.
+`servo_replay` follows the recorded command through grasp and pull, as the paper does.  Recordings
+without commands are replayed by `compare.inverse`.  Both return a function Physics -> Rollout for
+ONE sample; `compare.population` makes a compiled, sharded batch of it.
 """
 
 from __future__ import annotations
@@ -16,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
-from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide, check_joints
+from droid_jax.measure.checks import check_joints
+from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.model.physics import Physics
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, Rollout, State, Theta
@@ -119,7 +119,7 @@ def servo_replay(scene: Scene, drive: Drive, effects: Sequence[Effect] = (), *, 
         def step(carry, k):
             qpos, qvel, warm, load = carry
             state = State(k * drive.timestep, qpos, qvel, load)
-            ctrl = _command(table, drive.timestep, k, late, theta, effects)
+            ctrl = _servo(_command(table, drive.timestep, k, late, theta, effects), theta, state, effects)
             before = template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm, ctrl=ctrl)
             after = simulate_step(
                 _friction(model, theta, state, effects), _applied(before, theta, state, effects), parity=parity
@@ -138,7 +138,7 @@ def servo_replay(scene: Scene, drive: Drive, effects: Sequence[Effect] = (), *, 
         _, (torque, position, velocity, angle, contact) = jax.lax.scan(step, (start, zero, zero, zero), steps)
         time = jnp.asarray(drive.time, jnp.float32)
         rollout = Rollout(time, torque, position, velocity, angle, contact, jnp.array(True))
-        return _observe(rollout, theta, effects)
+        return observed(rollout, theta, effects)
 
     return replay
 
@@ -177,6 +177,13 @@ def _through(law: Callable, theta: Theta, look: Callable) -> Callable:
     return lambda time: law(theta, time, look)
 
 
+def _servo(ctrl: jax.Array, theta: Theta, state: State, effects: Sequence[Effect]) -> jax.Array:
+    for effect in effects:
+        if effect.servo is not None:
+            ctrl = effect.servo(theta, state, ctrl)
+    return ctrl
+
+
 def _friction(model, theta: Theta, state: State, effects: Sequence[Effect]):
     loss = model.dof_frictionloss
     for effect in effects:
@@ -190,8 +197,8 @@ def _applied(data, theta: Theta, state: State, effects: Sequence[Effect]):
     return data.replace(qfrc_applied=sum(forces)) if forces else data
 
 
-def _observe(rollout: Rollout, theta: Theta, effects: Sequence[Effect]) -> Rollout:
-    """Effects of the sensor, constant torque offsets, and the verdict on finiteness."""
+def observed(rollout: Rollout, theta: Theta, effects: Sequence[Effect]) -> Rollout:
+    """What the sensors make of a rollout, and the verdict on finiteness."""
     for effect in effects:
         if effect.observe is not None:
             rollout = effect.observe(theta, rollout)
@@ -244,68 +251,3 @@ def _touching(data, fingers: list[np.ndarray]) -> jax.Array:
     geoms = jnp.sort(contact.geom, axis=1)  # [contacts, 2]
     of_finger = [jnp.any(jnp.all(geoms[:, None] == pairs[None], axis=-1), axis=1) for pairs in fingers]
     return jnp.stack([jnp.any(mine & (contact.dist < 0)) for mine in of_finger])
-
-
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """A measured motion of the scene's joints, for the inverse mode.
-
-    time: [T] s.  position, velocity, acceleration: [T, J], in the order of `scene.joints`.
-    torque: convention of the measured torque.
-    """
-
-    time: np.ndarray
-    position: np.ndarray
-    velocity: np.ndarray
-    acceleration: np.ndarray
-    torque: TorqueConvention
-
-
-def inverse_replay(scene: Scene, motion: Motion, effects: Sequence[Effect] = ()) -> Replay:
-    """Torques of a prescribed motion, vectorised over time.
-
-    tau = M(q) qdd + c(q, qd) + k (q - q_spring) [+ g(q)] and, on the motor side, + armature qdd +
-    damping qd + dry friction sgn(qd).  On the link side none of the motor's own terms appear; what
-    the joint adds there (Coulomb and viscous friction, offset) is an observation effect.
-    Whether g(q) is there is the recording's word alone, not the MJCF's gravcomp.
-    Raises ValueError for effects that change the motion: a prescribed one cannot have them.
-    """
-    moving = [e.name for e in effects if e.force or e.frictionloss or e.command]
-    if moving:
-        raise ValueError(f"a prescribed motion cannot have effects that change it: {', '.join(moving)}")
-    joints, positions = scene.joint_dofs, scene.joint_qpos
-    springs = np.array([scene.id("joint", j) for j in scene.joints])
-    base = jnp.asarray(scene.model.qpos0, jnp.float32)
-    q, qd, qdd = (jnp.asarray(a, jnp.float32) for a in (motion.position, motion.velocity, motion.acceleration))
-    motor = motion.torque.side is TorqueSide.MOTOR
-
-    def replay(physics: Physics) -> Rollout:
-        model, theta = physics.model, physics.theta
-        link_model = model if motor else model.replace(dof_armature=jnp.zeros_like(model.dof_armature))
-        if not motion.torque.gravity:
-            link_model = link_model.replace(opt=link_model.opt.replace(gravity=jnp.zeros(3)))
-
-        def at(position, velocity, acceleration):
-            full = jnp.zeros(scene.model.nv, jnp.float32)
-            velocity = full.at[joints].set(velocity)
-            data = mjx.make_data(link_model).replace(qpos=base.at[positions].set(position), qvel=velocity)
-            data = mjx.fwd_velocity(link_model, mjx.fwd_position(link_model, data))
-            torque = mjx.full_m(link_model, data) @ full.at[joints].set(acceleration) + data.qfrc_bias
-            if motor:
-                torque = torque + model.dof_damping * velocity + model.dof_frictionloss * jnp.sign(velocity)
-            stretch = position - model.qpos_spring[positions]
-            return torque[joints] + model.jnt_stiffness[springs] * stretch
-
-        torque = jax.vmap(at)(q, qd, qdd)
-        rollout = Rollout(
-            time=jnp.asarray(motion.time, jnp.float32),
-            torque=torque,
-            position=q,
-            velocity=qd,
-            object_angle=jnp.zeros(len(motion.time)),
-            contact=jnp.zeros((len(motion.time), 0), bool),
-            finite=jnp.array(True),
-        )
-        return _observe(rollout, theta, effects)
-
-    return replay

@@ -8,19 +8,20 @@ residuals, in units of the noise of the repeats' mean.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from droid_jax.measure.noise import Noise, coarse_clock, estimate_noise, lowpass, smooth
+from droid_jax.measure.motion import CUTOFF
+from droid_jax.measure.noise import Noise, coarse_clock, discrepancy, estimate_noise, lowpass, smooth
 from droid_jax.measure.recording import Channel, Phase, Recording
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Rollout
 
-# Deviation below which a channel's noise is never believed, in the channel's unit.
 BLOWN_UP = 1e3  # noise units: worse than any replay that kept its numbers
+# Deviation below which a channel's noise is never believed, in the channel's unit.
 MINIMUM_NOISE = {"torque": 0.01, "position": 2e-5, "velocity": 5e-4, "object_angle": 2e-4}
 
 
@@ -34,6 +35,7 @@ class CompareConfig:
     shut_angle: rad; a door that never opens this far (or half as far as the measured one) stayed shut.
     grip_share: share of the gripping time that all fingers must touch.
     whitened: the cost is the root mean square of the whitened residuals instead of N m.
+    motion_cutoff: Hz, filter of the measured positions of a recording without commands.
     """
 
     channels: Mapping[str, float] = field(default_factory=lambda: {"torque": 1.0})
@@ -42,6 +44,7 @@ class CompareConfig:
     shut_angle: float = 0.0873
     grip_share: float = 0.95
     whitened: bool = False
+    motion_cutoff: float = CUTOFF
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +114,11 @@ class Comparison:
         residual = jnp.concatenate(parts)
         return jnp.where(rollout.finite & jnp.all(jnp.isfinite(residual)), residual, BLOWN_UP)
 
+    @property
+    def repeats(self) -> int:
+        """N."""
+        return len(self.channels[0].values)
+
     def deviations(self) -> np.ndarray:
         """[N, M] deviations of the repeats from their mean, whitened as the residuals are."""
         parts = []
@@ -118,6 +126,16 @@ class Comparison:
             apart = c.noise.repeats - c.noise.mean  # [N, K, C]
             parts.append(np.einsum("ckl,nlc->nck", c.noise.whitener, apart).reshape(len(apart), -1))
         return np.concatenate(parts, axis=1)
+
+    def restated(self, torque: np.ndarray) -> Comparison:
+        """The comparison with a noise of the torque that a model's own smoothed torque [K, C] leaves plausible.
+
+        One repeat does not tell its noise, and what a model cannot explain is far larger anyway.
+        """
+        channel = self.channel("torque")
+        left = discrepancy(channel.noise.mean - torque)
+        noise = channel.noise.stated(np.maximum(left, MINIMUM_NOISE["torque"]))
+        return replace(self, channels=tuple(replace(c, noise=noise) if c is channel else c for c in self.channels))
 
     def smoothed(self, rollout: Rollout, channel: str = "torque") -> jax.Array:
         """[K, C] a channel of the rollout through the filter the data went through."""
@@ -160,16 +178,12 @@ def _distance(channel: Measured, trace: jax.Array) -> jax.Array:
     return jnp.mean(jnp.sum(norm * measured, axis=1) / jnp.maximum(jnp.sum(measured, axis=1), 1))
 
 
-def make_comparison(
-    scene: Scene, recording: Recording, timestep: float, steps: int, config: CompareConfig
-) -> Comparison:
-    """Prepare a recording's channels for comparison with a replay of `steps` rows of `timestep` s.
+def make_comparison(scene: Scene, recording: Recording, clock: np.ndarray, config: CompareConfig) -> Comparison:
+    """Prepare a recording's channels for comparison with a replay whose rows have the times `clock` [T] s, regular.
 
     Raises ValueError for a channel the recording does not have, one that no replay produces, or a
     constant (dead) channel.
     """
-    start = float(recording.time[0]) if len(recording.time) else recording.span[0]
-    clock = start + np.arange(steps) * timestep
     channels = tuple(
         _measure(scene, recording.channel(name), clock, weight) for name, weight in config.channels.items()
     )
@@ -182,7 +196,8 @@ def make_comparison(
             shut = max(shut, 0.5 * float(np.max(np.where(angle.mask, angle.values, -np.inf))))
     rows = None
     if grip is not None:
-        first, end = (int(np.clip(round((t - start) / timestep), 0, steps)) for t in grip)
+        steps, timestep = len(clock), clock[1] - clock[0]
+        first, end = (int(np.clip(round((t - clock[0]) / timestep), 0, steps)) for t in grip)
         rows = (min(first, steps - 1), max(end, first + 1))
     return Comparison(recording.name, channels, rows, shut, recording.phases, config)
 

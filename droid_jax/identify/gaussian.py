@@ -16,15 +16,13 @@ File format (JSON, version 1)::
      "rule": str, "mean": [D], "cov": [D][D],
      "space": [{"name", "unit", "mean", "std", "low", "high", "nuisance", "group",
                 "scaling": "linear" | "log", "floor", "width": number | null,
-                "writes": [{"field", "index": [...], "mode", "gain"}]}]}
+                "writes": [{"field", "index": [...], "mode", "gain", "offset"}]}]}
 """
 
 from __future__ import annotations
 
 import json
 import math
-import os
-import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -35,6 +33,7 @@ import numpy as np
 from scipy import stats
 
 from droid_jax.model.parameters import Mode, Parameter, Scaling, Space, Write
+from droid_jax.storage import write_json
 
 Coordinates = Literal["search", "physical"]
 
@@ -154,7 +153,7 @@ class Gaussian:
         return Gaussian(self.space.select(names), self.mean[index], cov, self.rule, self.coordinates)
 
     def save(self, path: str | Path) -> None:
-        """Write the JSON file described in the module's text, atomically."""
+        """Write the JSON file described in the module's text, whole or not at all."""
         content = {
             "format": FORMAT,
             "version": VERSION,
@@ -164,7 +163,7 @@ class Gaussian:
             "cov": self.cov.tolist(),
             "space": space_to_json(self.space),
         }
-        _write_atomically(Path(path), json.dumps(content, indent=1, allow_nan=False))
+        write_json(Path(path), content)
 
     @cached_property
     def _grid(self) -> np.ndarray:
@@ -278,7 +277,7 @@ def _parameter_from_json(position: int, entry: Any) -> Parameter:
 def _write_from_json(entry: dict[str, Any]) -> Write:
     """One write of a parameter."""
     index = tuple(int(i) for i in entry["index"])
-    return Write(str(entry["field"]), index, Mode(entry["mode"]), float(entry["gain"]))
+    return Write(str(entry["field"]), index, Mode(entry["mode"]), float(entry["gain"]), float(entry.get("offset", 0.0)))
 
 
 def _entry(content: dict[str, Any], key: str, where: str) -> Any:
@@ -319,15 +318,3 @@ def _truncated_quantiles(q: np.ndarray, mean: float, std: float, low: float, hig
     if std == 0:
         return np.full(q.shape, mean)
     return stats.truncnorm.ppf(q, (low - mean) / std, (high - mean) / std, loc=mean, scale=std)
-
-
-def _write_atomically(path: Path, text: str) -> None:
-    """Write text to path so that a reader sees the old file or the new one, never a part."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text + "\n")
-        os.replace(temporary, path)
-    finally:
-        Path(temporary).unlink(missing_ok=True)

@@ -12,9 +12,10 @@ import numpy as np
 
 from droid_jax.compare.cost import Cost, make_cost
 from droid_jax.compare.residuals import CompareConfig
+from droid_jax.identify.fit import Fit
 from droid_jax.identify.gaussian import Gaussian, prior
 from droid_jax.identify.refine import RefineConfig, Refined, refine
-from droid_jax.identify.search import Fit, SearchConfig, search
+from droid_jax.identify.search import SearchConfig, search
 from droid_jax.identify.uncertainty import Identifiability, calibrated, identifiability, not_judged, time_blocks
 from droid_jax.measure.recording import Recording
 from droid_jax.model.parameters import Space
@@ -97,8 +98,15 @@ Progress = Callable[[str, Any], None]
 
 
 def split(recording: Recording, share: float) -> tuple[Recording, Recording, tuple[int, ...]]:
-    """Fitted and held-out repeats (the last ones), and the latter's indices; one repeat serves as both."""
+    """Fitted and held-out repeats (the last ones), and the latter's indices.
+
+    Of one repeat without commands the last part in time is held out; with commands, one serves as both.
+    """
     count = recording.repeats
+    if count == 1 and not recording.command.size:
+        first, last = recording.span
+        cut = last - max(share, 1 / 3) * (last - first)
+        return recording.window(first, cut), recording.window(cut, last), (0,)
     held = min(count - 1, max(1, round(share * count))) if count > 1 else 0
     if held == 0:
         return recording, recording, tuple(range(count))
@@ -146,6 +154,9 @@ def identify(
     seconds["search"] = time.monotonic() - began
 
     began = time.monotonic()
+    if any(r.repeats == 1 for r in fitted):
+        base = base.restated(full.values(dict(zip(space.names, found.best.tolist(), strict=True))))
+        first = base.first()
     refined = None
     if config.refine is not None:
         refined = refine(
@@ -162,7 +173,8 @@ def identify(
 
     began = time.monotonic()
     report("judge", None)
-    heldout = base.against(held)
+    commanded = all(r.command.size for r in recordings)
+    heldout = base.against(held) if commanded else make_cost(scene, full, held, config=config.compare)
     gaps = _gaps(heldout, full.mean, best)
     seconds["judge"] = time.monotonic() - began
     return Identified(

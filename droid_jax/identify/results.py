@@ -6,11 +6,7 @@ correlation.npz, fitted.xml; README.md lists them, `report` turns them into a pa
 
 from __future__ import annotations
 
-import contextlib
-import csv
-import io
 import json
-import os
 import tempfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -22,41 +18,7 @@ from droid_jax.identify.pipeline import Identified
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene
-
-
-def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all."""
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException:
-        with contextlib.suppress(FileNotFoundError):
-            os.unlink(name)
-        raise
-
-
-def write_json(path: Path, content: Any) -> None:
-    """JSON, indented; NaN and infinities are refused (they are not JSON)."""
-    write_bytes(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
-
-
-def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
-    """A compressed npz."""
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)
-    write_bytes(path, buffer.getvalue())
-
-
-def write_csv(path: Path, header: Iterable[str], rows: np.ndarray) -> None:
-    """A table with one header line."""
-    buffer = io.StringIO()
-    writer = csv.writer(buffer)
-    writer.writerow(list(header))
-    writer.writerows(np.asarray(rows).tolist())
-    write_bytes(path, buffer.getvalue().encode())
+from droid_jax.storage import write_csv, write_json, write_npz, write_text
 
 
 def prepare_folder(folder: Path) -> Path:
@@ -94,8 +56,8 @@ def write_run(
     write_npz(folder / "correlation.npz", {"names": np.array(found.full.names), "correlation": correlation})
     if samples is not None:
         write_npz(folder / "distribution.npz", samples)
-        write_csv(folder / "samples.csv", found.space.names, samples["fitted"])
-    write_bytes(folder / "fitted.xml", fitted_mjcf(found.scene, found.full, found.best).encode())
+        write_csv(folder / "samples.csv", found.space.names, samples["fitted"].tolist())
+    write_text(folder / "fitted.xml", fitted_mjcf(found.scene, found.full, found.best))
     write_json(folder / "config.json", dict(config))  # last: its presence says that the run is whole
 
 
@@ -176,7 +138,7 @@ def _write_history(folder: Path, found: Identified) -> None:
     write_npz(folder / "history.npz", arrays)
     table = np.column_stack([arrays[k] for k in ("generation", "best_cost", "median_cost", "sigma", "mean", "std")])
     header = ["generation", "best_cost", "median_cost", "sigma", *(f"mean_{n}" for n in names)]
-    write_csv(folder / "history.csv", [*header, *(f"std_{n}" for n in names)], table)
+    write_csv(folder / "history.csv", [*header, *(f"std_{n}" for n in names)], table.tolist())
 
 
 def _physical_deviation(space: Space, mean: np.ndarray, std: np.ndarray) -> np.ndarray:

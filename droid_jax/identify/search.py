@@ -1,14 +1,11 @@
 """CMA-ES over the parameters of a space: the search of the paper's section III-B.
 
 Each generation draws a population from the current Gaussian, asks the cost of every row in one
-batch, and moves the Gaussian towards the best rows.  The algebra is evosax's; the recombination
-weights are ours, because evosax gives half of the population a positive weight whatever
-`elite_ratio` says, and gives rows with equal costs the weight of their average rank.
+batch, and moves the Gaussian towards the best rows (`identify.cma`).
 
 The search moves in search coordinates x (one unit is about one prior deviation), the cost sees
 physical values.  Independent restarts are rows of the same batch.  Everything random comes from
 fold_in(key(seed), generation), so a resumed search repeats an uninterrupted one bit for bit.
-References "Tutorial" are to Hansen, The CMA Evolution Strategy: A Tutorial, arXiv 1604.00772.
 """
 
 from __future__ import annotations
@@ -19,23 +16,19 @@ import time
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
-from functools import cache
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from evosax.algorithms import CMA_ES
 
 from droid_jax.identify.checkpoints import Checkpoints, Tree
-from droid_jax.identify.gaussian import Gaussian, redraw_box, space_to_json
+from droid_jax.identify.cma import Strategy, recombination
+from droid_jax.identify.fit import Fit, History, Progress, Restart, on_bound
+from droid_jax.identify.gaussian import space_to_json
 from droid_jax.model.parameters import Space
 
 Cost = Callable[[np.ndarray], Any]  # [rows, D] float64 physical values -> [rows]; +inf is a failed row
 
-REDRAWS = 64  # draws per row among which one inside the bounds is looked for
-BOUND_SHARE = 0.01  # a best value this close to a bound, as a share of the range in x, counts as on it
 _REASONS = ("", "tol_cost", "tol_sigma")  # why a restart stopped, by the code kept in checkpoints
 
 
@@ -50,7 +43,7 @@ class SearchConfig:
                 draws what a single search with seed + r would draw.
     sigma:      initial step in search coordinates; 1 starts from the prior.
     bounds:     "resample" redraws rows in which a linearly scaled parameter is out of bounds and clips
-                what is still outside after REDRAWS draws; "clip" clips.  Log-scaled ones always clip.
+                what is still outside after cma.REDRAWS draws; "clip" clips.  Log-scaled ones always clip.
     active:     negative weights for the worst rows; None: only when `parents` is None.
     tol_cost:   a restart stops when its best cost fell by less than this share over `patience`
                 generations; 0 never.
@@ -104,90 +97,6 @@ class SearchConfig:
         return self.population // 2 if self.parents is None else self.parents
 
 
-@dataclass(frozen=True, eq=False)
-class History:
-    """One restart, generation by generation (G of them, P rows each); search state is after the update.
-
-    mean:        [G, D] physical units.
-    std:         [G, D] marginal deviations, search coordinates.
-    sigma:       [G] step size.
-    best_cost:   [G] lowest cost found so far.
-    mean_cost, median_cost: [G] over the rows of the generation that did not fail; inf if all did.
-    costs:       [G, P] cost of every row, inf where it failed.
-    seconds:     [G] wall time of the generation, cost included (the first one compiles).
-    """
-
-    mean: np.ndarray
-    std: np.ndarray
-    sigma: np.ndarray
-    best_cost: np.ndarray
-    mean_cost: np.ndarray
-    median_cost: np.ndarray
-    costs: np.ndarray
-    seconds: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class Restart:
-    """One of the independent searches: its seed, where it ended, why it stopped and its history.
-
-    best, mean: [D] physical units; cov: [D, D] sigma^2 C in search coordinates.
-    """
-
-    seed: int
-    best: np.ndarray
-    best_cost: float
-    mean: np.ndarray
-    cov: np.ndarray
-    stop: str
-    history: History
-
-
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """Result of a search: the restart with the lowest cost, and all of them in `restarts`.
-
-    best:     [D] physical values with the lowest cost, best_cost.
-    mean:     [D] physical values of the final Gaussian's centre.
-    cov:      [D, D] of the final Gaussian in search coordinates, sigma^2 C.
-    evaluations: rows given to the cost; failed: those that came back NaN or infinite.
-    stop:     "generations", "tol_cost", "tol_sigma" or "max_seconds".
-    on_bound: names of parameters whose best value lies within 1 % of the range of a bound.
-    """
-
-    space: Space
-    best: np.ndarray
-    best_cost: float
-    mean: np.ndarray
-    cov: np.ndarray
-    history: History
-    evaluations: int
-    failed: int
-    stop: str
-    on_bound: tuple[str, ...]
-    restarts: tuple[Restart, ...]
-
-    def gaussian(self) -> Gaussian:
-        """The search distribution.  Its width depends on when the search stopped: it is no posterior."""
-        return Gaussian(self.space, self.space.to_search(self.mean), self.cov, rule="cma-es covariance")
-
-
-@dataclass(frozen=True)
-class Progress:
-    """What a progress display needs after each generation; costs over all running restarts.
-
-    seconds: wall time so far; seconds_left: at most, at the pace of the latest generations.
-    """
-
-    generation: int
-    generations: int
-    best_cost: float
-    median_cost: float
-    sigma: float
-    seconds: float
-    seconds_left: float
-
-
 def search(
     cost: Cost,
     space: Space,
@@ -211,12 +120,12 @@ def search(
     Raises ValueError when a whole generation failed, on a cost of the wrong shape, a start out of
     bounds, or somebody else's checkpoint.
     """
-    strategy = _Strategy(space, config)
+    strategy = _strategy(space, config)
     centre = _start(space, config, start)
     with _checkpoints(checkpoint_dir, space, config, centre, fingerprint) as checkpoints:
         run = _restored(checkpoints, strategy, centre) or _Run.fresh(strategy.init(centre), config, len(space))
         while _unfinished(run, config):
-            _generation(run, cost, strategy)
+            _generation(run, cost, strategy, config)
             if checkpoints and (run.generation % config.checkpoint_every == 0 or not _unfinished(run, config)):
                 checkpoints.save(run.generation, run.tree())
             if progress:
@@ -224,134 +133,12 @@ def search(
     return _fit(run, space, config)
 
 
-class Recombination(NamedTuple):
-    """Weights of the ranked rows, and the learning rates that follow from them (Tutorial, Table 1)."""
-
-    weights: np.ndarray  # [P], best row first; the positive ones sum to 1
-    mu_eff: float
-    c_1: float
-    c_mu: float
-    c_std: float
-    d_std: float
-    c_c: float
-
-
-def recombination(population: int, parents: int, dims: int, active: bool) -> Recombination:
-    """Weights log(parents + 1/2) - log(rank): exactly the `parents` best rows have a positive one.
-
-    active gives the other rows negative weights (Tutorial, eqs. 50-53) in place of zero.
-    """
-    raw = math.log(parents + 0.5) - np.log(np.arange(1, population + 1))  # [P]
-    mu_eff = raw[:parents].sum() ** 2 / (raw[:parents] ** 2).sum()
-    mu_eff_minus = raw[parents:].sum() ** 2 / (raw[parents:] ** 2).sum()
-    c_c = (4 + mu_eff / dims) / (dims + 4 + 2 * mu_eff / dims)
-    c_1 = 2 / ((dims + 1.3) ** 2 + mu_eff)
-    c_mu = min(1 - c_1 - 1e-8, 2 * (mu_eff - 2 + 1 / mu_eff) / ((dims + 2) ** 2 + mu_eff))
-    c_std = (mu_eff + 2) / (dims + mu_eff + 5)
-    d_std = 1 + 2 * max(0.0, math.sqrt((mu_eff - 1) / (dims + 1)) - 1) + c_std
-    weights = np.zeros(population)
-    weights[:parents] = raw[:parents] / raw[:parents].sum()
-    if active and c_mu > 0:
-        alpha = min(1 + c_1 / c_mu, 1 + 2 * mu_eff_minus / (mu_eff + 2), (1 - c_1 - c_mu) / (dims * c_mu))
-        weights[parents:] = alpha * raw[parents:] / -raw[parents:].sum()
-    return Recombination(weights, float(mu_eff), c_1, float(c_mu), float(c_std), float(d_std), float(c_c))
-
-
-class _Strategy:
-    """evosax's CMA-ES for all restarts at once, on one device; leading axis [R] of restarts.
-
-    That device is a CPU where there is one: the matrices are tiny, and the draws are then the same on
-    every machine.
-    """
-
-    def __init__(self, space: Space, config: SearchConfig):
-        self.space, self.config, dims = space, config, len(space)
-        self._device = _one_device()
-        box = redraw_box(space) if config.bounds == "resample" else (np.full(dims, -np.inf), np.full(dims, np.inf))
-        with jax.default_device(self._device):
-            self._kernels = _kernels(config.population, dims, REDRAWS if np.isfinite(box).any() else 1)
-        active = config.parents is None if config.active is None else config.active
-        weights = recombination(config.population, config.elite, dims, active)
-        params = self._kernels.params.replace(std_init=config.sigma, **weights._asdict())
-        self._params = self._put(jax.tree.map(lambda a: np.asarray(a, np.float32), params))
-        self._box = self._put(np.asarray(box, np.float32))
-        self._bounds = self._put(np.asarray([space.to_search(space.low), space.to_search(space.high)], np.float32))
-        self._seeds = self._put(np.arange(config.restarts) + config.seed)
-
-    def init(self, centre: np.ndarray) -> Any:
-        """State of every restart at its start [R, D], physical values."""
-        x = self._put(np.asarray(self.space.to_search(centre), np.float32))
-        return self._kernels.init(self._seeds, x, self._params)
-
-    def ask(self, state: Any, generation: int) -> tuple[np.ndarray, Any]:
-        """Populations [R, P, D] in search coordinates, and the state with its axes brought up to date."""
-        number = self._put(np.int32(generation))
-        x, state = self._kernels.ask(self._seeds, number, state, self._params, self._box)
-        return np.asarray(x), state
-
-    def tell(self, state: Any, x: np.ndarray, costs: np.ndarray, running: np.ndarray) -> Any:
-        """State after costs [R, P] of x [R, P, D]; unchanged where a restart is not running [R]."""
-        # ranks, not costs: float64 costs that float32 cannot tell apart keep their order
-        ranks = np.argsort(np.argsort(costs, axis=1, kind="stable"), axis=1)
-        fitness = np.where(np.isfinite(costs), ranks, np.inf).astype(np.float32)
-        told = (self._put(a) for a in (x, fitness, running & np.isfinite(costs).any(axis=1)))
-        return self._kernels.tell(state, *told, self._params, self._bounds)
-
-    def put_state(self, state: Any, arrays: Tree) -> Any:
-        """A copy of a state with its arrays replaced."""
-        return state.replace(**{name: self._put(a) for name, a in arrays.items()})
-
-    def _put(self, tree: Any) -> Any:
-        return jax.device_put(tree, self._device)
-
-
-class _Kernels(NamedTuple):
-    """Jitted functions over all restarts, and evosax's default parameters for them."""
-
-    init: Callable[..., Any]
-    ask: Callable[..., Any]
-    tell: Callable[..., Any]
-    params: Any
-
-
-@cache  # a study runs many searches of one size: compile them once
-def _kernels(population: int, dims: int, redraws: int) -> _Kernels:
-    """The compiled algebra for P rows of D parameters, `redraws` draws per row."""
-    evosax = CMA_ES(population, jnp.zeros(dims), fitness_shaping_fn=_ranked_weights)
-
-    def init(seed: Any, x: Any, params: Any) -> Any:
-        return evosax.init(jax.random.key(seed), x, params)
-
-    def ask(seed: Any, generation: Any, state: Any, params: Any, box: Any) -> tuple[Any, Any]:
-        """One restart's rows [P, D]: per row, its first draw inside the box [2, D]."""
-        keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), generation), redraws)
-        draw = jax.vmap(lambda key: evosax.ask(key, state, params), out_axes=(0, None))
-        draws, state = draw(keys)  # [K, P, D]
-        inside = jnp.all((draws >= box[0]) & (draws <= box[1]), axis=-1)  # [K, P]
-        first = jnp.argmax(inside, axis=0)  # 0 where none is inside: that one is clipped
-        x = jnp.take_along_axis(draws, first[None, :, None], axis=0)[0]
-        return jnp.clip(x, box[0], box[1]), state
-
-    def tell(state: Any, x: Any, fitness: Any, running: Any, params: Any, bounds: Any) -> Any:
-        """One restart's update, its mean held inside the bounds [2, D]."""
-        new, _ = evosax.tell(jax.random.key(0), x, fitness, state, params)  # evosax draws nothing here
-        # beyond the bounds a clipped cost is flat and the mean would wander off for good
-        new = new.replace(mean=jnp.clip(new.mean, bounds[0], bounds[1]))
-        return jax.tree.map(lambda a, b: jnp.where(running, a, b), new, state)
-
-    return _Kernels(
-        init=jax.jit(jax.vmap(init, in_axes=(0, 0, None))),
-        ask=jax.jit(jax.vmap(ask, in_axes=(0, None, 0, None, None))),
-        tell=jax.jit(jax.vmap(tell, in_axes=(0, 0, 0, 0, None, None))),
-        params=jax.tree.map(np.asarray, evosax.default_params),
-    )
-
-
-def _ranked_weights(population: jax.Array, fitness: jax.Array, state: Any, params: Any) -> Any:
-    """Weights [P] by rank; a failed row (inf) is no parent, and the other parents share its weight."""
-    weights = params.weights[jnp.argsort(jnp.argsort(fitness))]
-    positive = jnp.where(jnp.isinf(fitness), 0.0, jnp.maximum(weights, 0.0))
-    return jnp.where(weights > 0, positive / jnp.sum(positive), weights)
+def _strategy(space: Space, config: SearchConfig) -> Strategy:
+    """The CMA-ES that a configuration asks for."""
+    active = config.parents is None if config.active is None else config.active
+    weights = recombination(config.population, config.elite, len(space), active)
+    seeds = range(config.seed, config.seed + config.restarts)
+    return Strategy(space, weights, sigma=config.sigma, seeds=seeds, redraw=config.bounds == "resample")
 
 
 @dataclass(eq=False)
@@ -405,10 +192,10 @@ class _Run:
         return _Run(state, generation, best, best_cost, stopped, ended, int(tree["failed"]), records)
 
 
-def _generation(run: _Run, cost: Cost, strategy: _Strategy) -> None:
+def _generation(run: _Run, cost: Cost, strategy: Strategy, config: SearchConfig) -> None:
     """One generation of every restart: draw, evaluate, update, record, judge."""
     started = time.perf_counter()
-    space, config = strategy.space, strategy.config
+    space = strategy.space
     running = run.stopped == 0
     x, state = strategy.ask(run.state, run.generation)  # [R, P, D]
     values = space.from_search(np.asarray(x, np.float64))
@@ -522,16 +309,9 @@ def _fit(run: _Run, space: Space, config: SearchConfig) -> Fit:
         evaluations=run.generation * config.restarts * config.population,
         failed=run.failed,
         stop=winner.stop,
-        on_bound=_on_bound(space, winner.best),
+        on_bound=on_bound(space, winner.best),
         restarts=restarts,
     )
-
-
-def _on_bound(space: Space, best: np.ndarray) -> tuple[str, ...]:
-    """Names of the parameters whose value lies within BOUND_SHARE of the range, in x, of a bound."""
-    low, x, high = (space.to_search(v) for v in (space.low, best, space.high))
-    near = np.minimum(x - low, high - x) <= BOUND_SHARE * (high - low)
-    return tuple(n for n, on in zip(space.names, near, strict=True) if on)
 
 
 def _start(space: Space, config: SearchConfig, start: np.ndarray | None) -> np.ndarray:
@@ -559,7 +339,7 @@ def _checkpoints(folder: Path | None, space: Space, config: SearchConfig, centre
     return Checkpoints(folder, fingerprint=texts)
 
 
-def _restored(checkpoints: Checkpoints | None, strategy: _Strategy, centre: np.ndarray) -> _Run | None:
+def _restored(checkpoints: Checkpoints | None, strategy: Strategy, centre: np.ndarray) -> _Run | None:
     """The search as its newest whole checkpoint left it, or None."""
     found = checkpoints.restore() if checkpoints else None
     if found is None:
@@ -567,11 +347,3 @@ def _restored(checkpoints: Checkpoints | None, strategy: _Strategy, centre: np.n
     generation, tree = found
     state = strategy.put_state(strategy.init(centre), tree["state"])
     return _Run.of_tree(generation, tree, state)
-
-
-def _one_device() -> Any:
-    """A CPU device of this process, or its first device where jax was told to leave the CPU out."""
-    try:
-        return jax.local_devices(backend="cpu")[0]
-    except RuntimeError:
-        return jax.local_devices()[0]

@@ -14,6 +14,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from droid_jax.measure.checks import validate
 from droid_jax.measure.recording import (
     Channel,
     Phase,
@@ -21,9 +22,10 @@ from droid_jax.measure.recording import (
     ServoGains,
     TorqueConvention,
     TorqueSide,
-    validate,
 )
-from droid_jax.model.scene import ARM, FINGERS, Scene, door_scene, mjcf_dir
+from droid_jax.model.builtin import ARM, FINGERS, mjcf_dir
+from droid_jax.model.door_scene import door_scene
+from droid_jax.model.scene import Scene
 
 OPEN, CLOSED = 0.04, 0.0  # m, finger command
 RATE = 500.0  # Hz, command clock

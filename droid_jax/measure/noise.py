@@ -6,7 +6,7 @@ mask and simulated traces pass through the same kernel.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
@@ -64,6 +64,10 @@ class Noise:
     whitener: np.ndarray
     repeats: np.ndarray
 
+    def stated(self, deviation: np.ndarray) -> Noise:
+        """White noise of a stated deviation [C], in the channel's unit, in place of the estimated one."""
+        return replace(self, whitener=np.eye(len(self.mean)) / deviation[:, None, None])
+
 
 def estimate_noise(repeats: np.ndarray, *, minimum: float, shrink: float = 0.1) -> Noise:
     """Noise of smoothed repeats [N, K, C], whole in time.
@@ -88,3 +92,23 @@ def estimate_noise(repeats: np.ndarray, *, minimum: float, shrink: float = 0.1) 
         covariance = scipy.linalg.toeplitz(lags) / count
         whitener[c] = np.linalg.inv(np.linalg.cholesky(covariance))
     return Noise(mean, whitener, repeats)
+
+
+def correlation_time(residuals: np.ndarray, rate: float = RATE) -> np.ndarray:
+    """[C] s, how long residuals [K, C] at `rate` Hz stay correlated: their autocorrelation's sum up to its first zero.
+
+    Two-sided, so that K / (rate * this) is about the number of independent samples.
+    """
+    times = []
+    for column in (residuals - residuals.mean(axis=0)).T:
+        lags = np.correlate(column, column, "full")[len(column) - 1 :]
+        lags = lags / max(lags[0], 1e-30)
+        end = int(np.argmax(lags <= 0)) or len(lags)
+        times.append((2 * lags[:end].sum() - 1) / rate)
+    return np.array(times)
+
+
+def discrepancy(residuals: np.ndarray) -> np.ndarray:
+    """[C] deviation to state as noise so that correlated residuals [K, C] count as often as they are independent."""
+    rms = np.sqrt(np.mean(residuals**2, axis=0))
+    return rms * np.sqrt(np.maximum(1.0, correlation_time(residuals) * RATE))

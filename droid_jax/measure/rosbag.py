@@ -21,15 +21,9 @@ from rosbags.rosbag1 import ReaderError as Ros1Error
 from rosbags.rosbag2 import ReaderError as Ros2Error
 from rosbags.typesys import Stores, get_typestore
 
-from droid_jax.measure.recording import (
-    Channel,
-    Phase,
-    Recording,
-    ServoGains,
-    TorqueConvention,
-    check_clock,
-    validate,
-)
+from droid_jax.measure.checks import validate
+from droid_jax.measure.clocks import check_clock
+from droid_jax.measure.recording import Channel, Phase, Recording, ServoGains, TorqueConvention
 
 # channel -> field of sensor_msgs/JointState and unit
 _FIELDS = {"torque": ("effort", "N m"), "position": ("position", "rad"), "velocity": ("velocity", "rad/s")}

@@ -16,8 +16,9 @@ import mujoco
 import numpy as np
 import scipy.signal
 
+from droid_jax.measure.checks import validate
 from droid_jax.measure.engine import Trace, instrument, simulate
-from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide, validate
+from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
 from droid_jax.model.door import JOINT_DAMPING, door_nuisances, door_space
 from droid_jax.model.door import truth as table_i
 from droid_jax.model.parameters import Space

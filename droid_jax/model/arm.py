@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import mujoco
 
-from droid_jax.model.scene import ARM, FINGERS, Scene, compile_scene, mjcf_dir
+from droid_jax.model.builtin import ARM, FINGERS, mjcf_dir
+from droid_jax.model.scene import Scene, compile_scene
 
 HAND = "hand"
 

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from droid_jax.model.builtin import ARM, HINGE
+from droid_jax.model.door_scene import PAPER_DAMPING
 from droid_jax.model.fields import (
     body_mass,
     body_mass_scale,
@@ -22,7 +24,7 @@ from droid_jax.model.fields import (
     servo_scale,
 )
 from droid_jax.model.parameters import Parameter, Scaling, Space
-from droid_jax.model.scene import ARM, HINGE, PAPER_DAMPING, TINY_FRICTIONLOSS, Scene
+from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
 
 PAPER_DAMPING_STD = (2.0, 2.0, 2.0, 2.0, 2.0, 1.0, 0.2)  # Table I, N m s/rad
 JOINT_DAMPING = tuple(f"joint_damping_{i}" for i in range(1, 8))

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -61,6 +62,21 @@ def joint_friction_space(
             for joint in joints
         )
     )
+
+
+def sensor_parameter(
+    joints: Sequence[str], term: str, joint: str, *, std: float, high: float, low: float | None = None, **options: Any
+) -> Parameter:
+    """One of those parameters with a prior deviation and bounds of its own (low: -high unless given).
+
+    options: nuisance, group.  Raises ValueError for an unknown term or joint.
+    """
+    if term not in TERMS:
+        raise ValueError(f"unknown sensor term {term!r}; valid: {', '.join(TERMS)}")
+    if joint not in joints:
+        raise ValueError(f"unknown joint {joint!r}; measured joints: {', '.join(joints)}")
+    options = {"unit": _UNITS[term], "mean": 0.0, "group": "Joint friction", **options}
+    return Parameter(f"{term}[{joint}]", std=std, low=-high if low is None else low, high=high, **options)
 
 
 def _column(theta: Theta, term: str, joints: Sequence[str]) -> jax.Array:

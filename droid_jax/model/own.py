@@ -5,6 +5,11 @@
 
 Every entry needs field, element, std and high; optional: column, name, unit, mean, low, mode
 (set, scale, divide, add, negative), scaling (linear, log), floor, width, nuisance, group.
+
+    {"sensor": "coulomb", "element": "elbow", "std": 0.5, "high": 5}
+
+What a torque sensor sees beyond the model has "sensor" in place of "field": viscous, coulomb or
+torque_offset of a joint (model/joint_friction.py), zero at first and between -high and high.
 """
 
 from __future__ import annotations
@@ -14,12 +19,14 @@ from pathlib import Path
 from typing import Any
 
 from droid_jax.model.fields import body_mass, model_parameter
+from droid_jax.model.joint_friction import sensor_parameter
 from droid_jax.model.parameters import Mode, Parameter, Scaling, Space
 from droid_jax.model.scene import Scene
 
-_NEEDED = ("field", "element", "std", "high")
+_NEEDED = ("element", "std", "high")
 _KNOWN = (
-    *_NEEDED, "column", "name", "unit", "mean", "low", "mode", "scaling", "floor", "width", "nuisance", "group",
+    *_NEEDED, "field", "sensor", "column", "name", "unit", "mean", "low", "mode", "scaling", "floor", "width",
+    "nuisance", "group",
 )  # fmt: skip
 
 
@@ -51,6 +58,8 @@ def _parameter(scene: Scene, entry: Any, where: str) -> Parameter:
     if not isinstance(entry, dict):
         raise ValueError(f"{where}: expected an object, got {type(entry).__name__}")
     missing = [k for k in _NEEDED if k not in entry]
+    if ("field" in entry) == ("sensor" in entry):
+        missing.insert(0, "one of field and sensor")
     unknown = [k for k in entry if k not in _KNOWN]
     if missing or unknown:
         raise ValueError(
@@ -58,10 +67,12 @@ def _parameter(scene: Scene, entry: Any, where: str) -> Parameter:
             f"known keys: {', '.join(_KNOWN)}"
         )
     options = dict(entry)
-    field, element = options.pop("field"), options.pop("element")
+    field, sensor, element = options.pop("field", None), options.pop("sensor", None), options.pop("element")
     try:
         if "scaling" in options:
             options["scaling"] = Scaling(options["scaling"])
+        if sensor is not None:
+            return sensor_parameter(scene.joints, sensor, element, **options)
         if "mode" in options:
             options["mode"] = Mode(options["mode"])
         if field == "body_mass" and "mode" not in options:

@@ -43,16 +43,18 @@ class Write:
     mode:  how value and nominal number combine.
     gain:  the value is multiplied by this first (mode SET of a mass uses 1; the inertia that
            scales with it uses SCALE with gain 1 / nominal mass).
+    offset: added after the gain (a relative error e enters as SCALE by 1 + e).
     """
 
     field: str
     index: tuple[int, ...]
     mode: Mode = Mode.SET
     gain: float = 1.0
+    offset: float = 0.0
 
     def new(self, nominal: Any, value: Any) -> Any:
         """The field's new number(s) for a value; works on numpy and jax arrays alike."""
-        value = value * self.gain
+        value = value * self.gain + self.offset
         if self.mode is Mode.SET:
             return value
         if self.mode is Mode.NEGATIVE:

@@ -7,7 +7,7 @@ specialised on its effects when it is traced: one that asks for none pays for no
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import jax
@@ -56,18 +56,36 @@ class Rollout:
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """One physical effect outside the MuJoCo model.
+    """One physical effect outside the MuJoCo model, or a change of it, that vanishes at neutral.
 
-    name, parameters: the theta entries it reads, with their neutral values as means.
+    name:         "hinge preload".
+    parameters:   what it reads from theta or writes into the model; their means are its neutral values,
+                  at which a replay is as without it.
     command:      (theta, time [], look) -> [U]; look(t) gives the command at time t [s].
+    servo:        (theta, State, ctrl [U]) -> [U], what the servo is given in place of the command.
     force:        (theta, State) -> [nv] generalised force added to qfrc_applied.
     frictionloss: (theta, State, base [nv]) -> [nv] N m, rewritten every step.
     observe:      (theta, Rollout) -> Rollout, what the sensor makes of the truth.
+
+    For the gap search:
+    what, mark:   a sentence each: what it is, and where its mark should appear.
+    confused_with: names of effects that look alike on some data.
+    places:       place -> the amplitudes there, e.g. {"joint3": ("joint_coulomb[joint3]",)}; without
+                  them the effect is of no interest to the search.
+    shapes:       parameters that matter only beside an amplitude, and the values to try.
+    smallest:     amplitude below which it is not worth a name, in its own unit.
     """
 
     name: str
     parameters: tuple[Parameter, ...] = ()
     command: Callable[[Theta, jax.Array, Callable], jax.Array] | None = None
+    servo: Callable[[Theta, State, jax.Array], jax.Array] | None = None
     force: Callable[[Theta, State], jax.Array] | None = None
     frictionloss: Callable[[Theta, State, jax.Array], jax.Array] | None = None
     observe: Callable[[Theta, Rollout], Rollout] | None = None
+    what: str = ""
+    mark: str = ""
+    confused_with: tuple[str, ...] = ()
+    places: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    shapes: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    smallest: float = 0.0

@@ -84,12 +84,11 @@ def save_image(path: Path, image: np.ndarray) -> None:
 
     from PIL import Image
 
-    from droid_jax.report.figures import write_atomically
+    from droid_jax.storage import write_bytes
 
-    path.parent.mkdir(parents=True, exist_ok=True)
     with io.BytesIO() as buffer:
         Image.fromarray(image).save(buffer, format="PNG", optimize=True)
-        write_atomically(path, buffer.getvalue())
+        write_bytes(path, buffer.getvalue())
 
 
 @cache

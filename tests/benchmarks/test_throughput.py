@@ -57,15 +57,6 @@ def test_interleave_needs_a_timed_call():
         common.interleave({"a": lambda: None}, 0)
 
 
-def test_a_result_is_written_whole_or_not_at_all(tmp_path):
-    path = tmp_path / "new" / "result.json"
-    common.write_json(path, {"a": 1.5})
-    with pytest.raises(ValueError):
-        common.write_json(path, {"a": float("nan")})
-    assert json.loads(path.read_text()) == {"a": 1.5}
-    assert [p.name for p in path.parent.iterdir()] == ["result.json"]
-
-
 def test_a_process_of_its_own(tmp_path):
     script = tmp_path / "script.py"
     script.write_text("import json, os, sys\nprint('talk')\nprint(json.dumps([sys.argv[1:], os.environ.get('MARK')]))")

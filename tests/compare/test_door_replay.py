@@ -19,9 +19,10 @@ from droid_jax.measure.engine import Trace, instrument, simulate
 from droid_jax.measure.formats import load
 from droid_jax.measure.recording import Channel, Recording
 from droid_jax.model.door import door_nuisances, door_space, truth
+from droid_jax.model.door_scene import door_scene
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_c_model, make_physics
-from droid_jax.model.scene import Scene, door_scene, with_options
+from droid_jax.model.scene import Scene, with_options
 from droid_jax.model.seam import Rollout
 
 

@@ -9,13 +9,17 @@ import numpy as np
 import pytest
 
 from droid_jax import runtime
-from droid_jax.compare.replay import Motion, inverse_replay, torque_offset_effect
+from droid_jax.compare.inverse import inverse_replay
+from droid_jax.compare.replay import torque_offset_effect
+from droid_jax.measure.motion import Motion
 from droid_jax.measure.recording import TorqueConvention, TorqueSide
+from droid_jax.model.builtin import ARM
 from droid_jax.model.door import torque_offsets
+from droid_jax.model.door_scene import door_scene
 from droid_jax.model.fields import body_mass, joint_damping
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_c_model, make_physics
-from droid_jax.model.scene import ARM, Scene, compile_scene, door_scene
+from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.model.seam import Effect, Rollout
 
 MOTOR, LINK = TorqueSide.MOTOR, TorqueSide.LINK
@@ -143,7 +147,7 @@ def test_observation_effects_are_applied(panda: tuple[Scene, Space]):
     np.testing.assert_allclose(shifted - plain, np.tile([0.0, 0.3], (40, 1)), atol=1e-5)
 
 
-@pytest.mark.parametrize("part", ["force", "command", "frictionloss"])
+@pytest.mark.parametrize("part", ["command", "servo"])
 def test_effects_that_a_prescribed_motion_cannot_have_are_refused(part: str):
     scene = planar()
     effect = Effect("backlash", **{part: lambda *_: None})

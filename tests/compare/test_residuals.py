@@ -10,7 +10,8 @@ import pytest
 
 from droid_jax.compare.residuals import BLOWN_UP, CompareConfig, Comparison, make_comparison
 from droid_jax.measure.recording import Channel, Phase, Recording, TorqueConvention, TorqueSide
-from droid_jax.model.scene import Scene, compile_scene, door_scene
+from droid_jax.model.door_scene import door_scene
+from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.model.seam import Rollout
 
 JOINTS = ("a", "b", "c")
@@ -74,8 +75,13 @@ def recording(*channels: Channel, start: float = 0.0, phases: tuple[Phase, ...] 
     )
 
 
+def rows(data: Recording) -> np.ndarray:
+    """[STEPS] s, the replay's clock."""
+    return data.time[0] + STEP * np.arange(STEPS)
+
+
 def compare(scene: Scene, data: Recording, **config) -> Comparison:
-    return make_comparison(scene, data, STEP, STEPS, CompareConfig(**config))
+    return make_comparison(scene, data, rows(data), CompareConfig(**config))
 
 
 def equation_1(channels: Mapping[str, tuple[Channel, float, np.ndarray]], clock: np.ndarray) -> float:
@@ -154,7 +160,8 @@ def door_comparison(door: Scene, *, angle: np.ndarray | None = None, phases=PHAS
     channels = [channel("torque", CLOCK, values, [f"panda_joint{i}" for i in range(1, 8)])]
     if angle is not None:
         channels.append(channel("object_angle", CLOCK, np.tile(angle[:, None], (2, 1, 1)), ["hinge"]))
-    return make_comparison(door, recording(*channels, phases=phases), STEP, STEPS, CompareConfig(**config))
+    data = recording(*channels, phases=phases)
+    return make_comparison(door, data, rows(data), CompareConfig(**config))
 
 
 def door_rollout(**parts) -> Rollout:

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from droid_jax.model.arm import panda_arm_scene
+from droid_jax.model.builtin import ARM, FINGERS
 from droid_jax.model.joint_friction import joint_friction_effect, joint_friction_space
-from droid_jax.model.scene import ARM, FINGERS
 
 EXPERIMENTS = Path(__file__).resolve().parents[2] / "experiments"
 VISCOUS = np.array([0.08, 0.2, 0.05, 0.22, 0.1, 0.03, 0.06])  # N m s/rad
@@ -124,9 +124,9 @@ def test_known_friction_comes_back(experiment: Callable[[str], ModuleType], tmp_
     write_panda(tmp_path)
     recording = panda.load_panda(tmp_path)
     scene = panda_arm_scene()
-    part, _ = panda.stretches(scene, recording)
+    part, _ = panda.cut(recording)
     space = panda.model_space(scene, "friction")
-    cost = fit.inverse_cost(scene, space, part, panda.model_effects(scene))
+    cost = fit.inverse_cost(scene, space, part, panda.MOTION_CUTOFF)
     before = fit.rms(fit.residual(cost, space.mean))
     truth = np.concatenate([VISCOUS, COULOMB, OFFSET])
     # 50 ms filter kernels and 20 ms steps blur the jump of the sign: that is what is left at the truth
@@ -145,15 +145,6 @@ def test_repeated_rows_are_left_out(experiment: Callable[[str], ModuleType]) -> 
     time = np.array([0.0, 1.0, 2.0, 3.0, 4.0])
     held = np.array([[0.0], [1.0], [1.0], [3.0], [4.0]])  # row 2 did not arrive
     np.testing.assert_allclose(fit.resampled(time, held, time), time[:, None])
-
-
-def test_correlation_time_of_a_moving_average(experiment: Callable[[str], ModuleType]) -> None:
-    fit = experiment("inverse_fit")
-    white = np.random.default_rng(1).normal(size=(4000, 1))
-    smooth = np.convolve(white[:, 0], np.ones(10) / 10, "valid")[:, None]
-    # a box of n samples has the triangular autocorrelation, whose two-sided sum is n
-    assert fit.correlation_time(smooth)[0] == pytest.approx(10 / 20.0, rel=0.3)
-    assert fit.correlation_time(white)[0] == pytest.approx(1 / 20.0, rel=0.4)
 
 
 def test_carriage_comes_back(experiment: Callable[[str], ModuleType], tmp_path: Path) -> None:

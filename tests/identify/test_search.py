@@ -10,8 +10,9 @@ import pytest
 from evosax.algorithms import CMA_ES
 
 from droid_jax.identify.checkpoints import Checkpoints
+from droid_jax.identify.cma import recombination
 from droid_jax.identify.gaussian import load
-from droid_jax.identify.search import SearchConfig, recombination, search
+from droid_jax.identify.search import SearchConfig, search
 from droid_jax.model.parameters import Parameter, Scaling, Space
 
 

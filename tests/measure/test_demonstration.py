@@ -22,8 +22,10 @@ from droid_jax.measure.demonstration import (
 )
 from droid_jax.measure.formats import load
 from droid_jax.measure.recording import Recording
+from droid_jax.model.builtin import ARM, FINGERS
 from droid_jax.model.door import door_space
-from droid_jax.model.scene import ARM, FINGERS, Scene, door_scene
+from droid_jax.model.door_scene import door_scene
+from droid_jax.model.scene import Scene
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,9 @@ from droid_jax.measure.demonstration import demonstration_path
 from droid_jax.measure.engine import Trace, instrument, simulate
 from droid_jax.measure.formats import load
 from droid_jax.model.door import door_space, truth
+from droid_jax.model.door_scene import door_scene
 from droid_jax.model.physics import make_c_model
-from droid_jax.model.scene import Scene, compile_scene, door_scene, with_options
+from droid_jax.model.scene import Scene, compile_scene, with_options
 
 
 @pytest.fixture(scope="module")

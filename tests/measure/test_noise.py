@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from droid_jax.measure.noise import RATE, coarse_clock, estimate_noise, lowpass, smooth
+from droid_jax.measure.noise import RATE, coarse_clock, correlation_time, discrepancy, estimate_noise, lowpass, smooth
 
 CLOCK = np.arange(0, 6.0, 0.002)
 COARSE = coarse_clock(0.0, float(CLOCK[-1]))
@@ -190,3 +190,21 @@ def test_columns_are_estimated_apart():
     noise = estimate_noise(repeats, minimum=1e-3)
     ratio = np.trace(noise.whitener[0]) / np.trace(noise.whitener[1])
     assert ratio == pytest.approx(10.0, rel=0.05)
+
+
+def test_correlation_time_of_a_moving_average():
+    white = np.random.default_rng(1).normal(size=(4000, 1))
+    averaged = np.convolve(white[:, 0], np.ones(10) / 10, "valid")[:, None]
+    # a box of n samples has the triangular autocorrelation, whose two-sided sum is n
+    assert correlation_time(averaged)[0] == pytest.approx(10 / RATE, rel=0.3)
+    assert correlation_time(white)[0] == pytest.approx(1 / RATE, rel=0.4)
+
+
+def test_the_stated_deviation_makes_correlated_residuals_count_once():
+    """The mean of K samples correlated over n varies like that of K white ones of sqrt(n) times the deviation."""
+    white = np.random.default_rng(2).normal(size=(4000, 2)) * [0.3, 3.0]
+    np.testing.assert_allclose(discrepancy(white), [0.3, 3.0], rtol=0.25)
+    averaged = np.stack([np.convolve(c, np.ones(10) / 10, "valid") for c in white.T], axis=1)
+    np.testing.assert_allclose(discrepancy(averaged), [0.3, 3.0], rtol=0.25)
+    noise = estimate_noise(averaged[None, :30], minimum=0.01).stated(np.array([0.3, 3.0]))
+    np.testing.assert_allclose(noise.whitener, np.eye(30) / np.array([0.3, 3.0])[:, None, None])

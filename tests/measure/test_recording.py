@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from droid_jax.measure.checks import check_joints, validate
 from droid_jax.measure.recording import (
     Channel,
     ObjectPose,
@@ -19,8 +20,6 @@ from droid_jax.measure.recording import (
     ServoGains,
     TorqueConvention,
     TorqueSide,
-    check_joints,
-    validate,
 )
 
 JOINTS = ("j1", "j2")

@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from droid_jax.measure import formats
-from droid_jax.measure.formats import load, resample, save
+from droid_jax.measure import csv_folder
+from droid_jax.measure.clocks import resample
+from droid_jax.measure.formats import load, save
 from droid_jax.measure.recording import (
     Channel,
     ObjectPose,
@@ -120,8 +121,8 @@ def test_a_failed_save_keeps_the_old_file(tmp_path: Path, where: str, monkeypatc
     def broken(*_args, **_kwargs):
         raise OSError("disk full")
 
-    monkeypatch.setattr(formats.np, "savez_compressed", broken)
-    monkeypatch.setattr(formats, "_write_table", broken)
+    monkeypatch.setattr(np, "savez_compressed", broken)
+    monkeypatch.setattr(csv_folder, "_write_table", broken)
     with pytest.raises(OSError, match="disk full"):
         save(make().repeats_subset([1]), tmp_path / where)
     monkeypatch.undo()

@@ -12,7 +12,11 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from droid_jax.report import figures, page, render
+from droid_jax.report import page, render, search_figures, torque_figures
+from droid_jax.report.export import inline_svg
+from droid_jax.report.run_folder import read_run
+from droid_jax.report.style import BEFORE
+from droid_jax.report.words import like, number, percent, summary
 
 JOINTS = [f"panda_joint{i}" for i in range(1, 8)]
 # Everything the demonstration tells, off its bounds, unless SPECIAL says otherwise.
@@ -220,7 +224,7 @@ def test_groups_come_in_the_order_of_the_papers_table(written: Page) -> None:
 
 
 def test_summary_is_made_from_the_numbers(run: Path) -> None:
-    text = " ".join(page.summary(page.read_run(run)))
+    text = " ".join(summary(read_run(run)))
     assert "8 parameters (4 of the door, 2 of the stand-in robot and 2 of the gripper)" in text
     assert "2 nuisances" in text and "1.22 N m before the fit" in text and "0.119 N m after it" in text
     assert "98 % of what can be closed" in text
@@ -235,7 +239,7 @@ def test_summary_says_when_the_fit_made_it_worse(tmp_path: Path) -> None:
     fit = json.loads((run / "fit.json").read_text())
     fit["gap"]["open_close"] |= {"after": 2.5, "closed": -1.1}
     (run / "fit.json").write_text(json.dumps(fit))
-    text = " ".join(page.summary(page.read_run(run)))
+    text = " ".join(summary(read_run(run)))
     assert "the fit made it worse" in text and "do not train on this fit" in text
     assert "look for it with python -m droid_jax.run gap" in text
 
@@ -246,9 +250,9 @@ def test_a_stand_in_is_never_called_a_robot(written: Page) -> None:
 
 
 def test_a_robot_is_not_called_a_stand_in(tmp_path: Path) -> None:
-    run = page.read_run(make_run(tmp_path / "run", stand_in=False))
-    assert "which the robot measured" in page.summary(run)[0]
-    assert "stand-in" not in " ".join(page.summary(run))
+    run = read_run(make_run(tmp_path / "run", stand_in=False))
+    assert "which the robot measured" in summary(run)[0]
+    assert "stand-in" not in " ".join(summary(run))
 
 
 def test_the_page_loads_nothing_and_every_link_is_there(run: Path, written: Page) -> None:
@@ -293,7 +297,7 @@ def test_drawing_leaves_the_callers_matplotlib_alone() -> None:
     import matplotlib
 
     before = dict(matplotlib.rcParams)
-    figures.gap_per_joint(JOINTS, np.ones(7), np.ones(7), None)
+    torque_figures.gap_per_joint(JOINTS, np.ones(7), np.ones(7), None)
     assert dict(matplotlib.rcParams) == before
 
 
@@ -315,13 +319,13 @@ def test_a_missing_key_and_a_wrong_shape_are_named(tmp_path: Path) -> None:
     del fit["parameters"][2]["truth"]
     (run / "fit.json").write_text(json.dumps(fit))
     with pytest.raises(ValueError, match=r"hinge_friction_loss.*'truth'"):
-        page.read_run(run)
+        read_run(run)
     run = make_run(tmp_path / "other")
     arrays = dict(np.load(run / "traces.npz"))
     arrays["open_close/after"] = arrays["open_close/after"][:-1]
     np.savez(run / "traces.npz", **arrays)
     with pytest.raises(ValueError, match=r"open_close/after must be .*\(3840, 7\).*\(3839, 7\)"):
-        page.read_run(run)
+        read_run(run)
 
 
 @pytest.mark.parametrize(
@@ -330,29 +334,29 @@ def test_a_missing_key_and_a_wrong_shape_are_named(tmp_path: Path) -> None:
      (None, "–"), (float("nan"), "–")],
 )  # fmt: skip
 def test_numbers_are_written_with_three_digits(value: float | None, shown: str) -> None:
-    assert page.number(value) == shown
+    assert number(value) == shown
 
 
 def test_numbers_follow_their_deviation() -> None:
-    assert page.like(1.23456, 0.021) == "1.235"
-    assert page.like(52.31, 0.83) == "52.31"
-    assert page.like(-1234.5, 40.0) == "−1234"  # half to even, and no digits that mean nothing
-    assert page.percent(0.999) == "99 %" and page.percent(1.0) == "100 %"
+    assert like(1.23456, 0.021) == "1.235"
+    assert like(52.31, 0.83) == "52.31"
+    assert like(-1234.5, 40.0) == "−1234"  # half to even, and no digits that mean nothing
+    assert percent(0.999) == "99 %" and percent(1.0) == "100 %"
 
 
 def test_long_traces_are_thinned_without_losing_a_spike() -> None:
     time = np.arange(20_000) * 0.001
     value = np.sin(time)
     value[7_777] = 50.0
-    thin_time, thin = figures._thin(time, value)
+    thin_time, thin = torque_figures._thin(time, value)
     assert len(thin) < 500 and thin.max() == 50.0 and (np.diff(thin_time) > 0).all()
-    _, low, high = figures._band(time, value - 1, value + 1)
+    _, low, high = torque_figures._band(time, value - 1, value + 1)
     assert low.min() == (value - 1).min() and high.max() == 51.0
 
 
 def test_torque_figure_draws_the_given_traces(run: Path) -> None:
-    traces = page.read_run(run).traces["open_close"]
-    figure = figures.torque_traces(traces, traces["phases"])
+    traces = read_run(run).traces["open_close"]
+    figure = torque_figures.torque_traces(traces, traces["phases"])
     panels = [a for a in figure.axes if a.get_visible()]
     assert [a.get_title("left") for a in panels] == [f"Joint {i}" for i in range(1, 8)]
     for j, axes in enumerate(panels):
@@ -365,29 +369,30 @@ def test_torque_figure_draws_the_given_traces(run: Path) -> None:
 
 def test_figures_survive_failed_replays() -> None:
     history = {"generation": np.arange(4), "best_cost": [np.inf, 2.0, 1.0, 0.5], "median_cost": [np.inf] * 4}
-    assert isinstance(figures.cost_history(history, {"best": 0.5, "floor": None}), Figure)
+    assert isinstance(search_figures.cost_history(history, {"best": 0.5, "floor": None}), Figure)
     costs = np.array([np.inf, 1.0, 2.0])
-    legend = figures.cost_histograms(costs, costs[1:]).legends[0]
+    legend = search_figures.cost_histograms(costs, costs[1:]).legends[0]
     assert any("1 without a finite cost" in t.get_text() for t in legend.get_texts())
     with pytest.raises(ValueError, match="no finite cost"):
-        figures.cost_histograms(np.array([np.inf]), np.array([np.nan]))
+        search_figures.cost_histograms(np.array([np.inf]), np.array([np.nan]))
 
 
 def test_the_best_told_parameters_are_chosen() -> None:
-    chosen = figures.most_identifiable(parameters(), {p["name"]: 0 for p in parameters()})
+    chosen = search_figures.most_identifiable(parameters(), {p["name"]: 0 for p in parameters()})
     ratio = {p["name"]: p["std"] / p["initial_std"] for p in parameters()}
     assert chosen[0] == "hinge_stiffness" and "door_mass" not in chosen and "door_x" not in chosen
     assert [ratio[n] for n in chosen] == sorted(ratio[n] for n in chosen) and 3 <= len(chosen) <= 6
-    assert len(figures.most_identifiable(parameters()[3:4] + parameters()[8:], {"door_mass": 0, "door_x": 1})) == 2
+    few = parameters()[3:4] + parameters()[8:]
+    assert len(search_figures.most_identifiable(few, {"door_mass": 0, "door_x": 1})) == 2
 
 
 def test_inline_svg_is_well_formed_and_follows_the_pages_colours() -> None:
-    figure = figures.gap_per_joint(JOINTS, np.ones(7), 0.1 * np.ones(7), 0.05)
-    svg = figures.inline_svg(figure, "x")
+    figure = torque_figures.gap_per_joint(JOINTS, np.ones(7), 0.1 * np.ones(7), 0.05)
+    svg = inline_svg(figure, "x")
     root = ElementTree.fromstring(svg)
     assert root.tag.endswith("svg") and "var(--before)" in svg and "var(--after)" in svg
-    assert figures.BEFORE not in svg
-    assert svg == figures.inline_svg(figures.gap_per_joint(JOINTS, np.ones(7), 0.1 * np.ones(7), 0.05), "x")
+    assert BEFORE not in svg
+    assert svg == inline_svg(torque_figures.gap_per_joint(JOINTS, np.ones(7), 0.1 * np.ones(7), 0.05), "x")
 
 
 XML = """<mujoco><visual><global offwidth="64" offheight="48"/></visual><worldbody>
@@ -451,16 +456,3 @@ def test_a_backend_that_cannot_draw_is_a_message_not_a_crash() -> None:
     assert "invalid value" in render._child("nonsense", None, 60.0)
     assert render._candidates("glfw", "linux") == ["glfw", "egl", "osmesa"]
     assert render._candidates("", "linux") == ["egl", "osmesa"]
-
-
-def test_writing_is_all_or_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    target = tmp_path / "page.html"
-    target.write_bytes(b"old")
-
-    def fail(*_: object) -> None:
-        raise OSError("disk full")
-
-    monkeypatch.setattr(figures.os, "replace", fail)
-    with pytest.raises(OSError, match="disk full"):
-        figures.write_atomically(target, b"new")
-    assert target.read_bytes() == b"old" and list(tmp_path.iterdir()) == [target]

@@ -1,0 +1,85 @@
+"""Clocks of measurements: whether one can be right, and several repeats on a common one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+SLACK = 1e-6  # s, two instants closer than this are the same
+_DAY = 86400.0  # s
+_JITTER = 0.5  # largest deviation of a clock's step from its median, as a fraction
+
+
+def check_clock(
+    time: np.ndarray,
+    where: str,
+    *,
+    allow_jitter: bool = False,
+    label: Callable[[int], str] = lambda i: f"row {i}",
+) -> None:
+    """ValueError unless time [T] is finite, in seconds, strictly increasing and regular.
+
+    where: what the clock belongs to; label: row index -> how the message calls that row.
+    """
+    bad = np.flatnonzero(~np.isfinite(time))
+    if bad.size:
+        raise ValueError(f"{where}, {label(int(bad[0]))}: time must be finite, got {time[bad[0]]}")
+    steps = np.diff(time.astype(np.float64))
+    bad = np.flatnonzero(steps <= 0)
+    if bad.size:
+        i = int(bad[0]) + 1
+        what = "repeats" if steps[i - 1] == 0 else "goes backwards:"
+        raise ValueError(
+            f"{where}, {label(i)}: time must increase, it {what} {float(time[i])!r} s after {float(time[i - 1])!r} s"
+        )
+    _check_seconds(time, steps, where)
+    if steps.size and not allow_jitter:
+        typical = float(np.median(steps))
+        i = int(np.argmax(np.abs(steps - typical)))
+        if abs(steps[i] - typical) > _JITTER * typical:
+            raise ValueError(
+                f"{where}, {label(i + 1)}: irregular rate, a step of {steps[i]:.6g} s where "
+                f"{typical:.6g} s is usual; resample the log or pass allow_jitter=True"
+            )
+
+
+def _check_seconds(time: np.ndarray, steps: np.ndarray, where: str) -> None:
+    """ValueError when the numbers of a clock can hardly be seconds since the start."""
+    hint = "time must be in seconds; is it in milliseconds, microseconds or nanoseconds?"
+    if not steps.size:
+        return
+    duration, typical = float(time[-1] - time[0]), float(np.median(steps))
+    if duration > _DAY:
+        raise ValueError(f"{where}: the clock runs over {duration:.6g} s, more than a day; {hint}")
+    # At or above, not only above: a 1 kHz log in milliseconds has steps of exactly 1.
+    if typical >= 1.0 - SLACK:
+        raise ValueError(f"{where}: the clock's usual step is {typical:.6g} s, 1 s or more; {hint}")
+    if typical < 1e-5:
+        raise ValueError(f"{where}: the clock's usual step is {typical:.3g} s, below 1e-5 s; {hint}")
+    if abs(float(time[0])) > _DAY:
+        raise ValueError(
+            f"{where}: the clock starts at {float(time[0]):.6g} s, more than a day from 0; "
+            "subtract the time of the first command from every clock"
+        )
+
+
+def resample(
+    times: Sequence[np.ndarray], values: Sequence[np.ndarray], clock: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Repeats with clocks of their own -> one clock [Tc] s and values [N, Tc, C].
+
+    times:  N arrays [T_r] s;  values: N arrays [T_r, C], NaN where nothing was measured.
+    clock:  where values are wanted, s; the first repeat's clock by default.
+
+    The clock is cut to the part that all repeats cover; in between, values are interpolated
+    linearly and are NaN where either neighbour is.  Raises ValueError when no part is common.
+    """
+    clock = times[0] if clock is None else clock
+    first, last = max(float(t[0]) for t in times), min(float(t[-1]) for t in times)
+    clock = clock[(clock >= first - SLACK) & (clock <= last + SLACK)]
+    if not len(clock):
+        spans = ", ".join(f"{t[0]:g} .. {t[-1]:g} s" for t in times)
+        raise ValueError(f"the repeats cover no common part of the clock: {spans}")
+    columns = [[np.interp(clock, t, v[:, c]) for c in range(v.shape[1])] for t, v in zip(times, values, strict=True)]
+    return clock, np.stack([np.stack(repeat, axis=-1) for repeat in columns])

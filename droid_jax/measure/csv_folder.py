@@ -1,0 +1,182 @@
+"""A recording as a folder of CSV files, one per repeat of each channel, and a recording.json."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from droid_jax.measure.clocks import SLACK, check_clock, resample
+from droid_jax.measure.metadata import metadata_from_json, metadata_to_json, recording_of
+from droid_jax.measure.recording import Channel, Recording
+from droid_jax.storage import new_folder, write_csv, write_text
+
+
+def save_csv(recording: Recording, path: Path) -> None:
+    """Write a recording, which is taken to be valid; ValueError where the folder holds something else."""
+    if path.exists() and not (path / "recording.json").exists() and (path.is_file() or any(path.iterdir())):
+        raise ValueError(f"{path}: exists and is not a recording's folder, it is not replaced")
+    with new_folder(path) as new:
+        write_text(new / "recording.json", metadata_to_json(recording) + "\n")
+        if recording.command_names:
+            _write_table(new / "command.csv", recording.command_names, recording.time, recording.command)
+        for key, c in recording.channels.items():
+            for r in range(recording.repeats):
+                values = np.where(c.mask[r], c.values[r], np.nan)
+                _write_table(new / f"{key}_{r:02d}.csv", c.columns, c.time, values)
+
+
+def _write_table(path: Path, columns: Sequence[str], time: np.ndarray, values: np.ndarray) -> None:
+    """A header and one line per row; NaN becomes an empty cell.
+
+    Numbers are written with the fewest digits that read back as the same float64.
+    """
+    rows = np.column_stack([time, values]).astype(np.float64).tolist()
+    cells = [["" if cell != cell else cell for cell in row] for row in rows]
+    write_csv(path, ["time", *columns], cells, line_end="\n")
+
+
+@dataclass(frozen=True, eq=False)
+class _Table:
+    """One CSV file: time [T], values [T, C] with NaN for empty cells."""
+
+    path: Path
+    columns: tuple[str, ...]
+    time: np.ndarray
+    values: np.ndarray
+
+
+def load_csv(path: Path, interpolate: bool, allow_jitter: bool) -> Recording:
+    """The recording in a folder, not yet validated; ValueError names the file and line that is wrong.
+
+    interpolate:  put repeats with clocks of their own on the first one's clock.
+    allow_jitter: accept irregular clocks.
+    """
+    meta = metadata_from_json(_text(path / "recording.json"), str(path / "recording.json"))
+    time, command, names = np.zeros(0), np.zeros((0, 0)), ()
+    if meta.commands:
+        if not (path / "command.csv").exists():
+            raise ValueError(
+                f'{path}: missing command.csv; a log without commands says "commands": false in its recording.json'
+            )
+        table = _read_table(path / "command.csv", meta.command_names, True, allow_jitter)
+        time, command, names = table.time, table.values, table.columns
+    channels = {}
+    for key, unit in meta.units.items():
+        tables = _read_repeats(path, key, meta.columns[key], allow_jitter)
+        times, values = [t.time for t in tables], [t.values for t in tables]
+        clock, stacked = (times[0], np.stack(values)) if _same_clock(tables, interpolate) else resample(times, values)
+        channels[key] = Channel(key, unit, tables[0].columns, clock, stacked, np.isfinite(stacked))
+    return recording_of(meta, path, time, command, names, channels)
+
+
+def _text(path: Path) -> str:
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: not a text file in UTF-8, byte {error.start} cannot be read") from None
+    if not text.strip():
+        raise ValueError(f"{path}: the file is empty")
+    return text
+
+
+def _read_repeats(path: Path, key: str, columns: tuple[str, ...], allow_jitter: bool) -> list[_Table]:
+    """The tables of key_00.csv, key_01.csv, ... without a gap, all with the same columns."""
+    matches = (re.fullmatch(rf"{re.escape(key)}_(\d+)\.csv", p.name) for p in path.iterdir())
+    files = {int(m[1]): path / m[0] for m in matches if m}
+    missing = [i for i in range(max(files, default=0) + 1) if i not in files]
+    if missing:
+        raise ValueError(f"{path}: missing {key}_{missing[0]:02d}.csv, repeat {missing[0]} of channel {key!r}")
+    tables = []
+    for i in range(len(files)):
+        table = _read_table(files[i], columns, False, allow_jitter)
+        columns = table.columns
+        tables.append(table)
+    return tables
+
+
+def _read_table(path: Path, expected: Sequence[str], full: bool, allow_jitter: bool) -> _Table:
+    """Reads one CSV file.
+
+    expected: column names that must be there, in the order wanted; empty takes the file's own.
+    full:     an empty cell is an error (commands) rather than a missing measurement.
+    """
+    reader = csv.reader(_text(path).splitlines(keepends=True))
+    try:
+        header = [cell.strip() for cell in next(reader)]
+        rows = [(reader.line_num, row) for row in reader if row]
+    except csv.Error as error:
+        raise ValueError(f"{path}, line {reader.line_num}: {error}") from None
+    order = _column_order(path, header, expected)
+    if not rows:
+        raise ValueError(f"{path}: empty, there is no row below the header")
+    data = np.array([_numbers(path, line, row, header, full) for line, row in rows])
+    lines = [line for line, _ in rows]
+    check_clock(data[:, 0], str(path), allow_jitter=allow_jitter, label=lambda i: f"line {lines[i]}")
+    columns = tuple(header[i] for i in order)
+    return _Table(path, columns, data[:, 0], np.ascontiguousarray(data[:, order]))
+
+
+def _column_order(path: Path, header: list[str], expected: Sequence[str]) -> list[int]:
+    """Where the wanted columns stand in the file."""
+    if header[0] != "time":
+        raise ValueError(f"{path}, line 1: the first column must be 'time' (comma separated), got {header[0]!r}")
+    names = header[1:]
+    twice = sorted({n for n in names if names.count(n) > 1})
+    if twice or not names or "" in names:
+        what = f"repeated: {', '.join(twice)}" if twice else f"got {names}"
+        raise ValueError(f"{path}, line 1: expected one named column per joint beside 'time', {what}")
+    wanted = list(expected) or names
+    missing, unknown = [n for n in wanted if n not in names], [n for n in names if n not in wanted]
+    if missing or unknown:
+        raise ValueError(
+            f"{path}, line 1: expected {len(wanted)} joint columns, got {len(names)}; missing: "
+            f"{', '.join(missing) or 'none'}; unknown: {', '.join(unknown) or 'none'}"
+        )
+    return [1 + names.index(n) for n in wanted]
+
+
+def _numbers(path: Path, line: int, row: list[str], header: list[str], full: bool) -> list[float]:
+    """The numbers of one row, NaN for an empty cell."""
+    if len(row) != len(header):
+        raise ValueError(f"{path}, line {line}: expected {len(header)} cells, got {len(row)}")
+    numbers = []
+    for cell, column in zip(row, header, strict=True):
+        blank = not cell.strip()
+        try:
+            number = float("nan") if blank else float(cell)
+        except ValueError:
+            raise ValueError(f"{path}, line {line}, column {column!r}: {cell!r} is not a number") from None
+        if blank and (full or column == "time"):
+            raise ValueError(f"{path}, line {line}, column {column!r}: expected a number, the cell is empty")
+        if not blank and not np.isfinite(number):
+            raise ValueError(
+                f"{path}, line {line}, column {column!r}: {cell!r} is not a finite number"
+                + ("" if full else "; leave the cell empty where nothing was measured")
+            )
+        numbers.append(number)
+    return numbers
+
+
+def _same_clock(tables: Sequence[_Table], interpolate: bool) -> bool:
+    """Whether all repeats share the first one's clock; ValueError if not and that is not allowed."""
+    first = tables[0]
+    for i, table in enumerate(tables[1:], start=1):
+        if len(table.time) != len(first.time):
+            what = f"{len(table.time)} rows where {first.path.name} has {len(first.time)}"
+        elif np.abs(table.time - first.time).max() > SLACK:
+            row = int(np.argmax(np.abs(table.time - first.time) > SLACK))
+            what = f"{table.time[row]!s} s in data row {row} where {first.path.name} has {first.time[row]!s} s"
+        else:
+            continue
+        if not interpolate:
+            raise ValueError(
+                f"{table.path}: repeat {i} has another clock than repeat 0, {what}; "
+                "load with resample=True to interpolate it"
+            )
+        return False
+    return True

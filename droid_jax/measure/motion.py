@@ -1,0 +1,81 @@
+"""The motion behind a log without commands: position, velocity and acceleration from measured positions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import signal
+
+from droid_jax.measure.recording import Recording, TorqueConvention
+
+CUTOFF = 20.0  # Hz, of the position before it is differentiated; above that of the torques, which are compared
+OVERSAMPLING = 6.0  # rows of a motion per period of its cutoff
+EDGE = 0.3  # s left out at both ends, where a zero-phase filter has no neighbours
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A measured motion of some joints, for the inverse mode.
+
+    time: [T] s, regular.  position, velocity, acceleration: [T, J] rad, rad/s, rad/s^2 (m for slides), in the
+    order of the scene's joints.  torque: convention of the measured torque.
+    """
+
+    time: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+    acceleration: np.ndarray
+    torque: TorqueConvention
+
+    @property
+    def timestep(self) -> float:
+        """s between rows."""
+        return float(self.time[-1] - self.time[0]) / (len(self.time) - 1)
+
+
+def measured_motion(recording: Recording, joints: Sequence[str], *, cutoff: float = CUTOFF) -> Motion:
+    """The motion of `joints` in a recording: the mean of the repeats' positions, smoothed and differentiated.
+
+    The position passes a zero-phase Butterworth filter of order 4 at `cutoff` Hz, then central
+    differences at the log's own rate; measured velocities are not used.  EDGE s at both ends are left out.
+    Raises ValueError where a joint's position was not measured throughout, the log is too slow for
+    the cutoff, or too short.
+    """
+    channel = recording.channel("position")
+    unknown = [j for j in joints if j not in channel.columns]
+    if unknown:
+        raise ValueError(
+            f"recording {recording.name!r} holds no commands and its positions lack {', '.join(unknown)}: "
+            "a motion is prescribed for every joint of the scene"
+        )
+    columns = [channel.columns.index(j) for j in joints]
+    mask = channel.mask[:, :, columns]
+    if not mask.any(axis=0).all():
+        row, column = np.argwhere(~mask.any(axis=0))[0]
+        raise ValueError(
+            f"recording {recording.name!r}, channel 'position', column {joints[column]!r}: not measured at "
+            f"{channel.time[row]:g} s; a motion needs every sample of at least one repeat"
+        )
+    rate = (len(channel.time) - 1) / float(channel.time[-1] - channel.time[0])
+    if rate < 2.5 * cutoff:
+        raise ValueError(
+            f"recording {recording.name!r} holds positions at {rate:.4g} Hz, too slow to be smoothed at {cutoff:g} Hz; "
+            f"state a motion cutoff below {rate / 2.5:.3g} Hz"
+        )
+    position = np.mean(channel.values[:, :, columns], axis=0, where=mask)
+    clock = _inner_clock(recording.name, channel.time, OVERSAMPLING * cutoff)
+    q = signal.sosfiltfilt(signal.butter(4, cutoff, fs=rate, output="sos"), position, axis=0)
+    qd = np.gradient(q, 1 / rate, axis=0)
+    qdd = np.gradient(qd, 1 / rate, axis=0)
+    rows = (np.stack([np.interp(clock, channel.time, c) for c in a.T], axis=1) for a in (q, qd, qdd))
+    return Motion(clock, *rows, torque=recording.torque)
+
+
+def _inner_clock(name: str, time: np.ndarray, rate: float) -> np.ndarray:
+    """[T] s at `rate`, EDGE inside the measured time."""
+    first, last = float(time[0]) + EDGE, float(time[-1]) - EDGE
+    if last - first < 1.0:
+        raise ValueError(f"recording {name!r} is {time[-1] - time[0]:.3g} s long; a motion needs {1 + 2 * EDGE:g} s")
+    return first + np.arange(int(np.floor((last - first) * rate + 1e-6)) + 1) / rate

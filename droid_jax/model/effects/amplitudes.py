@@ -1,0 +1,93 @@
+"""What the effects share: parameters for a hinge or for every joint, and smooth signs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from droid_jax.model.parameters import Parameter
+from droid_jax.model.scene import Scene
+from droid_jax.model.seam import State, Theta
+
+SLOW = 0.01  # rad/s: speeds well below this have no direction yet
+GROUP = "Effect"
+
+
+def amplitude(name: str, unit: str, typical: float, high: float, *, low: float | None = None) -> Parameter:
+    """A size that is zero at neutral; typical: its prior deviation; low: -high unless given."""
+    return Parameter(name, unit, 0.0, typical, -high if low is None else low, high, group=GROUP)
+
+
+def shape(name: str, unit: str, values: Sequence[float], low: float, high: float) -> Parameter:
+    """A width, position or speed that matters only beside an amplitude; it starts at the middle of `values`."""
+    ordered = sorted(values)
+    return Parameter(name, unit, ordered[len(ordered) // 2], (high - low) / 4, low, high, group=GROUP)
+
+
+def arm(scene: Scene) -> tuple[str, ...]:
+    """The measured joints but the object's own."""
+    return tuple(j for j in scene.joints if j != scene.object_joint)
+
+
+def arm_dofs(scene: Scene) -> np.ndarray:
+    """[J] their degrees of freedom."""
+    return np.array([scene.dof(j) for j in arm(scene)], dtype=int)
+
+
+def arm_qpos(scene: Scene) -> np.ndarray:
+    """[J] their entries of qpos."""
+    return np.array([scene.qpos(j) for j in arm(scene)], dtype=int)
+
+
+def of_joints(
+    name: str, joints: Sequence[str], unit: str, typical: float, high: float, *, low: float | None = None
+) -> tuple[Parameter, ...]:
+    """One amplitude a joint, `name[joint]`."""
+    return tuple(amplitude(f"{name}[{j}]", unit, typical, high, low=low) for j in joints)
+
+
+def places(joints: Sequence[str], *names: str) -> dict[str, tuple[str, ...]]:
+    """place -> amplitudes, for effects with the amplitudes `names` in every joint."""
+    return {j: tuple(f"{n}[{j}]" for n in names) for j in joints}
+
+
+def column(theta: Theta, name: str, joints: Sequence[str]) -> jax.Array:
+    """[J] one amplitude of all joints; zero where theta has none."""
+    return jnp.stack([value(theta, f"{name}[{j}]") for j in joints])
+
+
+def value(theta: Theta, name: str, neutral: float = 0.0) -> jax.Array:
+    """[] an entry of theta; its neutral value where theta has none."""
+    return jnp.asarray(theta.get(name, neutral), jnp.float32)
+
+
+def hinge(scene: Scene) -> str | None:
+    """The object's joint where it is a hinge, else None."""
+    joint = scene.object_joint
+    if joint is None or scene.model.jnt_type[scene.id("joint", joint)] != mujoco.mjtJoint.mjJNT_HINGE:
+        return None
+    return joint
+
+
+def at_dof(scene: Scene, joint: str, torque: jax.Array) -> jax.Array:
+    """[nv] a torque [] at one joint."""
+    return jnp.zeros(scene.model.nv, jnp.float32).at[scene.dof(joint)].set(torque)
+
+
+def angle(scene: Scene, joint: str, state: State) -> jax.Array:
+    """[] rad."""
+    return state.qpos[scene.qpos(joint)]
+
+
+def speed(scene: Scene, joint: str, state: State) -> jax.Array:
+    """[] rad/s."""
+    return state.qvel[scene.dof(joint)]
+
+
+def direction(velocity: jax.Array) -> jax.Array:
+    """Smooth sign of a speed, rad/s."""
+    return jnp.tanh(velocity / SLOW)

@@ -1,0 +1,35 @@
+"""Dry friction of the hinge that changes as the door opens: a door that drags on the floor."""
+
+import jax.numpy as jnp
+
+from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effects.registry import register
+from droid_jax.model.scene import Scene
+from droid_jax.model.seam import Effect
+
+SLOPE, CURVE = "angle_friction_slope", "angle_friction_curve"
+
+
+@register
+def angle_friction(scene: Scene) -> Effect | None:
+    """F(phi) = F0 + f1 phi + f2 phi^2 in place of the hinge's constant F0, never below zero."""
+    joint = a.hinge(scene)
+    if joint is None:
+        return None
+    dof = scene.dof(joint)
+
+    def frictionloss(theta, state, base):
+        phi = a.angle(scene, joint, state)
+        extra = a.value(theta, SLOPE) * phi + a.value(theta, CURVE) * phi**2
+        return base.at[dof].set(jnp.maximum(base[dof] + extra, 0.0))
+
+    return Effect(
+        "angle_friction",
+        (a.amplitude(SLOPE, "N m/rad", 0.5, 5.0), a.amplitude(CURVE, "N m/rad^2", 0.5, 5.0)),
+        frictionloss=frictionloss,
+        what="dry friction of the hinge that changes with the door's angle",
+        mark="hysteresis over the angle: opening and closing differ more at some angles",
+        confused_with=("hardening_spring", "hinge_directional"),
+        places={joint: (SLOPE, CURVE)},
+        smallest=0.1,
+    )

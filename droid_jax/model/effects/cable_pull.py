@@ -1,0 +1,35 @@
+"""A cable or hose that pulls a joint of the arm back to where it hangs free."""
+
+import jax.numpy as jnp
+
+from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effects.registry import register
+from droid_jax.model.scene import Scene
+from droid_jax.model.seam import Effect
+
+STIFFNESS, PULL = "cable_stiffness", "cable_pull"
+
+
+@register
+def cable_pull(scene: Scene) -> Effect | None:
+    """-k (q - q_start) - p in a joint: stiffness k, N m/rad, and the pull p at the start, N m."""
+    joints, positions = a.arm(scene), a.arm_qpos(scene)
+    if not joints:
+        return None
+    dofs, start = a.arm_dofs(scene), scene.model.qpos0[positions]
+
+    def force(theta, state):
+        stretch = state.qpos[positions] - start
+        torque = a.column(theta, STIFFNESS, joints) * stretch + a.column(theta, PULL, joints)
+        return jnp.zeros_like(state.qvel).at[dofs].add(-torque)
+
+    return Effect(
+        "cable_pull",
+        (*a.of_joints(STIFFNESS, joints, "N m/rad", 0.5, 10.0), *a.of_joints(PULL, joints, "N m", 0.3, 5.0)),
+        force=force,
+        what="a cable or hose that pulls on a joint of the arm",
+        mark="smooth in the position of one joint, the same at every speed",
+        confused_with=("payload", "torque_bias"),
+        places=a.places(joints, STIFFNESS, PULL),
+        smallest=0.1,
+    )

@@ -1,0 +1,27 @@
+"""Fingers and knob that give way more (or less) than the model's contact does."""
+
+from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effects.registry import register
+from droid_jax.model.parameters import Mode, Parameter, Write
+from droid_jax.model.scene import Scene
+from droid_jax.model.seam import Effect
+
+SOFTNESS = "contact_softness"
+
+
+@register
+def contact_compliance(scene: Scene) -> Effect | None:
+    """The contacts' time constant (solref) times 1 + s."""
+    if scene.grip is None:
+        return None
+    pairs = [scene.id("pair", pair) for finger in scene.grip.fingers for pair in finger]
+    writes = tuple(Write("pair_solref", (pair, 0), Mode.SCALE, offset=1.0) for pair in pairs)
+    return Effect(
+        "contact_compliance",
+        (Parameter(SOFTNESS, "-", 0.0, 0.5, -0.5, 5.0, writes=writes, group=a.GROUP),),
+        what="fingertips or a knob that give way more than the model's",
+        mark="grasp and breakaway, the peaks of the load",
+        confused_with=("hinge_stribeck", "joint_compliance"),
+        places={"grip": (SOFTNESS,)},
+        smallest=0.2,
+    )

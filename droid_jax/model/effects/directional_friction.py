@@ -1,0 +1,57 @@
+"""Dry friction that differs between the two directions: of the arm's joints, of the hinge."""
+
+import jax.numpy as jnp
+
+from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effects.registry import register
+from droid_jax.model.scene import Scene
+from droid_jax.model.seam import Effect
+
+JOINT, HINGE = "joint_directional", "hinge_directional"
+
+
+@register
+def joint_directional(scene: Scene) -> Effect | None:
+    """F+ - F- = 2 d: friction loss + d sgn(qd) in a joint, never below zero, N m."""
+    joints, dofs = a.arm(scene), a.arm_dofs(scene)
+    if not joints:
+        return None
+
+    def frictionloss(theta, state, base):
+        extra = a.column(theta, JOINT, joints) * a.direction(state.qvel[dofs])
+        return base.at[dofs].set(jnp.maximum(base[dofs] + extra, 0.0))
+
+    return Effect(
+        JOINT,
+        a.of_joints(JOINT, joints, "N m", 0.2, 2.0),
+        frictionloss=frictionloss,
+        what="dry friction of a joint of the arm that differs between its two directions",
+        mark="an offset that comes and goes with the direction of that joint",
+        confused_with=("joint_coulomb", "torque_bias"),
+        places=a.places(joints, JOINT),
+        smallest=0.03,
+    )
+
+
+@register
+def hinge_directional(scene: Scene) -> Effect | None:
+    """The same on the hinge."""
+    joint = a.hinge(scene)
+    if joint is None:
+        return None
+    dof = scene.dof(joint)
+
+    def frictionloss(theta, state, base):
+        extra = a.value(theta, HINGE) * a.direction(state.qvel[dof])
+        return base.at[dof].set(jnp.maximum(base[dof] + extra, 0.0))
+
+    return Effect(
+        HINGE,
+        (a.amplitude(HINGE, "N m", 0.3, 3.0),),
+        frictionloss=frictionloss,
+        what="dry friction of the hinge that differs between opening and closing",
+        mark="a step at the door's reversals",
+        confused_with=("hinge_preload", "angle_friction"),
+        places={joint: (HINGE,)},
+        smallest=0.05,
+    )

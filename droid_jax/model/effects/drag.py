@@ -1,0 +1,31 @@
+"""Drag that grows with the square of the door's speed: air, a fluid damper."""
+
+from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effects.registry import register
+from droid_jax.model.scene import Scene
+from droid_jax.model.seam import Effect
+
+DRAG = "drag"
+
+
+@register
+def drag(scene: Scene) -> Effect | None:
+    """-c w |w| on the hinge, N m s^2/rad^2."""
+    joint = a.hinge(scene)
+    if joint is None:
+        return None
+
+    def force(theta, state):
+        w = a.speed(scene, joint, state)
+        return a.at_dof(scene, joint, -a.value(theta, DRAG) * w * abs(w))
+
+    return Effect(
+        DRAG,
+        (a.amplitude(DRAG, "N m s^2/rad^2", 0.5, 5.0, low=0.0),),
+        force=force,
+        what="drag of the door that grows with the square of its speed",
+        mark="the contrast between fast and slow stretches",
+        confused_with=("door_closer", "opening_check"),
+        places={joint: (DRAG,)},
+        smallest=0.1,
+    )

@@ -1,0 +1,26 @@
+"""A constant torque on the hinge: a preloaded spring, a seal, a cord under tension."""
+
+from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effects.registry import register
+from droid_jax.model.scene import Scene
+from droid_jax.model.seam import Effect
+
+NAME = "hinge_preload"
+
+
+@register
+def hinge_preload(scene: Scene) -> Effect | None:
+    """-t0 on the hinge, N m; positive closes."""
+    joint = a.hinge(scene)
+    if joint is None:
+        return None
+    return Effect(
+        NAME,
+        (a.amplitude(NAME, "N m", 0.5, 5.0),),
+        force=lambda theta, state: a.at_dof(scene, joint, -a.value(theta, NAME)),
+        what="a constant torque that closes (or opens) the door",
+        mark="the whole opening, the same at every angle and speed",
+        confused_with=("tilted_frame", "over_centre_spring"),
+        places={joint: (NAME,)},
+        smallest=0.05,
+    )

@@ -1,0 +1,30 @@
+"""Dry friction of the arm's joints beyond what the model has."""
+
+from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effects.registry import register
+from droid_jax.model.scene import Scene
+from droid_jax.model.seam import Effect
+
+LOSS = "joint_coulomb"
+
+
+@register
+def joint_coulomb(scene: Scene) -> Effect | None:
+    """Fc sgn(qd) in a joint, N m: a constant added to its friction loss."""
+    joints, dofs = a.arm(scene), a.arm_dofs(scene)
+    if not joints:
+        return None
+
+    def frictionloss(theta, state, base):
+        return base.at[dofs].add(a.column(theta, LOSS, joints))
+
+    return Effect(
+        LOSS,
+        a.of_joints(LOSS, joints, "N m", 0.3, 5.0, low=0.0),
+        frictionloss=frictionloss,
+        what="dry friction in a joint of the arm",
+        mark="a step at every reversal of that joint, in all phases",
+        confused_with=("joint_stribeck", "joint_directional", "load_friction"),
+        places=a.places(joints, LOSS),
+        smallest=0.03,
+    )

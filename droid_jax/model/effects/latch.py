@@ -1,0 +1,40 @@
+"""A magnetic catch, a ball catch or a latch: it holds the door in the first degrees only."""
+
+import jax.numpy as jnp
+
+from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effects.registry import register
+from droid_jax.model.scene import Scene
+from droid_jax.model.seam import Effect
+
+TORQUE, WIDTH = "latch_torque", "latch_width"
+WIDTHS = (0.02, 0.04, 0.08, 0.14)  # rad
+
+
+@register
+def latch(scene: Scene) -> Effect | None:
+    """-A exp(-phi/width) on the hinge, phi >= 0.
+
+    At phi = 0 the frame carries what closes the door further; the simulated one has no frame, so the
+    pull fades in over a tenth of the width.
+    """
+    joint = a.hinge(scene)
+    if joint is None:
+        return None
+
+    def force(theta, state):
+        share = jnp.maximum(a.angle(scene, joint, state), 0.0) / a.value(theta, WIDTH, WIDTHS[2])
+        pull = jnp.exp(-share) - jnp.exp(-10.0 * share)
+        return a.at_dof(scene, joint, -a.value(theta, TORQUE) * pull)
+
+    return Effect(
+        "latch",
+        (a.amplitude(TORQUE, "N m", 1.0, 10.0, low=0.0), a.shape(WIDTH, "rad", WIDTHS, 0.01, 0.2)),
+        force=force,
+        what="a magnetic catch or latch that holds the door in its first degrees",
+        mark="the first degrees of opening, and the last of closing",
+        confused_with=("hinge_stribeck", "over_centre_spring"),
+        places={joint: (TORQUE,)},
+        shapes={WIDTH: WIDTHS},
+        smallest=0.1,
+    )

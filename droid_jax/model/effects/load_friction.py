@@ -1,0 +1,32 @@
+"""Joint friction that grows with the torque a gear carries."""
+
+import jax.numpy as jnp
+
+from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effects.registry import register
+from droid_jax.model.scene import Scene
+from droid_jax.model.seam import Effect
+
+SHARE = "load_friction"
+
+
+@register
+def load_friction(scene: Scene) -> Effect | None:
+    """K |tau| sgn(qd): a share K of the actuator's torque, on top of a joint's friction loss."""
+    joints, dofs = a.arm(scene), a.arm_dofs(scene)
+    if not joints:
+        return None
+
+    def frictionloss(theta, state, base):
+        return base.at[dofs].add(a.column(theta, SHARE, joints) * jnp.abs(state.load[dofs]))
+
+    return Effect(
+        SHARE,
+        a.of_joints(SHARE, joints, "-", 0.05, 0.3, low=0.0),
+        frictionloss=frictionloss,
+        what="friction of a joint of the arm that grows with its load",
+        mark="steps at that joint's reversals that grow with its torque",
+        confused_with=("joint_coulomb", "torque_gain"),
+        places=a.places(joints, SHARE),
+        smallest=0.01,
+    )

@@ -1,0 +1,35 @@
+"""A self-closing hinge: its spring pulls hardest at a small angle and lets go further out."""
+
+import jax.numpy as jnp
+
+from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effects.registry import register
+from droid_jax.model.scene import Scene
+from droid_jax.model.seam import Effect
+
+TORQUE, ANGLE = "over_centre_torque", "over_centre_angle"
+ANGLES = (0.1, 0.2, 0.35, 0.55)  # rad, of the peak: 5 to 30 degrees
+
+
+@register
+def over_centre_spring(scene: Scene) -> Effect | None:
+    """-A (phi/p) exp(1 - phi/p) on the hinge for phi > 0: zero when shut, A at phi = p, fading beyond."""
+    joint = a.hinge(scene)
+    if joint is None:
+        return None
+
+    def force(theta, state):
+        share = jnp.maximum(a.angle(scene, joint, state), 0.0) / a.value(theta, ANGLE, ANGLES[2])
+        return a.at_dof(scene, joint, -a.value(theta, TORQUE) * share * jnp.exp(1.0 - share))
+
+    return Effect(
+        "over_centre_spring",
+        (a.amplitude(TORQUE, "N m", 1.0, 10.0), a.shape(ANGLE, "rad", ANGLES, 0.05, 0.9)),
+        force=force,
+        what="a self-closing hinge whose spring pulls hardest at a small angle and fades further out",
+        mark="5 to 30 degrees of opening, in both directions",
+        confused_with=("latch", "hinge_preload"),
+        places={joint: (TORQUE,)},
+        shapes={ANGLE: ANGLES},
+        smallest=0.1,
+    )

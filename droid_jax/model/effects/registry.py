@@ -1,0 +1,69 @@
+"""The one list of effects: `register` adds to it, `library` makes what a scene can have."""
+
+from __future__ import annotations
+
+import copy
+import importlib
+import pkgutil
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from droid_jax.model.parameters import Space
+from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
+from droid_jax.model.seam import Effect
+
+Maker = Callable[[Scene], Effect | None]
+_MAKERS: dict[str, Maker] = {}
+
+
+def register(maker: Maker) -> Maker:
+    """Add a maker, Scene -> Effect or None where the scene cannot have it, under its function's name.
+
+    Raises ValueError for a name that another function has taken.
+    """
+    name = maker.__name__
+    known = _MAKERS.get(name)
+    if known is not None and (known.__module__, known.__qualname__) != (maker.__module__, maker.__qualname__):
+        raise ValueError(f"an effect {name!r} is registered already, by {known.__module__}")
+    _MAKERS[name] = maker
+    return maker
+
+
+def registered() -> tuple[str, ...]:
+    """Names of all effects, built in and added."""
+    package = importlib.import_module("droid_jax.model.effects")
+    for module in pkgutil.iter_modules(package.__path__):
+        importlib.import_module(f"{package.__name__}.{module.name}")
+    return tuple(sorted(_MAKERS))
+
+
+def library(scene: Scene, names: Iterable[str] | None = None) -> tuple[Effect, ...]:
+    """The effects that a scene can have, in the order of their names; `names` chooses some.
+
+    Raises ValueError for unknown names, listing the valid ones.
+    """
+    known = registered()
+    chosen = known if names is None else tuple(names)
+    unknown = [n for n in chosen if n not in known]
+    if unknown:
+        raise ValueError(f"unknown effects {', '.join(unknown)}; valid: {', '.join(known)}")
+    made = (_MAKERS[name](scene) for name in chosen)
+    return tuple(effect for effect in made if effect is not None)
+
+
+def ready(scene: Scene) -> Scene:
+    """The scene with a friction row for every joint whose friction an effect may raise.
+
+    MJX lays these rows out at compilation (see TINY_FRICTIONLOSS); they cost a little time each.
+    """
+    model = copy.copy(scene.model)
+    dofs = [scene.dof(j) for j in scene.joints]
+    model.dof_frictionloss[dofs] = np.maximum(model.dof_frictionloss[dofs], TINY_FRICTIONLOSS)
+    return replace(scene, model=model)
+
+
+def effect_space(effects: Iterable[Effect]) -> Space:
+    """All parameters of some effects; its mean is neutral."""
+    return Space(tuple(p for effect in effects for p in effect.parameters))

@@ -1,0 +1,35 @@
+"""Servo gains other than the stated ones."""
+
+from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effects.registry import register
+from droid_jax.model.parameters import Mode, Parameter, Write
+from droid_jax.model.scene import Scene
+from droid_jax.model.seam import Effect
+
+GAIN = "servo_gain"
+
+
+@register
+def servo_gain(scene: Scene) -> Effect | None:
+    """A joint's position gain times 1 + g."""
+    joints = tuple(j for j in a.arm(scene) if j in scene.command_names)
+    if not joints:
+        return None
+
+    def parameter(joint: str) -> Parameter:
+        row = scene.command_names.index(joint)
+        writes = tuple(
+            Write(field, (row, column), Mode.SCALE, offset=1.0)
+            for field, column in (("actuator_gainprm", 0), ("actuator_biasprm", 1))
+        )
+        return Parameter(f"{GAIN}[{joint}]", "-", 0.0, 0.1, -0.5, 0.5, writes=writes, group=a.GROUP)
+
+    return Effect(
+        GAIN,
+        tuple(parameter(j) for j in joints),
+        what="a servo whose position gain is not the stated one",
+        mark="tracking error of one joint",
+        confused_with=("joint_compliance", "command_delay", "torque_gain"),
+        places={j: (f"{GAIN}[{j}]",) for j in joints},
+        smallest=0.02,
+    )

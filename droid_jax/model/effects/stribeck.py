@@ -1,0 +1,65 @@
+"""Friction that is higher at rest than in motion (Stribeck): of the arm's joints, of the hinge."""
+
+import jax.numpy as jnp
+
+from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effects.registry import register
+from droid_jax.model.scene import Scene
+from droid_jax.model.seam import Effect
+
+JOINT, JOINT_SPEED = "joint_stribeck", "joint_stribeck_speed"
+HINGE, HINGE_SPEED = "hinge_stribeck", "hinge_stribeck_speed"
+SPEEDS = (0.01, 0.03, 0.1)  # rad/s
+
+
+def _excess(theta, speed_name: str, velocity):
+    """exp(-(v/vs)^2)."""
+    return jnp.exp(-((velocity / a.value(theta, speed_name, SPEEDS[1])) ** 2))
+
+
+@register
+def joint_stribeck(scene: Scene) -> Effect | None:
+    """(Fs - Fc) exp(-(v/vs)^2) on top of a joint's friction loss, N m."""
+    joints, dofs = a.arm(scene), a.arm_dofs(scene)
+    if not joints:
+        return None
+
+    def frictionloss(theta, state, base):
+        extra = a.column(theta, JOINT, joints) * _excess(theta, JOINT_SPEED, state.qvel[dofs])
+        return base.at[dofs].add(extra)
+
+    return Effect(
+        JOINT,
+        (*a.of_joints(JOINT, joints, "N m", 0.2, 2.0, low=0.0), a.shape(JOINT_SPEED, "rad/s", SPEEDS, 0.005, 0.2)),
+        frictionloss=frictionloss,
+        what="friction of a joint of the arm that is higher at rest than in motion",
+        mark="breakaway and reversals of that joint",
+        confused_with=("joint_coulomb",),
+        places=a.places(joints, JOINT),
+        shapes={JOINT_SPEED: SPEEDS},
+        smallest=0.05,
+    )
+
+
+@register
+def hinge_stribeck(scene: Scene) -> Effect | None:
+    """The same on the hinge."""
+    joint = a.hinge(scene)
+    if joint is None:
+        return None
+    dof = scene.dof(joint)
+
+    def frictionloss(theta, state, base):
+        return base.at[dof].add(a.value(theta, HINGE) * _excess(theta, HINGE_SPEED, state.qvel[dof]))
+
+    return Effect(
+        HINGE,
+        (a.amplitude(HINGE, "N m", 0.5, 3.0, low=0.0), a.shape(HINGE_SPEED, "rad/s", SPEEDS, 0.005, 0.2)),
+        frictionloss=frictionloss,
+        what="friction of the hinge that is higher at rest than in motion",
+        mark="breakaway and reversals of the door",
+        confused_with=("latch", "joint_stribeck"),
+        places={joint: (HINGE,)},
+        shapes={HINGE_SPEED: SPEEDS},
+        smallest=0.1,
+    )

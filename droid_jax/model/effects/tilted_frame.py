@@ -1,0 +1,33 @@
+"""A door frame out of plumb: gravity opens or closes the door."""
+
+import jax.numpy as jnp
+
+from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effects.registry import register
+from droid_jax.model.scene import Scene
+from droid_jax.model.seam import Effect
+
+SINE, COSINE = "tilt_sine", "tilt_cosine"
+
+
+@register
+def tilted_frame(scene: Scene) -> Effect | None:
+    """-(A sin phi + B cos phi) on the hinge, N m: m g d sin(alpha) for a lean to the front and to the side."""
+    joint = a.hinge(scene)
+    if joint is None:
+        return None
+
+    def force(theta, state):
+        phi = a.angle(scene, joint, state)
+        return a.at_dof(scene, joint, -(a.value(theta, SINE) * jnp.sin(phi) + a.value(theta, COSINE) * jnp.cos(phi)))
+
+    return Effect(
+        "tilted_frame",
+        (a.amplitude(SINE, "N m", 0.3, 3.0), a.amplitude(COSINE, "N m", 0.3, 3.0)),
+        force=force,
+        what="a frame out of plumb, so that gravity moves the door",
+        mark="smooth over the angle, the same at every speed and in both directions",
+        confused_with=("hinge_preload", "hardening_spring"),
+        places={joint: (SINE, COSINE)},
+        smallest=0.05,
+    )

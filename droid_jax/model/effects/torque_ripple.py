@@ -1,0 +1,42 @@
+"""Torque ripple: cogging of a motor or the teeth of a gear, periodic in a joint's position."""
+
+import jax.numpy as jnp
+
+from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effects.registry import register
+from droid_jax.model.scene import Scene
+from droid_jax.model.seam import Effect
+
+SINE, COSINE, PERIODS = "ripple_sine", "ripple_cosine", "ripple_periods"
+COUNTS = (6.0, 12.0, 24.0, 48.0)  # periods a turn
+
+
+@register
+def torque_ripple(scene: Scene) -> Effect | None:
+    """A sin(n q) + B cos(n q) in a joint, N m; n periods a turn."""
+    joints, positions = a.arm(scene), a.arm_qpos(scene)
+    if not joints:
+        return None
+    dofs = a.arm_dofs(scene)
+
+    def force(theta, state):
+        phase = a.value(theta, PERIODS, COUNTS[2]) * state.qpos[positions]
+        torque = a.column(theta, SINE, joints) * jnp.sin(phase)
+        torque = torque + a.column(theta, COSINE, joints) * jnp.cos(phase)
+        return jnp.zeros_like(state.qvel).at[dofs].add(torque)
+
+    return Effect(
+        "torque_ripple",
+        (
+            *a.of_joints(SINE, joints, "N m", 0.1, 1.0),
+            *a.of_joints(COSINE, joints, "N m", 0.1, 1.0),
+            a.shape(PERIODS, "1/turn", COUNTS, 2.0, 80.0),
+        ),
+        force=force,
+        what="torque ripple of a joint's motor or gear",
+        mark="periodic in the position of one joint",
+        confused_with=("cable_pull",),
+        places=a.places(joints, SINE, COSINE),
+        shapes={PERIODS: COUNTS},
+        smallest=0.02,
+    )

@@ -1,0 +1,68 @@
+"""Errors of the torque sensors: an offset, a wrong gain, a drift over the recording."""
+
+from dataclasses import replace
+
+from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effects.registry import register
+from droid_jax.model.scene import Scene
+from droid_jax.model.seam import Effect
+
+BIAS, GAIN, DRIFT = "torque_bias", "torque_gain", "torque_drift"
+
+
+@register
+def torque_bias(scene: Scene) -> Effect | None:
+    """tau + b, N m."""
+
+    def observe(theta, rollout):
+        return replace(rollout, torque=rollout.torque + a.column(theta, BIAS, scene.joints))
+
+    return Effect(
+        BIAS,
+        a.of_joints(BIAS, scene.joints, "N m", 0.3, 3.0),
+        observe=observe,
+        what="a constant error of a joint's torque sensor",
+        mark="one joint, the same throughout, also at rest",
+        confused_with=("payload", "cable_pull"),
+        places=a.places(scene.joints, BIAS),
+        smallest=0.05,
+    )
+
+
+@register
+def torque_gain(scene: Scene) -> Effect | None:
+    """(1 + g) tau."""
+
+    def observe(theta, rollout):
+        return replace(rollout, torque=rollout.torque * (1.0 + a.column(theta, GAIN, scene.joints)))
+
+    return Effect(
+        GAIN,
+        a.of_joints(GAIN, scene.joints, "-", 0.03, 0.3),
+        observe=observe,
+        what="a wrong gain of a joint's torque sensor",
+        mark="one joint, in proportion to its torque",
+        confused_with=("servo_gain", "load_friction"),
+        places=a.places(scene.joints, GAIN),
+        smallest=0.01,
+    )
+
+
+@register
+def torque_drift(scene: Scene) -> Effect | None:
+    """tau + d (t - t_end / 2), N m/s: without a mean, so that it is no offset."""
+
+    def observe(theta, rollout):
+        middle = rollout.time - 0.5 * (rollout.time[0] + rollout.time[-1])
+        return replace(rollout, torque=rollout.torque + a.column(theta, DRIFT, scene.joints) * middle[:, None])
+
+    return Effect(
+        DRIFT,
+        a.of_joints(DRIFT, scene.joints, "N m/s", 0.02, 0.3),
+        observe=observe,
+        what="a torque sensor that drifts during a recording",
+        mark="one joint, growing steadily with time whatever moves",
+        confused_with=("torque_bias", "cable_pull"),
+        places=a.places(scene.joints, DRIFT),
+        smallest=0.005,
+    )

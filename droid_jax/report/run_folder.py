@@ -1,0 +1,147 @@
+"""A run's folder as the report reads it: the files that must be there, checked, and those that may be."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+_RERUN = "run `python -m droid_jax.run identify` again, or pass the folder that it wrote"
+_ARRAYS = {
+    "history": ("names", "generation", "mean", "std", "best_cost", "median_cost"),
+    "correlation": ("names", "correlation"),
+    "distribution": ("initial_cost", "fitted_cost"),
+}
+_PARAMETER_KEYS = (
+    *(
+        "name",
+        "unit",
+        "group",
+        "nuisance",
+        "initial_mean",
+        "initial_std",
+        "low",
+        "high",
+        "best",
+        "mean",
+        "std",
+    ),
+    *("interval", "identifiable", "reason", "truth", "on_bound", "partners"),
+)
+_TRACE_KEYS = ("time", "measured_mean", "measured_low", "measured_high", "before", "after", "joints")
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a run's folder holds.
+
+    config, fit: config.json and fit.json.  traces: per recording the arrays of traces.npz plus
+    "phases", a list.  history, correlation: arrays by name.  distribution: None when missing.
+    frames: PNG files.  missing: one sentence per optional thing that the page leaves out.
+    """
+
+    folder: Path
+    config: Mapping[str, Any]
+    fit: Mapping[str, Any]
+    traces: Mapping[str, Mapping[str, Any]]
+    history: Mapping[str, np.ndarray]
+    correlation: Mapping[str, np.ndarray]
+    distribution: Mapping[str, np.ndarray] | None
+    frames: tuple[Path, ...]
+    missing: tuple[str, ...]
+
+    @property
+    def robot(self) -> str:
+        """How the page calls what was measured: a stand-in simulation is never called a robot."""
+        return "stand-in robot" if self.config["stand_in"] else "robot"
+
+    @property
+    def parameters(self) -> list[Mapping[str, Any]]:
+        """The parameters of interest, nuisances left out."""
+        return [p for p in self.fit["parameters"] if not p["nuisance"]]
+
+
+def read_run(run: Path) -> Run:
+    """Load and check a run's folder; ValueError names the file that is missing or broken."""
+    run = Path(run)
+    if not run.is_dir():
+        raise ValueError(f"report: there is no folder {run}; {_RERUN}")
+    config, fit = _json(run / "config.json"), _json(run / "fit.json")
+    _need(config, ("preset", "scene", "engine", "recordings", "seed", "stand_in"), "config.json")
+    _need(fit, ("parameters", "cost", "gap", "stop", "rule"), "fit.json")
+    for i, p in enumerate(fit["parameters"]):
+        _need(p, _PARAMETER_KEYS, f"fit.json, parameter {p.get('name', i)!r}")
+    for name, gap in fit["gap"].items():
+        _need(gap, ("before", "after", "per_joint_before", "per_joint_after"), f"fit.json, gap {name!r}")
+    missing = []
+    distribution = None
+    if not (run / "distribution.npz").is_file():
+        missing.append(
+            "distribution.npz is not there: the initial and the fitted Gaussian are not compared by samples."
+        )
+    else:
+        distribution = _arrays(run / "distribution.npz", _ARRAYS["distribution"])
+    frames = tuple(sorted((run / "frames").glob("*.png")))
+    if not frames:
+        missing.append("frames/ holds no pictures: drawing needs OpenGL, see the documentation.")
+    return Run(
+        folder=run,
+        config=config,
+        fit=fit,
+        traces=_traces(run / "traces.npz", list(fit["gap"])),
+        history=_arrays(run / "history.npz", _ARRAYS["history"]),
+        correlation=_arrays(run / "correlation.npz", _ARRAYS["correlation"]),
+        distribution=distribution,
+        frames=frames,
+        missing=tuple(missing),
+    )
+
+
+def _json(path: Path) -> dict[str, Any]:
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ValueError(f"report: {path} is missing; {_RERUN}") from None
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ValueError(f"report: {path} cannot be read ({error}); {_RERUN}") from None
+    if not isinstance(value, dict):
+        raise ValueError(f"report: {path} must hold a JSON object, got {type(value).__name__}; {_RERUN}")
+    return value
+
+
+def _need(table: Mapping[str, Any], keys: Iterable[str], where: str) -> None:
+    absent = [k for k in keys if k not in table]
+    if absent:
+        raise ValueError(f"report: {where} lacks {', '.join(map(repr, absent))}; {_RERUN}")
+
+
+def _arrays(path: Path, keys: Iterable[str] = ()) -> dict[str, np.ndarray]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {k: file[k] for k in file.files}
+    except FileNotFoundError:
+        raise ValueError(f"report: {path} is missing; {_RERUN}") from None
+    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+        raise ValueError(f"report: {path} cannot be read ({error}); {_RERUN}") from None
+    _need(arrays, keys, path.name)
+    return arrays
+
+
+def _traces(path: Path, recordings: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Arrays per recording, their shapes checked against time [T] and joints [J]."""
+    arrays = _arrays(path, [f"{r}/{key}" for r in recordings for key in _TRACE_KEYS])
+    traces: dict[str, dict[str, Any]] = {}
+    for r in recordings:
+        one: dict[str, Any] = {key: arrays[f"{r}/{key}"] for key in _TRACE_KEYS}
+        shape = (len(one["time"]), len(one["joints"]))
+        for key in _TRACE_KEYS[1:-1]:
+            if one[key].shape != shape:
+                raise ValueError(f"report: {path}, {r}/{key} must be [time, joints] = {shape}, got {one[key].shape}")
+        one["phases"] = json.loads(str(arrays[f"{r}/phases"])) if f"{r}/phases" in arrays else []
+        traces[r] = one
+    return traces

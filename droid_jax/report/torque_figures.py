@@ -1,0 +1,142 @@
+"""Figures of torques: joint by joint over time, and what is left between simulation and measurement."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from droid_jax.report.style import (
+    AFTER,
+    BEFORE,
+    MEASURED,
+    MUTED,
+    WIDE,
+    label_bottom,
+    legend,
+    panel_columns,
+    panel_grid,
+    styled,
+)
+from droid_jax.report.words import label
+
+_TRACES = ("measured_mean", "measured_low", "measured_high", "before", "after")
+
+
+@styled
+def torque_traces(traces: Mapping[str, Any], phases: Sequence[Mapping[str, Any]] = (), width: float = WIDE) -> Figure:
+    """Torque of every joint over time: the repeats' mean and 5 to 95 % band, before and after the fit.
+
+    traces: time [T] s; measured_mean, measured_low, measured_high, before, after [T, J] N m;
+    joints [J] names.  phases: parts of the motion, each with name, start and end in s.
+    """
+    time, joints = np.asarray(traces["time"]), [str(j) for j in traces["joints"]]
+    figure, panels = panel_grid(len(joints), width, height=1.75)
+    for j, (axes, joint) in enumerate(zip(panels, joints, strict=True)):
+        line = {k: np.asarray(traces[k])[:, j] for k in _TRACES}
+        _shade(axes, phases, named=j < panel_columns(width))
+        axes.fill_between(
+            *_band(time, line["measured_low"], line["measured_high"]),
+            color=MEASURED,
+            alpha=0.16,
+            linewidth=0,
+            label="measured, 5 to 95 % of held-out repeats",
+        )
+        axes.plot(*_thin(time, line["measured_mean"]), color=MEASURED, linewidth=2.4, label="measured, mean")
+        axes.plot(*_thin(time, line["before"]), color=BEFORE, linestyle=(0, (4, 1.5)), label="before the fit")
+        axes.plot(*_thin(time, line["after"]), color=AFTER, linewidth=1.0, label="after the fit")
+        axes.set(title=label(joint), xlim=(time[0], time[-1]), ylim=_torque_limits(line))
+        axes.set_ylabel("Torque [N m]" if j % panel_columns(width) == 0 else "")
+    label_bottom(panels, width, "Time [s]")
+    legend(figure, panels[0], width, columns=4)
+    return figure
+
+
+@styled
+def gap_per_joint(
+    joints: Sequence[str],
+    before: Sequence[float],
+    after: Sequence[float],
+    floor: float | None,
+    floors: Sequence[float] | None = None,
+    width: float = WIDE,
+) -> Figure:
+    """RMS torque difference of each joint [J] in N m on held-out repeats, before and after the fit.
+
+    floor: what repeats differ among themselves over all joints, N m, a dashed line; floors [J]
+    N m, the same joint by joint, small marks, where known.
+    """
+    figure = Figure(figsize=(width, 2.7), layout="constrained")
+    axes = figure.add_subplot()
+    x = np.arange(len(joints))
+    axes.bar(x - 0.2, before, 0.36, color=BEFORE, label="before the fit")
+    axes.bar(x + 0.2, after, 0.36, color=AFTER, label="after the fit")
+    if floors is not None:
+        axes.hlines(floors, x - 0.42, x + 0.42, color=MEASURED, linewidth=1.6, label="floor (repeats)")
+    elif floor is not None:
+        axes.axhline(floor, color=MEASURED, linestyle=(0, (3, 2)), linewidth=1.1, label="floor (repeats), all joints")
+    names = [label(j) for j in joints]
+    axes.set_xticks(x, names if width > 6 else [n.removeprefix("Joint ") for n in names])
+    axes.set_xlabel("" if width > 6 else "Joint")
+    axes.set_ylabel("RMS torque difference [N m]" if width > 6 else "RMS difference [N m]")
+    axes.grid(axis="x", visible=False)
+    legend(figure, axes, width, columns=3)
+    return figure
+
+
+def _shade(axes: Axes, phases: Sequence[Mapping[str, Any]], named: bool) -> None:
+    """Every other phase of the motion shaded; names at the top where asked for."""
+    for i, phase in enumerate(phases):
+        if i % 2 == 0:
+            axes.axvspan(phase["start"], phase["end"], color=MUTED, alpha=0.10, linewidth=0)
+        if named:
+            axes.text(
+                (phase["start"] + phase["end"]) / 2,
+                0.98,
+                phase["name"],
+                transform=axes.get_xaxis_transform(),
+                ha="center",
+                va="top",
+                fontsize=7,
+                color=MUTED,
+                clip_on=True,
+            )
+
+
+def _thin(time: np.ndarray, value: np.ndarray, buckets: int = 220) -> tuple[np.ndarray, np.ndarray]:
+    """The smallest and largest sample of each bucket, in order of time: short, and no spike is lost."""
+    if len(time) <= 2 * buckets:
+        return time, value
+    ranked = np.where(np.isfinite(value), value, 0.0)
+    edges = np.linspace(0, len(time), buckets + 1).astype(int)
+    keep = {0, len(time) - 1}
+    for a, b in pairwise(edges):
+        keep |= {a + int(ranked[a:b].argmin()), a + int(ranked[a:b].argmax())}
+    index = np.array(sorted(keep))
+    return time[index], value[index]
+
+
+def _band(
+    time: np.ndarray, low: np.ndarray, high: np.ndarray, buckets: int = 220
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The band's outline, one point per bucket, never inside the band itself."""
+    if len(time) <= buckets:
+        return time, low, high
+    start = np.linspace(0, len(time), buckets, endpoint=False).astype(int)
+    return time[start], np.minimum.reduceat(low, start), np.maximum.reduceat(high, start)
+
+
+def _torque_limits(line: Mapping[str, np.ndarray]) -> tuple[float, float]:
+    """Limits that show measurement and fit whole, and all but the extreme 2 % of the start."""
+    whole = np.concatenate([line[k] for k in _TRACES if k != "before"])
+    whole = whole[np.isfinite(whole)]
+    start = line["before"][np.isfinite(line["before"])]
+    marks = [*np.percentile(start, [1, 99])] if start.size else []
+    marks += [whole.min(), whole.max()] if whole.size else [0.0]
+    low, high = float(min(marks)), float(max(marks))
+    room = 0.08 * (high - low) or 0.5
+    return low - room, high + 2 * room  # the upper room holds the phases' names

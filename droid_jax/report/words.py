@@ -1,0 +1,160 @@
+"""Numbers, names and results of a run in words."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+from droid_jax.report.run_folder import Run
+
+
+def label(name: str) -> str:
+    """A name as it is read: "hinge_stiffness" -> "Hinge stiffness", "panda_joint3" -> "Joint 3"."""
+    joint = re.fullmatch(r"(?:\w+_)?joint_?(\d+)", name)
+    if joint:
+        return f"Joint {joint[1]}"
+    words = name.replace("_", " ").strip()
+    return words[:1].upper() + words[1:]
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """A number with three significant digits, a real minus sign, and a dash where there is none."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    size = abs(value)
+    if size and not 1e-4 <= size < 1e5:
+        mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+        return f"{mantissa}·10^{int(exponent)}".replace("-", "−")
+    decimals = max(0, digits - 1 - math.floor(math.log10(size))) if size else 0
+    return f"{value:.{decimals}f}".replace("-", "−")
+
+
+def like(value: float | None, deviation: float) -> str:
+    """A number with as many decimals as show two significant digits of its deviation."""
+    if value is None or not math.isfinite(value) or not math.isfinite(deviation) or deviation <= 0:
+        return number(value)
+    decimals = max(0, 1 - math.floor(math.log10(deviation)))
+    if decimals > 6 or abs(value) >= 1e6:
+        return number(value)
+    return f"{value:.{decimals}f}".replace("-", "−")
+
+
+def percent(share: float) -> str:
+    """A share as a whole percentage, 100 % only when it is."""
+    return f"{math.floor(100 * share + 1e-9)} %".replace("-", "−")
+
+
+def listed(names: Sequence[str]) -> str:
+    """ "a", "a and b", "a, b and c"."""
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+
+
+def summary(run: Run) -> list[str]:
+    """The sentences at the top of the page, from the numbers alone."""
+    sentences = [_what(run), *(_gap(run, name) for name in run.fit["gap"]), _told(run), *_truth(run)]
+    bound = [_bound(p) for p in run.fit["parameters"] if p["on_bound"]]
+    if bound:
+        sentences.append(f"On a bound of its range: {listed(bound)}.")
+    return [*sentences, _next(run)]
+
+
+def _what(run: Run) -> str:
+    groups = {g: len(ps) for g, ps in grouped(run.parameters).items()}
+    robot = run.robot
+    parts = listed([f"{n} of the {robot if g == 'Robot' else g.lower()}" for g, n in groups.items()])
+    nuisances = len(run.fit["parameters"]) - len(run.parameters)
+    beside = f", and {nuisances} nuisances beside them," if nuisances else ""
+    recordings = [r["name"] for r in run.config["recordings"]]
+    return (
+        f"{len(run.parameters)} parameters ({parts}){beside} were fitted so that the simulation "
+        f"reproduces the joint torques which the {robot} measured in "
+        f"the demonstration{'s' if len(recordings) > 1 else ''} {listed([f'“{r}”' for r in recordings])}."
+    )
+
+
+def _gap(run: Run, name: str) -> str:
+    gap = run.fit["gap"][name]
+    where = f"In “{name}”, on" if len(run.fit["gap"]) > 1 else "On"
+    text = (
+        f"{where} repeats that the fit did not see, simulation and {run.robot} differed by "
+        f"{number(gap['before'])} N m before the fit (RMS over all joints) and differ by "
+        f"{number(gap['after'])} N m after it"
+    )
+    floor, closed = gap.get("floor"), gap.get("closed")
+    if gap["after"] > gap["before"]:
+        return text + ": the fit made it worse."
+    if floor is None:
+        return text + "; how much repeats differ among themselves is not known."
+    share = f", so {percent(closed)} of what can be closed was closed" if closed is not None else ""
+    return f"{text}; repeats differ among themselves by {number(floor)} N m{share}."
+
+
+def _told(run: Run) -> str:
+    untold = [label(p["name"]).lower() for p in run.parameters if not p["identifiable"]]
+    if not untold:
+        return "Every parameter of interest can be told from this demonstration."
+    rows = "its row" if len(untold) == 1 else "their rows"
+    return f"This demonstration does not tell {listed(untold)}; take no number from {rows}."
+
+
+def _truth(run: Run) -> list[str]:
+    known = [p for p in run.parameters if p["truth"] is not None and p["identifiable"]]
+    if not known:
+        return []
+    inside = sum(p["interval"][0] <= p["truth"] <= p["interval"][1] for p in known)
+    return [
+        f"The true value is known for {len(known)} of the parameters that it does tell, and lies inside "
+        f"the 90 % interval for {inside} of them."
+    ]
+
+
+def _bound(p: Mapping[str, Any]) -> str:
+    return f"{label(p['name']).lower()} ({which_bound(p)})"
+
+
+def which_bound(p: Mapping[str, Any]) -> str:
+    """ "lower bound 0 N m", for a parameter that sits on one."""
+    low = abs(p["best"] - p["low"]) <= abs(p["best"] - p["high"])
+    value = number(p["low"] if low else p["high"])
+    return f"{'lower' if low else 'upper'} bound {value} {p['unit']}".strip()
+
+
+def _next(run: Run) -> str:
+    steps = []
+    gaps = list(run.fit["gap"].values())
+    if any(g["after"] > g["before"] for g in gaps):
+        steps.append("do not train on this fit; check the recording and the scene first")
+    if any(p["on_bound"] for p in run.fit["parameters"]):
+        steps.append("ask whether the bound is real; if not, widen it and fit again")
+    if any(not p["identifiable"] for p in run.parameters):
+        steps.append("record a motion that moves what is not told, or leave it at its initial spread")
+    if any(g.get("floor") and g["after"] > 1.5 * g["floor"] for g in gaps):
+        steps.append(
+            "what is left is well above the floor, so the model lacks something: "
+            "look for it with python -m droid_jax.run gap"
+        )
+    elif not steps:
+        steps.append("train on the fitted Gaussian with python -m droid_jax.run train")
+    return "Next: " + "; ".join(steps) + "."
+
+
+def speaker(run: Run) -> Callable[[str], str]:
+    """For texts of others: with a stand-in, "robot" becomes "stand-in robot"."""
+
+    def speak(text: str) -> str:
+        if not run.config["stand_in"]:
+            return text
+        text = re.sub(r"(?<!stand-in )(?<!Stand-in )\brobot", "stand-in robot", text)
+        return re.sub(r"(?<!stand-in )(?<!Stand-in )\bRobot", "Stand-in robot", text)
+
+    return speak
+
+
+def grouped(parameters: Iterable[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
+    """Parameters by group, in the order of the paper's Table I, other groups after it."""
+    groups: dict[str, list[Mapping[str, Any]]] = {"Door": [], "Robot": [], "Gripper": []}
+    for p in parameters:
+        groups.setdefault(p["group"], []).append({**p, "bound": which_bound(p) if p["on_bound"] else ""})
+    return {g: ps for g, ps in groups.items() if ps}

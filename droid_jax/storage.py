@@ -1,0 +1,79 @@
+"""Writing files and folders whole or not at all.
+
+What is written stands beside its final name first and is then moved there: a reader sees the old
+content or the new one, and a run that is killed or finds the disk full leaves the old one behind.
+Folders that are missing are made.  OSError where a place cannot be written.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """A file of these bytes; an existing one is replaced."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+        os.chmod(temporary, 0o644)  # mkstemp keeps others out; what is written here is for others
+        os.replace(temporary, path)
+    finally:
+        Path(temporary).unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """A text file in UTF-8, its line ends as they are in `text`."""
+    write_bytes(path, text.encode("utf-8"))
+
+
+def write_json(path: Path, content: Any, *, indent: int = 1) -> None:
+    """A JSON file; ValueError for NaN and infinities, which JSON has no word for."""
+    write_text(path, json.dumps(content, indent=indent, allow_nan=False) + "\n")
+
+
+def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
+    """A compressed npz file of these arrays by name; ValueError for objects, which would be pickled."""
+    import numpy as np  # only here: droid_jax.runtime imports this module, and `--help` waits for that
+
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, **arrays)
+    write_bytes(path, buffer.getvalue())
+
+
+def write_csv(path: Path, header: Iterable[str], rows: Iterable[Iterable[Any]], *, line_end: str = "\r\n") -> None:
+    """A table of one header line and these rows; a float has as many digits as it takes to read it back."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator=line_end)
+    writer.writerow(header)
+    writer.writerows(rows)
+    write_text(path, buffer.getvalue())
+
+
+@contextlib.contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """An empty folder to fill, which takes the place of `path` when the block ends without an error."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+    try:
+        new = temporary / "new"
+        new.mkdir()
+        yield new
+        # A folder cannot be replaced in one step: the old one steps aside first.
+        if path.exists():
+            os.replace(path, temporary / "old")
+        os.replace(new, path)
+    finally:
+        if (temporary / "old").exists() and not path.exists():
+            os.replace(temporary / "old", path)
+        shutil.rmtree(temporary)

@@ -1,0 +1,147 @@
+"""Large populations against the paper's 30 samples: held-out cost over wall time.
+
+    python experiments/population_curve.py [--quick] [--out DIR] [--minutes 2] [--populations 30 512]
+
+The one-spring door, demonstration A, everything Table I lists; every population searches for the same
+wall time, from the same prior, with several seeds.  After the search the mean of each generation is
+judged on repeats that the search did not see.  The compilation is done before the clock starts.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
+
+import tuned  # noqa: E402, F401  (before jax starts)
+
+# isort: split
+import json  # noqa: E402
+
+import numpy as np  # noqa: E402
+import tyro  # noqa: E402
+from matplotlib.figure import Figure  # noqa: E402
+
+from benchmarks.common import origin  # noqa: E402
+from droid_jax.compare.cost import Cost, make_cost  # noqa: E402
+from droid_jax.identify.pipeline import split  # noqa: E402
+from droid_jax.identify.search import SearchConfig, search  # noqa: E402
+from droid_jax.measure.demonstration import demonstration_path  # noqa: E402
+from droid_jax.measure.formats import load  # noqa: E402
+from droid_jax.measure.surrogate import record, stand_in_truth  # noqa: E402
+from droid_jax.model.door import door_space  # noqa: E402
+from droid_jax.model.door_scene import door_scene  # noqa: E402
+from droid_jax.storage import write_bytes, write_json  # noqa: E402
+
+COLOURS = ("#2b6cb0", "#c05621", "#2f855a", "#6b46c1")
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Options of the comparison."""
+
+    quick: bool = False
+    """Half a minute a search and one seed: shows that it runs."""
+    out: Path = ROOT / "benchmarks" / "results"
+    """Folder of population_curve.json and .png."""
+    minutes: float = 2.0
+    """Wall time of every search."""
+    populations: tuple[int, ...] = (30, 128, 512)
+    """Samples per generation."""
+    seeds: int = 3
+    """Searches of each population."""
+
+
+def prepare() -> tuple[Cost, Cost, dict[str, float]]:
+    """Cost of the fitted repeats, cost of the held-out ones, and the hidden truth."""
+    scene = door_scene(timestep=0.004)
+    truth = stand_in_truth(scene, 1, 1)
+    recording = record(scene, load(demonstration_path("A")), truth, seed=100, name="A")
+    fitted, held, _ = split(recording, 0.3)
+    cost = make_cost(scene, door_space(scene), [fitted])
+    return cost, cost.against([held]), truth
+
+
+def curve(cost: Cost, held: Cost, population: int, seconds: float, seed: int) -> dict[str, Any]:
+    """One search: seconds at the end of each generation and the held-out cost of its mean, N m."""
+    config = SearchConfig(
+        population=population, parents=None, generations=100_000, tol_cost=0, tol_sigma=1e-5,
+        max_seconds=seconds, seed=seed,
+    )  # fmt: skip
+    found = search(cost, cost.space, config)
+    history = found.history
+    return {
+        "population": population,
+        "seed": seed,
+        "stop": found.stop,
+        "generations": len(history.sigma),
+        "evaluations": found.evaluations,
+        "seconds": np.round(np.cumsum(history.seconds), 2).tolist(),
+        "held_out": np.round(held(_thinned(history.mean)), 4).tolist(),
+        "rows": _rows(len(history.mean)).tolist(),
+    }
+
+
+def _rows(generations: int, most: int = 64) -> np.ndarray:
+    """Generations at which a curve is judged: all, or about `most` of them."""
+    return np.unique(np.linspace(0, generations - 1, min(generations, most)).astype(int))
+
+
+def _thinned(means: np.ndarray) -> np.ndarray:
+    return means[_rows(len(means))]
+
+
+def at(run: dict[str, Any], seconds: float) -> float | None:
+    """Held-out cost of the latest judged generation finished by then; None before the first."""
+    done = [c for row, c in zip(run["rows"], run["held_out"], strict=True) if run["seconds"][row] <= seconds]
+    return done[-1] if done else None
+
+
+def figure(runs: list[dict[str, Any]], truth: float) -> Figure:
+    """Held-out cost over wall time: one line per seed, one colour per population."""
+    drawn = Figure(figsize=(7.0, 4.0), layout="constrained")
+    axes = drawn.subplots()
+    populations = sorted({r["population"] for r in runs})
+    for run in runs:
+        colour = COLOURS[populations.index(run["population"]) % len(COLOURS)]
+        label = f"{run['population']} samples" if run["seed"] == 0 else None
+        seconds = np.array(run["seconds"])[run["rows"]]
+        axes.plot(seconds, run["held_out"], color=colour, linewidth=1.3, label=label)
+    axes.axhline(truth, color="black", linewidth=0.8, linestyle=":", label="at the truth")
+    axes.set(xlabel="Wall time [s]", ylabel="Cost on held-out repeats [N m]", yscale="log")
+    axes.legend(frameon=False)
+    return drawn
+
+
+def main() -> None:
+    from droid_jax.report.export import png_bytes
+
+    arguments = tyro.cli(Arguments, description=__doc__)
+    seconds = 30.0 if arguments.quick else 60.0 * arguments.minutes
+    cost, held, truth = prepare()
+    hidden = cost.space.values({n: truth[n] for n in cost.space.names})
+    at_truth = float(held(hidden[None])[0])  # compiles what is timed, too
+    cost(np.tile(cost.space.mean, (max(arguments.populations), 1)))
+    runs = []
+    for seed in range(1 if arguments.quick else arguments.seeds):
+        for population in arguments.populations:
+            runs.append(curve(cost, held, population, seconds, seed))
+            print(f"{population} samples, seed {seed}: held-out {runs[-1]['held_out'][-1]:.4f} N m", flush=True)
+    shares = (0.25, 0.5, 1.0)
+    table = {
+        str(p): {f"{s * seconds:g} s": [at(r, s * seconds) for r in runs if r["population"] == p] for s in shares}
+        for p in arguments.populations
+    }
+    summary = {"held_out_at_truth": at_truth, "seconds": seconds, "held_out_by_population_and_time": table}
+    stem = "population_curve_quick" if arguments.quick else "population_curve"
+    write_json(arguments.out / f"{stem}.json", {**origin(0), **summary, "runs": runs})
+    write_bytes(arguments.out / f"{stem}.png", png_bytes(figure(runs, at_truth)))
+    print(json.dumps(summary))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,69 @@
+"""The motion behind a log without commands, against sines whose derivatives are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from droid_jax.measure.motion import EDGE, OVERSAMPLING, measured_motion
+from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
+
+TIME = np.arange(0, 6.0, 1e-3)
+JOINTS = ("a", "b")
+FREQUENCY = np.array([0.4, 1.1])  # Hz
+
+
+def sines(time: np.ndarray, order: int = 0) -> np.ndarray:
+    """[T, 2] the order-th derivative of two sines of 0.5 rad."""
+    w = 2 * np.pi * FREQUENCY
+    return 0.5 * w**order * np.sin(w * time[:, None] + order * np.pi / 2)
+
+
+def log(position: np.ndarray, time: np.ndarray = TIME, mask: np.ndarray | None = None) -> Recording:
+    """A log of repeats [N, T, 2] without commands."""
+    mask = np.ones(position.shape, bool) if mask is None else mask
+    channels = {"position": Channel("position", "rad", JOINTS, time, position, mask)}
+    convention = TorqueConvention(TorqueSide.LINK, gravity=True)
+    return Recording("log", np.zeros(0), np.zeros((0, 0)), (), channels, convention, qpos0={})
+
+
+def test_a_sine_is_differentiated_twice():
+    motion = measured_motion(log(sines(TIME)[None]), JOINTS)
+    assert motion.time[0] == pytest.approx(EDGE) and motion.time[-1] <= TIME[-1] - EDGE + 1e-9
+    assert motion.timestep == pytest.approx(1 / (OVERSAMPLING * 20.0))
+    np.testing.assert_allclose(motion.position, sines(motion.time), atol=1e-3)
+    np.testing.assert_allclose(motion.velocity, sines(motion.time, 1), atol=4e-3)
+    np.testing.assert_allclose(motion.acceleration, sines(motion.time, 2), atol=0.1)
+
+
+def test_joints_come_in_the_order_asked_for_and_repeats_are_averaged():
+    noise = np.random.default_rng(0).normal(0, 1e-3, (8, len(TIME), 2))
+    noise -= noise.mean(axis=0)
+    clean = measured_motion(log(sines(TIME)[None]), JOINTS)
+    swapped = measured_motion(log(sines(TIME)[None] + noise), ("b", "a"))
+    np.testing.assert_allclose(swapped.acceleration, clean.acceleration[:, ::-1], atol=1e-6)
+
+
+def test_a_lower_cutoff_lets_less_noise_through():
+    noise = np.random.default_rng(1).normal(0, 1e-4, (1, len(TIME), 2))
+    rough, calm = (measured_motion(log(sines(TIME)[None] + noise), JOINTS, cutoff=c) for c in (40.0, 8.0))
+    errors = [np.std(m.acceleration - sines(m.time, 2)) for m in (rough, calm)]
+    assert errors[1] < 0.1 * errors[0]
+
+
+def test_what_cannot_be_a_motion_is_refused():
+    with pytest.raises(ValueError, match="lack wrist"):
+        measured_motion(log(sines(TIME)[None]), ("a", "wrist"))
+    mask = np.ones((1, len(TIME), 2), bool)
+    mask[0, 1234, 1] = False
+    with pytest.raises(ValueError, match=r"column .b.: not measured at 1\.234 s"):
+        measured_motion(log(sines(TIME)[None], mask=mask), JOINTS)
+    slow = TIME[::40]
+    with pytest.raises(ValueError, match=r"25 Hz, too slow to be smoothed at 20 Hz.*below 10 Hz"):
+        measured_motion(log(sines(slow)[None], slow), JOINTS)
+    with pytest.raises(ValueError, match=r"1\.2 s long; a motion needs 1\.6 s"):
+        measured_motion(log(sines(TIME[:1201])[None], TIME[:1201]), JOINTS)
+    with pytest.raises(ValueError, match="unknown channel 'position'"):
+        measured_motion(replace(log(sines(TIME)[None]), channels={}), JOINTS)

@@ -1,0 +1,109 @@
+"""Files and folders are written whole or not at all."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from droid_jax import storage
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda path: storage.write_bytes(path, b"new"),
+        lambda path: storage.write_text(path, "new"),
+        lambda path: storage.write_json(path, ["new"]),
+        lambda path: storage.write_npz(path, {"new": np.ones(3)}),
+        lambda path: storage.write_csv(path, ["new"], [[1.0]]),
+    ],
+)
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(
+    write: Callable[[Path], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    target = tmp_path / "result"
+    target.write_bytes(b"old")
+
+    def fail(*_: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr(storage.os, "replace", fail)
+    with pytest.raises(OSError, match="disk full"):
+        write(target)
+    assert target.read_bytes() == b"old" and list(tmp_path.iterdir()) == [target]
+    monkeypatch.undo()
+    write(target)
+    assert target.read_bytes() != b"old" and list(tmp_path.iterdir()) == [target]
+
+
+def test_missing_folders_are_made_and_others_may_read(tmp_path: Path):
+    path = tmp_path / "a" / "b" / "text"
+    storage.write_text(path, "m²\n")
+    assert path.read_bytes() == "m²\n".encode()
+    assert path.stat().st_mode & 0o777 == 0o644
+
+
+def test_json_has_no_word_for_nan(tmp_path: Path):
+    path = tmp_path / "result.json"
+    storage.write_json(path, {"a": 1.5})
+    with pytest.raises(ValueError):
+        storage.write_json(path, {"a": float("nan")})
+    assert json.loads(path.read_text()) == {"a": 1.5}
+
+
+def test_an_npz_holds_no_objects(tmp_path: Path):
+    path = tmp_path / "arrays.npz"
+    with pytest.raises(ValueError, match="allow_pickle"):
+        storage.write_npz(path, {"a": np.array([{}, None])})
+    assert list(tmp_path.iterdir()) == []
+    storage.write_npz(path, {"a": np.arange(3)})
+    with np.load(path, allow_pickle=False) as file:
+        assert file["a"].tolist() == [0, 1, 2]
+
+
+def test_a_table_reads_back(tmp_path: Path):
+    path = tmp_path / "table.csv"
+    rows = np.array([[0.1, 1 / 3], [1e-300, -7.0]]).tolist()
+    storage.write_csv(path, ("x", 'a "quoted", name'), rows, line_end="\n")
+    head, *cells = csv.reader(path.read_text().splitlines())
+    assert head == ["x", 'a "quoted", name']
+    assert [[float(c) for c in row] for row in cells] == rows
+    assert b"\r" not in path.read_bytes()
+
+
+def test_a_folder_takes_the_place_of_an_old_one(tmp_path: Path):
+    target = tmp_path / "deep" / "folder"
+    for content in ("first", "second"):
+        with storage.new_folder(target) as new:
+            (new / content).write_text(content)
+            assert not (target / content).exists()
+        assert [p.name for p in target.iterdir()] == [content]
+    assert list(target.parent.iterdir()) == [target]
+
+
+@pytest.mark.parametrize("failing", [1, 2, 3])
+def test_a_failed_folder_leaves_the_old_one(failing: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Where the block fails (1), where the old folder is to step aside (2), where the new one is to take its place."""
+    target = tmp_path / "folder"
+    with storage.new_folder(target) as new:
+        (new / "old").touch()
+    replace, calls = storage.os.replace, []
+
+    def fail(*paths: Path) -> None:
+        calls.append(paths)
+        if len(calls) == failing - 1:
+            raise OSError("disk full")
+        replace(*paths)
+
+    monkeypatch.setattr(storage.os, "replace", fail)
+    with pytest.raises(OSError, match="disk full"), storage.new_folder(target) as new:
+        (new / "new").touch()
+        if failing == 1:
+            raise OSError("disk full")
+    assert [p.name for p in target.iterdir()] == ["old"]
+    assert list(tmp_path.iterdir()) == [target]
