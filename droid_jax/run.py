@@ -414,11 +414,11 @@ def _draw(out: Path, found: Any, recording: Recording) -> None:
 def _summary(found: Any) -> None:
     """Five lines that say how it went."""
     for name, gap in found.gaps.items():
-        way = f"a perfect model: {gap.floor:.3f}), {gap.closed:.0%} of the gap closed"
-        print(
-            f"{name}: held-out torque distance {gap.before:.3f} -> {gap.after:.3f} N m "
-            f"({way if gap.floor else 'one repeat: what noise alone would leave is not known)'}"
-        )
+        way = "one repeat: what noise alone would leave is not known"
+        if gap.floor is not None:
+            way = f"a perfect model: {gap.floor:.3f}; {gap.closed:.0%} of the gap closed"
+        unit = found.fit.comparisons[0].channel("torque").unit
+        print(f"{name}: held-out torque distance {gap.before:.3f} -> {gap.after:.3f} {unit} ({way})")
     silent = [t.name for t in found.tells if not t.identifiable and not found.full[t.name].nuisance]
     if silent and found.refined is not None:
         print(f"this demonstration tells little about: {', '.join(silent)}")

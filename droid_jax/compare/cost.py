@@ -92,8 +92,8 @@ class Cost:
         ]
         return assemble(self.scene, self.space, made, self._replays, self.drives)
 
-    def against(self, recordings: Sequence[Recording]) -> Cost:
-        """The same compiled replays compared with other repeats of the same recordings.
+    def against(self, recordings: Sequence[Recording], config: CompareConfig | None = None) -> Cost:
+        """The same compiled replays compared with other repeats of the same recordings, or in another way.
 
         Raises ValueError unless these are as many, with the same commands (where there are none, the
         same motion) on the same clock.
@@ -102,10 +102,10 @@ class Cost:
             raise ValueError(f"expected repeats of {len(self.drives)} replayed recordings, got {len(recordings)}")
         made = []
         for recording, old, drive in zip(recordings, self.comparisons, self.drives, strict=True):
-            new = followed(self.scene, recording, old.config)
+            new = followed(self.scene, recording, config or old.config)
             if type(new) is not type(drive) or not np.array_equal(_path(new), _path(drive)):
                 raise ValueError(f"recording {recording.name!r} holds other commands than {old.name!r} had")
-            made.append(make_comparison(self.scene, recording, _clock(recording, new), old.config))
+            made.append(make_comparison(self.scene, recording, _clock(recording, new), config or old.config))
         return assemble(self.scene, self.space, made, self._replays, self.drives)
 
     def _blockwise(self, values: Any, functions: Sequence[Callable], join: Callable) -> Any:

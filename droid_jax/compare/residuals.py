@@ -51,12 +51,13 @@ class CompareConfig:
 class Measured:
     """One channel ready to be compared.
 
-    at: [Tc] fractional rows of the simulated trace; values [N,Tc,C], mask [N,Tc,C]; columns [C]
+    unit: of the channel.  at: [Tc] fractional rows of the simulated trace; values [N,Tc,C], mask [N,Tc,C]; columns [C]
     of the simulated channel; kernel [C or 1,K,T] and noise for the whitened form; span [2] s of the
     coarse clock; weight in the distance.
     """
 
     name: str
+    unit: str
     at: np.ndarray
     values: np.ndarray
     mask: np.ndarray
@@ -245,6 +246,7 @@ def _measure(scene: Scene, channel: Channel, clock: np.ndarray, weight: float) -
     step = clock[1] - clock[0]
     return Measured(
         name=channel.name,
+        unit=channel.unit,
         at=(time - clock[0]) / step,
         values=values,
         mask=mask,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -50,13 +50,14 @@ class Gap:
 
     before, after, floor: equation 1 without penalty terms; floor is what a perfect model would
     leave, estimated from the repeats' scatter about their mean.  closed: share of the way from
-    before to floor.  per_joint_*: [J] root mean square of the smoothed traces' difference.
+    before to floor.  Both are None where there is one repeat only.
+    per_joint_*: [J] root mean square of the smoothed traces' difference.
     """
 
     before: float
     after: float
-    floor: float
-    closed: float
+    floor: float | None
+    closed: float | None
     per_joint_before: tuple[float, ...]
     per_joint_after: tuple[float, ...]
     per_joint_floor: tuple[float, ...]
@@ -173,8 +174,9 @@ def identify(
 
     began = time.monotonic()
     report("judge", None)
+    plain = replace(config.compare, whitened=False)
     commanded = all(r.command.size for r in recordings)
-    heldout = base.against(held) if commanded else make_cost(scene, full, held, config=config.compare)
+    heldout = base.against(held, plain) if commanded else make_cost(scene, full, held, config=plain)
     gaps = _gaps(heldout, full.mean, best)
     seconds["judge"] = time.monotonic() - began
     return Identified(
@@ -256,7 +258,7 @@ def _gaps(cost: Cost, before: np.ndarray, after: np.ndarray) -> list[Gap]:
                 before=float(first),
                 after=float(last),
                 floor=floor,
-                closed=float(1 - (last - floor) / max(first - floor, 1e-12)),
+                closed=None if floor is None else float(1 - (last - floor) / max(first - floor, 1e-12)),
                 per_joint_before=tuple(rms[0].tolist()),
                 per_joint_after=tuple(rms[1].tolist()),
                 per_joint_floor=tuple(_smooth_floor(torque.noise.repeats).tolist()),
@@ -265,11 +267,11 @@ def _gaps(cost: Cost, before: np.ndarray, after: np.ndarray) -> list[Gap]:
     return out
 
 
-def _floor(values: np.ndarray, mask: np.ndarray) -> float:
+def _floor(values: np.ndarray, mask: np.ndarray) -> float | None:
     """Equation 1 of a perfect model: the repeats' distance to their mean, corrected for the mean's own noise."""
     count = len(values)
     if count < 2:
-        return 0.0
+        return None
     filled = np.where(mask, values, np.nan)
     error = np.nan_to_num(filled - np.nanmean(filled, axis=0))
     return float(np.mean(np.linalg.norm(error, axis=-1)) / np.sqrt(1 - 1 / count))

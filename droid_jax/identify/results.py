@@ -104,15 +104,19 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
         }
         for name, g in found.gaps.items()
     }
+    floors: list[Any] = [g.floor for g in found.gaps.values()]
+    comparison = found.fit.comparisons[0]
     evaluations = found.search.evaluations + (found.refined.evaluations if found.refined else 0)
     return {
         "parameters": parameters,
         "cost": {
             "initial": float(costs[0]),
             "best": float(costs[1]),
-            "floor": float(np.mean([g.floor for g in found.gaps.values()])),
+            "floor": None if None in floors else float(np.mean(floors)),
+            "unit": "noise units" if comparison.config.whitened else comparison.channel("torque").unit,
         },
         "gap": gaps,
+        "torque_unit": comparison.channel("torque").unit,
         "stop": found.search.stop,
         "converged": None if found.refined is None else found.refined.converged,
         "generations": len(found.search.history.best_cost),

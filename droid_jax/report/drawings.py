@@ -43,13 +43,13 @@ def draw(run: Run) -> dict[str, list[Drawing]]:
         add(
             "gap", f"gap_{i}", f"Torque difference of each joint{of}",
             f"RMS difference between simulation and {robot} on held-out repeats, joint by joint.",
-            torque_figures.gap_per_joint, *bars, gap.get("per_joint_floor"),
+            torque_figures.gap_per_joint, *bars, gap.get("per_joint_floor"), run.torque_unit,
         )  # fmt: skip
         add(
             "torque", f"torque_{i}", f"Torque over time{of}",
             f"Thick line and band: the {robot}'s held-out repeats. Dashed: the simulation with the initial "
             "means. Thin blue line: with the fitted values. Shaded: every other phase of the motion.",
-            torque_figures.torque_traces, traces, traces["phases"],
+            torque_figures.torque_traces, traces, traces["phases"], run.torque_unit,
         )  # fmt: skip
     add(
         "parameters", "intervals", "What is known about each parameter",
@@ -81,7 +81,7 @@ def draw(run: Run) -> dict[str, list[Drawing]]:
             f"Parameter sets drawn from the initial and from the fitted Gaussian ({samples[0].size} and "
             f"{samples[1].size}), replayed against repeats that the fit did not see. Lines: medians. "
             "A failed replay counts with its penalty.",
-            search_figures.cost_histograms, *samples,
+            search_figures.cost_histograms, *samples, run.torque_unit,
         )  # fmt: skip
     return sections
 

@@ -45,7 +45,7 @@ def stages(names: Sequence[str]) -> Iterator[Report]:
 def _line(value: Any) -> dict[str, Any]:
     """What to show of a stage's progress value."""
     if hasattr(value, "generation"):
-        text = f"cost {value.best_cost:.4g} N m  sigma {value.sigma:.2g}"
+        text = f"cost {value.best_cost:.4g}  sigma {value.sigma:.2g}"
         return {"completed": value.generation, "total": value.generations, "text": text}
     return {
         "completed": value.iteration,

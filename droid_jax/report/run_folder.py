@@ -61,6 +61,11 @@ class Run:
         return "stand-in robot" if self.config["stand_in"] else "robot"
 
     @property
+    def torque_unit(self) -> str:
+        """N m, or N where slides are measured."""
+        return self.fit.get("torque_unit", "N m")
+
+    @property
     def parameters(self) -> list[Mapping[str, Any]]:
         """The parameters of interest, nuisances left out."""
         return [p for p in self.fit["parameters"] if not p["nuisance"]]

@@ -85,13 +85,13 @@ def cost_history(history: Mapping[str, Any], cost: Mapping[str, Any], width: flo
     if both.size and both.min() > 0 and both.max() > 10 * both.min():
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter("{x:g}")
-    axes.set(xlabel="Generation", ylabel="Cost [N m]")
+    axes.set(xlabel="Generation", ylabel=f"Cost [{cost.get('unit', 'N m')}]")
     legend(figure, axes, width, columns=4)
     return figure
 
 
 @styled
-def cost_histograms(initial: np.ndarray, fitted: np.ndarray, width: float = WIDE) -> Figure:
+def cost_histograms(initial: np.ndarray, fitted: np.ndarray, unit: str = "N m", width: float = WIDE) -> Figure:
     """Costs [n] in N m of parameter sets drawn from the initial and from the fitted Gaussian."""
     figure = Figure(figsize=(width, 2.7), layout="constrained")
     axes = figure.add_subplot()
@@ -120,7 +120,7 @@ def cost_histograms(initial: np.ndarray, fitted: np.ndarray, width: float = WIDE
     if logarithmic:
         axes.set_xscale("log")
         axes.xaxis.set_major_formatter("{x:g}")
-    axes.set(xlabel="Cost on repeats that the fit did not see [N m]", ylabel="Samples")
+    axes.set(xlabel=f"Cost on repeats that the fit did not see [{unit}]", ylabel="Samples")
     legend(figure, axes, width, columns=2)
     return figure
 

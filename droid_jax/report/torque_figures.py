@@ -28,7 +28,9 @@ _TRACES = ("measured_mean", "measured_low", "measured_high", "before", "after")
 
 
 @styled
-def torque_traces(traces: Mapping[str, Any], phases: Sequence[Mapping[str, Any]] = (), width: float = WIDE) -> Figure:
+def torque_traces(
+    traces: Mapping[str, Any], phases: Sequence[Mapping[str, Any]] = (), unit: str = "N m", width: float = WIDE
+) -> Figure:
     """Torque of every joint over time: the repeats' mean and 5 to 95 % band, before and after the fit.
 
     traces: time [T] s; measured_mean, measured_low, measured_high, before, after [T, J] N m;
@@ -50,7 +52,7 @@ def torque_traces(traces: Mapping[str, Any], phases: Sequence[Mapping[str, Any]]
         axes.plot(*_thin(time, line["before"]), color=BEFORE, linestyle=(0, (4, 1.5)), label="before the fit")
         axes.plot(*_thin(time, line["after"]), color=AFTER, linewidth=1.0, label="after the fit")
         axes.set(title=label(joint), xlim=(time[0], time[-1]), ylim=_torque_limits(line))
-        axes.set_ylabel("Torque [N m]" if j % panel_columns(width) == 0 else "")
+        axes.set_ylabel(f"Torque [{unit}]" if j % panel_columns(width) == 0 else "")
     label_bottom(panels, width, "Time [s]")
     legend(figure, panels[0], width, columns=4)
     return figure
@@ -63,6 +65,7 @@ def gap_per_joint(
     after: Sequence[float],
     floor: float | None,
     floors: Sequence[float] | None = None,
+    unit: str = "N m",
     width: float = WIDE,
 ) -> Figure:
     """RMS torque difference of each joint [J] in N m on held-out repeats, before and after the fit.
@@ -82,7 +85,7 @@ def gap_per_joint(
     names = [label(j) for j in joints]
     axes.set_xticks(x, names if width > 6 else [n.removeprefix("Joint ") for n in names])
     axes.set_xlabel("" if width > 6 else "Joint")
-    axes.set_ylabel("RMS torque difference [N m]" if width > 6 else "RMS difference [N m]")
+    axes.set_ylabel(f"RMS torque difference [{unit}]" if width > 6 else f"RMS difference [{unit}]")
     axes.grid(axis="x", visible=False)
     legend(figure, axes, width, columns=3)
     return figure

@@ -79,8 +79,8 @@ def _gap(run: Run, name: str) -> str:
     where = f"In “{name}”, on" if len(run.fit["gap"]) > 1 else "On"
     text = (
         f"{where} repeats that the fit did not see, simulation and {run.robot} differed by "
-        f"{number(gap['before'])} N m before the fit (RMS over all joints) and differ by "
-        f"{number(gap['after'])} N m after it"
+        f"{number(gap['before'])} {run.torque_unit} before the fit (RMS over all joints) and differ by "
+        f"{number(gap['after'])} {run.torque_unit} after it"
     )
     floor, closed = gap.get("floor"), gap.get("closed")
     if gap["after"] > gap["before"]:
@@ -88,7 +88,7 @@ def _gap(run: Run, name: str) -> str:
     if floor is None:
         return text + "; how much repeats differ among themselves is not known."
     share = f", so {percent(closed)} of what can be closed was closed" if closed is not None else ""
-    return f"{text}; repeats differ among themselves by {number(floor)} N m{share}."
+    return f"{text}; repeats differ among themselves by {number(floor)} {run.torque_unit}{share}."
 
 
 def _told(run: Run) -> str:
