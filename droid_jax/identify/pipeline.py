@@ -155,20 +155,9 @@ def identify(
     seconds["search"] = time.monotonic() - began
 
     began = time.monotonic()
-    if any(r.repeats == 1 for r in fitted):
-        base = base.restated(full.values(dict(zip(space.names, found.best.tolist(), strict=True))))
-        first = base.first()
     refined = None
     if config.refine is not None:
-        refined = refine(
-            base.whitened,
-            full,
-            starts(full, space, found),
-            config.refine,
-            first=first.whitened,
-            hypotheses=grip_hypotheses(space),
-            progress=lambda p: report("refine", p),
-        )
+        base, refined = _refined(base, starts(full, space, found), config.refine, lambda p: report("refine", p))
     best, full_gaussian = _distribution(full, space, found, refined, base)
     seconds["refine"] = time.monotonic() - began
 
@@ -195,6 +184,29 @@ def identify(
         heldout_repeats={n: p[2] for n, p in zip(names, parts, strict=True)},
         seconds=seconds,
     )
+
+
+def _refined(
+    base: Cost, begin: np.ndarray, config: RefineConfig, report: Callable[[Any], None]
+) -> tuple[Cost, Refined]:
+    """The refinement from starts [S, F], and the cost it ended on.
+
+    The noise of a single repeat is not known: it is stated twice, from what the search and then from
+    what a first refinement leaves unexplained.
+    """
+
+    def run(cost: Cost, begin: np.ndarray) -> Refined:
+        hypotheses = grip_hypotheses(cost.space)
+        rough = cost.first().whitened
+        return refine(
+            cost.whitened, cost.space, begin, config, first=rough, hypotheses=hypotheses, progress=report
+        )  # fmt: skip
+
+    if all(c.repeats > 1 for c in base.comparisons):
+        return base, run(base, begin)
+    base = base.restated(begin[0])
+    base = base.restated(run(base, begin).best)
+    return base, run(base, begin)
 
 
 def starts(full: Space, space: Space, found: Fit) -> np.ndarray:

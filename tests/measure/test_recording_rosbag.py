@@ -18,6 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 from droid_jax.measure.formats import load, save
 from droid_jax.measure.recording import TorqueConvention, TorqueSide
 from droid_jax.measure.rosbag import Stamps, read_bags
+from droid_jax.run import main
 
 JOINTS = ("j1", "j2")
 TORQUE = TorqueConvention(TorqueSide.LINK, gravity=True)
@@ -323,3 +324,44 @@ def test_load_finds_bags(tmp_path: Path, kind: str) -> None:
     file = paths[0] if kind == "ros1" else next(p for p in paths[0].iterdir() if p.suffix != ".yaml")
     assert load(file, **options).repeats == 1
     assert load(save(both, tmp_path / "door.npz")).sha256 == both.sha256
+
+
+# ----- on the command line
+
+
+def convert(*arguments: str | Path) -> int:
+    return main(["convert", *map(str, arguments)])
+
+
+def test_convert_turns_bags_into_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    paths = [pulled(tmp_path, "ros1", f"run{i}") for i in range(3)]
+    said = ["--joints", *JOINTS, "--torque", "link", "--gravity", "--command-topic", "/command"]
+    out = tmp_path / "door.npz"
+    assert convert(*paths, *said, "--stiffness", "80", "40", "--damping", "2", "1", "--out", out) == 0
+    assert "3 repeats of" in capsys.readouterr().out
+    recording = load(out)
+    assert recording.torque == TorqueConvention(TorqueSide.LINK, gravity=True)
+    assert recording.gains is not None
+    np.testing.assert_array_equal(recording.gains.stiffness, [80.0, 40.0])
+    expected = read_bags(paths, joints=JOINTS, torque=recording.torque, command_topic="/command", gains=recording.gains)
+    assert recording.sha256 == expected.sha256
+    assert convert(out, "--start", "0.2", "--end", "0.6", "--out", tmp_path / "part") == 0
+    part = load(tmp_path / "part")
+    assert (part.span, part.repeats) == (pytest.approx((0.2, 0.6)), 3)
+
+
+def test_convert_says_what_a_bag_lacks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    paths = [pulled(tmp_path, "ros1", f"run{i}") for i in range(2)]
+    out = tmp_path / "door.npz"
+    named = ["--joints", *JOINTS, "--torque", "motor"]
+    for arguments, expected in [
+        (paths, "give --joints, --torque"),
+        (paths[:1], "pass joints and torque"),
+        ([*paths, *named, "--stiffness", "80", "40"], "got 2 --stiffness and 0 --damping"),
+        ([*paths, *named, "--command-topic", "/nothing"], "/nothing"),
+        ([], "needs the files or folders to read"),
+    ]:
+        assert convert(*arguments, "--out", out) == 2
+        said = capsys.readouterr().err
+        assert said.startswith("error: ") and said.count("\n") == 1 and expected in said
+    assert not out.exists()

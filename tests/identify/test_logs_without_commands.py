@@ -1,0 +1,115 @@
+"""Identification from a log without commands, end to end: a carriage with a known equation of motion."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from droid_jax.compare.cost import make_cost
+from droid_jax.compare.residuals import CompareConfig
+from droid_jax.identify.pipeline import Identified, IdentifyConfig, identify, split
+from droid_jax.identify.search import SearchConfig
+from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
+from droid_jax.model.fields import body_mass, joint_damping
+from droid_jax.model.joint_friction import joint_friction_space, sensor_parameter
+from droid_jax.model.parameters import Space
+from droid_jax.model.scene import Scene, compile_scene
+
+XML = """<mujoco><option gravity="0 0 0"/><worldbody><body name="carriage">
+  <joint name="slide" type="slide" axis="1 0 0" damping="10" frictionloss="1e-6"/><geom size=".1" mass="8"/></body>
+</worldbody></mujoco>"""
+MASS, DAMPING, COULOMB = 5.0, 20.0, 3.0  # kg, N s/m, N
+TIME = np.arange(0, 12.0, 2e-3)
+
+
+def log(repeats: int, side: TorqueSide = TorqueSide.MOTOR) -> Recording:
+    """Two sines and the force they take, with noise of 0.05 N and 2 um."""
+    rng = np.random.default_rng(repeats)
+    w = 2 * np.pi * np.array([0.31, 0.83])[:, None]
+    size = np.array([[0.3], [0.1]])
+    x, v = (size * np.sin(w * TIME)).sum(0), (size * w * np.cos(w * TIME)).sum(0)
+    force = -MASS * (size * w**2 * np.sin(w * TIME)).sum(0) + DAMPING * v + COULOMB * np.sign(v)
+    shape = (repeats, len(TIME), 1)
+
+    def channel(name: str, unit: str, clean: np.ndarray, noise: float) -> Channel:
+        values = clean[None, :, None] + rng.normal(0, noise, shape)
+        return Channel(name, unit, ("slide",), TIME, values, np.ones(shape, bool))
+
+    channels = {"position": channel("position", "m", x, 2e-6), "torque": channel("torque", "N", force, 0.05)}
+    return Recording("log", np.zeros(0), np.zeros((0, 0)), (), channels, TorqueConvention(side, True), qpos0={})
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return compile_scene(mujoco.MjSpec.from_string(XML), "carriage", joints=["slide"])
+
+
+@pytest.fixture(scope="module")
+def space(scene: Scene) -> Space:
+    mass = body_mass(scene, "carriage", std=3.0, high=50.0)
+    return Space((mass, joint_damping(scene, "slide", std=10.0, high=100.0, unit="N s/m"))) + Space(
+        (sensor_parameter(("slide",), "coulomb", "slide", std=2.0, high=20.0),)
+    )
+
+
+@pytest.fixture(scope="module")
+def found(scene: Scene, space: Space) -> Identified:
+    config = IdentifyConfig(search=SearchConfig(population=16, parents=None, generations=10), samples=4)
+    return identify(scene, space, [log(1)], config=config)
+
+
+def test_mass_and_friction_come_back(found: Identified):
+    assert found.best == pytest.approx([MASS, DAMPING, COULOMB], rel=0.02)
+    low, high = found.gaussian.interval(0.9)
+    truth = np.array([MASS, DAMPING, COULOMB])
+    assert np.all((low < truth) & (truth < high))
+    assert np.all(high - low < 0.2 * truth)
+    assert all(t.identifiable for t in found.tells)
+
+
+def test_the_last_third_in_time_is_held_out(found: Identified):
+    (fitted,), (held,) = found.fit.comparisons, found.heldout.comparisons
+    assert fitted.channel("torque").span[1] < 8.0 < held.channel("torque").span[0]
+    gap = found.gaps["log"]
+    assert gap.floor is None and gap.closed is None
+    assert gap.after < 0.1 * gap.before
+    assert found.fit.comparisons[0].channel("torque").unit == "N"
+
+
+def test_the_noise_of_one_repeat_is_what_the_fit_leaves(found: Identified):
+    """Stated twice, not by the search alone: about as many whitened residuals as are independent have size one."""
+    assert found.refined is not None
+    assert 0.02 < np.mean(found.refined.residual**2) < 1.5
+
+
+def test_repeats_are_split_by_number(scene: Scene, space: Space):
+    recording = log(4)
+    fitted, held, rows = split(recording, 0.3)
+    assert (fitted.repeats, held.repeats, rows) == (3, 1, (3,))
+    cost = make_cost(scene, space, [fitted])
+    with pytest.raises(ValueError, match="other commands than 'log' had"):
+        cost.against([held])  # its own mean motion is another one
+    truth = space.values({"carriage_mass": MASS, "slide_damping": DAMPING, "coulomb[slide]": COULOMB})
+    near, far = cost(np.stack([truth, space.mean]))
+    assert near < 0.3 < far
+
+
+def test_the_c_engine_has_no_inverse_mode(scene: Scene, space: Space):
+    with pytest.raises(ValueError, match="inverse dynamics, which needs engine 'mjx'"):
+        make_cost(scene, space, [log(1)], engine="mujoco")
+
+
+def test_the_motion_filter_is_a_setting(scene: Scene, space: Space):
+    slow, fast = (make_cost(scene, space, [log(1)], config=CompareConfig(motion_cutoff=c)) for c in (5.0, 30.0))
+    assert slow.drives[0].timestep == pytest.approx(6 * fast.drives[0].timestep)
+
+
+def test_sensor_parameters():
+    names = joint_friction_space(["a", "b"]).names
+    one = sensor_parameter(("a", "b"), "viscous", "b", std=0.5, high=2.0, nuisance=True)
+    assert one.name in names and (one.low, one.mean, one.nuisance) == (-2.0, 0.0, True)
+    with pytest.raises(ValueError, match="unknown sensor term 'stiction'; valid: viscous, coulomb, torque_offset"):
+        sensor_parameter(("a",), "stiction", "a", std=1.0, high=2.0)
+    with pytest.raises(ValueError, match="unknown joint 'c'; measured joints: a, b"):
+        sensor_parameter(("a", "b"), "coulomb", "c", std=1.0, high=2.0)
