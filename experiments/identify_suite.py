@@ -257,17 +257,22 @@ def _coverage(cases: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _agreement(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
-    """Do the two poses' 90 % intervals overlap for what both identify?"""
+    """Do the two poses agree on what both tell?  Their difference, in units of its own deviation, is normal if so."""
     names = [
         n for n, p in a["parameters"].items()
         if not p["nuisance"] and p["identifiable"] and b["parameters"][n]["identifiable"]
     ]  # fmt: skip
-    overlap = [
-        max(a["parameters"][n]["interval"][0], b["parameters"][n]["interval"][0])
-        <= min(a["parameters"][n]["interval"][1], b["parameters"][n]["interval"][1])
-        for n in names
-    ]
-    return {"parameters": names, "overlapping": float(np.mean(overlap)) if names else None}
+
+    def gaussian(case: dict[str, Any], name: str) -> tuple[float, float]:
+        low, high = case["parameters"][name]["interval"]
+        return 0.5 * (low + high), (high - low) / (2 * scipy.stats.norm.ppf(0.95))
+
+    apart = {}
+    for name in names:
+        (mean_a, std_a), (mean_b, std_b) = gaussian(a, name), gaussian(b, name)
+        apart[name] = (mean_a - mean_b) / np.hypot(std_a, std_b)
+    within = np.abs(list(apart.values())) <= scipy.stats.norm.ppf(0.95)
+    return {"difference_in_deviations": apart, "within_90": float(np.mean(within)) if names else None}
 
 
 def main() -> None:

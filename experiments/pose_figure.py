@@ -1,0 +1,89 @@
+"""What two arm poses tell about one door: the paper's distribution figure (section IV-C), from the suite's cases.
+
+    python experiments/pose_figure.py [--out DIR]
+
+Reads pose_A and pose_B of `identify_suite.py` from DIR/identify_cases; writes DIR/pose_agreement.png.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
+
+import numpy as np  # noqa: E402
+import tyro  # noqa: E402
+from matplotlib.figure import Figure  # noqa: E402
+from scipy import stats  # noqa: E402
+
+from droid_jax.report.export import png_bytes  # noqa: E402
+from droid_jax.report.style import AFTER, BEFORE, TRUTH, WIDE, styled  # noqa: E402
+from droid_jax.report.words import label  # noqa: E402
+from droid_jax.storage import write_bytes  # noqa: E402
+
+LEVEL = 0.9  # of the intervals in the cases
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Where the cases are and the figure goes."""
+
+    out: Path = ROOT / "benchmarks" / "results"
+    """Folder with identify_cases."""
+    quick: bool = False
+    """Read the cases of a quick suite."""
+
+
+@styled
+def densities(a: dict[str, Any], b: dict[str, Any], width: float = WIDE) -> Figure:
+    """One panel for each parameter that both poses tell: the two Gaussians and the truth."""
+    names = [n for n, p in a.items() if not p["nuisance"] and p["identifiable"] and b[n]["identifiable"]]
+    columns = 4
+    rows = -(-len(names) // columns)
+    figure = Figure(figsize=(width, 0.6 + 1.5 * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for unused in panels[len(names) :]:
+        unused.set_visible(False)
+    for axes, name in zip(panels, names, strict=False):
+        low = min(a[name]["interval"][0], b[name]["interval"][0])
+        high = max(a[name]["interval"][1], b[name]["interval"][1])
+        x = np.linspace(low - 0.4 * (high - low), high + 0.4 * (high - low), 300)
+        for pose, colour, case in (("A", AFTER, a), ("B", BEFORE, b)):
+            density = stats.norm(*gaussian(case[name])).pdf(x)
+            axes.fill_between(x, density, color=colour, alpha=0.35, linewidth=0, label=f"pose {pose}")
+            axes.plot(x, density, color=colour, linewidth=1.2)
+        axes.axvline(a[name]["truth"], color=TRUTH, linewidth=1.4, linestyle=(0, (4, 1.5)), label="truth")
+        axes.set(title=label(name), yticks=[], xlim=(x[0], x[-1]))
+        axes.locator_params(axis="x", nbins=3)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper left", ncols=3, frameon=False)
+    return figure
+
+
+def gaussian(parameter: dict[str, Any]) -> tuple[float, float]:
+    """Centre and deviation of a parameter's interval."""
+    low, high = parameter["interval"]
+    return 0.5 * (low + high), (high - low) / (2 * stats.norm.ppf(0.5 + LEVEL / 2))
+
+
+def main() -> None:
+    arguments = tyro.cli(Arguments, description=__doc__)
+    folder = arguments.out / ("identify_cases_quick" if arguments.quick else "identify_cases")
+    missing = [p for p in "AB" if not (folder / f"pose_{p}.json").is_file()]
+    if missing:
+        raise SystemExit(
+            f"error: no case pose_{missing[0]} in {folder}; run experiments/identify_suite.py --parts pose"
+        )
+    a, b = (json.loads((folder / f"pose_{p}.json").read_text())["parameters"] for p in "AB")
+    path = arguments.out / "pose_agreement.png"
+    write_bytes(path, png_bytes(densities(a, b)))
+    print(json.dumps({"figure": str(path)}))
+
+
+if __name__ == "__main__":
+    main()
