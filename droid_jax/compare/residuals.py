@@ -70,9 +70,10 @@ class Measured:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Everything measured in one recording that a replay is compared with."""
+    """Everything measured in one recording that a replay is compared with; clock: [T] s of the replay's rows."""
 
     name: str
+    clock: np.ndarray
     channels: tuple[Measured, ...]
     grip_rows: tuple[int, int] | None
     shut_angle: float | None
@@ -200,7 +201,7 @@ def make_comparison(scene: Scene, recording: Recording, clock: np.ndarray, confi
         steps, timestep = len(clock), clock[1] - clock[0]
         first, end = (int(np.clip(round((t - clock[0]) / timestep), 0, steps)) for t in grip)
         rows = (min(first, steps - 1), max(end, first + 1))
-    return Comparison(recording.name, channels, rows, shut, recording.phases, config)
+    return Comparison(recording.name, clock, channels, rows, shut, recording.phases, config)
 
 
 def _grip_window(recording: Recording) -> tuple[float, float] | None:

@@ -198,9 +198,7 @@ def _refined(
     def run(cost: Cost, begin: np.ndarray) -> Refined:
         hypotheses = grip_hypotheses(cost.space)
         rough = cost.first().whitened
-        return refine(
-            cost.whitened, cost.space, begin, config, first=rough, hypotheses=hypotheses, progress=report
-        )  # fmt: skip
+        return refine(cost.whitened, cost.space, begin, config, first=rough, hypotheses=hypotheses, progress=report)
 
     if all(c.repeats > 1 for c in base.comparisons):
         return base, run(base, begin)

@@ -1,69 +1,130 @@
 """Gears that give way: elastic joints, and joints with backlash.
 
-The servo measures the motor, the dynamics move the link.  With the load tau of the step before, the
-motor stands at q + tau / k in an elastic joint, and half a backlash ahead of the link on the side
-that pushes.  Both are quasi-static: ringing is not simulated.
+The servo measures the motor, the dynamics move the link.  Under a torque tau the motor stands at q + tau c in an
+elastic joint; in one with backlash it turns freely within half of it to either side of the link.  Both are
+quasi-static: ringing is not simulated.
+
+The torque is solved for with the servo's own law.  Feeding back the torque of the step before would be simpler, but
+a stiff servo makes that a loop with a gain above one, which chatters.
 """
 
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from droid_jax.model.effects import amplitudes as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect
+from droid_jax.model.seam import Effect, State
 
 COMPLIANCE, BACKLASH = "joint_compliance", "joint_backlash"
-PUSHING = 0.1  # N m of load at which a gear surely leans on one side
 
 
-def _driven(scene: Scene) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
-    """The arm's driven joints, their actuators [J] and their degrees of freedom [J]."""
-    joints = tuple(j for j in a.arm(scene) if j in scene.command_names)
-    actuators = np.array([scene.command_names.index(j) for j in joints], dtype=int)
-    return joints, actuators, np.array([scene.dof(j) for j in joints], dtype=int)
+@dataclass(frozen=True, eq=False)
+class _Servos:
+    """The arm's joints with a position servo: names, actuators, positions and degrees of freedom, all [J].
+
+    gain, bias: [J], [J,3] of the actuators.  gear: [J].  stiffness: [J] N m/rad, at the joint.
+    """
+
+    joints: tuple[str, ...]
+    actuators: np.ndarray
+    positions: np.ndarray
+    dofs: np.ndarray
+    gain: np.ndarray
+    bias: np.ndarray
+    gear: np.ndarray
+    stiffness: np.ndarray
+
+    def rigid_torque(self, state: State, ctrl: jax.Array) -> jax.Array:
+        """[J] N m with the motor where its link is."""
+        length, speed = self.gear * state.qpos[self.positions], self.gear * state.qvel[self.dofs]
+        feedback = self.bias[:, 0] + self.bias[:, 1] * length + self.bias[:, 2] * speed
+        return self.gear * (self.gain * ctrl[self.actuators] + feedback)
+
+    def with_lead(self, ctrl: jax.Array, lead: jax.Array) -> jax.Array:
+        """[U] the command that has the same effect as motors ahead of their links by lead [J] rad."""
+        return ctrl.at[self.actuators].add(-self.stiffness * lead / (self.gear * self.gain))
+
+
+def _servos(scene: Scene) -> _Servos | None:
+    """None where no joint of the arm has a position servo: a torque does not care where its motor stands."""
+    model = scene.model
+    fixed = model.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED
+    affine = model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
+    gear = model.actuator_gear[:, 0]
+    stiffness = np.where(fixed & affine & (model.actuator_gainprm[:, 0] != 0), -model.actuator_biasprm[:, 1], 0.0)
+    stiffness = stiffness * gear**2
+    row = {j: scene.command_names.index(j) for j in a.arm(scene) if j in scene.command_names}
+    joints = tuple(j for j, u in row.items() if stiffness[u] > 0)
+    if not joints:
+        return None
+    actuators = np.array([row[j] for j in joints], dtype=int)
+    return _Servos(
+        joints=joints,
+        actuators=actuators,
+        positions=np.array([scene.qpos(j) for j in joints], dtype=int),
+        dofs=np.array([scene.dof(j) for j in joints], dtype=int),
+        gain=model.actuator_gainprm[actuators, 0],
+        bias=model.actuator_biasprm[actuators, :3],
+        gear=gear[actuators],
+        stiffness=stiffness[actuators],
+    )
 
 
 @register
 def joint_compliance(scene: Scene) -> Effect | None:
     """Motor ahead of the link by tau c, c = 1 / stiffness, rad/(N m)."""
-    joints, actuators, dofs = _driven(scene)
-    if not joints:
+    servos = _servos(scene)
+    if servos is None:
         return None
 
     def servo(theta, state, ctrl):
-        return ctrl.at[actuators].add(-a.column(theta, COMPLIANCE, joints) * state.load[dofs])
+        compliance = a.column(theta, COMPLIANCE, servos.joints)
+        torque = servos.rigid_torque(state, ctrl) / (1.0 + servos.stiffness * compliance)
+        return servos.with_lead(ctrl, compliance * torque)
+
+    def parameter(joint: str, stiffness: float):
+        # Below zero only so that a rigid joint is no edge; never so far that 1 + k c comes near zero.
+        return a.amplitude(f"{COMPLIANCE}[{joint}]", "rad/(N m)", 1e-4, 5e-4, low=-min(1e-4, 0.5 / stiffness))
 
     return Effect(
         COMPLIANCE,
-        a.of_joints(COMPLIANCE, joints, "rad/(N m)", 1e-4, 5e-4, low=-1e-4),
+        tuple(parameter(j, float(k)) for j, k in zip(servos.joints, servos.stiffness, strict=True)),
         servo=servo,
         what="an elastic gear between motor and link",
         mark="tracking error in proportion to load",
         confused_with=("servo_gain", "torque_gain"),
-        places=a.places(joints, COMPLIANCE),
+        places=a.places(servos.joints, COMPLIANCE),
         smallest=2e-5,
     )
 
 
 @register
 def joint_backlash(scene: Scene) -> Effect | None:
-    """Motor ahead of the link by half the backlash, on the side that pushes, rad."""
-    joints, actuators, dofs = _driven(scene)
-    if not joints:
+    """Motor ahead of the link by half the backlash, rad, on the side that pushes; in between there is no torque."""
+    servos = _servos(scene)
+    if servos is None:
         return None
 
     def servo(theta, state, ctrl):
-        half = 0.5 * a.column(theta, BACKLASH, joints)
-        return ctrl.at[actuators].add(-half * jnp.tanh(state.load[dofs] / PUSHING))
+        half = 0.5 * a.column(theta, BACKLASH, servos.joints)
+        error = servos.rigid_torque(state, ctrl) / servos.stiffness
+        lead = jnp.sign(half) * jnp.clip(error, -jnp.abs(half), jnp.abs(half))
+        return servos.with_lead(ctrl, lead)
 
     return Effect(
         BACKLASH,
-        a.of_joints(BACKLASH, joints, "rad", 2e-3, 2e-2, low=-2e-3),
+        a.of_joints(BACKLASH, servos.joints, "rad", 2e-3, 2e-2, low=-2e-3),
         servo=servo,
         what="backlash in a joint's gear",
         mark="a step where the load of that joint changes sign",
         confused_with=("joint_coulomb", "joint_compliance"),
-        places=a.places(joints, BACKLASH),
+        places=a.places(servos.joints, BACKLASH),
         smallest=3e-4,
     )

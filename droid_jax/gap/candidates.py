@@ -1,0 +1,57 @@
+"""What the search for a missing effect asks about: an effect, at a place, with a shape."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from droid_jax.model.parameters import Space
+from droid_jax.model.seam import Effect
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect at a place.
+
+    amplitudes: names of the parameters that make it; shapes: name -> value tried.
+    """
+
+    effect: str
+    place: str
+    amplitudes: tuple[str, ...]
+    shapes: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """ "latch at door_hinge"."""
+        return f"{self.effect} at {self.place}"
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """Tells candidates apart, shapes included."""
+        return self.effect, self.place, *sorted(self.shapes.items())
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Names of the parameters that a refit frees."""
+        return (*self.amplitudes, *self.shapes)
+
+
+def candidates(effects: Iterable[Effect]) -> tuple[Candidate, ...]:
+    """Every effect at every place with every combination of its shapes' values."""
+    out = []
+    for effect in effects:
+        grid = [dict(zip(effect.shapes, values, strict=True)) for values in itertools.product(*effect.shapes.values())]
+        for (place, amplitudes), shapes in itertools.product(effect.places.items(), grid):
+            out.append(Candidate(effect.name, place, amplitudes, shapes))
+    return tuple(out)
+
+
+def check_space(space: Space, effects: Iterable[Effect]) -> None:
+    """Raise ValueError unless the space holds every parameter of the effects, at neutral."""
+    for effect in effects:
+        for p in effect.parameters:
+            if space[p.name].mean != p.mean:
+                raise ValueError(f"{p.name}: the space starts at {space[p.name].mean}, neutral is {p.mean}")

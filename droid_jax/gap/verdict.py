@@ -1,0 +1,62 @@
+"""What the search for a missing effect ends with."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+from droid_jax.gap.localise import Localisation
+from droid_jax.gap.refit import Model
+from droid_jax.gap.screen import Screen
+from droid_jax.gap.select import Trial
+
+
+class Kind(enum.Enum):
+    """The answers there are."""
+
+    NONE = "none"  # nothing is missing that these recordings could tell
+    NAMED = "named"  # these effects are missing
+    TIE = "tie"  # one of these; an experiment that would tell them apart is named
+    PARTLY = "partly explained"  # these, and a remainder that nothing in the library explains
+    UNEXPLAINED = "unexplained"  # something is missing, and nothing in the library is it
+    UNCONVERGED = "fit not converged"  # the base fit's starts disagree; nothing can be concluded
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """The answer and its grounds.
+
+    kind; effects: names of what is in the model; tied: for each of them the names that do as well.
+    base, model: before and after.  floor: U0, what the simulation's own step leaves.
+    gaps: recording -> (U before, U after).  screen, trials, where: the grounds.
+    """
+
+    kind: Kind
+    effects: tuple[str, ...]
+    tied: tuple[tuple[str, ...], ...]
+    base: Model
+    model: Model
+    floor: float
+    gaps: dict[str, tuple[float, float]]
+    screens: tuple[Screen, ...]
+    trials: tuple[Trial, ...]
+    where: Localisation
+
+    def closed(self, recording: str) -> float:
+        """1 - (U_after - U0) / (U_before - U0)."""
+        before, after = self.gaps[recording]
+        return 1.0 - (after - self.floor) / max(before - self.floor, 1e-12)
+
+    @property
+    def sentence(self) -> str:
+        """The answer in words."""
+        named = " and ".join(self.effects)
+        ties = "; ".join(f"{e} or {' or '.join(t)}" for e, t in zip(self.effects, self.tied, strict=True) if t)
+        return {
+            Kind.NONE: "Nothing is missing that these recordings could tell.",
+            Kind.NAMED: f"The model lacks: {named}.",
+            Kind.TIE: f"The model lacks one of: {ties}.",
+            Kind.PARTLY: f"The model lacks {named}; a remainder is unexplained.",
+            Kind.UNEXPLAINED: "The model lacks something that is not in the library.",
+            Kind.UNCONVERGED: "The base fit did not converge; nothing can be concluded.",
+        }[self.kind]

@@ -1,0 +1,216 @@
+"""The search for a missing effect, top to bottom: fit, ask, name, confirm, decide."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from droid_jax.compare.cost import make_cost
+from droid_jax.compare.residuals import CompareConfig
+from droid_jax.gap.candidates import Candidate, candidates, check_space
+from droid_jax.gap.evidence import Evidence, evidence, gap
+from droid_jax.gap.flips import FEWEST
+from droid_jax.gap.localise import localise
+from droid_jax.gap.refit import REFIT, Model, embed, refit
+from droid_jax.gap.screen import Question, Screen, marks, project, questions_of, screen
+from droid_jax.gap.select import SIGNIFICANT, Trial, improvement, judge, one_sided_p, resampled
+from droid_jax.gap.verdict import Kind, Verdict
+from droid_jax.identify.pipeline import grip_hypotheses, starts
+from droid_jax.identify.refine import RefineConfig, refine
+from droid_jax.identify.search import SearchConfig, search
+from droid_jax.measure.recording import Recording
+from droid_jax.model.effects.registry import effect_space, ready
+from droid_jax.model.parameters import Space
+from droid_jax.model.scene import Scene
+from droid_jax.model.seam import Effect
+
+Progress = Callable[[str, Any], None]
+
+
+@dataclass(frozen=True)
+class GapConfig:
+    """Settings of the search for a missing effect.
+
+    search, refine: of the base fit.  refit: of every extended model.
+    refitted: candidates that are refitted in each round.  most: effects at most.
+    compare: how simulation and measurement are compared.  seed: of flips and resamples.
+    """
+
+    search: SearchConfig = field(default_factory=lambda: SearchConfig(parents=None, generations=20))
+    refine: RefineConfig = field(default_factory=RefineConfig)
+    refit: RefineConfig = REFIT
+    refitted: int = 6
+    most: int = 3
+    compare: CompareConfig = field(default_factory=CompareConfig)
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """What every stage needs: the evidence of each demonstration and what may be free."""
+
+    fit: Evidence
+    confirm: Evidence
+    base: Space
+    effects: tuple[Effect, ...]
+    config: GapConfig
+
+    @property
+    def whole(self) -> Space:
+        """Base parameters and all effects'."""
+        return self.fit.cost.space
+
+    @property
+    def smallest(self) -> dict[str, float]:
+        """Amplitude -> size worth naming."""
+        return {a: e.smallest for e in self.effects for amplitudes in e.places.values() for a in amplitudes}
+
+
+def make_case(
+    scene: Scene,
+    base: Space,
+    effects: Sequence[Effect],
+    fit: Recording,
+    confirm: Recording,
+    config: GapConfig | None = None,
+) -> Case:
+    """One compiled replay per demonstration, all effects in it, at neutral.
+
+    Raises ValueError for too few repeats: with fewer than eight, no flip of signs could ever be
+    significant.
+    """
+    config = config or GapConfig()
+    few = [r.name for r in (fit, confirm) if r.repeats < FEWEST]
+    if few:
+        raise ValueError(
+            f"recordings {', '.join(few)}: at least {FEWEST} repeats are needed to tell an effect from noise"
+        )
+    scene = ready(scene)
+    whole = base + effect_space(effects)
+    check_space(whole, effects)
+    made = [make_cost(scene, whole, [r], config=config.compare, effects=effects) for r in (fit, confirm)]
+    return Case(evidence(made[0]), evidence(made[1]), base, tuple(effects), config)
+
+
+def base_fit(case: Case, progress: Progress) -> Model:
+    """Everything but the effects, fitted to the first demonstration."""
+    cost, base = case.fit.cost, case.base
+    main = base.select([p.name for p in base.parameters if not p.nuisance])
+    neutral = case.whole.mean
+
+    def over_main(rows: np.ndarray) -> np.ndarray:
+        return cost(embed(case.whole, main, neutral, np.asarray(rows)))
+
+    def residuals(rows: np.ndarray) -> np.ndarray:
+        return cost.whitened(embed(case.whole, base, neutral, rows))
+
+    found = search(over_main, main, case.config.search, progress=lambda p: progress("search", p))
+    refined = refine(
+        residuals,
+        base,
+        starts(base, main, found),
+        case.config.refine,
+        hypotheses=grip_hypotheses(base),
+        progress=lambda p: progress("refine", p),
+    )
+    values = embed(case.whole, base, neutral, refined.best[None])[0]
+    left = case.fit.residuals(-refined.residual / np.sqrt(case.fit.repeats))
+    return Model((), values, base, refined, left, gap(left))
+
+
+def ask(case: Case, model: Model, asked: Sequence[Question]) -> Screen:
+    """Screen questions against a model's residuals on the first demonstration."""
+    count = case.fit.repeats
+    raw = marks(case.fit, model.values, asked)
+    base = model.refined.jacobian / np.sqrt(count)
+    projected = project(raw, -base, model.refined.prior * np.sqrt(count))
+    return screen(model.residuals, asked, projected, case.config.seed)
+
+
+def find(case: Case, base: Model, floor: float, progress: Progress = lambda stage, value: None) -> Verdict:
+    """From a converged base fit to a verdict."""
+    model, screens, trials = base, [], []
+    asked = questions_of(candidates(case.effects))
+    where = localise(case.fit, base.values, base.residuals)
+    for number in range(case.config.most):
+        progress("screen", number)
+        left = [q for q in asked if not set(q.candidate.amplitudes) & set(model.amplitudes)]
+        found = ask(case, model, left)
+        screens.append(found)
+        if found.p >= SIGNIFICANT or model.gap <= floor:
+            break
+        tried = _refit(case, model, found, progress)
+        passed = [(m, t) for m, t in tried if t.passed]
+        trials += [t for _, t in tried]
+        if not passed:
+            break
+        model = min(passed, key=lambda mt: mt[1].gap_confirm)[0]
+    return _verdict(case, base, model, floor, screens, trials, where)
+
+
+def _refit(case: Case, model: Model, found: Screen, progress: Progress) -> list[tuple[Model, Trial]]:
+    """The most promising candidates, each fitted with everything else, and their trials."""
+    chosen = resampled(found, model.residuals, case.config.seed)
+    out = []
+    for candidate, start in _promising(case, model, found):
+        progress("refit", candidate.name)
+        extended = refit(case.fit, case.base, (*model.parts, candidate), start[None], case.config.refit)
+        share = sum(chosen[n] for n in _alike(candidate, found))
+        out.append((extended, judge(case.fit, case.confirm, model, extended, share, case.smallest)))
+    return out
+
+
+def _promising(case: Case, model: Model, found: Screen) -> list[tuple[Candidate, np.ndarray]]:
+    """The best shape of the best candidates, with a start [D] at what the linear score says."""
+    seen: dict[str, tuple[Candidate, np.ndarray]] = {}
+    for k in found.best():
+        candidate = found.questions[k].candidate
+        if candidate.name in seen:
+            continue
+        start = model.values.copy()
+        for name, value in candidate.shapes.items():
+            start[case.whole.index(name)] = value
+        p = case.whole[found.questions[k].amplitude]
+        start[case.whole.index(p.name)] = np.clip(found.size[k], p.low, p.high)
+        seen[candidate.name] = (candidate, start)
+        if len(seen) == case.config.refitted:
+            break
+    return list(seen.values())
+
+
+COLLINEAR = 0.9
+
+
+def _alike(candidate: Candidate, found: Screen) -> set[str]:
+    """Names of the candidates whose marks are nearly this one's: a resample may pick any of them."""
+    rows = np.array([q.candidate.name == candidate.name for q in found.questions])
+    unit = found.marks / np.maximum(np.linalg.norm(found.marks, axis=1, keepdims=True), 1e-30)
+    near = np.max(np.abs(unit @ unit[rows].T), axis=1) > COLLINEAR
+    return {candidate.name} | {found.questions[k].candidate.name for k in np.flatnonzero(near)}
+
+
+def _verdict(
+    case: Case, base: Model, model: Model, floor: float, screens: list[Screen], trials: list[Trial], where: Any
+) -> Verdict:
+    before, after, _ = improvement(case.confirm, base.values, model.values)
+    gaps = {
+        case.fit.cost.comparisons[0].name: (base.gap, model.gap),
+        case.confirm.cost.comparisons[0].name: (before, after),
+    }
+    remainder = screens[-1].p < SIGNIFICANT and model.gap > floor and len(screens) > len(model.parts)
+    if not model.parts:
+        kind = Kind.UNEXPLAINED if remainder else Kind.NONE
+    elif remainder:
+        kind = Kind.PARTLY
+    else:
+        kind = Kind.NAMED
+    names = tuple(c.name for c in model.parts)
+    return Verdict(
+        kind, names, tuple(() for _ in names), base, model, floor, gaps, tuple(screens), tuple(trials), where
+    )
+
+
+__all__ = ["Case", "GapConfig", "ask", "base_fit", "find", "make_case", "one_sided_p"]
