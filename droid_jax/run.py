@@ -341,7 +341,8 @@ def _config(command: Identify) -> IdentifyConfig:
     }[command.preset]
     changes = {k: getattr(command, k) for k in ("population", "generations", "restarts")}
     search = dataclasses.replace(search, seed=command.seed, **{k: v for k, v in changes.items() if v is not None})
-    refine = None if command.preset == "paper" else RefineConfig()
+    hop = 12 if command.preset == "quick" else RefineConfig.hop_generations
+    refine = None if command.preset == "paper" else RefineConfig(hop_generations=hop)
     compare = CompareConfig(whitened=command.whitened)
     return IdentifyConfig(engine=command.engine, search=search, refine=refine, seed=command.seed, compare=compare)
 

@@ -50,7 +50,7 @@ class Gap:
 
     before, after, floor: equation 1 without penalty terms; floor is what a perfect model would
     leave, estimated from the repeats' scatter about their mean.  closed: share of the way from
-    before to floor.  Both are None where there is one repeat only.
+    before to floor.  Floors and closed are None where there is one repeat only.
     per_joint_*: [J] root mean square of the smoothed traces' difference.
     """
 
@@ -60,7 +60,7 @@ class Gap:
     closed: float | None
     per_joint_before: tuple[float, ...]
     per_joint_after: tuple[float, ...]
-    per_joint_floor: tuple[float, ...]
+    per_joint_floor: tuple[float, ...] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,7 +271,7 @@ def _gaps(cost: Cost, before: np.ndarray, after: np.ndarray) -> list[Gap]:
                 closed=None if floor is None else float(1 - (last - floor) / max(first - floor, 1e-12)),
                 per_joint_before=tuple(rms[0].tolist()),
                 per_joint_after=tuple(rms[1].tolist()),
-                per_joint_floor=tuple(_smooth_floor(torque.noise.repeats).tolist()),
+                per_joint_floor=_smooth_floor(torque.noise.repeats),
             )
         )
     return out
@@ -287,13 +287,13 @@ def _floor(values: np.ndarray, mask: np.ndarray) -> float | None:
     return float(np.mean(np.linalg.norm(error, axis=-1)) / np.sqrt(1 - 1 / count))
 
 
-def _smooth_floor(repeats: np.ndarray) -> np.ndarray:
+def _smooth_floor(repeats: np.ndarray) -> tuple[float, ...] | None:
     """[J] what the noise of the repeats' mean leaves of a smoothed difference, N m."""
     count = len(repeats)
     if count < 2:
-        return np.zeros(repeats.shape[-1])
+        return None
     variance = np.var(repeats, axis=0, ddof=1).mean(axis=0)
-    return np.sqrt(variance / count)
+    return tuple(np.sqrt(variance / count).tolist())
 
 
 def cost_samples(found: Identified, count: int, seed: int) -> dict[str, np.ndarray]:

@@ -100,7 +100,7 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
             "closed": g.closed,
             "per_joint_before": list(g.per_joint_before),
             "per_joint_after": list(g.per_joint_after),
-            "per_joint_floor": list(g.per_joint_floor),
+            "per_joint_floor": None if g.per_joint_floor is None else list(g.per_joint_floor),
         }
         for name, g in found.gaps.items()
     }

@@ -79,7 +79,7 @@ def draw(run: Run) -> dict[str, list[Drawing]]:
         add(
             "search", "cost_distribution", "The two Gaussians, replayed",
             f"Parameter sets drawn from the initial and from the fitted Gaussian ({samples[0].size} and "
-            f"{samples[1].size}), replayed against repeats that the fit did not see. Lines: medians. "
+            f"{samples[1].size}), replayed against data that the fit did not see. Lines: medians. "
             "A failed replay counts with its penalty.",
             search_figures.cost_histograms, *samples, run.torque_unit,
         )  # fmt: skip

@@ -11,7 +11,13 @@ from droid_jax.report.run_folder import Run
 
 
 def label(name: str) -> str:
-    """A name as it is read: "hinge_stiffness" -> "Hinge stiffness", "panda_joint3" -> "Joint 3"."""
+    """A name as it is read: "hinge_stiffness" -> "Hinge stiffness", "panda_joint3" -> "Joint 3".
+
+    "torque_offset[panda_joint3]" -> "Torque offset, joint 3".
+    """
+    indexed = re.fullmatch(r"(.+)\[(.+)\]", name)
+    if indexed:
+        return f"{label(indexed[1])}, {label(indexed[2]).lower()}"
     joint = re.fullmatch(r"(?:\w+_)?joint_?(\d+)", name)
     if joint:
         return f"Joint {joint[1]}"
@@ -78,7 +84,7 @@ def _gap(run: Run, name: str) -> str:
     gap = run.fit["gap"][name]
     where = f"In “{name}”, on" if len(run.fit["gap"]) > 1 else "On"
     text = (
-        f"{where} repeats that the fit did not see, simulation and {run.robot} differed by "
+        f"{where} data that the fit did not see, simulation and {run.robot} differed by "
         f"{number(gap['before'])} {run.torque_unit} before the fit (RMS over all joints) and differ by "
         f"{number(gap['after'])} {run.torque_unit} after it"
     )
@@ -132,11 +138,10 @@ def _next(run: Run) -> str:
         steps.append("record a motion that moves what is not told, or leave it at its initial spread")
     if any(g.get("floor") and g["after"] > 1.5 * g["floor"] for g in gaps):
         steps.append(
-            "what is left is well above the floor, so the model lacks something: "
-            "look for it with python -m droid_jax.run gap"
+            "what is left is well above the floor, so the model lacks something: see below in which joint and phase"
         )
     elif not steps:
-        steps.append("train on the fitted Gaussian with python -m droid_jax.run train")
+        steps.append("draw the simulations you train on from gaussian.json")
     return "Next: " + "; ".join(steps) + "."
 
 

@@ -241,7 +241,7 @@ def test_summary_says_when_the_fit_made_it_worse(tmp_path: Path) -> None:
     (run / "fit.json").write_text(json.dumps(fit))
     text = " ".join(summary(read_run(run)))
     assert "the fit made it worse" in text and "do not train on this fit" in text
-    assert "look for it with python -m droid_jax.run gap" in text
+    assert "so the model lacks something" in text
 
 
 def test_a_stand_in_is_never_called_a_robot(written: Page) -> None:
@@ -278,7 +278,7 @@ def test_texts_of_the_run_are_escaped(run: Path) -> None:
 def test_several_recordings_each_have_their_own_gap_and_figure(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", recordings=("slow", "fast"))
     text = page.write_report(run).read_text(encoding="utf-8")
-    assert "In “slow”, on repeats" in text and "In “fast”, on repeats" in text
+    assert "In “slow”, on data" in text and "In “fast”, on data" in text
     assert (run / "figures" / "torque_0.pdf").read_bytes().startswith(b"%PDF")
     assert (run / "figures" / "torque_1.png").read_bytes().startswith(b"\x89PNG")
 
