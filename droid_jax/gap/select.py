@@ -15,6 +15,8 @@ from droid_jax.gap.screen import Screen
 
 SIGNIFICANT = 0.01
 LESS = 0.2  # share of U that an effect must take away on the confirming demonstration
+OF_ALL = 0.05  # and share of the base model's U: what a wrong form of the first effect leaves is no effect of its own
+TIE = 0.1  # of what the best takes away: a rival that leaves no more than this beyond it does as well
 CHOSEN = 0.8  # share of the resamples in which an effect must win
 RESAMPLES = 400
 EDGE = 0.02  # share of a parameter's range that counts as its bound
@@ -85,9 +87,19 @@ def _explained(scores: np.ndarray, gram: np.ndarray) -> np.ndarray:
 
 
 def judge(
-    fit: Evidence, confirm: Evidence, base: Model, model: Model, chosen: float, smallest: dict[str, float]
+    fit: Evidence,
+    confirm: Evidence,
+    base: Model,
+    model: Model,
+    whole_gap: float,
+    chosen: float,
+    smallest: dict[str, float],
 ) -> Trial:
-    """Put an extended model on trial against the one without its last effect."""
+    """Put an extended model on trial against the one without its last effect.
+
+    whole_gap: U of the model without any effect on the confirming demonstration.  chosen: share of
+    resamples in which the effect, or one that looks like it, wins.
+    """
     before, after, gain = improvement(confirm, base.values, model.values)
     p = one_sided_p(gain)
     spans = intervals(fit, model)
@@ -97,6 +109,8 @@ def judge(
         reasons.append(f"not confirmed by the other demonstration (p = {p:.2g})")
     if after > (1 - LESS) * before:
         reasons.append(f"takes only {1 - after / before:.0%} of the gap away on the other demonstration")
+    elif before - after < OF_ALL * whole_gap:
+        reasons.append(f"takes only {(before - after) / whole_gap:.1%} of the first gap away")
     if all(low <= 0.0 <= high for low, high in (spans[a] for a in new)):
         reasons.append("its amplitude may be zero")
     if all(abs(model.values[fit.cost.space.index(a)]) < smallest[a] for a in new):
@@ -114,6 +128,7 @@ def _on_bound(fit: Evidence, model: Model, amplitude: str) -> bool:
     return value > p.high - reach or (p.low != p.mean and value < p.low + reach)
 
 
-def ranked(trials: Sequence[Trial]) -> list[Trial]:
-    """The best on the confirming demonstration first."""
-    return sorted(trials, key=lambda t: t.gap_confirm)
+def tied(trials: Sequence[Trial], best: Trial, before: float) -> list[Trial]:
+    """The rivals that passed and do as well as the best; before: U without any of them."""
+    enough = best.gap_confirm + TIE * (before - best.gap_confirm)
+    return [t for t in trials if t is not best and t.passed and t.gap_confirm <= enough]

@@ -16,7 +16,7 @@ from droid_jax.gap.flips import FEWEST
 from droid_jax.gap.localise import localise
 from droid_jax.gap.refit import REFIT, Model, embed, refit
 from droid_jax.gap.screen import Question, Screen, marks, project, questions_of, screen
-from droid_jax.gap.select import SIGNIFICANT, Trial, improvement, judge, one_sided_p, resampled
+from droid_jax.gap.select import SIGNIFICANT, Trial, improvement, judge, resampled, tied
 from droid_jax.gap.verdict import Kind, Verdict
 from droid_jax.identify.pipeline import grip_hypotheses, starts
 from droid_jax.identify.refine import RefineConfig, refine
@@ -28,6 +28,8 @@ from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
 
 Progress = Callable[[str, Any], None]
+COLLINEAR = 0.9  # absolute cosine from which two marks count as one
+OPEN = 0.2  # share of the gap left open from which a model explains it only partly
 
 
 @dataclass(frozen=True)
@@ -131,36 +133,53 @@ def ask(case: Case, model: Model, asked: Sequence[Question]) -> Screen:
 
 
 def find(case: Case, base: Model, floor: float, progress: Progress = lambda stage, value: None) -> Verdict:
-    """From a converged base fit to a verdict."""
-    model, screens, trials = base, [], []
+    """From a converged base fit to a verdict.  floor: U0, see `numerical_floor`."""
+    before, _, _ = improvement(case.confirm, base.values, base.values)
     asked = questions_of(candidates(case.effects))
-    where = localise(case.fit, base.values, base.residuals)
-    for number in range(case.config.most):
-        progress("screen", number)
+    grounds = Grounds([], [], [])
+    model, again = base, True
+    while again and len(model.parts) < case.config.most:
+        progress("screen", model.name)
         left = [q for q in asked if not set(q.candidate.amplitudes) & set(model.amplitudes)]
         found = ask(case, model, left)
-        screens.append(found)
+        grounds.screens.append(found)
         if found.p >= SIGNIFICANT or model.gap <= floor:
             break
-        tried = _refit(case, model, found, progress)
-        passed = [(m, t) for m, t in tried if t.passed]
-        trials += [t for _, t in tried]
-        if not passed:
-            break
-        model = min(passed, key=lambda mt: mt[1].gap_confirm)[0]
-    return _verdict(case, base, model, floor, screens, trials, where)
+        extended = _next(case, model, found, before, grounds, progress)
+        again, model = extended is not None, extended or model
+    return _verdict(case, base, model, floor, grounds)
 
 
-def _refit(case: Case, model: Model, found: Screen, progress: Progress) -> list[tuple[Model, Trial]]:
-    """The most promising candidates, each fitted with everything else, and their trials."""
+@dataclass(frozen=True, eq=False)
+class Grounds:
+    """What is gathered on the way: every screening, every trial, and the rivals of each effect chosen."""
+
+    screens: list[Screen]
+    trials: list[Trial]
+    rivals: list[tuple[str, ...]]
+
+
+def _next(
+    case: Case, model: Model, found: Screen, whole_gap: float, grounds: Grounds, progress: Progress
+) -> Model | None:
+    """The model with the effect that does best on the confirming demonstration, if one passes its trial."""
     chosen = resampled(found, model.residuals, case.config.seed)
-    out = []
+    tried: list[tuple[Model, Trial]] = []
     for candidate, start in _promising(case, model, found):
         progress("refit", candidate.name)
         extended = refit(case.fit, case.base, (*model.parts, candidate), start[None], case.config.refit)
         share = sum(chosen[n] for n in _alike(candidate, found))
-        out.append((extended, judge(case.fit, case.confirm, model, extended, share, case.smallest)))
-    return out
+        trial = judge(case.fit, case.confirm, model, extended, whole_gap, share, case.smallest)
+        tried.append((extended, trial))
+    grounds.trials.extend(t for _, t in tried)
+    passed = [(m, t) for m, t in tried if t.passed]
+    if not passed:
+        return None
+    winner, best = min(passed, key=lambda mt: mt[1].gap_confirm)
+    before, _, _ = improvement(case.confirm, model.values, model.values)
+    rivals = tied([t for _, t in passed], best, before)
+    grounds.rivals.append(tuple(t.name.split(" + ")[-1] for t in rivals))
+    return winner
 
 
 def _promising(case: Case, model: Model, found: Screen) -> list[tuple[Candidate, np.ndarray]]:
@@ -181,9 +200,6 @@ def _promising(case: Case, model: Model, found: Screen) -> list[tuple[Candidate,
     return list(seen.values())
 
 
-COLLINEAR = 0.9
-
-
 def _alike(candidate: Candidate, found: Screen) -> set[str]:
     """Names of the candidates whose marks are nearly this one's: a resample may pick any of them."""
     rows = np.array([q.candidate.name == candidate.name for q in found.questions])
@@ -192,25 +208,26 @@ def _alike(candidate: Candidate, found: Screen) -> set[str]:
     return {candidate.name} | {found.questions[k].candidate.name for k in np.flatnonzero(near)}
 
 
-def _verdict(
-    case: Case, base: Model, model: Model, floor: float, screens: list[Screen], trials: list[Trial], where: Any
-) -> Verdict:
+def _verdict(case: Case, base: Model, model: Model, floor: float, grounds: Grounds) -> Verdict:
     before, after, _ = improvement(case.confirm, base.values, model.values)
     gaps = {
         case.fit.cost.comparisons[0].name: (base.gap, model.gap),
         case.confirm.cost.comparisons[0].name: (before, after),
     }
-    remainder = screens[-1].p < SIGNIFICANT and model.gap > floor and len(screens) > len(model.parts)
-    if not model.parts:
-        kind = Kind.UNEXPLAINED if remainder else Kind.NONE
-    elif remainder:
-        kind = Kind.PARTLY
-    else:
-        kind = Kind.NAMED
-    names = tuple(c.name for c in model.parts)
+    open_share = (after - floor) / max(before - floor, 1e-12)
+    missing = grounds.screens[0].p < SIGNIFICANT and base.gap > floor
+    kind = Kind.NONE if not missing else Kind.UNEXPLAINED
+    if model.parts:
+        kind = Kind.PARTLY if open_share > OPEN else Kind.TIE if any(grounds.rivals) else Kind.NAMED
     return Verdict(
-        kind, names, tuple(() for _ in names), base, model, floor, gaps, tuple(screens), tuple(trials), where
+        kind=kind,
+        effects=tuple(c.name for c in model.parts),
+        tied=tuple(grounds.rivals),
+        base=base,
+        model=model,
+        floor=floor,
+        gaps=gaps,
+        screens=tuple(grounds.screens),
+        trials=tuple(grounds.trials),
+        where=localise(case.fit, base.values, base.residuals),
     )
-
-
-__all__ = ["Case", "GapConfig", "ask", "base_fit", "find", "make_case", "one_sided_p"]

@@ -12,14 +12,14 @@ STIFFNESS, PULL = "cable_stiffness", "cable_pull"
 
 @register
 def cable_pull(scene: Scene) -> Effect | None:
-    """-k (q - q_start) - p in a joint: stiffness k, N m/rad, and the pull p at the start, N m."""
+    """-k (q - q0) - p in a joint: stiffness k, N m/rad, and the pull p at q0, the model's reference pose, N m."""
     joints, positions = a.arm(scene), a.arm_qpos(scene)
     if not joints:
         return None
-    dofs, start = a.arm_dofs(scene), scene.model.qpos0[positions]
+    dofs, reference = a.arm_dofs(scene), scene.model.qpos0[positions]
 
     def force(theta, state):
-        stretch = state.qpos[positions] - start
+        stretch = state.qpos[positions] - reference
         torque = a.column(theta, STIFFNESS, joints) * stretch + a.column(theta, PULL, joints)
         return jnp.zeros_like(state.qvel).at[dofs].add(-torque)
 

@@ -29,7 +29,7 @@ COMPLIANCE, BACKLASH = "joint_compliance", "joint_backlash"
 class _Servos:
     """The arm's joints with a position servo: names, actuators, positions and degrees of freedom, all [J].
 
-    gain, bias: [J], [J,3] of the actuators.  gear: [J].  stiffness: [J] N m/rad, at the joint.
+    gain, bias: [J], [J,3] of the actuators, as the MJCF has them.  gear: [J].  stiffness: [J] N m/rad, at the joint.
     """
 
     joints: tuple[str, ...]
@@ -45,7 +45,7 @@ class _Servos:
         """[J] N m with the motor where its link is."""
         length, speed = self.gear * state.qpos[self.positions], self.gear * state.qvel[self.dofs]
         feedback = self.bias[:, 0] + self.bias[:, 1] * length + self.bias[:, 2] * speed
-        return self.gear * (self.gain * ctrl[self.actuators] + feedback)
+        return jnp.asarray(self.gear) * (self.gain * ctrl[self.actuators] + feedback)
 
     def with_lead(self, ctrl: jax.Array, lead: jax.Array) -> jax.Array:
         """[U] the command that has the same effect as motors ahead of their links by lead [J] rad."""

@@ -18,7 +18,8 @@ def payload(scene: Scene) -> Effect | None:
     joints = a.arm(scene)
     if not joints:
         return None
-    body = _carrier(scene, joints[-1])
+    last = max(joints, key=lambda joint: scene.id("joint", joint))  # in the chain, whatever order the channels have
+    body = _carrier(scene, last)
     mass = float(scene.model.body_mass[body])
     if mass <= 0:
         return None
@@ -33,7 +34,7 @@ def payload(scene: Scene) -> Effect | None:
         what="a tool or load that the arm's controller does not know of",
         mark="free motion: all joints in proportion to their lever",
         confused_with=("torque_bias", "cable_pull"),
-        places={joints[-1]: (MASS,)},
+        places={last: (MASS,)},
         smallest=0.02,
     )
 

@@ -1,0 +1,107 @@
+"""How long a fit takes on this machine, compilation included: the paper's size, and the quick preset.
+
+    python benchmarks/time_to_fit.py [--quick] [--out DIR]
+
+Paper's size: 30 samples, 100 generations, one opening of 3,850 steps of 2 ms (demonstration A).  Quick
+preset: `python -m droid_jax.run` in a process of its own.  Both start with an empty compilation cache.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
+
+import json  # noqa: E402
+
+import tyro  # noqa: E402
+
+from benchmarks.common import origin  # noqa: E402
+from droid_jax.storage import write_json  # noqa: E402
+
+POPULATION, GENERATIONS, TIMESTEP = 30, 100, 0.002
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Options."""
+
+    quick: bool = False
+    """Three generations and no preset: shows that it runs."""
+    out: Path = ROOT / "benchmarks" / "results"
+    """Folder of time_to_fit.json."""
+    part: str = "all"
+    """all, or fit: started by it in a process of its own."""
+
+
+def fit(generations: int) -> dict[str, Any]:
+    """The search alone: s of the whole, and of its first generation, which compiles."""
+    import tuned  # noqa: F401  (before jax starts)
+
+    from droid_jax.compare.cost import make_cost
+    from droid_jax.identify.search import SearchConfig, search
+    from droid_jax.measure.demonstration import demonstration_path
+    from droid_jax.measure.formats import load
+    from droid_jax.measure.surrogate import record, stand_in_truth
+    from droid_jax.model.door import door_space
+    from droid_jax.model.door_scene import door_scene
+
+    scene = door_scene(timestep=TIMESTEP)
+    recording = record(scene, load(demonstration_path("A")), stand_in_truth(scene, 1, 1), seed=1, name="A")
+    began = time.perf_counter()
+    cost = make_cost(scene, door_space(scene), [recording])
+    config = SearchConfig(population=POPULATION, parents=5, generations=generations, tol_cost=0, tol_sigma=0)
+    found = search(cost, cost.space, config)
+    return {
+        "seconds": time.perf_counter() - began,
+        "first_generation_s": float(found.history.seconds[0]),
+        "generations": len(found.history.seconds),
+        "population": POPULATION,
+        "steps": len(cost.drives[0].time),
+        "cost_before": float(cost(cost.space.mean[None])[0]),
+        "cost_after": found.best_cost,
+    }
+
+
+def preset() -> dict[str, Any]:
+    """s of `python -m droid_jax.run`, from the command to the finished page."""
+    with tempfile.TemporaryDirectory() as folder:
+        began = time.perf_counter()
+        command = [sys.executable, "-m", "droid_jax.run", "identify", "--out", f"{folder}/run"]
+        subprocess.run(command, check=True, cwd=ROOT, env=empty_cache(folder), stdout=subprocess.DEVNULL)
+        seconds = time.perf_counter() - began
+        stages = json.loads((Path(folder) / "run" / "fit.json").read_text())["seconds"]
+    return {"seconds": seconds, "stages": stages}
+
+
+def empty_cache(folder: str) -> dict[str, str]:
+    """An environment in which nothing has been compiled yet."""
+    return {**os.environ, "XDG_CACHE_HOME": f"{folder}/cache", "PYTHONPATH": str(ROOT)}
+
+
+def main() -> None:
+    arguments = tyro.cli(Arguments, description=__doc__)
+    if arguments.part == "fit":
+        print(json.dumps(fit(3 if arguments.quick else GENERATIONS)))
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, __file__, "--part", "fit", *(["--quick"] if arguments.quick else [])]
+        done = subprocess.run(command, check=True, env=empty_cache(folder), stdout=subprocess.PIPE, text=True)
+    result: dict[str, Any] = {"paper_size_fit": json.loads(done.stdout.splitlines()[-1])}
+    if not arguments.quick:
+        result["quick_preset"] = preset()
+    name = "time_to_fit_quick" if arguments.quick else "time_to_fit"
+    write_json(arguments.out / f"{name}.json", {**origin(0), **result})
+    print(json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,33 @@
+"""U0, the numerical floor: the gap that the simulation's own time step leaves.
+
+The base model is replayed at a quarter of the time step and taken for data.  What the base parameters
+cannot absorb of the difference would be called a gap though nothing is missing.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from droid_jax.compare.cost import Cost, make_cost
+from droid_jax.compare.replay import Drive
+from droid_jax.gap.evidence import Evidence
+from droid_jax.gap.refit import Model
+from droid_jax.gap.screen import project
+from droid_jax.measure.recording import Recording
+from droid_jax.model.scene import with_options
+
+FINER = 4
+
+
+def numerical_floor(evidence: Evidence, model: Model, recording: Recording) -> float:
+    """U0 of a fitted base model on the recording it was fitted to; zero in inverse mode, which has no time step."""
+    cost = evidence.cost
+    if not isinstance(cost.drives[0], Drive):
+        return 0.0
+    scene = with_options(cost.scene, timestep=float(cost.scene.model.opt.timestep) / FINER)
+    values = model.values[[cost.space.index(n) for n in model.space.names]]
+    fine: Cost = make_cost(scene, model.space, [recording], config=cost.comparisons[0].config)
+    count = evidence.repeats
+    off = (fine.whitened(values[None])[0] - cost.whitened(model.values[None])[0]).astype(np.float64) / np.sqrt(count)
+    left = project(off[None], model.refined.jacobian / np.sqrt(count), model.refined.prior * np.sqrt(count))[0]
+    return float(left @ left / len(left))

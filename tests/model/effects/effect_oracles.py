@@ -1,0 +1,223 @@
+"""What each effect promises, written a second time: as a change of the MJCF, or as a formula in numpy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from effect_bench import ARM, JOINTS
+
+Values = Mapping[str, float]
+ByJoint = dict[str, float]
+SLOW = 0.01  # rad/s: the width of smooth signs
+ELBOW_REFERENCE = 0.2  # rad, as in the MJCF
+LEAN = (0.05, -0.08)  # of gravity, to x and to y
+MOMENT = 2.0 * 0.2  # kg m: the panel's mass times its distance from the hinge; shut, it lies along x
+GRAVITY = 9.81
+
+
+@dataclass(frozen=True)
+class Now:
+    """One moment: each joint's angle, speed, actuator torque before, and how far its command is ahead of it."""
+
+    q: ByJoint
+    w: ByJoint
+    load: ByJoint
+    ahead: ByJoint
+
+
+@dataclass(frozen=True)
+class Oracle:
+    """An effect at some values of its parameters.
+
+    edit:  what it is in an MJCF, where MuJoCo has it.
+    force: torque on joints.  loss: friction loss on top of theirs, the sum at least zero.
+    late:  s, of the command.  lead: rad by which motors are ahead of their links.
+    read:  (values, time [T], torque [T,J]) -> [T,J], what the sensor makes of it.
+    joints: those to compare.
+    """
+
+    values: Values
+    edit: Callable[[mujoco.MjSpec, Values], None] | None = None
+    force: Callable[[Values, Now], ByJoint] | None = None
+    loss: Callable[[Values, Now], ByJoint] | None = None
+    late: Callable[[Values], float] | None = None
+    lead: Callable[[Values, Now], ByJoint] | None = None
+    read: Callable[[Values, np.ndarray, np.ndarray], np.ndarray] | None = None
+    joints: tuple[str, ...] = JOINTS
+
+
+def each(*joints: str, **numbers: tuple[float, ...]) -> dict[str, float]:
+    """{"name[joint]": number}."""
+    return {f"{n}[{j}]": v for n, values in numbers.items() for j, v in zip(joints, values, strict=True)}
+
+
+def of_joints(v: Values, name: str) -> np.ndarray:
+    """[J]"""
+    return np.array([v[f"{name}[{j}]"] for j in JOINTS])
+
+
+def at_door(torque: Callable[[Values, float, float], float]) -> Callable[[Values, Now], ByJoint]:
+    """A function of the door's angle and speed."""
+    return lambda v, now: {"door": torque(v, now.q["door"], now.w["door"])}
+
+
+def at_arm(torque: Callable[[Values, str, Now], float]) -> Callable[[Values, Now], ByJoint]:
+    """A function of a joint and the moment; `v` holds that joint's parameters without its name in brackets."""
+
+    def of_arm(v: Values, now: Now) -> ByJoint:
+        own = {j: {n.removesuffix(f"[{j}]"): number for n, number in v.items()} for j in ARM}
+        return {j: torque(own[j], j, now) for j in ARM}
+
+    return of_arm
+
+
+# ----- the MJCF's own means
+
+
+def rest_elsewhere(spec: mujoco.MjSpec, v: Values) -> None:
+    """A constant torque is a spring whose rest lies elsewhere."""
+    joint = spec.joint("door")
+    joint.springref = -v["hinge_preload"] / joint.stiffness[0]
+
+
+def more_frictionloss(spec: mujoco.MjSpec, v: Values) -> None:
+    for joint in ARM:
+        spec.joint(joint).frictionloss += v[f"joint_coulomb[{joint}]"]
+
+
+def lump(spec: mujoco.MjSpec, v: Values) -> None:
+    """A body at the hand's centre of mass, which nobody compensates."""
+    spec.body("hand").add_body(name="lump").add_geom(
+        type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-3, 0, 0], mass=v["payload_mass"], contype=0, conaffinity=0
+    )
+
+
+def other_gains(spec: mujoco.MjSpec, share: Callable[[float, str], float]) -> None:
+    for actuator in spec.actuators:
+        if actuator.target in ARM:
+            factor = share(actuator.gainprm[0], actuator.target)
+            actuator.gainprm[0] *= factor
+            actuator.biasprm[1] *= factor
+
+
+def gravity_leans(spec: mujoco.MjSpec, v: Values) -> None:
+    spec.option.gravity = [GRAVITY * LEAN[0], GRAVITY * LEAN[1], -GRAVITY]
+
+
+# ----- formulas
+
+
+def stribeck(height: float, width: float, speed: float) -> float:
+    return height * np.exp(-((speed / width) ** 2))
+
+
+def latch(v: Values, phi: float, w: float) -> float:
+    """The pull fades in over a tenth of the width; a door beyond shut is not pulled."""
+    return -v["latch_torque"] * (np.exp(-phi / v["latch_width"]) - np.exp(-10 * phi / v["latch_width"])) * (phi > 0)
+
+
+def over_centre(v: Values, phi: float, w: float) -> float:
+    share = phi / v["over_centre_angle"]
+    return -v["over_centre_torque"] * share * np.exp(1 - share) if phi > 0 else 0.0
+
+
+def check(v: Values, phi: float, w: float) -> float:
+    return -v["check_damping"] * w / (1 + np.exp(-(phi - v["check_angle"]) / 0.05)) if w > 0 else 0.0
+
+
+def stretch(joint: str, now: Now) -> float:
+    return now.q[joint] - (ELBOW_REFERENCE if joint == "elbow" else 0.0)
+
+
+ORACLES = {
+    "angle_friction": Oracle(  # below zero in the middle
+        {"angle_friction_slope": -1.5, "angle_friction_curve": 1.8},
+        loss=at_door(lambda v, phi, w: v["angle_friction_slope"] * phi + v["angle_friction_curve"] * phi**2),
+    ),
+    "cable_pull": Oracle(
+        each(*ARM, cable_stiffness=(1.5, -0.7), cable_pull=(-0.4, 0.6)),
+        force=at_arm(lambda v, j, now: -v["cable_stiffness"] * stretch(j, now) - v["cable_pull"]),
+    ),
+    "command_delay": Oracle({"command_delay": 0.0123}, late=lambda v: v["command_delay"]),
+    "door_closer": Oracle(
+        {"closer_damping": 3.0}, force=at_door(lambda v, phi, w: v["closer_damping"] * abs(w) if w < 0 else 0.0)
+    ),
+    "drag": Oracle({"drag": 1.2}, force=at_door(lambda v, phi, w: -v["drag"] * w**2 * np.sign(w))),
+    "hardening_spring": Oracle(
+        {"hardening_square": 1.5, "hardening_cube": -0.8},
+        force=at_door(lambda v, phi, w: -v["hardening_square"] * phi * abs(phi) - v["hardening_cube"] * phi**3),
+    ),
+    "hinge_directional": Oracle(  # more than the hinge has: none at all while it opens
+        {"hinge_directional": -0.3}, loss=at_door(lambda v, phi, w: v["hinge_directional"] * np.tanh(w / SLOW))
+    ),
+    "hinge_preload": Oracle(
+        {"hinge_preload": 0.7}, edit=rest_elsewhere, force=at_door(lambda v, phi, w: -v["hinge_preload"])
+    ),
+    "hinge_stribeck": Oracle(
+        {"hinge_stribeck": 0.8, "hinge_stribeck_speed": 0.06},
+        loss=at_door(lambda v, phi, w: stribeck(v["hinge_stribeck"], v["hinge_stribeck_speed"], w)),
+    ),
+    "joint_backlash": Oracle(  # as far as the command leads, and no further than half the backlash
+        each(*ARM, joint_backlash=(0.015, 0.01)),
+        lead=at_arm(lambda v, j, now: min(abs(now.ahead[j]), v["joint_backlash"] / 2) * np.sign(now.ahead[j])),
+    ),
+    "joint_compliance": Oracle(  # two springs in series
+        each(*ARM, joint_compliance=(3e-4, 4e-4)),
+        edit=lambda spec, v: other_gains(spec, lambda kp, j: 1 / (1 + kp * v[f"joint_compliance[{j}]"])),
+    ),
+    "joint_coulomb": Oracle(
+        each(*ARM, joint_coulomb=(0.5, 0.2)), edit=more_frictionloss, loss=at_arm(lambda v, j, now: v["joint_coulomb"])
+    ),
+    "joint_directional": Oracle(
+        each(*ARM, joint_directional=(0.5, -0.3)),
+        loss=at_arm(lambda v, j, now: v["joint_directional"] * np.tanh(now.w[j] / SLOW)),
+    ),
+    "joint_stribeck": Oracle(
+        {**each(*ARM, joint_stribeck=(0.6, 0.3)), "joint_stribeck_speed": 0.15},
+        loss=at_arm(lambda v, j, now: stribeck(v["joint_stribeck"], v["joint_stribeck_speed"], now.w[j])),
+    ),
+    "latch": Oracle({"latch_torque": 1.5, "latch_width": 0.05}, force=at_door(latch)),
+    "load_friction": Oracle(
+        each(*ARM, load_friction=(0.1, 0.2)), loss=at_arm(lambda v, j, now: v["load_friction"] * abs(now.load[j]))
+    ),
+    "opening_check": Oracle({"check_damping": 2.5, "check_angle": 0.4}, force=at_door(check)),
+    "over_centre_spring": Oracle({"over_centre_torque": 1.5, "over_centre_angle": 0.25}, force=at_door(over_centre)),
+    "payload": Oracle({"payload_mass": 0.3}, edit=lump),
+    "sensor_delay": Oracle(
+        {"sensor_delay": 0.0077},
+        read=lambda v, t, torque: np.stack([np.interp(t - v["sensor_delay"], t, c) for c in torque.T], axis=1),
+    ),
+    "servo_gain": Oracle(
+        each(*ARM, servo_gain=(0.1, -0.2)),
+        edit=lambda spec, v: other_gains(spec, lambda kp, j: 1 + v[f"servo_gain[{j}]"]),
+    ),
+    "tilted_frame": Oracle(  # the arm's weight leans with it: the door alone
+        {"tilt_sine": MOMENT * GRAVITY * LEAN[0], "tilt_cosine": -MOMENT * GRAVITY * LEAN[1]},
+        edit=gravity_leans,
+        force=at_door(lambda v, phi, w: MOMENT * GRAVITY * (LEAN[1] * np.cos(phi) - LEAN[0] * np.sin(phi))),
+        joints=("door",),
+    ),
+    "torque_bias": Oracle(
+        each(*JOINTS, torque_bias=(0.3, -0.2, 0.1)), read=lambda v, t, torque: torque + of_joints(v, "torque_bias")
+    ),
+    "torque_drift": Oracle(
+        each(*JOINTS, torque_drift=(0.05, -0.02, 0.03)),
+        read=lambda v, t, torque: torque + np.outer(t - t.mean(), of_joints(v, "torque_drift")),
+    ),
+    "torque_gain": Oracle(
+        each(*JOINTS, torque_gain=(0.05, -0.03, 0.1)),
+        read=lambda v, t, torque: torque * (1 + of_joints(v, "torque_gain")),
+    ),
+    "torque_ripple": Oracle(
+        {**each(*ARM, ripple_sine=(0.2, -0.1), ripple_cosine=(-0.15, 0.3)), "ripple_periods": 13.0},
+        force=at_arm(
+            lambda v, j, now: (
+                v["ripple_sine"] * np.sin(v["ripple_periods"] * now.q[j])
+                + v["ripple_cosine"] * np.cos(v["ripple_periods"] * now.q[j])
+            )
+        ),
+    ),
+}

@@ -1,0 +1,317 @@
+"""What every effect promises, whatever it is: nothing at neutral, something beyond, and no more than it declares."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from effect_bench import Bench, amplitudes, bare, door, door_bench, everywhere, make_bench, mechanism, typical
+
+from droid_jax.model.effects.registry import library, registered
+from droid_jax.model.parameters import Space
+from droid_jax.model.physics import DERIVED, Physics, make_physics, written_fields
+from droid_jax.model.scene import Scene
+from droid_jax.model.seam import Effect, Rollout, State
+
+EFFECTS = registered()
+NEUTRAL = 1e-3  # N m: what a program compiled with the effects may differ by from one without
+# N m, worst moment: above what two programs differ by, and less than any effect does even where a recording hardly
+# shows it (a closer in a door that only opens).
+SEEN = 2e-3
+# N m: a torque that goes up and down again from step to step.  The bare scenes stay below 0.02.
+CHATTER = 0.1
+
+
+@pytest.fixture(scope="session", params=["mechanism", "door"])
+def scene(request: pytest.FixtureRequest) -> Scene:
+    return mechanism() if request.param == "mechanism" else door()
+
+
+@pytest.fixture(params=EFFECTS)
+def effect(request: pytest.FixtureRequest, scene: Scene) -> Effect:
+    """Each effect on each scene that can have it."""
+    made = library(scene, [request.param])
+    if not made:
+        assert (request.param, scene.name) == ("contact_compliance", "mechanism")
+        pytest.skip("nothing is gripped in the small scene")
+    return made[0]
+
+
+@pytest.fixture(params=[n for n in EFFECTS if n != "contact_compliance"])
+def built_in(request: pytest.FixtureRequest, small: Bench) -> Effect:
+    """Each effect of the small scene, as its compiled replay has it."""
+    return small.effect(request.param)
+
+
+# ----- what is declared
+
+
+def test_the_name_is_the_registered_one(effect: Effect, request: pytest.FixtureRequest):
+    assert effect.name == request.node.callspec.params["effect"]
+
+
+def test_parameters_are_amplitudes_and_shapes(effect: Effect):
+    """Each is one of the two, amplitudes of one place alone and zero at neutral."""
+    named = [n for place in effect.places.values() for n in place]
+    assert named and all(effect.places.values())
+    assert sorted([*named, *effect.shapes]) == sorted(p.name for p in effect.parameters)
+    for parameter in amplitudes(effect):
+        assert parameter.mean == 0.0
+        assert 0 < effect.smallest < parameter.high
+        assert parameter.mean + parameter.std <= parameter.high
+        assert not parameter.nuisance and parameter.unit
+
+
+def test_shapes_start_at_one_of_the_values_to_try(effect: Effect):
+    space = Space(effect.parameters)
+    for name, values in effect.shapes.items():
+        assert len(values) > 1 and list(values) == sorted(set(values))
+        assert space[name].mean in values
+        assert space[name].low <= values[0] and values[-1] <= space[name].high
+        assert not space[name].writes
+
+
+def test_words_are_there(effect: Effect):
+    for words in (effect.what, effect.mark):
+        assert len(words.split()) >= 3 and words == words.strip() and not words.endswith(".")
+
+
+def test_what_it_may_be_confused_with_exists(effect: Effect):
+    assert effect.confused_with
+    assert set(effect.confused_with) <= set(EFFECTS) - {effect.name}
+    assert len(set(effect.confused_with)) == len(effect.confused_with)
+
+
+def test_it_does_something(effect: Effect):
+    functions = (effect.command, effect.servo, effect.force, effect.frictionloss, effect.observe)
+    assert any(functions) or all(p.writes for p in effect.parameters)
+
+
+# ----- neutral, by each function alone
+
+
+def moments(scene: Scene) -> list[State]:
+    """States in motion, creeping and at rest."""
+    rng = np.random.default_rng(4)
+    model = scene.model
+
+    def draw(size: int, scale: float) -> jax.Array:
+        return jnp.asarray(scale * rng.normal(size=size), jnp.float32)
+
+    return [
+        State(jnp.float32(time), draw(model.nq, 1.0), draw(model.nv, speed), draw(model.nv, 5.0))
+        for time, speed in ((0.0, 1.0), (0.3, 0.01), (0.6, 0.0))
+    ]
+
+
+def trace(scene: Scene) -> Rollout:
+    rng = np.random.default_rng(5)
+    time = jnp.linspace(0.0, 1.0, 11)
+    torque, position, velocity = (jnp.asarray(rng.normal(size=(11, len(scene.joints))), jnp.float32) for _ in range(3))
+    return Rollout(time, torque, position, velocity, position[:, 0], jnp.zeros((11, 0), bool), jnp.array(True))
+
+
+@pytest.mark.parametrize("given", [True, False], ids=["means", "absent"])
+def test_each_function_changes_nothing_at_neutral(effect: Effect, scene: Scene, given: bool):
+    """To the last digit, with the means in theta and with nothing there."""
+    theta = {p.name: jnp.float32(p.mean) for p in effect.parameters if given and not p.writes}
+    for state in moments(scene):
+        if effect.force:
+            np.testing.assert_array_equal(effect.force(theta, state), np.zeros(scene.model.nv))
+        if effect.frictionloss:
+            base = jnp.asarray(scene.model.dof_frictionloss, jnp.float32)
+            np.testing.assert_array_equal(effect.frictionloss(theta, state, base), base)
+        if effect.servo:
+            ctrl = jnp.cos(jnp.arange(scene.model.nu, dtype=jnp.float32))
+            np.testing.assert_array_equal(effect.servo(theta, state, ctrl), ctrl)
+        if effect.command:
+            np.testing.assert_array_equal(effect.command(theta, state.time, jnp.sin), jnp.sin(state.time))
+    if effect.observe:
+        rollout = trace(scene)
+        jax.tree.map(np.testing.assert_array_equal, effect.observe(theta, rollout), rollout)
+
+
+def test_a_shape_that_is_absent_is_at_its_mean(effect: Effect, scene: Scene):
+    loud = {p.name: jnp.float32(typical(p)) for p in amplitudes(effect)}
+    stated = loud | {name: jnp.float32(Space(effect.parameters)[name].mean) for name in effect.shapes}
+    base = jnp.asarray(scene.model.dof_frictionloss, jnp.float32)
+    for state in moments(scene) if effect.shapes else ():
+        if effect.force:
+            np.testing.assert_array_equal(effect.force(loud, state), effect.force(stated, state))
+        if effect.frictionloss:
+            given, absent = (effect.frictionloss(theta, state, base) for theta in (stated, loud))
+            np.testing.assert_array_equal(given, absent)
+
+
+def test_friction_never_pushes(effect: Effect, scene: Scene):
+    """At both bounds of every parameter the friction loss stays at or above zero, on more than one state."""
+    if not effect.frictionloss:
+        return
+    base = jnp.asarray(scene.model.dof_frictionloss, jnp.float32)
+    for bound in ("low", "high"):
+        theta = {p.name: jnp.float32(getattr(p, bound)) for p in effect.parameters}
+        losses = np.array([effect.frictionloss(theta, state, base) for state in moments(scene)])
+        assert (losses >= 0).all()
+        assert bound == "low" or not np.array_equal(losses[1], base)
+
+
+# ----- the model
+
+
+def numbers(model: Any, path: str = "") -> dict[str, np.ndarray]:
+    """Every array of an mjx.Model, parts included."""
+    out = {}
+    for field in dataclasses.fields(model):
+        value = getattr(model, field.name)
+        if dataclasses.is_dataclass(value):
+            out.update(numbers(value, f"{path}{field.name}."))
+        elif isinstance(value, (np.ndarray, jax.Array, float)):
+            out[f"{path}{field.name}"] = np.asarray(value)
+    return out
+
+
+def differing(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> set[str]:
+    assert a.keys() == b.keys() and len(a) > 60
+    return {n.split(".")[0] for n in a if not np.array_equal(a[n], b[n], equal_nan=a[n].dtype.kind == "f")}
+
+
+@pytest.fixture
+def apply(scene: Scene, effect: Effect) -> Callable[[np.ndarray], Physics]:
+    """Values [D] of an effect's parameters -> physics."""
+    space = Space(effect.parameters)
+    make = functools.partial(make_physics, scene, space)
+    make = jax.jit(make) if written_fields(space) else make  # op by op, what is derived would take seconds
+    return lambda values: make(jnp.asarray(values, jnp.float32))
+
+
+def test_only_declared_fields_of_the_model_change(effect: Effect, scene: Scene, apply):
+    physics = apply(np.array([typical(p) for p in effect.parameters]))
+    named = {w.field for p in effect.parameters for w in p.writes}
+    changed = differing(numbers(physics.model), numbers(scene.mjx))
+    assert named <= changed <= set(written_fields(Space(effect.parameters))) <= named | set(DERIVED)
+    outside = {p.name: typical(p) for p in effect.parameters if not p.writes}
+    assert {n: float(v) for n, v in physics.theta.items()} == pytest.approx(outside)
+
+
+def test_applying_twice_is_applying_once(effect: Effect, scene: Scene, apply):
+    values = np.array([typical(p) for p in effect.parameters])
+    before = numbers(scene.mjx)
+    once = apply(values)
+    apply(np.array([p.high for p in effect.parameters]))
+    assert not differing(numbers(once.model), numbers(apply(values).model))
+    assert not differing(numbers(scene.mjx), before)
+
+
+def test_contacts_take_their_time_constant_from_all_of_a_grips_pairs():
+    scene = door()
+    (effect,) = library(scene, ["contact_compliance"])
+    model = make_physics(scene, Space(effect.parameters), jnp.array([0.5])).model
+    assert scene.model.npair == 4 and sum(map(len, scene.finger_pairs)) == 4
+    np.testing.assert_allclose(model.pair_solref, scene.model.pair_solref * [1.5, 1.0], rtol=1e-6)
+
+
+# ----- the replay
+
+
+def check_neutral(bench: Bench, base: Rollout) -> None:
+    neutral = jax.tree.map(lambda array: array[0], bench.run(bench.space.mean[None]))
+    np.testing.assert_allclose(neutral.torque, base.torque, atol=NEUTRAL)
+    np.testing.assert_allclose(neutral.position, base.position, atol=1e-5)
+    np.testing.assert_allclose(neutral.object_angle, base.object_angle, atol=1e-5)
+    assert neutral.finite and np.abs(base.torque).max() > 100 * NEUTRAL
+
+
+def check_amplitudes(bench: Bench, effect: Effect) -> None:
+    """Each by itself, at a typical value and at its bounds, is seen and stays finite."""
+    rows = [{}]
+    for p in amplitudes(effect):
+        rows += [{p.name: value} for value in (typical(p), p.high, p.low) if value != p.mean]
+    got = bench.run(np.array([bench.space.values(row) for row in rows]))
+    assert got.finite.all() and np.isfinite(got.torque).all()
+    change = np.abs(got.torque[1:] - got.torque[0]).max(axis=(1, 2))
+    assert not [row for row, seen in zip(rows[1:], change > SEEN, strict=True) if not seen]
+
+
+def check_shapes(bench: Bench, effect: Effect) -> None:
+    """They do nothing by themselves, and every value of them is another effect beside an amplitude."""
+    for name, values in effect.shapes.items():
+        shape = bench.space[name]
+        tried = [{name: v} for v in (*values, shape.low, shape.high)]
+        quiet = bench.torque({}, *tried)
+        np.testing.assert_array_equal(quiet, np.broadcast_to(quiet[:1], quiet.shape))
+        loud = bench.torque(*({**everywhere(effect), **row} for row in tried))
+        assert np.isfinite(loud).all()
+        apart = np.abs(loud[:, None] - loud[None]).max(axis=(2, 3))
+        assert (apart[~np.eye(len(tried), dtype=bool)] > SEEN).all(), apart
+
+
+def check_calm(bench: Bench, effect: Effect) -> None:
+    """No effect makes the torque jump up and down from one step to the next, or blow up."""
+    for torque in bench.torque(everywhere(effect), everywhere(effect, lambda p: p.high)):
+        change = np.diff(torque, axis=0)
+        turns = change[1:] * change[:-1] < 0
+        assert np.where(turns, np.minimum(np.abs(change[1:]), np.abs(change[:-1])), 0.0).max() < CHATTER
+
+
+def test_neutral_is_the_scene_without_effects(small: Bench, small_bare: Rollout):
+    check_neutral(small, small_bare)
+
+
+def test_every_amplitude_is_seen(small: Bench, built_in: Effect):
+    check_amplitudes(small, built_in)
+
+
+def test_shapes_matter_beside_an_amplitude(small: Bench, built_in: Effect):
+    check_shapes(small, built_in)
+
+
+def test_nothing_chatters(small: Bench, built_in: Effect):
+    check_calm(small, built_in)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [n for n in EFFECTS if n != "contact_compliance"])
+def test_neutral_alone_is_the_scene_without_effects(small: Bench, small_bare: Rollout, name: str):
+    check_neutral(make_bench(small.scene, small.drive, [small.effect(name)]), small_bare)
+
+
+@pytest.mark.slow
+def test_neutral_is_the_door_without_effects(real: Bench):
+    base = bare(real)
+    assert np.rad2deg(base.object_angle.max()) > 45
+    check_neutral(real, base)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EFFECTS)
+def test_on_the_door(real: Bench, name: str):
+    effect = real.effect(name)
+    check_amplitudes(real, effect)
+    check_shapes(real, effect)
+    check_calm(real, effect)
+
+
+@pytest.mark.slow
+def test_soft_contacts_are_contacts_of_another_time_constant(real: Bench):
+    """The one effect that the small scene cannot have, against a model compiled with it."""
+    model = copy.copy(real.scene.model)
+    model.pair_solref[:, 0] *= 1.5
+    soft = bare(dataclasses.replace(real, scene=dataclasses.replace(real.scene, model=model)))
+    neutral, got = real.torque({}, {"contact_softness": 0.5})
+    np.testing.assert_allclose(got, soft.torque, atol=NEUTRAL)
+    assert np.abs(got - neutral).max() > 20 * NEUTRAL
+
+
+@pytest.mark.slow
+def test_soft_gears_stay_calm_behind_a_stiff_servo():
+    """A servo of 4500 N m/rad against half a thousandth of a rad/(N m): a loop gain above two."""
+    bench = door_bench("paper", ["joint_backlash", "joint_compliance"])
+    for effect in bench.effects:
+        check_calm(bench, effect)

@@ -1,0 +1,165 @@
+"""Effects in the inverse mode: what a prescribed motion has to overcome, on the motor's side and on the link's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+import pytest
+from effect_bench import JOINTS, MECHANISM, mechanism
+from effect_oracles import ORACLES, SLOW, Now
+
+from droid_jax.compare.inverse import inverse_replay
+from droid_jax.compare.population import over_population
+from droid_jax.measure.motion import Motion
+from droid_jax.measure.recording import TorqueConvention, TorqueSide
+from droid_jax.model.effects.registry import effect_space, library
+from droid_jax.model.joint_friction import joint_friction_effect, joint_friction_space
+from droid_jax.model.parameters import Space
+from droid_jax.model.physics import make_physics
+from droid_jax.model.scene import Scene
+
+MOTOR, LINK = TorqueSide.MOTOR, TorqueSide.LINK
+STEERING = ("command_delay", "joint_backlash", "joint_compliance")
+COULOMB = 0.15  # N m: the friction that a link-side sensor sees already, in one row of each comparison
+TOLERANCE = 1e-4  # N m: float32, 6e-8 of inertias times accelerations and of 9 N m of weight, summed
+
+
+def prescribed(scene: Scene, side: TorqueSide, gravity: bool) -> Motion:
+    """Moments without order: every sign of angle and speed, some nearly at rest."""
+    rng = np.random.default_rng(6)
+    size = (80, len(scene.joints))
+    speed = rng.normal(0, 1.0, size)
+    speed[::4] *= 0.02
+    return Motion(
+        time=0.01 * np.arange(len(speed)),
+        position=rng.uniform(-0.3, 1.0, size),
+        velocity=speed,
+        acceleration=rng.normal(0, 3.0, size),
+        torque=TorqueConvention(side, gravity),
+    )
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return mechanism()
+
+
+class Inverse:
+    """The inverse replay with all effects that it can have, and the sensor's own friction."""
+
+    def __init__(self, scene: Scene, side: TorqueSide, gravity: bool) -> None:
+        self.scene, self.side = scene, side
+        self.motion = prescribed(scene, side, gravity)
+        effects = [e for e in library(scene) if e.name not in STEERING]
+        self.space: Space = effect_space(effects) + joint_friction_space(JOINTS)
+        replay = inverse_replay(scene, self.motion, [*effects, joint_friction_effect(JOINTS)])
+        self.run = over_population(lambda v: replay(make_physics(scene, self.space, v)))
+
+    def torque(self, *rows: dict[str, float]) -> np.ndarray:
+        """[P, T, J] N m"""
+        return self.run(np.array([self.space.values(row) for row in rows])).torque.astype(float)
+
+    def by_formula(self, function: Callable, v: dict[str, float], load: np.ndarray) -> np.ndarray:
+        """[T, J] of an oracle's force or loss; NaN where it has none."""
+        out = np.full(load.shape, np.nan)
+        for k, numbers in enumerate(zip(self.motion.position, self.motion.velocity, load, strict=True)):
+            q, w, torque = (dict(zip(JOINTS, n.tolist(), strict=True)) for n in numbers)
+            for joint, value in function(v, Now(q, w, torque, {})).items():
+                out[k, JOINTS.index(joint)] = value
+        return out
+
+
+@pytest.fixture(scope="module", params=[(MOTOR, True), (LINK, False)], ids=["motor", "link"])
+def inverse(request: pytest.FixtureRequest, scene: Scene) -> Inverse:
+    return Inverse(scene, *request.param)
+
+
+def mj_inverse(spec: mujoco.MjSpec, motion: Motion, gravity: bool) -> np.ndarray:
+    """[T, J] N m that the links of an MJCF ask for."""
+    for body in spec.bodies:
+        body.gravcomp = 0
+    for joint in spec.joints:
+        joint.frictionloss = 0
+    spec.option.gravity = [0, 0, -9.81 * gravity]
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    dofs = [int(model.joint(j).dofadr[0]) for j in JOINTS]
+    out = []
+    for moment in zip(motion.position, motion.velocity, motion.acceleration, strict=True):
+        data.qpos[dofs], data.qvel[dofs], data.qacc[dofs] = moment
+        mujoco.mj_inverse(model, data)
+        out.append(data.qfrc_inverse[dofs].copy())
+    return np.array(out)
+
+
+@pytest.mark.parametrize("name", [n for n, o in ORACLES.items() if o.force])
+def test_forces_have_to_be_overcome(inverse: Inverse, name: str):
+    oracle = ORACLES[name]
+    neutral, got = inverse.torque({}, dict(oracle.values))
+    push = np.nan_to_num(inverse.by_formula(oracle.force, oracle.values, neutral))
+    np.testing.assert_allclose(got - neutral, -push, atol=TOLERANCE)
+    assert np.abs(push).max() > 100 * TOLERANCE
+
+
+@pytest.mark.parametrize("coulomb", [0.0, COULOMB])
+@pytest.mark.parametrize("name", [n for n, o in ORACLES.items() if o.loss])
+def test_friction_has_to_be_overcome(inverse: Inverse, name: str, coulomb: float):
+    """On top of what is there: the MJCF's before the motor's sensor, the sensor's own behind the gear."""
+    oracle = ORACLES[name]
+    seen = {f"coulomb[{j}]": coulomb for j in JOINTS}
+    neutral, got = inverse.torque(seen, {**seen, **oracle.values})
+    scene = inverse.scene
+    motors = scene.model.dof_frictionloss[scene.joint_dofs]
+    own = np.broadcast_to(motors if inverse.side is MOTOR else np.full(len(JOINTS), coulomb), neutral.shape)
+    direction = np.tanh(inverse.motion.velocity / SLOW)
+    more = inverse.by_formula(oracle.loss, oracle.values, neutral - coulomb * direction)
+    loss = np.where(np.isnan(more), own, np.maximum(own + more, 0.0))
+    expected = (loss - own) * direction
+    np.testing.assert_allclose(got - neutral, expected, atol=TOLERANCE)
+    assert np.abs(expected).max() > 100 * TOLERANCE
+
+
+@pytest.mark.parametrize("name", [n for n, o in ORACLES.items() if o.read])
+def test_sensors_read_what_they_read(inverse: Inverse, name: str):
+    oracle = ORACLES[name]
+    neutral, got = inverse.torque({}, dict(oracle.values))
+    np.testing.assert_allclose(got, oracle.read(oracle.values, inverse.motion.time, neutral), atol=TOLERANCE)
+    assert np.abs(got - neutral).max() > 100 * TOLERANCE
+
+
+def test_a_payload_is_carried(inverse: Inverse):
+    oracle = ORACLES["payload"]
+    neutral, got = inverse.torque({}, dict(oracle.values))
+    loaded = mujoco.MjSpec.from_string(MECHANISM)
+    oracle.edit(loaded, oracle.values)
+    gravity = inverse.motion.torque.gravity
+    expected = mj_inverse(loaded, inverse.motion, gravity)
+    expected -= mj_inverse(mujoco.MjSpec.from_string(MECHANISM), inverse.motion, gravity)
+    np.testing.assert_allclose(got - neutral, expected, atol=TOLERANCE)
+    assert np.abs(expected).max() > 100 * TOLERANCE
+
+
+def test_gains_of_servos_that_nobody_asks_change_nothing(inverse: Inverse):
+    neutral, got = inverse.torque({}, dict(ORACLES["servo_gain"].values))
+    np.testing.assert_array_equal(got, neutral)
+
+
+def test_these_are_all_effects(scene: Scene):
+    """Whatever is added to the library has to find its place here."""
+    left = {n for n, o in ORACLES.items() if not (o.force or o.loss or o.read)}
+    assert left == {"payload", "servo_gain", *STEERING}
+    assert {e.name for e in library(scene)} == set(ORACLES)
+
+
+@pytest.mark.parametrize("name", STEERING)
+def test_what_steers_is_refused_by_name(scene: Scene, name: str):
+    given = prescribed(scene, MOTOR, True)
+    with pytest.raises(ValueError, match=rf"no commands that an effect could change: {name}$"):
+        inverse_replay(scene, given, library(scene, ["drag", name, "torque_bias"]))
+
+
+def test_all_that_steer_are_named(scene: Scene):
+    with pytest.raises(ValueError, match=", ".join(STEERING)):
+        inverse_replay(scene, prescribed(scene, LINK, False), library(scene))

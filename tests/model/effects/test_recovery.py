@@ -1,0 +1,49 @@
+"""A recording with an effect in it gives the effect's own parameters back."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from effect_bench import Bench
+from effect_oracles import ORACLES
+
+from droid_jax.identify.refine import RefineConfig, refine
+from droid_jax.model.parameters import Space
+from droid_jax.model.seam import Effect
+
+NOISE = 0.003  # N m: a sensor's 0.01, the mean of ten repeats
+FAR = 5.0  # posterior deviations: 52 parameters stay inside unless something is wrong
+KNOWN = 0.15  # of a value: a posterior no wider says that the recording tells it
+LEFT_OVER = 1.05  # mean square of the residuals in units of the noise, which is 1 but for its own scatter of 0.01
+
+
+def starts(effect: Effect, free: Space) -> np.ndarray:
+    """[S, D] neutral, with every combination of shapes to try."""
+    combinations = itertools.product(*effect.shapes.values())
+    return np.array([free.values(dict(zip(effect.shapes, c, strict=True))) for c in combinations])
+
+
+@pytest.mark.parametrize("name", ORACLES)
+def test_the_effects_parameters_come_back(small: Bench, name: str):
+    """From neutral and the shapes to try, none of them the true one; every other effect stays at neutral."""
+    truth = dict(ORACLES[name].values)
+    free = small.space.select(truth)
+    columns = [small.space.index(n) for n in truth]
+    clean = small.torque(truth)[0]
+    measured = clean + np.random.default_rng(0).normal(0, NOISE, clean.shape)
+
+    def residuals(values: np.ndarray) -> np.ndarray:
+        whole = np.tile(small.space.mean, (len(values), 1))
+        whole[:, columns] = values
+        return ((small.run(whole).torque - measured) / NOISE).reshape(len(values), -1)
+
+    start = starts(small.effect(name), free)
+    true = np.array(list(truth.values()))
+    assert (start != true).all() and (np.mean(residuals(start) ** 2, axis=1) > 2.0).all()
+    fit = refine(residuals, free, start, RefineConfig(hops=0))
+    deviation = np.sqrt(np.diag(np.linalg.inv(fit.hessian))) * free.std
+    assert np.mean(fit.residual**2) < LEFT_OVER
+    assert (np.abs(fit.best - true) < FAR * deviation).all(), (fit.best, true, deviation)
+    assert (deviation < KNOWN * np.abs(true)).all(), (true, deviation)

@@ -1,0 +1,166 @@
+"""The list of effects: what a scene can have, names, and effects of one's own."""
+
+from __future__ import annotations
+
+import copy
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from effect_bench import ARM, JOINTS, MECHANISM, Bench, make_bench, mechanism
+
+from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effects import registry
+from droid_jax.model.effects.registry import effect_space, library, ready, register, registered
+from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene, compile_scene
+from droid_jax.model.seam import Effect
+
+OF_HINGES = {"angle_friction", "door_closer", "drag", "hardening_spring", "hinge_directional", "hinge_preload",
+             "hinge_stribeck", "latch", "opening_check", "over_centre_spring", "tilted_frame"}  # fmt: skip
+OF_ARMS = {"cable_pull", "joint_backlash", "joint_compliance", "joint_coulomb", "joint_directional", "joint_stribeck",
+           "load_friction", "payload", "servo_gain", "torque_ripple"}  # fmt: skip
+OF_SERVOS = {"joint_backlash", "joint_compliance"}
+OF_GRIPS = {"contact_compliance"}
+
+
+@pytest.fixture
+def own_list(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever a test registers is gone after it."""
+    registered()
+    monkeypatch.setattr(registry, "_MAKERS", copy.copy(registry._MAKERS))
+
+
+def names(scene: Scene) -> set[str]:
+    return {e.name for e in library(scene)}
+
+
+def edited(old: str, new: str, **options) -> Scene:
+    assert old in MECHANISM
+    options = {"joints": JOINTS, "object_joint": "door", **options}
+    return compile_scene(mujoco.MjSpec.from_string(MECHANISM.replace(old, new)), "edited", **options)
+
+
+# ----- what a scene can have
+
+
+def test_the_small_scene_has_all_but_the_grip():
+    assert names(mechanism()) == set(registered()) - OF_GRIPS
+
+
+def test_a_scene_without_an_object_has_no_effects_of_hinges():
+    assert names(edited("", "", object_joint=None)) == set(registered()) - OF_GRIPS - OF_HINGES
+
+
+def test_a_drawer_has_no_effects_of_hinges():
+    assert names(edited('"door" axis', '"door" type="slide" axis')) == set(registered()) - OF_GRIPS - OF_HINGES
+
+
+def test_a_door_alone_has_no_effects_of_arms():
+    assert names(edited("", "", joints=["door"])) == set(registered()) - OF_GRIPS - OF_ARMS
+
+
+def test_motors_feel_no_soft_gears():
+    """Their torque is what is commanded, wherever they stand."""
+    motors = edited('"s" joint="shoulder" kp="80"', '"s" joint="shoulder" kp="0"')
+    compliant = library(motors, sorted(OF_SERVOS))
+    assert [list(e.places) for e in compliant] == [["elbow"], ["elbow"]]
+    for effect in compliant:
+        assert [p.name for p in effect.parameters] == [f"{effect.name}[elbow]"]
+
+
+def test_joints_without_servos_have_none_of_theirs():
+    passive = edited('<position name="s" joint="shoulder" kp="80"/>', "")
+    assert list(library(passive, ["servo_gain"])[0].places) == ["elbow"]
+    assert list(library(passive, ["joint_coulomb"])[0].places) == list(ARM)
+
+
+def test_the_payload_hangs_on_the_end_of_the_chain():
+    """Though the channels name the elbow first, as the actuators do."""
+    scene = edited("", "", joints=None)
+    assert scene.joints == ("elbow", "door", "shoulder")
+    (payload,) = library(scene, ["payload"])
+    assert list(payload.places) == ["elbow"]
+    assert {w.index for p in payload.parameters for w in p.writes} == {(scene.id("body", "hand"),)}
+
+
+# ----- names
+
+
+def test_the_library_is_in_the_order_of_names_or_as_asked_for():
+    scene = mechanism()
+    assert [e.name for e in library(scene)] == sorted(names(scene))
+    assert registered() == tuple(sorted(registered()))
+    assert [e.name for e in library(scene, ["latch", "drag"])] == ["latch", "drag"]
+    assert library(scene, []) == ()
+    assert library(scene, ["contact_compliance"]) == ()
+
+
+def test_unknown_names_are_listed_with_the_valid_ones():
+    with pytest.raises(ValueError, match=r"unknown effects lath, dragg; valid: angle_friction, .*, torque_ripple$"):
+        library(mechanism(), ["lath", "latch", "dragg"])
+
+
+def test_no_two_effects_share_a_parameter():
+    assert len(effect_space(library(mechanism()))) == sum(len(e.parameters) for e in library(mechanism()))
+
+
+# ----- effects of one's own
+
+
+def test_a_taken_name_is_refused(own_list: None):
+    def drag(scene: Scene) -> Effect | None:
+        return None
+
+    with pytest.raises(ValueError, match=r"'drag' is registered already, by droid_jax\.model\.effects\.drag"):
+        register(drag)
+    assert [e.name for e in library(mechanism(), ["drag"])] == ["drag"]
+
+
+def test_the_same_function_may_come_again(own_list: None):
+    """As when its file is run twice in one session."""
+    before = registered()
+    register(registry._MAKERS["drag"])
+    assert registered() == before
+
+
+def test_an_effect_of_ones_own_is_part_of_the_library(own_list: None, small: Bench):
+    """A wind that opens the door: the opposite of a preload."""
+
+    @register
+    def wind(scene: Scene) -> Effect | None:
+        joint = a.hinge(scene)
+        if joint is None:
+            return None
+        return Effect(
+            "wind",
+            (a.amplitude("wind", "N m", 0.5, 5.0),),
+            force=lambda theta, state: jnp.zeros_like(state.qvel).at[scene.dof(joint)].set(theta["wind"]),
+            places={joint: ("wind",)},
+            smallest=0.1,
+        )
+
+    assert "wind" in registered()
+    assert [e.name for e in library(small.scene)] == sorted([*(e.name for e in small.effects), "wind"])
+    assert "wind" not in names(edited("", "", object_joint=None))
+    assert "wind" in effect_space(library(small.scene)).names
+    blown = make_bench(small.scene, small.drive, library(small.scene, ["wind"]))
+    np.testing.assert_allclose(blown.torque({"wind": 0.8}), small.torque({"hinge_preload": -0.8}), atol=1e-3)
+    assert np.abs(blown.torque({"wind": 0.8}) - blown.torque({})).max() > 0.5
+
+
+def test_it_is_gone_afterwards():
+    assert "wind" not in registered()
+
+
+# ----- rows of friction
+
+
+def test_a_ready_scene_has_a_friction_row_for_every_joint():
+    bare = edited("", "")
+    losses = bare.model.dof_frictionloss.copy()
+    made = ready(bare)
+    np.testing.assert_array_equal(bare.model.dof_frictionloss, losses)
+    assert losses.min() == 0.0
+    np.testing.assert_array_equal(made.model.dof_frictionloss, np.maximum(losses, TINY_FRICTIONLOSS))
+    assert made.joints == bare.joints and made.object_joint == "door"
