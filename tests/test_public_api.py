@@ -22,7 +22,10 @@ from droid_jax import runtime
 from droid_jax.identify.pipeline import identify as identify_function
 from droid_jax.identify.refine import RefineConfig
 from droid_jax.identify.search import SearchConfig
+from droid_jax.model.door_scene import door_scene
+from droid_jax.model.effects import registry
 from droid_jax.model.own import load_parameters
+from droid_jax.model.seam import State
 from droid_jax.run import Identify, _config, _model, main
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -236,6 +239,19 @@ def test_the_command_of_own_robot_runs(workplace: Path):
     assert found["forearm_mass"] == pytest.approx(1.1, rel=0.01)
     fitted = dj.load_scene(workplace / "runs" / "mine" / "fitted.xml")
     assert fitted.model.body("forearm").mass[0] == pytest.approx(found["forearm_mass"], rel=1e-4)
+
+
+def test_the_effect_of_method_gap_is_one(monkeypatch: pytest.MonkeyPatch):
+    """The example is registered, found for the door, pushes it open, and is gone again."""
+    monkeypatch.setattr(registry, "_MAKERS", dict(registry._MAKERS))
+    (code,) = blocks("docs/method-gap.md", "python")
+    exec(compile(code, "method-gap.md", "exec"), {})
+    scene = door_scene()
+    (effect,) = registry.library(scene, ["gasket"])
+    assert effect.force is not None
+    nothing = np.zeros(scene.model.nq)
+    push = effect.force({"gasket": 0.7}, State(0.0, nothing, nothing, nothing))  # type: ignore[arg-type]
+    assert float(push[scene.dof("hinge")]) == pytest.approx(0.7) and np.count_nonzero(push) == 1
 
 
 @pytest.mark.parametrize("document", ["README.md", *(f"docs/{p.name}" for p in sorted((ROOT / "docs").glob("*.md")))])

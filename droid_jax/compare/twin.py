@@ -1,7 +1,7 @@
 """The C twin of the servo replay: the same commands, values and outputs through plain C MuJoCo.
 
-It is the parity oracle, the CPU benchmark, and the engine of `--engine mujoco`.  It knows no
-effects that depend on the state (forces, friction laws): a scene with those needs MJX.
+It is the parity oracle, the CPU benchmark, and the engine of `--engine mujoco`.  Of effects it knows those
+that write model fields, and the torque offsets; everything else needs MJX.
 """
 
 from __future__ import annotations
@@ -24,14 +24,15 @@ def twin_replay(
 ) -> Callable[[np.ndarray], Rollout]:
     """values [P, D] -> Rollout with a leading [P], float64, on all cores.
 
-    Only effects that observe are possible; others raise ValueError, as does a recording whose
-    torque is on the link side or contains gravity (the C batch interface returns neither).
+    Effects with functions of their own raise ValueError, as does a recording whose torque is on the link
+    side or contains gravity (the C batch interface returns neither).
     """
     check_gains(scene, drive)
     check_stateless(scene)
-    stateful = [e.name for e in effects if e.force or e.frictionloss or e.command]
-    if stateful:
-        raise ValueError(f"the C engine cannot run effects that depend on the state: {', '.join(stateful)}; use MJX")
+    functions = ("command", "servo", "force", "frictionloss", "observe")
+    active = [e.name for e in effects if any(getattr(e, f) is not None for f in functions)]
+    if active:
+        raise ValueError(f"the C engine cannot run effects that depend on the state: {', '.join(active)}; use MJX")
     if drive.torque.side is TorqueSide.LINK or drive.torque.gravity:
         raise ValueError("the C engine replays motor-side torque without gravity only; use MJX for this recording")
     base = instrument(scene)

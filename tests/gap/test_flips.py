@@ -1,0 +1,78 @@
+"""Sign flips of whole repeats: exact where all are tried, silent where nothing is there."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from droid_jax.gap.evidence import gap, gaps
+from droid_jax.gap.flips import benjamini_hochberg, gap_p_values, largest_t, sign_flips, t_values
+
+
+def test_all_flips_up_to_twelve_repeats():
+    flips = sign_flips(5)
+    assert flips.shape == (16, 5) and np.all(flips[0] == 1)
+    both = {tuple(row) for row in np.concatenate([flips, -flips])}
+    assert both == set(itertools.product((-1.0, 1.0), repeat=5))
+    drawn = sign_flips(20, seed=3)
+    assert np.all(drawn[0] == 1) and set(np.unique(drawn)) == {-1.0, 1.0}
+    np.testing.assert_array_equal(drawn, sign_flips(20, seed=3))
+
+
+def test_the_unflipped_t_is_students():
+    scores = np.random.default_rng(0).normal(0.3, 1.0, (7, 9))
+    np.testing.assert_allclose(
+        t_values(scores, sign_flips(9))[0], scipy.stats.ttest_1samp(scores, 0.0, axis=1).statistic
+    )
+
+
+def test_the_largest_t_keeps_its_level():
+    """1,000 times nothing, 30 correlated questions each: p < 0.05 in about 5 of 100."""
+    rng = np.random.default_rng(1)
+    mixing = rng.normal(size=(30, 10))
+    p = [largest_t(mixing @ rng.normal(size=(10, 8)))[1] for _ in range(1000)]
+    assert 0.03 < np.mean(np.array(p) < 0.05) < 0.07
+
+
+def test_the_largest_t_finds_what_is_there():
+    rng = np.random.default_rng(2)
+    scores = rng.normal(size=(30, 10))
+    scores[17] += 4.0
+    t, p = largest_t(scores)
+    assert np.argmax(np.abs(t)) == 17
+    assert p == pytest.approx(1 / 512)  # the smallest that ten repeats allow
+
+
+def test_noise_does_not_bias_the_gap():
+    """U of pure noise is zero on average; of a common part it is that part's mean square, whatever the noise."""
+    rng = np.random.default_rng(3)
+    common = rng.normal(0, 0.4, 200)
+    none = [gap(rng.normal(0, 3.0, (10, 200))) for _ in range(400)]
+    there = [gap(common + rng.normal(0, 3.0, (10, 200))) for _ in range(400)]
+    assert np.mean(none) == pytest.approx(0.0, abs=4 * np.std(none) / 20)
+    assert np.mean(there) == pytest.approx(np.mean(common**2), abs=4 * np.std(there) / 20)
+
+
+def test_the_gap_lies_where_it_was_put():
+    rng = np.random.default_rng(4)
+    residuals = rng.normal(size=(10, 300))
+    residuals[:, 100:150] += 1.0
+    cells = np.zeros((6, 300), bool)
+    for k in range(6):
+        cells[k, 50 * k : 50 * (k + 1)] = True
+    p = gap_p_values(residuals, cells)
+    assert p[2] == pytest.approx(1 / 512)
+    assert np.argmax(gaps(residuals, cells)) == 2
+    np.testing.assert_array_equal(benjamini_hochberg(p, 0.02), np.arange(6) == 2)
+
+
+def test_benjamini_hochberg_is_scipys():
+    rng = np.random.default_rng(5)
+    for _ in range(50):
+        p = rng.uniform(size=12) ** 3
+        expected = scipy.stats.false_discovery_control(p, method="bh") <= 0.1
+        np.testing.assert_array_equal(benjamini_hochberg(p, 0.1), expected)
+    assert not benjamini_hochberg(np.ones(4), 0.1).any()
