@@ -294,9 +294,9 @@ def _refuse_constant(channel: Channel) -> None:
 
 def _fill(repeats: np.ndarray, name: str) -> np.ndarray:
     """Gaps in one repeat take the other repeats' mean there; a gap in all is an error."""
-    mean = np.nanmean(repeats, axis=0) if np.isnan(repeats).any() else None
-    if mean is None:
+    measured = ~np.isnan(repeats)
+    if measured.all():
         return repeats
-    if np.isnan(mean).any():
+    if not measured.any(axis=0).all():
         raise ValueError(f"channel {name!r} has a stretch that no repeat measured")
-    return np.where(np.isnan(repeats), mean[None], repeats)
+    return np.where(measured, repeats, np.nanmean(repeats, axis=0)[None])
