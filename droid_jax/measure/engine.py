@@ -107,10 +107,11 @@ def simulate(
     # MuJoCo repeats the last good state to the end, or starts over: in either case its clock is wrong.
     steps = np.array([m.opt.timestep for m in models])[:, None]
     late = np.abs(after[..., 0] - np.arange(1, after.shape[1] + 1) * steps) > 0.5 * steps
-    return _split(scene, np.where(np.logical_or.accumulate(late, axis=1)[..., None], np.nan, sensors))
+    return split(scene, np.where(np.logical_or.accumulate(late, axis=1)[..., None], np.nan, sensors))
 
 
-def _split(scene: Scene, sensors: np.ndarray) -> Trace:
+def split(scene: Scene, sensors: np.ndarray) -> Trace:
+    """Sensor rows [P, T, S] of an instrumented model as a Trace."""
     count = len(scene.joints)
     torque, position, velocity = (sensors[..., k * count : (k + 1) * count] for k in range(3))
     rest = sensors[..., 3 * count :]

@@ -19,7 +19,8 @@ import scipy.signal
 from droid_jax.measure.checks import validate
 from droid_jax.measure.engine import Trace, instrument, simulate
 from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
-from droid_jax.model.door import JOINT_DAMPING, door_nuisances, door_space
+from droid_jax.model.builtin import HINGE
+from droid_jax.model.door import JOINT_DAMPING, door_nuisances, door_space, time_offset, torque_offsets
 from droid_jax.model.door import truth as table_i
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_c_model
@@ -56,6 +57,30 @@ class SurrogateConfig:
     side: TorqueSide = TorqueSide.MOTOR
 
 
+@dataclass(frozen=True, eq=False)
+class StandIn:
+    """The stand-in robot before it moves, and what it shall repeat.
+
+    demonstration, truth, config, seed: as given to `record`.
+    scene: instrumented, at the stand-in's own time step and integrator.
+    models: [N], qpos0: [N, nq], each repeat with its own small errors; nominal: [nq] without them.
+    clock: [T] s and control: [T, U] at the stand-in's own time step.
+    rng: what is left of the recording's randomness, for the sensors.
+    """
+
+    demonstration: Recording
+    truth: Mapping[str, float]
+    config: SurrogateConfig
+    seed: int
+    scene: Scene
+    models: list[mujoco.MjModel]
+    qpos0: np.ndarray
+    nominal: np.ndarray
+    clock: np.ndarray
+    control: np.ndarray
+    rng: np.random.Generator
+
+
 DRIFT_TIME = 0.15  # s
 _WRIST = 4  # joints from here on have the smaller noise
 
@@ -84,17 +109,41 @@ def record(
     demonstration is safe by definition: choose another truth).
     """
     config = config or SurrogateConfig()
+    stand_in = set_up(scene, demonstration, truth, seed=seed, config=config)
+    trace = simulate(stand_in.scene, stand_in.models, stand_in.qpos0, stand_in.control[None])
+    return as_recording(stand_in, trace, sensor_torque(stand_in, trace), trace.position, name=name)
+
+
+def set_up(
+    scene: Scene,
+    demonstration: Recording,
+    truth: Mapping[str, float],
+    *,
+    seed: int,
+    config: SurrogateConfig,
+    space: Space | None = None,
+) -> StandIn:
+    """Models, start poses and commands of every repeat; `space` is what truth may speak of (default: the door's)."""
     if config.repeats < 1:
         raise ValueError(f"the stand-in robot needs at least one repeat, got {config.repeats}")
     rng = np.random.default_rng([seed, 2])
     hidden = _hidden_scene(scene, config)
-    models, qpos0 = _repeats(hidden, truth, demonstration, config, rng)
+    nominal = hidden.initial_qpos(dict(demonstration.qpos0))
+    models, qpos0 = _repeats(hidden, truth, nominal, config, rng, space)
     clock, control = _control(hidden, demonstration, config.timestep, truth.get("time_offset", 0.0))
-    trace = simulate(hidden, models, qpos0, control[None])
+    return StandIn(demonstration, truth, config, seed, hidden, models, qpos0, nominal, clock, control, rng)
+
+
+def as_recording(
+    stand_in: StandIn, trace: Trace, torque: np.ndarray, position: np.ndarray, *, name: str | None = None
+) -> Recording:
+    """What the sensors make of a trace: torque and position [N, T, J] with offset and noise at the sensors' rates."""
+    demonstration, config = stand_in.demonstration, stand_in.config
+    scene, clock, rng = stand_in.scene, stand_in.clock, stand_in.rng
     _check_opened(demonstration, clock, trace)
     every = round(1.0 / (config.rate * config.timestep))
     time = clock[::every]
-    torque = _torque(hidden, models, trace, config)[:, ::every] + _offset(scene, truth)
+    torque = torque[:, ::every] + _offset(scene, stand_in.truth)
     channels = {
         "torque": _channel("torque", "N m", scene.joints, time, torque + _torque_noise(torque.shape, config, rng)),
         "position": _channel(
@@ -102,19 +151,26 @@ def record(
             "rad",
             scene.joints,
             time,
-            trace.position[:, ::every] + rng.normal(0, config.position_noise, torque.shape),
+            position[:, ::every] + rng.normal(0, config.position_noise, torque.shape),
         ),
-        "object_angle": _camera(scene, clock, trace.object_angle, config, rng),
     }
+    if scene.object_joint:
+        channels["object_angle"] = _camera(scene, clock, trace.object_angle, config, rng)
     return validate(
         replace(
             demonstration,
             name=name or demonstration.name,
             channels=channels,
-            torque=TorqueConvention(config.side, gravity=False),
-            meta={"source": "stand-in robot (plain C MuJoCo), not a real one", "seed": str(seed)},
+            torque=TorqueConvention(config.side, gravity=_carries_weight(scene)),
+            meta={"source": "stand-in robot (plain C MuJoCo), not a real one", "seed": str(stand_in.seed)},
         )
     )
+
+
+def _carries_weight(scene: Scene) -> bool:
+    """Whether the measured torques contain the arm's weight: where no body of a measured joint is compensated."""
+    bodies = [scene.model.jnt_bodyid[scene.id("joint", j)] for j in scene.joints]
+    return bool(scene.model.opt.gravity.any()) and not scene.model.body_gravcomp[bodies].any()
 
 
 def _hidden_scene(scene: Scene, config: SurrogateConfig) -> Scene:
@@ -130,17 +186,18 @@ def _hidden_scene(scene: Scene, config: SurrogateConfig) -> Scene:
 def _repeats(
     hidden: Scene,
     truth: Mapping[str, float],
-    demonstration: Recording,
+    nominal: np.ndarray,
     config: SurrogateConfig,
     rng: np.random.Generator,
+    space: Space | None,
 ) -> tuple[list[mujoco.MjModel], np.ndarray]:
     """Models [N] and start poses [N, nq], each with its own small errors."""
-    space = _space(hidden, truth)
-    nominal = hidden.initial_qpos(dict(demonstration.qpos0))
+    space = _space(hidden, truth, space)
+    axes = [axis for axis in ("door_x", "door_y") if axis in space.names]
     models, poses = [], []
     for _ in range(config.repeats):
         values = space.values(dict(truth))
-        for axis in ("door_x", "door_y"):
+        for axis in axes:
             values[space.index(axis)] += rng.normal(0, config.pose_noise)
         models.append(make_c_model(hidden, space, values))
         pose = nominal.copy()
@@ -149,9 +206,15 @@ def _repeats(
     return models, np.array(poses)
 
 
-def _space(hidden: Scene, truth: Mapping[str, float]) -> Space:
-    """Every parameter the stand-in can have, around the scene's own values."""
-    space = door_space(hidden) + door_nuisances(hidden)
+def _space(hidden: Scene, truth: Mapping[str, float], space: Space | None) -> Space:
+    """Every parameter the stand-in can have, around the scene's own values.
+
+    Without a space: Table I and the nuisances for a door that is held, sensor offsets and timing otherwise.
+    """
+    if space is None and hidden.object_joint == HINGE and hidden.grip:
+        space = door_space(hidden) + door_nuisances(hidden)
+    elif space is None:
+        space = Space((time_offset(), *torque_offsets(hidden.joints)))
     own = {p.name: (_own_value(hidden, p), p.std) for p in space.parameters if p.writes and not p.nuisance}
     for name in truth:
         space.index(name)
@@ -184,13 +247,14 @@ def _check_opened(demonstration: Recording, clock: np.ndarray, trace: Trace) -> 
         raise ValueError(f"the stand-in robot lost its grasp in repeat {lost[0]} (too little friction for this door?)")
 
 
-def _torque(hidden: Scene, models: list[mujoco.MjModel], trace: Trace, config: SurrogateConfig) -> np.ndarray:
+def sensor_torque(stand_in: StandIn, trace: Trace) -> np.ndarray:
     """[N, T, J] N m at the motor, or at the link: without rotor inertia and joint damping."""
-    if config.side is TorqueSide.MOTOR:
+    if stand_in.config.side is TorqueSide.MOTOR:
         return trace.torque
-    acceleration = np.gradient(trace.velocity, config.timestep, axis=1)
-    armature = np.array([m.dof_armature[hidden.joint_dofs] for m in models])[:, None]
-    damping = np.array([m.dof_damping[hidden.joint_dofs] for m in models])[:, None]
+    dofs = stand_in.scene.joint_dofs
+    acceleration = np.gradient(trace.velocity, stand_in.config.timestep, axis=1)
+    armature = np.array([m.dof_armature[dofs] for m in stand_in.models])[:, None]
+    damping = np.array([m.dof_damping[dofs] for m in stand_in.models])[:, None]
     return trace.torque - armature * acceleration - damping * trace.velocity
 
 

@@ -1,0 +1,186 @@
+"""Hidden effects on the stand-in robot, for blind tests of the search for a gap.
+
+Written without knowledge of the library of effects that the search offers: forms, constants and
+time step are the stand-in's own.  What was hidden stands nowhere in the recording.  The formulas
+are in `hidden_door`, `hidden_friction`, `hidden_arm` and `hidden_signals`.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from droid_jax.measure.engine import split
+from droid_jax.measure.hidden_arm import ARM_EFFECTS
+from droid_jax.measure.hidden_door import DOOR
+from droid_jax.measure.hidden_friction import FRICTION
+from droid_jax.measure.hidden_hooks import Hidden, Influence, Place, Seen, edited, step_through
+from droid_jax.measure.hidden_signals import SIGNALS
+from droid_jax.measure.recording import Recording, TorqueSide
+from droid_jax.measure.surrogate import StandIn, SurrogateConfig, as_recording, sensor_torque, set_up
+from droid_jax.model.parameters import Space
+from droid_jax.model.scene import Scene
+
+HIDDEN: dict[str, Hidden] = {h.name: h for h in (*DOOR, *FRICTION, *ARM_EFFECTS, *SIGNALS)}
+LONGEST_STEP = 0.00025  # s: the explicit torques of hidden effects want a step this short
+PAUSE = 5.0  # s between repeats, for what warms up or drifts
+
+
+@dataclass(frozen=True)
+class Applied:
+    """One hidden effect at work: amplitude in the effect's unit, on one joint or on all that it can act on.
+
+    joint: "" for every measured joint; the hinge's name puts an effect "on" joints there.
+    """
+
+    name: str
+    amplitude: float
+    joint: str = ""
+
+
+def record_hidden(
+    scene: Scene,
+    demonstration: Recording,
+    truth: Mapping[str, float],
+    effects: Mapping[str, float] | Sequence[Applied],
+    *,
+    seed: int,
+    config: SurrogateConfig | None = None,
+    name: str | None = None,
+    space: Space | None = None,
+) -> Recording:
+    """Like `surrogate.record`, with effects that no parameter of the model stands for.
+
+    effects: amplitudes by name, or by "name[joint]"; or `Applied`.
+    config: the default records with time steps of 0.25 ms; longer ones are refused.
+    space: what truth may speak of; the default is a held door's parameters, else offsets and timing.
+    Without effects the recording equals `record`'s with the same config bit for bit: the same steps
+    of the same model, taken one by one.
+    On the link side the torque has passed what the effects put into the gears: friction added to
+    measured joints, ripple.
+    Raises ValueError for unknown names, joints or amplitudes, and like `record`.
+    """
+    config = config or SurrogateConfig(timestep=LONGEST_STEP)
+    if config.timestep > LONGEST_STEP * (1 + 1e-9):
+        raise ValueError(f"hidden effects need time steps of at most {LONGEST_STEP} s, got {config.timestep}")
+    applied = _listed(effects)
+    for one in applied:
+        _check(one, scene)
+    stand_in = set_up(scene, demonstration, truth, seed=seed, config=config, space=space)
+    rows, gears, sensors, stand_in = _simulate(stand_in, applied)
+    trace = split(stand_in.scene, rows)
+    torque = sensor_torque(stand_in, trace)
+    if config.side is TorqueSide.LINK:
+        torque = torque + gears[..., stand_in.scene.joint_dofs]
+    torque, position = _sensed(stand_in, sensors, torque, trace.position)
+    return as_recording(stand_in, trace, torque, position, name=name)
+
+
+def _listed(effects: Mapping[str, float] | Sequence[Applied]) -> list[Applied]:
+    if not isinstance(effects, Mapping):
+        return list(effects)
+    found = []
+    for key, amplitude in effects.items():
+        match = re.fullmatch(r"([^\[\]]*)(?:\[(.+)\])?", key)
+        found.append(Applied(match[1], amplitude, match[2] or "") if match else Applied(key, amplitude))
+    return found
+
+
+def hidden_effect(name: str) -> Hidden:
+    """The effect of that name; ValueError lists the valid ones."""
+    if name not in HIDDEN:
+        raise ValueError(f"unknown hidden effect {name!r}; there are: {', '.join(sorted(HIDDEN))}")
+    return HIDDEN[name]
+
+
+def possible(scene: Scene) -> tuple[str, ...]:
+    """Names of the effects that a scene can have."""
+    return tuple(name for name, effect in HIDDEN.items() if _lacks(effect, scene) is None)
+
+
+def _lacks(effect: Hidden, scene: Scene) -> str | None:
+    """What a scene would need and does not have."""
+    if effect.on == "hinge" and not scene.object_joint:
+        return "an object joint"
+    if effect.on == "grip" and not (scene.grip and any(scene.grip.fingers)):
+        return "a grip"
+    return None
+
+
+def _check(one: Applied, scene: Scene) -> None:
+    effect = hidden_effect(one.name)
+    if not math.isfinite(one.amplitude) or (one.amplitude < 0 and not effect.signed):
+        least = "a finite" if effect.signed else "a finite, not negative"
+        raise ValueError(f"hidden effect {one.name!r} needs {least} amplitude, got {one.amplitude}")
+    lacks = _lacks(effect, scene)
+    if lacks:
+        raise ValueError(f"hidden effect {one.name!r} needs a scene with {lacks}; {scene.name!r} has none")
+    valid = _joints(effect, scene)
+    if one.joint and one.joint not in valid:
+        listed = ", ".join(valid) or "none"
+        raise ValueError(f"hidden effect {one.name!r} cannot act on joint {one.joint!r}; it can on: {listed}")
+
+
+def _joints(effect: Hidden, scene: Scene) -> tuple[str, ...]:
+    """Joints an effect can be put on by name."""
+    if effect.on == "arm":
+        return scene.joints
+    if effect.on == "joint":
+        return tuple(dict.fromkeys((*scene.joints, *([scene.object_joint] if scene.object_joint else []))))
+    return ()
+
+
+def influences(stand_in: StandIn, applied: Sequence[Applied], repeat: int) -> list[Influence]:
+    """The effects of one repeat, each with a fresh state."""
+    scene, clock = stand_in.scene, stand_in.clock
+    period = float(clock[-1] - clock[0]) + PAUSE
+    return [
+        HIDDEN[a.name].make(
+            Place(scene, (a.joint,) if a.joint else scene.joints, stand_in.nominal, repeat, period), a.amplitude
+        )
+        for a in applied
+    ]
+
+
+def _simulate(
+    stand_in: StandIn, applied: Sequence[Applied]
+) -> tuple[np.ndarray, np.ndarray, list[list[Influence]], StandIn]:
+    """Sensor rows [N, T, S], torques in the gears [N, T, nv] (N m; only for the link side), the
+    effects of every repeat, and the stand-in with the models that they edited."""
+    count = len(stand_in.models)
+    effects = [influences(stand_in, applied, repeat) for repeat in range(count)]
+    models = [edited(model, own) for model, own in zip(stand_in.models, effects, strict=True)]
+    link = stand_in.config.side is TorqueSide.LINK
+    gears = np.zeros((count, len(stand_in.clock) if link else 0, stand_in.scene.model.nv))
+    since = stand_in.clock - stand_in.clock[0]
+
+    def one(repeat: int) -> np.ndarray:
+        control = stand_in.control
+        for influence in effects[repeat]:
+            if influence.command:
+                control = influence.command(since, control)
+        qpos0, own = stand_in.qpos0[repeat], gears[repeat] if link else None
+        return step_through(models[repeat], qpos0, control, effects[repeat], own)
+
+    with ThreadPoolExecutor(max_workers=min(count, os.cpu_count() or 1)) as pool:
+        rows = np.stack(list(pool.map(one, range(count))))
+    return rows, gears, effects, replace(stand_in, models=models)
+
+
+def _sensed(
+    stand_in: StandIn, effects: Sequence[Sequence[Influence]], torque: np.ndarray, position: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Torque and position [N, T, J] behind the effects on the sensors."""
+    seen = []
+    for repeat, own in enumerate(effects):
+        now = Seen(stand_in.clock - stand_in.clock[0], torque[repeat], position[repeat])
+        for influence in own:
+            now = influence.sense(now) if influence.sense else now
+        seen.append(now)
+    return np.stack([s.torque for s in seen]), np.stack([s.position for s in seen])
