@@ -76,9 +76,11 @@ def make_physics(scene: Scene, space: Space, values: jax.Array) -> Physics:
         if not hasattr(model, field):
             continue
         nominal = jnp.asarray(getattr(model, field))
-        index = tuple(np.array(axis) for axis in zip(*(w.index for _, w in writes), strict=True))
-        new = [w.new(nominal[w.index], values[column]) for column, w in writes]
-        changed[field] = nominal.at[index].set(jnp.stack(new).astype(nominal.dtype))
+        new: dict[tuple[int, ...], jax.Array] = {}
+        for column, w in writes:  # several parameters of one entry act one after the other
+            new[w.index] = w.new(new.get(w.index, nominal[w.index]), values[column])
+        index = tuple(np.array(axis) for axis in zip(*new, strict=True))
+        changed[field] = nominal.at[index].set(jnp.stack(list(new.values())).astype(nominal.dtype))
     if "body_quat" in changed:  # a write sets one component; engines differ in what they do with the norm
         changed["body_quat"] /= jnp.linalg.norm(changed["body_quat"], axis=1, keepdims=True)
     model = model.replace(**changed)
@@ -169,7 +171,7 @@ def make_c_model(scene: Scene, space: Space, values: np.ndarray) -> mujoco.MjMod
     model = copy.copy(scene.model)
     for column, write in model_writes(space):
         array = getattr(model, write.field)
-        array[write.index] = write.new(getattr(scene.model, write.field)[write.index], float(values[column]))
+        array[write.index] = write.new(array[write.index], float(values[column]))
     model.body_quat /= np.linalg.norm(model.body_quat, axis=1, keepdims=True)
     if _SOURCES & {w.field for _, w in model_writes(space)}:
         mujoco.mj_setConst(model, mujoco.MjData(model))

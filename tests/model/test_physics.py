@@ -7,6 +7,7 @@ import dataclasses
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from mujoco import mjx
 from droid_jax.model.builtin import ARM
 from droid_jax.model.door import door_nuisances, door_space
 from droid_jax.model.door_scene import door_scene
-from droid_jax.model.fields import body_mass, model_parameter
+from droid_jax.model.fields import body_mass, model_parameter, servo_scale
 from droid_jax.model.parameters import Mode, Space
 from droid_jax.model.physics import derive, make_c_model, make_physics, theta_of, written_fields
 from droid_jax.model.scene import LOOK_GROUP, Scene, compile_scene
@@ -299,3 +300,17 @@ def test_parameters_without_masses_derive_nothing(scene: Scene):
     space = Space((model_parameter(scene, "dof_damping", "hinge", unit="-", std=1.0, high=5.0, mode=Mode.SET),))
     assert written_fields(space) == ("dof_damping",)
     assert "dof_M0" in written_fields(Space((body_mass(scene, "door", std=1.0, high=5.0),)))
+
+
+def test_parameters_of_one_entry_act_one_after_the_other():
+    """A nuisance that scales a gain and an effect that scales it again: neither hides the other."""
+    scene = door_scene()
+    first, second = (servo_scale(scene, ARM[2], name=n) for n in ("first", "second"))
+    space = Space((first, second))
+    values = np.array([1.1, 0.9])
+    expected = scene.model.actuator_gainprm[2, 0] * 1.1 * 0.9
+    in_mjx = make_physics(scene, space, jnp.asarray(values, jnp.float32)).model
+    in_c = make_c_model(scene, space, values)
+    np.testing.assert_allclose(in_mjx.actuator_gainprm[2, 0], expected, rtol=1e-6)
+    np.testing.assert_allclose(in_c.actuator_gainprm[2, 0], expected, rtol=1e-12)
+    np.testing.assert_allclose(in_c.actuator_biasprm[2, 1], -expected, rtol=1e-12)
