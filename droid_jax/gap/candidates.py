@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from droid_jax.model.parameters import Space
 from droid_jax.model.seam import Effect
 
 
@@ -47,11 +46,3 @@ def candidates(effects: Iterable[Effect]) -> tuple[Candidate, ...]:
         for (place, amplitudes), shapes in itertools.product(effect.places.items(), grid):
             out.append(Candidate(effect.name, place, amplitudes, shapes))
     return tuple(out)
-
-
-def check_space(space: Space, effects: Iterable[Effect]) -> None:
-    """Raise ValueError unless the space holds every parameter of the effects, at neutral."""
-    for effect in effects:
-        for p in effect.parameters:
-            if space[p.name].mean != p.mean:
-                raise ValueError(f"{p.name}: the space starts at {space[p.name].mean}, neutral is {p.mean}")

@@ -32,6 +32,10 @@ class Evidence:
         """[P, D] -> [P, M] mean of the repeats minus simulation."""
         return -self.cost.whitened(np.atleast_2d(values)).astype(np.float64) / np.sqrt(self.repeats)
 
+    def gap_at(self, values: np.ndarray) -> float:
+        """U of the model at `values` [D]."""
+        return gap(self.residuals(self.common(values)[0]))
+
     def residuals(self, common: np.ndarray) -> np.ndarray:
         """[N, M] of every repeat, from the common part [M]."""
         return common + self.deviations

@@ -8,6 +8,7 @@ Multiple Testing, 1993 (the largest statistic over many questions).
 from __future__ import annotations
 
 import numpy as np
+import scipy.stats
 
 EXACT = 12  # up to this many repeats all flips are tried
 DRAWS = 4096
@@ -54,9 +55,4 @@ def gap_p_values(residuals: np.ndarray, cells: np.ndarray, seed: int = 0) -> np.
 
 def benjamini_hochberg(p: np.ndarray, level: float = 0.1) -> np.ndarray:
     """[K] bool, the hypotheses rejected at a false discovery rate.  Benjamini and Hochberg, JRSS B 1995."""
-    order = np.argsort(p)
-    passed = np.flatnonzero(p[order] <= level * np.arange(1, len(p) + 1) / len(p))
-    rejected = np.zeros(len(p), bool)
-    if len(passed):
-        rejected[order[: passed[-1] + 1]] = True
-    return rejected
+    return scipy.stats.false_discovery_control(p, method="bh") <= level

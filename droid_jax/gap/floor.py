@@ -25,7 +25,7 @@ def numerical_floor(evidence: Evidence, model: Model, recording: Recording) -> f
     if not isinstance(cost.drives[0], Drive):
         return 0.0
     scene = with_options(cost.scene, timestep=float(cost.scene.model.opt.timestep) / FINER)
-    values = model.values[[cost.space.index(n) for n in model.space.names]]
+    values = model.values[cost.space.columns(model.space)]
     fine: Cost = make_cost(scene, model.space, [recording], config=cost.comparisons[0].config)
     count = evidence.repeats
     off = (fine.whitened(values[None])[0] - cost.whitened(model.values[None])[0]).astype(np.float64) / np.sqrt(count)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,13 +28,9 @@ class Cell:
 
 @dataclass(frozen=True, eq=False)
 class Localisation:
-    """U in every cell, largest first, and the shares of the generalised force's three directions."""
+    """U in every cell, variable by variable."""
 
     cells: tuple[Cell, ...]
-
-    def over(self, variable: str) -> tuple[Cell, ...]:
-        """The cells of one variable, in their own order."""
-        return tuple(c for c in self.cells if c.variable == variable)
 
 
 def localise(evidence: Evidence, values: np.ndarray, residuals: np.ndarray) -> Localisation:
@@ -91,9 +86,3 @@ def _bins(variable: str, x: np.ndarray, unit: str) -> list[tuple[tuple[str, str]
         ((variable, f"{low:.2f} to {high:.2f} {unit}"), (x >= low) & (x < high))
         for low, high in itertools.pairwise(edges)
     ]
-
-
-def summary(cells: Sequence[Cell]) -> Mapping[str, float]:
-    """Share of the whole gap in each found cell of one variable."""
-    total = sum(max(c.gap, 0.0) for c in cells)
-    return {c.where: max(c.gap, 0.0) / total for c in cells if c.found} if total > 0 else {}

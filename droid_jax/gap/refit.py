@@ -13,9 +13,8 @@ import numpy as np
 
 from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.evidence import Evidence, gap
-from droid_jax.identify.gaussian import Gaussian
-from droid_jax.identify.refine import RefineConfig, Refined, RefineProgress, refine
-from droid_jax.identify.uncertainty import calibrated, time_blocks
+from droid_jax.identify.refine import Hypotheses, RefineConfig, Refined, RefineProgress, refine
+from droid_jax.identify.uncertainty import posterior
 from droid_jax.model.parameters import Space
 
 REFIT = RefineConfig(iterations=8, hops=0)
@@ -49,45 +48,34 @@ class Model:
         return tuple(a for c in self.parts for a in c.amplitudes)
 
 
-def embed(whole: Space, part: Space, values: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """[P, D] the vector `values` [D] over `whole` with the entries of `part` replaced by rows [P, F]."""
-    out = np.tile(values, (len(rows), 1))
-    out[:, [whole.index(n) for n in part.names]] = rows
-    return out
-
-
 def refit(
     evidence: Evidence,
     base: Space,
     parts: Sequence[Candidate],
     starts: np.ndarray,
     config: RefineConfig = REFIT,
+    hypotheses: Hypotheses = (),
     progress: Callable[[RefineProgress], None] | None = None,
 ) -> Model:
-    """Fit base parameters and the effects `parts` to one recording, from starts [S, D] over the whole space."""
+    """Fit base parameters and the effects `parts` to one recording, from starts [S, D] over the whole space.
+
+    What is not free stays as in the first start.
+    """
     whole = evidence.cost.space
     free = [name for c in parts for name in c.free]
     space = whole.select([*base.names, *dict.fromkeys(free)])
-    columns = [whole.index(n) for n in space.names]
 
     def residuals(rows: np.ndarray) -> np.ndarray:
-        return evidence.cost.whitened(embed(whole, space, starts[0], rows))
+        return evidence.cost.whitened(whole.embed(space, rows, starts[0]))
 
-    refined = refine(residuals, space, starts[:, columns], config, progress=progress)
-    values = embed(whole, space, starts[0], refined.best[None])[0]
+    begin = starts[:, whole.columns(space)]
+    refined = refine(residuals, space, begin, config, hypotheses=hypotheses, progress=progress)
+    values = whole.embed(space, refined.best[None], starts[0])[0]
     left = evidence.residuals(-refined.residual / np.sqrt(evidence.repeats))
     return Model(tuple(parts), values, space, refined, left, gap(left))
 
 
-def gaussian(evidence: Evidence, model: Model) -> Gaussian:
-    """The calibrated Gaussian over what was free in a model (the rule of identify/uncertainty.py)."""
-    comparison = evidence.cost.comparisons[0]
-    shapes = [(len(c.columns), c.noise.mean.shape[0]) for c in comparison.channels]
-    durations = [c.span[1] - c.span[0] for c in comparison.channels]
-    return calibrated(model.refined, [comparison.deviations()], time_blocks(shapes, durations))
-
-
 def intervals(evidence: Evidence, model: Model) -> dict[str, tuple[float, float]]:
     """Interval of every free amplitude, in its own unit."""
-    low, high = gaussian(evidence, model).interval(LEVEL)
+    low, high = posterior(model.refined, evidence.cost.comparisons).interval(LEVEL)
     return {a: (float(low[model.space.index(a)]), float(high[model.space.index(a)])) for a in model.amplitudes}

@@ -10,16 +10,16 @@ import numpy as np
 
 from droid_jax.compare.cost import make_cost
 from droid_jax.compare.residuals import CompareConfig
-from droid_jax.gap.candidates import Candidate, candidates, check_space
-from droid_jax.gap.evidence import Evidence, evidence, gap
+from droid_jax.gap.candidates import Candidate, candidates
+from droid_jax.gap.evidence import Evidence, evidence
 from droid_jax.gap.flips import FEWEST
 from droid_jax.gap.localise import localise
-from droid_jax.gap.refit import REFIT, Model, embed, refit
+from droid_jax.gap.refit import REFIT, Model, refit
 from droid_jax.gap.screen import Question, Screen, marks, project, questions_of, screen
 from droid_jax.gap.select import SIGNIFICANT, Trial, improvement, judge, resampled, tied
 from droid_jax.gap.verdict import Kind, Verdict
 from droid_jax.identify.pipeline import grip_hypotheses, starts
-from droid_jax.identify.refine import RefineConfig, refine
+from droid_jax.identify.refine import RefineConfig
 from droid_jax.identify.search import SearchConfig, search
 from droid_jax.measure.recording import Recording
 from droid_jax.model.effects.registry import effect_space, ready
@@ -92,7 +92,6 @@ def make_case(
         )
     scene = ready(scene)
     whole = base + effect_space(effects)
-    check_space(whole, effects)
     made = [make_cost(scene, whole, [r], config=config.compare, effects=effects) for r in (fit, confirm)]
     return Case(evidence(made[0]), evidence(made[1]), base, tuple(effects), config)
 
@@ -101,26 +100,21 @@ def base_fit(case: Case, progress: Progress) -> Model:
     """Everything but the effects, fitted to the first demonstration."""
     cost, base = case.fit.cost, case.base
     main = base.select([p.name for p in base.parameters if not p.nuisance])
-    neutral = case.whole.mean
-
-    def over_main(rows: np.ndarray) -> np.ndarray:
-        return cost(embed(case.whole, main, neutral, np.asarray(rows)))
-
-    def residuals(rows: np.ndarray) -> np.ndarray:
-        return cost.whitened(embed(case.whole, base, neutral, rows))
-
-    found = search(over_main, main, case.config.search, progress=lambda p: progress("search", p))
-    refined = refine(
-        residuals,
+    found = search(
+        lambda rows: cost(case.whole.embed(main, rows)),
+        main,
+        case.config.search,
+        progress=lambda p: progress("search", p),
+    )
+    return refit(
+        case.fit,
         base,
-        starts(base, main, found),
+        (),
+        case.whole.embed(base, starts(base, main, found)),
         case.config.refine,
         hypotheses=grip_hypotheses(base),
         progress=lambda p: progress("refine", p),
     )
-    values = embed(case.whole, base, neutral, refined.best[None])[0]
-    left = case.fit.residuals(-refined.residual / np.sqrt(case.fit.repeats))
-    return Model((), values, base, refined, left, gap(left))
 
 
 def ask(case: Case, model: Model, asked: Sequence[Question]) -> Screen:
@@ -134,7 +128,7 @@ def ask(case: Case, model: Model, asked: Sequence[Question]) -> Screen:
 
 def find(case: Case, base: Model, floor: float, progress: Progress = lambda stage, value: None) -> Verdict:
     """From a converged base fit to a verdict.  floor: U0, see `numerical_floor`."""
-    before, _, _ = improvement(case.confirm, base.values, base.values)
+    before = case.confirm.gap_at(base.values)
     asked = questions_of(candidates(case.effects))
     grounds = Grounds([], [], [])
     model, again = base, True
@@ -176,8 +170,7 @@ def _next(
     if not passed:
         return None
     winner, best = min(passed, key=lambda mt: mt[1].gap_confirm)
-    before, _, _ = improvement(case.confirm, model.values, model.values)
-    rivals = tied([t for _, t in passed], best, before)
+    rivals = tied([t for _, t in passed], best, case.confirm.gap_at(model.values))
     grounds.rivals.append(tuple(t.name.split(" + ")[-1] for t in rivals))
     return winner
 

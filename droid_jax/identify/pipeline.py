@@ -16,7 +16,7 @@ from droid_jax.identify.fit import Fit
 from droid_jax.identify.gaussian import Gaussian, prior
 from droid_jax.identify.refine import RefineConfig, Refined, refine
 from droid_jax.identify.search import SearchConfig, search
-from droid_jax.identify.uncertainty import Identifiability, calibrated, identifiability, not_judged, time_blocks
+from droid_jax.identify.uncertainty import Identifiability, identifiability, not_judged, posterior
 from droid_jax.measure.recording import Recording
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
@@ -145,7 +145,7 @@ def identify(
     base = make_cost(scene, full, fitted, engine=config.engine, config=config.compare)
     first = base.first()
     found = search(
-        _embed(first, space),
+        lambda rows: first(full.embed(space, rows)),
         space,
         config.search,
         checkpoint_dir=checkpoints,
@@ -158,7 +158,8 @@ def identify(
     refined = None
     if config.refine is not None:
         base, refined = _refined(base, starts(full, space, found), config.refine, lambda p: report("refine", p))
-    best, full_gaussian = _distribution(full, space, found, refined, base)
+    best = found.best if refined is None else refined.best
+    full_gaussian = found.gaussian() if refined is None else posterior(refined, base.comparisons)
     seconds["refine"] = time.monotonic() - began
 
     began = time.monotonic()
@@ -212,7 +213,7 @@ def starts(full: Space, space: Space, found: Fit) -> np.ndarray:
 
     A grip that slips and one that never does are different basins, and neither start finds the other's.
     """
-    searched = full.values(dict(zip(space.names, found.best.tolist(), strict=True)))
+    searched = full.embed(space, found.best[None])[0]
     firm = {p.name: min(p.high, 4.0 * p.mean) for p in space.parameters if p.name.startswith(("sliding", "torsional"))}
     return np.stack([searched, full.mean, full.values(firm)])
 
@@ -225,31 +226,6 @@ def grip_hypotheses(space: Space) -> list[dict[str, float]]:
     sliding = {p.name: p.mean for p in space.parameters if p.name.startswith("sliding_friction")}
     alone = [{name: mean} for name, mean in sliding.items()]
     return [*alone, sliding] if len(sliding) > 1 else alone
-
-
-def _embed(cost: Cost, space: Space) -> Callable[[Any], np.ndarray]:
-    """The cost over the full space as one over its first part, the rest at its means."""
-    full = cost.space
-    columns = [full.index(n) for n in space.names]
-
-    def embedded(values: Any) -> np.ndarray:
-        rows = np.tile(full.mean, (len(values), 1))
-        rows[:, columns] = np.asarray(values)
-        return cost(rows)
-
-    return embedded
-
-
-def _distribution(
-    full: Space, space: Space, found: Fit, refined: Refined | None, cost: Cost
-) -> tuple[np.ndarray, Gaussian]:
-    if refined is None:
-        return found.best, found.gaussian()
-    channels = [c for comparison in cost.comparisons for c in comparison.channels]
-    shapes = [(len(c.columns), c.noise.mean.shape[0]) for c in channels]
-    durations = [c.span[1] - c.span[0] for c in channels]
-    deviations = [comparison.deviations() for comparison in cost.comparisons]
-    return refined.best, calibrated(refined, deviations, time_blocks(shapes, durations))
 
 
 def _gaps(cost: Cost, before: np.ndarray, after: np.ndarray) -> list[Gap]:
@@ -303,13 +279,10 @@ def cost_samples(found: Identified, count: int, seed: int) -> dict[str, np.ndarr
     """
     first = prior(found.space).sample(seed, count)
     last = found.full_gaussian.sample(seed, count)
-    rows = np.tile(found.full.mean, (count, 1))
-    rows[:, [found.full.index(n) for n in found.space.names]] = first
-    columns = [found.full.index(n) for n in found.space.names]
     return {
         "initial": first,
-        "fitted": last[:, columns],
-        "initial_cost": found.heldout(rows),
+        "fitted": last[:, found.full.columns(found.space)],
+        "initial_cost": found.heldout(found.full.embed(found.space, first)),
         "fitted_cost": found.heldout(last),
         "names": np.array(found.space.names),
     }

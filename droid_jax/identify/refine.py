@@ -127,21 +127,24 @@ def refine(
         state, _ = rough.descend(rough.explore(state, hypotheses), config.rough)
     problem = _Problem(residuals, space, config, progress, rough)
     state, _ = problem.descend(problem.start(state.x))
-    settled = config.hops == 0
+    settled, slopes = config.hops == 0, None
     for number in range(config.hops):
-        hopped = problem.hop(state, number)
+        slopes = problem.jacobian(state)[0]
+        hopped = problem.hop(state, slopes, number)
         settled = bool(state.objective[0] - hopped.objective[0] <= HOP_TOLERANCE)
-        state = hopped if hopped.objective[0] < state.objective[0] else state
+        if hopped.objective[0] < state.objective[0]:
+            state, slopes = hopped, None
         if settled:
             break
         state, _ = problem.descend(state)
+        slopes = None
     return Refined(
         space=space,
         x=state.x[0],
         best=space.from_search(state.x[0]),
         objective=float(state.objective[0]),
         residual=state.residual[0],
-        jacobian=problem.wide_jacobian(state),
+        jacobian=problem.wide_jacobian(state, problem.jacobian(state)[0] if slopes is None else slopes),
         prior=problem.prior,
         starts=ended,
         evaluations=problem.evaluations,
@@ -259,13 +262,13 @@ class _Problem:
             state, alive = state.rows(good), alive[good]
         return state.rows([int(np.argmin(state.objective))]), ended
 
-    def hop(self, state: _State, seed: int) -> _State:
+    def hop(self, state: _State, jacobian: np.ndarray, seed: int) -> _State:
         """Leave a small basin: CMA-ES in the metric of the posterior, from a start that stands still.
 
         In x = x0 + L u, L L^T the posterior's covariance, the objective is about |u|^2 / 2 and what
         remains are the steps where a finger begins to stick or to slip, which no derivative sees.
         """
-        factor = self.axes(self.jacobian(state)[0], HOP_LONGEST)
+        factor = self.axes(jacobian, HOP_LONGEST)
 
         def around(u: np.ndarray) -> np.ndarray:
             return self.inside(state.x + u @ factor.T)
@@ -313,15 +316,14 @@ class _Problem:
         variance, axes = np.linalg.eigh(np.linalg.inv(_curvature(jacobian, self.prior)))
         return axes * np.minimum(np.sqrt(np.maximum(variance, 0.0)), longest / np.max(np.abs(axes), axis=0))
 
-    def wide_jacobian(self, state: _State) -> np.ndarray:
-        """[M, D] slopes of one start over the width of its posterior, along the posterior's own axes.
+    def wide_jacobian(self, state: _State, jacobian: np.ndarray) -> np.ndarray:
+        """[M, D] slopes of one start over the width of its posterior, from narrow ones, along the posterior's own axes.
 
         Differences of one parameter at a time carry the solver's rounding, which looks like
         information where two parameters trade with each other: their slopes cancel, its does not.
         Along the axes each difference is WIDE deviations of the result; as the first axes suffer from
         that rounding themselves, they are improved SPREADS times.
         """
-        jacobian = self.jacobian(state)[0]
         for _ in range(SPREADS):
             steps = WIDE * self.axes(jacobian, SPREAD_LONGEST).T
             spans, apart = self.differences(

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from droid_jax.compare.residuals import Comparison
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.refine import Refined
 
@@ -39,8 +40,16 @@ class Identifiability:
     reason: str
 
 
+def posterior(refined: Refined, comparisons: Sequence[Comparison]) -> Gaussian:
+    """The calibrated Gaussian in search coordinates over the refined space, from the recordings it was refined on."""
+    channels = [c for comparison in comparisons for c in comparison.channels]
+    shapes = [(len(c.columns), c.noise.mean.shape[0]) for c in channels]
+    durations = [c.span[1] - c.span[0] for c in channels]
+    return calibrated(refined, [c.deviations() for c in comparisons], time_blocks(shapes, durations))
+
+
 def calibrated(refined: Refined, deviations: Sequence[np.ndarray], block_ids: np.ndarray) -> Gaussian:
-    """The calibrated Gaussian in search coordinates over the refined space.
+    """The rule of the width on plain arrays.
 
     deviations: per recording [N, M_i] whitened deviations of its repeats from their mean (see
       `Comparison.deviations`); block_ids: [M] integer block of each residual (see `time_blocks`).

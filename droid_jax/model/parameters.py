@@ -232,6 +232,16 @@ class Space:
             out[self.index(name)] = value
         return out
 
+    def columns(self, part: Space) -> list[int]:
+        """Positions here of another space's parameters."""
+        return [self.index(n) for n in part.names]
+
+    def embed(self, part: Space, rows: Any, values: np.ndarray | None = None) -> np.ndarray:
+        """[P, D] the vector `values` [D] (default: the means) with the entries of `part` replaced by rows [P, F]."""
+        out = np.tile(self.mean if values is None else values, (len(rows), 1))
+        out[:, self.columns(part)] = np.asarray(rows)
+        return out
+
     def check(self, values: np.ndarray) -> np.ndarray:
         """values [..., D] as float64, or ValueError that says which entry is wrong and how."""
         values = np.asarray(values, dtype=np.float64)
