@@ -28,8 +28,9 @@ import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 
 from benchmarks.common import origin  # noqa: E402
+from droid_jax.gap.case import make_case  # noqa: E402
 from droid_jax.gap.floor import numerical_floor  # noqa: E402
-from droid_jax.gap.workflow import base_fit, find, make_case  # noqa: E402
+from droid_jax.gap.workflow import base_fit, find  # noqa: E402
 from droid_jax.measure.hidden import record_hidden  # noqa: E402
 from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide  # noqa: E402
 from droid_jax.model.door import time_offset, torque_offsets  # noqa: E402
@@ -148,7 +149,7 @@ def run_case(name: str) -> dict[str, Any]:
         "right": score(name, verdict.kind.value, effects, rivals),
         "gaps": {k: list(v) for k, v in verdict.gaps.items()},
         "floor": verdict.floor,
-        "p": verdict.screens[0].p,
+        "p": verdict.screens[0].p if verdict.screens else None,
         "converged": model.refined.converged,
         "seconds": time.monotonic() - began,
     }

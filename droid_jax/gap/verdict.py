@@ -22,13 +22,27 @@ class Kind(enum.Enum):
     UNCONVERGED = "fit not converged"  # the base fit's starts disagree; nothing can be concluded
 
 
+@dataclass(frozen=True)
+class Experiment:
+    """Something to record that would tell tied effects apart.
+
+    what: in words.  apart: standardised difference of the rivals' simulated torques there, after each was
+    refitted to what is recorded already; above about 6 ten repeats decide.
+    """
+
+    what: str
+    apart: float
+
+
 @dataclass(frozen=True, eq=False)
 class Verdict:
     """The answer and its grounds.
 
     kind; effects: names of what is in the model; tied: for each of them the names that do as well.
     base, model: before and after.  floor: U0, what the simulation's own step leaves.
-    gaps: recording -> (U before, U after).  screen, trials, where: the grounds.
+    gaps: "fit", "confirm", "sealed" -> (U before, U after).  screens, trials: the grounds, in the order they
+    were made.  before, after: where the gap lives on the fitted recording.  experiments: what would tell
+    the tied apart, the best first.  cut: in words what the budget left out, empty for nothing.
     """
 
     kind: Kind
@@ -40,11 +54,14 @@ class Verdict:
     gaps: dict[str, tuple[float, float]]
     screens: tuple[Screen, ...]
     trials: tuple[Trial, ...]
-    where: Localisation
+    before: Localisation
+    after: Localisation
+    experiments: tuple[Experiment, ...] = ()
+    cut: str = ""
 
-    def closed(self, recording: str) -> float:
-        """1 - (U_after - U0) / (U_before - U0)."""
-        before, after = self.gaps[recording]
+    def closed(self, role: str) -> float:
+        """1 - (U_after - U0) / (U_before - U0) on "fit", "confirm" or "sealed"."""
+        before, after = self.gaps[role]
         return 1.0 - (after - self.floor) / max(before - self.floor, 1e-12)
 
     @property

@@ -3,97 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from droid_jax.compare.cost import make_cost
-from droid_jax.compare.residuals import CompareConfig
 from droid_jax.gap.candidates import Candidate, candidates
-from droid_jax.gap.evidence import Evidence, evidence
-from droid_jax.gap.flips import FEWEST
+from droid_jax.gap.case import Case
 from droid_jax.gap.localise import localise
-from droid_jax.gap.refit import REFIT, Model, refit
+from droid_jax.gap.refit import Model, refit
 from droid_jax.gap.screen import Question, Screen, marks, project, questions_of, screen
-from droid_jax.gap.select import SIGNIFICANT, Trial, improvement, judge, resampled, tied
+from droid_jax.gap.select import SIGNIFICANT, Trial, judge, resampled, tied
 from droid_jax.gap.verdict import Kind, Verdict
 from droid_jax.identify.pipeline import grip_hypotheses, starts
-from droid_jax.identify.refine import RefineConfig
-from droid_jax.identify.search import SearchConfig, search
-from droid_jax.measure.recording import Recording
-from droid_jax.model.effects.registry import effect_space, ready
-from droid_jax.model.parameters import Space
-from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect
+from droid_jax.identify.search import search
 
 Progress = Callable[[str, Any], None]
 COLLINEAR = 0.9  # absolute cosine from which two marks count as one
 OPEN = 0.2  # share of the gap left open from which a model explains it only partly
-
-
-@dataclass(frozen=True)
-class GapConfig:
-    """Settings of the search for a missing effect.
-
-    search, refine: of the base fit.  refit: of every extended model.
-    refitted: candidates that are refitted in each round.  most: effects at most.
-    compare: how simulation and measurement are compared.  seed: of flips and resamples.
-    """
-
-    search: SearchConfig = field(default_factory=lambda: SearchConfig(parents=None, generations=20))
-    refine: RefineConfig = field(default_factory=RefineConfig)
-    refit: RefineConfig = REFIT
-    refitted: int = 6
-    most: int = 3
-    compare: CompareConfig = field(default_factory=CompareConfig)
-    seed: int = 0
-
-
-@dataclass(frozen=True, eq=False)
-class Case:
-    """What every stage needs: the evidence of each demonstration and what may be free."""
-
-    fit: Evidence
-    confirm: Evidence
-    base: Space
-    effects: tuple[Effect, ...]
-    config: GapConfig
-
-    @property
-    def whole(self) -> Space:
-        """Base parameters and all effects'."""
-        return self.fit.cost.space
-
-    @property
-    def smallest(self) -> dict[str, float]:
-        """Amplitude -> size worth naming."""
-        return {a: e.smallest for e in self.effects for amplitudes in e.places.values() for a in amplitudes}
-
-
-def make_case(
-    scene: Scene,
-    base: Space,
-    effects: Sequence[Effect],
-    fit: Recording,
-    confirm: Recording,
-    config: GapConfig | None = None,
-) -> Case:
-    """One compiled replay per demonstration, all effects in it, at neutral.
-
-    Raises ValueError for too few repeats: with fewer than eight, no flip of signs could ever be
-    significant.
-    """
-    config = config or GapConfig()
-    few = [r.name for r in (fit, confirm) if r.repeats < FEWEST]
-    if few:
-        raise ValueError(
-            f"recordings {', '.join(few)}: at least {FEWEST} repeats are needed to tell an effect from noise"
-        )
-    scene = ready(scene)
-    whole = base + effect_space(effects)
-    made = [make_cost(scene, whole, [r], config=config.compare, effects=effects) for r in (fit, confirm)]
-    return Case(evidence(made[0]), evidence(made[1]), base, tuple(effects), config)
 
 
 def base_fit(case: Case, progress: Progress) -> Model:
@@ -131,7 +58,7 @@ def find(case: Case, base: Model, floor: float, progress: Progress = lambda stag
     before = case.confirm.gap_at(base.values)
     asked = questions_of(candidates(case.effects))
     grounds = Grounds([], [], [])
-    model, again = base, True
+    model, again = base, base.refined.converged
     while again and len(model.parts) < case.config.most:
         progress("screen", model.name)
         left = [q for q in asked if not set(q.candidate.amplitudes) & set(model.amplitudes)]
@@ -202,15 +129,14 @@ def _alike(candidate: Candidate, found: Screen) -> set[str]:
 
 
 def _verdict(case: Case, base: Model, model: Model, floor: float, grounds: Grounds) -> Verdict:
-    before, after, _ = improvement(case.confirm, base.values, model.values)
-    gaps = {
-        case.fit.cost.comparisons[0].name: (base.gap, model.gap),
-        case.confirm.cost.comparisons[0].name: (before, after),
-    }
+    gaps = {role: (e.gap_at(base.values), e.gap_at(model.values)) for role, e in case.judged.items()}
+    before, after = gaps["confirm"]
     open_share = (after - floor) / max(before - floor, 1e-12)
-    missing = grounds.screens[0].p < SIGNIFICANT and base.gap > floor
+    missing = grounds.screens and grounds.screens[0].p < SIGNIFICANT and base.gap > floor
     kind = Kind.NONE if not missing else Kind.UNEXPLAINED
-    if model.parts:
+    if not base.refined.converged:
+        kind = Kind.UNCONVERGED
+    elif model.parts:
         kind = Kind.PARTLY if open_share > OPEN else Kind.TIE if any(grounds.rivals) else Kind.NAMED
     return Verdict(
         kind=kind,
@@ -222,5 +148,6 @@ def _verdict(case: Case, base: Model, model: Model, floor: float, grounds: Groun
         gaps=gaps,
         screens=tuple(grounds.screens),
         trials=tuple(grounds.trials),
-        where=localise(case.fit, base.values, base.residuals),
+        before=localise(case.fit, base.values, base.residuals),
+        after=localise(case.fit, model.values, model.residuals),
     )

@@ -1,0 +1,94 @@
+"""What a search for a missing effect works on: the evidence of each demonstration and what may be free."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from droid_jax.compare.cost import make_cost
+from droid_jax.compare.residuals import CompareConfig
+from droid_jax.gap.evidence import Evidence, evidence
+from droid_jax.gap.flips import FEWEST
+from droid_jax.gap.refit import REFIT
+from droid_jax.identify.refine import RefineConfig
+from droid_jax.identify.search import SearchConfig
+from droid_jax.measure.recording import Recording
+from droid_jax.model.effects.registry import effect_space, ready
+from droid_jax.model.parameters import Space
+from droid_jax.model.scene import Scene
+from droid_jax.model.seam import Effect
+
+
+@dataclass(frozen=True)
+class GapConfig:
+    """Settings of the search for a missing effect.
+
+    search, refine: of the base fit.  refit: of every extended model.
+    refitted: candidates that are refitted in each round.  most: effects at most.
+    compare: how simulation and measurement are compared.  seed: of flips and resamples.
+    """
+
+    search: SearchConfig = field(default_factory=lambda: SearchConfig(parents=None, generations=20))
+    refine: RefineConfig = field(default_factory=RefineConfig)
+    refit: RefineConfig = REFIT
+    refitted: int = 6
+    most: int = 3
+    compare: CompareConfig = field(default_factory=CompareConfig)
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """What every stage needs: the evidence of each demonstration and what may be free."""
+
+    fit: Evidence
+    confirm: Evidence
+    sealed: Evidence | None  # opened once, at the end
+    base: Space
+    effects: tuple[Effect, ...]
+    config: GapConfig
+
+    @property
+    def whole(self) -> Space:
+        """Base parameters and all effects'."""
+        return self.fit.cost.space
+
+    @property
+    def judged(self) -> dict[str, Evidence]:
+        """Role -> evidence: "fit", "confirm" and, where there is one, "sealed"."""
+        roles = {"fit": self.fit, "confirm": self.confirm, "sealed": self.sealed}
+        return {role: e for role, e in roles.items() if e is not None}
+
+    @property
+    def smallest(self) -> dict[str, float]:
+        """Amplitude -> size worth naming."""
+        return {a: e.smallest for e in self.effects for amplitudes in e.places.values() for a in amplitudes}
+
+
+def make_case(
+    scene: Scene,
+    base: Space,
+    effects: Sequence[Effect],
+    fit: Recording,
+    confirm: Recording,
+    sealed: Recording | None = None,
+    config: GapConfig | None = None,
+) -> Case:
+    """One compiled replay per demonstration, all effects in it, at neutral.
+
+    fit: parameters are fitted to it.  confirm: moves differently; effects are chosen on it.  sealed:
+    judged on once, when everything is decided.
+    Raises ValueError for too few repeats: with fewer than eight, no flip of signs could ever be
+    significant.
+    """
+    config = config or GapConfig()
+    recordings = [r for r in (fit, confirm, sealed) if r is not None]
+    few = [r.name for r in recordings if r.repeats < FEWEST]
+    if few:
+        raise ValueError(
+            f"recordings {', '.join(few)}: at least {FEWEST} repeats are needed to tell an effect from noise"
+        )
+    scene = ready(scene)
+    whole = base + effect_space(effects)
+    made = [evidence(make_cost(scene, whole, [r], config=config.compare, effects=effects)) for r in recordings]
+    return Case(made[0], made[1], made[2] if sealed is not None else None, base, tuple(effects), config)
