@@ -45,6 +45,7 @@ from droid_jax.storage import write_json  # noqa: E402
 
 Part = Literal["doors", "calibration", "pose", "parity"]
 MUST_BE_KNOWN = ("hinge_stiffness", "hinge_frictionloss", "hinge_damping", *JOINT_DAMPING)
+LEVEL = 0.9  # of the intervals in the cases
 TIMESTEP = 0.004  # s: the replay's second-order step is as good here as at 2 ms (docs/architecture.md)
 
 
@@ -75,7 +76,7 @@ def recordings(scene: Scene, truth: dict[str, float], names: str, seed: int) -> 
 
 def describe(found: Identified, truth: dict[str, float]) -> dict[str, Any]:
     """A case's figures: gap closed, every parameter with truth, interval and verdict."""
-    low, high = found.full_gaussian.interval(0.9)
+    low, high = found.full_gaussian.interval(LEVEL)
     parameters = {
         p.name: {
             "truth": truth[p.name],
@@ -262,17 +263,18 @@ def _agreement(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
         n for n, p in a["parameters"].items()
         if not p["nuisance"] and p["identifiable"] and b["parameters"][n]["identifiable"]
     ]  # fmt: skip
-
-    def gaussian(case: dict[str, Any], name: str) -> tuple[float, float]:
-        low, high = case["parameters"][name]["interval"]
-        return 0.5 * (low + high), (high - low) / (2 * scipy.stats.norm.ppf(0.95))
-
     apart = {}
     for name in names:
-        (mean_a, std_a), (mean_b, std_b) = gaussian(a, name), gaussian(b, name)
+        (mean_a, std_a), (mean_b, std_b) = (gaussian(case["parameters"][name]) for case in (a, b))
         apart[name] = (mean_a - mean_b) / np.hypot(std_a, std_b)
     within = np.abs(list(apart.values())) <= scipy.stats.norm.ppf(0.95)
     return {"difference_in_deviations": apart, "within_90": float(np.mean(within)) if names else None}
+
+
+def gaussian(parameter: dict[str, Any]) -> tuple[float, float]:
+    """Centre and deviation of the Gaussian whose interval a case's parameter states, in its own unit."""
+    low, high = parameter["interval"]
+    return 0.5 * (low + high), (high - low) / (2 * scipy.stats.norm.ppf(0.5 + LEVEL / 2))
 
 
 def main() -> None:

@@ -116,7 +116,7 @@ def measured_torque(cost: Cost) -> np.ndarray:
 
 def clock_of(cost: Cost) -> np.ndarray:
     """[K] s of `measured_torque` and `residual`."""
-    return noise.coarse_clock(*cost.comparisons[0].channel("torque").span)
+    return cost.comparisons[0].channel("torque").clock
 
 
 def residual(cost: Cost, values: np.ndarray) -> np.ndarray:

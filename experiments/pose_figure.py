@@ -18,6 +18,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
 
 import numpy as np  # noqa: E402
 import tyro  # noqa: E402
+from identify_suite import gaussian  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 from scipy import stats  # noqa: E402
 
@@ -25,8 +26,6 @@ from droid_jax.report.export import png_bytes  # noqa: E402
 from droid_jax.report.style import AFTER, BEFORE, TRUTH, WIDE, styled  # noqa: E402
 from droid_jax.report.words import label  # noqa: E402
 from droid_jax.storage import write_bytes  # noqa: E402
-
-LEVEL = 0.9  # of the intervals in the cases
 
 
 @dataclass(frozen=True)
@@ -63,12 +62,6 @@ def densities(a: dict[str, Any], b: dict[str, Any], width: float = WIDE) -> Figu
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper left", ncols=3, frameon=False)
     return figure
-
-
-def gaussian(parameter: dict[str, Any]) -> tuple[float, float]:
-    """Centre and deviation of a parameter's interval."""
-    low, high = parameter["interval"]
-    return 0.5 * (low + high), (high - low) / (2 * stats.norm.ppf(0.5 + LEVEL / 2))
 
 
 def main() -> None:

@@ -18,7 +18,7 @@ from droid_jax.measure.recording import TorqueSide
 from droid_jax.model.joint_friction import SMOOTHING
 from droid_jax.model.physics import Physics
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect, Rollout, State, Theta
+from droid_jax.model.seam import Effect, Rollout, State, Theta, column
 
 
 def inverse_replay(scene: Scene, motion: Motion, effects: Sequence[Effect] = ()) -> Replay:
@@ -90,5 +90,5 @@ def _resistance(theta: Theta, state: State, own: jax.Array, effects: Sequence[Ef
 
 def _behind_the_sensor(scene: Scene, theta: Theta) -> jax.Array:
     """[nv] the dry friction that `joint_friction_effect` adds to a link-side torque."""
-    coulomb = [jnp.asarray(theta.get(f"coulomb[{j}]", 0.0), jnp.float32) for j in scene.joints]
-    return jnp.zeros(scene.model.nv, jnp.float32).at[scene.joint_dofs].set(jnp.stack(coulomb))
+    coulomb = column(theta, "coulomb", scene.joints)
+    return jnp.zeros(scene.model.nv, jnp.float32).at[scene.joint_dofs].set(coulomb)

@@ -19,7 +19,7 @@ from droid_jax.measure.checks import check_joints
 from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.model.physics import Physics
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect, Rollout, State, Theta
+from droid_jax.model.seam import Effect, Rollout, State, Theta, column
 from droid_jax.model.step import step as simulate_step
 
 Replay = Callable[[Physics], Rollout]
@@ -210,8 +210,7 @@ def torque_offset_effect(joints: Sequence[str]) -> Effect:
     """Constant torque-sensor errors: reads `torque_offset[joint]` from theta, N m; absent means zero."""
 
     def observe(theta: Theta, rollout: Rollout) -> Rollout:
-        offset = jnp.stack([jnp.asarray(theta.get(f"torque_offset[{j}]", 0.0), jnp.float32) for j in joints])
-        return replace(rollout, torque=rollout.torque + offset)
+        return replace(rollout, torque=rollout.torque + column(theta, "torque_offset", joints))
 
     return Effect("torque offset", observe=observe)
 

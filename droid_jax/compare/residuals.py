@@ -67,6 +67,11 @@ class Measured:
     span: tuple[float, float]
     weight: float
 
+    @property
+    def clock(self) -> np.ndarray:
+        """[K] s, the coarse clock: the times of what is smoothed and whitened."""
+        return coarse_clock(*self.span)
+
 
 @dataclass(frozen=True, eq=False)
 class Comparison:

@@ -158,9 +158,8 @@ def traces(found: Identified) -> dict[str, np.ndarray]:
     for i, comparison in enumerate(found.heldout.comparisons):
         channel = comparison.channel("torque")
         repeats = channel.noise.repeats
-        rollout_time = np.linspace(0.0, 1.0, repeats.shape[1])
         name = comparison.name
-        out[f"{name}/time"] = channel.span[0] + rollout_time * (channel.span[1] - channel.span[0])
+        out[f"{name}/time"] = channel.clock
         out[f"{name}/measured_mean"] = channel.noise.mean
         out[f"{name}/measured_low"] = np.quantile(repeats, 0.05, axis=0)
         out[f"{name}/measured_high"] = np.quantile(repeats, 0.95, axis=0)

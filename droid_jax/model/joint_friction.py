@@ -14,11 +14,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 
 from droid_jax.model.parameters import Parameter, Space
-from droid_jax.model.seam import Effect, Rollout, Theta
+from droid_jax.model.seam import Effect, Rollout, Theta, column
 
 SMOOTHING = 0.01  # rad/s: tanh(qd / v0) reaches 0.96 at twice this speed
 TERMS = ("viscous", "coulomb", "torque_offset")
@@ -38,7 +37,7 @@ def joint_friction_effect(joints: Sequence[str], *, v0: float = SMOOTHING) -> Ef
 
     def observe(theta: Theta, rollout: Rollout) -> Rollout:
         speed = rollout.velocity  # [T, J]
-        friction = _column(theta, "viscous", joints) * speed + _column(theta, "coulomb", joints) * jnp.tanh(speed / v0)
+        friction = column(theta, "viscous", joints) * speed + column(theta, "coulomb", joints) * jnp.tanh(speed / v0)
         return replace(rollout, torque=rollout.torque + friction)
 
     parameters = tuple(p for p in joint_friction_space(joints).parameters if not p.name.startswith("torque_offset"))
@@ -77,8 +76,3 @@ def sensor_parameter(
         raise ValueError(f"unknown joint {joint!r}; measured joints: {', '.join(joints)}")
     options = {"unit": _UNITS[term], "mean": 0.0, "group": "Joint friction", **options}
     return Parameter(f"{term}[{joint}]", std=std, low=-high if low is None else low, high=high, **options)
-
-
-def _column(theta: Theta, term: str, joints: Sequence[str]) -> jax.Array:
-    """[J] one term of all joints, zero where theta has none."""
-    return jnp.stack([jnp.asarray(theta.get(f"{term}[{j}]", 0.0), jnp.float32) for j in joints])

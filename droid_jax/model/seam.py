@@ -6,11 +6,12 @@ specialised on its effects when it is traced: one that asks for none pays for no
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from droid_jax.model.parameters import Parameter
 
@@ -89,3 +90,8 @@ class Effect:
     places: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     shapes: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     smallest: float = 0.0
+
+
+def column(theta: Theta, name: str, joints: Sequence[str]) -> jax.Array:
+    """[J] the entries `name[joint]` of theta, in their own unit; zero where theta has none."""
+    return jnp.stack([jnp.asarray(theta.get(f"{name}[{j}]", 0.0), jnp.float32) for j in joints])

@@ -241,7 +241,9 @@ def test_summary_says_when_the_fit_made_it_worse(tmp_path: Path) -> None:
     (run / "fit.json").write_text(json.dumps(fit))
     text = " ".join(summary(read_run(run)))
     assert "the fit made it worse" in text and "do not train on this fit" in text
-    assert "so the model lacks something" in text
+    assert (
+        "what is left is well above the floor, so the model lacks something: see below in which joint and phase" in text
+    )
 
 
 def test_a_stand_in_is_never_called_a_robot(written: Page) -> None:
@@ -348,9 +350,9 @@ def test_long_traces_are_thinned_without_losing_a_spike() -> None:
     time = np.arange(20_000) * 0.001
     value = np.sin(time)
     value[7_777] = 50.0
-    thin_time, thin = torque_figures._thin(time, value)
+    thin_time, thin = torque_figures.thin(time, value)
     assert len(thin) < 500 and thin.max() == 50.0 and (np.diff(thin_time) > 0).all()
-    _, low, high = torque_figures._band(time, value - 1, value + 1)
+    _, low, high = torque_figures.band(time, value - 1, value + 1)
     assert low.min() == (value - 1).min() and high.max() == 51.0
 
 

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from droid_jax.model.joint_friction import SMOOTHING
 from droid_jax.model.parameters import Parameter
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import State, Theta
 
-SLOW = 0.01  # rad/s: speeds well below this have no direction yet
 GROUP = "Effect"
 
 
@@ -55,11 +55,6 @@ def places(joints: Sequence[str], *names: str) -> dict[str, tuple[str, ...]]:
     return {j: tuple(f"{n}[{j}]" for n in names) for j in joints}
 
 
-def column(theta: Theta, name: str, joints: Sequence[str]) -> jax.Array:
-    """[J] one amplitude of all joints; zero where theta has none."""
-    return jnp.stack([value(theta, f"{name}[{j}]") for j in joints])
-
-
 def value(theta: Theta, name: str, neutral: float = 0.0) -> jax.Array:
     """[] an entry of theta; its neutral value where theta has none."""
     return jnp.asarray(theta.get(name, neutral), jnp.float32)
@@ -89,5 +84,5 @@ def speed(scene: Scene, joint: str, state: State) -> jax.Array:
 
 
 def direction(velocity: jax.Array) -> jax.Array:
-    """Smooth sign of a speed, rad/s."""
-    return jnp.tanh(velocity / SLOW)
+    """Smooth sign of a speed, rad/s; speeds well below SMOOTHING have no direction yet."""
+    return jnp.tanh(velocity / SMOOTHING)

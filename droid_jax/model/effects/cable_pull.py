@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from droid_jax.model.effects import amplitudes as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect
+from droid_jax.model.seam import Effect, column
 
 STIFFNESS, PULL = "cable_stiffness", "cable_pull"
 
@@ -20,7 +20,7 @@ def cable_pull(scene: Scene) -> Effect | None:
 
     def force(theta, state):
         stretch = state.qpos[positions] - reference
-        torque = a.column(theta, STIFFNESS, joints) * stretch + a.column(theta, PULL, joints)
+        torque = column(theta, STIFFNESS, joints) * stretch + column(theta, PULL, joints)
         return jnp.zeros_like(state.qvel).at[dofs].add(-torque)
 
     return Effect(

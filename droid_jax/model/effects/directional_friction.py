@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from droid_jax.model.effects import amplitudes as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect
+from droid_jax.model.seam import Effect, column
 
 JOINT, HINGE = "joint_directional", "hinge_directional"
 
@@ -18,7 +18,7 @@ def joint_directional(scene: Scene) -> Effect | None:
         return None
 
     def frictionloss(theta, state, base):
-        extra = a.column(theta, JOINT, joints) * a.direction(state.qvel[dofs])
+        extra = column(theta, JOINT, joints) * a.direction(state.qvel[dofs])
         return base.at[dofs].set(jnp.maximum(base[dofs] + extra, 0.0))
 
     return Effect(

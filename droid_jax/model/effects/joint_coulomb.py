@@ -3,7 +3,7 @@
 from droid_jax.model.effects import amplitudes as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect
+from droid_jax.model.seam import Effect, column
 
 LOSS = "joint_coulomb"
 
@@ -16,7 +16,7 @@ def joint_coulomb(scene: Scene) -> Effect | None:
         return None
 
     def frictionloss(theta, state, base):
-        return base.at[dofs].add(a.column(theta, LOSS, joints))
+        return base.at[dofs].add(column(theta, LOSS, joints))
 
     return Effect(
         LOSS,

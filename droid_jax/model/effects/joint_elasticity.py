@@ -20,7 +20,7 @@ import numpy as np
 from droid_jax.model.effects import amplitudes as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect, State
+from droid_jax.model.seam import Effect, State, column
 
 COMPLIANCE, BACKLASH = "joint_compliance", "joint_backlash"
 
@@ -85,7 +85,7 @@ def joint_compliance(scene: Scene) -> Effect | None:
         return None
 
     def servo(theta, state, ctrl):
-        compliance = a.column(theta, COMPLIANCE, servos.joints)
+        compliance = column(theta, COMPLIANCE, servos.joints)
         torque = servos.rigid_torque(state, ctrl) / (1.0 + servos.stiffness * compliance)
         return servos.with_lead(ctrl, compliance * torque)
 
@@ -113,7 +113,7 @@ def joint_backlash(scene: Scene) -> Effect | None:
         return None
 
     def servo(theta, state, ctrl):
-        half = 0.5 * a.column(theta, BACKLASH, servos.joints)
+        half = 0.5 * column(theta, BACKLASH, servos.joints)
         error = servos.rigid_torque(state, ctrl) / servos.stiffness
         lead = jnp.sign(half) * jnp.clip(error, -jnp.abs(half), jnp.abs(half))
         return servos.with_lead(ctrl, lead)

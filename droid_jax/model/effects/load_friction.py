@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from droid_jax.model.effects import amplitudes as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect
+from droid_jax.model.seam import Effect, column
 
 SHARE = "load_friction"
 
@@ -18,7 +18,7 @@ def load_friction(scene: Scene) -> Effect | None:
         return None
 
     def frictionloss(theta, state, base):
-        return base.at[dofs].add(a.column(theta, SHARE, joints) * jnp.abs(state.load[dofs]))
+        return base.at[dofs].add(column(theta, SHARE, joints) * jnp.abs(state.load[dofs]))
 
     return Effect(
         SHARE,

@@ -1,8 +1,11 @@
 """Servo gains other than the stated ones."""
 
+from dataclasses import replace
+
 from droid_jax.model.effects import amplitudes as a
 from droid_jax.model.effects.registry import register
-from droid_jax.model.parameters import Mode, Parameter, Write
+from droid_jax.model.fields import servo_scale
+from droid_jax.model.parameters import Parameter
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
 
@@ -17,11 +20,7 @@ def servo_gain(scene: Scene) -> Effect | None:
         return None
 
     def parameter(joint: str) -> Parameter:
-        row = scene.command_names.index(joint)
-        writes = tuple(
-            Write(field, (row, column), Mode.SCALE, offset=1.0)
-            for field, column in (("actuator_gainprm", 0), ("actuator_biasprm", 1))
-        )
+        writes = tuple(replace(w, offset=1.0) for w in servo_scale(scene, joint).writes)
         return Parameter(f"{GAIN}[{joint}]", "-", 0.0, 0.1, -0.5, 0.5, writes=writes, group=a.GROUP)
 
     return Effect(
@@ -30,6 +29,6 @@ def servo_gain(scene: Scene) -> Effect | None:
         what="a servo whose position gain is not the stated one",
         mark="tracking error of one joint",
         confused_with=("joint_compliance", "command_delay", "torque_gain"),
-        places={j: (f"{GAIN}[{j}]",) for j in joints},
+        places=a.places(joints, GAIN),
         smallest=0.02,
     )

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from droid_jax.model.effects import amplitudes as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect
+from droid_jax.model.seam import Effect, column
 
 JOINT, JOINT_SPEED = "joint_stribeck", "joint_stribeck_speed"
 HINGE, HINGE_SPEED = "hinge_stribeck", "hinge_stribeck_speed"
@@ -25,7 +25,7 @@ def joint_stribeck(scene: Scene) -> Effect | None:
         return None
 
     def frictionloss(theta, state, base):
-        extra = a.column(theta, JOINT, joints) * _excess(theta, JOINT_SPEED, state.qvel[dofs])
+        extra = column(theta, JOINT, joints) * _excess(theta, JOINT_SPEED, state.qvel[dofs])
         return base.at[dofs].add(extra)
 
     return Effect(

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from droid_jax.model.effects import amplitudes as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect
+from droid_jax.model.seam import Effect, column
 
 SINE, COSINE, PERIODS = "ripple_sine", "ripple_cosine", "ripple_periods"
 COUNTS = (6.0, 12.0, 24.0, 48.0)  # periods a turn
@@ -21,8 +21,8 @@ def torque_ripple(scene: Scene) -> Effect | None:
 
     def force(theta, state):
         phase = a.value(theta, PERIODS, COUNTS[2]) * state.qpos[positions]
-        torque = a.column(theta, SINE, joints) * jnp.sin(phase)
-        torque = torque + a.column(theta, COSINE, joints) * jnp.cos(phase)
+        torque = column(theta, SINE, joints) * jnp.sin(phase)
+        torque = torque + column(theta, COSINE, joints) * jnp.cos(phase)
         return jnp.zeros_like(state.qvel).at[dofs].add(torque)
 
     return Effect(

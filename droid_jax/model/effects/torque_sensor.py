@@ -5,7 +5,7 @@ from dataclasses import replace
 from droid_jax.model.effects import amplitudes as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect
+from droid_jax.model.seam import Effect, column
 
 BIAS, GAIN, DRIFT = "torque_bias", "torque_gain", "torque_drift"
 
@@ -15,7 +15,7 @@ def torque_bias(scene: Scene) -> Effect | None:
     """tau + b, N m."""
 
     def observe(theta, rollout):
-        return replace(rollout, torque=rollout.torque + a.column(theta, BIAS, scene.joints))
+        return replace(rollout, torque=rollout.torque + column(theta, BIAS, scene.joints))
 
     return Effect(
         BIAS,
@@ -34,7 +34,7 @@ def torque_gain(scene: Scene) -> Effect | None:
     """(1 + g) tau."""
 
     def observe(theta, rollout):
-        return replace(rollout, torque=rollout.torque * (1.0 + a.column(theta, GAIN, scene.joints)))
+        return replace(rollout, torque=rollout.torque * (1.0 + column(theta, GAIN, scene.joints)))
 
     return Effect(
         GAIN,
@@ -54,7 +54,7 @@ def torque_drift(scene: Scene) -> Effect | None:
 
     def observe(theta, rollout):
         middle = rollout.time - 0.5 * (rollout.time[0] + rollout.time[-1])
-        return replace(rollout, torque=rollout.torque + a.column(theta, DRIFT, scene.joints) * middle[:, None])
+        return replace(rollout, torque=rollout.torque + column(theta, DRIFT, scene.joints) * middle[:, None])
 
     return Effect(
         DRIFT,
