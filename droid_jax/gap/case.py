@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from droid_jax.compare.cost import make_cost
 from droid_jax.compare.residuals import CompareConfig
@@ -14,9 +14,11 @@ from droid_jax.identify.refine import RefineConfig
 from droid_jax.identify.search import SearchConfig
 from droid_jax.measure.recording import Recording
 from droid_jax.model.effects.registry import effect_space, ready
-from droid_jax.model.parameters import Space
+from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
+
+BEYOND = 3.0  # prior deviations of a nuisance from which on it is an effect
 
 
 @dataclass(frozen=True)
@@ -24,13 +26,15 @@ class GapConfig:
     """Settings of the search for a missing effect.
 
     search, refine: of the base fit.  refit: of every extended model.
-    refitted: candidates that are refitted in each round.  most: effects at most.
+    looked: candidates that are tried by a short refit in each round; refitted: the best of these, in full.
+    most: effects at most.
     compare: how simulation and measurement are compared.  seed: of flips and resamples.
     """
 
     search: SearchConfig = field(default_factory=lambda: SearchConfig(parents=None, generations=20))
     refine: RefineConfig = field(default_factory=RefineConfig)
     refit: RefineConfig = REFIT
+    looked: int = 12
     refitted: int = 6
     most: int = 3
     compare: CompareConfig = field(default_factory=CompareConfig)
@@ -89,6 +93,19 @@ def make_case(
             f"recordings {', '.join(few)}: at least {FEWEST} repeats are needed to tell an effect from noise"
         )
     scene = ready(scene)
+    base = _restrained(base, effects)
     whole = base + effect_space(effects)
     made = [evidence(make_cost(scene, whole, [r], config=config.compare, effects=effects)) for r in recordings]
     return Case(made[0], made[1], made[2] if sealed is not None else None, base, tuple(effects), config)
+
+
+def _restrained(base: Space, effects: Sequence[Effect]) -> Space:
+    """The base with every nuisance that an effect stands for kept within BEYOND prior deviations."""
+    doubled = {name for effect in effects for name in effect.nuisances}
+
+    def restrained(p: Parameter) -> Parameter:
+        if not (p.nuisance and p.name in doubled):
+            return p
+        return replace(p, low=max(p.low, p.mean - BEYOND * p.std), high=min(p.high, p.mean + BEYOND * p.std))
+
+    return Space(tuple(restrained(p) for p in base.parameters))

@@ -1,23 +1,22 @@
-"""Which effects belong into the model: forward, judged on a demonstration that moves differently."""
+"""Which effects belong into the model: judged on a demonstration that moves differently, parameters frozen."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from droid_jax.gap.evidence import Evidence, gap
 from droid_jax.gap.flips import sign_flips, t_values
 from droid_jax.gap.refit import Model, intervals
-from droid_jax.gap.screen import Screen
 
 SIGNIFICANT = 0.01
 LESS = 0.2  # share of U that an effect must take away on the confirming demonstration
 OF_ALL = 0.05  # and share of the base model's U: what a wrong form of the first effect leaves is no effect of its own
-TIE = 0.1  # of what the best takes away: a rival that leaves no more than this beyond it does as well
-CHOSEN = 0.8  # share of the resamples in which an effect must win
+TIE = 3.0  # a rival that leaves no more than this times what the best leaves (above the floor) does as well
+DOUBT = 0.05  # share of the resamples in which a rival is better, from which it does as well
+CHOSEN = 0.8  # share of the resamples in which an effect, or one that does as well, must win
 RESAMPLES = 400
 EDGE = 0.02  # share of a parameter's range that counts as its bound
 
@@ -27,7 +26,8 @@ class Trial:
     """An effect's case: everything it had to pass, and the reason where it did not.
 
     gap_fit, gap_confirm: U with it on both demonstrations; p: of the improvement on the confirming one.
-    interval: of each amplitude; chosen: share of resamples.  reasons: why it lost, empty where it passed.
+    interval: of each amplitude; chosen: share of resamples.  rivals: names of models that cannot be told from it.
+    reasons: why it lost, empty where it passed.
     """
 
     name: str
@@ -37,21 +37,12 @@ class Trial:
     interval: dict[str, tuple[float, float]]
     chosen: float
     reasons: tuple[str, ...]
+    rivals: tuple[str, ...] = ()
 
     @property
     def passed(self) -> bool:
         """No reason against it."""
         return not self.reasons
-
-
-def improvement(confirm: Evidence, before: np.ndarray, after: np.ndarray) -> tuple[float, float, np.ndarray]:
-    """U before and after on the confirming demonstration, parameters frozen; and every repeat's gain [N].
-
-    before, after: [D] values.  gain: half the fall of a repeat's squared residual.
-    """
-    common = confirm.common(np.stack([before, after]))
-    old, new = (confirm.residuals(c) for c in common)
-    return gap(old), gap(new), 0.5 * (np.sum(old**2, axis=1) - np.sum(new**2, axis=1))
 
 
 def one_sided_p(gain: np.ndarray) -> float:
@@ -60,50 +51,67 @@ def one_sided_p(gain: np.ndarray) -> float:
     return float(np.mean(t >= t[0] - 1e-12))
 
 
-def resampled(screen: Screen, residuals: np.ndarray, seed: int = 0) -> dict[str, float]:
-    """Share of resamples of the repeats in which each candidate (any shape) explains most, linearly."""
-    rng = np.random.default_rng(seed)
-    count = len(residuals)
-    scores = screen.marks @ residuals.T  # [K, N]
-    gram = screen.marks @ screen.marks.T
-    groups: dict[Any, list[int]] = {}
-    for k, question in enumerate(screen.questions):
-        groups.setdefault(question.candidate.key, []).append(k)
-    draws = rng.multinomial(count, np.full(count, 1 / count), size=RESAMPLES) / count  # [R, N]
-    mean = draws @ scores.T  # [R, K]
-    explained = np.stack([_explained(mean[:, rows], gram[np.ix_(rows, rows)]) for rows in groups.values()], axis=1)
-    names = [screen.questions[rows[0]].candidate.name for rows in groups.values()]
-    winners = np.bincount(np.argmax(explained, axis=1), minlength=len(names)) / RESAMPLES
-    out: dict[str, float] = {}
-    for name, share in zip(names, winners, strict=True):
-        out[name] = out.get(name, 0.0) + float(share)
-    return out
+def resampled_losses(commons: np.ndarray, deviations: np.ndarray, seed: int = 0) -> np.ndarray:
+    """[R, K] squared mean residual of K models in resamples of the repeats, up to what all models share.
 
-
-def _explained(scores: np.ndarray, gram: np.ndarray) -> np.ndarray:
-    """[R] what the best combination of some amplitudes explains; scores [R, K] and gram [K, K] of their marks."""
-    damped = gram + 1e-9 * np.trace(gram) / len(gram) * np.eye(len(gram))
-    return np.einsum("rk,rk->r", scores, np.linalg.solve(damped, scores.T).T)
+    commons: [K, M] common part of the residuals of each model; deviations: [N, M] of the repeats.
+    """
+    count = len(deviations)
+    draws = np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), size=RESAMPLES) / count
+    return np.sum(commons**2, axis=1) + 2 * draws @ (deviations @ commons.T)
 
 
 def judge(
     fit: Evidence,
     confirm: Evidence,
-    base: Model,
-    model: Model,
+    before: Model,
+    models: Sequence[Model],
+    smallest: Mapping[str, float],
     whole_gap: float,
-    chosen: float,
-    smallest: dict[str, float],
-) -> Trial:
-    """Put an extended model on trial against the one without its last effect.
+    floor: float = 0.0,
+    seed: int = 0,
+) -> list[Trial]:
+    """Put extended models on trial against the one without their last effects, and against each other.
 
-    whole_gap: U of the model without any effect on the confirming demonstration.  chosen: share of
-    resamples in which the effect, or one that looks like it, wins.
+    before: that model.  smallest: amplitude -> size worth naming.  whole_gap: U of the model without
+    any effect on the confirming demonstration.  One batch of replays.
     """
-    before, after, gain = improvement(confirm, base.values, model.values)
-    p = one_sided_p(gain)
-    spans = intervals(fit, model)
-    new = [a for a in model.amplitudes if a not in base.amplitudes]
+    commons = confirm.common(np.stack([before.values, *(m.values for m in models)]))
+    repeats = [confirm.residuals(c) for c in commons]
+    left = np.array([gap(r) for r in repeats])
+    squares = np.array([np.sum(r**2, axis=1) for r in repeats])
+    losses = resampled_losses(commons[1:], confirm.deviations, seed)
+    same = alike(left[1:], losses, floor)
+    winners = np.bincount(np.argmin(losses, axis=1), minlength=len(models)) / len(losses)
+    out = []
+    for k, model in enumerate(models):
+        p = one_sided_p(0.5 * (squares[0] - squares[k + 1]))
+        chosen = float(winners[same[k]].sum())
+        spans = {a: s for a, s in intervals(fit, model).items() if a not in before.amplitudes}
+        reasons = _gap_reasons(left[0], left[k + 1], p, whole_gap)
+        reasons += _amplitude_reasons(fit, model, spans, smallest)
+        if chosen < CHOSEN:
+            leader = models[int(np.argmin(left[1:]).item())].name
+            reasons.append(f"wins only {chosen:.0%} of the resamples; {leader} does better")
+        rivals = tuple(models[i].name for i in np.flatnonzero(same[k]) if i != k)
+        out.append(Trial(model.name, model.gap, float(left[k + 1]), p, spans, chosen, tuple(reasons), rivals))
+    return out
+
+
+def alike(left: np.ndarray, losses: np.ndarray, floor: float) -> np.ndarray:
+    """[K, K] bool, which models cannot be told apart.
+
+    left: [K] U on the confirming demonstration; losses: [R, K] in resamples of its repeats.  What two
+    wrong forms leave says little about which is nearer the truth, so ratios count and not significance.
+    """
+    above = np.maximum(left - floor, 1e-12)
+    near = above[None, :] <= TIE * above[:, None]
+    better = np.mean(losses[:, None, :] < losses[:, :, None], axis=0) > DOUBT
+    as_good = near | better
+    return (as_good & as_good.T) | np.eye(len(left), dtype=bool)
+
+
+def _gap_reasons(before: float, after: float, p: float, whole_gap: float) -> list[str]:
     reasons = []
     if p >= SIGNIFICANT:
         reasons.append(f"not confirmed by the other demonstration (p = {p:.2g})")
@@ -111,14 +119,19 @@ def judge(
         reasons.append(f"takes only {1 - after / before:.0%} of the gap away on the other demonstration")
     elif before - after < OF_ALL * whole_gap:
         reasons.append(f"takes only {(before - after) / whole_gap:.1%} of the first gap away")
-    if all(low <= 0.0 <= high for low, high in (spans[a] for a in new)):
+    return reasons
+
+
+def _amplitude_reasons(
+    fit: Evidence, model: Model, spans: Mapping[str, tuple[float, float]], smallest: Mapping[str, float]
+) -> list[str]:
+    space = fit.cost.space
+    reasons = []
+    if all(low <= 0.0 <= high for low, high in spans.values()):
         reasons.append("its amplitude may be zero")
-    if all(abs(model.values[fit.cost.space.index(a)]) < smallest[a] for a in new):
+    if all(abs(model.values[space.index(a)] - space[a].mean) < smallest[a] for a in spans):
         reasons.append("too small to be worth a name")
-    reasons += [f"{a} ran into its bound" for a in new if _on_bound(fit, model, a)]
-    if chosen < CHOSEN:
-        reasons.append(f"wins only {chosen:.0%} of the resamples")
-    return Trial(model.name, model.gap, after, p, {a: spans[a] for a in new}, chosen, tuple(reasons))
+    return reasons + [f"{a} ran into its bound" for a in spans if _on_bound(fit, model, a)]
 
 
 def _on_bound(fit: Evidence, model: Model, amplitude: str) -> bool:
@@ -126,9 +139,3 @@ def _on_bound(fit: Evidence, model: Model, amplitude: str) -> bool:
     p = fit.cost.space[amplitude]
     value, reach = model.values[fit.cost.space.index(amplitude)], EDGE * (p.high - p.low)
     return value > p.high - reach or (p.low != p.mean and value < p.low + reach)
-
-
-def tied(trials: Sequence[Trial], best: Trial, before: float) -> list[Trial]:
-    """The rivals that passed and do as well as the best; before: U without any of them."""
-    enough = best.gap_confirm + TIE * (before - best.gap_confirm)
-    return [t for t in trials if t is not best and t.passed and t.gap_confirm <= enough]

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
-from droid_jax.gap.candidates import Candidate, candidates
+from droid_jax.gap.candidates import candidates
 from droid_jax.gap.case import Case
 from droid_jax.gap.localise import localise
 from droid_jax.gap.refit import Model, refit
+from droid_jax.gap.rounds import Round, forward, pairs, polished, pruned
 from droid_jax.gap.screen import Question, Screen, marks, project, questions_of, screen
-from droid_jax.gap.select import SIGNIFICANT, Trial, judge, resampled, tied
+from droid_jax.gap.select import SIGNIFICANT
 from droid_jax.gap.verdict import Kind, Verdict
 from droid_jax.identify.pipeline import grip_hypotheses, starts
 from droid_jax.identify.search import search
 
 Progress = Callable[[str, Any], None]
-COLLINEAR = 0.9  # absolute cosine from which two marks count as one
 OPEN = 0.2  # share of the gap left open from which a model explains it only partly
 
 
@@ -44,110 +41,86 @@ def base_fit(case: Case, progress: Progress) -> Model:
     )
 
 
-def ask(case: Case, model: Model, asked: Sequence[Question]) -> Screen:
+def ask(case: Case, model: Model, asked: tuple[Question, ...]) -> Screen:
     """Screen questions against a model's residuals on the first demonstration."""
     count = case.fit.repeats
     raw = marks(case.fit, model.values, asked)
-    base = model.refined.jacobian / np.sqrt(count)
-    projected = project(raw, -base, model.refined.prior * np.sqrt(count))
+    base = model.refined.jacobian / count**0.5
+    projected = project(raw, -base, model.refined.prior * count**0.5)
     return screen(model.residuals, asked, projected, case.config.seed)
 
 
 def find(case: Case, base: Model, floor: float, progress: Progress = lambda stage, value: None) -> Verdict:
-    """From a converged base fit to a verdict.  floor: U0, see `numerical_floor`."""
-    before = case.confirm.gap_at(base.values)
+    """From a base fit to a verdict.  floor: U0, see `numerical_floor`."""
+    if not base.refined.converged:
+        return _verdict(case, base, base, floor, [])
+    whole_gap = case.confirm.gap_at(base.values)
     asked = questions_of(candidates(case.effects))
-    grounds = Grounds([], [], [])
-    model, again = base, base.refined.converged
-    while again and len(model.parts) < case.config.most:
+    model, rounds = base, list[Round]()
+    while len(model.parts) < case.config.most:
         progress("screen", model.name)
-        left = [q for q in asked if not set(q.candidate.amplitudes) & set(model.amplitudes)]
+        left = tuple(q for q in asked if not set(q.candidate.amplitudes) & set(model.amplitudes))
         found = ask(case, model, left)
-        grounds.screens.append(found)
         if found.p >= SIGNIFICANT or model.gap <= floor:
+            rounds.append(Round(found))
             break
-        extended = _next(case, model, found, before, grounds, progress)
-        again, model = extended is not None, extended or model
-    return _verdict(case, base, model, floor, grounds)
-
-
-@dataclass(frozen=True, eq=False)
-class Grounds:
-    """What is gathered on the way: every screening, every trial, and the rivals of each effect chosen."""
-
-    screens: list[Screen]
-    trials: list[Trial]
-    rivals: list[tuple[str, ...]]
-
-
-def _next(
-    case: Case, model: Model, found: Screen, whole_gap: float, grounds: Grounds, progress: Progress
-) -> Model | None:
-    """The model with the effect that does best on the confirming demonstration, if one passes its trial."""
-    chosen = resampled(found, model.residuals, case.config.seed)
-    tried: list[tuple[Model, Trial]] = []
-    for candidate, start in _promising(case, model, found):
-        progress("refit", candidate.name)
-        extended = refit(case.fit, case.base, (*model.parts, candidate), start[None], case.config.refit)
-        share = sum(chosen[n] for n in _alike(candidate, found))
-        trial = judge(case.fit, case.confirm, model, extended, whole_gap, share, case.smallest)
-        tried.append((extended, trial))
-    grounds.trials.extend(t for _, t in tried)
-    passed = [(m, t) for m, t in tried if t.passed]
-    if not passed:
-        return None
-    winner, best = min(passed, key=lambda mt: mt[1].gap_confirm)
-    rivals = tied([t for _, t in passed], best, case.confirm.gap_at(model.values))
-    grounds.rivals.append(tuple(t.name.split(" + ")[-1] for t in rivals))
-    return winner
-
-
-def _promising(case: Case, model: Model, found: Screen) -> list[tuple[Candidate, np.ndarray]]:
-    """The best shape of the best candidates, with a start [D] at what the linear score says."""
-    seen: dict[str, tuple[Candidate, np.ndarray]] = {}
-    for k in found.best():
-        candidate = found.questions[k].candidate
-        if candidate.name in seen:
-            continue
-        start = model.values.copy()
-        for name, value in candidate.shapes.items():
-            start[case.whole.index(name)] = value
-        p = case.whole[found.questions[k].amplitude]
-        start[case.whole.index(p.name)] = np.clip(found.size[k], p.low, p.high)
-        seen[candidate.name] = (candidate, start)
-        if len(seen) == case.config.refitted:
+        done = forward(case, model, found, whole_gap, floor, progress)
+        rounds.append(done)
+        if done.winner is None:
             break
-    return list(seen.values())
+        model = done.winner
+    if (len(rounds) > 1 and rounds[1].trials and len(model.parts) != 1) or (not model.parts and rounds[0].trials):
+        paired = pairs(case, base, model, rounds[0], whole_gap, floor, progress)
+        rounds.append(paired)
+        model = paired.winner or model
+    model = pruned(case, model, whole_gap, floor, progress)
+    return _verdict(case, base, polished(case, model, progress), floor, rounds)
 
 
-def _alike(candidate: Candidate, found: Screen) -> set[str]:
-    """Names of the candidates whose marks are nearly this one's: a resample may pick any of them."""
-    rows = np.array([q.candidate.name == candidate.name for q in found.questions])
-    unit = found.marks / np.maximum(np.linalg.norm(found.marks, axis=1, keepdims=True), 1e-30)
-    near = np.max(np.abs(unit @ unit[rows].T), axis=1) > COLLINEAR
-    return {candidate.name} | {found.questions[k].candidate.name for k in np.flatnonzero(near)}
+def _unsettled(case: Case, model: Model, whole_gap: float, floor: float) -> bool:
+    """Nothing named yet, several effects, or much left over: one that mimics two may have stood in their way."""
+    return len(model.parts) != 1 or _open(case.confirm.gap_at(model.values), whole_gap, floor) > OPEN
 
 
-def _verdict(case: Case, base: Model, model: Model, floor: float, grounds: Grounds) -> Verdict:
+def _open(after: float, before: float, floor: float) -> float:
+    """Share of a gap that is left."""
+    return (after - floor) / max(before - floor, 1e-12)
+
+
+def _verdict(case: Case, base: Model, model: Model, floor: float, rounds: list[Round]) -> Verdict:
     gaps = {role: (e.gap_at(base.values), e.gap_at(model.values)) for role, e in case.judged.items()}
     before, after = gaps["confirm"]
-    open_share = (after - floor) / max(before - floor, 1e-12)
-    missing = grounds.screens and grounds.screens[0].p < SIGNIFICANT and base.gap > floor
+    missing = bool(rounds) and rounds[0].screen.p < SIGNIFICANT and base.gap > floor
+    tied = tuple(_rivals(model, part.name, rounds) for part in model.parts)
     kind = Kind.NONE if not missing else Kind.UNEXPLAINED
     if not base.refined.converged:
         kind = Kind.UNCONVERGED
     elif model.parts:
-        kind = Kind.PARTLY if open_share > OPEN else Kind.TIE if any(grounds.rivals) else Kind.NAMED
+        kind = Kind.PARTLY if _open(after, before, floor) > OPEN else Kind.TIE if any(tied) else Kind.NAMED
     return Verdict(
         kind=kind,
         effects=tuple(c.name for c in model.parts),
-        tied=tuple(grounds.rivals),
+        tied=tied,
         base=base,
         model=model,
         floor=floor,
         gaps=gaps,
-        screens=tuple(grounds.screens),
-        trials=tuple(grounds.trials),
+        screens=tuple(r.screen for r in rounds),
+        trials=tuple(t for r in rounds for t in r.trials),
         before=localise(case.fit, base.values, base.residuals),
         after=localise(case.fit, model.values, model.residuals),
     )
+
+
+def _rivals(model: Model, part: str, rounds: list[Round]) -> tuple[str, ...]:
+    """What does as well as one effect of the model: members of passing rivals in the round that chose it."""
+    for done in rounds:
+        if done.winner is not None and done.chosen is not None and part in _last(done.chosen.name, done):
+            names = {n for r in done.chosen.rivals for n in _last(r, done) if done.passed(r)}
+            return tuple(sorted(names - {part}))
+    return ()
+
+
+def _last(name: str, done: Round) -> tuple[str, ...]:
+    """The effects that a round added to what stood before."""
+    return tuple(n for n in name.split(" + ") if n not in done.stood)

@@ -45,6 +45,7 @@ class RefineConfig:
     hold: iterations for which the values of a hypothesis are held while all else settles.
     hops: searches at most for a better basin around where the iterations stood still.
     hop_generations: generations of each.
+    spreads: times that the slopes are taken over the width of the posterior at the end; 0 leaves the narrow ones.
     """
 
     iterations: int = 30
@@ -59,6 +60,7 @@ class RefineConfig:
     hold: int = 2
     hops: int = 4
     hop_generations: int = 20
+    spreads: int = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +174,6 @@ _DAMPINGS = 10.0 ** np.arange(-3.0, 5.0)
 _LENGTHS = (1.0, 0.5)
 _LONGEST = 2.0  # search units: the longest component of a step
 CHORDS = 3  # batches of trials at most with one Jacobian
-SPREADS = 2  # times that the posterior's axes are improved
 WIDE = 1.5  # posterior deviations: half-width of those differences
 SPREAD_LONGEST = 1.0  # search units
 HOP_POPULATION = 32
@@ -322,9 +323,9 @@ class _Problem:
         Differences of one parameter at a time carry the solver's rounding, which looks like
         information where two parameters trade with each other: their slopes cancel, its does not.
         Along the axes each difference is WIDE deviations of the result; as the first axes suffer from
-        that rounding themselves, they are improved SPREADS times.
+        that rounding themselves, they are improved `spreads` times.
         """
-        for _ in range(SPREADS):
+        for _ in range(self.config.spreads):
             steps = WIDE * self.axes(jacobian, SPREAD_LONGEST).T
             spans, apart = self.differences(
                 self.inside(state.x[:, None] + steps), self.inside(state.x[:, None] - steps), state

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from droid_jax.gap.candidates import Candidate, candidates
+from droid_jax.gap.rank import proposals
 from droid_jax.gap.screen import Question, project, screen
-from droid_jax.gap.select import Trial, one_sided_p, resampled, tied
-from droid_jax.model.parameters import Parameter
+from droid_jax.gap.select import alike, one_sided_p, resampled_losses
+from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.seam import Effect
 
 REPEATS, SIZE = 10, 400
@@ -57,15 +58,36 @@ def test_what_the_base_can_absorb_is_no_effect():
     assert abs(found.explained[4]) < 1e-2
 
 
-def test_resamples_agree_on_a_clear_winner_and_split_over_twins():
-    clear = screen(repeats(3, a2=0.6), QUESTIONS, project(MARKS, BASE, LOOSE))
-    assert resampled(clear, repeats(3, a2=0.6))["effect2 at hinge"] == 1.0
-    twin = MARKS.copy()
-    twin[4] = twin[2] + 0.02 * MARKS[0]
-    data = repeats(4, a2=0.6)
-    shares = resampled(screen(data, QUESTIONS, project(twin, BASE, LOOSE)), data)
-    assert shares["effect2 at hinge"] + shares["effect4 at hinge"] == pytest.approx(1.0)
-    assert sum(shares.values()) == pytest.approx(1.0)
+def test_the_ranking_takes_amplitudes_together_and_inside_their_bounds():
+    space = Space(tuple(Parameter(f"a{k}", "N m", 0.0, 1.0, 0.0 if k == 1 else -5.0, 5.0) for k in range(5)))
+    both = Candidate("both", "hinge", ("a3", "a4"))
+    questions = (*QUESTIONS[:3], Question(both, "a3"), Question(both, "a4"))
+    data = repeats(3, a1=-0.8, a3=0.5, a4=-0.6)
+    found = screen(data, questions, project(MARKS, BASE, LOOSE))
+    first, *rest = proposals(found, data, space)
+    assert first.names == ("both at hinge",)
+    assert first.sizes["a3"] == pytest.approx(0.5, abs=0.08) and first.sizes["a4"] == pytest.approx(-0.6, abs=0.08)
+    forbidden = next(p for p in rest if p.names == ("effect1 at hinge",))
+    assert forbidden.sizes["a1"] == 0.0 and forbidden.explained == 0.0
+    np.testing.assert_allclose(first.start(space, np.zeros(5)), [0, 0, 0, first.sizes["a3"], first.sizes["a4"]])
+
+
+def test_pairs_are_ranked_together():
+    space = Space(tuple(Parameter(f"a{k}", "N m", 0.0, 1.0, -5.0, 5.0) for k in range(5)))
+    data = repeats(4, a0=0.5, a2=0.5)
+    found = screen(data, QUESTIONS, project(MARKS, BASE, LOOSE))
+    best = proposals(found, data, space, number=2)
+    assert len(best) == 10 and set(best[0].names) == {"effect0 at hinge", "effect2 at hinge"}
+    few = proposals(found, data, space, number=2, among={"effect1 at hinge", "effect2 at hinge", "effect3 at hinge"})
+    assert len(few) == 3
+
+
+def test_shapes_are_not_rivals_of_each_other():
+    space = Space((Parameter("a", "N m", 0.0, 1.0, -5.0, 5.0), Parameter("w", "rad", 0.1, 0.1, 0.0, 1.0)))
+    shaped = tuple(Question(Candidate("latch", "hinge", ("a",), {"w": w}), "a") for w in (0.1, 0.2, 0.3))
+    data = repeats(5, a1=0.7)
+    (only,) = proposals(screen(data, shaped, project(MARKS[:3], BASE, LOOSE)), data, space)
+    assert only.parts[0].shapes == {"w": 0.2}
 
 
 def test_one_sided_p():
@@ -73,12 +95,35 @@ def test_one_sided_p():
     assert one_sided_p(-np.arange(1.0, 11.0)) > 0.9
 
 
-def test_rivals_that_do_as_well_are_ties():
-    def trial(name: str, left: float, *reasons: str) -> Trial:
-        return Trial(name, left, left, 0.002, {}, 1.0, reasons)
+def test_models_that_leave_much_the_same_are_ties():
+    left = np.array([1.0, 2.5, 10.0, 1.0])
+    losses = np.tile([1.0, 2.0, 9.0, 1.5], (400, 1))
+    same = alike(left, losses, floor=0.0)
+    np.testing.assert_array_equal(same, same.T)
+    assert same[0].tolist() == [True, True, False, True]
+    assert alike(left, losses, floor=0.9)[0].tolist() == [True, False, False, True]  # above the floor it is 16 times
 
-    best, near, far, failed = trial("a", 1.0), trial("b", 1.8), trial("c", 2.5), trial("d", 1.0, "on its bound")
-    assert tied([best, near, far, failed], best, before=10.0) == [near]
+
+def test_models_that_noise_cannot_separate_are_ties():
+    """Two models whose difference the repeats' scatter hides, and one that is clearly worse."""
+    rng = np.random.default_rng(6)
+    commons = 0.05 * rng.normal(size=(3, SIZE))
+    commons[1] = commons[0] + 0.005 * rng.normal(size=SIZE)
+    commons[2] += 1.0
+    deviations = rng.normal(size=(REPEATS, SIZE))
+    losses = resampled_losses(commons, deviations - deviations.mean(axis=0))
+    same = alike(np.array([1e-4, 1e-3, 1.0]), losses, floor=0.0)
+    assert same[0].tolist() == [True, True, False]
+
+
+def test_resampled_losses_are_the_squared_means_of_resamples():
+    rng = np.random.default_rng(7)
+    commons, deviations = rng.normal(size=(2, 30)), rng.normal(size=(REPEATS, 30))
+    deviations -= deviations.mean(axis=0)
+    losses = resampled_losses(commons, deviations, seed=8)
+    draws = np.random.default_rng(8).multinomial(REPEATS, np.full(REPEATS, 1 / REPEATS), size=len(losses)) / REPEATS
+    expected = np.sum((commons[:, None] + draws @ deviations) ** 2, axis=2).T
+    np.testing.assert_allclose(losses[:, 0] - losses[:, 1], expected[:, 0] - expected[:, 1])
 
 
 def test_candidates_are_effects_at_places_with_shapes():

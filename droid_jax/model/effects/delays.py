@@ -27,6 +27,7 @@ def command_delay(scene: Scene) -> Effect | None:
         confused_with=(SENSOR, "servo_gain"),
         places={"commands": (COMMAND,)},
         smallest=0.001,
+        nuisances=("time_offset",),
     )
 
 
@@ -53,4 +54,5 @@ def sensor_delay(scene: Scene) -> Effect | None:
         confused_with=(COMMAND,),
         places={"sensors": (SENSOR,)},
         smallest=0.001,
+        nuisances=("time_offset",),
     )

@@ -1,0 +1,200 @@
+"""The extended model: base parameters and the effects that a search named, as one thing to hand on.
+
+    extended = load_extended("runs/gap/extended.json", scene)
+    cost = make_cost(extended.scene, extended.space, [recording], effects=extended.effects)
+
+extended.json always holds all of it.  extended.xml is the scene as MJCF with the fitted values; effects
+that MJCF has no words for are missing in it, and extended.json says which.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from droid_jax.gap.candidates import Candidate
+from droid_jax.gap.case import Case
+from droid_jax.gap.refit import Model
+from droid_jax.identify.gaussian import Gaussian, space_from_json, space_to_json
+from droid_jax.identify.results import fitted_mjcf
+from droid_jax.identify.uncertainty import posterior
+from droid_jax.model.effects.registry import effect_space, library, ready
+from droid_jax.model.parameters import Space
+from droid_jax.model.physics import make_c_model
+from droid_jax.model.scene import Scene
+from droid_jax.model.seam import Effect
+from droid_jax.storage import write_json, write_text
+
+FORMAT, VERSION = "droid_jax extended model", 1
+FILE, MJCF = "extended.json", "extended.xml"
+# model fields that `fitted_mjcf`, or `_with_own_words` before it, writes into an MJCF
+_WORDS = {"body_mass", "body_inertia", "body_gravcomp", "actuator_gainprm", "actuator_biasprm", "pair_solref"}
+
+
+@dataclass(frozen=True, eq=False)
+class Extended:
+    """A fitted model with the effects that are in it.
+
+    scene: with all that the effects need of it.  parts: the effects with their places.  effects: for
+    `make_cost(..., effects=...)`.  values: [D] physical, over `space`.  gaussian: over `space`, base
+    parameters first.
+    """
+
+    scene: Scene
+    parts: tuple[Candidate, ...]
+    effects: tuple[Effect, ...]
+    values: np.ndarray
+    gaussian: Gaussian
+
+    @property
+    def space(self) -> Space:
+        """Base parameters, then those of the effects at their places."""
+        return self.gaussian.space
+
+    @property
+    def effect_space(self) -> Space:
+        """The effects' parameters alone, starting from the fitted values, each as wide as it ever was.
+
+        Raises ValueError where no effect is in the model.
+        """
+        if not self.parts:
+            raise ValueError("the extended model names no effect: it is the base model")
+        names = dict.fromkeys(name for part in self.parts for name in part.free)
+        at = dict(zip(self.space.names, self.values.tolist(), strict=True))
+        return Space(tuple(replace(self.space[name], mean=at[name]) for name in names))
+
+    @property
+    def lacking(self) -> tuple[str, ...]:
+        """Names of the parts that an MJCF cannot hold."""
+        return tuple(p.name for p in self.parts if not _native(p, self.effects, self.space))
+
+
+def extended(case: Case, model: Model) -> Extended:
+    """The extended model that a search ended with, as something to save."""
+    values = model.values[case.whole.columns(model.space)]
+    gaussian = posterior(model.refined, case.fit.cost.comparisons)
+    named = {part.effect for part in model.parts}
+    effects = tuple(e for e in case.effects if e.name in named)
+    return Extended(case.fit.cost.scene, model.parts, effects, values, gaussian)
+
+
+def save_extended(folder: Path, model: Extended) -> None:
+    """Write extended.json and extended.xml into `folder`."""
+    write_text(folder / MJCF, extended_mjcf(model))
+    write_json(folder / FILE, _to_json(model))
+
+
+def load_extended(path: str | Path, scene: Scene) -> Extended:
+    """What `save_extended` wrote, for the scene that it was fitted with (another time step is fine).
+
+    Raises ValueError that names the file where it is missing or damaged, or belongs to another scene.
+    """
+    path = Path(path)
+    try:
+        return _of_json(json.loads(path.read_text(encoding="utf-8")), scene)
+    except FileNotFoundError:
+        raise ValueError(f"{path}: there is no such file; `python -m droid_jax.run gap` writes one") from None
+    except (ValueError, KeyError, TypeError, OSError) as error:
+        what = f"there is no entry {error}" if isinstance(error, KeyError) else error
+        raise ValueError(f"{path}: {what}") from error
+
+
+def extended_mjcf(model: Extended) -> str:
+    """The scene as MJCF with the fitted values of the base parameters and of the effects that MJCF has words for."""
+    scene = model.scene
+    fitted = make_c_model(scene, model.space, model.values)
+    spec = scene.spec.copy()
+    for pair in spec.pairs:
+        pair.solref = fitted.pair_solref[scene.id("pair", pair.name)].tolist()
+    for body in spec.bodies[1:]:
+        _keep_inertia(scene, fitted, body)
+    return fitted_mjcf(replace(scene, spec=spec), model.space, model.values)
+
+
+def _keep_inertia(scene: Scene, fitted: Any, body: Any) -> None:
+    """Undo beforehand that `fitted_mjcf` scales inertia with mass, where the fit scaled the mass alone (a payload)."""
+    index = scene.id("body", body.name)
+    if scene.model.body_mass[index] <= 0:
+        return
+    scale = fitted.body_mass[index] / scene.model.body_mass[index]
+    inertia = fitted.body_inertia[index] / scale
+    if np.allclose(inertia, scene.model.body_inertia[index], rtol=1e-9):
+        return
+    body.explicitinertial = True
+    body.mass = float(scene.model.body_mass[index])
+    body.ipos, body.iquat = scene.model.body_ipos[index].tolist(), scene.model.body_iquat[index].tolist()
+    body.inertia, body.fullinertia = inertia.tolist(), [np.nan] * 6
+
+
+def _native(part: Candidate, effects: tuple[Effect, ...], space: Space) -> bool:
+    """Whether an effect is nothing but numbers of the model that an MJCF holds."""
+    (effect,) = (e for e in effects if e.name == part.effect)
+    laws = (effect.command, effect.servo, effect.force, effect.frictionloss, effect.observe)
+    fields = [{w.field for w in space[name].writes} for name in part.free]
+    return not any(laws) and all(written and written <= _WORDS for written in fields)
+
+
+def _to_json(model: Extended) -> dict[str, Any]:
+    what = {e.name: e.what for e in model.effects}
+    gaussian = model.gaussian
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "scene": _scene_to_json(model.scene),
+        "effects": [
+            {
+                "effect": part.effect,
+                "place": part.place,
+                "what": what[part.effect],
+                "amplitudes": list(part.amplitudes),
+                "shapes": list(part.shapes),
+            }
+            for part in model.parts
+        ],
+        "mjcf": {"file": MJCF, "lacks": list(model.lacking)},
+        "values": dict(zip(model.space.names, model.values.tolist(), strict=True)),
+        "gaussian": {
+            "coordinates": gaussian.coordinates,
+            "rule": gaussian.rule,
+            "mean": gaussian.mean.tolist(),
+            "cov": gaussian.cov.tolist(),
+        },
+        "space": space_to_json(model.space),
+    }
+
+
+def _of_json(content: Any, scene: Scene) -> Extended:
+    if not isinstance(content, dict) or (content.get("format"), content.get("version")) != (FORMAT, VERSION):
+        raise ValueError(f"expected a JSON object with format {FORMAT!r}, version {VERSION}")
+    if (own := _scene_to_json(scene)) | {"name": ""} != content["scene"] | {"name": ""}:
+        raise ValueError(f"it was fitted with another scene, {content['scene']}; this one is {own}")
+    space = space_from_json(content["space"])
+    values = np.array([content["values"][name] for name in space.names], dtype=np.float64)
+    at = dict(zip(space.names, values.tolist(), strict=True))
+    parts = tuple(
+        Candidate(e["effect"], e["place"], tuple(e["amplitudes"]), {name: at[name] for name in e["shapes"]})
+        for e in content["effects"]
+    )
+    effects = library(scene, dict.fromkeys(p.effect for p in parts))
+    _check_known(parts, effects, space)
+    g = content["gaussian"]
+    gaussian = Gaussian(space, g["mean"], g["cov"], g["rule"], g["coordinates"])
+    return Extended(ready(scene), parts, effects, space.check(values), gaussian)
+
+
+def _check_known(parts: tuple[Candidate, ...], effects: tuple[Effect, ...], space: Space) -> None:
+    """ValueError unless the library still makes these effects, and of the same numbers of the model."""
+    own = {p.name: p for p in (effect_space(effects).parameters if effects else ())}
+    for name in (name for part in parts for name in part.free):
+        if name not in own or own[name].writes != space[name].writes:
+            raise ValueError(f"the effect parameter {name!r} is not in this version's library, or another one there")
+
+
+def _scene_to_json(scene: Scene) -> dict[str, Any]:
+    """What a scene must have in common with the one that a model was fitted with: the indices that parameters write."""
+    sizes = {size: int(getattr(scene.model, size)) for size in ("nbody", "nv", "nu", "npair")}
+    return {"name": scene.name, "joints": list(scene.joints), "object_joint": scene.object_joint, **sizes}

@@ -1,0 +1,125 @@
+"""What recordings must fulfil before an effect is searched in them: said before anything long begins."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from droid_jax.gap.flips import FEWEST
+from droid_jax.measure.recording import Channel, Recording
+from droid_jax.model.scene import Scene
+
+STILL = 0.01  # rad or m: a robot whose joints all move less stood still
+SHUT = 0.05  # rad or m: the same for the thing that is moved, whose camera is noisy
+APART = 0.05  # s: repeats that are further apart in time were not cut alike
+
+
+def check_recordings(scene: Scene, roles: Mapping[str, Recording]) -> None:
+    """ValueError where a search in these recordings ("fit", "confirm", perhaps "sealed") could not end well.
+
+    Each must hold enough repeats, cut alike, of a motion that moves the robot and the object; all must
+    measure the same joints, and none may be another one once more.
+    """
+    for role, recording in roles.items():
+        where = f"the {role} recording {recording.name!r}"
+        _check_repeats(recording, where)
+        _check_moves(recording, where)
+        _check_object(scene, recording, where)
+        _check_timing(recording, where)
+    _check_different(roles)
+    _check_same_joints(roles)
+
+
+def _check_repeats(recording: Recording, where: str) -> None:
+    if recording.repeats >= FEWEST:
+        return
+    raise ValueError(
+        f"{where} has {recording.repeats} repeats: with fewer than {FEWEST} no effect can be told from chance. "
+        "What these can still tell: `python -m droid_jax.run identify` fits the parameters to them, and its report "
+        "shows in which joint and phase simulation and robot disagree"
+    )
+
+
+def _check_moves(recording: Recording, where: str) -> None:
+    ranges = {}
+    if "position" in recording.channels:
+        channel = recording.channels["position"]
+        ranges = dict(zip(channel.columns, np.ptp(_mean(channel), axis=0), strict=True))
+    elif recording.command.size:
+        ranges = dict(zip(recording.command_names, np.ptp(recording.command, axis=0), strict=True))
+    if ranges and max(ranges.values()) < STILL:
+        joint = max(ranges, key=lambda name: ranges[name])
+        raise ValueError(
+            f"{where} never moves: {joint}, which moves most, does by {ranges[joint]:.2g}; record a motion that "
+            "moves the joints and the object"
+        )
+
+
+def _check_object(scene: Scene, recording: Recording, where: str) -> None:
+    travel = None if scene.object_joint is None else _travel(recording, scene.object_joint)
+    if travel is not None and travel < SHUT:
+        raise ValueError(
+            f"{where}: the object joint {scene.object_joint!r} moves by {travel:.2g} only (at least {SHUT:g} is "
+            "needed), so nothing about it can be told; record a motion that opens it"
+        )
+
+
+def _travel(recording: Recording, joint: str) -> float | None:
+    """How far the object's joint moves, rad or m; None where nothing measured it."""
+    if "object_angle" in recording.channels:
+        trace = _mean(recording.channels["object_angle"])[:, 0]
+    elif "position" in recording.channels and joint in recording.channels["position"].columns:
+        channel = recording.channels["position"]
+        trace = _mean(channel)[:, channel.columns.index(joint)]
+    else:
+        return None
+    return float(np.subtract(*np.quantile(trace, [0.99, 0.01])))
+
+
+def _check_timing(recording: Recording, where: str) -> None:
+    late = lags(recording.channels["position" if "position" in recording.channels else "torque"])
+    worst = int(np.argmax(np.abs(late)))
+    if abs(late[worst]) > APART:
+        raise ValueError(
+            f"{where}: repeat {worst} runs {abs(late[worst]):.2g} s {'behind' if late[worst] > 0 else 'ahead of'} the "
+            f"others (at most {APART:g} s); cut the repeats so that each begins with the motion"
+        )
+
+
+def lags(channel: Channel) -> np.ndarray:
+    """[N] s by which each repeat lags the repeats' median, to first order in the lag."""
+    values = np.where(channel.mask, channel.values, np.nan).astype(float)
+    usual = np.nanmedian(values, axis=0)
+    slope = np.gradient(usual, channel.time, axis=0)
+    apart = np.nan_to_num(values - usual)
+    slope = np.nan_to_num(slope)
+    return -np.einsum("ntc,tc->n", apart, slope) / max(float(np.sum(slope**2)), 1e-12)
+
+
+def _check_different(roles: Mapping[str, Recording]) -> None:
+    seen: dict[str, str] = {}
+    for role, recording in roles.items():
+        first = seen.setdefault(recording.sha256, role)
+        if first != role:
+            raise ValueError(
+                f"the {first} and the {role} recording are the same ({recording.name!r}): an effect must be confirmed "
+                "on a recording that it was not fitted to, of another motion"
+            )
+
+
+def _check_same_joints(roles: Mapping[str, Recording]) -> None:
+    joints = {role: recording.channel("torque").columns for role, recording in roles.items()}
+    for role, names in joints.items():
+        if set(names) != set(joints["fit"]):
+            raise ValueError(
+                f"the recordings measure torques of different joints: fit {', '.join(joints['fit'])}; "
+                f"{role} {', '.join(names)}"
+            )
+
+
+def _mean(channel: Channel) -> np.ndarray:
+    """[Tc', C] mean over the repeats, where any repeat measured every column."""
+    values = np.where(channel.mask, channel.values, np.nan).astype(float)
+    seen = np.all(np.any(channel.mask, axis=0), axis=1)
+    return np.nanmean(values[:, seen], axis=0)

@@ -1,0 +1,225 @@
+"""What a search for a missing effect leaves in its folder: gap.json and gap.npz, the extended model beside them.
+
+docs/gap-command.md lists every entry; `report` turns them into a page.  No pickle.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from droid_jax.gap.case import Case
+from droid_jax.gap.evidence import Evidence
+from droid_jax.gap.extended import extended, save_extended
+from droid_jax.gap.localise import Localisation
+from droid_jax.gap.refit import intervals
+from droid_jax.gap.screen import Screen
+from droid_jax.gap.select import Trial
+from droid_jax.gap.verdict import Verdict
+from droid_jax.identify.uncertainty import posterior
+from droid_jax.storage import write_json, write_npz
+
+ROLES = ("fit", "confirm", "sealed")
+TRACES = ("time", "measured", "scatter", "before", "after")
+_KEYS = ("verdict", "sentence", "effects", "p", "floor", "gaps", "screens", "trials", "cells", "amplitudes", "shifts")
+
+
+@dataclass(frozen=True, eq=False)
+class GapFiles:
+    """A search's folder, read.
+
+    answer: gap.json.  joints: J names.  traces: role ("fit", "confirm" and perhaps "sealed") -> "time" [K] s and,
+    all [K, J] N m (N for slides), "measured" (mean of the repeats), "scatter" (their deviation), "before" and
+    "after" (simulated, through the measurement's filter).
+    """
+
+    answer: Mapping[str, Any]
+    joints: tuple[str, ...]
+    traces: Mapping[str, Mapping[str, np.ndarray]]
+
+
+def write_gap(folder: Path, case: Case, verdict: Verdict, description: Mapping[str, Any]) -> None:
+    """Write all files of a search; gap.json last, its presence says that the run is whole.
+
+    description: what else gap.json shall hold: "seconds", "versions", "device", "setup", ...
+    """
+    write_npz(folder / "gap.npz", gap_arrays(case, verdict))
+    save_extended(folder, extended(case, verdict.model))
+    write_json(folder / "gap.json", {**gap_json(case, verdict), **description})
+
+
+def load_gap(folder: str | Path) -> GapFiles:
+    """The answer and the traces of a finished search; ValueError names the file that is missing or broken."""
+    folder = Path(folder)
+    answer, arrays = _read_json(folder / "gap.json"), _read_npz(folder / "gap.npz")
+    absent = [key for key in _KEYS if key not in answer]
+    roles = [role for role in ROLES if role in answer.get("gaps", {})]
+    absent += [key for key in ("joints", *(f"{r}.{t}" for r in roles for t in TRACES)) if key not in arrays]
+    if absent:
+        raise ValueError(f"{folder}: gap.json and gap.npz lack {', '.join(absent)}; run the same command with --again")
+    traces = {role: {name: arrays[f"{role}.{name}"] for name in TRACES} for role in roles}
+    return GapFiles(answer, tuple(arrays["joints"].tolist()), traces)
+
+
+def gap_json(case: Case, verdict: Verdict) -> dict[str, Any]:
+    """The answer and its grounds as plain data."""
+    return {
+        "verdict": verdict.kind.value,
+        "sentence": verdict.sentence,
+        "effects": list(verdict.effects),
+        "tied": [list(rivals) for rivals in verdict.tied],
+        "p": verdict.screens[0].p if verdict.screens else None,
+        "floor": verdict.floor,
+        "converged": verdict.base.refined.converged,
+        "cut": verdict.cut,
+        "gaps": {role: _gap(role, e, verdict) for role, e in case.judged.items()},
+        "phases": {role: _phases(e) for role, e in case.judged.items()},
+        "screens": [{"p": found.p, "ranking": _ranking(found)} for found in verdict.screens],
+        "trials": [_trial(trial) for trial in verdict.trials],
+        "cells": {"before": _cells(verdict.before), "after": _cells(verdict.after)},
+        "amplitudes": _amplitudes(case, verdict),
+        "shifts": _shifts(case, verdict),
+        "experiments": [{"what": e.what, "apart": e.apart} for e in verdict.experiments],
+        "units": case.fit.cost.comparisons[0].channel("torque").unit,
+    }
+
+
+def gap_arrays(case: Case, verdict: Verdict) -> dict[str, np.ndarray]:
+    """Smoothed joint torques of each recording: the repeats, and the simulation before and after."""
+    joints = _joints(case.fit)
+    out = {"joints": np.array(joints)}
+    for role, evidence in case.judged.items():
+        order = [_joints(evidence).index(joint) for joint in joints]
+        channel = evidence.cost.comparisons[0].channel("torque")
+        (simulated,) = evidence.cost.smoothed(_before_after(verdict))
+        before, after = simulated[:, :, order]
+        out |= {
+            f"{role}.time": channel.clock,
+            f"{role}.measured": channel.noise.mean[:, order],
+            f"{role}.scatter": np.std(channel.noise.repeats, axis=0, ddof=1)[:, order],
+            f"{role}.before": before,
+            f"{role}.after": after,
+        }
+    return out
+
+
+def _before_after(verdict: Verdict) -> np.ndarray:
+    """[2, D] values of the base model and of the extended one."""
+    return np.stack([verdict.base.values, verdict.model.values])
+
+
+def _joints(evidence: Evidence) -> list[str]:
+    """Measured joints, in the order of the torque channel's columns."""
+    return [evidence.cost.scene.joints[c] for c in evidence.cost.comparisons[0].channel("torque").columns]
+
+
+def _gap(role: str, evidence: Evidence, verdict: Verdict) -> dict[str, Any]:
+    """U and the paper's distance, N m, before and after; closed: None where there was nothing above the floor."""
+    before, after = verdict.gaps[role]
+    both = _before_after(verdict)
+    distance = (evidence.cost.distances(both) - evidence.cost.penalties(both))[:, 0]
+    return {
+        "recording": evidence.cost.comparisons[0].name,
+        "before": before,
+        "after": after,
+        "closed": verdict.closed(role) if before > verdict.floor else None,
+        "torque_before": float(distance[0]),
+        "torque_after": float(distance[1]),
+    }
+
+
+def _phases(evidence: Evidence) -> list[dict[str, Any]]:
+    return [{"name": p.name, "start": p.start, "end": p.end} for p in evidence.cost.comparisons[0].phases]
+
+
+def _ranking(found: Screen) -> list[dict[str, Any]]:
+    """Every candidate with its best shape, by what that explains."""
+    best: dict[str, int] = {}
+    for k in found.best():
+        best.setdefault(found.questions[k].candidate.name, k)
+    return [
+        {"candidate": name, "t": float(found.t[k]), "explained": float(found.explained[k])} for name, k in best.items()
+    ]
+
+
+def _trial(trial: Trial) -> dict[str, Any]:
+    return {
+        "round": trial.name.count(" + "),
+        "name": trial.name,
+        "gap_fit": trial.gap_fit,
+        "gap_confirm": trial.gap_confirm,
+        "p": trial.p,
+        "chosen": trial.chosen,
+        "passed": trial.passed,
+        "reasons": list(trial.reasons),
+        "interval": {name: list(span) for name, span in trial.interval.items()},
+    }
+
+
+def _cells(found: Localisation) -> list[dict[str, Any]]:
+    return [{"variable": c.variable, "where": c.where, "gap": c.gap, "p": c.p, "found": c.found} for c in found.cells]
+
+
+def _amplitudes(case: Case, verdict: Verdict) -> list[dict[str, Any]]:
+    """Every amplitude of the final model with its interval."""
+    model, what = verdict.model, {e.name: e.what for e in case.effects}
+    spans = intervals(case.fit, model)
+    return [
+        {
+            "name": name,
+            "unit": case.whole[name].unit,
+            "value": float(model.values[case.whole.index(name)]),
+            "low": spans[name][0],
+            "high": spans[name][1],
+            "effect": part.name,
+            "what": what[part.effect],
+        }
+        for part in model.parts
+        for name in part.amplitudes
+    ]
+
+
+def _shifts(case: Case, verdict: Verdict) -> list[dict[str, Any]]:
+    """How the base parameters moved when the effects came in, against what the base fit thought it knew."""
+    columns = case.whole.columns(case.base)
+    deviation = posterior(verdict.base.refined, case.fit.cost.comparisons).physical_std
+    before, after = _before_after(verdict)[:, columns]
+    return [
+        {"name": p.name, "unit": p.unit, "before": b, "after": a, "deviation_before": s}
+        for p, b, a, s in zip(case.base.parameters, before.tolist(), after.tolist(), deviation.tolist(), strict=True)
+    ]
+
+
+def most_shifted(shifts: Sequence[Mapping[str, Any]]) -> tuple[Mapping[str, Any], float]:
+    """The entry of "shifts" that moved most, and by how many of its deviations."""
+    moved = [abs(s["after"] - s["before"]) / max(s["deviation_before"], 1e-12) for s in shifts]
+    most = int(np.argmax(moved))
+    return shifts[most], moved[most]
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ValueError(f"{path} is missing; `python -m droid_jax.run gap` writes it when it is done") from None
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path} cannot be read: {error}") from None
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} must hold a JSON object, got {type(content).__name__}")
+    return content
+
+
+def _read_npz(path: Path) -> dict[str, np.ndarray]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {key: file[key] for key in file.files}
+    except FileNotFoundError:
+        raise ValueError(f"{path} is missing; run the same command with --again") from None
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path} cannot be read: {error}") from None
