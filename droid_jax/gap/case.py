@@ -101,10 +101,12 @@ def make_case(
 
 def _restrained(base: Space, effects: Sequence[Effect]) -> Space:
     """The base with every nuisance that an effect stands for kept within BEYOND prior deviations."""
-    doubled = {name for effect in effects for name in effect.nuisances}
+    named = {name for effect in effects for name in effect.nuisances}
+    written = {(w.field, w.index) for effect in effects for p in effect.parameters for w in p.writes}
 
     def restrained(p: Parameter) -> Parameter:
-        if not (p.nuisance and p.name in doubled):
+        doubled = p.name in named or any((w.field, w.index) in written for w in p.writes)
+        if not (p.nuisance and doubled):
             return p
         return replace(p, low=max(p.low, p.mean - BEYOND * p.std), high=min(p.high, p.mean + BEYOND * p.std))
 

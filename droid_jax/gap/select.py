@@ -91,9 +91,9 @@ def judge(
         reasons = _gap_reasons(left[0], left[k + 1], p, whole_gap)
         reasons += _amplitude_reasons(fit, model, spans, smallest)
         if chosen < CHOSEN:
-            leader = models[int(np.argmin(left[1:]).item())].name
+            leader = min(zip(left[1:], models, strict=True), key=lambda lm: lm[0])[1].name
             reasons.append(f"wins only {chosen:.0%} of the resamples; {leader} does better")
-        rivals = tuple(models[i].name for i in np.flatnonzero(same[k]) if i != k)
+        rivals = tuple(models[i].name for i in np.flatnonzero(same[k]).tolist() if i != k)
         out.append(Trial(model.name, model.gap, float(left[k + 1]), p, spans, chosen, tuple(reasons), rivals))
     return out
 

@@ -75,8 +75,9 @@ class Effect:
                   them the effect is of no interest to the search.
     shapes:       parameters that matter only beside an amplitude, and the values to try.
     smallest:     amplitude below which it is not worth a name, in its own unit.
-    nuisances:    nuisances of a base model that mean the same.  They stay within three of their prior
-                  deviations while the search runs: what lies beyond is the effect.
+    nuisances:    nuisances of a base model that mean the same (beside those that write the same fields).
+                  They stay within three of their prior deviations while the search runs: what lies
+                  beyond is the effect.
     """
 
     name: str

@@ -31,5 +31,4 @@ def servo_gain(scene: Scene) -> Effect | None:
         confused_with=("joint_compliance", "command_delay", "torque_gain"),
         places=a.places(joints, GAIN),
         smallest=0.02,
-        nuisances=tuple(f"{j}_servo_scale" for j in joints),
     )
