@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from droid_jax.compare.cost import make_cost
+from droid_jax.compare.cost import Cost, make_cost
 from droid_jax.compare.residuals import CompareConfig
 from droid_jax.gap.evidence import Evidence, evidence
 from droid_jax.gap.flips import FEWEST
@@ -63,6 +63,14 @@ class Case:
         roles = {"fit": self.fit, "confirm": self.confirm, "sealed": self.sealed}
         return {role: e for role, e in roles.items() if e is not None}
 
+    def against(self, recordings: Mapping[str, Recording]) -> Case:
+        """The same compiled replays and other repeats, by role.
+
+        Raises ValueError unless they have the same commands on the same clock (see `Cost.against`).
+        """
+        costs = [e.cost.against([recordings[role]]) for role, e in self.judged.items()]
+        return _case(costs, self.base, self.effects, self.config)
+
     @property
     def smallest(self) -> dict[str, float]:
         """Amplitude -> size worth naming."""
@@ -95,8 +103,15 @@ def make_case(
     scene = ready(scene)
     base = _restrained(base, effects)
     whole = base + effect_space(effects)
-    made = [evidence(make_cost(scene, whole, [r], config=config.compare, effects=effects)) for r in recordings]
-    return Case(made[0], made[1], made[2] if sealed is not None else None, base, tuple(effects), config)
+    costs = [make_cost(scene, whole, [r], config=config.compare, effects=effects) for r in recordings]
+    return _case(costs, base, tuple(effects), config)
+
+
+def _case(costs: Sequence[Cost], base: Space, effects: tuple[Effect, ...], config: GapConfig) -> Case:
+    own = [p.name for p in base.parameters if p.nuisance and p.name.startswith("torque_offset[")]
+    fit, *others = (evidence(c) for c in costs)
+    confirm, *sealed = (e.with_own(own) for e in others)
+    return Case(fit, confirm, sealed[0] if sealed else None, base, effects, config)
 
 
 def _restrained(base: Space, effects: Sequence[Effect]) -> Space:

@@ -1,12 +1,19 @@
-"""One recording against a model: whitened residuals of every repeat, and the gap U that noise does not bias."""
+"""One recording against a model: whitened residuals of every repeat, and the gap U that noise does not bias.
+
+`Evidence` is of a recording with repeats, which are what the tests flip.  A recording without repeats is cut
+into blocks of time instead: `droid_jax.gap.blocks.Blocks`, which answers the same questions.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from droid_jax.compare.cost import Cost
+from droid_jax.compare.residuals import Comparison
+from droid_jax.gap.flips import gap_p_values, largest_t
 from droid_jax.measure.noise import coarse_clock
 
 
@@ -16,29 +23,89 @@ class Evidence:
 
     cost: of this recording alone.  deviations: [N, M] of the repeats from their mean, data minus mean.
     column, time: [M] compared column and instant [s] of each residual.
+    own: names of nuisances that this recording has for itself; own_columns: [M, len(own)] what one prior
+    deviation of each adds to the common residual.  See `with_own`.
     """
 
     cost: Cost
     deviations: np.ndarray
     column: np.ndarray
     time: np.ndarray
+    own: tuple[str, ...] = field(default=(), kw_only=True)
+    own_columns: np.ndarray | None = field(default=None, kw_only=True)
 
     @property
     def repeats(self) -> int:
         """N."""
         return len(self.deviations)
 
+    @property
+    def units(self) -> int:
+        """How many rows the residuals have: what is flipped and resampled."""
+        return self.repeats
+
     def common(self, values: np.ndarray) -> np.ndarray:
-        """[P, D] -> [P, M] mean of the repeats minus simulation."""
-        return -self.cost.whitened(np.atleast_2d(values)).astype(np.float64) / np.sqrt(self.repeats)
+        """[P, D] -> [P, M] mean of the repeats minus simulation, the recording's own nuisances at their best."""
+        rows = np.array(np.atleast_2d(values), dtype=np.float64)
+        space = self.cost.space
+        rows[:, [space.index(name) for name in self.own]] = [space[name].mean for name in self.own]
+        common = self._common(rows)
+        if self.own_columns is None:
+            return common
+        normal = self.own_columns.T @ self.own_columns + np.eye(len(self.own)) / self.repeats
+        return common - np.linalg.solve(normal, self.own_columns.T @ common.T).T @ self.own_columns.T
+
+    def _common(self, rows: np.ndarray) -> np.ndarray:
+        return -self.cost.whitened(rows).astype(np.float64) / np.sqrt(self.repeats)
+
+    def with_own(self, names: Sequence[str]) -> Evidence:
+        """The same, with nuisances `names` that are not the fitted recording's but fitted to this one.
+
+        They must enter the residual linearly (torque offsets).  Each is fitted with its own prior.
+        """
+        if not names:
+            return self
+        space = self.cost.space
+        rows = [space.mean, *(space.values({n: space[n].mean + space[n].std}) for n in names)]
+        common = self._common(np.stack(rows))
+        return replace(self, own=tuple(names), own_columns=(common[1:] - common[0]).T)
+
+    def residuals(self, common: np.ndarray) -> np.ndarray:
+        """[N, M] of every repeat, from the common part [M], which is their mean."""
+        return common + self.deviations
 
     def gap_at(self, values: np.ndarray) -> float:
         """U of the model at `values` [D]."""
-        return gap(self.residuals(self.common(values)[0]))
+        return self.gap(self.residuals(self.common(values)[0]))
 
-    def residuals(self, common: np.ndarray) -> np.ndarray:
-        """[N, M] of every repeat, from the common part [M]."""
-        return common + self.deviations
+    def gap(self, residuals: np.ndarray) -> float:
+        """U of residuals [N, M]."""
+        return gap(residuals)
+
+    def gaps(self, residuals: np.ndarray, cells: np.ndarray) -> np.ndarray:
+        """[K] U of each cell; cells: [K, M] bool."""
+        return gaps(residuals, cells)
+
+    def cell_p_values(self, residuals: np.ndarray, cells: np.ndarray) -> np.ndarray:
+        """[K] p-value of each cell's U being above zero."""
+        return gap_p_values(residuals, cells)
+
+    def largest(
+        self, scores: np.ndarray, marks: np.ndarray, base: np.ndarray, prior: np.ndarray, seed: int = 0
+    ) -> tuple[np.ndarray, float]:
+        """[K] t of K questions, and the p-value of the largest |t| under flips of whole repeats.
+
+        scores: [K, N] of projected marks [K, M].  base: [M, D] columns they were projected on, with
+        prior deviations [D]; repeats need neither.
+        """
+        return largest_t(scores, seed)
+
+    def losses(self, commons: np.ndarray, draws: np.ndarray) -> np.ndarray:
+        """[R, K] squared mean residual of K models in resamples of the repeats, up to what all models share.
+
+        commons: [K, M] common part of each model's residuals; draws: [R, N] weights, each row summing to one.
+        """
+        return np.sum(commons**2, axis=1) + 2 * draws @ (self.deviations @ commons.T)
 
 
 def evidence(cost: Cost) -> Evidence:
@@ -47,19 +114,29 @@ def evidence(cost: Cost) -> Evidence:
     Raises ValueError for several recordings at once, and for single repeats: whole repeats are what
     the tests flip.
     """
-    if len(cost.comparisons) != 1:
-        raise ValueError(f"evidence is of one recording, got {len(cost.comparisons)}")
-    (comparison,) = cost.comparisons
+    comparison = only_comparison(cost)
     if comparison.repeats < 2:
         raise ValueError(f"recording {comparison.name!r} has one repeat; a gap is told from noise by repeats")
+    deviations = comparison.deviations() / np.sqrt(comparison.repeats)
+    return Evidence(cost, deviations, *places(comparison))
+
+
+def only_comparison(cost: Cost) -> Comparison:
+    """The comparison of a cost over one recording; ValueError for several."""
+    if len(cost.comparisons) != 1:
+        raise ValueError(f"evidence is of one recording, got {len(cost.comparisons)}")
+    return cost.comparisons[0]
+
+
+def places(comparison: Comparison) -> tuple[np.ndarray, np.ndarray]:
+    """Column and instant [s] of each residual, both [M]."""
     columns, times, start = [], [], 0
     for channel in comparison.channels:
         clock = coarse_clock(*channel.span)
         columns.append(np.repeat(start + np.arange(len(channel.columns)), len(clock)))
         times.append(np.tile(clock, len(channel.columns)))
         start += len(channel.columns)
-    deviations = comparison.deviations() / np.sqrt(comparison.repeats)
-    return Evidence(cost, deviations, np.concatenate(columns), np.concatenate(times))
+    return np.concatenate(columns), np.concatenate(times)
 
 
 def gap(residuals: np.ndarray) -> float:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from droid_jax.gap.evidence import Evidence, gaps
-from droid_jax.gap.flips import benjamini_hochberg, gap_p_values
+from droid_jax.gap.evidence import Evidence
+from droid_jax.gap.flips import benjamini_hochberg
 
 FALSE_DISCOVERIES = 0.1
 BINS = 6
@@ -17,7 +17,10 @@ STILL = 0.01  # rad/s
 
 @dataclass(frozen=True)
 class Cell:
-    """One place of the disagreement: over which variable, where, how large, and whether it is there at all."""
+    """One place of the disagreement: over which variable, where, how large, and whether it is there at all.
+
+    Of a recording without repeats nothing tells the last: p = 1, found False.
+    """
 
     variable: str
     where: str
@@ -36,16 +39,16 @@ class Localisation:
 def localise(evidence: Evidence, values: np.ndarray, residuals: np.ndarray) -> Localisation:
     """Cells by joint and phase, door angle, sign and size of the door's speed, and each joint's position.
 
-    values: [D] of the model; residuals: [N, M] of its repeats.
+    values: [D] of the model; residuals: [N, M] of its repeats or blocks.
     """
     names, masks = zip(*_cells(evidence, values), strict=True)
     cells = np.stack(masks)
     kept = cells.sum(axis=1) >= 5
     p = np.ones(len(cells))
-    p[kept] = gap_p_values(residuals, cells[kept])
+    p[kept] = evidence.cell_p_values(residuals, cells[kept])
     found = np.zeros(len(cells), bool)
     found[kept] = benjamini_hochberg(p[kept], FALSE_DISCOVERIES)
-    size = gaps(residuals, cells)
+    size = evidence.gaps(residuals, cells)
     return Localisation(
         tuple(Cell(v, w, float(size[i]), float(p[i]), bool(found[i])) for i, (v, w) in enumerate(names))
     )
