@@ -16,6 +16,8 @@ from droid_jax.compare.residuals import Comparison
 from droid_jax.gap.flips import gap_p_values, largest_t
 from droid_jax.measure.noise import coarse_clock
 
+TIE = 3.0  # times what the best model leaves above the floor: a rival that leaves no more does as well
+
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
@@ -43,6 +45,11 @@ class Evidence:
     def units(self) -> int:
         """How many rows the residuals have: what is flipped and resampled."""
         return self.repeats
+
+    @property
+    def tie(self) -> float:
+        """Times what the best model leaves, up to which a rival's U is as good."""
+        return TIE
 
     def common(self, values: np.ndarray) -> np.ndarray:
         """[P, D] -> [P, M] mean of the repeats minus simulation, the recording's own nuisances at their best."""

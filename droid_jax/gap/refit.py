@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from droid_jax.gap.candidates import Candidate
-from droid_jax.gap.evidence import Evidence, gap
+from droid_jax.gap.evidence import Evidence
 from droid_jax.identify.refine import Hypotheses, RefineConfig, Refined, RefineProgress, refine
 from droid_jax.identify.uncertainty import posterior
 from droid_jax.model.parameters import Space
@@ -72,7 +72,7 @@ def refit(
     refined = refine(residuals, space, begin, config, hypotheses=hypotheses, progress=progress)
     values = whole.embed(space, refined.best[None], starts[0])[0]
     left = evidence.residuals(-refined.residual / np.sqrt(evidence.repeats))
-    return Model(tuple(parts), values, space, refined, left, gap(left))
+    return Model(tuple(parts), values, space, refined, left, evidence.gap(left))
 
 
 def intervals(evidence: Evidence, model: Model) -> dict[str, tuple[float, float]]:

@@ -8,7 +8,7 @@ computer models, JASA 2017.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,7 @@ from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.evidence import Evidence
 from droid_jax.gap.flips import largest_t
 
+Test = Callable[[np.ndarray], tuple[np.ndarray, float]]
 SMALL = 0.3  # prior deviations of an amplitude: large against solver noise, small enough to be linear
 
 
@@ -79,11 +80,16 @@ def project(columns: np.ndarray, base: np.ndarray, prior: np.ndarray) -> np.ndar
     return columns - np.linalg.solve(normal, base.T @ columns.T).T @ base.T
 
 
-def screen(residuals: np.ndarray, questions: Sequence[Question], projected: np.ndarray, seed: int = 0) -> Screen:
-    """Score projected marks [K, M] against residuals [N, M] of the base fit."""
+def screen(
+    residuals: np.ndarray, questions: Sequence[Question], projected: np.ndarray, test: Test = largest_t
+) -> Screen:
+    """Score projected marks [K, M] against residuals [N, M] of the base fit.
+
+    test: scores [K, N] -> statistic [K] and the p-value of the largest (see `Evidence.largest`).
+    """
     norm = np.einsum("km,km->k", projected, projected)
     scores = projected @ residuals.T  # [K, N]
-    t, p = largest_t(scores, seed)
+    t, p = test(scores)
     size = scores.mean(axis=1) / np.maximum(norm, 1e-30)
     shared = residuals.mean(axis=0)
     explained = size * scores.mean(axis=1) / max(float(shared @ shared), 1e-30)

@@ -7,14 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from droid_jax.gap.evidence import Evidence, gap
+from droid_jax.gap.evidence import Evidence
 from droid_jax.gap.flips import sign_flips, t_values
 from droid_jax.gap.refit import Model, intervals
 
 SIGNIFICANT = 0.01
 LESS = 0.2  # share of U that an effect must take away on the confirming demonstration
 OF_ALL = 0.05  # and share of the base model's U: what a wrong form of the first effect leaves is no effect of its own
-TIE = 3.0  # a rival that leaves no more than this times what the best leaves (above the floor) does as well
 DOUBT = 0.05  # share of the resamples in which a rival is better, from which it does as well
 CHOSEN = 0.8  # share of the resamples in which an effect, or one that does as well, must win
 RESAMPLES = 400
@@ -51,14 +50,9 @@ def one_sided_p(gain: np.ndarray) -> float:
     return float(np.mean(t >= t[0] - 1e-12))
 
 
-def resampled_losses(commons: np.ndarray, deviations: np.ndarray, seed: int = 0) -> np.ndarray:
-    """[R, K] squared mean residual of K models in resamples of the repeats, up to what all models share.
-
-    commons: [K, M] common part of the residuals of each model; deviations: [N, M] of the repeats.
-    """
-    count = len(deviations)
-    draws = np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), size=RESAMPLES) / count
-    return np.sum(commons**2, axis=1) + 2 * draws @ (deviations @ commons.T)
+def resamples(count: int, seed: int = 0) -> np.ndarray:
+    """[R, N] weights of the repeats in R resamples, each row summing to one."""
+    return np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), size=RESAMPLES) / count
 
 
 def judge(
@@ -78,10 +72,10 @@ def judge(
     """
     commons = confirm.common(np.stack([before.values, *(m.values for m in models)]))
     repeats = [confirm.residuals(c) for c in commons]
-    left = np.array([gap(r) for r in repeats])
+    left = np.array([confirm.gap(r) for r in repeats])
     squares = np.array([np.sum(r**2, axis=1) for r in repeats])
-    losses = resampled_losses(commons[1:], confirm.deviations, seed)
-    same = alike(left[1:], losses, floor)
+    losses = confirm.losses(commons[1:], resamples(confirm.units, seed))
+    same = alike(left[1:], losses, floor, confirm.tie)
     winners = np.bincount(np.argmin(losses, axis=1), minlength=len(models)) / len(losses)
     out = []
     for k, model in enumerate(models):
@@ -98,14 +92,14 @@ def judge(
     return out
 
 
-def alike(left: np.ndarray, losses: np.ndarray, floor: float) -> np.ndarray:
+def alike(left: np.ndarray, losses: np.ndarray, floor: float, tie: float) -> np.ndarray:
     """[K, K] bool, which models cannot be told apart.
 
     left: [K] U on the confirming demonstration; losses: [R, K] in resamples of its repeats.  What two
-    wrong forms leave says little about which is nearer the truth, so ratios count and not significance.
+    wrong forms leave says little about which is nearer the truth, so a ratio `tie` counts and not significance.
     """
     above = np.maximum(left - floor, 1e-12)
-    near = above[None, :] <= TIE * above[:, None]
+    near = above[None, :] <= tie * above[:, None]
     better = np.mean(losses[:, None, :] < losses[:, :, None], axis=0) > DOUBT
     as_good = near | better
     return (as_good & as_good.T) | np.eye(len(left), dtype=bool)

@@ -6,11 +6,12 @@ base model fitted to one half of it misses what only the other half moves, and t
 So the confirming blocks tell an effect from noise and not from another form of it; other motions are for what
 is sealed.
 
-Noise.  One recording does not tell its noise.  What is stated, and sets the blocks' length, is the residual that
-the best single candidate leaves, the amplitudes of all candidates fitted linearly.  With nothing missing that is a
-few per cent too small, as the best of many candidates takes some noise with it.  With more missing than the best
-candidate takes it is too large: priors then weigh more and intervals come out wide, so less is named.  A gap in
-these units is no absolute size; its ratios are.
+Noise.  One recording does not tell its noise.  What is stated, and sets the blocks' length, is the smallest
+residual that an extended model leaves: the base and up to GapConfig.most candidates, chosen and fitted linearly, each
+of which takes as much as an effect must.  With nothing missing, the best of many candidates may take that much of the
+noise; noise and blocks then come out too small.  With something missing that the library lacks, they come out too
+large: priors weigh more and intervals are wide, so less is named.  A gap in these units is no absolute size, but
+ratios of gaps are free of the unit.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ from droid_jax.gap.evidence import only_comparison
 from droid_jax.gap.flips import FEWEST
 from droid_jax.gap.rank import proposals
 from droid_jax.gap.refit import Model, refit
-from droid_jax.gap.screen import questions_of
+from droid_jax.gap.screen import Screen, questions_of
+from droid_jax.gap.select import LESS
 from droid_jax.gap.workflow import ask
 from droid_jax.measure.motion import Motion
 from droid_jax.measure.noise import discrepancy
@@ -146,17 +148,39 @@ def noise_of(
     """Deviation [C] to state as noise, and length [s] of the blocks, from what lies before `end`; see the module."""
     inside = log.clock < end
     block = interleaved(log.clock, log.clock[0], end, (end - log.clock[0]) / (FEWEST + 0.5))[0]
-    values = log.space.mean
-    for _ in range(2):  # the first fit's weights are those of the prior's mean
-        evidence = _blocks(log, discrepancy(log.left(values)[inside]), block)
-        case = Case(evidence, evidence, None, base, tuple(effects), config)
-        model = base_model(case, values)
-        values = model.values
+    case, model, deviation = _rough_fit(log, base, effects, log.space.mean, block, config)
+    case, model, deviation = _rough_fit(log, base, effects, model.values, block, config)
     found = ask(case, model, questions_of(candidates(effects)))
-    best = proposals(found, model.residuals, log.space)[0].start(log.space, values)
-    without, left = (log.left(v)[inside] for v in (values, best))
-    left = left if np.sum((left / without.std(axis=0)) ** 2) < without.size else without
+    whitened = _least(found, model.residuals.mean(axis=0), log.space, config.most)
+    left = (whitened.reshape(len(deviation), -1).T * deviation)[inside]
     return discrepancy(left), block_length(left)
+
+
+def _rough_fit(
+    log: Log, base: Space, effects: Sequence[Effect], values: np.ndarray, block: np.ndarray, config: GapConfig
+) -> tuple[Case, Model, np.ndarray]:
+    """The base fitted with the noise [C] stated that `values` [D] leave."""
+    deviation = np.maximum(discrepancy(log.left(values)[block >= 0]), MINIMUM_NOISE["torque"])
+    evidence = _blocks(log, deviation, block)
+    case = Case(evidence, evidence, None, base, tuple(effects), config)
+    return case, base_model(case, values), deviation
+
+
+def _least(found: Screen, left: np.ndarray, space: Space, most: int) -> np.ndarray:
+    """[M] what the best `most` candidates leave of residuals `left` [M], one after the other, linearly.
+
+    One that takes less than an effect must is left out: it would take noise.
+    """
+    for _ in range(most):
+        best = proposals(found, left[None], space)[0]
+        if best.explained < LESS:
+            break
+        keys = {part.key for part in best.parts}
+        rows = [k for k, q in enumerate(found.questions) if q.candidate.key in keys]
+        taken, _ = np.linalg.qr(found.marks[rows].T)
+        left = left - taken @ (taken.T @ left)
+        found = replace(found, marks=found.marks - (found.marks @ taken) @ taken.T)
+    return left
 
 
 def _blocks(log: Log, deviation: np.ndarray, block: np.ndarray) -> Blocks:

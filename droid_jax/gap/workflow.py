@@ -43,11 +43,12 @@ def base_fit(case: Case, progress: Progress) -> Model:
 
 def ask(case: Case, model: Model, asked: tuple[Question, ...]) -> Screen:
     """Screen questions against a model's residuals on the first demonstration."""
-    count = case.fit.repeats
-    raw = marks(case.fit, model.values, asked)
-    base = model.refined.jacobian / count**0.5
-    projected = project(raw, -base, model.refined.prior * count**0.5)
-    return screen(model.residuals, asked, projected, case.config.seed)
+    root = case.fit.repeats**0.5
+    base, prior = model.refined.jacobian / root, model.refined.prior * root
+    projected = project(marks(case.fit, model.values, asked), base, prior)
+    return screen(
+        model.residuals, asked, projected, lambda s: case.fit.largest(s, projected, base, prior, case.config.seed)
+    )
 
 
 def find(case: Case, base: Model, floor: float, progress: Progress = lambda stage, value: None) -> Verdict:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 import pytest
 
+from droid_jax.compare.cost import Cost
 from droid_jax.gap.candidates import Candidate, candidates
+from droid_jax.gap.evidence import Evidence
 from droid_jax.gap.rank import proposals
 from droid_jax.gap.screen import Question, project, screen
-from droid_jax.gap.select import alike, one_sided_p, resampled_losses
+from droid_jax.gap.select import alike, one_sided_p, resamples
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.seam import Effect
 
@@ -25,6 +29,12 @@ def repeats(seed: int, **amplitudes: float) -> np.ndarray:
     common = sum((size * MARKS[int(name[1:])] for name, size in amplitudes.items()), np.zeros(SIZE))
     left = project(common[None], BASE, LOOSE)[0]
     return left + np.random.default_rng(seed).normal(size=(REPEATS, SIZE))
+
+
+def measured(deviations: np.ndarray) -> Evidence:
+    """Repeats without a recording behind them."""
+    nowhere = np.zeros(deviations.shape[1])
+    return Evidence(cast(Cost, None), deviations, nowhere, nowhere)
 
 
 def test_the_projection_leaves_nothing_of_a_base_column():
@@ -98,10 +108,15 @@ def test_one_sided_p():
 def test_models_that_leave_much_the_same_are_ties():
     left = np.array([1.0, 2.5, 10.0, 1.0])
     losses = np.tile([1.0, 2.0, 9.0, 1.5], (400, 1))
-    same = alike(left, losses, floor=0.0)
+    same = alike(left, losses, floor=0.0, tie=3.0)
     np.testing.assert_array_equal(same, same.T)
     assert same[0].tolist() == [True, True, False, True]
-    assert alike(left, losses, floor=0.9)[0].tolist() == [True, False, False, True]  # above the floor it is 16 times
+    assert alike(left, losses, floor=0.9, tie=3.0)[0].tolist() == [
+        True,
+        False,
+        False,
+        True,
+    ]  # above the floor it is 16 times
 
 
 def test_models_that_noise_cannot_separate_are_ties():
@@ -111,8 +126,8 @@ def test_models_that_noise_cannot_separate_are_ties():
     commons[1] = commons[0] + 0.005 * rng.normal(size=SIZE)
     commons[2] += 1.0
     deviations = rng.normal(size=(REPEATS, SIZE))
-    losses = resampled_losses(commons, deviations - deviations.mean(axis=0))
-    same = alike(np.array([1e-4, 1e-3, 1.0]), losses, floor=0.0)
+    losses = measured(deviations - deviations.mean(axis=0)).losses(commons, resamples(REPEATS))
+    same = alike(np.array([1e-4, 1e-3, 1.0]), losses, floor=0.0, tie=3.0)
     assert same[0].tolist() == [True, True, False]
 
 
@@ -120,8 +135,8 @@ def test_resampled_losses_are_the_squared_means_of_resamples():
     rng = np.random.default_rng(7)
     commons, deviations = rng.normal(size=(2, 30)), rng.normal(size=(REPEATS, 30))
     deviations -= deviations.mean(axis=0)
-    losses = resampled_losses(commons, deviations, seed=8)
-    draws = np.random.default_rng(8).multinomial(REPEATS, np.full(REPEATS, 1 / REPEATS), size=len(losses)) / REPEATS
+    draws = resamples(REPEATS, seed=8)
+    losses = measured(deviations).losses(commons, draws)
     expected = np.sum((commons[:, None] + draws @ deviations) ** 2, axis=2).T
     np.testing.assert_allclose(losses[:, 0] - losses[:, 1], expected[:, 0] - expected[:, 1])
 
