@@ -34,7 +34,7 @@ def draw(run: Run) -> dict[str, list[Drawing]]:
     sections: dict[str, list[Drawing]] = {"gap": [], "torque": [], "parameters": [], "search": []}
 
     def add(section: str, stem: str, title: str, caption: str, make: Callable[..., Figure], *args: Any) -> None:
-        sections[section].append(_drawing(run.folder, stem, title, caption, make, *args))
+        sections[section].append(drawing(run.folder, stem, title, caption, make, *args))
 
     for i, (name, gap) in enumerate(fit["gap"].items()):
         of = f" ({name})" if len(fit["gap"]) > 1 else ""
@@ -86,8 +86,9 @@ def draw(run: Run) -> dict[str, list[Drawing]]:
     return sections
 
 
-def _drawing(folder: Path, stem: str, title: str, caption: str, make: Callable[..., Figure], *args: Any) -> Drawing:
-    wide, narrow = make(*args, width=WIDE), make(*args, width=NARROW)
+def drawing(folder: Path, stem: str, title: str, caption: str, make: Callable[..., Figure], *args: Any) -> Drawing:
+    """The figure `make(*args, width=...)` draws, for the page; PNG and PDF copies go to FOLDER/figures/STEM.*."""
+    wide, narrow = (export.settled(make(*args, width=width)) for width in (WIDE, NARROW))
     export.save(wide, folder / "figures", stem)
     html = [_inline(f, f"{stem}-{kind}", title) for kind, f in (("wide", wide), ("narrow", narrow))]
     return Drawing(stem, title, caption, *html)

@@ -20,6 +20,14 @@ from droid_jax.storage import write_bytes
 SVG_LIMIT = 300_000  # bytes; a larger drawing goes into the page as PNG
 
 
+def settled(figure: Figure) -> Figure:
+    """The figure with its panels arranged for good: saving it several times need not arrange them again."""
+    with matplotlib.rc_context(STYLE):
+        figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    return figure
+
+
 def inline_svg(figure: Figure, prefix: str) -> str:
     """The figure as an <svg> element for an HTML page, its colours replaced by CSS variables.
 

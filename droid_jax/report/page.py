@@ -1,21 +1,36 @@
-"""The report of an identification run: one HTML page, built from the files of the run's folder alone.
+"""The report of a run's folder: one HTML page, built from the files in it alone.
 
 `write_report(run)` reads the folder, puts its numbers into words, tables and figures and
 writes RUN/report.html (everything inside, nothing loaded from elsewhere) and the figures as
-PNG and PDF under RUN/figures/.  Required: config.json, fit.json, history.npz, traces.npz and
-correlation.npz.  distribution.npz and frames/*.png are optional; where one is missing the
-page says so in its place.
+PNG and PDF under RUN/figures/.  The folder holds an identification, a search for a missing
+effect, or both.  Of an identification, config.json, fit.json, history.npz, traces.npz and
+correlation.npz are required; distribution.npz and frames/*.png are optional; where one is missing the
+page says so in its place.  Of a search, gap.json and gap.npz are required.
 """
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import jinja2
 
 from droid_jax.report.drawings import draw, frame_rows
-from droid_jax.report.run_folder import read_run
+from droid_jax.report.gap_drawings import draw_gap
+from droid_jax.report.gap_folder import Gap, has_gap, read_gap
+from droid_jax.report.gap_tables import groups
+from droid_jax.report.gap_words import (
+    DECISIVE,
+    ROLES,
+    effect_words,
+    gap_summary,
+    readable,
+    role_words,
+    settings,
+    unit_words,
+)
+from droid_jax.report.run_folder import Run, has_run, read_run
 from droid_jax.report.words import grouped, label, like, number, percent, speaker, summary
 from droid_jax.storage import write_text
 
@@ -27,6 +42,10 @@ _DOWNLOADS = (
     ("history.csv", "the search, generation by generation"),
     ("traces.npz", "torques over time"),
     ("config.json", "how the run was set up"),
+    ("gap.json", "the search for a missing effect: every number"),
+    ("extended.json", "the extended model: effects, values and a Gaussian over all of it"),
+    ("extended.xml", "the scene with the fitted values of the extended model, as far as MJCF has words for it"),
+    ("gap.npz", "the search for a missing effect: torques over time"),
 )
 
 
@@ -35,7 +54,9 @@ def write_report(run: Path) -> Path:
 
     Raises ValueError that names the file when a required one is missing or broken.
     """
-    loaded = read_run(run)
+    folder = Path(run)
+    gap = read_gap(folder) if has_gap(folder) else None
+    loaded = read_run(folder) if not gap or has_run(folder) else None
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -48,19 +69,54 @@ def write_report(run: Path) -> Path:
         "like": like,
         "percent": percent,
         "label": label,
-        "speak": speaker(loaded),
+        "effect": effect_words,
+        "unit": unit_words,
+        "speak": speaker(loaded) if loaded else str,
         "unbroken": lambda text: re.sub(r"(?<=\d) (?=N m|%)", "\u00a0", text).replace("N m", "N\u00a0m"),
     }
-    nuisances = grouped(p for p in loaded.fit["parameters"] if p["nuisance"])
+    parts = (_search(gap) if gap else {}) | (_identification(loaded) if loaded else {})
+    downloads = [(f, text) for f, text in _DOWNLOADS if (folder / f).is_file()]
     html = environment.get_template("template.html.j2").render(
-        run=loaded,
-        summary=summary(loaded),
-        groups=grouped(loaded.parameters),
-        nuisances=nuisances,
-        drawings=draw(loaded),
-        frames=frame_rows(loaded.frames),
-        downloads=[(f, text) for f, text in _DOWNLOADS if (loaded.folder / f).is_file()],
+        folder=folder, run=loaded, gap=gap, downloads=downloads, **parts
     )
-    path = loaded.folder / "report.html"
+    path = folder / "report.html"
     write_text(path, html)
     return path
+
+
+def _identification(run: Run) -> dict[str, Any]:
+    """What the page says of an identification; the head of the page is its, also where both are there."""
+    config = run.config
+    count = len(config["recordings"])
+    meta = [f"Preset {config['preset']}", f"{count} recording{'s' if count != 1 else ''}"]
+    if "started" in config:
+        meta.append(str(config["started"])[:16].replace("T", " "))
+    return {
+        "title": f"Identification of {config['scene']}",
+        "heading": f"Identification report: {config['scene']}",
+        "meta": [*meta, run.folder.resolve().name],
+        "stand_in": config["stand_in"],
+        "summary": summary(run),
+        "groups": grouped(run.parameters),
+        "nuisances": grouped(p for p in run.fit["parameters"] if p["nuisance"]),
+        "drawings": draw(run),
+        "frames": frame_rows(run.frames),
+    }
+
+
+def _search(gap: Gap) -> dict[str, Any]:
+    """What the page says of a search for a missing effect."""
+    name = gap.folder.resolve().name
+    return {
+        "title": f"Search for a missing effect: {name}",
+        "heading": "Search for a missing effect",
+        "meta": [*(role_words(gap, role) for role in gap.roles), name],
+        "stand_in": gap.stand_in,
+        "answer": readable(gap.found["sentence"], gap.found),
+        "gap_summary": gap_summary(gap),
+        "gap_drawings": draw_gap(gap),
+        "settings": settings(gap),
+        "candidates": groups(gap.found),
+        "roles": ROLES,
+        "decisive": DECISIVE,
+    }

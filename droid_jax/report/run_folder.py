@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import json
-import zipfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-_RERUN = "run `python -m droid_jax.run identify` again, or pass the folder that it wrote"
+from droid_jax.report.reading import Reader
+
+_READ = Reader("identify")
 _ARRAYS = {
     "history": ("names", "generation", "mean", "std", "best_cost", "median_cost"),
     "correlation": ("names", "correlation"),
@@ -71,18 +72,23 @@ class Run:
         return [p for p in self.fit["parameters"] if not p["nuisance"]]
 
 
+def has_run(folder: Path) -> bool:
+    """Whether a folder holds, or should hold, an identification beside something else."""
+    return (folder / "fit.json").exists()
+
+
 def read_run(run: Path) -> Run:
     """Load and check a run's folder; ValueError names the file that is missing or broken."""
     run = Path(run)
     if not run.is_dir():
-        raise ValueError(f"report: there is no folder {run}; {_RERUN}")
-    config, fit = _json(run / "config.json"), _json(run / "fit.json")
-    _need(config, ("preset", "scene", "engine", "recordings", "seed", "stand_in"), "config.json")
-    _need(fit, ("parameters", "cost", "gap", "stop", "rule"), "fit.json")
+        raise _READ.fault(f"there is no folder {run}")
+    config, fit = _READ.json(run / "config.json"), _READ.json(run / "fit.json")
+    _READ.need(config, ("preset", "scene", "engine", "recordings", "seed", "stand_in"), "config.json")
+    _READ.need(fit, ("parameters", "cost", "gap", "stop", "rule"), "fit.json")
     for i, p in enumerate(fit["parameters"]):
-        _need(p, _PARAMETER_KEYS, f"fit.json, parameter {p.get('name', i)!r}")
+        _READ.need(p, _PARAMETER_KEYS, f"fit.json, parameter {p.get('name', i)!r}")
     for name, gap in fit["gap"].items():
-        _need(gap, ("before", "after", "per_joint_before", "per_joint_after"), f"fit.json, gap {name!r}")
+        _READ.need(gap, ("before", "after", "per_joint_before", "per_joint_after"), f"fit.json, gap {name!r}")
     missing = []
     distribution = None
     if not (run / "distribution.npz").is_file():
@@ -90,7 +96,7 @@ def read_run(run: Path) -> Run:
             "distribution.npz is not there: the initial and the fitted Gaussian are not compared by samples."
         )
     else:
-        distribution = _arrays(run / "distribution.npz", _ARRAYS["distribution"])
+        distribution = _READ.arrays(run / "distribution.npz", _ARRAYS["distribution"])
     frames = tuple(sorted((run / "frames").glob("*.png")))
     if not frames:
         missing.append("frames/ holds no pictures: drawing needs OpenGL, see the documentation.")
@@ -99,47 +105,17 @@ def read_run(run: Path) -> Run:
         config=config,
         fit=fit,
         traces=_traces(run / "traces.npz", list(fit["gap"])),
-        history=_arrays(run / "history.npz", _ARRAYS["history"]),
-        correlation=_arrays(run / "correlation.npz", _ARRAYS["correlation"]),
+        history=_READ.arrays(run / "history.npz", _ARRAYS["history"]),
+        correlation=_READ.arrays(run / "correlation.npz", _ARRAYS["correlation"]),
         distribution=distribution,
         frames=frames,
         missing=tuple(missing),
     )
 
 
-def _json(path: Path) -> dict[str, Any]:
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ValueError(f"report: {path} is missing; {_RERUN}") from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise ValueError(f"report: {path} cannot be read ({error}); {_RERUN}") from None
-    if not isinstance(value, dict):
-        raise ValueError(f"report: {path} must hold a JSON object, got {type(value).__name__}; {_RERUN}")
-    return value
-
-
-def _need(table: Mapping[str, Any], keys: Iterable[str], where: str) -> None:
-    absent = [k for k in keys if k not in table]
-    if absent:
-        raise ValueError(f"report: {where} lacks {', '.join(map(repr, absent))}; {_RERUN}")
-
-
-def _arrays(path: Path, keys: Iterable[str] = ()) -> dict[str, np.ndarray]:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {k: file[k] for k in file.files}
-    except FileNotFoundError:
-        raise ValueError(f"report: {path} is missing; {_RERUN}") from None
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
-        raise ValueError(f"report: {path} cannot be read ({error}); {_RERUN}") from None
-    _need(arrays, keys, path.name)
-    return arrays
-
-
 def _traces(path: Path, recordings: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Arrays per recording, their shapes checked against time [T] and joints [J]."""
-    arrays = _arrays(path, [f"{r}/{key}" for r in recordings for key in _TRACE_KEYS])
+    arrays = _READ.arrays(path, [f"{r}/{key}" for r in recordings for key in _TRACE_KEYS])
     traces: dict[str, dict[str, Any]] = {}
     for r in recordings:
         one: dict[str, Any] = {key: arrays[f"{r}/{key}"] for key in _TRACE_KEYS}

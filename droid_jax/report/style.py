@@ -99,12 +99,12 @@ def panel_columns(width: float) -> int:
     return 2 if width > 6 else 1
 
 
-def panel_grid(n: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
+def panel_grid(n: int, width: float, height: float, sharex: bool = True) -> tuple[Figure, list[Axes]]:
     """A figure with n panels of `height` inches in one or two columns, and the panels in reading order."""
     columns = panel_columns(width)
     rows = math.ceil(n / columns)
     figure = Figure(figsize=(width, 0.55 + height * rows), layout="constrained")
-    grid = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
+    grid = figure.subplots(rows, columns, sharex=sharex, squeeze=False).ravel()
     for axes in grid[n:]:
         axes.set_visible(False)
     return figure, list(grid[:n])

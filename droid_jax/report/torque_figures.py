@@ -40,17 +40,17 @@ def torque_traces(
     figure, panels = panel_grid(len(joints), width, height=1.75)
     for j, (axes, joint) in enumerate(zip(panels, joints, strict=True)):
         line = {k: np.asarray(traces[k])[:, j] for k in _TRACES}
-        _shade(axes, phases, named=j < panel_columns(width))
+        shade(axes, phases, named=j < panel_columns(width))
         axes.fill_between(
-            *_band(time, line["measured_low"], line["measured_high"]),
+            *band(time, line["measured_low"], line["measured_high"]),
             color=MEASURED,
             alpha=0.16,
             linewidth=0,
             label="measured, 5 to 95 % of held-out repeats",
         )
-        axes.plot(*_thin(time, line["measured_mean"]), color=MEASURED, linewidth=2.4, label="measured, mean")
-        axes.plot(*_thin(time, line["before"]), color=BEFORE, linestyle=(0, (4, 1.5)), label="before the fit")
-        axes.plot(*_thin(time, line["after"]), color=AFTER, linewidth=1.0, label="after the fit")
+        axes.plot(*thin(time, line["measured_mean"]), color=MEASURED, linewidth=2.4, label="measured, mean")
+        axes.plot(*thin(time, line["before"]), color=BEFORE, linestyle=(0, (4, 1.5)), label="before the fit")
+        axes.plot(*thin(time, line["after"]), color=AFTER, linewidth=1.0, label="after the fit")
         axes.set(title=label(joint), xlim=(time[0], time[-1]), ylim=_torque_limits(line))
         axes.set_ylabel(f"Torque [{unit}]" if j % panel_columns(width) == 0 else "")
     label_bottom(panels, width, "Time [s]")
@@ -91,7 +91,7 @@ def gap_per_joint(
     return figure
 
 
-def _shade(axes: Axes, phases: Sequence[Mapping[str, Any]], named: bool) -> None:
+def shade(axes: Axes, phases: Sequence[Mapping[str, Any]], named: bool) -> None:
     """Every other phase of the motion shaded; names at the top where asked for."""
     for i, phase in enumerate(phases):
         if i % 2 == 0:
@@ -110,7 +110,7 @@ def _shade(axes: Axes, phases: Sequence[Mapping[str, Any]], named: bool) -> None
             )
 
 
-def _thin(time: np.ndarray, value: np.ndarray, buckets: int = 220) -> tuple[np.ndarray, np.ndarray]:
+def thin(time: np.ndarray, value: np.ndarray, buckets: int = 220) -> tuple[np.ndarray, np.ndarray]:
     """The smallest and largest sample of each bucket, in order of time: short, and no spike is lost."""
     if len(time) <= 2 * buckets:
         return time, value
@@ -123,14 +123,15 @@ def _thin(time: np.ndarray, value: np.ndarray, buckets: int = 220) -> tuple[np.n
     return time[index], value[index]
 
 
-def _band(
+def band(
     time: np.ndarray, low: np.ndarray, high: np.ndarray, buckets: int = 220
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The band's outline, one point per bucket, never inside the band itself."""
+    """The band's outline, one point per bucket and one at the end, never inside the band itself."""
     if len(time) <= buckets:
         return time, low, high
     start = np.linspace(0, len(time), buckets, endpoint=False).astype(int)
-    return time[start], np.minimum.reduceat(low, start), np.maximum.reduceat(high, start)
+    low, high = np.minimum.reduceat(low, start), np.maximum.reduceat(high, start)
+    return np.append(time[start], time[-1]), np.append(low, low[-1]), np.append(high, high[-1])
 
 
 def _torque_limits(line: Mapping[str, np.ndarray]) -> tuple[float, float]:

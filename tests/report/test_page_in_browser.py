@@ -5,16 +5,15 @@ Skipped where no Chromium is on the path.
 
 from __future__ import annotations
 
-import importlib.util
 import re
 import shutil
 import subprocess
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
+from made_up_gap import make_gap
+from made_up_run import make_run
 
 from droid_jax.report import page
 
@@ -39,19 +38,14 @@ addEventListener('load', () => {
 </script></body>"""
 
 
-def _builder() -> ModuleType:
-    """The made-up run of the neighbouring test file, under any of pytest's import modes."""
-    spec = importlib.util.spec_from_file_location("report_run", Path(__file__).with_name("test_report.py"))
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return page.write_report(make_run(tmp_path_factory.mktemp("browser") / "run"))
 
 
 @pytest.fixture(scope="module")
-def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return page.write_report(_builder().make_run(tmp_path_factory.mktemp("browser") / "run"))
+def gap_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return page.write_report(make_gap(tmp_path_factory.mktemp("browser") / "gap", "partly explained"))
 
 
 def _browse(url: Path, *options: str, size: tuple[int, int]) -> subprocess.CompletedProcess[str]:
@@ -68,24 +62,40 @@ def _console(stderr: str) -> list[str]:
     return [line for line in stderr.splitlines() if "CONSOLE" in line]
 
 
-@pytest.mark.parametrize(("size", "shown", "hidden"), [((1200, 900), "wide", "narrow"), ((500, 900), "narrow", "wide")])
+SIZES = pytest.mark.parametrize(
+    ("size", "shown", "hidden"), [((1200, 900), "wide", "narrow"), ((500, 900), "narrow", "wide")]
+)
+
+
+def _probe(report: Path, size: tuple[int, int], name: str) -> dict[str, int]:
+    """What the browser draws of a page at this size; its console must be silent."""
+    probe = report.with_name(f"probe_{name}.html")
+    text = report.read_text(encoding="utf-8")
+    opened = text.replace("default-src 'none';", "default-src 'none'; script-src 'unsafe-inline';")
+    probe.write_text(opened.replace("</body>", PROBE), encoding="utf-8")
+    done = _browse(probe, "--dump-dom", size=size)
+    assert not _console(done.stderr)
+    return {k: int(v) for k, v in re.findall(r'data-(\w+)="(-?\d+)"', done.stdout[:2000])}
+
+
+@SIZES
 def test_everything_is_drawn_and_nothing_overflows(
     report: Path, size: tuple[int, int], shown: str, hidden: str
 ) -> None:
-    probe = report.with_name(f"probe_{shown}.html")
-    text = report.read_text(encoding="utf-8")
-    probe.write_text(
-        text.replace("default-src 'none';", "default-src 'none'; script-src 'unsafe-inline';").replace(
-            "</body>", PROBE
-        ),
-        encoding="utf-8",
-    )
-    done = _browse(probe, "--dump-dom", size=size)
-    found = {k: int(v) for k, v in re.findall(r'data-(\w+)="(-?\d+)"', done.stdout[:2000])}
-    assert not _console(done.stderr)
+    found = _probe(report, size, shown)
     assert found["images"] == found["loaded"] == 4
     assert found[shown] == 7 and found[hidden] == 0
     assert found["drawn"] == 7
+    assert found["overflow"] == 0
+
+
+@SIZES
+def test_the_search_for_a_missing_effect_is_drawn_too(
+    gap_report: Path, size: tuple[int, int], shown: str, hidden: str
+) -> None:
+    found = _probe(gap_report, size, shown)
+    assert found["images"] == 0  # every figure is short enough to be an SVG
+    assert found[shown] == found["drawn"] == 8 and found[hidden] == 0  # closed ones have a size too
     assert found["overflow"] == 0
 
 

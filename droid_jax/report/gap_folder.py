@@ -1,0 +1,126 @@
+"""What a search for a missing effect leaves in its folder, as the report reads it: gap.json and gap.npz, checked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from droid_jax.report.reading import Reader
+
+VERDICTS = ("none", "named", "tie", "partly explained", "unexplained", "fit not converged")
+ROLES = ("fit", "confirm", "sealed")
+_READ = Reader("gap")
+_NUMBER = (int, float)
+_MAYBE = (int, float, type(None))
+_CELL = {"variable": str, "where": str, "gap": _MAYBE, "p": _MAYBE, "found": bool}
+_GAP = {
+    "recording": str,
+    **dict.fromkeys(("before", "after", "closed", "torque_before", "torque_after"), _MAYBE),
+}
+_TRIAL = {
+    **{"round": int, "name": str, "passed": bool, "reasons": [str]},
+    **dict.fromkeys(("gap_fit", "gap_confirm", "p", "chosen"), _MAYBE),
+}
+_AMPLITUDE = {
+    **dict.fromkeys(("name", "unit", "effect", "what"), str),
+    **dict.fromkeys(("value", "low", "high"), _MAYBE),
+}
+_SHIFT = {"name": str, "unit": str, **dict.fromkeys(("before", "after", "deviation_before"), _MAYBE)}
+_SCHEMA = {
+    **{"verdict": str, "sentence": str, "effects": [str], "tied": [[str]], "p": _MAYBE, "floor": _MAYBE},
+    **{"converged": bool, "cut": str, "seconds": {str: _NUMBER}, "gaps": {str: _GAP}},
+    "phases": {str: [{"name": str, "start": _NUMBER, "end": _NUMBER}]},
+    "screens": [{"p": _MAYBE, "ranking": [{"candidate": str, "t": _MAYBE, "explained": _MAYBE}]}],
+    "trials": [_TRIAL],
+    "cells": {"before": [_CELL], "after": [_CELL]},
+    **{"amplitudes": [_AMPLITUDE], "shifts": [_SHIFT], "experiments": [{"what": str, "apart": _MAYBE}]},
+    **{"units": str, "versions": dict, "device": str, "setup": dict},
+}
+_LINES = ("measured", "scatter", "before", "after")
+
+
+@dataclass(frozen=True)
+class Gap:
+    """What a search for a missing effect found.
+
+    found: gap.json.  traces: role -> joints [J], time [K] s, and measured, scatter, before, after [K, J]
+    in `unit`, and the role's phases.
+    """
+
+    folder: Path
+    found: Mapping[str, Any]
+    traces: Mapping[str, Mapping[str, Any]]
+
+    @property
+    def unit(self) -> str:
+        """Of torques: N m, or N where slides are measured."""
+        return self.found["units"]
+
+    @property
+    def roles(self) -> list[str]:
+        """The demonstrations there are, by what they were for: "fit", "confirm" and perhaps "sealed"."""
+        return [r for r in ROLES if r in self.found["gaps"]]
+
+    @property
+    def judge(self) -> str:
+        """The role that says how large the gap is: the sealed one, or the best there is."""
+        return self.roles[-1]
+
+    @property
+    def extended(self) -> bool:
+        """Whether an effect entered the model: only then is there an "after"."""
+        return bool(self.found["effects"])
+
+    @property
+    def stand_in(self) -> bool:
+        """Whether the run says that its torques come from a stand-in robot: no recording was given to it."""
+        return self.found["setup"].get("stand_in", self.found["setup"].get("recording") == [])
+
+    def recording(self, role: str) -> str:
+        """Name of the demonstration in a role."""
+        return self.found["gaps"][role]["recording"]
+
+
+def has_gap(folder: Path) -> bool:
+    """Whether a folder holds, or should hold, a search for a missing effect."""
+    return any((folder / name).exists() for name in ("gap.json", "gap.npz"))
+
+
+def read_gap(folder: Path) -> Gap:
+    """Load and check; ValueError names what is missing or broken."""
+    found = _READ.json(folder / "gap.json")
+    _READ.check(found, _SCHEMA, "gap.json")
+    for fault in _faults(found):
+        raise _READ.fault(f"gap.json, {fault}")
+    roles = [r for r in ROLES if r in found["gaps"]]
+    return Gap(folder, found, _traces(folder / "gap.npz", roles, found["phases"]))
+
+
+def _faults(found: Mapping[str, Any]) -> Iterator[str]:
+    """What the schema cannot say."""
+    if found["verdict"] not in VERDICTS:
+        yield f"'verdict' must be one of {', '.join(VERDICTS)}, got {found['verdict']!r}"
+    absent = [r for r in ROLES[:2] if r not in found["gaps"]]
+    if absent:
+        yield f"'gaps' lacks {', '.join(map(repr, absent))}"
+    if len(found["tied"]) > len(found["effects"]):
+        yield f"'tied' has {len(found['tied'])} lists for {len(found['effects'])} effects"
+
+
+def _traces(path: Path, roles: Sequence[str], phases: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Arrays by role, their shapes checked against time [K] and joints [J]."""
+    arrays = _READ.arrays(path, ["joints", *(f"{r}.{key}" for r in roles for key in ("time", *_LINES))])
+    traces: dict[str, dict[str, Any]] = {}
+    for role in roles:
+        shape = (len(arrays[f"{role}.time"]), len(arrays["joints"]))
+        for key in _LINES:
+            if arrays[f"{role}.{key}"].shape != shape:
+                got = arrays[f"{role}.{key}"].shape
+                raise _READ.fault(f"{path}, {role}.{key} must be [time, joints] = {shape}, got {got}")
+        lines: dict[str, np.ndarray] = {key: arrays[f"{role}.{key}"] for key in ("time", *_LINES)}
+        traces[role] = {**lines, "joints": [str(j) for j in arrays["joints"]], "phases": phases.get(role, [])}
+    return traces

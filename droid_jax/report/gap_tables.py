@@ -1,0 +1,119 @@
+"""The candidates' tables: models with one effect, with two, with three; in rank order, and why each one lost."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from droid_jax.report.gap_words import BETWEEN, model_words, readable
+
+SIZES = ("One effect", "Two effects", "Three effects")
+
+
+@dataclass(frozen=True)
+class Row:
+    """A candidate, or a model that holds it.
+
+    t, explained: of the screening, None where it is not ranked.  trial: entry of gap.json, None where it
+    was screened only.  fate: what became of it.  kept: whether all of it is in the final model.
+    """
+
+    name: str
+    t: float | None
+    explained: float | None
+    trial: Mapping[str, Any] | None
+    fate: str
+    kept: bool
+
+
+@dataclass(frozen=True)
+class Group:
+    """Models with as many effects.
+
+    beside: the model that was screened, empty for the base model; p: of that screening, None where there was
+    none.  gap_fit, gap_confirm: U of that model.  tried: rows with a trial; others: rows that were screened only.
+    """
+
+    title: str
+    beside: str
+    p: float | None
+    gap_fit: float | None
+    gap_confirm: float | None
+    tried: tuple[Row, ...]
+    others: tuple[Row, ...]
+
+
+def groups(found: Mapping[str, Any]) -> list[Group]:
+    """One for each number of effects that was screened or tried."""
+    screens = found["screens"]
+    if len(screens) > 1 and screens[-1] == screens[0]:
+        screens = screens[:-1]  # pairs are proposed from the first screening, which is listed again for them
+    count = max([len(screens), *(t["round"] + 1 for t in found["trials"])])
+    return [_group(found, k, screens[k] if k < len(screens) else None) for k in range(count)]
+
+
+def _group(found: Mapping[str, Any], k: int, screen: Mapping[str, Any] | None) -> Group:
+    trials: dict[str, Mapping[str, Any]] = {}
+    for t in _of_size(found, k):
+        if t["name"] not in trials or t["passed"]:  # a pair may be tried twice, beside one of the two and from scratch
+            trials[t["name"]] = t
+    stood = _stood(found, k)
+    before = _gaps(found, k, stood)
+    ranking = {_joined(stood, r["candidate"]): r for r in reversed(screen["ranking"] if screen else [])}
+    names = [*reversed(ranking), *(name for name in trials if name not in ranking)]
+    rows = [_row(found, name, ranking.get(name), trials.get(name)) for name in names]
+    return Group(
+        title=SIZES[k] if k < len(SIZES) else f"{k + 1} effects",
+        beside=model_words(stood),
+        p=screen["p"] if screen else None,
+        gap_fit=before.get("gap_fit"),
+        gap_confirm=before.get("gap_confirm"),
+        tried=tuple(r for r in rows if r.trial is not None),
+        others=tuple(r for r in rows if r.trial is None),
+    )
+
+
+def _of_size(found: Mapping[str, Any], k: int) -> Sequence[Mapping[str, Any]]:
+    return [t for t in found["trials"] if t["round"] == k]
+
+
+def _stood(found: Mapping[str, Any], k: int) -> str:
+    """Name of the model that the k-th effect was added to: what most models of this size begin with."""
+    if k == 0:
+        return ""
+    begins = Counter(t["name"].rpartition(BETWEEN)[0] for t in _of_size(found, k))
+    passed = [t for t in _of_size(found, k - 1) if t["passed"]]
+    if begins:
+        return begins.most_common(1)[0][0]
+    return min(passed, key=lambda t: t["gap_confirm"])["name"] if passed else ""
+
+
+def _gaps(found: Mapping[str, Any], k: int, stood: str) -> Mapping[str, Any]:
+    """U of the model that stood, where gap.json says it."""
+    if not stood:
+        gaps = found["gaps"]
+        return {"gap_fit": gaps["fit"]["before"], "gap_confirm": gaps["confirm"]["before"]}
+    return next((t for t in _of_size(found, k - 1) if t["name"] == stood), {})
+
+
+def _joined(stood: str, candidate: str) -> str:
+    return f"{stood}{BETWEEN}{candidate}" if stood else candidate
+
+
+def _row(found: Mapping[str, Any], name: str, entry: Any, trial: Mapping[str, Any] | None) -> Row:
+    parts, effects = set(name.split(BETWEEN)), found["effects"]
+    rivals = {n for ties in found["tied"] for n in ties}
+    kept = trial is not None and trial["passed"] and parts <= set(effects)
+    if trial is None:
+        fate = "screened only: explains less"
+    elif trial["reasons"]:
+        fate = "; ".join(readable(r, found) for r in trial["reasons"])
+    elif kept:
+        tied = any(ties for effect, ties in zip(effects, found["tied"], strict=False) if effect in parts)
+        fate = "in the model, and others do as well" if tied else "in the model"
+    else:
+        fate = "does as well: a tie" if parts <= {*effects, *rivals} else "passed, but another leaves less"
+    ranked = entry or {"t": None, "explained": None}
+    return Row(model_words(name), ranked["t"], ranked["explained"], trial, fate, kept)

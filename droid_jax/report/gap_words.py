@@ -1,0 +1,204 @@
+"""The search for a missing effect in words: what was fitted, how large the gap is, what is missing, what to do."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from droid_jax.report.gap_folder import Gap
+from droid_jax.report.words import label, listed, number, percent
+
+SIGNIFICANT = 0.01  # p below which something is said to be missing
+DECISIVE = 6.0  # standardised difference from which ten repeats decide between rivals
+_U = "the gap U (1: what all repeats share is as large as one repeat's noise)"
+BETWEEN = " + "  # between the effects in a model's name
+ROLES = {"fit": "fitted", "confirm": "confirming", "sealed": "sealed"}
+
+
+def effect_words(name: str) -> str:
+    """ "latch at door_hinge" -> "latch at door hinge", "cable_pull at panda_joint3" -> "cable pull at joint 3"."""
+    effect, at, place = name.partition(" at ")
+    return label(effect).lower() + at + (label(place).lower() if at else "")
+
+
+def model_words(name: str) -> str:
+    """ "latch at door_hinge + drag at door_hinge" -> "latch at door hinge + drag at door hinge"."""
+    return BETWEEN.join(effect_words(part) for part in name.split(BETWEEN))
+
+
+def role_words(gap: Gap, role: str) -> str:
+    """ "A (fitted)"."""
+    return f"{gap.recording(role)} ({ROLES[role]})"
+
+
+def readable(text: str, found: Mapping[str, Any]) -> str:
+    """A text of gap.json, the names of candidates and parameters in it as they are read."""
+    names = {r["candidate"] for screen in found["screens"] for r in screen["ranking"]}
+    names |= {*found["effects"], *(name for rivals in found["tied"] for name in rivals)}
+    for name in sorted(names, key=len, reverse=True):
+        text = text.replace(name, effect_words(name))
+    return re.sub(r"\b\w+_\w+(\[\w+\])?", lambda m: label(m[0]).lower(), text)
+
+
+def unit_words(unit: str) -> str:
+    """ "N m s^2/rad^2" -> "N m s²/rad²"."""
+    return unit.replace("^2", "²").replace("^3", "³")
+
+
+def gap_summary(gap: Gap) -> list[str]:
+    """The sentences under the answer, from the numbers alone; the last says what to do."""
+    sentences = [_fitted(gap), _significance(gap.found), _size(gap), *_added(gap.found["amplitudes"])]
+    return [*(s for s in sentences if s), *_ties(gap.found), _next(gap)]
+
+
+def settings(gap: Gap) -> list[str]:
+    """What was asked for, one text per setting."""
+    out = []
+    for name, value in gap.found["setup"].items():
+        if value not in (None, [], ""):
+            words = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+            out.append(f"{name.replace('_', ' ')} {words}")
+    return out
+
+
+def _fitted(gap: Gap) -> str:
+    found = gap.found
+    text = f"The base model was fitted to “{gap.recording('fit')}”"
+    if not found["screens"]:
+        return text + "; no candidate was asked about."
+    asked = len({r["candidate"] for s in found["screens"] for r in s["ranking"]})
+    text += f", {asked} candidate effects were screened against what it leaves"
+    tried = len({t["name"] for t in found["trials"]})
+    if tried:
+        text += f", and {tried} extended models were refitted and judged on “{gap.recording('confirm')}”"
+    return text + "."
+
+
+def _significance(found: Mapping[str, Any]) -> str:
+    p, bar = found["p"], number(SIGNIFICANT, 1)
+    if p is None:
+        return ""
+    if found["verdict"] == "none" and p < SIGNIFICANT:
+        return (
+            f"What it leaves is no chance (p = {number(p, 2)}), but it is no larger than what the simulation's "
+            "own time step leaves."
+        )
+    chance = f"If nothing were missing, noise would look this much like one of them with p = {number(p, 2)}"
+    return f"{chance}; below {bar} something is missing." if p < SIGNIFICANT else f"{chance}, not below {bar}."
+
+
+def _size(gap: Gap) -> str:
+    one, floor = gap.found["gaps"][gap.judge], gap.found["floor"]
+    seen = {
+        "sealed": "which was opened once, at the end",
+        "confirm": "which also chose the effects, since none was kept sealed",
+        "fit": "the only one there is",
+    }
+    where = f"On “{one['recording']}”" + (f", {seen[gap.judge]}," if gap.extended else "")
+    at = f"the numerical floor is {number(floor)}" if floor is not None else "the numerical floor is not known"
+    if not gap.extended:
+        torque = f"{number(one['torque_before'])} {gap.unit}"
+        return f"{where} {_U} is {number(one['before'])} and the torque distance {torque}; {at}."
+    text = f"{where} {_U} was {number(one['before'])} before and is {number(one['after'])} after; {at}"
+    if one["closed"] is not None:
+        share = percent(max(one["closed"], 0.0))
+        text += f", so {share} of what can be closed was closed"
+    torque = f"{number(one['torque_before'])} to {number(one['torque_after'])} {gap.unit}"
+    return f"{text}. The torque distance went from {torque}."
+
+
+def _added(amplitudes: Sequence[Mapping[str, Any]]) -> list[str]:
+    """One sentence per effect."""
+    effects: dict[str, list[Mapping[str, Any]]] = {}
+    for a in amplitudes:
+        effects.setdefault(a["effect"], []).append(a)
+    out = []
+    for name, mine in effects.items():
+        words = effect_words(name)
+        out.append(f"The {words} is {mine[0]['what']}: {listed([_amplitude(a) for a in mine])} (90 % intervals).")
+    return out
+
+
+def _amplitude(a: Mapping[str, Any]) -> str:
+    unit = f" {unit_words(a['unit'])}" if a["unit"] else ""
+    name = label(a["name"]).lower()
+    return f"{name} {number(a['value'])}{unit}, {number(a['low'])} to {number(a['high'])}{unit}"
+
+
+def _ties(found: Mapping[str, Any]) -> list[str]:
+    """What does as well as each effect; a verdict "tie" says so in its own sentence."""
+    if found["verdict"] == "tie":
+        return []
+    both = [(effect, ties) for effect, ties in zip(found["effects"], found["tied"], strict=False) if ties]
+    return [f"In place of {effect_words(e)}, {' or '.join(map(effect_words, t))} would do as well." for e, t in both]
+
+
+def _next(gap: Gap) -> str:
+    named = listed([effect_words(e) for e in gap.found["effects"]])
+    steps = {
+        "none": "go on with the base model; a smaller effect would need more repeats, or a demonstration that also "
+        "closes, moves at another speed or reaches further",
+        "named": f"look for the {named} on the hardware, and simulate with it{_file(gap)}",
+        "tie": f"take no name for the cause yet. {_separate(gap.found['experiments'])}",
+        "partly explained": f"keep the {named} in the model{_file(gap)}, and look at the hardware {_where(gap)}; "
+        "that part has no name yet",
+        "unexplained": f"look at the hardware {_where(gap)}. The library holds no effect that does this: write one "
+        "of your own, or correct the scene there, and run again. Do not train on this part of the motion",
+        "fit not converged": "search longer (more generations, more restarts) or give the parameters tighter priors, "
+        "and run again; take no number from this page until the starts agree",
+    }
+    return f"Next: {steps[gap.found['verdict']]}."
+
+
+def _file(gap: Gap) -> str:
+    return " (extended.json)" if (gap.folder / "extended.json").is_file() else ""
+
+
+def _separate(experiments: Sequence[Mapping[str, Any]]) -> str:
+    known = [e for e in experiments if e["apart"] is not None]
+    if not known:
+        return "No experiment on the menu was found that separates them; for torques they act alike"
+    best = max(known, key=lambda e: e["apart"])
+    apart = f"{number(best['apart'])} standard deviations apart"
+    if best["apart"] >= DECISIVE:
+        return f"Record this too and run again: {best['what']}. There the rivals are {apart}, and ten repeats decide"
+    bar = number(DECISIVE, 1)
+    return (
+        f"The best to record is: {best['what']}. There the rivals are only {apart}; ten repeats decide from {bar} on, "
+        "so record more of them"
+    )
+
+
+def _where(gap: Gap) -> str:
+    """The largest cell that the test found in what is left."""
+    found = [c for c in gap.found["cells"]["after"] if c["found"] and c["gap"] is not None]
+    over_time = [c for c in found if c["variable"] == "joint x phase"]
+    if not found:
+        return "(no single place stands out)"
+    return "where the most is left: " + listed(
+        [place_words(max(cells, key=lambda c: c["gap"])) for cells in (over_time, _others(found)) if cells]
+    )
+
+
+def _others(found: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    return [c for c in found if c["variable"].startswith("object")]
+
+
+def place_words(cell: Mapping[str, Any]) -> str:
+    """ "joint 2 in opening, from 2.0 s on", "object angle 0.10 to 0.20 rad"."""
+    if cell["variable"] != "joint x phase":
+        return f"{cell['variable']} {span_words(cell['where'])}"
+    joint, phase, start = joint_phase(cell["where"])
+    return label(joint).lower() + (f" in {phase}, from {start} s on" if phase not in ("", "all") else "")
+
+
+def span_words(where: str) -> str:
+    """A bin without a sign before its zero: "-0.00 to 0.15 rad" -> "0.00 to 0.15 rad"."""
+    return re.sub(r"-(?=0\.?0*( |$))", "", where)
+
+
+def joint_phase(where: str) -> tuple[str, str, str]:
+    """ "panda_joint2, opening 2.0 s" -> ("panda_joint2", "opening", "2.0")."""
+    parts = re.fullmatch(r"(.+?), (.+) (-?[\d.]+) s", where)
+    return (parts[1], parts[2], parts[3]) if parts else (where, "", "")

@@ -1,0 +1,60 @@
+"""The figures of a search for a missing effect draw what they are given."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from made_up_gap import make_gap
+
+from droid_jax.report import gap_figures, gap_maps, gap_torques
+from droid_jax.report.gap_folder import Gap, read_gap
+from droid_jax.report.words import number
+
+
+@pytest.fixture(scope="module")
+def named(tmp_path_factory: pytest.TempPathFactory) -> Gap:
+    return read_gap(make_gap(tmp_path_factory.mktemp("gap") / "named"))
+
+
+def test_overlays_draw_the_given_torques(named: Gap) -> None:
+    traces = named.traces["sealed"]
+    figure = gap_torques.torque_overlays(traces, named.unit)
+    panels = [a for a in figure.axes if a.get_visible() and a.get_title("left")]
+    assert [a.get_title("left") for a in panels] == [f"Joint {i}" for i in range(1, 8)]
+    for j, axes in enumerate(panels):
+        drawn = {line.get_label(): line for line in axes.lines}
+        for name, key in (("base model", "before"), ("with what was missing", "after"), ("measured, mean", "measured")):
+            rows = np.searchsorted(traces["time"], drawn[name].get_xdata())
+            np.testing.assert_array_equal(drawn[name].get_ydata(), traces[key][rows, j])
+
+
+def test_the_maps_share_one_scale_and_leave_out_what_is_not_found(named: Gap) -> None:
+    cells = named.found["cells"]
+    first, second, *_ = gap_maps.cell_maps(cells["before"], cells["after"]).axes
+    before, after = first.collections[0], second.collections[0]
+    assert before.get_clim() == after.get_clim()
+    found = [c["found"] for c in cells["after"] if c["variable"] == gap_maps.TIME]
+    np.testing.assert_array_equal(~np.ma.getmaskarray(np.ma.asarray(after.get_array())).ravel(), found)
+    largest = max(c["gap"] for c in cells["before"] if c["variable"] == gap_maps.TIME)
+    assert np.max(np.asarray(before.get_array())) == largest
+    assert number(largest, 2) in {t.get_text() for t in first.texts}
+
+
+def test_figures_survive_odd_numbers(named: Gap) -> None:
+    found = named.found
+    gaps = [{**g, "after": -0.001, "torque_after": None} for g in found["gaps"].values()]
+    gap_figures.gap_bars(["A", "B", "C"], gaps, 0.0, "N m")
+    gap_figures.gap_bars(["A"], [{k: None for k in gaps[0]}], None, "N m")
+    silent = [{**c, "found": False, "gap": -0.01} for c in found["cells"]["before"]]
+    gap_maps.cell_maps(silent, silent)
+    gap_maps.state_bars(silent, None)
+    traces = named.traces["fit"]
+    assert len(gap_torques.remainder(traces, silent, "N m").axes) == 1  # no variable is located, time alone is drawn
+    gap_torques.remainder(traces, [], "N m")
+
+
+def test_shifts_are_counted_in_deviations() -> None:
+    shift = {"name": "knob_mass", "unit": "kg", "before": 2.6, "after": 0.2, "deviation_before": 0.4}
+    assert gap_figures.deviations(shift) == pytest.approx(-6.0)
+    unknown = [{**shift, "deviation_before": d} for d in (None, 0.0)]
+    assert gap_figures.largest_shifts([*unknown, shift]) == [shift]

@@ -1,0 +1,264 @@
+"""The page of a search for a missing effect: its numbers are the files', and every verdict has its words."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from made_up_gap import CLOSER, LATCH, STRIBECK, gap_json, make_gap
+from made_up_run import make_run
+from markupsafe import Markup
+from matplotlib.figure import Figure
+from reader import read_page
+
+from droid_jax.report import drawings, gap_drawings, gap_maps, gap_words, page, style
+from droid_jax.report.drawings import Drawing
+from droid_jax.report.gap_folder import VERDICTS, read_gap
+from droid_jax.report.gap_tables import groups
+from droid_jax.report.words import number, percent
+
+NEXT = {
+    "none": "go on with the base model",
+    "named": "look for the latch at door hinge on the hardware",
+    "tie": "Record this too and run again: the same motion at 0.3 of the speed. There the rivals are 14.3",
+    "partly explained": "where the most is left: joint 1 in opening, from 2.0 s on and object angle 0.00 to 0.14 rad",
+    "unexplained": "where the most is left: joint 1 in opening, from 2.0 s on",
+    "fit not converged": "search longer",
+}
+
+
+def _made_only(folder: Path, stem: str, title: str, caption: str, make: Callable[..., Figure], *args: Any) -> Drawing:
+    """A figure that is made, and neither saved nor put into the page, which would take seconds."""
+    assert isinstance(make(*args, width=style.WIDE), Figure)
+    return Drawing(stem, title, caption, Markup(""), Markup(""))
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (gap_drawings, drawings):
+        monkeypatch.setattr(module, "drawing", _made_only)
+
+
+@pytest.fixture
+def named(tmp_path: Path, quick: None) -> Path:
+    folder = make_gap(tmp_path / "named")
+    page.write_report(folder)
+    return folder
+
+
+def _shown(cell: dict[str, Any], value: float | None, written: Callable[..., str] = number) -> bool:
+    """Whether a cell holds this value, and shows it."""
+    if value is None:
+        return cell["text"].strip() == "–"
+    return cell["values"] == [value] and cell["text"].strip() == written(value)
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_every_verdict_has_its_words(tmp_path: Path, quick: None, verdict: str) -> None:
+    sealed = verdict not in ("none", "tie")
+    folder = make_gap(tmp_path / "run", verdict, sealed=sealed)
+    text = read_page(page.write_report(folder)).text.replace("\u00a0", " ")
+    gap = read_gap(folder)
+    assert gap_words.readable(gap.found["sentence"], gap.found) in text and "_" not in text.split("Next:")[0]
+    assert NEXT[verdict] in text
+    assert ("U after" in text) == bool(gap.found["effects"])
+    assert ("Descriptive only" in text) == (verdict in ("unexplained", "partly explained"))
+    assert ("No demonstration was kept sealed" in text) == (not sealed)
+    assert f"Torque over time, {gap.recording(gap.judge)} ({'sealed' if sealed else 'confirming'})" in text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("verdict", ["partly explained", "none"])
+def test_the_page_loads_nothing_and_every_link_is_there(tmp_path: Path, verdict: str) -> None:
+    folder = make_gap(tmp_path / "run", verdict)
+    written = read_page(page.write_report(folder))
+    assert all(source.startswith("data:") for source in written.loads)
+    assert not [link for link in written.links if not (folder / link).is_file()]
+    stems = {"gap", "cells", "state", "torque_fit", "torque_confirm", "torque_sealed"}
+    stems |= {"shifts", "remainder"} if verdict == "partly explained" else set()
+    names = {f"missing_{s}.{kind}" for s in stems for kind in ("png", "pdf")}
+    assert {p.name for p in (folder / "figures").iterdir()} == names
+
+
+def test_the_tables_hold_the_numbers_of_the_file(named: Path) -> None:
+    cells, found = read_page(named / "report.html").cells, read_gap(named).found
+    for role, gap in found["gaps"].items():
+        for field in ("before", "after", "torque_before", "torque_after"):
+            assert _shown(cells[f"gap:{role}", field], gap[field])
+        assert _shown(cells[f"gap:{role}", "closed"], gap["closed"], percent)
+    assert _shown(cells["gap:floor", "before"], found["floor"])
+    for a in found["amplitudes"]:
+        assert _shown(cells[f"amplitude:{a['name']}", "value"], a["value"])
+        assert cells[f"amplitude:{a['name']}", "interval"]["values"] == [a["low"], a["high"]]
+        assert a["what"] in cells[f"amplitude:{a['name']}", "effect"]["text"]
+    for s in found["shifts"]:
+        for field, key in (("before", "before"), ("after", "after"), ("deviation", "deviation_before")):
+            assert _shown(cells[f"shift:{s['name']}", field], s[key])
+    for t in found["trials"]:
+        row = f"candidate:{t['round']}:{gap_words.model_words(t['name'])}"
+        assert _shown(cells[row, "gap_fit"], t["gap_fit"]) and _shown(cells[row, "gap_confirm"], t["gap_confirm"])
+        assert _shown(cells[row, "share"], t["chosen"], percent)
+        assert _shown(cells[row, "p"], t["p"], lambda v: number(v, 2))
+        assert all(gap_words.readable(r, found) in cells[row, "fate"]["text"] for r in t["reasons"])
+    for entry in found["screens"][0]["ranking"]:
+        row = f"candidate:0:{gap_words.effect_words(entry['candidate'])}"
+        assert _shown(cells[row, "t"], entry["t"]) and _shown(cells[row, "explained"], entry["explained"], percent)
+
+
+def test_the_summary_says_how_large_and_how_sure(named: Path) -> None:
+    found, text = read_gap(named).found, read_page(named / "report.html").text.replace("\u00a0", " ")
+    sealed = found["gaps"]["sealed"]
+    assert f"was {number(sealed['before'])} before and is {number(sealed['after'])} after" in text
+    assert f"numerical floor is {number(found['floor'])}" in text and f"p = {number(found['p'], 2)}" in text
+    assert "11 candidate effects were screened" in text and "4 extended models" in text
+    for stage, seconds in found["seconds"].items():
+        assert f"{stage.replace('_', ' ')} {number(seconds)} s" in text
+    assert "Settings preset quick; fit a.npz; confirm b.npz; recording a.npz" in re.sub(r"\s+", " ", text)
+
+
+def test_what_was_cut_and_an_unknown_floor_are_said(tmp_path: Path, quick: None) -> None:
+    folder = make_gap(tmp_path / "run", cut="pairs were not tried", floor=None)
+    text = read_page(page.write_report(folder)).text
+    assert "Left out for lack of time: pairs were not tried" in text
+    assert "the numerical floor is not known" in text
+
+
+def test_a_tie_that_nothing_on_the_menu_separates(tmp_path: Path) -> None:
+    near = read_gap(make_gap(tmp_path / "near", "tie", experiments=[{"what": "another pose", "apart": 2.5}]))
+    assert "another pose. There the rivals are only 2.50 standard deviations apart" in gap_words.gap_summary(near)[-1]
+    none = read_gap(make_gap(tmp_path / "none", "tie", experiments=[]))
+    assert "No experiment on the menu" in gap_words.gap_summary(none)[-1]
+
+
+def test_significant_but_below_the_floor_is_said(tmp_path: Path) -> None:
+    gap = read_gap(make_gap(tmp_path / "run", "none", p=0.002))
+    assert "no larger than what the simulation's own time step leaves" in " ".join(gap_words.gap_summary(gap))
+
+
+def test_a_stand_in_is_said(tmp_path: Path, quick: None) -> None:
+    folder = make_gap(tmp_path / "run", "none", setup={"recording": []})
+    assert "stand-in robot" in read_page(page.write_report(folder)).text
+
+
+def test_candidates_say_what_became_of_them(tmp_path: Path) -> None:
+    found = read_gap(make_gap(tmp_path / "run", "partly explained")).found
+    one, two = groups(found)
+    assert [r.name for r in one.tried][:2] == ["latch at door hinge", "hinge stribeck at door hinge"]
+    assert one.tried[0].kept and one.tried[0].fate == "in the model"
+    assert not any(r.kept for r in (*one.tried[1:], *two.tried))
+    assert (one.gap_fit, one.gap_confirm) == tuple(found["gaps"][r]["before"] for r in ("fit", "confirm"))
+    assert two.beside == "latch at door hinge"
+    assert [r.name for r in two.tried] == ["latch at door hinge + door closer at door hinge"]
+    assert (two.tried[0].t, two.gap_fit, two.p) == (2.4 * 0.8**2, found["trials"][0]["gap_fit"], 0.412)
+    assert (len(one.others), len(two.others)) == (7, 9)
+    ties = groups(read_gap(make_gap(tmp_path / "tie", "tie")).found)[0].tried
+    assert [r.fate for r in ties[:2]] == ["in the model, and others do as well", "does as well: a tie"]
+
+
+def test_pairs_tried_from_scratch_stand_beside_those_that_grew(tmp_path: Path) -> None:
+    found = gap_json("partly explained", ("fit", "confirm"))
+    grown = next(t for t in found["trials"] if t["round"] == 1)
+    other = {**grown, "name": f"{STRIBECK} + {CLOSER}", "passed": True, "reasons": []}
+    found["trials"] += [{**grown, "passed": True, "reasons": [], "gap_confirm": 0.5}, other]
+    found["screens"].append(found["screens"][0])
+    found |= {"effects": [LATCH, CLOSER], "tied": [[STRIBECK], []]}
+    one, two = groups(read_gap(make_gap(tmp_path / "run", **found)).found)
+    assert [(r.fate, r.trial["gap_confirm"]) for r in two.tried if r.trial] == [
+        ("in the model, and others do as well", 0.5),
+        ("does as well: a tie", 2.4),
+    ]
+    assert two.tried[1].name == "hinge stribeck at door hinge + door closer at door hinge" and two.tried[1].t is None
+    assert one.tried[0].kept and two.tried[0].kept and not two.tried[1].kept
+    words = gap_words.gap_summary(read_gap(tmp_path / "run"))
+    assert "In place of latch at door hinge, hinge stribeck at door hinge would do as well." in words
+
+
+@pytest.mark.slow
+def test_one_page_for_a_folder_with_both(tmp_path: Path) -> None:
+    folder = make_gap(make_run(tmp_path / "run"), "named")
+    html = page.write_report(folder).read_text(encoding="utf-8")
+    written = read_page(folder / "report.html")
+    assert ("hinge_stiffness", "mean") in written.cells and ("gap:sealed", "after") in written.cells
+    ids = re.findall(r'\bid="([^"]+)"', html)
+    assert len(ids) == len(set(ids))
+    used = set(re.findall(r'(?:url\(#|href="#)([^")]+)', html))
+    assert {"identification", "missing"} <= used <= set(ids)
+    assert {link for link in written.links if link.startswith("gap.")} == {"gap.json", "gap.npz"}
+
+
+@pytest.mark.parametrize(
+    ("break_it", "message"),
+    [
+        (lambda f: f.pop("floor"), r"gap.json lacks 'floor'"),
+        (lambda f: f["trials"][2].pop("p"), r"gap.json, 'trials', entry 2 lacks 'p'"),
+        (lambda f: f["gaps"].pop("confirm"), r"'gaps' lacks 'confirm'"),
+        (lambda f: f["gaps"]["fit"].update(before="4"), r"'gaps', 'fit', 'before' must be a number or null, got str"),
+        (lambda f: f["cells"].update(after={}), r"'cells', 'after' must be a list, got dict"),
+        (lambda f: f.update(verdict="maybe"), r"'verdict' must be one of none, named.*got 'maybe'"),
+        (lambda f: f.update(tied=[[], []]), r"'tied' has 2 lists for 1 effects"),
+    ],
+)
+def test_a_damaged_file_is_named(tmp_path: Path, break_it: Callable[[dict[str, Any]], Any], message: str) -> None:
+    folder = make_gap(tmp_path / "run")
+    found = json.loads((folder / "gap.json").read_text())
+    break_it(found)
+    (folder / "gap.json").write_text(json.dumps(found))
+    with pytest.raises(ValueError, match=rf"gap\.json.*{message}.*droid_jax\.run gap|{message}.*droid_jax\.run gap"):
+        page.write_report(folder)
+    assert not (folder / "report.html").exists()
+
+
+@pytest.mark.parametrize("name", ["gap.json", "gap.npz"])
+@pytest.mark.parametrize("content", [None, b"", b"{broken", b"[]"])
+def test_a_missing_or_broken_file_is_named(tmp_path: Path, name: str, content: bytes | None) -> None:
+    folder = make_gap(tmp_path / "run")
+    (folder / name).unlink()
+    if content is not None:
+        (folder / name).write_bytes(content)
+    with pytest.raises(ValueError, match=rf"{re.escape(name)}.*droid_jax\.run gap"):
+        page.write_report(folder)
+
+
+def test_a_wrong_shape_is_named(tmp_path: Path) -> None:
+    folder = make_gap(tmp_path / "run")
+    arrays = dict(np.load(folder / "gap.npz"))
+    arrays["confirm.after"] = arrays["confirm.after"][:-1]
+    np.savez(folder / "gap.npz", **arrays)
+    with pytest.raises(ValueError, match=r"confirm\.after must be .*\(204, 7\).*\(203, 7\)"):
+        read_gap(folder)
+
+
+def test_words_agree_with_the_search() -> None:
+    from droid_jax.gap.select import SIGNIFICANT
+    from droid_jax.gap.verdict import Kind
+
+    assert {k.value for k in Kind} == set(VERDICTS)
+    assert gap_words.SIGNIFICANT == SIGNIFICANT
+
+
+@pytest.mark.parametrize(
+    ("where", "parts"),
+    [
+        ("panda_joint2, opening 2.0 s", ("panda_joint2", "opening", "2.0")),
+        ("elbow, slow, then fast 12.5 s", ("elbow", "slow, then fast", "12.5")),
+        ("nonsense", ("nonsense", "", "")),
+    ],
+)
+def test_places_are_read(where: str, parts: tuple[str, str, str]) -> None:
+    assert gap_words.joint_phase(where) == parts
+    bins = {"variable": "object angle", "where": "-0.00 to 0.15 rad"}
+    assert gap_words.place_words(bins) == "object angle 0.00 to 0.15 rad"
+    assert gap_words.place_words({"variable": gap_maps.TIME, "where": "elbow, all 0.0 s"}) == "elbow"
+
+
+def test_names_and_units_are_written_as_they_are_read(tmp_path: Path) -> None:
+    found = read_gap(make_gap(tmp_path / "run")).found
+    said = "wins only 3% of the resamples; joint_coulomb at panda_joint2 does better"
+    assert gap_words.readable(said, found).endswith("; joint coulomb at joint 2 does better")
+    assert gap_words.readable("torque_gain[panda_joint2] ran into", found) == "torque gain, joint 2 ran into"
+    assert gap_words.unit_words("N m s^2/rad^2") == "N m s²/rad²"
