@@ -27,7 +27,8 @@ class GapConfig:
 
     search, refine: of the base fit.  refit: of every extended model.
     looked: candidates that are tried by a short refit in each round; refitted: the best of these, in full.
-    most: effects at most.
+    most: effects at most.  budget: minutes for all refits, None for no limit; at least one candidate of a
+    round is always tried.
     compare: how simulation and measurement are compared.  seed: of flips and resamples.
     """
 
@@ -37,6 +38,7 @@ class GapConfig:
     looked: int = 12
     refitted: int = 6
     most: int = 3
+    budget: float | None = None
     compare: CompareConfig = field(default_factory=CompareConfig)
     seed: int = 0
 

@@ -13,6 +13,8 @@ from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.screen import Screen
 from droid_jax.model.parameters import Space
 
+COLLINEAR = 0.9  # absolute cosine from which two marks count as one
+
 
 @dataclass(frozen=True)
 class Proposal:
@@ -93,3 +95,11 @@ def _parts(screen: Screen, rows: Sequence[int]) -> tuple[Candidate, ...]:
         candidate = screen.questions[k].candidate
         found.setdefault(candidate.key, candidate)
     return tuple(found.values())
+
+
+def collinear(screen: Screen, names: Container[str]) -> set[str]:
+    """Names of the candidates with a mark that is nearly one of these candidates'."""
+    rows = np.array([q.candidate.name in names for q in screen.questions])
+    unit = screen.marks / np.maximum(np.linalg.norm(screen.marks, axis=1, keepdims=True), 1e-30)
+    near = np.max(np.abs(unit @ unit[rows].T), axis=1) > COLLINEAR
+    return {screen.questions[k].candidate.name for k in np.flatnonzero(near)}

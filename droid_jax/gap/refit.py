@@ -6,14 +6,14 @@ measured only after everything else has been allowed to move.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.evidence import Evidence
-from droid_jax.identify.refine import Hypotheses, RefineConfig, Refined, RefineProgress, refine
+from droid_jax.identify.refine import Hypotheses, RefineConfig, Refined, RefineProgress, chord, refine
 from droid_jax.identify.uncertainty import posterior
 from droid_jax.model.parameters import Space
 
@@ -73,6 +73,30 @@ def refit(
     values = whole.embed(space, refined.best[None], starts[0])[0]
     left = evidence.residuals(-refined.residual / np.sqrt(evidence.repeats))
     return Model(tuple(parts), values, space, refined, left, evidence.gap(left))
+
+
+def look(
+    evidence: Evidence, model: Model, part: Candidate, marks: Mapping[str, np.ndarray]
+) -> tuple[np.ndarray, float]:
+    """A first look at a model with one more effect, with slopes that are known already: values [D], objective.
+
+    marks: amplitude -> [M] what a unit of it adds to the simulation at `model`, in one repeat's noise.
+    """
+    whole = evidence.cost.space
+    space = whole.select(dict.fromkeys((*model.space.names, *part.free)))
+    jacobian = np.zeros((model.refined.jacobian.shape[0], len(space)))
+    jacobian[:, space.columns(model.space)] = model.refined.jacobian
+    for name in part.amplitudes:
+        jacobian[:, space.index(name)] = marks[name] * space[name].std * np.sqrt(evidence.repeats)
+    begin = model.values.copy()
+    for name, value in part.shapes.items():
+        begin[whole.index(name)] = value
+
+    def residuals(rows: np.ndarray) -> np.ndarray:
+        return evidence.cost.whitened(whole.embed(space, rows, begin))
+
+    values, objective = chord(residuals, space, begin[whole.columns(space)], jacobian)
+    return whole.embed(space, values[None], begin)[0], objective
 
 
 def intervals(evidence: Evidence, model: Model) -> dict[str, tuple[float, float]]:

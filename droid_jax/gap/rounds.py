@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
 
+from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.case import Case
-from droid_jax.gap.rank import Proposal, proposals
-from droid_jax.gap.refit import Model, refit
+from droid_jax.gap.rank import Proposal, collinear, proposals
+from droid_jax.gap.refit import Model, look, refit
 from droid_jax.gap.screen import Screen
-from droid_jax.gap.select import OF_ALL, Trial, judge
+from droid_jax.gap.select import MORE, OF_ALL, Trial, judge
 from droid_jax.identify.refine import RefineConfig
 
+T = TypeVar("T")
 Progress = Callable[[str, Any], None]
-LOOK = RefineConfig(iterations=2, hops=0, spreads=0)  # enough to tell what is worth a refit
+POLISH = RefineConfig(iterations=12, hops=0)
 PAIRS = 4  # pairs refitted
 
 
@@ -24,79 +27,161 @@ PAIRS = 4  # pairs refitted
 class Round:
     """What was asked, what was tried, and what won.
 
-    screen: of the model that stood; stood: names of its effects.  trials: of the refitted models;
-    winner, chosen: the model that does best and its trial, or None.
+    screen: of the model that stood; stood: names of its effects.  tried, trials: the refitted models;
+    winner, chosen: the one that does best and its trial, or None.
     """
 
     screen: Screen
     stood: tuple[str, ...] = ()
+    tried: tuple[Model, ...] = ()
     trials: tuple[Trial, ...] = ()
     winner: Model | None = None
     chosen: Trial | None = None
 
-    def passed(self, name: str) -> bool:
-        """Whether a model stood its trial but for others that do as well."""
-        return any(t.passed for t in self.trials if t.name == name)
+    @property
+    def rivals(self) -> tuple[Model, ...]:
+        """Models that stood their trial and cannot be told from the winner."""
+        if self.chosen is None:
+            return ()
+        both = zip(self.tried, self.trials, strict=True)
+        return tuple(m for m, t in both if t.passed and t.name in self.chosen.rivals)
 
 
-def forward(case: Case, model: Model, found: Screen, whole_gap: float, floor: float, progress: Progress) -> Round:
+class Budget:
+    """Minutes for refits: says when to stop, and afterwards what was left out."""
+
+    def __init__(self, minutes: float | None) -> None:
+        self._end = None if minutes is None else time.monotonic() + 60 * minutes
+        self._cut: list[str] = []
+
+    def within(self, what: str, items: Sequence[T]) -> Iterator[T]:
+        """The items for as long as there is time, at least one."""
+        for number, item in enumerate(items):
+            if number and self.spent:
+                self._cut.append(f"{len(items) - number} of {len(items)} {what}")
+                return
+            yield item
+
+    @property
+    def spent(self) -> bool:
+        """No time left."""
+        return self._end is not None and time.monotonic() > self._end
+
+    def skip(self, what: str) -> None:
+        """Note something left out."""
+        self._cut.append(what)
+
+    @property
+    def cut(self) -> str:
+        """In words; empty for nothing."""
+        return "; ".join(self._cut)
+
+
+@dataclass(frozen=True, eq=False)
+class Hunt:
+    """What every round is given: the case, U of its base model on the confirming demonstration, the floor."""
+
+    case: Case
+    whole_gap: float
+    floor: float
+    budget: Budget
+    progress: Progress
+
+    def look(self, model: Model, part: Candidate, found: Screen) -> tuple[np.ndarray, float]:
+        """A first look at one more effect: values [D] and objective (see `refit.look`)."""
+        self.progress("look", " + ".join(c.name for c in (*model.parts, part)))
+        rows = {q.amplitude: k for k, q in enumerate(found.questions) if q.candidate.key == part.key}
+        return look(self.case.fit, model, part, {a: found.raw[k] for a, k in rows.items()})
+
+    def refit(self, parts: Sequence[Candidate], start: np.ndarray, config: RefineConfig, note: str = "") -> Model:
+        """Base parameters and parts from a start [D] over the whole space."""
+        self.progress("refit", " + ".join(c.name for c in parts) + note)
+        return refit(self.case.fit, self.case.base, parts, start[None], config)
+
+    def gap(self, model: Model) -> float:
+        """U on the confirming demonstration."""
+        return self.case.confirm.gap_at(model.values)
+
+
+def forward(hunt: Hunt, model: Model, found: Screen) -> Round:
     """Add the effect that does best on the confirming demonstration, if one passes its trial."""
-    ranked = proposals(found, model.residuals, case.whole)[: case.config.looked]
-    looks = [_refit(case, model.parts, p, p.start(case.whole, model.values)[None], LOOK, progress) for p in ranked]
-    best = sorted(looks, key=lambda m: m.refined.objective)[: case.config.refitted]
-    tried = [refit(case.fit, case.base, m.parts, m.values[None], case.config.refit) for m in best]
-    return _decided(case, model, found, tried, whole_gap, floor)
+    case, config = hunt.case, hunt.case.config
+    ranked = proposals(found, model.residuals, case.whole)
+    looks = [
+        (hunt.look(model, p.parts[0], found), p)
+        for p in hunt.budget.within("candidates not looked at", ranked[: config.looked])
+    ]
+    best = sorted(looks, key=lambda look: look[0][1])[: config.refitted]
+    tried = [
+        hunt.refit((*model.parts, *p.parts), values, config.refit)
+        for (values, _), p in hunt.budget.within("candidates not refitted", best)
+    ]
+    done = _decided(hunt, model, found, tried)
+    twins = _twins(done, ranked)
+    if not twins:
+        return done
+    tried += [
+        hunt.refit((*model.parts, *p.parts), p.start(case.whole, model.values), config.refit, " (looks like the best)")
+        for p in hunt.budget.within("candidates that look like the best not refitted", twins)
+    ]
+    return _decided(hunt, model, found, tried)
 
 
-def pairs(
-    case: Case, base: Model, model: Model, first: Round, whole_gap: float, floor: float, progress: Progress
-) -> Round:
+def _twins(done: Round, ranked: Sequence[Proposal]) -> list[Proposal]:
+    """Candidates that were not refitted though their marks are nearly the winner's: they may do as well."""
+    if done.winner is None:
+        return []
+    new = [c.name for c in done.winner.parts if c.name not in done.stood]
+    tried = {c.name for m in done.tried for c in m.parts}
+    near = collinear(done.screen, set(new))
+    return [p for p in ranked if p.names[0] in near - tried]
+
+
+def pairs(hunt: Hunt, base: Model, model: Model, first: Round) -> Round:
     """Two effects at once, from the best of the first round: one that mimics both may have stood in their way."""
+    case = hunt.case
     best = sorted(first.trials, key=lambda t: t.gap_confirm)[: case.config.refitted]
     ranked = proposals(first.screen, base.residuals, case.whole, number=2, among={t.name for t in best})
-    known = {frozenset(c.name for c in model.parts)}
-    ranked = [p for p in ranked if frozenset(p.names) not in known][:PAIRS]
-    tried = [_refit(case, (), p, p.start(case.whole, base.values)[None], case.config.refit, progress) for p in ranked]
-    tried = [*tried, model] if len(model.parts) > 1 else tried
-    return _decided(case, base, first.screen, tried, whole_gap, floor)
+    known = {c.name for c in model.parts}
+    ranked = [p for p in ranked if set(p.names) != known][:PAIRS]
+    tried = [
+        hunt.refit(p.parts, p.start(case.whole, base.values), case.config.refit)
+        for p in hunt.budget.within("pairs not tried", ranked)
+    ]
+    alone = min(t.gap_confirm for t in first.trials)
+    done = _decided(hunt, base, first.screen, [*tried, model] if len(model.parts) > 1 else tried)
+    if done.chosen is not None and done.chosen.gap_confirm > (1 - MORE) * alone:
+        return replace(done, winner=None, chosen=None)
+    return done
 
 
-def pruned(case: Case, model: Model, whole_gap: float, floor: float, progress: Progress) -> Model:
+def pruned(hunt: Hunt, model: Model) -> Model:
     """The model without what no longer pays for itself on the confirming demonstration."""
     for part in model.parts if len(model.parts) > 1 else ():
-        rest = tuple(c for c in model.parts if c is not part)
         start = model.values.copy()
-        free = [case.whole.index(a) for a in part.amplitudes]
-        start[free] = case.whole.mean[free]
-        progress("refit", f"without {part.name}")
-        less = refit(case.fit, case.base, rest, start[None], case.config.refit)
-        if case.confirm.gap_at(less.values) - case.confirm.gap_at(model.values) < OF_ALL * whole_gap:
-            return pruned(case, less, whole_gap, floor, progress)
+        free = [hunt.case.whole.index(a) for a in part.amplitudes]
+        start[free] = hunt.case.whole.mean[free]
+        rest = tuple(c for c in model.parts if c is not part)
+        less = hunt.refit(rest, start, hunt.case.config.refit, f" without {part.name}")
+        if hunt.gap(less) - hunt.gap(model) < OF_ALL * hunt.whole_gap:
+            return pruned(hunt, less)
     return model
 
 
-def polished(case: Case, model: Model, progress: Progress) -> Model:
+def polished(hunt: Hunt, model: Model) -> Model:
     """The same model settled, with slopes over the width of its posterior: its intervals are reported."""
     if not model.parts:
         return model
-    progress("refit", model.name)
-    return refit(case.fit, case.base, model.parts, model.values[None], RefineConfig(iterations=12, hops=0))
+    return hunt.refit(model.parts, model.values, POLISH, " settled")
 
 
-def _refit(
-    case: Case, parts: Sequence[Any], proposal: Proposal, starts: np.ndarray, config: RefineConfig, progress: Progress
-) -> Model:
-    progress("refit", " + ".join(c.name for c in (*parts, *proposal.parts)))
-    return refit(case.fit, case.base, (*parts, *proposal.parts), starts, config)
-
-
-def _decided(case: Case, before: Model, found: Screen, tried: Sequence[Model], whole_gap: float, floor: float) -> Round:
-    stood = tuple(c.name for c in before.parts)
+def _decided(hunt: Hunt, before: Model, found: Screen, tried: Sequence[Model]) -> Round:
+    case, stood = hunt.case, tuple(c.name for c in before.parts)
     if not tried:
         return Round(found, stood)
-    trials = judge(case.fit, case.confirm, before, tried, case.smallest, whole_gap, floor=floor, seed=case.config.seed)
+    trials = judge(
+        case.fit, case.confirm, before, tried, case.smallest, hunt.whole_gap, floor=hunt.floor, seed=case.config.seed
+    )
     passed = [(m, t) for m, t in zip(tried, trials, strict=True) if t.passed]
-    if not passed:
-        return Round(found, stood, tuple(trials))
-    winner, chosen = min(passed, key=lambda mt: mt[1].gap_confirm)
-    return Round(found, stood, tuple(trials), winner, chosen)
+    winner, chosen = min(passed, key=lambda mt: mt[1].gap_confirm) if passed else (None, None)
+    return Round(found, stood, tuple(tried), tuple(trials), winner, chosen)

@@ -33,11 +33,13 @@ class Question:
 class Screen:
     """What the screening found.
 
-    questions: K of them.  marks: [K, M] per unit of amplitude, projected; t: [K]; explained: [K] share of the gap
-    that the best amplitude would take away, linearly; size: [K] that amplitude.  p: of the largest |t|.
+    questions: K of them.  raw: [K, M] what a unit of each amplitude adds; marks: [K, M] the same, projected.
+    t: [K]; explained: [K] share of the gap that the best amplitude would take away, linearly; size: [K] that
+    amplitude.  p: of the largest |t|.
     """
 
     questions: tuple[Question, ...]
+    raw: np.ndarray
     marks: np.ndarray
     t: np.ndarray
     explained: np.ndarray
@@ -81,11 +83,16 @@ def project(columns: np.ndarray, base: np.ndarray, prior: np.ndarray) -> np.ndar
 
 
 def screen(
-    residuals: np.ndarray, questions: Sequence[Question], projected: np.ndarray, test: Test = largest_t
+    residuals: np.ndarray,
+    questions: Sequence[Question],
+    raw: np.ndarray,
+    projected: np.ndarray,
+    test: Test = largest_t,
 ) -> Screen:
     """Score projected marks [K, M] against residuals [N, M] of the base fit.
 
-    test: scores [K, N] -> statistic [K] and the p-value of the largest (see `Evidence.largest`).
+    raw: [K, M] the marks before projection.  test: scores [K, N] -> statistic [K] and the p-value of the
+    largest (see `Evidence.largest`).
     """
     norm = np.einsum("km,km->k", projected, projected)
     scores = projected @ residuals.T  # [K, N]
@@ -93,4 +100,4 @@ def screen(
     size = scores.mean(axis=1) / np.maximum(norm, 1e-30)
     shared = residuals.mean(axis=0)
     explained = size * scores.mean(axis=1) / max(float(shared @ shared), 1e-30)
-    return Screen(tuple(questions), projected, t, explained, size, p)
+    return Screen(tuple(questions), raw, projected, t, explained, size, p)

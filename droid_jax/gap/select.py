@@ -12,7 +12,8 @@ from droid_jax.gap.flips import sign_flips, t_values
 from droid_jax.gap.refit import Model, intervals
 
 SIGNIFICANT = 0.01
-LESS = 0.2  # share of U that an effect must take away on the confirming demonstration
+LESS = 0.2  # share of U that the first effect must take away on the confirming demonstration
+MORE = 0.6  # share of what is left that every further effect must: a wrong form of the first leaves something too
 OF_ALL = 0.05  # and share of the base model's U: what a wrong form of the first effect leaves is no effect of its own
 DOUBT = 0.05  # share of the resamples in which a rival is better, from which it does as well
 CHOSEN = 0.8  # share of the resamples in which an effect, or one that does as well, must win
@@ -82,7 +83,7 @@ def judge(
         p = one_sided_p(0.5 * (squares[0] - squares[k + 1]))
         chosen = float(winners[same[k]].sum())
         spans = {a: s for a, s in intervals(fit, model).items() if a not in before.amplitudes}
-        reasons = _gap_reasons(left[0], left[k + 1], p, whole_gap)
+        reasons = _gap_reasons(left[0], left[k + 1], p, whole_gap, MORE if before.parts else LESS)
         reasons += _amplitude_reasons(fit, model, spans, smallest)
         if chosen < CHOSEN:
             leader = min(zip(left[1:], models, strict=True), key=lambda lm: lm[0])[1].name
@@ -105,11 +106,13 @@ def alike(left: np.ndarray, losses: np.ndarray, floor: float, tie: float) -> np.
     return (as_good & as_good.T) | np.eye(len(left), dtype=bool)
 
 
-def _gap_reasons(before: float, after: float, p: float, whole_gap: float) -> list[str]:
+def _gap_reasons(before: float, after: float, p: float, whole_gap: float, least: float) -> list[str]:
     reasons = []
     if p >= SIGNIFICANT:
         reasons.append(f"not confirmed by the other demonstration (p = {p:.2g})")
-    if after > (1 - LESS) * before:
+    if after > before:
+        reasons.append("makes the gap on the other demonstration larger")
+    elif after > (1 - least) * before:
         reasons.append(f"takes only {1 - after / before:.0%} of the gap away on the other demonstration")
     elif before - after < OF_ALL * whole_gap:
         reasons.append(f"takes only {(before - after) / whole_gap:.1%} of the first gap away")

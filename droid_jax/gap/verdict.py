@@ -19,7 +19,7 @@ class Kind(enum.Enum):
     TIE = "tie"  # one of these; an experiment that would tell them apart is named
     PARTLY = "partly explained"  # these, and a remainder that nothing in the library explains
     UNEXPLAINED = "unexplained"  # something is missing, and nothing in the library is it
-    UNCONVERGED = "fit not converged"  # the base fit's starts disagree; nothing can be concluded
+    UNCONVERGED = "fit not converged"  # of the base model or of the extended one; nothing can be concluded
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,9 @@ class Verdict:
     kind; effects: names of what is in the model; tied: for each of them the names that do as well.
     base, model: before and after.  floor: U0, what the simulation's own step leaves.
     gaps: "fit", "confirm", "sealed" -> (U before, U after).  screens, trials: the grounds, in the order they
-    were made.  before, after: where the gap lives on the fitted recording.  experiments: what would tell
-    the tied apart, the best first.  cut: in words what the budget left out, empty for nothing.
+    were made.  before, after: where the gap lives on the fitted recording.  rivals: models that do as well as
+    `model`, refitted; experiments: what would tell them apart, the best first.  cut: in words what the
+    budget left out, empty for nothing.
     """
 
     kind: Kind
@@ -56,6 +57,7 @@ class Verdict:
     trials: tuple[Trial, ...]
     before: Localisation
     after: Localisation
+    rivals: tuple[Model, ...] = ()
     experiments: tuple[Experiment, ...] = ()
     cut: str = ""
 
@@ -63,6 +65,10 @@ class Verdict:
         """1 - (U_after - U0) / (U_before - U0) on "fit", "confirm" or "sealed"."""
         before, after = self.gaps[role]
         return 1.0 - (after - self.floor) / max(before - self.floor, 1e-12)
+
+    @property
+    def _unsettled(self) -> str:
+        return "the model with the effects" if self.base.refined.converged else "the base model"
 
     @property
     def sentence(self) -> str:
@@ -75,5 +81,5 @@ class Verdict:
             Kind.TIE: f"The model lacks one of: {ties}.",
             Kind.PARTLY: f"The model lacks {named}; a remainder is unexplained.",
             Kind.UNEXPLAINED: "The model lacks something that is not in the library.",
-            Kind.UNCONVERGED: "The base fit did not converge; nothing can be concluded.",
+            Kind.UNCONVERGED: f"The fit of {self._unsettled} did not converge; nothing can be concluded.",
         }[self.kind]

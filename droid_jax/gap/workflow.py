@@ -9,9 +9,9 @@ from droid_jax.gap.candidates import candidates
 from droid_jax.gap.case import Case
 from droid_jax.gap.localise import localise
 from droid_jax.gap.refit import Model, refit
-from droid_jax.gap.rounds import Round, forward, pairs, polished, pruned
+from droid_jax.gap.rounds import Budget, Hunt, Round, forward, pairs, polished, pruned
 from droid_jax.gap.screen import Question, Screen, marks, project, questions_of, screen
-from droid_jax.gap.select import SIGNIFICANT
+from droid_jax.gap.select import OF_ALL, SIGNIFICANT
 from droid_jax.gap.verdict import Kind, Verdict
 from droid_jax.identify.pipeline import grip_hypotheses, starts
 from droid_jax.identify.search import search
@@ -45,42 +45,43 @@ def ask(case: Case, model: Model, asked: tuple[Question, ...]) -> Screen:
     """Screen questions against a model's residuals on the first demonstration."""
     root = case.fit.repeats**0.5
     base, prior = model.refined.jacobian / root, model.refined.prior * root
-    projected = project(marks(case.fit, model.values, asked), base, prior)
+    raw = marks(case.fit, model.values, asked)
+    projected = project(raw, base, prior)
     return screen(
-        model.residuals, asked, projected, lambda s: case.fit.largest(s, projected, base, prior, case.config.seed)
+        model.residuals, asked, raw, projected, lambda s: case.fit.largest(s, projected, base, prior, case.config.seed)
     )
 
 
 def find(case: Case, base: Model, floor: float, progress: Progress = lambda stage, value: None) -> Verdict:
     """From a base fit to a verdict.  floor: U0, see `numerical_floor`."""
+    hunt = Hunt(case, case.confirm.gap_at(base.values), floor, Budget(case.config.budget), progress)
     if not base.refined.converged:
-        return _verdict(case, base, base, floor, [])
-    whole_gap = case.confirm.gap_at(base.values)
+        return _verdict(hunt, base, base, [])
     asked = questions_of(candidates(case.effects))
     model, rounds = base, list[Round]()
     while len(model.parts) < case.config.most:
         progress("screen", model.name)
         left = tuple(q for q in asked if not set(q.candidate.amplitudes) & set(model.amplitudes))
         found = ask(case, model, left)
-        if found.p >= SIGNIFICANT or model.gap <= floor:
-            rounds.append(Round(found))
-            break
-        done = forward(case, model, found, whole_gap, floor, progress)
+        enough = hunt.gap(model) > max(floor, OF_ALL * hunt.whole_gap if model.parts else 0.0)
+        there = found.p < SIGNIFICANT and model.gap > floor and enough
+        done = forward(hunt, model, found) if there else Round(found)
         rounds.append(done)
         if done.winner is None:
             break
         model = done.winner
-    if (len(rounds) > 1 and rounds[1].trials and len(model.parts) != 1) or (not model.parts and rounds[0].trials):
-        paired = pairs(case, base, model, rounds[0], whole_gap, floor, progress)
-        rounds.append(paired)
-        model = paired.winner or model
-    model = pruned(case, model, whole_gap, floor, progress)
-    return _verdict(case, base, polished(case, model, progress), floor, rounds)
+    if rounds[0].trials and _unsettled(hunt, model):
+        if hunt.budget.spent:
+            hunt.budget.skip("pairs of effects not tried")
+        else:
+            rounds.append(pairs(hunt, base, model, rounds[0]))
+            model = rounds[-1].winner or model
+    return _verdict(hunt, base, polished(hunt, pruned(hunt, model)), rounds)
 
 
-def _unsettled(case: Case, model: Model, whole_gap: float, floor: float) -> bool:
+def _unsettled(hunt: Hunt, model: Model) -> bool:
     """Nothing named yet, several effects, or much left over: one that mimics two may have stood in their way."""
-    return len(model.parts) != 1 or _open(case.confirm.gap_at(model.values), whole_gap, floor) > OPEN
+    return len(model.parts) != 1 or _open(hunt.gap(model), hunt.whole_gap, hunt.floor) > OPEN
 
 
 def _open(after: float, before: float, floor: float) -> float:
@@ -88,13 +89,14 @@ def _open(after: float, before: float, floor: float) -> float:
     return (after - floor) / max(before - floor, 1e-12)
 
 
-def _verdict(case: Case, base: Model, model: Model, floor: float, rounds: list[Round]) -> Verdict:
+def _verdict(hunt: Hunt, base: Model, model: Model, rounds: list[Round]) -> Verdict:
+    case, floor = hunt.case, hunt.floor
     gaps = {role: (e.gap_at(base.values), e.gap_at(model.values)) for role, e in case.judged.items()}
     before, after = gaps["confirm"]
     missing = bool(rounds) and rounds[0].screen.p < SIGNIFICANT and base.gap > floor
-    tied = tuple(_rivals(model, part.name, rounds) for part in model.parts)
+    tied = tuple(_tied(part.name, rounds) for part in model.parts)
     kind = Kind.NONE if not missing else Kind.UNEXPLAINED
-    if not base.refined.converged:
+    if not base.refined.converged or not model.refined.converged:
         kind = Kind.UNCONVERGED
     elif model.parts:
         kind = Kind.PARTLY if _open(after, before, floor) > OPEN else Kind.TIE if any(tied) else Kind.NAMED
@@ -110,18 +112,16 @@ def _verdict(case: Case, base: Model, model: Model, floor: float, rounds: list[R
         trials=tuple(t for r in rounds for t in r.trials),
         before=localise(case.fit, base.values, base.residuals),
         after=localise(case.fit, model.values, model.residuals),
+        rivals=next((r.rivals for r in reversed(rounds) if r.winner is not None), ()),
+        cut=hunt.budget.cut,
     )
 
 
-def _rivals(model: Model, part: str, rounds: list[Round]) -> tuple[str, ...]:
-    """What does as well as one effect of the model: members of passing rivals in the round that chose it."""
+def _tied(part: str, rounds: list[Round]) -> tuple[str, ...]:
+    """What does as well as one effect of the model: what rivals have in its place in the round that chose it."""
     for done in rounds:
-        if done.winner is not None and done.chosen is not None and part in _last(done.chosen.name, done):
-            names = {n for r in done.chosen.rivals for n in _last(r, done) if done.passed(r)}
-            return tuple(sorted(names - {part}))
+        added = {c.name for c in done.winner.parts} - set(done.stood) if done.winner is not None else set()
+        if part in added:
+            others = [{c.name for c in m.parts} - set(done.stood) for m in done.rivals]
+            return tuple(sorted({n for o in others if added - o == {part} for n in o - added}))
     return ()
-
-
-def _last(name: str, done: Round) -> tuple[str, ...]:
-    """The effects that a round added to what stood before."""
-    return tuple(n for n in name.split(" + ") if n not in done.stood)

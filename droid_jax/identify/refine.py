@@ -155,6 +155,17 @@ def refine(
     )
 
 
+def chord(residuals: Residuals, space: Space, start: np.ndarray, jacobian: np.ndarray) -> tuple[np.ndarray, float]:
+    """What steps with a Jacobian [M, D] known from elsewhere reach from a start [D]: values [D], objective.
+
+    A few batches of trials and no differences: a first look at what a refinement would find.
+    """
+    problem = _Problem(residuals, space, RefineConfig())
+    state = problem.start(problem.inside(space.to_search(space.check(start[None]))))
+    state = problem.trials(state, jacobian[None])
+    return space.from_search(state.x[0]), float(state.objective[0])
+
+
 @dataclass(frozen=True, eq=False)
 class _State:
     """Live starts: x [S, D], residual [S, M], objective [S], damping [S], difference widths [S, D]."""
@@ -293,16 +304,21 @@ class _Problem:
         jacobian = self.jacobian(state)
         before = state.objective
         self.iterations += 1
-        for _ in range(CHORDS):
-            last = state.objective
-            state = self._try(state, jacobian, held)
-            if np.all(_fall(last, state.objective) <= self.config.chord * state.objective):
-                break
+        state = self.trials(state, jacobian, held)
         curvature = np.einsum("smd,smd->sd", jacobian, jacobian) + self.prior**-2
         # About one deviation wide, the others given; a start that stood still looks from elsewhere.
         widths = np.where((state.objective < before)[:, None], 1.0, 3.0) / np.sqrt(curvature)
         widths = np.clip(widths, self.config.smallest_step, self.config.step)
         return replace(state, widths=widths), _fall(before, state.objective)
+
+    def trials(self, state: _State, jacobian: np.ndarray, held: np.ndarray | None = None) -> _State:
+        """Batches of trials with one Jacobian [S, M, D] for as long as they pay."""
+        for _ in range(CHORDS):
+            last = state.objective
+            state = self._try(state, jacobian, held)
+            if np.all(_fall(last, state.objective) <= self.config.chord * state.objective):
+                break
+        return state
 
     def jacobian(self, state: _State) -> np.ndarray:
         """[S, M, D] differences of every start in one batch; one-sided where a bound is in the way."""

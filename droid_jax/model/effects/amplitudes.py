@@ -15,6 +15,9 @@ from droid_jax.model.scene import Scene
 from droid_jax.model.seam import State, Theta
 
 GROUP = "Effect"
+USUAL_SPEED = 0.3  # rad/s
+RELIEF = 1.5
+EXPONENTS = (1.0, 2.0)  # of a damper
 
 
 def amplitude(name: str, unit: str, typical: float, high: float, *, low: float | None = None) -> Parameter:
@@ -81,6 +84,15 @@ def angle(scene: Scene, joint: str, state: State) -> jax.Array:
 def speed(scene: Scene, joint: str, state: State) -> jax.Array:
     """[] rad/s."""
     return state.qvel[scene.dof(joint)]
+
+
+def damping(speed: jax.Array, exponent: jax.Array) -> jax.Array:
+    """[] rad/s, what a damper's coefficient multiplies: the speed where it is 0.3 rad/s, growing with its power.
+
+    Oil through a narrow gap is linear in the speed, through an orifice quadratic; above RELIEF times
+    0.3 rad/s a valve opens, which also keeps a force that is taken at the old speed from ringing.
+    """
+    return USUAL_SPEED * jnp.minimum(jnp.abs(speed) / USUAL_SPEED, RELIEF) ** exponent
 
 
 def direction(velocity: jax.Array) -> jax.Array:

@@ -7,24 +7,29 @@ from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
 
-DAMPING = "closer_damping"
+DAMPING, EXPONENT = "closer_damping", "closer_exponent"
 
 
 @register
 def door_closer(scene: Scene) -> Effect | None:
-    """-c w on the hinge where w < 0, N m s/rad.  Its preload is the effect hinge_preload."""
+    """c w0 (|w| / w0)^n on the hinge where w < 0, w0 = 0.3 rad/s.  Its preload is the effect hinge_preload."""
     joint = a.hinge(scene)
     if joint is None:
         return None
+
+    def force(theta, state):
+        closing = jnp.minimum(a.speed(scene, joint, state), 0.0)
+        brake = a.damping(closing, a.value(theta, EXPONENT, a.EXPONENTS[1]))
+        return a.at_dof(scene, joint, a.value(theta, DAMPING) * brake)
+
     return Effect(
         "door_closer",
-        (a.amplitude(DAMPING, "N m s/rad", 2.0, 20.0, low=0.0),),
-        force=lambda theta, state: a.at_dof(
-            scene, joint, -a.value(theta, DAMPING) * jnp.minimum(a.speed(scene, joint, state), 0.0)
-        ),
+        (a.amplitude(DAMPING, "N m s/rad", 2.0, 6.0, low=0.0), a.shape(EXPONENT, "-", a.EXPONENTS, 0.8, 2.2)),
+        force=force,
         what="a door closer's damper, which brakes while the door closes",
         mark="closing only, growing with speed",
         confused_with=("drag", "opening_check"),
         places={joint: (DAMPING,)},
+        shapes={EXPONENT: a.EXPONENTS},
         smallest=0.2,
     )

@@ -8,14 +8,14 @@ from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
 
-DAMPING, ANGLE = "check_damping", "check_angle"
+DAMPING, ANGLE, EXPONENT = "check_damping", "check_angle", "check_exponent"
 ANGLES = (0.3, 0.5, 0.7)  # rad, where the braking begins
 SOFT = 0.05  # rad over which it sets in
 
 
 @register
 def opening_check(scene: Scene) -> Effect | None:
-    """-c w on the hinge beyond phi_b while w > 0, N m s/rad."""
+    """-c w0 (w / w0)^n on the hinge beyond phi_b while w > 0, w0 = 0.3 rad/s."""
     joint = a.hinge(scene)
     if joint is None:
         return None
@@ -23,16 +23,21 @@ def opening_check(scene: Scene) -> Effect | None:
     def force(theta, state):
         phi, w = a.angle(scene, joint, state), a.speed(scene, joint, state)
         beyond = jax.nn.sigmoid((phi - a.value(theta, ANGLE, ANGLES[1])) / SOFT)
-        return a.at_dof(scene, joint, -a.value(theta, DAMPING) * beyond * jnp.maximum(w, 0.0))
+        brake = a.damping(jnp.maximum(w, 0.0), a.value(theta, EXPONENT, a.EXPONENTS[1]))
+        return a.at_dof(scene, joint, -a.value(theta, DAMPING) * beyond * brake)
 
     return Effect(
         "opening_check",
-        (a.amplitude(DAMPING, "N m s/rad", 2.0, 20.0, low=0.0), a.shape(ANGLE, "rad", ANGLES, 0.1, 1.2)),
+        (
+            a.amplitude(DAMPING, "N m s/rad", 2.0, 6.0, low=0.0),
+            a.shape(ANGLE, "rad", ANGLES, 0.1, 1.2),
+            a.shape(EXPONENT, "-", a.EXPONENTS, 0.8, 2.2),
+        ),
         force=force,
         what="an opening check, which brakes the door beyond some angle",
         mark="late in a fast opening",
         confused_with=("hardening_spring", "drag"),
         places={joint: (DAMPING,)},
-        shapes={ANGLE: ANGLES},
+        shapes={ANGLE: ANGLES, EXPONENT: a.EXPONENTS},
         smallest=0.2,
     )

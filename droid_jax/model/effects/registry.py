@@ -42,7 +42,7 @@ def registered() -> tuple[str, ...]:
 def library(scene: Scene, names: Iterable[str] | None = None) -> tuple[Effect, ...]:
     """The effects that a scene can have, in the order of their names; `names` chooses some.
 
-    Raises ValueError for unknown names, listing the valid ones.
+    Raises ValueError for unknown names, listing the valid ones, and for an effect that is not well made.
     """
     known = registered()
     chosen = known if names is None else tuple(names)
@@ -50,7 +50,25 @@ def library(scene: Scene, names: Iterable[str] | None = None) -> tuple[Effect, .
     if unknown:
         raise ValueError(f"unknown effects {', '.join(unknown)}; valid: {', '.join(known)}")
     made = (_MAKERS[name](scene) for name in chosen)
-    return tuple(effect for effect in made if effect is not None)
+    return tuple(_checked(effect) for effect in made if effect is not None)
+
+
+def _checked(effect: Effect) -> Effect:
+    """The effect; ValueError where it names parameters that it does not have, or cannot be neutral."""
+    own = {p.name: p for p in effect.parameters}
+    amplitudes = [name for place in effect.places.values() for name in place]
+    for name in (*amplitudes, *effect.shapes):
+        if name not in own:
+            raise ValueError(
+                f"effect {effect.name!r} speaks of a parameter {name!r} that it does not have; it has: {', '.join(own)}"
+            )
+    for p in (own[name] for name in amplitudes):
+        if p.mean != 0.0:  # `Parameter` itself sees that the mean lies within the bounds
+            raise ValueError(
+                f"effect {effect.name!r}: an amplitude is neutral at 0, but {p.name!r} starts at {p.mean:g} {p.unit} "
+                f"with bounds [{p.low:g}, {p.high:g}]; let its bounds hold 0 and its mean be 0"
+            )
+    return effect
 
 
 def ready(scene: Scene) -> Scene:

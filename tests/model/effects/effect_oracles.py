@@ -125,7 +125,12 @@ def over_centre(v: Values, phi: float, w: float) -> float:
 
 
 def check(v: Values, phi: float, w: float) -> float:
-    return -v["check_damping"] * w / (1 + np.exp(-(phi - v["check_angle"]) / 0.05)) if w > 0 else 0.0
+    brake = 0.3 * min(max(w, 0.0) / 0.3, 1.5) ** v["check_exponent"]
+    return -v["check_damping"] * brake / (1 + np.exp(-(phi - v["check_angle"]) / 0.05))
+
+
+def closer(v: Values, phi: float, w: float) -> float:
+    return v["closer_damping"] * 0.3 * min(max(-w, 0.0) / 0.3, 1.5) ** v["closer_exponent"]
 
 
 def stretch(joint: str, now: Now) -> float:
@@ -142,9 +147,7 @@ ORACLES = {
         force=at_arm(lambda v, j, now: -v["cable_stiffness"] * stretch(j, now) - v["cable_pull"]),
     ),
     "command_delay": Oracle({"command_delay": 0.0123}, late=lambda v: v["command_delay"]),
-    "door_closer": Oracle(
-        {"closer_damping": 3.0}, force=at_door(lambda v, phi, w: v["closer_damping"] * abs(w) if w < 0 else 0.0)
-    ),
+    "door_closer": Oracle({"closer_damping": 3.0, "closer_exponent": 1.4}, force=at_door(closer)),
     "drag": Oracle({"drag": 1.2}, force=at_door(lambda v, phi, w: -v["drag"] * w**2 * np.sign(w))),
     "hardening_spring": Oracle(
         {"hardening_square": 1.5, "hardening_cube": -0.8},
@@ -183,7 +186,7 @@ ORACLES = {
     "load_friction": Oracle(
         each(*ARM, load_friction=(0.1, 0.2)), loss=at_arm(lambda v, j, now: v["load_friction"] * abs(now.load[j]))
     ),
-    "opening_check": Oracle({"check_damping": 2.5, "check_angle": 0.4}, force=at_door(check)),
+    "opening_check": Oracle({"check_damping": 2.5, "check_angle": 0.4, "check_exponent": 1.7}, force=at_door(check)),
     "over_centre_spring": Oracle({"over_centre_torque": 1.5, "over_centre_angle": 0.25}, force=at_door(over_centre)),
     "payload": Oracle({"payload_mass": 0.3}, edit=lump),
     "sensor_delay": Oracle(
