@@ -19,6 +19,7 @@ import pytest
 
 import droid_jax as dj
 from droid_jax import runtime
+from droid_jax.commands.identify import Identify, config_of, model_of
 from droid_jax.identify.pipeline import identify as identify_function
 from droid_jax.identify.refine import RefineConfig
 from droid_jax.identify.search import SearchConfig
@@ -26,7 +27,7 @@ from droid_jax.model.door_scene import door_scene
 from droid_jax.model.effects import registry
 from droid_jax.model.own import load_parameters
 from droid_jax.model.seam import State
-from droid_jax.run import Identify, _config, _model, main
+from droid_jax.run import main
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLE = ROOT / "docs" / "examples" / "two_link.py"
@@ -279,10 +280,10 @@ def test_the_presets_are_those_of_the_command_line():
     assert [r[0] for r in rows] == ["quick", "standard", "paper", "gpu"]
     for preset, *numbers, step, refined in rows:
         command = Identify(preset=preset)
-        config, search = _config(command), _config(command).search
+        config, search = config_of(command), config_of(command).search
         assert [search.population, search.elite, search.generations, search.restarts] == [int(n) for n in numbers]
         assert (config.refine is not None) == (refined == "yes")
-        scene, _, nuisances = _model(command)
+        scene, _, nuisances = model_of(command)
         assert scene.model.opt.timestep == pytest.approx(int(step) / 1000)
         assert (nuisances is not None) == (preset != "paper")
 

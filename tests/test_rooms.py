@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "droid_jax"
-ORDER = ("model", "measure", "compare", "identify", "gap", "policy", "report", "run")
+ORDER = ("model", "measure", "compare", "identify", "gap", "policy", "report", "commands", "run")
 FOR_ALL = ("storage", "runtime", "errors")
 # Third-party package -> the only file or folder of droid_jax that may import it.
 ONLY_IN = {
@@ -96,6 +96,8 @@ def test_every_folder_and_file_of_the_package_is_a_room():
         ("identify/refine.py", "from evosax.algorithms import CMA_ES"),
         ("gap/screen.py", "import brax.envs"),
         ("gap/screen.py", "import matplotlib.pyplot as plt"),
+        ("report/page.py", "from droid_jax.commands import gap"),
+        ("commands/gap.py", "from droid_jax.run import main"),
         ("run.py", "from PIL import Image"),
     ],
 )
@@ -116,7 +118,8 @@ def test_a_wrong_import_is_found(tmp_path, path, source):
         ("model/own.py", "from droid_jax.storage import write_json"),
         ("identify/cma.py", "from evosax.algorithms import CMA_ES"),
         ("policy/train.py", "from brax.training.agents.ppo import train"),
-        ("run.py", "from droid_jax.report import page\nimport numpy, pathlib"),
+        ("commands/gap.py", "from droid_jax.gap.case import make_case\nfrom droid_jax.report import page"),
+        ("run.py", "from droid_jax.commands import gap\nimport numpy, pathlib"),
         ("__init__.py", "from droid_jax.report.page import write"),
     ],
 )

@@ -29,7 +29,7 @@ from droid_jax.measure.noise import correlation_time
 LENGTH = 1.5  # correlation times of the residual, its columns' median: a block at least
 SHORTEST = 0.5  # s; the low-pass alone reaches 0.2 s to either side
 OUTSIDE = -1
-TIE = 1.2  # U holds the noise: a rival that leaves this much more leaves far more beyond the noise
+TIE = 1.5  # U holds the noise: a rival that leaves this much more leaves far more beyond the noise
 CHUNK = 256  # flips at once
 
 

@@ -18,21 +18,18 @@ import numpy as np
 
 from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.case import Case
+from droid_jax.gap.mjcf import in_mjcf, mjcf
 from droid_jax.gap.refit import Model
 from droid_jax.identify.gaussian import Gaussian, space_from_json, space_to_json
-from droid_jax.identify.results import fitted_mjcf
 from droid_jax.identify.uncertainty import posterior
 from droid_jax.model.effects.registry import effect_space, library, ready
 from droid_jax.model.parameters import Space
-from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
 from droid_jax.storage import write_json, write_text
 
 FORMAT, VERSION = "droid_jax extended model", 1
 FILE, MJCF = "extended.json", "extended.xml"
-# model fields that `fitted_mjcf`, or `_with_own_words` before it, writes into an MJCF
-_WORDS = {"body_mass", "body_inertia", "body_gravcomp", "actuator_gainprm", "actuator_biasprm", "pair_solref"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +67,8 @@ class Extended:
     @property
     def lacking(self) -> tuple[str, ...]:
         """Names of the parts that an MJCF cannot hold."""
-        return tuple(p.name for p in self.parts if not _native(p, self.effects, self.space))
+        effects = {e.name: e for e in self.effects}
+        return tuple(p.name for p in self.parts if not in_mjcf(effects[p.effect], self.space.select(p.free)))
 
 
 def extended(case: Case, model: Model) -> Extended:
@@ -84,7 +82,7 @@ def extended(case: Case, model: Model) -> Extended:
 
 def save_extended(folder: Path, model: Extended) -> None:
     """Write extended.json and extended.xml into `folder`."""
-    write_text(folder / MJCF, extended_mjcf(model))
+    write_text(folder / MJCF, mjcf(model.scene, model.space, model.values))
     write_json(folder / FILE, _to_json(model))
 
 
@@ -101,41 +99,6 @@ def load_extended(path: str | Path, scene: Scene) -> Extended:
     except (ValueError, KeyError, TypeError, OSError) as error:
         what = f"there is no entry {error}" if isinstance(error, KeyError) else error
         raise ValueError(f"{path}: {what}") from error
-
-
-def extended_mjcf(model: Extended) -> str:
-    """The scene as MJCF with the fitted values of the base parameters and of the effects that MJCF has words for."""
-    scene = model.scene
-    fitted = make_c_model(scene, model.space, model.values)
-    spec = scene.spec.copy()
-    for pair in spec.pairs:
-        pair.solref = fitted.pair_solref[scene.id("pair", pair.name)].tolist()
-    for body in spec.bodies[1:]:
-        _keep_inertia(scene, fitted, body)
-    return fitted_mjcf(replace(scene, spec=spec), model.space, model.values)
-
-
-def _keep_inertia(scene: Scene, fitted: Any, body: Any) -> None:
-    """Undo beforehand that `fitted_mjcf` scales inertia with mass, where the fit scaled the mass alone (a payload)."""
-    index = scene.id("body", body.name)
-    if scene.model.body_mass[index] <= 0:
-        return
-    scale = fitted.body_mass[index] / scene.model.body_mass[index]
-    inertia = fitted.body_inertia[index] / scale
-    if np.allclose(inertia, scene.model.body_inertia[index], rtol=1e-9):
-        return
-    body.explicitinertial = True
-    body.mass = float(scene.model.body_mass[index])
-    body.ipos, body.iquat = scene.model.body_ipos[index].tolist(), scene.model.body_iquat[index].tolist()
-    body.inertia, body.fullinertia = inertia.tolist(), [np.nan] * 6
-
-
-def _native(part: Candidate, effects: tuple[Effect, ...], space: Space) -> bool:
-    """Whether an effect is nothing but numbers of the model that an MJCF holds."""
-    (effect,) = (e for e in effects if e.name == part.effect)
-    laws = (effect.command, effect.servo, effect.force, effect.frictionloss, effect.observe)
-    fields = [{w.field for w in space[name].writes} for name in part.free]
-    return not any(laws) and all(written and written <= _WORDS for written in fields)
 
 
 def _to_json(model: Extended) -> dict[str, Any]:

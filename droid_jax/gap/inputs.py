@@ -78,7 +78,7 @@ def _travel(recording: Recording, joint: str) -> float | None:
 
 
 def _check_timing(recording: Recording, where: str) -> None:
-    late = lags(recording.channels["position" if "position" in recording.channels else "torque"])
+    late = lags(recording.channel("position" if "position" in recording.channels else "torque"))
     worst = int(np.argmax(np.abs(late)))
     if abs(late[worst]) > APART:
         raise ValueError(
@@ -89,11 +89,10 @@ def _check_timing(recording: Recording, where: str) -> None:
 
 def lags(channel: Channel) -> np.ndarray:
     """[N] s by which each repeat lags the repeats' median, to first order in the lag."""
-    values = np.where(channel.mask, channel.values, np.nan).astype(float)
+    time, values = _measured(channel)
     usual = np.nanmedian(values, axis=0)
-    slope = np.gradient(usual, channel.time, axis=0)
+    slope = np.gradient(usual, time, axis=0)
     apart = np.nan_to_num(values - usual)
-    slope = np.nan_to_num(slope)
     return -np.einsum("ntc,tc->n", apart, slope) / max(float(np.sum(slope**2)), 1e-12)
 
 
@@ -119,7 +118,15 @@ def _check_same_joints(roles: Mapping[str, Recording]) -> None:
 
 
 def _mean(channel: Channel) -> np.ndarray:
-    """[Tc', C] mean over the repeats, where any repeat measured every column."""
-    values = np.where(channel.mask, channel.values, np.nan).astype(float)
+    """[K, C] mean over the repeats."""
+    return np.nanmean(_measured(channel)[1], axis=0)
+
+
+def _measured(channel: Channel) -> tuple[np.ndarray, np.ndarray]:
+    """[K] s and values [N, K, C], NaN where masked, at the instants at which some repeat measured each column."""
     seen = np.all(np.any(channel.mask, axis=0), axis=1)
-    return np.nanmean(values[:, seen], axis=0)
+    if seen.sum() < 2:
+        raise ValueError(
+            f"channel {channel.name!r} has no two instants at which every column was measured; give them one clock"
+        )
+    return channel.time[seen], np.where(channel.mask, channel.values, np.nan).astype(float)[:, seen]

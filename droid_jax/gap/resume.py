@@ -34,24 +34,25 @@ def remembering(case: Case, folder: Path) -> Case:
     def kept(role: str, evidence: Evidence) -> Evidence:
         cost = evidence.cost
         each = {f.name: getattr(cost, f.name) for f in dataclasses.fields(Cost)}
-        return replace(evidence, cost=Remembered(**each, folder=folder / role))
+        return replace(evidence, cost=Remembered(**each, plain=cost, folder=folder / role))
 
     return replace(case, **{role: kept(role, evidence) for role, evidence in case.judged.items()})
 
 
 @dataclass(frozen=True, eq=False)
 class Remembered(Cost):
-    """A cost over one recording that looks in its folder before it replays."""
+    """The cost `plain` over one recording, which looks in its folder before it replays."""
 
+    plain: Cost
     folder: Path
 
     def distances(self, values: Any) -> np.ndarray:
         """Like `Cost.distances`."""
-        return self._kept("distances", values, super().distances)
+        return self._kept("distances", values, self.plain.distances)
 
     def whitened(self, values: Any) -> np.ndarray:
         """Like `Cost.whitened`."""
-        return self._kept("whitened", values, super().whitened)
+        return self._kept("whitened", values, self.plain.whitened)
 
     def first(self) -> Cost:
         """Itself: there is one recording."""

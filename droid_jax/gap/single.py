@@ -24,7 +24,7 @@ import numpy as np
 
 from droid_jax.compare.cost import Cost, make_cost
 from droid_jax.compare.residuals import MINIMUM_NOISE
-from droid_jax.gap.blocks import Blocks, block_length, blocks, interleaved
+from droid_jax.gap.blocks import OUTSIDE, Blocks, block_length, blocks, interleaved
 from droid_jax.gap.candidates import candidates
 from droid_jax.gap.case import Case, GapConfig
 from droid_jax.gap.evidence import only_comparison
@@ -97,39 +97,49 @@ class Log(Cost):
 
 
 def make_log(
-    scene: Scene, base: Space, effects: Sequence[Effect], recording: Recording, config: GapConfig | None = None
+    scene: Scene,
+    base: Space,
+    effects: Sequence[Effect],
+    recording: Recording,
+    config: GapConfig | None = None,
+    known: Sequence[Effect] = (),
 ) -> Log:
     """The log of a recording of one repeat without commands, all effects in its replay, at neutral.
 
+    known: effects that the base has already; their parameters are in `base`.
     Raises ValueError for repeats, which tell more than blocks do, and for commands: the numerical floor
     of a servo's replay needs repeats.
     """
     if recording.repeats > 1:
         raise ValueError(f"recording {recording.name!r} has {recording.repeats} repeats: use make_case")
-    whole = base + effect_space(effects)
-    cost = make_cost(ready(scene), whole, [recording], config=(config or GapConfig()).compare, effects=effects)
+    whole, config = base + effect_space(effects), config or GapConfig()
+    cost = make_cost(ready(scene), whole, [recording], config=config.compare, effects=[*known, *effects])
     if not isinstance(cost.drives[0], Motion):
         raise ValueError(f"recording {recording.name!r} holds commands; blocks are for logs in inverse mode")
     return Log(**{f.name: getattr(cost, f.name) for f in fields(cost)})
 
 
 def single_case(
-    log: Log, base: Space, effects: Sequence[Effect], sealed: Log | None = None, config: GapConfig | None = None
+    log: Log,
+    base: Space,
+    effects: Sequence[Effect],
+    sealed: Log | None = None,
+    config: GapConfig | None = None,
+    start: np.ndarray | None = None,
 ) -> Case:
     """A case from one log, or from two of which the second is sealed.
 
+    start: [D] where fits begin, fitted to this motion before; the prior's mean unless given.
     Raises ValueError where the log is too short for its residual's correlation time.
     """
     config = config or GapConfig()
     clock = log.clock
     end = clock[-1] + 1e-6 if sealed is not None else clock[0] + FITTED * (clock[-1] - clock[0])
-    deviation, length = noise_of(log, base, effects, end, config)
+    deviation, length = noise_of(log, base, effects, end, config, start)
     parts = interleaved(clock, clock[0], end, length, 2)
     fit, confirm = (_blocks(log, deviation, part) for part in parts)
     rest = log if sealed is None else sealed
-    start = end if sealed is None else rest.clock[0]
-    last = rest.clock[-1] + 1e-6
-    judged = _blocks(rest, deviation, interleaved(rest.clock, start, last, (last - start) / (FEWEST + 0.5))[0])
+    judged = _blocks(rest, deviation, _any_blocks(rest.clock, end if sealed is None else rest.clock[0]))
     return Case(fit, confirm, judged, base, tuple(effects), config)
 
 
@@ -143,13 +153,15 @@ def base_model(case: Case, start: np.ndarray | None = None) -> Model:
 
 
 def noise_of(
-    log: Log, base: Space, effects: Sequence[Effect], end: float, config: GapConfig
+    log: Log, base: Space, effects: Sequence[Effect], end: float, config: GapConfig, start: np.ndarray | None
 ) -> tuple[np.ndarray, float]:
     """Deviation [C] to state as noise, and length [s] of the blocks, from what lies before `end`; see the module."""
     inside = log.clock < end
-    block = interleaved(log.clock, log.clock[0], end, (end - log.clock[0]) / (FEWEST + 0.5))[0]
-    case, model, deviation = _rough_fit(log, base, effects, log.space.mean, block, config)
-    case, model, deviation = _rough_fit(log, base, effects, model.values, block, config)
+    block = _any_blocks(log.clock[inside], log.clock[0])
+    block = np.r_[block, np.full(len(log.clock) - len(block), OUTSIDE)]
+    if start is None:  # what the prior's mean leaves is no noise
+        start = _rough_fit(log, base, effects, log.space.mean, block, config)[1].values
+    case, model, deviation = _rough_fit(log, base, effects, start, block, config)
     found = ask(case, model, questions_of(candidates(effects)))
     whitened = _least(found, model.residuals.mean(axis=0), log.space, config.most)
     left = (whitened.reshape(len(deviation), -1).T * deviation)[inside]
@@ -181,6 +193,12 @@ def _least(found: Screen, left: np.ndarray, space: Space, most: int) -> np.ndarr
         left = left - taken @ (taken.T @ left)
         found = replace(found, marks=found.marks - (found.marks @ taken) @ taken.T)
     return left
+
+
+def _any_blocks(clock: np.ndarray, first: float) -> np.ndarray:
+    """[K] block of each instant from `first` on, for what is not tested: as few as there may be."""
+    end = clock[-1] + 1e-6
+    return interleaved(clock, first, end, (end - first) / (FEWEST + 0.5))[0]
 
 
 def _blocks(log: Log, deviation: np.ndarray, block: np.ndarray) -> Blocks:

@@ -1,0 +1,89 @@
+"""A run's folder before and after the run: whose it is, whether the run is whole, what it can go on from."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import shutil
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from droid_jax.measure.recording import Recording
+    from droid_jax.model.parameters import Space
+    from droid_jax.model.scene import Scene
+
+
+def setup_of(command: Any) -> dict[str, Any]:
+    """What decides a run's results, as plain data: a finished run with the same is not run again."""
+    fields = dataclasses.asdict(command)
+    for name in ("out", "again"):
+        fields.pop(name)
+    return {k: [str(v) for v in value] if isinstance(value, tuple) else _plain(value) for k, value in fields.items()}
+
+
+def _plain(value: Any) -> Any:
+    return str(value) if isinstance(value, Path) else value
+
+
+def fingerprints(scene: Scene, space: Space, recordings: Iterable[Recording]) -> dict[str, Any]:
+    """Hashes of what a run's files say, for its setup: it does not go on with changed ones."""
+    import mujoco
+    import numpy as np
+
+    from droid_jax.identify.gaussian import space_to_json
+
+    model = np.empty(mujoco.mj_sizeModel(scene.model), np.uint8)
+    mujoco.mj_saveModel(scene.model, None, model)
+    return {
+        "scene_sha256": hashlib.sha256(model.tobytes()).hexdigest(),
+        "parameters_sha256": hashlib.sha256(json.dumps(space_to_json(space)).encode()).hexdigest(),
+        "recordings_sha256": [recording.sha256 for recording in recordings],
+    }
+
+
+def finished(out: Path, setup: dict[str, Any], again: bool, last: str = "config.json") -> bool:
+    """True where the folder holds this very run, whole: with `last`, the file that is written last.
+
+    A folder with another run in it is refused.
+    """
+    path = out / "setup.json"
+    if again or not path.is_file():
+        return False
+    try:
+        before = json.loads(path.read_text())
+        changed = sorted(k for k in {*before, *setup} if before.get(k) != setup.get(k))
+    except (json.JSONDecodeError, UnicodeDecodeError, AttributeError, TypeError):
+        raise ValueError(f"{path} is damaged; choose another --out, or start over with --again") from None
+    if changed:
+        raise ValueError(
+            f"{out} holds a run with other settings ({', '.join(changed)}); choose another --out, or --again"
+        )
+    if not (out / last).is_file():
+        print(f"{out} holds this run unfinished; going on")
+        return False
+    print(f"{out} holds this run already; its report is built again (start over with --again)")
+    return True
+
+
+def begin(out: Path, setup: dict[str, Any], again: bool, last: str = "config.json") -> None:
+    """Only now, with all input read, forget an earlier run where that was asked for, and say what runs here."""
+    from droid_jax.storage import write_json
+
+    if again:
+        shutil.rmtree(out / "checkpoints", ignore_errors=True)
+        (out / last).unlink(missing_ok=True)
+    write_json(out / "setup.json", setup)
+
+
+def kept_recording(path: Path, again: bool, name: str, record: Callable[[], Recording]) -> Recording:
+    """What the stand-in robot recorded earlier into this run's folder; recorded now where it did not."""
+    from droid_jax.measure.formats import load, save
+
+    if again or not path.is_file():
+        print(f"recording the stand-in robot: demonstration {name}, 10 repeats ...", flush=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save(record(), path)
+    return load(path, name=name)

@@ -1,0 +1,250 @@
+"""`gap`: which physical effect does the model lack?"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from droid_jax.commands import report
+from droid_jax.commands.folder import begin, fingerprints, finished, setup_of
+from droid_jax.commands.hidden import hidden_effects, record_stand_in
+from droid_jax.commands.presets import TIMESTEP, refine_config, search_config
+from droid_jax.commands.scenes import own_scene
+from droid_jax.storage import write_json
+
+if TYPE_CHECKING:
+    from droid_jax.gap.case import Case, GapConfig
+    from droid_jax.gap.verdict import Verdict
+    from droid_jax.measure.recording import Recording
+    from droid_jax.model.parameters import Space
+    from droid_jax.model.scene import Scene
+    from droid_jax.model.seam import Effect
+
+STAGES = ("search", "refine", "floor", "screen", "look", "refit", "judge")
+ROLES = ("fit", "confirm", "sealed")
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Find the physical effect that the model lacks: fit, ask a library of effects, confirm on another motion.
+
+    Without --recording a stand-in robot with a hidden effect is recorded first.
+    """
+
+    recording: tuple[Path, ...] = ()
+    """FIT CONFIRM [SEALED]: two or three motions of the same robot and object, eight repeats or more of each. The
+    fit sees the first, effects are chosen on the second, the third is opened when all is decided."""
+    preset: Literal["quick", "standard", "gpu"] = "quick"
+    """Of the base fit, as in identify."""
+    scene: Path | None = None
+    """Your own MJCF instead of the built-in door."""
+    parameters: Path | None = None
+    """JSON list of the parameters of your own scene (docs/own-robot.md)."""
+    joints: tuple[str, ...] = ()
+    """Measured joints of your own scene; default: all driven joints."""
+    object_joint: str | None = None
+    """Joint of the thing that is moved, in your own scene; without it no effect of a door is asked about."""
+    effects: tuple[str, ...] = ()
+    """Effects of the library to ask about; default: all that the scene can have."""
+    without: tuple[str, ...] = ()
+    """Effects of the library to leave out."""
+    budget: float | None = None
+    """Minutes after which no further candidate is tried; the report says what was left out."""
+    hide: tuple[str, ...] | None = None
+    """What the stand-in robot hides, name=amplitude or name[joint]=amplitude; none for nothing.
+    Default: magnetic_catch=1.5 (N m)."""
+    springs: Literal[0, 1, 2] = 1
+    """Springs on the stand-in's door."""
+    seed: int = 0
+    """Seed of the search, of the stand-in robot and of the resamples."""
+    out: Path = Path("runs/gap")
+    """Results folder. A run that was interrupted goes on from where it was."""
+    again: bool = False
+    """Start over, even if the folder holds a finished or interrupted run."""
+
+
+def run(command: Gap) -> None:
+    """Record or load, fit, search, write the run's folder and its page."""
+    print("starting jax ...", flush=True)
+    from droid_jax import runtime
+
+    runtime.tune()
+    runtime.import_mjx()
+    from droid_jax.gap.inputs import check_recordings
+    from droid_jax.gap.results import write_gap
+    from droid_jax.identify.results import prepare_folder
+
+    out = prepare_folder(command.out)
+    scene, base = model_of(command)
+    given, hidden = _given(command), hidden_effects(command.hide, scene)
+    effects = chosen_effects(command, scene, [*given.values()])
+    setup = {**setup_of(command), "command": "gap", **fingerprints(scene, base, given.values())}
+    if finished(out, setup, command.again, "gap.json"):
+        _done(out)
+        return
+    check_recordings(scene, given)
+    config = config_of(command)
+    begin(out, setup, command.again, "gap.json")
+    recordings = given or record_stand_in(scene, hidden, out, command.springs, command.seed, command.again)
+    case, verdict, seconds = _searched(scene, base, effects, recordings, config, out / "checkpoints")
+    description = {
+        "seconds": seconds,
+        "versions": runtime.versions(),
+        "device": runtime.device(),
+        "setup": {**setup, "stand_in": not given},
+    }
+    write_gap(out, case, verdict, description)
+    shutil.rmtree(out / "checkpoints" / "replays", ignore_errors=True)
+    _done(out)
+
+
+def model_of(command: Gap) -> tuple[Scene, Space]:
+    """The scene and all that is fitted without any effect, nuisances among it."""
+    from droid_jax.model.door import door_nuisances, door_space
+    from droid_jax.model.door_scene import door_scene
+
+    if command.scene is not None:
+        return own_scene(command)
+    scene = door_scene(timestep=TIMESTEP[command.preset])
+    return scene, door_space(scene) + door_nuisances(scene)
+
+
+def chosen_effects(command: Gap, scene: Scene, recordings: list[Recording]) -> tuple[Effect, ...]:
+    """The library's effects for this scene, --effects and --without applied.
+
+    Raises ValueError for unknown names, for effects that this scene cannot have, and where none is left.
+    """
+    from droid_jax.model.effects.registry import library
+
+    library(scene, command.without)  # names are checked there
+    possible = library(scene)
+    if any(not r.command.size for r in recordings):  # a measured motion has no servo that an effect could change
+        possible = tuple(e for e in possible if not e.command and not e.servo)
+    asked = library(scene, command.effects or None)
+    names = {e.name for e in possible}
+    impossible = [name for name in command.effects if name not in names]
+    left = tuple(e for e in asked if e.name in names and e.name not in command.without)
+    if impossible or not left:
+        what = f"cannot have {', '.join(impossible)}" if impossible else "is left without any effect"
+        raise ValueError(f"scene {scene.name!r} {what} here; it can have: {', '.join(sorted(names))}")
+    return left
+
+
+def config_of(command: Gap) -> GapConfig:
+    """The preset with the command's own numbers."""
+    from droid_jax.gap.case import GapConfig
+    from droid_jax.identify.refine import RefineConfig
+
+    if command.budget is not None and not command.budget > 0:
+        raise ValueError(f"--budget must be above 0 minutes, got {command.budget:g}")
+    asked: dict[str, Any] = {} if command.budget is None else {"budget": command.budget}
+    return GapConfig(
+        search=search_config(command.preset, command.seed),
+        refine=refine_config(command.preset) or RefineConfig(),
+        seed=command.seed,
+        **asked,
+    )
+
+
+def _given(command: Gap) -> dict[str, Recording]:
+    """Role -> recording, none where the stand-in robot shall record."""
+    from droid_jax.measure.formats import load
+
+    if not command.recording:
+        if command.scene is not None:
+            raise ValueError("--scene needs --recording: the stand-in robot only knows the built-in door")
+        return {}
+    if command.hide is not None:
+        raise ValueError("--hide is for the stand-in robot, and --recording says that there is none")
+    if not 2 <= len(command.recording) <= 3:
+        raise ValueError(
+            f"--recording takes FIT CONFIRM [SEALED], two or three recordings, got {len(command.recording)}: an effect "
+            "must be confirmed on another motion. With one, `python -m droid_jax.run identify` fits the parameters, "
+            "and its report shows where simulation and robot disagree"
+        )
+    return dict(zip(ROLES, [load(path) for path in command.recording], strict=False))
+
+
+def _searched(
+    scene: Scene,
+    base: Space,
+    effects: tuple[Effect, ...],
+    recordings: Mapping[str, Recording],
+    config: GapConfig,
+    checkpoints: Path,
+) -> tuple[Case, Verdict, dict[str, float]]:
+    """The search from top to bottom, going on from `checkpoints`; and each stage's seconds."""
+    from droid_jax.gap.case import make_case
+    from droid_jax.gap.floor import numerical_floor
+    from droid_jax.gap.menu import separating
+    from droid_jax.gap.resume import kept_model, kept_number, remembering
+    from droid_jax.gap.workflow import base_fit, find
+    from droid_jax.report.progress import stages
+
+    case = remembering(make_case(scene, base, effects, **recordings, config=config), checkpoints / "replays")
+    with stages(STAGES) as show:
+        clock = _Clock(show, checkpoints / "seconds.json")
+        model = kept_model(checkpoints / "base", case.base, lambda: base_fit(case, clock))
+        clock("floor", None)
+        floor = kept_number(checkpoints / "floor", lambda: numerical_floor(case.fit, model, recordings["fit"]))
+        verdict = find(case, model, floor, clock)
+        clock("judge", None)
+        if verdict.rivals:
+            tied = (verdict.model, *verdict.rivals)
+            verdict = replace(verdict, experiments=separating(case, tied, recordings["fit"]))
+        clock("judge", None)  # its seconds count
+    return case, verdict, clock.seconds
+
+
+class _Clock:
+    """Hands progress on, and counts the seconds of each stage; those of an earlier part of this run are in `kept`."""
+
+    def __init__(self, show: Callable[[str, Any], None], kept: Path) -> None:
+        self.show, self.kept = show, kept
+        self.seconds: dict[str, float] = _seconds(kept)
+        self._stage, self._since = STAGES[0], time.monotonic()
+
+    def __call__(self, stage: str, value: Any) -> None:
+        now = time.monotonic()
+        self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._since
+        if stage != self._stage:
+            write_json(self.kept, self.seconds)
+        self._stage, self._since = stage, now
+        if stage in STAGES:
+            self.show(stage, None if isinstance(value, str) else value)  # bars show numbers, not names
+
+
+def _seconds(kept: Path) -> dict[str, float]:
+    """What was counted before; nothing where that cannot be read, it decides nothing."""
+    try:
+        before = json.loads(kept.read_text())
+        return {stage: float(before[stage]) for stage in STAGES if stage in before}
+    except (OSError, ValueError, TypeError):
+        return {}
+
+
+def _done(out: Path) -> None:
+    """Build the page, and say in five lines what was found."""
+    from droid_jax.gap.results import load_gap, most_shifted
+
+    found = load_gap(out).answer
+    page = report.write(out)
+    print(found["sentence"])
+    p = "not asked" if found["p"] is None else f"p = {found['p']:.2g} that chance alone does this"
+    print(f"something missing: {p}; converged: {'yes' if found['converged'] else 'no'}")
+    gaps = []
+    for role, gap in found["gaps"].items():
+        closed = "" if gap["closed"] is None else f" ({gap['closed']:.0%} closed)"
+        gaps.append(f"{role} {gap['before']:.3g} -> {gap['after']:.3g}{closed}")
+    print(f"gap, noise units squared: {', '.join(gaps)}")
+    shift, deviations = most_shifted(found["shifts"])
+    moved = (
+        f"{shift['name']} {shift['before']:.3g} -> {shift['after']:.3g} {shift['unit']} ({deviations:.1f} deviations)"
+    )
+    print(f"shifted most: {moved if found['effects'] else 'nothing, no effect came in'}")
+    print(f"report: {page}")

@@ -1,0 +1,63 @@
+"""The stand-in robot with something hidden in it, for a `gap` without recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from droid_jax.commands.folder import kept_recording
+
+if TYPE_CHECKING:
+    from droid_jax.measure.recording import Recording
+    from droid_jax.model.scene import Scene
+
+DEMONSTRATIONS = {"fit": "C", "confirm": "B", "sealed": "A"}
+HIDE = ("magnetic_catch=1.5",)  # N m
+
+
+def hidden_effects(entries: Sequence[str] | None, scene: Scene) -> dict[str, float]:
+    """What --hide says: name or name[joint] -> amplitude.
+
+    entries: "name=amplitude" each, or "none" alone; None: one effect of this program's choice.
+    Raises ValueError for what they cannot mean, listing the valid names.
+    """
+    from droid_jax.measure.hidden import hidden_effect, possible
+
+    entries = HIDE if entries is None else tuple(entries)
+    if entries in ((), ("none",)):
+        return {}
+    found = {}
+    for entry in entries:
+        name, _, amplitude = entry.partition("=")
+        try:
+            found[name] = float(amplitude)
+        except ValueError:
+            raise ValueError(
+                f"--hide takes name=amplitude, for example {HIDE[0]}, or none; got {entry!r}. "
+                f"There are: {', '.join(possible(scene))}"
+            ) from None
+        hidden_effect(name.partition("[")[0])
+    return found
+
+
+def record_stand_in(
+    scene: Scene, hidden: Mapping[str, float], out: Path, springs: int, seed: int, again: bool
+) -> dict[str, Recording]:
+    """Role -> what the stand-in robot measured; kept in the run's folder, recorded anew where `again` asks for it."""
+    from droid_jax.measure.demonstration import demonstration_path
+    from droid_jax.measure.formats import load
+    from droid_jax.measure.hidden import record_hidden
+    from droid_jax.measure.surrogate import stand_in_truth
+
+    truth = stand_in_truth(scene, springs, seed)
+
+    def recorded(index: int, name: str) -> Recording:
+        demonstration = load(demonstration_path(name))
+        return record_hidden(scene, demonstration, truth, hidden, seed=1000 * seed + index, name=name)
+
+    recordings = {}
+    for index, (role, name) in enumerate(DEMONSTRATIONS.items()):
+        path = out / "recordings" / f"{name}.npz"
+        recordings[role] = kept_recording(path, again, name, lambda i=index, n=name: recorded(i, n))
+    return recordings

@@ -1,0 +1,228 @@
+"""`identify`: recordings in, a Gaussian over the parameters out."""
+
+from __future__ import annotations
+
+import datetime
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from droid_jax.commands import report
+from droid_jax.commands.folder import begin, finished, kept_recording, setup_of
+from droid_jax.commands.presets import TIMESTEP, Preset, refine_config, search_config
+from droid_jax.commands.scenes import own_scene
+
+if TYPE_CHECKING:
+    from droid_jax.identify.pipeline import Identified, IdentifyConfig
+    from droid_jax.measure.recording import Recording
+    from droid_jax.model.parameters import Space
+    from droid_jax.model.scene import Scene
+    from droid_jax.model.seam import Effect
+
+
+@dataclass(frozen=True)
+class Identify:
+    """Fit the physics to recorded torques: recordings in, a Gaussian over the parameters out.
+
+    Without --recording a stand-in robot (a simulation with hidden physics) is recorded first.
+    """
+
+    preset: Preset = "quick"
+    """quick: a laptop, minutes.  standard: 100 generations, 2 ms steps.  paper: the paper's own
+    setting (Table I's servo, 30 samples, 5 parents, no refinement).  gpu: 1024 samples."""
+    recording: tuple[Path, ...] = ()
+    """Recordings to fit (npz, CSV folder, ROS bag); several of the same robot and object are fitted together."""
+    demonstrations: tuple[str, ...] = ("A", "C")
+    """What the stand-in robot repeats when no recording is given (A, B or C; the paper preset uses A)."""
+    springs: Literal[0, 1, 2] = 1
+    """Springs on the stand-in's door (its values are the fitted columns of Table I)."""
+    scene: Path | None = None
+    """Your own MJCF instead of the built-in door."""
+    parameters: Path | None = None
+    """JSON list of the parameters of your own scene (docs/own-robot.md)."""
+    joints: tuple[str, ...] = ()
+    """Measured joints of your own scene; default: all driven joints."""
+    object_joint: str | None = None
+    """Joint of the thing that is moved, in your own scene."""
+    extended: Path | None = None
+    """extended.json of a gap search: the effects that it named are in the model and fitted too."""
+    engine: Literal["mjx", "mujoco"] = "mjx"
+    """mjx: compiled, all devices.  mujoco: plain C, all cores."""
+    population: int | None = None
+    """Samples per generation; default: the preset's."""
+    generations: int | None = None
+    """Generations at most; default: the preset's."""
+    restarts: int | None = None
+    """Independent searches in one batch; default: the preset's."""
+    nuisances: bool = True
+    """Fit and marginalise pose, link masses, servo gains, timing and offsets too (never in the paper preset).
+    In your own scene: those of your parameters that say "nuisance": true."""
+    whitened: bool = False
+    """The search counts torques in units of their noise instead of N m (the refinement always does)."""
+    seed: int = 0
+    """Seed of the search, of the stand-in robot and of the samples."""
+    out: Path = Path("runs/identify")
+    """Results folder. A run that was interrupted goes on from where it was."""
+    again: bool = False
+    """Start over, even if the folder holds a finished or interrupted run."""
+
+
+def run(command: Identify) -> None:
+    """Record or load, fit, write the run's folder and its page."""
+    print("starting jax ...", flush=True)
+    from droid_jax import runtime
+
+    runtime.tune()
+    runtime.import_mjx()
+    from droid_jax.identify.pipeline import cost_samples, identify
+    from droid_jax.identify.results import prepare_folder, write_run
+    from droid_jax.report.progress import stages
+
+    out = prepare_folder(command.out)
+    setup = setup_of(command)
+    if finished(out, setup, command.again):
+        report.run(report.Report(out))
+        return
+    scene, space, nuisances = model_of(command)
+    scene, space, effects = _extended(command, scene, space)
+    recordings, truth = _recordings(command, scene, out)
+    config = config_of(command)
+    begin(out, setup, command.again)
+    started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    with stages(("search", "refine", "judge", "sample")) as progress:
+        found = identify(
+            scene, space, recordings, nuisances=nuisances, config=config, checkpoints=out / "checkpoints",
+            progress=progress, **effects,
+        )  # fmt: skip
+        progress("sample", None)
+        samples = cost_samples(found, config.samples, config.seed)
+    description = {
+        "command": "identify",
+        "preset": command.preset,
+        "scene": scene.name,
+        "engine": config.engine,
+        "recordings": [
+            {
+                "name": r.name,
+                "sha256": r.sha256,
+                "repeats": r.repeats,
+                "heldout": list(found.heldout_repeats[r.name]),
+                "duration": r.duration,
+            }
+            for r in recordings
+        ],
+        "seed": command.seed,
+        "versions": runtime.versions(),
+        "device": runtime.device(),
+        "started": started,
+        "stand_in": truth is not None,
+        "setup": setup,
+    }
+    write_run(out, found, description, truth=truth, samples=samples)
+    _draw(out, found, recordings[0])
+    report.run(report.Report(out))
+    _summary(found)
+
+
+def model_of(command: Identify) -> tuple[Scene, Space, Space | None]:
+    """The scene, what is fitted, and the nuisances beside it."""
+    from droid_jax.model.door import door_nuisances, door_space
+    from droid_jax.model.door_scene import door_scene
+
+    if command.scene is not None:
+        scene, listed = own_scene(command)
+        main = listed.select(p.name for p in listed.parameters if not p.nuisance)
+        extra = [p.name for p in listed.parameters if p.nuisance]
+        return scene, main, listed.select(extra) if command.nuisances and extra else None
+    timestep = TIMESTEP[command.preset]
+    if command.preset == "paper":
+        scene = door_scene(gains="paper", timestep=timestep)
+        return scene, door_space(scene, preset="paper"), None
+    scene = door_scene(timestep=timestep)
+    return scene, door_space(scene), door_nuisances(scene) if command.nuisances else None
+
+
+def config_of(command: Identify) -> IdentifyConfig:
+    """The preset with the command's own numbers."""
+    from droid_jax.compare.residuals import CompareConfig
+    from droid_jax.identify.pipeline import IdentifyConfig
+
+    changes = {k: getattr(command, k) for k in ("population", "generations", "restarts")}
+    return IdentifyConfig(
+        engine=command.engine,
+        search=search_config(command.preset, command.seed, **changes),
+        refine=refine_config(command.preset),
+        seed=command.seed,
+        compare=CompareConfig(whitened=command.whitened),
+    )
+
+
+def _extended(command: Identify, scene: Scene, space: Space) -> tuple[Scene, Space, dict[str, tuple[Effect, ...]]]:
+    """Scene and space with the effects of --extended in them, and what `identify` has to be told of these."""
+    if command.extended is None:
+        return scene, space, {}
+    from droid_jax.gap.extended import load_extended
+
+    model = load_extended(command.extended, scene)
+    return model.scene, space + model.effect_space, {"effects": model.effects}
+
+
+def _recordings(command: Identify, scene: Scene, out: Path) -> tuple[list[Recording], dict[str, float] | None]:
+    """The given recordings, or the stand-in's (kept in the run's folder) with their hidden truth."""
+    from droid_jax.measure.formats import load
+
+    if command.recording:
+        return [load(path) for path in command.recording], None
+    if command.scene is not None:
+        raise ValueError("--scene needs --recording: the stand-in robot only knows the built-in door")
+    from droid_jax.measure.demonstration import demonstration_path
+    from droid_jax.measure.surrogate import record, stand_in_truth
+
+    gains = "paper" if command.preset == "paper" else "impedance"
+    names = command.demonstrations[:1] if command.preset == "paper" else command.demonstrations
+    truth = stand_in_truth(scene, command.springs, command.seed, nuisances=command.preset != "paper")
+
+    def recorded(index: int, name: str) -> Recording:
+        demonstration = load(demonstration_path(name, gains=gains))
+        return record(scene, demonstration, truth, seed=1000 * command.seed + index)
+
+    recordings = []
+    for index, name in enumerate(names):
+        path = out / "recordings" / f"{name}_springs{command.springs}_seed{command.seed}.npz"
+        recordings.append(kept_recording(path, command.again, name, lambda i=index, n=name: recorded(i, n)))
+    return recordings, truth
+
+
+def _draw(out: Path, found: Identified, recording: Recording) -> None:
+    """Frames of the fitted replay; without OpenGL the report says that there are none."""
+    from droid_jax.compare.replay import make_drive
+    from droid_jax.measure.engine import poses
+    from droid_jax.model.physics import make_c_model
+    from droid_jax.report.render import NoOpenGL, frames, save_frames
+
+    if found.scene.grip is None:
+        return
+    drive = make_drive(found.scene, recording)
+    qpos = poses(make_c_model(found.scene, found.full, found.best), drive.qpos0, drive.command)
+    rows = [int(f * (len(qpos) - 1)) for f in (0.0, 0.33, 0.6, 1.0)]
+    try:
+        images = frames(found.scene.visual_model(), qpos, rows)
+    except NoOpenGL as error:
+        print(f"no pictures: {error}", file=sys.stderr)
+        return
+    save_frames(out / "frames", images, [float(drive.time[r]) for r in rows], "after")
+
+
+def _summary(found: Identified) -> None:
+    """Five lines that say how it went."""
+    for name, gap in found.gaps.items():
+        way = "one repeat: what noise alone would leave is not known"
+        if gap.floor is not None:
+            way = f"a perfect model: {gap.floor:.3f}; {gap.closed:.0%} of the gap closed"
+        unit = found.fit.comparisons[0].channel("torque").unit
+        print(f"{name}: held-out torque distance {gap.before:.3f} -> {gap.after:.3f} {unit} ({way})")
+    silent = [t.name for t in found.tells if not t.identifiable and not found.full[t.name].nuisance]
+    if silent and found.refined is not None:
+        print(f"this demonstration tells little about: {', '.join(silent)}")
+    print(f"search stopped: {found.search.stop}; {sum(found.seconds.values()):.0f} s")

@@ -1,0 +1,35 @@
+"""What the presets of `identify` and `gap` stand for."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from droid_jax.identify.refine import RefineConfig
+    from droid_jax.identify.search import SearchConfig
+
+Preset = Literal["quick", "standard", "paper", "gpu"]
+TIMESTEP: dict[Preset, float] = {"quick": 0.004, "standard": 0.002, "paper": 0.002, "gpu": 0.002}  # s, built-in door
+
+
+def search_config(preset: Preset, seed: int, **changes: int | None) -> SearchConfig:
+    """The preset's search; changes: fields of SearchConfig that were asked for, None for those that were not."""
+    from droid_jax.identify.search import SearchConfig
+
+    chosen: dict[str, int | None] = {
+        "quick": dict(population=30, parents=None, generations=20),
+        "standard": dict(population=30, parents=None, generations=100),
+        "paper": dict(population=30, parents=5, generations=100),
+        "gpu": dict(population=1024, parents=None, generations=60, restarts=2),
+    }[preset]
+    asked = {name: value for name, value in changes.items() if value is not None}
+    return SearchConfig(**{**chosen, **asked}, seed=seed)  # type: ignore[arg-type]
+
+
+def refine_config(preset: Preset) -> RefineConfig | None:
+    """The preset's refinement; None: the paper has none."""
+    from droid_jax.identify.refine import RefineConfig
+
+    if preset == "paper":
+        return None
+    return RefineConfig(hop_generations=12) if preset == "quick" else RefineConfig()

@@ -1,0 +1,41 @@
+"""`record`: the stand-in robot repeats a demonstration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class Record:
+    """Record the stand-in robot (plain C MuJoCo with hidden physics): repeats of a demonstration, as an npz file."""
+
+    demonstration: str = "A"
+    """A, B or C."""
+    springs: Literal[0, 1, 2] = 1
+    """Springs on the door."""
+    repeats: int = 10
+    """How often the motion is repeated."""
+    seed: int = 0
+    """Seed of the robot's hidden errors and of its noise."""
+    gains: Literal["impedance", "paper"] = "impedance"
+    """Servo gains."""
+    out: Path = Path("runs/recording.npz")
+    """File (npz) or folder (CSV) to write."""
+
+
+def run(command: Record) -> None:
+    """Record the stand-in robot and save what it measured."""
+    from droid_jax.measure.demonstration import demonstration_path
+    from droid_jax.measure.formats import load, save
+    from droid_jax.measure.surrogate import SurrogateConfig, record, stand_in_truth
+    from droid_jax.model.door_scene import door_scene
+
+    scene = door_scene(springs=command.springs, gains=command.gains)
+    demonstration = load(demonstration_path(command.demonstration, gains=command.gains))
+    truth = stand_in_truth(scene, command.springs, command.seed)
+    recording = record(scene, demonstration, truth, seed=command.seed, config=SurrogateConfig(repeats=command.repeats))
+    command.out.parent.mkdir(parents=True, exist_ok=True)
+    path = save(recording, command.out)
+    print(f"stand-in robot recorded {recording.repeats} repeats of {recording.duration:.1f} s: {path}")

@@ -1,0 +1,286 @@
+"""The blind suite: no truth in a recording, seeds from the commit, an answer for everything, rates that are right."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from droid_jax.measure.formats import load
+from droid_jax.measure.hidden import HIDDEN, Applied, possible
+from droid_jax.model.effects.registry import registered
+from droid_jax.model.parameters import Parameter, Space
+from experiments.blind import limits, score
+from experiments.blind.answers import ANSWERS, inside, right, targets, without
+from experiments.blind.baselines import bic_outcome
+from experiments.blind.cases import Counts, amplitude, key, keys, plans
+from experiments.blind.draws import commit_of, draw_truths, folder_of, seed_of
+from experiments.blind.make import make
+from experiments.blind.marks import Ground
+from experiments.blind.scenes import ROLES, Setting, setting
+
+CHEAP = ("hinge", "bench", "arm")
+COMMIT = "0" * 40
+
+
+@pytest.fixture(scope="module")
+def hinge() -> Setting:
+    """The lone hinge with motions of a quarter of a second."""
+    whole = setting("hinge")
+    short = {role: r.window(0.0, 0.25) for role, r in whole.demonstrations.items()}
+    return replace(whole, motions=lambda: short)
+
+
+def entry(**changes: Any) -> dict[str, Any]:
+    return {"limit": 0.1, "unit": "N m", "right": {"door_closer at door": 0.3}, "worth": 0.02, **changes}
+
+
+# ----- what is made
+
+
+def test_a_recording_holds_nothing_of_the_truth(hinge: Setting, tmp_path: Path):
+    (plan,) = [p for p in plans(hinge, Counts(), COMMIT) if p.name == "hinge/single/closer/3x/0"]
+    cases, sealed = tmp_path / "cases", tmp_path / "sealed"
+    assert make(hinge, plan, COMMIT, {"closer": entry()}, cases, sealed) == "made"
+    assert make(hinge, plan, COMMIT, {"closer": entry()}, cases, sealed) == "there"
+    (folder,) = cases.iterdir()
+    (seal,) = sealed.iterdir()
+    truth = json.loads(seal.read_text())
+    assert truth["hidden"] == [{"name": "closer", "amplitude": pytest.approx(0.3), "joint": ""}]
+    files = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
+    assert files == ["case.json", *(f"recordings/{role}.npz" for role in sorted(ROLES))]
+    assert json.loads((folder / "case.json").read_text()) == {"scene": "hinge", "without": []}
+    words = {"closer", "single", "3x", str(truth["seed"]), *(str(s) for s in truth["seeds"].values())}
+    for role in ROLES:
+        recording = load(folder / "recordings" / f"{role}.npz")
+        assert recording.name == role and not recording.meta and recording.repeats == 10
+        with np.load(folder / "recordings" / f"{role}.npz") as file:
+            assert not any(word in str(file["metadata"]) for word in words)
+    assert not any(word in folder.name for word in (*words, f"{truth['seed']:x}"))
+    offsets = [truth["truths"][role]["torque_offset[door]"] for role in ROLES]
+    assert len(set(offsets)) == 3
+    assert len({truth["truths"][role]["door_damping"] for role in ROLES}) == 1
+
+
+def test_what_is_left_out_is_all_that_would_be_right(hinge: Setting, tmp_path: Path):
+    known = {key(e.name, e.joint): entry() for e in keys(hinge)}
+    left = next(p for p in plans(hinge, Counts(), COMMIT) if p.kind == "left_out" and "preload" in p.name)
+    assert make(hinge, left, COMMIT, known, tmp_path / "cases", tmp_path / "sealed") == "made"
+    (folder,) = (tmp_path / "cases").iterdir()
+    told = json.loads((folder / "case.json").read_text())["without"]
+    assert {"hinge_preload", "tilted_frame"} <= set(told)
+    assert not set(told) & {e.name for e in hinge.effects(told)}
+
+
+def test_seeds_and_folders_come_from_the_commit():
+    name = "bench/none/nothing/0x/0"
+    assert seed_of("a", name) == seed_of("a", name) != seed_of("b", name)
+    assert 0 <= seed_of("a", name) < 1 << 32
+    assert folder_of("a", name).startswith("bench_") and folder_of("a", name) != folder_of("b", name)
+    assert commit_of("development") == "development"
+    with pytest.raises(ValueError, match="no commit"):
+        commit_of("no such thing")
+
+
+def test_truths_are_the_robots_own_in_all_recordings_but_for_the_sensors():
+    bench = setting("bench")
+    truths = draw_truths(bench, np.random.default_rng(3))
+    assert set(truths) == set(ROLES) and set(truths["fit"]) == set(bench.base.names)
+    apart = {n for n in bench.base.names if truths["fit"][n] != truths["confirm"][n]}
+    assert apart == {n for n in bench.base.names if n.startswith("torque_offset[")}
+
+
+@pytest.mark.parametrize("name", CHEAP)
+def test_motions_differ_and_begin_at_rest(name: str):
+    motions = setting(name).demonstrations
+    assert tuple(motions) == ROLES
+    for motion in motions.values():
+        assert np.all(np.abs(motion.command[1] - motion.command[0]) < 1e-4)
+        assert motion.command[0].tolist() == list(motion.qpos0.values())
+    assert not np.allclose(motions["fit"].command, motions["confirm"].command, atol=0.05)
+
+
+# ----- what is right
+
+
+def test_every_hidden_effect_has_an_answer():
+    assert set(ANSWERS) == set(HIDDEN)
+    known = set(registered())
+    for name, answer in ANSWERS.items():
+        assert {n for n in (answer.exact, *answer.ties) if n} <= known, name
+        assert answer.exact or (answer.why and not answer.ties), name
+
+
+@pytest.mark.parametrize("name", CHEAP)
+def test_targets_can_be_hidden_and_named(name: str):
+    where = setting(name)
+    offered = {f"{e.name} at {place}" for e in where.effects() for place in e.places}
+    for hidden in keys(where):
+        assert hidden.name in possible(where.scene)
+        names = right(where.scene, hidden)
+        assert bool(names) == inside(hidden.name)
+        assert not names or names[0] in offered, (hidden, names)
+        assert set(without(where.scene, [hidden])) == {n.split(" at ")[0] for n in names}
+
+
+def test_places_of_answers():
+    bench = setting("bench")
+    assert right(bench.scene, Applied("stribeck_friction", 1.0, "elbow")) == ("joint_stribeck at elbow",)
+    assert right(bench.scene, Applied("stribeck_friction", 1.0, "door")) == ("hinge_stribeck at door",)
+    assert right(bench.scene, Applied("torque_bias", 1.0, "elbow")) == ("torque_bias at elbow", "cable_pull at elbow")
+    assert right(bench.scene, Applied("detent", 1.0)) == ()
+    assert "elbow" not in targets(bench, "dry_friction")  # its friction is a base parameter
+
+
+def test_plans_are_of_all_classes_and_drawn_by_the_commit():
+    bench = setting("bench")
+    made = plans(bench, Counts(none=2, single=1, pair=5, outside=1, left_out=4), COMMIT)
+    kinds = [p.kind for p in made]
+    assert {k: kinds.count(k) for k in ("none", "pair", "left_out")} == {"none": 2, "pair": 5, "left_out": 4}
+    assert len({p.name for p in made}) == len(made)
+    assert made == plans(bench, Counts(none=2, single=1, pair=5, outside=1, left_out=4), COMMIT)
+    other = plans(bench, Counts(pair=5), "1" * 40)
+    assert [p.effects for p in made if p.kind == "pair"] != [p.effects for p in other if p.kind == "pair"]
+
+
+def test_amplitudes_are_multiples_of_what_can_be_told_and_is_worth_it():
+    known = {"closer": entry(), "air_drag": entry(limit=0.01), "detent": entry(right={}), "payload": entry(limit=None)}
+    assert amplitude("closer", "", 3.0, known) == pytest.approx(0.3)
+    assert amplitude("air_drag", "", 3.0, known) == pytest.approx(0.06)  # worth naming only from there
+    assert amplitude("detent", "", 1.0, known) == pytest.approx(0.1)
+    assert amplitude("closer", "", 1000.0, known) is None  # no door withstands it
+    assert amplitude("payload", "", 1.0, known) is None
+    assert amplitude("closer", "", 1.0, {"closer": entry(right={"door_closer at door": 0.95})}) is None
+
+
+# ----- detection limits
+
+
+class Stage:
+    """A ground of three candidates, one of them absorbed by the only base parameter."""
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(0)
+        self.noise = rng.normal(size=(limits.REPEATS * 4, 40))
+
+    def projected(self, columns: np.ndarray, free: np.ndarray | None = None) -> np.ndarray:
+        return columns * (np.arange(40) >= 10)
+
+    def left(self, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return column * (np.arange(40) >= 10), np.ones(1, bool)
+
+
+def test_limits_scale_with_the_effect():
+    rng = np.random.default_rng(1)
+    stage: Any = Stage()
+    marks = rng.normal(size=(3, 40))
+    power = limits.Power(stage, marks, rng.permuted(np.tile(np.arange(40), (60, 1)), axis=1)[:, :10], {})
+    added = np.tile(marks[1], (limits.REPEATS, 1))
+    found = power.limit(added, 10.0)
+    assert found is not None
+    assert power.at(2 * found, added) > limits.POWER > power.at(found / 2, added)
+    twice = power.limit(2 * added, 10.0)
+    assert twice == pytest.approx(found / 2, rel=0.05)
+    assert power.limit(added * (np.arange(40) < 10), 10.0) is None  # nothing of it is left
+
+
+def test_bounds_hold_what_the_base_model_absorbs():
+    """A column twice as long as a parameter may go leaves the rest, and that parameter counts as stuck."""
+    space = Space((Parameter("a", "-", 0.0, 1.0, -1.0, 1.0), Parameter("b", "-", 0.0, 1.0, -9.0, 9.0)))
+    slopes = np.zeros((6, 2))
+    slopes[0, 0] = slopes[1, 1] = 100.0
+    refined: Any = type("Refined", (), {"x": np.zeros(2), "jacobian": slopes, "prior": np.full(2, 10.0)})
+    model: Any = type("Model", (), {"space": space, "refined": refined})
+    seen: Any = type("Seen", (), {"repeats": 1})
+    ground = Ground(setting("hinge"), {}, 0, seen, model, np.zeros((1, 6)))
+    left, free = ground.left(np.array([200.0, 200.0, 5.0, 0.0, 0.0, 0.0]))
+    np.testing.assert_allclose(left, [100.0, 0.0, 5.0, 0.0, 0.0, 0.0], atol=0.01)
+    assert free.tolist() == [False, True]
+
+
+# ----- scoring
+
+
+def case(
+    kind: str, verdict: str, effects: list[str], right_names: list[list[str]], tied: Any = None, **more: Any
+) -> Any:
+    hidden = [{"name": f"h{k}", "joint": "", "amplitude": 2.0} for k in range(len(right_names))]
+    truth = {"name": f"{kind}", "scene": "s", "kind": kind, "factor": 3.0, "hidden": hidden, "commit": COMMIT}
+    gaps = {"confirm": [11.0, 2.0], "sealed": [11.0, 1.5]}
+    result = {
+        "verdict": verdict, "effects": effects, "tied": tied or [[] for _ in effects], "p": 0.002, "gaps": gaps,
+        "floor": 1.0, "seconds": {"base": 2.0, "find": 3.0}, **more,
+    }  # fmt: skip
+    return {"truth": truth, "result": result, "right": right_names}
+
+
+def rates(*cases: Any, known: Any = None) -> dict[str, Any]:
+    return score.summarise([score.judge(c, known or {}) for c in cases])
+
+
+def test_rates_of_what_is_named():
+    latch, closer = "latch at door", "door_closer at door"
+    found = rates(
+        case("single", "named", [latch], [[latch]]),
+        case("single", "tie", [closer], [[latch]], tied=[[latch]]),
+        case("single", "partly explained", [latch], [[latch]]),
+        case("single", "named", [closer], [[latch]]),
+        case("single", "unexplained", [], [[latch]]),
+        case("pair", "named", [latch], [[latch], [closer]]),
+        case("pair", "named", [latch, closer], [[latch], [closer]]),
+        case("outside", "partly explained", [closer], [[]]),
+        case("outside", "named", [closer], [[]]),
+        case("left_out", "named", [latch], [[latch]]),
+        case("none", "none", [], []),
+        case("none", "named", [latch], []),
+    )
+    expected = {
+        "named_up_to_tie": (3, 5), "named_exactly": (1, 5), "partly": (1, 5), "wrong_confident": (3, 10),
+        "false_names": (4, 10), "pair_one_named_none_false": (2, 2), "pair_both_named": (1, 2), "called_open": (1, 3),
+        "false_alarms": (1, 2), "false_names_where_nothing": (1, 2), "detected": (7, 7),
+    }  # fmt: skip
+    for name, (hits, of) in expected.items():
+        assert (found[name]["hits"], found[name]["of"]) == (hits, of), name
+        low, high = found[name]["interval_95"]
+        assert 0 <= low <= hits / of <= high <= 1
+    assert found["closed_confirm"]["median"] == pytest.approx(0.9)
+    assert found["closed_sealed"]["median"] == pytest.approx(0.95)
+    assert found["within_floor"]["rate"] == 1.0 and found["seconds"]["whole"] == 5.0
+
+
+def test_intervals_are_compared_with_what_the_library_form_should_take():
+    form = {"name": "latch at door", "per_unit": {"latch_torque": 1.5}, "left_after_refit": 0.1}
+    known = {"s": {"h0": {"form": form}}}
+
+    def one(low: float, high: float) -> Any:
+        span = {"latch_torque": {"value": 3.0, "interval": [low, high]}}
+        return case("single", "named", ["latch at door"], [["latch at door"]], amplitudes=span)
+
+    found = rates(one(2.9, 3.1), one(3.1, 3.3), known=known)
+    assert (found["amplitude_coverage"]["hits"], found["amplitude_coverage"]["of"]) == (1, 2)
+    far = {"s": {"h0": {"form": {**form, "left_after_refit": 0.9}}}}
+    assert "amplitude_coverage" not in rates(one(2.9, 3.1), known=far)
+
+
+def test_confusion_and_errors():
+    judged = [
+        score.judge(c, {})
+        for c in (
+            case("single", "named", ["latch at door"], [["latch at door"]]),
+            case("single", "unexplained", [], [["latch at door"]]),
+            {**case("single", "error", [], [["latch at door"]]), "result": {"verdict": "error", "error": "no replay"}},
+        )
+    ]
+    assert score.confusion(judged) == {"h0": {"latch": 1, "(unexplained)": 1, "(error)": 1}}
+    assert score.summarise(judged)["unconverged_or_error"]["hits"] == 1
+
+
+def test_bic_is_judged_by_the_same_answers():
+    assert bic_outcome(["a"], [["a", "b"]]) == {"all": True, "false": False}
+    assert bic_outcome(["a", "c"], [["a", "b"]]) == {"all": True, "false": True}
+    assert bic_outcome(["a"], [["a"], ["b"]]) == {"all": False, "false": False}
+    assert bic_outcome(["a"], []) == {"all": False, "false": True}

@@ -1,0 +1,220 @@
+"""Blocks of time in place of repeats: the arithmetic, the level of their test, and a search in one small log."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from droid_jax.compare.cost import make_cost
+from droid_jax.compare.residuals import CompareConfig
+from droid_jax.gap.blocks import OUTSIDE, Blocks, block_length, blocks, interleaved
+from droid_jax.gap.case import GapConfig
+from droid_jax.gap.flips import largest_t
+from droid_jax.gap.screen import project
+from droid_jax.gap.select import resamples
+from droid_jax.gap.single import Log, base_model, make_log, single_case
+from droid_jax.gap.verdict import Kind
+from droid_jax.gap.workflow import find
+from droid_jax.identify.refine import RefineConfig
+from droid_jax.measure.noise import RATE, coarse_clock
+from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
+from droid_jax.model.effects.registry import library, ready
+from droid_jax.model.fields import joint_damping
+from droid_jax.model.joint_friction import SMOOTHING
+from droid_jax.model.parameters import Parameter, Space
+from droid_jax.model.scene import Scene, compile_scene
+
+MJCF = """
+<mujoco>
+  <option gravity="0 0 0"/>
+  <worldbody>
+    <body>
+      <joint name="elbow" axis="0 0 1" damping="0.4"/>
+      <inertial pos="0.2 0 0" mass="2" diaginertia="0.01 0.01 0.01"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+CONFIG = GapConfig(
+    refine=RefineConfig(iterations=10, hops=0, spreads=0), compare=CompareConfig(whitened=True, motion_cutoff=10.0)
+)
+ASKED = ("joint_coulomb", "cable_pull", "torque_drift", "torque_gain")
+INERTIA = 0.09  # kg m^2 about the joint
+COULOMB, NOISE = 0.5, 0.06  # N m
+
+
+# Arithmetic --------------------------------------------------------------------------------
+
+
+def test_parts_take_turns():
+    clock = coarse_clock(0.0, 30.0)
+    parts = interleaved(clock, 0.0, 20.0, 1.0, 2)
+    assert parts.shape == (2, len(clock)) and parts.max() == 9
+    assert np.all((parts[0] == OUTSIDE) | (parts[1] == OUTSIDE))
+    assert np.all((parts.max(axis=0) == OUTSIDE) == (clock >= 20.0))
+    for part in parts:
+        for block in range(10):
+            at = np.flatnonzero(part == block)
+            assert np.all(np.diff(at) == 1) and len(at) >= 1.0 * RATE - 1
+
+
+def test_too_short_a_log_says_how_long_it_should_be():
+    with pytest.raises(ValueError, match="record for 32 s"):
+        interleaved(coarse_clock(0.0, 30.0), 0.0, 20.0, 2.0, 2)
+
+
+def test_blocks_are_longer_than_the_correlation():
+    rng = np.random.default_rng(0)
+    white = rng.normal(size=(4000, 1))
+    slow = np.convolve(white[:, 0], np.ones(20))[:4000, None]  # correlated for one second
+    assert block_length(white) == 0.5
+    assert block_length(slow) == pytest.approx(1.5, rel=0.3)
+
+
+def made_blocks(count: int = 8, size: int = 25, columns: int = 2) -> Blocks:
+    """Blocks without a recording, with a tail that belongs to no block."""
+    block = np.r_[np.repeat(np.arange(count), size), np.full(10, OUTSIDE)]
+    whole = np.tile(block, columns)
+    column = np.repeat(np.arange(columns), len(block))
+    return Blocks(None, np.zeros((1, len(whole))), column, np.zeros(len(whole)), whole)  # pyright: ignore
+
+
+def test_rows_are_blocks_and_their_mean_the_residual():
+    made, rng = made_blocks(), np.random.default_rng(1)
+    common = rng.normal(size=len(made.block))
+    rows = made.residuals(common)
+    inside = made.block != OUTSIDE
+    np.testing.assert_allclose(rows.mean(axis=0), np.where(inside, common, 0.0))
+    assert made.repeats == 1 and made.units == len(rows) == 8
+    assert made.gap(rows) == pytest.approx(np.mean(common[inside] ** 2))
+    first = made.column == 0
+    np.testing.assert_allclose(made.gaps(rows, first[None]), np.mean(common[inside & first] ** 2))
+    np.testing.assert_array_equal(made.cell_p_values(rows, first[None]), [1.0])
+    losses = made.losses(np.stack([common, 2 * common]), np.full((1, 8), 1 / 8))
+    np.testing.assert_allclose(losses[0], np.sum(common[inside] ** 2) * np.array([1.0, 4.0]))
+    draws = resamples(8, seed=0)
+    by_hand = draws @ [8 * np.sum(common[made.block == b] ** 2) for b in range(8)]
+    np.testing.assert_allclose(made.losses(common[None], draws)[:, 0], by_hand)
+
+
+# Level and power of the test ---------------------------------------------------------------
+
+
+def p_values(count: int, present: float) -> np.ndarray:
+    """[count, 2] p-values of blocks and of plain flips after a fit of 24 smooth columns, one of 30 marks `present`."""
+    made, rng = made_blocks(columns=1), np.random.default_rng(2)
+    inside, out = made.block != OUTSIDE, []
+    prior = np.full(24, 10.0)
+    for _ in range(count):
+        base = rng.normal(size=(len(inside), 24)) * inside[:, None]
+        marks = rng.normal(size=(30, len(inside))) * inside * rng.gamma(0.5, size=9)[made.block]
+        noise = (present * marks[0] + rng.normal(size=len(inside))) * inside
+        left, projected = project(noise[None], base, prior)[0], project(marks, base, prior)
+        scores = projected @ made.residuals(left).T
+        out.append((made.largest(scores, projected, base, prior)[1], largest_t(scores)[1]))
+    return np.array(out)
+
+
+def test_blocks_keep_their_level_after_a_fit():
+    p = p_values(400, 0.0)
+    assert np.mean(p[:, 0] < 0.05) < 0.08
+
+
+def test_an_effect_that_lives_in_few_blocks_is_found():
+    """Student's t of uneven blocks does not grow with the effect; the standardised score does."""
+    p = p_values(40, 3.0)
+    assert np.mean(p[:, 0] < 0.01) > 0.8
+    assert np.mean(p[:, 1] < 0.01) < 0.5
+
+
+# One log -----------------------------------------------------------------------------------
+
+
+def elbow() -> Scene:
+    return compile_scene(mujoco.MjSpec.from_string(MJCF), "elbow", joints=["elbow"])
+
+
+def elbow_space(scene: Scene) -> Space:
+    return Space(
+        (
+            joint_damping(scene, "elbow", std=0.4, high=10.0),
+            Parameter("torque_offset[elbow]", "N m", 0.0, 0.3, -3.0, 3.0),
+        )
+    )
+
+
+def elbow_log(coulomb: float, seconds: float = 36.0) -> Recording:
+    """Sines, their torque by hand, and noise that is correlated for a fifth of a second."""
+    time = np.arange(0.0, seconds, 0.01)
+    phase = 2 * np.pi * np.array([[0.23], [0.51]]) * time
+    size, w = np.array([[0.5], [0.15]]), 2 * np.pi * np.array([[0.23], [0.51]])
+    q, qd, qdd = (
+        (size * np.sin(phase)).sum(0), (size * w * np.cos(phase)).sum(0), -(size * w**2 * np.sin(phase)).sum(0)
+    )  # fmt: skip
+    white = np.random.default_rng(3).normal(0.0, NOISE, len(time) + 19)
+    noise = np.convolve(white, np.ones(20) / np.sqrt(20), "valid")
+    torque = INERTIA * qdd + 0.6 * qd + 0.1 + coulomb * np.tanh(qd / SMOOTHING) + noise
+    mask = np.ones((1, len(time), 1), bool)
+    channels = {
+        "position": Channel("position", "rad", ("elbow",), time, q[None, :, None], mask),
+        "torque": Channel("torque", "N m", ("elbow",), time, torque[None, :, None], mask),
+    }
+    convention = TorqueConvention(TorqueSide.MOTOR, gravity=True)
+    return Recording("elbow", np.zeros(0), np.zeros((0, 0)), (), channels, convention, qpos0={})
+
+
+@pytest.fixture(scope="module")
+def log() -> Log:
+    scene = elbow()
+    return make_log(scene, elbow_space(scene), library(scene, ASKED), elbow_log(COULOMB), CONFIG)
+
+
+def test_a_log_is_whitened_as_its_cost_would(log: Log):
+    scene = elbow()
+    cost = make_cost(ready(scene), elbow_space(scene), [elbow_log(COULOMB)], config=CONFIG.compare)
+    values = elbow_space(scene).mean
+    whole = log.space.mean
+    restated = cost.restated(values)
+    deviation = 1 / restated.comparisons[0].channel("torque").noise.whitener[0, 0, 0]
+    everywhere = np.ones(len(log.clock), bool)
+    stated = log.stated(np.array([deviation]), everywhere)
+    np.testing.assert_allclose(stated.whitened(whole[None]), restated.whitened(values[None]), atol=1e-3)
+    some = log.clock < 5.0
+    np.testing.assert_array_equal(log.stated(np.ones(1), some).whitened(whole[None])[0] == 0, ~some)
+    held = log.holding(log.simulated(whole[None])[0])
+    np.testing.assert_allclose(held.left(whole), 0.0, atol=1e-9)
+
+
+def test_dry_friction_is_found_in_one_log(log: Log):
+    scene = elbow()
+    effects, base = library(scene, ASKED), elbow_space(scene)
+    case = single_case(log, base, effects, config=CONFIG)
+    assert case.fit.units == case.confirm.units >= 8
+    assert not np.any((case.fit.block >= 0) & (case.confirm.block >= 0))  # pyright: ignore
+    verdict = find(case, base_model(case), 0.0)
+    assert verdict.kind is Kind.NAMED and verdict.effects == ("joint_coulomb at elbow",)
+    at = case.whole.index("joint_coulomb[elbow]")
+    assert verdict.model.values[at] == pytest.approx(COULOMB, rel=0.1)
+    before, after = verdict.gaps["sealed"]
+    assert after < 0.1 * before
+    assert all(cell.p == 1.0 and not cell.found for cell in verdict.before.cells)
+
+
+def test_nothing_is_said_where_nothing_is_missing(log: Log):
+    scene = elbow()
+    effects, base = library(scene, ASKED), elbow_space(scene)
+    case = single_case(log.holding(elbow_torque(log)), base, effects, config=CONFIG)
+    assert find(case, base_model(case), 0.0).kind is Kind.NONE
+
+
+def elbow_torque(log: Log) -> np.ndarray:
+    """[K, 1] what the log would hold without its dry friction."""
+    values = np.stack([log.space.mean, log.space.values({"joint_coulomb[elbow]": COULOMB})])
+    without, with_it = log.simulated(values)
+    return log.measured - (with_it - without)
+
+
+def test_repeats_need_no_blocks(log: Log):
+    with pytest.raises(ValueError, match="3 blocks, at least 8"):
+        blocks(log, np.minimum(np.arange(len(log.clock)) // 100, 2))

@@ -1,0 +1,196 @@
+"""What a search leaves in its folder: the verdict's own numbers, readable again, and none where there are none."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_gap import FLOOR, JOINTS, PRELOAD, Small, small
+
+from droid_jax.gap.results import ROLES, TRACES, gap_arrays, gap_json, load_gap, most_shifted, write_gap
+from droid_jax.gap.verdict import Experiment, Kind
+from droid_jax.report.gap_folder import read_gap
+
+MORE = {"seconds": {"search": 1.0}, "versions": {}, "device": "test", "setup": {"recording": []}}
+
+
+@pytest.fixture(scope="module")
+def found() -> Small:
+    return small()
+
+
+@pytest.fixture(scope="module")
+def folder(found: Small, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("gap")
+    write_gap(path, found.case, found.verdict, MORE)
+    return path
+
+
+def test_what_was_hidden_is_in_the_file(folder: Path):
+    answer = load_gap(folder).answer
+    assert answer["verdict"] == "named" and answer["effects"] == ["hinge_preload at door"] and answer["tied"] == [[]]
+    (amplitude,) = answer["amplitudes"]
+    assert amplitude["low"] < PRELOAD < amplitude["high"]
+    assert amplitude["value"] == pytest.approx(PRELOAD, rel=0.05)
+    assert (amplitude["unit"], amplitude["effect"]) == ("N m", "hinge_preload at door")
+    assert "constant torque" in amplitude["what"]
+    assert answer["p"] == pytest.approx(1 / 128)  # the smallest that eight repeats allow
+    assert answer["converged"] is True and answer["floor"] == FLOOR and answer["units"] == "N m"
+
+
+def test_gaps_are_the_verdicts_and_distances_those_of_the_traces(found: Small, folder: Path):
+    loaded = load_gap(folder)
+    assert list(loaded.answer["gaps"]) == ["fit", "confirm"]
+    for role, gap in loaded.answer["gaps"].items():
+        assert (gap["before"], gap["after"]) == found.verdict.gaps[role]
+        assert gap["recording"] == role and 0.95 < gap["closed"] <= 1.01
+        traces = loaded.traces[role]
+        for when in ("before", "after"):
+            torque = found.recordings[role].channel("torque")
+            noise = np.linalg.norm(torque.values - torque.values.mean(axis=0), axis=-1).mean()
+            left = np.linalg.norm(traces[when] - traces["measured"], axis=-1).mean()
+            assert gap[f"torque_{when}"] == pytest.approx(np.hypot(left, noise), rel=0.25)
+        assert gap["torque_after"] < gap["torque_before"]
+
+
+def test_traces_have_one_shape_and_their_clock(found: Small, folder: Path):
+    loaded = load_gap(folder)
+    assert loaded.joints == JOINTS
+    for role, traces in loaded.traces.items():
+        assert set(traces) == set(TRACES)
+        shape = (len(traces["time"]), len(JOINTS))
+        assert all(traces[name].shape == shape for name in TRACES[1:])
+        recording = found.recordings[role]
+        torque = recording.channel("torque")
+        assert recording.time[0] <= traces["time"][0] < traces["time"][-1] <= recording.time[-1]
+        at = np.searchsorted(torque.time, traces["time"])
+        raw = torque.values.mean(axis=0)[np.clip(at, 0, len(torque.time) - 1)]
+        inside = slice(2, -2)  # at the ends the filter sees one side only
+        assert np.sqrt(np.mean((raw - traces["measured"])[inside] ** 2)) < 0.1  # it takes noise away, no more
+        assert 0.001 < np.median(traces["scatter"]) < 0.1
+
+
+def test_joints_keep_one_order_whatever_the_recordings_have(found: Small):
+    """A recording whose channels come in another order ends up in the order of the first."""
+    case = found.case
+    channel = case.confirm.cost.comparisons[0].channels[0]
+    order = [2, 0, 1]
+    turned = dataclasses.replace(
+        channel,
+        columns=channel.columns[order],
+        noise=dataclasses.replace(
+            channel.noise, mean=channel.noise.mean[:, order], repeats=channel.noise.repeats[:, :, order]
+        ),
+    )
+    comparison = dataclasses.replace(case.confirm.cost.comparisons[0], channels=(turned,))
+
+    class Turned:
+        comparisons = (comparison,)
+        scene = case.confirm.cost.scene
+
+        def smoothed(self, values):
+            return tuple(s[:, :, order] for s in case.confirm.cost.smoothed(values))
+
+    other = dataclasses.replace(case, confirm=dataclasses.replace(case.confirm, cost=Turned()))
+    plain, again = gap_arrays(case, found.verdict), gap_arrays(other, found.verdict)
+    for key in plain:
+        if key == "joints":
+            np.testing.assert_array_equal(plain[key], again[key])
+        else:
+            np.testing.assert_allclose(plain[key], again[key], rtol=1e-9)
+
+
+def test_grounds_are_all_there(found: Small, folder: Path):
+    answer = load_gap(folder).answer
+    first = answer["screens"][0]["ranking"]
+    assert first[0]["candidate"] == "hinge_preload at door"
+    assert len({r["candidate"] for r in first}) == len(first) == 3
+    assert [r["explained"] for r in first] == sorted((r["explained"] for r in first), reverse=True)
+    assert [t["name"] for t in answer["trials"]] == [t.name for t in found.verdict.trials]
+    assert all(t["round"] == 0 and t["passed"] == (not t["reasons"]) for t in answer["trials"])
+    (interval,) = answer["trials"][0]["interval"].values()
+    assert interval[0] < interval[1]
+    where = [c for c in answer["cells"]["before"] if c["variable"] == "joint x phase"]
+    assert len(where) == 6 and [c["found"] for c in where if c["where"].startswith("door")] == [True, True]
+    assert answer["phases"]["fit"][1] == {"name": "second", "start": 1.5, "end": pytest.approx(2.998)}
+
+
+def test_shifts_are_in_deviations_of_the_base_fit(folder: Path):
+    answer = load_gap(folder).answer
+    names = ["forearm_mass", "door_damping", "door_stiffness", "torque_offset[elbow]"]
+    assert [s["name"] for s in answer["shifts"]] == names
+    assert all(s["deviation_before"] > 0 for s in answer["shifts"])
+    most, deviations = most_shifted(answer["shifts"])
+    assert most["name"] == "door_stiffness" and deviations > 1  # a spring had stood in for the preload
+    truth = {"door_stiffness": 0.7, "forearm_mass": 0.9, "door_damping": 0.6}
+    for shift in answer["shifts"][:3]:
+        assert shift["after"] == pytest.approx(truth[shift["name"]], rel=0.15)
+
+
+def test_the_report_reads_it(folder: Path):
+    assert read_gap(folder).roles == ["fit", "confirm"]
+
+
+def test_ties_experiments_and_cuts_come_along(found: Small):
+    verdict = dataclasses.replace(
+        found.verdict, kind=Kind.TIE, tied=(("tilted_frame at door",),), experiments=(Experiment("open further", 7.5),),
+        cut="two candidates were not tried",
+    )  # fmt: skip
+    answer = gap_json(found.case, verdict)
+    assert answer["tied"] == [["tilted_frame at door"]] and answer["cut"] == "two candidates were not tried"
+    assert answer["experiments"] == [{"what": "open further", "apart": 7.5}]
+
+
+def test_where_nothing_was_asked_or_found_there_are_no_numbers(found: Small):
+    """An unconverged fit, and a gap below the floor: null, never a made-up share."""
+    nothing = dataclasses.replace(
+        found.verdict, kind=Kind.UNCONVERGED, effects=(), tied=(), model=found.base, screens=(), trials=(), floor=1e4,
+        gaps={role: (e.gap_at(found.base.values),) * 2 for role, e in found.case.judged.items()},
+    )  # fmt: skip
+    answer = json.loads(json.dumps(gap_json(found.case, nothing), allow_nan=False))
+    assert answer["p"] is None and answer["screens"] == answer["trials"] == answer["amplitudes"] == []
+    assert all(gap["closed"] is None for gap in answer["gaps"].values())
+    assert all(s["before"] == s["after"] for s in answer["shifts"])
+
+
+def test_the_sealed_recording_is_a_role_like_the_others(found: Small):
+    case = dataclasses.replace(found.case, sealed=found.case.confirm)
+    gaps = {**found.verdict.gaps, "sealed": found.verdict.gaps["confirm"]}
+    verdict = dataclasses.replace(found.verdict, gaps=gaps)
+    answer, arrays = gap_json(case, verdict), gap_arrays(case, verdict)
+    assert tuple(answer["gaps"]) == tuple(answer["phases"]) == ROLES
+    np.testing.assert_array_equal(arrays["sealed.after"], arrays["confirm.after"])
+
+
+@pytest.mark.parametrize("name", ["gap.json", "gap.npz"])
+def test_a_folder_that_lacks_a_file_or_holds_a_damaged_one(folder: Path, tmp_path: Path, name: str):
+    for file in ("gap.json", "gap.npz"):
+        (tmp_path / file).write_bytes((folder / file).read_bytes())
+    whole = (tmp_path / name).read_bytes()
+    (tmp_path / name).write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ValueError, match=f"{name} cannot be read"):
+        load_gap(tmp_path)
+    (tmp_path / name).unlink()
+    with pytest.raises(ValueError, match=f"{name} is missing"):
+        load_gap(tmp_path)
+
+
+def test_entries_that_are_missing_are_named(folder: Path, tmp_path: Path):
+    content = json.loads((folder / "gap.json").read_text())
+    del content["shifts"]
+    (tmp_path / "gap.json").write_text(json.dumps(content))
+    arrays = dict(np.load(folder / "gap.npz"))
+    del arrays["confirm.after"]
+    np.savez(tmp_path / "gap.npz", **arrays)
+    with pytest.raises(ValueError, match=r"lack shifts, confirm\.after"):
+        load_gap(tmp_path)
+
+
+def test_it_is_written_whole_or_not_at_all(found: Small, tmp_path: Path):
+    """gap.json comes last: where writing fails before it, no run looks finished."""
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_gap(tmp_path, found.case, found.verdict, {"seconds": float("nan")})
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["extended.json", "extended.xml", "gap.npz"]

@@ -1,0 +1,105 @@
+"""A small search for a missing effect, for the tests of its command and of what it writes.
+
+experiments/bench.xml (an arm of two links and a driven door), short motions, and a hidden preload of the hinge.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from droid_jax.gap.case import Case, GapConfig, make_case
+from droid_jax.gap.refit import Model
+from droid_jax.gap.verdict import Verdict
+from droid_jax.gap.workflow import base_fit, find
+from droid_jax.identify.refine import RefineConfig
+from droid_jax.identify.search import SearchConfig
+from droid_jax.measure.hidden import record_hidden
+from droid_jax.measure.recording import Phase, Recording, TorqueConvention, TorqueSide
+from droid_jax.measure.surrogate import SurrogateConfig
+from droid_jax.model.effects.registry import library
+from droid_jax.model.own import load_parameters
+from droid_jax.model.parameters import Space
+from droid_jax.model.scene import Scene, load_scene
+
+SCENE = Path(__file__).resolve().parents[1] / "experiments" / "bench.xml"
+JOINTS = ("shoulder", "elbow", "door")
+SECONDS = 3.0
+PARAMETERS = [
+    {"field": "body_mass", "element": "forearm", "std": 0.2, "high": 3.0},
+    {"field": "dof_damping", "element": "door", "unit": "N m s/rad", "std": 0.3, "high": 10.0, "scaling": "log",
+     "floor": 0.05},
+    {"field": "jnt_stiffness", "element": "door", "unit": "N m/rad", "std": 0.3, "high": 10.0},
+    {"sensor": "torque_offset", "element": "elbow", "std": 0.1, "high": 2.0, "nuisance": True},
+]  # fmt: skip
+TRUTH = {"forearm_mass": 0.9, "door_damping": 0.6, "door_stiffness": 0.7, "torque_offset[elbow]": 0.03}
+PRELOAD = 0.6  # N m
+FLOOR = 0.01
+EFFECTS = ("hinge_preload", "drag", "payload")
+QUICK = GapConfig(
+    search=SearchConfig(population=12, parents=None, generations=4),
+    refine=RefineConfig(iterations=20, hops=0),
+    refit=RefineConfig(iterations=6, hops=0),
+    most=1,
+)
+
+
+def write_parameters(folder: Path) -> Path:
+    """The parameter file of the small scene."""
+    path = folder / "parameters.json"
+    path.write_text(json.dumps(PARAMETERS))
+    return path
+
+
+def small_scene() -> tuple[Scene, Space]:
+    """As the command line makes it."""
+    scene = load_scene(SCENE, object_joint="door")
+    with tempfile.TemporaryDirectory() as folder:
+        return scene, load_parameters(write_parameters(Path(folder)), scene)
+
+
+def demonstration(name: str) -> Recording:
+    """ "fit" and "confirm" open and close the door at different speeds; so does "sealed", less far."""
+    t = np.arange(0.0, SECONDS, 0.002)
+    period, reach, pace = {"fit": (1.5, 0.4, 2.0), "confirm": (3.0, 0.35, 1.5), "sealed": (2.5, 0.3, 1.0)}[name]
+    arm = [0.5 * np.sin(pace * t), 0.6 * np.sin(1.4 * pace * t)]
+    command = np.stack([*arm, reach * (1 - np.cos(2 * np.pi * t / period))], axis=1)
+    convention = TorqueConvention(TorqueSide.MOTOR, gravity=True)
+    phases = (Phase("first", 0.0, 0.5 * SECONDS), Phase("second", 0.5 * SECONDS, float(t[-1])))
+    return Recording(name, t, command, JOINTS, {}, convention, qpos0=dict.fromkeys(JOINTS, 0.0), phases=phases)
+
+
+@functools.cache
+def record(name: str, repeats: int = 8, preload: float = PRELOAD) -> Recording:
+    """What the stand-in measures."""
+    scene, space = small_scene()
+    seed = 1 + ("fit", "confirm", "sealed").index(name)
+    config = SurrogateConfig(repeats=repeats, timestep=0.00025)
+    hidden = {"hinge_preload": preload} if preload else {}
+    return record_hidden(scene, demonstration(name), TRUTH, hidden, seed=seed, config=config, name=name, space=space)
+
+
+@dataclass(frozen=True, eq=False)
+class Small:
+    """A finished search."""
+
+    scene: Scene
+    recordings: dict[str, Recording]
+    case: Case
+    base: Model
+    verdict: Verdict
+
+
+@functools.cache
+def small() -> Small:
+    """The search of this session."""
+    recordings = {name: record(name) for name in ("fit", "confirm")}
+    scene, space = small_scene()
+    case = make_case(scene, space, library(scene, EFFECTS), **recordings, config=QUICK)
+    base = base_fit(case, lambda stage, value: None)
+    return Small(scene, recordings, case, base, find(case, base, FLOOR))

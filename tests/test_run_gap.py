@@ -1,0 +1,409 @@
+"""The command `gap`: bad input ends in one sentence, a run goes on after a stop, and its folder is whole."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_gap import EFFECTS, FLOOR, JOINTS, PRELOAD, QUICK, SCENE, record, small, write_parameters
+
+from droid_jax import runtime
+from droid_jax.commands import gap, report
+from droid_jax.commands.hidden import hidden_effects, record_stand_in
+from droid_jax.gap import case as case_module
+from droid_jax.gap import floor, menu, workflow
+from droid_jax.gap.inputs import check_recordings, lags
+from droid_jax.gap.results import load_gap
+from droid_jax.gap.verdict import Experiment
+from droid_jax.measure.formats import save
+from droid_jax.measure.recording import Channel, Recording
+from droid_jax.model.door_scene import door_scene
+from droid_jax.model.effects import registry
+from droid_jax.model.parameters import Parameter
+from droid_jax.model.seam import Effect
+from droid_jax.run import main
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(autouse=True)
+def tuned(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runtime, "tune", lambda *a, **k: None)  # jax runs already in this process
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Path:
+    """A folder with parameters.json, fit.npz and confirm.npz."""
+    write_parameters(tmp_path)
+    for name in ("fit", "confirm"):
+        save(record(name), tmp_path / f"{name}.npz")
+    return tmp_path
+
+
+def arguments(place: Path, *options: str | Path, recordings: tuple[str, ...] = ("fit.npz", "confirm.npz")) -> list[str]:
+    """A whole command line in the small scene."""
+    files = [place / name for name in recordings]
+    own = ("--scene", SCENE, "--parameters", place / "parameters.json", "--object-joint", "door")
+    return [str(a) for a in ("gap", "--recording", *files, *own, "--out", place / "run", *options)]
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str]) -> Callable[[list[str]], str]:
+    """Runs a command that must fail with exit code 2; returns its one line on stderr."""
+
+    def run(command: list[str]) -> str:
+        assert main(command) == 2
+        lines = capsys.readouterr().err.splitlines()
+        assert len(lines) == 1 and lines[0].startswith("error: "), lines
+        return lines[0]
+
+    return run
+
+
+def changed(recording: Recording, name: str, function: Callable[[np.ndarray], np.ndarray]) -> Recording:
+    """A recording with other values [N, Tc, C] in one channel."""
+    channel = recording.channels[name]
+    values = function(channel.values.astype(float)).astype(np.float32)
+    return replace(recording, channels={**recording.channels, name: replace(channel, values=values)})
+
+
+# ----- recordings
+
+
+@pytest.mark.parametrize("count", [1, 4])
+def test_one_recording_confirms_nothing(place: Path, refused, count: int):
+    said = refused(arguments(place, recordings=("fit.npz", "confirm.npz", "fit.npz", "confirm.npz")[:count]))
+    assert "FIT CONFIRM [SEALED]" in said and f"got {count}" in said and "identify" in said
+
+
+def test_too_few_repeats_say_what_can_still_be_concluded(place: Path, refused):
+    save(record("fit").repeats_subset(range(5)), place / "fit.npz")
+    said = refused(arguments(place))
+    assert "the fit recording 'fit' has 5 repeats" in said and "fewer than 8" in said
+    assert "droid_jax.run identify" in said and "in which joint and phase" in said
+
+
+def test_the_same_recording_twice(place: Path, refused):
+    said = refused(arguments(place, recordings=("fit.npz", "fit.npz")))
+    assert "the fit and the confirm recording are the same" in said and "another motion" in said
+
+
+def test_the_sealed_recording_once_more(place: Path, refused):
+    said = refused(arguments(place, recordings=("fit.npz", "confirm.npz", "confirm.npz")))
+    assert "the confirm and the sealed recording are the same" in said
+
+
+def test_a_repeat_that_runs_late(place: Path, refused):
+    def late(values: np.ndarray) -> np.ndarray:
+        values[3] = np.roll(values[3], 75, axis=0)  # 500 Hz
+        values[3, :75] = values[3, 75]
+        return values
+
+    save(changed(record("confirm"), "position", late), place / "confirm.npz")
+    said = refused(arguments(place))
+    assert "the confirm recording 'confirm': repeat 3 runs 0.1" in said and "behind the others" in said
+
+
+def test_repeats_with_clocks_of_their_own(place: Path, refused):
+    save(record("confirm"), place / "csv")
+    path = place / "csv" / "torque_02.csv"
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:-20]))
+    said = refused(arguments(place, recordings=("fit.npz", "csv")))
+    assert "torque_02.csv: repeat 2 has another clock than repeat 0" in said
+
+
+def test_a_robot_that_never_moves(place: Path, refused):
+    save(changed(record("fit"), "position", lambda v: v[:, :1] + 1e-4 * np.sin(np.arange(v.shape[1]))[:, None]),
+         place / "fit.npz")  # fmt: skip
+    said = refused(arguments(place))
+    assert "the fit recording 'fit' never moves" in said and "0.0002" in said
+
+
+def test_a_door_that_never_opens(place: Path, refused):
+    save(changed(record("confirm"), "object_angle", lambda v: 0.02 * v), place / "confirm.npz")
+    said = refused(arguments(place))
+    assert "the object joint 'door' moves by 0.0" in said and "record a motion that opens it" in said
+
+
+def test_a_dead_sensor(place: Path, refused):
+    def dead(values: np.ndarray) -> np.ndarray:
+        values[..., 1] = 1.5
+        return values
+
+    save(changed(record("fit"), "torque", dead), place / "fit.npz")
+    said = refused(arguments(place, "--effects", "hinge_preload"))
+    assert "channel 'torque', column 'elbow' never changes (1.5 N m)" in said
+
+
+def test_recordings_of_different_joints(place: Path, refused):
+    recording = record("confirm")
+    torque = recording.channels["torque"]
+    fewer = replace(torque, columns=JOINTS[:2], values=torque.values[..., :2], mask=torque.mask[..., :2])
+    save(replace(recording, channels={**recording.channels, "torque": fewer}), place / "confirm.npz")
+    said = refused(arguments(place))
+    assert "different joints" in said and "fit shoulder, elbow, door; confirm shoulder, elbow" in said
+
+
+def test_good_recordings_are_not_refused():
+    scene = door_scene()
+    roles = {name: record(name) for name in ("fit", "confirm")}
+    check_recordings(replace(scene, object_joint="door"), roles)
+
+
+def test_lags_are_measured_in_seconds():
+    time = np.arange(0.0, 5.0, 0.01)
+    delays = np.array([0.0, 0.0, 0.03, -0.02, 0.0])
+    values = np.stack([np.sin(1.3 * (time - d)) for d in delays])[..., None]
+    channel = Channel("position", "rad", ("a",), time, values, np.ones(values.shape, bool))
+    np.testing.assert_allclose(lags(channel), delays, atol=1e-3)
+    masked = channel.mask.copy()
+    masked[2, 100:200] = False
+    with_gap = replace(channel, mask=masked, values=np.where(masked, values, np.nan))
+    np.testing.assert_allclose(lags(with_gap)[2], 0.03, atol=0.01)
+    alternating = np.zeros((5, len(time), 2), bool)
+    alternating[:, ::2, 0] = alternating[:, 1::2, 1] = True
+    with pytest.raises(ValueError, match="no two instants at which every column was measured"):
+        lags(replace(channel, columns=("a", "b"), values=np.repeat(values, 2, axis=2), mask=alternating))
+
+
+# ----- effects and options
+
+
+@pytest.mark.parametrize("option", ["--effects", "--without"])
+def test_unknown_effects_list_the_valid_ones(place: Path, refused, option: str):
+    said = refused(arguments(place, option, "gravity_waves"))
+    assert "unknown effects gravity_waves; valid: " in said and "hinge_preload" in said
+
+
+def test_an_effect_that_the_scene_cannot_have(place: Path, refused):
+    said = refused(arguments(place, "--effects", "contact_compliance", "payload"))
+    assert "cannot have contact_compliance" in said and "payload" in said.split("it can have:")[1]
+
+
+def test_no_effect_left(place: Path, refused):
+    said = refused(arguments(place, "--effects", "payload", "--without", "payload"))
+    assert "is left without any effect" in said
+
+
+def test_effects_are_restricted_and_left_out():
+    scene = door_scene()
+    everything = gap.chosen_effects(gap.Gap(), scene, [])
+    assert {e.name for e in everything} == {e.name for e in registry.library(scene)}
+    fewer = gap.chosen_effects(gap.Gap(without=("latch", "payload")), scene, [])
+    assert {e.name for e in everything} - {e.name for e in fewer} == {"latch", "payload"}
+    chosen = gap.chosen_effects(gap.Gap(effects=("latch", "drag"), without=("drag",)), scene, [])
+    assert [e.name for e in chosen] == ["latch"]
+
+
+def test_a_log_without_commands_has_no_servo_to_suspect():
+    scene = door_scene()
+    log = replace(record("fit"), time=np.zeros(0), command=np.zeros((0, 0)), command_names=())
+    names = {e.name for e in gap.chosen_effects(gap.Gap(), scene, [log])}
+    assert "torque_bias" in names and not names & {"command_delay", "joint_backlash", "joint_compliance"}
+    with pytest.raises(ValueError, match="cannot have command_delay"):
+        gap.chosen_effects(gap.Gap(effects=("command_delay",)), scene, [log])
+
+
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [
+        (lambda: Parameter("gasket", "N m", 0.0, 0.5, 0.1, 5.0), "parameter 'gasket': the start 0.0 N m lies outside"),
+        (lambda: Parameter("gasket", "N m", 0.5, 0.5, 0.1, 5.0), "neutral at 0, but 'gasket' starts at 0.5 N m"),
+        (lambda: Parameter("seal", "N m", 0.0, 0.5, 0.0, 5.0), "speaks of a parameter 'gasket' that it does not have"),
+    ],
+)
+def test_an_effect_that_cannot_be_neutral(
+    place: Path, refused, monkeypatch: pytest.MonkeyPatch, make: Callable[[], Parameter], expected: str
+):
+    monkeypatch.setattr(registry, "_MAKERS", dict(registry._MAKERS))
+
+    @registry.register
+    def gasket(scene):
+        return Effect("gasket", (make(),), force=lambda theta, state: state.qvel, places={"door": ("gasket",)})
+
+    assert expected in refused(arguments(place, "--effects", "gasket"))
+
+
+def test_no_time_is_no_budget(place: Path, refused):
+    assert "--budget must be above 0 minutes, got 0" in refused(arguments(place, "--budget", "0"))
+
+
+# ----- the stand-in
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--hide", "closer"], "--hide takes name=amplitude"),
+        (["--hide", "closer=much"], "got 'closer=much'. There are: hinge_preload"),
+        (["--hide", "poltergeist=1"], "unknown hidden effect 'poltergeist'; there are: air_drag"),
+        (["--hide", "none", "closer=1"], "got 'none'"),
+    ],
+)
+def test_what_cannot_be_hidden(tmp_path: Path, refused, options: list[str], expected: str):
+    assert expected in refused(["gap", *options, "--out", str(tmp_path / "run")])
+    assert list((tmp_path / "run").iterdir()) == []
+
+
+def test_hiding_is_for_the_stand_in(place: Path, refused):
+    assert "--hide is for the stand-in robot" in refused(arguments(place, "--hide", "closer=1"))
+
+
+def test_a_scene_of_ones_own_needs_recordings(tmp_path: Path, refused):
+    command = ["gap", "--scene", str(SCENE), "--parameters", str(write_parameters(tmp_path)), "--out", str(tmp_path)]
+    assert "--scene needs --recording" in refused(command)
+
+
+def test_what_is_hidden():
+    scene = door_scene()
+    assert hidden_effects(None, scene) == {"magnetic_catch": 1.5}
+    assert hidden_effects(["none"], scene) == hidden_effects([], scene) == {}
+    entries = ["closer=1", "torque_gain[panda_joint4]=-0.05"]
+    assert hidden_effects(entries, scene) == {"closer": 1.0, "torque_gain[panda_joint4]": -0.05}
+
+
+def test_the_stand_in_records_each_demonstration_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """C is fitted, B confirms, A stays sealed; nothing in the files says what was hidden."""
+    from droid_jax.measure import hidden
+
+    asked = []
+
+    def instead(scene, demonstration, truth, effects, *, seed, name):
+        asked.append((demonstration.name, dict(effects), seed))
+        return replace(record("fit"), name=name)
+
+    monkeypatch.setattr(hidden, "record_hidden", instead)
+    roles = record_stand_in(door_scene(), {"closer": 1.0}, tmp_path, 1, 3, False)
+    assert {role: r.name for role, r in roles.items()} == {"fit": "C", "confirm": "B", "sealed": "A"}
+    assert asked == [("C", {"closer": 1.0}, 3000), ("B", {"closer": 1.0}, 3001), ("A", {"closer": 1.0}, 3002)]
+    record_stand_in(door_scene(), {"closer": 1.0}, tmp_path, 1, 3, False)
+    assert len(asked) == 3
+    assert sorted(p.name for p in (tmp_path / "recordings").iterdir()) == ["A.npz", "B.npz", "C.npz"]
+
+
+# ----- the run
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A case compiled already, of small budgets; no replays at a quarter of the time step, and no page."""
+    monkeypatch.setattr(gap, "config_of", lambda command: QUICK)
+    monkeypatch.setattr(case_module, "make_case", lambda *arguments, **roles: small().case)
+    monkeypatch.setattr(floor, "numerical_floor", lambda *arguments: FLOOR)
+    monkeypatch.setattr(report, "write", lambda folder: folder / "report.html")
+
+
+def test_a_run_goes_on_after_a_stop_and_is_whole(
+    place: Path, quick: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], refused
+):
+    """Killed in the search; then with the base fit gone missing, were it asked for again; then finished."""
+    command = arguments(place, "--effects", *EFFECTS)
+    find = workflow.find
+
+    def killed(case, base, floor, progress):
+        find(case, base, floor, progress)  # what it computed is remembered
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(workflow, "find", killed)
+    assert main(command) == 130
+    assert "the same command goes on from here" in capsys.readouterr().err
+    out = place / "run"
+    assert sorted(p.name for p in out.iterdir()) == ["checkpoints", "setup.json"]
+
+    monkeypatch.setattr(workflow, "find", find)
+    monkeypatch.setattr(workflow, "base_fit", lambda *a: pytest.fail("the base fit was kept"))
+    assert main(command) == 0
+    said = capsys.readouterr().out
+    assert "holds this run unfinished; going on" in said
+    lines = said.splitlines()[-5:]
+    assert lines[0] == "The model lacks: hinge_preload at door."
+    assert lines[1] == "something missing: p = 0.0078 that chance alone does this; converged: yes"
+    assert lines[2].startswith("gap, noise units squared: fit ") and "% closed), confirm " in lines[2]
+    assert lines[3].startswith("shifted most: door_stiffness ") and lines[3].endswith(" deviations)")
+    assert lines[4] == f"report: {out / 'report.html'}"
+    files = {p.name for p in out.iterdir()}
+    assert files == {"checkpoints", "setup.json", "gap.json", "gap.npz", "extended.json", "extended.xml"}
+    assert not (out / "checkpoints" / "replays").exists()
+    answer = load_gap(out).answer
+    assert answer["amplitudes"][0]["value"] == pytest.approx(PRELOAD, rel=0.05)
+    assert {"search", "refine", "floor", "screen", "refit"} <= set(answer["seconds"])
+    assert answer["setup"]["stand_in"] is False and answer["setup"]["command"] == "gap"
+    assert answer["versions"]["jax"] and answer["device"]
+
+    monkeypatch.setattr(workflow, "find", lambda *a: pytest.fail("this run is whole"))
+    assert main(command) == 0
+    said = capsys.readouterr().out
+    assert "holds this run already" in said and said.splitlines()[-5:] == lines
+
+    before = (out / "gap.json").read_bytes()
+    assert "other settings (seed)" in refused([*command, "--seed", "1"])
+    save(record("sealed"), place / "confirm.npz")
+    assert "other settings (recordings_sha256)" in refused(command)
+    assert (out / "gap.json").read_bytes() == before
+
+
+def test_ties_come_with_an_experiment(place: Path, quick: None, monkeypatch: pytest.MonkeyPatch):
+    """The command asks what would tell the rivals apart, on the fitted recording."""
+    done, asked = small(), []
+
+    def apart(case, models, recording):
+        asked.append(([m.name for m in models], recording.name))
+        return (Experiment("the same motion twice as fast", 8.5),)
+
+    monkeypatch.setattr(workflow, "base_fit", lambda *a: done.base)
+    monkeypatch.setattr(workflow, "find", lambda *a: replace(done.verdict, rivals=(done.base,)))
+    monkeypatch.setattr(menu, "separating", apart)
+    assert main(arguments(place, "--effects", *EFFECTS)) == 0
+    assert asked == [(["hinge_preload at door", "base"], "fit")]
+    assert load_gap(place / "run").answer["experiments"] == [{"what": "the same motion twice as fast", "apart": 8.5}]
+
+
+@pytest.mark.slow
+def test_the_command_as_a_user_runs_it(place: Path):
+    """A process of its own: every file and the page; then the parameters once more, with the effect in the model."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
+
+    def run(*words: str) -> str:
+        done = subprocess.run(
+            [sys.executable, "-m", "droid_jax.run", *words],
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=900,
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    said = run(*arguments(place, "--effects", *EFFECTS))
+    assert "hinge_preload" in said and (place / "run" / "report.html").stat().st_size > 10_000
+    own = ("--scene", SCENE, "--parameters", place / "parameters.json", "--object-joint", "door")
+    again = ("identify", "--recording", place / "fit.npz", *own, "--extended", place / "run" / "extended.json",
+             "--generations", "4", "--population", "10", "--out", place / "identified")  # fmt: skip
+    run(*(str(w) for w in again))
+    fitted = json.loads((place / "identified" / "fit.json").read_text())
+    found = {p["name"]: p for p in fitted["parameters"]}
+    low, high = found["hinge_preload"]["interval"]
+    assert low < PRELOAD < high and not found["hinge_preload"]["nuisance"]
+    assert found["door_stiffness"]["best"] == pytest.approx(0.7, rel=0.15)
+
+
+def test_help_is_quick():
+    """It loads nothing that takes time."""
+    code = (
+        "import sys\nfrom droid_jax.run import main\n"
+        "try:\n    main(['gap', '--help'])\nexcept SystemExit as stop:\n    assert stop.code == 0\n"
+        "heavy = [m for m in ('jax', 'mujoco', 'numpy', 'scipy', 'matplotlib', 'evosax') if m in sys.modules]\n"
+        "assert not heavy, heavy"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "120"}
+    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60)
+    assert run.returncode == 0, run.stderr
+    for option in ("--recording", "--hide", "--budget", "--effects", "--without", "--again"):
+        assert option in run.stdout
