@@ -1,19 +1,20 @@
-"""Does the search for a missing effect find what was hidden?  Development cases on a cheap scene; NOT the blind suite.
+"""The blind suite: does the search for a missing effect find what was hidden, and nothing where nothing was?
 
-    python experiments/hidden_effects.py [--quick] [--out DIR] [--effects magnetic_catch closer ...]
+    python experiments/hidden_effects.py limits --scenes hinge bench   # once, before the method is frozen
+    python experiments/hidden_effects.py make --scenes hinge bench     # recordings and, elsewhere, the truth
+    python experiments/hidden_effects.py search                        # sees recordings only; goes on after a stop
+    python experiments/hidden_effects.py score                         # opens the seals
+    python experiments/hidden_effects.py all --quick                   # make, search and score a few cases
 
-The stand-in (plain C MuJoCo, another time step, nuisances, its own formulas) records two demonstrations of
-an arm of two links and a servo-driven door with one effect hidden; the search gets the recordings alone.
-Truths are known while the method is still being changed, so these figures tune it and prove nothing.
+The package `blind` says how it is kept honest.  Each command ends with one line of JSON.
 """
 
 from __future__ import annotations
 
 import sys
-import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
@@ -22,163 +23,165 @@ import tuned  # noqa: E402, F401  (before jax starts)
 
 # isort: split
 import json  # noqa: E402
+import subprocess  # noqa: E402
 
-import mujoco  # noqa: E402
-import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 
 from benchmarks.common import origin  # noqa: E402
-from droid_jax.gap.case import make_case  # noqa: E402
-from droid_jax.gap.floor import numerical_floor  # noqa: E402
-from droid_jax.gap.workflow import base_fit, find  # noqa: E402
-from droid_jax.measure.hidden import record_hidden  # noqa: E402
-from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide  # noqa: E402
-from droid_jax.model.door import time_offset, torque_offsets  # noqa: E402
-from droid_jax.model.effects.registry import library, ready  # noqa: E402
-from droid_jax.model.fields import (  # noqa: E402
-    body_mass,
-    joint_damping,
-    joint_frictionloss,
-    joint_stiffness,
-    servo_scale,
-)
-from droid_jax.model.parameters import Space  # noqa: E402
-from droid_jax.model.scene import Scene, compile_scene  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
+from experiments.blind.cases import Counts, plans  # noqa: E402
+from experiments.blind.draws import commit_of  # noqa: E402
+from experiments.blind.limits import scene_limits  # noqa: E402
+from experiments.blind.make import make  # noqa: E402
+from experiments.blind.scenes import setting  # noqa: E402
+from experiments.blind.score import score_folder  # noqa: E402
+from experiments.blind.search import Bench, search_all  # noqa: E402
 
-# hidden name -> names in the library that are right
-RIGHT: dict[str, tuple[str, ...]] = {
-    "hinge_preload": ("hinge_preload", "tilted_frame"),
-    "binding_spring": ("hardening_spring",),
-    "over_centre": ("over_centre_spring",),
-    "magnetic_catch": ("latch",),
-    "closer": ("door_closer",),
-    "opening_check": ("opening_check",),
-    "air_drag": ("drag",),
-    "tilted_frame": ("tilted_frame", "hinge_preload"),
-    "torque_gain": ("torque_gain",),
-    "detent": (),
-    "gasket": (),
-    "neighbour_door": (),
-}
-AMPLITUDES = {
-    "hinge_preload": 0.4, "binding_spring": 1.0, "over_centre": 1.0, "magnetic_catch": 1.0, "closer": 2.0,
-    "opening_check": 3.0, "air_drag": 1.0, "tilted_frame": 0.05, "torque_gain": 0.05, "detent": 0.5, "gasket": 0.5,
-    "neighbour_door": 1.0,
-}  # fmt: skip
-SECONDS = 8.0
+SceneName = Literal["hinge", "bench", "arm", "door"]
+RUNS = ROOT / "runs" / "hidden_effects"
+LIMITS = ROOT / "benchmarks" / "results" / "detection_limits.json"
+QUICK = Counts(none=1, single=1, pair=0, outside=0, left_out=0)
 
 
 @dataclass(frozen=True)
-class Arguments:
-    """Options."""
+class Limits:
+    """Detection limits of every hidden effect, by scene; what the file holds of other scenes stays."""
 
-    quick: bool = False
-    """Nothing hidden, and one effect."""
-    out: Path = ROOT / "runs" / "hidden_effects"
-    """Folder of the cases, one JSON each; what is there is not run again."""
+    scenes: tuple[SceneName, ...] = ("hinge", "bench")
+    """Scenes."""
     effects: tuple[str, ...] = ()
-    """Hidden effects to try; default: nothing hidden, and all there are amplitudes for."""
+    """Hidden effects; default: all that a scene can have."""
+    draws: int = 3
+    """Robots drawn; the median of their limits counts."""
+    out: Path = LIMITS
+    """The file."""
+    quick: bool = False
+    """One robot, one effect."""
 
 
-def bench() -> Scene:
-    """The cheap scene, with rows for every friction that an effect may raise."""
-    spec = mujoco.MjSpec.from_file(str(Path(__file__).parent / "bench.xml"))
-    return ready(compile_scene(spec, "bench", object_joint="door"))
+@dataclass(frozen=True)
+class Make:
+    """Record cases: what the search may see goes to OUT/cases, the truth to OUT/sealed."""
+
+    scenes: tuple[SceneName, ...] = ("hinge", "bench")
+    """Scenes."""
+    commit: str = "HEAD"
+    """Commit that froze the method: all seeds derive from its hash.  "development" draws cases to tune with."""
+    counts: Counts = field(default_factory=Counts)
+    """Cases of each class."""
+    classes: tuple[str, ...] = ()
+    """Classes; default: all."""
+    effects: tuple[str, ...] = ()
+    """Only cases with one of these hidden effects (and none)."""
+    limits: Path = LIMITS
+    """Detection limits, see the command limits."""
+    out: Path = RUNS
+    """Folder of cases and seals."""
+    quick: bool = False
+    """The lone hinge: nothing, and a closer."""
 
 
-def base_space(scene: Scene) -> Space:
-    """What is fitted without any effect, nuisances included."""
-    return Space(
-        (
-            body_mass(scene, "forearm", std=0.2, high=3.0),
-            joint_damping(scene, "shoulder", std=0.5, high=20.0),
-            joint_damping(scene, "elbow", std=0.5, high=20.0),
-            joint_frictionloss(scene, "elbow", std=0.1, high=2.0),
-            joint_damping(scene, "door", std=0.3, high=10.0),
-            joint_frictionloss(scene, "door", std=0.1, high=3.0),
-            joint_stiffness(scene, "door", std=0.3, high=10.0),
-            *(servo_scale(scene, j, nuisance=True, std=0.03) for j in scene.joints),
-            time_offset(),
-            *torque_offsets(scene.joints),
-        )
-    )
+@dataclass(frozen=True)
+class Search:
+    """Search case folders that have no result yet, one after the other in this process."""
+
+    cases: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    """Case folders; default: all in OUT/cases."""
+    scenes: tuple[SceneName, ...] = ()
+    """Only cases of these scenes."""
+    at_most: int = 1000000
+    """Stop after so many."""
+    out: Path = RUNS
+    """Folder that holds `cases`."""
 
 
-def demonstration(name: str) -> Recording:
-    """Two motions that open and close at two speeds; they differ in speed and reach."""
-    t = np.arange(0.0, SECONDS, 0.002)
-    if name == "fit":
-        fast, slow = 0.45 * (1 - np.cos(2 * np.pi * t / 3)), 0.45 * (1 - np.cos(2 * np.pi * (t - 3) / 5))
-        door = np.where(t < 3, fast, slow)
-        arm = [0.6 * np.sin(1.2 * t), 0.8 * np.sin(2.0 * t) + 0.2 * np.sin(0.7 * t)]
-    else:
-        door = 0.35 * (1 - np.cos(2 * np.pi * t / 4))
-        arm = [0.5 * np.sin(0.9 * t), 0.6 * np.sin(1.5 * t) - 0.3 * np.sin(0.5 * t)]
-    joints = ("shoulder", "elbow", "door")
-    convention = TorqueConvention(TorqueSide.MOTOR, gravity=True)
-    return Recording(name, t, np.stack([*arm, door], axis=1), joints, {}, convention, qpos0=dict.fromkeys(joints, 0.0))
+@dataclass(frozen=True)
+class Score:
+    """Open the seals of all cases that have a result."""
+
+    out: Path = RUNS
+    """Folder of cases and seals."""
+    limits: Path = LIMITS
+    """Detection limits, for what a hidden amplitude is in the library's terms."""
+    results: Path | None = None
+    """Folder of hidden_effects.json; default: OUT."""
 
 
-def run_case(name: str) -> dict[str, Any]:
-    """Hide, record, search, score."""
-    scene = bench()
-    base = base_space(scene)
-    rng = np.random.default_rng(sorted([*AMPLITUDES, "none"]).index(name))
-    nuisance = base.nuisance
-    truth_values = np.clip(rng.normal(base.mean, np.where(nuisance, base.std, 0.5 * base.std)), base.low, base.high)
-    truth = dict(zip(base.names, truth_values.tolist(), strict=True))
-    hidden = {} if name == "none" else {name: AMPLITUDES[name]}
-    recordings = [
-        record_hidden(scene, demonstration(n), truth, hidden, seed=int(rng.integers(1 << 30)), name=n, space=base)
-        for n in ("fit", "confirm")
-    ]
-    began = time.monotonic()
-    fit, confirm = recordings
-    case = make_case(scene, base, library(scene), fit, confirm)
-    model = base_fit(case, lambda stage, value: None)
-    verdict = find(case, model, numerical_floor(case.fit, model, fit))
-    effects = [e.split(" at ")[0] for e in verdict.effects]
-    rivals = [[r.split(" at ")[0] for r in rs] for rs in verdict.tied]
-    return {
-        "hidden": hidden,
-        "verdict": verdict.kind.value,
-        "sentence": verdict.sentence,
-        "effects": list(verdict.effects),
-        "tied": [list(t) for t in verdict.tied],
-        "right": score(name, verdict.kind.value, effects, rivals),
-        "gaps": {k: list(v) for k, v in verdict.gaps.items()},
-        "floor": verdict.floor,
-        "p": verdict.screens[0].p if verdict.screens else None,
-        "converged": model.refined.converged,
-        "seconds": time.monotonic() - began,
-    }
+@dataclass(frozen=True)
+class All(Make):
+    """make, search in a process of its own, score."""
 
 
-def score(name: str, verdict: str, effects: list[str], rivals: list[list[str]]) -> bool:
-    """Nothing for nothing; no clean name for what no library holds; else only right names, ties included."""
-    if name == "none":
-        return verdict == "none"
-    if not RIGHT[name]:
-        return verdict in ("unexplained", "partly explained")
-    named = [{e, *r} for e, r in zip(effects, rivals, strict=True)]
-    return bool(named) and all(n & set(RIGHT[name]) for n in named)
+Command = Limits | Make | Search | Score | All
+
+
+def run_limits(command: Limits) -> dict[str, Any]:
+    """Write every scene's limits as soon as they are known."""
+    effects = ("closer",) if command.quick else command.effects
+    for name in command.scenes:
+        where = setting(name, RUNS / "door")
+        found = scene_limits(where, 1 if command.quick else command.draws, effects, _tell)
+        known = json.loads(command.out.read_text()) if command.out.is_file() else {"scenes": {}}
+        scenes = {**known["scenes"], name: {**known["scenes"].get(name, {}), **found}}
+        write_json(command.out, {**origin(0), "scenes": scenes})
+    return {"file": command.out.name, "limits": {n: len(scenes[n]) for n in command.scenes}}
+
+
+def run_make(command: Make) -> dict[str, Any]:
+    """Record every planned case that is not there."""
+    if not command.limits.is_file():
+        raise SystemExit(f"error: no detection limits at {command.limits}; run the command limits first")
+    known = json.loads(command.limits.read_text())["scenes"]
+    commit = commit_of(command.commit)
+    counts = QUICK if command.quick else command.counts
+    effects = ("closer",) if command.quick else command.effects
+    outcomes: dict[str, list[str]] = {}
+    for name in ("hinge",) if command.quick else command.scenes:
+        where = setting(name, command.out / "door")
+        for plan in plans(where, counts, commit):
+            if command.classes and plan.kind not in command.classes:
+                continue
+            if effects and plan.effects and not set(effects) & set(plan.effects):
+                continue
+            outcome = make(where, plan, commit, known.get(name, {}), command.out / "cases", command.out / "sealed")
+            outcomes.setdefault(outcome, []).append(plan.name)
+            _tell(f"{plan.name}: {outcome}")
+    write_json(command.out / "made.json", {"commit": commit, **outcomes})
+    return {outcome: len(names) for outcome, names in outcomes.items()}
+
+
+def run_search(command: Search) -> dict[str, Any]:
+    """All folders, those of one scene after each other."""
+    folders = command.cases or tuple(sorted((command.out / "cases").iterdir()))
+    chosen = [f for f in folders if not command.scenes or f.name.split("_")[0] in command.scenes]
+    open_ones = [f for f in chosen if not (f / "result.json").is_file()][: command.at_most]
+    return {"searched": search_all(open_ones, Bench(), _tell), "cases": len(chosen)}
+
+
+def run_score(command: Score) -> dict[str, Any]:
+    """Write hidden_effects.json and hand its headline figures on."""
+    limits = json.loads(command.limits.read_text())["scenes"] if command.limits.is_file() else {}
+    result = score_folder(command.out / "cases", command.out / "sealed", limits)
+    write_json((command.results or command.out) / "hidden_effects.json", {**origin(0), **result})
+    return result["summary"]
+
+
+def run_all(command: All) -> dict[str, Any]:
+    """The search gets a process of its own, which knows the folder of the cases alone."""
+    made = run_make(command)
+    script = [sys.executable, str(Path(__file__).resolve()), "search"]
+    subprocess.run([*script, "--out", str(command.out)], check=True)
+    return {"made": made, **run_score(Score(out=command.out, limits=command.limits))}
+
+
+def _tell(line: str) -> None:
+    print(line, flush=True)
 
 
 def main() -> None:
-    arguments = tyro.cli(Arguments, description=__doc__)
-    names = arguments.effects or (("none", "closer") if arguments.quick else ("none", *AMPLITUDES))
-    unknown = [n for n in names if n != "none" and n not in AMPLITUDES]
-    if unknown:
-        raise SystemExit(f"error: unknown effects {', '.join(unknown)}; valid: none, {', '.join(AMPLITUDES)}")
-    results = {}
-    for name in names:
-        path = arguments.out / f"{name}.json"
-        if not path.is_file():
-            write_json(path, {**origin(0), **run_case(name)})
-        results[name] = json.loads(path.read_text())
-        print(f"{name}: {results[name]['sentence']} ({results[name]['seconds']:.0f} s)", flush=True)
-    print(json.dumps({"cases": len(results), "right": sum(r["right"] for r in results.values())}))
+    command = tyro.cli(Command, description=__doc__)  # pyright: ignore[reportArgumentType]
+    run = {Limits: run_limits, Make: run_make, Search: run_search, Score: run_score, All: run_all}[type(command)]
+    print(json.dumps(run(command)))  # pyright: ignore[reportArgumentType]
 
 
 if __name__ == "__main__":

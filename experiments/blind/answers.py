@@ -1,0 +1,150 @@
+"""Which names are right for what was hidden, and which of them are declared ties.
+
+Settled before the method was frozen.  A tie is declared where the two differ, after the base model has been
+fitted again, by less than the forms themselves do (`forms.py` measures that; its table is in
+benchmarks/results/detection_limits.json).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from droid_jax.measure.hidden import HIDDEN, Applied
+from droid_jax.model.scene import Scene
+from experiments.blind.scenes import Setting
+
+
+@dataclass(frozen=True)
+class Answer:
+    """exact: the library's name for it, "" where it has none.  ties: names that are as right.  why: of both.
+
+    scenes: where it is hidden; empty for all that can have it.
+    """
+
+    exact: str
+    ties: tuple[str, ...] = ()
+    why: str = ""
+    scenes: tuple[str, ...] = ()
+
+
+HINGED = ("hinge", "bench", "door")
+SERVO = ("bench", "door")
+ANSWERS: dict[str, Answer] = {
+    "hinge_preload": Answer(
+        "hinge_preload", ("tilted_frame", "torque_bias"),
+        "over small angles a tilt's cosine is constant; where the hinge has a sensor of its own, so is its offset",
+    ),
+    "binding_spring": Answer(
+        "hardening_spring", ("tilted_frame",), "with the spring's stiffness free a tilt's sine bends like a cube"
+    ),
+    "over_centre": Answer(
+        "over_centre_spring", ("tilted_frame", "hinge_preload"),
+        "its moment is nearly a sine about 0.4 rad: a tilted frame's, or a preload's with less stiffness",
+    ),
+    "magnetic_catch": Answer("latch"),
+    "closer": Answer("door_closer"),
+    "opening_check": Answer("opening_check"),
+    "air_drag": Answer("drag"),
+    "floor_friction": Answer("angle_friction"),
+    "tilted_frame": Answer(
+        "tilted_frame", ("hinge_preload", "hardening_spring", "torque_bias"), "the same, seen from the other side"
+    ),
+    "detent": Answer("", why="no library entry acts in the middle of the travel only"),
+    "pin_wobble": Answer("", why="friction that is periodic in the angle; angle_friction is a parabola"),
+    "gasket": Answer("", why="suction has a memory"),
+    "neighbour_door": Answer("", why="a contact far out, with damping"),
+    "dry_friction": Answer("joint_coulomb"),
+    "stribeck_friction": Answer("joint_stribeck"),
+    "directional_friction": Answer("joint_directional"),
+    "load_friction": Answer("load_friction"),
+    "bristle_friction": Answer("joint_coulomb", why="bristles bend by milliradians before they slip"),
+    "warm_up_friction": Answer("joint_coulomb", why="what its repeats share is dry friction; the rest counts as noise"),
+    "payload": Answer("payload", scenes=("arm", "door")),
+    "cable_pull": Answer("cable_pull"),
+    "torque_ripple": Answer("torque_ripple"),
+    "joint_elasticity": Answer(
+        "joint_compliance", ("servo_gain",), "1 / (1 + k c) on a position servo is exactly a lower gain", SERVO
+    ),
+    "backlash": Answer(
+        "", why="a play that the command leads; joint_backlash follows the load and explains none of it", scenes=SERVO
+    ),
+    "servo_gains": Answer(
+        "servo_gain", ("joint_compliance",), "a lower gain is exactly an elastic gear's", SERVO
+    ),
+    "grip_compliance": Answer("contact_compliance"),
+    "command_delay": Answer(
+        "command_delay", ("sensor_delay",), "positions are not scored", HINGED
+    ),
+    "sensor_delay": Answer("sensor_delay", ("command_delay",), "positions are not scored"),
+    "torque_bias": Answer(
+        "torque_bias", ("hinge_preload", "tilted_frame", "cable_pull"),
+        "a constant torque is a preload on the hinge and a pull on a joint of the arm",
+    ),
+    "torque_gain": Answer("torque_gain"),
+    "torque_drift": Answer("torque_drift", ("torque_bias",), "it warms up mostly between the repeats"),
+}  # fmt: skip
+# On the hinge these have a name of their own in the library.
+ON_HINGE = {"joint_stribeck": "hinge_stribeck", "joint_directional": "hinge_directional"}
+NO_HINGE = ("cable_pull", "torque_ripple", "dry_friction", "bristle_friction", "warm_up_friction", "load_friction",
+            "joint_elasticity", "backlash", "servo_gains")  # fmt: skip
+PLACES = {"command_delay": "commands", "sensor_delay": "sensors", "contact_compliance": "grip"}
+OF_HINGE = frozenset({
+    "hinge_preload", "tilted_frame", "hardening_spring", "over_centre_spring", "latch", "door_closer", "opening_check",
+    "drag", "angle_friction", "hinge_stribeck", "hinge_directional",
+})  # fmt: skip
+WHOLE = ("command_delay", "sensor_delay", "payload", "grip_compliance")  # not one joint's
+
+
+def inside(name: str) -> bool:
+    """Whether the library has a form of it."""
+    return bool(ANSWERS[name].exact)
+
+
+def targets(setting: Setting, name: str) -> tuple[str, ...]:
+    """Joints on which something is hidden in a scene ("" for none in particular); empty where it cannot be.
+
+    Dry friction of a joint whose friction is a base parameter is no missing effect.
+    """
+    scene, answer, hidden = setting.scene, ANSWERS[name], HIDDEN[name]
+    if answer.scenes and setting.name not in answer.scenes:
+        return ()
+    if hidden.on == "hinge" or name in WHOLE:
+        needs = {"hinge": scene.object_joint, "grip": scene.grip}.get(hidden.on, True)
+        return ("",) if needs else ()
+    arm = setting.hidden_joints or tuple(j for j in scene.joints if j != scene.object_joint)
+    on_hinge = scene.object_joint and name not in NO_HINGE
+    sensed = scene.object_joint in scene.joints  # by a sensor of its own
+    joints = (*arm, str(scene.object_joint)) if on_hinge and (sensed or hidden.on == "joint") else arm
+    if answer.exact == "joint_coulomb":
+        joints = tuple(j for j in joints if f"{j}_frictionloss" not in setting.base.names)
+    return joints
+
+
+def right(scene: Scene, hidden: Applied) -> tuple[str, ...]:
+    """Names "effect at place" that are right, the exact one first; none where the library has no form of it."""
+    answer = ANSWERS[hidden.name]
+    if not answer.exact:
+        return ()
+    names = (_at(scene, name, hidden.joint) for name in (answer.exact, *answer.ties))
+    return tuple(dict.fromkeys(n for n in names if n))
+
+
+def _at(scene: Scene, name: str, joint: str) -> str:
+    """ "" where the place cannot have it: a torque sensor on a joint that has none, a hinge's spring on the arm."""
+    on_hinge = not joint or joint == scene.object_joint
+    if on_hinge:
+        name = ON_HINGE.get(name, name)
+    if name in PLACES:
+        return f"{name} at {PLACES[name]}"
+    if name == "payload":
+        return f"payload at {scene.joints[-1]}"
+    if name in OF_HINGE:
+        return f"{name} at {scene.object_joint}" if on_hinge else ""
+    place = joint or scene.object_joint
+    return f"{name} at {place}" if place in scene.joints and (not on_hinge or name not in NO_HINGE) else ""
+
+
+def without(scene: Scene, hidden: Iterable[Applied]) -> tuple[str, ...]:
+    """Library entries that a leave-one-out case does without: all that would be right."""
+    return tuple(sorted({n.split(" at ")[0] for h in hidden for n in right(scene, h)}))

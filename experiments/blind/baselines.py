@@ -1,0 +1,161 @@
+"""What simpler methods make of the same base fit: names by BIC, and a black box that closes the gap and names nothing.
+
+Plain stepwise BIC over the candidates' linear marks is what one would try first; a small network from the state of
+the motion to the torque that is left over is what one would try without caring for a name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from droid_jax.gap.case import Case
+from droid_jax.gap.evidence import Evidence
+from droid_jax.gap.refit import Model
+from droid_jax.gap.screen import Screen, project
+from droid_jax.measure.noise import lowpass, smooth
+from droid_jax.measure.recording import Recording
+from experiments.blind.units import torques, whitened
+
+MOST = 5  # effects that BIC may name
+WIDTH, LEARNING, DECAY = 32, 3e-3, 1e-3
+ROUNDS, STEPS = 30, 100  # the network of the round that does best on blocks left aside is kept
+BLOCK = 0.5  # s, every fifth such block is left aside
+FOLDS = 5
+
+
+def baselines(case: Case, model: Model, screen: Screen | None, recordings: Mapping[str, Recording]) -> dict[str, Any]:
+    """Both, from a fitted base model; screen: its first screening, if it came that far."""
+    return {
+        "bic": [] if screen is None else stepwise_bic(screen, model.residuals.mean(axis=0)),
+        "black_box": black_box(case, model, recordings),
+    }
+
+
+def stepwise_bic(screen: Screen, common: np.ndarray) -> list[str]:
+    """Names in the order in which adding them lowers n log(RSS / n) + k log(n) most, until none does.
+
+    common: [M] the mean residual.  A candidate counts its amplitudes, and its shapes too.
+    """
+    groups: dict[Any, list[int]] = {}
+    for k, question in enumerate(screen.questions):
+        groups.setdefault(question.candidate.key, []).append(k)
+    names = {key: screen.questions[rows[0]].candidate for key, rows in groups.items()}
+    size, chosen, named, cost = len(common), list[int](), list[str](), 0
+    best = size * np.log(max(float(common @ common), 1e-30) / size)
+    while len(named) < MOST:
+        tried = {}
+        for key, rows in groups.items():
+            if names[key].name not in named:
+                columns = screen.marks[[*chosen, *rows]].T
+                rest = common - columns @ np.linalg.lstsq(columns, common, rcond=1e-8)[0]
+                parameters = cost + len(rows) + len(names[key].shapes)
+                tried[key] = size * np.log(max(float(rest @ rest), 1e-30) / size) + parameters * np.log(size)
+        winner = min(tried, key=lambda key: tried[key]) if tried else None
+        if winner is None or tried[winner] >= best:
+            break
+        best = tried[winner]
+        chosen += groups[winner]
+        cost += len(groups[winner]) + len(names[winner].shapes)
+        named.append(names[winner].name)
+    return named
+
+
+def black_box(case: Case, model: Model, recordings: Mapping[str, Recording]) -> dict[str, list[float]]:
+    """Role -> U before and after a network, trained on the fitted recording, has added its torque."""
+    inputs = {role: features(e, recordings[role]) for role, e in case.judged.items()}
+    left = _shaped(case.fit, torques(case.fit, case.fit.common(model.values)))
+    centre, scale = inputs["fit"].mean(axis=0), inputs["fit"].std(axis=0) + 1e-9
+    size = left.std(axis=0) + 1e-9
+    time = case.fit.time[: len(left)]
+    aside = (np.floor((time - time[0]) / BLOCK) % FOLDS) == FOLDS - 1
+    weights = train((inputs["fit"] - centre) / scale, left / size, aside)
+    out = {}
+    for role, e in case.judged.items():
+        common = e.common(model.values)[0]
+        torque = np.asarray(_Network(left.shape[1]).apply(weights, (inputs[role] - centre) / scale)) * size
+        added = whitened(e, torque.T.reshape(1, -1))[0]
+        if e.own_columns is not None:  # the recording's own offsets are fitted again
+            added = project(added[None], e.own_columns, np.full(len(e.own), np.sqrt(e.repeats)))[0]
+        out[role] = [e.gap(e.residuals(common)), e.gap(e.residuals(common - added))]
+    return out
+
+
+def features(evidence: Evidence, recording: Recording) -> np.ndarray:
+    """[K, F] mean position and velocity of the joints, angle and speed of the object, on the coarse clock."""
+    clock = evidence.time[: np.sum(evidence.column == 0)]
+    columns = []
+    for name in ("position", "object_angle"):
+        if name in recording.channels:
+            channel = recording.channels[name]
+            inside = np.clip(clock, channel.time[0], channel.time[-1])
+            mean = smooth(channel.values, channel.mask, lowpass(channel.time, inside)).mean(axis=0)
+            columns += [mean, np.gradient(mean, clock, axis=0)]
+    return np.concatenate(columns, axis=1)
+
+
+def train(inputs: np.ndarray, targets: np.ndarray, aside: np.ndarray) -> Any:
+    """Weights of the network with the least error on rows left aside ([K] bool), out of `ROUNDS`."""
+    network = _Network(targets.shape[1])
+    weights = network.init(jax.random.key(0), inputs[:1])
+    x, y = jnp.asarray(inputs, jnp.float32), jnp.asarray(targets, jnp.float32)
+    kept, history = weights, []
+    state = _OPTIMISER.init(weights)
+    for _ in range(ROUNDS):
+        weights, state, error = _round(network, weights, state, x, y, jnp.asarray(aside))
+        history.append(float(error))
+        if history[-1] <= min(history):
+            kept = weights
+    return kept
+
+
+class _Network(nn.Module):
+    outputs: int
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        for _ in range(2):
+            x = nn.tanh(nn.Dense(WIDTH)(x))
+        return nn.Dense(self.outputs)(x)
+
+
+_OPTIMISER = optax.adamw(LEARNING, weight_decay=DECAY)
+
+
+@jax.jit(static_argnums=0)
+def _round(network: _Network, weights: Any, state: Any, x: jax.Array, y: jax.Array, aside: jax.Array) -> Any:
+    """`STEPS` steps of all rows but those aside, and the error of the latter."""
+
+    def error(weights: Any, rows: jax.Array) -> jax.Array:
+        predicted: Any = network.apply(weights, x)
+        square = jnp.mean((predicted - y) ** 2, axis=1)
+        return jnp.sum(square * rows) / jnp.maximum(jnp.sum(rows), 1)
+
+    def step(carry: Any, _: None) -> Any:
+        weights, state = carry
+        slopes = jax.grad(error)(weights, ~aside)
+        change, state = _OPTIMISER.update(slopes, state, weights)
+        return (optax.apply_updates(weights, change), state), None
+
+    (weights, state), _ = jax.lax.scan(step, (weights, state), length=STEPS)
+    return weights, state, error(weights, aside)
+
+
+def _shaped(evidence: Evidence, rows: np.ndarray) -> np.ndarray:
+    """[1, M] -> [K, C]."""
+    columns = int(evidence.column.max()) + 1
+    return rows.reshape(columns, -1).T
+
+
+def bic_outcome(named: Sequence[str], right: Sequence[Sequence[str]]) -> dict[str, bool]:
+    """Whether BIC named everything hidden, and anything that was not."""
+    return {
+        "all": all(set(names) & set(named) for names in right if names) and any(right),
+        "false": any(not any(n in names for names in right) for n in named),
+    }

@@ -1,0 +1,122 @@
+"""The list of cases: what is hidden in which scene, how large, and what the search must do without.
+
+Classes: "none"; "single", one effect of the library's at 1, 3 and 10 times its detection limit; "pair", two at
+3 times; "outside", what no library entry is; "left_out", a single one whose library entries are taken away.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from droid_jax.measure.hidden import HIDDEN, Applied
+from droid_jax.model.scene import Scene
+from experiments.blind.answers import ANSWERS, inside, right, targets
+from experiments.blind.draws import seed_of
+from experiments.blind.scenes import Setting
+
+NAMELESS = 0.9  # share left over by a name that takes no fifth of the gap away: the search would not give it
+SAFE = 2.0  # times the upper end of an effect's typical range: beyond it the stand-in may lose the door
+
+Limits = Mapping[str, Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One case before anything is drawn.
+
+    name: "bench/single/closer/3x/0"; it stands in sealed files only.  factor: of the detection limit.
+    """
+
+    name: str
+    scene: str
+    kind: str
+    effects: tuple[str, ...] = ()
+    factor: float = 0.0
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Cases of each class in one scene; single and outside: of each effect at each factor."""
+
+    none: int = 10
+    single: int = 1
+    pair: int = 10
+    outside: int = 2
+    left_out: int = 10
+
+
+QUICK = Counts(none=1, single=0, pair=0, outside=0, left_out=0)
+
+
+def plans(setting: Setting, counts: Counts, commit: str) -> list[Plan]:
+    """All cases of a scene; pairs and what is left out are drawn by the commit."""
+    possible = [n for n in ANSWERS if targets(setting, n)]
+    named, strange = [(n,) for n in possible if inside(n)], [(n,) for n in possible if not inside(n)]
+    rng = np.random.default_rng(seed_of(commit, f"{setting.name}/plans"))
+    pairs = [(*a, *b) for a, b in itertools.combinations(named, 2) if _apart(setting.scene, *a, *b)]
+    wanted = [("none", (), 0.0, k) for k in range(counts.none)]
+    wanted += [("single", e, f, k) for e in named for f in (1.0, 3.0, 10.0) for k in range(counts.single)]
+    wanted += [("pair", pairs[i], 3.0, k) for k, i in enumerate(_some(rng, len(pairs), counts.pair))]
+    wanted += [("outside", e, f, k) for e in strange for f in (3.0, 10.0) for k in range(counts.outside)]
+    wanted += [("left_out", named[i], (3.0, 10.0)[k % 2], k)
+               for k, i in enumerate(_some(rng, len(named), counts.left_out))]  # fmt: skip
+    return [_plan(setting.name, *one) for one in wanted]
+
+
+def _plan(scene: str, kind: str, effects: tuple[str, ...], factor: float, number: int) -> Plan:
+    return Plan(f"{scene}/{kind}/{'+'.join(effects) or 'nothing'}/{factor:g}x/{number}", scene, kind, effects, factor)
+
+
+def _apart(scene: Scene, first: str, second: str) -> bool:
+    """Whether no name is right for both: the answers to such a pair could not be told apart."""
+    names = [{n.split(" at ")[0] for n in right(scene, Applied(e, 1.0))} for e in (first, second)]
+    return not names[0] & names[1]
+
+
+def _some(rng: np.random.Generator, length: int, count: int) -> list[int]:
+    """`count` indices below length, as evenly as it goes."""
+    rounds = [rng.permutation(length) for _ in range(-(-count // length) if length else 0)]
+    return np.concatenate(rounds)[:count].tolist() if rounds else []
+
+
+def applied(setting: Setting, plan: Plan, limits: Limits, rng: np.random.Generator) -> tuple[Applied, ...] | None:
+    """The plan's effects with joints and amplitudes; None where no joint can have one that large.
+
+    Only effects of the arm get a random sign: a door that swings open by itself cannot be grasped.
+    """
+    out = []
+    for name in plan.effects:
+        sizes = {j: size for j in targets(setting, name) if (size := amplitude(name, j, plan.factor, limits))}
+        if not sizes:
+            return None
+        joint = list(sizes)[int(rng.integers(len(sizes)))]
+        sign = rng.choice([-1.0, 1.0]) if HIDDEN[name].signed and HIDDEN[name].on == "arm" else 1.0
+        out.append(Applied(name, float(sign * sizes[joint]), joint))
+    return tuple(out)
+
+
+def amplitude(name: str, joint: str, factor: float, limits: Limits) -> float | None:
+    """factor times the detection limit (or the size worth naming, where that is larger).
+
+    None where that is not safe, or where no right name explains anything there.
+    """
+    entry = limits.get(key(name, joint), {})
+    if entry.get("limit") is None or (entry["right"] and min(entry["right"].values()) >= NAMELESS):
+        return None
+    size = factor * max(entry["limit"], entry.get("worth", 0.0))
+    return size if size <= SAFE * HIDDEN[name].typical[1] else None
+
+
+def key(name: str, joint: str) -> str:
+    """ "torque_ripple[elbow]", or the name alone."""
+    return f"{name}[{joint}]" if joint else name
+
+
+def keys(setting: Setting) -> Iterable[Applied]:
+    """Everything that can be hidden in a scene, with amplitude 0."""
+    return [Applied(name, 0.0, joint) for name in ANSWERS for joint in targets(setting, name)]

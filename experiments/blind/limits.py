@@ -1,0 +1,119 @@
+"""Detection limits: the amplitude at which the sign-flip test finds an effect in half of the cases.
+
+Computed from the stand-in's noise before the method is frozen.  What a hidden effect adds is recorded once, small,
+with and without it and with the same noise; what the base model cannot absorb of it grows with the amplitude.
+Repeats are drawn from those of a long recording with nothing hidden; the test is `largest_t` over the full list
+of candidates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from droid_jax.gap.candidates import candidates
+from droid_jax.gap.flips import largest_t
+from droid_jax.gap.screen import questions_of
+from droid_jax.measure.hidden import HIDDEN, Applied
+from experiments.blind.cases import SAFE, key, keys
+from experiments.blind.draws import DEVELOPMENT, draw_truths, seed_of
+from experiments.blind.forms import Forms, forms_of
+from experiments.blind.marks import REPEATS, Ground, ground
+from experiments.blind.scenes import Setting
+
+SIGNIFICANT, POWER = 0.01, 0.5
+DRAWS = 60
+LOWEST, HALVINGS = 1e-5, 9  # of the largest amplitude; halvings of the logarithm
+RECORDED = 3  # times an effect is recorded at most, each time nearer to its limit
+TYPICAL = 3.0  # times the limit: where an effect is compared with its library form
+NEAR = 2.0  # of the limit: within this factor an effect counts as proportional to its amplitude
+
+
+@dataclass(frozen=True, eq=False)
+class Power:
+    """How often the test rejects.
+
+    marks: [K, M] of all candidates, raw.  chosen: [D, N] repeats of each draw.  known: projected marks and
+    their scores of the noise, by which base parameters are free.
+    """
+
+    where: Ground
+    marks: np.ndarray
+    chosen: np.ndarray
+    known: dict[bytes, tuple[np.ndarray, np.ndarray]]
+
+    def at(self, amplitude: float, added: np.ndarray) -> float:
+        """Share of draws with p < 0.01, of an effect that adds [N, M] per unit to the repeats."""
+        common = added.mean(axis=0)
+        left, free = self.where.left(amplitude * common)
+        marks, noise = self._projected(free)
+        scores = marks @ (left + amplitude * (added - common)).T
+        p = [largest_t(scores + noise[:, rows])[1] for rows in self.chosen]
+        return float(np.mean(np.array(p) < SIGNIFICANT))
+
+    def limit(self, added: np.ndarray, largest: float) -> float | None:
+        """Amplitude with `POWER`, by bisection in its logarithm; None where the largest has less."""
+        if self.at(largest, added) < POWER:
+            return None
+        low, high = largest * LOWEST, largest
+        for _ in range(HALVINGS):
+            middle = float(np.sqrt(low * high))
+            low, high = (low, middle) if self.at(middle, added) >= POWER else (middle, high)
+        return float(np.sqrt(low * high))
+
+    def _projected(self, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if free.tobytes() not in self.known:
+            marks = self.where.projected(self.marks, free)
+            self.known[free.tobytes()] = marks, marks @ self.where.noise.T
+        return self.known[free.tobytes()]
+
+
+def power_of(where: Ground, seed: int) -> Power:
+    """Marks of all candidates, and draws of repeats."""
+    rng = np.random.default_rng(seed)
+    raw = where.added(questions_of(candidates(where.setting.effects())))
+    chosen = [rng.choice(len(where.noise), REPEATS, replace=False) for _ in range(DRAWS)]
+    return Power(where, raw, np.stack(chosen), {})
+
+
+def limit_of(where: Ground, power: Power, forms: Forms, effect: Applied) -> dict[str, Any]:
+    """One effect's entry: limit, unit, size worth naming, and how far it is from its library form."""
+    hidden = HIDDEN[effect.name]
+    largest, size = SAFE * hidden.typical[1], hidden.typical[0]
+    limit, added = None, np.zeros(0)
+    for _ in range(RECORDED):
+        added = where.hidden(replace(effect, amplitude=size))
+        limit = power.limit(added, largest)
+        if limit is None or max(limit / size, size / limit) <= NEAR:
+            break
+        size = limit
+    common = added.mean(axis=0)
+    _, free = where.left(TYPICAL * (limit or largest) * common)
+    return {"limit": limit, "unit": hidden.unit, "recorded_at": size, **forms.of(effect, common, free)}
+
+
+def scene_limits(
+    setting: Setting, draws: int, wanted: tuple[str, ...] = (), tell: Callable[[str], None] = print
+) -> dict[str, dict[str, Any]]:
+    """key -> entry, the medians over some draws of the robot."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for number in range(draws):
+        seed = seed_of(DEVELOPMENT, f"{setting.name}/limits/{number}")
+        where = ground(setting, draw_truths(setting, np.random.default_rng(seed))["fit"], seed)
+        power, forms = power_of(where, seed), forms_of(where)
+        for effect in keys(setting):
+            if wanted and effect.name not in wanted:
+                continue
+            entry = limit_of(where, power, forms, effect)
+            found.setdefault(key(effect.name, effect.joint), []).append(entry)
+            tell(f"{setting.name} {number} {key(effect.name, effect.joint)}: {entry}")
+    return {name: _median(entries) for name, entries in found.items()}
+
+
+def _median(entries: list[dict[str, Any]]) -> dict[str, Any]:
+    """The draw with the median limit; undetected ones count as infinite."""
+    ordered = sorted(entries, key=lambda e: np.inf if e["limit"] is None else e["limit"])
+    return {**ordered[(len(ordered) - 1) // 2], "limits": [e["limit"] for e in entries]}

@@ -1,0 +1,133 @@
+"""What a hidden effect leaves in a recording, in the search's own terms: whitened, with and without the base model.
+
+Everything is taken at one draw of the robot's hidden values: its noise, the slopes of the base model there, and
+what the library's candidates would add.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+
+from droid_jax.gap.candidates import Candidate, candidates
+from droid_jax.gap.case import make_case
+from droid_jax.gap.evidence import Evidence
+from droid_jax.gap.refit import Model, refit
+from droid_jax.gap.screen import Question, marks, project, questions_of
+from droid_jax.identify.refine import RefineConfig
+from droid_jax.measure.hidden import Applied
+from droid_jax.measure.noise import lowpass, smooth
+from droid_jax.measure.recording import Recording
+from droid_jax.model.effects.registry import effect_space
+from droid_jax.model.seam import Effect
+from experiments.blind.draws import Truth
+from experiments.blind.make import Drawn, record
+from experiments.blind.scenes import Setting
+from experiments.blind.units import torques, whitened
+
+REPEATS = 10  # of a case
+NOISY = 40  # repeats from which noise is drawn
+DENSE = 24  # values of a shape, where a form is fitted
+BY_REPEAT = ("warm_up_friction", "torque_drift")  # differ from repeat to repeat
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """A recording with nothing hidden, at the truth.
+
+    setting, truth, seed: of the recording.  evidence: of its `NOISY` repeats.  model: the base model at the
+    truth.  noise: [NOISY, M] of single repeats.  plain: number of repeats -> [N, M] with nothing hidden.
+    """
+
+    setting: Setting
+    truth: Truth
+    seed: int
+    evidence: Evidence
+    model: Model
+    noise: np.ndarray
+    plain: dict[int, np.ndarray] = field(default_factory=dict)
+
+    @functools.cached_property
+    def slopes(self) -> np.ndarray:
+        """[M, D] of the base parameters, in search units, in units of one repeat's noise."""
+        return self.model.refined.jacobian / np.sqrt(self.evidence.repeats)
+
+    @property
+    def prior(self) -> np.ndarray:
+        """[D] deviations, search units, for `REPEATS` repeats whose noise is one."""
+        return self.model.refined.prior * np.sqrt(REPEATS)
+
+    def projected(self, columns: np.ndarray, free: np.ndarray | None = None) -> np.ndarray:
+        """[K, M] without what the base parameters (those `free`, [D] bool) would absorb of them."""
+        chosen = np.ones(len(self.prior), bool) if free is None else free
+        return project(columns, self.slopes[:, chosen], self.prior[chosen])
+
+    def left(self, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """[M] what the base model leaves of a column within its bounds, and which parameters [D] stay off them."""
+        space, x = self.model.space, self.model.refined.x
+        low, high = space.to_search(space.low) - x, space.to_search(space.high) - x
+        normal = self.slopes.T @ self.slopes + np.diag(self.prior**-2)
+        root = scipy.linalg.cholesky(normal)  # as upper triangle: |root dx - w|^2 is the objective
+        aim = scipy.linalg.solve_triangular(root.T, self.slopes.T @ column, lower=True)
+        step = scipy.optimize.lsq_linear(root, aim, (low - 1e-9, high + 1e-9)).x
+        return column - self.slopes @ step, (step > low + 1e-6) & (step < high - 1e-6)
+
+    def added(self, questions: tuple[Question, ...]) -> np.ndarray:
+        """[K, M] what the library's amplitudes add, per unit of each."""
+        return marks(self.evidence, self.model.values, questions)
+
+    def record(self, hidden: tuple[Applied, ...], repeats: int) -> Recording:
+        """The same robot and the same noise, with something hidden."""
+        return record(self.setting, Drawn(hidden, {"fit": self.truth}, {"fit": self.seed}), ("fit",), repeats)["fit"]
+
+    def hidden(self, effect: Applied) -> np.ndarray:
+        """[REPEATS, M] what a hidden effect adds to each repeat, per unit of its amplitude."""
+        count = REPEATS if effect.name in BY_REPEAT else 2
+        if count not in self.plain:
+            self.plain[count] = self._whitened(self.record((), count))
+        each = (self._whitened(self.record((effect,), count)) - self.plain[count]) / effect.amplitude
+        return each if count == REPEATS else np.repeat(each.mean(axis=0)[None], REPEATS, axis=0)
+
+    def torques(self, columns: np.ndarray) -> np.ndarray:
+        """[K, M] units of noise -> [K, M] N m."""
+        return torques(self.evidence, columns)
+
+    def _whitened(self, recording: Recording) -> np.ndarray:
+        """[N, M] of a recording's torques, in units of one repeat's noise."""
+        (channel,) = self.evidence.cost.comparisons[0].channels
+        measured = recording.channel(channel.name)
+        smoothed = smooth(measured.values, measured.mask, lowpass(measured.time, channel.clock))
+        return whitened(self.evidence, smoothed.transpose(0, 2, 1).reshape(len(smoothed), -1))
+
+
+def ground(setting: Setting, truth: Truth, seed: int) -> Ground:
+    """Record, compile, and take the slopes at the truth."""
+    recording = record(setting, Drawn((), {"fit": truth}, {"fit": seed}), ("fit",), NOISY)["fit"]
+    case = make_case(setting.scene, setting.base, setting.effects(), recording, recording)
+    base = case.base
+    known = {n: float(np.clip(v, base[n].low, base[n].high)) for n, v in truth.items() if n in base.names}
+    model = refit(case.fit, base, (), case.whole.values(known)[None], RefineConfig(iterations=0, hops=0))
+    return Ground(setting, truth, seed, case.fit, model, case.fit.deviations * np.sqrt(NOISY / (NOISY - 1)))
+
+
+def dense(effects: tuple[Effect, ...]) -> tuple[Candidate, ...]:
+    """Candidates with `DENSE` values of every shape, within its bounds."""
+    out = []
+    for effect in effects:
+        bounds = {p.name: (p.low, p.high) for p in effect_space([effect]).parameters}
+        grid = {n: tuple(np.geomspace(*bounds[n], DENSE).tolist()) for n in effect.shapes}
+        out.append(replace(effect, shapes=grid))
+    return candidates(out)
+
+
+def by_candidate(found: tuple[Candidate, ...]) -> tuple[tuple[Question, ...], list[list[int]]]:
+    """All questions, and which of them belong to each candidate."""
+    questions = questions_of(found)
+    rows: dict[tuple, list[int]] = {}
+    for k, question in enumerate(questions):
+        rows.setdefault(question.candidate.key, []).append(k)
+    return questions, [rows[c.key] for c in found]

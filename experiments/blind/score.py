@@ -1,0 +1,233 @@
+"""Scoring: what the searches said against what was hidden, with intervals, by scene, class and factor."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.stats
+
+from droid_jax.measure.hidden import Applied
+from experiments.blind.answers import right
+from experiments.blind.baselines import bic_outcome
+from experiments.blind.cases import key
+from experiments.blind.scenes import setting
+
+NAMING = ("named", "tie", "partly explained")  # verdicts that give a name
+CLEAN = ("named", "tie")  # and say that this is all
+OPEN = ("unexplained", "partly explained")
+CLOSED = 0.8  # share of a gap that a named effect has to close
+COMPARABLE = 0.5  # of an effect's own size, left over by its library form, up to which amplitudes are compared
+
+Case = Mapping[str, Any]  # {"truth": sealed file, "result": result.json, "right": [names of each hidden effect]}
+
+
+def score_folder(cases: Path, sealed: Path, limits: Mapping[str, Any]) -> dict[str, Any]:
+    """Everything about all cases with a result."""
+    scenes: dict[str, Any] = {}
+    found = []
+    for path in sorted(sealed.glob("*.json")):
+        result = cases / path.stem / "result.json"
+        if not result.is_file():
+            continue
+        truth = json.loads(path.read_text())
+        scene = scenes.setdefault(truth["scene"], setting(truth["scene"]).scene)
+        names = [list(right(scene, Applied(**h))) for h in truth["hidden"]]
+        found.append({"truth": truth, "result": json.loads(result.read_text()), "right": names})
+    judged = [judge(case, limits) for case in found]
+    groups = grouped(judged)
+    return {
+        "summary": summarise(judged),
+        "by_group": {name: summarise(cases) for name, cases in groups.items()},
+        "confusion": confusion(judged),
+        "commits": sorted({c["truth"]["commit"] for c in found}),
+        "cases": judged,
+    }
+
+
+def judge(case: Case, limits: Mapping[str, Any]) -> dict[str, Any]:
+    """One case: what is right and wrong about its verdict."""
+    truth, result, right_names = case["truth"], case["result"], case["right"]
+    verdict = result["verdict"]
+    slots = [{e, *ties} for e, ties in zip(result.get("effects", ()), result.get("tied", ()), strict=True)]
+    if truth["kind"] == "left_out":
+        right_names = [[] for _ in right_names]
+    met = [any(slot & set(names) for slot in slots) for names in right_names]
+    false = [sorted(slot) for slot in slots if not any(slot & set(names) for names in right_names)]
+    exact = [any(e == names[0] for e in result.get("effects", ())) for names in right_names if names]
+    seconds = result.get("seconds", {})
+    return {
+        "name": truth["name"],
+        "seed": truth.get("seed"),
+        "scene": truth["scene"],
+        "class": truth["kind"],
+        "factor": truth["factor"],
+        "hidden": {key(h["name"], h["joint"]): h["amplitude"] for h in truth["hidden"]},
+        "verdict": verdict,
+        "effects": list(result.get("effects", ())),
+        "tied": [list(t) for t in result.get("tied", ())],
+        "p": result.get("p"),
+        "false_names": false,
+        "wrong_confident": bool(false) and verdict in CLEAN,
+        "met": met,
+        "named": bool(met) and all(met) and not false and verdict in NAMING,
+        "exact": bool(exact) and all(exact) and not false and not any(result.get("tied", ())) and verdict == "named",
+        "open": verdict in OPEN,
+        "gaps": result.get("gaps", {}),
+        "closed": {role: closed(result, role) for role in result.get("gaps", {})},
+        "within_floor": within_floor(result),
+        "coverage": coverage(case, limits),
+        "baselines": against_baselines(case),
+        "seconds": seconds,
+    }
+
+
+def closed(result: Mapping[str, Any], role: str) -> float:
+    """1 - (U after - U0) / (U before - U0)."""
+    before, after = result["gaps"][role]
+    return 1.0 - (after - result["floor"]) / max(before - result["floor"], 1e-12)
+
+
+def within_floor(result: Mapping[str, Any]) -> bool | None:
+    """Whether what is left on the sealed recording is within 2 U0 of the floor."""
+    if "sealed" not in result.get("gaps", {}):
+        return None
+    return bool(result["gaps"]["sealed"][1] <= 3.0 * result["floor"])
+
+
+def coverage(case: Case, limits: Mapping[str, Any]) -> list[bool]:
+    """For each amplitude that was named exactly and has a counterpart: whether its interval holds the truth.
+
+    The counterpart is what the library form takes when it is fitted to what the hidden effect adds
+    (`forms.py`); only forms with one amplitude that leave little over are compared.
+    """
+    truth, out = case["truth"], []
+    for hidden in truth["hidden"]:
+        form = limits.get(truth["scene"], {}).get(key(hidden["name"], hidden["joint"]), {}).get("form", {})
+        if len(form.get("per_unit", ())) != 1 or form["left_after_refit"] > COMPARABLE:
+            continue
+        ((name, per_unit),) = form["per_unit"].items()
+        span = case["result"].get("amplitudes", {}).get(name)
+        if span is not None:
+            low, high = span["interval"]
+            out.append(bool(low <= per_unit * hidden["amplitude"] <= high))
+    return out
+
+
+def against_baselines(case: Case) -> dict[str, Any] | None:
+    """What BIC named and what the black box closed, on this case."""
+    found = case["result"].get("baselines")
+    if not found:
+        return None
+    names = [[] for _ in case["right"]] if case["truth"]["kind"] == "left_out" else case["right"]
+    boxes = {"gaps": found["black_box"], "floor": case["result"]["floor"]}
+    return {
+        "bic": found["bic"],
+        **{f"bic_{k}": v for k, v in bic_outcome(found["bic"], names).items()},
+        "closed": {role: closed(boxes, role) for role in ("confirm", "sealed")},
+    }
+
+
+def grouped(judged: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+    """By scene, and by scene, class and factor."""
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for case in judged:
+        for name in (case["scene"], f"{case['scene']}/{case['class']}", _label(case)):
+            groups.setdefault(name, []).append(case)
+    return dict(sorted(groups.items()))
+
+
+def _label(case: Mapping[str, Any]) -> str:
+    return f"{case['scene']}/{case['class']}/{case['factor']:g}x"
+
+
+def summarise(judged: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """All rates of some cases, those that do not apply left away."""
+    none = [c for c in judged if c["class"] == "none"]
+    known = [c for c in judged if c["class"] in ("single", "pair")]
+    single, pair = [c for c in known if c["class"] == "single"], [c for c in known if c["class"] == "pair"]
+    strange = [c for c in judged if c["class"] in ("outside", "left_out")]
+    named = [c for c in known if c["named"]]
+    rates = {
+        "false_alarms": rate(none, lambda c: c["verdict"] != "none"),
+        "false_names_where_nothing": rate(none, lambda c: bool(c["effects"])),
+        "wrong_confident": rate([*single, *pair, *strange], lambda c: c["wrong_confident"]),
+        "false_names": rate([*single, *pair, *strange], lambda c: bool(c["false_names"])),
+        "detected": rate(known, lambda c: c["verdict"] != "none"),
+        "named_up_to_tie": rate(single, lambda c: c["named"]),
+        "named_exactly": rate(single, lambda c: c["exact"]),
+        "partly": rate(single, lambda c: c["verdict"] == "partly explained"),
+        "pair_one_named_none_false": rate(pair, lambda c: any(c["met"]) and not c["false_names"]),
+        "pair_both_named": rate(pair, lambda c: c["named"]),
+        "called_open": rate(strange, lambda c: c["open"]),
+        "unconverged_or_error": rate(judged, lambda c: c["verdict"] in ("fit not converged", "error")),
+        "closed_confirm": closing(named, "confirm"),
+        "closed_sealed": closing(named, "sealed"),
+        "within_floor": rate(named, lambda c: bool(c["within_floor"])),
+        "amplitude_coverage": rate([{"inside": i} for c in named for i in c["coverage"]], lambda c: c["inside"]),
+        "baselines": summarise_baselines(judged),
+        "seconds": _seconds(judged),
+    }
+    return {"cases": len(judged), **{name: figure for name, figure in rates.items() if figure is not None}}
+
+
+def summarise_baselines(judged: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
+    """The same cases by simpler means: BIC's names, the black box's gap, and the gap that the base model leaves."""
+    done = [c for c in judged if c["baselines"]]
+    if not done:
+        return None
+    none, known = ([c for c in done if c["class"] in kinds] for kinds in (("none",), ("single", "pair")))
+    hidden = [{"closed": c["baselines"]["closed"]} for c in done if c["class"] != "none"]
+    return {
+        "base_gap_sealed_median": float(np.median([c["gaps"]["sealed"][0] for c in done])),
+        "bic_names_where_nothing": rate(none, lambda c: bool(c["baselines"]["bic"])),
+        "bic_names_all_hidden": rate(known, lambda c: c["baselines"]["bic_all"]),
+        "bic_false_names": rate(done, lambda c: c["baselines"]["bic_false"]),
+        "black_box_closed_confirm": closing(hidden, "confirm"),
+        "black_box_closed_sealed": closing(hidden, "sealed"),
+    }
+
+
+def rate(cases: Sequence[Any], hit: Callable[[Any], bool]) -> dict[str, Any] | None:
+    """Share of cases with its 95 % interval (Wilson 1927)."""
+    if not cases:
+        return None
+    hits = sum(bool(hit(c)) for c in cases)
+    span = scipy.stats.binomtest(hits, len(cases)).proportion_ci(0.95, method="wilson")
+    return {"hits": hits, "of": len(cases), "rate": hits / len(cases), "interval_95": [span.low, span.high]}
+
+
+def closing(cases: Sequence[dict[str, Any]], role: str) -> dict[str, Any] | None:
+    """Median of the gap closed with a bootstrap over cases, and the share of cases that close `CLOSED` of it."""
+    values = np.array([c["closed"][role] for c in cases if role in c["closed"]])
+    if not len(values):
+        return None
+    draws = np.median(np.random.default_rng(0).choice(values, (2000, len(values))), axis=1)
+    return {
+        "median": float(np.median(values)),
+        "interval_95": np.quantile(draws, [0.025, 0.975]).tolist(),
+        "at_least": rate(values.tolist(), lambda v: v >= CLOSED),
+    }
+
+
+def confusion(judged: Sequence[dict[str, Any]]) -> dict[str, dict[str, int]]:
+    """What was hidden -> what the verdict names, without places, or its kind where it names nothing."""
+    table: dict[str, Counter[str]] = {}
+    for case in judged:
+        hidden = "+".join(sorted(h.split("[")[0] for h in case["hidden"])) or "nothing"
+        said = " + ".join(sorted(e.split(" at ")[0] for e in case["effects"])) or f"({case['verdict']})"
+        table.setdefault(f"{hidden}{' left out' if case['class'] == 'left_out' else ''}", Counter())[said] += 1
+    return {hidden: dict(said.most_common()) for hidden, said in sorted(table.items())}
+
+
+def _seconds(judged: Sequence[dict[str, Any]]) -> dict[str, float] | None:
+    """Median seconds of a case by stage, and in all."""
+    taken = [c["seconds"] for c in judged if c["seconds"]]
+    if not taken:
+        return None
+    stages = {stage: float(np.median([t.get(stage, 0.0) for t in taken])) for stage in taken[-1]}
+    return {**stages, "whole": float(np.median([sum(t.values()) for t in taken]))}

@@ -1,0 +1,140 @@
+"""The search on one case folder after another: recordings in, a small result.json out.  Knows no truth.
+
+One process takes many cases: those of a scene repeat the same commands, so their replays are compiled once.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from droid_jax.gap.case import Case, GapConfig, make_case
+from droid_jax.gap.evidence import Evidence, evidence
+from droid_jax.gap.floor import numerical_floor
+from droid_jax.gap.refit import intervals
+from droid_jax.gap.verdict import Verdict
+from droid_jax.gap.workflow import base_fit, find
+from droid_jax.measure.formats import load
+from droid_jax.measure.recording import Recording
+from droid_jax.storage import write_json
+from experiments.blind.baselines import baselines
+from experiments.blind.scenes import ROLES, Setting, setting
+
+RESULT = "result.json"
+
+
+@dataclass
+class Bench:
+    """Settings and compiled replays that later cases use again."""
+
+    settings: dict[str, Setting] = field(default_factory=dict)
+    config: GapConfig | None = None
+    compiled: dict[str, Case] = field(default_factory=dict)
+
+    def setting(self, name: str) -> Setting:
+        """The setting of a scene, made once."""
+        if name not in self.settings:
+            self.settings[name] = setting(name)
+        return self.settings[name]
+
+    def case(self, scene: str, recordings: Mapping[str, Recording], without: Iterable[str] = ()) -> Case:
+        """The case of recordings by role; effects left out stay at neutral and are not asked for.
+
+        Where there is nothing to confirm or to judge on, the fitted recording stands in.
+        """
+        where = self.setting(scene)
+        given = {role: recordings.get(role, recordings["fit"]) for role in ROLES}
+        if scene not in self.compiled or where.prescribed:  # a measured motion is its own in every case
+            self.compiled[scene] = make_case(where.scene, where.base, where.effects(), **given, config=self.config)
+        known = self.compiled[scene]
+        of = {role: _again(known.judged[role], recording) for role, recording in recordings.items()}
+        kept = {e.name for e in where.effects(without)}
+        return replace(known, **of, effects=tuple(e for e in known.effects if e.name in kept))
+
+
+def _again(known: Evidence, recording: Recording) -> Evidence:
+    """The evidence of another recording of the same commands, on the same compiled replay."""
+    fresh = evidence(known.cost.against([recording]))
+    return fresh.with_own(known.own) if known.own else fresh
+
+
+@dataclass
+class Stopwatch:
+    """Seconds by stage."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def __call__(self, stage: str, work: Callable[[], Any]) -> Any:
+        began = time.monotonic()
+        try:
+            return work()
+        finally:
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.monotonic() - began
+
+
+def search_case(folder: Path, bench: Bench) -> dict[str, Any]:
+    """The result of one case folder; an error of the search is a result too."""
+    told = json.loads((folder / "case.json").read_text())
+    recordings = {role: load(folder / "recordings" / f"{role}.npz") for role in ROLES}
+    watch = Stopwatch()
+    result: dict[str, Any] = {"scene": told["scene"], "without": told["without"]}
+    try:
+        case = watch("prepare", lambda: bench.case(told["scene"], recordings, told["without"]))
+        model = watch("base", lambda: base_fit(case, silent))
+        floor = watch("floor", lambda: numerical_floor(case.fit, model, recordings["fit"]))
+        verdict = watch("find", lambda: find(case, model, floor))
+        result |= describe(case, verdict)
+        first = verdict.screens[0] if verdict.screens else None
+        result["baselines"] = watch("baselines", lambda: baselines(case, model, first, recordings))
+    except (ValueError, ArithmeticError) as error:
+        result |= {"verdict": "error", "error": str(error)}
+    return {**result, "seconds": watch.seconds}
+
+
+def describe(case: Case, verdict: Verdict) -> dict[str, Any]:
+    """A verdict as plain numbers."""
+    spans = intervals(case.fit, verdict.model) if verdict.model.parts else {}
+    space = case.whole
+    return {
+        "verdict": verdict.kind.value,
+        "sentence": verdict.sentence,
+        "effects": list(verdict.effects),
+        "tied": [list(t) for t in verdict.tied],
+        "p": verdict.screens[0].p if verdict.screens else None,
+        "gaps": {role: list(pair) for role, pair in verdict.gaps.items()},
+        "floor": verdict.floor,
+        "converged": verdict.base.refined.converged,
+        "amplitudes": {
+            name: {"value": float(verdict.model.values[space.index(name)]), "interval": list(span)}
+            for name, span in spans.items()
+        },
+        "shapes": {
+            name: float(verdict.model.values[space.index(name)]) for part in verdict.model.parts for name in part.shapes
+        },
+        "trials": [
+            {"name": t.name, "gap_fit": t.gap_fit, "gap_confirm": t.gap_confirm, "reasons": list(t.reasons)}
+            for t in verdict.trials
+        ],
+    }
+
+
+def search_all(folders: Iterable[Path], bench: Bench, tell: Callable[[str], None] = print) -> int:
+    """Search every folder that has no result yet; how many there were."""
+    count = 0
+    for folder in folders:
+        if (folder / RESULT).is_file():
+            continue
+        result = search_case(folder, bench)
+        write_json(folder / RESULT, result)
+        count += 1
+        taken = ", ".join(f"{stage} {seconds:.0f}" for stage, seconds in result["seconds"].items())
+        tell(f"{folder.name}: {result.get('sentence', result.get('error'))} ({taken} s)")
+    return count
+
+
+def silent(stage: str, value: Any) -> None:
+    """Progress that nobody follows."""

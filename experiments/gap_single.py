@@ -1,0 +1,270 @@
+"""What the gap searches in single real logs share: the search, its controls, its false alarms, its report.
+
+Every experiment answers four questions about its log:
+
+1. What is missing in the model that a person would start from?
+2. Control: with that in the model, is it named again?  (It must not be.)
+3. Control: is a known effect found that is added to the real measurement?  The measured torque is raised by
+   what the effect adds to the simulation; everything real stays in the residual.
+4. False alarms: synthetic logs of the real motion, torques of the fitted base model and coloured noise fitted to the
+   real residual, nothing missing.  In how many is something said to be missing, and in how many named?
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import tuned  # noqa: F401  before anything that imports jax
+
+# isort: split
+import numpy as np
+import scipy.linalg
+import scipy.signal
+import scipy.stats
+from inverse_fit import rms, rounded
+
+from droid_jax.compare.residuals import CompareConfig
+from droid_jax.gap.blocks import OUTSIDE, Blocks
+from droid_jax.gap.case import Case, GapConfig
+from droid_jax.gap.evidence import Evidence
+from droid_jax.gap.refit import intervals
+from droid_jax.gap.select import SIGNIFICANT
+from droid_jax.gap.single import Log, base_model, make_log, single_case
+from droid_jax.gap.verdict import Verdict
+from droid_jax.gap.workflow import find
+from droid_jax.identify.refine import RefineConfig
+from droid_jax.measure.recording import Recording
+from droid_jax.model.effects.registry import effect_space
+from droid_jax.model.parameters import Space
+from droid_jax.model.scene import Scene
+from droid_jax.model.seam import Effect, Theta
+
+ORDER = 20  # of the noise's autoregression, at 20 Hz: one second
+BURN = 400  # samples before the noise is stationary
+
+
+# Search ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """A log, the model one starts from, and what may be missing in it.
+
+    sealed: another log, or None.  base: with the parameters of `known`, the effects that the base has.
+    """
+
+    log: Log
+    sealed: Log | None
+    base: Space
+    effects: tuple[Effect, ...]
+    config: GapConfig
+    known: tuple[Effect, ...] = ()
+
+    def case(self, log: Log | None = None, start: np.ndarray | None = None) -> Case:
+        """Of this log, or of another with the same motion."""
+        return single_case(log or self.log, self.base, self.effects, self.sealed, self.config, start)
+
+
+def settings(motion_cutoff: float, seed: int) -> GapConfig:
+    """Inverse dynamics is smooth in its parameters: no search and no hops before the refinement."""
+    return GapConfig(
+        refine=RefineConfig(iterations=12, hops=0, spreads=0),
+        compare=CompareConfig(whitened=True, motion_cutoff=motion_cutoff),
+        seed=seed,
+    )
+
+
+def make_search(
+    scene: Scene,
+    base: Space,
+    effects: Sequence[Effect],
+    recordings: Sequence[Recording],
+    config: GapConfig,
+    known: Sequence[Effect] = (),
+) -> Search:
+    """A search in one recording, or in the first of two with the second sealed.
+
+    known: effects that the base has beside the parameters `base` (see `as_known`).
+    """
+    base = base + effect_space(known) if known else base
+    logs = [make_log(scene, base, effects, r, config, known) for r in recordings]
+    return Search(logs[0], logs[1] if len(logs) > 1 else None, base, tuple(effects), config, tuple(known))
+
+
+def run_search(search: Search, log: Log | None = None, start: np.ndarray | None = None) -> tuple[Case, Verdict]:
+    """Its case and the verdict."""
+    case = search.case(log, start)
+    return case, find(case, base_model(case, start), 0.0)
+
+
+def answer(search: Search, log: Log | None = None, start: np.ndarray | None = None) -> dict[str, Any]:
+    """The report of a search, or why none was possible: nothing is said then."""
+    try:
+        return report(*run_search(search, log, start))
+    except ValueError as error:
+        silent = {"effects": [], "tied": [], "p": [], "rms": {}}
+        return {"verdict": "refused", "sentence": str(error), **silent}
+
+
+def as_known(effect: Effect) -> Effect:
+    """The same physics under parameters `known_...`, for a base that has it while it is asked about once more."""
+
+    def own(theta: Theta) -> Theta:
+        return {p.name: theta[f"known_{p.name}"] for p in effect.parameters}
+
+    def renamed(function: Callable[..., Any] | None) -> Callable[..., Any] | None:
+        return None if function is None else lambda theta, *rest: function(own(theta), *rest)
+
+    return Effect(
+        f"known {effect.name}",
+        tuple(replace(p, name=f"known_{p.name}", group="Model") for p in effect.parameters),
+        force=renamed(effect.force),
+        frictionloss=renamed(effect.frictionloss),
+        observe=renamed(effect.observe),
+    )
+
+
+def adding(log: Log, values: np.ndarray, added: Mapping[str, float]) -> Log:
+    """The log with what parameters `added` change in the simulation at `values` [D] added to its measurement."""
+    without, with_it = log.simulated(np.stack([values, _changed(log, values, added)]))
+    return log.holding(log.measured + with_it - without)
+
+
+def _changed(log: Log, values: np.ndarray, added: Mapping[str, float]) -> np.ndarray:
+    out = values.copy()
+    for name, value in added.items():
+        out[log.space.index(name)] = value
+    return out
+
+
+# False alarms ------------------------------------------------------------------------------
+
+
+def coloured(residuals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """[K, C] noise with the autocorrelation of residuals [K, C], column by column (Yule and Walker)."""
+    out = []
+    for column in (residuals - residuals.mean(axis=0)).T:
+        size = len(column)
+        lags = np.array([column[: size - k] @ column[k:] / size for k in range(ORDER + 1)])
+        weights = scipy.linalg.solve_toeplitz(lags[:-1], lags[1:])
+        deviation = np.sqrt(max(lags[0] - weights @ lags[1:], 0.0))
+        drawn = scipy.signal.lfilter([1.0], np.r_[1.0, -weights], rng.normal(0.0, deviation, size + BURN))
+        out.append(np.asarray(drawn)[BURN:])
+    return np.stack(out, axis=1)
+
+
+def false_alarms(search: Search, verdict: Verdict, count: int, seed: int) -> dict[str, Any]:
+    """The whole search on `count` synthetic logs in which nothing is missing.
+
+    Torques of the fitted base model; noise like what the extended model leaves of the real log.
+    """
+    rng = np.random.default_rng(seed)
+    truth, left = verdict.base.values, search.log.left(verdict.model.values)
+    simulated = search.log.simulated(truth[None])[0]
+    missing, named = [], []
+    for number in range(count):
+        log = search.log.holding(simulated + coloured(left, rng))
+        try:
+            case, found = run_search(search, log, truth)
+        except ValueError as error:  # too short for the residual's correlation time: nothing is said
+            print(f"  {number + 1:4d}: {error}", flush=True)
+            continue
+        missing.append(found.screens[0].p < SIGNIFICANT)
+        named.extend([{"case": number, "effects": list(found.effects)}] if found.effects else [])
+        print(f"  {number + 1:4d}: p {found.screens[0].p:.4f} {found.kind.value} {case.fit.units} blocks", flush=True)
+    return {
+        "cases": count,
+        "refused": count - len(missing),
+        "said_to_be_missing": share(int(np.sum(missing)), len(missing)),
+        "named": share(len(named), len(missing)),
+        "names": named,
+        "noise": f"autoregression of order {ORDER} of the residual that the extended model leaves, column by column",
+        "level": SIGNIFICANT,
+    }
+
+
+def share(hits: int, count: int) -> dict[str, Any]:
+    """Hits, their share and its 95 % interval (Wilson 1927); of nothing, all is possible."""
+    if count == 0:
+        return {"hits": 0, "share": None, "interval": [0.0, 1.0]}
+    span = scipy.stats.binomtest(hits, count).proportion_ci(0.95, method="wilson")
+    return {"hits": hits, "share": round(hits / count, 4), "interval": rounded([span.low, span.high])}
+
+
+# Report ------------------------------------------------------------------------------------
+
+
+def report(case: Case, verdict: Verdict) -> dict[str, Any]:
+    """A verdict with its grounds as JSON values."""
+    spans = intervals(case.fit, verdict.model)
+    return {
+        "verdict": verdict.kind.value,
+        "sentence": verdict.sentence,
+        "effects": list(verdict.effects),
+        "tied": [list(t) for t in verdict.tied],
+        "values": {
+            p.name: {
+                "unit": p.unit,
+                "value": float(verdict.model.values[case.whole.index(p.name)]),
+                **({"interval": rounded(spans[p.name])} if p.name in spans else {}),
+                "base": float(verdict.base.values[case.whole.index(p.name)]),
+            }
+            for p in verdict.model.space.parameters
+        },
+        "p": [s.p for s in verdict.screens],
+        "gaps": {role: {"before": b, "after": a, "closed": 1 - a / b} for role, (b, a) in verdict.gaps.items()},
+        "rms": {role: _rms_of(case, verdict, role) for role in ("fit", "confirm", "sealed")},
+        "noise_stated": rounded(1 / np.einsum("ckk->kc", _torque(case).noise.whitener).max(axis=0)),
+        "blocks": {"each": case.fit.units, "seconds": round(_block_seconds(case), 3)},
+        "where": [
+            {"variable": b.variable, "where": b.where, "before": b.gap, "after": a.gap}
+            for b, a in zip(verdict.before.cells, verdict.after.cells, strict=True)
+        ],
+        "trials": [
+            {"name": t.name, "passed": t.passed, "p": t.p, "gap_fit": t.gap_fit, "gap_confirm": t.gap_confirm,
+             "chosen": t.chosen, "rivals": list(t.rivals), "reasons": list(t.reasons)}
+            for t in verdict.trials
+        ],
+    }  # fmt: skip
+
+
+def _torque(case: Case) -> Any:
+    return case.fit.cost.comparisons[0].channel("torque")
+
+
+def _block_seconds(case: Case) -> float:
+    """Shortest of the blocks."""
+    block, time = _block(case.fit), case.fit.time
+    return min(float(np.sum(block == b)) for b in range(case.fit.units)) * float(time[1] - time[0])
+
+
+def _block(evidence: Evidence) -> np.ndarray:
+    """[K] block of each instant."""
+    assert isinstance(evidence, Blocks)
+    return evidence.block[evidence.column == 0]
+
+
+def _rms_of(case: Case, verdict: Verdict, role: str) -> dict[str, list[float]]:
+    """RMS of each column before and after, in its unit, over the instants of a role."""
+    evidence = case.judged[role]
+    inside, log = _block(evidence) != OUTSIDE, evidence.cost
+    assert isinstance(log, Log)
+    return {
+        when: rounded(rms(log.left(model.values)[inside]))
+        for when, model in (("before", verdict.base), ("after", verdict.model))
+    }
+
+
+def show(title: str, found: Mapping[str, Any]) -> None:
+    """A few lines for people."""
+    print(f"{title}: {found['sentence']}  (p {', '.join(f'{p:.2g}' for p in found['p'])})", flush=True)
+    for role, r in found["rms"].items():
+        print(f"  {role:8s} RMS {r['before']} -> {r['after']}", flush=True)
+
+
+def silent_about(found: Mapping[str, Any], names: Sequence[str]) -> bool:
+    """Whether none of some effects is named, also not as a tie."""
+    said = [*found["effects"], *(n for t in found["tied"] for n in t)]
+    return not any(s.split(" at ")[0] in names for s in said)

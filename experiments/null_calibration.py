@@ -1,0 +1,141 @@
+"""How often does the search raise an alarm where nothing is hidden?
+
+    python experiments/null_calibration.py [--quick] [--counts.hinge 150 ...] [--commit HASH] [--out DIR]
+
+Every case draws a robot with all its nuisances and records it; base fit and screening follow.  Only where the
+screening rejects are the other demonstrations recorded and the search taken to its end.  One small JSON a case
+under OUT/null_cases: the run can be stopped and goes on where it was.  Truths and seeds come as in the blind suite.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
+
+import tuned  # noqa: E402, F401  (before jax starts)
+
+# isort: split
+import json  # noqa: E402
+
+import numpy as np  # noqa: E402
+import scipy.stats  # noqa: E402
+import tyro  # noqa: E402
+
+from benchmarks.common import origin  # noqa: E402
+from droid_jax.gap.candidates import candidates  # noqa: E402
+from droid_jax.gap.floor import numerical_floor  # noqa: E402
+from droid_jax.gap.screen import questions_of  # noqa: E402
+from droid_jax.gap.workflow import ask, base_fit, find  # noqa: E402
+from droid_jax.storage import write_json  # noqa: E402
+from experiments.blind.cases import Plan  # noqa: E402
+from experiments.blind.draws import commit_of, seed_of  # noqa: E402
+from experiments.blind.make import ATTEMPTS, draw, record  # noqa: E402
+from experiments.blind.scenes import ROLES, setting  # noqa: E402
+from experiments.blind.score import rate  # noqa: E402
+from experiments.blind.search import Bench, Stopwatch, silent  # noqa: E402
+
+SIGNIFICANT = 0.01
+LEVELS = (0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9)
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Cases of each scene."""
+
+    hinge: int = 160
+    bench: int = 140
+    arm: int = 60
+    door: int = 60
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Options."""
+
+    quick: bool = False
+    """Two cases of the lone hinge."""
+    counts: Counts = field(default_factory=Counts)
+    """Cases of each scene."""
+    commit: str = "HEAD"
+    """Commit that froze the method: seeds derive from it.  "development" draws cases to tune with."""
+    out: Path = ROOT / "runs" / "null_calibration"
+    """Folder of the cases and of null_calibration.json."""
+
+
+def run_case(plan: Plan, commit: str, bench: Bench) -> dict[str, Any]:
+    """Screen one case; search it to the end where the screening rejects."""
+    scene, where, watch = plan.scene, bench.setting(plan.scene), Stopwatch()
+    drawn, recordings = _recorded(bench, plan, commit, watch)
+    case = watch("prepare", lambda: bench.case(scene, recordings))
+    model = watch("base", lambda: base_fit(case, silent))
+    screen = watch("screen", lambda: ask(case, model, questions_of(candidates(case.effects))))
+    best = screen.questions[int(np.argmax(np.abs(screen.t)))].candidate.name
+    result = {"scene": scene, "p": screen.p, "gap": model.gap, "converged": bool(model.refined.converged), "best": best}
+    if screen.p < SIGNIFICANT:
+        floor = watch("floor", lambda: numerical_floor(case.fit, model, recordings["fit"]))
+        others = watch("record", lambda: record(where, drawn, ROLES[1:]))
+        whole = watch("prepare", lambda: bench.case(scene, {**recordings, **others}))
+        verdict = watch("find", lambda: find(whole, model, floor))
+        result |= {"floor": floor, "verdict": verdict.kind.value, "effects": list(verdict.effects)}
+    return {**result, "seed": seed_of(commit, plan.name), "seconds": watch.seconds}
+
+
+def _recorded(bench: Bench, plan: Plan, commit: str, watch: Stopwatch) -> tuple[Any, dict[str, Any]]:
+    """What was drawn, and the recording to fit; robots that lose their door are drawn again."""
+    where, seed = bench.setting(plan.scene), seed_of(commit, plan.name)
+    for attempt in range(ATTEMPTS):
+        drawn = draw(where, plan, {}, np.random.default_rng([seed, attempt]))
+        assert drawn is not None  # nothing is hidden, so nothing can be too large
+        try:
+            return drawn, watch("record", lambda d=drawn: record(where, d, ("fit",)))
+        except ValueError as error:
+            if "grasp" not in str(error):
+                raise
+    raise ValueError(f"case {plan.name}: no robot of {ATTEMPTS} kept hold of its door")
+
+
+def summarise(cases: list[dict[str, Any]]) -> dict[str, Any]:
+    """False alarms with Wilson's intervals, and the p-values' distribution."""
+    p = np.array([c["p"] for c in cases])
+    return {
+        "cases": len(cases),
+        "screening_rejects": rate(cases, lambda c: c["p"] < SIGNIFICANT),
+        "alarms": rate(cases, lambda c: c.get("verdict", "none") not in ("none", "fit not converged")),
+        "names": rate(cases, lambda c: bool(c.get("effects"))),
+        "unconverged": rate(cases, lambda c: not c["converged"]),
+        "p_below": {f"{level:g}": float(np.mean(p < level)) for level in LEVELS},
+        "uniform_p": float(scipy.stats.kstest(p, "uniform").pvalue),
+        "p_histogram": np.histogram(p, np.linspace(0, 1, 11))[0].tolist(),
+        "gap_median": float(np.median([c["gap"] for c in cases])),
+        "seconds_median": float(np.median([sum(c["seconds"].values()) for c in cases])),
+    }
+
+
+def main() -> None:
+    arguments = tyro.cli(Arguments, description=__doc__)
+    commit = commit_of(arguments.commit)
+    wanted = {"hinge": 2} if arguments.quick else asdict(arguments.counts)
+    found: dict[str, list[dict[str, Any]]] = {}
+    for scene, count in wanted.items():
+        bench = Bench({scene: setting(scene, arguments.out / "door")})
+        for number in range(count):
+            name = f"{scene}/null/{number}"
+            path = arguments.out / "null_cases" / f"{scene}_{number:03d}_{seed_of(commit, name):08x}.json"
+            if not path.is_file():
+                write_json(path, run_case(Plan(name, scene, "none"), commit, bench))
+            found.setdefault(scene, []).append(json.loads(path.read_text()))
+            print(f"{scene} {number}: p = {found[scene][-1]['p']:.3f}", flush=True)
+    scenes = {scene: summarise(cases) for scene, cases in found.items()}
+    whole = summarise([c for cases in found.values() for c in cases])
+    result = {**origin(0), "seeds_from": commit, "all": whole, "scenes": scenes}
+    write_json(arguments.out / "null_calibration.json", result)
+    print(json.dumps(whole))
+
+
+if __name__ == "__main__":
+    main()
