@@ -235,8 +235,8 @@ def _done(out: Path) -> None:
     found = load_gap(out).answer
     page = report.write(out)
     print(found["sentence"])
-    p = "not asked" if found["p"] is None else f"p = {found['p']:.2g} that chance alone does this"
-    print(f"something missing: {p}; converged: {'yes' if found['converged'] else 'no'}")
+    p = "nothing was asked" if found["p"] is None else f"p = {found['p']:.2g} if nothing were missing"
+    print(f"{p}; base fit converged: {'yes' if found['converged'] else 'no'}")
     gaps = []
     for role, gap in found["gaps"].items():
         closed = "" if gap["closed"] is None else f" ({gap['closed']:.0%} closed)"

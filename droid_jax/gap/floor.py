@@ -14,19 +14,31 @@ from droid_jax.gap.evidence import Evidence
 from droid_jax.gap.refit import Model
 from droid_jax.gap.screen import project
 from droid_jax.measure.recording import Recording
+from droid_jax.model.parameters import Space
 from droid_jax.model.scene import with_options
 
 FINER = 4
 
 
-def numerical_floor(evidence: Evidence, model: Model, recording: Recording) -> float:
-    """U0 of a fitted base model on the recording it was fitted to; zero in inverse mode, which has no time step."""
+def finer(evidence: Evidence, base: Space, recording: Recording) -> Cost | None:
+    """The cost of the base model at a quarter of the time step; None in inverse mode, which has no time step."""
     cost = evidence.cost
     if not isinstance(cost.drives[0], Drive):
-        return 0.0
+        return None
     scene = with_options(cost.scene, timestep=float(cost.scene.model.opt.timestep) / FINER)
+    return make_cost(scene, base, [recording], config=cost.comparisons[0].config)
+
+
+def numerical_floor(evidence: Evidence, model: Model, recording: Recording, fine: Cost | None = None) -> float:
+    """U0 of a fitted base model on the recording it was fitted to; zero in inverse mode.
+
+    fine: what `finer` made, of this recording or of another with the same commands, to spare a compilation.
+    """
+    cost = evidence.cost
+    fine = finer(evidence, model.space, recording) if fine is None else fine.against([recording])
+    if fine is None:
+        return 0.0
     values = model.values[cost.space.columns(model.space)]
-    fine: Cost = make_cost(scene, model.space, [recording], config=cost.comparisons[0].config)
     count = evidence.repeats
     off = (fine.whitened(values[None])[0] - cost.whitened(model.values[None])[0]).astype(np.float64) / np.sqrt(count)
     left = project(off[None], model.refined.jacobian / np.sqrt(count), model.refined.prior * np.sqrt(count))[0]

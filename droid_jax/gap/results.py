@@ -97,7 +97,7 @@ def gap_arrays(case: Case, verdict: Verdict) -> dict[str, np.ndarray]:
     for role, evidence in case.judged.items():
         order = [_joints(evidence).index(joint) for joint in joints]
         channel = evidence.cost.comparisons[0].channel("torque")
-        (simulated,) = evidence.cost.smoothed(_before_after(verdict))
+        (simulated,) = evidence.cost.smoothed(_before_after(evidence, verdict))
         before, after = simulated[:, :, order]
         out |= {
             f"{role}.time": channel.clock,
@@ -109,9 +109,19 @@ def gap_arrays(case: Case, verdict: Verdict) -> dict[str, np.ndarray]:
     return out
 
 
-def _before_after(verdict: Verdict) -> np.ndarray:
-    """[2, D] values of the base model and of the extended one."""
-    return np.stack([verdict.base.values, verdict.model.values])
+def _before_after(evidence: Evidence, verdict: Verdict) -> np.ndarray:
+    """[2, D] values of the base model and of the extended one, the recording's own nuisances at their best."""
+    rows = np.stack([verdict.base.values, verdict.model.values])
+    if evidence.own_columns is None:
+        return rows
+    space, columns = evidence.cost.space, evidence.own_columns
+    own = [space.index(name) for name in evidence.own]
+    rows[:, own] = space.mean[own]
+    left = -evidence.cost.whitened(rows).astype(np.float64) / np.sqrt(evidence.repeats)
+    normal = columns.T @ columns + np.eye(len(own)) / evidence.repeats  # as in `Evidence.common`
+    best = space.mean[own] - space.std[own] * np.linalg.solve(normal, columns.T @ left.T).T
+    rows[:, own] = np.clip(best, space.low[own], space.high[own])
+    return rows
 
 
 def _joints(evidence: Evidence) -> list[str]:
@@ -122,7 +132,7 @@ def _joints(evidence: Evidence) -> list[str]:
 def _gap(role: str, evidence: Evidence, verdict: Verdict) -> dict[str, Any]:
     """U and the paper's distance, N m, before and after; closed: None where there was nothing above the floor."""
     before, after = verdict.gaps[role]
-    both = _before_after(verdict)
+    both = _before_after(evidence, verdict)
     distance = (evidence.cost.distances(both) - evidence.cost.penalties(both))[:, 0]
     return {
         "recording": evidence.cost.comparisons[0].name,
@@ -189,7 +199,7 @@ def _shifts(case: Case, verdict: Verdict) -> list[dict[str, Any]]:
     """How the base parameters moved when the effects came in, against what the base fit thought it knew."""
     columns = case.whole.columns(case.base)
     deviation = posterior(verdict.base.refined, case.fit.cost.comparisons).physical_std
-    before, after = _before_after(verdict)[:, columns]
+    before, after = verdict.base.values[columns], verdict.model.values[columns]
     return [
         {"name": p.name, "unit": p.unit, "before": b, "after": a, "deviation_before": s}
         for p, b, a, s in zip(case.base.parameters, before.tolist(), after.tolist(), deviation.tolist(), strict=True)

@@ -40,11 +40,11 @@ class Round:
 
     @property
     def rivals(self) -> tuple[Model, ...]:
-        """Models that stood their trial and cannot be told from the winner."""
+        """Models that cannot be told from the winner and lost, if at all, for their size or significance alone."""
         if self.chosen is None:
             return ()
         both = zip(self.tried, self.trials, strict=True)
-        return tuple(m for m, t in both if t.passed and t.name in self.chosen.rivals)
+        return tuple(m for m, t in both if (t.passed or t.weak) and t.name in self.chosen.rivals)
 
 
 class Budget:
@@ -182,6 +182,8 @@ def _decided(hunt: Hunt, before: Model, found: Screen, tried: Sequence[Model]) -
     trials = judge(
         case.fit, case.confirm, before, tried, case.smallest, hunt.whole_gap, floor=hunt.floor, seed=case.config.seed
     )
-    passed = [(m, t) for m, t in zip(tried, trials, strict=True) if t.passed]
-    winner, chosen = min(passed, key=lambda mt: mt[1].gap_confirm) if passed else (None, None)
+    standing = [(m, t) for m, t in zip(tried, trials, strict=True) if t.passed or t.weak]
+    winner, chosen = min(standing, key=lambda mt: mt[1].gap_confirm, default=(None, None))
+    if chosen is None or chosen.weak:  # what does best is too weak to be named, so nothing worse is named instead
+        winner, chosen = None, None
     return Round(found, stood, tuple(tried), tuple(trials), winner, chosen)

@@ -27,7 +27,8 @@ class Trial:
 
     gap_fit, gap_confirm: U with it on both demonstrations; p: of the improvement on the confirming one.
     interval: of each amplitude; chosen: share of resamples.  rivals: names of models that cannot be told from it.
-    reasons: why it lost, empty where it passed.
+    reasons: why it lost, empty where it passed.  weak: it lost for nothing but its size or its significance,
+    and may yet be the truth.
     """
 
     name: str
@@ -38,6 +39,7 @@ class Trial:
     chosen: float
     reasons: tuple[str, ...]
     rivals: tuple[str, ...] = ()
+    weak: bool = False
 
     @property
     def passed(self) -> bool:
@@ -83,13 +85,20 @@ def judge(
         p = one_sided_p(0.5 * (squares[0] - squares[k + 1]))
         chosen = float(winners[same[k]].sum())
         spans = {a: s for a, s in intervals(fit, model).items() if a not in before.amplitudes}
-        reasons = _gap_reasons(left[0], left[k + 1], p, whole_gap, MORE if before.parts else LESS)
-        reasons += _amplitude_reasons(fit, model, spans, smallest)
+        weak = [f"not confirmed by the other demonstration (p = {p:.2g})"] if p >= SIGNIFICANT else []
+        weak += _too_small(fit, model, spans, smallest)
+        reasons = _gap_reasons(left[0], left[k + 1], whole_gap, MORE if before.parts else LESS)
+        reasons += _amplitude_reasons(fit, model, spans)
         if chosen < CHOSEN:
             leader = min(zip(left[1:], models, strict=True), key=lambda lm: lm[0])[1].name
             reasons.append(f"wins only {chosen:.0%} of the resamples; {leader} does better")
         rivals = tuple(models[i].name for i in np.flatnonzero(same[k]).tolist() if i != k)
-        out.append(Trial(model.name, model.gap, float(left[k + 1]), p, spans, chosen, tuple(reasons), rivals))
+        out.append(
+            Trial(
+                model.name, model.gap, float(left[k + 1]), p, spans, chosen, (*weak, *reasons), rivals,
+                weak=bool(weak) and not reasons,
+            )
+        )  # fmt: skip
     return out
 
 
@@ -106,10 +115,8 @@ def alike(left: np.ndarray, losses: np.ndarray, floor: float, tie: float) -> np.
     return (as_good & as_good.T) | np.eye(len(left), dtype=bool)
 
 
-def _gap_reasons(before: float, after: float, p: float, whole_gap: float, least: float) -> list[str]:
+def _gap_reasons(before: float, after: float, whole_gap: float, least: float) -> list[str]:
     reasons = []
-    if p >= SIGNIFICANT:
-        reasons.append(f"not confirmed by the other demonstration (p = {p:.2g})")
     if after > before:
         reasons.append("makes the gap on the other demonstration larger")
     elif after > (1 - least) * before:
@@ -119,15 +126,17 @@ def _gap_reasons(before: float, after: float, p: float, whole_gap: float, least:
     return reasons
 
 
-def _amplitude_reasons(
+def _too_small(
     fit: Evidence, model: Model, spans: Mapping[str, tuple[float, float]], smallest: Mapping[str, float]
 ) -> list[str]:
     space = fit.cost.space
-    reasons = []
-    if all(low <= 0.0 <= high for low, high in spans.values()):
-        reasons.append("its amplitude may be zero")
-    if all(abs(model.values[space.index(a)] - space[a].mean) < smallest[a] for a in spans):
-        reasons.append("too small to be worth a name")
+    small = all(abs(model.values[space.index(a)] - space[a].mean) < smallest[a] for a in spans)
+    return ["too small to be worth a name"] if small else []
+
+
+def _amplitude_reasons(fit: Evidence, model: Model, spans: Mapping[str, tuple[float, float]]) -> list[str]:
+    zero = all(low <= 0.0 <= high for low, high in spans.values())
+    reasons = ["its amplitude may be zero"] if zero else []
     return reasons + [f"{a} ran into its bound" for a in spans if _on_bound(fit, model, a)]
 
 

@@ -56,27 +56,27 @@ def find(case: Case, base: Model, floor: float, progress: Progress = lambda stag
     """From a base fit to a verdict.  floor: U0, see `numerical_floor`."""
     hunt = Hunt(case, case.confirm.gap_at(base.values), floor, Budget(case.config.budget), progress)
     if not base.refined.converged:
-        return _verdict(hunt, base, base, [])
+        return _verdict(hunt, base, base, [], quiet=False)
     asked = questions_of(candidates(case.effects))
-    model, rounds = base, list[Round]()
+    model, rounds, quiet = base, list[Round](), False
     while len(model.parts) < case.config.most:
         progress("screen", model.name)
         left = tuple(q for q in asked if not set(q.candidate.amplitudes) & set(model.amplitudes))
         found = ask(case, model, left)
-        enough = hunt.gap(model) > max(floor, OF_ALL * hunt.whole_gap if model.parts else 0.0)
-        there = found.p < SIGNIFICANT and model.gap > floor and enough
-        done = forward(hunt, model, found) if there else Round(found)
+        quiet = found.p >= SIGNIFICANT or model.gap <= floor
+        enough = not model.parts or hunt.gap(model) > OF_ALL * hunt.whole_gap
+        done = forward(hunt, model, found) if enough and not quiet else Round(found)
         rounds.append(done)
         if done.winner is None:
             break
         model = done.winner
-    if rounds[0].trials and _unsettled(hunt, model):
+    if not quiet and _unsettled(hunt, model):
         if hunt.budget.spent:
             hunt.budget.skip("pairs of effects not tried")
         else:
             rounds.append(pairs(hunt, base, model, rounds[0]))
             model = rounds[-1].winner or model
-    return _verdict(hunt, base, polished(hunt, pruned(hunt, model)), rounds)
+    return _verdict(hunt, base, polished(hunt, pruned(hunt, model)), rounds, quiet)
 
 
 def _unsettled(hunt: Hunt, model: Model) -> bool:
@@ -89,7 +89,8 @@ def _open(after: float, before: float, floor: float) -> float:
     return (after - floor) / max(before - floor, 1e-12)
 
 
-def _verdict(hunt: Hunt, base: Model, model: Model, rounds: list[Round]) -> Verdict:
+def _verdict(hunt: Hunt, base: Model, model: Model, rounds: list[Round], quiet: bool) -> Verdict:
+    """quiet: the last screening found nothing more."""
     case, floor = hunt.case, hunt.floor
     gaps = {role: (e.gap_at(base.values), e.gap_at(model.values)) for role, e in case.judged.items()}
     before, after = gaps["confirm"]
@@ -99,7 +100,8 @@ def _verdict(hunt: Hunt, base: Model, model: Model, rounds: list[Round]) -> Verd
     if not base.refined.converged or not model.refined.converged:
         kind = Kind.UNCONVERGED
     elif model.parts:
-        kind = Kind.PARTLY if _open(after, before, floor) > OPEN else Kind.TIE if any(tied) else Kind.NAMED
+        much_left = not quiet and _open(after, before, floor) > OPEN
+        kind = Kind.PARTLY if much_left else Kind.TIE if any(tied) else Kind.NAMED
     return Verdict(
         kind=kind,
         effects=tuple(c.name for c in model.parts),

@@ -73,6 +73,20 @@ def test_traces_have_one_shape_and_their_clock(found: Small, folder: Path):
         assert 0.001 < np.median(traces["scatter"]) < 0.1
 
 
+def test_a_recordings_own_offset_is_no_gap_of_the_traces(found: Small):
+    """A sensor that was 0.15 N m off on the second day: U fits that, and so do the traces beside it."""
+    recording = found.recordings["confirm"]
+    torque = recording.channel("torque")
+    shifted = dataclasses.replace(torque, values=torque.values + np.float32([0.0, 0.15, 0.0]))
+    confirm = dataclasses.replace(recording, channels={**recording.channels, "torque": shifted})
+    case = found.case.against({"fit": found.recordings["fit"], "confirm": confirm})
+    arrays = gap_arrays(case, found.verdict)
+    left = (arrays["confirm.after"] - arrays["confirm.measured"]).mean(axis=0)
+    np.testing.assert_allclose(left, 0.0, atol=0.02)
+    before = gap_json(found.case, found.verdict)["gaps"]["confirm"]["torque_after"]
+    assert gap_json(case, found.verdict)["gaps"]["confirm"]["torque_after"] == pytest.approx(before, rel=0.05)
+
+
 def test_joints_keep_one_order_whatever_the_recordings_have(found: Small):
     """A recording whose channels come in another order ends up in the order of the first."""
     case = found.case
@@ -89,7 +103,8 @@ def test_joints_keep_one_order_whatever_the_recordings_have(found: Small):
 
     class Turned:
         comparisons = (comparison,)
-        scene = case.confirm.cost.scene
+        scene, space = case.confirm.cost.scene, case.confirm.cost.space
+        whitened = staticmethod(case.confirm.cost.whitened)
 
         def smoothed(self, values):
             return tuple(s[:, :, order] for s in case.confirm.cost.smoothed(values))

@@ -31,5 +31,5 @@ def door_closer(scene: Scene) -> Effect | None:
         confused_with=("drag", "opening_check"),
         places={joint: (DAMPING,)},
         shapes={EXPONENT: a.EXPONENTS},
-        smallest=0.2,
+        smallest=0.1,
     )

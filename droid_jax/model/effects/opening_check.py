@@ -39,5 +39,5 @@ def opening_check(scene: Scene) -> Effect | None:
         confused_with=("hardening_spring", "drag"),
         places={joint: (DAMPING,)},
         shapes={ANGLE: ANGLES, EXPONENT: a.EXPONENTS},
-        smallest=0.2,
+        smallest=0.1,
     )
