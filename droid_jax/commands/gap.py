@@ -216,7 +216,7 @@ class _Clock:
             write_json(self.kept, self.seconds)
         self._stage, self._since = stage, now
         if stage in STAGES:
-            self.show(stage, None if isinstance(value, str) else value)  # bars show numbers, not names
+            self.show(stage, value)
 
 
 def _seconds(kept: Path) -> dict[str, float]:

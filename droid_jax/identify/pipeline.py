@@ -20,6 +20,7 @@ from droid_jax.identify.uncertainty import Identifiability, identifiability, not
 from droid_jax.measure.recording import Recording
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
+from droid_jax.model.seam import Effect
 
 
 @dataclass(frozen=True)
@@ -122,12 +123,14 @@ def identify(
     *,
     nuisances: Space | None = None,
     config: IdentifyConfig | None = None,
+    effects: Sequence[Effect] = (),
     checkpoints: Path | None = None,
     progress: Progress | None = None,
 ) -> Identified:
     """Fit `space` to one or several recordings of the same robot and object.
 
     nuisances: fitted and marginalised beside it in the refinement; None for none.
+    effects: in the model beside what the scene has; their parameters are in `space` or stay at neutral.
     checkpoints: folder where the search saves itself and from which it resumes.
     progress: called with a stage's name and its progress value.
     """
@@ -142,7 +145,7 @@ def identify(
     seconds: dict[str, float] = {}
 
     began = time.monotonic()
-    base = make_cost(scene, full, fitted, engine=config.engine, config=config.compare)
+    base = make_cost(scene, full, fitted, engine=config.engine, config=config.compare, effects=effects)
     first = base.first()
     found = search(
         lambda rows: first(full.embed(space, rows)),
@@ -166,7 +169,7 @@ def identify(
     report("judge", None)
     plain = replace(config.compare, whitened=False)
     commanded = all(r.command.size for r in recordings)
-    heldout = base.against(held, plain) if commanded else make_cost(scene, full, held, config=plain)
+    heldout = base.against(held, plain) if commanded else make_cost(scene, full, held, config=plain, effects=effects)
     gaps = _gaps(heldout, full.mean, best)
     seconds["judge"] = time.monotonic() - began
     return Identified(

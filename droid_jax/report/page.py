@@ -36,6 +36,8 @@ from droid_jax.storage import write_text
 
 _DOWNLOADS = (
     ("gaussian.json", "the fitted Gaussian, for training"),
+    ("extended.json", "the extended model: effects, values and Gaussian, for fits and training"),
+    ("extended.xml", "the extended model as MJCF, as far as MJCF has words for it"),
     ("fitted.xml", "the scene with the fitted values"),
     ("fit.json", "every number of this page"),
     ("samples.csv", "parameter sets drawn from the fitted Gaussian"),

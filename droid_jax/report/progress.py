@@ -43,7 +43,9 @@ def stages(names: Sequence[str]) -> Iterator[Report]:
 
 
 def _line(value: Any) -> dict[str, Any]:
-    """What to show of a stage's progress value."""
+    """What to show of a stage's progress value, or a text in place of one."""
+    if isinstance(value, str):
+        return {"text": value}
     if hasattr(value, "generation"):
         text = f"cost {value.best_cost:.4g}  sigma {value.sigma:.2g}"
         return {"completed": value.generation, "total": value.generations, "text": text}

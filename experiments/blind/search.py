@@ -12,10 +12,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from droid_jax.compare.cost import Cost
 from droid_jax.gap.case import Case, GapConfig, make_case
 from droid_jax.gap.evidence import Evidence, evidence
-from droid_jax.gap.floor import numerical_floor
-from droid_jax.gap.refit import intervals
+from droid_jax.gap.floor import finer, numerical_floor
+from droid_jax.gap.refit import Model, intervals
 from droid_jax.gap.verdict import Verdict
 from droid_jax.gap.workflow import base_fit, find
 from droid_jax.measure.formats import load
@@ -34,6 +35,7 @@ class Bench:
     settings: dict[str, Setting] = field(default_factory=dict)
     config: GapConfig | None = None
     compiled: dict[str, Case] = field(default_factory=dict)
+    fine: dict[str, Cost | None] = field(default_factory=dict)
 
     def setting(self, name: str) -> Setting:
         """The setting of a scene, made once."""
@@ -54,6 +56,12 @@ class Bench:
         of = {role: _again(known.judged[role], recording) for role, recording in recordings.items()}
         kept = {e.name for e in where.effects(without)}
         return replace(known, **of, effects=tuple(e for e in known.effects if e.name in kept))
+
+    def floor(self, scene: str, case: Case, model: Model, recording: Recording) -> float:
+        """U0 of a base model; the finer replay is compiled once a scene."""
+        if scene not in self.fine:
+            self.fine[scene] = finer(case.fit, model.space, recording)
+        return numerical_floor(case.fit, model, recording, self.fine[scene])
 
 
 def _again(known: Evidence, recording: Recording) -> Evidence:
@@ -85,7 +93,7 @@ def search_case(folder: Path, bench: Bench) -> dict[str, Any]:
     try:
         case = watch("prepare", lambda: bench.case(told["scene"], recordings, told["without"]))
         model = watch("base", lambda: base_fit(case, silent))
-        floor = watch("floor", lambda: numerical_floor(case.fit, model, recordings["fit"]))
+        floor = watch("floor", lambda: bench.floor(told["scene"], case, model, recordings["fit"]))
         verdict = watch("find", lambda: find(case, model, floor))
         result |= describe(case, verdict)
         first = verdict.screens[0] if verdict.screens else None
