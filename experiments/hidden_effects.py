@@ -120,7 +120,7 @@ def run_limits(command: Limits) -> dict[str, Any]:
     effects = ("closer",) if command.quick else command.effects
     for name in command.scenes:
         where = setting(name, RUNS / "door")
-        found = scene_limits(where, 1 if command.quick else command.draws, effects, _tell)
+        found = scene_limits(where, 1 if command.quick else command.draws, RUNS / "limits", effects, _tell)
         known = json.loads(command.out.read_text()) if command.out.is_file() else {"scenes": {}}
         scenes = {**known["scenes"], name: {**known["scenes"].get(name, {}), **found}}
         write_json(command.out, {**origin(0), "scenes": scenes})

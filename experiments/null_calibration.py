@@ -28,7 +28,6 @@ import tyro  # noqa: E402
 
 from benchmarks.common import origin  # noqa: E402
 from droid_jax.gap.candidates import candidates  # noqa: E402
-from droid_jax.gap.floor import numerical_floor  # noqa: E402
 from droid_jax.gap.screen import questions_of  # noqa: E402
 from droid_jax.gap.workflow import ask, base_fit, find  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
@@ -77,7 +76,7 @@ def run_case(plan: Plan, commit: str, bench: Bench) -> dict[str, Any]:
     best = screen.questions[int(np.argmax(np.abs(screen.t)))].candidate.name
     result = {"scene": scene, "p": screen.p, "gap": model.gap, "converged": bool(model.refined.converged), "best": best}
     if screen.p < SIGNIFICANT:
-        floor = watch("floor", lambda: numerical_floor(case.fit, model, recordings["fit"]))
+        floor = watch("floor", lambda: bench.floor(scene, case, model, recordings["fit"]))
         others = watch("record", lambda: record(where, drawn, ROLES[1:]))
         whole = watch("prepare", lambda: bench.case(scene, {**recordings, **others}))
         verdict = watch("find", lambda: find(whole, model, floor))

@@ -51,6 +51,11 @@ class Evidence:
         """Times what the best model leaves, up to which a rival's U is as good."""
         return TIE
 
+    @property
+    def slack(self) -> float:
+        """Times its prior that a base parameter may move when marks are projected."""
+        return 1.0
+
     def common(self, values: np.ndarray) -> np.ndarray:
         """[P, D] -> [P, M] mean of the repeats minus simulation, the recording's own nuisances at their best."""
         rows = np.array(np.atleast_2d(values), dtype=np.float64)

@@ -6,12 +6,13 @@ base model fitted to one half of it misses what only the other half moves, and t
 So the confirming blocks tell an effect from noise and not from another form of it; other motions are for what
 is sealed.
 
-Noise.  One recording does not tell its noise.  What is stated, and sets the blocks' length, is the smallest
-residual that an extended model leaves: the base and up to GapConfig.most candidates, chosen and fitted linearly, each
-of which takes as much as an effect must.  With nothing missing, the best of many candidates may take that much of the
-noise; noise and blocks then come out too small.  With something missing that the library lacks, they come out too
-large: priors weigh more and intervals are wide, so less is named.  A gap in these units is no absolute size, but
-ratios of gaps are free of the unit.
+Noise.  One recording does not tell its noise.  What is stated, and sets the blocks' length, is the smallest residual
+that an extended model leaves, the base and up to GapConfig.most candidates chosen and fitted linearly, where that is
+less than a fifth of what the base leaves (in squares); else what the base leaves.  The fifth is there because
+the best of many candidates takes noise too, of slow noise up to three quarters (40 synthetic door logs), and what it
+leaves is correlated for too short a time.  So with something missing that the library explains in part only,
+noise is stated too large and blocks are long: intervals are wide and less is named.  A gap in these units is no
+absolute size, but ratios of gaps are free of the unit.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from droid_jax.gap.rank import proposals
 from droid_jax.gap.refit import Model, refit
 from droid_jax.gap.screen import Screen, questions_of
 from droid_jax.gap.select import LESS
-from droid_jax.gap.workflow import ask
+from droid_jax.gap.workflow import OPEN, ask
 from droid_jax.measure.motion import Motion
 from droid_jax.measure.noise import discrepancy
 from droid_jax.measure.recording import Recording
@@ -163,8 +164,10 @@ def noise_of(
         start = _rough_fit(log, base, effects, log.space.mean, block, config)[1].values
     case, model, deviation = _rough_fit(log, base, effects, start, block, config)
     found = ask(case, model, questions_of(candidates(effects)))
-    whitened = _least(found, model.residuals.mean(axis=0), log.space, config.most)
-    left = (whitened.reshape(len(deviation), -1).T * deviation)[inside]
+    whole = model.residuals.mean(axis=0)
+    least = _least(found, whole, log.space, config.most)
+    noise = least if least @ least < OPEN * (whole @ whole) else whole
+    left = (noise.reshape(len(deviation), -1).T * deviation)[inside]
     return discrepancy(left), block_length(left)
 
 

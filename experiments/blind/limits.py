@@ -2,14 +2,16 @@
 
 Computed from the stand-in's noise before the method is frozen.  What a hidden effect adds is recorded once, small,
 with and without it and with the same noise; what the base model cannot absorb of it grows with the amplitude.
-Repeats are drawn from those of a long recording with nothing hidden; the test is `largest_t` over the full list
-of candidates.
+Repeats are drawn, with replacement, from those of a long recording with nothing hidden; the test is `largest_t` over
+the full list of candidates.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,7 @@ from droid_jax.gap.candidates import candidates
 from droid_jax.gap.flips import largest_t
 from droid_jax.gap.screen import questions_of
 from droid_jax.measure.hidden import HIDDEN, Applied
+from droid_jax.storage import write_json
 from experiments.blind.cases import SAFE, key, keys
 from experiments.blind.draws import DEVELOPMENT, draw_truths, seed_of
 from experiments.blind.forms import Forms, forms_of
@@ -75,8 +78,7 @@ def power_of(where: Ground, seed: int) -> Power:
     """Marks of all candidates, and draws of repeats."""
     rng = np.random.default_rng(seed)
     raw = where.added(questions_of(candidates(where.setting.effects())))
-    chosen = [rng.choice(len(where.noise), REPEATS, replace=False) for _ in range(DRAWS)]
-    return Power(where, raw, np.stack(chosen), {})
+    return Power(where, raw, rng.integers(len(where.noise), size=(DRAWS, REPEATS)), {})
 
 
 def limit_of(where: Ground, power: Power, forms: Forms, effect: Applied) -> dict[str, Any]:
@@ -96,21 +98,35 @@ def limit_of(where: Ground, power: Power, forms: Forms, effect: Applied) -> dict
 
 
 def scene_limits(
-    setting: Setting, draws: int, wanted: tuple[str, ...] = (), tell: Callable[[str], None] = print
+    setting: Setting, draws: int, folder: Path, wanted: tuple[str, ...] = (), tell: Callable[[str], None] = print
 ) -> dict[str, dict[str, Any]]:
-    """key -> entry, the medians over some draws of the robot."""
-    found: dict[str, list[dict[str, Any]]] = {}
-    for number in range(draws):
-        seed = seed_of(DEVELOPMENT, f"{setting.name}/limits/{number}")
-        where = ground(setting, draw_truths(setting, np.random.default_rng(seed))["fit"], seed)
-        power, forms = power_of(where, seed), forms_of(where)
-        for effect in keys(setting):
-            if wanted and effect.name not in wanted:
-                continue
-            entry = limit_of(where, power, forms, effect)
-            found.setdefault(key(effect.name, effect.joint), []).append(entry)
-            tell(f"{setting.name} {number} {key(effect.name, effect.joint)}: {entry}")
-    return {name: _median(entries) for name, entries in found.items()}
+    """key -> entry, the medians over some draws of the robot.
+
+    folder: what one draw found is kept there, so that a run that was stopped goes on where it was.
+    """
+    asked = [e for e in keys(setting) if not wanted or e.name in wanted]
+    found = [_draw_limits(setting, number, folder, asked, tell) for number in range(draws)]
+    return {key(e.name, e.joint): _median([entries[key(e.name, e.joint)] for entries in found]) for e in asked}
+
+
+def _draw_limits(
+    setting: Setting, number: int, folder: Path, asked: list[Applied], tell: Callable[[str], None]
+) -> dict[str, dict[str, Any]]:
+    """key -> entry, of one robot."""
+    path = folder / f"{setting.name}_{number}.json"
+    known = json.loads(path.read_text()) if path.is_file() else {}
+    left = [e for e in asked if key(e.name, e.joint) not in known]
+    if not left:
+        return known
+    seed = seed_of(DEVELOPMENT, f"{setting.name}/limits/{number}")
+    where = ground(setting, draw_truths(setting, np.random.default_rng(seed))["fit"], seed)
+    power, forms = power_of(where, seed), forms_of(where)
+    for effect in left:
+        name = key(effect.name, effect.joint)
+        known[name] = limit_of(where, power, forms, effect)
+        write_json(path, known)
+        tell(f"{setting.name}, robot {number}, {name}: {known[name]['limit']} {known[name]['unit']}")
+    return known
 
 
 def _median(entries: list[dict[str, Any]]) -> dict[str, Any]:

@@ -78,7 +78,7 @@ def judge(case: Case, limits: Mapping[str, Any]) -> dict[str, Any]:
         "exact": bool(exact) and all(exact) and not false and not any(result.get("tied", ())) and verdict == "named",
         "open": verdict in OPEN,
         "gaps": result.get("gaps", {}),
-        "closed": {role: closed(result, role) for role in result.get("gaps", {})},
+        "closed": {role: closed(result, role) for role in result.get("gaps", {}) if result["effects"]},
         "within_floor": within_floor(result),
         "coverage": coverage(case, limits),
         "baselines": against_baselines(case),
