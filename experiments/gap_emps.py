@@ -23,6 +23,7 @@ from typing import Any
 from gap_single import (
     Search,
     adding,
+    answer,
     as_known,
     false_alarms,
     make_search,
@@ -153,8 +154,7 @@ def main(config: GapEmps) -> None:
     added = {}
     for effect, amplitudes in ADDED.items():
         log = adding(made["dry"].log, verdicts["dry"].base.values, amplitudes)
-        case, verdict = run_search(made["dry"], log)
-        added[effect] = {"added": amplitudes, **report(case, verdict)}
+        added[effect] = {"added": amplitudes, **answer(made["dry"], log)}
         show(f"{effect} added", added[effect])
     alarms = false_alarms(made["viscous"], verdicts["viscous"], 3 if config.quick else config.cases, config.seed)
     print(f"  false alarms: {alarms['said_to_be_missing']}, named {alarms['named']}")

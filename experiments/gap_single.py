@@ -177,8 +177,9 @@ def false_alarms(search: Search, verdict: Verdict, count: int, seed: int) -> dic
     return {
         "cases": count,
         "refused": count - len(missing),
-        "said_to_be_missing": share(int(np.sum(missing)), len(missing)),
-        "named": share(len(named), len(missing)),
+        "said_to_be_missing": share(int(np.sum(missing)), count),
+        "named": share(len(named), count),
+        "said_to_be_missing_where_not_refused": share(int(np.sum(missing)), len(missing)),
         "names": named,
         "noise": f"autoregression of order {ORDER} of the residual that the extended model leaves, column by column",
         "level": SIGNIFICANT,

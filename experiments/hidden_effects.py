@@ -138,7 +138,7 @@ def run_make(command: Make) -> dict[str, Any]:
     outcomes: dict[str, list[str]] = {}
     for name in ("hinge",) if command.quick else command.scenes:
         where = setting(name, command.out / "door")
-        for plan in plans(where, counts, commit):
+        for plan in plans(where, counts, commit, known.get(name, {})):
             if command.classes and plan.kind not in command.classes:
                 continue
             if effects and plan.effects and not set(effects) & set(plan.effects):

@@ -20,6 +20,7 @@ from experiments.blind.draws import seed_of
 from experiments.blind.scenes import Setting
 
 NAMELESS = 0.9  # share left over by a name that takes no fifth of the gap away: the search would not give it
+FACTORS = (1.0, 3.0, 10.0)  # of the detection limit
 SAFE = 2.0  # times the upper end of an effect's typical range: beyond it the stand-in may lose the door
 
 Limits = Mapping[str, Mapping[str, Any]]
@@ -50,21 +51,18 @@ class Counts:
     left_out: int = 10
 
 
-QUICK = Counts(none=1, single=0, pair=0, outside=0, left_out=0)
-
-
-def plans(setting: Setting, counts: Counts, commit: str) -> list[Plan]:
-    """All cases of a scene; pairs and what is left out are drawn by the commit."""
-    possible = [n for n in ANSWERS if targets(setting, n)]
-    named, strange = [(n,) for n in possible if inside(n)], [(n,) for n in possible if not inside(n)]
+def plans(setting: Setting, counts: Counts, commit: str, limits: Limits) -> list[Plan]:
+    """All cases of a scene.  Pairs and what is left out are drawn by the commit, among what is possible there."""
+    hidden = [n for n in ANSWERS if targets(setting, n)]
+    named, strange = [(n,) for n in hidden if inside(n)], [(n,) for n in hidden if not inside(n)]
     rng = np.random.default_rng(seed_of(commit, f"{setting.name}/plans"))
     pairs = [(*a, *b) for a, b in itertools.combinations(named, 2) if _apart(setting.scene, *a, *b)]
     wanted = [("none", (), 0.0, k) for k in range(counts.none)]
-    wanted += [("single", e, f, k) for e in named for f in (1.0, 3.0, 10.0) for k in range(counts.single)]
-    wanted += [("pair", pairs[i], 3.0, k) for k, i in enumerate(_some(rng, len(pairs), counts.pair))]
-    wanted += [("outside", e, f, k) for e in strange for f in (3.0, 10.0) for k in range(counts.outside)]
-    wanted += [("left_out", named[i], (3.0, 10.0)[k % 2], k)
-               for k, i in enumerate(_some(rng, len(named), counts.left_out))]  # fmt: skip
+    wanted += [("single", *one, k) for one in itertools.product(named, FACTORS) for k in range(counts.single)]
+    wanted += [("pair", *one) for one in _some(rng, setting, [(p, 3.0) for p in pairs], limits, counts.pair)]
+    wanted += [("outside", *one, k) for one in itertools.product(strange, FACTORS[1:]) for k in range(counts.outside)]
+    left_out = list(itertools.product(named, FACTORS[1:]))
+    wanted += [("left_out", *one) for one in _some(rng, setting, left_out, limits, counts.left_out)]
     return [_plan(setting.name, *one) for one in wanted]
 
 
@@ -78,10 +76,13 @@ def _apart(scene: Scene, first: str, second: str) -> bool:
     return not names[0] & names[1]
 
 
-def _some(rng: np.random.Generator, length: int, count: int) -> list[int]:
-    """`count` indices below length, as evenly as it goes."""
-    rounds = [rng.permutation(length) for _ in range(-(-count // length) if length else 0)]
-    return np.concatenate(rounds)[:count].tolist() if rounds else []
+def _some(
+    rng: np.random.Generator, setting: Setting, wanted: list[tuple[tuple[str, ...], float]], limits: Limits, count: int
+) -> list[tuple[tuple[str, ...], float, int]]:
+    """`count` of the (effects, factor) that are possible, numbered, each as often as any other."""
+    fit = [(names, f) for names, f in wanted if all(sizes(setting, n, f, limits) for n in names)]
+    order = [i for _ in range(-(-count // len(fit))) for i in rng.permutation(len(fit))] if fit else []
+    return [(*fit[i], k) for k, i in enumerate(order[:count])]
 
 
 def applied(setting: Setting, plan: Plan, limits: Limits, rng: np.random.Generator) -> tuple[Applied, ...] | None:
@@ -91,13 +92,19 @@ def applied(setting: Setting, plan: Plan, limits: Limits, rng: np.random.Generat
     """
     out = []
     for name in plan.effects:
-        sizes = {j: size for j in targets(setting, name) if (size := amplitude(name, j, plan.factor, limits))}
-        if not sizes:
+        of_joints = sizes(setting, name, plan.factor, limits)
+        if not of_joints:
             return None
-        joint = list(sizes)[int(rng.integers(len(sizes)))]
+        joint = list(of_joints)[int(rng.integers(len(of_joints)))]
         sign = rng.choice([-1.0, 1.0]) if HIDDEN[name].signed and HIDDEN[name].on == "arm" else 1.0
-        out.append(Applied(name, float(sign * sizes[joint]), joint))
+        out.append(Applied(name, float(sign * of_joints[joint]), joint))
     return tuple(out)
+
+
+def sizes(setting: Setting, name: str, factor: float, limits: Limits) -> dict[str, float]:
+    """Joint -> amplitude, of those on which it can be that large."""
+    found = {joint: amplitude(name, joint, factor, limits) for joint in targets(setting, name)}
+    return {joint: size for joint, size in found.items() if size is not None}
 
 
 def amplitude(name: str, joint: str, factor: float, limits: Limits) -> float | None:

@@ -30,7 +30,7 @@ from experiments.blind.scenes import Setting
 from experiments.blind.units import torques, whitened
 
 REPEATS = 10  # of a case
-NOISY = 40  # repeats from which noise is drawn
+NOISY = 80  # repeats from which noise is drawn
 DENSE = 24  # values of a shape, where a form is fitted
 BY_REPEAT = ("warm_up_friction", "torque_drift")  # differ from repeat to repeat
 

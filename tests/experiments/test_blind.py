@@ -35,6 +35,10 @@ def hinge() -> Setting:
     return replace(whole, motions=lambda: short)
 
 
+def limits_of(where: Setting) -> dict[str, dict[str, Any]]:
+    return {key(e.name, e.joint): entry(limit=1e-4, worth=0.0, right={}) for e in keys(where)}
+
+
 def entry(**changes: Any) -> dict[str, Any]:
     return {"limit": 0.1, "unit": "N m", "right": {"door_closer at door": 0.3}, "worth": 0.02, **changes}
 
@@ -43,7 +47,7 @@ def entry(**changes: Any) -> dict[str, Any]:
 
 
 def test_a_recording_holds_nothing_of_the_truth(hinge: Setting, tmp_path: Path):
-    (plan,) = [p for p in plans(hinge, Counts(), COMMIT) if p.name == "hinge/single/closer/3x/0"]
+    (plan,) = [p for p in plans(hinge, Counts(), COMMIT, {}) if p.name == "hinge/single/closer/3x/0"]
     cases, sealed = tmp_path / "cases", tmp_path / "sealed"
     assert make(hinge, plan, COMMIT, {"closer": entry()}, cases, sealed) == "made"
     assert make(hinge, plan, COMMIT, {"closer": entry()}, cases, sealed) == "there"
@@ -67,8 +71,10 @@ def test_a_recording_holds_nothing_of_the_truth(hinge: Setting, tmp_path: Path):
 
 
 def test_what_is_left_out_is_all_that_would_be_right(hinge: Setting, tmp_path: Path):
-    known = {key(e.name, e.joint): entry() for e in keys(hinge)}
-    left = next(p for p in plans(hinge, Counts(), COMMIT) if p.kind == "left_out" and "preload" in p.name)
+    known = limits_of(hinge)
+    left = next(
+        p for p in plans(hinge, Counts(left_out=99), COMMIT, known) if p.name.startswith("hinge/left_out/hinge_p")
+    )
     assert make(hinge, left, COMMIT, known, tmp_path / "cases", tmp_path / "sealed") == "made"
     (folder,) = (tmp_path / "cases").iterdir()
     told = json.loads((folder / "case.json").read_text())["without"]
@@ -138,13 +144,16 @@ def test_places_of_answers():
 
 def test_plans_are_of_all_classes_and_drawn_by_the_commit():
     bench = setting("bench")
-    made = plans(bench, Counts(none=2, single=1, pair=5, outside=1, left_out=4), COMMIT)
+    known, counts = limits_of(bench), Counts(none=2, single=1, pair=5, outside=1, left_out=4)
+    made = plans(bench, counts, COMMIT, known)
     kinds = [p.kind for p in made]
     assert {k: kinds.count(k) for k in ("none", "pair", "left_out")} == {"none": 2, "pair": 5, "left_out": 4}
     assert len({p.name for p in made}) == len(made)
-    assert made == plans(bench, Counts(none=2, single=1, pair=5, outside=1, left_out=4), COMMIT)
-    other = plans(bench, Counts(pair=5), "1" * 40)
+    assert made == plans(bench, counts, COMMIT, known)
+    other = plans(bench, counts, "1" * 40, known)
     assert [p.effects for p in made if p.kind == "pair"] != [p.effects for p in other if p.kind == "pair"]
+    few = {"closer": entry(), "air_drag": entry(), "detent": entry()}
+    assert {p.effects for p in plans(bench, counts, COMMIT, few) if p.kind == "pair"} == {("closer", "air_drag")}
 
 
 def test_amplitudes_are_multiples_of_what_can_be_told_and_is_worth_it():
