@@ -24,7 +24,12 @@ Every case draws: the robot's and the door's nuisances from their priors (door p
 1 mm, link masses and servo gains 3 %, clock 1 ms), torque offsets that DIFFER between the recordings of a case,
 start poses, coloured torque noise, angle noise at 30 Hz.
 
-scenes, door_motion  where      draws, cases, make  what is recorded      answers  what is right
-search               the part that knows nothing    score                 rates and their intervals
-marks, forms, limits what a hidden effect leaves in the torques, how much of it is seen, and whose it could be
+Nulls by the hundred, screened only: experiments/null_calibration.py.
+
+scenes, door_motion   where
+draws, cases, make    what is hidden, and how it is recorded
+answers               which names are right, and which ties are declared
+search, baselines     the part that knows nothing, and simpler methods on the same base fit
+score                 rates and their intervals
+units, marks, forms, limits   what a hidden effect leaves in the torques, whose it could be, and whether it is seen
 """

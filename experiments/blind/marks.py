@@ -85,7 +85,10 @@ class Ground:
         return record(self.setting, Drawn(hidden, {"fit": self.truth}, {"fit": self.seed}), ("fit",), repeats)["fit"]
 
     def hidden(self, effect: Applied) -> np.ndarray:
-        """[REPEATS, M] what a hidden effect adds to each repeat, per unit of its amplitude."""
+        """[REPEATS, M] what a hidden effect adds to each repeat, per unit of its amplitude.
+
+        In inverse mode the motion counts as unchanged by it: the servo holds the arm on its path.
+        """
         count = REPEATS if effect.name in BY_REPEAT else 2
         if count not in self.plain:
             self.plain[count] = self._whitened(self.record((), count))
