@@ -55,6 +55,8 @@ class Limits:
     """Robots drawn; the median of their limits counts."""
     out: Path = LIMITS
     """The file."""
+    kept: Path = RUNS / "limits"
+    """Folder of what is known so far of each robot: a run that was stopped goes on."""
     quick: bool = False
     """One robot, one effect."""
 
@@ -73,6 +75,8 @@ class Make:
     """Classes; default: all."""
     effects: tuple[str, ...] = ()
     """Only cases with one of these hidden effects (and none)."""
+    factors: tuple[float, ...] = ()
+    """Only these multiples of the detection limit (and none); default: all."""
     limits: Path = LIMITS
     """Detection limits, see the command limits."""
     out: Path = RUNS
@@ -92,7 +96,7 @@ class Search:
     at_most: int = 1000000
     """Stop after so many."""
     out: Path = RUNS
-    """Folder that holds `cases`."""
+    """Folder that holds `cases`; what is found goes to `results` beside it."""
 
 
 @dataclass(frozen=True)
@@ -119,8 +123,8 @@ def run_limits(command: Limits) -> dict[str, Any]:
     """Write every scene's limits as soon as they are known."""
     effects = ("closer",) if command.quick else command.effects
     for name in command.scenes:
-        where = setting(name, RUNS / "door")
-        found = scene_limits(where, 1 if command.quick else command.draws, RUNS / "limits", effects, _tell)
+        where = setting(name, command.kept / "door")
+        found = scene_limits(where, 1 if command.quick else command.draws, command.kept, effects, _tell)
         known = json.loads(command.out.read_text()) if command.out.is_file() else {"scenes": {}}
         scenes = {**known["scenes"], name: {**known["scenes"].get(name, {}), **found}}
         write_json(command.out, {**origin(0), "scenes": scenes})
@@ -141,6 +145,8 @@ def run_make(command: Make) -> dict[str, Any]:
         for plan in plans(where, counts, commit, known.get(name, {})):
             if command.classes and plan.kind not in command.classes:
                 continue
+            if command.factors and plan.effects and plan.factor not in command.factors:
+                continue
             if effects and plan.effects and not set(effects) & set(plan.effects):
                 continue
             outcome = make(where, plan, commit, known.get(name, {}), command.out / "cases", command.out / "sealed")
@@ -154,14 +160,15 @@ def run_search(command: Search) -> dict[str, Any]:
     """All folders, those of one scene after each other."""
     folders = command.cases or tuple(sorted((command.out / "cases").iterdir()))
     chosen = [f for f in folders if not command.scenes or f.name.split("_")[0] in command.scenes]
-    open_ones = [f for f in chosen if not (f / "result.json").is_file()][: command.at_most]
-    return {"searched": search_all(open_ones, Bench(), _tell), "cases": len(chosen)}
+    results = command.out / "results"
+    open_ones = [f for f in chosen if not (results / f"{f.name}.json").is_file()][: command.at_most]
+    return {"searched": search_all(open_ones, results, Bench(), _tell), "cases": len(chosen)}
 
 
 def run_score(command: Score) -> dict[str, Any]:
     """Write hidden_effects.json and hand its headline figures on."""
     limits = json.loads(command.limits.read_text())["scenes"] if command.limits.is_file() else {}
-    result = score_folder(command.out / "cases", command.out / "sealed", limits)
+    result = score_folder(command.out / "results", command.out / "sealed", limits)
     write_json((command.results or command.out) / "hidden_effects.json", {**origin(0), **result})
     return result["summary"]
 

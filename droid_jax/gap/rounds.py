@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
@@ -14,11 +14,12 @@ from droid_jax.gap.case import Case
 from droid_jax.gap.rank import Proposal, collinear, proposals
 from droid_jax.gap.refit import Model, look, refit
 from droid_jax.gap.screen import Screen
-from droid_jax.gap.select import MORE, OF_ALL, Trial, judge
+from droid_jax.gap.select import LESS, MORE, OF_ALL, Trial, judge
 from droid_jax.identify.refine import RefineConfig
 
 T = TypeVar("T")
 Progress = Callable[[str, Any], None]
+Starter = tuple[Sequence[Candidate], np.ndarray]  # effects, and values [D] to start from
 POLISH = RefineConfig(iterations=12, hops=0)
 PAIRS = 4  # pairs refitted
 
@@ -98,6 +99,19 @@ class Hunt:
         self.progress("refit", " + ".join(c.name for c in parts) + note)
         return refit(self.case.fit, self.case.base, parts, start[None], config)
 
+    def race(self, starters: Iterable[Starter], aim: float, note: str = "") -> list[Model]:
+        """Refits one after the other; one that will reach neither `aim` nor the best so far is given up early."""
+        models = list[Model]()
+        for parts, start in starters:
+            aim = min([aim, *(m.refined.objective for m in models)])
+            models.append(self.refit(parts, start, replace(self.case.config.refit, aim=aim), note))
+        return models
+
+    def aim(self, model: Model) -> float:
+        """Objective [log likelihood] of a fit that would take half of what a further effect has to."""
+        least = 0.5 * (MORE if model.parts else LESS)
+        return model.refined.objective - 0.5 * least * model.gap * model.residuals.size
+
     def gap(self, model: Model) -> float:
         """U on the confirming demonstration."""
         return self.case.confirm.gap_at(model.values)
@@ -112,18 +126,15 @@ def forward(hunt: Hunt, model: Model, found: Screen) -> Round:
         for p in hunt.budget.within("candidates not looked at", ranked[: config.looked])
     ]
     best = sorted(looks, key=lambda look: look[0][1])[: config.refitted]
-    tried = [
-        hunt.refit((*model.parts, *p.parts), values, config.refit)
-        for (values, _), p in hunt.budget.within("candidates not refitted", best)
-    ]
+    left = hunt.budget.within("candidates not refitted", best)
+    tried = hunt.race((((*model.parts, *p.parts), values) for (values, _), p in left), hunt.aim(model))
     done = _decided(hunt, model, found, tried)
     twins = _twins(done, ranked)
     if not twins:
         return done
-    tried += [
-        hunt.refit((*model.parts, *p.parts), p.start(case.whole, model.values), config.refit, " (looks like the best)")
-        for p in hunt.budget.within("candidates that look like the best not refitted", twins)
-    ]
+    left = hunt.budget.within("candidates that look like the best not refitted", twins)
+    starters = (((*model.parts, *p.parts), p.start(case.whole, model.values)) for p in left)
+    tried += hunt.race(starters, min(m.refined.objective for m in tried), " (looks like the best)")
     return _decided(hunt, model, found, tried)
 
 
@@ -144,10 +155,9 @@ def pairs(hunt: Hunt, base: Model, model: Model, first: Round) -> Round:
     ranked = proposals(first.screen, base.residuals, case.whole, number=2, among={t.name for t in best})
     known = {c.name for c in model.parts}
     ranked = [p for p in ranked if set(p.names) != known][:PAIRS]
-    tried = [
-        hunt.refit(p.parts, p.start(case.whole, base.values), case.config.refit)
-        for p in hunt.budget.within("pairs not tried", ranked)
-    ]
+    left = hunt.budget.within("pairs not tried", ranked)
+    starters = ((p.parts, p.start(case.whole, base.values)) for p in left)
+    tried = hunt.race(starters, hunt.aim(min(first.tried, key=lambda m: m.refined.objective)))
     alone = min(t.gap_confirm for t in first.trials)
     done = _decided(hunt, base, first.screen, [*tried, model] if len(model.parts) > 1 else tried)
     if done.chosen is not None and done.chosen.gap_confirm > (1 - MORE) * alone:

@@ -38,6 +38,7 @@ class RefineConfig:
     main_prior: prior deviation of parameters of interest, search units.
     tolerance: stop when an iteration lowers the objective (a log likelihood) by less than this.
     rough: while starts and hypotheses are sorted out, already when it lowers it by less than this share.
+    aim: an objective to reach: stop where the last iteration's gain, HOPELESS times over, would not do.
     chord: a Jacobian serves another batch of trials while the last lowered the objective by this share.
     keep: after iteration i only starts within keep[i] times the best objective go on (the last
       number holds from there on).
@@ -54,6 +55,7 @@ class RefineConfig:
     main_prior: float = 4.0
     tolerance: float = 0.5
     rough: float = 5e-3
+    aim: float = np.inf
     chord: float = 0.03
     keep: tuple[float, ...] = (100.0, 20.0, 3.0, 1.3, 1.0)
     doubt: float = 1.1
@@ -184,6 +186,7 @@ class _State:
 _DAMPINGS = 10.0 ** np.arange(-3.0, 5.0)
 _LENGTHS = (1.0, 0.5)
 _LONGEST = 2.0  # search units: the longest component of a step
+HOPELESS = 30.0  # iterations like the last: an aim farther off than that is given up
 CHORDS = 3  # batches of trials at most with one Jacobian
 WIDE = 1.5  # posterior deviations: half-width of those differences
 SPREAD_LONGEST = 1.0  # search units
@@ -269,6 +272,8 @@ class _Problem:
             leader = int(np.argmin(state.objective))
             self._report(state.objective[leader], state.residual.shape[1])
             if gain[leader] <= max(self.config.tolerance, rough * state.objective[leader]):
+                break
+            if HOPELESS * gain[leader] < state.objective[leader] - self.config.aim:
                 break
             good = state.objective <= keep[min(number, len(keep) - 1)] * state.objective[leader]
             state, alive = state.rows(good), alive[good]

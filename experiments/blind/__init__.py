@@ -18,7 +18,8 @@ Usage, from the root of the checkout:
     python experiments/hidden_effects.py search runs/dev/cases/bench_3fa91c02     # one case
     python experiments/hidden_effects.py score --out runs/dev                     # runs/dev/hidden_effects.json
 
-Deleting a result.json runs its case again.  Within a process the replays of a scene are compiled once.
+Results go to OUT/results/, a file a case; deleting one runs its case again.  Within a process the replays of a
+scene are compiled once.
 
 Every case draws: the robot's and the door's nuisances from their priors (door pose 2 mm and 0.5 degree, knob
 1 mm, link masses and servo gains 3 %, clock 1 ms), torque offsets that DIFFER between the recordings of a case,

@@ -51,7 +51,7 @@ def draw_truths(setting: Setting, rng: np.random.Generator) -> dict[str, Truth]:
 
 
 def _truth(setting: Setting, rng: np.random.Generator) -> Truth:
-    """Around the priors.  A sensor's friction stays zero: the stand-in has its own, on the motor's side."""
+    """Around the priors.  Friction that only a sensor sees stays zero: the stand-in has its own in its joints."""
     space = setting.base
     values = rng.normal(space.mean, np.where(space.nuisance, space.std, SPREAD * space.std))
     values = np.clip(values, space.low, space.high)

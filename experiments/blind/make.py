@@ -16,7 +16,7 @@ import numpy as np
 
 from droid_jax.measure.formats import save
 from droid_jax.measure.hidden import LONGEST_STEP, Applied, record_hidden
-from droid_jax.measure.recording import Recording, TorqueSide
+from droid_jax.measure.recording import Recording
 from droid_jax.measure.surrogate import SurrogateConfig
 from droid_jax.storage import new_folder, write_json
 from experiments.blind.answers import without
@@ -71,8 +71,7 @@ def draw(setting: Setting, plan: Plan, limits: Limits, rng: np.random.Generator)
 
 def record(setting: Setting, drawn: Drawn, roles: tuple[str, ...] = ROLES, repeats: int = 10) -> dict[str, Recording]:
     """Role -> recording.  Raises ValueError where the stand-in loses the door."""
-    side = TorqueSide.LINK if setting.prescribed else TorqueSide.MOTOR
-    config = SurrogateConfig(repeats=repeats, timestep=LONGEST_STEP, side=side)
+    config = SurrogateConfig(repeats=repeats, timestep=LONGEST_STEP)
     out = {}
     for role in roles:
         made = record_hidden(

@@ -2,7 +2,7 @@
 
 hinge  a servo-driven door alone: every effect of a hinge, in seconds.
 bench  the same door beside an arm of two links: effects of joints and servos too.
-arm    the free Panda, its torques behind the gears, replayed by inverse dynamics as real logs are.
+arm    the free Panda, its motors' torques replayed by inverse dynamics, as logs of real arms are.
 door   the built-in scene, where the targets are to be met.
 
 In each the first motion ("fit") opens and closes at two speeds, "confirm" moves differently and "sealed"
@@ -46,6 +46,7 @@ DOOR = "door"  # the joint that a servo turns in the cheap scenes
 SOME_JOINTS = ("panda_joint2", "panda_joint4", "panda_joint6")  # shoulder, elbow, wrist; the search asks for all
 SECONDS = 8.0
 AJAR = 0.02  # rad: a door that a servo turns here never meets its frame, which is not simulated
+SERVO_LAG = 0.07  # s: velocity gain of the free arm's servos over their position gain
 # (seconds, furthest angle in rad) of each opening and closing
 STROKES = {
     "fit": ((3.0, 0.9), (5.0, 0.9)),
@@ -120,7 +121,7 @@ def _bench() -> Setting:
 
 
 def _arm() -> Setting:
-    scene = ready(_uncompensated(panda_arm_scene()))
+    scene = ready(_driven(panda_arm_scene()))
     friction = joint_friction_space(ARM)
     viscous = friction.select([n for n in friction.names if n.startswith("viscous")])
     links = Space(tuple(body_mass_scale(scene, f"link{i}", nuisance=True) for i in range(2, 8)))
@@ -138,11 +139,13 @@ def _from_file(name: str) -> Scene:
     return ready(compile_scene(spec, name, object_joint=DOOR))
 
 
-def _uncompensated(scene: Scene) -> Scene:
-    """The arm as its torque sensors feel it: with its weight."""
+def _driven(scene: Scene) -> Scene:
+    """The arm as its motors feel it, with its weight, and with servos that damp what they drive."""
     spec = scene.spec.copy()
     for body in spec.bodies:
         body.gravcomp = 0
+    for servo in spec.actuators:
+        servo.biasprm[2] = -SERVO_LAG * servo.gainprm[0]
     return compile_scene(spec, scene.name, joints=scene.joints, unlimited=scene.joints)
 
 

@@ -23,15 +23,15 @@ OPEN = ("unexplained", "partly explained")
 CLOSED = 0.8  # share of a gap that a named effect has to close
 COMPARABLE = 0.5  # of an effect's own size, left over by its library form, up to which amplitudes are compared
 
-Case = Mapping[str, Any]  # {"truth": sealed file, "result": result.json, "right": [names of each hidden effect]}
+Case = Mapping[str, Any]  # {"truth": sealed file, "result": its search's file, "right": [names of each hidden effect]}
 
 
-def score_folder(cases: Path, sealed: Path, limits: Mapping[str, Any]) -> dict[str, Any]:
+def score_folder(results: Path, sealed: Path, limits: Mapping[str, Any]) -> dict[str, Any]:
     """Everything about all cases with a result."""
     scenes: dict[str, Any] = {}
     found = []
     for path in sorted(sealed.glob("*.json")):
-        result = cases / path.stem / "result.json"
+        result = results / path.name
         if not result.is_file():
             continue
         truth = json.loads(path.read_text())

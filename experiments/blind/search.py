@@ -1,4 +1,4 @@
-"""The search on one case folder after another: recordings in, a small result.json out.  Knows no truth.
+"""The search on one case folder after another: recordings in, a small JSON file out.  Knows no truth.
 
 One process takes many cases: those of a scene repeat the same commands, so their replays are compiled once.
 """
@@ -24,8 +24,6 @@ from droid_jax.measure.recording import Recording
 from droid_jax.storage import write_json
 from experiments.blind.baselines import baselines
 from experiments.blind.scenes import ROLES, Setting, setting
-
-RESULT = "result.json"
 
 
 @dataclass
@@ -130,14 +128,15 @@ def describe(case: Case, verdict: Verdict) -> dict[str, Any]:
     }
 
 
-def search_all(folders: Iterable[Path], bench: Bench, tell: Callable[[str], None] = print) -> int:
-    """Search every folder that has no result yet; how many there were."""
+def search_all(folders: Iterable[Path], results: Path, bench: Bench, tell: Callable[[str], None] = print) -> int:
+    """Search every folder that has no result yet in the folder `results`; how many there were."""
     count = 0
     for folder in folders:
-        if (folder / RESULT).is_file():
+        path = results / f"{folder.name}.json"
+        if path.is_file():
             continue
         result = search_case(folder, bench)
-        write_json(folder / RESULT, result)
+        write_json(path, result)
         count += 1
         taken = ", ".join(f"{stage} {seconds:.0f}" for stage, seconds in result["seconds"].items())
         tell(f"{folder.name}: {result.get('sentence', result.get('error'))} ({taken} s)")

@@ -386,3 +386,19 @@ def test_what_a_hop_has_found_is_kept():
     space = Space((line("a"), line("b")))
     fit = refine(step, space, [-1.0, 1.0], RefineConfig(main_prior=1e6))
     assert fit.objective < 1.9  # 0.72 is found by the hop, 2.0 returned
+
+
+def test_an_aim_that_is_out_of_reach_is_given_up_and_one_within_reach_is_pursued():
+    """A quartic valley gains ever less: half a million of an objective is never reached at its pace, the bottom is."""
+    space = Space((line("a", 0.0, 1.0),))
+
+    def quartic(values):
+        return (values - 50.0) ** 2 * 0.2
+
+    plain = RefineConfig(hops=0, tolerance=1e-3, rough=0.0, main_prior=1e6)
+    whole = refine(quartic, space, [0.0], plain)
+    reachable = refine(quartic, space, [0.0], dataclasses.replace(plain, aim=0.0))
+    hopeless = refine(quartic, space, [0.0], dataclasses.replace(plain, aim=-5e5))
+    assert reachable.objective == whole.objective and reachable.evaluations == whole.evaluations
+    assert hopeless.evaluations < whole.evaluations
+    assert hopeless.objective > whole.objective
