@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from droid_jax import runtime
-from droid_jax.compare.inverse import inverse_replay
+from droid_jax.compare.inverse import path_of, path_replay
 from droid_jax.compare.population import blocks, over_block
 from droid_jax.compare.replay import Drive, Replay, make_drive, servo_replay, torque_offset_effect
 from droid_jax.compare.residuals import CompareConfig, Comparison, make_comparison
@@ -95,18 +95,21 @@ class Cost:
     def against(self, recordings: Sequence[Recording], config: CompareConfig | None = None) -> Cost:
         """The same compiled replays compared with other repeats of the same recordings, or in another way.
 
-        Raises ValueError unless these are as many, with the same commands (where there are none, the
-        same motion) on the same clock.
+        A recording without commands may hold another motion: its replay is given it.
+        Raises ValueError unless these are as many, with the same commands (where there are none, as many
+        instants and the same torque convention) on the same clock.
         """
         if len(recordings) != len(self.drives):
             raise ValueError(f"expected repeats of {len(self.drives)} replayed recordings, got {len(recordings)}")
-        made = []
+        made, drives = [], []
         for recording, old, drive in zip(recordings, self.comparisons, self.drives, strict=True):
             new = followed(self.scene, recording, config or old.config)
-            if type(new) is not type(drive) or not np.array_equal(_path(new), _path(drive)):
+            if not _same(new, drive):
                 raise ValueError(f"recording {recording.name!r} holds other commands than {old.name!r} had")
             made.append(make_comparison(self.scene, recording, _clock(recording, new), config or old.config))
-        return assemble(self.scene, self.space, made, self._replays, self.drives)
+            drives.append(new)
+        replays = [_along(replay, new) for replay, new in zip(self._replays, drives, strict=True)]
+        return assemble(self.scene, self.space, made, replays, drives)
 
     def _blockwise(self, values: Any, functions: Sequence[Callable], join: Callable) -> Any:
         pieces = []
@@ -181,8 +184,27 @@ def followed(scene: Scene, recording: Recording, config: CompareConfig) -> Drive
     return measured_motion(recording, scene.joints, cutoff=config.motion_cutoff)
 
 
-def _path(follows: Drive | Motion) -> np.ndarray:
-    return follows.position if isinstance(follows, Motion) else follows.command
+@dataclass(frozen=True, eq=False)
+class Along:
+    """A compiled batch of inverse replays along a motion: [B, D] -> Rollout [B, ...]."""
+
+    compiled: Callable[..., Rollout]
+    motion: Motion
+
+    def __call__(self, values: np.ndarray) -> Rollout:
+        return self.compiled(values, path_of(self.motion))
+
+
+def _along(replay: Callable[[np.ndarray], Rollout], follows: Drive | Motion) -> Callable[[np.ndarray], Rollout]:
+    """The same compiled batch along another motion."""
+    return Along(replay.compiled, follows) if isinstance(replay, Along) and isinstance(follows, Motion) else replay
+
+
+def _same(new: Drive | Motion, old: Drive | Motion) -> bool:
+    """Whether what was compiled for the one serves the other."""
+    if isinstance(new, Motion):
+        return isinstance(old, Motion) and new.torque == old.torque and np.array_equal(new.time, old.time)
+    return not isinstance(old, Motion) and np.array_equal(new.command, old.command)
 
 
 def _clock(recording: Recording, follows: Drive | Motion) -> np.ndarray:
@@ -205,7 +227,8 @@ def _engine(
     if isinstance(drive, Motion):
         if engine != "mjx":
             raise ValueError("a recording without commands is replayed by inverse dynamics, which needs engine 'mjx'")
-        return batch_replay(scene, space, inverse_replay(scene, drive, effects))
+        along = path_replay(scene, drive.torque, effects)
+        return Along(over_block(lambda values, path: along(make_physics(scene, space, values), path)), drive)
     if engine == "mjx":
         return batch_replay(scene, space, servo_replay(scene, drive, effects))
     twin = twin_replay(scene, space, drive, [e for e in effects if e.name != "torque offset"])

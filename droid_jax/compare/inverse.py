@@ -5,7 +5,8 @@ For recordings that hold no commands, such as logs of free motion.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,15 +15,37 @@ from mujoco import mjx
 
 from droid_jax.compare.replay import Replay, observed
 from droid_jax.measure.motion import Motion
-from droid_jax.measure.recording import TorqueSide
+from droid_jax.measure.recording import TorqueConvention, TorqueSide
 from droid_jax.model.joint_friction import SMOOTHING
 from droid_jax.model.physics import Physics
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, Rollout, State, Theta, column
 
 
+class Path(NamedTuple):
+    """The arrays of a motion, single precision: [T] s, and [T, J] rad, rad/s, rad/s^2 (m for slides)."""
+
+    time: jax.Array
+    position: jax.Array
+    velocity: jax.Array
+    acceleration: jax.Array
+
+
+def path_of(motion: Motion) -> Path:
+    """What a compiled replay is given of a motion."""
+    return Path(*(jnp.asarray(getattr(motion, name), jnp.float32) for name in Path._fields))
+
+
 def inverse_replay(scene: Scene, motion: Motion, effects: Sequence[Effect] = ()) -> Replay:
-    """Torques of a prescribed motion, vectorised over time.
+    """Torques of one prescribed motion; see `path_replay`."""
+    replay, path = path_replay(scene, motion.torque, effects), path_of(motion)
+    return lambda physics: replay(physics, path)
+
+
+def path_replay(
+    scene: Scene, convention: TorqueConvention, effects: Sequence[Effect] = ()
+) -> Callable[[Physics, Path], Rollout]:
+    """Torques of prescribed motions, vectorised over time.
 
     tau = M(q) qdd + c(q, qd) + k (q - q_spring) [+ g(q)] and, on the motor side, + armature qdd +
     damping qd + dry friction sgn(qd).  On the link side none of the motor's own terms appear; what
@@ -37,13 +60,12 @@ def inverse_replay(scene: Scene, motion: Motion, effects: Sequence[Effect] = ())
     joints, positions = scene.joint_dofs, scene.joint_qpos
     springs = np.array([scene.id("joint", j) for j in scene.joints])
     base = jnp.asarray(scene.model.qpos0, jnp.float32)
-    q, qd, qdd = (jnp.asarray(a, jnp.float32) for a in (motion.position, motion.velocity, motion.acceleration))
-    motor = motion.torque.side is TorqueSide.MOTOR
+    motor = convention.side is TorqueSide.MOTOR
 
-    def replay(physics: Physics) -> Rollout:
+    def replay(physics: Physics, path: Path) -> Rollout:
         model, theta = physics.model, physics.theta
         link_model = model if motor else model.replace(dof_armature=jnp.zeros_like(model.dof_armature))
-        if not motion.torque.gravity:
+        if not convention.gravity:
             link_model = link_model.replace(opt=link_model.opt.replace(gravity=jnp.zeros(3)))
 
         def at(time, position, velocity, acceleration):
@@ -60,16 +82,15 @@ def inverse_replay(scene: Scene, motion: Motion, effects: Sequence[Effect] = ())
             own = model.dof_frictionloss if motor else _behind_the_sensor(scene, theta)
             return (torque + _resistance(theta, state, own, effects))[joints]
 
-        time = jnp.asarray(motion.time, jnp.float32)
-        torque = jax.vmap(at)(time, q, qd, qdd)
+        torque = jax.vmap(at)(*path)
         hinge = scene.joints.index(scene.object_joint) if scene.object_joint in scene.joints else None
         rollout = Rollout(
-            time=time,
+            time=path.time,
             torque=torque,
-            position=q,
-            velocity=qd,
-            object_angle=jnp.zeros(len(motion.time)) if hinge is None else q[:, hinge],
-            contact=jnp.zeros((len(motion.time), 0), bool),
+            position=path.position,
+            velocity=path.velocity,
+            object_angle=jnp.zeros(len(path.time)) if hinge is None else path.position[:, hinge],
+            contact=jnp.zeros((len(path.time), 0), bool),
             finite=jnp.array(True),
         )
         return observed(rollout, theta, effects)

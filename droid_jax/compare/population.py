@@ -45,19 +45,24 @@ def blocks(values: Any) -> Iterator[tuple[np.ndarray, int]]:
         yield np.concatenate([block, np.repeat(block[-1:], size - len(block), axis=0)]), len(block)
 
 
-def over_block(function: Callable[[jax.Array], Any]) -> Callable[[Any], Any]:
-    """Compile `function` ([D] -> pytree) for whole blocks: [B, D] -> the same with a leading [B].
+def over_block(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile `function` ([D], *shared -> pytree) for whole blocks: [B, D], *shared -> the same with a leading [B].
 
-    B must be a multiple of the number of devices (see `block_size`).  The result lives on the
-    devices, sharded by rows.
+    B must be a multiple of the number of devices (see `block_size`).  What is shared by all rows (pytrees of
+    arrays) is no constant of the program: other arrays of the same shapes compile nothing anew.  The result
+    lives on the devices, sharded by rows.
     """
     rows = PartitionSpec(AXIS)
+
+    def block(values: jax.Array, shared: tuple[Any, ...]) -> Any:
+        return jax.vmap(lambda row: function(row, *shared))(values)
+
     # check_vma: mjx's own loops mix sharded and constant carries, which the check refuses.
     mapped = jax.shard_map(
-        jax.vmap(function), mesh=runtime.devices_mesh(), in_specs=rows, out_specs=rows, check_vma=False
+        block, mesh=runtime.devices_mesh(), in_specs=(rows, PartitionSpec()), out_specs=rows, check_vma=False
     )
     compiled = jax.jit(mapped, compiler_options=runtime.compiler_options())
-    return lambda values: compiled(jnp.asarray(values, jnp.float32))
+    return lambda values, *shared: compiled(jnp.asarray(values, jnp.float32), shared)
 
 
 def over_population(function: Callable[[jax.Array], Any]) -> Callable[[Any], Any]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +86,7 @@ def gap_json(case: Case, verdict: Verdict) -> dict[str, Any]:
         "amplitudes": _amplitudes(case, verdict),
         "shifts": _shifts(case, verdict),
         "experiments": [{"what": e.what, "apart": e.apart} for e in verdict.experiments],
+        "trends": [{**asdict(t), "unit": case.whole[t.amplitude].unit} for t in (verdict.trend,) if t is not None],
         "units": case.fit.cost.comparisons[0].channel("torque").unit,
     }
 

@@ -9,6 +9,7 @@ from droid_jax.gap.localise import Localisation
 from droid_jax.gap.refit import Model
 from droid_jax.gap.screen import Screen
 from droid_jax.gap.select import Trial
+from droid_jax.gap.trend import Trend
 
 
 class Kind(enum.Enum):
@@ -43,7 +44,7 @@ class Verdict:
     gaps: "fit", "confirm", "sealed" -> (U before, U after).  screens, trials: the grounds, in the order they
     were made.  before, after: where the gap lives on the fitted recording.  rivals: models that do as well as
     `model`, refitted; experiments: what would tell them apart, the best first.  cut: in words what the
-    budget left out, empty for nothing.
+    budget left out, empty for nothing.  trend: what changes from repeat to repeat, None where nothing was asked.
     """
 
     kind: Kind
@@ -60,6 +61,7 @@ class Verdict:
     rivals: tuple[Model, ...] = ()
     experiments: tuple[Experiment, ...] = ()
     cut: str = ""
+    trend: Trend | None = None
 
     def closed(self, role: str) -> float:
         """1 - (U_after - U0) / (U_before - U0) on "fit", "confirm" or "sealed"."""

@@ -12,6 +12,7 @@ from droid_jax.gap.refit import Model, refit
 from droid_jax.gap.rounds import Budget, Hunt, Round, forward, pairs, polished, pruned
 from droid_jax.gap.screen import Question, Screen, marks, project, questions_of, screen
 from droid_jax.gap.select import OF_ALL, SIGNIFICANT
+from droid_jax.gap.trend import trend
 from droid_jax.gap.verdict import Kind, Verdict
 from droid_jax.identify.pipeline import grip_hypotheses, starts
 from droid_jax.identify.search import search
@@ -116,6 +117,7 @@ def _verdict(hunt: Hunt, base: Model, model: Model, rounds: list[Round], quiet: 
         after=localise(case.fit, model.values, model.residuals),
         rivals=next((r.rivals for r in reversed(rounds) if r.winner is not None), ()),
         cut=hunt.budget.cut,
+        trend=trend(rounds[0].screen, base.residuals, case.config.seed) if rounds and case.fit.repeats > 1 else None,
     )
 
 

@@ -30,6 +30,7 @@ _AMPLITUDE = {
     **dict.fromkeys(("value", "low", "high"), _MAYBE),
 }
 _SHIFT = {"name": str, "unit": str, **dict.fromkeys(("before", "after", "deviation_before"), _MAYBE)}
+_TREND = {**dict.fromkeys(("candidate", "amplitude", "unit"), str), "per_repeat": _MAYBE, "p": _MAYBE}
 _SCHEMA = {
     **{"verdict": str, "sentence": str, "effects": [str], "tied": [[str]], "p": _MAYBE, "floor": _MAYBE},
     **{"converged": bool, "cut": str, "seconds": {str: _NUMBER}, "gaps": {str: _GAP}},
@@ -38,6 +39,7 @@ _SCHEMA = {
     "trials": [_TRIAL],
     "cells": {"before": [_CELL], "after": [_CELL]},
     **{"amplitudes": [_AMPLITUDE], "shifts": [_SHIFT], "experiments": [{"what": str, "apart": _MAYBE}]},
+    "trends": [_TREND],
     **{"units": str, "versions": dict, "device": str, "setup": dict},
 }
 _LINES = ("measured", "scatter", "before", "after")

@@ -49,7 +49,7 @@ def unit_words(unit: str) -> str:
 def gap_summary(gap: Gap) -> list[str]:
     """The sentences under the answer, from the numbers alone; the last says what to do."""
     sentences = [_fitted(gap), _significance(gap.found), _size(gap), *_added(gap.found["amplitudes"])]
-    return [*(s for s in sentences if s), *_ties(gap.found), _next(gap)]
+    return [*(s for s in sentences if s), *_ties(gap.found), *_trends(gap.found), _next(gap)]
 
 
 def settings(gap: Gap) -> list[str]:
@@ -132,6 +132,17 @@ def _ties(found: Mapping[str, Any]) -> list[str]:
         return []
     both = [(effect, ties) for effect, ties in zip(found["effects"], found["tied"], strict=False) if ties]
     return [f"In place of {effect_words(e)}, {' or '.join(map(effect_words, t))} would do as well." for e, t in both]
+
+
+def _trends(found: Mapping[str, Any]) -> list[str]:
+    """What changes from repeat to repeat, which is in no gap: the repeats pass for the same."""
+    return [
+        f"The repeats are not alike: {effect_words(t['candidate'])} changes by about "
+        f"{number(t['per_repeat'], 2)} {unit_words(t['unit'])} from one to the next (p = {number(t['p'], 2)} if their "
+        "order said nothing); let the robot warm up first, or look for what works loose."
+        for t in found["trends"]
+        if t["p"] is not None and t["p"] < SIGNIFICANT
+    ]
 
 
 def _next(gap: Gap) -> str:

@@ -108,11 +108,11 @@ def test_a_model_without_effects_is_the_base_model(found: Small, tmp_path: Path)
 
 def test_shapes_and_places_come_back(tmp_path: Path):
     scene, base = small_scene()
-    values = {"latch_torque": 1.2, "latch_width": 0.05, "torque_gain[elbow]": 0.04}
+    values = {"latch_torque": 1.2, "latch_width": 0.05, "latch_exponent": 1.5, "torque_gain[elbow]": 0.04}
     save_extended(tmp_path, with_effects(scene, base, **values))
     model = load_extended(tmp_path / "extended.json", scene)
     assert [(p.effect, p.place) for p in model.parts] == [("latch", "door"), ("torque_gain", "elbow")]
-    assert model.parts[0].shapes == {"latch_width": 0.05} and model.parts[1].shapes == {}
+    assert model.parts[0].shapes == {"latch_width": 0.05, "latch_exponent": 1.5} and model.parts[1].shapes == {}
     assert dict(zip(model.effect_space.names, model.effect_space.mean.tolist(), strict=True)) == values
     assert model.lacking == ("latch at door", "torque_gain at elbow")
 

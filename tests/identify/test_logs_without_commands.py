@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from droid_jax.compare.cost import make_cost
+from droid_jax.compare.cost import Along, make_cost
 from droid_jax.compare.residuals import CompareConfig
 from droid_jax.identify.pipeline import Identified, IdentifyConfig, identify, split
 from droid_jax.identify.search import SearchConfig
@@ -88,11 +88,31 @@ def test_repeats_are_split_by_number(scene: Scene, space: Space):
     fitted, held, rows = split(recording, 0.3)
     assert (fitted.repeats, held.repeats, rows) == (3, 1, (3,))
     cost = make_cost(scene, space, [fitted])
-    with pytest.raises(ValueError, match="other commands than 'log' had"):
-        cost.against([held])  # its own mean motion is another one
     truth = space.values({"carriage_mass": MASS, "slide_damping": DAMPING, "coulomb[slide]": COULOMB})
     near, far = cost(np.stack([truth, space.mean]))
     assert near < 0.3 < far
+
+
+def test_another_motion_on_the_same_clock_compiles_no_replay(scene: Scene, space: Space):
+    fitted, held, _ = split(log(4), 0.3)
+    cost = make_cost(scene, space, [fitted])
+    rows = np.stack([space.mean, space.values({"carriage_mass": MASS})])
+    first = cost.whitened(rows)
+    (along,) = cost._replays
+    assert isinstance(along, Along)
+    again = cost.against([held])  # its mean motion is another one
+    assert again._replays[0].compiled is along.compiled
+    np.testing.assert_allclose(
+        again.rollouts(rows)[0].torque, make_cost(scene, space, [held]).rollouts(rows)[0].torque, atol=1e-5
+    )
+    assert np.abs(again.rollouts(rows)[0].position - cost.rollouts(rows)[0].position).max() > 1e-6
+    np.testing.assert_array_equal(cost.whitened(rows), first)
+
+
+def test_a_motion_on_another_clock_is_refused(scene: Scene, space: Space):
+    cost = make_cost(scene, space, [log(1)])
+    with pytest.raises(ValueError, match="other commands than 'log' had"):
+        cost.against([log(1).window(0.0, 8.0)])
 
 
 def test_the_c_engine_has_no_inverse_mode(scene: Scene, space: Space):

@@ -67,7 +67,7 @@ def gap_json(verdict: str, roles: tuple[str, ...]) -> dict[str, Any]:
         "cells": {"before": _cells(first), "after": _cells(first if left is None else left)},
         "amplitudes": _amplitudes() if effects else [],
         "shifts": [dict(zip(("name", "unit", "before", "after", "deviation_before"), s, strict=True)) for s in SHIFTS],
-        "experiments": _experiments() if verdict == "tie" else [], "units": "N m",
+        "experiments": _experiments() if verdict == "tie" else [], "trends": _trends(verdict), "units": "N m",
         "versions": {"mujoco": "3.17.0", "jax": "0.9.2"}, "device": "2 CPU cores",
         "setup": {"preset": "quick", "fit": "a.npz", "confirm": "b.npz", "recording": ["a.npz"], "scene": None},
     }  # fmt: skip
@@ -142,6 +142,15 @@ def _amplitudes() -> list[dict[str, Any]]:
         dict(zip(("name", "unit", "value", "low", "high"), s, strict=True)) | {"effect": LATCH, "what": what}
         for s in sizes
     ]
+
+
+def _trends(verdict: str) -> list[dict[str, Any]]:
+    """A gear that warms up while something is named."""
+    p = 0.0005 if verdict == "named" else 0.4
+    return [
+        {"candidate": "joint_coulomb at panda_joint2", "amplitude": "joint_coulomb[panda_joint2]", "unit": "N m",
+         "per_repeat": -0.0213, "p": p}
+    ]  # fmt: skip
 
 
 def _experiments() -> list[dict[str, Any]]:

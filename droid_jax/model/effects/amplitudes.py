@@ -17,7 +17,7 @@ from droid_jax.model.seam import State, Theta
 GROUP = "Effect"
 USUAL_SPEED = 0.3  # rad/s
 RELIEF = 1.5
-EXPONENTS = (1.0, 2.0)  # of a damper
+EXPONENTS = (1.0, 2.0)  # of a damper, of Stribeck's excess
 
 
 def amplitude(name: str, unit: str, typical: float, high: float, *, low: float | None = None) -> Parameter:

@@ -7,13 +7,14 @@ from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
 
-TORQUE, WIDTH = "latch_torque", "latch_width"
+TORQUE, WIDTH, EXPONENT = "latch_torque", "latch_width", "latch_exponent"
 WIDTHS = (0.02, 0.04, 0.08, 0.14)  # rad
+EXPONENTS = (0.6, 1.0, 2.0)
 
 
 @register
 def latch(scene: Scene) -> Effect | None:
-    """-A exp(-phi/width) on the hinge, phi >= 0.
+    """-A exp(-(phi/width)^n) on the hinge, phi >= 0: n = 1 far from a magnet, n = 2 a ball that leaves its seat.
 
     At phi = 0 the frame carries what closes the door further; the simulated one has no frame, so the
     pull fades in over a tenth of the width.
@@ -24,17 +25,22 @@ def latch(scene: Scene) -> Effect | None:
 
     def force(theta, state):
         share = jnp.maximum(a.angle(scene, joint, state), 0.0) / a.value(theta, WIDTH, WIDTHS[2])
-        pull = jnp.exp(-share) - jnp.exp(-10.0 * share)
+        far = share ** a.value(theta, EXPONENT, EXPONENTS[1])
+        pull = jnp.exp(-far) - jnp.exp(-10.0 * share - far)
         return a.at_dof(scene, joint, -a.value(theta, TORQUE) * pull)
 
     return Effect(
         "latch",
-        (a.amplitude(TORQUE, "N m", 1.0, 10.0, low=0.0), a.shape(WIDTH, "rad", WIDTHS, 0.01, 0.2)),
+        (
+            a.amplitude(TORQUE, "N m", 1.0, 10.0, low=0.0),
+            a.shape(WIDTH, "rad", WIDTHS, 0.01, 0.2),
+            a.shape(EXPONENT, "-", EXPONENTS, 0.5, 2.5),
+        ),
         force=force,
         what="a magnetic catch or latch that holds the door in its first degrees",
         mark="the first degrees of opening, and the last of closing",
         confused_with=("hinge_stribeck", "over_centre_spring"),
         places={joint: (TORQUE,)},
-        shapes={WIDTH: WIDTHS},
+        shapes={WIDTH: WIDTHS, EXPONENT: EXPONENTS},
         smallest=0.1,
     )

@@ -1,4 +1,7 @@
-"""Friction that is higher at rest than in motion (Stribeck): of the arm's joints, of the hinge."""
+"""Friction that is higher at rest than in motion (Stribeck): of the arm's joints, of the hinge.
+
+exp(-|v/vs|^n): n = 1 after Tustin, n = 2 after Armstrong-Helouvry (Automatica 1994, table 3).
+"""
 
 import jax.numpy as jnp
 
@@ -7,36 +10,41 @@ from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, column
 
-JOINT, JOINT_SPEED = "joint_stribeck", "joint_stribeck_speed"
-HINGE, HINGE_SPEED = "hinge_stribeck", "hinge_stribeck_speed"
+JOINT, JOINT_SPEED, JOINT_EXPONENT = "joint_stribeck", "joint_stribeck_speed", "joint_stribeck_exponent"
+HINGE, HINGE_SPEED, HINGE_EXPONENT = "hinge_stribeck", "hinge_stribeck_speed", "hinge_stribeck_exponent"
 SPEEDS = (0.01, 0.03, 0.1)  # rad/s
 
 
-def _excess(theta, speed_name: str, velocity):
-    """exp(-(v/vs)^2)."""
-    return jnp.exp(-((velocity / a.value(theta, speed_name, SPEEDS[1])) ** 2))
+def _excess(theta, speed_name: str, exponent_name: str, velocity):
+    """exp(-|v/vs|^n)."""
+    share = jnp.abs(velocity / a.value(theta, speed_name, SPEEDS[1]))
+    return jnp.exp(-(share ** a.value(theta, exponent_name, a.EXPONENTS[1])))
 
 
 @register
 def joint_stribeck(scene: Scene) -> Effect | None:
-    """(Fs - Fc) exp(-(v/vs)^2) on top of a joint's friction loss, N m."""
+    """(Fs - Fc) exp(-|v/vs|^n) on top of a joint's friction loss, N m."""
     joints, dofs = a.arm(scene), a.arm_dofs(scene)
     if not joints:
         return None
 
     def frictionloss(theta, state, base):
-        extra = column(theta, JOINT, joints) * _excess(theta, JOINT_SPEED, state.qvel[dofs])
+        extra = column(theta, JOINT, joints) * _excess(theta, JOINT_SPEED, JOINT_EXPONENT, state.qvel[dofs])
         return base.at[dofs].add(extra)
 
     return Effect(
         JOINT,
-        (*a.of_joints(JOINT, joints, "N m", 0.2, 2.0, low=0.0), a.shape(JOINT_SPEED, "rad/s", SPEEDS, 0.005, 0.2)),
+        (
+            *a.of_joints(JOINT, joints, "N m", 0.2, 2.0, low=0.0),
+            a.shape(JOINT_SPEED, "rad/s", SPEEDS, 0.005, 0.2),
+            a.shape(JOINT_EXPONENT, "-", a.EXPONENTS, 0.5, 2.5),
+        ),
         frictionloss=frictionloss,
         what="friction of a joint of the arm that is higher at rest than in motion",
         mark="breakaway and reversals of that joint",
         confused_with=("joint_coulomb",),
         places=a.places(joints, JOINT),
-        shapes={JOINT_SPEED: SPEEDS},
+        shapes={JOINT_SPEED: SPEEDS, JOINT_EXPONENT: a.EXPONENTS},
         smallest=0.05,
     )
 
@@ -50,16 +58,20 @@ def hinge_stribeck(scene: Scene) -> Effect | None:
     dof = scene.dof(joint)
 
     def frictionloss(theta, state, base):
-        return base.at[dof].add(a.value(theta, HINGE) * _excess(theta, HINGE_SPEED, state.qvel[dof]))
+        return base.at[dof].add(a.value(theta, HINGE) * _excess(theta, HINGE_SPEED, HINGE_EXPONENT, state.qvel[dof]))
 
     return Effect(
         HINGE,
-        (a.amplitude(HINGE, "N m", 0.5, 3.0, low=0.0), a.shape(HINGE_SPEED, "rad/s", SPEEDS, 0.005, 0.2)),
+        (
+            a.amplitude(HINGE, "N m", 0.5, 3.0, low=0.0),
+            a.shape(HINGE_SPEED, "rad/s", SPEEDS, 0.005, 0.2),
+            a.shape(HINGE_EXPONENT, "-", a.EXPONENTS, 0.5, 2.5),
+        ),
         frictionloss=frictionloss,
         what="friction of the hinge that is higher at rest than in motion",
         mark="breakaway and reversals of the door",
         confused_with=("latch", "joint_stribeck"),
         places={joint: (HINGE,)},
-        shapes={HINGE_SPEED: SPEEDS},
+        shapes={HINGE_SPEED: SPEEDS, HINGE_EXPONENT: a.EXPONENTS},
         smallest=0.1,
     )

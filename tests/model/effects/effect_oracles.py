@@ -110,13 +110,14 @@ def gravity_leans(spec: mujoco.MjSpec, v: Values) -> None:
 # ----- formulas
 
 
-def stribeck(height: float, width: float, speed: float) -> float:
-    return height * np.exp(-((speed / width) ** 2))
+def stribeck(v: Values, name: str, height: float, speed: float) -> float:
+    return height * np.exp(-(abs(speed / v[f"{name}_speed"]) ** v[f"{name}_exponent"]))
 
 
 def latch(v: Values, phi: float, w: float) -> float:
     """The pull fades in over a tenth of the width; a door beyond shut is not pulled."""
-    return -v["latch_torque"] * (np.exp(-phi / v["latch_width"]) - np.exp(-10 * phi / v["latch_width"])) * (phi > 0)
+    share = max(phi, 0.0) / v["latch_width"]
+    return -v["latch_torque"] * np.exp(-(share ** v["latch_exponent"])) * (1 - np.exp(-10 * share))
 
 
 def over_centre(v: Values, phi: float, w: float) -> float:
@@ -160,8 +161,8 @@ ORACLES = {
         {"hinge_preload": 0.7}, edit=rest_elsewhere, force=at_door(lambda v, phi, w: -v["hinge_preload"])
     ),
     "hinge_stribeck": Oracle(
-        {"hinge_stribeck": 0.8, "hinge_stribeck_speed": 0.06},
-        loss=at_door(lambda v, phi, w: stribeck(v["hinge_stribeck"], v["hinge_stribeck_speed"], w)),
+        {"hinge_stribeck": 0.8, "hinge_stribeck_speed": 0.06, "hinge_stribeck_exponent": 1.3},
+        loss=at_door(lambda v, phi, w: stribeck(v, "hinge_stribeck", v["hinge_stribeck"], w)),
     ),
     "joint_backlash": Oracle(  # as far as the command leads, and no further than half the backlash
         each(*ARM, joint_backlash=(0.015, 0.01)),
@@ -179,10 +180,10 @@ ORACLES = {
         loss=at_arm(lambda v, j, now: v["joint_directional"] * np.tanh(now.w[j] / SLOW)),
     ),
     "joint_stribeck": Oracle(
-        {**each(*ARM, joint_stribeck=(0.6, 0.3)), "joint_stribeck_speed": 0.15},
-        loss=at_arm(lambda v, j, now: stribeck(v["joint_stribeck"], v["joint_stribeck_speed"], now.w[j])),
+        {**each(*ARM, joint_stribeck=(0.6, 0.3)), "joint_stribeck_speed": 0.15, "joint_stribeck_exponent": 0.8},
+        loss=at_arm(lambda v, j, now: stribeck(v, "joint_stribeck", v["joint_stribeck"], now.w[j])),
     ),
-    "latch": Oracle({"latch_torque": 1.5, "latch_width": 0.05}, force=at_door(latch)),
+    "latch": Oracle({"latch_torque": 1.5, "latch_width": 0.05, "latch_exponent": 1.6}, force=at_door(latch)),
     "load_friction": Oracle(
         each(*ARM, load_friction=(0.1, 0.2)), loss=at_arm(lambda v, j, now: v["load_friction"] * abs(now.load[j]))
     ),
