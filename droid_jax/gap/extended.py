@@ -18,11 +18,11 @@ import numpy as np
 
 from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.case import Case
-from droid_jax.gap.mjcf import in_mjcf, mjcf
 from droid_jax.gap.refit import Model
 from droid_jax.identify.gaussian import Gaussian, space_from_json, space_to_json
 from droid_jax.identify.uncertainty import posterior
 from droid_jax.model.effects.registry import effect_space, library, ready
+from droid_jax.model.mjcf import WORDS, fitted_mjcf
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
@@ -68,7 +68,7 @@ class Extended:
     def lacking(self) -> tuple[str, ...]:
         """Names of the parts that an MJCF cannot hold."""
         effects = {e.name: e for e in self.effects}
-        return tuple(p.name for p in self.parts if not in_mjcf(effects[p.effect], self.space.select(p.free)))
+        return tuple(p.name for p in self.parts if not _in_mjcf(effects[p.effect], self.space.select(p.free)))
 
 
 def extended(case: Case, model: Model) -> Extended:
@@ -82,7 +82,7 @@ def extended(case: Case, model: Model) -> Extended:
 
 def save_extended(folder: Path, model: Extended) -> None:
     """Write extended.json and extended.xml into `folder`."""
-    write_text(folder / MJCF, mjcf(model.scene, model.space, model.values))
+    write_text(folder / MJCF, fitted_mjcf(model.scene, model.space, model.values))
     write_json(folder / FILE, _to_json(model))
 
 
@@ -99,6 +99,13 @@ def load_extended(path: str | Path, scene: Scene) -> Extended:
     except (ValueError, KeyError, TypeError, OSError) as error:
         what = f"there is no entry {error}" if isinstance(error, KeyError) else error
         raise ValueError(f"{path}: {what}") from error
+
+
+def _in_mjcf(effect: Effect, free: Space) -> bool:
+    """Whether an effect is nothing but numbers of the model that MJCF has words for; free: its parameters in use."""
+    laws = (effect.command, effect.servo, effect.force, effect.frictionloss, effect.observe)
+    fields = [{w.field for w in p.writes} for p in free.parameters]
+    return not any(laws) and all(written and written <= WORDS for written in fields)
 
 
 def _to_json(model: Extended) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Where simulation and measurement disagree: U by joint and phase, and over the state of the motion."""
+"""Where simulation and measurement disagree: U by joint and phase, over the state of the motion, along the hinge."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from droid_jax.gap.flips import benjamini_hochberg
 FALSE_DISCOVERIES = 0.1
 BINS = 6
 STILL = 0.01  # rad/s
+ALONG = "hinge_preload"  # the amplitude whose mark says how a torque of the hinge shows in the measured joints
+HELD = 0.2  # of that mark's size where it is large: with less the door is not held
 
 
 @dataclass(frozen=True)
@@ -49,8 +51,41 @@ def localise(evidence: Evidence, values: np.ndarray, residuals: np.ndarray) -> L
     found = np.zeros(len(cells), bool)
     found[kept] = benjamini_hochberg(p[kept], FALSE_DISCOVERIES)
     size = evidence.gaps(residuals, cells)
-    return Localisation(
-        tuple(Cell(v, w, float(size[i]), float(p[i]), bool(found[i])) for i, (v, w) in enumerate(names))
+    cells = tuple(Cell(v, w, float(size[i]), float(p[i]), bool(found[i])) for i, (v, w) in enumerate(names))
+    return Localisation((*cells, *_parts(evidence, values, residuals)))
+
+
+def _parts(evidence: Evidence, values: np.ndarray, residuals: np.ndarray) -> tuple[Cell, ...]:
+    """U of three parts: what a torque of the hinge would do, what it cannot do, and the door not held.
+
+    The first is the hinge's; the second pose, contact or the arm's; the third the arm's, its tool's or a sensor's.
+    Empty where nothing tells the first: no hinge, a sensor on the hinge itself, or blocks instead of repeats.
+    """
+    space, scene = evidence.cost.space, evidence.cost.scene
+    if ALONG not in space.names or scene.object_joint in scene.joints or evidence.units != evidence.repeats:
+        return ()
+    pushed = values.copy()
+    pushed[space.index(ALONG)] += 0.5 * space[ALONG].std
+    without, with_it = -evidence.common(np.stack([values, pushed]))
+    columns = int(evidence.column.max()) + 1
+    mark = (with_it - without).reshape(columns, -1)
+    size = np.linalg.norm(mark, axis=0)
+    held = size > HELD * np.quantile(size, 0.9)
+    if columns < 2 or held.all() or not held.any():
+        return ()
+    unit = mark[:, held] / size[held]
+    each = residuals.reshape(len(residuals), columns, -1)
+    along = np.einsum("nck,ck->nk", each[..., held], unit)
+    # Columns minus one directions are left, spread over all columns.
+    across = (each[..., held] - along[:, None] * unit) * np.sqrt(columns / (columns - 1))
+    free = each[..., ~held].reshape(len(residuals), -1)
+    parts = (("along the hinge", along), ("door held, other directions", across), ("door not held", free))
+    flat = [part.reshape(len(residuals), -1) for _, part in parts]
+    p = [evidence.cell_p_values(f, np.ones((1, f.shape[1]), bool))[0] for f in flat]
+    found = benjamini_hochberg(np.array(p), FALSE_DISCOVERIES)
+    return tuple(
+        Cell("force", name, evidence.gap(f), float(p[i]), bool(found[i]))
+        for i, ((name, _), f) in enumerate(zip(parts, flat, strict=True))
     )
 
 

@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 
 from droid_jax.identify.pipeline import Identified
+from droid_jax.model.mjcf import fitted_mjcf
 from droid_jax.model.parameters import Space
-from droid_jax.model.physics import make_c_model
-from droid_jax.model.scene import Scene
 from droid_jax.storage import write_csv, write_json, write_npz, write_text
 
 
@@ -168,65 +167,3 @@ def traces(found: Identified) -> dict[str, np.ndarray]:
         phases = [{"name": p.name, "start": p.start, "end": p.end} for p in comparison.phases]
         out[f"{name}/phases"] = np.array(json.dumps(phases))
     return out
-
-
-def fitted_mjcf(scene: Scene, space: Space, values: np.ndarray) -> str:
-    """The scene as MJCF with the fitted values written in.
-
-    Model entries that MJCF has an attribute for are set on the spec; what lives outside the model
-    (offsets) is not in it.  Bodies of one geom get their mass through it.
-    """
-    spec = scene.spec.copy()
-    model = make_c_model(scene, space, values)
-    fields = {w.field for p in space.parameters for w in p.writes}
-    for joint in spec.joints:
-        dof, index = scene.dof(joint.name), scene.id("joint", joint.name)
-        if "dof_damping" in fields:
-            joint.damping = [float(model.dof_damping[dof]), 0, 0]
-        if "jnt_stiffness" in fields:
-            joint.stiffness = [float(model.jnt_stiffness[index]), 0, 0]
-        if "dof_frictionloss" in fields:
-            joint.frictionloss = float(model.dof_frictionloss[dof])
-    for body in spec.bodies[1:]:
-        _write_body(scene, model, body, fields)
-    for pair in spec.pairs:
-        if "pair_friction" in fields:
-            pair.friction = model.pair_friction[scene.id("pair", pair.name)].tolist()
-    for index, actuator in enumerate(spec.actuators):
-        if "actuator_gainprm" in fields:
-            actuator.gainprm = model.actuator_gainprm[index].tolist()
-            actuator.biasprm = model.actuator_biasprm[index].tolist()
-    for geom in spec.geoms:
-        if "geom_size" in fields and geom.name and _has(scene, geom.name):
-            geom.size[0] += (
-                model.geom_size[scene.id("geom", geom.name), 0] - scene.model.geom_size[scene.id("geom", geom.name), 0]
-            )
-    spec.compile()
-    return spec.to_xml()
-
-
-def _has(scene: Scene, geom: str) -> bool:
-    try:
-        scene.id("geom", geom)
-    except ValueError:
-        return False
-    return True
-
-
-def _write_body(scene: Scene, model: Any, body: Any, fields: set[str]) -> None:
-    index = scene.id("body", body.name)
-    if {"body_pos", "body_quat"} & fields:
-        body.pos = model.body_pos[index].tolist()
-        body.quat = model.body_quat[index].tolist()
-    if "body_gravcomp" in fields:
-        body.gravcomp = float(model.body_gravcomp[index])
-    scale = model.body_mass[index] / scene.model.body_mass[index] if scene.model.body_mass[index] > 0 else 1.0
-    if abs(scale - 1) < 1e-12:
-        return
-    if body.explicitinertial:
-        body.mass *= scale
-        body.fullinertia = (np.asarray(body.fullinertia) * scale).tolist()
-        body.inertia = (np.asarray(body.inertia) * scale).tolist()
-    for geom in body.geoms:
-        if geom.mass > 0:
-            geom.mass *= scale

@@ -17,9 +17,9 @@ import droid_jax as dj
 from droid_jax.compare.cost import make_cost
 from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.extended import Extended, extended, load_extended, save_extended
-from droid_jax.gap.mjcf import mjcf
 from droid_jax.identify.gaussian import prior
 from droid_jax.model.effects.registry import effect_space, library, ready
+from droid_jax.model.mjcf import fitted_mjcf
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene, load_scene
@@ -137,7 +137,7 @@ def test_effects_that_only_write_numbers_are_in_the_mjcf(values: dict[str, float
     scene, base = small_scene()
     model = with_effects(scene, base, **values)
     assert model.lacking == ()
-    written = mujoco.MjModel.from_xml_string(mjcf(model.scene, model.space, model.values))
+    written = mujoco.MjModel.from_xml_string(fitted_mjcf(model.scene, model.space, model.values))
     expected = make_c_model(scene, model.space, model.values)
     for field in ("body_mass", "body_inertia", "body_ipos", "actuator_gainprm", "actuator_biasprm", "dof_damping"):
         np.testing.assert_allclose(getattr(written, field), getattr(expected, field), rtol=1e-4, atol=1e-9)
@@ -149,7 +149,7 @@ def test_softer_contacts_are_in_the_mjcf():
     scene = dj.door_scene()
     model = with_effects(scene, dj.door_space(scene), contact_softness=0.7)
     assert model.lacking == ()
-    written = mujoco.MjModel.from_xml_string(mjcf(model.scene, model.space, model.values))
+    written = mujoco.MjModel.from_xml_string(fitted_mjcf(model.scene, model.space, model.values))
     expected = make_c_model(scene, model.space, model.values)
     np.testing.assert_allclose(written.pair_solref, expected.pair_solref, rtol=1e-4)
     assert np.allclose(expected.pair_solref[:, 0], 1.7 * scene.model.pair_solref[:, 0])

@@ -1,0 +1,69 @@
+"""Three parts of a gap: along the hinge, across it, and where the door is not held."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from droid_jax.gap.evidence import gap
+from droid_jax.gap.flips import gap_p_values
+from droid_jax.gap.localise import _parts
+from droid_jax.model.parameters import Parameter, Space
+
+REPEATS, COLUMNS, INSTANTS, FREE = 10, 3, 80, 30
+SPACE = Space(
+    (Parameter("mass", "kg", 1.0, 0.1, 0.0, 9.0), Parameter("hinge_preload", "N m", 0.0, 1.0, -5.0, 5.0)),
+)
+
+
+@pytest.fixture(scope="module")
+def unit() -> np.ndarray:
+    """[C, K] direction in which the hinge shows, which turns with the motion."""
+    drawn = np.random.default_rng(0).normal(size=(COLUMNS, 1)) + 0.5 * np.sin(np.arange(INSTANTS) / 9.0)
+    return drawn / np.linalg.norm(drawn, axis=0)
+
+
+@pytest.fixture(scope="module")
+def evidence(unit: np.ndarray) -> Any:
+    size = np.where(np.arange(INSTANTS) < FREE, 0.0, 7.0)
+
+    def common(values: np.ndarray) -> np.ndarray:
+        return -values[:, 1:] * (unit * size).ravel()
+
+    return SimpleNamespace(
+        cost=SimpleNamespace(space=SPACE, scene=SimpleNamespace(object_joint="hinge", joints=("a", "b", "c"))),
+        units=REPEATS, repeats=REPEATS, column=np.repeat(np.arange(COLUMNS), INSTANTS), common=common, gap=gap,
+        cell_p_values=gap_p_values,
+    )  # fmt: skip
+
+
+def residuals(shared: np.ndarray) -> np.ndarray:
+    """[N, M] of repeats that all hold `shared` [C, K], and noise of one."""
+    return shared.ravel() + np.random.default_rng(1).normal(size=(REPEATS, shared.size))
+
+
+@pytest.mark.parametrize(
+    ("where", "name"),
+    [("along", "along the hinge"), ("across", "door held, other directions"), ("free", "door not held")],
+)
+def test_each_part_holds_what_was_put_there(evidence: Any, unit: np.ndarray, where: str, name: str) -> None:
+    held = np.arange(INSTANTS) >= FREE
+    turned = np.stack([-unit[1], unit[0], np.zeros(INSTANTS)])
+    across = turned / np.linalg.norm(turned, axis=0)
+    shared = {"along": 2.0 * unit * held, "across": 2.0 * across * held, "free": 2.0 * across * ~held}[where]
+    cells = {c.where: c for c in _parts(evidence, SPACE.mean, residuals(shared))}
+    assert list(cells) == ["along the hinge", "door held, other directions", "door not held"]
+    degrees = {"along": 1, "across": COLUMNS - 1, "free": COLUMNS}[where]
+    for cell in cells.values():
+        assert cell.variable == "force"
+        assert cell.found == (cell.where == name)
+        assert cell.gap == pytest.approx(4.0 / degrees if cell.where == name else 0.0, abs=0.25)
+
+
+def test_a_hinge_with_a_sensor_of_its_own_needs_no_parts(evidence: Any) -> None:
+    cost = SimpleNamespace(space=SPACE, scene=SimpleNamespace(object_joint="c", joints=("a", "b", "c")))
+    one = SimpleNamespace(**{**vars(evidence), "cost": cost})
+    assert _parts(one, SPACE.mean, residuals(np.zeros((COLUMNS, INSTANTS)))) == ()  # type: ignore[arg-type]
