@@ -22,6 +22,8 @@ Progress = Callable[[str, Any], None]
 Starter = tuple[Sequence[Candidate], np.ndarray]  # effects, and values [D] to start from
 POLISH = RefineConfig(iterations=12, hops=0)
 PAIRS = 4  # pairs refitted
+PLAIN = 1.25  # times what the best leaves above the floor: up to here a plainer model is preferred
+NOTHING = 0.01  # share of the first gap that is no difference
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,6 +196,16 @@ def _decided(hunt: Hunt, before: Model, found: Screen, tried: Sequence[Model]) -
     )
     standing = [(m, t) for m, t in zip(tried, trials, strict=True) if t.passed or t.weak]
     winner, chosen = min(standing, key=lambda mt: mt[1].gap_confirm, default=(None, None))
-    if chosen is None or chosen.weak:  # what does best is too weak to be named, so nothing worse is named instead
-        winner, chosen = None, None
+    if (
+        winner is None or chosen is None or chosen.weak
+    ):  # what does best is too weak, and nothing worse is named instead
+        return Round(found, stood, tuple(tried), tuple(trials))
+    enough = hunt.floor + PLAIN * max(chosen.gap_confirm - hunt.floor, 0.0) + NOTHING * hunt.whole_gap
+    alike = [(m, t) for m, t in standing if t.passed and t.name in (chosen.name, *chosen.rivals)]
+    winner, chosen = plainest([(m, t) for m, t in alike if t.gap_confirm <= enough])
     return Round(found, stood, tuple(tried), tuple(trials), winner, chosen)
+
+
+def plainest(tied: Sequence[tuple[Model, Trial]]) -> tuple[Model, Trial]:
+    """Of models that do as well, the one with the fewest parameters: a flexible form mimics a plain one."""
+    return min(tied, key=lambda mt: (sum(len(c.free) for c in mt[0].parts), mt[1].gap_confirm))

@@ -37,7 +37,7 @@ def joint_stribeck(scene: Scene) -> Effect | None:
         (
             *a.of_joints(JOINT, joints, "N m", 0.2, 2.0, low=0.0),
             a.shape(JOINT_SPEED, "rad/s", SPEEDS, 0.005, 0.2),
-            a.shape(JOINT_EXPONENT, "-", a.EXPONENTS, 0.5, 2.5),
+            a.shape(JOINT_EXPONENT, "-", a.EXPONENTS, 1.0, 2.5),
         ),
         frictionloss=frictionloss,
         what="friction of a joint of the arm that is higher at rest than in motion",
@@ -65,7 +65,7 @@ def hinge_stribeck(scene: Scene) -> Effect | None:
         (
             a.amplitude(HINGE, "N m", 0.5, 3.0, low=0.0),
             a.shape(HINGE_SPEED, "rad/s", SPEEDS, 0.005, 0.2),
-            a.shape(HINGE_EXPONENT, "-", a.EXPONENTS, 0.5, 2.5),
+            a.shape(HINGE_EXPONENT, "-", a.EXPONENTS, 1.0, 2.5),
         ),
         frictionloss=frictionloss,
         what="friction of the hinge that is higher at rest than in motion",
