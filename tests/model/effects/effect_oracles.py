@@ -180,7 +180,7 @@ ORACLES = {
         loss=at_arm(lambda v, j, now: v["joint_directional"] * np.tanh(now.w[j] / SLOW)),
     ),
     "joint_stribeck": Oracle(
-        {**each(*ARM, joint_stribeck=(0.6, 0.3)), "joint_stribeck_speed": 0.15, "joint_stribeck_exponent": 0.8},
+        {**each(*ARM, joint_stribeck=(0.6, 0.3)), "joint_stribeck_speed": 0.15, "joint_stribeck_exponent": 1.4},
         loss=at_arm(lambda v, j, now: stribeck(v, "joint_stribeck", v["joint_stribeck"], now.w[j])),
     ),
     "latch": Oracle({"latch_torque": 1.5, "latch_width": 0.05, "latch_exponent": 1.6}, force=at_door(latch)),
