@@ -243,7 +243,7 @@ def check_shapes(bench: Bench, effect: Effect) -> None:
     """They do nothing by themselves, and every value of them is another effect beside an amplitude."""
     for name, values in effect.shapes.items():
         shape = bench.space[name]
-        tried = [{name: v} for v in (*values, shape.low, shape.high)]
+        tried = [{name: v} for v in sorted({*values, shape.low, shape.high})]
         quiet = bench.torque({}, *tried)
         np.testing.assert_array_equal(quiet, np.broadcast_to(quiet[:1], quiet.shape))
         loud = bench.torque(*({**everywhere(effect), **row} for row in tried))
