@@ -1,7 +1,7 @@
-"""Which experiment would tell tied effects apart: what each of them predicts for the same motion in another time.
+"""Which experiment would tell tied effects apart: what each of them predicts for it.
 
-Every entry of the menu replays the fitted demonstration on another clock, which stays within reach of whoever
-gave it: slower, faster, there and back, with a stop half-way.
+Every entry of the menu is within reach of whoever gave the fitted demonstration: the same motion on another clock
+(slower, faster, there and back, with a stop half-way), or the same motion with a known weight at the hand.
 """
 
 from __future__ import annotations
@@ -12,13 +12,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from droid_jax.compare.cost import make_cost
+from droid_jax.compare.cost import Cost, make_cost
 from droid_jax.gap.case import Case
 from droid_jax.gap.refit import Model
 from droid_jax.gap.verdict import Experiment
 from droid_jax.measure.recording import Channel, Recording
 
 STOP = 2.0  # s
+WEIGHT, CARRIED = 0.5, "payload_mass"  # kg, and the library's parameter that stands for it
 
 
 @dataclass(frozen=True)
@@ -81,9 +82,24 @@ def separating(case: Case, models: Sequence[Model], recording: Recording) -> tup
     for entry in MENU:
         other = warped(recording, entry)
         cost = make_cost(known.scene, case.whole, [other], config=known.comparisons[0].config, effects=case.effects)
-        if cost.failed(values).any():
-            continue
-        simulated = cost.whitened(values).astype(np.float64)
-        apart = min(float(np.linalg.norm(a - b)) for a, b in itertools.combinations(simulated, 2))
-        found.append(Experiment(entry.what, apart))
+        found += _experiment(entry.what, cost, values)
+    if CARRIED in case.whole.names:
+        what = f"the same motion with {WEIGHT:g} kg more, weighed, at the hand"
+        found += _experiment(what, known, _carrying(case, values))
     return tuple(sorted(found, key=lambda e: -e.apart))
+
+
+def _experiment(what: str, cost: Cost, values: np.ndarray) -> list[Experiment]:
+    """How far apart models [K, D] are that one experiment tells apart least; none where one cannot be replayed."""
+    if cost.failed(values).any():
+        return []
+    simulated = cost.whitened(values).astype(np.float64)
+    apart = min(float(np.linalg.norm(a - b)) for a, b in itertools.combinations(simulated, 2))
+    return [Experiment(what, apart)]
+
+
+def _carrying(case: Case, values: np.ndarray) -> np.ndarray:
+    """Models [K, D] with a known weight at the hand."""
+    out, column = values.copy(), case.whole.index(CARRIED)
+    out[:, column] = np.minimum(out[:, column] + WEIGHT, case.whole[CARRIED].high)
+    return out

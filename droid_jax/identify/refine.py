@@ -185,6 +185,7 @@ class _State:
 # A batch of trials for each start: damping factors x lengths x paths, 32 in all, the block of a CPU.
 _DAMPINGS = 10.0 ** np.arange(-3.0, 5.0)
 _LENGTHS = (1.0, 0.5)
+TRIALS = 2 * len(_DAMPINGS) * len(_LENGTHS)
 _LONGEST = 2.0  # search units: the longest component of a step
 HOPELESS = 30.0  # iterations like the last: an aim farther off than that is given up
 CHORDS = 3  # batches of trials at most with one Jacobian

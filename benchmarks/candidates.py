@@ -1,0 +1,111 @@
+"""What a candidate effect costs: the replay that holds all of them, and every stage of a search per candidate.
+
+    python benchmarks/candidates.py [--quick] [--out DIR]
+
+On the built-in door at a 4 ms step, demonstration A: the replay with the whole library at neutral beside the one with
+no effect at all (interleaved), and what screening, a first look and a refit take of it in rows.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
+
+import tuned  # noqa: E402, F401  (before jax starts)
+
+# isort: split
+import json  # noqa: E402
+
+import numpy as np  # noqa: E402
+import tyro  # noqa: E402
+
+from benchmarks.common import interleave, origin  # noqa: E402
+from droid_jax.compare.cost import Cost, make_cost  # noqa: E402
+from droid_jax.gap.candidates import candidates  # noqa: E402
+from droid_jax.gap.case import GapConfig  # noqa: E402
+from droid_jax.gap.screen import questions_of  # noqa: E402
+from droid_jax.identify.refine import TRIALS  # noqa: E402
+from droid_jax.measure.demonstration import demonstration_path  # noqa: E402
+from droid_jax.measure.formats import load  # noqa: E402
+from droid_jax.measure.recording import Recording  # noqa: E402
+from droid_jax.measure.surrogate import SurrogateConfig, record, stand_in_truth  # noqa: E402
+from droid_jax.model.door import door_nuisances, door_space  # noqa: E402
+from droid_jax.model.door_scene import door_scene  # noqa: E402
+from droid_jax.model.effects.registry import effect_space, library, ready  # noqa: E402
+from droid_jax.storage import write_json  # noqa: E402
+
+TIMESTEP = 0.004  # s
+SHORT = 1.0  # s of the demonstration with --quick
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Options."""
+
+    quick: bool = False
+    """A second of the demonstration, one timed call."""
+    rows: int = 128
+    """Rows of a batch."""
+    repeats: int = 5
+    """Timed calls."""
+    out: Path = ROOT / "benchmarks" / "results"
+    """Folder of candidates.json."""
+
+
+def recording(quick: bool) -> Recording:
+    """Two repeats of the stand-in robot: what they hold does not matter here."""
+    scene, demonstration = door_scene(), load(demonstration_path("A"))
+    if quick:
+        first = float(demonstration.time[0])
+        demonstration = demonstration.window(first, first + SHORT)
+    return record(scene, demonstration, stand_in_truth(scene, 1, 0), seed=0, config=SurrogateConfig(repeats=2))
+
+
+def main() -> None:
+    arguments = tyro.cli(Arguments, description=__doc__)
+    scene, measured = ready(door_scene(timestep=TIMESTEP)), recording(arguments.quick)
+    base, effects = door_space(scene) + door_nuisances(scene), library(scene)
+    bare = make_cost(scene, base, [measured])
+    full = make_cost(scene, base + effect_space(effects), [measured], effects=effects)
+
+    def batch(cost: Cost) -> np.ndarray:
+        return cost.whitened(np.repeat(cost.space.mean[None], arguments.rows, axis=0))
+
+    repeats = 1 if arguments.quick else arguments.repeats
+    first, usual = interleave({"bare": lambda: batch(bare), "full": lambda: batch(full)}, repeats)
+    apart = np.abs(full.smoothed(full.space.mean[None])[0] - bare.smoothed(base.mean[None])[0]).max()
+    asked, config = candidates(effects), GapConfig()
+    questions = questions_of(asked)
+    row = usual["full"] / arguments.rows
+    refit_rows = 2 * (len(base) + 2) + TRIALS
+    result = {
+        **origin(0),
+        "quick": arguments.quick,
+        "timestep": TIMESTEP,
+        "seconds_of_motion": measured.duration,
+        "rows": arguments.rows,
+        "first_call_s": first,
+        "batch_s": usual,
+        "row_s": {name: s / arguments.rows for name, s in usual.items()},
+        "effects_cost": usual["full"] / usual["bare"],
+        "neutral_apart_n_m": float(apart),
+        "effects": len(effects),
+        "candidates": len(asked),
+        "questions": len(questions),
+        "screening_s": (len(questions) + 1) * row,
+        "candidate_screened_s": (len(questions) + 1) * row / len(asked),
+        "look_rows_at_most": 3 * TRIALS,
+        "look_s_at_most": 3 * TRIALS * row,
+        "refit_iteration_rows": refit_rows,
+        "refit_s_at_most": config.refit.iterations * refit_rows * row,
+    }
+    write_json(arguments.out / "candidates.json", result)
+    print(json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()

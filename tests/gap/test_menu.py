@@ -1,0 +1,74 @@
+"""Experiments that tell tied effects apart: clocks in closed form, and rivals whose difference is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_gap import record, small
+
+from droid_jax.gap import menu
+from droid_jax.gap.menu import CARRIED, MENU, STOP, WEIGHT, separating, warped
+from droid_jax.gap.refit import Model
+
+
+@pytest.fixture(scope="module")
+def demonstration():
+    return record("fit")
+
+
+@pytest.mark.parametrize(
+    ("number", "seconds", "at"),
+    [
+        (0, lambda d: 3 * d, {0.9: 0.3, 6.0: 2.0}),
+        (1, lambda d: d / 2, {0.5: 1.0, 1.2: 2.4}),
+        (2, lambda d: 2 * d, {1.0: 1.0, 5.0: 0.996}),
+        (3, lambda d: d + STOP, {1.0: 1.0, 2.5: 1.499, 4.5: 2.5}),
+    ],
+)
+def test_a_motion_on_another_clock(demonstration, number, seconds, at):
+    """`at`: instants of the new motion and of the demonstration (2.998 s long) that have the same command."""
+    new = warped(demonstration, MENU[number])
+    assert new.duration == pytest.approx(seconds(demonstration.duration), abs=0.005)
+    for later, before in at.items():
+        expected = [np.interp(before, demonstration.time, c) for c in demonstration.command.T]
+        found = [np.interp(later, new.time, c) for c in new.command.T]
+        np.testing.assert_allclose(found, expected, atol=2e-3)
+    for channel in new.channels.values():
+        assert channel.values.shape[1] == len(channel.time) == channel.mask.shape[1]
+        assert channel.time[-1] <= new.time[-1] + 0.1
+
+
+def model(name: str, value: float) -> Model:
+    """The base fit with one effect beside it."""
+    found = small()
+    values = found.base.values.copy()
+    values[found.case.whole.index(name)] = value
+    return replace(found.base, values=values)
+
+
+def test_a_drag_is_told_from_a_preload_by_another_speed(demonstration, monkeypatch):
+    """Rivals that differ in a speed-dependent torque: three times slower they come closer, twice as fast they part."""
+    monkeypatch.setattr(menu, "MENU", MENU[:2])
+    rivals = (model("drag", 0.0), model("drag", 0.8))
+    found = {e.what: e.apart for e in separating(small().case, rivals, demonstration)}
+    slower, faster = (found[entry.what] for entry in MENU[:2])
+    assert faster > 3.0 * slower > 0.0
+    weighed = next(apart for what, apart in found.items() if "weighed" in what)
+    assert slower < weighed < faster
+
+
+def test_a_known_weight_tells_only_what_acts_through_it(demonstration, monkeypatch):
+    """Two payloads differ by as much with a weight beside them as without; two preloads likewise."""
+    monkeypatch.setattr(menu, "MENU", ())
+    case = small().case
+    rivals = (model(CARRIED, 0.0), model(CARRIED, 0.2))
+    (found,) = separating(case, rivals, demonstration)
+    plain = case.fit.cost.whitened(np.stack([m.values for m in rivals])).astype(float)
+    assert f"{WEIGHT:g} kg" in found.what
+    assert found.apart == pytest.approx(np.linalg.norm(plain[0] - plain[1]), rel=0.2)
+
+
+def test_one_model_needs_no_experiment(demonstration):
+    assert separating(small().case, (model("drag", 0.0),), demonstration) == ()
