@@ -48,9 +48,10 @@ class Bench:
         """
         where = self.setting(scene)
         given = {role: recordings.get(role, recordings["fit"]) for role in ROLES}
-        if scene not in self.compiled:
-            self.compiled[scene] = make_case(where.scene, where.base, where.effects(), **given, config=self.config)
-        known = self.compiled[scene]
+        key = ", ".join((scene, *sorted(recordings)))
+        if key not in self.compiled:
+            self.compiled[key] = make_case(where.scene, where.base, where.effects(), **given, config=self.config)
+        known = self.compiled[key]
         of = {role: _again(known.judged[role], recording) for role, recording in recordings.items()}
         kept = {e.name for e in where.effects(without)}
         return replace(known, **of, effects=tuple(e for e in known.effects if e.name in kept))
