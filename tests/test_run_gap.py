@@ -77,10 +77,9 @@ def changed(recording: Recording, name: str, function: Callable[[np.ndarray], np
 # ----- recordings
 
 
-@pytest.mark.parametrize("count", [1, 4])
-def test_one_recording_confirms_nothing(place: Path, refused, count: int):
-    said = refused(arguments(place, recordings=("fit.npz", "confirm.npz", "fit.npz", "confirm.npz")[:count]))
-    assert "FIT CONFIRM [SEALED]" in said and f"got {count}" in said and "identify" in said
+def test_four_recordings_are_too_many(place: Path, refused):
+    said = refused(arguments(place, recordings=("fit.npz", "confirm.npz", "fit.npz", "confirm.npz")))
+    assert "FIT CONFIRM [SEALED]" in said and "got 4" in said and "identify" in said
 
 
 def test_too_few_repeats_say_what_can_still_be_concluded(place: Path, refused):

@@ -2,43 +2,38 @@
 
 from __future__ import annotations
 
-import json
 import shutil
-import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from droid_jax.commands import report
 from droid_jax.commands.folder import begin, fingerprints, finished, setup_of
+from droid_jax.commands.gap_search import searched
 from droid_jax.commands.hidden import hidden_effects, record_stand_in
 from droid_jax.commands.presets import TIMESTEP, refine_config, search_config
 from droid_jax.commands.scenes import own_scene
-from droid_jax.storage import write_json
 
 if TYPE_CHECKING:
-    from droid_jax.gap.case import Case, GapConfig
-    from droid_jax.gap.verdict import Verdict
+    from droid_jax.gap.case import GapConfig
     from droid_jax.measure.recording import Recording
     from droid_jax.model.parameters import Space
     from droid_jax.model.scene import Scene
     from droid_jax.model.seam import Effect
 
-STAGES = ("search", "refine", "floor", "screen", "look", "refit", "judge")
-ROLES = ("fit", "confirm", "sealed")
-
 
 @dataclass(frozen=True)
 class Gap:
-    """Find the physical effect that the model lacks: fit, ask a library of effects, confirm on another motion.
+    """Find the physical effect that the model lacks: fit, ask a library of effects, confirm on what was not fitted.
 
     Without --recording a stand-in robot with a hidden effect is recorded first.
     """
 
     recording: tuple[Path, ...] = ()
     """FIT CONFIRM [SEALED]: two or three motions of the same robot and object, eight repeats or more of each. The
-    fit sees the first, effects are chosen on the second, the third is opened when all is decided."""
+    fit sees the first, effects are chosen on the second, the third is opened when all is decided. Or one motion, of
+    which less can be concluded: ONE, sixteen repeats or more, of which the second half confirms; LOG [SEALED], without
+    repeats and commands, whose blocks of time fit and confirm in turns."""
     preset: Literal["quick", "standard", "gpu"] = "quick"
     """Of the base fit, as in identify."""
     scene: Path | None = None
@@ -77,22 +72,28 @@ def run(command: Gap) -> None:
     runtime.import_mjx()
     from droid_jax.gap.inputs import check_recordings
     from droid_jax.gap.results import write_gap
+    from droid_jax.gap.split import Split, roles_of, split_of
     from droid_jax.identify.results import prepare_folder
 
     out = prepare_folder(command.out)
     scene, base = model_of(command)
     given, hidden = _given(command), hidden_effects(command.hide, scene)
-    effects = chosen_effects(command, scene, [*given.values()])
-    setup = {**setup_of(command), "command": "gap", **fingerprints(scene, base, given.values())}
+    effects = chosen_effects(command, scene, given)
+    setup = {**setup_of(command), "command": "gap", **fingerprints(scene, base, given)}
     if finished(out, setup, command.again, "gap.json"):
         _done(out)
         return
-    check_recordings(scene, given)
+    split, roles = Split.RECORDINGS, {}
+    if given:
+        split = split_of(given)
+        roles = roles_of(split, given)
+        check_recordings(scene, {"only": given[0]} if split is Split.REPEATS else roles)
     config = config_of(command)
     begin(out, setup, command.again, "gap.json")
-    recordings = given or record_stand_in(scene, hidden, out, command.springs, command.seed, command.again)
-    case, verdict, seconds = _searched(scene, base, effects, recordings, config, out / "checkpoints")
+    roles = roles or record_stand_in(scene, hidden, out, command.springs, command.seed, command.again)
+    case, verdict, seconds = searched(split, scene, base, effects, roles, config, out / "checkpoints")
     description = {
+        "split": {"by": split.value, "limits": split.limits},
         "seconds": seconds,
         "versions": runtime.versions(),
         "device": runtime.device(),
@@ -151,85 +152,26 @@ def config_of(command: Gap) -> GapConfig:
     )
 
 
-def _given(command: Gap) -> dict[str, Recording]:
-    """Role -> recording, none where the stand-in robot shall record."""
+def _given(command: Gap) -> list[Recording]:
+    """The recordings, none where the stand-in robot shall record."""
     from droid_jax.measure.formats import load
 
     if not command.recording:
         if command.scene is not None:
             raise ValueError("--scene needs --recording: the stand-in robot only knows the built-in door")
-        return {}
+        return []
     if command.hide is not None:
         raise ValueError("--hide is for the stand-in robot, and --recording says that there is none")
-    if not 2 <= len(command.recording) <= 3:
+    if len(command.recording) > 3:
         raise ValueError(
-            f"--recording takes FIT CONFIRM [SEALED], two or three recordings, got {len(command.recording)}: an effect "
-            "must be confirmed on another motion. With one, `python -m droid_jax.run identify` fits the parameters, "
-            "and its report shows where simulation and robot disagree"
+            f"--recording takes FIT CONFIRM [SEALED], or ONE with repeats, or LOG [SEALED] without, got "
+            f"{len(command.recording)} recordings; `python -m droid_jax.run identify` fits any number"
         )
-    return dict(zip(ROLES, [load(path) for path in command.recording], strict=False))
-
-
-def _searched(
-    scene: Scene,
-    base: Space,
-    effects: tuple[Effect, ...],
-    recordings: Mapping[str, Recording],
-    config: GapConfig,
-    checkpoints: Path,
-) -> tuple[Case, Verdict, dict[str, float]]:
-    """The search from top to bottom, going on from `checkpoints`; and each stage's seconds."""
-    from droid_jax.gap.case import make_case
-    from droid_jax.gap.floor import numerical_floor
-    from droid_jax.gap.menu import separating
-    from droid_jax.gap.resume import kept_model, kept_number, remembering
-    from droid_jax.gap.workflow import base_fit, find
-    from droid_jax.report.progress import stages
-
-    case = remembering(make_case(scene, base, effects, **recordings, config=config), checkpoints / "replays")
-    with stages(STAGES) as show:
-        clock = _Clock(show, checkpoints / "seconds.json")
-        model = kept_model(checkpoints / "base", case.base, lambda: base_fit(case, clock))
-        clock("floor", None)
-        floor = kept_number(checkpoints / "floor", lambda: numerical_floor(case.fit, model, recordings["fit"]))
-        verdict = find(case, model, floor, clock)
-        clock("judge", None)
-        if verdict.rivals:
-            tied = (verdict.model, *verdict.rivals)
-            verdict = replace(verdict, experiments=separating(case, tied, recordings["fit"]))
-        clock("judge", None)  # its seconds count
-    return case, verdict, clock.seconds
-
-
-class _Clock:
-    """Hands progress on, and counts the seconds of each stage; those of an earlier part of this run are in `kept`."""
-
-    def __init__(self, show: Callable[[str, Any], None], kept: Path) -> None:
-        self.show, self.kept = show, kept
-        self.seconds: dict[str, float] = _seconds(kept)
-        self._stage, self._since = STAGES[0], time.monotonic()
-
-    def __call__(self, stage: str, value: Any) -> None:
-        now = time.monotonic()
-        self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._since
-        if stage != self._stage:
-            write_json(self.kept, self.seconds)
-        self._stage, self._since = stage, now
-        if stage in STAGES:
-            self.show(stage, value)
-
-
-def _seconds(kept: Path) -> dict[str, float]:
-    """What was counted before; nothing where that cannot be read, it decides nothing."""
-    try:
-        before = json.loads(kept.read_text())
-        return {stage: float(before[stage]) for stage in STAGES if stage in before}
-    except (OSError, ValueError, TypeError):
-        return {}
+    return [load(path) for path in command.recording]
 
 
 def _done(out: Path) -> None:
-    """Build the page, and say in five lines what was found."""
+    """Build the page, and say in a few lines what was found."""
     from droid_jax.gap.results import load_gap, most_shifted
 
     found = load_gap(out).answer
@@ -242,6 +184,8 @@ def _done(out: Path) -> None:
         closed = "" if gap["closed"] is None else f" ({gap['closed']:.0%} closed)"
         gaps.append(f"{role} {gap['before']:.3g} -> {gap['after']:.3g}{closed}")
     print(f"gap, noise units squared: {', '.join(gaps)}")
+    if limits := found.get("split", {}).get("limits"):
+        print(limits)
     shift, deviations = most_shifted(found["shifts"])
     moved = (
         f"{shift['name']} {shift['before']:.3g} -> {shift['after']:.3g} {shift['unit']} ({deviations:.1f} deviations)"

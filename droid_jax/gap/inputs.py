@@ -6,7 +6,6 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from droid_jax.gap.flips import FEWEST
 from droid_jax.measure.recording import Channel, Recording
 from droid_jax.model.scene import Scene
 
@@ -18,27 +17,16 @@ APART = 0.05  # s: repeats that are further apart in time were not cut alike
 def check_recordings(scene: Scene, roles: Mapping[str, Recording]) -> None:
     """ValueError where a search in these recordings ("fit", "confirm", perhaps "sealed") could not end well.
 
-    Each must hold enough repeats, cut alike, of a motion that moves the robot and the object; all must
-    measure the same joints, and none may be another one once more.
+    Each must hold repeats, cut alike, of a motion that moves the robot and the object; all must measure the same
+    joints, and none may be another one once more.  How many repeats are enough: `droid_jax.gap.split`.
     """
     for role, recording in roles.items():
         where = f"the {role} recording {recording.name!r}"
-        _check_repeats(recording, where)
         _check_moves(recording, where)
         _check_object(scene, recording, where)
         _check_timing(recording, where)
     _check_different(roles)
     _check_same_joints(roles)
-
-
-def _check_repeats(recording: Recording, where: str) -> None:
-    if recording.repeats >= FEWEST:
-        return
-    raise ValueError(
-        f"{where} has {recording.repeats} repeats: with fewer than {FEWEST} no effect can be told from chance. "
-        "What these can still tell: `python -m droid_jax.run identify` fits the parameters to them, and its report "
-        "shows in which joint and phase simulation and robot disagree"
-    )
 
 
 def _check_moves(recording: Recording, where: str) -> None:
@@ -109,11 +97,12 @@ def _check_different(roles: Mapping[str, Recording]) -> None:
 
 def _check_same_joints(roles: Mapping[str, Recording]) -> None:
     joints = {role: recording.channel("torque").columns for role, recording in roles.items()}
-    for role, names in joints.items():
-        if set(names) != set(joints["fit"]):
+    first, *others = joints
+    for role in others:
+        if set(joints[role]) != set(joints[first]):
             raise ValueError(
-                f"the recordings measure torques of different joints: fit {', '.join(joints['fit'])}; "
-                f"{role} {', '.join(names)}"
+                f"the recordings measure torques of different joints: {first} {', '.join(joints[first])}; "
+                f"{role} {', '.join(joints[role])}"
             )
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from droid_jax.gap.blocks import OUTSIDE, Blocks
 from droid_jax.gap.case import Case
 from droid_jax.gap.evidence import Evidence
 from droid_jax.gap.extended import extended, save_extended
@@ -21,11 +22,11 @@ from droid_jax.gap.localise import Localisation
 from droid_jax.gap.refit import intervals
 from droid_jax.gap.screen import Screen
 from droid_jax.gap.select import Trial
+from droid_jax.gap.split import ROLES
 from droid_jax.gap.verdict import Verdict
 from droid_jax.identify.uncertainty import posterior
 from droid_jax.storage import write_json, write_npz
 
-ROLES = ("fit", "confirm", "sealed")
 TRACES = ("time", "measured", "scatter", "before", "after")
 _KEYS = ("verdict", "sentence", "effects", "p", "floor", "gaps", "screens", "trials", "cells", "amplitudes", "shifts")
 
@@ -35,8 +36,8 @@ class GapFiles:
     """A search's folder, read.
 
     answer: gap.json.  joints: J names.  traces: role ("fit", "confirm" and perhaps "sealed") -> "time" [K] s and,
-    all [K, J] N m (N for slides), "measured" (mean of the repeats), "scatter" (their deviation), "before" and
-    "after" (simulated, through the measurement's filter).
+    all [K, J] N m (N for slides), "measured" (mean of the repeats), "scatter" (their deviation, zero of one repeat),
+    "before" and "after" (simulated, through the measurement's filter).  Of a log in blocks: at its role's instants.
     """
 
     answer: Mapping[str, Any]
@@ -92,22 +93,34 @@ def gap_json(case: Case, verdict: Verdict) -> dict[str, Any]:
 
 
 def gap_arrays(case: Case, verdict: Verdict) -> dict[str, np.ndarray]:
-    """Smoothed joint torques of each recording: the repeats, and the simulation before and after."""
+    """Smoothed joint torques of each recording: the repeats, and the simulation before and after.
+
+    Where one log has several roles, each has the instants of its own blocks.
+    """
     joints = _joints(case.fit)
     out = {"joints": np.array(joints)}
     for role, evidence in case.judged.items():
         order = [_joints(evidence).index(joint) for joint in joints]
         channel = evidence.cost.comparisons[0].channel("torque")
+        mine = _instants(evidence)
         (simulated,) = evidence.cost.smoothed(_before_after(evidence, verdict))
-        before, after = simulated[:, :, order]
+        before, after = simulated[:, mine][:, :, order]
+        repeats = channel.noise.repeats[:, mine][:, :, order]
         out |= {
-            f"{role}.time": channel.clock,
-            f"{role}.measured": channel.noise.mean[:, order],
-            f"{role}.scatter": np.std(channel.noise.repeats, axis=0, ddof=1)[:, order],
+            f"{role}.time": channel.clock[mine],
+            f"{role}.measured": channel.noise.mean[mine][:, order],
+            f"{role}.scatter": np.std(repeats, axis=0, ddof=1) if len(repeats) > 1 else np.zeros(repeats.shape[1:]),
             f"{role}.before": before,
             f"{role}.after": after,
         }
     return out
+
+
+def _instants(evidence: Evidence) -> np.ndarray:
+    """[K] bool of the coarse clock: all, or those of a role's blocks."""
+    if isinstance(evidence, Blocks):
+        return evidence.block[evidence.column == 0] != OUTSIDE
+    return np.ones(int(np.sum(evidence.column == 0)), bool)
 
 
 def _before_after(evidence: Evidence, verdict: Verdict) -> np.ndarray:

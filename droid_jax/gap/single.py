@@ -21,6 +21,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
+import jax
 import numpy as np
 
 from droid_jax.compare.cost import Cost, make_cost
@@ -63,6 +64,21 @@ class Log(Cost):
     def simulated(self, values: Any) -> np.ndarray:
         """[P, D] -> [P, K, C] simulated torques through the data's filter, in the channel's unit."""
         return self.smoothed(values)[0].astype(np.float64)
+
+    def distances(self, values: Any) -> np.ndarray:
+        """[P, D] -> [P, 1] equation 1 over the instants that count."""
+        (rollout,) = self.rollouts(values)
+        comparison = only_comparison(self)
+        torque = comparison.channel("torque")
+        counts = np.any(np.einsum("ckk->kc", torque.noise.whitener) > 0, axis=1)
+        raw = comparison.clock[0] + torque.at * (comparison.clock[1] - comparison.clock[0])
+        near = np.abs(raw[:, None] - self.clock).argmin(axis=1)
+        part = replace(comparison, channels=(replace(torque, mask=torque.mask & counts[near][:, None]),))
+        return np.asarray(jax.vmap(part.distance)(rollout))[:, None]
+
+    def part(self, name: str) -> Log:
+        """The same log under a name for one part of it."""
+        return replace(self, comparisons=(replace(only_comparison(self), name=name),))
 
     @property
     def measured(self) -> np.ndarray:
@@ -138,8 +154,10 @@ def single_case(
     end = clock[-1] + 1e-6 if sealed is not None else clock[0] + FITTED * (clock[-1] - clock[0])
     deviation, length = noise_of(log, base, effects, end, config, start)
     parts = interleaved(clock, clock[0], end, length, 2)
-    fit, confirm = (_blocks(log, deviation, part) for part in parts)
-    rest = log if sealed is None else sealed
+    name = only_comparison(log).name
+    turns = (f"{name}, every other block", f"{name}, the blocks between")
+    fit, confirm = (_blocks(log.part(n), deviation, part) for n, part in zip(turns, parts, strict=True))
+    rest = log.part(f"{name}, last third") if sealed is None else sealed
     judged = _blocks(rest, deviation, _any_blocks(rest.clock, end if sealed is None else rest.clock[0]))
     return Case(fit, confirm, judged, base, tuple(effects), config)
 

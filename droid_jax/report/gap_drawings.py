@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from matplotlib.figure import Figure
@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from droid_jax.report import gap_figures, gap_maps, gap_torques
 from droid_jax.report.drawings import Drawing, drawing
 from droid_jax.report.gap_folder import Gap
+from droid_jax.report.gap_maps import Cell
 from droid_jax.report.gap_words import ROLES, role_words
 
 CURVE = ("unexplained", "partly explained")  # verdicts that leave something to look at
@@ -19,31 +20,29 @@ def draw_gap(gap: Gap) -> dict[str, list[Drawing]]:
     """Figures by section of the page; PNG and PDF copies go to FOLDER/figures/."""
     found, extended = gap.found, gap.extended
     sections: dict[str, list[Drawing]] = {"size": [], "torque": [], "place": [], "shifts": [], "curve": []}
-    cells = (found["cells"]["before"], found["cells"]["after"] if extended else None)
+    before, after = (_shown(gap, found["cells"][when]) for when in ("before", "after"))
+    cells = (before, after if extended else None)
 
     def add(section: str, stem: str, title: str, caption: str, make: Callable[..., Figure], *args: Any) -> None:
         sections[section].append(drawing(gap.folder, f"missing_{stem}", title, caption, make, *args))
 
-    if found["floor"] is None:
-        floor = ""
-    else:
-        floor = " Dashed: what the simulation's own time step leaves; nothing below it has a meaning."
-    names = [f"{gap.recording(role)}\n{ROLES[role]}" for role in gap.roles]
+    floor = " Dashed: what the simulation's own time step leaves; nothing below it has a meaning." if gap.floor else ""
+    names = [f"{gap.recording(role)}\n{ROLES[role]}".replace(", ", ",\n") for role in gap.roles]
     add(
         "size", "gap", "U and torque distance",
-        "Left: U, the mean square of what all repeats share of the residual, σ being one repeat's noise; noise itself "
-        f"has no part in it.{floor} Right: the paper's distance between simulated and measured torques, with noise.",
-        gap_figures.gap_bars, names, [found["gaps"][r] for r in gap.roles], found["floor"], gap.unit, extended,
+        f"Left: {gap.parts.bars}{floor} "
+        "Right: the paper's distance between simulated and measured torques, with noise.",
+        gap_figures.gap_bars, names, [found["gaps"][r] for r in gap.roles], gap.floor, gap.unit, extended,
     )  # fmt: skip
-    for role in reversed(gap.roles):
-        shaded = " Shaded: every other phase of the motion." if gap.traces[role]["phases"] else ""
+    for roles, traces in gap.sheets:
+        shaded = " Shaded: every other phase of the motion." if traces["phases"] else ""
+        where = " and ".join(role_words(gap, role) for role in roles)
         add(
-            "torque", f"torque_{role}", f"Torque over time, {role_words(gap, role)}",
-            "Upper: black line and band, the repeats' mean and two of their deviations; lines, the simulation. "
-            f"Lower: measurement minus simulation.{shaded}",
-            gap_torques.torque_overlays, gap.traces[role], gap.unit, extended,
+            "torque", f"torque_{roles[0]}", f"Torque over time, {where}",
+            f"Upper: {gap.parts.lines} Lower: measurement minus simulation.{shaded}",
+            gap_torques.torque_overlays, traces, gap.unit, extended,
         )  # fmt: skip
-    fitted = f"On {role_words(gap, 'fit')}. Hatched: the sign-flip test (false discoveries 10 %) finds nothing there."
+    fitted = f"On {role_words(gap, 'fit')}. {gap.parts.places}"
     if gap_maps.joints_and_phases(cells[0])[0]:
         add("place", "cells", "By joint and phase", fitted, gap_maps.cell_maps, *cells)
     if gap_maps.state_bins(cells[0]):
@@ -59,7 +58,14 @@ def draw_gap(gap: Gap) -> dict[str, list[Drawing]]:
         add(
             "curve", "remainder", "What is left, as a curve",
             f"Descriptive only, on {role_words(gap, 'fit')}: it shows where the remainder lives and is no name for it. "
-            "σ: one repeat's noise.",
-            gap_torques.remainder, gap.traces["fit"], found["cells"]["after"], gap.unit,
+            f"σ: {gap.parts.sigma}.",
+            gap_torques.remainder, gap.sheets[-1][1], found["cells"]["after"], gap.unit,
         )  # fmt: skip
     return sections
+
+
+def _shown(gap: Gap, cells: Sequence[Cell]) -> Sequence[Cell]:
+    """Cells to draw; without repeats no test judges them, and all that hold an instant are shown as they are."""
+    if gap.parts.repeated:
+        return cells
+    return [{**c, "found": True} for c in cells if c["gap"]]

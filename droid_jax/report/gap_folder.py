@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from droid_jax.report.gap_parts import PARTS, Parts, parts_of, split_of
 from droid_jax.report.reading import Reader
 
 VERDICTS = ("none", "named", "tie", "partly explained", "unexplained", "fit not converged")
@@ -42,6 +43,7 @@ _SCHEMA = {
     "trends": [_TREND],
     **{"units": str, "versions": dict, "device": str, "setup": dict},
 }
+_SPLIT = {"by": str, "limits": str}
 _LINES = ("measured", "scatter", "before", "after")
 
 
@@ -78,6 +80,33 @@ class Gap:
         return bool(self.found["effects"])
 
     @property
+    def floor(self) -> float | None:
+        """U0; None where it is not known and where there is none, see `timeless`."""
+        return self.found["floor"] or None
+
+    @property
+    def timeless(self) -> bool:
+        """Whether a measured motion was replayed, which has no time step and whose floor is exactly zero."""
+        return self.found["floor"] == 0
+
+    @property
+    def parts(self) -> Parts:
+        """What is said of how the recordings were divided."""
+        return parts_of(self.found)
+
+    @property
+    def limits(self) -> str:
+        """What cannot be concluded, in words; empty where nothing is to be said."""
+        return split_of(self.found)["limits"]
+
+    @property
+    def sheets(self) -> list[tuple[tuple[str, ...], Mapping[str, Any]]]:
+        """Roles and what is drawn of them over time, the judging role first; parts that take turns are drawn as one."""
+        together = [("fit", "confirm")] if self.parts.in_turns else [("fit",), ("confirm",)]
+        sheets = [*together, *((r,) for r in self.roles[2:])]
+        return [(roles, _joined([self.traces[r] for r in roles])) for roles in reversed(sheets)]
+
+    @property
     def stand_in(self) -> bool:
         """Whether the run says that its torques come from a stand-in robot: no recording was given to it."""
         return self.found["setup"].get("stand_in", self.found["setup"].get("recording") == [])
@@ -96,6 +125,7 @@ def read_gap(folder: Path) -> Gap:
     """Load and check; ValueError names what is missing or broken."""
     found = _READ.json(folder / "gap.json")
     _READ.check(found, _SCHEMA, "gap.json")
+    _READ.check(split_of(found), _SPLIT, "gap.json, 'split'")
     for fault in _faults(found):
         raise _READ.fault(f"gap.json, {fault}")
     roles = [r for r in ROLES if r in found["gaps"]]
@@ -106,6 +136,9 @@ def _faults(found: Mapping[str, Any]) -> Iterator[str]:
     """What the schema cannot say."""
     if found["verdict"] not in VERDICTS:
         yield f"'verdict' must be one of {', '.join(VERDICTS)}, got {found['verdict']!r}"
+    by = split_of(found)["by"]
+    if by not in PARTS:
+        yield f"'split', 'by' must be one of {', '.join(PARTS)}, got {by!r}"
     absent = [r for r in ROLES[:2] if r not in found["gaps"]]
     if absent:
         yield f"'gaps' lacks {', '.join(map(repr, absent))}"
@@ -126,3 +159,10 @@ def _traces(path: Path, roles: Sequence[str], phases: Mapping[str, Any]) -> dict
         lines: dict[str, np.ndarray] = {key: arrays[f"{role}.{key}"] for key in ("time", *_LINES)}
         traces[role] = {**lines, "joints": [str(j) for j in arrays["joints"]], "phases": phases.get(role, [])}
     return traces
+
+
+def _joined(traces: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
+    """Traces of one recording's parts in order of time."""
+    order = np.argsort(np.concatenate([t["time"] for t in traces]), kind="stable")
+    lines = {key: np.concatenate([t[key] for t in traces])[order] for key in ("time", *_LINES)}
+    return {**traces[0], **lines}

@@ -60,7 +60,8 @@ def _models(extended: bool) -> list[tuple[str, str, dict[str, Any]]]:
 def _overlay(axes: Axes, traces: Mapping[str, Any], j: int, extended: bool) -> None:
     time, measured, scatter = traces["time"], traces["measured"][:, j], SCATTERS * traces["scatter"][:, j]
     _fill(axes, time, measured - scatter, measured + scatter, "measured, ±2 deviations of the repeats")
-    axes.plot(*thin(time, measured, POINTS), color=MEASURED, linewidth=2.2, label="measured, mean")
+    name = "measured, mean" if scatter.any() else "measured"
+    axes.plot(*thin(time, measured, POINTS), color=MEASURED, linewidth=2.2, label=name)
     for key, name, look in _models(extended):
         axes.plot(*thin(time, traces[key][:, j], POINTS), label=name, **look)
     axes.margins(y=0.14)  # room for the phases' names
@@ -75,7 +76,9 @@ def _residual(axes: Axes, traces: Mapping[str, Any], j: int, extended: bool) -> 
 
 
 def _fill(axes: Axes, time: np.ndarray, low: np.ndarray, high: np.ndarray, name: str = "") -> None:
-    axes.fill_between(*band(time, low, high, POINTS), color=MEASURED, alpha=0.16, linewidth=0, label=name or None)
+    """A band of the repeats; none where there is one repeat, whose scatter is zero."""
+    if np.any(high > low):
+        axes.fill_between(*band(time, low, high, POINTS), color=MEASURED, alpha=0.16, linewidth=0, label=name or None)
 
 
 @styled

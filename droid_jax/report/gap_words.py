@@ -7,11 +7,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from droid_jax.report.gap_folder import Gap
+from droid_jax.report.gap_parts import PARTS, parts_of
 from droid_jax.report.words import label, listed, number, percent
 
 SIGNIFICANT = 0.01  # p below which something is said to be missing
 DECISIVE = 6.0  # standardised difference from which ten repeats decide between rivals
-_U = "the gap U (1: what all repeats share is as large as one repeat's noise)"
+OTHER = PARTS["recordings"].other  # as the search calls it, whatever confirms
 BETWEEN = " + "  # between the effects in a model's name
 ROLES = {"fit": "fitted", "confirm": "confirming", "sealed": "sealed"}
 
@@ -33,7 +34,8 @@ def role_words(gap: Gap, role: str) -> str:
 
 
 def readable(text: str, found: Mapping[str, Any]) -> str:
-    """A text of gap.json, the names of candidates and parameters in it as they are read."""
+    """A text of gap.json, the names of candidates and parameters in it, and what confirms, as they are read."""
+    text = text.replace(OTHER, parts_of(found).other)
     names = {r["candidate"] for screen in found["screens"] for r in screen["ranking"]}
     names |= {*found["effects"], *(name for rivals in found["tied"] for name in rivals)}
     for name in sorted(names, key=len, reverse=True):
@@ -48,8 +50,9 @@ def unit_words(unit: str) -> str:
 
 def gap_summary(gap: Gap) -> list[str]:
     """The sentences under the answer, from the numbers alone; the last says what to do."""
-    sentences = [_fitted(gap), _significance(gap.found), _size(gap), *_added(gap.found["amplitudes"])]
-    return [*(s for s in sentences if s), *_ties(gap.found), *_trends(gap.found), _next(gap)]
+    sentences = [_fitted(gap), _significance(gap), _size(gap), *_added(gap.found["amplitudes"])]
+    said = [*sentences, *_ties(gap.found), *_trends(gap.found), gap.limits]
+    return [*(s for s in said if s), _next(gap)]
 
 
 def settings(gap: Gap) -> list[str]:
@@ -75,37 +78,39 @@ def _fitted(gap: Gap) -> str:
     return text + "."
 
 
-def _significance(found: Mapping[str, Any]) -> str:
-    p, bar = found["p"], number(SIGNIFICANT, 1)
+def _significance(gap: Gap) -> str:
+    p, bar = gap.found["p"], number(SIGNIFICANT, 1)
     if p is None:
         return ""
-    if found["verdict"] == "none" and p < SIGNIFICANT:
-        return (
-            f"What it leaves is no chance (p = {number(p, 2)}), but it is no larger than what the simulation's "
-            "own time step leaves."
-        )
+    if gap.found["verdict"] == "none" and p < SIGNIFICANT:
+        small = "U is not above zero" if gap.timeless else "no larger than what the simulation's own time step leaves"
+        return f"What it leaves is no chance (p = {number(p, 2)}), but it is small: {small}."
     chance = f"If nothing were missing, noise would look this much like one of them with p = {number(p, 2)}"
     return f"{chance}; below {bar} something is missing." if p < SIGNIFICANT else f"{chance}, not below {bar}."
 
 
 def _size(gap: Gap) -> str:
-    one, floor = gap.found["gaps"][gap.judge], gap.found["floor"]
+    one = gap.found["gaps"][gap.judge]
     seen = {
         "sealed": "which was opened once, at the end",
         "confirm": "which also chose the effects, since none was kept sealed",
         "fit": "the only one there is",
     }
     where = f"On “{one['recording']}”" + (f", {seen[gap.judge]}," if gap.extended else "")
-    at = f"the numerical floor is {number(floor)}" if floor is not None else "the numerical floor is not known"
+    at, size = _floor(gap), gap.parts.gap
     if not gap.extended:
         torque = f"{number(one['torque_before'])} {gap.unit}"
-        return f"{where} {_U} is {number(one['before'])} and the torque distance {torque}; {at}."
-    text = f"{where} {_U} was {number(one['before'])} before and is {number(one['after'])} after; {at}"
-    if one["closed"] is not None:
-        share = percent(max(one["closed"], 0.0))
-        text += f", so {share} of what can be closed was closed"
+        return f"{where} {size} is {number(one['before'])} and the torque distance {torque}; {at}."
+    share = "" if one["closed"] is None else ", " + gap.parts.closed.format(share=percent(max(one["closed"], 0.0)))
+    text = f"{where} {size} was {number(one['before'])} before and is {number(one['after'])} after{share}; {at}"
     torque = f"{number(one['torque_before'])} to {number(one['torque_after'])} {gap.unit}"
     return f"{text}. The torque distance went from {torque}."
+
+
+def _floor(gap: Gap) -> str:
+    if gap.timeless:
+        return "there is no numerical floor, since a measured motion is replayed without a time step"
+    return "the numerical floor is not known" if gap.floor is None else f"the numerical floor is {number(gap.floor)}"
 
 
 def _added(amplitudes: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -148,10 +153,9 @@ def _trends(found: Mapping[str, Any]) -> list[str]:
 def _next(gap: Gap) -> str:
     named = listed([effect_words(e) for e in gap.found["effects"]])
     steps = {
-        "none": "go on with the base model; a smaller effect would need more repeats, or a demonstration that also "
-        "closes, moves at another speed or reaches further",
+        "none": f"go on with the base model; a smaller effect would need {gap.parts.more}",
         "named": f"look for the {named} on the hardware, and simulate with it{_file(gap)}",
-        "tie": f"take no name for the cause yet. {_separate(gap.found['experiments'])}",
+        "tie": f"take no name for the cause yet. {_separate(gap)}",
         "partly explained": f"keep the {named} in the model{_file(gap)}, and look at the hardware {_where(gap)}; "
         "that part has no name yet",
         "unexplained": f"look at the hardware {_where(gap)}. The library holds no effect that does this: write one "
@@ -166,8 +170,13 @@ def _file(gap: Gap) -> str:
     return " (extended.json)" if (gap.folder / "extended.json").is_file() else ""
 
 
-def _separate(experiments: Sequence[Mapping[str, Any]]) -> str:
-    known = [e for e in experiments if e["apart"] is not None]
+def _separate(gap: Gap) -> str:
+    known = [e for e in gap.found["experiments"] if e["apart"] is not None]
+    if gap.timeless:
+        return (
+            "Without commands no other motion can be tried in simulation: record one that is slower, faster or comes "
+            "back, and run again"
+        )
     if not known:
         return "No experiment on the menu was found that separates them; for torques they act alike"
     best = max(known, key=lambda e: e["apart"])
@@ -182,12 +191,14 @@ def _separate(experiments: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _where(gap: Gap) -> str:
-    """The largest cell that the test found in what is left."""
-    found = [c for c in gap.found["cells"]["after"] if c["found"] and c["gap"] is not None]
+    """The largest cell that the test found in what is left; of all, where there are no repeats to test."""
+    cells = [c for c in gap.found["cells"]["after"] if c["gap"] is not None]
+    found = [c for c in cells if c["found"] or not gap.parts.repeated]
     over_time = [c for c in found if c["variable"] == "joint x phase"]
     if not found:
         return "(no single place stands out)"
-    return "where the most is left: " + listed(
+    noise = "" if gap.parts.repeated else ", noise included"
+    return f"where the most is left{noise}: " + listed(
         [place_words(max(cells, key=lambda c: c["gap"])) for cells in (over_time, _others(found)) if cells]
     )
 

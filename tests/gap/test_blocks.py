@@ -2,47 +2,20 @@
 
 from __future__ import annotations
 
-import mujoco
 import numpy as np
 import pytest
+from small_log import ASKED, CONFIG, COULOMB, elbow, elbow_log, elbow_space
 
 from droid_jax.compare.cost import make_cost
-from droid_jax.compare.residuals import CompareConfig
 from droid_jax.gap.blocks import OUTSIDE, Blocks, block_length, blocks, interleaved
-from droid_jax.gap.case import GapConfig
 from droid_jax.gap.flips import largest_t
 from droid_jax.gap.screen import project
 from droid_jax.gap.select import resamples
 from droid_jax.gap.single import Log, base_model, make_log, single_case
 from droid_jax.gap.verdict import Kind
 from droid_jax.gap.workflow import find
-from droid_jax.identify.refine import RefineConfig
 from droid_jax.measure.noise import RATE, coarse_clock
-from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
 from droid_jax.model.effects.registry import library, ready
-from droid_jax.model.fields import joint_damping
-from droid_jax.model.joint_friction import SMOOTHING
-from droid_jax.model.parameters import Parameter, Space
-from droid_jax.model.scene import Scene, compile_scene
-
-MJCF = """
-<mujoco>
-  <option gravity="0 0 0"/>
-  <worldbody>
-    <body>
-      <joint name="elbow" axis="0 0 1" damping="0.4"/>
-      <inertial pos="0.2 0 0" mass="2" diaginertia="0.01 0.01 0.01"/>
-    </body>
-  </worldbody>
-</mujoco>
-"""
-CONFIG = GapConfig(
-    refine=RefineConfig(iterations=10, hops=0, spreads=0), compare=CompareConfig(whitened=True, motion_cutoff=10.0)
-)
-ASKED = ("joint_coulomb", "cable_pull", "torque_drift", "torque_gain")
-INERTIA = 0.09  # kg m^2 about the joint
-COULOMB, NOISE = 0.5, 0.06  # N m
-
 
 # Arithmetic --------------------------------------------------------------------------------
 
@@ -129,39 +102,6 @@ def test_an_effect_that_lives_in_few_blocks_is_found():
 
 
 # One log -----------------------------------------------------------------------------------
-
-
-def elbow() -> Scene:
-    return compile_scene(mujoco.MjSpec.from_string(MJCF), "elbow", joints=["elbow"])
-
-
-def elbow_space(scene: Scene) -> Space:
-    return Space(
-        (
-            joint_damping(scene, "elbow", std=0.4, high=10.0),
-            Parameter("torque_offset[elbow]", "N m", 0.0, 0.3, -3.0, 3.0),
-        )
-    )
-
-
-def elbow_log(coulomb: float, seconds: float = 36.0) -> Recording:
-    """Sines, their torque by hand, and noise that is correlated for a fifth of a second."""
-    time = np.arange(0.0, seconds, 0.01)
-    phase = 2 * np.pi * np.array([[0.23], [0.51]]) * time
-    size, w = np.array([[0.5], [0.15]]), 2 * np.pi * np.array([[0.23], [0.51]])
-    q, qd, qdd = (
-        (size * np.sin(phase)).sum(0), (size * w * np.cos(phase)).sum(0), -(size * w**2 * np.sin(phase)).sum(0)
-    )  # fmt: skip
-    white = np.random.default_rng(3).normal(0.0, NOISE, len(time) + 19)
-    noise = np.convolve(white, np.ones(20) / np.sqrt(20), "valid")
-    torque = INERTIA * qdd + 0.6 * qd + 0.1 + coulomb * np.tanh(qd / SMOOTHING) + noise
-    mask = np.ones((1, len(time), 1), bool)
-    channels = {
-        "position": Channel("position", "rad", ("elbow",), time, q[None, :, None], mask),
-        "torque": Channel("torque", "N m", ("elbow",), time, torque[None, :, None], mask),
-    }
-    convention = TorqueConvention(TorqueSide.MOTOR, gravity=True)
-    return Recording("elbow", np.zeros(0), np.zeros((0, 0)), (), channels, convention, qpos0={})
 
 
 @pytest.fixture(scope="module")

@@ -19,6 +19,7 @@ from reader import read_page
 from droid_jax.report import drawings, gap_drawings, gap_maps, gap_words, page, style
 from droid_jax.report.drawings import Drawing
 from droid_jax.report.gap_folder import VERDICTS, read_gap
+from droid_jax.report.gap_parts import PARTS
 from droid_jax.report.gap_tables import groups
 from droid_jax.report.words import number, percent
 
@@ -141,6 +142,61 @@ def test_significant_but_below_the_floor_is_said(tmp_path: Path) -> None:
     assert "no larger than what the simulation's own time step leaves" in " ".join(gap_words.gap_summary(gap))
 
 
+BLOCKS = {"by": "blocks", "limits": "The confirming blocks are of the same motion."}
+HALVES = {"by": "repeats", "limits": "The confirming repeats repeat the fitted motion."}
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_a_log_in_blocks_claims_nothing_that_takes_repeats(tmp_path: Path, quick: None, verdict: str) -> None:
+    found = gap_json(verdict, ("fit", "confirm", "sealed"))
+    cells = {when: [{**c, "found": False} for c in found["cells"][when]] for when in ("before", "after")}
+    changes = {"split": BLOCKS, "floor": 0.0, "cells": cells, "experiments": [], "trends": []}
+    folder = make_gap(tmp_path / "run", verdict, **changes)
+    text = read_page(page.write_report(folder)).text.replace("\u00a0", " ")
+    assert BLOCKS["limits"] in text and "noise included" in text and "there is no numerical floor" in text
+    untrue = ("repeats' mean", "one repeat", "ten repeats", "more repeats", "Numerical floor", "Hatched", "other demon")
+    assert [words for words in (*untrue, "whole repeats", "no single place") if words in text] == []
+    expected = {
+        "tie": "record one that is slower, faster or comes back",
+        "unexplained": "where the most is left, noise included: joint 1 in opening",
+        "none": "a smaller effect would need repeats, a longer log",
+    }
+    assert expected.get(verdict, "Next:") in text
+    assert ("not confirmed by the other blocks (p = 0.12)" in text) == (verdict not in ("none", "fit not converged"))
+
+
+def test_a_log_is_drawn_in_order_of_time(tmp_path: Path) -> None:
+    """Its turns are one trace, and a place that holds no instant is none."""
+    folder = make_gap(tmp_path / "run", "unexplained", split=BLOCKS)
+    arrays = dict(np.load(folder / "gap.npz"))
+    whole = {key: arrays[f"fit.{key}"] for key in ("time", "measured", "before")}
+    for role, turn in (("fit", 0), ("confirm", 1)):
+        arrays |= {key: arrays[key][turn::2] for key in arrays if key.startswith(f"{role}.")}
+        arrays |= {f"{role}.{key}": values[turn::2] for key, values in whole.items()}
+    np.savez(folder / "gap.npz", **arrays)
+    sealed, (roles, drawn) = read_gap(folder).sheets
+    assert (sealed[0], roles) == (("sealed",), ("fit", "confirm"))
+    for key, values in whole.items():
+        np.testing.assert_array_equal(drawn[key], values)
+    gap = read_gap(folder)
+    empty = {"variable": gap_maps.TIME, "where": "elbow, later 9.0 s", "gap": 0.0, "p": 1.0, "found": False}
+    assert gap_drawings._shown(gap, [empty, {**empty, "gap": 2.0}]) == [{**empty, "gap": 2.0, "found": True}]
+
+
+def test_halves_of_the_repeats_say_what_they_cannot_tell(tmp_path: Path, quick: None) -> None:
+    folder = make_gap(tmp_path / "run", "partly explained", sealed=False, split=HALVES)
+    text = read_page(page.write_report(folder)).text.replace("\u00a0", " ")
+    assert HALVES["limits"] in text and "No demonstration was kept sealed" in text and "Hatched" in text
+    assert "not confirmed by the other repeats (p = 0.12)" in text and "other demonstration" not in text
+    assert [r for r, _ in read_gap(folder).sheets] == [("confirm",), ("fit",)]
+
+
+def test_an_inverse_replay_has_no_floor(tmp_path: Path, quick: None) -> None:
+    folder = make_gap(tmp_path / "run", "none", floor=0.0, p=0.002)
+    text = read_page(page.write_report(folder)).text.replace("\u00a0", " ")
+    assert "but it is small: U is not above zero" in text and "Numerical floor" not in text
+
+
 def test_a_stand_in_is_said(tmp_path: Path, quick: None) -> None:
     folder = make_gap(tmp_path / "run", "none", setup={"recording": []})
     assert "stand-in robot" in read_page(page.write_report(folder)).text
@@ -201,6 +257,8 @@ def test_one_page_for_a_folder_with_both(tmp_path: Path) -> None:
         (lambda f: f["gaps"]["fit"].update(before="4"), r"'gaps', 'fit', 'before' must be a number or null, got str"),
         (lambda f: f["cells"].update(after={}), r"'cells', 'after' must be a list, got dict"),
         (lambda f: f.update(verdict="maybe"), r"'verdict' must be one of none, named.*got 'maybe'"),
+        (lambda f: f.update(split={"by": "halves", "limits": ""}), r"'by' must be one of recordings.*got 'halves'"),
+        (lambda f: f.update(split={"by": "blocks"}), r"'split' lacks 'limits'"),
         (lambda f: f.update(tied=[[], []]), r"'tied' has 2 lists for 1 effects"),
     ],
 )
@@ -235,10 +293,14 @@ def test_a_wrong_shape_is_named(tmp_path: Path) -> None:
 
 
 def test_words_agree_with_the_search() -> None:
+    from droid_jax.gap import select
     from droid_jax.gap.select import SIGNIFICANT
+    from droid_jax.gap.split import Split
     from droid_jax.gap.verdict import Kind
 
     assert {k.value for k in Kind} == set(VERDICTS)
+    assert {s.value for s in Split} == set(PARTS)
+    assert gap_words.OTHER in Path(select.__file__).read_text(encoding="utf-8")
     assert gap_words.SIGNIFICANT == SIGNIFICANT
 
 
