@@ -30,10 +30,13 @@ class Gap:
     """
 
     recording: tuple[Path, ...] = ()
-    """FIT CONFIRM [SEALED]: two or three motions of the same robot and object, eight repeats or more of each. The
-    fit sees the first, effects are chosen on the second, the third is opened when all is decided. Or one motion, of
-    which less can be concluded: ONE, sixteen repeats or more, of which the second half confirms; LOG [SEALED], without
-    repeats and commands, whose blocks of time fit and confirm in turns."""
+    """FIT CONFIRM [SEALED]: two or three motions of the same robot and object, eight repeats or more of each.
+    The fit sees the first, effects are chosen on the second, the third is opened when all is decided.
+
+    ONE: one motion, sixteen repeats or more; the second half of them confirms.
+
+    LOG [SEALED]: without repeats and commands; blocks of time fit and confirm in turns, the last third or the second
+    log is sealed. Of one motion less can be concluded, and the report says what."""
     preset: Literal["quick", "standard", "gpu"] = "quick"
     """Of the base fit, as in identify."""
     scene: Path | None = None
