@@ -35,7 +35,8 @@ class Screen:
 
     questions: K of them.  raw: [K, M] what a unit of each amplitude adds; marks: [K, M] the same, projected.
     t: [K]; explained: [K] share of the gap that the best amplitude would take away, linearly; size: [K] that
-    amplitude.  p: of the largest |t|.
+    amplitude.  p: of the largest |t|.  failed: names of candidates that made the replay blow up; their marks
+    are zero.
     """
 
     questions: tuple[Question, ...]
@@ -45,6 +46,7 @@ class Screen:
     explained: np.ndarray
     size: np.ndarray
     p: float
+    failed: tuple[str, ...] = ()
 
     def best(self) -> list[int]:
         """Questions by what they explain, the best first."""
@@ -54,7 +56,7 @@ class Screen:
 def marks(evidence: Evidence, values: np.ndarray, questions: Sequence[Question]) -> np.ndarray:
     """[K, M] what each amplitude adds to the simulation, per unit of it, in units of one repeat's noise.
 
-    values: [D] the base fit, effects at neutral.  One batch for all.
+    values: [D] the base fit, effects at neutral.  One batch for all.  NaN where the replay blew up.
     """
     space = evidence.cost.space
     rows, sizes = [values], []
@@ -68,7 +70,9 @@ def marks(evidence: Evidence, values: np.ndarray, questions: Sequence[Question])
         rows.append(row)
         sizes.append(size)
     simulated = -evidence.common(np.stack(rows))
-    return (simulated[1:] - simulated[0]) / np.array(sizes)[:, None]
+    found = (simulated[1:] - simulated[0]) / np.array(sizes)[:, None]
+    constant = np.ptp(simulated[1:], axis=1) == 0.0  # `BLOWN_UP` throughout
+    return np.where((constant | ~np.isfinite(found).all(axis=1))[:, None], np.nan, found)
 
 
 def questions_of(candidates: Sequence[Candidate]) -> tuple[Question, ...]:

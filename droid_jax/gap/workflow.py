@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
+
+import numpy as np
 
 from droid_jax.gap.candidates import candidates
 from droid_jax.gap.case import Case
@@ -47,10 +50,14 @@ def ask(case: Case, model: Model, asked: tuple[Question, ...]) -> Screen:
     root = case.fit.repeats**0.5
     base, prior = model.refined.jacobian / root, model.refined.prior * root
     raw = marks(case.fit, model.values, asked)
+    blown_up = np.isnan(raw).any(axis=1)
+    raw[blown_up] = 0.0
     projected = project(raw, base, prior)
-    return screen(
+    found = screen(
         model.residuals, asked, raw, projected, lambda s: case.fit.largest(s, projected, base, prior, case.config.seed)
     )
+    names = (asked[k].candidate.name for k in np.flatnonzero(blown_up))
+    return replace(found, failed=tuple(dict.fromkeys(names)))
 
 
 def find(case: Case, base: Model, floor: float, progress: Progress = lambda stage, value: None) -> Verdict:
