@@ -26,9 +26,10 @@ def fitted_mjcf(scene: Scene, space: Space, values: np.ndarray) -> str:
     What lives outside the model (offsets, laws of effects) is not in it.
     """
     spec, model = scene.spec.copy(), make_c_model(scene, space, values)
+    spec.compile()  # numbers its elements, of which not all need a name
     fields = {w.field for p in space.parameters for w in p.writes}
     for joint in spec.joints:
-        dof, index = scene.dof(joint.name), scene.id("joint", joint.name)
+        dof, index = model.jnt_dofadr[joint.id], joint.id
         if "dof_damping" in fields:
             joint.damping = [float(model.dof_damping[dof]), 0, 0]
         if "jnt_stiffness" in fields:
@@ -40,7 +41,7 @@ def fitted_mjcf(scene: Scene, space: Space, values: np.ndarray) -> str:
         and np.allclose(model.body_inertia, scene.model.body_inertia, rtol=1e-12)
     )
     for body in spec.bodies[1:]:
-        index = scene.id("body", body.name)
+        index = body.id
         if {"body_pos", "body_quat"} & fields:
             body.pos, body.quat = model.body_pos[index].tolist(), model.body_quat[index].tolist()
         if "body_gravcomp" in fields:
@@ -50,7 +51,7 @@ def fitted_mjcf(scene: Scene, space: Space, values: np.ndarray) -> str:
     if heavier:  # every body says what it weighs, so none is left to its geoms
         spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
     for pair in spec.pairs:
-        index = scene.id("pair", pair.name)
+        index = pair.id
         if "pair_friction" in fields:
             pair.friction = model.pair_friction[index].tolist()
         if "pair_solref" in fields:

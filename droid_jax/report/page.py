@@ -45,8 +45,6 @@ _DOWNLOADS = (
     ("traces.npz", "torques over time"),
     ("config.json", "how the run was set up"),
     ("gap.json", "the search for a missing effect: every number"),
-    ("extended.json", "the extended model: effects, values and a Gaussian over all of it"),
-    ("extended.xml", "the scene with the fitted values of the extended model, as far as MJCF has words for it"),
     ("gap.npz", "the search for a missing effect: torques over time"),
 )
 

@@ -62,3 +62,18 @@ def test_a_mass_that_geoms_make_up(heavier: str) -> None:
     for field in FIELDS:
         np.testing.assert_allclose(getattr(written, field), getattr(expected, field), rtol=1e-4, atol=1e-9)
     assert expected.body(heavier).mass[0] == pytest.approx(1.3 * scene.model.body(heavier).mass[0])
+
+
+def test_what_has_no_name_is_written_too() -> None:
+    """Bodies and contact pairs, as MJCF allows."""
+    pairs = '<contact><pair geom1="bar" geom2="end" friction="1 1 0.1 0 0"/></contact></mujoco>'
+    nameless = GEOMS.replace('<body name="tip" ', "<body ").replace("</mujoco>", pairs)
+    nameless = nameless.replace('<geom type="sphere"', '<geom name="bar" type="sphere"')
+    scene = compile_scene(
+        mujoco.MjSpec.from_string(nameless.replace('<geom type="capsule"', '<geom name="end" type="capsule"')), "geoms"
+    )
+    space = Space((body_mass(scene, "arm", std=0.2, high=50.0),))
+    written = mujoco.MjModel.from_xml_string(fitted_mjcf(scene, space, 1.3 * space.mean))
+    expected = make_c_model(scene, space, 1.3 * space.mean)
+    for field in (*FIELDS, "pair_friction"):
+        np.testing.assert_allclose(getattr(written, field), getattr(expected, field), rtol=1e-4, atol=1e-9)
