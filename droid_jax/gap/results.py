@@ -81,7 +81,9 @@ def gap_json(case: Case, verdict: Verdict) -> dict[str, Any]:
         "cut": verdict.cut,
         "gaps": {role: _gap(role, e, verdict) for role, e in case.judged.items()},
         "phases": {role: _phases(e) for role, e in case.judged.items()},
-        "screens": [{"p": found.p, "ranking": _ranking(found)} for found in verdict.screens],
+        "screens": [
+            {"p": found.p, "ranking": _ranking(found), "failed": list(found.failed)} for found in verdict.screens
+        ],
         "trials": [_trial(trial) for trial in verdict.trials],
         "cells": {"before": _cells(verdict.before), "after": _cells(verdict.after)},
         "amplitudes": _amplitudes(case, verdict),

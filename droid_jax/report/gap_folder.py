@@ -36,7 +36,7 @@ _SCHEMA = {
     **{"verdict": str, "sentence": str, "effects": [str], "tied": [[str]], "p": _MAYBE, "floor": _MAYBE},
     **{"converged": bool, "cut": str, "seconds": {str: _NUMBER}, "gaps": {str: _GAP}},
     "phases": {str: [{"name": str, "start": _NUMBER, "end": _NUMBER}]},
-    "screens": [{"p": _MAYBE, "ranking": [{"candidate": str, "t": _MAYBE, "explained": _MAYBE}]}],
+    "screens": [{"p": _MAYBE, "ranking": [{"candidate": str, "t": _MAYBE, "explained": _MAYBE}], "failed": [str]}],
     "trials": [_TRIAL],
     "cells": {"before": [_CELL], "after": [_CELL]},
     **{"amplitudes": [_AMPLITUDE], "shifts": [_SHIFT], "experiments": [{"what": str, "apart": _MAYBE}]},

@@ -75,7 +75,9 @@ def _fitted(gap: Gap) -> str:
     tried = len({t["name"] for t in found["trials"]})
     if tried:
         text += f", and {tried} extended models were refitted and judged on “{gap.recording('confirm')}”"
-    return text + "."
+    failed = dict.fromkeys(name for s in found["screens"] for name in s["failed"])
+    left_out = f" Left out, because the simulation blew up with it: {listed([effect_words(f) for f in failed])}."
+    return f"{text}.{left_out if failed else ''}"
 
 
 def _significance(gap: Gap) -> str:

@@ -87,7 +87,7 @@ def _screen(k: int, verdict: str) -> dict[str, Any]:
     names = [n for n in SCREENED if k == 0 or n != LATCH]
     size = 14.2 if k == 0 and verdict != "none" else 2.4
     ranking = [{"candidate": n, "t": size * 0.8**i, "explained": 0.913 * 0.5**i} for i, n in enumerate(names)]
-    return {"p": 0.00195 if size > 3 else 0.412, "ranking": ranking}
+    return {"p": 0.00195 if size > 3 else 0.412, "ranking": ranking, "failed": ["drag at hinge"] if size > 3 else []}
 
 
 def _trials(verdict: str, first: float, left: float | None) -> list[dict[str, Any]]:

@@ -67,6 +67,8 @@ def test_every_verdict_has_its_words(tmp_path: Path, quick: None, verdict: str) 
     gap = read_gap(folder)
     assert gap_words.readable(gap.found["sentence"], gap.found) in text and "_" not in text.split("Next:")[0]
     assert NEXT[verdict] in text
+    blew_up = any(screen["failed"] for screen in gap.found["screens"])
+    assert ("because the simulation blew up with it: drag at hinge." in text) == blew_up
     assert ("joint coulomb at joint 2 changes by about" in text) == (verdict == "named")
     assert ("U after" in text) == bool(gap.found["effects"])
     assert ("Descriptive only" in text) == (verdict in ("unexplained", "partly explained"))
