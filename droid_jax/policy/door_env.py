@@ -1,0 +1,197 @@
+"""The task as a brax environment on MJX: one door, whose physics (`sys`) brax's wrappers may randomise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from brax.envs.base import Env
+from brax.envs.base import State as EnvState
+from mujoco import mjx
+
+from droid_jax.compare.replay import check_stateless
+from droid_jax.measure.demonstration import OPEN, PLANS, Plan, grasp_pose, solve_pose
+from droid_jax.model.effects.registry import ready
+from droid_jax.model.physics import Physics
+from droid_jax.model.scene import Scene
+from droid_jax.model.seam import Effect, State, Theta
+from droid_jax.model.step import step as simulate_step
+from droid_jax.policy.hand import finger_forces, hand_of, looked
+from droid_jax.policy.task import (
+    ACTIONS,
+    OBSERVED,
+    Task,
+    command,
+    gripped,
+    holding,
+    observation,
+    reward,
+    succeeded,
+    terms,
+)
+
+PAST = 4  # commands remembered: a delay of up to three times Task.control
+
+
+class World(NamedTuple):
+    """What the simulation carries from one action to the next.
+
+    qpos [nq], qvel [nv], warm [nv] (solver's start), load [nv] N m; commands [PAST, 9], the latest last; pads [2, 3]
+    m in the knob's frame; time, held, longest: s.
+    """
+
+    qpos: jax.Array
+    qvel: jax.Array
+    warm: jax.Array
+    load: jax.Array
+    commands: jax.Array
+    pads: jax.Array
+    time: jax.Array
+    held: jax.Array
+    longest: jax.Array
+
+
+class DoorEnv(Env):
+    """Opening the built-in door, or another scene with a gripper and a knob.
+
+    scene: with joint limits enforced.  effects: of the extended model; their parameters are in `sys.theta`, and
+    what they do to torque sensors is not seen by a policy.  sys: `Physics`, the scene's own unless randomised.
+    The hand starts in front of the knob, open, in the arm pose of `plan`.
+    """
+
+    def __init__(self, scene: Scene, task: Task | None = None, effects: Sequence[Effect] = (), plan: Plan = PLANS["A"]):
+        check_stateless(scene)
+        self.scene, self.task, self.effects = ready(scene) if effects else scene, task or Task(), tuple(effects)
+        self.sys = Physics(self.scene.mjx, {})
+        self.start = start_pose(self.scene, self.task, plan)
+        self._hand, self._template = hand_of(self.scene), mjx.make_data(self.scene.mjx)
+        self._timestep = float(self.scene.model.opt.timestep)
+        self._substeps = round(self.task.control / self._timestep)
+        if abs(self._substeps * self._timestep - self.task.control) > 1e-9:
+            raise ValueError(
+                f"the time between actions, {self.task.control:g} s, is no multiple of the scene's time step, "
+                f"{self._timestep:g} s"
+            )
+
+    @property
+    def observation_size(self) -> int:
+        return OBSERVED
+
+    @property
+    def action_size(self) -> int:
+        return ACTIONS
+
+    @property
+    def backend(self) -> str:
+        return "mjx"
+
+    def reset(self, rng: jax.Array) -> EnvState:
+        """The start pose, each joint of the arm off by its own draw."""
+        scene, zero = self.scene, jnp.zeros(self.scene.model.nv, jnp.float32)
+        off = self.task.spread * jax.random.normal(rng, (len(scene.joints),))
+        qpos = jnp.asarray(self.start, jnp.float32).at[scene.joint_qpos].add(off)
+        still = jnp.concatenate([qpos[scene.joint_qpos], jnp.full(2, OPEN, jnp.float32)])
+        nothing = jnp.zeros(())
+        world = World(qpos, zero, zero, zero, jnp.tile(still, (PAST, 1)), jnp.zeros((2, 3)), nothing, nothing, nothing)
+        seen = self._look(self.sys.model, world, jnp.zeros(2))
+        world = world._replace(pads=seen.pads)
+        seen = seen._replace(sliding=nothing)
+        metrics = {name: nothing for name in ("success", "angle", "grip", "blown_up", *terms(self.task, seen))}
+        carried: Any = world  # brax means its own kind of state
+        return EnvState(carried, self._observe(world, seen), nothing, nothing, metrics)
+
+    def step(self, state: EnvState, action: jax.Array) -> EnvState:
+        """One action: `Task.control` seconds of simulation.
+
+        An episode ends with success, or where the simulation is no longer a number (counted in `blown_up`).
+        """
+        carried: Any = state.pipeline_state
+        before: World = carried
+        target = command(self.task, before.qpos[self.scene.joint_qpos], action)
+        commands = jnp.concatenate([before.commands[1:], target[None]])
+        world, force = self._advance(self.sys, before._replace(commands=commands))
+        finite = jnp.all(jnp.isfinite(world.qpos)) & jnp.all(jnp.isfinite(world.qvel)) & jnp.all(jnp.isfinite(force))
+        world = jax.tree.map(lambda new, old: jnp.where(finite, new, old), world, before)
+        force = jnp.where(finite, force, 0.0)
+        seen = self._look(self.sys.model, world, force)
+        held = holding(self.task, seen, before.held)
+        world = world._replace(pads=seen.pads, held=held, longest=jnp.maximum(before.longest, held))
+        success = succeeded(self.task, world.longest)
+        metrics = {
+            "success": success,
+            "angle": seen.angle,
+            "grip": gripped(self.task, seen),
+            "blown_up": ~finite,
+            **terms(self.task, seen),
+        }
+        return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
+            pipeline_state=world,
+            obs=self._observe(world, seen),
+            reward=jnp.where(finite, reward(self.task, seen), 0.0),
+            done=(success | ~finite).astype(jnp.float32),
+            metrics={name: jnp.asarray(value, jnp.float32) for name, value in metrics.items()},
+        )
+
+    def _advance(self, physics: Physics, world: World) -> tuple[World, jax.Array]:
+        """`Task.control` seconds later; and the force on each finger [2] N in the last of its steps."""
+        model, theta = physics.model, physics.theta
+
+        def substep(carry, number):
+            qpos, qvel, warm, load, _ = carry
+            now = State(world.time + number * self._timestep, qpos, qvel, load)
+            ctrl = self._servo(theta, now, world)
+            data = self._template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm, ctrl=ctrl)
+            forces = [effect.force(theta, now) for effect in self.effects if effect.force is not None]
+            data = data.replace(qfrc_applied=sum(forces)) if forces else data
+            after = simulate_step(self._rubbing(model, theta, now), data)
+            force = finger_forces(self._hand, after)
+            return (after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator, force), None
+
+        start = (world.qpos, world.qvel, world.warm, world.load, jnp.zeros(2))
+        (qpos, qvel, warm, load, force), _ = jax.lax.scan(substep, start, jnp.arange(self._substeps))
+        return world._replace(qpos=qpos, qvel=qvel, warm=warm, load=load, time=world.time + self.task.control), force
+
+    def _servo(self, theta: Theta, now: State, world: World) -> jax.Array:
+        """[9] what the servos are given: the latest command, or what effects make of the latest ones."""
+
+        def look(time: jax.Array) -> jax.Array:
+            back = jnp.ceil((world.time - time) / self.task.control - 1e-6)
+            return world.commands[jnp.clip(PAST - 1 - back.astype(jnp.int32), 0, PAST - 1)]
+
+        for effect in self.effects:
+            if effect.command is not None:
+                look = _through(effect, theta, look)
+        ctrl = look(now.time)
+        for effect in self.effects:
+            ctrl = ctrl if effect.servo is None else effect.servo(theta, now, ctrl)
+        return ctrl
+
+    def _rubbing(self, model, theta: Theta, now: State):
+        loss = model.dof_frictionloss
+        for effect in self.effects:
+            loss = loss if effect.frictionloss is None else effect.frictionloss(theta, now, loss)
+        return model if loss is model.dof_frictionloss else model.replace(dof_frictionloss=loss)
+
+    def _look(self, model, world: World, force: jax.Array):
+        data = mjx.kinematics(model, self._template.replace(qpos=world.qpos))
+        return looked(self._hand, data, force, world.pads, self.task.control)
+
+    def _observe(self, world: World, seen) -> jax.Array:
+        return observation(world.qpos[self.scene.joint_qpos], world.qvel[self.scene.joint_dofs], seen)
+
+
+def _through(effect: Effect, theta: Theta, look):
+    assert effect.command is not None
+    return lambda time, law=effect.command: law(theta, time, look)
+
+
+def start_pose(scene: Scene, task: Task, plan: Plan) -> np.ndarray:
+    """[nq] the arm in front of the closed door's knob, fingers open.  ValueError where the knob is out of reach."""
+    q = solve_pose(scene, np.array(plan.pose), *grasp_pose(scene, 0.0, 0.0, plan.roll))
+    for standoff in np.linspace(0.0, task.standoff, 10):
+        q = solve_pose(scene, q, *grasp_pose(scene, 0.0, standoff, plan.roll))
+    fingers = [name for name in scene.command_names if name not in scene.joints]
+    return scene.initial_qpos({**dict(zip(scene.joints, q.tolist(), strict=True)), **dict.fromkeys(fingers, OPEN)})

@@ -1,0 +1,124 @@
+"""The task: pull a cabinet door open by its knob, which the hand must hold and not hook.
+
+Pure functions of what is seen of hand and knob, for the simulation that trains and the robot that is judged alike.
+Reward: equation 4 of the paper, five terms after DoorGym (Urakami et al. 2019); what counts as a grip is ours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+ARM, FINGERS = 7, 2
+OBSERVED = 2 * ARM + 9
+ACTIONS = ARM + FINGERS
+LAYOUT = (
+    *(f"position of joint {i}, rad" for i in range(1, ARM + 1)),
+    *(f"velocity of joint {i}, rad/s" for i in range(1, ARM + 1)),
+    *(f"{of} from the knob, {axis} of the knob's frame, m" for of in ("pinch point", "left pad", "right pad")
+      for axis in "xyz"),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is asked for, and what it is worth.
+
+    control: s between actions; steps: actions at most.  opened: rad, from which the door counts as open.
+    held: s at `opened` or beyond with the grip on that make a success.
+    force: N on each finger, and yaw: rad of the hand against the door, that make a grip.
+    reach: rad by which an action of one moves a joint's target from where the joint is; width: m, finger command
+    of an action of one (of minus one: shut).
+    door, orientation, distance, log_distance, slip: weights of the reward's terms; near: m, where the
+    logarithm of the distance flattens.
+    spread: rad, deviation of the joints' start pose; standoff: m, hand in front of the knob at the start.
+    """
+
+    control: float = 0.02
+    steps: int = 512
+    opened: float = float(np.deg2rad(30.0))
+    held: float = 0.5
+    force: float = 1.0
+    yaw: float = float(np.deg2rad(20.0))
+    reach: float = 0.1
+    width: float = 0.04
+    door: float = 2.0
+    orientation: float = 0.2
+    distance: float = 1.0
+    log_distance: float = 0.1
+    slip: float = 0.2
+    near: float = 0.01
+    spread: float = 0.02
+    standoff: float = 0.05
+
+
+class Seen(NamedTuple):
+    """Hand and knob at one instant.
+
+    angle: [] rad of the hinge.  pinch: [3] and pads: [2, 3] m from the knob, in its frame (x the door's inward
+    normal, z up).  normal: [] cosine between the hand's axis and the door's inward normal; yaw: [] rad between
+    them, seen from above.  force: [2] N, normal force on each finger.  sliding: [] m/s, the faster pad's, along
+    the knob.
+    """
+
+    angle: Any
+    pinch: Any
+    pads: Any
+    normal: Any
+    yaw: Any
+    force: Any
+    sliding: Any
+
+
+def gripped(task: Task, seen: Seen) -> Any:
+    """[] bool: both fingers press and the hand faces the door.
+
+    A finger that hooks the knob from the side presses alone, or needs the hand turned.
+    """
+    return jnp.all(seen.force >= task.force) & (jnp.abs(seen.yaw) <= task.yaw)
+
+
+def terms(task: Task, seen: Seen) -> dict[str, Any]:
+    """The five terms of equation 4, unweighted: door, orientation, distance, log_distance, slip.
+
+    The door's opening counts while the knob is gripped; distances count below `opened` only.
+    """
+    distance = jnp.linalg.norm(seen.pinch)
+    grip = gripped(task, seen)
+    shut = seen.angle < task.opened
+    return {
+        "door": jnp.where(grip, jnp.clip(seen.angle / task.opened, 0.0, 2.0), 0.0),
+        "orientation": seen.normal - jnp.abs(seen.yaw),
+        "distance": jnp.where(shut, -distance, 0.0),
+        "log_distance": jnp.where(shut, -jnp.log(distance + task.near), 0.0),
+        "slip": -jnp.where(jnp.any(seen.force > 0.0), jnp.minimum(seen.sliding, 1.0), 0.0),
+    }
+
+
+def reward(task: Task, seen: Seen) -> Any:
+    """[] equation 4."""
+    return sum(getattr(task, name) * value for name, value in terms(task, seen).items())
+
+
+def observation(position: Any, velocity: Any, seen: Seen) -> Any:
+    """[23] as `LAYOUT` says, from joint positions and velocities [7]."""
+    return jnp.concatenate([position, velocity, seen.pinch, seen.pads.reshape(-1)])
+
+
+def command(task: Task, position: Any, action: Any) -> Any:
+    """[9] servo command, rad and m, of an action [9] in -1 .. 1 at joint positions [7]."""
+    action = jnp.clip(action, -1.0, 1.0)
+    return jnp.concatenate([position + task.reach * action[:ARM], 0.5 * task.width * (1.0 + action[ARM:])])
+
+
+def holding(task: Task, seen: Seen, before: Any) -> Any:
+    """[] s for which the door has been open with the grip on, without a break; before: the same an action ago."""
+    return jnp.where(gripped(task, seen) & (seen.angle >= task.opened), before + task.control, 0.0)
+
+
+def succeeded(task: Task, longest: Any) -> Any:
+    """[] bool, from the longest time that the open door was held, s."""
+    return longest >= task.held - 1e-6

@@ -1,0 +1,113 @@
+"""The environment against plain C MuJoCo: the same commands, the same door, the same grip."""
+
+from __future__ import annotations
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+from droid_jax import runtime
+from droid_jax.measure.demonstration import PLANS, joint_path
+from droid_jax.model.door_scene import door_scene
+from droid_jax.policy.door_env import DoorEnv
+from droid_jax.policy.hand import finger_forces_c, hand_of, looked_c
+from droid_jax.policy.task import ACTIONS, OBSERVED, Task, command
+
+TASK = Task()
+SECONDS, TO = 2.4, 0.5  # of the scripted opening, rad
+
+
+@pytest.fixture(scope="module")
+def env() -> DoorEnv:
+    return DoorEnv(door_scene(timestep=0.004, limits=True), TASK)
+
+
+@pytest.fixture(scope="module")
+def script(env: DoorEnv) -> np.ndarray:
+    """[K, 9] commands: to the knob, grip, open."""
+    steps = lambda seconds: round(seconds / TASK.control)  # noqa: E731
+    reach, grip, pull = steps(0.8), steps(0.4), steps(SECONDS)
+    angles = np.concatenate([np.zeros(reach + grip), np.linspace(0.0, TO, pull)])
+    standoffs = np.concatenate([np.linspace(TASK.standoff, 0.0, reach), np.zeros(grip + pull)])
+    fingers = np.concatenate([np.full(reach, 0.04), np.zeros(grip + pull)])
+    path = joint_path(env.scene, PLANS["A"], angles, standoffs)
+    lag = env.scene.model.dof_damping[env.scene.joint_dofs] / env.scene.model.actuator_gainprm[:7, 0]
+    path = path + lag * np.gradient(path, TASK.control, axis=0)
+    return np.column_stack([path, fingers, fingers])
+
+
+@pytest.fixture(scope="module")
+def trained_on(env: DoorEnv, script: np.ndarray) -> dict[str, np.ndarray]:
+    """What MJX makes of the script, each command turned into the action that asks for it."""
+
+    def act(state, target):
+        position = state.pipeline_state.qpos[env.scene.joint_qpos]
+        action = jax.numpy.concatenate([(target[:7] - position) / TASK.reach, 2 * target[7:] / TASK.width - 1])
+        state = env.step(state, action)
+        world, metrics = state.pipeline_state, state.metrics
+        return state, (metrics["angle"], metrics["grip"], world.qpos, state.obs, world.longest, state.reward)
+
+    def roll(script):
+        return jax.lax.scan(act, env.reset(jax.random.key(0)), script)[1]
+
+    rolled = jax.jit(roll, compiler_options=runtime.compiler_options())
+    names = ("angle", "grip", "qpos", "obs", "longest", "reward")
+    return dict(zip(names, map(np.asarray, rolled(np.asarray(script, np.float32))), strict=True))
+
+
+@pytest.fixture(scope="module")
+def in_c(env: DoorEnv, script: np.ndarray, trained_on: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The same commands in C at 0.5 ms, from the same start."""
+    scene = door_scene(timestep=0.0005, limits=True)
+    model, hand = scene.model, hand_of(scene)
+    data = mujoco.MjData(model)
+    data.qpos[:] = np.asarray(env.reset(jax.random.key(0)).pipeline_state.qpos)
+    out, last = {"angle": [], "force": [], "yaw": [], "pads": []}, np.zeros((2, 3))
+    for target in script:
+        position = data.qpos[scene.joint_qpos]
+        action = np.concatenate([(target[:7] - position) / TASK.reach, 2 * target[7:] / TASK.width - 1])
+        data.ctrl[:] = np.asarray(command(TASK, position, action))
+        for _ in range(round(TASK.control / 0.0005)):
+            mujoco.mj_step(model, data)
+        mujoco.mj_forward(model, data)
+        seen = looked_c(hand, data, finger_forces_c(hand, model, data), last, TASK.control)
+        last = seen.pads
+        for name, values in out.items():
+            values.append(getattr(seen, name))
+    return {name: np.array(values) for name, values in out.items()}
+
+
+def test_the_door_opens_as_in_c(trained_on, in_c):
+    assert in_c["angle"].max() > 0.9 * TO
+    np.testing.assert_allclose(trained_on["angle"], in_c["angle"], atol=np.deg2rad(1.0))
+
+
+def test_the_grip_is_on_where_c_presses_with_both_fingers(trained_on, in_c):
+    pressed = np.all(in_c["force"] >= TASK.force, axis=1) & (np.abs(in_c["yaw"]) < TASK.yaw)
+    assert pressed[-50:].all() and not pressed[:40].any()
+    assert np.mean(trained_on["grip"].astype(bool) == pressed) > 0.97
+
+
+def test_observations_are_what_c_sees(trained_on, in_c):
+    """Pads to a tenth of a millimetre; while the fingers snap shut, to their way in a time step."""
+    apart = np.abs(trained_on["obs"][:, -6:] - in_c["pads"].reshape(-1, 6))
+    assert apart.max() < 3e-3
+    assert np.median(apart) < 1e-4 and np.quantile(apart, 0.99) < 1e-3
+
+
+def test_the_reward_rises_as_the_door_opens(trained_on):
+    assert trained_on["reward"][-1] > trained_on["reward"][70] > trained_on["reward"][0]
+    assert np.isfinite(trained_on["reward"]).all()
+
+
+def test_sizes(env: DoorEnv):
+    state = env.reset(jax.random.key(1))
+    assert state.obs.shape == (env.observation_size,) == (OBSERVED,)
+    assert env.action_size == ACTIONS == 9
+    assert not np.allclose(state.obs, env.reset(jax.random.key(2)).obs)
+
+
+def test_a_time_step_that_does_not_fit_is_refused():
+    with pytest.raises(ValueError, match=r"0\.02 s, is no multiple of the scene's time step, 0\.003 s"):
+        DoorEnv(door_scene(timestep=0.003, limits=True), TASK)

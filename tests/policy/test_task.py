@@ -1,0 +1,101 @@
+"""Grip, reward and success against what they should be by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from droid_jax.policy.task import (
+    LAYOUT,
+    OBSERVED,
+    Seen,
+    Task,
+    command,
+    gripped,
+    holding,
+    observation,
+    reward,
+    succeeded,
+    terms,
+)
+
+TASK = Task()
+HELD = Seen(
+    angle=0.2, pinch=np.array([0.003, 0.0, 0.004]), pads=np.zeros((2, 3)), normal=1.0, yaw=0.0,
+    force=np.array([5.0, 6.0]), sliding=0.0,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("changes", "is_one"),
+    [
+        ({}, True),
+        ({"force": np.array([5.0, 0.0])}, False),  # one finger hooks
+        ({"force": np.array([0.5, 5.0])}, False),
+        ({"yaw": np.deg2rad(19.0)}, True),
+        ({"yaw": np.deg2rad(-21.0)}, False),  # both press, the hand turned aside
+        ({"yaw": np.deg2rad(90.0)}, False),
+    ],
+)
+def test_a_grip_takes_both_fingers_and_a_hand_that_faces_the_door(changes, is_one):
+    assert bool(gripped(TASK, HELD._replace(**changes))) == is_one
+
+
+def test_the_door_pays_only_while_it_is_gripped():
+    hooked = HELD._replace(force=np.array([9.0, 0.0]))
+    assert float(terms(TASK, HELD)["door"]) == pytest.approx(0.2 / np.deg2rad(30))
+    assert float(terms(TASK, hooked)["door"]) == 0.0
+    assert float(reward(TASK, HELD)) > float(reward(TASK, hooked))
+
+
+def test_distances_count_below_thirty_degrees_only():
+    far = HELD._replace(pinch=np.array([0.0, 0.0, 0.1]))
+    opened = far._replace(angle=np.deg2rad(31.0))
+    shut = {name: float(value) for name, value in terms(TASK, far).items()}
+    open_ = {name: float(value) for name, value in terms(TASK, opened).items()}
+    assert shut["distance"] == pytest.approx(-0.1)
+    assert shut["log_distance"] == pytest.approx(-np.log(0.1 + TASK.near))
+    assert open_["distance"] == open_["log_distance"] == 0.0
+
+
+def test_the_reward_is_the_weighted_sum():
+    seen = HELD._replace(yaw=0.1, normal=0.9, sliding=0.3)
+    expected = sum(getattr(TASK, name) * float(value) for name, value in terms(TASK, seen).items())
+    assert float(reward(TASK, seen)) == pytest.approx(expected)
+    without_slip = replace(TASK, slip=0.0)
+    assert float(reward(without_slip, seen)) == pytest.approx(expected + 0.2 * 0.3)
+
+
+def test_sliding_past_a_knob_that_is_not_touched_costs_nothing():
+    seen = HELD._replace(force=np.zeros(2), sliding=0.5)
+    assert float(terms(TASK, seen)["slip"]) == 0.0
+
+
+def test_a_success_is_held_for_half_a_second_without_a_break():
+    """Opening past 30 degrees and flinging the door on is none."""
+    opened, lost = HELD._replace(angle=0.55), HELD._replace(angle=0.9, force=np.zeros(2))
+    held = longest = 0.0
+    for k in range(60):
+        held = float(holding(TASK, lost if k in (0, 24) else opened, held))
+        longest = max(longest, held)
+        assert bool(succeeded(TASK, longest)) == (k >= 49)
+    assert longest == pytest.approx(35 * TASK.control)
+
+
+def test_the_observation_is_laid_out_as_documented():
+    pads = np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
+    seen = HELD._replace(pinch=np.array([7.0, 8.0, 9.0]), pads=pads)
+    found = np.asarray(observation(np.arange(7.0), 10 + np.arange(7.0), seen))
+    assert found.shape == (OBSERVED,) == (len(LAYOUT),)
+    at = dict(zip(LAYOUT, found.tolist(), strict=True))
+    assert at["position of joint 3, rad"] == 2.0
+    assert at["velocity of joint 1, rad/s"] == 10.0
+    assert at["pinch point from the knob, y of the knob's frame, m"] == 8.0
+    assert at["right pad from the knob, x of the knob's frame, m"] == pytest.approx(0.4)
+
+
+def test_actions_are_clipped_and_reach_from_where_the_joints_are():
+    found = np.asarray(command(TASK, np.full(7, 0.5), np.array([1.0, -5.0, 0, 0, 0, 0, 0.5, -1.0, 3.0])))
+    np.testing.assert_allclose(found, [0.6, 0.4, 0.5, 0.5, 0.5, 0.5, 0.55, 0.0, TASK.width], atol=1e-6)
