@@ -71,7 +71,7 @@ def finger_forces(hand: Hand, data: Any) -> jax.Array:
     contact, rows = data._impl.contact, data._impl
     geoms = jnp.sort(contact.geom, axis=1)
     force: Any = rows.efc_force
-    edges = force[contact.efc_address[:, None] + np.arange(EDGES)]
+    edges: Any = force[contact.efc_address[:, None] + np.arange(EDGES)]
     normal = jnp.sum(edges, axis=1) * (contact.dist < 0)
     mine = [jnp.any(jnp.all(geoms[:, None] == pairs[None], axis=-1), axis=1) for pairs in hand.pairs]
     return jnp.stack([jnp.sum(jnp.where(m, normal, 0.0)) for m in mine])

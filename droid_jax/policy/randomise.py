@@ -1,0 +1,111 @@
+"""From a Gaussian over parameters to randomised physics: brax's randomization_fn(sys, rng) -> (sys_v, in_axes).
+
+Any Gaussian will do: the prior, a fitted mean alone (`fixed`), CMA-ES's covariance or the calibrated one.  `sys` is
+our `Physics`, so that parameters outside the model (effects) vary too.  Only fields that parameters write, and what
+follows from them, are batched.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from droid_jax.identify.gaussian import Gaussian
+from droid_jax.model.parameters import Space
+from droid_jax.model.physics import Physics, make_physics, model_writes, written_fields
+from droid_jax.model.scene import Scene
+
+Randomise = Callable[[Any, jax.Array], tuple[Any, Any]]
+
+
+def randomised(scene: Scene, gaussian: Gaussian) -> Randomise:
+    """A randomization_fn for environments whose `sys` is `Physics`: one draw of the Gaussian for each key.
+
+    Raises ValueError for a Gaussian of another scene.
+    """
+    check_scene(scene, gaussian.space)
+
+    def randomise(sys: Physics, rng: jax.Array) -> tuple[Physics, Physics]:
+        values = gaussian.sample(_seed(rng), _count(rng))
+        return physics_of(scene, gaussian.space, values), axes(scene, gaussian.space)
+
+    return randomise
+
+
+def randomised_model(scene: Scene, gaussian: Gaussian) -> Randomise:
+    """The same for environments that know an mjx.Model only (mujoco_playground's): the model fields alone.
+
+    Warns of parameters that live outside the model: they have no place there and stay at neutral.
+    """
+    check_scene(scene, gaussian.space)
+    outside = [p.name for p in gaussian.space.parameters if not p.writes]
+    if outside:
+        warnings.warn(
+            f"an environment that knows an mjx.Model only cannot vary {', '.join(outside)}: they are no fields of it",
+            stacklevel=2,
+        )
+    both = randomised(scene, gaussian)
+
+    def randomise(model: Any, rng: jax.Array) -> tuple[Any, Any]:
+        physics, batched = both(Physics(model, {}), rng)
+        return physics.model, batched.model
+
+    return randomise
+
+
+def fixed(scene: Scene, space: Space, values: np.ndarray) -> Randomise:
+    """The same values [D] in every environment: no randomisation."""
+    check_scene(scene, space)
+
+    def randomise(sys: Physics, rng: jax.Array) -> tuple[Physics, Physics]:
+        return physics_of(scene, space, np.repeat(values[None], _count(rng), axis=0)), axes(scene, space)
+
+    return randomise
+
+
+def physics_of(scene: Scene, space: Space, values: np.ndarray) -> Physics:
+    """Physics of rows of values [N, D], batched where `axes` says so."""
+    make = jax.vmap(lambda row: make_physics(scene, space, row), out_axes=axes(scene, space))
+    return jax.jit(make)(jnp.asarray(values, jnp.float32))
+
+
+def axes(scene: Scene, space: Space) -> Physics:
+    """0 for what varies from row to row, None for what all share; to be handed to vmap."""
+    model = jax.tree.map(lambda leaf: None, scene.mjx)
+    written = [field for field in written_fields(space) if hasattr(scene.mjx, field)]
+    model = model.replace(**{field: jax.tree.map(lambda leaf: 0, getattr(scene.mjx, field)) for field in written})
+    theta: dict[str, Any] = {p.name: 0 for p in space.parameters if not p.writes}
+    return Physics(model, theta)
+
+
+def check_scene(scene: Scene, space: Space) -> None:
+    """ValueError where a space writes entries that the scene's model does not have."""
+    for column, write in model_writes(space):
+        array = getattr(scene.model, write.field, None)
+        name = space.parameters[column].name
+        if array is None:
+            raise ValueError(
+                f"parameter {name!r} writes {write.field}, which the model of {scene.name!r} does not have"
+            )
+        shape = np.shape(array)
+        if len(write.index) != len(shape) or any(i >= n for i, n in zip(write.index, shape, strict=True)):
+            raise ValueError(
+                f"parameter {name!r} writes {write.field}[{', '.join(map(str, write.index))}], but in {scene.name!r} "
+                f"that field has shape {shape}: the Gaussian belongs to another scene"
+            )
+
+
+def _count(rng: jax.Array) -> int:
+    """Keys in a batch of them, raw or typed."""
+    return int(rng.shape[0])
+
+
+def _seed(rng: jax.Array) -> np.random.Generator:
+    """A host generator out of a batch of keys; the same keys give the same draws."""
+    raw = jax.random.key_data(rng) if jnp.issubdtype(rng.dtype, jax.dtypes.prng_key) else rng
+    return np.random.default_rng(np.asarray(raw).ravel().tolist())

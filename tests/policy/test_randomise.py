@@ -1,0 +1,101 @@
+"""Randomised physics: every row is what its draw makes of the scene, and nothing else is batched."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from droid_jax.identify.gaussian import Gaussian, prior
+from droid_jax.model.door import door_space
+from droid_jax.model.door_scene import door_scene
+from droid_jax.model.effects.registry import effect_space, library
+from droid_jax.model.parameters import Space
+from droid_jax.model.physics import Physics, make_physics, written_fields
+from droid_jax.policy.randomise import fixed, randomised, randomised_model
+
+ENVS = 5
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return door_scene(timestep=0.004, limits=True)
+
+
+@pytest.fixture(scope="module")
+def gaussian(scene) -> Gaussian:
+    return prior(door_space(scene))
+
+
+@pytest.fixture
+def keys():
+    return jax.random.split(jax.random.key(3), ENVS)
+
+
+def rows(physics: Physics, batched: Physics, k: int) -> Physics:
+    """Row k, as vmap would hand it on."""
+    leaves, tree = jax.tree.flatten(physics)
+    at = jax.tree.leaves(batched, is_leaf=lambda leaf: leaf is None)
+    return jax.tree.unflatten(tree, [leaf if axis is None else leaf[k] for leaf, axis in zip(leaves, at, strict=True)])
+
+
+def test_every_row_is_its_draw(scene, gaussian, keys):
+    physics, batched = randomised(scene, gaussian)(Physics(scene.mjx, {}), keys)
+    again, _ = randomised(scene, gaussian)(Physics(scene.mjx, {}), keys)
+    for a, b in zip(jax.tree.leaves(physics), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(a, b)
+    seen = np.asarray(physics.model.dof_damping)[:, scene.dof("hinge")]
+    assert len(np.unique(seen)) == ENVS
+    low, high = gaussian.space["hinge_damping"].low, gaussian.space["hinge_damping"].high
+    assert np.all((seen >= low) & (seen <= high))
+    values = gaussian.sample(np.random.default_rng(np.asarray(jax.random.key_data(keys)).ravel().tolist()), ENVS)
+    for k in range(ENVS):
+        expected, found = make_physics(scene, gaussian.space, values[k]), rows(physics, batched, k)
+        for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_allclose(a, b, rtol=2e-4, atol=1e-5)
+
+
+def test_only_what_is_written_is_batched(scene, gaussian, keys):
+    physics, batched = randomised(scene, gaussian)(Physics(scene.mjx, {}), keys)
+    varied = {f for f in ("dof_damping", "body_mass", "pair_friction", "geom_size", "jnt_range", "qpos0", "body_pos")
+              if getattr(batched.model, f, None) is not None}  # fmt: skip
+    assert varied == set(written_fields(gaussian.space)) & {
+        "dof_damping", "body_mass", "pair_friction", "geom_size", "jnt_range", "qpos0", "body_pos"
+    }  # fmt: skip
+    assert physics.model.qpos0.shape == scene.mjx.qpos0.shape
+
+
+def test_without_randomisation_all_are_alike(scene, gaussian, keys):
+    values = gaussian.space.mean
+    physics, _ = fixed(scene, gaussian.space, values)(Physics(scene.mjx, {}), keys)
+    hinge = np.asarray(physics.model.dof_damping)[:, scene.dof("hinge")]
+    np.testing.assert_allclose(hinge, gaussian.space["hinge_damping"].mean, rtol=1e-6)
+
+
+def test_effects_ride_in_theta(scene, keys):
+    space = door_space(scene) + effect_space(library(scene, ["latch"]))
+    physics, batched = randomised(scene, prior(space))(Physics(scene.mjx, {}), keys)
+    assert physics.theta["latch_torque"].shape == (ENVS,)
+    assert batched.theta["latch_torque"] == 0
+
+
+def test_an_environment_that_knows_a_model_only_is_told_what_it_lacks(scene, gaussian, keys):
+    space = gaussian.space + effect_space(library(scene, ["latch"]))
+    with pytest.warns(UserWarning, match=r"cannot vary .*latch_torque, latch_width"):
+        randomise = randomised_model(scene, prior(space))
+    model, batched = randomise(scene.mjx, keys)
+    assert model.dof_damping.shape == (ENVS, scene.model.nv) and batched.dof_damping == 0
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        randomised_model(scene, gaussian)
+
+
+def test_a_gaussian_of_another_scene_is_refused(scene, gaussian):
+    first = gaussian.space.parameters[0]
+    write = replace(first.writes[0], index=(99,))
+    other = Space((replace(first, writes=(write,)), *gaussian.space.parameters[1:]))
+    with pytest.raises(ValueError, match=rf"{first.name}.*\[99\].*belongs to another scene"):
+        randomised(scene, prior(other))
