@@ -48,7 +48,7 @@ def base_fit(case: Case, progress: Progress) -> Model:
 def ask(case: Case, model: Model, asked: tuple[Question, ...]) -> Screen:
     """Screen questions against a model's residuals on the first demonstration."""
     root = case.fit.repeats**0.5
-    base, prior = model.refined.jacobian / root, model.refined.prior * root
+    base, prior = model.refined.jacobian / root, model.refined.prior * root * case.fit.slack
     raw = marks(case.fit, model.values, asked)
     blown_up = np.isnan(raw).any(axis=1)
     raw[blown_up] = 0.0

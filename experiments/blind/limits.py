@@ -69,7 +69,7 @@ class Power:
 
     def _projected(self, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if free.tobytes() not in self.known:
-            marks = self.where.projected(self.marks, free)
+            marks = self.where.asked(self.marks, free)
             self.known[free.tobytes()] = marks, marks @ self.where.noise.T
         return self.known[free.tobytes()]
 

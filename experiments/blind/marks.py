@@ -62,9 +62,13 @@ class Ground:
         return self.model.refined.prior * np.sqrt(REPEATS)
 
     def projected(self, columns: np.ndarray, free: np.ndarray | None = None) -> np.ndarray:
-        """[K, M] without what the base parameters (those `free`, [D] bool) would absorb of them."""
+        """[K, M] without what the base parameters (those `free`, [D] bool) would absorb of them in a fit."""
         chosen = np.ones(len(self.prior), bool) if free is None else free
         return project(columns, self.slopes[:, chosen], self.prior[chosen])
+
+    def asked(self, columns: np.ndarray, free: np.ndarray) -> np.ndarray:
+        """[K, M] marks as the test has them, which lets base parameters move further (`Evidence.slack`)."""
+        return project(columns, self.slopes[:, free], self.evidence.slack * self.prior[free])
 
     def left(self, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """[M] what the base model leaves of a column within its bounds, and which parameters [D] stay off them."""

@@ -176,7 +176,7 @@ class Stage:
         rng = np.random.default_rng(0)
         self.noise = rng.normal(size=(limits.REPEATS * 4, 40))
 
-    def projected(self, columns: np.ndarray, free: np.ndarray | None = None) -> np.ndarray:
+    def asked(self, columns: np.ndarray, free: np.ndarray) -> np.ndarray:
         return columns * (np.arange(40) >= 10)
 
     def left(self, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
