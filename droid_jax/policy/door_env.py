@@ -132,7 +132,7 @@ class DoorEnv(Env):
             obs=self._observe(world, seen),
             reward=jnp.where(finite, reward(self.task, seen), 0.0),
             done=(success | ~finite).astype(jnp.float32),
-            metrics={name: jnp.asarray(value, jnp.float32) for name, value in metrics.items()},
+            metrics=state.metrics | {name: jnp.asarray(value, jnp.float32) for name, value in metrics.items()},
         )
 
     def _advance(self, physics: Physics, world: World) -> tuple[World, jax.Array]:

@@ -1,0 +1,243 @@
+"""Training: the one caller of brax's PPO.
+
+Paper, section IV-D: actor and critic of two hidden layers of 64, tanh, Adam with a step of 1e-3, 512 actions at most.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import flax.serialization
+import jax
+import jax.numpy as jnp
+import numpy as np
+from brax.training.agents.ppo import networks as ppo_networks
+from brax.training.agents.ppo import train as ppo
+
+from droid_jax.identify.checkpoints import Checkpoints
+from droid_jax.policy.door_env import DoorEnv
+from droid_jax.policy.network import Policy, layer_sizes, policy_of
+from droid_jax.policy.randomise import Randomise
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Settings of PPO; the defaults are the preset "quick".
+
+    steps: actions in all, over all environments.  envs: environments at once, over all devices.
+    hidden: sizes of the hidden layers of actor and critic.
+    learning_rate, discount, gae, clip, entropy, reward_scaling: of PPO.
+    unroll: actions between updates; batch, minibatches: unrolls of a minibatch, and minibatches; epochs: times
+    that each is used.
+    evaluations: times that the policy is tried (and saved) while it trains; eval_envs: episodes each time.
+    seed.
+    """
+
+    steps: int = 2_000_000
+    envs: int = 256
+    hidden: tuple[int, ...] = (64, 64)
+    learning_rate: float = 1e-3
+    discount: float = 0.98
+    gae: float = 0.95
+    clip: float = 0.2
+    entropy: float = 5e-3
+    reward_scaling: float = 0.1
+    unroll: int = 16
+    batch: int = 32
+    minibatches: int = 8
+    epochs: int = 6
+    evaluations: int = 10
+    eval_envs: int = 64
+    seed: int = 0
+
+
+PRESETS = {
+    "quick": TrainConfig(),
+    "paper": TrainConfig(steps=20_000_000, batch=64, evaluations=40, eval_envs=128),
+    "gpu": TrainConfig(steps=40_000_000, envs=4096, batch=512, minibatches=8, evaluations=40, eval_envs=512),
+}
+
+
+@dataclass(frozen=True)
+class TrainProgress:
+    """After each evaluation.
+
+    step, of: actions; seconds: since training began, compilation included; rate: actions per second of the last
+    part; reward: of an episode; success: share of episodes; angle: rad at the end of an episode, mean.
+    """
+
+    step: int
+    of: int
+    seconds: float
+    rate: float
+    reward: float
+    success: float
+
+    @property
+    def left(self) -> float:
+        """s that the rest will take at this rate; infinite before the first part."""
+        return (self.of - self.step) / self.rate if self.rate > 0 else float("inf")
+
+
+@dataclass(frozen=True, eq=False)
+class Trained:
+    """A policy and how it came to be."""
+
+    policy: Policy
+    history: tuple[TrainProgress, ...]
+
+
+def train(
+    env: DoorEnv,
+    randomise: Randomise | None = None,
+    config: TrainConfig | None = None,
+    *,
+    checkpoints: Path | None = None,
+    fingerprint: dict[str, str] | None = None,
+    progress: Callable[[TrainProgress], None] = lambda now: None,
+) -> Trained:
+    """Train a policy on environments that `randomise` makes, all alike where it is None.
+
+    checkpoints: folder where the networks are kept after every evaluation, and from which an interrupted run goes on
+    (with Adam's moments anew); fingerprint: what else they belong to.
+    Raises ValueError for more devices than divide the environments.
+    """
+    config = config or TrainConfig()
+    devices = jax.local_device_count()
+    if config.envs % devices or (config.batch * config.minibatches) % config.envs:
+        raise ValueError(
+            f"{config.envs} environments must be a multiple of the {devices} devices, and batch x minibatches "
+            f"({config.batch} x {config.minibatches}) one of the environments"
+        )
+    texts = {"config": repr(replace(config, steps=0)), "task": repr(asdict(env.task)), **(fingerprint or {})}
+    run = functools.partial(_brax, env, randomise, config)
+    if checkpoints is None:
+        return run(None, 0, progress, lambda step, params: None)
+    with Checkpoints(checkpoints, fingerprint=texts) as kept:
+        found = kept.restore()
+        step, tree = found if found is not None else (0, None)
+        return run(tree, step, progress, kept.save)
+
+
+def _brax(
+    env: DoorEnv,
+    randomise: Randomise | None,
+    config: TrainConfig,
+    tree: dict[str, Any] | None,
+    done: int,
+    progress: Callable[[TrainProgress], None],
+    save: Callable[[int, dict[str, Any]], None],
+) -> Trained:
+    """brax's PPO from `done` actions on, with the networks of `tree` where there are any."""
+    history, began = list[TrainProgress](), time.monotonic()
+
+    def tell(step: int, metrics: dict[str, Any]) -> None:
+        now = TrainProgress(
+            step=done + step,
+            of=config.steps,
+            seconds=time.monotonic() - began,
+            rate=float(metrics.get("training/sps", 0.0)),
+            reward=float(metrics["eval/episode_reward"]),
+            success=float(metrics["eval/episode_success"]),
+        )
+        history.append(now)
+        progress(now)
+
+    def keep(step: int, _: Any, params: Any) -> None:
+        if step:
+            save(done + step, to_tree(params))
+
+    def run(steps: int, restore: Any = None, **hooks: Any) -> Any:
+        return ppo.train(
+            environment=env,
+            num_timesteps=steps,
+            num_envs=config.envs,
+            episode_length=env.task.steps,
+            learning_rate=config.learning_rate,
+            entropy_cost=config.entropy,
+            discounting=config.discount,
+            unroll_length=config.unroll,
+            batch_size=config.batch,
+            num_minibatches=config.minibatches,
+            num_updates_per_batch=config.epochs,
+            normalize_observations=True,
+            reward_scaling=config.reward_scaling,
+            clipping_epsilon=config.clip,
+            gae_lambda=config.gae,
+            network_factory=functools.partial(
+                ppo_networks.make_ppo_networks,
+                policy_hidden_layer_sizes=config.hidden,
+                value_hidden_layer_sizes=config.hidden,
+                activation=jnp.tanh,
+            ),
+            seed=config.seed + done,
+            num_evals=config.evaluations,
+            num_eval_envs=config.eval_envs,
+            deterministic_eval=True,
+            randomization_fn=randomise,
+            restore_params=restore,
+            **hooks,
+        )
+
+    with replicated():
+        params: Any = None
+        if tree is not None:
+            _, blank, _ = run(0)
+            params = from_tree(blank, tree)
+        if done < config.steps:
+            _, params, _ = run(config.steps - done, params, progress_fn=tell, policy_params_fn=keep)
+    normaliser, actor, _ = params
+    return Trained(policy_of(normaliser, actor, layer_sizes(config.hidden)), tuple(history))
+
+
+def to_tree(params: Any) -> dict[str, Any]:
+    """brax's (normaliser, actor, critic) as a nested dictionary of numpy arrays."""
+    return jax.tree.map(np.asarray, flax.serialization.to_state_dict(dict(zip(_NAMES, params, strict=True))))
+
+
+def from_tree(blank: Any, tree: dict[str, Any]) -> Any:
+    """The inverse of `to_tree`, onto parameters of the same networks.  ValueError for those of other networks."""
+    target = dict(zip(_NAMES, blank, strict=True))
+    try:
+        found = flax.serialization.from_state_dict(target, tree)
+    except (KeyError, ValueError) as error:
+        raise ValueError(f"the checkpoint holds another network: {error}") from None
+    for own, other in zip(jax.tree.leaves(target), jax.tree.leaves(found), strict=True):
+        if np.shape(own) != np.shape(other):
+            raise ValueError(
+                f"the checkpoint holds a layer of shape {np.shape(other)}, this network one of {np.shape(own)}"
+            )
+    return tuple(found[name] for name in _NAMES)
+
+
+_NAMES = ("normaliser", "actor", "critic")
+
+
+class replicated:
+    """jax.device_put_replicated while brax needs it: jax 0.10 removed it, and brax 0.14.2 calls it once.
+
+    A stand-in with the same meaning (a leading axis over the devices); where jax still has it, nothing is touched.
+    """
+
+    def __init__(self, module: Any = jax) -> None:
+        self._module, self._missing = module, not hasattr(module, "device_put_replicated")
+
+    def __enter__(self) -> None:
+        if self._missing:
+            self._module.device_put_replicated = put_replicated
+
+    def __exit__(self, *_: object) -> None:
+        if self._missing:
+            del self._module.device_put_replicated
+
+
+def put_replicated(tree: Any, devices: Any) -> Any:
+    """A copy of every array on every device, [devices, ...], as jax.pmap wants it."""
+    mesh = jax.sharding.Mesh(np.array(devices), ("devices",))
+    sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("devices"))
+    return jax.tree.map(lambda a: jax.device_put(jnp.stack([jnp.asarray(a)] * len(devices)), sharding), tree)

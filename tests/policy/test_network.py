@@ -1,0 +1,91 @@
+"""The policy as numbers: brax's own network is the oracle, and files that are not as they should be are named."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from brax.training.acme import running_statistics, specs
+from brax.training.agents.ppo import networks as ppo_networks
+
+from droid_jax.policy.network import Policy, layer_sizes, load_policy, policy_of, save_policy
+from droid_jax.policy.task import ACTIONS, LAYOUT, OBSERVED
+
+HIDDEN = (64, 64)
+
+
+@pytest.fixture(scope="module")
+def networks():
+    make = functools.partial(ppo_networks.make_ppo_networks, activation=jnp.tanh)
+    return make(
+        OBSERVED,
+        ACTIONS,
+        running_statistics.normalize,
+        policy_hidden_layer_sizes=HIDDEN,
+        value_hidden_layer_sizes=HIDDEN,
+    )
+
+
+@pytest.fixture(scope="module")
+def parameters(networks):
+    """A normaliser that has seen something, and an actor's initial weights."""
+    normaliser = running_statistics.init_state(specs.Array((OBSERVED,), jnp.dtype("float32")))
+    seen = 3.0 + 2.0 * jax.random.normal(jax.random.key(0), (500, OBSERVED))
+    return running_statistics.update(normaliser, seen), networks.policy_network.init(jax.random.key(1))
+
+
+@pytest.fixture(scope="module")
+def policy(parameters) -> Policy:
+    return policy_of(*parameters, layer_sizes(HIDDEN))
+
+
+def test_it_acts_as_braxs_deterministic_policy(networks, parameters, policy):
+    act = ppo_networks.make_inference_fn(networks)((*parameters, None), deterministic=True)
+    observations = 3.0 + 4.0 * np.random.default_rng(2).normal(size=(200, OBSERVED)).astype(np.float32)
+    expected, _ = act(jnp.asarray(observations), jax.random.key(3))
+    np.testing.assert_allclose(policy.act(observations), expected, atol=2e-6)
+    np.testing.assert_allclose(policy.act(jnp.asarray(observations), jnp), expected, atol=2e-6)
+    assert np.abs(policy.act(observations)).max() <= 1.0 and policy.act(observations[0]).shape == (ACTIONS,)
+
+
+def test_a_file_brings_it_back(policy, tmp_path: Path):
+    save_policy(tmp_path / "policy.npz", policy)
+    found = load_policy(tmp_path / "policy.npz")
+    observation = np.linspace(-1, 1, OBSERVED, dtype=np.float32)
+    np.testing.assert_array_equal(found.act(observation), policy.act(observation))
+
+
+def test_a_network_of_other_sizes_is_refused(parameters):
+    with pytest.raises(ValueError, match=r"a network of \(23, 32, 32, 18\) .* got \(23, 64, 64, 18\)"):
+        policy_of(*parameters, layer_sizes((32, 32)))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "expected"),
+    [
+        (lambda path: path.unlink(), "there is no such file"),
+        (lambda path: path.write_bytes(path.read_bytes()[:200]), "cannot be read"),
+        (lambda path: np.savez(path, format="something else"), "is no policy"),
+    ],
+)
+def test_files_that_are_not_as_they_should_be(policy, tmp_path: Path, spoil, expected: str):
+    path = tmp_path / "policy.npz"
+    save_policy(path, policy)
+    spoil(path)
+    with pytest.raises(ValueError, match=expected):
+        load_policy(path)
+
+
+def test_another_layout_of_observations_is_refused(policy, tmp_path: Path):
+    path = tmp_path / "policy.npz"
+    save_policy(path, policy)
+    with np.load(path) as file:
+        found = {name: file[name] for name in file.files}
+    found["layout"] = np.array([*LAYOUT[:-1], "temperature of the knob, K"])
+    np.savez(path, **found)
+    with pytest.raises(ValueError, match="trained on another observation: temperature of the knob, K"):
+        load_policy(path)

@@ -1,0 +1,76 @@
+"""Training through brax: its missing function, networks that come back, and a short run that goes on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+
+from droid_jax.identify.gaussian import prior
+from droid_jax.model.door import door_space
+from droid_jax.model.door_scene import door_scene
+from droid_jax.policy.door_env import DoorEnv
+from droid_jax.policy.randomise import randomised
+from droid_jax.policy.task import OBSERVED, Task
+from droid_jax.policy.train import TrainConfig, from_tree, put_replicated, replicated, to_tree, train
+
+SHORT = TrainConfig(
+    steps=1024, envs=32, unroll=4, batch=8, minibatches=4, epochs=2, evaluations=3, eval_envs=4, hidden=(8, 8)
+)
+
+
+def test_the_stand_in_for_braxs_missing_function_puts_a_copy_on_every_device():
+    devices = jax.local_devices()
+    found = put_replicated({"a": np.arange(3.0), "b": 2}, devices)
+    assert found["a"].shape == (len(devices), 3) and found["b"].shape == (len(devices),)
+    doubled = jax.pmap(lambda x: 2 * x)(found["a"])
+    np.testing.assert_array_equal(doubled, 2 * np.tile(np.arange(3.0), (len(devices), 1)))
+
+
+def test_jax_is_left_as_it_was():
+    new, old = SimpleNamespace(), SimpleNamespace(device_put_replicated="its own")
+    with replicated(new):
+        assert new.device_put_replicated is put_replicated
+    assert not hasattr(new, "device_put_replicated")
+    with replicated(old):
+        assert old.device_put_replicated == "its own"
+    assert old.device_put_replicated == "its own"
+
+
+def test_networks_come_back_from_a_tree_and_others_are_refused():
+    blank = ({"mean": np.zeros(3)}, {"kernel": np.zeros((3, 2))}, {"kernel": np.zeros((3, 1))})
+    full = ({"mean": np.ones(3)}, {"kernel": np.full((3, 2), 2.0)}, {"kernel": np.full((3, 1), 3.0)})
+    found = from_tree(blank, to_tree(full))
+    np.testing.assert_array_equal(found[1]["kernel"], full[1]["kernel"])
+    other = ({"mean": np.ones(3)}, {"kernel": np.zeros((4, 2))}, {"kernel": np.zeros((3, 1))})
+    with pytest.raises(ValueError, match=r"holds a layer of shape \(4, 2\), this network one of \(3, 2\)"):
+        from_tree(blank, to_tree(other))
+    with pytest.raises(ValueError, match="holds another network"):
+        from_tree(blank, {**to_tree(full), "actor": {"bias": np.zeros(2)}})
+
+
+def test_environments_that_do_not_divide_are_refused():
+    env = object.__new__(DoorEnv)
+    with pytest.raises(ValueError, match="33 environments must be a multiple"):
+        train(env, config=replace(SHORT, envs=33, batch=5, minibatches=1))
+
+
+@pytest.mark.slow
+def test_a_short_run_is_kept_and_goes_on(tmp_path: Path):
+    scene = door_scene(timestep=0.004, limits=True)
+    env, randomise = DoorEnv(scene, Task(steps=20)), randomised(scene, prior(door_space(scene)))
+    first = train(env, randomise, SHORT, checkpoints=tmp_path)
+    assert [now.step for now in first.history] == [0, 512, 1024]
+    assert first.policy.mean.shape == (OBSERVED,) and np.abs(first.policy.mean).max() > 0.1
+    assert all(0.0 <= now.success <= 1.0 and np.isfinite(now.reward) for now in first.history)
+    longer = train(env, randomise, replace(SHORT, steps=2048), checkpoints=tmp_path)
+    assert longer.history[0].step == 1024 and longer.history[-1].step == 2048
+    done = train(env, randomise, SHORT, checkpoints=tmp_path)
+    assert done.history == ()
+    np.testing.assert_array_equal(done.policy.weights[0], longer.policy.weights[0])
+    with pytest.raises(ValueError, match="belongs to another run: it differs in task"):
+        train(DoorEnv(scene, Task(steps=30)), randomise, SHORT, checkpoints=tmp_path)
