@@ -74,7 +74,7 @@ def finger_forces(hand: Hand, data: Any) -> jax.Array:
     edges: Any = force[contact.efc_address[:, None] + np.arange(EDGES)]
     normal = jnp.sum(edges, axis=1) * (contact.dist < 0)
     mine = [jnp.any(jnp.all(geoms[:, None] == pairs[None], axis=-1), axis=1) for pairs in hand.pairs]
-    return jnp.stack([jnp.sum(jnp.where(m, normal, 0.0)) for m in mine])
+    return jnp.stack([jnp.sum(normal * m) for m in mine])
 
 
 def finger_forces_c(hand: Hand, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
