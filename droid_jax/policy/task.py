@@ -78,7 +78,7 @@ def gripped(task: Task, seen: Seen) -> Any:
 
     A finger that hooks the knob from the side presses alone, or needs the hand turned.
     """
-    return jnp.all(seen.force >= task.force) & (jnp.abs(seen.yaw) <= task.yaw)
+    return (seen.force >= task.force).all() & (abs(seen.yaw) <= task.yaw)
 
 
 def terms(task: Task, seen: Seen) -> dict[str, Any]:
@@ -103,20 +103,20 @@ def reward(task: Task, seen: Seen) -> Any:
     return sum(getattr(task, name) * value for name, value in terms(task, seen).items())
 
 
-def observation(position: Any, velocity: Any, seen: Seen) -> Any:
-    """[23] as `LAYOUT` says, from joint positions and velocities [7]."""
-    return jnp.concatenate([position, velocity, seen.pinch, seen.pads.reshape(-1)])
+def observation(position: Any, velocity: Any, seen: Seen, numbers: Any = jnp) -> Any:
+    """[23] as `LAYOUT` says, from joint positions and velocities [7]; numbers: jax.numpy or numpy."""
+    return numbers.concatenate([position, velocity, seen.pinch, seen.pads.reshape(-1)])
 
 
-def command(task: Task, position: Any, action: Any) -> Any:
+def command(task: Task, position: Any, action: Any, numbers: Any = jnp) -> Any:
     """[9] servo command, rad and m, of an action [9] in -1 .. 1 at joint positions [7]."""
-    action = jnp.clip(action, -1.0, 1.0)
-    return jnp.concatenate([position + task.reach * action[:ARM], 0.5 * task.width * (1.0 + action[ARM:])])
+    action = numbers.clip(action, -1.0, 1.0)
+    return numbers.concatenate([position + task.reach * action[:ARM], 0.5 * task.width * (1.0 + action[ARM:])])
 
 
 def holding(task: Task, seen: Seen, before: Any) -> Any:
     """[] s for which the door has been open with the grip on, without a break; before: the same an action ago."""
-    return jnp.where(gripped(task, seen) & (seen.angle >= task.opened), before + task.control, 0.0)
+    return (before + task.control) * (gripped(task, seen) & (seen.angle >= task.opened))
 
 
 def succeeded(task: Task, longest: Any) -> Any:

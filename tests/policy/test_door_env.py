@@ -6,9 +6,9 @@ import jax
 import mujoco
 import numpy as np
 import pytest
+from scripted import action, opening
 
 from droid_jax import runtime
-from droid_jax.measure.demonstration import PLANS, joint_path
 from droid_jax.model.door_scene import door_scene
 from droid_jax.policy.door_env import DoorEnv
 from droid_jax.policy.hand import finger_forces_c, hand_of, looked_c
@@ -26,15 +26,7 @@ def env() -> DoorEnv:
 @pytest.fixture(scope="module")
 def script(env: DoorEnv) -> np.ndarray:
     """[K, 9] commands: to the knob, grip, open."""
-    steps = lambda seconds: round(seconds / TASK.control)  # noqa: E731
-    reach, grip, pull = steps(0.8), steps(0.4), steps(SECONDS)
-    angles = np.concatenate([np.zeros(reach + grip), np.linspace(0.0, TO, pull)])
-    standoffs = np.concatenate([np.linspace(TASK.standoff, 0.0, reach), np.zeros(grip + pull)])
-    fingers = np.concatenate([np.full(reach, 0.04), np.zeros(grip + pull)])
-    path = joint_path(env.scene, PLANS["A"], angles, standoffs)
-    lag = env.scene.model.dof_damping[env.scene.joint_dofs] / env.scene.model.actuator_gainprm[:7, 0]
-    path = path + lag * np.gradient(path, TASK.control, axis=0)
-    return np.column_stack([path, fingers, fingers])
+    return opening(env.scene, TASK, SECONDS, TO)
 
 
 @pytest.fixture(scope="module")
@@ -66,8 +58,7 @@ def in_c(env: DoorEnv, script: np.ndarray, trained_on: dict[str, np.ndarray]) ->
     out, last = {"angle": [], "force": [], "yaw": [], "pads": []}, np.zeros((2, 3))
     for target in script:
         position = data.qpos[scene.joint_qpos]
-        action = np.concatenate([(target[:7] - position) / TASK.reach, 2 * target[7:] / TASK.width - 1])
-        data.ctrl[:] = np.asarray(command(TASK, position, action))
+        data.ctrl[:] = np.asarray(command(TASK, position, action(TASK, position, target)))
         for _ in range(round(TASK.control / 0.0005)):
             mujoco.mj_step(model, data)
         mujoco.mj_forward(model, data)

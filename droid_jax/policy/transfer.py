@@ -1,0 +1,175 @@
+"""A policy on the stand-in robot: plain MuJoCo C, a fine time step, hidden values and effects, noisy sensors.
+
+It stands for the paper's robot in Table II, and is called a stand-in wherever its figures are shown.
+"""
+
+from __future__ import annotations
+
+import copy
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any
+
+import mujoco
+import numpy as np
+import scipy.stats
+
+from droid_jax.measure.hidden import HIDDEN, Applied
+from droid_jax.measure.hidden_hooks import Influence, Live, Place, edited
+from droid_jax.model.door import door_nuisances, door_space
+from droid_jax.model.physics import make_c_model
+from droid_jax.model.scene import Scene
+from droid_jax.policy.hand import finger_forces_c, hand_of, looked_c
+from droid_jax.policy.network import Policy
+from droid_jax.policy.task import Task, command, gripped, holding, observation, succeeded
+
+
+@dataclass(frozen=True)
+class TransferConfig:
+    """How the stand-in robot differs from what the policy was trained on, beside its hidden values.
+
+    trials.  timestep: s, of the Euler integrator.  position_noise, velocity_noise: rad, rad/s of the joints' sensors;
+    knob_noise: m, of the camera's sight of the knob, drawn once for each trial and axis.  seed.
+    """
+
+    trials: int = 100
+    timestep: float = 0.0005
+    position_noise: float = 1e-4
+    velocity_noise: float = 5e-3
+    knob_noise: float = 1e-3
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Transfer:
+    """What came of the trials.
+
+    success: [N] bool.  angle: [N] rad, the largest; steps: [N] actions until success, or all there were;
+    grip: [N] share of actions with the knob gripped.
+    """
+
+    success: np.ndarray
+    angle: np.ndarray
+    steps: np.ndarray
+    grip: np.ndarray
+
+    @property
+    def rate(self) -> float:
+        """Share of trials that succeeded."""
+        return float(np.mean(self.success))
+
+    def interval(self, level: float = 0.95) -> tuple[float, float]:
+        """Of the success rate.  Wilson, JASA 1927."""
+        count = scipy.stats.binomtest(int(np.sum(self.success)), len(self.success))
+        span = count.proportion_ci(level, method="wilson")
+        return float(span.low), float(span.high)
+
+
+def transfer(
+    policy: Policy,
+    scene: Scene,
+    start: np.ndarray,
+    truth: Mapping[str, float],
+    hidden: Sequence[Applied] = (),
+    task: Task | None = None,
+    config: TransferConfig | None = None,
+) -> Transfer:
+    """Trials of a policy on the stand-in robot.
+
+    start: [nq] as in training (`DoorEnv.start`), off by `Task.spread` in every trial.  truth: hidden values, of the
+    door space and its nuisances.  hidden: effects as of the blind suite.
+    Raises ValueError for hidden effects that act on commands or sensors as whole traces: in a closed loop there are
+    none yet.
+    """
+    task, config = task or Task(), config or TransferConfig()
+    unfit = [a.name for a in hidden if _acts_on_traces(scene, start, a)]
+    if unfit:
+        raise ValueError(
+            f"hidden effects {', '.join(unfit)} change whole traces, which a closed loop does not have yet"
+        )
+    stand_in = robot(scene, truth, config.timestep)
+    rngs = np.random.default_rng(config.seed).spawn(config.trials)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        done = list(pool.map(lambda rng: _trial(policy, stand_in, start, hidden, task, config, rng), rngs))
+    return Transfer(*(np.array(column) for column in zip(*done, strict=True)))
+
+
+def robot(scene: Scene, truth: Mapping[str, float], timestep: float) -> Scene:
+    """The scene with hidden values, at the stand-in's own time step, integrator and solver effort."""
+    space = door_space(scene) + door_nuisances(scene)
+    model = make_c_model(scene, space, space.values(dict(truth)))
+    model.opt.timestep, model.opt.integrator = timestep, mujoco.mjtIntegrator.mjINT_EULER
+    model.opt.iterations, model.opt.ls_iterations = 100, 50
+    return replace(scene, model=model)
+
+
+def _trial(
+    policy: Policy,
+    stand_in: Scene,
+    start: np.ndarray,
+    hidden: Sequence[Applied],
+    task: Task,
+    config: TransferConfig,
+    rng: np.random.Generator,
+) -> tuple[bool, float, int, float]:
+    """Success, largest angle, actions, share of them with the grip on."""
+    influences = [_influence(stand_in, start, a) for a in hidden]
+    model, hand, joints = edited(stand_in.model, influences), hand_of(stand_in), stand_in.joint_qpos
+    data = mujoco.MjData(model)
+    data.qpos[:] = start
+    data.qpos[joints] += rng.normal(0.0, task.spread, len(joints))
+    mujoco.mj_forward(model, data)
+    advance = _stepper(model, data, influences, round(task.control / config.timestep))
+    seen = looked_c(hand, data, finger_forces_c(hand, model, data), np.zeros((2, 3)), task.control)
+    sight = rng.normal(0.0, config.knob_noise, 3)
+    held = longest = angle = 0.0
+    grips = 0
+    for number in range(task.steps):
+        position = data.qpos[joints] + rng.normal(0.0, config.position_noise, len(joints))
+        velocity = data.qvel[stand_in.joint_dofs] + rng.normal(0.0, config.velocity_noise, len(joints))
+        near = seen._replace(pinch=seen.pinch + sight, pads=seen.pads + sight)
+        action = policy.act(np.asarray(observation(position, velocity, near, np)))
+        advance(np.asarray(command(task, position, action, np)))
+        seen = looked_c(hand, data, finger_forces_c(hand, model, data), seen.pads, task.control)
+        if not np.isfinite(data.qpos).all():
+            return False, angle, number + 1, grips / (number + 1)
+        grips += bool(gripped(task, seen))
+        angle, held = max(angle, float(seen.angle)), float(holding(task, seen, held))
+        longest = max(longest, held)
+        if succeeded(task, longest):
+            return True, angle, number + 1, grips / (number + 1)
+    return False, angle, task.steps, grips / task.steps
+
+
+def _stepper(model: mujoco.MjModel, data: mujoco.MjData, influences: Sequence[Influence], steps: int) -> Any:
+    """A function of a command [U] that advances the simulation by so many steps."""
+    live, own_loss = Live.of(model, data), model.dof_frictionloss.copy()
+    for influence in influences:
+        if influence.begin:
+            influence.begin(live)
+    each = [i.step for i in influences if i.step]
+
+    def plain(ctrl: np.ndarray) -> None:
+        data.ctrl[:] = ctrl
+        mujoco.mj_step(model, data, nstep=steps)
+
+    def influenced(ctrl: np.ndarray) -> None:
+        for _ in range(steps):
+            live.control[:], live.applied[:], live.gear[:], live.loss[:] = ctrl, 0.0, 0.0, own_loss
+            for step in each:
+                step(live)
+            mujoco.mj_step(model, data)
+
+    return influenced if each else plain
+
+
+def _influence(scene: Scene, start: np.ndarray, one: Applied) -> Influence:
+    joints = (one.joint,) if one.joint else scene.joints
+    return HIDDEN[one.name].make(Place(scene, joints, start), one.amplitude)
+
+
+def _acts_on_traces(scene: Scene, start: np.ndarray, one: Applied) -> bool:
+    found = _influence(replace(scene, model=copy.copy(scene.model)), start, one)
+    return found.command is not None or found.sense is not None

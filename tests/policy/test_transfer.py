@@ -1,0 +1,89 @@
+"""The stand-in robot in closed loop: what opens by the book opens, and what must fail fails."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scripted import Script, opening
+
+from droid_jax.measure.demonstration import PLANS
+from droid_jax.measure.hidden import Applied
+from droid_jax.measure.surrogate import stand_in_truth
+from droid_jax.model.door_scene import door_scene
+from droid_jax.policy.door_env import start_pose
+from droid_jax.policy.task import Task
+from droid_jax.policy.transfer import Transfer, TransferConfig, transfer
+
+TASK = Task(steps=260, spread=0.0)
+ONE = TransferConfig(trials=1)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return door_scene(limits=True)
+
+
+@pytest.fixture(scope="module")
+def start(scene) -> np.ndarray:
+    return start_pose(scene, TASK, PLANS["A"])
+
+
+@pytest.fixture(scope="module")
+def commands(scene) -> np.ndarray:
+    return opening(scene, TASK, 2.4, np.deg2rad(42.0), hold=1.0)
+
+
+def tried(scene, start, commands, truth=None, hidden=(), task=TASK) -> Transfer:
+    truth = stand_in_truth(scene, 0, 0) if truth is None else truth
+    return transfer(Script(task, commands), scene, start, truth, hidden, task, ONE)  # type: ignore[arg-type]
+
+
+def test_an_opening_by_the_book_succeeds_with_the_grip_held(scene, start, commands):
+    found = tried(scene, start, commands)
+    assert found.success[0] and found.angle[0] > np.deg2rad(30.0)
+    assert 100 < found.steps[0] < TASK.steps
+    assert found.grip[0] > 0.5
+
+
+def test_a_strong_closer_is_felt(scene, start, commands):
+    """The same commands open the door less far against a preload that pulls it shut."""
+    free, held = (tried(scene, start, commands, hidden=h) for h in ((), (Applied("hinge_preload", 6.0),)))
+    assert held.angle[0] < free.angle[0] - np.deg2rad(1.0)
+
+
+def test_without_friction_on_the_pads_nothing_opens(scene, start, commands):
+    slippery = {**stand_in_truth(scene, 2, 0), "hinge_stiffness": 8.0}
+    slippery |= {n: 0.05 for n in slippery if n.startswith(("sliding_friction", "torsional_friction"))}
+    found = tried(scene, start, commands, slippery)
+    assert not found.success[0] and found.angle[0] < np.deg2rad(30.0)
+
+
+def test_a_hand_that_stays_where_it_is_opens_nothing(scene, start):
+    found = tried(scene, start, np.repeat(np.append(start[scene.joint_qpos], [0.04, 0.04])[None], 2, axis=0),
+                  task=replace(TASK, steps=40))  # fmt: skip
+    assert not found.success[0] and found.steps[0] == 40
+    assert found.angle[0] < 0.01 and found.grip[0] == 0.0
+
+
+def test_trials_differ_and_the_same_seed_repeats_them(scene, start):
+    still = np.append(start[scene.joint_qpos], [0.0, 0.0])[None]
+    task = replace(TASK, steps=10, spread=0.05)
+    runs = [
+        transfer(Script(task, still), scene, start, stand_in_truth(scene, 0, 0), (), task, replace(ONE, trials=3))  # type: ignore[arg-type]
+        for _ in range(2)
+    ]
+    np.testing.assert_array_equal(runs[0].angle, runs[1].angle)
+    assert runs[0].rate == 0.0
+
+
+def test_the_interval_is_wilsons():
+    found = Transfer(np.arange(100) < 80, np.zeros(100), np.zeros(100), np.zeros(100))
+    low, high = found.interval()
+    assert (low, high) == (pytest.approx(0.711, abs=1e-3), pytest.approx(0.867, abs=1e-3))
+
+
+def test_effects_on_whole_traces_are_refused(scene, start, commands):
+    with pytest.raises(ValueError, match="hidden effects command_delay change whole traces"):
+        tried(scene, start, commands, hidden=(Applied("command_delay", 0.01),))
