@@ -119,10 +119,10 @@ def servo_replay(scene: Scene, drive: Drive, effects: Sequence[Effect] = (), *, 
         def step(carry, k):
             qpos, qvel, warm, load = carry
             state = State(k * drive.timestep, qpos, qvel, load)
-            ctrl = _servo(_command(table, drive.timestep, k, late, theta, effects), theta, state, effects)
+            ctrl = servo_given(_command(table, drive.timestep, k, late, theta, effects), theta, state, effects)
             before = template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm, ctrl=ctrl)
             after = simulate_step(
-                _friction(model, theta, state, effects), _applied(before, theta, state, effects), parity=parity
+                rubbing(model, theta, state, effects), pushed(before, theta, state, effects), parity=parity
             )
             out = (
                 _joint_torque(model, before, after, joints, drive, parity),
@@ -169,22 +169,25 @@ def _command(
     ctrl = table[high] * (1 - part) + table[low] * part
     laws = [effect.command for effect in effects if effect.command is not None]
     for law in laws:  # each law sees what the one before it made of the command
-        look = _through(law, theta, look)
+        look = through(law, theta, look)
     return look((k - delay) * timestep) if laws else ctrl
 
 
-def _through(law: Callable, theta: Theta, look: Callable) -> Callable:
+def through(law: Callable, theta: Theta, look: Callable) -> Callable:
+    """What an effect's law makes of a command, look(t) -> [U]."""
     return lambda time: law(theta, time, look)
 
 
-def _servo(ctrl: jax.Array, theta: Theta, state: State, effects: Sequence[Effect]) -> jax.Array:
+def servo_given(ctrl: jax.Array, theta: Theta, state: State, effects: Sequence[Effect]) -> jax.Array:
+    """[U] what the servos are given in place of the command."""
     for effect in effects:
         if effect.servo is not None:
             ctrl = effect.servo(theta, state, ctrl)
     return ctrl
 
 
-def _friction(model, theta: Theta, state: State, effects: Sequence[Effect]):
+def rubbing(model, theta: Theta, state: State, effects: Sequence[Effect]):
+    """The model with the friction losses that effects give it in this state."""
     loss = model.dof_frictionloss
     for effect in effects:
         if effect.frictionloss is not None:
@@ -192,7 +195,8 @@ def _friction(model, theta: Theta, state: State, effects: Sequence[Effect]):
     return model if loss is model.dof_frictionloss else model.replace(dof_frictionloss=loss)
 
 
-def _applied(data, theta: Theta, state: State, effects: Sequence[Effect]):
+def pushed(data, theta: Theta, state: State, effects: Sequence[Effect]):
+    """The data with the forces of effects in this state."""
     forces = [effect.force(theta, state) for effect in effects if effect.force is not None]
     return data.replace(qfrc_applied=sum(forces)) if forces else data
 

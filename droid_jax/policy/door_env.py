@@ -12,7 +12,7 @@ from brax.envs.base import Env
 from brax.envs.base import State as EnvState
 from mujoco import mjx
 
-from droid_jax.compare.replay import check_stateless
+from droid_jax.compare.replay import check_stateless, pushed, rubbing, servo_given, through
 from droid_jax.measure.demonstration import OPEN, PLANS, Plan, grasp_pose, solve_pose
 from droid_jax.model.effects.registry import ready
 from droid_jax.model.physics import Physics
@@ -144,9 +144,7 @@ class DoorEnv(Env):
             now = State(world.time + number * self._timestep, qpos, qvel, load)
             ctrl = self._servo(theta, now, world)
             data = self._template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm, ctrl=ctrl)
-            forces = [effect.force(theta, now) for effect in self.effects if effect.force is not None]
-            data = data.replace(qfrc_applied=sum(forces)) if forces else data
-            after = simulate_step(self._rubbing(model, theta, now), data)
+            after = simulate_step(rubbing(model, theta, now, self.effects), pushed(data, theta, now, self.effects))
             force = finger_forces(self._hand, after)
             return (after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator, force), None
 
@@ -163,17 +161,8 @@ class DoorEnv(Env):
 
         for effect in self.effects:
             if effect.command is not None:
-                look = _through(effect, theta, look)
-        ctrl = look(now.time)
-        for effect in self.effects:
-            ctrl = ctrl if effect.servo is None else effect.servo(theta, now, ctrl)
-        return ctrl
-
-    def _rubbing(self, model, theta: Theta, now: State):
-        loss = model.dof_frictionloss
-        for effect in self.effects:
-            loss = loss if effect.frictionloss is None else effect.frictionloss(theta, now, loss)
-        return model if loss is model.dof_frictionloss else model.replace(dof_frictionloss=loss)
+                look = through(effect.command, theta, look)
+        return servo_given(look(now.time), theta, now, self.effects)
 
     def _look(self, model, world: World, force: jax.Array):
         data = mjx.kinematics(model, self._template.replace(qpos=world.qpos))
@@ -181,11 +170,6 @@ class DoorEnv(Env):
 
     def _observe(self, world: World, seen) -> jax.Array:
         return observation(world.qpos[self.scene.joint_qpos], world.qvel[self.scene.joint_dofs], seen)
-
-
-def _through(effect: Effect, theta: Theta, look):
-    assert effect.command is not None
-    return lambda time, law=effect.command: law(theta, time, look)
 
 
 def start_pose(scene: Scene, task: Task, plan: Plan) -> np.ndarray:

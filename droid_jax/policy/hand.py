@@ -43,26 +43,24 @@ def hand_of(scene: Scene) -> Hand:
     return Hand(scene.id("site", "pinch"), scene.id("site", "knob"), fingers, scene.qpos(scene.object_joint), pairs)
 
 
-def looked(hand: Hand, data: Any, force: Any, last: Any, seconds: float) -> Seen:
-    """From mjx.Data with fresh kinematics.
+def looked(hand: Hand, data: Any, force: Any, last: Any, seconds: float, numbers: Any = jnp) -> Seen:
+    """From mjx.Data, or MjData with numbers=numpy, with fresh kinematics.
 
     force: [2] N.  last: [2, 3] pads a while ago, `seconds` before, in the knob's frame.
     """
     knob, turned = data.site_xpos[hand.knob], data.site_xmat[hand.knob].reshape(3, 3)
-    places = data.xpos[hand.fingers] + jnp.einsum(
-        "fij,j->fi", data.xmat[hand.fingers].reshape(-1, 3, 3), jnp.array(PAD, jnp.float32)
-    )
-    pads = (places - knob) @ turned
-    axis = data.site_xmat[hand.pinch].reshape(3, 3)[:, 2]
-    inward = turned[:, 0]
+    pad = numbers.array(PAD, data.xpos.dtype)
+    pads = (data.xpos[hand.fingers] + data.xmat[hand.fingers].reshape(-1, 3, 3) @ pad - knob) @ turned
+    axis, inward = data.site_xmat[hand.pinch].reshape(3, 3)[:, 2], turned[:, 0]
+    across, along = inward[0] * axis[1] - inward[1] * axis[0], inward[:2] @ axis[:2]
     return Seen(
         angle=data.qpos[hand.hinge],
         pinch=(data.site_xpos[hand.pinch] - knob) @ turned,
         pads=pads,
-        normal=jnp.dot(axis, inward),
-        yaw=jnp.arctan2(inward[0] * axis[1] - inward[1] * axis[0], inward[0] * axis[0] + inward[1] * axis[1]),
+        normal=axis @ inward,
+        yaw=numbers.arctan2(across, along),
         force=force,
-        sliding=jnp.max(jnp.linalg.norm((pads - last) / seconds, axis=1)),
+        sliding=numbers.max(numbers.linalg.norm((pads - last) / seconds, axis=1)),
     )
 
 
@@ -87,20 +85,3 @@ def finger_forces_c(hand: Hand, model: mujoco.MjModel, data: mujoco.MjData) -> n
                 mujoco.mj_contactForce(model, data, index, wrench)
                 out[finger] += wrench[0]
     return out
-
-
-def looked_c(hand: Hand, data: mujoco.MjData, force: np.ndarray, last: np.ndarray, seconds: float) -> Seen:
-    """The same as `looked`, in plain C."""
-    knob, turned = data.site_xpos[hand.knob], data.site_xmat[hand.knob].reshape(3, 3)
-    places = data.xpos[hand.fingers] + data.xmat[hand.fingers].reshape(-1, 3, 3) @ np.array(PAD)
-    pads = (places - knob) @ turned
-    axis, inward = data.site_xmat[hand.pinch].reshape(3, 3)[:, 2], turned[:, 0]
-    return Seen(
-        angle=float(data.qpos[hand.hinge]),
-        pinch=(data.site_xpos[hand.pinch] - knob) @ turned,
-        pads=pads,
-        normal=float(axis @ inward),
-        yaw=float(np.arctan2(inward[0] * axis[1] - inward[1] * axis[0], inward[:2] @ axis[:2])),
-        force=force,
-        sliding=float(np.max(np.linalg.norm((pads - last) / seconds, axis=1))),
-    )

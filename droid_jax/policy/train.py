@@ -68,7 +68,7 @@ class TrainProgress:
     """After each evaluation.
 
     step, of: actions; seconds: since training began, compilation included; rate: actions per second of the last
-    part; reward: of an episode; success: share of episodes; angle: rad at the end of an episode, mean.
+    part; reward: of an episode; success: share of episodes.
     """
 
     step: int

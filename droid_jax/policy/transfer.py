@@ -5,7 +5,6 @@ It stands for the paper's robot in Table II, and is called a stand-in wherever i
 
 from __future__ import annotations
 
-import copy
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -21,7 +20,7 @@ from droid_jax.measure.hidden_hooks import Influence, Live, Place, edited
 from droid_jax.model.door import door_nuisances, door_space
 from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene
-from droid_jax.policy.hand import finger_forces_c, hand_of, looked_c
+from droid_jax.policy.hand import finger_forces_c, hand_of, looked
 from droid_jax.policy.network import Policy
 from droid_jax.policy.task import Task, command, gripped, holding, observation, succeeded
 
@@ -122,7 +121,7 @@ def _trial(
     data.qpos[joints] += rng.normal(0.0, task.spread, len(joints))
     mujoco.mj_forward(model, data)
     advance = _stepper(model, data, influences, round(task.control / config.timestep))
-    seen = looked_c(hand, data, finger_forces_c(hand, model, data), np.zeros((2, 3)), task.control)
+    seen = looked(hand, data, finger_forces_c(hand, model, data), np.zeros((2, 3)), task.control, np)
     sight = rng.normal(0.0, config.knob_noise, 3)
     held = longest = angle = 0.0
     grips = 0
@@ -132,7 +131,7 @@ def _trial(
         near = seen._replace(pinch=seen.pinch + sight, pads=seen.pads + sight)
         action = policy.act(np.asarray(observation(position, velocity, near, np)))
         advance(np.asarray(command(task, position, action, np)))
-        seen = looked_c(hand, data, finger_forces_c(hand, model, data), seen.pads, task.control)
+        seen = looked(hand, data, finger_forces_c(hand, model, data), seen.pads, task.control, np)
         if not np.isfinite(data.qpos).all():
             return False, angle, number + 1, grips / (number + 1)
         grips += bool(gripped(task, seen))
@@ -171,5 +170,5 @@ def _influence(scene: Scene, start: np.ndarray, one: Applied) -> Influence:
 
 
 def _acts_on_traces(scene: Scene, start: np.ndarray, one: Applied) -> bool:
-    found = _influence(replace(scene, model=copy.copy(scene.model)), start, one)
+    found = _influence(scene, start, one)
     return found.command is not None or found.sense is not None

@@ -11,7 +11,7 @@ from scripted import action, opening
 from droid_jax import runtime
 from droid_jax.model.door_scene import door_scene
 from droid_jax.policy.door_env import DoorEnv
-from droid_jax.policy.hand import finger_forces_c, hand_of, looked_c
+from droid_jax.policy.hand import finger_forces_c, hand_of, looked
 from droid_jax.policy.task import ACTIONS, OBSERVED, Task, command
 
 TASK = Task()
@@ -62,7 +62,7 @@ def in_c(env: DoorEnv, script: np.ndarray, trained_on: dict[str, np.ndarray]) ->
         for _ in range(round(TASK.control / 0.0005)):
             mujoco.mj_step(model, data)
         mujoco.mj_forward(model, data)
-        seen = looked_c(hand, data, finger_forces_c(hand, model, data), last, TASK.control)
+        seen = looked(hand, data, finger_forces_c(hand, model, data), last, TASK.control, np)
         last = seen.pads
         for name, values in out.items():
             values.append(getattr(seen, name))
