@@ -175,12 +175,15 @@ def _carries_weight(scene: Scene) -> bool:
 
 def _hidden_scene(scene: Scene, config: SurrogateConfig) -> Scene:
     """The scene instrumented, at the stand-in's own time step, integrator and solver effort."""
-    model = copy.copy(scene.model)
-    model.opt.timestep = config.timestep
-    model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
-    model.opt.iterations, model.opt.ls_iterations = 100, 50
-    hidden = replace(scene, model=model)
+    hidden = replace(scene, model=own_engine(copy.copy(scene.model), config.timestep))
     return replace(hidden, model=instrument(hidden))
+
+
+def own_engine(model: mujoco.MjModel, timestep: float) -> mujoco.MjModel:
+    """The model with the stand-in's own time step, integrator and solver effort set."""
+    model.opt.timestep, model.opt.integrator = timestep, mujoco.mjtIntegrator.mjINT_EULER
+    model.opt.iterations, model.opt.ls_iterations = 100, 50
+    return model
 
 
 def _repeats(

@@ -17,6 +17,7 @@ import scipy.stats
 
 from droid_jax.measure.hidden import HIDDEN, Applied
 from droid_jax.measure.hidden_hooks import Influence, Live, Place, edited
+from droid_jax.measure.surrogate import own_engine
 from droid_jax.model.door import door_nuisances, door_space
 from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene
@@ -99,9 +100,7 @@ def robot(scene: Scene, truth: Mapping[str, float], timestep: float) -> Scene:
     """The scene with hidden values, at the stand-in's own time step, integrator and solver effort."""
     space = door_space(scene) + door_nuisances(scene)
     model = make_c_model(scene, space, space.values(dict(truth)))
-    model.opt.timestep, model.opt.integrator = timestep, mujoco.mjtIntegrator.mjINT_EULER
-    model.opt.iterations, model.opt.ls_iterations = 100, 50
-    return replace(scene, model=model)
+    return replace(scene, model=own_engine(model, timestep))
 
 
 def _trial(
