@@ -19,10 +19,9 @@ from droid_jax.model.physics import Physics
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, State, Theta
 from droid_jax.model.step import step as simulate_step
+from droid_jax.policy.control import ACTIONS, OBSERVED
 from droid_jax.policy.hand import finger_forces, hand_of, looked
 from droid_jax.policy.task import (
-    ACTIONS,
-    OBSERVED,
     Task,
     command,
     gripped,
@@ -172,7 +171,7 @@ class DoorEnv(Env):
         return observation(world.qpos[self.scene.joint_qpos], world.qvel[self.scene.joint_dofs], seen)
 
 
-def start_pose(scene: Scene, task: Task, plan: Plan) -> np.ndarray:
+def start_pose(scene: Scene, task: Task, plan: Plan = PLANS["A"]) -> np.ndarray:
     """[nq] the arm in front of the closed door's knob, fingers open.  ValueError where the knob is out of reach."""
     q = solve_pose(scene, np.array(plan.pose), *grasp_pose(scene, 0.0, 0.0, plan.roll))
     for standoff in np.linspace(0.0, task.standoff, 10):

@@ -12,15 +12,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-ARM, FINGERS = 7, 2
-OBSERVED = 2 * ARM + 9
-ACTIONS = ARM + FINGERS
-LAYOUT = (
-    *(f"position of joint {i}, rad" for i in range(1, ARM + 1)),
-    *(f"velocity of joint {i}, rad/s" for i in range(1, ARM + 1)),
-    *(f"{of} from the knob, {axis} of the knob's frame, m" for of in ("pinch point", "left pad", "right pad")
-      for axis in "xyz"),
-)  # fmt: skip
+from droid_jax.policy.control import ARM
 
 
 @dataclass(frozen=True)
@@ -104,7 +96,7 @@ def reward(task: Task, seen: Seen) -> Any:
 
 
 def observation(position: Any, velocity: Any, seen: Seen, numbers: Any = jnp) -> Any:
-    """[23] as `LAYOUT` says, from joint positions and velocities [7]; numbers: jax.numpy or numpy."""
+    """[23] as `control.LAYOUT` says, from joint positions and velocities [7]; numbers: jax.numpy or numpy."""
     return numbers.concatenate([position, velocity, seen.pinch, seen.pads.reshape(-1)])
 
 

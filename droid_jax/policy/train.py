@@ -20,8 +20,10 @@ from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.agents.ppo import train as ppo
 
 from droid_jax.identify.checkpoints import Checkpoints
+from droid_jax.policy.control import Policy
 from droid_jax.policy.door_env import DoorEnv
-from droid_jax.policy.network import Policy, layer_sizes, policy_of
+from droid_jax.policy.interface import interface_of
+from droid_jax.policy.network import layer_sizes, policy_of
 from droid_jax.policy.randomise import Randomise
 
 
@@ -192,7 +194,8 @@ def _brax(
         if done < config.steps:
             _, params, _ = run(config.steps - done, params, progress_fn=tell, policy_params_fn=keep)
     normaliser, actor, _ = params
-    return Trained(policy_of(normaliser, actor, layer_sizes(config.hidden)), tuple(history))
+    interface = interface_of(env.scene, env.task, env.start)
+    return Trained(policy_of(normaliser, actor, layer_sizes(config.hidden), interface), tuple(history))
 
 
 def to_tree(params: Any) -> dict[str, Any]:

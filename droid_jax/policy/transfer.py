@@ -1,12 +1,14 @@
 """A policy on the stand-in robot: plain MuJoCo C, a fine time step, hidden values and effects, noisy sensors.
 
+The loop that closes it is the one that goes to a real robot, `control.Controller`.
+
 It stands for the paper's robot in Table II, and is called a stand-in wherever its figures are shown.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -21,9 +23,9 @@ from droid_jax.measure.surrogate import own_engine
 from droid_jax.model.door import door_nuisances, door_space
 from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene
+from droid_jax.policy.control import Controller, Policy, Reading
 from droid_jax.policy.hand import finger_forces_c, hand_of, looked
-from droid_jax.policy.network import Policy
-from droid_jax.policy.task import Task, command, gripped, holding, observation, succeeded
+from droid_jax.policy.task import Task, gripped, holding, succeeded
 
 
 @dataclass(frozen=True)
@@ -47,13 +49,14 @@ class Transfer:
     """What came of the trials.
 
     success: [N] bool.  angle: [N] rad, the largest; steps: [N] actions until success, or all there were;
-    grip: [N] share of actions with the knob gripped.
+    grip: [N] share of actions with the knob gripped.  stopped: [N] why the control loop stopped, "" where it did not.
     """
 
     success: np.ndarray
     angle: np.ndarray
     steps: np.ndarray
     grip: np.ndarray
+    stopped: np.ndarray
 
     @property
     def rate(self) -> float:
@@ -81,9 +84,11 @@ def transfer(
     start: [nq] as in training (`DoorEnv.start`), off by `Task.spread` in every trial.  truth: hidden values, of the
     door space and its nuisances.  hidden: effects as of the blind suite.
     Raises ValueError for hidden effects that act on commands or sensors as whole traces: in a closed loop there are
-    none yet.
+    none yet; and for a policy that acts at another rate than the task's.
     """
     task, config = task or Task(), config or TransferConfig()
+    if abs(policy.interface.period - task.control) > 1e-9:
+        raise ValueError(f"the policy acts every {policy.interface.period:g} s, the task asks every {task.control:g} s")
     unfit = [a.name for a in hidden if _acts_on_traces(scene, start, a)]
     if unfit:
         raise ValueError(
@@ -111,8 +116,8 @@ def _trial(
     task: Task,
     config: TransferConfig,
     rng: np.random.Generator,
-) -> tuple[bool, float, int, float]:
-    """Success, largest angle, actions, share of them with the grip on."""
+) -> tuple[bool, float, int, float, str]:
+    """Success, largest angle, actions, share of them with the grip on, why the loop stopped."""
     influences = [_influence(stand_in, start, a) for a in hidden]
     model, hand, joints = edited(stand_in.model, influences), hand_of(stand_in), stand_in.joint_qpos
     data = mujoco.MjData(model)
@@ -120,25 +125,46 @@ def _trial(
     data.qpos[joints] += rng.normal(0.0, task.spread, len(joints))
     mujoco.mj_forward(model, data)
     advance = _stepper(model, data, influences, round(task.control / config.timestep))
+    sense = _senses(stand_in, data, config, rng)
     seen = looked(hand, data, finger_forces_c(hand, model, data), np.zeros((2, 3)), task.control, np)
-    sight = rng.normal(0.0, config.knob_noise, 3)
+    loop = Controller(policy)
     held = longest = angle = 0.0
-    grips = 0
-    for number in range(task.steps):
-        position = data.qpos[joints] + rng.normal(0.0, config.position_noise, len(joints))
-        velocity = data.qvel[stand_in.joint_dofs] + rng.normal(0.0, config.velocity_noise, len(joints))
-        near = seen._replace(pinch=seen.pinch + sight, pads=seen.pads + sight)
-        action = policy.act(np.asarray(observation(position, velocity, near, np)))
-        advance(np.asarray(command(task, position, action, np)))
-        seen = looked(hand, data, finger_forces_c(hand, model, data), seen.pads, task.control, np)
+    grips = number = 0
+    while number < task.steps and not succeeded(task, longest):
+        asked = loop.act(sense(number * task.control))
+        if asked.stopped is not None:
+            break
+        advance(np.concatenate([asked.arm, asked.fingers]))
+        number += 1
         if not np.isfinite(data.qpos).all():
-            return False, angle, number + 1, grips / (number + 1)
+            break
+        seen = looked(hand, data, finger_forces_c(hand, model, data), seen.pads, task.control, np)
         grips += bool(gripped(task, seen))
         angle, held = max(angle, float(seen.angle)), float(holding(task, seen, held))
         longest = max(longest, held)
-        if succeeded(task, longest):
-            return True, angle, number + 1, grips / (number + 1)
-    return False, angle, task.steps, grips / task.steps
+    return bool(succeeded(task, longest)), angle, number, grips / max(number, 1), loop.stopped or ""
+
+
+def _senses(
+    stand_in: Scene, data: mujoco.MjData, config: TransferConfig, rng: np.random.Generator
+) -> Callable[[float], Reading]:
+    """What the robot's sensors say at a time; the camera's error is drawn once."""
+    joints, dofs, knob = stand_in.joint_qpos, stand_in.joint_dofs, stand_in.id("site", "knob")
+    fingers = [stand_in.qpos(name) for name in stand_in.command_names if name not in stand_in.joints]
+    sight, pose = rng.normal(0.0, config.knob_noise, 3), np.eye(4)
+
+    def sense(time: float) -> Reading:
+        pose[:3, :3], pose[:3, 3] = data.site_xmat[knob].reshape(3, 3), data.site_xpos[knob] - sight
+        return Reading(
+            time,
+            data.qpos[joints] + rng.normal(0.0, config.position_noise, len(joints)),
+            data.qvel[dofs] + rng.normal(0.0, config.velocity_noise, len(joints)),
+            data.qfrc_actuator[dofs].copy(),
+            data.qpos[fingers].copy(),
+            pose,
+        )
+
+    return sense
 
 
 def _stepper(model: mujoco.MjModel, data: mujoco.MjData, influences: Sequence[Influence], steps: int) -> Any:

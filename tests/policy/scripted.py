@@ -6,6 +6,7 @@ import numpy as np
 
 from droid_jax.measure.demonstration import PLANS, joint_path
 from droid_jax.model.scene import Scene
+from droid_jax.policy.control import Interface
 from droid_jax.policy.task import Task
 
 REACH, GRIP = 0.8, 0.4  # s
@@ -31,8 +32,8 @@ def action(task: Task, position: np.ndarray, target: np.ndarray) -> np.ndarray:
 class Script:
     """A policy that plays commands, whatever it sees but the joints' positions; for one trial."""
 
-    def __init__(self, task: Task, commands: np.ndarray):
-        self.task, self.commands, self.at = task, commands, 0
+    def __init__(self, task: Task, commands: np.ndarray, interface: Interface):
+        self.task, self.commands, self.interface, self.at = task, commands, interface, 0
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         target = self.commands[min(self.at, len(self.commands) - 1)]

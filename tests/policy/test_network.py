@@ -12,8 +12,12 @@ import pytest
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks as ppo_networks
 
-from droid_jax.policy.network import Policy, layer_sizes, load_policy, policy_of, save_policy
-from droid_jax.policy.task import ACTIONS, LAYOUT, OBSERVED
+from droid_jax.model.door_scene import door_scene
+from droid_jax.policy.control import ACTIONS, LAYOUT, OBSERVED, Interface, Policy, load
+from droid_jax.policy.door_env import start_pose
+from droid_jax.policy.interface import interface_of
+from droid_jax.policy.network import layer_sizes, policy_of, save_policy
+from droid_jax.policy.task import Task
 
 HIDDEN = (64, 64)
 
@@ -39,8 +43,14 @@ def parameters(networks):
 
 
 @pytest.fixture(scope="module")
-def policy(parameters) -> Policy:
-    return policy_of(*parameters, layer_sizes(HIDDEN))
+def interface() -> Interface:
+    scene, task = door_scene(limits=True), Task()
+    return interface_of(scene, task, start_pose(scene, task))
+
+
+@pytest.fixture(scope="module")
+def policy(parameters, interface) -> Policy:
+    return policy_of(*parameters, layer_sizes(HIDDEN), interface)
 
 
 def test_it_acts_as_braxs_deterministic_policy(networks, parameters, policy):
@@ -54,14 +64,16 @@ def test_it_acts_as_braxs_deterministic_policy(networks, parameters, policy):
 
 def test_a_file_brings_it_back(policy, tmp_path: Path):
     save_policy(tmp_path / "policy.npz", policy)
-    found = load_policy(tmp_path / "policy.npz")
+    found = load(tmp_path / "policy.npz")
     observation = np.linspace(-1, 1, OBSERVED, dtype=np.float32)
     np.testing.assert_array_equal(found.act(observation), policy.act(observation))
+    assert found.interface.period == 0.02 and isinstance(found.interface.period, float)
+    np.testing.assert_array_equal(found.interface.chain, policy.interface.chain)
 
 
-def test_a_network_of_other_sizes_is_refused(parameters):
+def test_a_network_of_other_sizes_is_refused(parameters, interface):
     with pytest.raises(ValueError, match=r"a network of \(23, 32, 32, 18\) .* got \(23, 64, 64, 18\)"):
-        policy_of(*parameters, layer_sizes((32, 32)))
+        policy_of(*parameters, layer_sizes((32, 32)), interface)
 
 
 @pytest.mark.parametrize(
@@ -77,7 +89,7 @@ def test_files_that_are_not_as_they_should_be(policy, tmp_path: Path, spoil, exp
     save_policy(path, policy)
     spoil(path)
     with pytest.raises(ValueError, match=expected):
-        load_policy(path)
+        load(path)
 
 
 def test_another_layout_of_observations_is_refused(policy, tmp_path: Path):
@@ -88,4 +100,4 @@ def test_another_layout_of_observations_is_refused(policy, tmp_path: Path):
     found["layout"] = np.array([*LAYOUT[:-1], "temperature of the knob, K"])
     np.savez(path, **found)
     with pytest.raises(ValueError, match="trained on another observation: temperature of the knob, K"):
-        load_policy(path)
+        load(path)

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from droid_jax.policy.control import LAYOUT, OBSERVED
 from droid_jax.policy.task import (
-    LAYOUT,
-    OBSERVED,
     Seen,
     Task,
     command,

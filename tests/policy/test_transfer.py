@@ -13,6 +13,7 @@ from droid_jax.measure.hidden import Applied
 from droid_jax.measure.surrogate import stand_in_truth
 from droid_jax.model.door_scene import door_scene
 from droid_jax.policy.door_env import start_pose
+from droid_jax.policy.interface import interface_of
 from droid_jax.policy.task import Task
 from droid_jax.policy.transfer import Transfer, TransferConfig, transfer
 
@@ -37,7 +38,8 @@ def commands(scene) -> np.ndarray:
 
 def tried(scene, start, commands, truth=None, hidden=(), task=TASK) -> Transfer:
     truth = stand_in_truth(scene, 0, 0) if truth is None else truth
-    return transfer(Script(task, commands), scene, start, truth, hidden, task, ONE)  # type: ignore[arg-type]
+    script = Script(task, commands, interface_of(scene, task, start))
+    return transfer(script, scene, start, truth, hidden, task, ONE)  # type: ignore[arg-type]
 
 
 def test_an_opening_by_the_book_succeeds_with_the_grip_held(scene, start, commands):
@@ -70,8 +72,9 @@ def test_a_hand_that_stays_where_it_is_opens_nothing(scene, start):
 def test_trials_differ_and_the_same_seed_repeats_them(scene, start):
     still = np.append(start[scene.joint_qpos], [0.0, 0.0])[None]
     task = replace(TASK, steps=10, spread=0.05)
+    interface, truth = interface_of(scene, task, start), stand_in_truth(scene, 0, 0)
     runs = [
-        transfer(Script(task, still), scene, start, stand_in_truth(scene, 0, 0), (), task, replace(ONE, trials=3))  # type: ignore[arg-type]
+        transfer(Script(task, still, interface), scene, start, truth, (), task, replace(ONE, trials=3))  # type: ignore[arg-type]
         for _ in range(2)
     ]
     np.testing.assert_array_equal(runs[0].angle, runs[1].angle)
@@ -79,7 +82,7 @@ def test_trials_differ_and_the_same_seed_repeats_them(scene, start):
 
 
 def test_the_interval_is_wilsons():
-    found = Transfer(np.arange(100) < 80, np.zeros(100), np.zeros(100), np.zeros(100))
+    found = Transfer(np.arange(100) < 80, *np.zeros((3, 100)), np.full(100, ""))
     low, high = found.interval()
     assert (low, high) == (pytest.approx(0.711, abs=1e-3), pytest.approx(0.867, abs=1e-3))
 

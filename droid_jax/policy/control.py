@@ -1,0 +1,276 @@
+"""A trained policy on a robot: policy file, observation, control loop.  Needs numpy and nothing else.
+
+`python -m droid_jax.run export` puts a copy of this file beside the policy's; on the robot's computer:
+
+    import control
+
+    loop = control.Controller(control.load("policy.npz"))
+    while not loop.stopped:
+        command = loop.act(control.Reading(time, position, velocity, torque, fingers, knob))
+        ...  # send command.arm and command.fingers, wait for the next period
+
+or `control.drive(loop, robot, seconds)` with an object that reads, sends and waits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+FORMAT = "droid_jax policy 2"
+ARM, FINGERS = 7, 2
+LAYOUT = (
+    *(f"position of joint {i}, rad" for i in range(1, ARM + 1)),
+    *(f"velocity of joint {i}, rad/s" for i in range(1, ARM + 1)),
+    *(f"{of} from the knob, {axis} of the knob's frame, m" for of in ("pinch point", "left pad", "right pad")
+      for axis in "xyz"),
+)  # fmt: skip
+OBSERVED, ACTIONS = len(LAYOUT), ARM + FINGERS
+
+
+@dataclass(frozen=True, eq=False)
+class Interface:
+    """What a policy and its robot must agree on, taken from the scene that the policy was trained in.
+
+    period: s between actions.  reach: rad by which an action of one moves a joint's target from where the joint is;
+    width: m, finger command of an action of one (of minus one: shut).
+    ranges: [7, 2] rad.  speed: [7] rad/s and effort: [7] N m, the arm's limits.  stiffness: [7] N m/rad of its
+    position servo, damping: [7] N m s/rad: what to set on the robot.
+    workspace: [2, 3] m, lowest and highest corner of where the pinch point may be, base frame.
+    chain: [8, 4, 4] from base to joint 1, joint to joint, joint 7 to pinch point, all joints at zero, each joint
+    turning about its frame's z axis.
+    pads: [2, 3] m of the pads in the pinch point's frame, shut; slides: [2, 3] how they move with a finger's position.
+    start: [9] rad and m, arm and fingers where training starts.
+    """
+
+    period: float
+    reach: float
+    width: float
+    ranges: np.ndarray
+    speed: np.ndarray
+    effort: np.ndarray
+    stiffness: np.ndarray
+    damping: np.ndarray
+    workspace: np.ndarray
+    chain: np.ndarray
+    pads: np.ndarray
+    slides: np.ndarray
+    start: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Policy:
+    """mean, std: [23] of the observations seen in training.  weights, biases: of each layer, the last of twice
+    nine numbers, of which the first nine are the action's mean before tanh."""
+
+    mean: np.ndarray
+    std: np.ndarray
+    weights: tuple[np.ndarray, ...]
+    biases: tuple[np.ndarray, ...]
+    interface: Interface
+
+    def act(self, observation: Any, numbers: Any = np) -> Any:
+        """[..., 9] in -1 .. 1, the most likely action at observations [..., 23]; numbers: numpy or jax.numpy."""
+        x = (observation - self.mean) / self.std
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            x = numbers.tanh(x @ weight + bias)
+        return numbers.tanh((x @ self.weights[-1] + self.biases[-1])[..., :ACTIONS])
+
+
+def arrays(policy: Policy) -> dict[str, Any]:
+    """The content of a policy's npz file: mean, std, weight_0, bias_0, ..., the interface, the layout in words."""
+    layers = {f"weight_{k}": w for k, w in enumerate(policy.weights)}
+    layers |= {f"bias_{k}": b for k, b in enumerate(policy.biases)}
+    interface = {f.name: getattr(policy.interface, f.name) for f in fields(Interface)}
+    own = {"format": FORMAT, "layout": np.array(LAYOUT), "mean": policy.mean, "std": policy.std}
+    return {**own, **layers, **interface}
+
+
+def load(path: str | Path) -> Policy:
+    """ValueError names what is wrong with a file: missing, damaged, or of another layout of observations."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            found = {name: file[name] for name in file.files}
+    except FileNotFoundError:
+        raise ValueError(f"{path}: there is no such file; `train` and `export` write it") from None
+    except Exception as error:  # what numpy and zipfile raise on damaged files is of many kinds
+        raise ValueError(f"{path} cannot be read: {error}") from None
+    if str(found.get("format")) != FORMAT:
+        raise ValueError(f"{path} is no policy: expected format {FORMAT!r}, got {str(found.get('format'))!r}")
+    if tuple(found["layout"].tolist()) != LAYOUT:
+        other = [name for name in found["layout"].tolist() if name not in LAYOUT] or ["another order"]
+        raise ValueError(f"{path} was trained on another observation: {', '.join(other[:3])}")
+    layers = range(sum(name.startswith("weight_") for name in found))
+    weights, biases = (tuple(found[f"{kind}_{k}"] for k in layers) for kind in ("weight", "bias"))
+    interface = {f.name: found[f.name] if found[f.name].ndim else float(found[f.name]) for f in fields(Interface)}
+    return Policy(found["mean"], found["std"], weights, biases, Interface(**interface))
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """What a robot says of itself at one instant.
+
+    time: s, any clock that runs on.  position: [7] rad, velocity: [7] rad/s, of the arm.  torque: [7] N m, or None.
+    fingers: [2] m, how far each stands from shut.  knob: [4, 4] pose of the knob in the robot's base frame, m: x the
+    door's inward normal, z up.
+    """
+
+    time: float
+    position: np.ndarray
+    velocity: np.ndarray
+    torque: np.ndarray | None
+    fingers: np.ndarray
+    knob: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Command:
+    """arm: [7] rad and fingers: [2] m, for position servos.  stopped: why the loop stopped, where it did."""
+
+    arm: np.ndarray
+    fingers: np.ndarray
+    stopped: str | None = None
+
+
+def pinch_pose(interface: Interface, position: np.ndarray) -> np.ndarray:
+    """[4, 4] the pinch point in the base frame at joint positions [7]."""
+    pose = interface.chain[0]
+    for angle, link in zip(position, interface.chain[1:], strict=True):
+        c, s = np.cos(angle), np.sin(angle)
+        pose = pose @ np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) @ link
+    return pose
+
+
+def observe(interface: Interface, reading: Reading) -> np.ndarray:
+    """[23] as `LAYOUT` says."""
+    hand = pinch_pose(interface, reading.position)
+    pads = interface.pads + reading.fingers[:, None] * interface.slides
+    points = np.vstack([hand[:3, 3], pads @ hand[:3, :3].T + hand[:3, 3]])
+    near = (points - reading.knob[:3, 3]) @ reading.knob[:3, :3]
+    return np.concatenate([reading.position, reading.velocity, near.reshape(-1)])
+
+
+@dataclass(frozen=True)
+class Safety:
+    """When the loop stops.
+
+    late: share of the period by which a reading may come late.  speed, effort: shares of the arm's limits that
+    measured velocities and torques may reach.  margin: rad that targets keep from the ends of the joints' ranges.
+    """
+
+    late: float = 0.5
+    speed: float = 1.0
+    effort: float = 1.1
+    margin: float = 0.02
+
+
+class Controller:
+    """The policy as a control loop: a reading in, a command out.
+
+    Targets stay inside the joints' ranges and so near to where the arm is that the servo's torque stays inside its
+    limits.  The loop stops, and from then on commands the pose at which it stopped, when a reading is stale, late, of
+    a wrong shape or no number, when a measured velocity or torque is beyond its limit, or when the hand leaves the
+    workspace; `stopped` says why.
+    """
+
+    def __init__(self, policy: Policy, safety: Safety | None = None):
+        self.policy, self.safety = policy, safety or Safety()
+        self.stopped: str | None = None
+        self._last: Command | None = None
+        self._pose: np.ndarray | None = None
+        self._time = -np.inf
+
+    def act(self, reading: Reading) -> Command:
+        """The command for the period that begins with this reading.
+
+        Raises ValueError where already the first reading is of no use: there is no pose to hold then.
+        """
+        if self.stopped is None:
+            self.stopped = fault(self.policy.interface, self.safety, reading, self._time)
+        if self.stopped is not None:
+            if self._last is None or self._pose is None:
+                raise ValueError(f"cannot begin: {self.stopped}")
+            return Command(self._pose, self._last.fingers, self.stopped)
+        position = np.asarray(reading.position, float)
+        action = np.clip(self.policy.act(observe(self.policy.interface, reading)), -1.0, 1.0)
+        self._last = limited(self.policy.interface, self.safety, position, action)
+        self._pose, self._time = position, reading.time
+        return self._last
+
+
+def limited(interface: Interface, safety: Safety, position: np.ndarray, action: np.ndarray) -> Command:
+    """The command of an action [9] at joint positions [7], inside torques and ranges."""
+    near = interface.effort / interface.stiffness
+    low, high = interface.ranges[:, 0] + safety.margin, interface.ranges[:, 1] - safety.margin
+    arm = np.clip(position + np.clip(interface.reach * action[:ARM], -near, near), low, high)
+    return Command(arm, 0.5 * interface.width * (1.0 + action[ARM:]))
+
+
+def fault(interface: Interface, safety: Safety, reading: Reading, before: float) -> str | None:
+    """What forbids going on from a reading, in words; before: time of the one before it, s."""
+    wrong = _unusable({"position": (reading.position, (ARM,)), "velocity": (reading.velocity, (ARM,)),
+                       "fingers": (reading.fingers, (FINGERS,)), "knob": (reading.knob, (4, 4)),
+                       **({} if reading.torque is None else {"torque": (reading.torque, (ARM,))})})  # fmt: skip
+    if wrong is not None:
+        return wrong
+    if not np.isfinite(reading.time) or reading.time <= before:
+        return f"stale reading: its time is {reading.time:g} s, that of the one before {before:g} s"
+    if reading.time - before > (1.0 + safety.late) * interface.period and np.isfinite(before):
+        return f"late: {1e3 * (reading.time - before):.0f} ms between readings, expected {1e3 * interface.period:.0f}"
+    fast = _beyond(reading.velocity, safety.speed * interface.speed, "rad/s")
+    if fast is not None:
+        return f"too fast: {fast}"
+    strained = None if reading.torque is None else _beyond(reading.torque, safety.effort * interface.effort, "N m")
+    if strained is not None:
+        return f"too much torque: {strained}"
+    point = pinch_pose(interface, reading.position)[:3, 3]
+    if (point < interface.workspace[0]).any() or (point > interface.workspace[1]).any():
+        return f"the hand has left its workspace: it is at ({', '.join(f'{x:.2f}' for x in point)}) m"
+    return None
+
+
+def _unusable(values: Mapping[str, tuple[Any, tuple[int, ...]]]) -> str | None:
+    for name, (value, shape) in values.items():
+        if np.shape(value) != shape:
+            return f"{name} must have shape {list(shape)}, got {list(np.shape(value))}"
+        if not np.isfinite(value).all():
+            return f"{name} holds a value that is no number"
+    return None
+
+
+def _beyond(values: np.ndarray, limits: np.ndarray, unit: str) -> str | None:
+    over = np.abs(values) > limits
+    if not over.any():
+        return None
+    joint = int(np.argmax(np.abs(values) / limits))
+    return f"joint {joint + 1} at {values[joint]:.3g} {unit}, limit {limits[joint]:.3g}"
+
+
+class Robot(Protocol):
+    """What `drive` asks of a robot."""
+
+    def read(self) -> Reading:
+        """The state of now."""
+        ...
+
+    def send(self, command: Command) -> None:
+        """Hand the targets to the servos."""
+        ...
+
+    def wait(self, period: float) -> None:
+        """Sleep until the next period begins, s."""
+        ...
+
+
+def drive(controller: Controller, robot: Robot, seconds: float) -> str | None:
+    """Let the policy drive a robot for so long, or until it stops; why it stopped, or None."""
+    for _ in range(round(seconds / controller.policy.interface.period)):
+        robot.send(controller.act(robot.read()))
+        if controller.stopped is not None:
+            break
+        robot.wait(controller.policy.interface.period)
+    return controller.stopped

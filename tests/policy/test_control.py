@@ -1,0 +1,202 @@
+"""The control loop: it sees what training saw, keeps to the limits, stops when it must, and needs numpy alone."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from droid_jax.model.door_scene import door_scene
+from droid_jax.policy import control
+from droid_jax.policy.control import ACTIONS, OBSERVED, Command, Controller, Interface, Policy, Reading, Safety, drive
+from droid_jax.policy.door_env import start_pose
+from droid_jax.policy.hand import hand_of, looked
+from droid_jax.policy.interface import interface_of
+from droid_jax.policy.network import save_policy
+from droid_jax.policy.task import Task
+from droid_jax.policy.task import command as asked
+from droid_jax.policy.task import observation as trained_on
+
+TASK = Task()
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return door_scene(limits=True)
+
+
+@pytest.fixture(scope="module")
+def start(scene) -> np.ndarray:
+    return start_pose(scene, TASK)
+
+
+@pytest.fixture(scope="module")
+def interface(scene, start) -> Interface:
+    return interface_of(scene, TASK, start)
+
+
+@pytest.fixture(scope="module")
+def policy(interface) -> Policy:
+    rng = np.random.default_rng(0)
+    weights = (0.3 * rng.normal(size=(OBSERVED, 16)), 0.3 * rng.normal(size=(16, 2 * ACTIONS)))
+    return Policy(np.zeros(OBSERVED), np.ones(OBSERVED), weights, (np.zeros(16), np.zeros(2 * ACTIONS)), interface)
+
+
+def state(scene, start, rng: np.random.Generator) -> mujoco.MjData:
+    data = mujoco.MjData(scene.model)
+    data.qpos[:] = start
+    data.qpos[scene.joint_qpos] += rng.normal(0, 0.3, 7)
+    data.qpos[[scene.qpos(f"panda_finger_joint{i}") for i in (1, 2)]] = rng.uniform(0, 0.04, 2)
+    data.qpos[scene.qpos("hinge")] = rng.uniform(0, 1)
+    data.qvel[scene.joint_dofs] = rng.normal(0, 0.3, 7)
+    mujoco.mj_forward(scene.model, data)
+    return data
+
+
+def reading(scene, data: mujoco.MjData, time: float = 0.0) -> Reading:
+    knob = np.eye(4)
+    site = scene.id("site", "knob")
+    knob[:3, :3], knob[:3, 3] = data.site_xmat[site].reshape(3, 3), data.site_xpos[site]
+    fingers = data.qpos[[scene.qpos(f"panda_finger_joint{i}") for i in (1, 2)]].copy()
+    position, velocity = data.qpos[scene.joint_qpos].copy(), data.qvel[scene.joint_dofs].copy()
+    return Reading(time, position, velocity, np.zeros(7), fingers, knob)
+
+
+@pytest.fixture
+def still(scene, start) -> Reading:
+    data = mujoco.MjData(scene.model)
+    data.qpos[:] = start
+    mujoco.mj_forward(scene.model, data)
+    return reading(scene, data)
+
+
+def test_it_sees_what_training_saw(scene, start, interface):
+    """Own kinematics of numpy against MuJoCo's, at random poses of arm, fingers and door."""
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        data = state(scene, start, rng)
+        seen = looked(hand_of(scene), data, np.zeros(2), np.zeros((2, 3)), 1.0, np)
+        expected = trained_on(data.qpos[scene.joint_qpos], data.qvel[scene.joint_dofs], seen, np)
+        np.testing.assert_allclose(control.observe(interface, reading(scene, data)), expected, atol=1e-9)
+
+
+def test_inside_all_limits_it_commands_what_training_did(interface):
+    rng = np.random.default_rng(2)
+    gentle = replace(interface, effort=np.full(7, np.inf), ranges=np.tile([-np.inf, np.inf], (7, 1)))
+    for _ in range(20):
+        position, action = rng.normal(size=7), rng.uniform(-1, 1, 9)
+        found = control.limited(gentle, Safety(), position, action)
+        np.testing.assert_allclose(np.append(found.arm, found.fingers), asked(TASK, position, action, np), atol=1e-6)
+
+
+def test_targets_keep_inside_torques_and_ranges(interface):
+    rng = np.random.default_rng(3)
+    low, high = interface.ranges.T
+    for _ in range(200):
+        position = rng.uniform(low, high)
+        found = control.limited(interface, Safety(), position, rng.choice([-1.0, 1.0], 9))
+        inside = (found.arm >= low + 0.02 - 1e-12) & (found.arm <= high - 0.02 + 1e-12)
+        assert inside.all() and ((found.fingers == 0) | (found.fingers == 0.04)).all()
+        free = (position > low + 0.2) & (position < high - 0.2)
+        torque = interface.stiffness * np.abs(found.arm - position)
+        assert (torque[free] <= interface.effort[free] + 1e-9).all()
+        assert torque[4] <= 12.0 + 1e-9 or not free[4]
+
+
+def test_a_good_reading_is_acted_on(policy, still):
+    loop = Controller(policy)
+    first = loop.act(still)
+    second = loop.act(replace(still, time=0.02))
+    assert loop.stopped is None and second.stopped is None
+    np.testing.assert_array_equal(first.arm, second.arm)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "why"),
+    [
+        (lambda r: replace(r, time=0.0), "stale reading"),
+        (lambda r: replace(r, time=np.nan), "stale reading"),
+        (lambda r: replace(r, time=0.1), "late: 100 ms between readings, expected 20"),
+        (lambda r: replace(r, position=np.full(7, np.nan)), "position holds a value that is no number"),
+        (lambda r: replace(r, knob=np.full((4, 4), np.inf)), "knob holds a value that is no number"),
+        (lambda r: replace(r, velocity=np.zeros(6)), r"velocity must have shape \[7\], got \[6\]"),
+        (lambda r: replace(r, velocity=np.array([0, 0, 0, 0, 2.7, 0, 0])), "too fast: joint 5 at 2.7 rad/s, limit 2.61"),
+        (lambda r: replace(r, torque=np.array([0, 99, 0, 0, 0, 0, 0])), "too much torque: joint 2 at 99 N m"),
+        (lambda r: replace(r, position=r.position + 1.0), "the hand has left its workspace"),
+    ],
+)  # fmt: skip
+def test_it_stops_and_holds_the_pose(policy, still, spoil, why: str):
+    loop = Controller(policy)
+    before = loop.act(still)
+    bad = loop.act(spoil(replace(still, time=0.02)))
+    assert bad.stopped is not None and loop.stopped == bad.stopped
+    with pytest.raises(AssertionError, match=why):
+        raise AssertionError(bad.stopped)
+    np.testing.assert_array_equal(bad.arm, still.position)
+    np.testing.assert_array_equal(bad.fingers, before.fingers)
+    again = loop.act(replace(still, time=0.04))
+    assert again.stopped == bad.stopped
+    np.testing.assert_array_equal(again.arm, still.position)
+
+
+def test_there_is_no_beginning_from_a_bad_reading(policy, still):
+    with pytest.raises(ValueError, match="cannot begin: position holds a value that is no number"):
+        Controller(policy).act(replace(still, position=np.full(7, np.nan)))
+
+
+def test_a_robot_without_torque_sensors_is_fine(policy, still):
+    assert Controller(policy).act(replace(still, torque=None)).stopped is None
+
+
+class Arm:
+    """A robot that stands still, whose clock fails after some readings."""
+
+    def __init__(self, reading: Reading, good: int):
+        self.reading, self.good, self.time, self.sent = reading, good, 0.0, list[Command]()
+
+    def read(self) -> Reading:
+        return replace(self.reading, time=min(self.time, self.good * 0.02))
+
+    def send(self, command: Command) -> None:
+        self.sent.append(command)
+
+    def wait(self, period: float) -> None:
+        self.time += period
+
+
+def test_driving_ends_with_the_time_or_with_a_stop(policy, still):
+    arm = Arm(still, 1000)
+    assert drive(Controller(policy), arm, 0.2) is None and len(arm.sent) == 10
+    arm = Arm(still, 4)
+    assert "stale" in str(drive(Controller(policy), arm, 0.2)) and len(arm.sent) == 6
+    assert arm.sent[-1].stopped is not None
+
+
+def test_numpy_is_all_it_needs(policy, still, tmp_path: Path):
+    """A copy of the file beside a policy, in a Python that is refused everything but numpy."""
+    save_policy(tmp_path / "policy.npz", policy)
+    (tmp_path / "control.py").write_text(Path(control.__file__).read_text())
+    np.savez(tmp_path / "reading.npz", position=still.position, fingers=still.fingers, knob=still.knob)
+    script = """
+import sys
+class Refuse:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("jax", "jaxlib", "mujoco", "droid_jax", "scipy", "brax", "flax"):
+            raise ImportError(name)
+sys.meta_path.insert(0, Refuse())
+import numpy as np, control
+r = np.load("reading.npz")
+loop = control.Controller(control.load("policy.npz"))
+out = loop.act(control.Reading(0.0, r["position"], np.zeros(7), None, r["fingers"], r["knob"]))
+print(",".join(repr(float(x)) for x in (*out.arm, *out.fingers)))
+"""
+    run = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=True)
+    expected = Controller(policy).act(replace(still, torque=None))
+    np.testing.assert_allclose(
+        [float(x) for x in run.stdout.split(",")], [*expected.arm, *expected.fingers], atol=1e-12
+    )
