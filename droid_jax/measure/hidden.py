@@ -142,7 +142,7 @@ def influences(stand_in: StandIn, applied: Sequence[Applied], repeat: int) -> li
     period = float(clock[-1] - clock[0]) + PAUSE
     return [
         HIDDEN[a.name].make(
-            Place(scene, (a.joint,) if a.joint else scene.joints, stand_in.nominal, repeat, period), a.amplitude
+            Place(scene, (a.joint,) if a.joint else scene.joints, repeat, period), a.amplitude
         )
         for a in applied
     ]

@@ -67,16 +67,21 @@ def _steiner(offset: np.ndarray) -> np.ndarray:
 
 
 def cable_pull(place: Place, a: float) -> Influence:
-    """-a sinh(2 (q - q_start)) / sinh(2): a dress pack that hangs slack, then pulls; a in N m at 1 rad."""
+    """-a sinh(2 (q - q_rest)) / sinh(2): a dress pack that hangs slack, then pulls; a in N m at 1 rad.
+
+    It hangs slack in the middle of the joint's range, wherever a motion begins.
+    """
+    model = place.scene.model
+    rest = model.jnt_range[[place.scene.id("joint", name) for name in place.joints]].mean(axis=1)
 
     def step(live: Live) -> None:
-        live.applied[place.dofs] += cable(a, live.position[place.qpos] - place.start[place.qpos])
+        live.applied[place.dofs] += cable(a, live.position[place.qpos] - rest)
 
     return Influence(step=step)
 
 
 def cable(a: float, turned: np.ndarray) -> np.ndarray:
-    """The cable's torque in N m at an angle turned from the start, rad."""
+    """The cable's torque in N m at an angle turned from where it hangs slack, rad."""
     return -a * np.sinh(2.0 * turned) / np.sinh(2.0)
 
 

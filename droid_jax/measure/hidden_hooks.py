@@ -22,14 +22,12 @@ from droid_jax.model.scene import Scene
 class Place:
     """What one effect acts on in one repeat.
 
-    scene: the instrumented scene.  joints: what a joint effect acts on.  start: [nq] the start
-    pose without its error.  repeat: counts from 0.  period: s from the start of a repeat to that
-    of the next one, pause included.
+    scene: the instrumented scene.  joints: what a joint effect acts on.  repeat: counts from 0.
+    period: s from the start of a repeat to that of the next one, pause included.
     """
 
     scene: Scene
     joints: tuple[str, ...]
-    start: np.ndarray
     repeat: int = 0
     period: float = 0.0
 

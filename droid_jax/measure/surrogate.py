@@ -63,7 +63,7 @@ class StandIn:
 
     demonstration, truth, config, seed: as given to `record`.
     scene: instrumented, at the stand-in's own time step and integrator.
-    models: [N], qpos0: [N, nq], each repeat with its own small errors; nominal: [nq] without them.
+    models: [N], qpos0: [N, nq], each repeat with its own small errors.
     clock: [T] s and control: [T, U] at the stand-in's own time step.
     rng: what is left of the recording's randomness, for the sensors.
     """
@@ -75,7 +75,6 @@ class StandIn:
     scene: Scene
     models: list[mujoco.MjModel]
     qpos0: np.ndarray
-    nominal: np.ndarray
     clock: np.ndarray
     control: np.ndarray
     rng: np.random.Generator
@@ -131,7 +130,7 @@ def set_up(
     nominal = hidden.initial_qpos(dict(demonstration.qpos0))
     models, qpos0 = _repeats(hidden, truth, nominal, config, rng, space)
     clock, control = _control(hidden, demonstration, config.timestep, truth.get("time_offset", 0.0))
-    return StandIn(demonstration, truth, config, seed, hidden, models, qpos0, nominal, clock, control, rng)
+    return StandIn(demonstration, truth, config, seed, hidden, models, qpos0, clock, control, rng)
 
 
 def as_recording(

@@ -89,7 +89,7 @@ def transfer(
     task, config = task or Task(), config or TransferConfig()
     if abs(policy.interface.period - task.control) > 1e-9:
         raise ValueError(f"the policy acts every {policy.interface.period:g} s, the task asks every {task.control:g} s")
-    unfit = [a.name for a in hidden if _acts_on_traces(scene, start, a)]
+    unfit = [a.name for a in hidden if _acts_on_traces(scene, a)]
     if unfit:
         raise ValueError(
             f"hidden effects {', '.join(unfit)} change whole traces, which a closed loop does not have yet"
@@ -118,7 +118,7 @@ def _trial(
     rng: np.random.Generator,
 ) -> tuple[bool, float, int, float, str]:
     """Success, largest angle, actions, share of them with the grip on, why the loop stopped."""
-    influences = [_influence(stand_in, start, a) for a in hidden]
+    influences = [_influence(stand_in, a) for a in hidden]
     model, hand, joints = edited(stand_in.model, influences), hand_of(stand_in), stand_in.joint_qpos
     data = mujoco.MjData(model)
     data.qpos[:] = start
@@ -189,11 +189,11 @@ def _stepper(model: mujoco.MjModel, data: mujoco.MjData, influences: Sequence[In
     return influenced if each else plain
 
 
-def _influence(scene: Scene, start: np.ndarray, one: Applied) -> Influence:
+def _influence(scene: Scene, one: Applied) -> Influence:
     joints = (one.joint,) if one.joint else scene.joints
-    return HIDDEN[one.name].make(Place(scene, joints, start), one.amplitude)
+    return HIDDEN[one.name].make(Place(scene, joints), one.amplitude)
 
 
-def _acts_on_traces(scene: Scene, start: np.ndarray, one: Applied) -> bool:
-    found = _influence(scene, start, one)
+def _acts_on_traces(scene: Scene, one: Applied) -> bool:
+    found = _influence(scene, one)
     return found.command is not None or found.sense is not None

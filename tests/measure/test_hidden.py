@@ -110,7 +110,7 @@ def live_at(scene: Scene, q: Sequence[float] = (0, 0, 0), v: Sequence[float] = (
 
 
 def made(scene: Scene, name: str, amplitude: float, joints: Sequence[str] | None = None, repeat: int = 0) -> Influence:
-    place = Place(scene, tuple(joints or scene.joints), np.array([0.0, 0.4, 0.0]), repeat, 10.0)
+    place = Place(scene, tuple(joints or scene.joints), repeat, 10.0)
     return HIDDEN[name].make(place, amplitude)
 
 
@@ -460,8 +460,14 @@ def test_cable_ripple_and_twist_by_hand(scene: Scene):
     np.testing.assert_allclose(
         hidden_arm.cable(3.0, np.array([0.0, 1.0, -0.5])), [0, -3, 3 * (math.e - 1 / math.e) / (math.e**2 - math.e**-2)]
     )
-    applied, _, _ = stepped(made(scene, "cable_pull", 3.0, ARM), live_at(scene, (0.5, 1.4, 0.0)))
+    applied, _, _ = stepped(made(scene, "cable_pull", 3.0, ARM), live_at(scene, (0.5, 1.0, 0.0)))
     np.testing.assert_allclose(applied, [0, -3, 0], atol=1e-12)
+    panda, (low, high) = door_scene(), (-3.0718, -0.0698)  # joint 4
+    place = Place(replace(panda, model=instrument(panda)), ("panda_joint4",))
+    live = Live.of(place.scene.model, mujoco.MjData(place.scene.model))
+    live.data.qpos[place.qpos] = (low + high) / 2 - 1.0
+    applied, _, _ = stepped(HIDDEN["cable_pull"].make(place, 3.0), live)
+    assert applied[place.dofs[0]] == pytest.approx(3.0) and np.count_nonzero(applied) == 1
     q = np.array([-0.4 / 18, 0.3])
     expected = [0.7 * math.sin(1.9 - 0.4 * 44 / 18), 2 * (math.sin(5.8) + 0.35 * math.sin(15.1))]
     np.testing.assert_allclose(hidden_arm.ripple(2.0, q), expected)

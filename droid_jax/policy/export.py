@@ -1,0 +1,105 @@
+"""A policy to take along: npz, ONNX and the control loop in one folder."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from droid_jax.policy import control
+from droid_jax.policy.control import ACTIONS, ARM, LAYOUT, OBSERVED, Policy
+from droid_jax.policy.network import save_policy
+from droid_jax.storage import write_bytes
+
+OPSET = 17
+CLOSE = 2e-5  # largest difference of an action, of -1 .. 1, between float32 programs
+OUTPUTS = (
+    *(f"target of joint {i}, in units of reach from where the joint is" for i in range(1, ARM + 1)),
+    *(f"target of the {side} finger, -1 shut, 1 open" for side in ("left", "right")),
+)
+
+
+def export(folder: Path, policy: Policy) -> float:
+    """Write policy.npz, policy.onnx and control.py; the largest difference of an action between ONNX and JAX.
+
+    Raises ValueError where onnx or onnxruntime is not installed, or the two differ by more than `CLOSE`.
+    """
+    missing = [name for name in ("onnx", "onnxruntime") if importlib.util.find_spec(name) is None]
+    if missing:
+        raise ValueError(f"export needs {' and '.join(missing)}: pip install 'droid_jax[export]'")
+    model = to_onnx(policy)
+    apart = difference(policy, model)
+    if not apart <= CLOSE:
+        raise ValueError(f"the ONNX policy differs from the JAX policy by {apart:.2g} in an action: it is not written")
+    folder.mkdir(parents=True, exist_ok=True)
+    save_policy(folder / "policy.npz", policy)
+    write_bytes(folder / "policy.onnx", model)
+    shutil.copyfile(control.__file__, folder / "control.py")
+    return apart
+
+
+def to_onnx(policy: Policy) -> bytes:
+    """observation [N, 23] float32 -> action [N, 9] in -1 .. 1, the normalisation included.
+
+    The file's metadata say what the numbers mean, the period in s, reach in rad and width in m.
+    """
+    import onnx
+    from onnx import TensorProto, helper, numpy_helper
+
+    nodes, constants = [], []
+
+    def constant(name: str, value: np.ndarray) -> str:
+        constants.append(numpy_helper.from_array(value, name))
+        return name
+
+    def node(kind: str, name: str, *inputs: str) -> str:
+        nodes.append(helper.make_node(kind, list(inputs), [name]))
+        return name
+
+    x = node("Sub", "centred", "observation", constant("mean", np.float32(policy.mean)))
+    x = node("Div", "normalised", x, constant("std", np.float32(policy.std)))
+    last = len(policy.weights) - 1
+    for k, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
+        kept = slice(ACTIONS) if k == last else slice(None)  # the widths of the actions are training's business
+        weight, bias = np.float32(weight[:, kept]), np.float32(bias[kept])
+        x = node("Gemm", f"layer_{k}", x, constant(f"weight_{k}", weight), constant(f"bias_{k}", bias))
+        x = node("Tanh", "action" if k == last else f"hidden_{k}", x)
+    ends = [
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["N", size])
+        for name, size in (("observation", OBSERVED), ("action", ACTIONS))
+    ]
+    graph = helper.make_graph(nodes, "policy", ends[:1], ends[1:], constants)
+    opset = helper.make_opsetid("", OPSET)
+    model = helper.make_model(graph, producer_name="droid_jax", opset_imports=[opset], ir_version=9)
+    helper.set_model_props(model, _notes(policy))
+    onnx.checker.check_model(model)
+    return model.SerializeToString()
+
+
+def _notes(policy: Policy) -> dict[str, str]:
+    numbers: dict[str, Any] = {"period, s": policy.interface.period, "reach, rad": policy.interface.reach,
+                               "width, m": policy.interface.width}  # fmt: skip
+    return {
+        "observation": json.dumps(LAYOUT),
+        "action": json.dumps(OUTPUTS),
+        **{name: repr(float(value)) for name, value in numbers.items()},
+    }
+
+
+def difference(policy: Policy, model: bytes, count: int = 1000, seed: int = 0) -> float:
+    """Largest difference of an action between the ONNX policy and the JAX policy, over random observations."""
+    import onnxruntime
+
+    rng = np.random.default_rng(seed)
+    observations = np.float32(policy.mean + 2.0 * policy.std * rng.normal(size=(count, OBSERVED)))
+    session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
+    found: Any = session.run(["action"], {"observation": observations})[0]
+    with jax.default_matmul_precision("highest"):
+        expected = policy.act(jnp.asarray(observations), jnp)
+    return float(np.max(np.abs(found - np.asarray(expected))))
