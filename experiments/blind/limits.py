@@ -30,9 +30,12 @@ from experiments.blind.scenes import Setting
 SIGNIFICANT, POWER = 0.01, 0.5
 DRAWS = 60
 LOWEST, HALVINGS = 1e-5, 9  # of the largest amplitude; halvings of the logarithm
-RECORDED = 3  # times an effect is recorded at most, each time nearer to its limit
-TYPICAL = 3.0  # times the limit: where an effect is compared with its library form
-NEAR = 2.0  # of the limit: within this factor an effect counts as proportional to its amplitude
+RECORDED = 3  # times an effect is recorded at most
+# Times the limit: where an effect is recorded, and compared with its library form.  At the limit itself fingers that
+# stick a little earlier or later would count as the effect: of wrong servo gains, which the base model absorbs, a sixth
+# seemed to be left, and cases of ten times such a limit held nothing that could be seen.
+TYPICAL = 3.0
+NEAR = 2.0  # within this factor of that size an effect counts as proportional to its amplitude
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,9 +92,10 @@ def limit_of(where: Ground, power: Power, forms: Forms, effect: Applied) -> dict
     for _ in range(RECORDED):
         added = where.hidden(replace(effect, amplitude=size))
         limit = power.limit(added, largest)
-        if limit is None or max(limit / size, size / limit) <= NEAR:
+        wanted = largest if limit is None else min(TYPICAL * limit, largest)
+        if max(wanted / size, size / wanted) <= NEAR:
             break
-        size = limit
+        size = wanted
     common = added.mean(axis=0)
     _, free = where.left(TYPICAL * (limit or largest) * common)
     return {"limit": limit, "unit": hidden.unit, "recorded_at": size, **forms.of(effect, common, free)}
