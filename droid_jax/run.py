@@ -12,12 +12,24 @@ from typing import Any
 
 import tyro
 
-from droid_jax.commands import convert, gap, identify, record, report
+from droid_jax.commands import convert, evaluate, export, gap, identify, record, report, train
 
-Command = identify.Identify | gap.Gap | record.Record | convert.Convert | report.Report
+Command = (
+    identify.Identify
+    | gap.Gap
+    | train.Train
+    | evaluate.Evaluate
+    | export.Export
+    | record.Record
+    | convert.Convert
+    | report.Report
+)
 _ACTIONS: dict[type, Callable[[Any], None]] = {
     identify.Identify: identify.run,
     gap.Gap: gap.run,
+    train.Train: train.run,
+    evaluate.Evaluate: evaluate.run,
+    export.Export: export.run,
     record.Record: record.run,
     convert.Convert: convert.run,
     report.Report: report.run,

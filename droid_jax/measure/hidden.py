@@ -69,7 +69,7 @@ def record_hidden(
     config = config or SurrogateConfig(timestep=LONGEST_STEP)
     if config.timestep > LONGEST_STEP * (1 + 1e-9):
         raise ValueError(f"hidden effects need time steps of at most {LONGEST_STEP} s, got {config.timestep}")
-    applied = _listed(effects)
+    applied = listed(effects)
     for one in applied:
         _check(one, scene)
     stand_in = set_up(scene, demonstration, truth, seed=seed, config=config, space=space)
@@ -82,7 +82,8 @@ def record_hidden(
     return as_recording(stand_in, trace, torque, position, name=name)
 
 
-def _listed(effects: Mapping[str, float] | Sequence[Applied]) -> list[Applied]:
+def listed(effects: Mapping[str, float] | Sequence[Applied]) -> list[Applied]:
+    """Amplitudes by name or by "name[joint]" as effects at work; a list of these as it is."""
     if not isinstance(effects, Mapping):
         return list(effects)
     found = []
@@ -141,9 +142,7 @@ def influences(stand_in: StandIn, applied: Sequence[Applied], repeat: int) -> li
     scene, clock = stand_in.scene, stand_in.clock
     period = float(clock[-1] - clock[0]) + PAUSE
     return [
-        HIDDEN[a.name].make(
-            Place(scene, (a.joint,) if a.joint else scene.joints, repeat, period), a.amplitude
-        )
+        HIDDEN[a.name].make(Place(scene, (a.joint,) if a.joint else scene.joints, repeat, period), a.amplitude)
         for a in applied
     ]
 

@@ -85,7 +85,7 @@ def arrays(policy: Policy) -> dict[str, Any]:
     """The content of a policy's npz file: mean, std, weight_0, bias_0, ..., the interface, the layout in words."""
     layers = {f"weight_{k}": w for k, w in enumerate(policy.weights)}
     layers |= {f"bias_{k}": b for k, b in enumerate(policy.biases)}
-    interface = {f.name: getattr(policy.interface, f.name) for f in fields(Interface)}
+    interface: Any = {f.name: getattr(policy.interface, f.name) for f in fields(Interface)}
     own = {"format": FORMAT, "layout": np.array(LAYOUT), "mean": policy.mean, "std": policy.std}
     return {**own, **layers, **interface}
 
@@ -106,7 +106,7 @@ def load(path: str | Path) -> Policy:
         raise ValueError(f"{path} was trained on another observation: {', '.join(other[:3])}")
     layers = range(sum(name.startswith("weight_") for name in found))
     weights, biases = (tuple(found[f"{kind}_{k}"] for k in layers) for kind in ("weight", "bias"))
-    interface = {f.name: found[f.name] if found[f.name].ndim else float(found[f.name]) for f in fields(Interface)}
+    interface: Any = {f.name: found[f.name] if found[f.name].ndim else float(found[f.name]) for f in fields(Interface)}
     return Policy(found["mean"], found["std"], weights, biases, Interface(**interface))
 
 

@@ -105,7 +105,8 @@ class DoorEnv(Env):
     def step(self, state: EnvState, action: jax.Array) -> EnvState:
         """One action: `Task.control` seconds of simulation.
 
-        An episode ends with success, or where the simulation is no longer a number (counted in `blown_up`).
+        An episode ends early where the simulation is no longer a number (counted in `blown_up`), and not with success:
+        an end is an end of rewards, and a policy would wait in front of it.  `success` is 1 in the step that earns it.
         """
         carried: Any = state.pipeline_state
         before: World = carried
@@ -118,7 +119,7 @@ class DoorEnv(Env):
         seen = self._look(self.sys.model, world, force)
         held = holding(self.task, seen, before.held)
         world = world._replace(pads=seen.pads, held=held, longest=jnp.maximum(before.longest, held))
-        success = succeeded(self.task, world.longest)
+        success = succeeded(self.task, world.longest) & ~succeeded(self.task, before.longest)
         metrics = {
             "success": success,
             "angle": seen.angle,
@@ -130,7 +131,7 @@ class DoorEnv(Env):
             pipeline_state=world,
             obs=self._observe(world, seen),
             reward=jnp.where(finite, reward(self.task, seen), 0.0),
-            done=(success | ~finite).astype(jnp.float32),
+            done=(~finite).astype(jnp.float32),
             metrics=state.metrics | {name: jnp.asarray(value, jnp.float32) for name, value in metrics.items()},
         )
 

@@ -55,20 +55,20 @@ def to_onnx(policy: Policy) -> bytes:
     nodes, constants = [], []
 
     def constant(name: str, value: np.ndarray) -> str:
-        constants.append(numpy_helper.from_array(value, name))
+        constants.append(numpy_helper.from_array(value.astype(np.float32), name))
         return name
 
     def node(kind: str, name: str, *inputs: str) -> str:
         nodes.append(helper.make_node(kind, list(inputs), [name]))
         return name
 
-    x = node("Sub", "centred", "observation", constant("mean", np.float32(policy.mean)))
-    x = node("Div", "normalised", x, constant("std", np.float32(policy.std)))
+    x = node("Sub", "centred", "observation", constant("mean", policy.mean))
+    x = node("Div", "normalised", x, constant("std", policy.std))
     last = len(policy.weights) - 1
     for k, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
         kept = slice(ACTIONS) if k == last else slice(None)  # the widths of the actions are training's business
-        weight, bias = np.float32(weight[:, kept]), np.float32(bias[kept])
-        x = node("Gemm", f"layer_{k}", x, constant(f"weight_{k}", weight), constant(f"bias_{k}", bias))
+        inputs = constant(f"weight_{k}", weight[:, kept]), constant(f"bias_{k}", bias[kept])
+        x = node("Gemm", f"layer_{k}", x, *inputs)
         x = node("Tanh", "action" if k == last else f"hidden_{k}", x)
     ends = [
         helper.make_tensor_value_info(name, TensorProto.FLOAT, ["N", size])

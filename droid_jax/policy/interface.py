@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import mujoco
 import numpy as np
 
@@ -42,7 +44,7 @@ def interface_of(scene: Scene, task: Task, start: np.ndarray, plan: Plan = PLANS
         stiffness=stiffness,
         damping=model.dof_damping[arm].copy(),
         workspace=_workspace(scene, hand, start, plan),
-        chain=np.array([np.linalg.inv(a) @ b for a, b in zip(links[:-1], links[1:], strict=True)]),
+        chain=np.array([np.linalg.inv(a) @ b for a, b in itertools.pairwise(links)]),
         pads=shut,
         slides=slides,
         start=start[[*scene.joint_qpos, *fingers]],

@@ -21,11 +21,13 @@ class Task:
 
     control: s between actions; steps: actions at most.  opened: rad, from which the door counts as open.
     held: s at `opened` or beyond with the grip on that make a success.
-    force: N on each finger, and yaw: rad of the hand against the door, that make a grip.
+    force: N on each finger, yaw: rad of the hand against the door, and along: m of each pad from the knob's middle
+    along its axis, that make a grip.
     reach: rad by which an action of one moves a joint's target from where the joint is; width: m, finger command
     of an action of one (of minus one: shut).
     door, orientation, distance, log_distance, slip: weights of the reward's terms; near: m, where the
-    logarithm of the distance flattens.
+    logarithm of the distance flattens; grip: worth of two fingers that press the knob of a shut door, as a share
+    of opening it.
     spread: rad, deviation of the joints' start pose; standoff: m, hand in front of the knob at the start.
     """
 
@@ -35,6 +37,7 @@ class Task:
     held: float = 0.5
     force: float = 1.0
     yaw: float = float(np.deg2rad(20.0))
+    along: float = 0.012
     reach: float = 0.1
     width: float = 0.04
     door: float = 2.0
@@ -43,6 +46,7 @@ class Task:
     log_distance: float = 0.1
     slip: float = 0.2
     near: float = 0.01
+    grip: float = 0.25
     spread: float = 0.02
     standoff: float = 0.05
 
@@ -66,23 +70,27 @@ class Seen(NamedTuple):
 
 
 def gripped(task: Task, seen: Seen) -> Any:
-    """[] bool: both fingers press and the hand faces the door.
+    """[] bool: both fingers press on the knob's middle, and the hand faces the door.
 
-    A finger that hooks the knob from the side presses alone, or needs the hand turned.
+    A finger that hooks the knob from the side presses alone, or needs the hand turned; two that close behind its
+    round end, where the door would be in their way, are off its middle.
     """
-    return (seen.force >= task.force).all() & (abs(seen.yaw) <= task.yaw)
+    return (seen.force >= task.force).all() & (abs(seen.pads[:, 0]) <= task.along).all() & (abs(seen.yaw) <= task.yaw)
 
 
 def terms(task: Task, seen: Seen) -> dict[str, Any]:
     """The five terms of equation 4, unweighted: door, orientation, distance, log_distance, slip.
 
-    The door's opening counts while the knob is gripped; distances count below `opened` only.
+    The door's opening counts while the knob is gripped, and each finger that presses a little: without that, training
+    ends with open fingers around the knob.  Distances count below `opened` only.
     """
     distance = jnp.linalg.norm(seen.pinch)
     grip = gripped(task, seen)
+    pressing = jnp.mean((seen.force >= task.force) & (jnp.abs(seen.pads[:, 0]) <= task.along))
+    pressing *= jnp.abs(seen.yaw) <= task.yaw
     shut = seen.angle < task.opened
     return {
-        "door": jnp.where(grip, jnp.clip(seen.angle / task.opened, 0.0, 2.0), 0.0),
+        "door": task.grip * pressing + jnp.where(grip, jnp.clip(seen.angle / task.opened, 0.0, 2.0), 0.0),
         "orientation": seen.normal - jnp.abs(seen.yaw),
         "distance": jnp.where(shut, -distance, 0.0),
         "log_distance": jnp.where(shut, -jnp.log(distance + task.near), 0.0),

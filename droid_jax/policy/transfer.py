@@ -15,9 +15,8 @@ from typing import Any
 
 import mujoco
 import numpy as np
-import scipy.stats
 
-from droid_jax.measure.hidden import HIDDEN, Applied
+from droid_jax.measure.hidden import HIDDEN, LONGEST_STEP, Applied
 from droid_jax.measure.hidden_hooks import Influence, Live, Place, edited
 from droid_jax.measure.surrogate import own_engine
 from droid_jax.model.door import door_nuisances, door_space
@@ -26,14 +25,16 @@ from droid_jax.model.scene import Scene
 from droid_jax.policy.control import Controller, Policy, Reading
 from droid_jax.policy.hand import finger_forces_c, hand_of, looked
 from droid_jax.policy.task import Task, gripped, holding, succeeded
+from droid_jax.policy.trials import Trials
 
 
 @dataclass(frozen=True)
 class TransferConfig:
     """How the stand-in robot differs from what the policy was trained on, beside its hidden values.
 
-    trials.  timestep: s, of the Euler integrator.  position_noise, velocity_noise: rad, rad/s of the joints' sensors;
-    knob_noise: m, of the camera's sight of the knob, drawn once for each trial and axis.  seed.
+    trials.  timestep: s, of the Euler integrator; hidden effects shorten it where they must.
+    position_noise, velocity_noise: rad, rad/s of the joints' sensors; knob_noise: m, of the camera's sight of the
+    knob, drawn once for each trial and axis.  seed.
     """
 
     trials: int = 100
@@ -45,112 +46,111 @@ class TransferConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class Transfer:
-    """What came of the trials.
+class StandIn:
+    """The stand-in robot before a trial; `stand_in` makes it.
 
-    success: [N] bool.  angle: [N] rad, the largest; steps: [N] actions until success, or all there were;
-    grip: [N] share of actions with the knob gripped.  stopped: [N] why the control loop stopped, "" where it did not.
+    scene: with the hidden values, at the robot's own time step, integrator and solver effort.  start: [nq].
+    hidden: effects, as of the blind suite.
     """
 
-    success: np.ndarray
-    angle: np.ndarray
-    steps: np.ndarray
-    grip: np.ndarray
-    stopped: np.ndarray
-
-    @property
-    def rate(self) -> float:
-        """Share of trials that succeeded."""
-        return float(np.mean(self.success))
-
-    def interval(self, level: float = 0.95) -> tuple[float, float]:
-        """Of the success rate.  Wilson, JASA 1927."""
-        count = scipy.stats.binomtest(int(np.sum(self.success)), len(self.success))
-        span = count.proportion_ci(level, method="wilson")
-        return float(span.low), float(span.high)
+    scene: Scene
+    start: np.ndarray
+    hidden: tuple[Applied, ...]
+    task: Task
+    config: TransferConfig
 
 
-def transfer(
-    policy: Policy,
+def stand_in(
     scene: Scene,
     start: np.ndarray,
     truth: Mapping[str, float],
     hidden: Sequence[Applied] = (),
     task: Task | None = None,
     config: TransferConfig | None = None,
-) -> Transfer:
-    """Trials of a policy on the stand-in robot.
+) -> StandIn:
+    """A robot with hidden values and effects.
 
     start: [nq] as in training (`DoorEnv.start`), off by `Task.spread` in every trial.  truth: hidden values, of the
-    door space and its nuisances.  hidden: effects as of the blind suite.
+    door space and its nuisances; what it leaves out is at its prior's mean.
     Raises ValueError for hidden effects that act on commands or sensors as whole traces: in a closed loop there are
-    none yet; and for a policy that acts at another rate than the task's.
+    none yet.
     """
     task, config = task or Task(), config or TransferConfig()
-    if abs(policy.interface.period - task.control) > 1e-9:
-        raise ValueError(f"the policy acts every {policy.interface.period:g} s, the task asks every {task.control:g} s")
     unfit = [a.name for a in hidden if _acts_on_traces(scene, a)]
     if unfit:
         raise ValueError(
             f"hidden effects {', '.join(unfit)} change whole traces, which a closed loop does not have yet"
         )
-    stand_in = robot(scene, truth, config.timestep)
-    rngs = np.random.default_rng(config.seed).spawn(config.trials)
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        done = list(pool.map(lambda rng: _trial(policy, stand_in, start, hidden, task, config, rng), rngs))
-    return Transfer(*(np.array(column) for column in zip(*done, strict=True)))
-
-
-def robot(scene: Scene, truth: Mapping[str, float], timestep: float) -> Scene:
-    """The scene with hidden values, at the stand-in's own time step, integrator and solver effort."""
+    if hidden:
+        config = replace(config, timestep=min(config.timestep, LONGEST_STEP))
     space = door_space(scene) + door_nuisances(scene)
     model = make_c_model(scene, space, space.values(dict(truth)))
-    return replace(scene, model=own_engine(model, timestep))
+    own = replace(scene, model=own_engine(model, config.timestep))
+    return StandIn(own, start, tuple(hidden), task, config)
+
+
+def transfer(policy: Policy, robot: StandIn) -> Trials:
+    """Trials of a policy on the stand-in robot.  ValueError for a policy that acts at another rate than the task's."""
+    _check_rate(policy, robot.task)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        done = list(pool.map(lambda number: _trial(policy, robot, number), range(robot.config.trials)))
+    return Trials(*(np.array(column) for column in zip(*done, strict=True)))
+
+
+def filmed(policy: Policy, robot: StandIn, number: int) -> np.ndarray:
+    """[K, nq] the states of one of `transfer`'s trials, before each action and at the end."""
+    _check_rate(policy, robot.task)
+    states: list[np.ndarray] = []
+    _trial(policy, robot, number, lambda data: states.append(data.qpos.copy()))
+    return np.array(states)
+
+
+def _check_rate(policy: Policy, task: Task) -> None:
+    if abs(policy.interface.period - task.control) > 1e-9:
+        raise ValueError(f"the policy acts every {policy.interface.period:g} s, the task asks every {task.control:g} s")
 
 
 def _trial(
-    policy: Policy,
-    stand_in: Scene,
-    start: np.ndarray,
-    hidden: Sequence[Applied],
-    task: Task,
-    config: TransferConfig,
-    rng: np.random.Generator,
+    policy: Policy, robot: StandIn, number: int, watch: Callable[[mujoco.MjData], None] = lambda data: None
 ) -> tuple[bool, float, int, float, str]:
     """Success, largest angle, actions, share of them with the grip on, why the loop stopped."""
-    influences = [_influence(stand_in, a) for a in hidden]
-    model, hand, joints = edited(stand_in.model, influences), hand_of(stand_in), stand_in.joint_qpos
+    scene, task, config = robot.scene, robot.task, robot.config
+    rng = np.random.default_rng([config.seed, number])
+    influences = [_influence(scene, a) for a in robot.hidden]
+    model, hand = edited(scene.model, influences), hand_of(scene)
     data = mujoco.MjData(model)
-    data.qpos[:] = start
-    data.qpos[joints] += rng.normal(0.0, task.spread, len(joints))
+    data.qpos[:] = robot.start
+    data.qpos[scene.joint_qpos] += rng.normal(0.0, task.spread, len(scene.joints))
     mujoco.mj_forward(model, data)
     advance = _stepper(model, data, influences, round(task.control / config.timestep))
-    sense = _senses(stand_in, data, config, rng)
+    sense = _senses(scene, data, config, rng)
     seen = looked(hand, data, finger_forces_c(hand, model, data), np.zeros((2, 3)), task.control, np)
     loop = Controller(policy)
     held = longest = angle = 0.0
-    grips = number = 0
-    while number < task.steps and not succeeded(task, longest):
-        asked = loop.act(sense(number * task.control))
+    grips = steps = 0
+    watch(data)
+    while steps < task.steps and not succeeded(task, longest):
+        asked = loop.act(sense(steps * task.control))
         if asked.stopped is not None:
             break
         advance(np.concatenate([asked.arm, asked.fingers]))
-        number += 1
+        steps += 1
         if not np.isfinite(data.qpos).all():
             break
+        watch(data)
         seen = looked(hand, data, finger_forces_c(hand, model, data), seen.pads, task.control, np)
         grips += bool(gripped(task, seen))
         angle, held = max(angle, float(seen.angle)), float(holding(task, seen, held))
         longest = max(longest, held)
-    return bool(succeeded(task, longest)), angle, number, grips / max(number, 1), loop.stopped or ""
+    return bool(succeeded(task, longest)), angle, steps, grips / max(steps, 1), loop.stopped or ""
 
 
 def _senses(
-    stand_in: Scene, data: mujoco.MjData, config: TransferConfig, rng: np.random.Generator
+    scene: Scene, data: mujoco.MjData, config: TransferConfig, rng: np.random.Generator
 ) -> Callable[[float], Reading]:
     """What the robot's sensors say at a time; the camera's error is drawn once."""
-    joints, dofs, knob = stand_in.joint_qpos, stand_in.joint_dofs, stand_in.id("site", "knob")
-    fingers = [stand_in.qpos(name) for name in stand_in.command_names if name not in stand_in.joints]
+    joints, dofs, knob = scene.joint_qpos, scene.joint_dofs, scene.id("site", "knob")
+    fingers = [scene.qpos(name) for name in scene.command_names if name not in scene.joints]
     sight, pose = rng.normal(0.0, config.knob_noise, 3), np.eye(4)
 
     def sense(time: float) -> Reading:

@@ -3,9 +3,9 @@
 `write_report(run)` reads the folder, puts its numbers into words, tables and figures and
 writes RUN/report.html (everything inside, nothing loaded from elsewhere) and the figures as
 PNG and PDF under RUN/figures/.  The folder holds an identification, a search for a missing
-effect, or both.  Of an identification, config.json, fit.json, history.npz, traces.npz and
+effect, a trained policy, or several of these.  Of an identification, config.json, fit.json, history.npz, traces.npz and
 correlation.npz are required; distribution.npz and frames/*.png are optional; where one is missing the
-page says so in its place.  Of a search, gap.json and gap.npz are required.
+page says so in its place.  Of a search, gap.json and gap.npz are required; of a policy, training.json.
 """
 
 from __future__ import annotations
@@ -30,6 +30,9 @@ from droid_jax.report.gap_words import (
     settings,
     unit_words,
 )
+from droid_jax.report.policy_drawings import draw_policy, film_row
+from droid_jax.report.policy_folder import Trained, has_policy, read_policy
+from droid_jax.report.policy_words import policy_summary
 from droid_jax.report.run_folder import Run, has_run, read_run
 from droid_jax.report.words import grouped, label, like, number, percent, speaker, summary
 from droid_jax.storage import write_text
@@ -44,6 +47,9 @@ _DOWNLOADS = (
     ("history.csv", "the search, generation by generation"),
     ("traces.npz", "torques over time"),
     ("config.json", "how the run was set up"),
+    ("policy.npz", "the policy: python -m droid_jax.run export makes it ready for a robot"),
+    ("training.json", "how the policy was trained"),
+    ("transfer.json", "every trial of the policy"),
     ("gap.json", "the search for a missing effect: every number"),
     ("gap.npz", "the search for a missing effect: torques over time"),
 )
@@ -56,7 +62,8 @@ def write_report(run: Path) -> Path:
     """
     folder = Path(run)
     gap = read_gap(folder) if has_gap(folder) else None
-    loaded = read_run(folder) if not gap or has_run(folder) else None
+    policy = read_policy(folder) if has_policy(folder) else None
+    loaded = read_run(folder) if has_run(folder) or not (gap or policy) else None
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -74,10 +81,11 @@ def write_report(run: Path) -> Path:
         "speak": speaker(loaded) if loaded else str,
         "unbroken": lambda text: re.sub(r"(?<=\d) (?=N m|%)", "\u00a0", text).replace("N m", "N\u00a0m"),
     }
-    parts = (_search(gap) if gap else {}) | (_identification(loaded) if loaded else {})
+    parts = (_policy(policy) if policy else {}) | (_search(gap) if gap else {})
+    parts |= _identification(loaded) if loaded else {}
     downloads = [(f, text) for f, text in _DOWNLOADS if (folder / f).is_file()]
     html = environment.get_template("template.html.j2").render(
-        folder=folder, run=loaded, gap=gap, downloads=downloads, **parts
+        folder=folder, run=loaded, gap=gap, policy=policy, downloads=downloads, **parts
     )
     path = folder / "report.html"
     write_text(path, html)
@@ -119,4 +127,18 @@ def _search(gap: Gap) -> dict[str, Any]:
         "candidates": groups(gap.found),
         "roles": ROLES,
         "decisive": DECISIVE,
+    }
+
+
+def _policy(trained: Trained) -> dict[str, Any]:
+    """What the page says of a trained policy."""
+    setup, name = trained.training["setup"], trained.folder.resolve().name
+    return {
+        "title": f"Policy: {name}",
+        "heading": f"Policy for {trained.training['scene']}",
+        "meta": [f"Method {setup['method']}", f"preset {setup['preset']}", f"seed {setup['seed']}", name],
+        "stand_in": bool(trained.trials),
+        "policy_summary": policy_summary(trained),
+        "policy_drawings": draw_policy(trained),
+        "films": film_row(trained),
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -54,3 +55,26 @@ def _line(value: Any) -> dict[str, Any]:
         "total": value.iterations,
         "text": f"mean square {value.mean_square:.3g} (noise: 1)",
     }
+
+
+@contextlib.contextmanager
+def training(steps: int) -> Iterator[Callable[[Any], None]]:
+    """Show one bar for training, in actions; yields the function that takes each `TrainProgress`."""
+    columns = (
+        TextColumn("training"),
+        BarColumn(bar_width=30),
+        TextColumn("{task.percentage:>3.0f}%"),
+        TextColumn("{task.fields[text]}"),
+        TimeElapsedColumn(),
+        TextColumn("left {task.fields[left]}"),
+    )
+    with Progress(*columns) as bars:
+        task = bars.add_task("training", total=steps, text="compiling, a minute", left="–")
+
+        def report(now: Any) -> None:
+            rate = f"{now.rate:,.0f} actions/s" if now.rate else "started"
+            text = f"reward {now.reward:.0f}  success {now.success:.0%}  {rate}"
+            left = f"{now.left / 60:.0f} min" if math.isfinite(now.left) else "–"
+            bars.update(task, completed=min(now.step, steps), text=text, left=left)
+
+        yield report

@@ -125,7 +125,7 @@ def test_a_good_reading_is_acted_on(policy, still):
         (lambda r: replace(r, position=np.full(7, np.nan)), "position holds a value that is no number"),
         (lambda r: replace(r, knob=np.full((4, 4), np.inf)), "knob holds a value that is no number"),
         (lambda r: replace(r, velocity=np.zeros(6)), r"velocity must have shape \[7\], got \[6\]"),
-        (lambda r: replace(r, velocity=np.array([0, 0, 0, 0, 2.7, 0, 0])), "too fast: joint 5 at 2.7 rad/s, limit 2.61"),
+        (lambda r: replace(r, velocity=np.array([0, 0, 0, 0, 2.7, 0, 0])), "too fast: joint 5 at 2.7 rad/s"),
         (lambda r: replace(r, torque=np.array([0, 99, 0, 0, 0, 0, 0])), "too much torque: joint 2 at 99 N m"),
         (lambda r: replace(r, position=r.position + 1.0), "the hand has left its workspace"),
     ],

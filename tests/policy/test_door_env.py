@@ -10,9 +10,9 @@ from scripted import action, opening
 
 from droid_jax import runtime
 from droid_jax.model.door_scene import door_scene
+from droid_jax.policy.control import ACTIONS, OBSERVED
 from droid_jax.policy.door_env import DoorEnv
 from droid_jax.policy.hand import finger_forces_c, hand_of, looked
-from droid_jax.policy.control import ACTIONS, OBSERVED
 from droid_jax.policy.task import Task, command
 
 TASK = Task()

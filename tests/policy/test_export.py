@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +23,7 @@ onnxruntime = pytest.importorskip("onnxruntime")
 def policy() -> Policy:
     rng = np.random.default_rng(0)
     sizes = (OBSERVED, 64, 64, 2 * ACTIONS)
-    weights = tuple(np.float32(rng.normal(size=s) / np.sqrt(s[0])) for s in zip(sizes[:-1], sizes[1:], strict=True))
+    weights = tuple(np.float32(rng.normal(size=s) / np.sqrt(s[0])) for s in itertools.pairwise(sizes))
     biases = tuple(np.float32(0.1 * rng.normal(size=s)) for s in sizes[1:])
     blank = {f: np.zeros(1) for f in Interface.__dataclass_fields__}
     interface = Interface(**{**blank, "period": 0.02, "reach": 0.1, "width": 0.04})  # type: ignore[arg-type]

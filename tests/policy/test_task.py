@@ -36,6 +36,8 @@ HELD = Seen(
         ({"yaw": np.deg2rad(19.0)}, True),
         ({"yaw": np.deg2rad(-21.0)}, False),  # both press, the hand turned aside
         ({"yaw": np.deg2rad(90.0)}, False),
+        ({"pads": np.array([[0.01, 0.017, 0.0], [0.01, -0.017, 0.0]])}, True),
+        ({"pads": np.array([[0.01, 0.017, 0.0], [0.03, -0.003, 0.0]])}, False),  # one behind the knob's round end
     ],
 )
 def test_a_grip_takes_both_fingers_and_a_hand_that_faces_the_door(changes, is_one):
@@ -44,8 +46,8 @@ def test_a_grip_takes_both_fingers_and_a_hand_that_faces_the_door(changes, is_on
 
 def test_the_door_pays_only_while_it_is_gripped():
     hooked = HELD._replace(force=np.array([9.0, 0.0]))
-    assert float(terms(TASK, HELD)["door"]) == pytest.approx(0.2 / np.deg2rad(30))
-    assert float(terms(TASK, hooked)["door"]) == 0.0
+    assert float(terms(TASK, HELD)["door"]) == pytest.approx(0.25 + 0.2 / np.deg2rad(30))
+    assert float(terms(TASK, hooked)["door"]) == pytest.approx(0.125)
     assert float(reward(TASK, HELD)) > float(reward(TASK, hooked))
 
 

@@ -13,9 +13,9 @@ import pytest
 from droid_jax.identify.gaussian import prior
 from droid_jax.model.door import door_space
 from droid_jax.model.door_scene import door_scene
+from droid_jax.policy.control import OBSERVED
 from droid_jax.policy.door_env import DoorEnv
 from droid_jax.policy.randomise import randomised
-from droid_jax.policy.control import OBSERVED
 from droid_jax.policy.task import Task
 from droid_jax.policy.train import TrainConfig, from_tree, put_replicated, replicated, to_tree, train
 

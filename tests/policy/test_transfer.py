@@ -15,7 +15,8 @@ from droid_jax.model.door_scene import door_scene
 from droid_jax.policy.door_env import start_pose
 from droid_jax.policy.interface import interface_of
 from droid_jax.policy.task import Task
-from droid_jax.policy.transfer import Transfer, TransferConfig, transfer
+from droid_jax.policy.transfer import TransferConfig, filmed, stand_in, transfer
+from droid_jax.policy.trials import Trials
 
 TASK = Task(steps=260, spread=0.0)
 ONE = TransferConfig(trials=1)
@@ -36,10 +37,10 @@ def commands(scene) -> np.ndarray:
     return opening(scene, TASK, 2.4, np.deg2rad(42.0), hold=1.0)
 
 
-def tried(scene, start, commands, truth=None, hidden=(), task=TASK) -> Transfer:
+def tried(scene, start, commands, truth=None, hidden=(), task=TASK) -> Trials:
     truth = stand_in_truth(scene, 0, 0) if truth is None else truth
     script = Script(task, commands, interface_of(scene, task, start))
-    return transfer(script, scene, start, truth, hidden, task, ONE)  # type: ignore[arg-type]
+    return transfer(script, stand_in(scene, start, truth, hidden, task, ONE))  # type: ignore[arg-type]
 
 
 def test_an_opening_by_the_book_succeeds_with_the_grip_held(scene, start, commands):
@@ -47,6 +48,25 @@ def test_an_opening_by_the_book_succeeds_with_the_grip_held(scene, start, comman
     assert found.success[0] and found.angle[0] > np.deg2rad(30.0)
     assert 100 < found.steps[0] < TASK.steps
     assert found.grip[0] > 0.5
+
+
+def test_a_film_shows_the_same_trial(scene, start, commands):
+    truth, task = stand_in_truth(scene, 0, 0), replace(TASK, steps=12, spread=0.02)
+    robot = stand_in(scene, start, truth, (), task, replace(ONE, trials=2))
+
+    def script() -> Script:
+        return Script(task, commands, interface_of(scene, task, start))
+
+    films = [filmed(script(), robot, number) for number in (1, 1, 0)]  # type: ignore[arg-type]
+    assert films[0].shape == (13, scene.model.nq)
+    np.testing.assert_array_equal(films[0], films[1])
+    assert np.abs(films[0][0] - films[2][0]).max() > 1e-3
+
+
+def test_a_policy_of_another_rate_is_refused(scene, start, commands):
+    robot = stand_in(scene, start, {}, (), replace(TASK, control=0.04), ONE)
+    with pytest.raises(ValueError, match=r"the policy acts every 0.02 s, the task asks every 0.04 s"):
+        transfer(Script(TASK, commands, interface_of(scene, TASK, start)), robot)  # type: ignore[arg-type]
 
 
 def test_a_strong_closer_is_felt(scene, start, commands):
@@ -74,7 +94,7 @@ def test_trials_differ_and_the_same_seed_repeats_them(scene, start):
     task = replace(TASK, steps=10, spread=0.05)
     interface, truth = interface_of(scene, task, start), stand_in_truth(scene, 0, 0)
     runs = [
-        transfer(Script(task, still, interface), scene, start, truth, (), task, replace(ONE, trials=3))  # type: ignore[arg-type]
+        transfer(Script(task, still, interface), stand_in(scene, start, truth, (), task, replace(ONE, trials=3)))  # type: ignore[arg-type]
         for _ in range(2)
     ]
     np.testing.assert_array_equal(runs[0].angle, runs[1].angle)
@@ -82,7 +102,7 @@ def test_trials_differ_and_the_same_seed_repeats_them(scene, start):
 
 
 def test_the_interval_is_wilsons():
-    found = Transfer(np.arange(100) < 80, *np.zeros((3, 100)), np.full(100, ""))
+    found = Trials(np.arange(100) < 80, *np.zeros((3, 100)), np.full(100, ""))
     low, high = found.interval()
     assert (low, high) == (pytest.approx(0.711, abs=1e-3), pytest.approx(0.867, abs=1e-3))
 

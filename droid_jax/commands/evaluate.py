@@ -1,0 +1,153 @@
+"""`evaluate`: a trained policy in its simulation and on the stand-in robot."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from droid_jax.commands import report
+from droid_jax.commands.folder import setup_of
+from droid_jax.commands.hidden import hidden_effects
+from droid_jax.commands.source import source
+from droid_jax.commands.train import POLICY, TRAINING, randomise
+
+if TYPE_CHECKING:
+    from droid_jax.policy.control import Policy
+    from droid_jax.policy.door_env import DoorEnv
+    from droid_jax.policy.transfer import StandIn
+    from droid_jax.policy.trials import Trials
+
+TRANSFER, FILMS = "transfer.json", "films"
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Try a trained policy: in the simulation it was trained in, and on the stand-in robot (plain C MuJoCo with hidden
+    physics, sensor noise and, where wanted, a hidden effect)."""
+
+    run: Annotated[Path, tyro.conf.Positional] = Path("runs/train")
+    """Folder of `train`."""
+    trials: int = 100
+    """Trials on the stand-in robot, and episodes in simulation."""
+    springs: Literal[0, 1, 2] | None = None
+    """Springs on the stand-in's door. Default: those of the stand-in that was fitted, else 1."""
+    hide: tuple[str, ...] | None = None
+    """What the stand-in hides, name=amplitude; none for nothing. Default: what the fitted one hid."""
+    robot: int | None = None
+    """Seed of the stand-in's hidden values. Default: that of the one that was fitted, else 0."""
+    seed: int = 0
+    """Seed of start poses and sensor noise."""
+    film: bool = True
+    """Film a good and a bad trial."""
+    again: bool = False
+    """Try again, even where this very evaluation is there already."""
+
+
+def run(command: Evaluate) -> None:
+    """Try the policy, write transfer.json and the films, and build the page."""
+    print("starting jax ...", flush=True)
+    from droid_jax import runtime
+
+    runtime.tune()
+    runtime.import_mjx()
+    from droid_jax.policy.control import load
+    from droid_jax.policy.door_env import DoorEnv
+    from droid_jax.policy.simulated import simulated
+    from droid_jax.policy.task import Task
+    from droid_jax.policy.transfer import transfer
+    from droid_jax.storage import write_json
+
+    trained = _trained(command.run)
+    setup, policy = trained["setup"], load(command.run / POLICY)
+    scene, gaussian, effects = source(command.run, setup["knob"])
+    env = DoorEnv(scene, Task(**trained["task"]), effects)
+    print(f"{command.trials} episodes in simulation ...", flush=True)
+    inside = simulated(policy, env, randomise(setup["method"], scene, gaussian), command.trials, command.seed)
+    robot, truth = _robot(command, trained, env)
+    print(f"{command.trials} trials on the stand-in robot ...", flush=True)
+    outside = transfer(policy, robot)
+    write_json(
+        command.run / TRANSFER,
+        {
+            "simulation": inside.to_json(),
+            "stand_in": outside.to_json(),
+            "robot": {"truth": truth, "hidden": [dataclasses.asdict(a) for a in robot.hidden]},
+            "setup": setup_of(command),
+            "versions": runtime.versions(),
+            "device": runtime.device(),
+        },
+    )
+    if command.film:
+        _film(command.run, policy, robot, outside)
+    for where, found in (("simulation", inside), ("stand-in robot", outside)):
+        low, high = found.interval()
+        print(f"{where}: {found.rate:.0%} success ({low:.0%} to {high:.0%}), {_angle(found)}")
+    report.run(report.Report(command.run))
+
+
+def _robot(command: Evaluate, trained: Mapping[str, Any], env: DoorEnv) -> tuple[StandIn, dict[str, float]]:
+    """The stand-in robot, the one that was fitted unless asked for another; and its hidden values."""
+    fitted = trained["stand_in"]
+    from droid_jax.measure.hidden import listed
+    from droid_jax.measure.surrogate import stand_in_truth
+    from droid_jax.model.door_scene import door_scene
+    from droid_jax.policy.transfer import TransferConfig, stand_in
+
+    def first(*choices: Any) -> Any:
+        return next(c for c in choices if c is not None)
+
+    springs = first(command.springs, fitted.get("springs"), 1)
+    seed = first(command.robot, fitted.get("seed"), 0)
+    hide = command.hide if command.hide is not None or "hide" in fitted else ()
+    hide = fitted.get("hide") if hide is None else hide
+    scene = door_scene(limits=True, knob=trained["setup"]["knob"])
+    truth = stand_in_truth(scene, springs, seed)
+    config = TransferConfig(trials=command.trials, seed=command.seed)
+    return stand_in(scene, env.start, truth, listed(hidden_effects(hide, scene)), env.task, config), truth
+
+
+def _angle(found: Trials) -> str:
+    import numpy as np
+
+    degrees = np.rad2deg(found.angle)
+    return f"opened to {degrees.mean():.1f} ± {degrees.std():.1f} degrees"
+
+
+def _film(folder: Path, policy: Policy, robot: StandIn, found: Trials) -> None:
+    """good.webp and bad.webp: of the trials that succeeded and of those that failed, the one of median angle."""
+    import numpy as np
+
+    from droid_jax.policy.transfer import filmed
+    from droid_jax.report.film import film
+    from droid_jax.report.render import NoOpenGL
+
+    chosen = {"good": np.flatnonzero(found.success), "bad": np.flatnonzero(~found.success)}
+    for name, numbers in chosen.items():
+        path = folder / FILMS / f"{name}.webp"
+        path.unlink(missing_ok=True)
+        if not len(numbers):
+            continue
+        number = int(numbers[np.argsort(found.angle[numbers])[len(numbers) // 2]])
+        try:
+            film(path, robot.scene.visual_model(), filmed(policy, robot, number), robot.task.control)
+        except NoOpenGL as error:
+            print(f"no films: {error}", file=sys.stderr)
+            return
+
+
+def _trained(folder: Path) -> dict[str, Any]:
+    """training.json."""
+    path = folder / TRAINING
+    try:
+        return json.loads(path.read_text())
+    except FileNotFoundError:
+        raise ValueError(f"{path} is missing: `python -m droid_jax.run train --out {folder}` writes it") from None
+    except ValueError as error:
+        raise ValueError(f"{path} cannot be read ({error}); train again") from None

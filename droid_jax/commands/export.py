@@ -1,0 +1,32 @@
+"""`export`: a trained policy to take along to a robot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from droid_jax.commands.train import POLICY
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write a trained policy for a robot's computer: ONNX (checked against JAX), npz, and a control loop that needs
+    numpy alone (docs/policy-on-a-robot.md)."""
+
+    run: Annotated[Path, tyro.conf.Positional] = Path("runs/train")
+    """Folder of `train`."""
+    out: Path | None = None
+    """Folder to write; default: RUN/export."""
+
+
+def run(command: Export) -> None:
+    """Write policy.npz, policy.onnx and control.py."""
+    from droid_jax.policy.control import load
+    from droid_jax.policy.export import export
+
+    out = command.out or command.run / "export"
+    apart = export(out, load(command.run / POLICY))
+    print(f"policy.npz, policy.onnx and control.py: {out}; ONNX and JAX differ by at most {apart:.1e} in an action")

@@ -1,0 +1,136 @@
+"""`train`: a policy that opens the door, on environments drawn from a distribution."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from droid_jax.commands import report
+from droid_jax.commands.folder import begin, finished, setup_of
+from droid_jax.commands.source import GAUSSIAN, extended_of, source, stand_in_of
+
+if TYPE_CHECKING:
+    from droid_jax.identify.gaussian import Gaussian
+    from droid_jax.model.scene import Scene
+    from droid_jax.policy.randomise import Randomise
+    from droid_jax.policy.train import TrainConfig
+
+Method = Literal["fitted", "mean", "prior"]
+POLICY, TRAINING = "policy.npz", "training.json"
+USUAL = Path("runs/identify")
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train a policy with PPO on doors drawn from a Gaussian: the fitted one, or the prior.
+
+    With --fit it is the Gaussian that `identify` fitted, or the extended model that `gap` found.
+    """
+
+    fit: Path | None = None
+    """Folder of `identify` or `gap`. Default: runs/identify where there is one, else the prior."""
+    method: Method = "fitted"
+    """fitted: every environment its own draw of the fitted Gaussian.  mean: all have its mean.  prior: draws of what
+    was assumed before the fit (the three methods of the paper's Table II)."""
+    preset: Literal["quick", "paper", "gpu"] = "quick"
+    """quick: a laptop, minutes.  paper: longer.  gpu: 4096 environments."""
+    knob: Literal[0, 1, 2, 3] = 0
+    """Where the knob is along the door, each 5 cm nearer to the hinge than the one before."""
+    steps: int | None = None
+    """Actions in all; default: the preset's."""
+    seed: int = 0
+    """Seed of the networks and of the environments."""
+    out: Path = Path("runs/train")
+    """Results folder. A run that was interrupted goes on from its last checkpoint."""
+    again: bool = False
+    """Start over, even if the folder holds a finished or interrupted run."""
+
+
+def run(command: Train) -> None:
+    """Train, and write the run's folder and its page."""
+    print("starting jax ...", flush=True)
+    from droid_jax import runtime
+
+    runtime.tune()
+    runtime.import_mjx()
+    from droid_jax.gap.extended import FILE
+    from droid_jax.identify.results import prepare_folder
+    from droid_jax.policy.door_env import DoorEnv
+    from droid_jax.policy.network import save_policy
+    from droid_jax.policy.train import train
+    from droid_jax.report.progress import training
+    from droid_jax.storage import write_json
+
+    out, fit = prepare_folder(command.out), _fit_folder(command)
+    scene, gaussian, effects = source(fit, command.knob)
+    gaussian = _chosen(command, gaussian)
+    setup = {**setup_of(command), "command": "train", "fit": None if fit is None else str(fit)}
+    if finished(out, setup, command.again, TRAINING):
+        report.run(report.Report(out))
+        return
+    config = config_of(command)
+    env = DoorEnv(scene, effects=effects)
+    begin(out, setup, command.again, TRAINING)
+    gaussian.save(out / GAUSSIAN)
+    model = None if fit is None else extended_of(fit)
+    if model is not None:
+        shutil.copyfile(model, out / FILE)
+    with training(config.steps) as progress:
+        found = train(
+            env, randomise(command.method, scene, gaussian), config, checkpoints=out / "checkpoints",
+            fingerprint={"method": command.method, "gaussian": (out / GAUSSIAN).read_text()}, progress=progress,
+        )  # fmt: skip
+    save_policy(out / POLICY, found.policy)
+    content = {
+        "setup": setup,
+        "stand_in": stand_in_of(fit),
+        "config": dataclasses.asdict(config),
+        "task": dataclasses.asdict(env.task),
+        "scene": scene.name,
+        "effects": [e.name for e in effects],
+        "history": [dataclasses.asdict(now) for now in found.history],
+        "versions": runtime.versions(),
+        "device": runtime.device(),
+    }
+    write_json(out / TRAINING, content)  # last: its presence says that the run is whole
+    report.run(report.Report(out))
+
+
+def config_of(command: Train) -> TrainConfig:
+    """The preset with the command's own numbers."""
+    from droid_jax.policy.train import PRESETS
+
+    asked = {} if command.steps is None else {"steps": command.steps}
+    return dataclasses.replace(PRESETS[command.preset], seed=command.seed, **asked)
+
+
+def randomise(method: str, scene: Scene, gaussian: Gaussian) -> Randomise:
+    """Draws of the Gaussian, or its mean alone where the method is "mean"."""
+    from droid_jax.policy.randomise import fixed, randomised
+
+    if method == "mean":
+        return fixed(scene, gaussian.space, gaussian.physical_mean)
+    return randomised(scene, gaussian)
+
+
+def _chosen(command: Train, gaussian: Gaussian) -> Gaussian:
+    from droid_jax.identify.gaussian import prior
+
+    return prior(gaussian.space) if command.method == "prior" else gaussian
+
+
+def _fit_folder(command: Train) -> Path | None:
+    """Where the Gaussian comes from; None for the prior of the built-in door."""
+    if command.fit is not None:
+        return command.fit
+    if (USUAL / GAUSSIAN).is_file():
+        print(f"training on the fit in {USUAL} (another: --fit)")
+        return USUAL
+    if command.method == "mean":
+        raise ValueError(f"--method mean needs a fit: there is none in {USUAL}, and no --fit FOLDER was given")
+    if command.method == "fitted":
+        print(f"there is no fit in {USUAL}: training on the prior (--fit FOLDER of `identify` or `gap` for another)")
+    return None

@@ -1,0 +1,50 @@
+"""What came of letting a policy try: success, angle, grip, with intervals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.stats
+
+
+@dataclass(frozen=True, eq=False)
+class Trials:
+    """One entry for each trial, N of them.
+
+    success: [N] bool.  angle: [N] rad, the largest; steps: [N] actions until success, or all there were;
+    grip: [N] share of actions with the knob gripped.  stopped: [N] why a trial was stopped, "" where it was not.
+    """
+
+    success: np.ndarray
+    angle: np.ndarray
+    steps: np.ndarray
+    grip: np.ndarray
+    stopped: np.ndarray
+
+    @property
+    def rate(self) -> float:
+        """Share of trials that succeeded."""
+        return float(np.mean(self.success))
+
+    def interval(self, level: float = 0.95) -> tuple[float, float]:
+        """Of the success rate.  Wilson, JASA 1927."""
+        count = scipy.stats.binomtest(int(np.sum(self.success)), len(self.success))
+        span = count.proportion_ci(level, method="wilson")
+        return float(span.low), float(span.high)
+
+    def to_json(self) -> dict[str, Any]:
+        """As plain data, angles in degrees; trial by trial and in sum."""
+        degrees = np.rad2deg(self.angle)
+        reasons, counts = np.unique(self.stopped[self.stopped != ""], return_counts=True)
+        return {
+            "trials": len(self.success),
+            "success_rate": self.rate,
+            "interval_95": list(self.interval()),
+            "angle_deg": {"mean": float(degrees.mean()), "std": float(degrees.std()), "all": degrees.round(2).tolist()},
+            "steps": {"mean": float(self.steps.mean()), "std": float(self.steps.std()), "all": self.steps.tolist()},
+            "grip": {"mean": float(self.grip.mean()), "all": self.grip.round(3).tolist()},
+            "success": self.success.astype(bool).tolist(),
+            "stopped": dict(zip(reasons.tolist(), counts.tolist(), strict=True)),
+        }

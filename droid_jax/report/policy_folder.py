@@ -1,0 +1,63 @@
+"""What training and trials leave in a folder, as the report reads it: training.json, transfer.json, films; checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from droid_jax.report.reading import Reader
+
+_READ = Reader("train")
+_NUMBER = (int, float)
+_TRAINING = {
+    "setup": {"method": str, "preset": str, "knob": int, "seed": int},
+    **{"task": {"opened": _NUMBER, "held": _NUMBER, "control": _NUMBER, "steps": int}, "scene": str},
+    **{"effects": [str], "versions": dict, "device": str},
+    "history": [{"step": int, **dict.fromkeys(("seconds", "rate", "reward", "success"), _NUMBER)}],
+}
+_SPREAD = {"mean": _NUMBER, "std": _NUMBER, "all": [_NUMBER]}
+_TRIALS = {
+    **{"trials": int, "success_rate": _NUMBER, "interval_95": [_NUMBER], "success": [bool], "stopped": {str: int}},
+    **{"angle_deg": _SPREAD, "steps": _SPREAD, "grip": {"mean": _NUMBER}},
+}
+_TRANSFER = {"simulation": _TRIALS, "stand_in": _TRIALS, "robot": {"hidden": [{"name": str, "amplitude": _NUMBER}]}}
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What a folder of `train` holds.
+
+    training: training.json.  transfer: transfer.json, None before `evaluate`.  films: by name, "good" and "bad".
+    """
+
+    folder: Path
+    training: Mapping[str, Any]
+    transfer: Mapping[str, Any] | None
+    films: Mapping[str, Path]
+
+    @property
+    def trials(self) -> dict[str, Mapping[str, Any]]:
+        """Where the policy was tried -> what came of it."""
+        if self.transfer is None:
+            return {}
+        return {"simulation": self.transfer["simulation"], "stand-in robot": self.transfer["stand_in"]}
+
+
+def has_policy(folder: Path) -> bool:
+    """Whether a folder holds, or should hold, a trained policy."""
+    return (folder / "training.json").exists()
+
+
+def read_policy(folder: Path) -> Trained:
+    """Load and check; ValueError names the file that is missing or broken."""
+    training = _READ.json(folder / "training.json")
+    _READ.check(training, _TRAINING, "training.json")
+    transfer = None
+    if (folder / "transfer.json").is_file():
+        read = Reader("evaluate")
+        transfer = read.json(folder / "transfer.json")
+        read.check(transfer, _TRANSFER, "transfer.json")
+    films = {path.stem: path for path in sorted((folder / "films").glob("*.webp"))}
+    return Trained(folder, training, transfer, films)

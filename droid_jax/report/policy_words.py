@@ -1,0 +1,61 @@
+"""A trained policy in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from droid_jax.report.policy_folder import Trained
+from droid_jax.report.words import label, listed, number, percent
+
+METHODS = {
+    "fitted": "doors drawn from the fitted distribution",
+    "mean": "one door, with the fitted means",
+    "prior": "doors drawn from what was assumed before any fit",
+}
+ENOUGH = 0.8  # success on the stand-in from which the next step is the robot
+
+
+def policy_summary(trained: Trained) -> list[str]:
+    """The sentences at the top, from the numbers alone; the last says what to do next."""
+    training = trained.training
+    last = training["history"][-1] if training["history"] else None
+    known = training["setup"]["fit"] is not None
+    method = METHODS[training["setup"]["method"] if known else "prior"]
+    sentences = [f"A policy was trained on {method}{_with(training['effects'])}."]
+    if last is not None:
+        sentences.append(
+            f"It saw {last['step'] / 1e6:.2g} million actions in {last['seconds'] / 60:.0f} minutes; at the end "
+            f"{percent(last['success'])} of its episodes in simulation succeeded."
+        )
+    sentences += [_tried(where, found, training["task"]) for where, found in trained.trials.items()]
+    return [*sentences, _next(trained)]
+
+
+def _with(effects: list[str]) -> str:
+    names = [label(e).lower() for e in effects]
+    return f", whose model holds {listed(names)}" if names else ""
+
+
+def _tried(where: str, found: Mapping[str, Any], task: Mapping[str, Any]) -> str:
+    low, high = found["interval_95"]
+    place = {"simulation": "In the simulation", "stand-in robot": "On the stand-in robot"}[where]
+    stopped = "; ".join(f"{count} stopped: {why}" for why, count in found["stopped"].items())
+    return (
+        f"{place} it held the door open for {number(task['held'], 2)} s at {np.rad2deg(task['opened']):.0f} degrees "
+        f"or more, knob in hand, in {percent(found['success_rate'])} of {found['trials']} trials (95 % interval "
+        f"{percent(low)} to {percent(high)}); it opened to {found['angle_deg']['mean']:.1f} ± "
+        f"{found['angle_deg']['std']:.1f} degrees{'; ' + stopped if stopped else ''}."
+    )
+
+
+def _next(trained: Trained) -> str:
+    if trained.transfer is None:
+        return f"Next: python -m droid_jax.run evaluate {trained.folder}"
+    if trained.transfer["stand_in"]["success_rate"] >= ENOUGH:
+        return f"Next: python -m droid_jax.run export {trained.folder}, and docs/policy-on-a-robot.md."
+    if trained.transfer["simulation"]["success_rate"] < ENOUGH:
+        return "It has not learned the task in simulation yet: train longer (--steps), or with another --seed."
+    return "It works in simulation and not on the stand-in robot: search the gap (python -m droid_jax.run gap)."

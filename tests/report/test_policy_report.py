@@ -1,0 +1,88 @@
+"""The page of a trained policy: its numbers are the files', and it says what to do next."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from made_up_gap import make_gap
+from made_up_policy import make_policy
+from reader import read_page
+
+from droid_jax.report import page
+from droid_jax.report.policy_folder import read_policy
+from droid_jax.report.policy_words import policy_summary
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = make_policy(tmp_path_factory.mktemp("policy") / "run")
+    page.write_report(made)
+    return made
+
+
+def test_the_page_shows_what_the_files_hold(folder: Path):
+    text = (folder / "report.html").read_text().replace("\u00a0", " ")
+    transfer = json.loads((folder / "transfer.json").read_text())
+    for name in ("simulation", "stand_in"):
+        assert f'<data value="{transfer[name]["success_rate"]}">' in text
+    assert "97 %" in text and "95 %" in text  # 39 and 38 of 40
+    assert text.count("data:image/webp;base64,") == 2
+    assert "not hardware" in text and "The stand-in robot hid closer (2.00)" in text
+    assert "2 million actions in 7 minutes" in text and "96 % of its episodes" in text
+    for stem in ("learning", "angles"):
+        assert (folder / "figures" / f"{stem}.pdf").is_file() and f'id="{stem}"' in text
+    assert read_page(folder / "report.html")
+
+
+@pytest.mark.parametrize(
+    ("successes", "simulated", "next_step"),
+    [
+        (None, None, "Next: python -m droid_jax.run evaluate"),
+        (38, None, "Next: python -m droid_jax.run export"),
+        (10, None, "search the gap"),
+        (0, 0.1, "has not learned the task in simulation yet"),
+    ],
+)
+def test_it_says_what_to_do_next(tmp_path: Path, successes: int | None, simulated: float | None, next_step: str):
+    made = make_policy(tmp_path / "run", successes)
+    if simulated is not None:
+        content = json.loads((made / "transfer.json").read_text())
+        content["simulation"]["success_rate"] = simulated
+        (made / "transfer.json").write_text(json.dumps(content))
+    assert next_step in policy_summary(read_policy(made))[-1]
+
+
+def test_what_it_was_trained_on_is_said(tmp_path: Path):
+    made = make_policy(tmp_path / "a", None, effects=["door_closer"])
+    assert (
+        "doors drawn from the fitted distribution, whose model holds door closer"
+        in policy_summary(read_policy(made))[0]
+    )
+    setup = {"method": "fitted", "preset": "quick", "knob": 0, "seed": 3, "fit": None}
+    other = make_policy(tmp_path / "b", None, setup=setup)
+    assert "what was assumed before any fit" in policy_summary(read_policy(other))[0]
+
+
+def test_a_search_and_a_policy_share_a_page(tmp_path: Path):
+    made = make_gap(tmp_path / "run")
+    make_policy(tmp_path / "policy", None)
+    (made / "training.json").write_text((tmp_path / "policy" / "training.json").read_text())
+    text = page.write_report(made).read_text()
+    assert '<a href="#missing">' in text and '<a href="#policy">' in text and 'id="policy"' in text
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "fault"),
+    [
+        ("training.json", "{}", "training.json.* lacks 'setup'.*run train` again"),
+        ("training.json", "{", "cannot be read"),
+        ("transfer.json", '{"simulation": {}}', "lacks .*run evaluate` again"),
+    ],
+)
+def test_broken_files_are_named(tmp_path: Path, name: str, content: str, fault: str):
+    made = make_policy(tmp_path / "run")
+    (made / name).write_text(content)
+    with pytest.raises(ValueError, match=fault):
+        page.write_report(made)
