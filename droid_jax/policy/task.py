@@ -21,8 +21,8 @@ class Task:
 
     control: s between actions; steps: actions at most.  opened: rad, from which the door counts as open.
     held: s at `opened` or beyond with the grip on that make a success.
-    force: N on each finger, yaw: rad of the hand against the door, and along: m of each pad from the knob's middle
-    along its axis, that make a grip.
+    force: N on each finger, yaw: rad of the hand against the door, and behind: m that each pad may be nearer to
+    the door than the knob's middle, that make a grip.
     reach: rad by which an action of one moves a joint's target from where the joint is; width: m, finger command
     of an action of one (of minus one: shut).
     door, orientation, distance, log_distance, slip: weights of the reward's terms; near: m, where the
@@ -37,7 +37,7 @@ class Task:
     held: float = 0.5
     force: float = 1.0
     yaw: float = float(np.deg2rad(20.0))
-    along: float = 0.012
+    behind: float = 0.012
     reach: float = 0.1
     width: float = 0.04
     door: float = 2.0
@@ -70,12 +70,17 @@ class Seen(NamedTuple):
 
 
 def gripped(task: Task, seen: Seen) -> Any:
-    """[] bool: both fingers press on the knob's middle, and the hand faces the door.
+    """[] bool: both fingers press from the sides, and the hand faces the door.
 
     A finger that hooks the knob from the side presses alone, or needs the hand turned; two that close behind its
-    round end, where the door would be in their way, are off its middle.
+    round end hold it without friction, in a place that a real door takes up.
     """
-    return (seen.force >= task.force).all() & (abs(seen.pads[:, 0]) <= task.along).all() & (abs(seen.yaw) <= task.yaw)
+    return (pressing(task, seen)).all() & (abs(seen.yaw) <= task.yaw)
+
+
+def pressing(task: Task, seen: Seen) -> Any:
+    """[2] bool: each finger presses the knob, and not from behind."""
+    return (seen.force >= task.force) & (seen.pads[:, 0] <= task.behind)
 
 
 def terms(task: Task, seen: Seen) -> dict[str, Any]:
@@ -86,11 +91,10 @@ def terms(task: Task, seen: Seen) -> dict[str, Any]:
     """
     distance = jnp.linalg.norm(seen.pinch)
     grip = gripped(task, seen)
-    pressing = jnp.mean((seen.force >= task.force) & (jnp.abs(seen.pads[:, 0]) <= task.along))
-    pressing *= jnp.abs(seen.yaw) <= task.yaw
+    touch = jnp.mean(pressing(task, seen)) * (jnp.abs(seen.yaw) <= task.yaw)
     shut = seen.angle < task.opened
     return {
-        "door": task.grip * pressing + jnp.where(grip, jnp.clip(seen.angle / task.opened, 0.0, 2.0), 0.0),
+        "door": task.grip * touch + jnp.where(grip, jnp.clip(seen.angle / task.opened, 0.0, 2.0), 0.0),
         "orientation": seen.normal - jnp.abs(seen.yaw),
         "distance": jnp.where(shut, -distance, 0.0),
         "log_distance": jnp.where(shut, -jnp.log(distance + task.near), 0.0),
