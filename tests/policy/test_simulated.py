@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import pytest
 
 from droid_jax.identify.gaussian import prior
 from droid_jax.model.door import door_space

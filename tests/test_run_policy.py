@@ -1,0 +1,100 @@
+"""The commands train, evaluate and export, one after the other in one folder."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from droid_jax import runtime
+from droid_jax.commands.evaluate import Evaluate, _robot
+from droid_jax.commands.source import extended_of, source, stand_in_of
+from droid_jax.identify.gaussian import prior
+from droid_jax.model.door import door_space
+from droid_jax.model.door_scene import door_scene
+from droid_jax.policy.control import load
+from droid_jax.policy.door_env import DoorEnv
+from droid_jax.run import main
+
+
+@pytest.fixture(autouse=True)
+def tuned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(runtime, "tune", lambda *a, **k: None)  # jax runs already in this process
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return door_scene(timestep=0.004, limits=True)
+
+
+def fit(folder: Path, scene, **setup) -> Path:
+    """A folder as `identify` leaves one."""
+    prior(door_space(scene).select(["hinge_stiffness", "hinge_damping"])).save(folder / "gaussian.json")
+    (folder / "setup.json").write_text(json.dumps(setup))
+    return folder
+
+
+def test_a_fit_brings_its_gaussian_and_its_stand_in(scene, tmp_path: Path):
+    folder = fit(tmp_path, scene, springs=2, seed=7, recording=[])
+    found, gaussian, effects = source(folder, knob=1)
+    assert gaussian.space.names == ("hinge_stiffness", "hinge_damping") and effects == () and "knob 1" in found.name
+    assert stand_in_of(folder) == {"springs": 2, "seed": 7} and extended_of(folder) is None
+    assert stand_in_of(fit(tmp_path, scene, springs=1, recording=["own.npz"])) == {}
+
+
+def test_without_a_fit_there_is_the_prior(scene):
+    _, gaussian, _ = source(None, knob=0)
+    assert gaussian.space.names == door_space(scene).names and stand_in_of(None) == {}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["train", "--fit", "nowhere"], "nowhere holds no gaussian.json"),
+        (["train", "--method", "mean"], "--method mean needs a fit"),
+        (["evaluate", "nowhere"], "nowhere/training.json is missing: `python -m droid_jax.run train --out nowhere`"),
+        (["export", "nowhere"], "nowhere/policy.npz: there is no such file"),
+    ],
+)
+def test_what_is_missing_is_said(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]):
+    assert main(arguments) == 2
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("fitted", "asked", "stiffness", "hidden"),
+    [
+        ({}, {}, 1.06, ()),
+        ({"springs": 2, "seed": 3, "hide": ["closer=2"]}, {}, 1.24, ("closer",)),
+        ({"springs": 2, "hide": None}, {}, 1.24, ("magnetic_catch",)),
+        ({"springs": 2, "hide": ["closer=2"]}, {"springs": 0, "hide": ("none",)}, 0.002, ()),
+    ],
+)
+def test_the_stand_in_is_the_fitted_one_unless_asked(scene, fitted, asked, stiffness: float, hidden: tuple[str, ...]):
+    trained = {"stand_in": fitted, "setup": {"knob": 0}}
+    robot, truth = _robot(Evaluate(trials=3, **asked), trained, DoorEnv(scene))
+    assert truth["hinge_stiffness"] == pytest.approx(stiffness, rel=0.3)
+    assert tuple(a.name for a in robot.hidden) == hidden and robot.config.trials == 3
+    assert robot.config.timestep <= (0.00025 if hidden else 0.0005)
+
+
+@pytest.mark.slow
+def test_train_evaluate_export(scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    folder = tmp_path / "fit"
+    folder.mkdir()
+    fit(folder, scene, springs=0, seed=1, recording=[])
+    assert main(["train", "--fit", "fit", "--steps", "20000", "--out", "run"]) == 0
+    assert main(["evaluate", "run", "--trials", "4", "--no-film"]) == 0
+    pytest.importorskip("onnxruntime")
+    assert main(["export", "run"]) == 0
+    said = capsys.readouterr().out
+    assert "stand-in robot: 0% success" in said and "ONNX and JAX differ by at most" in said
+    transfer = json.loads((tmp_path / "run" / "transfer.json").read_text())
+    assert transfer["simulation"]["trials"] == transfer["stand_in"]["trials"] == 4
+    assert np.isfinite(load(tmp_path / "run" / "export" / "policy.npz").act(np.zeros(23))).all()
+    assert "Learning" in (tmp_path / "run" / "report.html").read_text()
+    assert main(["train", "--fit", "fit", "--steps", "20000", "--out", "run"]) == 0
+    assert "holds this run already" in capsys.readouterr().out
