@@ -17,8 +17,7 @@ from droid_jax.policy.trials import Trials
 
 
 def simulated(policy: Policy, env: DoorEnv, randomise: Randomise | None, episodes: int, seed: int = 0) -> Trials:
-    """Episodes of the deterministic policy until they succeed, each in its own draw of the physics (without, all in the
-    scene's own)."""
+    """Episodes of the deterministic policy, each in its own draw of the physics (without, all in the scene's own)."""
     start, physics = jax.random.split(jax.random.key(seed))
     keys = jax.random.split(physics, episodes)
     many = (
@@ -26,20 +25,20 @@ def simulated(policy: Policy, env: DoorEnv, randomise: Randomise | None, episode
     )
 
     def step(carry, _):
-        state, won, best, grips, count = carry
-        going = (state.done == 0.0) & (won == 0.0)
+        state, won, best, grips, count, steps = carry
+        going = state.done == 0.0
         after = many.step(state, policy.act(state.obs, jnp))
         state = jax.tree.map(lambda new, old: jnp.where(_as(going, new), new, old), after, state)
         best = jnp.maximum(best, state.metrics["angle"])
         seen = going * after.metrics["success"], going * after.metrics["grip"]
-        return (state, won + seen[0], best, grips + seen[1], count + going), None
+        return (state, won + seen[0], best, grips + seen[1], count + going, steps + (going & (won == 0.0))), None
 
     @functools.partial(jax.jit, compiler_options=runtime.compiler_options())
     def run(keys):
         nothing = jnp.zeros(episodes)
-        carry = (many.reset(keys), nothing, nothing, nothing, nothing)
-        (state, won, best, grips, count), _ = jax.lax.scan(step, carry, None, length=env.task.steps)
-        return won, best, count, grips / jnp.maximum(count, 1.0), state.metrics["blown_up"]
+        carry = (many.reset(keys), nothing, nothing, nothing, nothing, nothing)
+        (state, won, best, grips, count, steps), _ = jax.lax.scan(step, carry, None, length=env.task.steps)
+        return won, best, steps, grips / jnp.maximum(count, 1.0), state.metrics["blown_up"]
 
     won, angle, steps, grip, blown_up = (np.asarray(a) for a in run(jax.random.split(start, episodes)))
     stopped = np.where(blown_up > 0, "the simulation blew up", "")

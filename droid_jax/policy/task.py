@@ -86,15 +86,17 @@ def pressing(task: Task, seen: Seen) -> Any:
 def terms(task: Task, seen: Seen) -> dict[str, Any]:
     """The five terms of equation 4, unweighted: door, orientation, distance, log_distance, slip.
 
-    The door's opening counts while the knob is gripped, and each finger that presses a little: without that, training
-    ends with open fingers around the knob.  Distances count below `opened` only.
+    Distances count below `opened` only.  The door's opening counts while the knob is gripped.  Each finger that presses
+    counts a little: without that, training ends with open fingers around the knob.  And an open door counts once more:
+    without that, training ends a hair before `opened`, from where on the distances pay nothing.
     """
     distance = jnp.linalg.norm(seen.pinch)
     grip = gripped(task, seen)
     touch = jnp.mean(pressing(task, seen)) * (jnp.abs(seen.yaw) <= task.yaw)
     shut = seen.angle < task.opened
+    opening = jnp.clip(seen.angle / task.opened, 0.0, 2.0) + jnp.where(shut, 0.0, 1.0)
     return {
-        "door": task.grip * touch + jnp.where(grip, jnp.clip(seen.angle / task.opened, 0.0, 2.0), 0.0),
+        "door": task.grip * touch + jnp.where(grip, opening, 0.0),
         "orientation": seen.normal - jnp.abs(seen.yaw),
         "distance": jnp.where(shut, -distance, 0.0),
         "log_distance": jnp.where(shut, -jnp.log(distance + task.near), 0.0),

@@ -127,22 +127,22 @@ def _trial(
     seen = looked(hand, data, finger_forces_c(hand, model, data), np.zeros((2, 3)), task.control, np)
     loop = Controller(policy)
     held = longest = angle = 0.0
-    grips = steps = 0
+    grips = steps = number = 0
     watch(data)
-    while steps < task.steps and not succeeded(task, longest):
-        asked = loop.act(sense(steps * task.control))
+    for number in range(1, task.steps + 1):
+        asked = loop.act(sense((number - 1) * task.control))
         if asked.stopped is not None:
             break
         advance(np.concatenate([asked.arm, asked.fingers]))
-        steps += 1
         if not np.isfinite(data.qpos).all():
             break
         watch(data)
         seen = looked(hand, data, finger_forces_c(hand, model, data), seen.pads, task.control, np)
         grips += bool(gripped(task, seen))
         angle, held = max(angle, float(seen.angle)), float(holding(task, seen, held))
+        steps += not succeeded(task, longest)
         longest = max(longest, held)
-    return bool(succeeded(task, longest)), angle, steps, grips / max(steps, 1), loop.stopped or ""
+    return bool(succeeded(task, longest)), angle, steps, grips / max(number, 1), loop.stopped or ""
 
 
 def _senses(

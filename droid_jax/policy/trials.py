@@ -13,6 +13,7 @@ import scipy.stats
 class Trials:
     """One entry for each trial, N of them.
 
+    A trial goes on after success until its time is up, as a trial of the paper does.
     success: [N] bool.  angle: [N] rad, the largest; steps: [N] actions until success, or all there were;
     grip: [N] share of actions with the knob gripped.  stopped: [N] why a trial was stopped, "" where it was not.
     """

@@ -51,6 +51,12 @@ def test_the_door_pays_only_while_it_is_gripped():
     assert float(reward(TASK, HELD)) > float(reward(TASK, hooked))
 
 
+def test_an_open_door_pays_more_than_one_just_short_of_it():
+    """Though the distances stop to pay at thirty degrees."""
+    before, after = (HELD._replace(angle=TASK.opened + by) for by in (-0.01, 0.01))
+    assert float(reward(TASK, after)) > float(reward(TASK, before)) + 1.0
+
+
 def test_distances_count_below_thirty_degrees_only():
     far = HELD._replace(pinch=np.array([0.0, 0.0, 0.1]))
     opened = far._replace(angle=np.deg2rad(31.0))
