@@ -40,7 +40,7 @@ class TrainConfig:
     seed.
     """
 
-    steps: int = 2_000_000
+    steps: int = 4_000_000
     envs: int = 256
     hidden: tuple[int, ...] = (64, 64)
     learning_rate: float = 1e-3
@@ -53,8 +53,8 @@ class TrainConfig:
     batch: int = 32
     minibatches: int = 8
     epochs: int = 6
-    evaluations: int = 10
-    eval_envs: int = 64
+    evaluations: int = 16
+    eval_envs: int = 128
     seed: int = 0
 
 
@@ -88,7 +88,11 @@ class TrainProgress:
 
 @dataclass(frozen=True, eq=False)
 class Trained:
-    """A policy and how it came to be."""
+    """A policy and how it came to be.
+
+    policy: of all that were tried while it trained, the one that succeeded most, and among those the one of largest
+    reward: PPO's last update is not always its best.
+    """
 
     policy: Policy
     history: tuple[TrainProgress, ...]
@@ -107,7 +111,7 @@ def train(
 
     checkpoints: folder where the networks are kept after every evaluation, and from which an interrupted run goes on
     (with Adam's moments anew); fingerprint: what else they belong to.
-    Raises ValueError for more devices than divide the environments.
+    Raises ValueError for a checkpoint of another run or network, and for more devices than divide the environments.
     """
     config = config or TrainConfig()
     devices = jax.local_device_count()
@@ -137,8 +141,12 @@ def _brax(
 ) -> Trained:
     """brax's PPO from `done` actions on, with the networks of `tree` where there are any."""
     history, began = list[TrainProgress](), time.monotonic()
+    latest: Any = None
+    best: Any = None
+    score = (-np.inf, -np.inf)
 
     def tell(step: int, metrics: dict[str, Any]) -> None:
+        nonlocal best, score
         now = TrainProgress(
             step=done + step,
             of=config.steps,
@@ -149,10 +157,15 @@ def _brax(
         )
         history.append(now)
         progress(now)
+        if latest is None or not step:
+            return
+        if best is None or (now.success, now.reward) >= score:
+            best, score = latest, (now.success, now.reward)
+        save(done + step, {"latest": to_tree(latest), "best": to_tree(best), "score": np.array(score)})
 
     def keep(step: int, _: Any, params: Any) -> None:
-        if step:
-            save(done + step, to_tree(params))
+        nonlocal latest
+        latest = params
 
     def run(steps: int, restore: Any = None, **hooks: Any) -> Any:
         return ppo.train(
@@ -190,10 +203,11 @@ def _brax(
         params: Any = None
         if tree is not None:
             _, blank, _ = run(0)
-            params = from_tree(blank, tree)
+            params, best = (from_tree(blank, tree[name]) for name in ("latest", "best"))
+            score = tuple(tree["score"].tolist())
         if done < config.steps:
-            _, params, _ = run(config.steps - done, params, progress_fn=tell, policy_params_fn=keep)
-    normaliser, actor, _ = params
+            run(config.steps - done, params, progress_fn=tell, policy_params_fn=keep)
+    normaliser, actor, _ = best
     interface = interface_of(env.scene, env.task, env.start)
     return Trained(policy_of(normaliser, actor, layer_sizes(config.hidden), interface), tuple(history))
 
