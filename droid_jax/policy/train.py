@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -242,7 +243,9 @@ class replicated:
     """
 
     def __init__(self, module: Any = jax) -> None:
-        self._module, self._missing = module, not hasattr(module, "device_put_replicated")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # jax 0.9 warns of it, even when it is only looked for
+            self._module, self._missing = module, not hasattr(module, "device_put_replicated")
 
     def __enter__(self) -> None:
         if self._missing:

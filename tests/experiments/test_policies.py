@@ -74,8 +74,9 @@ def test_settings_have_their_names():
 
 
 @pytest.mark.slow
-def test_the_experiment_runs_quick(tmp_path: Path):
-    command = [sys.executable, "experiments/table2.py", "--quick", "--out", str(tmp_path)]
+@pytest.mark.parametrize(("script", "line"), [("table2", {"paper"}), ("knob_locations", {"0.15 m"})])
+def test_the_experiments_run_quick(tmp_path: Path, script: str, line: set[str]):
+    command = [sys.executable, f"experiments/{script}.py", "--quick", "--out", str(tmp_path)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    assert set(json.loads(done.stdout.splitlines()[-1])["paper"]) == {"prior", "mean", "fitted"}
-    assert (tmp_path / "table2_quick.json").is_file()
+    assert set(json.loads(done.stdout.splitlines()[-1])) == line
+    assert (tmp_path / f"{script}_quick.json").is_file()
