@@ -1,0 +1,152 @@
+"""Does it pay to find a missing effect?  Policies trained on the base fit, and on the extended model.
+
+    python experiments/hidden_effect_policy.py [--quick] [--out DIR] [--hide closer=3] [--seeds 5] [--trials 100]
+
+The stand-in robot hides an effect.  It is recorded in three motions and searched once (`gap`); the verdict, right or
+wrong, is taken as it comes.  Then policies are trained on draws of the base model's Gaussian and on draws of the
+extended model's, alike in everything else, and tried on the robot that hides the effect.  Every policy is one JSON file
+under DIR/hidden_effect_cases and is not trained again; DIR/hidden_effect_policy.json sums them up.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
+
+import tuned  # noqa: E402, F401  (before jax starts)
+
+# isort: split
+import functools  # noqa: E402
+import itertools  # noqa: E402
+import json  # noqa: E402
+
+import tyro  # noqa: E402
+
+from benchmarks.common import origin  # noqa: E402
+from droid_jax.commands.gap_search import searched  # noqa: E402
+from droid_jax.commands.hidden import hidden_effects, record_stand_in  # noqa: E402
+from droid_jax.gap.case import GapConfig  # noqa: E402
+from droid_jax.gap.extended import FILE, extended, load_extended, save_extended  # noqa: E402
+from droid_jax.gap.split import Split  # noqa: E402
+from droid_jax.identify.gaussian import load as load_gaussian  # noqa: E402
+from droid_jax.identify.refine import RefineConfig  # noqa: E402
+from droid_jax.identify.search import SearchConfig  # noqa: E402
+from droid_jax.identify.uncertainty import posterior  # noqa: E402
+from droid_jax.measure.hidden import listed  # noqa: E402
+from droid_jax.measure.surrogate import stand_in_truth  # noqa: E402
+from droid_jax.model.door import door_nuisances, door_space  # noqa: E402
+from droid_jax.model.door_scene import door_scene  # noqa: E402
+from droid_jax.model.effects.registry import library  # noqa: E402
+from droid_jax.policy.door_env import DoorEnv  # noqa: E402
+from droid_jax.policy.randomise import randomised  # noqa: E402
+from droid_jax.policy.task import Task  # noqa: E402
+from droid_jax.policy.transfer import TransferConfig, stand_in  # noqa: E402
+from droid_jax.storage import write_json  # noqa: E402
+from experiments.policies.cases import QUICK_STEPS, TIMESTEP, Budget, run_all, tried  # noqa: E402
+from experiments.policies.table import PLACES, apart, column  # noqa: E402
+
+MODELS = ("base", "extended")
+BASE = "base.json"
+SPRINGS, ROBOT = 0, 21  # the stand-in's column of Table I, and the seed of its hidden errors
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Options of the experiment."""
+
+    quick: bool = False
+    """One small policy of each model, a search for the hidden effect alone: shows that it runs."""
+    out: Path = ROOT / "experiments" / "results"
+    """Folder of hidden_effect_policy.json and of the cases."""
+    hide: tuple[str, ...] = ("closer=3",)
+    """What the stand-in robot hides, name=amplitude."""
+    steps_allowed: int = 512
+    """Actions of an episode."""
+    seeds: int = 5
+    """Policies of each model."""
+    first: int = 0
+    """Seed of the first policy: pilots use others than the runs that are reported."""
+    trials: int = 100
+    """Trials of each policy on the stand-in robot, and episodes in simulation."""
+    steps: int | None = None
+    """Actions of each training; default: the preset's."""
+    preset: Literal["quick", "paper", "gpu"] = "quick"
+    """Of training."""
+    at_most: int = 1_000_000
+    """Stop after so many policies."""
+
+
+def search(arguments: Arguments, folder: Path) -> dict[str, Any]:
+    """The verdict on the robot that hides an effect; base.json and extended.json are in the folder then."""
+    if (folder / "verdict.json").is_file():
+        return json.loads((folder / "verdict.json").read_text())
+    scene = door_scene(timestep=TIMESTEP)
+    base = door_space(scene) + door_nuisances(scene)
+    roles = record_stand_in(scene, hidden_effects(arguments.hide, scene), folder, SPRINGS, ROBOT, again=False)
+    config = GapConfig()
+    if arguments.quick:
+        small = RefineConfig(iterations=1, hops=0, spreads=0)
+        config = GapConfig(SearchConfig(population=8, parents=None, generations=1), small, small, 1, 1, 1)
+    case, verdict, _ = searched(Split.RECORDINGS, scene, base, library(scene), roles, config, folder / "checkpoints")
+    posterior(verdict.base.refined, case.fit.cost.comparisons).save(folder / BASE)
+    save_extended(folder, extended(case, verdict.model))
+    found = {"verdict": verdict.kind.value, "sentence": verdict.sentence, "effects": list(verdict.effects)}
+    write_json(folder / "verdict.json", found)
+    return found
+
+
+def case(model: str, seed: int, folder: Path, arguments: Arguments, budget: Budget) -> dict[str, Any]:
+    """One policy, trained on one of the two models."""
+    search(arguments, folder)
+    scene, task = door_scene(timestep=TIMESTEP, limits=True), Task(steps=arguments.steps_allowed)
+    task = replace(task, steps=QUICK_STEPS) if budget.quick else task
+    if model == "base":
+        env, gaussian = DoorEnv(scene, task), load_gaussian(folder / BASE)
+    else:
+        found = load_extended(folder / FILE, scene)
+        env, gaussian = DoorEnv(found.scene, task, found.effects), found.gaussian
+    hidden, config = listed(hidden_effects(arguments.hide, scene)), TransferConfig(trials=budget.trials, seed=ROBOT)
+    truth = stand_in_truth(door_scene(), SPRINGS, ROBOT)
+    robot = stand_in(door_scene(limits=True), env.start, truth, hidden, task, config)
+    return {
+        "model": model,
+        **tried(folder / f"{model}_{seed}", env, randomised(env.scene, gaussian), robot, seed, budget),
+    }
+
+
+def main() -> None:
+    arguments = tyro.cli(Arguments, description=__doc__)
+    cases = arguments.out / ("hidden_effect_cases_quick" if arguments.quick else "hidden_effect_cases")
+    budget = Budget.of(arguments.preset, arguments.steps, arguments.trials, arguments.quick)
+    seeds = range(arguments.first, arguments.first + (1 if arguments.quick else arguments.seeds))
+    run_all(
+        {
+            cases / f"{model}_{seed}.json": functools.partial(case, model, seed, cases, arguments, budget)
+            for seed, model in itertools.product(seeds, MODELS)
+        },
+        arguments.at_most,
+    )
+    found = [json.loads(path.read_text()) for path in sorted(cases.glob("*_*.json"))]
+    of = {model: [c for c in found if c["model"] == model] for model in MODELS}
+    table = {model: {place: column(own, place) for place in PLACES} for model, own in of.items() if own}
+    better = {}
+    if all(of.values()):
+        better = {what: apart(of["extended"], of["base"], what) for what in ("success", "angle")}
+    content = {
+        "hidden": list(arguments.hide),
+        **search(arguments, cases),
+        "models": table,
+        "extended_better_by": better,
+    }
+    name = "hidden_effect_policy_quick.json" if arguments.quick else "hidden_effect_policy.json"
+    write_json(arguments.out / name, {**content, **origin(0)})
+    print(json.dumps({m: {p: round(c[p]["success_rate"], 3) for p in PLACES} for m, c in table.items()}))
+
+
+if __name__ == "__main__":
+    main()
