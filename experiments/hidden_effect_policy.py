@@ -108,15 +108,13 @@ def case(model: str, seed: int, folder: Path, arguments: Arguments, budget: Budg
     if model == "base":
         env, gaussian = DoorEnv(scene, task), load_gaussian(folder / BASE)
     else:
-        found = load_extended(folder / FILE, scene)
-        env, gaussian = DoorEnv(found.scene, task, found.effects), found.gaussian
+        known = load_extended(folder / FILE, scene)
+        env, gaussian = DoorEnv(known.scene, task, known.effects), known.gaussian
     hidden, config = listed(hidden_effects(arguments.hide, scene)), TransferConfig(trials=budget.trials, seed=ROBOT)
     truth = stand_in_truth(door_scene(), SPRINGS, ROBOT)
     robot = stand_in(door_scene(limits=True), env.start, truth, hidden, task, config)
-    return {
-        "model": model,
-        **tried(folder / f"{model}_{seed}", env, randomised(env.scene, gaussian), robot, seed, budget),
-    }
+    found = tried(folder / f"{model}_{seed}", env, randomised(env.scene, gaussian), robot, seed, budget)
+    return {"model": model, **found}
 
 
 def main() -> None:
@@ -137,14 +135,9 @@ def main() -> None:
     better = {}
     if all(of.values()):
         better = {what: apart(of["extended"], of["base"], what) for what in ("success", "angle")}
-    content = {
-        "hidden": list(arguments.hide),
-        **search(arguments, cases),
-        "models": table,
-        "extended_better_by": better,
-    }
+    content = {"hidden": list(arguments.hide), **search(arguments, cases)}
     name = "hidden_effect_policy_quick.json" if arguments.quick else "hidden_effect_policy.json"
-    write_json(arguments.out / name, {**content, **origin(0)})
+    write_json(arguments.out / name, {**content, "models": table, "extended_better_by": better, **origin(0)})
     print(json.dumps({m: {p: round(c[p]["success_rate"], 3) for p in PLACES} for m, c in table.items()}))
 
 
