@@ -84,7 +84,10 @@ class Arguments:
 def search(arguments: Arguments, folder: Path) -> dict[str, Any]:
     """The verdict on the robot that hides an effect; base.json and extended.json are in the folder then."""
     if (folder / "verdict.json").is_file():
-        return json.loads((folder / "verdict.json").read_text())
+        known = json.loads((folder / "verdict.json").read_text())
+        if known["hidden"] != list(arguments.hide):
+            raise SystemExit(f"error: {folder} is of a robot that hides {known['hidden']}; choose another --out")
+        return known
     scene = door_scene(timestep=TIMESTEP)
     base = door_space(scene) + door_nuisances(scene)
     roles = record_stand_in(scene, hidden_effects(arguments.hide, scene), folder, SPRINGS, ROBOT, again=False)
@@ -95,7 +98,12 @@ def search(arguments: Arguments, folder: Path) -> dict[str, Any]:
     case, verdict, _ = searched(Split.RECORDINGS, scene, base, library(scene), roles, config, folder / "checkpoints")
     posterior(verdict.base.refined, case.fit.cost.comparisons).save(folder / BASE)
     save_extended(folder, extended(case, verdict.model))
-    found = {"verdict": verdict.kind.value, "sentence": verdict.sentence, "effects": list(verdict.effects)}
+    found = {
+        "hidden": list(arguments.hide),
+        "verdict": verdict.kind.value,
+        "sentence": verdict.sentence,
+        "effects": list(verdict.effects),
+    }
     write_json(folder / "verdict.json", found)
     return found
 
@@ -113,7 +121,8 @@ def case(model: str, seed: int, folder: Path, arguments: Arguments, budget: Budg
     hidden, config = listed(hidden_effects(arguments.hide, scene)), TransferConfig(trials=budget.trials, seed=ROBOT)
     truth = stand_in_truth(door_scene(), SPRINGS, ROBOT)
     robot = stand_in(door_scene(limits=True), env.start, truth, hidden, task, config)
-    found = tried(folder / f"{model}_{seed}", env, randomised(env.scene, gaussian), robot, seed, budget)
+    doors_of = repr((arguments.hide, gaussian.mean.tolist(), gaussian.cov.tolist()))
+    found = tried(folder / f"{model}_{seed}", env, randomised(env.scene, gaussian), robot, seed, budget, doors_of)
     return {"model": model, **found}
 
 
@@ -122,22 +131,20 @@ def main() -> None:
     cases = arguments.out / ("hidden_effect_cases_quick" if arguments.quick else "hidden_effect_cases")
     budget = Budget.of(arguments.preset, arguments.steps, arguments.trials, arguments.quick)
     seeds = range(arguments.first, arguments.first + (1 if arguments.quick else arguments.seeds))
-    run_all(
-        {
-            cases / f"{model}_{seed}.json": functools.partial(case, model, seed, cases, arguments, budget)
-            for seed, model in itertools.product(seeds, MODELS)
-        },
-        arguments.at_most,
-    )
-    found = [json.loads(path.read_text()) for path in sorted(cases.glob("*_*.json"))]
+    planned = {
+        cases / f"{model}_{seed}.json": functools.partial(case, model, seed, cases, arguments, budget)
+        for seed, model in itertools.product(seeds, MODELS)
+    }
+    found = run_all(planned, budget, arguments.at_most)
     of = {model: [c for c in found if c["model"] == model] for model in MODELS}
     table = {model: {place: column(own, place) for place in PLACES} for model, own in of.items() if own}
     better = {}
     if all(of.values()):
         better = {what: apart(of["extended"], of["base"], what) for what in ("success", "angle")}
-    content = {"hidden": list(arguments.hide), **search(arguments, cases)}
     name = "hidden_effect_policy_quick.json" if arguments.quick else "hidden_effect_policy.json"
-    write_json(arguments.out / name, {**content, "models": table, "extended_better_by": better, **origin(0)})
+    write_json(
+        arguments.out / name, {**search(arguments, cases), "models": table, "extended_better_by": better, **origin(0)}
+    )
     print(json.dumps({m: {p: round(c[p]["success_rate"], 3) for p in PLACES} for m, c in table.items()}))
 
 

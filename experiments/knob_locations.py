@@ -34,7 +34,7 @@ from droid_jax.policy.task import Task  # noqa: E402
 from droid_jax.policy.transfer import TransferConfig, stand_in  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 from experiments.policies.cases import QUICK_STEPS, TIMESTEP, Budget, run_all, tried  # noqa: E402
-from experiments.policies.robots import fitted, truth_of  # noqa: E402
+from experiments.policies.robots import GAUSSIAN, fitted, truth_of  # noqa: E402
 from experiments.policies.settings import SETTINGS  # noqa: E402
 from experiments.policies.table import PLACES, column  # noqa: E402
 
@@ -71,7 +71,8 @@ def case(knob: int, seed: int, folder: Path, budget: Budget) -> dict[str, Any]:
     config = TransferConfig(trials=budget.trials, seed=setting.robot)
     robot = stand_in(door_scene(limits=True, knob=knob), env.start, truth_of(setting), (), env.task, config)
     randomise = randomised(scene, fitted(setting, folder, budget.quick))
-    return {"knob": knob, **tried(folder / f"knob{knob}_{seed}", env, randomise, robot, seed, budget)}
+    doors_of = repr((knob, (folder / GAUSSIAN).read_text()))
+    return {"knob": knob, **tried(folder / f"knob{knob}_{seed}", env, randomise, robot, seed, budget, doors_of)}
 
 
 def main() -> None:
@@ -81,14 +82,11 @@ def main() -> None:
     if arguments.quick:
         arguments = replace(arguments, seeds=1, knobs=arguments.knobs[-1:])
     seeds = range(arguments.first, arguments.first + arguments.seeds)
-    run_all(
-        {
-            cases / f"knob{knob}_{seed}.json": functools.partial(case, knob, seed, cases, budget)
-            for seed, knob in itertools.product(seeds, arguments.knobs)
-        },
-        arguments.at_most,
-    )
-    found = [json.loads(path.read_text()) for path in sorted(cases.glob("knob*_*.json"))]
+    planned = {
+        cases / f"knob{knob}_{seed}.json": functools.partial(case, knob, seed, cases, budget)
+        for seed, knob in itertools.product(seeds, arguments.knobs)
+    }
+    found = run_all(planned, budget, arguments.at_most)
     table = {}
     for knob in sorted({c["knob"] for c in found}):
         own = [c for c in found if c["knob"] == knob]

@@ -1,12 +1,12 @@
 """Table II of the paper: three ways to choose the doors that a policy is trained on, judged on a robot it never saw.
 
-    python experiments/table2.py [--quick] [--out DIR] [--settings paper hard] [--seeds 5] [--trials 100]
+    python experiments/table2.py [--quick] [--out DIR] [--settings paper] [--seeds 5] [--trials 100]
 
 For each setting: the stand-in robot is recorded and fitted once; then policies are trained on draws of the prior, on
 the fitted mean alone and on draws of the fitted Gaussian, alike in everything else, and tried in simulation and on the
 stand-in robot.  Every policy is one JSON file under DIR/table2_cases and is not trained again: the experiment can be
-stopped and goes on where it was.  DIR/table2.json sums them up, with intervals by bootstrap over policies;
-DIR/table2.png has the histograms.  docs/paper.md says what was fixed before the runs.
+stopped and goes on where it was.  DIR/table2.json sums them up, with intervals by bootstrap over policies.
+docs/paper.md says what was fixed before the runs.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from droid_jax.policy.task import Task  # noqa: E402
 from droid_jax.policy.transfer import TransferConfig, stand_in  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 from experiments.policies.cases import QUICK_STEPS, TIMESTEP, Budget, run_all, tried  # noqa: E402
-from experiments.policies.robots import fitted, truth_of  # noqa: E402
+from experiments.policies.robots import GAUSSIAN, fitted, truth_of  # noqa: E402
 from experiments.policies.settings import SETTINGS, Setting  # noqa: E402
 from experiments.policies.table import summed_up  # noqa: E402
 
@@ -54,7 +54,7 @@ class Arguments:
     """One small policy of each method: shows that it runs, says nothing about quality."""
     out: Path = ROOT / "experiments" / "results"
     """Folder of table2.json and of the cases."""
-    settings: tuple[str, ...] = ("paper", "hard")
+    settings: tuple[str, ...] = tuple(SETTINGS)
     """Which doors."""
     methods: tuple[Method, ...] = METHODS
     """Which methods."""
@@ -89,7 +89,8 @@ def case(method: Method, seed: int, setting: Setting, folder: Path, budget: Budg
     config = TransferConfig(trials=budget.trials, seed=setting.robot)
     robot = stand_in(door_scene(limits=True), env.start, truth_of(setting), (), env.task, config)
     randomise = doors(method, setting, folder, budget.quick, env)
-    found = tried(folder / f"{method}_{seed}", env, randomise, robot, seed, budget)
+    doors_of = repr((setting, (folder / GAUSSIAN).read_text() if method != "prior" else "prior"))
+    found = tried(folder / f"{method}_{seed}", env, randomise, robot, seed, budget, doors_of)
     return {"setting": setting.name, "method": method, **found}
 
 
@@ -104,16 +105,13 @@ def main() -> None:
         raise SystemExit(f"error: unknown setting {unknown[0]!r}; valid: {', '.join(SETTINGS)}")
     seeds = range(arguments.first, arguments.first + arguments.seeds)
     wanted = itertools.product(arguments.settings, seeds, arguments.methods)
-    run_all(
-        {
-            cases / name / f"{method}_{seed}.json": functools.partial(
-                case, method, seed, SETTINGS[name], cases / name, budget
-            )
-            for name, seed, method in wanted
-        },
-        arguments.at_most,
-    )
-    found = [json.loads(path.read_text()) for path in sorted(cases.glob("*/*_*.json"))]
+    planned = {
+        cases / name / f"{method}_{seed}.json": functools.partial(
+            case, method, seed, SETTINGS[name], cases / name, budget
+        )
+        for name, seed, method in wanted
+    }
+    found = run_all(planned, budget, arguments.at_most)
     summary = summed_up(found, {name: SETTINGS[name] for name in arguments.settings})
     write_json(arguments.out / ("table2_quick.json" if arguments.quick else "table2.json"), {**summary, **origin(0)})
     print(json.dumps(summary["line"]))

@@ -10,7 +10,9 @@ import pytest
 
 from droid_jax import runtime
 from droid_jax.commands.evaluate import Evaluate, _robot
+from droid_jax.commands.folder import setup_of
 from droid_jax.commands.source import extended_of, source, stand_in_of
+from droid_jax.commands.train import Train, _forget
 from droid_jax.identify.gaussian import prior
 from droid_jax.model.door import door_space
 from droid_jax.model.door_scene import door_scene
@@ -30,9 +32,9 @@ def scene():
     return door_scene(timestep=0.004, limits=True)
 
 
-def fit(folder: Path, scene, **setup) -> Path:
+def fit(folder: Path, door, **setup) -> Path:
     """A folder as `identify` leaves one."""
-    prior(door_space(scene).select(["hinge_stiffness", "hinge_damping"])).save(folder / "gaussian.json")
+    prior(door_space(door).select(["hinge_stiffness", "hinge_damping"])).save(folder / "gaussian.json")
     (folder / "setup.json").write_text(json.dumps(setup))
     return folder
 
@@ -45,6 +47,31 @@ def test_a_fit_brings_its_gaussian_and_its_stand_in(scene, tmp_path: Path):
     assert stand_in_of(fit(tmp_path, scene, springs=1, recording=["own.npz"])) == {}
 
 
+def test_fits_for_another_servo_or_scene_are_refused(scene, tmp_path: Path):
+    with pytest.raises(ValueError, match="fitted with the paper's stiff servo"):
+        source(fit(tmp_path, scene, preset="paper", generations=None), knob=0)
+    with pytest.raises(ValueError, match=r"was fitted in own.xml: policies are trained in the built-in scene"):
+        source(fit(tmp_path, scene, preset="quick", scene="own.xml"), knob=0)
+
+
+def test_a_trained_folder_hands_on_its_stand_in(scene, tmp_path: Path):
+    fit(tmp_path, scene, command="train", seed=9, stand_in={"springs": 2, "seed": 3})
+    assert stand_in_of(tmp_path) == {"springs": 2, "seed": 3}
+
+
+def test_the_setup_of_every_command_can_be_written():
+    assert setup_of(Evaluate())["trials"] == 100
+    assert "again" not in setup_of(Train())
+
+
+def test_a_new_training_forgets_the_old_policy(tmp_path: Path):
+    for name in ("policy.npz", "transfer.json", "extended.json", "films/good.webp", "export/policy.onnx", "setup.json"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("old")
+    _forget(tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["setup.json"]
+
+
 def test_without_a_fit_there_is_the_prior(scene):
     _, gaussian, _ = source(None, knob=0)
     assert gaussian.space.names == door_space(scene).names and stand_in_of(None) == {}
@@ -55,6 +82,7 @@ def test_without_a_fit_there_is_the_prior(scene):
     [
         (["train", "--fit", "nowhere"], "nowhere holds no gaussian.json"),
         (["train", "--method", "mean"], "--method mean needs a fit"),
+        (["evaluate", "--trials", "0"], "--trials must be 1 or more, got 0"),
         (["evaluate", "nowhere"], "nowhere/training.json is missing: `python -m droid_jax.run train --out nowhere`"),
         (["export", "nowhere"], "nowhere/policy.npz: there is no such file"),
     ],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ import tyro
 from droid_jax.commands import report
 from droid_jax.commands.folder import setup_of
 from droid_jax.commands.hidden import hidden_effects
-from droid_jax.commands.source import source
+from droid_jax.commands.source import needs_brax, source
 from droid_jax.commands.train import POLICY, TRAINING, randomise
 
 if TYPE_CHECKING:
@@ -46,12 +47,13 @@ class Evaluate:
     """Seed of start poses and sensor noise."""
     film: bool = True
     """Film a good and a bad trial."""
-    again: bool = False
-    """Try again, even where this very evaluation is there already."""
 
 
 def run(command: Evaluate) -> None:
     """Try the policy, write transfer.json and the films, and build the page."""
+    needs_brax()
+    if command.trials < 1:
+        raise ValueError(f"--trials must be 1 or more, got {command.trials}")
     print("starting jax ...", flush=True)
     from droid_jax import runtime
 
@@ -68,9 +70,10 @@ def run(command: Evaluate) -> None:
     setup, policy = trained["setup"], load(command.run / POLICY)
     scene, gaussian, effects = source(command.run, setup["knob"])
     env = DoorEnv(scene, Task(**trained["task"]), effects)
+    robot, truth = _robot(command, trained, env)
+    shutil.rmtree(command.run / FILMS, ignore_errors=True)
     print(f"{command.trials} episodes in simulation ...", flush=True)
     inside = simulated(policy, env, randomise(setup["method"], scene, gaussian), command.trials, command.seed)
-    robot, truth = _robot(command, trained, env)
     print(f"{command.trials} trials on the stand-in robot ...", flush=True)
     outside = transfer(policy, robot)
     write_json(
@@ -130,10 +133,9 @@ def _film(folder: Path, policy: Policy, robot: StandIn, found: Trials) -> None:
 
     chosen = {"good": np.flatnonzero(found.success), "bad": np.flatnonzero(~found.success)}
     for name, numbers in chosen.items():
-        path = folder / FILMS / f"{name}.webp"
-        path.unlink(missing_ok=True)
         if not len(numbers):
             continue
+        path = folder / FILMS / f"{name}.webp"
         number = int(numbers[np.argsort(found.angle[numbers])[len(numbers) // 2]])
         try:
             film(path, robot.scene.visual_model(), filmed(policy, robot, number), robot.task.control)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import importlib.util
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +21,7 @@ def source(folder: Path | None, knob: int) -> tuple[Scene, Gaussian, tuple[Effec
     """The scene to train in, the Gaussian in a folder of `identify`, `gap` or `train`, and the effects of its model.
 
     folder: None for the prior of the built-in door.
-    Raises ValueError where the folder holds no Gaussian, or one of another scene.
+    Raises ValueError where the folder holds no Gaussian, or one of another scene or servo.
     """
     from droid_jax.gap.extended import load_extended
     from droid_jax.identify.gaussian import load, prior
@@ -29,6 +31,11 @@ def source(folder: Path | None, knob: int) -> tuple[Scene, Gaussian, tuple[Effec
     scene = door_scene(timestep=TIMESTEP, limits=True, knob=knob)
     if folder is None:
         return scene, prior(door_space(scene)), ()
+    other = setup(folder)
+    if other.get("preset") == "paper" and "generations" in other:
+        raise ValueError(f"{folder} was fitted with the paper's stiff servo: train on a fit of another preset")
+    if other.get("scene"):
+        raise ValueError(f"{folder} was fitted in {other['scene']}: policies are trained in the built-in scene")
     at, model = folder / GAUSSIAN, extended_of(folder)
     if model is None:
         if not at.is_file():
@@ -36,8 +43,8 @@ def source(folder: Path | None, knob: int) -> tuple[Scene, Gaussian, tuple[Effec
         return scene, load(at), ()
     extended = load_extended(model, scene)
     own = load(at) if at.is_file() else extended.gaussian
-    whole = own if set(extended.space.names) <= set(own.space.names) else extended.gaussian
-    return extended.scene, whole, extended.effects
+    effects = {name for part in extended.parts for name in part.free}
+    return extended.scene, own if effects <= set(own.space.names) else extended.gaussian, extended.effects
 
 
 def extended_of(folder: Path) -> Path | None:
@@ -51,9 +58,25 @@ def extended_of(folder: Path) -> Path | None:
 def stand_in_of(folder: Path | None) -> dict[str, Any]:
     """Which stand-in robot a fit was made of, if it was one: its springs, seed and hidden effects."""
     known = {} if folder is None else setup(folder)
+    if known.get("command") == "train":
+        return known.get("stand_in", {})
     if known.get("recording"):
         return {}
     return {k: known[k] for k in ("springs", "seed", "hide") if k in known}
+
+
+def fingerprint(folder: Path | None) -> str | None:
+    """Hash of what a policy is trained on; None for the prior."""
+    if folder is None:
+        return None
+    files = [folder / GAUSSIAN, extended_of(folder)]
+    return hashlib.sha256(b"".join(f.read_bytes() for f in files if f is not None and f.is_file())).hexdigest()
+
+
+def needs_brax() -> None:
+    """ValueError that says what to install where brax is not."""
+    if importlib.util.find_spec("brax") is None:
+        raise ValueError("policies need brax: pip install 'droid_jax[train]'")
 
 
 def setup(folder: Path) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 from droid_jax.commands import report
 from droid_jax.commands.folder import begin, finished, setup_of
-from droid_jax.commands.source import GAUSSIAN, extended_of, source, stand_in_of
+from droid_jax.commands.source import GAUSSIAN, extended_of, fingerprint, needs_brax, source, stand_in_of
 
 if TYPE_CHECKING:
     from droid_jax.identify.gaussian import Gaussian
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 Method = Literal["fitted", "mean", "prior"]
 POLICY, TRAINING = "policy.npz", "training.json"
+EXTENDED = "extended.json"
 USUAL = Path("runs/identify")
 
 
@@ -40,7 +41,7 @@ class Train:
     knob: Literal[0, 1, 2, 3] = 0
     """Where the knob is along the door, each 5 cm nearer to the hinge than the one before."""
     steps: int | None = None
-    """Actions in all; default: the preset's."""
+    """Actions in all, rounded up to whole rounds; default: the preset's."""
     seed: int = 0
     """Seed of the networks and of the environments."""
     out: Path = Path("runs/train")
@@ -51,12 +52,12 @@ class Train:
 
 def run(command: Train) -> None:
     """Train, and write the run's folder and its page."""
+    needs_brax()
     print("starting jax ...", flush=True)
     from droid_jax import runtime
 
     runtime.tune()
     runtime.import_mjx()
-    from droid_jax.gap.extended import FILE
     from droid_jax.identify.results import prepare_folder
     from droid_jax.policy.door_env import DoorEnv
     from droid_jax.policy.network import save_policy
@@ -67,26 +68,29 @@ def run(command: Train) -> None:
     out, fit = prepare_folder(command.out), _fit_folder(command)
     scene, gaussian, effects = source(fit, command.knob)
     gaussian = _chosen(command, gaussian)
-    setup = {**setup_of(command), "command": "train", "fit": None if fit is None else str(fit)}
+    origin = {"fit": None if fit is None else str(fit), "fit_sha256": fingerprint(fit), "stand_in": stand_in_of(fit)}
+    setup = {**setup_of(command), "command": "train", **origin}
     if finished(out, setup, command.again, TRAINING):
         report.run(report.Report(out))
         return
     config = config_of(command)
     env = DoorEnv(scene, effects=effects)
     begin(out, setup, command.again, TRAINING)
+    _forget(out)
     gaussian.save(out / GAUSSIAN)
     model = None if fit is None else extended_of(fit)
     if model is not None:
-        shutil.copyfile(model, out / FILE)
+        shutil.copyfile(model, out / EXTENDED)
     with training(config.steps) as progress:
         found = train(
             env, randomise(command.method, scene, gaussian), config, checkpoints=out / "checkpoints",
-            fingerprint={"method": command.method, "gaussian": (out / GAUSSIAN).read_text()}, progress=progress,
+            fingerprint={"method": command.method, "gaussian": (out / GAUSSIAN).read_text()},
+            progress=progress,
         )  # fmt: skip
     save_policy(out / POLICY, found.policy)
     content = {
         "setup": setup,
-        "stand_in": stand_in_of(fit),
+        "stand_in": setup["stand_in"],
         "config": dataclasses.asdict(config),
         "task": dataclasses.asdict(env.task),
         "scene": scene.name,
@@ -97,6 +101,14 @@ def run(command: Train) -> None:
     }
     write_json(out / TRAINING, content)  # last: its presence says that the run is whole
     report.run(report.Report(out))
+
+
+def _forget(out: Path) -> None:
+    """Remove what belongs to a policy that was trained here before."""
+    for name in (POLICY, "transfer.json", EXTENDED):
+        (out / name).unlink(missing_ok=True)
+    for name in ("films", "export"):
+        shutil.rmtree(out / name, ignore_errors=True)
 
 
 def config_of(command: Train) -> TrainConfig:
@@ -127,7 +139,8 @@ def _fit_folder(command: Train) -> Path | None:
     if command.fit is not None:
         return command.fit
     if (USUAL / GAUSSIAN).is_file():
-        print(f"training on the fit in {USUAL} (another: --fit)")
+        what = "what was assumed before the fit" if command.method == "prior" else "the fit"
+        print(f"training on {what} in {USUAL} (another: --fit)")
         return USUAL
     if command.method == "mean":
         raise ValueError(f"--method mean needs a fit: there is none in {USUAL}, and no --fit FOLDER was given")

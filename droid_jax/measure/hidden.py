@@ -71,7 +71,7 @@ def record_hidden(
         raise ValueError(f"hidden effects need time steps of at most {LONGEST_STEP} s, got {config.timestep}")
     applied = listed(effects)
     for one in applied:
-        _check(one, scene)
+        check(one, scene)
     stand_in = set_up(scene, demonstration, truth, seed=seed, config=config, space=space)
     rows, gears, sensors, stand_in = _simulate(stand_in, applied)
     trace = split(stand_in.scene, rows)
@@ -114,7 +114,7 @@ def _lacks(effect: Hidden, scene: Scene) -> str | None:
     return None
 
 
-def _check(one: Applied, scene: Scene) -> None:
+def check(one: Applied, scene: Scene) -> None:
     effect = hidden_effect(one.name)
     if not math.isfinite(one.amplitude) or (one.amplitude < 0 and not effect.signed):
         least = "a finite" if effect.signed else "a finite, not negative"

@@ -44,7 +44,7 @@ class Interface:
     chain: [8, 4, 4] from base to joint 1, joint to joint, joint 7 to pinch point, all joints at zero, each joint
     turning about its frame's z axis.
     pads: [2, 3] m of the pads in the pinch point's frame, shut; slides: [2, 3] how they move with a finger's position.
-    start: [9] rad and m, arm and fingers where training starts.
+    start: [9] rad and m, arm and fingers where training starts; knob: [4, 4] pose of the knob then, base frame, m.
     """
 
     period: float
@@ -60,6 +60,7 @@ class Interface:
     pads: np.ndarray
     slides: np.ndarray
     start: np.ndarray
+    knob: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +92,7 @@ def arrays(policy: Policy) -> dict[str, Any]:
 
 
 def load(path: str | Path) -> Policy:
-    """ValueError names what is wrong with a file: missing, damaged, or of another layout of observations."""
+    """ValueError names what is wrong with a file: missing, damaged, no numbers, of another layout of observations."""
     try:
         with np.load(path, allow_pickle=False) as file:
             found = {name: file[name] for name in file.files}
@@ -105,6 +106,13 @@ def load(path: str | Path) -> Policy:
         other = [name for name in found["layout"].tolist() if name not in LAYOUT] or ["another order"]
         raise ValueError(f"{path} was trained on another observation: {', '.join(other[:3])}")
     layers = range(sum(name.startswith("weight_") for name in found))
+    names = [f"{kind}_{k}" for kind in ("weight", "bias") for k in layers]
+    lacking = [n for n in ("mean", "std", "weight_0", *names, *(f.name for f in fields(Interface))) if n not in found]
+    if lacking:
+        raise ValueError(f"{path} lacks {', '.join(lacking)}")
+    broken = [n for n in ("mean", "std", *names) if not np.isfinite(found[n]).all()]
+    if broken:
+        raise ValueError(f"{path}: {', '.join(broken)} hold values that are no numbers; train again")
     weights, biases = (tuple(found[f"{kind}_{k}"] for k in layers) for kind in ("weight", "bias"))
     interface: Any = {f.name: found[f.name] if found[f.name].ndim else float(found[f.name]) for f in fields(Interface)}
     return Policy(found["mean"], found["std"], weights, biases, Interface(**interface))
@@ -114,9 +122,9 @@ def load(path: str | Path) -> Policy:
 class Reading:
     """What a robot says of itself at one instant.
 
-    time: s, any clock that runs on.  position: [7] rad, velocity: [7] rad/s, of the arm.  torque: [7] N m, or None.
-    fingers: [2] m, how far each stands from shut.  knob: [4, 4] pose of the knob in the robot's base frame, m: x the
-    door's inward normal, z up.
+    time: s, any clock that runs on.  position: [7] rad, velocity: [7] rad/s, of the arm.  torque: [7] N m, without
+    what carries the arm's own weight, or None.  fingers: [2] m, how far each stands from shut.  knob: [4, 4] pose of
+    the knob in the robot's base frame, m: x the door's inward normal, z up.
     """
 
     time: float
@@ -159,29 +167,33 @@ class Safety:
     """When the loop stops.
 
     late: share of the period by which a reading may come late.  speed, effort: shares of the arm's limits that
-    measured velocities and torques may reach.  margin: rad that targets keep from the ends of the joints' ranges.
+    measured velocities and torques may reach.  margin: rad that targets keep from the ends of the joints' ranges, and
+    by which a joint may be beyond them.  off, turned: m and rad by which the knob may be away from where it was in
+    training when the loop begins.
     """
 
     late: float = 0.5
     speed: float = 1.0
     effort: float = 1.1
     margin: float = 0.02
+    off: float = 0.05
+    turned: float = 0.2
 
 
 class Controller:
     """The policy as a control loop: a reading in, a command out.
 
-    Targets stay inside the joints' ranges and so near to where the arm is that the servo's torque stays inside its
-    limits.  The loop stops, and from then on commands the pose at which it stopped, when a reading is stale, late, of
-    a wrong shape or no number, when a measured velocity or torque is beyond its limit, or when the hand leaves the
-    workspace; `stopped` says why.
+    Targets stay inside the joints' ranges and so near to where the arm is that the spring torque of the servo,
+    stiffness times distance, stays inside the joints' limits.  The loop stops, and from then on commands the pose of
+    the last good reading, when a reading is stale, late, of a wrong shape or no number, when a joint is beyond its
+    range, a measured velocity or torque beyond its limit, the hand outside the workspace, or the policy's action no
+    number; `stopped` says why.
     """
 
     def __init__(self, policy: Policy, safety: Safety | None = None):
         self.policy, self.safety = policy, safety or Safety()
         self.stopped: str | None = None
-        self._last: Command | None = None
-        self._pose: np.ndarray | None = None
+        self._held: Command | None = None
         self._time = -np.inf
 
     def act(self, reading: Reading) -> Command:
@@ -190,16 +202,37 @@ class Controller:
         Raises ValueError where already the first reading is of no use: there is no pose to hold then.
         """
         if self.stopped is None:
-            self.stopped = fault(self.policy.interface, self.safety, reading, self._time)
-        if self.stopped is not None:
-            if self._last is None or self._pose is None:
-                raise ValueError(f"cannot begin: {self.stopped}")
-            return Command(self._pose, self._last.fingers, self.stopped)
-        position = np.asarray(reading.position, float)
-        action = np.clip(self.policy.act(observe(self.policy.interface, reading)), -1.0, 1.0)
-        self._last = limited(self.policy.interface, self.safety, position, action)
-        self._pose, self._time = position, reading.time
-        return self._last
+            try:
+                reading = _copied(reading)
+                self.stopped = fault(self.policy.interface, self.safety, reading, self._time)
+            except (TypeError, ValueError) as error:
+                self.stopped = f"a reading that cannot be read: {error}"
+        if self.stopped is None:
+            action = self.policy.act(observe(self.policy.interface, reading))
+            if np.isfinite(action).all():
+                command = limited(self.policy.interface, self.safety, reading.position, np.clip(action, -1.0, 1.0))
+                self._held, self._time = Command(reading.position, command.fingers), reading.time
+                return command
+            self.stopped = "the policy's action holds a value that is no number"
+        return self.hold()
+
+    def hold(self) -> Command:
+        """The pose of the last good reading, fingers as they were told last.  ValueError where there was none."""
+        if self._held is None:
+            raise ValueError(f"cannot begin: {self.stopped or 'nothing was read yet'}")
+        return Command(self._held.arm, self._held.fingers, self.stopped)
+
+
+def _copied(reading: Reading) -> Reading:
+    """Arrays of its own: a driver may write into the ones it handed over."""
+    return Reading(
+        time=reading.time,
+        position=np.array(reading.position, float),
+        velocity=np.array(reading.velocity, float),
+        torque=None if reading.torque is None else np.array(reading.torque, float),
+        fingers=np.array(reading.fingers, float),
+        knob=np.array(reading.knob, float),
+    )
 
 
 def limited(interface: Interface, safety: Safety, position: np.ndarray, action: np.ndarray) -> Command:
@@ -211,7 +244,7 @@ def limited(interface: Interface, safety: Safety, position: np.ndarray, action: 
 
 
 def fault(interface: Interface, safety: Safety, reading: Reading, before: float) -> str | None:
-    """What forbids going on from a reading, in words; before: time of the one before it, s."""
+    """What forbids going on from a reading, in words; before: time of the one before it, s, minus infinity for none."""
     wrong = _unusable({"position": (reading.position, (ARM,)), "velocity": (reading.velocity, (ARM,)),
                        "fingers": (reading.fingers, (FINGERS,)), "knob": (reading.knob, (4, 4)),
                        **({} if reading.torque is None else {"torque": (reading.torque, (ARM,))})})  # fmt: skip
@@ -221,6 +254,10 @@ def fault(interface: Interface, safety: Safety, reading: Reading, before: float)
         return f"stale reading: its time is {reading.time:g} s, that of the one before {before:g} s"
     if reading.time - before > (1.0 + safety.late) * interface.period and np.isfinite(before):
         return f"late: {1e3 * (reading.time - before):.0f} ms between readings, expected {1e3 * interface.period:.0f}"
+    middle, half = interface.ranges.mean(axis=1), np.ptp(interface.ranges, axis=1) / 2 + safety.margin
+    outside = _beyond(reading.position - middle, half, "rad from the middle of its range")
+    if outside is not None:
+        return f"out of range: {outside}"
     fast = _beyond(reading.velocity, safety.speed * interface.speed, "rad/s")
     if fast is not None:
         return f"too fast: {fast}"
@@ -230,6 +267,23 @@ def fault(interface: Interface, safety: Safety, reading: Reading, before: float)
     point = pinch_pose(interface, reading.position)[:3, 3]
     if (point < interface.workspace[0]).any() or (point > interface.workspace[1]).any():
         return f"the hand has left its workspace: it is at ({', '.join(f'{x:.2f}' for x in point)}) m"
+    return _knob_elsewhere(interface, safety, reading.knob, not np.isfinite(before))
+
+
+def _knob_elsewhere(interface: Interface, safety: Safety, knob: np.ndarray, first: bool) -> str | None:
+    """A pose that is none, or, when the loop begins, a knob that is not where it was in training."""
+    turn = knob[:3, :3]
+    if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3 or np.linalg.det(turn) < 0:
+        return "the knob's pose is no pose: its first three rows and columns are no rotation"
+    if not first:
+        return None
+    off = float(np.linalg.norm(knob[:3, 3] - interface.knob[:3, 3]))
+    angle = float(np.arccos(np.clip((np.trace(interface.knob[:3, :3].T @ turn) - 1) / 2, -1, 1)))
+    if off > safety.off or angle > safety.turned:
+        return (
+            f"the knob is elsewhere: {off:.2f} m and {angle:.2f} rad from where it was in training, "
+            f"({', '.join(f'{x:.2f}' for x in interface.knob[:3, 3])}) m in the base frame"
+        )
     return None
 
 
@@ -267,10 +321,21 @@ class Robot(Protocol):
 
 
 def drive(controller: Controller, robot: Robot, seconds: float) -> str | None:
-    """Let the policy drive a robot for so long, or until it stops; why it stopped, or None."""
-    for _ in range(round(seconds / controller.policy.interface.period)):
-        robot.send(controller.act(robot.read()))
-        if controller.stopped is not None:
-            break
-        robot.wait(controller.policy.interface.period)
+    """Let the policy drive a robot for so long, or until it stops; why it stopped, or None.
+
+    In the end, and where the robot's own functions raise, the robot is told to hold its last pose, once: one that wants
+    commands all the time must go on with `Controller.hold`.
+    """
+    begun = False
+    try:
+        for _ in range(round(seconds / controller.policy.interface.period)):
+            command = controller.act(robot.read())
+            begun = True
+            if command.stopped is not None:
+                break
+            robot.send(command)
+            robot.wait(controller.policy.interface.period)
+    finally:
+        if begun:
+            robot.send(controller.hold())
     return controller.stopped

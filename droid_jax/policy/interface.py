@@ -24,7 +24,7 @@ def interface_of(scene: Scene, task: Task, start: np.ndarray, plan: Plan = PLANS
     fingers = [scene.qpos(n) for n in scene.command_names if n not in scene.joints]
     motors = [scene.command_names.index(name) for name in scene.joints]
     at_zero = np.zeros(model.nq)
-    data = _posed(model, at_zero)
+    data, closed = _posed(model, at_zero), _posed(model, start)
     frames = [_pose(data.xpos[body], data.xmat[body]) for body in model.dof_bodyid[arm]]
     pinch = _pose(data.site_xpos[hand.pinch], data.site_xmat[hand.pinch])
     links = [np.eye(4), *frames, pinch]
@@ -48,6 +48,7 @@ def interface_of(scene: Scene, task: Task, start: np.ndarray, plan: Plan = PLANS
         pads=shut,
         slides=slides,
         start=start[[*scene.joint_qpos, *fingers]],
+        knob=_pose(closed.site_xpos[hand.knob], closed.site_xmat[hand.knob]),
     )
 
 

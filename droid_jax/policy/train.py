@@ -32,7 +32,8 @@ from droid_jax.policy.randomise import Randomise
 class TrainConfig:
     """Settings of PPO; the defaults are the preset "quick".
 
-    steps: actions in all, over all environments.  envs: environments at once, over all devices.
+    steps: actions in all, over all environments, rounded up to whole rounds.  envs: environments at once, over all
+    devices.  devices: how many; None for the most that divide the environments.
     hidden: sizes of the hidden layers of actor and critic.
     learning_rate, discount, gae, clip, entropy, reward_scaling: of PPO.
     unroll: actions between updates; batch, minibatches: unrolls of a minibatch, and minibatches; epochs: times
@@ -43,6 +44,7 @@ class TrainConfig:
 
     steps: int = 4_000_000
     envs: int = 256
+    devices: int | None = None
     hidden: tuple[int, ...] = (64, 64)
     learning_rate: float = 1e-3
     discount: float = 0.98
@@ -70,8 +72,8 @@ PRESETS = {
 class TrainProgress:
     """After each evaluation.
 
-    step, of: actions; seconds: since training began, compilation included; rate: actions per second of the last
-    part; reward: of an episode; success: share of episodes.
+    step, of: actions; seconds: since training began, compilation included and pauses not; rate: actions per second
+    of the last part; reward: of an episode; success: share of episodes.
     """
 
     step: int
@@ -111,17 +113,14 @@ def train(
     """Train a policy on environments that `randomise` makes, all alike where it is None.
 
     checkpoints: folder where the networks are kept after every evaluation, and from which an interrupted run goes on
-    (with Adam's moments anew); fingerprint: what else they belong to.
-    Raises ValueError for a checkpoint of another run or network, and for more devices than divide the environments.
+    (with Adam's moments, doors and starts drawn anew); fingerprint: what else they belong to.
+    Raises ValueError for a checkpoint of another run or network, for settings that do not go together, for more devices
+    than there are, and where no policy came of it that consists of numbers.
     """
     config = config or TrainConfig()
-    devices = jax.local_device_count()
-    if config.envs % devices or (config.batch * config.minibatches) % config.envs:
-        raise ValueError(
-            f"{config.envs} environments must be a multiple of the {devices} devices, and batch x minibatches "
-            f"({config.batch} x {config.minibatches}) one of the environments"
-        )
-    texts = {"config": repr(replace(config, steps=0)), "task": repr(asdict(env.task)), **(fingerprint or {})}
+    config = replace(config, devices=_devices(config))
+    of = {"scene": env.scene.name, "effects": ", ".join(e.name for e in env.effects), "task": repr(asdict(env.task))}
+    texts = {"config": repr(replace(config, steps=0, devices=None)), **of, **(fingerprint or {})}
     run = functools.partial(_brax, env, randomise, config)
     if checkpoints is None:
         return run(None, 0, progress, lambda step, params: None)
@@ -129,6 +128,25 @@ def train(
         found = kept.restore()
         step, tree = found if found is not None else (0, None)
         return run(tree, step, progress, kept.save)
+
+
+def _devices(config: TrainConfig) -> int:
+    """How many devices to use; ValueError for settings that do not go together."""
+    if min(config.steps, config.evaluations) < 1:
+        raise ValueError(f"steps and evaluations must be 1 or more, got {config.steps} and {config.evaluations}")
+    if (config.batch * config.minibatches) % config.envs:
+        raise ValueError(
+            f"batch x minibatches ({config.batch} x {config.minibatches}) must be a multiple of the {config.envs} "
+            "environments"
+        )
+    there = jax.local_device_count()
+    if config.devices is None:
+        return max(d for d in range(1, there + 1) if config.envs % d == 0)
+    if not 1 <= config.devices <= there:
+        raise ValueError(f"{config.devices} devices were asked for, there are {there}")
+    if config.envs % config.devices:
+        raise ValueError(f"{config.envs} environments do not divide among {config.devices} devices")
+    return config.devices
 
 
 def _brax(
@@ -141,13 +159,13 @@ def _brax(
     save: Callable[[int, dict[str, Any]], None],
 ) -> Trained:
     """brax's PPO from `done` actions on, with the networks of `tree` where there are any."""
-    history, began = list[TrainProgress](), time.monotonic()
+    history = [TrainProgress(int(row[0]), *row[1:]) for row in tree["history"].tolist()] if tree else []
+    began = time.monotonic() - (history[-1].seconds if history else 0.0)
     latest: Any = None
     best: Any = None
-    score = (-np.inf, -np.inf)
 
     def tell(step: int, metrics: dict[str, Any]) -> None:
-        nonlocal best, score
+        nonlocal best
         now = TrainProgress(
             step=done + step,
             of=config.steps,
@@ -156,13 +174,15 @@ def _brax(
             reward=float(metrics["eval/episode_reward"]),
             success=float(metrics["eval/episode_success"]),
         )
-        history.append(now)
         progress(now)
-        if latest is None or not step:
-            return
-        if best is None or (now.success, now.reward) >= score:
-            best, score = latest, (now.success, now.reward)
-        save(done + step, {"latest": to_tree(latest), "best": to_tree(best), "score": np.array(score)})
+        if not step and history:
+            return  # where an earlier part ended
+        if latest is not None and _finite(latest) and (best is None or _rank(now) >= max(map(_rank, history))):
+            best = latest
+        history.append(now)
+        if best is not None:
+            rows = np.array([list(asdict(h).values()) for h in history], np.float64)
+            save(done + step, {"latest": to_tree(latest), "best": to_tree(best), "history": rows})
 
     def keep(step: int, _: Any, params: Any) -> None:
         nonlocal latest
@@ -192,10 +212,11 @@ def _brax(
                 activation=jnp.tanh,
             ),
             seed=config.seed + done,
-            num_evals=config.evaluations,
+            num_evals=max(2, round(config.evaluations * steps / config.steps)),
             num_eval_envs=config.eval_envs,
             deterministic_eval=True,
             randomization_fn=randomise,
+            max_devices_per_host=config.devices,
             restore_params=restore,
             **hooks,
         )
@@ -205,12 +226,21 @@ def _brax(
         if tree is not None:
             _, blank, _ = run(0)
             params, best = (from_tree(blank, tree[name]) for name in ("latest", "best"))
-            score = tuple(tree["score"].tolist())
         if done < config.steps:
             run(config.steps - done, params, progress_fn=tell, policy_params_fn=keep)
+    if best is None:
+        raise ValueError("training ended in numbers that are none: try another seed, or a smaller learning rate")
     normaliser, actor, _ = best
     interface = interface_of(env.scene, env.task, env.start)
     return Trained(policy_of(normaliser, actor, layer_sizes(config.hidden), interface), tuple(history))
+
+
+def _rank(now: TrainProgress) -> tuple[float, float]:
+    return now.success, now.reward
+
+
+def _finite(params: Any) -> bool:
+    return all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
 
 
 def to_tree(params: Any) -> dict[str, Any]:

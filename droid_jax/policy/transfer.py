@@ -16,7 +16,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from droid_jax.measure.hidden import HIDDEN, LONGEST_STEP, Applied
+from droid_jax.measure.hidden import HIDDEN, LONGEST_STEP, Applied, check
 from droid_jax.measure.hidden_hooks import Influence, Live, Place, edited
 from droid_jax.measure.surrogate import own_engine
 from droid_jax.model.door import door_nuisances, door_space
@@ -72,14 +72,17 @@ def stand_in(
 
     start: [nq] as in training (`DoorEnv.start`), off by `Task.spread` in every trial.  truth: hidden values, of the
     door space and its nuisances; what it leaves out is at its prior's mean.
-    Raises ValueError for hidden effects that act on commands or sensors as whole traces: in a closed loop there are
-    none yet.
+    Raises ValueError for unknown effects and amplitudes, and for hidden effects that act on commands or sensors as
+    whole traces: in a closed loop there are none yet.
     """
     task, config = task or Task(), config or TransferConfig()
+    for one in hidden:
+        check(one, scene)
     unfit = [a.name for a in hidden if _acts_on_traces(scene, a)]
     if unfit:
         raise ValueError(
-            f"hidden effects {', '.join(unfit)} change whole traces, which a closed loop does not have yet"
+            f"hidden effects {', '.join(unfit)} change whole traces, which a closed loop does not have yet: "
+            "choose others, or none"
         )
     if hidden:
         config = replace(config, timestep=min(config.timestep, LONGEST_STEP))
@@ -127,14 +130,18 @@ def _trial(
     seen = looked(hand, data, finger_forces_c(hand, model, data), np.zeros((2, 3)), task.control, np)
     loop = Controller(policy)
     held = longest = angle = 0.0
-    grips = steps = number = 0
+    grips = made = steps = 0
+    stopped = ""
     watch(data)
-    for number in range(1, task.steps + 1):
-        asked = loop.act(sense((number - 1) * task.control))
+    while made < task.steps:
+        asked = loop.act(sense(made * task.control))
         if asked.stopped is not None:
+            stopped = asked.stopped
             break
         advance(np.concatenate([asked.arm, asked.fingers]))
-        if not np.isfinite(data.qpos).all():
+        made += 1
+        if not np.isfinite(data.qpos).all() or data.time < (made - 0.5) * task.control:
+            stopped = "the simulation blew up"  # MuJoCo starts over then: its clock is late
             break
         watch(data)
         seen = looked(hand, data, finger_forces_c(hand, model, data), seen.pads, task.control, np)
@@ -142,7 +149,7 @@ def _trial(
         angle, held = max(angle, float(seen.angle)), float(holding(task, seen, held))
         steps += not succeeded(task, longest)
         longest = max(longest, held)
-    return bool(succeeded(task, longest)), angle, steps, grips / max(number, 1), loop.stopped or ""
+    return bool(succeeded(task, longest)), angle, steps, grips / max(made, 1), stopped
 
 
 def _senses(

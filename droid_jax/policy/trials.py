@@ -14,7 +14,7 @@ class Trials:
     """One entry for each trial, N of them.
 
     A trial goes on after success until its time is up, as a trial of the paper does.
-    success: [N] bool.  angle: [N] rad, the largest; steps: [N] actions until success, or all there were;
+    success: [N] bool.  angle: [N] rad, the largest; steps: [N] actions until success, or all that were made;
     grip: [N] share of actions with the knob gripped.  stopped: [N] why a trial was stopped, "" where it was not.
     """
 
@@ -36,15 +36,23 @@ class Trials:
         return float(span.low), float(span.high)
 
     def to_json(self) -> dict[str, Any]:
-        """As plain data, angles in degrees; trial by trial and in sum."""
-        degrees = np.rad2deg(self.angle)
-        reasons, counts = np.unique(self.stopped[self.stopped != ""], return_counts=True)
+        """As plain data, angles in degrees; trial by trial and in sum.
+
+        Steps in sum are those of successes, None where there were none; why trials stopped, without its numbers.
+        """
+        degrees, steps = np.rad2deg(self.angle), self.steps[self.success.astype(bool)]
+        short = np.array([str(why).partition(":")[0] for why in self.stopped if why])
+        reasons, counts = np.unique(short, return_counts=True)
         return {
             "trials": len(self.success),
             "success_rate": self.rate,
             "interval_95": list(self.interval()),
             "angle_deg": {"mean": float(degrees.mean()), "std": float(degrees.std()), "all": degrees.round(2).tolist()},
-            "steps": {"mean": float(self.steps.mean()), "std": float(self.steps.std()), "all": self.steps.tolist()},
+            "steps": {
+                "mean": float(steps.mean()) if len(steps) else None,
+                "std": float(steps.std()) if len(steps) else None,
+                "all": self.steps.tolist(),
+            },
             "grip": {"mean": float(self.grip.mean()), "all": self.grip.round(3).tolist()},
             "success": self.success.astype(bool).tolist(),
             "stopped": dict(zip(reasons.tolist(), counts.tolist(), strict=True)),

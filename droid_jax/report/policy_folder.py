@@ -17,7 +17,8 @@ _TRAINING = {
     **{"effects": [str], "versions": dict, "device": str},
     "history": [{"step": int, **dict.fromkeys(("seconds", "rate", "reward", "success"), _NUMBER)}],
 }
-_SPREAD = {"mean": _NUMBER, "std": _NUMBER, "all": [_NUMBER]}
+_MAYBE = (int, float, type(None))
+_SPREAD = {"mean": _MAYBE, "std": _MAYBE, "all": [_NUMBER]}
 _TRIALS = {
     **{"trials": int, "success_rate": _NUMBER, "interval_95": [_NUMBER], "success": [bool], "stopped": {str: int}},
     **{"angle_deg": _SPREAD, "steps": _SPREAD, "grip": {"mean": _NUMBER}},

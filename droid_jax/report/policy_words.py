@@ -21,17 +21,22 @@ ENOUGH = 0.8  # success on the stand-in from which the next step is the robot
 def policy_summary(trained: Trained) -> list[str]:
     """The sentences at the top, from the numbers alone; the last says what to do next."""
     training = trained.training
-    last = training["history"][-1] if training["history"] else None
+    history = training["history"]
     known = training["setup"]["fit"] is not None
+    own = known and not training["stand_in"]
     method = METHODS[training["setup"]["method"] if known else "prior"]
     sentences = [f"A policy was trained on {method}{_with(training['effects'])}."]
-    if last is not None:
+    if history:
+        best = max(history, key=lambda now: (now["success"], now["reward"]))
         sentences.append(
-            f"It saw {last['step'] / 1e6:.2g} million actions in {last['seconds'] / 60:.0f} minutes; at the end "
-            f"{percent(last['success'])} of its episodes in simulation succeeded."
+            f"Training saw {history[-1]['step'] / 1e6:.2g} million actions in {history[-1]['seconds'] / 60:.0f} "
+            f"minutes; of the policies tried on the way the best was kept, which succeeded in "
+            f"{percent(best['success'])} of its episodes in simulation."
         )
     sentences += [_tried(where, found, training["task"]) for where, found in trained.trials.items()]
-    return [*sentences, _next(trained)]
+    if own and trained.trials:
+        sentences.append("The fit is of your own recordings: the stand-in robot is another one, and says little of it.")
+    return [*sentences, _next(trained, own)]
 
 
 def _with(effects: list[str]) -> str:
@@ -51,11 +56,13 @@ def _tried(where: str, found: Mapping[str, Any], task: Mapping[str, Any]) -> str
     )
 
 
-def _next(trained: Trained) -> str:
+def _next(trained: Trained, own: bool) -> str:
     if trained.transfer is None:
         return f"Next: python -m droid_jax.run evaluate {trained.folder}"
     if trained.transfer["stand_in"]["success_rate"] >= ENOUGH:
         return f"Next: python -m droid_jax.run export {trained.folder}, and docs/policy-on-a-robot.md."
     if trained.transfer["simulation"]["success_rate"] < ENOUGH:
         return "It has not learned the task in simulation yet: train longer (--steps), or with another --seed."
+    if own:
+        return "It works in simulation and not on a robot that it was not fitted to, which was to be expected."
     return "It works in simulation and not on the stand-in robot: search the gap (python -m droid_jax.run gap)."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -28,6 +29,11 @@ class Budget:
     trials: int
     quick: bool = False
 
+    def to_json(self) -> dict[str, Any]:
+        """As plain data; the seed is each policy's own."""
+        config = asdict(replace(self.config, seed=0))
+        return {**json.loads(json.dumps(config)), "trials": self.trials}
+
     @classmethod
     def of(cls, preset: str, steps: int | None, trials: int, quick: bool) -> Budget:
         """From an experiment's options."""
@@ -38,13 +44,19 @@ class Budget:
         return cls(small, 2, True)
 
 
-def tried(place: Path, env: DoorEnv, randomise: Randomise, robot: StandIn, seed: int, budget: Budget) -> dict[str, Any]:
-    """Train with checkpoints in a folder, and try: the figures of one policy."""
+def tried(
+    place: Path, env: DoorEnv, randomise: Randomise, robot: StandIn, seed: int, budget: Budget, origin_of: str
+) -> dict[str, Any]:
+    """Train with checkpoints in a folder, and try: the figures of one policy.
+
+    origin_of: what the doors that it is trained on are made of, in words; checkpoints of others are refused.
+    """
     config = replace(budget.config, seed=seed)
-    found = train(env, randomise, config, checkpoints=place / "checkpoints", fingerprint={"place": place.name})
+    found = train(env, randomise, config, checkpoints=place / "checkpoints", fingerprint={"doors": origin_of})
     save_policy(place / "policy.npz", found.policy)
     return {
         "seed": seed,
+        "budget": budget.to_json(),
         "simulation": simulated(found.policy, env, randomise, budget.trials, seed).to_json(),
         "stand_in": transfer(found.policy, robot).to_json(),
         "history": [asdict(now) for now in found.history],
@@ -52,10 +64,18 @@ def tried(place: Path, env: DoorEnv, randomise: Randomise, robot: StandIn, seed:
     }
 
 
-def run_all(cases: Mapping[Path, Callable[[], dict[str, Any]]], at_most: int) -> None:
-    """Run what has no file yet, write it, and say what came of it."""
+def run_all(cases: Mapping[Path, Callable[[], dict[str, Any]]], budget: Budget, at_most: int) -> list[dict[str, Any]]:
+    """Run what has no file yet, write it, and say what came of it; all of these cases that there are.
+
+    Raises ValueError for a file that was made with another budget.
+    """
     for path, make in [(p, m) for p, m in cases.items() if not p.is_file()][:at_most]:
         result = make()
         write_json(path, result)
         rates = {where: result[where]["success_rate"] for where in ("simulation", "stand_in")}
         print(f"{path.parent.name}/{path.stem}: {rates}", flush=True)
+    found = {path: json.loads(path.read_text()) for path in cases if path.is_file()}
+    for path, result in found.items():
+        if result["budget"] != budget.to_json():
+            raise ValueError(f"{path} was made with another budget: {result['budget']}; choose another --out")
+    return list(found.values())

@@ -17,6 +17,8 @@ from droid_jax.model.door_scene import door_scene
 from experiments.policies.cases import TIMESTEP
 from experiments.policies.settings import Setting
 
+GAUSSIAN = "gaussian.json"
+
 
 def truth_of(setting: Setting) -> dict[str, float]:
     """The stand-in's hidden values."""
@@ -25,7 +27,7 @@ def truth_of(setting: Setting) -> dict[str, float]:
 
 def fitted(setting: Setting, folder: Path, quick: bool) -> Gaussian:
     """What demonstrations A and C tell of the setting's robot; kept in the folder."""
-    path = folder / "gaussian.json"
+    path = folder / GAUSSIAN
     if not path.is_file():
         scene = door_scene(timestep=TIMESTEP)
         truth = truth_of(setting)

@@ -38,24 +38,27 @@ def summed_up(cases: Sequence[Mapping[str, Any]], settings: Mapping[str, Setting
 
 
 def column(cases: Sequence[Mapping[str, Any]], place: str) -> dict[str, Any]:
-    """Success, largest angle and steps of one method's policies in one place."""
+    """Success, largest angle and steps of one method's policies in one place; steps of the trials that succeeded."""
     each = [trials(case, place) for case in cases]
-    rates = [float(np.mean(t["success"])) for t in each]
-    means, spans = {}, {}
-    for what in ("success", "angle", "steps"):
-        means[what] = float(np.mean(np.concatenate([t[what] for t in each])))
-        spans[what] = span(resampled([t[what] for t in each]))
-    deviation = {w: float(np.std(np.concatenate([t[w] for t in each]))) for w in ("angle", "steps")}
     return {
         "policies": len(each),
         "trials": sum(len(t["success"]) for t in each),
         "seeds": [case["seed"] for case in cases],
-        "success_rate": means["success"],
-        "success_interval_95": spans["success"],
-        "success_of_each": rates,
-        "angle_deg": {"mean": means["angle"], "std": deviation["angle"], "interval_95": spans["angle"]},
-        "steps": {"mean": means["steps"], "std": deviation["steps"], "interval_95": spans["steps"]},
+        "success_rate": float(np.mean(np.concatenate([t["success"] for t in each]))),
+        "success_interval_95": span(resampled([t["success"] for t in each])),
+        "success_of_each": [float(np.mean(t["success"])) for t in each],
+        "angle_deg": spread([t["angle"] for t in each]),
+        "steps": spread([t["steps"][t["success"] > 0] for t in each]),
     }
+
+
+def spread(each: Sequence[np.ndarray]) -> dict[str, Any]:
+    """Mean and deviation over all trials, interval of the mean; None where no policy has any."""
+    there = [values for values in each if len(values)]
+    if not there:
+        return {"mean": None, "std": None, "interval_95": None}
+    both = np.concatenate(there)
+    return {"mean": float(both.mean()), "std": float(both.std()), "interval_95": span(resampled(there))}
 
 
 def trials(case: Mapping[str, Any], place: str) -> dict[str, np.ndarray]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from droid_jax.policy.trials import Trials
+from experiments.policies.cases import Budget, run_all
 from experiments.policies.settings import SETTINGS, Setting
 from experiments.policies.table import apart, column, resampled, summed_up
 
@@ -36,6 +38,8 @@ def test_a_column_is_the_mean_over_all_trials():
     assert (found["policies"], found["trials"], found["seeds"]) == (2, 100, [0, 1])
     assert found["success_rate"] == pytest.approx(0.5) and found["success_of_each"] == pytest.approx([0.2, 0.8])
     assert found["angle_deg"]["mean"] == pytest.approx(25.0) and found["angle_deg"]["std"] == pytest.approx(15.0)
+    assert found["steps"]["mean"] == 100.0  # of successes
+    assert column([case("mean", 0, 0.0)], "stand_in")["steps"] == {"mean": None, "std": None, "interval_95": None}
 
 
 def test_policies_that_differ_widen_the_interval():
@@ -71,6 +75,22 @@ def test_the_table_holds_what_was_run_and_the_papers_own():
 
 def test_settings_have_their_names():
     assert all(name == setting.name and isinstance(setting, Setting) for name, setting in SETTINGS.items())
+
+
+def test_what_is_there_is_not_made_again_and_another_budget_is_refused(tmp_path: Path):
+    made = list[str]()
+    budget = Budget.of("quick", 1000, 2, False)
+
+    def make(name: str, of: Budget) -> dict[str, Any]:
+        made.append(name)
+        return {**case("mean", 0, 0.5), "budget": of.to_json()}
+
+    planned = {tmp_path / f"{n}.json": functools.partial(make, n, budget) for n in "abc"}
+    assert len(run_all(planned, budget, 2)) == 2 and made == ["a", "b"]
+    (tmp_path / "pilot_100.json").write_text("{}")  # lies beside them and is none of them
+    assert len(run_all(planned, budget, 9)) == 3 and made == ["a", "b", "c"]
+    with pytest.raises(ValueError, match=r"a.json was made with another budget: .*choose another --out"):
+        run_all(planned, Budget.of("quick", 2000, 2, False), 0)
 
 
 @pytest.mark.slow

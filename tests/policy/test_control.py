@@ -127,7 +127,10 @@ def test_a_good_reading_is_acted_on(policy, still):
         (lambda r: replace(r, velocity=np.zeros(6)), r"velocity must have shape \[7\], got \[6\]"),
         (lambda r: replace(r, velocity=np.array([0, 0, 0, 0, 2.7, 0, 0])), "too fast: joint 5 at 2.7 rad/s"),
         (lambda r: replace(r, torque=np.array([0, 99, 0, 0, 0, 0, 0])), "too much torque: joint 2 at 99 N m"),
-        (lambda r: replace(r, position=r.position + 1.0), "the hand has left its workspace"),
+        (lambda r: replace(r, torque=[[1.0], [1.0, 2.0]]), "a reading that cannot be read"),
+        (lambda r: replace(r, position=r.position + 2 * np.pi * np.eye(7)[6]), "out of range: joint 7"),
+        (lambda r: replace(r, position=r.position - 0.5 * np.eye(7)[0]), "the hand has left its workspace"),
+        (lambda r: replace(r, knob=1e3 * r.knob), "the knob's pose is no pose"),
     ],
 )  # fmt: skip
 def test_it_stops_and_holds_the_pose(policy, still, spoil, why: str):
@@ -147,6 +150,39 @@ def test_it_stops_and_holds_the_pose(policy, still, spoil, why: str):
 def test_there_is_no_beginning_from_a_bad_reading(policy, still):
     with pytest.raises(ValueError, match="cannot begin: position holds a value that is no number"):
         Controller(policy).act(replace(still, position=np.full(7, np.nan)))
+
+
+@pytest.mark.parametrize("moved", [np.array([0.0, 0.06, 0.0]), np.array([300.0, 0.0, 0.0])])
+def test_a_knob_that_is_elsewhere_is_no_beginning(policy, still, moved):
+    knob = still.knob.copy()
+    knob[:3, 3] += moved
+    with pytest.raises(ValueError, match=r"cannot begin: the knob is elsewhere: [\d.]+ m and 0.00 rad"):
+        Controller(policy).act(replace(still, knob=knob))
+
+
+def test_later_the_knob_may_go_with_its_door(policy, still):
+    loop, knob = Controller(policy), still.knob.copy()
+    loop.act(still)
+    knob[:3, 3] -= [0.1, 0.0, 0.0]
+    assert loop.act(replace(still, time=0.02, knob=knob)).stopped is None
+
+
+def test_a_driver_may_write_into_what_it_handed_over(policy, still):
+    loop, buffer = Controller(policy), still.position.copy()
+    loop.act(replace(still, position=buffer))
+    buffer[:] = np.nan
+    held = loop.act(replace(still, position=buffer, time=0.02))
+    assert held.stopped is not None
+    np.testing.assert_array_equal(held.arm, still.position)
+
+
+def test_a_policy_that_gives_no_numbers_is_stopped(policy, still):
+    loop = Controller(policy)
+    loop.act(still)
+    loop.policy = replace(policy, biases=(policy.biases[0], np.full(2 * ACTIONS, np.nan)))
+    held = loop.act(replace(still, time=0.02))
+    assert held.stopped == "the policy's action holds a value that is no number"
+    np.testing.assert_array_equal(held.arm, still.position)
 
 
 def test_a_robot_without_torque_sensors_is_fine(policy, still):
@@ -171,10 +207,25 @@ class Arm:
 
 def test_driving_ends_with_the_time_or_with_a_stop(policy, still):
     arm = Arm(still, 1000)
-    assert drive(Controller(policy), arm, 0.2) is None and len(arm.sent) == 10
+    assert drive(Controller(policy), arm, 0.2) is None and len(arm.sent) == 11
+    np.testing.assert_array_equal(arm.sent[-1].arm, still.position)  # in the end it holds
     arm = Arm(still, 4)
     assert "stale" in str(drive(Controller(policy), arm, 0.2)) and len(arm.sent) == 6
     assert arm.sent[-1].stopped is not None
+
+
+def test_a_robot_that_fails_is_told_to_hold(policy, still):
+    arm = Arm(still, 1000)
+
+    def fail() -> Reading:
+        if len(arm.sent) == 3:
+            raise OSError("no connection")
+        return Arm.read(arm)
+
+    arm.read = fail  # type: ignore[method-assign]
+    with pytest.raises(OSError, match="no connection"):
+        drive(Controller(policy), arm, 0.2)
+    np.testing.assert_array_equal(arm.sent[-1].arm, still.position)
 
 
 def test_numpy_is_all_it_needs(policy, still, tmp_path: Path):

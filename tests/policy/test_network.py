@@ -76,12 +76,24 @@ def test_a_network_of_other_sizes_is_refused(parameters, interface):
         policy_of(*parameters, layer_sizes((32, 32)), interface)
 
 
+def rewritten(path: Path, change) -> None:
+    with np.load(path) as file:
+        found = {name: file[name] for name in file.files}
+    change(found)
+    np.savez(path, **found)
+
+
 @pytest.mark.parametrize(
     ("spoil", "expected"),
     [
         (lambda path: path.unlink(), "there is no such file"),
         (lambda path: path.write_bytes(path.read_bytes()[:200]), "cannot be read"),
         (lambda path: np.savez(path, format="something else"), "is no policy"),
+        (lambda path: rewritten(path, lambda found: found.pop("bias_1")), "lacks bias_1"),
+        (
+            lambda path: rewritten(path, lambda found: found["mean"].fill(np.nan)),
+            "mean hold values that are no",
+        ),
     ],
 )
 def test_files_that_are_not_as_they_should_be(policy, tmp_path: Path, spoil, expected: str):
@@ -95,9 +107,7 @@ def test_files_that_are_not_as_they_should_be(policy, tmp_path: Path, spoil, exp
 def test_another_layout_of_observations_is_refused(policy, tmp_path: Path):
     path = tmp_path / "policy.npz"
     save_policy(path, policy)
-    with np.load(path) as file:
-        found = {name: file[name] for name in file.files}
-    found["layout"] = np.array([*LAYOUT[:-1], "temperature of the knob, K"])
-    np.savez(path, **found)
+    other = np.array([*LAYOUT[:-1], "temperature of the knob, K"])
+    rewritten(path, lambda found: found.update(layout=other))
     with pytest.raises(ValueError, match="trained on another observation: temperature of the knob, K"):
         load(path)

@@ -25,7 +25,7 @@ class Still:
 
 
 @pytest.mark.slow
-def test_a_hand_that_stays_opens_nothing_and_success_ends_an_episode():
+def test_a_hand_that_stays_opens_nothing_and_steps_count_until_success():
     scene = door_scene(timestep=0.004, limits=True)
     env, randomise = DoorEnv(scene, Task(steps=10)), randomised(scene, prior(door_space(scene)))
     found = simulated(Still(), env, randomise, 3)  # type: ignore[arg-type]

@@ -17,7 +17,7 @@ from droid_jax.policy.control import OBSERVED
 from droid_jax.policy.door_env import DoorEnv
 from droid_jax.policy.randomise import randomised
 from droid_jax.policy.task import Task
-from droid_jax.policy.train import TrainConfig, from_tree, put_replicated, replicated, to_tree, train
+from droid_jax.policy.train import TrainConfig, _devices, from_tree, put_replicated, replicated, to_tree, train
 
 SHORT = TrainConfig(
     steps=1024, envs=32, unroll=4, batch=8, minibatches=4, epochs=2, evaluations=3, eval_envs=4, hidden=(8, 8)
@@ -54,10 +54,26 @@ def test_networks_come_back_from_a_tree_and_others_are_refused():
         from_tree(blank, {**to_tree(full), "actor": {"bias": np.zeros(2)}})
 
 
-def test_environments_that_do_not_divide_are_refused():
-    env = object.__new__(DoorEnv)
-    with pytest.raises(ValueError, match="33 environments must be a multiple"):
-        train(env, config=replace(SHORT, envs=33, batch=5, minibatches=1))
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"envs": 33}, "must be a multiple of the 33 environments"),
+        ({"devices": 99}, "99 devices were asked for, there are"),
+        ({"devices": 0}, "0 devices were asked for"),
+        ({"steps": 0}, "steps and evaluations must be 1 or more, got 0 and 3"),
+        ({"evaluations": 0}, "steps and evaluations must be 1 or more"),
+    ],
+)
+def test_settings_that_do_not_go_together_are_refused(changes, said: str):
+    with pytest.raises(ValueError, match=said):
+        train(object.__new__(DoorEnv), config=replace(SHORT, **changes))
+
+
+def test_devices_that_do_not_divide_are_left_out(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(jax, "local_device_count", lambda: 6)
+    assert _devices(SHORT) == 4
+    with pytest.raises(ValueError, match="32 environments do not divide among 5 devices"):
+        _devices(replace(SHORT, devices=5))
 
 
 @pytest.mark.slow
@@ -69,9 +85,10 @@ def test_a_short_run_is_kept_and_goes_on(tmp_path: Path):
     assert first.policy.mean.shape == (OBSERVED,) and np.abs(first.policy.mean).max() > 0.1
     assert all(0.0 <= now.success <= 1.0 and np.isfinite(now.reward) for now in first.history)
     longer = train(env, randomise, replace(SHORT, steps=2048), checkpoints=tmp_path)
-    assert longer.history[0].step == 1024 and longer.history[-1].step == 2048
+    assert longer.history[:3] == first.history and longer.history[-1].step == 2048
+    assert longer.history[3].seconds > first.history[-1].seconds
     done = train(env, randomise, SHORT, checkpoints=tmp_path)
-    assert done.history == ()
+    assert done.history == longer.history
     np.testing.assert_array_equal(done.policy.weights[0], longer.policy.weights[0])
     with pytest.raises(ValueError, match="belongs to another run: it differs in task"):
         train(DoorEnv(scene, Task(steps=30)), randomise, SHORT, checkpoints=tmp_path)

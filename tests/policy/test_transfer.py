@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
 from scripted import Script, opening
@@ -15,7 +16,7 @@ from droid_jax.model.door_scene import door_scene
 from droid_jax.policy.door_env import start_pose
 from droid_jax.policy.interface import interface_of
 from droid_jax.policy.task import Task
-from droid_jax.policy.transfer import TransferConfig, filmed, stand_in, transfer
+from droid_jax.policy.transfer import TransferConfig, _trial, filmed, stand_in, transfer
 from droid_jax.policy.trials import Trials
 
 TASK = Task(steps=260, spread=0.0)
@@ -89,22 +90,58 @@ def test_a_hand_that_stays_where_it_is_opens_nothing(scene, start):
     assert found.angle[0] < 0.01 and found.grip[0] == 0.0
 
 
-def test_trials_differ_and_the_same_seed_repeats_them(scene, start):
-    still = np.append(start[scene.joint_qpos], [0.0, 0.0])[None]
+def test_trials_differ_and_the_same_seed_repeats_them(scene, start, commands):
     task = replace(TASK, steps=10, spread=0.05)
     interface, truth = interface_of(scene, task, start), stand_in_truth(scene, 0, 0)
-    runs = [
-        transfer(Script(task, still, interface), stand_in(scene, start, truth, (), task, replace(ONE, trials=3)))  # type: ignore[arg-type]
-        for _ in range(2)
-    ]
-    np.testing.assert_array_equal(runs[0].angle, runs[1].angle)
-    assert runs[0].rate == 0.0
+
+    def begun(seed: int) -> list[np.ndarray]:
+        robot = stand_in(scene, start, truth, (), task, replace(ONE, trials=3, seed=seed))
+        return [filmed(Script(task, commands, interface), robot, number)[0] for number in range(3)]  # type: ignore[arg-type]
+
+    first, again, other = begun(0), begun(0), begun(1)
+    np.testing.assert_array_equal(first, again)
+    assert all(
+        np.abs(a - b).max() > 0.01 for a, b in ((first[0], first[1]), (first[1], first[2]), (first[0], other[0]))
+    )
+
+
+def test_a_simulation_that_blows_up_is_said(scene, start, commands):
+    """MuJoCo starts over by itself then; the trial does not go on as if nothing had happened."""
+    script = Script(TASK, commands, interface_of(scene, TASK, start))
+    seen = list[float]()
+
+    def watch(data: mujoco.MjData) -> None:
+        seen.append(data.time)
+        if len(seen) == 5:
+            data.qacc_warmstart[:] = data.qvel[:] = 1e12
+
+    robot = stand_in(scene, start, stand_in_truth(scene, 0, 0), (), TASK, ONE)
+    success, angle, steps, _, stopped = _trial(script, robot, 0, watch)  # type: ignore[arg-type]
+    assert stopped == "the simulation blew up" or stopped.startswith("too fast")
+    assert not success and steps == 4 and len(seen) == 5 and 0 <= angle < 0.1
 
 
 def test_the_interval_is_wilsons():
     found = Trials(np.arange(100) < 80, *np.zeros((3, 100)), np.full(100, ""))
     low, high = found.interval()
     assert (low, high) == (pytest.approx(0.711, abs=1e-3), pytest.approx(0.867, abs=1e-3))
+
+
+def test_sums_leave_out_what_failed_and_reasons_their_numbers():
+    why = ["", "", "too fast: joint 5 at 2.7 rad/s", "too fast: joint 1 at 3.1 rad/s"]
+    found = Trials(
+        np.array([True, True, False, False]), np.ones(4), np.array([100, 200, 3, 5]), np.ones(4), np.array(why)
+    )
+    content = found.to_json()
+    assert content["steps"]["mean"] == 150.0 and content["steps"]["all"] == [100, 200, 3, 5]
+    assert content["stopped"] == {"too fast": 2}
+    nothing = Trials(np.zeros(2, bool), np.zeros(2), np.ones(2), np.zeros(2), np.full(2, "")).to_json()
+    assert nothing["steps"]["mean"] is None and nothing["stopped"] == {}
+
+
+def test_amplitudes_that_cannot_be_are_refused(scene, start):
+    with pytest.raises(ValueError, match="hidden effect 'closer' needs a finite, not negative amplitude, got nan"):
+        stand_in(scene, start, {}, (Applied("closer", np.nan),), TASK, ONE)
 
 
 def test_effects_on_whole_traces_are_refused(scene, start, commands):

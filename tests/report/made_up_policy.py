@@ -29,7 +29,8 @@ def training_json(**changes: Any) -> dict[str, Any]:
     task = {f: getattr(Task(), f) for f in Task.__dataclass_fields__}
     setup = {"method": "fitted", "preset": "quick", "knob": 0, "seed": 3, "fit": "runs/identify"}
     of = {"setup": setup, "task": task, "scene": "door (no spring, knob 0, impedance gains)", "effects": []}
-    return {**of, "history": history, "stand_in": {}, "config": {}, "versions": {}, "device": "cpu", **changes}
+    of |= {"stand_in": {"springs": 1, "seed": 0}, "config": {}, "versions": {}, "device": "cpu"}
+    return {**of, "history": history, **changes}
 
 
 def make_policy(folder: Path, successes: int | None = 38, **changes: Any) -> Path:

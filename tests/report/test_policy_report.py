@@ -30,7 +30,7 @@ def test_the_page_shows_what_the_files_hold(folder: Path):
     assert "97 %" in text and "95 %" in text  # 39 and 38 of 40
     assert text.count("data:image/webp;base64,") == 2
     assert "not hardware" in text and "The stand-in robot hid closer (2.00)" in text
-    assert "2 million actions in 7 minutes" in text and "96 % of its episodes" in text
+    assert "2 million actions in 7 minutes" in text and "succeeded in 96 % of its episodes" in text
     for stem in ("learning", "angles"):
         assert (folder / "figures" / f"{stem}.pdf").is_file() and f'id="{stem}"' in text
     assert read_page(folder / "report.html")
@@ -52,6 +52,11 @@ def test_it_says_what_to_do_next(tmp_path: Path, successes: int | None, simulate
         content["simulation"]["success_rate"] = simulated
         (made / "transfer.json").write_text(json.dumps(content))
     assert next_step in policy_summary(read_policy(made))[-1]
+
+
+def test_a_stand_in_that_was_not_fitted_says_little(tmp_path: Path):
+    said = policy_summary(read_policy(make_policy(tmp_path / "run", 10, stand_in={})))
+    assert "The fit is of your own recordings" in said[-2] and "was to be expected" in said[-1]
 
 
 def test_what_it_was_trained_on_is_said(tmp_path: Path):
