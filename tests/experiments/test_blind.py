@@ -205,7 +205,7 @@ def test_bounds_hold_what_the_base_model_absorbs():
     refined: Any = type("Refined", (), {"x": np.zeros(2), "jacobian": slopes, "prior": np.full(2, 10.0)})
     model: Any = type("Model", (), {"space": space, "refined": refined})
     seen: Any = type("Seen", (), {"repeats": 1})
-    ground = Ground(setting("hinge"), {}, 0, seen, model, np.zeros((1, 6)))
+    ground = Ground(setting("hinge"), {}, 0, seen, model, slopes, np.zeros((1, 6)))
     left, free = ground.left(np.array([200.0, 200.0, 5.0, 0.0, 0.0, 0.0]))
     np.testing.assert_allclose(left, [100.0, 0.0, 5.0, 0.0, 0.0, 0.0], atol=0.01)
     assert free.tolist() == [False, True]
