@@ -40,8 +40,8 @@ class Ground:
     """A recording with nothing hidden, at the truth.
 
     setting, truth, seed: of the recording.  evidence: of its `NOISY` repeats.  model: the base model at the
-    truth.  wide: [M, D] its slopes as the search has them, over the width of the posterior.  noise: [NOISY, M] of single
-    repeats.  plain: number of repeats -> [N, M] with nothing hidden.
+    truth.  wide: [M, D] its slopes as the search has them, over the width of the posterior.  noise: [NOISY, M] of
+    single repeats.  plain: number of repeats -> [N, M] with nothing hidden.
     """
 
     setting: Setting
@@ -58,8 +58,8 @@ class Ground:
         """[M, D] of the base parameters, in search units, in units of one repeat's noise.
 
         Over a third of a search unit and not over the width of the posterior: an effect that the base model absorbs
-        moves it by a hundred posterior deviations, and what those slopes owe to the solver's rounding seemed to be left.
-        Of a command delay of 3 ms they left 33 units, a refit leaves 8 and these slopes 11.
+        moves it by a hundred posterior deviations, and what those slopes owe to the solver's rounding seemed to be
+        left.  Of a command delay of 3 ms they left 33 units, a refit leaves 8 and these slopes 11.
         """
         return self.model.refined.jacobian / np.sqrt(self.evidence.repeats)
 

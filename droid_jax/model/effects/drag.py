@@ -21,7 +21,7 @@ def drag(scene: Scene) -> Effect | None:
 
     return Effect(
         DRAG,
-        (a.amplitude(DRAG, "N m s^2/rad^2", 0.5, 5.0, low=0.0),),
+        (a.amplitude(DRAG, "N m s^2/rad^2", 0.5, 20.0, low=0.0),),
         force=force,
         what="drag of the door that grows with the square of its speed",
         mark="the contrast between fast and slow stretches",

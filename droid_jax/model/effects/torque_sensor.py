@@ -19,7 +19,7 @@ def torque_bias(scene: Scene) -> Effect | None:
 
     return Effect(
         BIAS,
-        a.of_joints(BIAS, scene.joints, "N m", 0.3, 3.0),
+        a.of_joints(BIAS, scene.joints, "N m", 0.3, 10.0),
         observe=observe,
         what="a constant error of a joint's torque sensor",
         mark="one joint, the same throughout, also at rest",
