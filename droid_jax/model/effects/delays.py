@@ -20,7 +20,7 @@ def command_delay(scene: Scene) -> Effect | None:
         return None
     return Effect(
         COMMAND,
-        (a.amplitude(COMMAND, "s", 0.005, 0.1, low=-0.01),),
+        (a.amplitude(COMMAND, "s", 0.005, 0.05, low=-0.01),),
         command=lambda theta, time, look: look(time - a.value(theta, COMMAND)),
         what="commands that reach the servo late",
         mark="all joints, in proportion to the commanded speed; torques and positions shift together",
@@ -47,7 +47,7 @@ def sensor_delay(scene: Scene) -> Effect | None:
 
     return Effect(
         SENSOR,
-        (a.amplitude(SENSOR, "s", 0.005, 0.1, low=-0.01),),
+        (a.amplitude(SENSOR, "s", 0.005, 0.05, low=-0.01),),
         observe=observe,
         what="torques that are recorded late",
         mark="all joints, where torques change fast; positions stay",

@@ -92,7 +92,7 @@ def joint_compliance(scene: Scene) -> Effect | None:
     def parameter(joint: str, stiffness: float):
         # Below zero only so that a rigid joint is no edge; never so far that 1 + k c comes near zero.
         return a.amplitude(
-            f"{COMPLIANCE}[{joint}]", "rad/(N m)", 1e-4, max(5e-4, 0.3 / stiffness), low=-min(1e-4, 0.5 / stiffness)
+            f"{COMPLIANCE}[{joint}]", "rad/(N m)", 1e-4, max(1e-3, 0.3 / stiffness), low=-min(1e-4, 0.5 / stiffness)
         )
 
     return Effect(

@@ -22,7 +22,7 @@ def load_friction(scene: Scene) -> Effect | None:
 
     return Effect(
         SHARE,
-        a.of_joints(SHARE, joints, "-", 0.05, 0.3, low=0.0),
+        a.of_joints(SHARE, joints, "-", 0.05, 1.0, low=0.0),
         frictionloss=frictionloss,
         what="friction of a joint of the arm that grows with its load",
         mark="steps at that joint's reversals that grow with its torque",
