@@ -17,6 +17,7 @@ import flax.serialization
 import jax
 import jax.numpy as jnp
 import numpy as np
+from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.agents.ppo import train as ppo
 
@@ -205,12 +206,7 @@ def _brax(
             reward_scaling=config.reward_scaling,
             clipping_epsilon=config.clip,
             gae_lambda=config.gae,
-            network_factory=functools.partial(
-                ppo_networks.make_ppo_networks,
-                policy_hidden_layer_sizes=config.hidden,
-                value_hidden_layer_sizes=config.hidden,
-                activation=jnp.tanh,
-            ),
+            network_factory=_networks(config),
             seed=config.seed + done,
             num_evals=max(2, round(config.evaluations * steps / config.steps)),
             num_eval_envs=config.eval_envs,
@@ -224,7 +220,7 @@ def _brax(
     with replicated():
         params: Any = None
         if tree is not None:
-            _, blank, _ = run(0)
+            blank = _blank(env, config)
             params, best = (from_tree(blank, tree[name]) for name in ("latest", "best"))
         if done < config.steps:
             run(config.steps - done, params, progress_fn=tell, policy_params_fn=keep)
@@ -233,6 +229,23 @@ def _brax(
     normaliser, actor, _ = best
     interface = interface_of(env.scene, env.task, env.start)
     return Trained(policy_of(normaliser, actor, layer_sizes(config.hidden), interface), tuple(history))
+
+
+def _networks(config: TrainConfig) -> Callable[..., Any]:
+    """Actor and critic, as brax makes them of the sizes of observation and action."""
+    return functools.partial(
+        ppo_networks.make_ppo_networks,
+        policy_hidden_layer_sizes=config.hidden,
+        value_hidden_layer_sizes=config.hidden,
+        activation=jnp.tanh,
+    )
+
+
+def _blank(env: DoorEnv, config: TrainConfig) -> Any:
+    """Parameters as brax has them, (normaliser, actor, critic), to be filled."""
+    nets, key = _networks(config)(env.observation_size, env.action_size), jax.random.key(0)
+    normaliser = running_statistics.init_state(specs.Array((env.observation_size,), jnp.dtype("float32")))
+    return normaliser, nets.policy_network.init(key), nets.value_network.init(key)
 
 
 def _rank(now: TrainProgress) -> tuple[float, float]:
