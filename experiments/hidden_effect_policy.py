@@ -11,9 +11,9 @@ under DIR/hidden_effect_cases and is not trained again; DIR/hidden_effect_policy
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
@@ -47,7 +47,7 @@ from droid_jax.policy.randomise import randomised  # noqa: E402
 from droid_jax.policy.task import Task  # noqa: E402
 from droid_jax.policy.transfer import TransferConfig, stand_in  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
-from experiments.policies.cases import QUICK_STEPS, TIMESTEP, Budget, run_all, tried  # noqa: E402
+from experiments.policies.cases import TIMESTEP, Options, run_all, tried  # noqa: E402
 from experiments.policies.table import PLACES, apart, column  # noqa: E402
 
 MODELS = ("base", "extended")
@@ -56,29 +56,13 @@ SPRINGS, ROBOT = 0, 21  # the stand-in's column of Table I, and the seed of its 
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(Options):
     """Options of the experiment."""
 
-    quick: bool = False
-    """One small policy of each model, a search for the hidden effect alone: shows that it runs."""
-    out: Path = ROOT / "experiments" / "results"
-    """Folder of hidden_effect_policy.json and of the cases."""
     hide: tuple[str, ...] = ("closer=3",)
     """What the stand-in robot hides, name=amplitude."""
     steps_allowed: int = 512
     """Actions of an episode."""
-    seeds: int = 5
-    """Policies of each model."""
-    first: int = 0
-    """Seed of the first policy: pilots use others than the runs that are reported."""
-    trials: int = 100
-    """Trials of each policy on the stand-in robot, and episodes in simulation."""
-    steps: int | None = None
-    """Actions of each training; default: the preset's."""
-    preset: Literal["quick", "paper", "gpu"] = "quick"
-    """Of training."""
-    at_most: int = 1_000_000
-    """Stop after so many policies."""
 
 
 def search(arguments: Arguments, folder: Path) -> dict[str, Any]:
@@ -108,11 +92,11 @@ def search(arguments: Arguments, folder: Path) -> dict[str, Any]:
     return found
 
 
-def case(model: str, seed: int, folder: Path, arguments: Arguments, budget: Budget) -> dict[str, Any]:
+def case(model: str, seed: int, folder: Path, arguments: Arguments) -> dict[str, Any]:
     """One policy, trained on one of the two models."""
     search(arguments, folder)
-    scene, task = door_scene(timestep=TIMESTEP, limits=True), Task(steps=arguments.steps_allowed)
-    task = replace(task, steps=QUICK_STEPS) if budget.quick else task
+    budget = arguments.budget
+    scene, task = door_scene(timestep=TIMESTEP, limits=True), budget.task(Task(steps=arguments.steps_allowed))
     if model == "base":
         env, gaussian = DoorEnv(scene, task), load_gaussian(folder / BASE)
     else:
@@ -128,22 +112,21 @@ def case(model: str, seed: int, folder: Path, arguments: Arguments, budget: Budg
 
 def main() -> None:
     arguments = tyro.cli(Arguments, description=__doc__)
-    cases = arguments.out / ("hidden_effect_cases_quick" if arguments.quick else "hidden_effect_cases")
-    budget = Budget.of(arguments.preset, arguments.steps, arguments.trials, arguments.quick)
-    seeds = range(arguments.first, arguments.first + (1 if arguments.quick else arguments.seeds))
+    cases = arguments.cases("hidden_effect")
     planned = {
-        cases / f"{model}_{seed}.json": functools.partial(case, model, seed, cases, arguments, budget)
-        for seed, model in itertools.product(seeds, MODELS)
+        cases / f"{model}_{seed}.json": functools.partial(case, model, seed, cases, arguments)
+        for seed, model in itertools.product(arguments.policies, MODELS)
     }
-    found = run_all(planned, budget, arguments.at_most)
+    found = run_all(planned, arguments.budget, arguments.at_most)
     of = {model: [c for c in found if c["model"] == model] for model in MODELS}
     table = {model: {place: column(own, place) for place in PLACES} for model, own in of.items() if own}
     better = {}
     if all(of.values()):
         better = {what: apart(of["extended"], of["base"], what) for what in ("success", "angle")}
-    name = "hidden_effect_policy_quick.json" if arguments.quick else "hidden_effect_policy.json"
+    verdict = search(arguments, cases)
     write_json(
-        arguments.out / name, {**search(arguments, cases), "models": table, "extended_better_by": better, **origin(0)}
+        arguments.summary("hidden_effect_policy"),
+        {**verdict, "models": table, "extended_better_by": better, **origin(0)},
     )
     print(json.dumps({m: {p: round(c[p]["success_rate"], 3) for p in PLACES} for m, c in table.items()}))
 

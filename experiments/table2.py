@@ -12,7 +12,7 @@ docs/paper.md says what was fixed before the runs.
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -37,7 +37,7 @@ from droid_jax.policy.randomise import Randomise, fixed, randomised  # noqa: E40
 from droid_jax.policy.task import Task  # noqa: E402
 from droid_jax.policy.transfer import TransferConfig, stand_in  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
-from experiments.policies.cases import QUICK_STEPS, TIMESTEP, Budget, run_all, tried  # noqa: E402
+from experiments.policies.cases import TIMESTEP, Budget, Options, run_all, tried  # noqa: E402
 from experiments.policies.robots import GAUSSIAN, fitted, truth_of  # noqa: E402
 from experiments.policies.settings import SETTINGS, Setting  # noqa: E402
 from experiments.policies.table import summed_up  # noqa: E402
@@ -47,29 +47,13 @@ Method = Literal["prior", "mean", "fitted"]
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(Options):
     """Options of the experiment."""
 
-    quick: bool = False
-    """One small policy of each method: shows that it runs, says nothing about quality."""
-    out: Path = ROOT / "experiments" / "results"
-    """Folder of table2.json and of the cases."""
     settings: tuple[str, ...] = tuple(SETTINGS)
     """Which doors."""
     methods: tuple[Method, ...] = METHODS
     """Which methods."""
-    seeds: int = 5
-    """Policies of each method."""
-    first: int = 0
-    """Seed of the first policy: pilots use others than the runs that are reported."""
-    trials: int = 100
-    """Trials of each policy on the stand-in robot, and episodes in simulation."""
-    steps: int | None = None
-    """Actions of each training; default: the preset's."""
-    preset: Literal["quick", "paper", "gpu"] = "quick"
-    """Of training."""
-    at_most: int = 1_000_000
-    """Stop after so many policies."""
 
 
 def doors(method: Method, setting: Setting, folder: Path, quick: bool, env: DoorEnv) -> Randomise:
@@ -83,9 +67,7 @@ def doors(method: Method, setting: Setting, folder: Path, quick: bool, env: Door
 
 def case(method: Method, seed: int, setting: Setting, folder: Path, budget: Budget) -> dict[str, Any]:
     """One policy of one method."""
-    task = Task(**setting.task)
-    scene = door_scene(timestep=TIMESTEP, limits=True)
-    env = DoorEnv(scene, replace(task, steps=QUICK_STEPS) if budget.quick else task)
+    env = DoorEnv(door_scene(timestep=TIMESTEP, limits=True), budget.task(Task(**setting.task)))
     config = TransferConfig(trials=budget.trials, seed=setting.robot)
     robot = stand_in(door_scene(limits=True), env.start, truth_of(setting), (), env.task, config)
     randomise = doors(method, setting, folder, budget.quick, env)
@@ -96,24 +78,17 @@ def case(method: Method, seed: int, setting: Setting, folder: Path, budget: Budg
 
 def main() -> None:
     arguments = tyro.cli(Arguments, description=__doc__)
-    cases = arguments.out / ("table2_cases_quick" if arguments.quick else "table2_cases")
-    budget = Budget.of(arguments.preset, arguments.steps, arguments.trials, arguments.quick)
-    if arguments.quick:
-        arguments = replace(arguments, seeds=1, settings=arguments.settings[:1])
     unknown = [name for name in arguments.settings if name not in SETTINGS]
     if unknown:
         raise SystemExit(f"error: unknown setting {unknown[0]!r}; valid: {', '.join(SETTINGS)}")
-    seeds = range(arguments.first, arguments.first + arguments.seeds)
-    wanted = itertools.product(arguments.settings, seeds, arguments.methods)
+    settings = {name: SETTINGS[name] for name in arguments.settings[: 1 if arguments.quick else None]}
+    cases, budget = arguments.cases("table2"), arguments.budget
     planned = {
-        cases / name / f"{method}_{seed}.json": functools.partial(
-            case, method, seed, SETTINGS[name], cases / name, budget
-        )
-        for name, seed, method in wanted
+        cases / name / f"{method}_{seed}.json": functools.partial(case, method, seed, setting, cases / name, budget)
+        for (name, setting), seed, method in itertools.product(settings.items(), arguments.policies, arguments.methods)
     }
-    found = run_all(planned, budget, arguments.at_most)
-    summary = summed_up(found, {name: SETTINGS[name] for name in arguments.settings})
-    write_json(arguments.out / ("table2_quick.json" if arguments.quick else "table2.json"), {**summary, **origin(0)})
+    summary = summed_up(run_all(planned, budget, arguments.at_most), settings)
+    write_json(arguments.summary("table2"), {**summary, **origin(0)})
     print(json.dumps(summary["line"]))
 
 

@@ -1,4 +1,4 @@
-"""One policy of an experiment: trained, and tried in simulation and on the stand-in robot."""
+"""Options of an experiment with policies, and one of its policies: trained, tried in simulation and on the robot."""
 
 from __future__ import annotations
 
@@ -6,19 +6,65 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from benchmarks.common import origin
 from droid_jax.policy.door_env import DoorEnv
 from droid_jax.policy.network import save_policy
 from droid_jax.policy.randomise import Randomise
 from droid_jax.policy.simulated import simulated
+from droid_jax.policy.task import Task
 from droid_jax.policy.train import PRESETS, TrainConfig, train
 from droid_jax.policy.transfer import StandIn, transfer
 from droid_jax.storage import write_json
 
 TIMESTEP = 0.004  # s, of the simulation that trains
 QUICK_STEPS = 20  # actions of an episode where nothing shall be learned
+RESULTS = Path(__file__).resolve().parents[1] / "results"
+
+
+@dataclass(frozen=True)
+class Options:
+    """What every experiment with policies can be told."""
+
+    quick: bool = False
+    """One small policy of each kind: shows that it runs, says nothing about quality."""
+    out: Path = RESULTS
+    """Folder of the summary and of the cases."""
+    seeds: int = 5
+    """Policies of each kind."""
+    first: int = 0
+    """Seed of the first policy: pilots use others than the runs that are reported."""
+    trials: int = 100
+    """Trials of each policy on the stand-in robot, and episodes in simulation."""
+    steps: int | None = None
+    """Actions of each training; default: the preset's."""
+    preset: Literal["quick", "paper", "gpu"] = "quick"
+    """Of training."""
+    at_most: int = 1_000_000
+    """Stop after so many policies."""
+
+    @property
+    def policies(self) -> range:
+        """Seeds of the policies."""
+        return range(self.first, self.first + (1 if self.quick else self.seeds))
+
+    @property
+    def budget(self) -> Budget:
+        """What a policy costs."""
+        config = PRESETS[self.preset] if self.steps is None else replace(PRESETS[self.preset], steps=self.steps)
+        if not self.quick:
+            return Budget(config, self.trials)
+        small = replace(config, steps=8192, envs=64, batch=16, minibatches=4, evaluations=2, eval_envs=8)
+        return Budget(small, 2, True)
+
+    def cases(self, name: str) -> Path:
+        """Folder of the cases."""
+        return self.out / f"{name}_cases{'_quick' if self.quick else ''}"
+
+    def summary(self, name: str) -> Path:
+        """File of the summary."""
+        return self.out / f"{name}{'_quick' if self.quick else ''}.json"
 
 
 @dataclass(frozen=True)
@@ -34,14 +80,9 @@ class Budget:
         config = asdict(replace(self.config, seed=0))
         return {**json.loads(json.dumps(config)), "trials": self.trials}
 
-    @classmethod
-    def of(cls, preset: str, steps: int | None, trials: int, quick: bool) -> Budget:
-        """From an experiment's options."""
-        config = PRESETS[preset] if steps is None else replace(PRESETS[preset], steps=steps)
-        if not quick:
-            return cls(config, trials)
-        small = replace(config, steps=8192, envs=64, batch=16, minibatches=4, evaluations=2, eval_envs=8)
-        return cls(small, 2, True)
+    def task(self, task: Task) -> Task:
+        """The task, in short where nothing shall be learned."""
+        return replace(task, steps=QUICK_STEPS) if self.quick else task
 
 
 def tried(

@@ -6,14 +6,11 @@ from pathlib import Path
 
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.gaussian import load as load_gaussian
-from droid_jax.identify.pipeline import IdentifyConfig, identify
-from droid_jax.identify.refine import RefineConfig
-from droid_jax.identify.search import SearchConfig
-from droid_jax.measure.demonstration import demonstration_path
-from droid_jax.measure.formats import load
-from droid_jax.measure.surrogate import record, stand_in_truth
+from droid_jax.identify.pipeline import identify
+from droid_jax.measure.surrogate import stand_in_truth
 from droid_jax.model.door import door_nuisances, door_space
 from droid_jax.model.door_scene import door_scene
+from experiments.identify_suite import recordings, settings
 from experiments.policies.cases import TIMESTEP
 from experiments.policies.settings import Setting
 
@@ -30,16 +27,8 @@ def fitted(setting: Setting, folder: Path, quick: bool) -> Gaussian:
     path = folder / GAUSSIAN
     if not path.is_file():
         scene = door_scene(timestep=TIMESTEP)
-        truth = truth_of(setting)
-        recordings = [
-            record(scene, load(demonstration_path(name)), truth, seed=setting.robot + k, name=name)
-            for k, name in enumerate("A" if quick else "AC")
-        ]
-        config = IdentifyConfig(
-            search=SearchConfig(population=30, parents=None, generations=3 if quick else 20, seed=setting.robot),
-            refine=RefineConfig(iterations=2 if quick else 30),
-            seed=setting.robot,
-        )
-        found = identify(scene, door_space(scene), recordings, nuisances=door_nuisances(scene), config=config)
+        recorded = recordings(scene, truth_of(setting), "A" if quick else "AC", setting.robot)
+        config = settings(quick, setting.robot)
+        found = identify(scene, door_space(scene), recorded, nuisances=door_nuisances(scene), config=config)
         found.gaussian.save(path)
     return load_gaussian(path)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from droid_jax.policy.trials import Trials
-from experiments.policies.cases import Budget, run_all
+from experiments.policies.cases import Budget, Options, run_all
 from experiments.policies.settings import SETTINGS, Setting
 from experiments.policies.table import apart, column, resampled, summed_up
 
@@ -79,7 +79,7 @@ def test_settings_have_their_names():
 
 def test_what_is_there_is_not_made_again_and_another_budget_is_refused(tmp_path: Path):
     made = list[str]()
-    budget = Budget.of("quick", 1000, 2, False)
+    budget = Options(steps=1000, trials=2).budget
 
     def make(name: str, of: Budget) -> dict[str, Any]:
         made.append(name)
@@ -90,7 +90,7 @@ def test_what_is_there_is_not_made_again_and_another_budget_is_refused(tmp_path:
     (tmp_path / "pilot_100.json").write_text("{}")  # lies beside them and is none of them
     assert len(run_all(planned, budget, 9)) == 3 and made == ["a", "b", "c"]
     with pytest.raises(ValueError, match=r"a.json was made with another budget: .*choose another --out"):
-        run_all(planned, Budget.of("quick", 2000, 2, False), 0)
+        run_all(planned, Options(steps=2000, trials=2).budget, 0)
 
 
 @pytest.mark.slow
