@@ -115,6 +115,7 @@ def _lacks(effect: Hidden, scene: Scene) -> str | None:
 
 
 def check(one: Applied, scene: Scene) -> None:
+    """ValueError for an effect that is unknown, an amplitude it cannot have, a scene or joint it cannot act on."""
     effect = hidden_effect(one.name)
     if not math.isfinite(one.amplitude) or (one.amplitude < 0 and not effect.signed):
         least = "a finite" if effect.signed else "a finite, not negative"
@@ -124,8 +125,8 @@ def check(one: Applied, scene: Scene) -> None:
         raise ValueError(f"hidden effect {one.name!r} needs a scene with {lacks}; {scene.name!r} has none")
     valid = _joints(effect, scene)
     if one.joint and one.joint not in valid:
-        listed = ", ".join(valid) or "none"
-        raise ValueError(f"hidden effect {one.name!r} cannot act on joint {one.joint!r}; it can on: {listed}")
+        known = ", ".join(valid) or "none"
+        raise ValueError(f"hidden effect {one.name!r} cannot act on joint {one.joint!r}; it can on: {known}")
 
 
 def _joints(effect: Hidden, scene: Scene) -> tuple[str, ...]:
@@ -137,14 +138,10 @@ def _joints(effect: Hidden, scene: Scene) -> tuple[str, ...]:
     return ()
 
 
-def influences(stand_in: StandIn, applied: Sequence[Applied], repeat: int) -> list[Influence]:
-    """The effects of one repeat, each with a fresh state."""
-    scene, clock = stand_in.scene, stand_in.clock
-    period = float(clock[-1] - clock[0]) + PAUSE
-    return [
-        HIDDEN[a.name].make(Place(scene, (a.joint,) if a.joint else scene.joints, repeat, period), a.amplitude)
-        for a in applied
-    ]
+def at_work(scene: Scene, applied: Sequence[Applied], repeat: int = 0, period: float = 0.0) -> list[Influence]:
+    """The effects of one repeat, each with a fresh state; repeat and period as in `Place`."""
+    places = [Place(scene, (one.joint,) if one.joint else scene.joints, repeat, period) for one in applied]
+    return [HIDDEN[one.name].make(place, one.amplitude) for one, place in zip(applied, places, strict=True)]
 
 
 def _simulate(
@@ -153,11 +150,12 @@ def _simulate(
     """Sensor rows [N, T, S], torques in the gears [N, T, nv] (N m; only for the link side), the
     effects of every repeat, and the stand-in with the models that they edited."""
     count = len(stand_in.models)
-    effects = [influences(stand_in, applied, repeat) for repeat in range(count)]
+    since = stand_in.clock - stand_in.clock[0]
+    period = float(since[-1]) + PAUSE
+    effects = [at_work(stand_in.scene, applied, repeat, period) for repeat in range(count)]
     models = [edited(model, own) for model, own in zip(stand_in.models, effects, strict=True)]
     link = stand_in.config.side is TorqueSide.LINK
     gears = np.zeros((count, len(stand_in.clock) if link else 0, stand_in.scene.model.nv))
-    since = stand_in.clock - stand_in.clock[0]
 
     def one(repeat: int) -> np.ndarray:
         control = stand_in.control

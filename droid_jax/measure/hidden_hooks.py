@@ -139,6 +139,29 @@ class Hidden:
     signed: bool = False
 
 
+def under(
+    model: mujoco.MjModel, data: mujoco.MjData, influences: Sequence[Influence]
+) -> tuple[Live, Callable[[np.ndarray], None]]:
+    """A simulation that the effects begin to act on, and what takes it one step on with a command [U]."""
+    live, own_loss = Live.of(model, data), model.dof_frictionloss.copy()
+    for influence in influences:
+        if influence.begin:
+            influence.begin(live)
+    steps = [i.step for i in influences if i.step]
+    applied, gear, loss, ctrl = live.applied, live.gear, live.loss, live.control
+
+    def advance(command: np.ndarray) -> None:
+        ctrl[:] = command
+        applied[:] = 0.0
+        gear[:] = 0.0
+        loss[:] = own_loss
+        for step in steps:
+            step(live)
+        mujoco.mj_step(model, data)
+
+    return live, advance
+
+
 def step_through(
     model: mujoco.MjModel,
     qpos0: np.ndarray,
@@ -153,25 +176,14 @@ def step_through(
     model = copy.copy(model)
     data = mujoco.MjData(model)
     data.qpos[:] = qpos0
-    live = Live.of(model, data)
     own_loss = model.dof_frictionloss.copy()
-    for influence in influences:
-        if influence.begin:
-            influence.begin(live)
-    steps = [i.step for i in influences if i.step]
+    live, advance = under(model, data, influences)
     rows, sensors = np.empty((len(control), model.nsensordata)), data.sensordata
-    applied, loss, ctrl = live.applied, live.loss, live.control
     for k, command in enumerate(control):
-        ctrl[:] = command
-        applied[:] = 0.0
-        live.gear[:] = 0.0
-        loss[:] = own_loss
-        for step in steps:
-            step(live)
-        mujoco.mj_step(model, data)
+        advance(command)
         rows[k] = sensors
         if gears is not None:
-            gears[k] = live.gear + _added_friction(data, loss, own_loss)
+            gears[k] = live.gear + _added_friction(data, live.loss, own_loss)
     # MuJoCo starts over where it blows up: its clock is then late.
     if abs(data.time - len(control) * live.timestep) > 0.5 * live.timestep:
         rows[:] = np.nan

@@ -99,6 +99,11 @@ class Scene:
         fingers = self.grip.fingers if self.grip else ()
         return tuple(np.array([self.id("pair", p) for p in pairs], dtype=int) for pairs in fingers)
 
+    @property
+    def finger_joints(self) -> tuple[str, ...]:
+        """The gripper's joints: commanded, but not measured."""
+        return tuple(name for name in self.command_names if name not in self.joints)
+
     @functools.cached_property
     def mjx(self) -> Any:
         """The mjx.Model on the default device."""

@@ -177,5 +177,5 @@ def start_pose(scene: Scene, task: Task, plan: Plan = PLANS["A"]) -> np.ndarray:
     q = solve_pose(scene, np.array(plan.pose), *grasp_pose(scene, 0.0, 0.0, plan.roll))
     for standoff in np.linspace(0.0, task.standoff, 10):
         q = solve_pose(scene, q, *grasp_pose(scene, 0.0, standoff, plan.roll))
-    fingers = [name for name in scene.command_names if name not in scene.joints]
-    return scene.initial_qpos({**dict(zip(scene.joints, q.tolist(), strict=True)), **dict.fromkeys(fingers, OPEN)})
+    arm = dict(zip(scene.joints, q.tolist(), strict=True))
+    return scene.initial_qpos({**arm, **dict.fromkeys(scene.finger_joints, OPEN)})

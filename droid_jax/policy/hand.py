@@ -43,14 +43,19 @@ def hand_of(scene: Scene) -> Hand:
     return Hand(scene.id("site", "pinch"), scene.id("site", "knob"), fingers, scene.qpos(scene.object_joint), pairs)
 
 
+def pads_at(hand: Hand, data: Any, origin: Any, axes: Any, numbers: Any = np) -> Any:
+    """[2, 3] m, the middles of the pads' faces in a frame of axes [3, 3] at an origin [3]."""
+    pad = numbers.array(PAD, data.xpos.dtype)
+    return (data.xpos[hand.fingers] + data.xmat[hand.fingers].reshape(-1, 3, 3) @ pad - origin) @ axes
+
+
 def looked(hand: Hand, data: Any, force: Any, last: Any, seconds: float, numbers: Any = jnp) -> Seen:
     """From mjx.Data, or MjData with numbers=numpy, with fresh kinematics.
 
     force: [2] N.  last: [2, 3] pads a while ago, `seconds` before, in the knob's frame.
     """
     knob, turned = data.site_xpos[hand.knob], data.site_xmat[hand.knob].reshape(3, 3)
-    pad = numbers.array(PAD, data.xpos.dtype)
-    pads = (data.xpos[hand.fingers] + data.xmat[hand.fingers].reshape(-1, 3, 3) @ pad - knob) @ turned
+    pads = pads_at(hand, data, knob, turned, numbers)
     axis, inward = data.site_xmat[hand.pinch].reshape(3, 3)[:, 2], turned[:, 0]
     across, along = inward[0] * axis[1] - inward[1] * axis[0], inward[:2] @ axis[:2]
     return Seen(

@@ -10,7 +10,7 @@ import numpy as np
 from droid_jax.measure.demonstration import PLANS, Plan, joint_path
 from droid_jax.model.scene import Scene
 from droid_jax.policy.control import Interface
-from droid_jax.policy.hand import PAD, hand_of
+from droid_jax.policy.hand import Hand, hand_of, pads_at
 from droid_jax.policy.task import Task
 
 SPEED = (2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61)  # rad/s, Panda: Franka's data sheet
@@ -21,7 +21,7 @@ WIDEST = 1.2  # rad, of that opening
 def interface_of(scene: Scene, task: Task, start: np.ndarray, plan: Plan = PLANS["A"]) -> Interface:
     """Of the built-in scene.  start: [nq], `DoorEnv.start`.  The base frame is the scene's world."""
     model, hand, arm = scene.model, hand_of(scene), list(scene.joint_dofs)
-    fingers = [scene.qpos(n) for n in scene.command_names if n not in scene.joints]
+    fingers = [scene.qpos(name) for name in scene.finger_joints]
     motors = [scene.command_names.index(name) for name in scene.joints]
     at_zero = np.zeros(model.nq)
     data, closed = _posed(model, at_zero), _posed(model, start)
@@ -33,7 +33,6 @@ def interface_of(scene: Scene, task: Task, start: np.ndarray, plan: Plan = PLANS
         moved = at_zero.copy()
         moved[address] = 0.01
         slides[k] = (_pads(model, hand, moved)[k] - shut[k]) / 0.01
-    stiffness = model.actuator_gainprm[motors, 0].copy()
     return Interface(
         period=task.control,
         reach=task.reach,
@@ -41,7 +40,7 @@ def interface_of(scene: Scene, task: Task, start: np.ndarray, plan: Plan = PLANS
         ranges=model.jnt_range[model.dof_jntid[arm]].copy(),
         speed=np.array(SPEED),
         effort=model.jnt_actfrcrange[model.dof_jntid[arm], 1].copy(),
-        stiffness=stiffness,
+        stiffness=model.actuator_gainprm[motors, 0].copy(),
         damping=model.dof_damping[arm].copy(),
         workspace=_workspace(scene, hand, start, plan),
         chain=np.array([np.linalg.inv(a) @ b for a, b in itertools.pairwise(links)]),
@@ -52,7 +51,7 @@ def interface_of(scene: Scene, task: Task, start: np.ndarray, plan: Plan = PLANS
     )
 
 
-def _workspace(scene: Scene, hand, start: np.ndarray, plan: Plan) -> np.ndarray:
+def _workspace(scene: Scene, hand: Hand, start: np.ndarray, plan: Plan) -> np.ndarray:
     """[2, 3] m, lowest and highest corner around the pinch point of an opening by the book, and its start."""
     path = joint_path(scene, plan, np.linspace(0.0, WIDEST, 25), np.zeros(25))
     points = []
@@ -63,11 +62,10 @@ def _workspace(scene: Scene, hand, start: np.ndarray, plan: Plan) -> np.ndarray:
     return np.array([np.min(points, axis=0) - ROOM, np.max(points, axis=0) + ROOM])
 
 
-def _pads(model: mujoco.MjModel, hand, qpos: np.ndarray) -> np.ndarray:
+def _pads(model: mujoco.MjModel, hand: Hand, qpos: np.ndarray) -> np.ndarray:
     """[2, 3] m, the pads in the pinch point's frame."""
     data = _posed(model, qpos)
-    pads = data.xpos[hand.fingers] + data.xmat[hand.fingers].reshape(-1, 3, 3) @ np.array(PAD)
-    return (pads - data.site_xpos[hand.pinch]) @ data.site_xmat[hand.pinch].reshape(3, 3)
+    return pads_at(hand, data, data.site_xpos[hand.pinch], data.site_xmat[hand.pinch].reshape(3, 3))
 
 
 def _posed(model: mujoco.MjModel, qpos: np.ndarray) -> mujoco.MjData:

@@ -11,13 +11,12 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any
 
 import mujoco
 import numpy as np
 
-from droid_jax.measure.hidden import HIDDEN, LONGEST_STEP, Applied, check
-from droid_jax.measure.hidden_hooks import Influence, Live, Place, edited
+from droid_jax.measure.hidden import LONGEST_STEP, Applied, at_work, check
+from droid_jax.measure.hidden_hooks import Influence, edited, under
 from droid_jax.measure.surrogate import own_engine
 from droid_jax.model.door import door_nuisances, door_space
 from droid_jax.model.physics import make_c_model
@@ -119,13 +118,13 @@ def _trial(
     """Success, largest angle, actions, share of them with the grip on, why the loop stopped."""
     scene, task, config = robot.scene, robot.task, robot.config
     rng = np.random.default_rng([config.seed, number])
-    influences = [_influence(scene, a) for a in robot.hidden]
+    influences = at_work(scene, robot.hidden)
     model, hand = edited(scene.model, influences), hand_of(scene)
     data = mujoco.MjData(model)
     data.qpos[:] = robot.start
     data.qpos[scene.joint_qpos] += rng.normal(0.0, task.spread, len(scene.joints))
     mujoco.mj_forward(model, data)
-    advance = _stepper(model, data, influences, round(task.control / config.timestep))
+    advance = _advancer(model, data, influences, round(task.control / config.timestep))
     sense = _senses(scene, data, config, rng)
     seen = looked(hand, data, finger_forces_c(hand, model, data), np.zeros((2, 3)), task.control, np)
     loop = Controller(policy)
@@ -157,7 +156,7 @@ def _senses(
 ) -> Callable[[float], Reading]:
     """What the robot's sensors say at a time; the camera's error is drawn once."""
     joints, dofs, knob = scene.joint_qpos, scene.joint_dofs, scene.id("site", "knob")
-    fingers = [scene.qpos(name) for name in scene.command_names if name not in scene.joints]
+    fingers = [scene.qpos(name) for name in scene.finger_joints]
     sight, pose = rng.normal(0.0, config.knob_noise, 3), np.eye(4)
 
     def sense(time: float) -> Reading:
@@ -174,33 +173,23 @@ def _senses(
     return sense
 
 
-def _stepper(model: mujoco.MjModel, data: mujoco.MjData, influences: Sequence[Influence], steps: int) -> Any:
-    """A function of a command [U] that advances the simulation by so many steps."""
-    live, own_loss = Live.of(model, data), model.dof_frictionloss.copy()
-    for influence in influences:
-        if influence.begin:
-            influence.begin(live)
-    each = [i.step for i in influences if i.step]
+def _advancer(
+    model: mujoco.MjModel, data: mujoco.MjData, influences: Sequence[Influence], steps: int
+) -> Callable[[np.ndarray], None]:
+    """A function of a command [U] that takes the simulation so many steps on."""
+    _, step = under(model, data, influences)
 
     def plain(ctrl: np.ndarray) -> None:
         data.ctrl[:] = ctrl
-        mujoco.mj_step(model, data, nstep=steps)
+        mujoco.mj_step(model, data, nstep=steps)  # all in C
 
     def influenced(ctrl: np.ndarray) -> None:
         for _ in range(steps):
-            live.control[:], live.applied[:], live.gear[:], live.loss[:] = ctrl, 0.0, 0.0, own_loss
-            for step in each:
-                step(live)
-            mujoco.mj_step(model, data)
+            step(ctrl)
 
-    return influenced if each else plain
-
-
-def _influence(scene: Scene, one: Applied) -> Influence:
-    joints = (one.joint,) if one.joint else scene.joints
-    return HIDDEN[one.name].make(Place(scene, joints), one.amplitude)
+    return influenced if any(i.step for i in influences) else plain
 
 
 def _acts_on_traces(scene: Scene, one: Applied) -> bool:
-    found = _influence(scene, one)
+    (found,) = at_work(scene, [one])
     return found.command is not None or found.sense is not None
