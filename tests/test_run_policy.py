@@ -83,7 +83,7 @@ def test_without_a_fit_there_is_the_prior(scene):
         (["train", "--fit", "nowhere"], "nowhere holds no gaussian.json"),
         (["train", "--method", "mean"], "--method mean needs a fit"),
         (["evaluate", "--trials", "0"], "--trials must be 1 or more, got 0"),
-        (["evaluate", "nowhere"], "nowhere/training.json is missing: `python -m droid_jax.run train --out nowhere`"),
+        (["evaluate", "nowhere"], "nowhere/training.json is missing; run `python -m droid_jax.run train` again"),
         (["export", "nowhere"], "nowhere/policy.npz: there is no such file"),
     ],
 )

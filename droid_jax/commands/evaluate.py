@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import shutil
 import sys
 from collections.abc import Mapping
@@ -17,15 +16,14 @@ from droid_jax.commands import report
 from droid_jax.commands.folder import setup_of
 from droid_jax.commands.hidden import hidden_effects
 from droid_jax.commands.source import needs_brax, source
-from droid_jax.commands.train import POLICY, TRAINING, randomise
+from droid_jax.commands.train import randomise
+from droid_jax.report.policy_folder import FILMS, POLICY, TRANSFER, read_training
 
 if TYPE_CHECKING:
     from droid_jax.policy.control import Policy
     from droid_jax.policy.door_env import DoorEnv
     from droid_jax.policy.transfer import StandIn
     from droid_jax.policy.trials import Trials
-
-TRANSFER, FILMS = "transfer.json", "films"
 
 
 @dataclass(frozen=True)
@@ -66,7 +64,7 @@ def run(command: Evaluate) -> None:
     from droid_jax.policy.transfer import transfer
     from droid_jax.storage import write_json
 
-    trained = _trained(command.run)
+    trained = read_training(command.run)
     setup, policy = trained["setup"], load(command.run / POLICY)
     scene, gaussian, effects = source(command.run, setup["knob"])
     env = DoorEnv(scene, Task(**trained["task"]), effects)
@@ -97,23 +95,18 @@ def run(command: Evaluate) -> None:
 
 def _robot(command: Evaluate, trained: Mapping[str, Any], env: DoorEnv) -> tuple[StandIn, dict[str, float]]:
     """The stand-in robot, the one that was fitted unless asked for another; and its hidden values."""
-    fitted = trained["stand_in"]
     from droid_jax.measure.hidden import listed
     from droid_jax.measure.surrogate import stand_in_truth
     from droid_jax.model.door_scene import door_scene
     from droid_jax.policy.transfer import TransferConfig, stand_in
 
-    def first(*choices: Any) -> Any:
-        return next(c for c in choices if c is not None)
-
-    springs = first(command.springs, fitted.get("springs"), 1)
-    seed = first(command.robot, fitted.get("seed"), 0)
-    hide = command.hide if command.hide is not None or "hide" in fitted else ()
-    hide = fitted.get("hide") if hide is None else hide
+    asked = {"springs": command.springs, "seed": command.robot, "hide": command.hide}
+    usual = {"springs": 1, "seed": 0, "hide": ()}
+    own = usual | trained["stand_in"] | {name: value for name, value in asked.items() if value is not None}
     scene = door_scene(limits=True, knob=trained["setup"]["knob"])
-    truth = stand_in_truth(scene, springs, seed)
+    truth = stand_in_truth(scene, own["springs"], own["seed"])
     config = TransferConfig(trials=command.trials, seed=command.seed)
-    return stand_in(scene, env.start, truth, listed(hidden_effects(hide, scene)), env.task, config), truth
+    return stand_in(scene, env.start, truth, listed(hidden_effects(own["hide"], scene)), env.task, config), truth
 
 
 def _angle(found: Trials) -> str:
@@ -142,14 +135,3 @@ def _film(folder: Path, policy: Policy, robot: StandIn, found: Trials) -> None:
         except NoOpenGL as error:
             print(f"no films: {error}", file=sys.stderr)
             return
-
-
-def _trained(folder: Path) -> dict[str, Any]:
-    """training.json."""
-    path = folder / TRAINING
-    try:
-        return json.loads(path.read_text())
-    except FileNotFoundError:
-        raise ValueError(f"{path} is missing: `python -m droid_jax.run train --out {folder}` writes it") from None
-    except ValueError as error:
-        raise ValueError(f"{path} cannot be read ({error}); train again") from None

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal
 from droid_jax.commands import report
 from droid_jax.commands.folder import begin, finished, setup_of
 from droid_jax.commands.source import GAUSSIAN, extended_of, fingerprint, needs_brax, source, stand_in_of
+from droid_jax.report.policy_folder import FILMS, POLICY, TRAINING, TRANSFER
 
 if TYPE_CHECKING:
     from droid_jax.identify.gaussian import Gaussian
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
     from droid_jax.policy.train import TrainConfig
 
 Method = Literal["fitted", "mean", "prior"]
-POLICY, TRAINING = "policy.npz", "training.json"
-EXTENDED = "extended.json"
 USUAL = Path("runs/identify")
 
 
@@ -58,6 +57,7 @@ def run(command: Train) -> None:
 
     runtime.tune()
     runtime.import_mjx()
+    from droid_jax.gap.extended import FILE
     from droid_jax.identify.results import prepare_folder
     from droid_jax.policy.door_env import DoorEnv
     from droid_jax.policy.network import save_policy
@@ -80,7 +80,7 @@ def run(command: Train) -> None:
     gaussian.save(out / GAUSSIAN)
     model = None if fit is None else extended_of(fit)
     if model is not None:
-        shutil.copyfile(model, out / EXTENDED)
+        shutil.copyfile(model, out / FILE)
     with training(config.steps) as progress:
         found = train(
             env, randomise(command.method, scene, gaussian), config, checkpoints=out / "checkpoints",
@@ -105,9 +105,11 @@ def run(command: Train) -> None:
 
 def _forget(out: Path) -> None:
     """Remove what belongs to a policy that was trained here before."""
-    for name in (POLICY, "transfer.json", EXTENDED):
+    from droid_jax.gap.extended import FILE
+
+    for name in (POLICY, TRANSFER, FILE):
         (out / name).unlink(missing_ok=True)
-    for name in ("films", "export"):
+    for name in (FILMS, "export"):
         shutil.rmtree(out / name, ignore_errors=True)
 
 

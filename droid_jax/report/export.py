@@ -45,9 +45,9 @@ def inline_svg(figure: Figure, prefix: str) -> str:
     return svg
 
 
-def data_uri(png: bytes) -> str:
-    """PNG bytes as a data URI."""
-    return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
+def data_uri(image: bytes, kind: str = "png") -> str:
+    """An image's bytes as a data URI; kind: png or webp."""
+    return f"data:image/{kind};base64,{base64.b64encode(image).decode('ascii')}"
 
 
 def png_bytes(figure: Figure) -> bytes:

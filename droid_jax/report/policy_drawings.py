@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import base64
-
 import numpy as np
 
 from droid_jax.report.drawings import Drawing, drawing
+from droid_jax.report.export import data_uri
 from droid_jax.report.policy_figures import angles, learning
 from droid_jax.report.policy_folder import Trained
 
-FILMS = {"good": "A trial that succeeded, on the stand-in robot", "bad": "A trial that failed, on the stand-in robot"}
+CAPTIONS = {
+    "good": "A trial that succeeded, on the stand-in robot",
+    "bad": "A trial that failed, on the stand-in robot",
+}
 
 
 def draw_policy(trained: Trained) -> dict[str, list[Drawing]]:
@@ -39,6 +41,6 @@ def draw_policy(trained: Trained) -> dict[str, list[Drawing]]:
 def film_row(trained: Trained) -> list[tuple[str, str]]:
     """Films with their captions, as data URIs."""
     return [
-        (FILMS.get(name, name), "data:image/webp;base64," + base64.b64encode(path.read_bytes()).decode("ascii"))
+        (CAPTIONS.get(name, name), data_uri(path.read_bytes(), "webp"))
         for name, path in sorted(trained.films.items(), reverse=True)
     ]

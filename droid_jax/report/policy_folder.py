@@ -9,10 +9,12 @@ from typing import Any
 
 from droid_jax.report.reading import Reader
 
+POLICY, TRAINING, TRANSFER, FILMS = "policy.npz", "training.json", "transfer.json", "films"
 _READ = Reader("train")
 _NUMBER = (int, float)
 _TRAINING = {
     "setup": {"method": str, "preset": str, "knob": int, "seed": int},
+    "stand_in": dict,
     **{"task": {"opened": _NUMBER, "held": _NUMBER, "control": _NUMBER, "steps": int}, "scene": str},
     **{"effects": [str], "versions": dict, "device": str},
     "history": [{"step": int, **dict.fromkeys(("seconds", "rate", "reward", "success"), _NUMBER)}],
@@ -48,17 +50,23 @@ class Trained:
 
 def has_policy(folder: Path) -> bool:
     """Whether a folder holds, or should hold, a trained policy."""
-    return (folder / "training.json").exists()
+    return (folder / TRAINING).exists()
+
+
+def read_training(folder: Path) -> Mapping[str, Any]:
+    """training.json, checked; ValueError where it is missing or broken."""
+    training = _READ.json(folder / TRAINING)
+    _READ.check(training, _TRAINING, TRAINING)
+    return training
 
 
 def read_policy(folder: Path) -> Trained:
     """Load and check; ValueError names the file that is missing or broken."""
-    training = _READ.json(folder / "training.json")
-    _READ.check(training, _TRAINING, "training.json")
+    training = read_training(folder)
     transfer = None
-    if (folder / "transfer.json").is_file():
+    if (folder / TRANSFER).is_file():
         read = Reader("evaluate")
-        transfer = read.json(folder / "transfer.json")
-        read.check(transfer, _TRANSFER, "transfer.json")
-    films = {path.stem: path for path in sorted((folder / "films").glob("*.webp"))}
+        transfer = read.json(folder / TRANSFER)
+        read.check(transfer, _TRANSFER, TRANSFER)
+    films = {path.stem: path for path in sorted((folder / FILMS).glob("*.webp"))}
     return Trained(folder, training, transfer, films)

@@ -24,7 +24,7 @@ class Reader:
     def fault(self, what: str) -> ValueError:
         """The error for a fault, with what to do about it."""
         again = f"run `python -m droid_jax.run {self.command}` again, or pass the folder that it wrote"
-        return ValueError(f"report: {what}; {again}")
+        return ValueError(f"{what}; {again}")
 
     def json(self, path: Path) -> dict[str, Any]:
         """A JSON object."""
