@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 
-from droid_jax.commands import convert, evaluate, export, gap, identify, record, report, train
+from droid_jax.commands import convert, evaluate, export, gap, identify, record, report, train, whole
 
 Command = (
-    identify.Identify
+    Annotated[whole.All, tyro.conf.subcommand("all")]
+    | identify.Identify
     | gap.Gap
     | train.Train
     | evaluate.Evaluate
@@ -25,6 +26,7 @@ Command = (
     | report.Report
 )
 _ACTIONS: dict[type, Callable[[Any], None]] = {
+    whole.All: whole.run,
     identify.Identify: identify.run,
     gap.Gap: gap.run,
     train.Train: train.run,
@@ -36,12 +38,17 @@ _ACTIONS: dict[type, Callable[[Any], None]] = {
 }
 
 
+WHAT = """From recordings of a robot to a fitted simulation, to what that simulation lacks, and to a policy.
+
+Without a command: `all`, on a stand-in robot."""
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; bad input ends with one line on stderr and exit code 2."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if not arguments or (arguments[0].startswith("-") and arguments[0] not in ("-h", "--help")):
-        arguments = ["identify", *arguments]
-    command = tyro.cli(Command, args=arguments, prog="python -m droid_jax.run", description=__doc__)
+        arguments = ["all", *arguments]
+    command = tyro.cli(Command, args=arguments, prog="python -m droid_jax.run", description=WHAT)
     try:
         _ACTIONS[type(command)](command)
     except (ValueError, OSError) as error:

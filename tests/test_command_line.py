@@ -146,19 +146,25 @@ def test_a_report_of_nothing(refused, tmp_path: Path):
 
 def test_a_scene_without_parameters(refused, run_folder: Path):
     before = content(run_folder)
-    said = refused("--scene", XML, "--out", run_folder)
+    said = refused("identify", "--scene", XML, "--out", run_folder)
     assert "--scene needs --parameters" in said
     assert content(run_folder) == before
 
 
 def test_a_scene_without_a_recording(refused, tmp_path: Path):
-    said = refused("--scene", XML, "--parameters", parameters(tmp_path, GOOD), "--out", tmp_path / "run")
+    said = refused("identify", "--scene", XML, "--parameters", parameters(tmp_path, GOOD), "--out", tmp_path / "run")
     assert "--scene needs --recording" in said
 
 
 def test_a_missing_scene(refused, tmp_path: Path):
     said = refused(
-        "--scene", tmp_path / "no.xml", "--parameters", parameters(tmp_path, GOOD), "--out", tmp_path / "run"
+        "identify",
+        "--scene",
+        tmp_path / "no.xml",
+        "--parameters",
+        parameters(tmp_path, GOOD),
+        "--out",
+        tmp_path / "run",
     )
     assert f"no MJCF file at {tmp_path / 'no.xml'}" in said
 
@@ -167,7 +173,9 @@ def test_a_scene_that_mjx_would_ignore_in_part(refused, tmp_path: Path):
     text = XML.read_text().replace('damping="2"', 'damping="2 1"')
     assert text != XML.read_text()
     (tmp_path / "odd.xml").write_text(text)
-    said = refused("--scene", tmp_path / "odd.xml", "--parameters", parameters(tmp_path, GOOD), "--out", tmp_path / "r")
+    said = refused(
+        "identify", "--scene", tmp_path / "odd.xml", "--parameters", parameters(tmp_path, GOOD), "--out", tmp_path / "r"
+    )
     assert "polynomial joint damping" in said
 
 
@@ -177,7 +185,7 @@ def test_a_scene_that_mjx_would_ignore_in_part(refused, tmp_path: Path):
 )
 def test_an_unknown_joint(refused, tmp_path: Path, options: list[str], expected: str):
     said = refused(
-        "--scene", XML, "--parameters", parameters(tmp_path, GOOD), "--out", tmp_path / "run", *options
+        "identify", "--scene", XML, "--parameters", parameters(tmp_path, GOOD), "--out", tmp_path / "run", *options
     )  # fmt: skip
     assert f"unknown joint {expected!r}" in said and "shoulder, elbow" in said
 
@@ -201,7 +209,9 @@ def test_an_unknown_joint(refused, tmp_path: Path, options: list[str], expected:
 def test_a_bad_parameter(refused, run_folder: Path, tmp_path: Path, entry: object, expected: str):
     path = parameters(tmp_path, GOOD, entry)
     before = content(run_folder)
-    said = refused("--scene", XML, "--parameters", path, "--recording", tmp_path / "x.npz", "--out", run_folder)
+    said = refused(
+        "identify", "--scene", XML, "--parameters", path, "--recording", tmp_path / "x.npz", "--out", run_folder
+    )
     assert f"{path}, entry 2" in said and expected in said
     assert content(run_folder) == before
 
@@ -214,12 +224,14 @@ def test_a_bad_parameter_file(refused, tmp_path: Path, text: str | None, expecte
     path = tmp_path / "parameters.json"
     if text is not None:
         path.write_text(text)
-    said = refused("--scene", XML, "--parameters", path, "--out", tmp_path / "run")
+    said = refused("identify", "--scene", XML, "--parameters", path, "--out", tmp_path / "run")
     assert str(path) in said and expected in said
 
 
 def test_the_same_name_twice(refused, tmp_path: Path):
-    said = refused("--scene", XML, "--parameters", parameters(tmp_path, GOOD, GOOD), "--out", tmp_path / "run")
+    said = refused(
+        "identify", "--scene", XML, "--parameters", parameters(tmp_path, GOOD, GOOD), "--out", tmp_path / "run"
+    )
     assert "elbow_damping" in said and "unique" in said
 
 

@@ -284,7 +284,9 @@ def test_the_stand_in_records_each_demonstration_once(tmp_path: Path, monkeypatc
     assert asked == [("C", {"closer": 1.0}, 3000), ("B", {"closer": 1.0}, 3001), ("A", {"closer": 1.0}, 3002)]
     record_stand_in(door_scene(), {"closer": 1.0}, tmp_path, 1, 3, False)
     assert len(asked) == 3
-    assert sorted(p.name for p in (tmp_path / "recordings").iterdir()) == ["A.npz", "B.npz", "C.npz"]
+    assert sorted(p.name for p in (tmp_path / "recordings").iterdir()) == [
+        "A.npz", "B.npz", "C.npz", "stand_in.json",
+    ]  # fmt: skip
 
 
 # ----- the run
@@ -333,7 +335,7 @@ def test_a_run_goes_on_after_a_stop_and_is_whole(
     answer = load_gap(out).answer
     assert answer["amplitudes"][0]["value"] == pytest.approx(PRELOAD, rel=0.05)
     assert {"search", "refine", "floor", "screen", "refit"} <= set(answer["seconds"])
-    assert answer["setup"]["stand_in"] is False and answer["setup"]["command"] == "gap"
+    assert answer["setup"]["stand_in"] is True and answer["setup"]["command"] == "gap"
     assert answer["versions"]["jax"] and answer["device"]
 
     monkeypatch.setattr(workflow, "find", lambda *a: pytest.fail("this run is whole"))

@@ -17,7 +17,7 @@ from droid_jax.commands.folder import setup_of
 from droid_jax.commands.hidden import hidden_effects
 from droid_jax.commands.source import needs_brax, source
 from droid_jax.commands.train import randomise
-from droid_jax.report.policy_folder import FILMS, POLICY, TRANSFER, read_training
+from droid_jax.report.files import FILMS, POLICY, TRANSFER
 
 if TYPE_CHECKING:
     from droid_jax.policy.control import Policy
@@ -62,6 +62,7 @@ def run(command: Evaluate) -> None:
     from droid_jax.policy.simulated import simulated
     from droid_jax.policy.task import Task
     from droid_jax.policy.transfer import transfer
+    from droid_jax.report.policy_folder import read_training
     from droid_jax.storage import write_json
 
     trained = read_training(command.run)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from droid_jax.report.policy_folder import POLICY
+from droid_jax.report.files import POLICY
 
 
 @dataclass(frozen=True)

@@ -44,10 +44,14 @@ def fingerprints(scene: Scene, space: Space, recordings: Iterable[Recording]) ->
     }
 
 
+class OtherRun(ValueError):
+    """The folder holds a run with other settings or inputs."""
+
+
 def finished(out: Path, setup: dict[str, Any], again: bool, last: str = "config.json") -> bool:
     """True where the folder holds this very run, whole: with `last`, the file that is written last.
 
-    A folder with another run in it is refused.
+    Raises OtherRun for a folder with another run in it.
     """
     path = out / "setup.json"
     if again or not path.is_file():
@@ -58,7 +62,7 @@ def finished(out: Path, setup: dict[str, Any], again: bool, last: str = "config.
     except (json.JSONDecodeError, UnicodeDecodeError, AttributeError, TypeError):
         raise ValueError(f"{path} is damaged; choose another --out, or start over with --again") from None
     if changed:
-        raise ValueError(
+        raise OtherRun(
             f"{out} holds a run with other settings ({', '.join(changed)}); choose another --out, or --again"
         )
     if not (out / last).is_file():

@@ -77,6 +77,7 @@ def run(command: Gap) -> None:
     from droid_jax.gap.results import write_gap
     from droid_jax.gap.split import Split, roles_of, split_of
     from droid_jax.identify.results import prepare_folder
+    from droid_jax.measure.surrogate import is_stand_in
 
     out = prepare_folder(command.out)
     scene, base = model_of(command)
@@ -100,7 +101,7 @@ def run(command: Gap) -> None:
         "seconds": seconds,
         "versions": runtime.versions(),
         "device": runtime.device(),
-        "setup": {**setup, "stand_in": not given},
+        "setup": {**setup, "stand_in": all(is_stand_in(r) for r in roles.values())},
     }
     write_gap(out, case, verdict, description)
     shutil.rmtree(out / "checkpoints" / "replays", ignore_errors=True)

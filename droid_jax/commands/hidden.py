@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from droid_jax.commands.folder import kept_recording
 
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
 
 DEMONSTRATIONS = {"fit": "C", "confirm": "B", "sealed": "A"}
 HIDE = ("magnetic_catch=1.5",)  # N m
+KNOWN = "stand_in.json"  # beside the stand-in's recordings: its springs, seed and hidden effects
 
 
 def hidden_effects(entries: Sequence[str] | None, scene: Scene) -> dict[str, float]:
@@ -49,6 +51,7 @@ def record_stand_in(
     from droid_jax.measure.formats import load
     from droid_jax.measure.hidden import record_hidden
     from droid_jax.measure.surrogate import stand_in_truth
+    from droid_jax.storage import write_json
 
     truth = stand_in_truth(scene, springs, seed)
 
@@ -60,4 +63,19 @@ def record_stand_in(
     for index, (role, name) in enumerate(DEMONSTRATIONS.items()):
         path = out / "recordings" / f"{name}.npz"
         recordings[role] = kept_recording(path, again, name, lambda i=index, n=name: recorded(i, n))
+    write_json(out / "recordings" / KNOWN, stand_in_json(hidden, springs, seed))
     return recordings
+
+
+def stand_in_json(hidden: Mapping[str, float], springs: int, seed: int) -> dict[str, Any]:
+    """What is known of the stand-in robot that made some recordings."""
+    return {"springs": springs, "seed": seed, "hide": [f"{name}={amplitude:g}" for name, amplitude in hidden.items()]}
+
+
+def known_stand_in(recordings: Sequence[str | Path]) -> dict[str, Any]:
+    """Springs, seed and hidden effects of the stand-in robot that made these files; empty where that is not known."""
+    folders = {Path(path).resolve().parent for path in recordings}
+    try:
+        return json.loads((folders.pop() / KNOWN).read_text()) if len(folders) == 1 else {}
+    except (OSError, ValueError):
+        return {}

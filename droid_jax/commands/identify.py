@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from droid_jax.commands import report
-from droid_jax.commands.folder import begin, finished, kept_recording, setup_of
+from droid_jax.commands.folder import begin, fingerprints, finished, kept_recording, setup_of
+from droid_jax.commands.hidden import known_stand_in
 from droid_jax.commands.presets import TIMESTEP, Preset, refine_config, search_config
 from droid_jax.commands.scenes import own_scene
 
@@ -77,16 +78,18 @@ def run(command: Identify) -> None:
     runtime.import_mjx()
     from droid_jax.identify.pipeline import cost_samples, identify
     from droid_jax.identify.results import prepare_folder, write_run
+    from droid_jax.measure.surrogate import is_stand_in
     from droid_jax.report.progress import stages
 
     out = prepare_folder(command.out)
-    setup = setup_of(command)
+    scene, space, nuisances = model_of(command)
+    scene, space, effects = _extended(command, scene, space)
+    given = _given(command)
+    setup = {**setup_of(command), **fingerprints(scene, space, given)}
     if finished(out, setup, command.again):
         report.run(report.Report(out))
         return
-    scene, space, nuisances = model_of(command)
-    scene, space, effects = _extended(command, scene, space)
-    recordings, truth = _recordings(command, scene, out)
+    recordings, truth = _recordings(command, scene, out, given)
     config = config_of(command)
     begin(out, setup, command.again)
     started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
@@ -116,7 +119,7 @@ def run(command: Identify) -> None:
         "versions": runtime.versions(),
         "device": runtime.device(),
         "started": started,
-        "stand_in": truth is not None,
+        "stand_in": all(is_stand_in(r) for r in recordings),
         "setup": setup,
     }
     write_run(out, found, description, truth=truth, samples=samples)
@@ -168,16 +171,27 @@ def _extended(command: Identify, scene: Scene, space: Space) -> tuple[Scene, Spa
     return model.scene, space + model.effect_space, {"effects": model.effects}
 
 
-def _recordings(command: Identify, scene: Scene, out: Path) -> tuple[list[Recording], dict[str, float] | None]:
-    """The given recordings, or the stand-in's (kept in the run's folder) with their hidden truth."""
+def _given(command: Identify) -> list[Recording]:
+    """The recordings, none where the stand-in robot shall record."""
     from droid_jax.measure.formats import load
 
-    if command.recording:
-        return [load(path) for path in command.recording], None
-    if command.scene is not None:
+    if not command.recording and command.scene is not None:
         raise ValueError("--scene needs --recording: the stand-in robot only knows the built-in door")
+    return [load(path) for path in command.recording]
+
+
+def _recordings(
+    command: Identify, scene: Scene, out: Path, given: list[Recording]
+) -> tuple[list[Recording], dict[str, float] | None]:
+    """The given recordings, or the stand-in's (kept in the run's folder); with its hidden truth where that is known."""
+    from droid_jax.measure.formats import load
+    from droid_jax.measure.surrogate import stand_in_truth
+
+    if given:
+        known = {} if command.scene else known_stand_in(command.recording)
+        return given, stand_in_truth(scene, known["springs"], known["seed"]) if known else None
     from droid_jax.measure.demonstration import demonstration_path
-    from droid_jax.measure.surrogate import record, stand_in_truth
+    from droid_jax.measure.surrogate import record
 
     gains = "paper" if command.preset == "paper" else "impedance"
     names = command.demonstrations[:1] if command.preset == "paper" else command.demonstrations

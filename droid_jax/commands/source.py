@@ -8,6 +8,8 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from droid_jax.commands.hidden import known_stand_in
+
 if TYPE_CHECKING:
     from droid_jax.identify.gaussian import Gaussian
     from droid_jax.model.scene import Scene
@@ -61,7 +63,7 @@ def stand_in_of(folder: Path | None) -> dict[str, Any]:
     if known.get("command") == "train":
         return known.get("stand_in", {})
     if known.get("recording"):
-        return {}
+        return known_stand_in(known["recording"])
     return {k: known[k] for k in ("springs", "seed", "hide") if k in known}
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 from droid_jax.commands import report
 from droid_jax.commands.folder import begin, finished, setup_of
 from droid_jax.commands.source import GAUSSIAN, extended_of, fingerprint, needs_brax, source, stand_in_of
-from droid_jax.report.policy_folder import FILMS, POLICY, TRAINING, TRANSFER
+from droid_jax.report.files import FILMS, POLICY, TRAINING, TRANSFER
 
 if TYPE_CHECKING:
     from droid_jax.identify.gaussian import Gaussian

@@ -80,6 +80,7 @@ class StandIn:
     rng: np.random.Generator
 
 
+SOURCE = "stand-in robot (plain C MuJoCo), not a real one"
 DRIFT_TIME = 0.15  # s
 _WRIST = 4  # joints from here on have the smaller noise
 
@@ -161,7 +162,7 @@ def as_recording(
             name=name or demonstration.name,
             channels=channels,
             torque=TorqueConvention(config.side, gravity=_carries_weight(scene)),
-            meta={"source": "stand-in robot (plain C MuJoCo), not a real one", "seed": str(stand_in.seed)},
+            meta={"source": SOURCE, "seed": str(stand_in.seed)},
         )
     )
 
@@ -294,6 +295,11 @@ def _camera(
 
 def _channel(name: str, unit: str, columns: tuple[str, ...], time: np.ndarray, values: np.ndarray) -> Channel:
     return Channel(name, unit, columns, time, values.astype(np.float32), np.ones(values.shape, bool))
+
+
+def is_stand_in(recording: Recording) -> bool:
+    """Whether the stand-in robot made a recording, whichever file it has been through since."""
+    return recording.meta.get("source") == SOURCE
 
 
 def stand_in_truth(scene: Scene, springs: int, seed: int, *, nuisances: bool = True) -> dict[str, float]:

@@ -2,15 +2,18 @@
 
 `write_report(run)` reads the folder, puts its numbers into words, tables and figures and
 writes RUN/report.html (everything inside, nothing loaded from elsewhere) and the figures as
-PNG and PDF under RUN/figures/.  The folder holds an identification, a search for a missing
-effect, a trained policy, or several of these.  Of an identification, config.json, fit.json, history.npz, traces.npz and
-correlation.npz are required; distribution.npz and frames/*.png are optional; where one is missing the
-page says so in its place.  Of a search, gap.json and gap.npz are required; of a policy, training.json.
+PNG and PDF under figures/ of the folder that they belong to.  RUN holds an identification, a
+search for a missing effect, a trained policy, or several of these, in it or in the folders of
+their stages.  Of an identification, config.json, fit.json, history.npz, traces.npz and
+correlation.npz are required; distribution.npz and frames/*.png are optional; where one is missing
+the page says so in its place.  Of a search, gap.json and gap.npz are required; of a policy,
+training.json.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +33,7 @@ from droid_jax.report.gap_words import (
     settings,
     unit_words,
 )
+from droid_jax.report.lead import lead
 from droid_jax.report.policy_drawings import draw_policy, film_row
 from droid_jax.report.policy_folder import Trained, has_policy, read_policy
 from droid_jax.report.policy_words import policy_summary
@@ -37,6 +41,7 @@ from droid_jax.report.run_folder import Run, has_run, read_run
 from droid_jax.report.words import grouped, label, like, number, percent, speaker, summary
 from droid_jax.storage import write_text
 
+STAGES = ("identify", "gap", "train")  # folders of `all`
 _DOWNLOADS = (
     ("gaussian.json", "the fitted Gaussian, for training"),
     ("extended.json", "the extended model: effects, values and Gaussian, for fits and training"),
@@ -61,9 +66,10 @@ def write_report(run: Path) -> Path:
     Raises ValueError that names the file when a required one is missing or broken.
     """
     folder = Path(run)
-    gap = read_gap(folder) if has_gap(folder) else None
-    policy = read_policy(folder) if has_policy(folder) else None
-    loaded = read_run(folder) if has_run(folder) or not (gap or policy) else None
+    gap = read_gap(at) if (at := _part(folder, has_gap)) else None
+    policy = read_policy(at) if (at := _part(folder, has_policy)) else None
+    at = _part(folder, has_run)
+    loaded = read_run(at or folder) if at or not (gap or policy) else None
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -83,13 +89,40 @@ def write_report(run: Path) -> Path:
     }
     parts = (_policy(policy) if policy else {}) | (_search(gap) if gap else {})
     parts |= _identification(loaded) if loaded else {}
-    downloads = [(f, text) for f, text in _DOWNLOADS if (folder / f).is_file()]
+    if len([part for part in (loaded, gap, policy) if part]) > 1:
+        parts |= _together(folder, loaded, gap, policy)
+    parts_at = [part.folder for part in (loaded, gap, policy) if part]
+    downloads = [(path.relative_to(folder), text) for path, text in _downloads(parts_at)]
     html = environment.get_template("template.html.j2").render(
-        folder=folder, run=loaded, gap=gap, policy=policy, downloads=downloads, **parts
+        folder=folder, run=loaded, gap=gap, policy=policy, downloads=downloads, **{"lead": [], **parts}
     )
     path = folder / "report.html"
     write_text(path, html)
     return path
+
+
+def _part(folder: Path, has: Callable[[Path], bool]) -> Path | None:
+    """Where a part of the page is: in the folder, or in a stage's folder in it."""
+    return next((at for at in (folder, *(folder / stage for stage in STAGES)) if has(at)), None)
+
+
+def _downloads(folders: Sequence[Path]) -> Iterator[tuple[Path, str]]:
+    """The files to offer, of several with one name the first."""
+    for name, text in _DOWNLOADS:
+        at = next((folder / name for folder in folders if (folder / name).is_file()), None)
+        if at is not None:
+            yield at, text
+
+
+def _together(folder: Path, run: Run | None, gap: Gap | None, policy: Trained | None) -> dict[str, Any]:
+    """The head of a page with several parts."""
+    name = folder.resolve().name
+    scene = run.config["scene"] if run else policy.training["scene"] if policy else ""
+    return {
+        "title": f"Report: {name}",
+        "heading": f"Report: {scene or name}",
+        "lead": lead(run, gap, policy),
+    }
 
 
 def _identification(run: Run) -> dict[str, Any]:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from droid_jax.report.files import FILMS, TRAINING, TRANSFER
 from droid_jax.report.reading import Reader
 
-POLICY, TRAINING, TRANSFER, FILMS = "policy.npz", "training.json", "transfer.json", "films"
 _READ = Reader("train")
 _NUMBER = (int, float)
 _TRAINING = {

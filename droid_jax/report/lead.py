@@ -1,0 +1,47 @@
+"""The paragraph at the top of a page with several parts: what was fitted, how large the gap is, what is missing, what
+next."""
+
+from __future__ import annotations
+
+from droid_jax.report.gap_folder import Gap
+from droid_jax.report.gap_words import gap_summary, readable
+from droid_jax.report.policy_folder import Trained
+from droid_jax.report.policy_words import policy_summary
+from droid_jax.report.run_folder import Run
+from droid_jax.report.words import listed, number, percent, summary
+
+
+def lead(run: Run | None, gap: Gap | None, policy: Trained | None) -> list[str]:
+    """From the numbers alone; the last sentence says what to do next."""
+    sentences, following = [], ""
+    if run:
+        sentences.append(_fitted(run))
+        following = summary(run)[-1]
+    if gap:
+        sentences += [readable(gap.found["sentence"], gap.found), *_closed(gap)]
+        following = gap_summary(gap)[-1]
+    if policy:
+        sentences += [_opened(where, found["success_rate"]) for where, found in policy.trials.items()]
+        following = policy_summary(policy)[-1]
+    return [*sentences, following]
+
+
+def _fitted(run: Run) -> str:
+    gaps = run.fit["gap"]
+    sizes = [f"{number(g['before'])} to {number(g['after'])} {run.torque_unit} in “{name}”" for name, g in gaps.items()]
+    return (
+        f"{len(run.parameters)} parameters were fitted to what the {run.robot} measured: on repeats that the fit did "
+        f"not see, the distance between measured and simulated torques fell from {listed(sizes)}."
+    )
+
+
+def _closed(gap: Gap) -> list[str]:
+    one = gap.found["gaps"][gap.judge]
+    if not gap.extended or one["closed"] is None:
+        return []
+    return [f"With that in the model {percent(max(one['closed'], 0.0))} of the gap on “{one['recording']}” is closed."]
+
+
+def _opened(where: str, rate: float) -> str:
+    place = {"simulation": "in the simulation", "stand-in robot": "on the stand-in robot"}[where]
+    return f"The policy opens the door in {percent(rate)} of its trials {place}."

@@ -1,0 +1,99 @@
+"""`all`: its stages, what they are given, and what is not run again."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from droid_jax.commands import evaluate, gap, hidden, identify, report, train, whole
+from droid_jax.commands.folder import OtherRun
+from droid_jax.commands.hidden import known_stand_in
+from droid_jax.commands.source import stand_in_of
+from droid_jax.run import main
+
+
+@pytest.fixture
+def called(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
+    """The stages' commands, in the order in which they were run; nothing is recorded or fitted."""
+    commands: list[Any] = []
+    monkeypatch.chdir(tmp_path)
+    for module in (identify, gap, train, evaluate):
+        monkeypatch.setattr(module, "run", commands.append)
+    monkeypatch.setattr(hidden, "kept_recording", lambda path, again, name, record: None)
+    monkeypatch.setattr(report, "write", lambda folder: folder / "report.html")
+    return commands
+
+
+def found(folder: Path, effects: list[str]) -> None:
+    """A folder with the results of a search."""
+    folder.mkdir(parents=True)
+    gaps = {role: {"closed": 0.5 + 0.1 * k} for k, role in enumerate(("fit", "confirm", "sealed"))}
+    (folder / "gap.json").write_text(
+        json.dumps({"effects": effects, "sentence": "The model lacks: latch.", "gaps": gaps})
+    )
+
+
+def test_without_arguments_every_stage_runs_on_one_recording(called, tmp_path: Path, capsys):
+    assert main([]) == 0
+    fit, search, policy, trials = called
+    files = tuple(Path("runs/all/recordings") / f"{name}.npz" for name in "CBA")
+    assert fit.recording == files[:2] and search.recording == files
+    assert policy.fit == fit.out and policy.out == trials.run == Path("runs/all/train")
+    assert known_stand_in(files) == {"springs": 1, "seed": 0, "hide": ["magnetic_catch=1.5"]}
+    lines = capsys.readouterr().out.splitlines()
+    assert [line for line in lines if line.startswith("[")] == [
+        "[1/4] identify", "[2/4] gap", "[3/4] train", "[4/4] evaluate",
+    ]  # fmt: skip
+    assert lines[-1] == "report: runs/all/report.html"
+
+
+def test_a_policy_is_trained_on_the_extended_model_where_there_is_one(called, tmp_path: Path, capsys):
+    found(tmp_path / "runs" / "all" / "gap", ["latch at door_hinge"])
+    assert main(["all", "--stages", "train"]) == 0
+    assert called[0].fit == Path("runs/all/gap")
+    assert "gap: The model lacks: latch.; 70% of the gap closed on the sealed motion" in capsys.readouterr().out
+
+
+def test_without_a_named_effect_it_is_trained_on_the_fit(called, tmp_path: Path):
+    found(tmp_path / "run" / "gap", [])
+    assert main(["all", "--stages", "train", "--out", "run"]) == 0
+    assert called[0].fit == Path("run/identify")
+
+
+def test_a_stage_with_other_inputs_is_run_again(called, monkeypatch: pytest.MonkeyPatch, capsys):
+    def changed(command: identify.Identify) -> None:
+        called.append(command)
+        if not command.again:
+            raise OtherRun("run holds a run with other settings (recordings_sha256); choose another --out")
+
+    monkeypatch.setattr(identify, "run", changed)
+    assert main(["all", "--stages", "identify"]) == 0
+    assert [command.again for command in called] == [False, True]
+    assert "other settings (recordings_sha256): it is run again" in capsys.readouterr().out
+
+
+def test_another_stand_in_is_recorded_anew(called, monkeypatch: pytest.MonkeyPatch):
+    again: list[bool] = []
+    monkeypatch.setattr(hidden, "kept_recording", lambda path, anew, name, record: again.append(anew))
+    for springs, expected in (("1", False), ("1", False), ("2", True)):
+        again.clear()
+        assert main(["all", "--stages", "gap", "--springs", springs]) == 0
+        assert again == [expected] * 3
+
+
+def test_your_own_recordings_know_no_stand_in(called, tmp_path: Path):
+    assert main(["all", "--recording", "a.npz", "b.npz", "--stages", "identify", "gap"]) == 0
+    assert called[0].recording == called[1].recording == (Path("a.npz"), Path("b.npz"))
+    (tmp_path / "setup.json").write_text(json.dumps({"command": "identify", "recording": ["a.npz", "b.npz"]}))
+    assert stand_in_of(tmp_path) == {}
+
+
+def test_presets_reach_the_stages(called):
+    assert main(["all", "--preset", "paper", "--seed", "3"]) == 0
+    fit, search, policy, _ = called
+    assert (fit.preset, search.preset, policy.preset) == ("standard", "standard", "paper")
+    assert {c.seed for c in called} == {3}
+    assert whole.PRESETS["gpu"] == ("gpu", "gpu")
