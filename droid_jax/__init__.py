@@ -18,7 +18,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from droid_jax.compare.cost import make_cost as make_cost
+    from droid_jax.gap.extended import load_extended as load_extended
     from droid_jax.identify.gaussian import Gaussian as Gaussian
+    from droid_jax.identify.gaussian import load as load_gaussian
     from droid_jax.identify.pipeline import IdentifyConfig as IdentifyConfig
     from droid_jax.identify.pipeline import identify as identify
     from droid_jax.measure.formats import load as load_recording
@@ -32,6 +34,8 @@ if TYPE_CHECKING:
     from droid_jax.model.parameters import Space as Space
     from droid_jax.model.scene import Scene as Scene
     from droid_jax.model.scene import load_scene as load_scene
+    from droid_jax.policy.randomise import randomised as randomised
+    from droid_jax.policy.randomise import randomised_model as randomised_model
     from droid_jax.runtime import tune as tune
 
 __all__ = [
@@ -51,6 +55,10 @@ __all__ = [
     "identify",
     "IdentifyConfig",
     "Gaussian",
+    "load_gaussian",
+    "load_extended",
+    "randomised",
+    "randomised_model",
 ]
 
 # Public name -> (module, name in it).  `identify` is missing: see `_Room`.
@@ -70,6 +78,10 @@ _HOMES = {
     "make_cost": ("compare.cost", "make_cost"),
     "IdentifyConfig": ("identify.pipeline", "IdentifyConfig"),
     "Gaussian": ("identify.gaussian", "Gaussian"),
+    "load_gaussian": ("identify.gaussian", "load"),
+    "load_extended": ("gap.extended", "load_extended"),
+    "randomised": ("policy.randomise", "randomised"),
+    "randomised_model": ("policy.randomise", "randomised_model"),
 }
 
 

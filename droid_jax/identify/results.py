@@ -1,7 +1,7 @@
 """A run's folder: everything an identification found, as JSON, npz, CSV, MJCF. No pickle.
 
 config.json, fit.json, gaussian.json, history.npz/.csv, samples.csv, traces.npz, distribution.npz,
-correlation.npz, fitted.xml; README.md lists them, `report` turns them into a page.
+correlation.npz, fitted.xml; docs/results-folder.md lists them, `report` turns them into a page.
 """
 
 from __future__ import annotations
