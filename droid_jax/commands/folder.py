@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 def setup_of(command: Any) -> dict[str, Any]:
     """What decides a run's results, as plain data: a finished run with the same is not run again."""
     fields = dataclasses.asdict(command)
-    for name in ("out", "again"):
+    for name in ("out", "again", "tensorboard"):
         fields.pop(name, None)
     return {k: [str(v) for v in value] if isinstance(value, tuple) else _plain(value) for k, value in fields.items()}
 

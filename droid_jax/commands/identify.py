@@ -6,7 +6,7 @@ import datetime
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from droid_jax.commands import report
 from droid_jax.commands.folder import begin, fingerprints, finished, kept_recording, setup_of
@@ -63,6 +63,8 @@ class Identify:
     """The search counts torques in units of their noise instead of N m (the refinement always does)."""
     seed: int = 0
     """Seed of the search, of the stand-in robot and of the samples."""
+    tensorboard: bool = False
+    """Write scalars for TensorBoard while it runs, to OUT/tensorboard."""
     out: Path = Path("runs/identify")
     """Results folder. A run that was interrupted goes on from where it was."""
     again: bool = False
@@ -80,6 +82,7 @@ def run(command: Identify) -> None:
     from droid_jax.identify.results import prepare_folder, write_run
     from droid_jax.measure.surrogate import is_stand_in
     from droid_jax.report.progress import stages
+    from droid_jax.report.scalars import FOLDER, scalars
 
     out = prepare_folder(command.out)
     scene, space, nuisances = model_of(command)
@@ -93,7 +96,13 @@ def run(command: Identify) -> None:
     config = config_of(command)
     begin(out, setup, command.again)
     started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    with stages(("search", "refine", "judge", "sample")) as progress:
+    board = out / FOLDER if command.tensorboard else None
+    with stages(("search", "refine", "judge", "sample")) as show, scalars(board) as write:
+
+        def progress(stage: str, value: Any) -> None:
+            show(stage, value)
+            write(stage, value)
+
         found = identify(
             scene, space, recordings, nuisances=nuisances, config=config, checkpoints=out / "checkpoints",
             progress=progress, **effects,

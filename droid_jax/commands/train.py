@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from droid_jax.identify.gaussian import Gaussian
     from droid_jax.model.scene import Scene
     from droid_jax.policy.randomise import Randomise
-    from droid_jax.policy.train import TrainConfig
+    from droid_jax.policy.train import TrainConfig, TrainProgress
 
 Method = Literal["fitted", "mean", "prior"]
 USUAL = Path("runs/identify")
@@ -43,6 +43,8 @@ class Train:
     """Actions in all, rounded up to whole rounds; default: the preset's."""
     seed: int = 0
     """Seed of the networks and of the environments."""
+    tensorboard: bool = False
+    """Write scalars for TensorBoard while it runs, to OUT/tensorboard."""
     out: Path = Path("runs/train")
     """Results folder. A run that was interrupted goes on from its last checkpoint."""
     again: bool = False
@@ -63,6 +65,7 @@ def run(command: Train) -> None:
     from droid_jax.policy.network import save_policy
     from droid_jax.policy.train import train
     from droid_jax.report.progress import training
+    from droid_jax.report.scalars import FOLDER, scalars
     from droid_jax.storage import write_json
 
     out, fit = prepare_folder(command.out), _fit_folder(command)
@@ -81,7 +84,13 @@ def run(command: Train) -> None:
     model = None if fit is None else extended_of(fit)
     if model is not None:
         shutil.copyfile(model, out / FILE)
-    with training(config.steps) as progress:
+    board = out / FOLDER if command.tensorboard else None
+    with training(config.steps) as show, scalars(board) as write:
+
+        def progress(now: TrainProgress) -> None:
+            show(now)
+            write("train", now)
+
         found = train(
             env, randomise(command.method, scene, gaussian), config, checkpoints=out / "checkpoints",
             fingerprint={"method": command.method, "gaussian": (out / GAUSSIAN).read_text()},

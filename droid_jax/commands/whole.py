@@ -13,6 +13,7 @@ from typing import Any, Literal, NamedTuple
 from droid_jax.commands import evaluate, gap, identify, report, train
 from droid_jax.commands.folder import OtherRun
 from droid_jax.commands.hidden import DEMONSTRATIONS, KNOWN, hidden_effects, record_stand_in, stand_in_json
+from droid_jax.commands.source import needs_brax
 from droid_jax.report.files import TRANSFER
 
 Stage = Literal["identify", "gap", "train", "evaluate"]
@@ -75,6 +76,8 @@ def run(command: All) -> None:
     from droid_jax.identify.results import prepare_folder
 
     out = prepare_folder(command.out)
+    if command.scene is None and "train" in command.stages:
+        needs_brax()  # rather now than after the search
     plan = _plan(command, out, command.recording or _recorded(command))
     for number, (stage, run_stage) in enumerate(plan.items(), 1):
         print(f"\n[{number}/{len(plan)}] {stage}", flush=True)
