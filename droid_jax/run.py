@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from droid_jax.commands import convert, evaluate, export, gap, identify, record, report, train, whole
+from droid_jax.commands import convert, evaluate, export, gap, identify, record, report, train, view, whole
 
 Command = (
     Annotated[whole.All, tyro.conf.subcommand("all")]
@@ -24,6 +24,7 @@ Command = (
     | record.Record
     | convert.Convert
     | report.Report
+    | view.View
 )
 _ACTIONS: dict[type, Callable[[Any], None]] = {
     whole.All: whole.run,
@@ -35,6 +36,7 @@ _ACTIONS: dict[type, Callable[[Any], None]] = {
     record.Record: record.run,
     convert.Convert: convert.run,
     report.Report: report.run,
+    view.View: view.run,
 }
 
 

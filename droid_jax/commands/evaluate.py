@@ -132,7 +132,7 @@ def _film(folder: Path, policy: Policy, robot: StandIn, found: Trials) -> None:
         path = folder / FILMS / f"{name}.webp"
         number = int(numbers[np.argsort(found.angle[numbers])[len(numbers) // 2]])
         try:
-            film(path, robot.scene.visual_model(), filmed(policy, robot, number), robot.task.control)
+            film(path, robot.scene.visual_model(), [filmed(policy, robot, number)], robot.task.control)
         except NoOpenGL as error:
             print(f"no films: {error}", file=sys.stderr)
             return

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from droid_jax.commands import report
 from droid_jax.commands.folder import begin, fingerprints, finished, kept_recording, setup_of
 from droid_jax.commands.hidden import known_stand_in
+from droid_jax.commands.pictures import draw
 from droid_jax.commands.presets import TIMESTEP, Preset, refine_config, search_config
 from droid_jax.commands.scenes import own_scene
 
@@ -132,7 +132,7 @@ def run(command: Identify) -> None:
         "setup": setup,
     }
     write_run(out, found, description, truth=truth, samples=samples)
-    _draw(out, found, recordings[0])
+    draw(out, found, recordings[0])
     report.run(report.Report(out))
     _summary(found)
 
@@ -215,26 +215,6 @@ def _recordings(
         path = out / "recordings" / f"{name}_springs{command.springs}_seed{command.seed}.npz"
         recordings.append(kept_recording(path, command.again, name, lambda i=index, n=name: recorded(i, n)))
     return recordings, truth
-
-
-def _draw(out: Path, found: Identified, recording: Recording) -> None:
-    """Frames of the fitted replay; without OpenGL the report says that there are none."""
-    from droid_jax.compare.replay import make_drive
-    from droid_jax.measure.engine import poses
-    from droid_jax.model.physics import make_c_model
-    from droid_jax.report.render import NoOpenGL, frames, save_frames
-
-    if found.scene.grip is None:
-        return
-    drive = make_drive(found.scene, recording)
-    qpos = poses(make_c_model(found.scene, found.full, found.best), drive.qpos0, drive.command)
-    rows = [int(f * (len(qpos) - 1)) for f in (0.0, 0.33, 0.6, 1.0)]
-    try:
-        images = frames(found.scene.visual_model(), qpos, rows)
-    except NoOpenGL as error:
-        print(f"no pictures: {error}", file=sys.stderr)
-        return
-    save_frames(out / "frames", images, [float(drive.time[r]) for r in rows], "after")
 
 
 def _summary(found: Identified) -> None:

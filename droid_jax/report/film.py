@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,20 +16,28 @@ if TYPE_CHECKING:
     import mujoco
 
 RATE = 12.5  # pictures per second
+LONGEST = 150  # pictures
 SIZE = (270, 360)  # height, width
 QUALITY = 60  # of WebP
 LAST = 1.5  # s for which the last picture stays
 
 
-def film(path: Path, model: mujoco.MjModel, qpos: np.ndarray, period: float, camera: str = "front") -> None:
-    """Write states qpos [T, nq], `period` s apart, as PATH (webp), in the time they took.
+def film(
+    path: Path, model: mujoco.MjModel, sides: Sequence[np.ndarray], period: float, camera: str | None = "front"
+) -> None:
+    """Write states [T, nq], `period` s apart, as PATH (webp), in the time they took; several side by side.
 
-    Raises NoOpenGL where nothing can draw, ValueError for states that do not fit the model.
+    sides: each [T, nq].  camera: see `frames`.
+    Raises NoOpenGL where nothing can draw, ValueError for states that do not fit the model or each other.
     """
     from PIL import Image
 
-    every = max(1, round(1.0 / (RATE * period)))
-    images = frames(model, qpos, range(0, len(qpos), every), camera, SIZE)
+    length = len(sides[0])
+    if any(len(states) != length for states in sides):
+        raise ValueError(f"film: all sides must be as long as each other, got {[len(s) for s in sides]} states")
+    every = max(1, round(1.0 / (RATE * period)), -(-length // LONGEST))
+    drawn = frames(model, np.concatenate(sides), _rows(length, every, len(sides)), camera, SIZE)
+    images = np.concatenate(np.array_split(np.array(drawn), len(sides)), axis=2)
     pictures = [Image.fromarray(image) for image in images]
     shown = [round(1e3 * every * period)] * (len(pictures) - 1) + [round(1e3 * LAST)]
     with io.BytesIO() as buffer:
@@ -36,3 +45,8 @@ def film(path: Path, model: mujoco.MjModel, qpos: np.ndarray, period: float, cam
             buffer, format="WEBP", save_all=True, append_images=pictures[1:], duration=shown, loop=0, quality=QUALITY
         )
         write_bytes(path, buffer.getvalue())
+
+
+def _rows(length: int, every: int, sides: int) -> list[int]:
+    """Rows to draw of all sides one after the other."""
+    return [side * length + row for side in range(sides) for row in range(0, length, every)]

@@ -20,6 +20,7 @@ from typing import Any
 import jinja2
 
 from droid_jax.report.drawings import draw, frame_rows
+from droid_jax.report.export import data_uri
 from droid_jax.report.gap_drawings import draw_gap
 from droid_jax.report.gap_folder import Gap, has_gap, read_gap
 from droid_jax.report.gap_tables import groups
@@ -142,6 +143,7 @@ def _identification(run: Run) -> dict[str, Any]:
         "nuisances": grouped(p for p in run.fit["parameters"] if p["nuisance"]),
         "drawings": draw(run),
         "frames": frame_rows(run.frames),
+        "replay": data_uri(run.film.read_bytes(), "webp") if run.film else None,
     }
 
 

@@ -36,14 +36,14 @@ def frames(
     model: mujoco.MjModel,
     qpos: np.ndarray,
     indices: Sequence[int],
-    camera: str = "front",
+    camera: str | None = "front",
     size: tuple[int, int] = (480, 640),
 ) -> list[np.ndarray]:
     """Pictures of the states qpos[i] for i in indices, each uint8 [height, width, 3].
 
     model: compiled scene.  qpos: [T, nq], m and rad.  indices: rows of qpos, negative ones
-    count from the end.  camera: name of a fixed camera of the model.  size: (height, width) in
-    pixels, at most the model's offscreen buffer.
+    count from the end.  camera: name of a fixed camera of the model, None for one that sees all of it.
+    size: (height, width) in pixels, at most the model's offscreen buffer.
     Raises ValueError for an argument that does not fit the model, NoOpenGL where nothing can draw.
     """
     states = _states(model, qpos, indices)
@@ -155,16 +155,18 @@ def _states(model: mujoco.MjModel, qpos: np.ndarray, indices: Sequence[int]) -> 
     return states
 
 
-def _check_view(model: mujoco.MjModel, camera: str, size: tuple[int, int]) -> None:
+def _check_view(model: mujoco.MjModel, camera: str | None, size: tuple[int, int]) -> None:
     cameras = [model.camera(i).name for i in range(model.ncam)]
-    if camera not in cameras:
+    if camera is not None and camera not in cameras:
         raise ValueError(f"frames: no camera {camera!r}; this model has: {', '.join(cameras) or 'none'}")
     limit = (model.vis.global_.offheight, model.vis.global_.offwidth)
     if not all(0 < s <= most for s, most in zip(size, limit, strict=True)):
         raise ValueError(f"frames: size (height, width) must be within (1, 1) and {limit}, got {size}")
 
 
-def _save_job(folder: Path, model: mujoco.MjModel, states: np.ndarray, camera: str, size: tuple[int, int]) -> None:
+def _save_job(
+    folder: Path, model: mujoco.MjModel, states: np.ndarray, camera: str | None, size: tuple[int, int]
+) -> None:
     """What the child reads: the compiled model, the states and the view."""
     import mujoco
 
@@ -191,7 +193,7 @@ def _draw(folder: Path | None) -> None:
         for state in np.load(folder / "states.npy"):
             data.qpos[:] = state
             mujoco.mj_forward(model, data)
-            renderer.update_scene(data, camera=view["camera"])
+            renderer.update_scene(data, **({"camera": view["camera"]} if view["camera"] else {}))
             images.append(renderer.render())
     np.save(folder / "frames.npy", np.stack(images))
 

@@ -43,7 +43,8 @@ class Run:
 
     config, fit: config.json and fit.json.  traces: per recording the arrays of traces.npz plus
     "phases", a list.  history, correlation: arrays by name.  distribution: None when missing.
-    frames: PNG files.  missing: one sentence per optional thing that the page leaves out.
+    frames: PNG files.  film: of the replay before and after, None when missing.  missing: one
+    sentence per optional thing that the page leaves out.
     """
 
     folder: Path
@@ -54,6 +55,7 @@ class Run:
     correlation: Mapping[str, np.ndarray]
     distribution: Mapping[str, np.ndarray] | None
     frames: tuple[Path, ...]
+    film: Path | None
     missing: tuple[str, ...]
 
     @property
@@ -98,6 +100,7 @@ def read_run(run: Path) -> Run:
     else:
         distribution = _READ.arrays(run / "distribution.npz", _ARRAYS["distribution"])
     frames = tuple(sorted((run / "frames").glob("*.png")))
+    film = run / "films" / "replay.webp"
     if not frames:
         missing.append("frames/ holds no pictures: drawing needs OpenGL, see the documentation.")
     return Run(
@@ -109,6 +112,7 @@ def read_run(run: Path) -> Run:
         correlation=_READ.arrays(run / "correlation.npz", _ARRAYS["correlation"]),
         distribution=distribution,
         frames=frames,
+        film=film if film.is_file() else None,
         missing=tuple(missing),
     )
 

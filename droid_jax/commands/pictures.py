@@ -1,0 +1,52 @@
+"""Pictures of a fit: the replay before and after it, as states, film and frames."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from droid_jax.identify.pipeline import Identified
+    from droid_jax.measure.recording import Recording
+
+REPLAY = "replay.npz"
+RATE = 25.0  # states per second
+AT = (0.0, 0.33, 0.6, 1.0)  # of the motion, where a frame is taken
+
+
+def draw(out: Path, found: Identified, recording: Recording) -> None:
+    """Replay a recording's commands in plain C before and after the fit: replay.npz, films/ and frames/.
+
+    Without OpenGL only the states are written, and the report says that there are no pictures.  A recording
+    without commands has no replay to show.
+    """
+    import numpy as np
+
+    from droid_jax.compare.replay import make_drive
+    from droid_jax.measure.engine import poses
+    from droid_jax.model.physics import make_c_model
+    from droid_jax.report.film import film
+    from droid_jax.report.render import NoOpenGL, frames, save_frames
+    from droid_jax.storage import write_npz
+
+    if not recording.command.size:
+        return
+    drive = make_drive(found.scene, recording)
+    every = max(1, round(1.0 / (RATE * drive.timestep)))
+    before, after = (
+        poses(make_c_model(found.scene, found.full, values), drive.qpos0, drive.command)[::every]
+        for values in (found.start, found.best)
+    )
+    time = drive.timestep * every * np.arange(len(after))
+    write_npz(out / REPLAY, {"time": time, "before": before, "after": after})
+    model = found.scene.visual_model()
+    camera = "front" if "front" in {model.camera(i).name for i in range(model.ncam)} else None
+    rows = [int(f * (len(after) - 1)) for f in AT]
+    try:
+        images = frames(model, after, rows, camera)
+        film(out / "films" / "replay.webp", model, (before, after), drive.timestep * every, camera)
+    except NoOpenGL as error:
+        print(f"no pictures: {error}", file=sys.stderr)
+        return
+    save_frames(out / "frames", images, [float(time[r]) for r in rows], "after")

@@ -1,0 +1,85 @@
+"""`view`: a fit's replay in MuJoCo's viewer, before and after side by side."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from droid_jax.commands.pictures import REPLAY
+
+if TYPE_CHECKING:
+    import mujoco
+    import numpy as np
+
+FITTED = "fitted.xml"
+APART = 1.6  # times the scene's extent between the two
+
+
+@dataclass(frozen=True)
+class View:
+    """Watch the replay in MuJoCo's viewer: before the fit on the left, after it on the right. Needs a screen."""
+
+    run: Annotated[Path, tyro.conf.Positional] = Path("runs/identify")
+    """Folder of `identify`, or of `all`."""
+    speed: float = 1.0
+    """Times real time."""
+
+
+def run(command: View) -> None:
+    """Play the states of replay.npz over and over until the window is closed."""
+    if not command.speed > 0:
+        raise ValueError(f"--speed must be above 0, got {command.speed:g}")
+    folder = next((f for f in (command.run, command.run / "identify") if (f / REPLAY).is_file()), None)
+    if folder is None:
+        raise ValueError(
+            f"{command.run} holds no {REPLAY}: `python -m droid_jax.run identify` writes one for recordings that hold "
+            "commands"
+        )
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise ValueError(f"there is no screen here; the same replay is a film in {folder / 'report.html'}")
+    import mujoco
+    import mujoco.viewer
+
+    clock, states = replay_of(folder)
+    model = side_by_side(folder / FITTED)
+    if states.shape[1] != model.nq:
+        raise ValueError(f"{folder / REPLAY} has {states.shape[1]} positions, two of {folder / FITTED} have {model.nq}")
+    data = mujoco.MjData(model)
+    with mujoco.viewer.launch_passive(model, data) as window:
+        began = time.monotonic()
+        while window.is_running():
+            at = command.speed * (time.monotonic() - began) % (clock[-1] + 1.0)  # a second's pause at the end
+            data.qpos[:] = states[min(int(clock.searchsorted(at, "right")) - 1, len(states) - 1)]
+            mujoco.mj_forward(model, data)
+            window.sync()
+            time.sleep(0.02)
+
+
+def replay_of(folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Times [K] s, and the states before and after the fit beside each other [K, 2 nq]."""
+    import numpy as np
+
+    with np.load(folder / REPLAY) as file:
+        return file["time"], np.concatenate([file["before"], file["after"]], axis=1)
+
+
+def side_by_side(mjcf: Path) -> mujoco.MjModel:
+    """A model of two copies of an MJCF, the first on the left; its positions are theirs, one after the other."""
+    import mujoco
+
+    one = mujoco.MjModel.from_xml_path(str(mjcf))
+    half = 0.5 * APART * float(one.stat.extent)
+    both = mujoco.MjSpec()
+    for name, y in (("before", half), ("after", -half)):
+        frame = both.worldbody.add_frame(pos=[0.0, y, 0.0])
+        both.attach(mujoco.MjSpec.from_file(str(mjcf)), prefix=f"{name}/", frame=frame)
+    with warnings.catch_warnings():  # of settings that only matter where something is simulated
+        warnings.simplefilter("ignore", UserWarning)
+        return both.compile()

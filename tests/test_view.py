@@ -1,0 +1,56 @@
+"""`view`: what it would show, and what it says where it cannot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from droid_jax.commands.pictures import REPLAY
+from droid_jax.commands.view import FITTED, replay_of, side_by_side
+from droid_jax.model.door import door_space
+from droid_jax.model.door_scene import door_scene
+from droid_jax.model.mjcf import fitted_mjcf
+from droid_jax.run import main
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run's folder as far as `view` reads it: the built-in scene, and a door that opens in "after" alone."""
+    made, scene = tmp_path_factory.mktemp("view"), door_scene()
+    space = door_space(scene)
+    (made / FITTED).write_text(fitted_mjcf(scene, space, space.mean))
+    before = np.tile(scene.model.qpos0, (5, 1))
+    after = before.copy()
+    after[:, scene.qpos(scene.object_joint)] = np.linspace(0.0, 0.8, 5)
+    np.savez(made / REPLAY, time=np.arange(5) / 25.0, before=before, after=after)
+    return made
+
+
+def test_the_two_stand_side_by_side_and_move_as_they_did(folder: Path):
+    clock, states = replay_of(folder)
+    model, one = side_by_side(folder / FITTED), mujoco.MjModel.from_xml_path(str(folder / FITTED))
+    assert states.shape == (5, model.nq) == (len(clock), 2 * one.nq)
+    both, alone = mujoco.MjData(model), mujoco.MjData(one)
+    both.qpos[:] = states[-1]
+    mujoco.mj_kinematics(model, both)
+    for name, side in (("before", states[-1][: one.nq]), ("after", states[-1][one.nq :])):
+        alone.qpos[:] = side
+        mujoco.mj_kinematics(one, alone)
+        apart = both.site(f"{name}/knob").xpos - alone.site("knob").xpos
+        np.testing.assert_allclose(apart[[0, 2]], 0.0, atol=1e-9)
+        assert apart[1] > 0.5 if name == "before" else apart[1] < -0.5
+
+
+def test_without_a_screen_it_names_the_film(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    assert main(["view", str(folder)]) == 2
+    assert f"a film in {folder / 'report.html'}" in capsys.readouterr().err
+
+
+def test_a_folder_without_a_replay_is_refused(tmp_path: Path, capsys):
+    assert main(["view", str(tmp_path)]) == 2
+    assert f"{tmp_path} holds no replay.npz: `python -m droid_jax.run identify` writes one" in capsys.readouterr().err
