@@ -3,6 +3,7 @@
     python experiments/hidden_effects.py limits --scenes hinge bench   # once, before the method is frozen
     python experiments/hidden_effects.py make --scenes hinge bench     # recordings and, elsewhere, the truth
     python experiments/hidden_effects.py search                        # sees recordings only; goes on after a stop
+    python experiments/hidden_effects.py oracle                        # what the right names could reach
     python experiments/hidden_effects.py score                         # opens the seals
     python experiments/hidden_effects.py all --quick                   # make, search and score a few cases
 
@@ -33,6 +34,7 @@ from experiments.blind.cases import Counts, plans  # noqa: E402
 from experiments.blind.draws import commit_of  # noqa: E402
 from experiments.blind.limits import scene_limits  # noqa: E402
 from experiments.blind.make import make  # noqa: E402
+from experiments.blind.oracle import oracle_all  # noqa: E402
 from experiments.blind.scenes import setting  # noqa: E402
 from experiments.blind.score import score_folder  # noqa: E402
 from experiments.blind.search import Bench, search_all  # noqa: E402
@@ -100,6 +102,16 @@ class Search:
 
 
 @dataclass(frozen=True)
+class Oracle:
+    """Fit the library's forms of what was hidden from the truth: what a search could reach at best."""
+
+    cases: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Names of cases; default: all in OUT/cases."""
+    out: Path = RUNS
+    """Folder of cases and seals; what is found goes to `oracle` beside them."""
+
+
+@dataclass(frozen=True)
 class Score:
     """Open the seals of all cases that have a result."""
 
@@ -113,10 +125,10 @@ class Score:
 
 @dataclass(frozen=True)
 class All(Make):
-    """make, search in a process of its own, score."""
+    """make, search in a process of its own, oracle, score."""
 
 
-Command = Limits | Make | Search | Score | All
+Command = Limits | Make | Search | Oracle | Score | All
 
 
 def run_limits(command: Limits) -> dict[str, Any]:
@@ -165,10 +177,17 @@ def run_search(command: Search) -> dict[str, Any]:
     return {"searched": search_all(open_ones, results, Bench(), _tell), "cases": len(chosen)}
 
 
+def run_oracle(command: Oracle) -> dict[str, Any]:
+    """Every case that the library has forms of."""
+    names = command.cases or tuple(sorted(p.name for p in (command.out / "cases").iterdir()))
+    folders = (command.out / name for name in ("cases", "sealed", "oracle"))
+    return {"oracles": oracle_all(*folders, names, Bench(), _tell)}
+
+
 def run_score(command: Score) -> dict[str, Any]:
     """Write hidden_effects.json and hand its headline figures on."""
     limits = json.loads(command.limits.read_text())["scenes"] if command.limits.is_file() else {}
-    result = score_folder(command.out / "results", command.out / "sealed", limits)
+    result = score_folder(command.out / "results", command.out / "sealed", limits, command.out / "oracle")
     write_json((command.results or command.out) / "hidden_effects.json", {**origin(0), **result})
     return result["summary"]
 
@@ -178,6 +197,7 @@ def run_all(command: All) -> dict[str, Any]:
     made = run_make(command)
     script = [sys.executable, str(Path(__file__).resolve()), "search"]
     subprocess.run([*script, "--out", str(command.out)], check=True)
+    run_oracle(Oracle(out=command.out))
     return {"made": made, **run_score(Score(out=command.out, limits=command.limits))}
 
 
@@ -187,7 +207,9 @@ def _tell(line: str) -> None:
 
 def main() -> None:
     command = tyro.cli(Command, description=__doc__)  # pyright: ignore[reportArgumentType]
-    run = {Limits: run_limits, Make: run_make, Search: run_search, Score: run_score, All: run_all}[type(command)]
+    run = {
+        Limits: run_limits, Make: run_make, Search: run_search, Oracle: run_oracle, Score: run_score, All: run_all,
+    }[type(command)]  # fmt: skip
     print(json.dumps(run(command)))  # pyright: ignore[reportArgumentType]
 
 

@@ -36,7 +36,8 @@ class RefineConfig:
     step: half-width of the first central differences, search units.
     smallest_step: and of later ones at least, search units (below it solver noise would show).
     main_prior: prior deviation of parameters of interest, search units.
-    tolerance: stop when an iteration lowers the objective (a log likelihood) by less than this.
+    tolerance: stop when an iteration lowers the objective (a log likelihood) by less than this, or by less than a
+      share FAR of what it is above that of noise alone: a model that misses something may be far from any fit.
     rough: while starts and hypotheses are sorted out, already when it lowers it by less than this share.
     aim: an objective to reach: stop where the last iteration's gain, HOPELESS times over, would not do.
     chord: a Jacobian serves another batch of trials while the last lowered the objective by this share.
@@ -135,7 +136,8 @@ def refine(
     for number in range(config.hops):
         slopes = problem.jacobian(state)[0]
         hopped = problem.hop(state, slopes, number)
-        settled = bool(state.objective[0] - hopped.objective[0] <= HOP_TOLERANCE)
+        least = max(HOP_TOLERANCE, HOP_FAR * problem.excess(state)[0])
+        settled = bool(state.objective[0] - hopped.objective[0] <= least)
         if hopped.objective[0] < state.objective[0]:
             state, slopes = hopped, None
         if settled:
@@ -194,6 +196,7 @@ SPREAD_LONGEST = 1.0  # search units
 HOP_POPULATION = 32
 HOP_SIGMA = 1.5  # posterior deviations
 HOP_TOLERANCE = 2.0  # of the objective: a hop that finds less ends the refinement
+FAR, HOP_FAR = 5e-4, 4e-3  # the same as shares of what the objective is above noise alone
 HOP_LONGEST = 1.0  # search units: what the data do not tell is not searched far
 _SHORTEST = 0.05  # a straight path in physical units never takes a parameter below this share of itself
 
@@ -254,6 +257,10 @@ class _Problem:
         value = 0.5 * np.sum(residual**2, axis=-1) + 0.5 * np.sum((x / self.prior) ** 2, axis=-1)
         return np.where(np.isfinite(value), value, np.inf)
 
+    def excess(self, state: _State) -> np.ndarray:
+        """[S] by how much the objectives are above half a unit for each residual, which noise alone leaves."""
+        return np.maximum(state.objective - 0.5 * state.residual.shape[1], 0.0)
+
     def start(self, x: np.ndarray) -> _State:
         """The state of fresh starts [S, D]."""
         residual = self.replay(x)
@@ -272,7 +279,8 @@ class _Problem:
             ended[alive] = state.objective
             leader = int(np.argmin(state.objective))
             self._report(state.objective[leader], state.residual.shape[1])
-            if gain[leader] <= max(self.config.tolerance, rough * state.objective[leader]):
+            least = max(self.config.tolerance, FAR * self.excess(state)[leader], rough * state.objective[leader])
+            if gain[leader] <= least:
                 break
             if HOPELESS * gain[leader] < state.objective[leader] - self.config.aim:
                 break

@@ -18,6 +18,7 @@ from experiments.blind.scenes import Setting
 @dataclass(frozen=True)
 class Answer:
     """exact: the library's name for it, "" where it has none.  ties: names that are as right.  why: of both.
+    parts: names beside a right one that are not wrong, but not enough either.
 
     scenes: where it is hidden; empty for all that can have it.
     """
@@ -26,6 +27,7 @@ class Answer:
     ties: tuple[str, ...] = ()
     why: str = ""
     scenes: tuple[str, ...] = ()
+    parts: tuple[str, ...] = ()
 
 
 HINGED = ("hinge", "bench", "door")
@@ -56,8 +58,13 @@ ANSWERS: dict[str, Answer] = {
     "neighbour_door": Answer("", why="a contact far out, with damping"),
     "dry_friction": Answer("joint_coulomb"),
     "stribeck_friction": Answer("joint_stribeck"),
-    "directional_friction": Answer("joint_directional"),
-    "load_friction": Answer("load_friction"),
+    "directional_friction": Answer(
+        "joint_directional", parts=("joint_coulomb", "joint_stribeck", "angle_friction"),
+        why="friction one way is as much dry friction both ways, and a difference",
+    ),
+    "load_friction": Answer(
+        "load_friction", parts=("joint_coulomb",), why="under a steady load it is dry friction"
+    ),
     "bristle_friction": Answer("joint_coulomb", why="bristles bend by milliradians before they slip"),
     "warm_up_friction": Answer("joint_coulomb", why="what its repeats share is dry friction; the rest counts as noise"),
     "payload": Answer("payload", scenes=("arm", "door")),
@@ -128,6 +135,12 @@ def right(scene: Scene, hidden: Applied) -> tuple[str, ...]:
         return ()
     names = (_at(scene, name, hidden.joint) for name in (answer.exact, *answer.ties))
     return tuple(dict.fromkeys(n for n in names if n))
+
+
+def parts(scene: Scene, hidden: Applied) -> tuple[str, ...]:
+    """Names "effect at place" of what is only a part of what was hidden."""
+    names = (_at(scene, name, hidden.joint) for name in ANSWERS[hidden.name].parts)
+    return tuple(n for n in names if n)
 
 
 def _at(scene: Scene, name: str, joint: str) -> str:

@@ -9,9 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from droid_jax.measure.surrogate import stand_in_truth
+from droid_jax.model.parameters import Space
 from experiments.blind.scenes import ROLES, Setting
 
 DEVELOPMENT = "development"  # in place of a commit: cases to tune with, which prove nothing
+FAR = 2.5  # prior deviations from which on a nuisance is drawn no further
 SPREAD = 0.5  # prior deviations of what is fitted and no nuisance
 HINGE = ("hinge_stiffness", "hinge_frictionloss", "hinge_damping")
 
@@ -47,7 +49,14 @@ def draw_truths(setting: Setting, rng: np.random.Generator) -> dict[str, Truth]:
     space = setting.base
     truth = _door_truth(setting, rng) if setting.name == "door" else _truth(setting, rng)
     offsets = [p for p in space.parameters if p.name.startswith("torque_offset[")]
-    return {role: {**truth, **{p.name: float(rng.normal(p.mean, p.std)) for p in offsets}} for role in ROLES}
+    own = [{p.name: float(rng.normal(p.mean, p.std)) for p in offsets} for _ in ROLES]
+    return {role: _near(space, {**truth, **mine}) for role, mine in zip(ROLES, own, strict=True)}
+
+
+def _near(space: Space, truth: Truth) -> Truth:
+    """The truth with no nuisance further from its prior's mean than FAR deviations: beyond three it is an effect."""
+    reach = {p.name: (p.mean - FAR * p.std, p.mean + FAR * p.std) for p in space.parameters if p.nuisance}
+    return {name: float(np.clip(value, *reach[name])) if name in reach else value for name, value in truth.items()}
 
 
 def _truth(setting: Setting, rng: np.random.Generator) -> Truth:

@@ -12,7 +12,7 @@ import numpy as np
 import scipy.stats
 
 from droid_jax.measure.hidden import Applied
-from experiments.blind.answers import right
+from experiments.blind.answers import parts, right
 from experiments.blind.baselines import bic_outcome
 from experiments.blind.cases import key
 from experiments.blind.scenes import setting
@@ -21,13 +21,15 @@ NAMING = ("named", "tie", "partly explained")  # verdicts that give a name
 CLEAN = ("named", "tie")  # and say that this is all
 OPEN = ("unexplained", "partly explained")
 CLOSED = 0.8  # share of a gap that a named effect has to close
+NAMEABLE = 0.5  # share of the gap that the right names have to close from the truth: less explains nothing
+SEEN = 0.02  # U above the floor below which a recording shows no gap
 COMPARABLE = 0.5  # of an effect's own size, left over by its library form, up to which amplitudes are compared
 
 Case = Mapping[str, Any]  # {"truth": sealed file, "result": its search's file, "right": [names of each hidden effect]}
 
 
-def score_folder(results: Path, sealed: Path, limits: Mapping[str, Any]) -> dict[str, Any]:
-    """Everything about all cases with a result."""
+def score_folder(results: Path, sealed: Path, limits: Mapping[str, Any], oracles: Path | None = None) -> dict[str, Any]:
+    """Everything about all cases with a result.  oracles: folder of what the right names could reach, if known."""
     scenes: dict[str, Any] = {}
     found = []
     for path in sorted(sealed.glob("*.json")):
@@ -37,7 +39,16 @@ def score_folder(results: Path, sealed: Path, limits: Mapping[str, Any]) -> dict
         truth = json.loads(path.read_text())
         scene = scenes.setdefault(truth["scene"], setting(truth["scene"]).scene)
         names = [list(right(scene, Applied(**h))) for h in truth["hidden"]]
-        found.append({"truth": truth, "result": json.loads(result.read_text()), "right": names})
+        known = oracles / path.name if oracles else None
+        found.append(
+            {
+                "truth": truth,
+                "result": json.loads(result.read_text()),
+                "right": names,
+                "parts": [list(parts(scene, Applied(**h))) for h in truth["hidden"]],
+                "oracle": json.loads(known.read_text()) if known and known.is_file() else None,
+            }
+        )
     judged = [judge(case, limits) for case in found]
     groups = grouped(judged)
     return {
@@ -57,7 +68,8 @@ def judge(case: Case, limits: Mapping[str, Any]) -> dict[str, Any]:
     if truth["kind"] == "left_out":
         right_names = [[] for _ in right_names]
     met = [any(slot & set(names) for slot in slots) for names in right_names]
-    false = [sorted(slot) for slot in slots if not any(slot & set(names) for names in right_names)]
+    allowed = right_names if truth["kind"] == "left_out" else [*right_names, *case.get("parts", ())]
+    false = [sorted(slot) for slot in slots if not any(slot & set(names) for names in allowed)]
     exact = [any(e == names[0] for e in result.get("effects", ())) for names in right_names if names]
     seconds = result.get("seconds", {})
     return {
@@ -77,6 +89,7 @@ def judge(case: Case, limits: Mapping[str, Any]) -> dict[str, Any]:
         "named": bool(met) and all(met) and not false and verdict in NAMING,
         "exact": bool(exact) and all(exact) and not false and not any(result.get("tied", ())) and verdict == "named",
         "open": verdict in OPEN,
+        "reachable": reachable(case),
         "gaps": result.get("gaps", {}),
         "closed": {role: closed(result, role) for role in result.get("gaps", {}) if result["effects"]},
         "within_floor": within_floor(result),
@@ -90,6 +103,20 @@ def closed(result: Mapping[str, Any], role: str) -> float:
     """1 - (U after - U0) / (U before - U0)."""
     before, after = result["gaps"][role]
     return 1.0 - (after - result["floor"]) / max(before - result["floor"], 1e-12)
+
+
+def reachable(case: Case) -> float | None:
+    """Share of the confirming recording's gap that the right names close from the truth; None where that is not known.
+
+    0 where the base model leaves hardly a gap: nothing can be named there.
+    """
+    known, gaps = case.get("oracle"), case["result"].get("gaps", {})
+    if not known or "confirm" not in gaps:
+        return None
+    floor, before = case["result"]["floor"], gaps["confirm"][0]
+    if before - floor < SEEN:
+        return 0.0
+    return 1.0 - (known["gaps"]["confirm"] - floor) / (before - floor)
 
 
 def within_floor(result: Mapping[str, Any]) -> bool | None:
@@ -150,6 +177,8 @@ def summarise(judged: Sequence[dict[str, Any]]) -> dict[str, Any]:
     none = [c for c in judged if c["class"] == "none"]
     known = [c for c in judged if c["class"] in ("single", "pair")]
     single, pair = [c for c in known if c["class"] == "single"], [c for c in known if c["class"] == "pair"]
+    nameable = [c for c in known if (c["reachable"] or 0.0) >= NAMEABLE]
+    alone, both = [c for c in nameable if c["class"] == "single"], [c for c in nameable if c["class"] == "pair"]
     strange = [c for c in judged if c["class"] in ("outside", "left_out")]
     named = [c for c in known if c["named"]]
     rates = {
@@ -160,6 +189,11 @@ def summarise(judged: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "detected": rate(known, lambda c: c["verdict"] != "none"),
         "named_up_to_tie": rate(single, lambda c: c["named"]),
         "named_exactly": rate(single, lambda c: c["exact"]),
+        "nameable": rate([c for c in known if c["reachable"] is not None], lambda c: c["reachable"] >= NAMEABLE),
+        "nameable_named_up_to_tie": rate(alone, lambda c: c["named"]),
+        "nameable_named_exactly": rate(alone, lambda c: c["exact"]),
+        "nameable_pair_one_named_none_false": rate(both, lambda c: any(c["met"]) and not c["false_names"]),
+        "nameable_pair_both_named": rate(both, lambda c: c["named"]),
         "partly": rate(single, lambda c: c["verdict"] == "partly explained"),
         "pair_one_named_none_false": rate(pair, lambda c: any(c["met"]) and not c["false_names"]),
         "pair_both_named": rate(pair, lambda c: c["named"]),

@@ -15,7 +15,7 @@ from droid_jax.measure.hidden import HIDDEN, Applied, possible
 from droid_jax.model.effects.registry import registered
 from droid_jax.model.parameters import Parameter, Space
 from experiments.blind import limits, score
-from experiments.blind.answers import ANSWERS, inside, right, targets, without
+from experiments.blind.answers import ANSWERS, inside, parts, right, targets, without
 from experiments.blind.baselines import bic_outcome
 from experiments.blind.cases import Counts, amplitude, key, keys, plans
 from experiments.blind.draws import commit_of, draw_truths, folder_of, seed_of
@@ -98,6 +98,10 @@ def test_truths_are_the_robots_own_in_all_recordings_but_for_the_sensors():
     assert set(truths) == set(ROLES) and set(truths["fit"]) == set(bench.base.names)
     apart = {n for n in bench.base.names if truths["fit"][n] != truths["confirm"][n]}
     assert apart == {n for n in bench.base.names if n.startswith("torque_offset[")}
+    for seed in range(40):  # none so far out that the search would have to call it an effect
+        truth = draw_truths(bench, np.random.default_rng(seed))["fit"]
+        nuisances = [p for p in bench.base.parameters if p.nuisance]
+        assert all(abs(truth[p.name] - p.mean) <= 2.5001 * p.std for p in nuisances)
 
 
 @pytest.mark.parametrize("name", CHEAP)
@@ -224,7 +228,12 @@ def case(
         "verdict": verdict, "effects": effects, "tied": tied or [[] for _ in effects], "p": 0.002, "gaps": gaps,
         "floor": 1.0, "seconds": {"base": 2.0, "find": 3.0}, **more,
     }  # fmt: skip
-    return {"truth": truth, "result": result, "right": right_names}
+    return {"truth": truth, "result": result, "right": right_names, "parts": [], "oracle": None}
+
+
+def reached(confirm: float) -> Any:
+    """An oracle."""
+    return {"gaps": {"confirm": confirm}}
 
 
 def rates(*cases: Any, known: Any = None) -> dict[str, Any]:
@@ -259,6 +268,35 @@ def test_rates_of_what_is_named():
     assert found["closed_confirm"]["median"] == pytest.approx(0.9)
     assert found["closed_sealed"]["median"] == pytest.approx(0.95)
     assert found["within_floor"]["rate"] == 1.0 and found["seconds"]["whole"] == 5.0
+
+
+def test_cases_are_nameable_where_the_right_names_close_half_of_the_gap():
+    latch = "latch at door"
+    good, poor = ({"oracle": reached(u)} for u in (5.0, 7.0))  # of 10 above the floor they close 6 and 4
+    found = rates(
+        {**case("single", "named", [latch], [[latch]]), **good},
+        {**case("single", "unexplained", [], [[latch]]), **good},
+        {**case("single", "unexplained", [], [[latch]]), **poor},
+        {**case("pair", "named", [latch, "drag at door"], [[latch], ["drag at door"]]), **good},
+    )
+    hits = {name: (found[name]["hits"], found[name]["of"]) for name in found if name.startswith("nameable")}
+    assert hits == {
+        "nameable": (3, 4), "nameable_named_up_to_tie": (1, 2), "nameable_named_exactly": (1, 2),
+        "nameable_pair_one_named_none_false": (1, 1), "nameable_pair_both_named": (1, 1),
+    }  # fmt: skip
+    shut = {**case("single", "none", [], [[latch]], gaps={"confirm": [1.01, 1.01], "sealed": [1.0, 1.0]}), **good}
+    assert score.reachable(shut) == 0.0  # no gap to speak of
+
+
+def test_a_part_of_what_was_hidden_is_no_false_name_and_not_enough():
+    whole, part = "joint_directional at j", "joint_coulomb at j"
+    both, alone = case("single", "named", [whole, part], [[whole]]), case("single", "named", [part], [[whole]])
+    judged = [score.judge({**c, "parts": [[part]]}, {}) for c in (both, alone)]
+    assert [j["named"] for j in judged] == [True, False] and not any(j["false_names"] for j in judged)
+    assert parts(setting("arm").scene, Applied("directional_friction", 1.0, "panda_joint2")) == (
+        "joint_coulomb at panda_joint2",
+        "joint_stribeck at panda_joint2",
+    )
 
 
 def test_intervals_are_compared_with_what_the_library_form_should_take():
