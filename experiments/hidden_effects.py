@@ -43,6 +43,7 @@ SceneName = Literal["hinge", "bench", "arm", "door"]
 RUNS = ROOT / "runs" / "hidden_effects"
 LIMITS = ROOT / "benchmarks" / "results" / "detection_limits.json"
 QUICK = Counts(none=1, single=1, pair=0, outside=0, left_out=0)
+QUICK_EFFECTS = ("hinge_preload",)
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ class Make:
     out: Path = RUNS
     """Folder of cases and seals."""
     quick: bool = False
-    """The lone hinge: nothing, and a closer."""
+    """The lone hinge: nothing, and a preload."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,7 @@ Command = Limits | Make | Search | Oracle | Score | All
 
 def run_limits(command: Limits) -> dict[str, Any]:
     """Write every scene's limits as soon as they are known."""
-    effects = ("closer",) if command.quick else command.effects
+    effects = QUICK_EFFECTS if command.quick else command.effects
     for name in command.scenes:
         where = setting(name, command.kept / "door")
         found = scene_limits(where, 1 if command.quick else command.draws, command.kept, effects, _tell)
@@ -150,7 +151,7 @@ def run_make(command: Make) -> dict[str, Any]:
     known = json.loads(command.limits.read_text())["scenes"]
     commit = commit_of(command.commit)
     counts = QUICK if command.quick else command.counts
-    effects = ("closer",) if command.quick else command.effects
+    effects = QUICK_EFFECTS if command.quick else command.effects
     outcomes: dict[str, list[str]] = {}
     for name in ("hinge",) if command.quick else command.scenes:
         where = setting(name, command.out / "door")

@@ -1,0 +1,95 @@
+"""What the right names could reach on a case: the library's forms of what was hidden, fitted from the truth.
+
+The base model absorbs most of many effects, and what a hidden effect's other equation leaves does not shrink with
+it: of friction that grows with the load the base model took 98 % on the door, and the right form from the truth took
+only a tenth of the rest away.  No search can name that, and none should.  The oracle knows the truth and says so; the
+search never sees it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from droid_jax.gap.candidates import Candidate, candidates
+from droid_jax.gap.case import Case
+from droid_jax.gap.refit import Model, refit
+from droid_jax.identify.refine import RefineConfig
+from droid_jax.measure.formats import load
+from droid_jax.measure.hidden import Applied
+from droid_jax.storage import write_json
+from experiments.blind.answers import right
+from experiments.blind.scenes import ROLES
+from experiments.blind.search import Bench
+
+FROM_TRUTH = RefineConfig(iterations=12, hops=0, spreads=0)
+SIZES = np.geomspace(3e-3, 0.8, 12)  # of the way from neutral to a bound
+KINDS = ("single", "pair")  # whose effects the library has forms of
+
+
+def oracle(folder: Path, truth: dict[str, Any], bench: Bench) -> dict[str, Any]:
+    """U on every recording with the right forms in the model, parameters fitted to the first alone."""
+    recordings = {role: load(folder / "recordings" / f"{role}.npz") for role in ROLES}
+    case = bench.case(truth["scene"], recordings)
+    scene = bench.setting(truth["scene"]).scene
+    model = fitted(case, truth["truths"]["fit"], [right(scene, Applied(**h)) for h in truth["hidden"]])
+    return {
+        "model": model.name,
+        "gaps": {role: of.gap_at(model.values) for role, of in case.judged.items()},
+        "amplitudes": {name: float(model.values[case.whole.index(name)]) for name in model.amplitudes},
+        "converged": model.refined.converged,
+    }
+
+
+def fitted(case: Case, truth: dict[str, float], names: Sequence[Sequence[str]]) -> Model:
+    """The best model with one of the right names for each hidden effect, from the truth of all else."""
+    whole = case.whole
+    start = whole.mean.copy()
+    for name, value in truth.items():
+        if name in whole.names:
+            start[whole.index(name)] = value
+    start, parts = np.clip(start, whole.low, whole.high), list[Candidate]()
+    for own in names:
+        start, part = best_start(case, start, [c for c in candidates(case.effects) if c.name in own])
+        parts.append(part)
+    return refit(case.fit, case.base, parts, start[None], FROM_TRUTH)
+
+
+def best_start(case: Case, start: np.ndarray, asked: Iterable[Candidate]) -> tuple[np.ndarray, Candidate]:
+    """Values [D] with the one amplitude, of all of these candidates over a grid of sizes, that leaves the least."""
+    whole = case.whole
+    rows, parts = list[np.ndarray](), list[Candidate]()
+    for candidate in asked:
+        for amplitude in candidate.amplitudes:
+            p = whole[amplitude]
+            for reach in {p.high - p.mean, p.low - p.mean} - {0.0}:
+                for size in SIZES:
+                    row = start.copy()
+                    for name, value in candidate.shapes.items():
+                        row[whole.index(name)] = value
+                    row[whole.index(amplitude)] = p.mean + size * reach
+                    rows.append(row)
+                    parts.append(candidate)
+    left = np.sum(case.fit.cost.whitened(np.stack(rows)) ** 2, axis=1)
+    best = int(np.nanargmin(left))
+    return rows[best], parts[best]
+
+
+def oracle_all(
+    cases: Path, sealed: Path, results: Path, chosen: Iterable[str], bench: Bench, tell: Callable[[str], None] = print
+) -> int:
+    """The oracle of every chosen case that has forms in the library and none yet in the folder `results`."""
+    count = 0
+    for name in chosen:
+        path, truth = results / f"{name}.json", json.loads((sealed / f"{name}.json").read_text())
+        if path.is_file() or truth["kind"] not in KINDS:
+            continue
+        found = oracle(cases / name, truth, bench)
+        write_json(path, found)
+        count += 1
+        tell(f"{name}: {found['model']}, U {', '.join(f'{role} {u:.3g}' for role, u in found['gaps'].items())}")
+    return count
