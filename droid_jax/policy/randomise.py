@@ -8,7 +8,7 @@ follows from them, are batched.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -40,7 +40,9 @@ def randomised(scene: Scene, gaussian: Gaussian) -> Randomise:
 def randomised_model(scene: Scene, gaussian: Gaussian) -> Randomise:
     """The same for environments that know an mjx.Model only (mujoco_playground's): the model fields alone.
 
+    scene: of the same MJCF.  Fields that no parameter writes stay the environment's own.
     Warns of parameters that live outside the model: they have no place there and stay at neutral.
+    Raises ValueError for a Gaussian of another scene, and when called with a model of another scene.
     """
     check_scene(scene, gaussian.space)
     outside = [p.name for p in gaussian.space.parameters if not p.writes]
@@ -49,11 +51,19 @@ def randomised_model(scene: Scene, gaussian: Gaussian) -> Randomise:
             f"an environment that knows an mjx.Model only cannot vary {', '.join(outside)}: they are no fields of it",
             stacklevel=2,
         )
-    both = randomised(scene, gaussian)
+    both, fields = randomised(scene, gaussian), _batched(scene, gaussian.space)
 
     def randomise(model: Any, rng: jax.Array) -> tuple[Any, Any]:
-        physics, batched = both(Physics(model, {}), rng)
-        return physics.model, batched.model
+        for field in fields:
+            own, given = (jax.tree.map(jnp.shape, getattr(m, field)) for m in (scene.mjx, model))
+            if own != given:
+                raise ValueError(
+                    f"the environment's model has {field} of shape {given}, the scene {scene.name!r} of {own}: the "
+                    "scene must be of the environment's MJCF"
+                )
+        physics, _ = both(Physics(scene.mjx, {}), rng)
+        drawn = model.replace(**{field: getattr(physics.model, field) for field in fields})
+        return drawn, _zeros(model, fields)
 
     return randomise
 
@@ -76,11 +86,20 @@ def physics_of(scene: Scene, space: Space, values: np.ndarray) -> Physics:
 
 def axes(scene: Scene, space: Space) -> Physics:
     """0 for what varies from row to row, None for what all share; to be handed to vmap."""
-    model = jax.tree.map(lambda leaf: None, scene.mjx)
-    written = [field for field in written_fields(space) if hasattr(scene.mjx, field)]
-    model = model.replace(**{field: jax.tree.map(lambda leaf: 0, getattr(scene.mjx, field)) for field in written})
+    model = _zeros(scene.mjx, _batched(scene, space))
     theta: dict[str, Any] = {p.name: 0 for p in space.parameters if not p.writes}
     return Physics(model, theta)
+
+
+def _batched(scene: Scene, space: Space) -> tuple[str, ...]:
+    """Fields of an mjx.Model that vary from row to row."""
+    return tuple(field for field in written_fields(space) if hasattr(scene.mjx, field))
+
+
+def _zeros(model: Any, fields: Sequence[str]) -> Any:
+    """The model's tree with 0 in these fields and None in all others."""
+    zeros = {field: jax.tree.map(lambda leaf: 0, getattr(model, field)) for field in fields}
+    return jax.tree.map(lambda leaf: None, model).replace(**zeros)
 
 
 def check_scene(scene: Scene, space: Space) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import warnings
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -13,8 +15,10 @@ from droid_jax.identify.gaussian import Gaussian, prior
 from droid_jax.model.door import door_space
 from droid_jax.model.door_scene import door_scene
 from droid_jax.model.effects.registry import effect_space, library
+from droid_jax.model.fields import body_mass, joint_damping
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import Physics, make_physics, written_fields
+from droid_jax.model.scene import load_scene
 from droid_jax.policy.randomise import fixed, randomised, randomised_model
 
 ENVS = 5
@@ -91,6 +95,34 @@ def test_an_environment_that_knows_a_model_only_is_told_what_it_lacks(scene, gau
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         randomised_model(scene, gaussian)
+
+
+def test_an_environments_own_model_is_kept_but_for_what_varies(scene, gaussian, keys):
+    own = scene.mjx.replace(qpos0=scene.mjx.qpos0 + 0.125)
+    model, batched = randomised_model(scene, gaussian)(own, keys)
+    np.testing.assert_array_equal(model.qpos0, own.qpos0)
+    assert batched.qpos0 is None and model.body_mass.shape == (ENVS, scene.model.nbody)
+    with pytest.raises(ValueError, match=r"has dof_damping of shape \(3,\).*must be of the environment's MJCF"):
+        randomised_model(scene, gaussian)(own.replace(dof_damping=own.dof_damping[:3], body_mass=own.body_mass), keys)
+
+
+@pytest.mark.slow
+def test_mujoco_playground_takes_it():
+    """Its own wrapper: every pole its own damping and mass, all else shared."""
+    pytest.importorskip("mujoco_playground")
+    from mujoco_playground import registry, wrapper
+
+    env = registry.load("CartpoleBalance", config_overrides={"impl": "jax"})
+    pole = load_scene(env.xml_path)
+    space = Space((joint_damping(pole, "hinge_1", std=0.1, high=1.0), body_mass(pole, "pole_1", std=0.05, high=1.0)))
+    keys = jax.random.split(jax.random.key(0), ENVS)
+    randomise = functools.partial(randomised_model(pole, prior(space)), rng=keys)
+    wrapped = wrapper.wrap_for_brax_training(env, episode_length=20, action_repeat=1, randomization_fn=randomise)
+    state = jax.jit(wrapped.reset)(jnp.tile(jax.random.key_data(jax.random.key(1)), (ENVS, 1)))
+    for _ in range(10):
+        state = jax.jit(wrapped.step)(state, jnp.full((ENVS, 1), 0.3))
+    assert np.isfinite(state.reward).all()
+    assert len(np.unique(np.asarray(state.data.qpos)[:, 1])) == ENVS  # alike at the start, but not their physics
 
 
 def test_a_gaussian_of_another_scene_is_refused(scene, gaussian):
