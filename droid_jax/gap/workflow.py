@@ -46,9 +46,12 @@ def base_fit(case: Case, progress: Progress) -> Model:
 
 
 def ask(case: Case, model: Model, asked: tuple[Question, ...]) -> Screen:
-    """Screen questions against a model's residuals on the first demonstration."""
-    root = case.fit.repeats**0.5
-    base, prior = model.refined.jacobian / root, model.refined.prior * root * case.fit.slack
+    """Screen questions against a model's residuals on the first demonstration.
+
+    A base parameter at a bound absorbs nothing more: marks keep what it would have taken.
+    """
+    root, free = case.fit.repeats**0.5, model.refined.free
+    base, prior = model.refined.jacobian[:, free] / root, model.refined.prior[free] * root * case.fit.slack
     raw = marks(case.fit, model.values, asked)
     blown_up = np.isnan(raw).any(axis=1)
     raw[blown_up] = 0.0

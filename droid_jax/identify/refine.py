@@ -89,6 +89,12 @@ class Refined:
     converged: bool
 
     @property
+    def free(self) -> np.ndarray:
+        """[D] bool, parameters that are not at a bound."""
+        space = self.space
+        return (self.x > space.to_search(space.low) + AT_BOUND) & (self.x < space.to_search(space.high) - AT_BOUND)
+
+    @property
     def hessian(self) -> np.ndarray:
         """[D, D] Gauss-Newton curvature, prior included."""
         return _curvature(self.jacobian, self.prior)
@@ -197,6 +203,7 @@ HOP_POPULATION = 32
 HOP_SIGMA = 1.5  # posterior deviations
 HOP_TOLERANCE = 2.0  # of the objective: a hop that finds less ends the refinement
 FAR, HOP_FAR = 5e-4, 4e-3  # the same as shares of what the objective is above noise alone
+AT_BOUND = 1e-4  # search units: no further from it a parameter counts as stuck there
 HOP_LONGEST = 1.0  # search units: what the data do not tell is not searched far
 _SHORTEST = 0.05  # a straight path in physical units never takes a parameter below this share of itself
 

@@ -75,9 +75,6 @@ class Effect:
                   them the effect is of no interest to the search.
     shapes:       parameters that matter only beside an amplitude, and the values to try.
     smallest:     amplitude below which it is not worth a name, in its own unit.
-    nuisances:    nuisances of a base model that mean the same (beside those that write the same fields).
-                  They stay within three of their prior deviations while the search runs: what lies
-                  beyond is the effect.
     """
 
     name: str
@@ -93,7 +90,6 @@ class Effect:
     places: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     shapes: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     smallest: float = 0.0
-    nuisances: tuple[str, ...] = ()
 
 
 def column(theta: Theta, name: str, joints: Sequence[str]) -> jax.Array:

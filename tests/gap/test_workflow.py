@@ -59,6 +59,25 @@ def test_where_nothing_blows_up_nothing_is_left_out(found: Small):
     assert ask(found.case, found.base, questions_of(candidates(found.case.effects))).failed == ()
 
 
+def test_a_nuisance_goes_no_further_than_its_prior_says(found: Small):
+    p = found.case.base["torque_offset[elbow]"]
+    assert (p.low, p.high) == (pytest.approx(-0.3), pytest.approx(0.3))  # of bounds of 2 and a deviation of 0.1
+
+
+def test_a_parameter_at_its_bound_absorbs_nothing_more(found: Small):
+    asked, refined = questions_of(candidates(found.case.effects)), found.base.refined
+    assert refined.free.all()
+    at = refined.space.index("door_stiffness")
+    x = refined.x.copy()
+    x[at] = refined.space.to_search(refined.space.high)[at]
+    stuck = replace(found.base, refined=replace(refined, x=x))
+    assert np.flatnonzero(~stuck.refined.free).tolist() == [at]
+    before, after = (np.linalg.norm(ask(found.case, m, asked).marks, axis=1) for m in (found.base, stuck))
+    assert np.all(after >= before - 1e-9)
+    preload = [q.amplitude for q in asked].index("hinge_preload")
+    assert after[preload] > 1.2 * before[preload]  # a spring looks like a preload
+
+
 def test_no_verdict_from_a_base_fit_that_did_not_converge(found: Small):
     base = replace(found.base, refined=replace(found.base.refined, converged=False))
     verdict = find(found.case, base, FLOOR)

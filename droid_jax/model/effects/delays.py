@@ -27,7 +27,6 @@ def command_delay(scene: Scene) -> Effect | None:
         confused_with=(SENSOR, "servo_gain"),
         places={"commands": (COMMAND,)},
         smallest=0.001,
-        nuisances=("time_offset",),
     )
 
 
@@ -54,5 +53,4 @@ def sensor_delay(scene: Scene) -> Effect | None:
         confused_with=(COMMAND,),
         places={"sensors": (SENSOR,)},
         smallest=0.001,
-        nuisances=("time_offset",),
     )

@@ -26,7 +26,6 @@ def torque_bias(scene: Scene) -> Effect | None:
         confused_with=("payload", "cable_pull"),
         places=a.places(scene.joints, BIAS),
         smallest=0.05,
-        nuisances=tuple(f"torque_offset[{j}]" for j in scene.joints),
     )
 
 
