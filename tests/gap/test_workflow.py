@@ -75,7 +75,7 @@ def test_a_parameter_at_its_bound_absorbs_nothing_more(found: Small):
     before, after = (np.linalg.norm(ask(found.case, m, asked).marks, axis=1) for m in (found.base, stuck))
     assert np.all(after >= before - 1e-9)
     preload = [q.amplitude for q in asked].index("hinge_preload")
-    assert after[preload] > 1.2 * before[preload]  # a spring looks like a preload
+    assert after[preload] > 1.1 * before[preload]  # a spring looks like a preload
 
 
 def test_no_verdict_from_a_base_fit_that_did_not_converge(found: Small):
