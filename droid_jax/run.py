@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
@@ -40,6 +41,8 @@ _ACTIONS: dict[type, Callable[[Any], None]] = {
 }
 
 
+SCRIPT = "droid-jax"  # as pyproject.toml installs it
+WHOLE = ("-h", "--help", "--tyro-")  # options of the program itself: help, shell completion
 WHAT = """From recordings of a robot to a fitted simulation, to what that simulation lacks, and to a policy.
 
 Without a command: `all`, on a stand-in robot."""
@@ -48,9 +51,11 @@ Without a command: `all`, on a stand-in robot."""
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; bad input ends with one line on stderr and exit code 2."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    if not arguments or (arguments[0].startswith("-") and arguments[0] not in ("-h", "--help")):
+    if not arguments or (arguments[0].startswith("-") and not arguments[0].startswith(WHOLE)):
         arguments = ["all", *arguments]
-    command = tyro.cli(Command, args=arguments, prog="python -m droid_jax.run", description=WHAT)
+    script = Path(sys.argv[0]).name
+    prog = script if script == SCRIPT else "python -m droid_jax.run"
+    command = tyro.cli(Command, args=arguments, prog=prog, description=WHAT)
     try:
         _ACTIONS[type(command)](command)
     except (ValueError, OSError) as error:

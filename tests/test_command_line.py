@@ -291,3 +291,14 @@ def test_help_is_quick(arguments: list[str]):
     run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60)
     assert run.returncode == 0, run.stderr
     assert ("--out" if arguments[0] in ("identify", "record") else "report") in run.stdout
+
+
+# ----- the program itself
+
+
+def test_it_completes_in_a_shell(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    monkeypatch.setattr(sys, "argv", ["/usr/bin/droid-jax", "--tyro-print-completion", "bash"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    out = capsys.readouterr().out
+    assert not ended.value.code and "droid-jax" in out and "identify" in out and "--recording" in out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import zipfile
@@ -66,3 +67,11 @@ def test_installed_package_finds_its_own_mjcf(built, tmp_path):
     assert Path(module).is_relative_to(target)
     assert Path(folder).resolve() == (target / "droid_jax" / "mjcf").resolve()
     assert int(actuators) > 0
+
+
+def test_the_api_reference_is_built(tmp_path: Path):
+    pytest.importorskip("pdoc")
+    (rooms,) = re.findall(r"^python -m pdoc (.*)$", (ROOT / "docs" / "api.md").read_text(), re.MULTILINE)
+    run("-m", "pdoc", *rooms.split(), "-o", str(tmp_path))
+    assert "make_cost" in (tmp_path / "droid_jax.html").read_text()
+    assert (tmp_path / "droid_jax" / "gap" / "workflow.html").is_file()
