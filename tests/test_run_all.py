@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from droid_jax import runtime
 from droid_jax.commands import evaluate, gap, hidden, identify, report, train, whole
 from droid_jax.commands.folder import OtherRun
 from droid_jax.commands.hidden import known_stand_in
 from droid_jax.commands.source import stand_in_of
 from droid_jax.run import main
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture
@@ -20,6 +26,7 @@ def called(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
     """The stages' commands, in the order in which they were run; nothing is recorded or fitted."""
     commands: list[Any] = []
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(runtime, "tune", lambda *a, **k: None)  # jax runs already in this process
     for module in (identify, gap, train, evaluate):
         monkeypatch.setattr(module, "run", commands.append)
     monkeypatch.setattr(hidden, "kept_recording", lambda path, again, name, record: None)
@@ -97,3 +104,21 @@ def test_presets_reach_the_stages(called):
     assert (fit.preset, search.preset, policy.preset) == ("standard", "standard", "paper")
     assert {c.seed for c in called} == {3}
     assert whole.PRESETS["gpu"] == ("gpu", "gpu")
+
+
+def test_jax_is_tuned_before_the_stand_in_is_recorded(tmp_path: Path):
+    """In a process of its own, where nothing has started jax: it could not be tuned afterwards."""
+    code = (
+        "from droid_jax.commands import hidden, identify, report, whole\n"
+        "hidden.kept_recording = lambda path, again, name, record: None\n"
+        "def fit(command):\n"
+        "    from droid_jax import runtime\n"
+        "    runtime.tune()\n"
+        "    print('tuned twice')\n"
+        "identify.run = fit\n"
+        "report.write = lambda folder: folder\n"
+        "whole.run(whole.All(stages=('identify',)))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)},
+                          capture_output=True, text=True, timeout=120)  # fmt: skip
+    assert "tuned twice" in done.stdout, done.stderr
