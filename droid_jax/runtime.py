@@ -160,6 +160,14 @@ def import_mjx() -> ModuleType:
         return importlib.import_module("mujoco.mjx")
 
 
+@functools.cache
+def start() -> None:
+    """Tune and import what a command needs, and say so, since it takes seconds; the second time nothing happens."""
+    print("starting jax ...", flush=True)
+    tune()
+    import_mjx()
+
+
 def _cores() -> int:
     """Cores this process may run on."""
     if hasattr(os, "sched_getaffinity"):

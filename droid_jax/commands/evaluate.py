@@ -52,11 +52,9 @@ def run(command: Evaluate) -> None:
     needs_brax()
     if command.trials < 1:
         raise ValueError(f"--trials must be 1 or more, got {command.trials}")
-    print("starting jax ...", flush=True)
     from droid_jax import runtime
 
-    runtime.tune()
-    runtime.import_mjx()
+    runtime.start()
     from droid_jax.policy.control import load
     from droid_jax.policy.door_env import DoorEnv
     from droid_jax.policy.simulated import simulated

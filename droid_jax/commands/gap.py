@@ -68,11 +68,9 @@ class Gap:
 
 def run(command: Gap) -> None:
     """Record or load, fit, search, write the run's folder and its page."""
-    print("starting jax ...", flush=True)
     from droid_jax import runtime
 
-    runtime.tune()
-    runtime.import_mjx()
+    runtime.start()
     from droid_jax.gap.inputs import check_recordings
     from droid_jax.gap.results import write_gap
     from droid_jax.gap.split import Split, roles_of, split_of

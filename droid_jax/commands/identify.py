@@ -73,11 +73,9 @@ class Identify:
 
 def run(command: Identify) -> None:
     """Record or load, fit, write the run's folder and its page."""
-    print("starting jax ...", flush=True)
     from droid_jax import runtime
 
-    runtime.tune()
-    runtime.import_mjx()
+    runtime.start()
     from droid_jax.identify.pipeline import cost_samples, identify
     from droid_jax.identify.results import prepare_folder, write_run
     from droid_jax.measure.surrogate import is_stand_in

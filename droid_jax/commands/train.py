@@ -54,11 +54,9 @@ class Train:
 def run(command: Train) -> None:
     """Train, and write the run's folder and its page."""
     needs_brax()
-    print("starting jax ...", flush=True)
     from droid_jax import runtime
 
-    runtime.tune()
-    runtime.import_mjx()
+    runtime.start()
     from droid_jax.gap.extended import FILE
     from droid_jax.identify.results import prepare_folder
     from droid_jax.policy.door_env import DoorEnv

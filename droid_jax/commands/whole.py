@@ -73,10 +73,9 @@ class All:
 def run(command: All) -> None:
     """Every stage in a folder of its own below OUT, then the page of all of them."""
     started = time.monotonic()
-    print("starting jax ...", flush=True)
     from droid_jax import runtime
 
-    runtime.tune()  # before the recording, which starts jax
+    runtime.start()  # before the recording, which would start jax untuned
     from droid_jax.identify.results import prepare_folder
 
     out = prepare_folder(command.out)
