@@ -74,7 +74,7 @@ def test_a_stage_with_other_inputs_is_run_again(called, monkeypatch: pytest.Monk
     def changed(command: identify.Identify) -> None:
         called.append(command)
         if not command.again:
-            raise OtherRun("run holds a run with other settings (recordings_sha256); choose another --out")
+            raise OtherRun(command.out, ["recordings_sha256"])
 
     monkeypatch.setattr(identify, "run", changed)
     assert main(["all", "--stages", "identify"]) == 0

@@ -45,7 +45,11 @@ def fingerprints(scene: Scene, space: Space, recordings: Iterable[Recording]) ->
 
 
 class OtherRun(ValueError):
-    """The folder holds a run with other settings or inputs."""
+    """The folder holds a run with other settings or inputs; `what` says which."""
+
+    def __init__(self, out: Path, changed: Iterable[str]) -> None:
+        self.what = f"{out} holds a run with other settings ({', '.join(changed)})"
+        super().__init__(f"{self.what}; choose another --out, or --again")
 
 
 def finished(out: Path, setup: dict[str, Any], again: bool, last: str = "config.json") -> bool:
@@ -62,9 +66,7 @@ def finished(out: Path, setup: dict[str, Any], again: bool, last: str = "config.
     except (json.JSONDecodeError, UnicodeDecodeError, AttributeError, TypeError):
         raise ValueError(f"{path} is damaged; choose another --out, or start over with --again") from None
     if changed:
-        raise OtherRun(
-            f"{out} holds a run with other settings ({', '.join(changed)}); choose another --out, or --again"
-        )
+        raise OtherRun(out, changed)
     if not (out / last).is_file():
         print(f"{out} holds this run unfinished; going on")
         return False

@@ -12,7 +12,7 @@ from droid_jax.commands.folder import begin, fingerprints, finished, setup_of
 from droid_jax.commands.gap_search import searched
 from droid_jax.commands.hidden import hidden_effects, record_stand_in
 from droid_jax.commands.presets import TIMESTEP, refine_config, search_config
-from droid_jax.commands.scenes import own_scene
+from droid_jax.commands.scenes import needs_recording, own_scene
 
 if TYPE_CHECKING:
     from droid_jax.gap.case import GapConfig
@@ -158,9 +158,8 @@ def _given(command: Gap) -> list[Recording]:
     """The recordings, none where the stand-in robot shall record."""
     from droid_jax.measure.formats import load
 
+    needs_recording(command)
     if not command.recording:
-        if command.scene is not None:
-            raise ValueError("--scene needs --recording: the stand-in robot only knows the built-in door")
         return []
     if command.hide is not None:
         raise ValueError("--hide is for the stand-in robot, and --recording says that there is none")

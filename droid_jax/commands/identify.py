@@ -12,7 +12,7 @@ from droid_jax.commands.folder import begin, fingerprints, finished, kept_record
 from droid_jax.commands.hidden import known_stand_in
 from droid_jax.commands.pictures import draw
 from droid_jax.commands.presets import TIMESTEP, Preset, refine_config, search_config
-from droid_jax.commands.scenes import own_scene
+from droid_jax.commands.scenes import needs_recording, own_scene
 
 if TYPE_CHECKING:
     from droid_jax.identify.pipeline import Identified, IdentifyConfig
@@ -182,8 +182,7 @@ def _given(command: Identify) -> list[Recording]:
     """The recordings, none where the stand-in robot shall record."""
     from droid_jax.measure.formats import load
 
-    if not command.recording and command.scene is not None:
-        raise ValueError("--scene needs --recording: the stand-in robot only knows the built-in door")
+    needs_recording(command)
     return [load(path) for path in command.recording]
 
 

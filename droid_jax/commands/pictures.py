@@ -6,11 +6,12 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from droid_jax.report.files import FILMS, REPLAY, REPLAY_FILM
+
 if TYPE_CHECKING:
     from droid_jax.identify.pipeline import Identified
     from droid_jax.measure.recording import Recording
 
-REPLAY = "replay.npz"
 RATE = 25.0  # states per second
 AT = (0.0, 0.33, 0.6, 1.0)  # of the motion, where a frame is taken
 
@@ -45,7 +46,7 @@ def draw(out: Path, found: Identified, recording: Recording) -> None:
     rows = [int(f * (len(after) - 1)) for f in AT]
     try:
         images = frames(model, after, rows, camera)
-        film(out / "films" / "replay.webp", model, (before, after), drive.timestep * every, camera)
+        film(out / FILMS / REPLAY_FILM, model, (before, after), drive.timestep * every, camera)
     except NoOpenGL as error:
         print(f"no pictures: {error}", file=sys.stderr)
         return

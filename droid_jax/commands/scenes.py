@@ -11,8 +11,10 @@ if TYPE_CHECKING:
 
 
 class OwnScene(Protocol):
-    """The options that describe it."""
+    """The options that describe it, and what was measured in it."""
 
+    @property
+    def recording(self) -> tuple[Path, ...]: ...
     @property
     def scene(self) -> Path | None: ...
     @property
@@ -21,6 +23,12 @@ class OwnScene(Protocol):
     def joints(self) -> tuple[str, ...]: ...
     @property
     def object_joint(self) -> str | None: ...
+
+
+def needs_recording(options: OwnScene) -> None:
+    """ValueError for a scene of one's own in which nothing was measured."""
+    if options.scene is not None and not options.recording:
+        raise ValueError("--scene needs --recording: the stand-in robot only knows the built-in door")
 
 
 def own_scene(options: OwnScene) -> tuple[Scene, Space]:

@@ -12,13 +12,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from droid_jax.commands.pictures import REPLAY
+from droid_jax.report.files import FITTED, REPLAY
 
 if TYPE_CHECKING:
     import mujoco
     import numpy as np
 
-FITTED = "fitted.xml"
 APART = 1.6  # times the scene's extent between the two
 
 

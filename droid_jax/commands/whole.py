@@ -13,6 +13,7 @@ from typing import Any, Literal, NamedTuple
 from droid_jax.commands import evaluate, gap, identify, report, train
 from droid_jax.commands.folder import OtherRun
 from droid_jax.commands.hidden import DEMONSTRATIONS, KNOWN, hidden_effects, record_stand_in, stand_in_json
+from droid_jax.commands.scenes import needs_recording
 from droid_jax.commands.source import needs_brax
 from droid_jax.report.files import TRANSFER
 
@@ -81,6 +82,7 @@ def run(command: All) -> None:
     out = prepare_folder(command.out)
     if command.scene is None and "train" in command.stages:
         needs_brax()  # rather now than after the search
+    needs_recording(command)
     plan = _plan(command, out, command.recording or _recorded(command))
     for number, (stage, run_stage) in enumerate(plan.items(), 1):
         print(f"\n[{number}/{len(plan)}] {stage}", flush=True)
@@ -127,7 +129,8 @@ def told(out: Path) -> list[str]:
     """One line for each stage that has a result."""
     lines = []
     if fit := _json(out / "identify" / "fit.json"):
-        gaps = [f"{name} {g['before']:.3f} -> {g['after']:.3f} N m" for name, g in fit["gap"].items()]
+        unit = fit.get("torque_unit", "N m")
+        gaps = [f"{name} {g['before']:.3f} -> {g['after']:.3f} {unit}" for name, g in fit["gap"].items()]
         lines.append(f"identify: torque distance on repeats that were not fitted: {', '.join(gaps)}")
     if found := _json(out / "gap" / "gap.json"):
         role, size = list(found["gaps"].items())[-1]
@@ -143,8 +146,6 @@ def told(out: Path) -> list[str]:
 
 def _recorded(command: All) -> tuple[Path, ...]:
     """Files of the stand-in robot's motions: fit, confirm, sealed."""
-    if command.scene is not None:
-        raise ValueError("--scene needs --recording: the stand-in robot only knows the built-in door")
     from droid_jax.commands.presets import TIMESTEP
     from droid_jax.model.door_scene import door_scene
 
@@ -160,8 +161,8 @@ def _stage(run_stage: Callable[[Any], None], command: Any) -> None:
     """Run a stage, anew where its folder holds a run with other inputs."""
     try:
         run_stage(command)
-    except OtherRun as changed:
-        print(f"{changed.args[0].split(';')[0]}: it is run again")
+    except OtherRun as other:
+        print(f"{other.what}: it is run again")
         run_stage(replace(command, again=True))
 
 

@@ -44,14 +44,13 @@ def randomised_model(scene: Scene, gaussian: Gaussian) -> Randomise:
     Warns of parameters that live outside the model: they have no place there and stay at neutral.
     Raises ValueError for a Gaussian of another scene, and when called with a model of another scene.
     """
-    check_scene(scene, gaussian.space)
+    both, fields = randomised(scene, gaussian), _batched(scene, gaussian.space)
     outside = [p.name for p in gaussian.space.parameters if not p.writes]
     if outside:
         warnings.warn(
             f"an environment that knows an mjx.Model only cannot vary {', '.join(outside)}: they are no fields of it",
             stacklevel=2,
         )
-    both, fields = randomised(scene, gaussian), _batched(scene, gaussian.space)
 
     def randomise(model: Any, rng: jax.Array) -> tuple[Any, Any]:
         for field in fields:

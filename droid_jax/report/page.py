@@ -21,6 +21,7 @@ import jinja2
 
 from droid_jax.report.drawings import draw, frame_rows
 from droid_jax.report.export import data_uri
+from droid_jax.report.files import FITTED, POLICY, STAGES, TRAINING, TRANSFER
 from droid_jax.report.gap_drawings import draw_gap
 from droid_jax.report.gap_folder import Gap, has_gap, read_gap
 from droid_jax.report.gap_tables import groups
@@ -42,20 +43,19 @@ from droid_jax.report.run_folder import Run, has_run, read_run
 from droid_jax.report.words import grouped, label, like, number, percent, speaker, summary
 from droid_jax.storage import write_text
 
-STAGES = ("identify", "gap", "train")  # folders of `all`
 _DOWNLOADS = (
     ("gaussian.json", "the fitted Gaussian, for training"),
     ("extended.json", "the extended model: effects, values and Gaussian, for fits and training"),
     ("extended.xml", "the extended model as MJCF, as far as MJCF has words for it"),
-    ("fitted.xml", "the scene with the fitted values"),
+    (FITTED, "the scene with the fitted values"),
     ("fit.json", "every number of this page"),
     ("samples.csv", "parameter sets drawn from the fitted Gaussian"),
     ("history.csv", "the search, generation by generation"),
     ("traces.npz", "torques over time"),
     ("config.json", "how the run was set up"),
-    ("policy.npz", "the policy: python -m droid_jax.run export makes it ready for a robot"),
-    ("training.json", "how the policy was trained"),
-    ("transfer.json", "every trial of the policy"),
+    (POLICY, "the policy: python -m droid_jax.run export makes it ready for a robot"),
+    (TRAINING, "how the policy was trained"),
+    (TRANSFER, "every trial of the policy"),
     ("gap.json", "the search for a missing effect: every number"),
     ("gap.npz", "the search for a missing effect: torques over time"),
 )

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from droid_jax.report.files import FILMS, REPLAY_FILM
 from droid_jax.report.reading import Reader
 
 _READ = Reader("identify")
@@ -100,7 +101,7 @@ def read_run(run: Path) -> Run:
     else:
         distribution = _READ.arrays(run / "distribution.npz", _ARRAYS["distribution"])
     frames = tuple(sorted((run / "frames").glob("*.png")))
-    film = run / "films" / "replay.webp"
+    film = run / FILMS / REPLAY_FILM
     if not frames:
         missing.append("frames/ holds no pictures: drawing needs OpenGL, see the documentation.")
     return Run(

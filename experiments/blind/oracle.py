@@ -48,11 +48,8 @@ def oracle(folder: Path, truth: dict[str, Any], bench: Bench) -> dict[str, Any]:
 def fitted(case: Case, truth: dict[str, float], names: Sequence[Sequence[str]]) -> Model:
     """The best model with one of the right names for each hidden effect, from the truth of all else."""
     whole = case.whole
-    start = whole.mean.copy()
-    for name, value in truth.items():
-        if name in whole.names:
-            start[whole.index(name)] = value
-    start, parts = np.clip(start, whole.low, whole.high), list[Candidate]()
+    known = {name: value for name, value in truth.items() if name in whole.names}
+    start, parts = np.clip(whole.values(known), whole.low, whole.high), list[Candidate]()
     for own in names:
         start, part = best_start(case, start, [c for c in candidates(case.effects) if c.name in own])
         parts.append(part)

@@ -25,7 +25,8 @@ NAMEABLE = 0.5  # share of the gap that the right names have to close from the t
 SEEN = 0.02  # U above the floor below which a recording shows no gap
 COMPARABLE = 0.5  # of an effect's own size, left over by its library form, up to which amplitudes are compared
 
-Case = Mapping[str, Any]  # {"truth": sealed file, "result": its search's file, "right": [names of each hidden effect]}
+# {"truth": sealed file, "result": its search's file, "right", "parts": [names of each hidden effect], "oracle": file}
+Case = Mapping[str, Any]
 
 
 def score_folder(results: Path, sealed: Path, limits: Mapping[str, Any], oracles: Path | None = None) -> dict[str, Any]:
@@ -68,7 +69,7 @@ def judge(case: Case, limits: Mapping[str, Any]) -> dict[str, Any]:
     if truth["kind"] == "left_out":
         right_names = [[] for _ in right_names]
     met = [any(slot & set(names) for slot in slots) for names in right_names]
-    allowed = right_names if truth["kind"] == "left_out" else [*right_names, *case.get("parts", ())]
+    allowed = right_names if truth["kind"] == "left_out" else [*right_names, *case["parts"]]
     false = [sorted(slot) for slot in slots if not any(slot & set(names) for names in allowed)]
     exact = [any(e == names[0] for e in result.get("effects", ())) for names in right_names if names]
     seconds = result.get("seconds", {})
@@ -110,7 +111,7 @@ def reachable(case: Case) -> float | None:
 
     0 where the base model leaves hardly a gap: nothing can be named there.
     """
-    known, gaps = case.get("oracle"), case["result"].get("gaps", {})
+    known, gaps = case["oracle"], case["result"].get("gaps", {})
     if not known or "confirm" not in gaps:
         return None
     floor, before = case["result"]["floor"], gaps["confirm"][0]
