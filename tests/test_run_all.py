@@ -61,7 +61,7 @@ def test_a_policy_is_trained_on_the_extended_model_where_there_is_one(called, tm
     found(tmp_path / "runs" / "all" / "gap", ["latch at door_hinge"])
     assert main(["all", "--stages", "train"]) == 0
     assert called[0].fit == Path("runs/all/gap")
-    assert "gap: The model lacks: latch.; 70% of the gap closed on the sealed motion" in capsys.readouterr().out
+    assert "gap: The model lacks: latch.; 70 % of the gap closed on the sealed motion" in capsys.readouterr().out
 
 
 def test_without_a_named_effect_it_is_trained_on_the_fit(called, tmp_path: Path):

@@ -326,7 +326,7 @@ def test_a_run_goes_on_after_a_stop_and_is_whole(
     lines = said.splitlines()[-5:]
     assert lines[0] == "The model lacks: hinge_preload at door."
     assert lines[1] == "p = 0.0078 if nothing were missing; base fit converged: yes"
-    assert lines[2].startswith("gap, noise units squared: fit ") and "% closed), confirm " in lines[2]
+    assert lines[2].startswith("gap, noise units squared: fit ") and " % closed), confirm " in lines[2]
     assert lines[3].startswith("shifted most: door_stiffness ") and lines[3].endswith(" deviations)")
     assert lines[4] == f"report: {out / 'report.html'}"
     files = {p.name for p in out.iterdir()}

@@ -119,7 +119,7 @@ def test_train_evaluate_export(scene, tmp_path: Path, capsys: pytest.CaptureFixt
     pytest.importorskip("onnxruntime")
     assert main(["export", "run"]) == 0
     said = capsys.readouterr().out
-    assert "stand-in robot: 0% success" in said and "ONNX and JAX differ by at most" in said
+    assert "stand-in robot: 0 % success" in said and "ONNX and JAX differ by at most" in said
     transfer = json.loads((tmp_path / "run" / "transfer.json").read_text())
     assert transfer["simulation"]["trials"] == transfer["stand_in"]["trials"] == 4
     assert np.isfinite(load(tmp_path / "run" / "export" / "policy.npz").act(np.zeros(23))).all()

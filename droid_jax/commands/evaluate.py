@@ -61,6 +61,7 @@ def run(command: Evaluate) -> None:
     from droid_jax.policy.task import Task
     from droid_jax.policy.transfer import transfer
     from droid_jax.report.policy_folder import read_training
+    from droid_jax.report.words import percent
     from droid_jax.storage import write_json
 
     trained = read_training(command.run)
@@ -88,7 +89,7 @@ def run(command: Evaluate) -> None:
         _film(command.run, policy, robot, outside)
     for where, found in (("simulation", inside), ("stand-in robot", outside)):
         low, high = found.interval()
-        print(f"{where}: {found.rate:.0%} success ({low:.0%} to {high:.0%}), {_angle(found)}")
+        print(f"{where}: {percent(found.rate)} success ({percent(low)} to {percent(high)}), {_angle(found)}")
     report.run(report.Report(command.run))
 
 

@@ -174,6 +174,7 @@ def _given(command: Gap) -> list[Recording]:
 def _done(out: Path) -> None:
     """Build the page, and say in a few lines what was found."""
     from droid_jax.gap.results import load_gap, most_shifted
+    from droid_jax.report.words import percent
 
     found = load_gap(out).answer
     page = report.write(out)
@@ -182,7 +183,7 @@ def _done(out: Path) -> None:
     print(f"{p}; base fit converged: {'yes' if found['converged'] else 'no'}")
     gaps = []
     for role, gap in found["gaps"].items():
-        closed = "" if gap["closed"] is None else f" ({gap['closed']:.0%} closed)"
+        closed = "" if gap["closed"] is None else f" ({percent(gap['closed'])} closed)"
         gaps.append(f"{role} {gap['before']:.3g} -> {gap['after']:.3g}{closed}")
     print(f"gap, noise units squared: {', '.join(gaps)}")
     if limits := found.get("split", {}).get("limits"):

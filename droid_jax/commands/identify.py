@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import datetime
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -132,7 +134,7 @@ def run(command: Identify) -> None:
     write_run(out, found, description, truth=truth, samples=samples)
     draw(out, found, recordings[0])
     report.run(report.Report(out))
-    _summary(found)
+    _summary(found, json.loads((out / "fit.json").read_text()))
 
 
 def model_of(command: Identify) -> tuple[Scene, Space, Space | None]:
@@ -214,15 +216,19 @@ def _recordings(
     return recordings, truth
 
 
-def _summary(found: Identified) -> None:
-    """Five lines that say how it went."""
+def _summary(found: Identified, fit: Mapping[str, Any]) -> None:
+    """A few lines that say how it went; fit: of fit.json."""
+    from droid_jax.report.words import lacks_something, percent
+
     for name, gap in found.gaps.items():
         way = "one repeat: what noise alone would leave is not known"
-        if gap.floor is not None:
-            way = f"a perfect model: {gap.floor:.3f}; {gap.closed:.0%} of the gap closed"
+        if gap.floor is not None and gap.closed is not None:
+            way = f"a perfect model: {gap.floor:.3f}; {percent(gap.closed)} of the gap closed"
         unit = found.fit.comparisons[0].channel("torque").unit
         print(f"{name}: held-out torque distance {gap.before:.3f} -> {gap.after:.3f} {unit} ({way})")
     silent = [t.name for t in found.tells if not t.identifiable and not found.full[t.name].nuisance]
     if silent and found.refined is not None:
         print(f"this demonstration tells little about: {', '.join(silent)}")
     print(f"search stopped: {found.search.stop}; {sum(found.seconds.values()):.0f} s")
+    if lacks_something(fit):
+        print("what is left is well above noise: `python -m droid_jax.run gap` looks for what the model lacks")

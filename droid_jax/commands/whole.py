@@ -127,6 +127,8 @@ def model_folder(out: Path) -> Path:
 
 def told(out: Path) -> list[str]:
     """One line for each stage that has a result."""
+    from droid_jax.report.words import percent
+
     lines = []
     if fit := _json(out / "identify" / "fit.json"):
         unit = fit.get("torque_unit", "N m")
@@ -134,13 +136,13 @@ def told(out: Path) -> list[str]:
         lines.append(f"identify: torque distance on repeats that were not fitted: {', '.join(gaps)}")
     if found := _json(out / "gap" / "gap.json"):
         role, size = list(found["gaps"].items())[-1]
-        closed = "" if size["closed"] is None else f"; {size['closed']:.0%} of the gap closed on the {role} motion"
+        closed = "" if size["closed"] is None else f"; {percent(size['closed'])} of the gap closed on the {role} motion"
         lines.append(f"gap: {found['sentence']}{closed}")
     for name, of in (_json(out / "train" / TRANSFER) or {}).items():
         if name in ("simulation", "stand_in"):
             low, high = of["interval_95"]
             where = {"simulation": "in simulation", "stand_in": "on the stand-in robot"}[name]
-            lines.append(f"policy: {of['success_rate']:.0%} success {where} ({low:.0%} to {high:.0%})")
+            lines.append(f"policy: {percent(of['success_rate'])} success {where} ({percent(low)} to {percent(high)})")
     return lines
 
 

@@ -118,6 +118,7 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
         "torque_unit": comparison.channel("torque").unit,
         "stop": found.search.stop,
         "converged": None if found.refined is None else found.refined.converged,
+        "mean_square": None if found.refined is None else float(np.mean(found.refined.residual**2)),
         "generations": len(found.search.history.best_cost),
         "evaluations": int(evaluations),
         "seconds": {**found.seconds, "total": sum(found.seconds.values())},

@@ -60,7 +60,7 @@ def door_scene(
     grip = _add_grip(spec)
     return compile_scene(
         spec,
-        f"door ({('no spring', '1 spring', '2 springs')[springs]}, knob {knob}, {gains} gains)",
+        f"door ({('', '1 spring, ', '2 springs, ')[springs]}knob {knob}, {gains} gains)",
         joints=ARM,
         object_joint=HINGE,
         grip=grip,

@@ -1,20 +1,27 @@
-"""Progress bars of a run, one per stage, with cost and time left."""
+"""Progress of a run, with cost and time left: a bar per stage on a terminal, a line now and then in a log file."""
 
 from __future__ import annotations
 
 import contextlib
 import math
+import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 Report = Callable[[str, Any], None]
+COMPILING = "compiling, a minute"
+QUIET = 20.0  # s between two lines of one stage where there is no terminal
 
 
 @contextlib.contextmanager
 def stages(names: Sequence[str]) -> Iterator[Report]:
     """Show one bar per stage; yields the function that stages report to: (stage, its progress value)."""
+    if not Console().is_terminal:
+        yield Lines().report
+        return
     columns = (
         TextColumn("{task.description:>8}"),
         BarColumn(bar_width=30),
@@ -60,6 +67,11 @@ def _line(value: Any) -> dict[str, Any]:
 @contextlib.contextmanager
 def training(steps: int) -> Iterator[Callable[[Any], None]]:
     """Show one bar for training, in actions; yields the function that takes each `TrainProgress`."""
+    if not Console().is_terminal:
+        lines = Lines()
+        lines.show("training", COMPILING, 0, steps)
+        yield lambda now: lines.show("training", _trained(now), min(now.step, steps), steps)
+        return
     columns = (
         TextColumn("training"),
         BarColumn(bar_width=30),
@@ -69,12 +81,47 @@ def training(steps: int) -> Iterator[Callable[[Any], None]]:
         TextColumn("left {task.fields[left]}"),
     )
     with Progress(*columns) as bars:
-        task = bars.add_task("training", total=steps, text="compiling, a minute", left="–")
+        task = bars.add_task("training", total=steps, text=COMPILING, left="–")
 
         def report(now: Any) -> None:
-            rate = f"{now.rate:,.0f} actions/s" if now.rate else "started"
-            text = f"reward {now.reward:.0f}  success {now.success:.0%}  {rate}"
             left = f"{now.left / 60:.0f} min" if math.isfinite(now.left) else "–"
-            bars.update(task, completed=min(now.step, steps), text=text, left=left)
+            bars.update(task, completed=min(now.step, steps), text=_trained(now), left=left)
 
         yield report
+
+
+def _trained(now: Any) -> str:
+    """What to show of a `TrainProgress`."""
+    rate = f"{now.rate:,.0f} actions/s" if now.rate else "started"
+    return f"reward {now.reward:.0f}  success {now.success:.0%}  {rate}"
+
+
+class Lines:
+    """Lines in place of bars: one where a stage begins, then at most one every QUIET seconds and one at its end."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._stage = ""
+        self._began = self._last = 0.0
+        self._first = (0.0, 0.0)  # s and count of the stage's first line: what compiled before it tells no rate
+
+    def report(self, stage: str, value: Any) -> None:
+        """What `stages` yields."""
+        line = {} if value is None else _line(value)
+        self.show(stage, line.get("text", ""), line.get("completed", 0), line.get("total", 0))
+
+    def show(self, stage: str, text: str, done: float, total: float) -> None:
+        """Print where a stage stands, if it is time to."""
+        now = self._clock()
+        new = stage != self._stage
+        if new:
+            self._stage, self._began, self._first = stage, now, (now, done)
+        elif not self._first[1] and done:  # the first count: the clock of the rate starts here
+            self._first = (now, done)
+        elif now - self._last < QUIET and not (total and done >= total):
+            return
+        self._last, spent = now, now - self._began
+        more, since = done - self._first[1], now - self._first[0]
+        left = f", about {since * (total - done) / more:.0f} s left" if more > 0 and done < total else ""
+        count = f" {done:.0f}/{total:.0f}" if total else ""
+        print(f"{stage}{count} {text}".rstrip() + f" ({spent:.0f} s{left})", flush=True)

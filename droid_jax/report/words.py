@@ -48,8 +48,13 @@ def like(value: float | None, deviation: float) -> str:
 
 
 def percent(share: float) -> str:
-    """A share as a whole percentage, 100 % only when it is."""
-    return f"{math.floor(100 * share + 1e-9)} %".replace("-", "−")
+    """A share as a whole percentage; 100 % only when it is all of it, 0 % only when it is nothing."""
+    nearest = round(100 * share)
+    if nearest == 100 and share < 1.0:
+        nearest = 99
+    if nearest == 0 and share > 0.0:
+        return "< 1 %"
+    return f"{nearest} %".replace("-", "−")
 
 
 def listed(names: Sequence[str]) -> str:
@@ -136,13 +141,23 @@ def _next(run: Run) -> str:
         steps.append("ask whether the bound is real; if not, widen it and fit again")
     if any(not p["identifiable"] for p in run.parameters):
         steps.append("record a motion that moves what is not told, or leave it at its initial spread")
-    if any(g.get("floor") and g["after"] > 1.5 * g["floor"] for g in gaps):
+    if lacks_something(run.fit):
         steps.append(
-            "what is left is well above the floor, so the model lacks something: see below in which joint and phase"
+            "what is left is well above noise, so the model lacks something: see below in which joint and phase, "
+            "and let python -m droid_jax.run gap look for the missing effect"
         )
     elif not steps:
         steps.append("draw the simulations you train on from gaussian.json")
     return "Next: " + "; ".join(steps) + "."
+
+
+def lacks_something(fit: Mapping[str, Any]) -> bool:
+    """Whether a fit.json says that noise alone does not explain what the fit left.
+
+    By the mean square of its whitened residuals (0.6 to 1.4 in fits where nothing is missing), and by equation 1.
+    """
+    far = any(g.get("floor") and g["after"] > 1.5 * g["floor"] for g in fit["gap"].values())
+    return far or (fit.get("mean_square") or 0.0) > 2.0
 
 
 def speaker(run: Run) -> Callable[[str], str]:

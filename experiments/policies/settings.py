@@ -22,4 +22,20 @@ class Setting:
     task: Mapping[str, Any] = field(default_factory=dict)
 
 
-SETTINGS = {"paper": Setting("paper", springs=0, robot=11)}
+SETTINGS = {
+    "paper": Setting("paper", springs=0, robot=11),
+    "dry": Setting(
+        "dry",
+        springs=1,
+        robot=12,
+        truth={
+            "hinge_stiffness": 2.0,
+            "hinge_frictionloss": 4.5,
+            "hinge_damping": 6.0,
+            "sliding_friction_left": 1.5,
+            "sliding_friction_right": 1.5,
+            "torsional_friction_left": 1.0,
+            "torsional_friction_right": 1.0,
+        },
+    ),
+}

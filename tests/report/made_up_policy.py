@@ -28,7 +28,7 @@ def training_json(**changes: Any) -> dict[str, Any]:
     ]  # fmt: skip
     task = {f: getattr(Task(), f) for f in Task.__dataclass_fields__}
     setup = {"method": "fitted", "preset": "quick", "knob": 0, "seed": 3, "fit": "runs/identify"}
-    of = {"setup": setup, "task": task, "scene": "door (no spring, knob 0, impedance gains)", "effects": []}
+    of = {"setup": setup, "task": task, "scene": "door (knob 0, impedance gains)", "effects": []}
     of |= {"stand_in": {"springs": 1, "seed": 0}, "config": {}, "versions": {}, "device": "cpu"}
     return {**of, "history": history, **changes}
 

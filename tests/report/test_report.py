@@ -78,9 +78,15 @@ def test_summary_says_when_the_fit_made_it_worse(tmp_path: Path) -> None:
     (run / "fit.json").write_text(json.dumps(fit))
     text = " ".join(summary(read_run(run)))
     assert "the fit made it worse" in text and "do not train on this fit" in text
-    assert (
-        "what is left is well above the floor, so the model lacks something: see below in which joint and phase" in text
-    )
+    assert "what is left is well above noise, so the model lacks something: see below in which joint and phase" in text
+
+
+def test_residuals_far_above_noise_point_to_the_gap_command(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run")
+    fit = json.loads((run / "fit.json").read_text())
+    for mean_square, said in ((1.4, False), (2.5, True)):
+        (run / "fit.json").write_text(json.dumps({**fit, "mean_square": mean_square}))
+        assert ("droid_jax.run gap" in summary(read_run(run))[-1]) is said
 
 
 def test_a_stand_in_is_never_called_a_robot(written: Page) -> None:
@@ -181,6 +187,7 @@ def test_numbers_follow_their_deviation() -> None:
     assert like(52.31, 0.83) == "52.31"
     assert like(-1234.5, 40.0) == "−1234"  # half to even, and no digits that mean nothing
     assert percent(0.999) == "99 %" and percent(1.0) == "100 %"
+    assert percent(0.837) == "84 %" and percent(0.001) == "< 1 %" and percent(0.0) == "0 %"
 
 
 def test_long_traces_are_thinned_without_losing_a_spike() -> None:

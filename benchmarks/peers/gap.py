@@ -1,0 +1,36 @@
+"""Our `gap` on recordings, in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from droid_jax.measure.formats import save
+from droid_jax.measure.recording import Recording
+
+
+def run_gap(recordings: Sequence[Recording], folder: Path, arguments: Sequence[str] = ()) -> dict[str, Any]:
+    """What it says (of gap.json) and its seconds; its results stay in folder / "run".
+
+    Raises RuntimeError with its last line where it fails.
+    """
+    paths = [str(folder / f"{r.name}.npz") for r in recordings]
+    for recording, path in zip(recordings, paths, strict=True):
+        save(recording, path)
+    out = folder / "run"
+    command = [sys.executable, "-m", "droid_jax.run", "gap", *arguments, "--recording", *paths, "--out", str(out)]
+    began = time.perf_counter()
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    seconds = time.perf_counter() - began
+    if done.returncode:
+        raise RuntimeError(f"gap ended with {done.returncode}: {' '.join(done.stderr.strip().splitlines()[-1:])}")
+    found = json.loads((out / "gap.json").read_text())
+    return {
+        **{k: found[k] for k in ("verdict", "sentence", "effects", "tied", "p", "gaps", "shifts")},
+        "seconds": seconds,
+    }

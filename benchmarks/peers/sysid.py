@@ -1,0 +1,141 @@
+"""mujoco.sysid behind one function: our scene, our parameters and our recordings, its residual and its optimiser.
+
+What is ours here is what a user would have to write: how values enter the model, and where a time offset
+and torque offsets enter a prediction.  Rollouts, residual, least squares, intervals and what its report
+says about the result are its own.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from droid_jax.compare.replay import make_drive
+from droid_jax.measure.engine import instrument
+from droid_jax.measure.recording import Recording
+from droid_jax.model.parameters import Parameter, Space
+from droid_jax.model.physics import make_c_model
+from droid_jax.model.scene import Scene
+
+
+@dataclass(frozen=True, eq=False)
+class PeerFit:
+    """What it found.
+
+    values, half_width: [D] physical values and half of its 95 % intervals (inf where it sees nothing).
+    seconds: of the optimisation; says: its report's insights, in its words.
+    """
+
+    values: np.ndarray
+    half_width: np.ndarray
+    seconds: float
+    says: tuple[str, ...]
+
+    @property
+    def interval(self) -> tuple[np.ndarray, np.ndarray]:
+        """[D], [D] ends of the 95 % intervals."""
+        return self.values - self.half_width, self.values + self.half_width
+
+
+def library() -> Any:
+    """mujoco.sysid; without its extras the module is silently empty, which is said here."""
+    from mujoco import sysid
+
+    if not hasattr(sysid, "optimize"):
+        raise ImportError("mujoco.sysid needs its extras: pip install -c constraints.txt -e '.[peers]'")
+    return sysid
+
+
+def minimise(parameters: Any, residual: Any, **options: Any) -> PeerFit:
+    """Its least squares from where `parameters` stand, intervals at the end, and its insights."""
+    sysid = library()
+    from mujoco.sysid.report.sections.insights import AutomatedInsights
+
+    began = time.perf_counter()
+    found, result = sysid.optimize(initial_params=parameters, residual_fn=residual, verbose=False, **options)
+    seconds = time.perf_counter() - began
+    values = found.as_vector()
+    _, half = sysid.calculate_intervals(residual(values, found)[0], np.asarray(result.jac))
+    insights = AutomatedInsights("insights", found).get_context()["insights"]
+    return PeerFit(values, np.asarray(half), seconds, tuple(f"{i['title']}: {i['message']}" for i in insights))
+
+
+def fit(
+    scene: Scene, space: Space, recordings: Sequence[Recording], *, off_bounds: bool = False, **options: Any
+) -> PeerFit:
+    """Fit all of `space`, from its means and within its bounds, to the mean torques of recordings with commands.
+
+    off_bounds: move what starts near a bound inwards, as its own warning advises.
+    options: of its optimiser (max_iters, x_scale, optimizer, ...).
+    """
+    sysid = library()
+    plain = replace(scene, model=instrument(scene))
+    groups = []
+    for recording in recordings:
+        drive = make_drive(scene, recording)
+        state = sysid.create_initial_state(plain.model, drive.qpos0)
+        control = sysid.TimeSeries(drive.time, drive.command)
+        measured = _measured(recording)
+        groups.append(
+            sysid.ModelSequences(
+                recording.name, scene.spec, "repeats", state, control, measured, allow_missing_sensors=True
+            )
+        )
+    residual = sysid.build_residual_fn(
+        models_sequences=groups,
+        build_model=lambda parameters, spec: make_c_model(plain, space, parameters.as_vector()),
+        modify_residual=_difference(plain, space),
+        resample_true=False,
+    )
+    parameters = parameters_of(space)
+    return minimise(parameters.move_off_bounds() if off_bounds else parameters, residual, **options)
+
+
+def parameters_of(space: Space, modifier: Callable[[Parameter], Callable[..., None]] | None = None) -> Any:
+    """Its parameters at our means and within our bounds; modifier: how one enters an MjSpec, where that is its way."""
+    sysid = library()
+    parameters = sysid.ParameterDict()
+    for p in space.parameters:
+        how = None if modifier is None else modifier(p)
+        parameters.add(sysid.Parameter(p.name, nominal=p.mean, min_value=p.low, max_value=p.high, modifier=how))
+    return parameters
+
+
+def _measured(recording: Recording) -> Any:
+    """Its time series of the repeats' mean torque."""
+    sysid = library()
+    channel = recording.channel("torque")
+    mean = np.nanmean(np.where(channel.mask, channel.values, np.nan), axis=0)
+    names = {name: (sysid.SignalType.CustomObs, np.array([i])) for i, name in enumerate(channel.columns)}
+    return sysid.TimeSeries(channel.time - recording.time[0], mean, signal_mapping=names)
+
+
+def _difference(scene: Scene, space: Space) -> Any:
+    """Its residual of one rollout: offsets in time and torque applied, at the times of the measurement.
+
+    Rows of sensors belong to the state before a step, its clock to the state after it.
+    """
+    sysid = library()
+    joints = len(scene.joints)
+    offsets = [space.names.index(n) if n in space.names else None for n in _offsets(scene)]
+    late = space.names.index("time_offset") if "time_offset" in space.names else None
+
+    def modify(parameters, predicted, measured, model, return_pred_all, state=None, sensor_weights=None):
+        x = parameters.as_vector()
+        at = measured.times - (0.0 if late is None else x[late])
+        clock = predicted.times - model.opt.timestep
+        values = np.stack([np.interp(at, clock, column) for column in predicted.data[:, :joints].T], axis=1)
+        values += [0.0 if i is None else x[i] for i in offsets]
+        trace = sysid.TimeSeries(measured.times, values, measured.signal_mapping)
+        error = sysid.weighted_diff(predicted_data=values, measured_data=measured.data, model=model)
+        return sysid.normalize_residual(error, measured.data), trace, measured
+
+    return modify
+
+
+def _offsets(scene: Scene) -> list[str]:
+    return [f"torque_offset[{joint}]" for joint in scene.joints]

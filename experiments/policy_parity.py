@@ -1,0 +1,143 @@
+"""Does a policy open the door as far in plain C MuJoCo as in the simulation that trained it?
+
+    python experiments/policy_parity.py [--policy runs/train/policy.npz] [--gaussian FILE] [--quick] [--out DIR]
+
+A policy without any noise on doors drawn from the distribution that it was trained on (without effects): each once
+in MJX with the training's time step, and once in C at 1 ms with a solver that has converged.  Start pose and physics
+are the same, so what differs is the simulation.  Writes DIR/policy_parity.json and .png; the target is a largest
+opening angle within 3 degrees.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
+
+import tuned  # noqa: E402, F401  (before jax starts)
+
+# isort: split
+import json  # noqa: E402
+
+import numpy as np  # noqa: E402
+import tyro  # noqa: E402
+from matplotlib.figure import Figure  # noqa: E402
+
+from benchmarks.common import origin  # noqa: E402
+from droid_jax.identify.gaussian import Gaussian, prior  # noqa: E402
+from droid_jax.identify.gaussian import load as load_gaussian  # noqa: E402
+from droid_jax.model.door import door_nuisances, door_space  # noqa: E402
+from droid_jax.model.door_scene import door_scene  # noqa: E402
+from droid_jax.policy.control import Policy, load  # noqa: E402
+from droid_jax.policy.door_env import DoorEnv  # noqa: E402
+from droid_jax.policy.randomise import axes, physics_of, randomised  # noqa: E402
+from droid_jax.policy.simulated import simulated  # noqa: E402
+from droid_jax.policy.task import Task  # noqa: E402
+from droid_jax.policy.train import train  # noqa: E402
+from droid_jax.policy.transfer import TransferConfig, stand_in, transfer  # noqa: E402
+from droid_jax.policy.trials import Trials  # noqa: E402
+from droid_jax.report.export import png_bytes  # noqa: E402
+from droid_jax.report.style import AFTER, INK, styled  # noqa: E402
+from droid_jax.storage import write_bytes, write_json  # noqa: E402
+from experiments.policies.cases import QUICK_STEPS, RESULTS, TIMESTEP, Options  # noqa: E402
+
+WITHIN = 3.0  # degrees
+EXACT = TransferConfig(trials=1, timestep=0.001, position_noise=0.0, velocity_noise=0.0, knob_noise=0.0)
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Options."""
+
+    policy: Path = ROOT / "runs" / "train" / "policy.npz"
+    """As `train` writes it, or an experiment with policies."""
+    gaussian: Path | None = None
+    """What it was trained on; default: gaussian.json beside the policy."""
+    quick: bool = False
+    """A policy that has learned nothing, on two doors: shows that it runs."""
+    out: Path = RESULTS
+    """Folder of the results."""
+    doors: int = 50
+    """Doors, one episode each."""
+    seed: int = 0
+    """Of the doors."""
+
+
+def trained(policy: Path, gaussian: Path) -> tuple[Policy, DoorEnv, Gaussian]:
+    """Policy, environment without spread of the start pose, and distribution."""
+    scene, drawn = door_scene(timestep=TIMESTEP, limits=True), load_gaussian(gaussian)
+    known = door_space(scene) + door_nuisances(scene)
+    strange = [n for n in drawn.space.names if n not in known.names]
+    if strange:
+        raise SystemExit(f"error: {gaussian} has effects that plain C MuJoCo does not have: {', '.join(strange)}")
+    return load(policy), DoorEnv(scene, Task(spread=0.0)), drawn
+
+
+def untrained() -> tuple[Policy, DoorEnv, Gaussian]:
+    """The same of a training that is over at once."""
+    scene = door_scene(timestep=TIMESTEP, limits=True)
+    env, gaussian = DoorEnv(scene, Task(steps=QUICK_STEPS, spread=0.0)), prior(door_space(scene))
+    return train(env, randomised(scene, gaussian), Options(quick=True).budget.config).policy, env, gaussian
+
+
+def in_mjx(policy: Policy, env: DoorEnv, gaussian: Gaussian, values: np.ndarray) -> Trials:
+    """An episode on each door [N, D]."""
+    space = gaussian.space
+    return simulated(
+        policy, env, lambda sys, rng: (physics_of(env.scene, space, values), axes(env.scene, space)), len(values)
+    )
+
+
+def in_c(policy: Policy, env: DoorEnv, gaussian: Gaussian, values: np.ndarray) -> Trials:
+    """The same in plain C, door by door."""
+    rows = [dict(zip(gaussian.space.names, row.tolist(), strict=True)) for row in values]
+    made = [transfer(policy, stand_in(env.scene, env.start, truth, (), env.task, EXACT)) for truth in rows]
+    return Trials(
+        *(np.concatenate([getattr(t, f) for t in made]) for f in ("success", "angle", "steps", "grip", "stopped"))
+    )
+
+
+@styled
+def scatter(mjx: np.ndarray, c: np.ndarray) -> Figure:
+    """Largest angles [N] in degrees, one against the other, with the band of the target."""
+    figure = Figure(figsize=(3.6, 3.4), layout="constrained")
+    axes_ = figure.add_subplot()
+    line = np.array([0.0, 1.05 * max(mjx.max(), c.max())])
+    axes_.fill_between(line, line - WITHIN, line + WITHIN, color=INK, alpha=0.12, linewidth=0)
+    axes_.plot(mjx, c, "o", color=AFTER, ms=4)
+    axes_.set(xlabel="MJX, 4 ms [degrees]", ylabel="C, 1 ms [degrees]", xlim=line, ylim=line, aspect="equal")
+    return figure
+
+
+def main() -> None:
+    arguments = tyro.cli(Arguments, description=__doc__)
+    beside = arguments.gaussian or arguments.policy.with_name("gaussian.json")
+    policy, env, gaussian = untrained() if arguments.quick else trained(arguments.policy, beside)
+    values = gaussian.sample(arguments.seed, 2 if arguments.quick else arguments.doors)
+    both = {"mjx": in_mjx(policy, env, gaussian, values), "c": in_c(policy, env, gaussian, values)}
+    angle = {name: np.rad2deg(trials.angle) for name, trials in both.items()}
+    apart = np.abs(angle["mjx"] - angle["c"])
+    result: dict[str, Any] = {
+        "doors": len(values),
+        "difference_deg": {
+            "median": float(np.median(apart)),
+            "quantile_90": float(np.quantile(apart, 0.9)),
+            "largest": float(apart.max()),
+            "within_target": float(np.mean(apart <= WITHIN)),
+        },
+        "mean_angle_deg": {name: float(a.mean()) for name, a in angle.items()},
+        "success_rate": {name: trials.rate for name, trials in both.items()},
+    }
+    name = "policy_parity_quick" if arguments.quick else "policy_parity"
+    write_bytes(arguments.out / f"{name}.png", png_bytes(scatter(angle["mjx"], angle["c"])))
+    every = {n: a.round(3).tolist() for n, a in angle.items()}
+    write_json(arguments.out / f"{name}.json", {**result, "angles_deg": every, **origin(arguments.seed)})
+    print(json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,118 @@
+"""Table I: initial and fitted distributions of the three doors, the paper's beside this program's.
+
+    python experiments/table1.py [--quick] [--out DIR]
+
+Reads the cases door_0, door_1 and door_2 of `identify_suite.py` in DIR/identify_cases (that script makes them);
+writes DIR/table1.md and DIR/table1.json.  The paper's fitted means are the hidden truth of the stand-in robot (its
+recordings are not public), all but the joints' damping, which here is the servo's (docs/paper.md).  So the
+program's mean is to be near the paper's mean; the deviations are each one's own.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
+
+import tyro  # noqa: E402
+from identify_suite import gaussian  # noqa: E402
+
+from droid_jax.report.words import label, like, number  # noqa: E402
+from droid_jax.storage import write_json, write_text  # noqa: E402
+
+# Table I of the paper: mean and diag(Sigma), initial and for the doors with 0, 1 and 2 springs.
+PAPER: dict[str, tuple[tuple[float, float], ...]] = {
+    "door_mass": ((1.144, 0.5), (1.50, 0.73), (0.92, 0.52), (2.54, 1.23)),
+    "knob_mass": ((0.199, 0.1), (1.98, 1.86), (2.31, 0.42), (3.99, 1.29)),
+    "hinge_frictionloss": ((0.05, 0.025), (0.10, 0.02), (0.0, 0.0), (0.56, 0.05)),
+    "hinge_stiffness": ((0.01, 0.005), (0.002, 0.008), (1.06, 0.0), (1.24, 0.06)),
+    "hinge_damping": ((2.0, 1.0), (0.10, 0.19), (0.71, 0.01), (0.6, 0.18)),
+    "joint_damping_1": ((100, 2.0), (101.35, 1.06), (98.11, 0.41), (98.63, 1.23)),
+    "joint_damping_2": ((100, 2.0), (100.06, 1.83), (98.69, 0.63), (99.28, 0.71)),
+    "joint_damping_3": ((100, 2.0), (100.08, 0.67), (100.38, 0.65), (95.83, 1.42)),
+    "joint_damping_4": ((100, 2.0), (99.61, 0.41), (99.64, 0.15), (100.12, 0.81)),
+    "joint_damping_5": ((100, 2.0), (99.14, 0.68), (101.01, 0.96), (95.71, 0.77)),
+    "joint_damping_6": ((10, 1.0), (10.05, 0.64), (9.72, 0.04), (11.55, 0.46)),
+    "joint_damping_7": ((0.4, 0.2), (0.83, 0.57), (1.17, 1.19), (1.54, 0.67)),
+    "sliding_friction_left": ((0.5, 0.25), (0.47, 0.70), (1.37, 0.35), (3.04, 0.46)),
+    "sliding_friction_right": ((0.5, 0.25), (1.78, 0.86), (0.76, 0.39), (2.68, 0.54)),
+    "torsional_friction_left": ((0.5, 0.25), (1.38, 0.66), (0.79, 0.42), (1.04, 0.72)),
+    "torsional_friction_right": ((0.5, 0.25), (1.84, 0.92), (2.29, 0.80), (2.0, 0.83)),
+}
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Where the cases are and the table goes."""
+
+    out: Path = ROOT / "benchmarks" / "results"
+    """Folder with identify_cases."""
+    quick: bool = False
+    """Read the cases of a quick suite, which has the door with one spring alone."""
+
+
+def table(cases: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:
+    """Parameter -> the paper's (mean, deviation) and, by door, truth, mean, deviation and whether the motion tells it.
+
+    cases: by number of springs, "parameters" of the suite's cases.
+    """
+    rows = {}
+    for name, paper in PAPER.items():
+        doors = {}
+        for springs, parameters in cases.items():
+            mean, std = gaussian(parameters[name])
+            doors[str(springs)] = {
+                "paper": list(paper[springs + 1]),
+                "truth": parameters[name]["truth"],
+                "mean": mean,
+                "std": std,
+                "identifiable": parameters[name]["identifiable"],
+            }
+        rows[name] = {"initial": list(paper[0]), "doors": doors}
+    return rows
+
+
+def as_markdown(rows: Mapping[str, Any]) -> str:
+    """The table as text; a mean in brackets is one that the motion does not tell."""
+    doors = list(next(iter(rows.values()))["doors"])
+    springs = {"0": "no spring", "1": "one spring", "2": "two springs"}
+    head = ["", "initial, paper", *(c for d in doors for c in (f"{springs[d]}, paper", "truth here", "found here"))]
+    lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    for name, row in rows.items():
+        cells = [label(name), _pair(*row["initial"])]
+        for door in row["doors"].values():
+            found = f"{like(door['mean'], door['std'])} ± {number(door['std'], 2)}"
+            cells += [_pair(*door["paper"]), number(door["truth"]), found if door["identifiable"] else f"({found})"]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _pair(mean: float, deviation: float) -> str:
+    return f"{mean:g} ± {deviation:g}"
+
+
+def main() -> None:
+    arguments = tyro.cli(Arguments, description=__doc__)
+    folder = arguments.out / ("identify_cases_quick" if arguments.quick else "identify_cases")
+    paths = {k: folder / f"door_{k}.json" for k in ((1,) if arguments.quick else (0, 1, 2))}
+    missing = [p.stem for p in paths.values() if not p.is_file()]
+    if missing:
+        raise SystemExit(f"error: no case {missing[0]} in {folder}; run experiments/identify_suite.py --parts doors")
+    cases = {k: json.loads(p.read_text()) for k, p in paths.items()}
+    rows = table({k: case["parameters"] for k, case in cases.items()})
+    write_text(arguments.out / "table1.md", as_markdown(rows))
+    origins = {str(k): case["origin"] for k, case in cases.items()}
+    write_json(arguments.out / "table1.json", {"parameters": rows, "origin": origins}, indent=2)
+    told = [d for r in rows.values() for d in r["doors"].values() if d["identifiable"]]
+    inside = sum(bool(abs(d["mean"] - d["truth"]) <= 1.645 * d["std"]) for d in told)
+    print(json.dumps({"identifiable": len(told), "inside_90": inside, "table": str(arguments.out / "table1.md")}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,71 @@
+"""Every script of experiments/ and benchmarks/ runs with --quick and ends with one line of JSON."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+DATA = {  # folders of real logs
+    "experiments/gap_door.py": "door_pr2_ikea",
+    "experiments/gap_emps.py": "emps",
+    "experiments/gap_panda.py": "franka_gaz2019",
+    "experiments/real_emps.py": "emps",
+    "experiments/real_panda.py": "franka_gaz2019",
+}
+# Arguments before --quick --out, by script.
+SCRIPTS: dict[str, tuple[str, ...]] = {
+    "experiments/hidden_effects.py": ("all",),
+    "experiments/null_calibration.py": (),
+    "experiments/identify_suite.py": ("--parts", "doors", "pose"),
+    "experiments/population_curve.py": (),
+    "experiments/search_figure.py": (),
+    "experiments/hidden_effect_policy.py": (),
+    "experiments/policy_parity.py": (),
+    **dict.fromkeys(DATA, ()),
+    "benchmarks/candidates.py": (),
+    "benchmarks/step_accuracy.py": (),
+    "benchmarks/time_to_fit.py": (),
+    "benchmarks/peer_sysid.py": (),
+}
+READERS = ("experiments/pose_figure.py", "experiments/table1.py")  # of what identify_suite.py has left
+ELSEWHERE = {  # run by other tests
+    "experiments/table2.py",
+    "experiments/knob_locations.py",
+    "benchmarks/throughput.py",
+}
+
+
+def run(script: str, *arguments: str) -> dict:
+    """The JSON object on a script's last line."""
+    done = subprocess.run([sys.executable, script, *arguments], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def test_every_script_is_run_by_some_test() -> None:
+    scripts = {str(p.relative_to(ROOT)) for f in ("experiments", "benchmarks") for p in (ROOT / f).glob("*.py")}
+    commands = {s for s in scripts if "tyro.cli(" in (ROOT / s).read_text()}
+    assert commands == {*SCRIPTS, *READERS, *ELSEWHERE}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("script", sorted(SCRIPTS))
+def test_a_quick_run_ends_in_one_line_of_json(tmp_path: Path, script: str, shared_data: Callable[[str], Path]) -> None:
+    arguments = list(SCRIPTS[script])
+    if "peer" in script and not hasattr(pytest.importorskip("mujoco.sysid"), "optimize"):
+        pytest.skip("mujoco.sysid has no extras here: pip install -e '.[peers]'")
+    if script in DATA:
+        arguments = ["--data", str(shared_data(DATA[script]))]
+    assert run(script, *arguments, "--quick", "--out", str(tmp_path))
+    if script == "experiments/identify_suite.py":
+        cases = tmp_path / "identify_cases_quick"
+        shutil.copy(cases / "pose_A.json", cases / "pose_B.json")  # a quick suite has one pose
+        for reader in READERS:
+            assert run(reader, "--quick", "--out", str(tmp_path))
