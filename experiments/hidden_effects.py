@@ -181,8 +181,7 @@ def run_search(command: Search) -> dict[str, Any]:
 def run_oracle(command: Oracle) -> dict[str, Any]:
     """Every case that the library has forms of."""
     names = command.cases or tuple(sorted(p.name for p in (command.out / "cases").iterdir()))
-    folders = (command.out / name for name in ("cases", "sealed", "oracle"))
-    return {"oracles": oracle_all(*folders, names, Bench(), _tell)}
+    return {"oracles": oracle_all(command.out, names, Bench(), _tell)}
 
 
 def run_score(command: Score) -> dict[str, Any]:

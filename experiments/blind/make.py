@@ -24,6 +24,7 @@ from experiments.blind.cases import Limits, Plan, applied
 from experiments.blind.draws import Truth, draw_truths, folder_of, seed_of
 from experiments.blind.scenes import ROLES, Setting
 
+USUAL = SurrogateConfig(timestep=LONGEST_STEP)  # ten repeats with a real robot's noise
 ATTEMPTS = 8  # draws of a robot that keeps hold of its door with this effect
 
 
@@ -69,9 +70,10 @@ def draw(setting: Setting, plan: Plan, limits: Limits, rng: np.random.Generator)
     return Drawn(hidden, draw_truths(setting, rng), seeds)
 
 
-def record(setting: Setting, drawn: Drawn, roles: tuple[str, ...] = ROLES, repeats: int = 10) -> dict[str, Recording]:
+def record(
+    setting: Setting, drawn: Drawn, roles: tuple[str, ...] = ROLES, config: SurrogateConfig = USUAL
+) -> dict[str, Recording]:
     """Role -> recording.  Raises ValueError where the stand-in loses the door."""
-    config = SurrogateConfig(repeats=repeats, timestep=LONGEST_STEP)
     out = {}
     for role in roles:
         made = record_hidden(

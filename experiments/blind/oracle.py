@@ -23,6 +23,7 @@ from droid_jax.measure.formats import load
 from droid_jax.measure.hidden import Applied
 from droid_jax.storage import write_json
 from experiments.blind.answers import right
+from experiments.blind.quiet import settled
 from experiments.blind.scenes import ROLES
 from experiments.blind.search import Bench
 
@@ -31,8 +32,11 @@ SIZES = np.geomspace(3e-3, 0.8, 12)  # of the way from neutral to a bound
 KINDS = ("single", "pair")  # whose effects the library has forms of
 
 
-def oracle(folder: Path, truth: dict[str, Any], bench: Bench) -> dict[str, Any]:
-    """U on every recording with the right forms in the model, parameters fitted to the first alone."""
+def oracle(folder: Path, truth: dict[str, Any], result: dict[str, Any] | None, bench: Bench) -> dict[str, Any]:
+    """U on every recording with the right forms in the model, parameters fitted to the first alone.
+
+    result: what the search found, whose amplitudes are then told without noise as well (`quiet.py`).
+    """
     recordings = {role: load(folder / "recordings" / f"{role}.npz") for role in ROLES}
     case = bench.case(truth["scene"], recordings)
     scene = bench.setting(truth["scene"]).scene
@@ -42,6 +46,7 @@ def oracle(folder: Path, truth: dict[str, Any], bench: Bench) -> dict[str, Any]:
         "gaps": {role: of.gap_at(model.values) for role, of in case.judged.items()},
         "amplitudes": {name: float(model.values[case.whole.index(name)]) for name in model.amplitudes},
         "converged": model.refined.converged,
+        "settled": settled(recordings, truth, result, bench) if result else None,
     }
 
 
@@ -76,16 +81,15 @@ def best_start(case: Case, start: np.ndarray, asked: Iterable[Candidate]) -> tup
     return rows[best], parts[best]
 
 
-def oracle_all(
-    cases: Path, sealed: Path, results: Path, chosen: Iterable[str], bench: Bench, tell: Callable[[str], None] = print
-) -> int:
-    """The oracle of every chosen case that has forms in the library and none yet in the folder `results`."""
+def oracle_all(runs: Path, chosen: Iterable[str], bench: Bench, tell: Callable[[str], None] = print) -> int:
+    """The oracle of every chosen case that has forms in the library and none yet in the folder `oracle` of a run."""
     count = 0
     for name in chosen:
-        path, truth = results / f"{name}.json", json.loads((sealed / f"{name}.json").read_text())
+        path, sealed, known = (runs / folder / f"{name}.json" for folder in ("oracle", "sealed", "results"))
+        truth = json.loads(sealed.read_text())
         if path.is_file() or truth["kind"] not in KINDS:
             continue
-        found = oracle(cases / name, truth, bench)
+        found = oracle(runs / "cases" / name, truth, json.loads(known.read_text()) if known.is_file() else None, bench)
         write_json(path, found)
         count += 1
         tell(f"{name}: {found['model']}, U {', '.join(f'{role} {u:.3g}' for role, u in found['gaps'].items())}")

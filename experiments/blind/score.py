@@ -94,7 +94,8 @@ def judge(case: Case, limits: Mapping[str, Any]) -> dict[str, Any]:
         "gaps": result.get("gaps", {}),
         "closed": {role: closed(result, role) for role in result.get("gaps", {}) if result["effects"]},
         "within_floor": within_floor(result),
-        "coverage": coverage(case, limits),
+        "coverage": coverage(case),
+        "counterpart_coverage": counterpart_coverage(case, limits),
         "baselines": against_baselines(case),
         "seconds": seconds,
     }
@@ -127,11 +128,19 @@ def within_floor(result: Mapping[str, Any]) -> bool | None:
     return bool(result["gaps"]["sealed"][1] <= 3.0 * result["floor"])
 
 
-def coverage(case: Case, limits: Mapping[str, Any]) -> list[bool]:
-    """For each amplitude that was named exactly and has a counterpart: whether its interval holds the truth.
+def coverage(case: Case) -> list[bool]:
+    """For each amplitude of the answer: whether its interval holds what the same model settles at without noise."""
+    settled = (case["oracle"] or {}).get("settled") or {}
+    found = case["result"].get("amplitudes", {})
+    return [bool(found[n]["interval"][0] <= at <= found[n]["interval"][1]) for n, at in settled.items() if n in found]
 
-    The counterpart is what the library form takes when it is fitted to what the hidden effect adds
-    (`forms.py`); only forms with one amplitude that leave little over are compared.
+
+def counterpart_coverage(case: Case, limits: Mapping[str, Any]) -> list[bool]:
+    """For each amplitude that was named exactly and has a counterpart: whether its interval holds that.
+
+    The counterpart is what the library form takes when it is fitted to what the hidden effect adds to the torques
+    of another robot (`forms.py`); only forms with one amplitude that leave little over are compared.  The error of
+    the form is in it, and in no interval.
     """
     truth, out = case["truth"], []
     for hidden in truth["hidden"]:
@@ -203,7 +212,10 @@ def summarise(judged: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "closed_confirm": closing(named, "confirm"),
         "closed_sealed": closing(named, "sealed"),
         "within_floor": rate(named, lambda c: bool(c["within_floor"])),
-        "amplitude_coverage": rate([{"inside": i} for c in named for i in c["coverage"]], lambda c: c["inside"]),
+        **{
+            f"amplitude_{key}": rate([{"inside": i} for c in named for i in c[key]], lambda c: c["inside"])
+            for key in ("coverage", "counterpart_coverage")
+        },
         "baselines": summarise_baselines(judged),
         "seconds": _seconds(judged),
     }

@@ -19,8 +19,9 @@ from experiments.blind.answers import ANSWERS, inside, parts, right, targets, wi
 from experiments.blind.baselines import bic_outcome
 from experiments.blind.cases import Counts, amplitude, key, keys, plans
 from experiments.blind.draws import commit_of, draw_truths, folder_of, seed_of
-from experiments.blind.make import make
+from experiments.blind.make import Drawn, make, record
 from experiments.blind.marks import Ground
+from experiments.blind.quiet import QUIET, around
 from experiments.blind.scenes import ROLES, Setting, setting
 
 CHEAP = ("hinge", "bench", "arm")
@@ -233,7 +234,7 @@ def case(
 
 def reached(confirm: float) -> Any:
     """An oracle."""
-    return {"gaps": {"confirm": confirm}}
+    return {"gaps": {"confirm": confirm}, "settled": None}
 
 
 def rates(*cases: Any, known: Any = None) -> dict[str, Any]:
@@ -299,18 +300,38 @@ def test_a_part_of_what_was_hidden_is_no_false_name_and_not_enough():
     )
 
 
+def test_without_noise_a_recording_keeps_its_scatter_and_gets_another_mean(hinge: Setting):
+    truths = draw_truths(hinge, np.random.default_rng(3))
+    drawn = Drawn((Applied("hinge_preload", 0.5),), truths, dict.fromkeys(ROLES, 7))
+    (noisy,), (plain,) = (record(hinge, drawn, ("fit",), *config).values() for config in ((), (QUIET,)))
+    moved = around(plain, noisy)
+    for name, channel in moved.channels.items():
+        quiet, rough = plain.channels[name].values, noisy.channels[name].values
+        assert np.ptp(quiet, axis=0).max() == 0.0 < np.ptp(rough, axis=0).max(), name
+        np.testing.assert_allclose(channel.values.mean(axis=0), quiet[0], atol=1e-6)
+        np.testing.assert_allclose(channel.values - quiet[0], rough - rough.mean(axis=0), atol=1e-6)
+
+
+def measured(low: float, high: float) -> Any:
+    span = {"latch_torque": {"value": 3.0, "interval": [low, high]}}
+    return case("single", "named", ["latch at door"], [["latch at door"]], amplitudes=span)
+
+
+def test_intervals_are_compared_with_where_the_model_settles_without_noise():
+    without_noise = {"oracle": {**reached(2.0), "settled": {"latch_torque": 3.2}}}
+    found = rates(*({**measured(*span), **without_noise} for span in ((2.9, 3.3), (3.0, 3.1), (3.1, 3.3))))
+    assert (found["amplitude_coverage"]["hits"], found["amplitude_coverage"]["of"]) == (2, 3)
+    assert "amplitude_coverage" not in rates({**measured(2.9, 3.1), "oracle": reached(2.0)}, measured(2.9, 3.1))
+
+
 def test_intervals_are_compared_with_what_the_library_form_should_take():
     form = {"name": "latch at door", "per_unit": {"latch_torque": 1.5}, "left_after_refit": 0.1}
     known = {"s": {"h0": {"form": form}}}
-
-    def one(low: float, high: float) -> Any:
-        span = {"latch_torque": {"value": 3.0, "interval": [low, high]}}
-        return case("single", "named", ["latch at door"], [["latch at door"]], amplitudes=span)
-
-    found = rates(one(2.9, 3.1), one(3.1, 3.3), known=known)
-    assert (found["amplitude_coverage"]["hits"], found["amplitude_coverage"]["of"]) == (1, 2)
+    found = rates(measured(2.9, 3.1), measured(3.1, 3.3), known=known)
+    counted = found["amplitude_counterpart_coverage"]
+    assert (counted["hits"], counted["of"]) == (1, 2)
     far = {"s": {"h0": {"form": {**form, "left_after_refit": 0.9}}}}
-    assert "amplitude_coverage" not in rates(one(2.9, 3.1), known=far)
+    assert "amplitude_counterpart_coverage" not in rates(measured(2.9, 3.1), known=far)
 
 
 def test_confusion_and_errors():
