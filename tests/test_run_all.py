@@ -57,6 +57,14 @@ def test_without_arguments_every_stage_runs_on_one_recording(called, tmp_path: P
     assert lines[-1] == "report: runs/all/report.html"
 
 
+def test_the_search_for_what_is_missing_begins_at_the_fit(called, tmp_path: Path):
+    assert main(["all", "--stages", "gap"]) == 0
+    (tmp_path / "runs" / "all" / "identify").mkdir(parents=True)
+    (tmp_path / "runs" / "all" / "identify" / "fit.json").write_text("{}")
+    assert main(["all", "--stages", "gap"]) == 0
+    assert [c.fit for c in called] == [None, Path("runs/all/identify")]
+
+
 def test_a_policy_is_trained_on_the_extended_model_where_there_is_one(called, tmp_path: Path, capsys):
     found(tmp_path / "runs" / "all" / "gap", ["latch at door_hinge"])
     assert main(["all", "--stages", "train"]) == 0

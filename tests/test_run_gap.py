@@ -301,6 +301,43 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(report, "write", lambda folder: folder / "report.html")
 
 
+def fit_json(folder: Path, **values: float) -> Path:
+    """A folder of `identify` with these best values."""
+    folder.mkdir(exist_ok=True)
+    parameters = [{"name": name, "best": value} for name, value in values.items()]
+    (folder / "fit.json").write_text(json.dumps({"parameters": parameters}))
+    return folder
+
+
+def test_the_base_fit_begins_at_an_earlier_fit(place: Path, quick: None, monkeypatch: pytest.MonkeyPatch):
+    """No search, the known values (within bounds) as the one start, and what the fit does not know at its mean."""
+    base = small().case.base
+    monkeypatch.setattr(workflow, "search", lambda *a, **k: pytest.fail("there is nothing to search for"))
+    begun = []
+
+    def refit(evidence, space, parts, starts, *rest, **more):
+        begun.append(starts)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(workflow, "refit", refit)
+    known = {p.name: 0.5 * (p.mean + p.high) for p in base.parameters if not p.nuisance}
+    first = next(iter(known))
+    folder = fit_json(place / "earlier", **{**known, first: 1e9, "of_another_model": 1.0})
+    assert main(arguments(place, "--fit", folder)) == 130
+    (start,) = begun[0]
+    space = small().case.whole
+    assert start[space.index(first)] == base[first].high
+    for p in base.parameters:
+        assert p.name == first or start[space.index(p.name)] == pytest.approx(known.get(p.name, p.mean))
+
+
+def test_a_fit_that_is_none_or_of_another_model(place: Path, quick: None, refused):
+    said = refused(arguments(place, "--fit", place / "nowhere"))
+    assert "nowhere is no folder of a finished `identify`" in said
+    said = refused(arguments(place, "--fit", fit_json(place / "other", door_mass=1.0)))
+    assert "is of another model: it lacks" in said and "door_damping" in said
+
+
 def test_a_run_goes_on_after_a_stop_and_is_whole(
     place: Path, quick: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], refused
 ):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,8 @@ from droid_jax.commands.presets import TIMESTEP, refine_config, search_config
 from droid_jax.commands.scenes import needs_recording, own_scene
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from droid_jax.gap.case import GapConfig
     from droid_jax.measure.recording import Recording
     from droid_jax.model.parameters import Space
@@ -37,6 +40,8 @@ class Gap:
 
     LOG [SEALED]: without repeats and commands; blocks of time fit and confirm in turns, the last third or the second
     log is sealed. Of one motion less can be concluded, and the report says what."""
+    fit: Path | None = None
+    """Folder of a finished `identify` of this robot and object: the base fit begins there instead of with a search."""
     preset: Literal["quick", "standard", "gpu"] = "quick"
     """Of the base fit, as in identify."""
     scene: Path | None = None
@@ -81,7 +86,10 @@ def run(command: Gap) -> None:
     scene, base = model_of(command)
     given, hidden = _given(command), hidden_effects(command.hide, scene)
     effects = chosen_effects(command, scene, given)
+    start = None if command.fit is None else values_of(command.fit, base)
     setup = {**setup_of(command), "command": "gap", **fingerprints(scene, base, given)}
+    if start is not None:
+        setup["start"] = start.tolist()
     if finished(out, setup, command.again, "gap.json"):
         _done(out)
         return
@@ -90,10 +98,12 @@ def run(command: Gap) -> None:
         split = split_of(given)
         roles = roles_of(split, given)
         check_recordings(scene, {"only": given[0]} if split is Split.REPEATS else roles)
+    if split is Split.BLOCKS and start is not None:
+        print("a log without repeats is fitted without a search: --fit is not needed")
     config = config_of(command)
     begin(out, setup, command.again, "gap.json")
     roles = roles or record_stand_in(scene, hidden, out, command.springs, command.seed, command.again)
-    case, verdict, seconds = searched(split, scene, base, effects, roles, config, out / "checkpoints")
+    case, verdict, seconds = searched(split, scene, base, effects, roles, config, out / "checkpoints", start)
     description = {
         "split": {"by": split.value, "limits": split.limits},
         "seconds": seconds,
@@ -115,6 +125,23 @@ def model_of(command: Gap) -> tuple[Scene, Space]:
         return own_scene(command)
     scene = door_scene(timestep=TIMESTEP[command.preset])
     return scene, door_space(scene) + door_nuisances(scene)
+
+
+def values_of(folder: Path, base: Space) -> np.ndarray:
+    """[F] values of the base parameters in a folder of `identify`; its nuisances where it fitted the same.
+
+    Raises ValueError where there is no whole fit, or one that lacks a parameter of this model.
+    """
+    import numpy as np
+
+    try:
+        known = {p["name"]: float(p["best"]) for p in json.loads((folder / "fit.json").read_text())["parameters"]}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"--fit {folder} is no folder of a finished `identify`: {error}") from None
+    lacking = [p.name for p in base.parameters if not p.nuisance and p.name not in known]
+    if lacking:
+        raise ValueError(f"--fit {folder} is of another model: it lacks {', '.join(lacking)}")
+    return np.clip(base.values({n: v for n, v in known.items() if n in base.names}), base.low, base.high)
 
 
 def chosen_effects(command: Gap, scene: Scene, recordings: list[Recording]) -> tuple[Effect, ...]:

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 from droid_jax.storage import write_json
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from droid_jax.gap.case import Case, GapConfig
     from droid_jax.gap.split import Split
     from droid_jax.gap.verdict import Verdict
@@ -32,8 +34,12 @@ def searched(
     roles: Mapping[str, Recording],
     config: GapConfig,
     checkpoints: Path,
+    start: np.ndarray | None = None,
 ) -> tuple[Case, Verdict, dict[str, float]]:
-    """Case and verdict of recordings by role, going on from `checkpoints`; and each stage's seconds."""
+    """Case and verdict of recordings by role, going on from `checkpoints`; and each stage's seconds.
+
+    start: [F] values of the base parameters from which their fit begins, instead of a search.
+    """
     from droid_jax.gap.floor import numerical_floor
     from droid_jax.gap.menu import separating
     from droid_jax.gap.resume import kept_model, kept_number, remembering
@@ -42,7 +48,7 @@ def searched(
     from droid_jax.gap.workflow import base_fit, find
     from droid_jax.report.progress import stages
 
-    names = IN_BLOCKS if split is Split.BLOCKS else STAGES
+    names = IN_BLOCKS if split is Split.BLOCKS else STAGES if start is None else STAGES[1:]
     with stages(names) as show:
         clock = Clock(names, show, checkpoints / "seconds.json")
         clock(names[0], None)
@@ -50,7 +56,7 @@ def searched(
         if split is Split.BLOCKS:
             model, floor = kept_model(checkpoints / "base", case.base, lambda: base_model(case)), 0.0
         else:
-            model = kept_model(checkpoints / "base", case.base, lambda: base_fit(case, clock))
+            model = kept_model(checkpoints / "base", case.base, lambda: base_fit(case, clock, start))
             clock("floor", None)
             floor = kept_number(checkpoints / "floor", lambda: numerical_floor(case.fit, model, roles["fit"]))
         verdict = find(case, model, floor, clock)

@@ -105,7 +105,8 @@ def _plan(command: All, out: Path, recordings: tuple[Path, ...]) -> dict[str, Ca
         _stage(identify.run, identify.Identify(presets.identify, recording=seen, out=out / "identify", **own, **common))
 
     def search() -> None:
-        _stage(gap.run, gap.Gap(recordings, preset=presets.identify, out=out / "gap", **own, **common))
+        fit = out / "identify" if (out / "identify" / "fit.json").is_file() else None
+        _stage(gap.run, gap.Gap(recordings, fit=fit, preset=presets.identify, out=out / "gap", **own, **common))
 
     def learn() -> None:
         _stage(train.run, train.Train(model_folder(out), preset=presets.train, out=out / "train", **common))

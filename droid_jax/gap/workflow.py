@@ -24,25 +24,35 @@ Progress = Callable[[str, Any], None]
 OPEN = 0.2  # share of the gap left open from which a model explains it only partly
 
 
-def base_fit(case: Case, progress: Progress) -> Model:
-    """Everything but the effects, fitted to the first demonstration."""
-    cost, base = case.fit.cost, case.base
-    main = base.select([p.name for p in base.parameters if not p.nuisance])
-    found = search(
-        lambda rows: cost(case.whole.embed(main, rows)),
-        main,
-        case.config.search,
-        progress=lambda p: progress("search", p),
-    )
+def base_fit(case: Case, progress: Progress, start: np.ndarray | None = None) -> Model:
+    """Everything but the effects, fitted to the first demonstration.
+
+    start: [F] values of the base parameters out of an earlier fit; without it they are searched for.
+    """
+    base = case.base
+    begin = _searched(case, progress) if start is None else np.clip(start, base.low, base.high)[None]
     return refit(
         case.fit,
         base,
         (),
-        case.whole.embed(base, starts(base, main, found)),
+        case.whole.embed(base, begin),
         case.config.refine,
         hypotheses=grip_hypotheses(base),
         progress=lambda p: progress("refine", p),
     )
+
+
+def _searched(case: Case, progress: Progress) -> np.ndarray:
+    """[S, F] where the refinement of the base parameters begins."""
+    base = case.base
+    main = base.select([p.name for p in base.parameters if not p.nuisance])
+    found = search(
+        lambda rows: case.fit.cost(case.whole.embed(main, rows)),
+        main,
+        case.config.search,
+        progress=lambda p: progress("search", p),
+    )
+    return starts(base, main, found)
 
 
 def ask(case: Case, model: Model, asked: tuple[Question, ...]) -> Screen:
