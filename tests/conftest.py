@@ -70,13 +70,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session")
 def shared_data() -> Callable[[str], Path]:
-    """Finder of a real-data folder: DROID_JAX_DATA/<name>, else ../shared/real/<name> beside the checkout."""
+    """Finder of a real-data folder: DROID_JAX_DATA/<name>, else real/<name> in a folder beside the checkout."""
 
     def find(name: str) -> Path:
         chosen = os.environ.get(DATA_VARIABLE)
-        folder = (Path(chosen) if chosen else ROOT.parent / "shared" / "real") / name
-        if not folder.is_dir():
-            pytest.skip(f"real data {name!r} not found: {folder} is no folder (set {DATA_VARIABLE})")
-        return folder
+        folders = [Path(chosen) / name] if chosen else sorted(ROOT.parent.glob(f"*/real/{name}"))
+        for folder in folders:
+            if folder.is_dir():
+                return folder
+        pytest.skip(f"real data {name!r} not found (set {DATA_VARIABLE} to the folder that holds {name})")
 
     return find

@@ -46,7 +46,10 @@ def hidden_effects(entries: Sequence[str] | None, scene: Scene) -> dict[str, flo
 def record_stand_in(
     scene: Scene, hidden: Mapping[str, float], out: Path, springs: int, seed: int, again: bool
 ) -> dict[str, Recording]:
-    """Role -> what the stand-in robot measured; kept in the run's folder, recorded anew where `again` asks for it."""
+    """Role -> what the stand-in robot measured; kept in the run's folder.
+
+    Recorded anew where `again` asks for it, and where the folder is not known to hold recordings of this very robot.
+    """
     from droid_jax.measure.demonstration import demonstration_path
     from droid_jax.measure.formats import load
     from droid_jax.measure.hidden import record_hidden
@@ -59,12 +62,16 @@ def record_stand_in(
         demonstration = load(demonstration_path(name))
         return record_hidden(scene, demonstration, truth, hidden, seed=1000 * seed + index, name=name)
 
-    recordings = {}
-    for index, (role, name) in enumerate(DEMONSTRATIONS.items()):
-        path = out / "recordings" / f"{name}.npz"
-        recordings[role] = kept_recording(path, again, name, lambda i=index, n=name: recorded(i, n))
-    write_json(out / "recordings" / KNOWN, stand_in_json(hidden, springs, seed))
-    return recordings
+    paths = {name: out / "recordings" / f"{name}.npz" for name in DEMONSTRATIONS.values()}
+    this = stand_in_json(hidden, springs, seed)
+    if again or known_stand_in(list(paths.values())) != this:
+        for path in paths.values():
+            path.unlink(missing_ok=True)
+    write_json(out / "recordings" / KNOWN, this)  # before the first: a stop leaves no recordings of an unknown robot
+    return {
+        role: kept_recording(paths[name], False, name, lambda i=index, n=name: recorded(i, n))
+        for index, (role, name) in enumerate(DEMONSTRATIONS.items())
+    }
 
 
 def stand_in_json(hidden: Mapping[str, float], springs: int, seed: int) -> dict[str, Any]:

@@ -78,7 +78,7 @@ def fingerprint(folder: Path | None) -> str | None:
 def needs_brax() -> None:
     """ValueError that says what to install where brax is not."""
     if importlib.util.find_spec("brax") is None:
-        raise ValueError("policies need brax: pip install 'droid_jax[train]'")
+        raise ValueError("policies need brax: pip install -e '.[train]' in the checkout")
 
 
 def setup(folder: Path) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 from droid_jax.commands import evaluate, gap, identify, report, train
 from droid_jax.commands.folder import OtherRun
-from droid_jax.commands.hidden import DEMONSTRATIONS, KNOWN, hidden_effects, record_stand_in, stand_in_json
+from droid_jax.commands.hidden import DEMONSTRATIONS, hidden_effects, record_stand_in
 from droid_jax.commands.scenes import needs_recording
 from droid_jax.commands.source import needs_brax
 from droid_jax.report.files import TRANSFER
@@ -154,9 +154,7 @@ def _recorded(command: All) -> tuple[Path, ...]:
 
     scene = door_scene(timestep=TIMESTEP[PRESETS[command.preset].identify])
     hidden = hidden_effects(command.hide, scene)
-    known = _json(command.out / "recordings" / KNOWN)
-    again = command.again or known not in (None, stand_in_json(hidden, command.springs, command.seed))
-    record_stand_in(scene, hidden, command.out, command.springs, command.seed, again)
+    record_stand_in(scene, hidden, command.out, command.springs, command.seed, command.again)
     return tuple(command.out / "recordings" / f"{name}.npz" for name in DEMONSTRATIONS.values())
 
 

@@ -50,6 +50,11 @@ class Blocks(Evidence):
         return int(self.block.max()) + 1
 
     @property
+    def size(self) -> int:
+        """Those of the blocks."""
+        return int((self.block != OUTSIDE).sum())
+
+    @property
     def tie(self) -> float:
         """Closer to one than with repeats, whose U holds no noise."""
         return TIE

@@ -103,7 +103,7 @@ def make_case(
             f"recordings {', '.join(few)}: at least {FEWEST} repeats are needed to tell an effect from noise"
         )
     scene = ready(scene)
-    base = _restrained(base)
+    base = restrained(base)
     whole = base + effect_space(effects)
     costs = [make_cost(scene, whole, [r], config=config.compare, effects=effects) for r in recordings]
     return _case(costs, base, tuple(effects), config)
@@ -116,16 +116,16 @@ def _case(costs: Sequence[Cost], base: Space, effects: tuple[Effect, ...], confi
     return Case(fit, confirm, sealed[0] if sealed else None, base, effects, config)
 
 
-def _restrained(base: Space) -> Space:
+def restrained(base: Space) -> Space:
     """The base with every nuisance kept within BEYOND prior deviations.
 
     What stands that far off is no nuisance but something missing: a payload of 0.4 kg, say, was absorbed by a forearm
     eleven deviations too heavy and a shoulder seven too light.
     """
 
-    def restrained(p: Parameter) -> Parameter:
+    def kept(p: Parameter) -> Parameter:
         if not p.nuisance:
             return p
         return replace(p, low=max(p.low, p.mean - BEYOND * p.std), high=min(p.high, p.mean + BEYOND * p.std))
 
-    return Space(tuple(restrained(p) for p in base.parameters))
+    return Space(tuple(kept(p) for p in base.parameters))

@@ -51,6 +51,11 @@ class Evidence:
         return self.repeats
 
     @property
+    def size(self) -> int:
+        """How many residuals the log likelihood holds: U of one is half of this."""
+        return self.deviations.size
+
+    @property
     def tie(self) -> float:
         """Times what the best model leaves, up to which a rival's U is as good."""
         return TIE

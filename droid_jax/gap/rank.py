@@ -65,10 +65,13 @@ def _combinations(groups: Sequence[list[int]], number: int, screen: Screen) -> l
     if number == 1:
         return list(groups)
 
-    def effects(rows: list[int]) -> str:
-        return screen.questions[rows[0]].candidate.name
+    def together(a: Candidate, b: Candidate) -> bool:
+        """Not the same candidate; and an effect has one shape at all its places."""
+        return a.name != b.name and (a.effect != b.effect or a.shapes == b.shapes)
 
-    return [[*a, *b] for i, a in enumerate(groups) for b in groups[i + 1 :] if effects(a) != effects(b)]
+    of = [screen.questions[rows[0]].candidate for rows in groups]
+    both = ((i, k) for i in range(len(of)) for k in range(i + 1, len(of)) if together(of[i], of[k]))
+    return [[*groups[i], *groups[k]] for i, k in both]
 
 
 def _proposal(

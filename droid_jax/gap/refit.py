@@ -99,6 +99,12 @@ def look(
     return whole.embed(space, values[None], begin)[0], objective
 
 
+def deviations(evidence: Evidence, model: Model) -> dict[str, float]:
+    """Posterior deviation of every free amplitude, in its own unit, bounds or no bounds."""
+    std = np.sqrt(np.diag(posterior(model.refined, evidence.cost.comparisons).cov))
+    return {a: float(std[model.space.index(a)] * model.space[a].std) for a in model.amplitudes}
+
+
 def intervals(evidence: Evidence, model: Model) -> dict[str, tuple[float, float]]:
     """Interval of every free amplitude, in its own unit."""
     low, high = posterior(model.refined, evidence.cost.comparisons).interval(LEVEL)

@@ -112,7 +112,7 @@ class Hunt:
     def aim(self, model: Model) -> float:
         """Objective [log likelihood] of a fit that would take half of what a further effect has to."""
         least = 0.5 * (MORE if model.parts else LESS)
-        return model.refined.objective - 0.5 * least * model.gap * model.residuals.size
+        return model.refined.objective - 0.5 * least * model.gap * self.case.fit.size
 
     def gap(self, model: Model) -> float:
         """U on the confirming demonstration."""

@@ -6,10 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.stats
 
 from droid_jax.gap.evidence import Evidence
 from droid_jax.gap.flips import sign_flips, t_values
-from droid_jax.gap.refit import Model, intervals
+from droid_jax.gap.refit import LEVEL, Model, deviations, intervals
 
 SIGNIFICANT = 0.01
 LESS = 0.2  # share of U that the first effect must take away on the confirming demonstration
@@ -77,7 +78,7 @@ def judge(
     repeats = [confirm.residuals(c) for c in commons]
     left = np.array([confirm.gap(r) for r in repeats])
     squares = np.array([np.sum(r**2, axis=1) for r in repeats])
-    losses = confirm.losses(commons[1:], resamples(confirm.units, seed))
+    losses = np.nan_to_num(confirm.losses(commons[1:], resamples(confirm.units, seed)), nan=np.inf)
     same = alike(left[1:], losses, floor, confirm.tie)
     winners = np.bincount(np.argmin(losses, axis=1), minlength=len(models)) / len(losses)
     out = []
@@ -87,7 +88,7 @@ def judge(
         spans = {a: s for a, s in intervals(fit, model).items() if a not in before.amplitudes}
         weak = [f"not confirmed by the other demonstration (p = {p:.2g})"] if p >= SIGNIFICANT else []
         weak += _too_small(fit, model, spans, smallest)
-        reasons = _gap_reasons(left[0], left[k + 1], whole_gap, MORE if before.parts else LESS)
+        reasons = _gap_reasons(left[0], left[k + 1], whole_gap, MORE if before.parts else LESS, floor)
         reasons += _amplitude_reasons(fit, model, spans)
         if chosen < CHOSEN:
             leader = min(zip(left[1:], models, strict=True), key=lambda lm: lm[0])[1].name
@@ -115,9 +116,13 @@ def alike(left: np.ndarray, losses: np.ndarray, floor: float, tie: float) -> np.
     return (as_good & as_good.T) | np.eye(len(left), dtype=bool)
 
 
-def _gap_reasons(before: float, after: float, whole_gap: float, least: float) -> list[str]:
+def _gap_reasons(before: float, after: float, whole_gap: float, least: float, floor: float) -> list[str]:
     reasons = []
-    if after > before:
+    if not np.isfinite(after):
+        reasons.append("its replay of the other demonstration is no number")
+    elif before <= floor:
+        reasons.append("the other demonstration shows no gap that it could take away")
+    elif after > before:
         reasons.append("makes the gap on the other demonstration larger")
     elif after > (1 - least) * before:
         reasons.append(f"takes only {1 - after / before:.0%} of the gap away on the other demonstration")
@@ -135,8 +140,14 @@ def _too_small(
 
 
 def _amplitude_reasons(fit: Evidence, model: Model, spans: Mapping[str, tuple[float, float]]) -> list[str]:
-    zero = all(low <= 0.0 <= high for low, high in spans.values())
-    reasons = ["its amplitude may be zero"] if zero else []
+    """An interval ends at its bound, often neutral: whether an amplitude may be zero is asked of its deviation."""
+    space, deviation, reach = fit.cost.space, deviations(fit, model), scipy.stats.norm.ppf(0.5 + 0.5 * LEVEL)
+
+    def vanishing(a: str) -> bool:
+        return bool(abs(model.values[space.index(a)] - space[a].mean) <= reach * deviation[a])
+
+    new = [c for c in model.parts if set(c.amplitudes) <= set(spans)]
+    reasons = ["its amplitude may be zero"] if any(all(map(vanishing, c.amplitudes)) for c in new) else []
     return reasons + [f"{a} ran into its bound" for a in spans if _on_bound(fit, model, a)]
 
 

@@ -28,7 +28,7 @@ from droid_jax.compare.cost import Cost, make_cost
 from droid_jax.compare.residuals import MINIMUM_NOISE
 from droid_jax.gap.blocks import OUTSIDE, Blocks, block_length, blocks, interleaved
 from droid_jax.gap.candidates import candidates
-from droid_jax.gap.case import Case, GapConfig
+from droid_jax.gap.case import Case, GapConfig, restrained
 from droid_jax.gap.evidence import only_comparison
 from droid_jax.gap.flips import FEWEST
 from droid_jax.gap.rank import proposals
@@ -129,7 +129,7 @@ def make_log(
     """
     if recording.repeats > 1:
         raise ValueError(f"recording {recording.name!r} has {recording.repeats} repeats: use make_case")
-    whole, config = base + effect_space(effects), config or GapConfig()
+    whole, config = restrained(base) + effect_space(effects), config or GapConfig()
     cost = make_cost(ready(scene), whole, [recording], config=config.compare, effects=[*known, *effects])
     if not isinstance(cost.drives[0], Motion):
         raise ValueError(f"recording {recording.name!r} holds commands; blocks are for logs in inverse mode")
@@ -159,7 +159,7 @@ def single_case(
     fit, confirm = (_blocks(log.part(n), deviation, part) for n, part in zip(turns, parts, strict=True))
     rest = log.part(f"{name}, last third") if sealed is None else sealed
     judged = _blocks(rest, deviation, _any_blocks(rest.clock, end if sealed is None else rest.clock[0]))
-    return Case(fit, confirm, judged, base, tuple(effects), config)
+    return Case(fit, confirm, judged, restrained(base), tuple(effects), config)
 
 
 def base_model(case: Case, start: np.ndarray | None = None) -> Model:

@@ -73,15 +73,21 @@ class Verdict:
         return "the model with the effects" if self.base.refined.converged else "the base model"
 
     @property
+    def _lacking(self) -> str:
+        """ "a and b", "a, and one of: b or c"."""
+        both = list(zip(self.effects, self.tied, strict=True))
+        certain = " and ".join(e for e, ties in both if not ties)
+        open_ones = [f"one of: {' or '.join((e, *ties))}" for e, ties in both if ties]
+        return ", and ".join([certain, *open_ones] if certain else open_ones)
+
+    @property
     def sentence(self) -> str:
         """The answer in words."""
-        named = " and ".join(self.effects)
-        ties = "; ".join(f"{e} or {' or '.join(t)}" for e, t in zip(self.effects, self.tied, strict=True) if t)
         return {
             Kind.NONE: "Nothing is missing that these recordings could tell.",
-            Kind.NAMED: f"The model lacks: {named}.",
-            Kind.TIE: f"The model lacks one of: {ties}.",
-            Kind.PARTLY: f"The model lacks {named}; a remainder is unexplained.",
+            Kind.NAMED: f"The model lacks: {self._lacking}.",
+            Kind.TIE: f"The model lacks {self._lacking}.",
+            Kind.PARTLY: f"The model lacks {self._lacking}; a remainder is unexplained.",
             Kind.UNEXPLAINED: "The model lacks something that is not in the library.",
             Kind.UNCONVERGED: f"The fit of {self._unsettled} did not converge; nothing can be concluded.",
         }[self.kind]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -82,8 +82,7 @@ def find(case: Case, base: Model, floor: float, progress: Progress = lambda stag
     model, rounds, quiet = base, list[Round](), False
     while len(model.parts) < case.config.most:
         progress("screen", model.name)
-        left = tuple(q for q in asked if not set(q.candidate.amplitudes) & set(model.amplitudes))
-        found = ask(case, model, left)
+        found = ask(case, model, further(asked, model))
         quiet = found.p >= SIGNIFICANT or model.gap <= floor
         enough = not model.parts or hunt.gap(model) > OF_ALL * hunt.whole_gap
         done = forward(hunt, model, found) if enough and not quiet else Round(found)
@@ -100,6 +99,22 @@ def find(case: Case, base: Model, floor: float, progress: Progress = lambda stag
     return _verdict(hunt, base, polished(hunt, pruned(hunt, model)), rounds, quiet)
 
 
+def further(asked: Sequence[Question], model: Model) -> tuple[Question, ...]:
+    """Questions that a model leaves open.
+
+    A shape belongs to an effect at all places alike: where the effect is in the model at one place, it is asked about
+    at the others with the shape that it has there.
+    """
+    known = {c.effect for c in model.parts}
+    left = dict[Any, Question]()
+    for q in asked:
+        if set(q.candidate.amplitudes) & set(model.amplitudes):
+            continue
+        part = replace(q.candidate, shapes={}) if q.candidate.effect in known else q.candidate
+        left.setdefault((part.key, q.amplitude), replace(q, candidate=part))
+    return tuple(left.values())
+
+
 def _unsettled(hunt: Hunt, model: Model) -> bool:
     """Nothing named yet, several effects, or much left over: one that mimics two may have stood in their way."""
     return len(model.parts) != 1 or _open(hunt.gap(model), hunt.whole_gap, hunt.floor) > OPEN
@@ -111,18 +126,19 @@ def _open(after: float, before: float, floor: float) -> float:
 
 
 def _verdict(hunt: Hunt, base: Model, model: Model, rounds: list[Round], quiet: bool) -> Verdict:
-    """quiet: the last screening found nothing more."""
+    """quiet: the last screening found nothing more.  Of a fit that did not converge nothing is named."""
     case, floor = hunt.case, hunt.floor
+    converged = base.refined.converged and model.refined.converged
+    if not converged:
+        model, rounds = base, [replace(r, winner=None, chosen=None) for r in rounds]
     gaps = {role: (e.gap_at(base.values), e.gap_at(model.values)) for role, e in case.judged.items()}
-    before, after = gaps["confirm"]
     missing = bool(rounds) and rounds[0].screen.p < SIGNIFICANT and base.gap > floor
-    tied = tuple(_tied(part.name, rounds) for part in model.parts)
+    tied = tuple(_tied(part.name, model, rounds) for part in model.parts)
     kind = Kind.NONE if not missing else Kind.UNEXPLAINED
-    if not base.refined.converged or not model.refined.converged:
+    if not converged:
         kind = Kind.UNCONVERGED
     elif model.parts:
-        much_left = not quiet and _open(after, before, floor) > OPEN
-        kind = Kind.PARTLY if much_left else Kind.TIE if any(tied) else Kind.NAMED
+        kind = Kind.PARTLY if _remains(hunt, model, quiet) else Kind.TIE if any(tied) else Kind.NAMED
     return Verdict(
         kind=kind,
         effects=tuple(c.name for c in model.parts),
@@ -141,11 +157,29 @@ def _verdict(hunt: Hunt, base: Model, model: Model, rounds: list[Round], quiet: 
     )
 
 
-def _tied(part: str, rounds: list[Round]) -> tuple[str, ...]:
-    """What does as well as one effect of the model: what rivals have in its place in the round that chose it."""
-    for done in rounds:
+def _remains(hunt: Hunt, model: Model, quiet: bool) -> bool:
+    """Whether much of the gap is left on the confirming demonstration, and more than chance leaves.
+
+    An effect that no candidate looks like is seen by no screening, but by every repeat.
+    """
+    confirm = hunt.case.confirm
+    residuals = confirm.residuals(confirm.common(model.values)[0])
+    if _open(confirm.gap(residuals), hunt.whole_gap, hunt.floor) <= OPEN:
+        return False
+    everywhere = np.ones((1, residuals.shape[1]), bool)
+    return not quiet or float(confirm.cell_p_values(residuals, everywhere)[0]) < SIGNIFICANT
+
+
+def _tied(part: str, model: Model, rounds: Sequence[Round]) -> tuple[str, ...]:
+    """What does as well as one effect of the model: what rivals have in its place in the last round that chose it.
+
+    A rival that does without several of the model's effects is named whole, beside each of them.
+    """
+    known = {c.name for c in model.parts}
+    for done in reversed(rounds):
         added = {c.name for c in done.winner.parts} - set(done.stood) if done.winner is not None else set()
         if part in added:
             others = [{c.name for c in m.parts} - set(done.stood) for m in done.rivals]
-            return tuple(sorted({n for o in others if added - o == {part} for n in o - added}))
+            instead = [o - added for o in others if part not in o and not (o - added) & known]
+            return tuple(sorted({" + ".join(sorted(names)) for names in instead if names}))
     return ()

@@ -111,7 +111,5 @@ def _load_bags(bags: list[Path], name: str | None, allow_jitter: bool, options: 
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] != "rosbags":
             raise
-        raise ImportError(
-            f"{bags[0]}: reading ROS bags needs the package 'rosbags': pip install droid_jax[ros]"
-        ) from None
+        raise ImportError(f"{bags[0]}: reading ROS bags needs the package 'rosbags': pip install rosbags") from None
     return read_bags(bags, name=name, allow_jitter=allow_jitter, **options)

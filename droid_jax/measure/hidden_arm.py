@@ -69,20 +69,22 @@ def _steiner(offset: np.ndarray) -> np.ndarray:
 def cable_pull(place: Place, a: float) -> Influence:
     """-a sinh(2 (q - q_rest)) / sinh(2): a dress pack that hangs slack, then pulls; a in N m at 1 rad.
 
-    It hangs slack in the middle of the joint's range, wherever a motion begins.
+    It hangs slack in the middle of the joint's range, wherever a motion begins, and rubs in its clamps with a
+    tenth of its pull.
     """
     model = place.scene.model
     rest = model.jnt_range[[place.scene.id("joint", name) for name in place.joints]].mean(axis=1)
 
     def step(live: Live) -> None:
-        live.applied[place.dofs] += cable(a, live.position[place.qpos] - rest)
+        live.applied[place.dofs] += cable(a, live.position[place.qpos] - rest, live.velocity[place.dofs])
 
     return Influence(step=step)
 
 
-def cable(a: float, turned: np.ndarray) -> np.ndarray:
-    """The cable's torque in N m at an angle turned from where it hangs slack, rad."""
-    return -a * np.sinh(2.0 * turned) / np.sinh(2.0)
+def cable(a: float, turned: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """The cable's torque in N m at an angle turned from where it hangs slack, rad, and a speed in rad/s."""
+    pull = a * np.sinh(2.0 * turned) / np.sinh(2.0)
+    return -pull - 0.1 * np.abs(pull) * np.tanh(v / 0.01)
 
 
 def torque_ripple(place: Place, a: float) -> Influence:

@@ -13,19 +13,20 @@ import numpy as np
 
 from droid_jax.measure.hidden_hooks import Hidden, Influence, Live, Place, hinge_loss, hinge_torque
 
+BENT = 0.25  # of a leaning door's torque: hinges that are not in line
+
 
 def preload(a: float, q: float, v: float) -> float:
-    """-a (1 + q / 10): a coil spring wound up by 10 rad before it was mounted; a in N m at the closed door."""
-    return -a * (1.0 + q / 10.0)
+    """-a (1 + q / 5): a coil spring wound up by 5 rad before it was mounted; a in N m at the closed door."""
+    return -a * (1.0 + q / 5.0)
 
 
 def binding_spring(a: float, q: float, v: float) -> float:
-    """-a/3 sum_i s ln(1 + exp((q - q_i) / s)): coils that lie down one after the other.
+    """-a s ln(1 + exp((q - 0.45) / s)): a second spring that the door meets at 0.45 rad, rounded over s = 0.02 rad.
 
-    Three coils at q_i = 0.20, 0.40 and 0.60 rad, each rounded over s = 0.02 rad, each adding a third of
-    the stiffness; a in N m/rad.
+    a in N m/rad.
     """
-    return -a / 3.0 * sum(0.02 * _softplus((q - at) / 0.02) for at in (0.20, 0.40, 0.60))
+    return -a * 0.02 * _softplus((q - 0.45) / 0.02)
 
 
 def over_centre(a: float, q: float, v: float) -> float:
@@ -44,12 +45,12 @@ def over_centre(a: float, q: float, v: float) -> float:
 
 
 def magnetic_catch(a: float, q: float, v: float) -> float:
-    """-a (1 + q / 0.02)⁻² exp(-(q / 0.09)²): inverse square of the air gap, with the pole's finite reach.
+    """-a (1 / (1 + (q / 0.03)²) - 0.12 exp(-((q - 0.14) / 0.04)²)): pulls in; further out its ring of iron pushes.
 
-    0.02 rad are 6 mm of gap at a lever of 0.3 m; a closed door (or one pressed in) has the full a, N m.
+    0.03 rad are 9 mm of gap at a lever of 0.3 m; a closed door (or one pressed in) has the full a, N m.
     """
     q = max(q, 0.0)
-    return -a * (1.0 + q / 0.02) ** -2 * math.exp(-((q / 0.09) ** 2))
+    return -a * (1.0 / (1.0 + (q / 0.03) ** 2) - 0.12 * math.exp(-(((q - 0.14) / 0.04) ** 2)))
 
 
 def closer(a: float, q: float, v: float) -> float:
@@ -111,10 +112,11 @@ def pin_wobble(a: float, q: float) -> float:
 
 
 def tilted_frame(place: Place, a: float) -> Influence:
-    """The frame leans by a rad: axis · (c x M (R g - g)), the door's full gravity torque as it turns.
+    """The frame leans by a rad: axis · (c x M (R g - g)), the door's gravity torque as it turns, on bent hinges.
 
-    R turns gravity about a horizontal line 30 degrees off the world's x axis (in the built-in scene the
-    door's inward normal: it leans along its panel and a little forward); c is the centre of everything
+    Its two hinges are not quite in line, so 0.25 of the torque's size comes and goes with the sine of three times
+    the angle turned.  R turns gravity about a horizontal line 30 degrees off the world's x axis (in the built-in
+    scene the door's inward normal: it leans along its panel and a little forward); c is the centre of everything
     that the hinge carries, M its mass.  A positive lean closes the built-in door; a negative one swings
     it open before it is grasped unless friction holds it.
     """
@@ -127,7 +129,8 @@ def tilted_frame(place: Place, a: float) -> Influence:
 
     def step(live: Live) -> None:
         turned = float(live.position[q]) - start[0]
-        live.applied[v] += start[1] * math.cos(turned) + start[2] * math.sin(turned)
+        bent = BENT * math.hypot(*start[1:]) * math.sin(3.0 * turned)
+        live.applied[v] += start[1] * math.cos(turned) + start[2] * math.sin(turned) + bent
 
     return Influence(begin=begin, step=step)
 

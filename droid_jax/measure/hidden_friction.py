@@ -19,8 +19,8 @@ def dry_loss(a: float, q: np.ndarray) -> np.ndarray:
 
 
 def stribeck_loss(a: float, v: np.ndarray) -> np.ndarray:
-    """a exp(-|v| / 0.04): what sticking adds to sliding; Tustin's exponential (1947), not Stribeck's Gauss."""
-    return a * np.exp(-np.abs(v) / 0.04)
+    """a / (1 + (v / 0.04)²): what sticking adds to sliding, after Hess and Soom (1990), not Stribeck's Gauss."""
+    return a / (1.0 + (v / 0.04) ** 2)
 
 
 def directional_loss(a: float, v: np.ndarray) -> np.ndarray:

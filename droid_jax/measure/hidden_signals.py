@@ -10,6 +10,7 @@ from droid_jax.measure.hidden_hooks import Hidden, Influence, Place, Seen, lagge
 
 GAIN_KNEE = 20.0  # N m, where the torque sensor's wrong gain begins to level off
 DRIFT_TIME = 60.0  # s, a sensor warming up
+SETTLING_TIME = 2.0  # s, a sensor that has just been loaded
 
 
 def command_delay(place: Place, a: float) -> Influence:
@@ -24,18 +25,41 @@ def command_delay(place: Place, a: float) -> Influence:
 
 
 def sensor_delay(place: Place, a: float) -> Influence:
-    """The torque arrives a s late: 0.6 a of dead time, then a first-order lag of 0.4 a; positions do not."""
-    return _on_torque(place, lambda seen, torque, _: lagged(torque, seen.clock, 0.6 * a, 0.4 * a))
+    """The torque arrives a s late: 0.6 a of dead time, then a first-order lag of 0.4 a; positions do not.
+
+    The joints are asked one after the other: a is the mean, the first one's is 0.8 of it and the last one's 1.2.
+    """
+
+    def late(seen: Seen, torque: np.ndarray, _: np.ndarray) -> np.ndarray:
+        delays = a * np.linspace(0.8, 1.2, torque.shape[1]) if torque.shape[1] > 1 else [a]
+        each = [lagged(torque[:, [k]], seen.clock, 0.6 * d, 0.4 * d) for k, d in enumerate(delays)]
+        return np.concatenate(each, axis=1)
+
+    return _on_torque(place, late)
 
 
 def torque_bias(place: Place, a: float) -> Influence:
-    """torque + a (1 + 0.2 sin q): a zero that moves a little as the joint turns; a in N m."""
-    return _on_torque(place, lambda seen, torque, position: torque + a * (1.0 + 0.2 * np.sin(position)))
+    """torque + a (1 + 0.2 sin q + 0.3 exp(-t / 2 s)): a zero that moves a little as the joint turns, and settles.
+
+    a in N m, t from the start of each repeat.
+    """
+
+    def biased(seen: Seen, torque: np.ndarray, position: np.ndarray) -> np.ndarray:
+        return torque + a * (1.0 + 0.2 * np.sin(position) + 0.3 * np.exp(-seen.clock[:, None] / SETTLING_TIME))
+
+    return _on_torque(place, biased)
 
 
 def torque_gain(place: Place, a: float) -> Influence:
-    """torque + a t tanh(torque / t), t = 20 N m: a wrong gain that levels off; a without unit."""
-    return _on_torque(place, lambda seen, torque, _: torque + a * GAIN_KNEE * np.tanh(torque / GAIN_KNEE))
+    """torque + a (t tanh(torque / t) + 0.2 |torque|), t = 20 N m: a wrong gain that levels off, and is steeper one way.
+
+    a without unit.
+    """
+
+    def gained(seen: Seen, torque: np.ndarray, _: np.ndarray) -> np.ndarray:
+        return torque + a * (GAIN_KNEE * np.tanh(torque / GAIN_KNEE) + 0.2 * np.abs(torque))
+
+    return _on_torque(place, gained)
 
 
 def torque_drift(place: Place, a: float) -> Influence:

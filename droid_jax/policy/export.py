@@ -32,7 +32,7 @@ def export(folder: Path, policy: Policy) -> float:
     """
     missing = [name for name in ("onnx", "onnxruntime") if importlib.util.find_spec(name) is None]
     if missing:
-        raise ValueError(f"export needs {' and '.join(missing)}: pip install 'droid_jax[export]'")
+        raise ValueError(f"export needs {' and '.join(missing)}: pip install -e '.[export]' in the checkout")
     model = to_onnx(policy)
     apart = difference(policy, model)
     if not apart <= CLOSE:

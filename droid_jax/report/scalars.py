@@ -24,7 +24,7 @@ def scalars(folder: Path | None) -> Iterator[Callable[[str, Any], None]]:
         yield lambda stage, value: None
         return
     if importlib.util.find_spec("tensorboardX") is None:
-        raise ValueError("--tensorboard needs tensorboardX: pip install tensorboardX, or 'droid_jax[train]'")
+        raise ValueError("--tensorboard needs tensorboardX: pip install tensorboardX")
     from tensorboardX import SummaryWriter
 
     with SummaryWriter(str(folder)) as writer:

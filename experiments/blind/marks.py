@@ -25,7 +25,7 @@ from droid_jax.measure.recording import Recording
 from droid_jax.model.effects.registry import effect_space
 from droid_jax.model.seam import Effect
 from experiments.blind.draws import Truth
-from experiments.blind.make import Drawn, record
+from experiments.blind.make import USUAL, Drawn, record
 from experiments.blind.scenes import Setting
 from experiments.blind.units import torques, whitened
 
@@ -93,7 +93,7 @@ class Ground:
 
     def record(self, hidden: tuple[Applied, ...], repeats: int) -> Recording:
         """The same robot and the same noise, with something hidden."""
-        return record(self.setting, Drawn(hidden, {"fit": self.truth}, {"fit": self.seed}), ("fit",), repeats)["fit"]
+        return _recorded(self.setting, hidden, self.truth, self.seed, repeats)
 
     def hidden(self, effect: Applied) -> np.ndarray:
         """[REPEATS, M] what a hidden effect adds to each repeat, per unit of its amplitude.
@@ -120,7 +120,7 @@ class Ground:
 
 def ground(setting: Setting, truth: Truth, seed: int) -> Ground:
     """Record, compile, and take the slopes at the truth."""
-    recording = record(setting, Drawn((), {"fit": truth}, {"fit": seed}), ("fit",), NOISY)["fit"]
+    recording = _recorded(setting, (), truth, seed, NOISY)
     case = make_case(setting.scene, setting.base, setting.effects(), recording, recording)
     base = case.base
     known = {n: float(np.clip(v, base[n].low, base[n].high)) for n, v in truth.items() if n in base.names}
@@ -128,6 +128,11 @@ def ground(setting: Setting, truth: Truth, seed: int) -> Ground:
     model, asked = (refit(case.fit, base, (), at, RefineConfig(iterations=0, hops=0, spreads=s)) for s in (0, 2))
     wide = asked.refined.jacobian / np.sqrt(case.fit.repeats)
     return Ground(setting, truth, seed, case.fit, model, wide, case.fit.deviations * np.sqrt(NOISY / (NOISY - 1)))
+
+
+def _recorded(setting: Setting, hidden: tuple[Applied, ...], truth: Truth, seed: int, repeats: int) -> Recording:
+    drawn = Drawn(hidden, {"fit": truth}, {"fit": seed})
+    return record(setting, drawn, ("fit",), replace(USUAL, repeats=repeats))["fit"]
 
 
 def dense(effects: tuple[Effect, ...]) -> tuple[Candidate, ...]:

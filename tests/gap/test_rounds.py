@@ -5,8 +5,13 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
+import pytest
+
+from droid_jax.gap.blocks import OUTSIDE, Blocks
 from droid_jax.gap.candidates import Candidate
-from droid_jax.gap.rounds import plainest
+from droid_jax.gap.evidence import Evidence
+from droid_jax.gap.rounds import Budget, Hunt, plainest
 
 
 def model(effect: str, amplitudes: int, shapes: int, left: float) -> Any:
@@ -21,3 +26,25 @@ def test_the_fewest_parameters_lead_and_among_equals_the_smallest_gap() -> None:
     )
     assert plainest([stribeck, coulomb, bias]) == coulomb
     assert plainest([stribeck]) == stribeck
+
+
+def test_a_budget_says_what_it_left_out() -> None:
+    tight = Budget(1e-9)
+    assert list(tight.within("candidates not refitted", "abc")) == ["a"] and tight.spent
+    tight.skip("pairs of effects not tried")
+    assert tight.cut == "2 of 3 candidates not refitted; pairs of effects not tried"
+    free = Budget(None)
+    assert list(free.within("candidates not refitted", "abc")) == ["a", "b", "c"] and free.cut == ""
+
+
+@pytest.mark.parametrize("blocks", [False, True])
+def test_the_aim_is_the_objective_of_half_the_share_that_an_effect_must_take(blocks: bool) -> None:
+    """U of 4, a fifth of which an effect must take away: the objective falls by a tenth of it."""
+    cost, nothing, none = SimpleNamespace(), np.zeros((1, 30)), np.zeros(30)
+    block = np.array([0] * 6 + [1] * 6 + [OUTSIDE] * 18)
+    known: Any = (cost, nothing, none, none)
+    evidence = Blocks(*known, block) if blocks else Evidence(*known)
+    count = 12 if blocks else 30
+    fitted: Any = SimpleNamespace(parts=(), gap=4.0, refined=SimpleNamespace(objective=0.5 * count * 4.0))
+    hunt: Any = SimpleNamespace(case=SimpleNamespace(fit=evidence))
+    assert Hunt.aim(hunt, fitted) == pytest.approx(0.9 * fitted.refined.objective)

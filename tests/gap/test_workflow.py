@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_gap import EFFECTS, FLOOR, QUICK, Small, record, small, small_scene
 
-from droid_jax.gap.candidates import candidates
+from droid_jax.gap import workflow
+from droid_jax.gap.candidates import Candidate, candidates
 from droid_jax.gap.case import make_case
 from droid_jax.gap.screen import questions_of
 from droid_jax.gap.verdict import Kind
@@ -87,8 +90,6 @@ def test_no_verdict_from_a_base_fit_that_did_not_converge(found: Small):
 
 
 def test_no_name_from_an_extended_fit_that_did_not_converge(found: Small, monkeypatch: pytest.MonkeyPatch):
-    from droid_jax.gap import workflow
-
     def unsettled(hunt, model):
         return replace(model, refined=replace(model.refined, converged=False))
 
@@ -96,6 +97,85 @@ def test_no_name_from_an_extended_fit_that_did_not_converge(found: Small, monkey
     verdict = find(found.case, found.base, FLOOR)
     assert verdict.kind is Kind.UNCONVERGED
     assert "the model with the effects" in verdict.sentence
+    assert (verdict.effects, verdict.tied, verdict.rivals) == ((), (), ()) and verdict.model is found.base
+    assert any(trial.passed for trial in verdict.trials)  # the grounds are told
+
+
+def test_what_is_left_counts_where_chance_would_not_leave_it(found: Small):
+    """A remainder that no candidate looks like is one: half of what was there, or half of noise."""
+    case = found.case
+    hunt: Any = SimpleNamespace(case=case, floor=FLOOR, whole_gap=2.0 * found.base.gap)
+    assert workflow._remains(hunt, found.base, quiet=True)
+    assert not workflow._remains(SimpleNamespace(**{**vars(hunt), "whole_gap": 1e3}), found.base, quiet=False)
+    signs = np.where(np.arange(case.confirm.repeats) % 2, 1.0, -1.0)[:, None]
+    chance: Any = SimpleNamespace(
+        common=lambda values: [None], residuals=lambda common: signs * np.ones((case.confirm.repeats, 6)),
+        gap=lambda residuals: found.base.gap, cell_p_values=case.confirm.cell_p_values,
+    )  # fmt: skip
+    hunt.case = SimpleNamespace(confirm=chance)
+    assert not workflow._remains(hunt, found.base, quiet=True) and workflow._remains(hunt, found.base, quiet=False)
+
+
+def candidate(name: str, place: str = "door", **shapes: float) -> Candidate:
+    return Candidate(name, place, (f"{name}[{place}]",), shapes)
+
+
+def chosen(stood: list[str], winner: list[str], *rivals: list[str]) -> Any:
+    """A round: names of effects that stood, that won, that did as well."""
+
+    def model(names: list[str]) -> Any:
+        return SimpleNamespace(parts=[candidate(n) for n in names])
+
+    places = [f"{name} at door" for name in stood]
+    return SimpleNamespace(stood=places, winner=model(winner), rivals=[model(names) for names in rivals])
+
+
+def ties(names: str, *rounds: Any) -> dict[str, tuple[str, ...]]:
+    """Of a model with these effects, one letter each."""
+    model: Any = SimpleNamespace(parts=[candidate(n) for n in names])
+    return {n: workflow._tied(f"{n} at door", model, rounds) for n in names}
+
+
+def test_ties_are_those_of_the_last_round_that_chose_an_effect():
+    first, pair = chosen([], ["a"], ["x"]), chosen([], ["a", "b"], ["y", "b"])
+    assert ties("a", first) == {"a": ("x at door",)}
+    assert ties("ab", first, pair) == {"a": ("y at door",), "b": ()}
+    lost: Any = SimpleNamespace(stood=[], winner=None, rivals=[])
+    assert ties("a", first, lost) == {"a": ("x at door",)}
+
+
+def test_an_effect_of_the_model_is_no_rival_of_another():
+    first, second = chosen([], ["a"], ["b"], ["x"]), chosen(["a"], ["a", "b"])
+    assert ties("ab", first, second) == {"a": ("x at door",), "b": ()}
+
+
+def test_a_rival_without_any_of_the_models_effects_is_named_whole():
+    assert ties("ab", chosen([], ["a", "b"], ["c", "e"])) == {n: ("c at door + e at door",) for n in "ab"}
+    assert ties("ab", chosen([], ["a", "b"], ["c"])) == {n: ("c at door",) for n in "ab"}
+
+
+def test_an_effect_is_asked_about_elsewhere_with_the_shape_it_has():
+    speeds = [candidate("ripple", place, periods=periods) for place in ("one", "two") for periods in (10.0, 20.0)]
+    asked = questions_of([*speeds, candidate("latch", width=0.1)])
+    model: Any = SimpleNamespace(parts=speeds[:1], amplitudes=("ripple[one]",))
+    left = [q.candidate for q in workflow.further(asked, model)]
+    assert left == [candidate("ripple", "two"), candidate("latch", width=0.1)]
+
+
+@pytest.mark.parametrize(
+    ("tied", "said"),
+    [
+        (((), ()), "The model lacks: a and b."),
+        ((("x",), ()), "The model lacks b, and one of: a or x."),
+        ((("x",), ("y", "z")), "The model lacks one of: a or x, and one of: b or y or z."),
+    ],
+)
+def test_the_sentence_keeps_what_is_certain(found: Small, tied: Any, said: str):
+    verdict = find(found.case, found.base, 2.0 * found.base.gap)
+    kind = Kind.TIE if any(tied) else Kind.NAMED
+    assert replace(verdict, kind=kind, effects=("a", "b"), tied=tied).sentence == said
+    partly = replace(verdict, kind=Kind.PARTLY, effects=("a", "b"), tied=tied).sentence
+    assert partly == said.replace("lacks: ", "lacks ")[:-1] + "; a remainder is unexplained."
 
 
 def test_a_gap_below_the_floor_is_none(found: Small):

@@ -185,7 +185,7 @@ def test_effects_add_up_and_repeats_differ(scene: Scene, demonstration: Recordin
     plain = record(scene, demonstration, {}, seed=4, config=replace(CONFIG, repeats=2)).channel("torque").values
     added = values - plain
     assert not added[..., 0].any()
-    assert np.all(added[..., 1] * plain[..., 1] >= -1e-2) and np.abs(added[..., 2] - 0.5).max() < 0.1 * 0.5 + 0.05
+    assert np.all(added[..., 1] * plain[..., 1] >= -1e-2) and np.abs(added[..., 2] - 0.57).max() < 0.12
 
 
 def test_the_default_step_is_the_longest_allowed(scene: Scene, demonstration: Recording):
@@ -247,15 +247,15 @@ def test_the_hidden_effects_know_nothing_of_the_programs_library():
     ("name", "q", "v", "expected"),
     [
         ("hinge_preload", 0.0, 0.0, -2.0),
-        ("hinge_preload", 0.5, 9.0, -2.1),
-        ("binding_spring", 0.0, 0.0, -2 / 3 * 0.02 * math.log1p(math.exp(-10))),
-        ("binding_spring", 0.9, 0.0, -2 / 3 * (0.7 + 0.5 + 0.3)),
+        ("hinge_preload", 0.5, 9.0, -2.2),
+        ("binding_spring", 0.45, 0.0, -2 * 0.02 * math.log(2)),
+        ("binding_spring", 0.9, 0.0, -2 * 0.45),
         ("over_centre", 0.0, 0.0, -2.0),
         ("over_centre", 0.4, 0.0, 0.0),
         ("over_centre", 0.8, 0.0, 2.0),
         ("magnetic_catch", -0.01, 0.0, -2.0),
-        ("magnetic_catch", 0.02, 0.0, -0.5 * math.exp(-4 / 81)),
-        ("magnetic_catch", 0.2, 0.0, -2 / 121 * math.exp(-400 / 81)),
+        ("magnetic_catch", 0.03, 0.0, -1.0 + 0.24 * math.exp(-(2.75**2))),
+        ("magnetic_catch", 0.14, 0.0, -2 / (1 + 196 / 9) + 0.24),
         ("closer", 0.5, 0.3, 0.0),
         ("closer", 0.5, -0.3, 2.0),
         ("closer", 0.5, -0.6, 2.0 * 3.031433),
@@ -316,7 +316,7 @@ def test_hinge_friction_by_hand(scene: Scene, name: str, q: float, expected: flo
 
 @pytest.mark.parametrize("start", [0.0, 0.35])
 def test_the_tilted_frame_is_gravity_turned(scene: Scene, start: float):
-    """Against MuJoCo's own gravity, turned by hand, for the flap alone."""
+    """Against MuJoCo's own gravity, turned by hand, for the flap alone, on hinges that are not in line."""
     influence, lean = made(scene, "tilted_frame", 0.12), 0.12
     live = live_at(scene, (start, 0, 0))
     assert influence.begin
@@ -325,6 +325,7 @@ def test_the_tilted_frame_is_gravity_turned(scene: Scene, start: float):
     turn, quaternion = np.zeros(3), np.zeros(4)
     mujoco.mju_axisAngle2Quat(quaternion, line, lean)
     mujoco.mju_rotVecQuat(turn, np.array([0.0, 0.0, -9.81]), quaternion)
+    size = np.hypot(*hidden_door.lean_torque(live.model, live.data, scene.id("joint", "flap"), lean))
     for q in (0.0, 0.4, 0.9):
         live.position[0] = q
         live.applied[:] = 0
@@ -332,7 +333,8 @@ def test_the_tilted_frame_is_gravity_turned(scene: Scene, start: float):
         leaning = live_at(scene, (q, 0, 0))
         leaning.model.opt.gravity[:] = turn
         mujoco.mj_forward(leaning.model, leaning.data)
-        assert live.applied[0] == pytest.approx(-leaning.data.qfrc_bias[0], rel=1e-9)
+        bent = 0.25 * size * math.sin(3 * (q - start))
+        assert live.applied[0] - bent == pytest.approx(-leaning.data.qfrc_bias[0], rel=1e-9)
         assert abs(live.applied[0]) > 0.05
 
 
@@ -360,7 +362,7 @@ def test_the_closer_changes_nothing_before_the_door_closes(scene: Scene, demonst
 
 def test_friction_losses_by_hand():
     v = np.array([0.0, 0.04, -0.08])
-    np.testing.assert_allclose(hidden_friction.stribeck_loss(2.0, v), [2, 2 / math.e, 2 / math.e**2])
+    np.testing.assert_allclose(hidden_friction.stribeck_loss(2.0, v), [2, 1, 0.4])
     np.testing.assert_allclose(hidden_friction.directional_loss(2.0, np.array([-1, 0, 0.01, 1])), [0, 1, 1.7615942, 2])
     q = np.array([-0.25, (math.pi / 2 - 0.5) / 2])
     np.testing.assert_allclose(hidden_friction.dry_loss(2.0, q), [2.0, 2.3])
@@ -458,8 +460,10 @@ def test_the_payload_is_a_body_welded_to_the_hand(scene: Scene):
 
 def test_cable_ripple_and_twist_by_hand(scene: Scene):
     np.testing.assert_allclose(
-        hidden_arm.cable(3.0, np.array([0.0, 1.0, -0.5])), [0, -3, 3 * (math.e - 1 / math.e) / (math.e**2 - math.e**-2)]
+        hidden_arm.cable(3.0, np.array([0.0, 1.0, -0.5]), np.zeros(3)),
+        [0, -3, 3 * (math.e - 1 / math.e) / (math.e**2 - math.e**-2)],
     )
+    np.testing.assert_allclose(hidden_arm.cable(3.0, np.ones(2), np.array([1.0, -1.0])), [-3.3, -2.7])
     applied, _, _ = stepped(made(scene, "cable_pull", 3.0, ARM), live_at(scene, (0.5, 1.0, 0.0)))
     np.testing.assert_allclose(applied, [0, -3, 0], atol=1e-12)
     panda, (low, high) = door_scene(), (-3.0718, -0.0698)  # joint 4
@@ -534,8 +538,8 @@ def test_signals_by_hand(scene: Scene):
         assert after.position is seen.position
         return after.torque[:, 1] - torque[:, 1]
 
-    np.testing.assert_allclose(sensed("torque_bias", 0.5), [0.6, 0.6])
-    np.testing.assert_allclose(sensed("torque_gain", 0.1), [-2 * math.tanh(1), 2 * math.tanh(2)])
+    np.testing.assert_allclose(sensed("torque_bias", 0.5), [0.75, 0.6])
+    np.testing.assert_allclose(sensed("torque_gain", 0.1), [0.4 - 2 * math.tanh(1), 0.8 + 2 * math.tanh(2)])
     np.testing.assert_allclose(sensed("torque_drift", 2.0), [0, 2 * (1 - 1 / math.e)])
     np.testing.assert_allclose(sensed("torque_drift", 2.0, repeat=6)[0], 2 * (1 - 1 / math.e))  # period 10 s
     assert torque[0, 1] == -20.0  # the input is left alone

@@ -31,6 +31,11 @@ def shape(name: str, unit: str, values: Sequence[float], low: float, high: float
     return Parameter(name, unit, ordered[len(ordered) // 2], (high - low) / 4, low, high, group=GROUP)
 
 
+def never_negative(friction: jax.Array, extra: jax.Array) -> jax.Array:
+    """Friction with something added or taken away, never below zero; one that is negative already stays as it is."""
+    return jnp.maximum(friction + extra, jnp.minimum(friction, 0.0))
+
+
 def arm(scene: Scene) -> tuple[str, ...]:
     """The measured joints but the object's own."""
     return tuple(j for j in scene.joints if j != scene.object_joint)

@@ -1,7 +1,5 @@
 """Dry friction of the hinge that changes as the door opens: a door that drags on the floor."""
 
-import jax.numpy as jnp
-
 from droid_jax.model.effects import amplitudes as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
@@ -21,7 +19,7 @@ def angle_friction(scene: Scene) -> Effect | None:
     def frictionloss(theta, state, base):
         phi = a.angle(scene, joint, state)
         extra = a.value(theta, SLOPE) * phi + a.value(theta, CURVE) * phi**2
-        return base.at[dof].set(jnp.maximum(base[dof] + extra, 0.0))
+        return base.at[dof].set(a.never_negative(base[dof], extra))
 
     return Effect(
         "angle_friction",

@@ -1,7 +1,5 @@
 """Dry friction that differs between the two directions: of the arm's joints, of the hinge."""
 
-import jax.numpy as jnp
-
 from droid_jax.model.effects import amplitudes as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
@@ -19,7 +17,7 @@ def joint_directional(scene: Scene) -> Effect | None:
 
     def frictionloss(theta, state, base):
         extra = column(theta, JOINT, joints) * a.direction(state.qvel[dofs])
-        return base.at[dofs].set(jnp.maximum(base[dofs] + extra, 0.0))
+        return base.at[dofs].set(a.never_negative(base[dofs], extra))
 
     return Effect(
         JOINT,
@@ -43,7 +41,7 @@ def hinge_directional(scene: Scene) -> Effect | None:
 
     def frictionloss(theta, state, base):
         extra = a.value(theta, HINGE) * a.direction(state.qvel[dof])
-        return base.at[dof].set(jnp.maximum(base[dof] + extra, 0.0))
+        return base.at[dof].set(a.never_negative(base[dof], extra))
 
     return Effect(
         HINGE,

@@ -1,0 +1,83 @@
+"""The trial of an effect: every reason against it, and none where it is right."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_gap import FLOOR, Small, small
+
+from droid_jax.gap.candidates import candidates
+from droid_jax.gap.refit import deviations, intervals, refit
+from droid_jax.gap.select import _gap_reasons, judge, one_sided_p
+
+
+@pytest.fixture(scope="module")
+def found() -> Small:
+    return small()
+
+
+def extended(found: Small, name: str):
+    """The base model with one effect, refitted."""
+    case = found.case
+    (part,) = [c for c in candidates(case.effects) if c.name == name][:1]
+    return refit(case.fit, case.base, (part,), found.base.values[None], case.config.refit)
+
+
+def tried(found: Small, model, **smallest: float):
+    case = found.case
+    whole = case.confirm.gap_at(found.base.values)
+    (trial,) = judge(case.fit, case.confirm, found.base, [model], {**case.smallest, **smallest}, whole, FLOOR)
+    return trial
+
+
+def test_the_missing_effect_passes(found: Small):
+    trial = tried(found, extended(found, "hinge_preload at door"))
+    assert trial.passed and trial.p < 0.01 and trial.chosen == 1.0 and trial.rivals == ()
+
+
+def test_an_effect_smaller_than_is_worth_a_name_is_weak(found: Small):
+    trial = tried(found, extended(found, "hinge_preload at door"), hinge_preload=9.0)
+    assert trial.reasons == ("too small to be worth a name",) and trial.weak
+
+
+def test_an_amplitude_at_its_neutral_bound_may_be_zero(found: Small):
+    """Its interval ends at the bound and so never holds zero inside: the deviation is asked."""
+    model = extended(found, "hinge_preload at door")
+    (name,) = model.amplitudes
+    at, deviation = found.case.whole.index(name), deviations(found.case.fit, model)[name]
+    low, high = intervals(found.case.fit, model)[name]
+    assert (high - low) / 2 == pytest.approx(1.645 * deviation, rel=0.01)  # no bound is near
+    for factor, zero in ((1.0, True), (2.5, False)):
+        values = model.values.copy()
+        values[at] = factor * deviation
+        assert ("its amplitude may be zero" in tried(found, replace(model, values=values)).reasons) is zero
+
+
+def test_an_amplitude_at_its_other_bound_has_run_into_it(found: Small):
+    model = extended(found, "hinge_preload at door")
+    (name,) = model.amplitudes
+    values = model.values.copy()
+    values[found.case.whole.index(name)] = found.case.whole[name].high
+    assert f"{name} ran into its bound" in tried(found, replace(model, values=values)).reasons
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "said"),
+    [
+        (1.0, 0.1, None),
+        (1.0, 1.1, "makes the gap on the other demonstration larger"),
+        (1.0, 0.9, "takes only 10% of the gap away on the other demonstration"),
+        (0.04, 0.001, "takes only 3.9% of the first gap away"),
+        (1.0, np.nan, "its replay of the other demonstration is no number"),
+        (0.005, 0.001, "the other demonstration shows no gap that it could take away"),
+        (-0.01, -0.012, "the other demonstration shows no gap that it could take away"),
+    ],
+)
+def test_reasons_of_the_gap(before: float, after: float, said: str | None):
+    assert _gap_reasons(before, after, 1.0, 0.2, 0.01) == ([] if said is None else [said])
+
+
+def test_gains_of_every_repeat_are_no_chance_and_of_half_of_them_are():
+    assert one_sided_p(np.full(10, 1.0)) < 0.01 < 0.3 < one_sided_p(np.array([1.0, -1.0] * 5))
