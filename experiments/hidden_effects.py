@@ -152,9 +152,14 @@ def run_make(command: Make) -> dict[str, Any]:
     commit = commit_of(command.commit)
     counts = QUICK if command.quick else command.counts
     effects = QUICK_EFFECTS if command.quick else command.effects
-    outcomes: dict[str, list[str]] = {}
+    path, made = command.out / "made.json", dict[str, dict[str, list[str]]]()
+    if path.is_file():
+        known_cases = json.loads(path.read_text())
+        if known_cases["commit"] != commit:
+            raise SystemExit(f"error: {command.out} holds cases of {known_cases['commit']}; choose another --out")
+        made = known_cases["scenes"]
     for name in ("hinge",) if command.quick else command.scenes:
-        where = setting(name, command.out / "door")
+        where, outcomes = setting(name, command.out / "door"), dict[str, list[str]]()
         for plan in plans(where, counts, commit, known.get(name, {})):
             if command.classes and plan.kind not in command.classes:
                 continue
@@ -165,8 +170,9 @@ def run_make(command: Make) -> dict[str, Any]:
             outcome = make(where, plan, commit, known.get(name, {}), command.out / "cases", command.out / "sealed")
             outcomes.setdefault(outcome, []).append(plan.name)
             _tell(f"{plan.name}: {outcome}")
-    write_json(command.out / "made.json", {"commit": commit, **outcomes})
-    return {outcome: len(names) for outcome, names in outcomes.items()}
+        made[name] = outcomes
+        write_json(path, {"commit": commit, "scenes": made})
+    return {scene: {outcome: len(names) for outcome, names in found.items()} for scene, found in made.items()}
 
 
 def run_search(command: Search) -> dict[str, Any]:

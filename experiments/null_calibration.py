@@ -33,8 +33,8 @@ from droid_jax.gap.workflow import ask, base_fit, find  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 from experiments.blind.cases import Plan  # noqa: E402
 from experiments.blind.draws import commit_of, seed_of  # noqa: E402
-from experiments.blind.make import ATTEMPTS, draw, record  # noqa: E402
-from experiments.blind.scenes import ROLES, setting  # noqa: E402
+from experiments.blind.make import recorded  # noqa: E402
+from experiments.blind.scenes import setting  # noqa: E402
 from experiments.blind.score import rate  # noqa: E402
 from experiments.blind.search import Bench, Stopwatch, silent  # noqa: E402
 
@@ -69,33 +69,21 @@ class Arguments:
 def run_case(plan: Plan, commit: str, bench: Bench) -> dict[str, Any]:
     """Screen one case; search it to the end where the screening rejects."""
     scene, where, watch = plan.scene, bench.setting(plan.scene), Stopwatch()
-    drawn, recordings = _recorded(bench, plan, commit, watch)
-    case = watch("prepare", lambda: bench.case(scene, recordings))
+    found = watch("record", lambda: recorded(where, plan, {}, seed_of(commit, plan.name)))
+    if isinstance(found, str):
+        raise ValueError(f"case {plan.name}: {found}")
+    recordings = found[2]
+    case = watch("prepare", lambda: bench.case(scene, {"fit": recordings["fit"]}))
     model = watch("base", lambda: base_fit(case, silent))
     screen = watch("screen", lambda: ask(case, model, questions_of(candidates(case.effects))))
     best = screen.questions[int(np.argmax(np.abs(screen.t)))].candidate.name
     result = {"scene": scene, "p": screen.p, "gap": model.gap, "converged": bool(model.refined.converged), "best": best}
     if screen.p < SIGNIFICANT:
         floor = watch("floor", lambda: bench.floor(scene, case, model, recordings["fit"]))
-        others = watch("record", lambda: record(where, drawn, ROLES[1:]))
-        whole = watch("prepare", lambda: bench.case(scene, {**recordings, **others}))
+        whole = watch("prepare", lambda: bench.case(scene, recordings))
         verdict = watch("find", lambda: find(whole, model, floor))
         result |= {"floor": floor, "verdict": verdict.kind.value, "effects": list(verdict.effects)}
     return {**result, "seed": seed_of(commit, plan.name), "seconds": watch.seconds}
-
-
-def _recorded(bench: Bench, plan: Plan, commit: str, watch: Stopwatch) -> tuple[Any, dict[str, Any]]:
-    """What was drawn, and the recording to fit; robots that lose their door are drawn again."""
-    where, seed = bench.setting(plan.scene), seed_of(commit, plan.name)
-    for attempt in range(ATTEMPTS):
-        drawn = draw(where, plan, {}, np.random.default_rng([seed, attempt]))
-        assert drawn is not None  # nothing is hidden, so nothing can be too large
-        try:
-            return drawn, watch("record", lambda d=drawn: record(where, d, ("fit",)))
-        except ValueError as error:
-            if "grasp" not in str(error):
-                raise
-    raise ValueError(f"case {plan.name}: no robot of {ATTEMPTS} kept hold of its door")
 
 
 def summarise(cases: list[dict[str, Any]]) -> dict[str, Any]:

@@ -18,9 +18,12 @@ def dry_loss(a: float, q: np.ndarray) -> np.ndarray:
     return a * (1.0 + 0.15 * np.sin(2.0 * q + 0.5))
 
 
-def stribeck_loss(a: float, v: np.ndarray) -> np.ndarray:
-    """a / (1 + (v / 0.04)²): what sticking adds to sliding, after Hess and Soom (1990), not Stribeck's Gauss."""
-    return a / (1.0 + (v / 0.04) ** 2)
+def stribeck_loss(a: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """a (1 + 0.15 sin(8 q)) / (1 + (v / 0.04)²): what sticking adds to sliding, more of it where teeth are worn.
+
+    After Hess and Soom (1990), not Stribeck's Gauss.
+    """
+    return a * (1.0 + 0.15 * np.sin(8.0 * q)) / (1.0 + (v / 0.04) ** 2)
 
 
 def directional_loss(a: float, v: np.ndarray) -> np.ndarray:
@@ -62,7 +65,7 @@ def dry_friction(place: Place, a: float) -> Influence:
 
 def stribeck_friction(place: Place, a: float) -> Influence:
     """Friction loss of `stribeck_loss`."""
-    return _friction(place, lambda live: stribeck_loss(a, live.velocity[place.dofs]))
+    return _friction(place, lambda live: stribeck_loss(a, live.position[place.qpos], live.velocity[place.dofs]))
 
 
 def directional_friction(place: Place, a: float) -> Influence:

@@ -10,6 +10,7 @@ from droid_jax.measure.hidden_hooks import Hidden, Influence, Place, Seen, lagge
 
 GAIN_KNEE = 20.0  # N m, where the torque sensor's wrong gain begins to level off
 DRIFT_TIME = 60.0  # s, a sensor warming up
+CREEP_TIME = 0.5  # s, a torque sensor's body
 SETTLING_TIME = 2.0  # s, a sensor that has just been loaded
 
 
@@ -51,13 +52,14 @@ def torque_bias(place: Place, a: float) -> Influence:
 
 
 def torque_gain(place: Place, a: float) -> Influence:
-    """torque + a (t tanh(torque / t) + 0.2 |torque|), t = 20 N m: a wrong gain that levels off, and is steeper one way.
+    """torque + a (0.7 x + 0.3 y), x = t tanh(torque / t), t = 20 N m: a wrong gain that levels off.
 
-    a without unit.
+    y is x behind a first-order lag of 0.5 s, what the sensor's body creeps; a without unit.
     """
 
     def gained(seen: Seen, torque: np.ndarray, _: np.ndarray) -> np.ndarray:
-        return torque + a * (GAIN_KNEE * np.tanh(torque / GAIN_KNEE) + 0.2 * np.abs(torque))
+        level = GAIN_KNEE * np.tanh(torque / GAIN_KNEE)
+        return torque + a * (0.7 * level + 0.3 * lagged(level, seen.clock, 0.0, CREEP_TIME))
 
     return _on_torque(place, gained)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -43,21 +43,30 @@ def make(setting: Setting, plan: Plan, commit: str, limits: Limits, cases: Path,
     if (cases / folder).is_dir() and (sealed / f"{folder}.json").is_file():
         return "there"
     seed = seed_of(commit, plan.name)
+    found = recorded(setting, plan, limits, seed)
+    if isinstance(found, str):
+        return found
+    attempt, drawn, recordings = found
+    left_out = without(setting.scene, drawn.hidden) if plan.kind == "left_out" else ()
+    origin = {"without": left_out, "commit": commit, "seed": seed, "attempt": attempt}
+    write_json(sealed / f"{folder}.json", {**asdict(plan), **_plain(drawn), **origin})
+    write_case(cases / folder, setting.name, left_out, recordings)
+    return "made"
+
+
+def recorded(
+    setting: Setting, plan: Plan, limits: Limits, seed: int
+) -> tuple[int, Drawn, dict[str, Recording]] | Literal["not possible", "never held its door"]:
+    """The first robot drawn that keeps hold of its door in all motions: number of the attempt, robot, recordings."""
     for attempt in range(ATTEMPTS):
         drawn = draw(setting, plan, limits, np.random.default_rng([seed, attempt]))
         if drawn is None:
             return "not possible"
         try:
-            recordings = record(setting, drawn)
+            return attempt, drawn, record(setting, drawn)
         except ValueError as error:  # this robot loses its door: a demonstration is safe by definition
             if "grasp" not in str(error) and "unstable" not in str(error):
                 raise
-            continue
-        left_out = without(setting.scene, drawn.hidden) if plan.kind == "left_out" else ()
-        origin = {"without": left_out, "commit": commit, "seed": seed, "attempt": attempt}
-        write_json(sealed / f"{folder}.json", {**asdict(plan), **_plain(drawn), **origin})
-        write_case(cases / folder, setting.name, left_out, recordings)
-        return "made"
     return "never held its door"
 
 

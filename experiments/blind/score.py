@@ -192,11 +192,11 @@ def summarise(judged: Sequence[dict[str, Any]]) -> dict[str, Any]:
     strange = [c for c in judged if c["class"] in ("outside", "left_out")]
     named = [c for c in known if c["named"]]
     rates = {
-        "false_alarms": rate(none, lambda c: c["verdict"] != "none"),
+        "false_alarm_rate": rate(none, lambda c: c["verdict"] != "none"),
         "false_names_where_nothing": rate(none, lambda c: bool(c["effects"])),
-        "wrong_confident": rate([*single, *pair, *strange], lambda c: c["wrong_confident"]),
+        "wrong_name_rate": rate([*single, *pair, *strange], lambda c: c["wrong_confident"]),
         "false_names": rate([*single, *pair, *strange], lambda c: bool(c["false_names"])),
-        "detected": rate(known, lambda c: c["verdict"] != "none"),
+        "detected": rate(known, lambda c: c["verdict"] in (*NAMING, "unexplained")),
         "named_up_to_tie": rate(single, lambda c: c["named"]),
         "named_exactly": rate(single, lambda c: c["exact"]),
         "nameable": rate([c for c in known if c["reachable"] is not None], lambda c: c["reachable"] >= NAMEABLE),
@@ -204,13 +204,14 @@ def summarise(judged: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "nameable_named_exactly": rate(alone, lambda c: c["exact"]),
         "nameable_pair_one_named_none_false": rate(both, lambda c: any(c["met"]) and not c["false_names"]),
         "nameable_pair_both_named": rate(both, lambda c: c["named"]),
+        "alternatives": _alternatives(named),
         "partly": rate(single, lambda c: c["verdict"] == "partly explained"),
         "pair_one_named_none_false": rate(pair, lambda c: any(c["met"]) and not c["false_names"]),
         "pair_both_named": rate(pair, lambda c: c["named"]),
-        "called_open": rate(strange, lambda c: c["open"]),
+        "unexplained_recall": rate(strange, lambda c: c["open"]),
         "unconverged_or_error": rate(judged, lambda c: c["verdict"] in ("fit not converged", "error")),
-        "closed_confirm": closing(named, "confirm"),
-        "closed_sealed": closing(named, "sealed"),
+        "gap_closed_confirm": closing(named, "confirm"),
+        "gap_closed": closing(named, "sealed"),
         "within_floor": rate(named, lambda c: bool(c["within_floor"])),
         **{
             f"amplitude_{key}": rate([{"inside": i} for c in named for i in c[key]], lambda c: c["inside"])
@@ -269,6 +270,12 @@ def confusion(judged: Sequence[dict[str, Any]]) -> dict[str, dict[str, int]]:
         said = " + ".join(sorted(e.split(" at ")[0] for e in case["effects"])) or f"({case['verdict']})"
         table.setdefault(f"{hidden}{' left out' if case['class'] == 'left_out' else ''}", Counter())[said] += 1
     return {hidden: dict(said.most_common()) for hidden, said in sorted(table.items())}
+
+
+def _alternatives(named: Sequence[dict[str, Any]]) -> dict[str, float] | None:
+    """How many names an answer gives for one effect, itself among them: a tie of everything names nothing."""
+    counts = [1 + len(ties) for c in named for ties in c["tied"]]
+    return {"median": float(np.median(counts)), "mean": float(np.mean(counts)), "most": max(counts)} if counts else None
 
 
 def _seconds(judged: Sequence[dict[str, Any]]) -> dict[str, float] | None:

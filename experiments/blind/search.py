@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from droid_jax import runtime
 from droid_jax.compare.cost import Cost
 from droid_jax.gap.case import Case, GapConfig, make_case
 from droid_jax.gap.evidence import Evidence, evidence
@@ -88,17 +89,21 @@ def search_case(folder: Path, bench: Bench) -> dict[str, Any]:
     told = json.loads((folder / "case.json").read_text())
     recordings = {role: load(folder / "recordings" / f"{role}.npz") for role in ROLES}
     watch = Stopwatch()
-    result: dict[str, Any] = {"scene": told["scene"], "without": told["without"]}
+    code = runtime.versions().get("git")
+    result: dict[str, Any] = {"scene": told["scene"], "without": told["without"], "code": code}
     try:
         case = watch("prepare", lambda: bench.case(told["scene"], recordings, told["without"]))
         model = watch("base", lambda: base_fit(case, silent))
         floor = watch("floor", lambda: bench.floor(told["scene"], case, model, recordings["fit"]))
         verdict = watch("find", lambda: find(case, model, floor))
-        result |= describe(case, verdict)
-        first = verdict.screens[0] if verdict.screens else None
-        result["baselines"] = watch("baselines", lambda: baselines(case, model, first, recordings))
     except (ValueError, ArithmeticError) as error:
-        result |= {"verdict": "error", "error": str(error)}
+        return {**result, "verdict": "error", "error": str(error), "seconds": watch.seconds}
+    result |= describe(case, verdict)
+    first = verdict.screens[0] if verdict.screens else None
+    try:
+        result["baselines"] = watch("baselines", lambda: baselines(case, model, first, recordings))
+    except (ValueError, ArithmeticError) as error:  # what they are compared with stands
+        result["baselines_failed"] = str(error)
     return {**result, "seconds": watch.seconds}
 
 

@@ -258,16 +258,17 @@ def test_rates_of_what_is_named():
         case("none", "named", [latch], []),
     )
     expected = {
-        "named_up_to_tie": (3, 5), "named_exactly": (1, 5), "partly": (1, 5), "wrong_confident": (3, 10),
-        "false_names": (4, 10), "pair_one_named_none_false": (2, 2), "pair_both_named": (1, 2), "called_open": (1, 3),
-        "false_alarms": (1, 2), "false_names_where_nothing": (1, 2), "detected": (7, 7),
+        "named_up_to_tie": (3, 5), "named_exactly": (1, 5), "partly": (1, 5), "wrong_name_rate": (3, 10),
+        "false_names": (4, 10), "pair_one_named_none_false": (2, 2), "pair_both_named": (1, 2),
+        "unexplained_recall": (1, 3),
+        "false_alarm_rate": (1, 2), "false_names_where_nothing": (1, 2), "detected": (7, 7),
     }  # fmt: skip
     for name, (hits, of) in expected.items():
         assert (found[name]["hits"], found[name]["of"]) == (hits, of), name
         low, high = found[name]["interval_95"]
         assert 0 <= low <= hits / of <= high <= 1
-    assert found["closed_confirm"]["median"] == pytest.approx(0.9)
-    assert found["closed_sealed"]["median"] == pytest.approx(0.95)
+    assert found["gap_closed_confirm"]["median"] == pytest.approx(0.9)
+    assert found["gap_closed"]["median"] == pytest.approx(0.95)
     assert found["within_floor"]["rate"] == 1.0 and found["seconds"]["whole"] == 5.0
 
 

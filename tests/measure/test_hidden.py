@@ -362,7 +362,8 @@ def test_the_closer_changes_nothing_before_the_door_closes(scene: Scene, demonst
 
 def test_friction_losses_by_hand():
     v = np.array([0.0, 0.04, -0.08])
-    np.testing.assert_allclose(hidden_friction.stribeck_loss(2.0, v), [2, 1, 0.4])
+    np.testing.assert_allclose(hidden_friction.stribeck_loss(2.0, np.zeros(3), v), [2, 1, 0.4])
+    assert hidden_friction.stribeck_loss(2.0, np.pi / 16, 0.0) == pytest.approx(2.3)  # type: ignore[arg-type]
     np.testing.assert_allclose(hidden_friction.directional_loss(2.0, np.array([-1, 0, 0.01, 1])), [0, 1, 1.7615942, 2])
     q = np.array([-0.25, (math.pi / 2 - 0.5) / 2])
     np.testing.assert_allclose(hidden_friction.dry_loss(2.0, q), [2.0, 2.3])
@@ -539,7 +540,11 @@ def test_signals_by_hand(scene: Scene):
         return after.torque[:, 1] - torque[:, 1]
 
     np.testing.assert_allclose(sensed("torque_bias", 0.5), [0.75, 0.6])
-    np.testing.assert_allclose(sensed("torque_gain", 0.1), [0.4 - 2 * math.tanh(1), 0.8 + 2 * math.tanh(2)])
+    first, last = -2 * math.tanh(1), 2 * math.tanh(2)  # 60 s apart: the creep has settled
+    np.testing.assert_allclose(sensed("torque_gain", 0.1), [first, last])
+    close = replace(seen, clock=np.array([0.0, 0.5]))
+    crept = made(scene, "torque_gain", 0.1, ("shoulder",)).sense(close).torque[1, 1] - 40.0  # type: ignore[misc]
+    assert crept == pytest.approx(0.7 * last + 0.3 * (first / math.e + last * (1 - 1 / math.e)))
     np.testing.assert_allclose(sensed("torque_drift", 2.0), [0, 2 * (1 - 1 / math.e)])
     np.testing.assert_allclose(sensed("torque_drift", 2.0, repeat=6)[0], 2 * (1 - 1 / math.e))  # period 10 s
     assert torque[0, 1] == -20.0  # the input is left alone
