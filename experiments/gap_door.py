@@ -38,6 +38,7 @@ from gap_single import (
     as_known,
     false_alarms,
     make_search,
+    names_one_of,
     report,
     run_search,
     settings,
@@ -173,7 +174,7 @@ def main(config: GapDoor) -> None:
             "held_out_30_percent_better": tangential[JUDGE]["less"] >= 0.3,
             "tie_with_a_spring": found["verdict"] == "tie" and any(n in SPRINGS for n in named),
             "not_named_again": silent_about(again, [e.name for e in springs]),
-            "added_found": {effect: not silent_about(a, [effect]) for effect, a in added.items()},
+            "added_found": {effect: names_one_of(a, [effect]) for effect, a in added.items()},
         },
     }
     write_json(config.out / "gap_door.json", result, indent=2)

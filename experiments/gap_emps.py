@@ -27,6 +27,7 @@ from gap_single import (
     as_known,
     false_alarms,
     make_search,
+    names_one_of,
     report,
     run_search,
     settings,
@@ -175,7 +176,7 @@ def main(config: GapEmps) -> None:
             "dry_friction_not_named_again": silent_about(found["dry"], DRY),
             "asymmetry_named_by_library": "joint_directional at slide" in found["dry"]["effects"],
             "asymmetry_named_by_own_effect": "uneven_damping at slide" in found["dry, own effect"]["effects"],
-            "added_found": {effect: not silent_about(a, [effect]) for effect, a in added.items()},
+            "added_found": {effect: names_one_of(a, [effect]) for effect, a in added.items()},
         },
     }
     write_json(config.out / "gap_emps.json", result, indent=2)

@@ -131,6 +131,26 @@ def test_a_door_that_never_opens(place: Path, refused):
     assert "the object joint 'door' moves by 0.0" in said and "record a motion that opens it" in said
 
 
+def test_one_repeat_that_missed_its_grasp(place: Path, refused):
+    def missed(values: np.ndarray) -> np.ndarray:
+        values[4] *= 0.1
+        return values
+
+    save(changed(record("confirm"), "object_angle", missed), place / "confirm.npz")
+    said = refused(arguments(place))
+    assert "in repeat 4 the object joint 'door' moves by 0.0" in said and "leave that repeat away" in said
+
+
+def test_a_sensor_that_is_dead_in_one_repeat(place: Path, refused):
+    def dead(values: np.ndarray) -> np.ndarray:
+        values[2, :, 1] = 0.25
+        return values
+
+    save(changed(record("fit"), "torque", dead), place / "fit.npz")
+    said = refused(arguments(place))
+    assert "never changes in repeat 2 (0.25 N m)" in said and "leave that repeat away" in said
+
+
 def test_a_dead_sensor(place: Path, refused):
     def dead(values: np.ndarray) -> np.ndarray:
         values[..., 1] = 1.5

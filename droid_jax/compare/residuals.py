@@ -289,11 +289,13 @@ def _same_filter(kernel: np.ndarray, mask: np.ndarray, kept: np.ndarray) -> np.n
 
 def _refuse_constant(channel: Channel) -> None:
     for c, column in enumerate(channel.columns):
-        measured = channel.values[:, :, c][channel.mask[:, :, c]]
-        if measured.size and np.ptp(measured) == 0:
+        repeats = [values[mask] for values, mask in zip(channel.values[:, :, c], channel.mask[:, :, c], strict=True)]
+        still = [k for k, values in enumerate(repeats) if values.size and np.ptp(values) == 0]
+        if still:
+            where = "" if len(still) == len(repeats) else f" in repeat {still[0]}"
             raise ValueError(
-                f"channel {channel.name!r}, column {column!r} never changes ({measured[0]:g} {channel.unit}): "
-                "a dead sensor? mask it out or leave the column away"
+                f"channel {channel.name!r}, column {column!r} never changes{where} ({repeats[still[0]][0]:g} "
+                f"{channel.unit}): a dead sensor? mask it out or leave {'that repeat' if where else 'the column'} away"
             )
 
 

@@ -11,6 +11,7 @@ from droid_jax.model.scene import Scene
 
 STILL = 0.01  # rad or m: a robot whose joints all move less stood still
 SHUT = 0.05  # rad or m: the same for the thing that is moved, whose camera is noisy
+MISSED = 0.5  # of the usual travel: a repeat that moves the object by less has missed its grasp
 APART = 0.05  # s: repeats that are further apart in time were not cut alike
 
 
@@ -45,24 +46,36 @@ def _check_moves(recording: Recording, where: str) -> None:
 
 
 def _check_object(scene: Scene, recording: Recording, where: str) -> None:
-    travel = None if scene.object_joint is None else _travel(recording, scene.object_joint)
-    if travel is not None and travel < SHUT:
+    each = None if scene.object_joint is None else _travels(recording, scene.object_joint)
+    if each is None:
+        return
+    usual, least = float(np.median(each)), int(np.argmin(each))
+    if usual < SHUT:
         raise ValueError(
-            f"{where}: the object joint {scene.object_joint!r} moves by {travel:.2g} only (at least {SHUT:g} is "
+            f"{where}: the object joint {scene.object_joint!r} moves by {usual:.2g} only (at least {SHUT:g} is "
             "needed), so nothing about it can be told; record a motion that opens it"
+        )
+    if each[least] < MISSED * usual:
+        raise ValueError(
+            f"{where}: in repeat {least} the object joint {scene.object_joint!r} moves by {each[least]:.2g}, in most "
+            f"repeats by {usual:.2g}; leave that repeat away if the grasp was missed"
         )
 
 
-def _travel(recording: Recording, joint: str) -> float | None:
-    """How far the object's joint moves, rad or m; None where nothing measured it."""
-    if "object_angle" in recording.channels:
-        trace = _mean(recording.channels["object_angle"])[:, 0]
-    elif "position" in recording.channels and joint in recording.channels["position"].columns:
-        channel = recording.channels["position"]
-        trace = _mean(channel)[:, channel.columns.index(joint)]
-    else:
+def _travels(recording: Recording, joint: str) -> np.ndarray | None:
+    """[N] how far the object's joint moves in each repeat, rad or m; None where nothing measured it."""
+    name = "object_angle" if "object_angle" in recording.channels else "position"
+    if name not in recording.channels:
         return None
-    return float(np.subtract(*np.quantile(trace, [0.99, 0.01])))
+    channel = recording.channels[name]
+    if name == "position" and joint not in channel.columns:
+        return None
+    column = 0 if name == "object_angle" else channel.columns.index(joint)
+    values = np.where(channel.mask, channel.values, np.nan)[:, :, column]
+    values = values[~np.isnan(values).all(axis=1)]  # what was not measured in a repeat is no missed grasp
+    if not len(values):
+        return None
+    return np.subtract(*np.nanquantile(values, [0.99, 0.01], axis=1))
 
 
 def _check_timing(recording: Recording, where: str) -> None:

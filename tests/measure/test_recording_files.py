@@ -161,7 +161,7 @@ def test_bags_without_the_package_say_what_to_install(tmp_path: Path, monkeypatc
     for name in ("rosbags", "rosbags.highlevel"):
         monkeypatch.setitem(sys.modules, name, None)
     (tmp_path / "a.bag").write_text("x")
-    with pytest.raises(ImportError, match=r"a\.bag: reading ROS bags needs .* pip install droid_jax\[ros\]"):
+    with pytest.raises(ImportError, match=r"a\.bag: reading ROS bags needs .* pip install rosbags"):
         load(tmp_path / "a.bag", joints=JOINTS, torque=make().torque)
 
 
