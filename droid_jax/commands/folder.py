@@ -30,15 +30,10 @@ def _plain(value: Any) -> Any:
 
 def fingerprints(scene: Scene, space: Space, recordings: Iterable[Recording]) -> dict[str, Any]:
     """Hashes of what a run's files say, for its setup: it does not go on with changed ones."""
-    import mujoco
-    import numpy as np
-
     from droid_jax.identify.gaussian import space_to_json
 
-    model = np.empty(mujoco.mj_sizeModel(scene.model), np.uint8)
-    mujoco.mj_saveModel(scene.model, None, model)
     return {
-        "scene_sha256": hashlib.sha256(model.tobytes()).hexdigest(),
+        "scene_sha256": scene.sha256,
         "parameters_sha256": hashlib.sha256(json.dumps(space_to_json(space)).encode()).hexdigest(),
         "recordings_sha256": [recording.sha256 for recording in recordings],
     }

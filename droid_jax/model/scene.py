@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import hashlib
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -112,6 +113,13 @@ class Scene:
 
         with jax.ensure_compile_time_eval():  # else a first use inside jit would keep that trace's values
             return mjx.put_model(self.model)
+
+    @functools.cached_property
+    def sha256(self) -> str:
+        """Hash of the compiled model."""
+        model = np.empty(mujoco.mj_sizeModel(self.model), np.uint8)
+        mujoco.mj_saveModel(self.model, None, model)
+        return hashlib.sha256(model.tobytes()).hexdigest()
 
     def visual_model(self) -> mujoco.MjModel:
         """The same scene with its looks, for rendering."""

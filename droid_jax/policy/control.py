@@ -30,6 +30,11 @@ LAYOUT = (
       for axis in "xyz"),
 )  # fmt: skip
 OBSERVED, ACTIONS = len(LAYOUT), ARM + FINGERS
+SHAPES: dict[str, tuple[int, ...]] = {  # of an `Interface`
+    "period": (), "reach": (), "width": (), "ranges": (ARM, 2), "speed": (ARM,), "effort": (ARM,),
+    "stiffness": (ARM,), "damping": (ARM,), "workspace": (2, 3), "chain": (ARM + 1, 4, 4), "pads": (FINGERS, 3),
+    "slides": (FINGERS, 3), "start": (ARM + FINGERS,), "knob": (4, 4),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,12 +115,29 @@ def load(path: str | Path) -> Policy:
     lacking = [n for n in ("mean", "std", "weight_0", *names, *(f.name for f in fields(Interface))) if n not in found]
     if lacking:
         raise ValueError(f"{path} lacks {', '.join(lacking)}")
-    broken = [n for n in ("mean", "std", *names) if not np.isfinite(found[n]).all()]
+    numeric = ("mean", "std", *names, *(f.name for f in fields(Interface)))
+    broken = [n for n in numeric if found[n].dtype.kind not in "fiu" or not np.isfinite(found[n]).all()]
     if broken:
         raise ValueError(f"{path}: {', '.join(broken)} hold values that are no numbers; train again")
+    wrong = _misshapen(found, len(layers))
+    if wrong:
+        raise ValueError(f"{path} is damaged: {wrong}; train or export again")
     weights, biases = (tuple(found[f"{kind}_{k}"] for k in layers) for kind in ("weight", "bias"))
     interface: Any = {f.name: found[f.name] if found[f.name].ndim else float(found[f.name]) for f in fields(Interface)}
     return Policy(found["mean"], found["std"], weights, biases, Interface(**interface))
+
+
+def _misshapen(found: Mapping[str, np.ndarray], layers: int) -> str | None:
+    """The first array of a policy's file that does not fit to the others, in words."""
+    inner = [found[f"bias_{k}"].size for k in range(layers - 1)]
+    sizes = [OBSERVED, *inner, 2 * ACTIONS]
+    expected: dict[str, tuple[int, ...]] = {"mean": (OBSERVED,), "std": (OBSERVED,), **SHAPES}
+    for k in range(layers):
+        expected |= {f"weight_{k}": (sizes[k], sizes[k + 1]), f"bias_{k}": (sizes[k + 1],)}
+    for name, shape in expected.items():
+        if found[name].shape != shape:
+            return f"{name} has shape {found[name].shape}, expected {shape}"
+    return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,13 +188,14 @@ def observe(interface: Interface, reading: Reading) -> np.ndarray:
 class Safety:
     """When the loop stops.
 
-    late: share of the period by which a reading may come late.  speed, effort: shares of the arm's limits that
-    measured velocities and torques may reach.  margin: rad that targets keep from the ends of the joints' ranges, and
-    by which a joint may be beyond them.  off, turned: m and rad by which the knob may be away from where it was in
-    training when the loop begins.
+    late, early: shares of the period by which a reading may come late or early.  speed, effort: shares of the arm's
+    limits that measured velocities and torques may reach.  margin: rad that targets keep from the ends of the joints'
+    ranges, and by which a joint may be beyond them.  off, turned: m and rad by which the knob may be away from where
+    it was in training when the loop begins.
     """
 
     late: float = 0.5
+    early: float = 0.5
     speed: float = 1.0
     effort: float = 1.1
     margin: float = 0.02
@@ -185,9 +208,9 @@ class Controller:
 
     Targets stay inside the joints' ranges and so near to where the arm is that the spring torque of the servo,
     stiffness times distance, stays inside the joints' limits.  The loop stops, and from then on commands the pose of
-    the last good reading, when a reading is stale, late, of a wrong shape or no number, when a joint is beyond its
-    range, a measured velocity or torque beyond its limit, the hand outside the workspace, or the policy's action no
-    number; `stopped` says why.
+    the last good reading, when a reading is stale, late, early, of a wrong shape or no number, when a joint is beyond
+    its range, a measured velocity or torque beyond its limit, the hand outside the workspace, or the command no number;
+    `stopped` says why.
     """
 
     def __init__(self, policy: Policy, safety: Safety | None = None):
@@ -209,11 +232,11 @@ class Controller:
                 self.stopped = f"a reading that cannot be read: {error}"
         if self.stopped is None:
             action = self.policy.act(observe(self.policy.interface, reading))
-            if np.isfinite(action).all():
-                command = limited(self.policy.interface, self.safety, reading.position, np.clip(action, -1.0, 1.0))
+            command = limited(self.policy.interface, self.safety, reading.position, action)
+            if np.isfinite(command.arm).all() and np.isfinite(command.fingers).all():
                 self._held, self._time = Command(reading.position, command.fingers), reading.time
                 return command
-            self.stopped = "the policy's action holds a value that is no number"
+            self.stopped = "the policy's command holds a value that is no number"
         return self.hold()
 
     def hold(self) -> Command:
@@ -235,11 +258,15 @@ def _copied(reading: Reading) -> Reading:
     )
 
 
-def limited(interface: Interface, safety: Safety, position: np.ndarray, action: np.ndarray) -> Command:
-    """The command of an action [9] at joint positions [7], inside torques and ranges."""
+def limited(interface: Interface, safety: Safety, position: Any, action: Any, numbers: Any = np) -> Command:
+    """The command of an action [9] at joint positions [7], inside torques and ranges; numbers: numpy or jax.numpy.
+
+    Training commands by this too, so that a policy learns what the robot will do.
+    """
+    action = numbers.clip(action, -1.0, 1.0)
     near = interface.effort / interface.stiffness
     low, high = interface.ranges[:, 0] + safety.margin, interface.ranges[:, 1] - safety.margin
-    arm = np.clip(position + np.clip(interface.reach * action[:ARM], -near, near), low, high)
+    arm = numbers.clip(position + numbers.clip(interface.reach * action[:ARM], -near, near), low, high)
     return Command(arm, 0.5 * interface.width * (1.0 + action[ARM:]))
 
 
@@ -252,6 +279,8 @@ def fault(interface: Interface, safety: Safety, reading: Reading, before: float)
         return wrong
     if not np.isfinite(reading.time) or reading.time <= before:
         return f"stale reading: its time is {reading.time:g} s, that of the one before {before:g} s"
+    if reading.time - before < (1.0 - safety.early) * interface.period:
+        return f"early: {1e3 * (reading.time - before):.0f} ms between readings, expected {1e3 * interface.period:.0f}"
     if reading.time - before > (1.0 + safety.late) * interface.period and np.isfinite(before):
         return f"late: {1e3 * (reading.time - before):.0f} ms between readings, expected {1e3 * interface.period:.0f}"
     middle, half = interface.ranges.mean(axis=1), np.ptp(interface.ranges, axis=1) / 2 + safety.margin

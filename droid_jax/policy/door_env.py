@@ -19,11 +19,11 @@ from droid_jax.model.physics import Physics
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, State, Theta
 from droid_jax.model.step import step as simulate_step
-from droid_jax.policy.control import ACTIONS, OBSERVED
+from droid_jax.policy.control import ACTIONS, OBSERVED, Safety, limited
 from droid_jax.policy.hand import finger_forces, hand_of, looked
+from droid_jax.policy.interface import interface_of
 from droid_jax.policy.task import (
     Task,
-    command,
     gripped,
     holding,
     observation,
@@ -33,6 +33,7 @@ from droid_jax.policy.task import (
 )
 
 PAST = 4  # commands remembered: a delay of up to three times Task.control
+FAST = 100.0  # rad/s or m/s: ten times what arm, fingers and door ever do; beyond, the simulation has come apart
 
 
 class World(NamedTuple):
@@ -66,6 +67,7 @@ class DoorEnv(Env):
         self.scene, self.task, self.effects = ready(scene) if effects else scene, task or Task(), tuple(effects)
         self.sys = Physics(self.scene.mjx, {})
         self.start = start_pose(self.scene, self.task, plan)
+        self.interface = interface_of(self.scene, self.task, self.start, plan)
         self._hand, self._template = hand_of(self.scene), mjx.make_data(self.scene.mjx)
         self._timestep = float(self.scene.model.opt.timestep)
         self._substeps = round(self.task.control / self._timestep)
@@ -105,15 +107,17 @@ class DoorEnv(Env):
     def step(self, state: EnvState, action: jax.Array) -> EnvState:
         """One action: `Task.control` seconds of simulation.
 
-        An episode ends early where the simulation is no longer a number (counted in `blown_up`), and not with success:
-        an end is an end of rewards, and a policy would wait in front of it.  `success` is 1 in the step that earns it.
+        An episode ends early where the simulation is no longer one, its state no number or faster than `FAST`
+        (counted in `blown_up`; one such observation would spoil the running statistics that all are normalised with).
+        It does not end with success: an end is an end of rewards, and a policy would wait in front of it.  `success` is
+        1 in the step that earns it.
         """
         carried: Any = state.pipeline_state
         before: World = carried
-        target = command(self.task, before.qpos[self.scene.joint_qpos], action)
-        commands = jnp.concatenate([before.commands[1:], target[None]])
+        target = limited(self.interface, Safety(), before.qpos[self.scene.joint_qpos], action, jnp)
+        commands = jnp.concatenate([before.commands[1:], jnp.concatenate([target.arm, target.fingers])[None]])
         world, force = self._advance(self.sys, before._replace(commands=commands))
-        finite = jnp.all(jnp.isfinite(world.qpos)) & jnp.all(jnp.isfinite(world.qvel)) & jnp.all(jnp.isfinite(force))
+        finite = jnp.all(jnp.isfinite(world.qpos)) & jnp.all(jnp.abs(world.qvel) < FAST) & jnp.all(jnp.isfinite(force))
         world = jax.tree.map(lambda new, old: jnp.where(finite, new, old), world, before)
         force = jnp.where(finite, force, 0.0)
         seen = self._look(self.sys.model, world, force)

@@ -12,8 +12,6 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from droid_jax.policy.control import ARM
-
 
 @dataclass(frozen=True)
 class Task:
@@ -112,12 +110,6 @@ def reward(task: Task, seen: Seen) -> Any:
 def observation(position: Any, velocity: Any, seen: Seen, numbers: Any = jnp) -> Any:
     """[23] as `control.LAYOUT` says, from joint positions and velocities [7]; numbers: jax.numpy or numpy."""
     return numbers.concatenate([position, velocity, seen.pinch, seen.pads.reshape(-1)])
-
-
-def command(task: Task, position: Any, action: Any, numbers: Any = jnp) -> Any:
-    """[9] servo command, rad and m, of an action [9] in -1 .. 1 at joint positions [7]."""
-    action = numbers.clip(action, -1.0, 1.0)
-    return numbers.concatenate([position + task.reach * action[:ARM], 0.5 * task.width * (1.0 + action[ARM:])])
 
 
 def holding(task: Task, seen: Seen, before: Any) -> Any:

@@ -5,6 +5,7 @@ Paper, section IV-D: actor and critic of two hidden layers of 64, tanh, Adam wit
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import time
 import warnings
@@ -24,7 +25,7 @@ from brax.training.agents.ppo import train as ppo
 from droid_jax.identify.checkpoints import Checkpoints
 from droid_jax.policy.control import Policy
 from droid_jax.policy.door_env import DoorEnv
-from droid_jax.policy.interface import interface_of
+from droid_jax.policy.doors import wrapped
 from droid_jax.policy.network import layer_sizes, policy_of
 from droid_jax.policy.randomise import Randomise
 
@@ -74,7 +75,8 @@ class TrainProgress:
     """After each evaluation.
 
     step, of: actions; seconds: since training began, compilation included and pauses not; rate: actions per second
-    of the last part; reward: of an episode; success: share of episodes.
+    of the last part; reward: of an episode; success, blown_up: share of episodes, the latter of those that ended
+    because the simulation was no longer one.
     """
 
     step: int
@@ -83,6 +85,7 @@ class TrainProgress:
     rate: float
     reward: float
     success: float
+    blown_up: float = 0.0
 
     @property
     def left(self) -> float:
@@ -114,13 +117,14 @@ def train(
     """Train a policy on environments that `randomise` makes, all alike where it is None.
 
     checkpoints: folder where the networks are kept after every evaluation, and from which an interrupted run goes on
-    (with Adam's moments, doors and starts drawn anew); fingerprint: what else they belong to.
+    (with Adam's moments and starts drawn anew, and the same doors); fingerprint: what else they belong to.
     Raises ValueError for a checkpoint of another run or network, for settings that do not go together, for more devices
     than there are, and where no policy came of it that consists of numbers.
     """
     config = config or TrainConfig()
     config = replace(config, devices=_devices(config))
-    of = {"scene": env.scene.name, "effects": ", ".join(e.name for e in env.effects), "task": repr(asdict(env.task))}
+    scene = f"{env.scene.name}, {env.scene.sha256}, {env.start.tolist()}"
+    of = {"scene": scene, "effects": ", ".join(e.name for e in env.effects), "task": repr(asdict(env.task))}
     texts = {"config": repr(replace(config, steps=0, devices=None)), **of, **(fingerprint or {})}
     run = functools.partial(_brax, env, randomise, config)
     if checkpoints is None:
@@ -174,16 +178,20 @@ def _brax(
             rate=float(metrics.get("training/sps", 0.0)),
             reward=float(metrics["eval/episode_reward"]),
             success=float(metrics["eval/episode_success"]),
+            blown_up=float(metrics["eval/episode_blown_up"]),
         )
         progress(now)
-        if not step and history:
-            return  # where an earlier part ended
-        if latest is not None and _finite(latest) and (best is None or _rank(now) >= max(map(_rank, history))):
+        if not step:  # before the first update, or where an earlier part ended
+            if not history:
+                history.append(now)
+            return
+        if not _finite(latest):
+            raise _Diverged
+        if best is None or _rank(now) >= max(_rank(h) for h in history if h.step):
             best = latest
         history.append(now)
-        if best is not None:
-            rows = np.array([list(asdict(h).values()) for h in history], np.float64)
-            save(done + step, {"latest": to_tree(latest), "best": to_tree(best), "history": rows})
+        rows = np.array([list(asdict(h).values()) for h in history], np.float64)
+        save(done + step, {"latest": to_tree(latest), "best": to_tree(best), "history": rows})
 
     def keep(step: int, _: Any, params: Any) -> None:
         nonlocal latest
@@ -212,6 +220,7 @@ def _brax(
             num_eval_envs=config.eval_envs,
             deterministic_eval=True,
             randomization_fn=randomise,
+            wrap_env_fn=wrapped(randomise, config.devices or 1, config.seed),
             max_devices_per_host=config.devices,
             restore_params=restore,
             **hooks,
@@ -223,12 +232,16 @@ def _brax(
             blank = _blank(env, config)
             params, best = (from_tree(blank, tree[name]) for name in ("latest", "best"))
         if done < config.steps:
-            run(config.steps - done, params, progress_fn=tell, policy_params_fn=keep)
+            with contextlib.suppress(_Diverged):  # numbers that are none do not come back: the best so far stays
+                run(config.steps - done, params, progress_fn=tell, policy_params_fn=keep)
     if best is None:
         raise ValueError("training ended in numbers that are none: try another seed, or a smaller learning rate")
     normaliser, actor, _ = best
-    interface = interface_of(env.scene, env.task, env.start)
-    return Trained(policy_of(normaliser, actor, layer_sizes(config.hidden), interface), tuple(history))
+    return Trained(policy_of(normaliser, actor, layer_sizes(config.hidden), env.interface), tuple(history))
+
+
+class _Diverged(Exception):
+    """The networks are no numbers any more."""
 
 
 def _networks(config: TrainConfig) -> Callable[..., Any]:

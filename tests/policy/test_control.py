@@ -7,6 +7,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -19,7 +20,6 @@ from droid_jax.policy.hand import hand_of, looked
 from droid_jax.policy.interface import interface_of
 from droid_jax.policy.network import save_policy
 from droid_jax.policy.task import Task
-from droid_jax.policy.task import command as asked
 from droid_jax.policy.task import observation as trained_on
 
 TASK = Task()
@@ -85,13 +85,21 @@ def test_it_sees_what_training_saw(scene, start, interface):
         np.testing.assert_allclose(control.observe(interface, reading(scene, data)), expected, atol=1e-9)
 
 
-def test_inside_all_limits_it_commands_what_training_did(interface):
-    rng = np.random.default_rng(2)
+def test_inside_all_limits_an_action_reaches_from_where_the_joints_are(interface):
     gentle = replace(interface, effort=np.full(7, np.inf), ranges=np.tile([-np.inf, np.inf], (7, 1)))
+    action = np.array([1.0, -5.0, 0, 0, 0, 0, 0.5, -1.0, 3.0])
+    found = control.limited(gentle, Safety(), np.full(7, 0.5), action)
+    np.testing.assert_allclose(found.arm, [0.6, 0.4, 0.5, 0.5, 0.5, 0.5, 0.55], atol=1e-9)
+    np.testing.assert_allclose(found.fingers, [0.0, TASK.width], atol=1e-9)
+
+
+def test_training_commands_what_the_robot_will_do(interface):
+    rng = np.random.default_rng(2)
     for _ in range(20):
-        position, action = rng.normal(size=7), rng.uniform(-1, 1, 9)
-        found = control.limited(gentle, Safety(), position, action)
-        np.testing.assert_allclose(np.append(found.arm, found.fingers), asked(TASK, position, action, np), atol=1e-6)
+        position, action = rng.normal(size=7), rng.uniform(-1.5, 1.5, 9)
+        robot, training = (control.limited(interface, Safety(), position, action, numbers) for numbers in (np, jnp))
+        np.testing.assert_allclose(training.arm, robot.arm, atol=1e-6)
+        np.testing.assert_allclose(training.fingers, robot.fingers, atol=1e-6)
 
 
 def test_targets_keep_inside_torques_and_ranges(interface):
@@ -181,8 +189,40 @@ def test_a_policy_that_gives_no_numbers_is_stopped(policy, still):
     loop.act(still)
     loop.policy = replace(policy, biases=(policy.biases[0], np.full(2 * ACTIONS, np.nan)))
     held = loop.act(replace(still, time=0.02))
-    assert held.stopped == "the policy's action holds a value that is no number"
+    assert held.stopped == "the policy's command holds a value that is no number"
     np.testing.assert_array_equal(held.arm, still.position)
+
+
+def test_a_command_that_is_no_number_is_stopped(policy, still):
+    loop = Controller(policy)
+    loop.act(still)
+    loop.policy = replace(policy, interface=replace(policy.interface, width=np.nan))
+    held = loop.act(replace(still, time=0.02))
+    assert held.stopped == "the policy's command holds a value that is no number" and np.isfinite(held.fingers).all()
+
+
+def test_readings_that_come_too_fast_stop_it(policy, still):
+    loop = Controller(policy)
+    loop.act(still)
+    assert loop.act(replace(still, time=0.0001)).stopped == "early: 0 ms between readings, expected 20"
+    loop = Controller(policy)
+    loop.act(still)
+    assert loop.act(replace(still, time=0.011)).stopped is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"weight_0": np.zeros((20, 16))}, r"weight_0 has shape \(20, 16\), expected \(23, 16\)"),
+        ({"bias_1": np.zeros(9)}, r"bias_1 has shape \(9,\), expected \(18,\)"),
+        ({"effort": np.zeros(6)}, r"effort has shape \(6,\), expected \(7,\)"),
+        ({"effort": np.full(7, np.nan)}, "effort hold values that are no numbers"),
+    ],
+)
+def test_a_damaged_file_is_refused(policy, tmp_path: Path, changes, said: str):
+    np.savez(tmp_path / "policy.npz", **{**control.arrays(policy), **changes})
+    with pytest.raises(ValueError, match=said):
+        control.load(tmp_path / "policy.npz")
 
 
 def test_a_robot_without_torque_sensors_is_fine(policy, still):

@@ -10,10 +10,10 @@ from scripted import action, opening
 
 from droid_jax import runtime
 from droid_jax.model.door_scene import door_scene
-from droid_jax.policy.control import ACTIONS, OBSERVED
+from droid_jax.policy.control import ACTIONS, OBSERVED, Safety, limited
 from droid_jax.policy.door_env import DoorEnv
 from droid_jax.policy.hand import finger_forces_c, hand_of, looked
-from droid_jax.policy.task import Task, command
+from droid_jax.policy.task import Task
 
 TASK = Task()
 SECONDS, TO = 2.4, 0.5  # of the scripted opening, rad
@@ -59,7 +59,8 @@ def in_c(env: DoorEnv, script: np.ndarray, trained_on: dict[str, np.ndarray]) ->
     out, last = {"angle": [], "force": [], "yaw": [], "pads": []}, np.zeros((2, 3))
     for target in script:
         position = data.qpos[scene.joint_qpos]
-        data.ctrl[:] = np.asarray(command(TASK, position, action(TASK, position, target)))
+        asked = limited(env.interface, Safety(), position, action(TASK, position, target))
+        data.ctrl[:] = np.append(asked.arm, asked.fingers)
         for _ in range(round(TASK.control / 0.0005)):
             mujoco.mj_step(model, data)
         mujoco.mj_forward(model, data)
@@ -98,6 +99,21 @@ def test_sizes(env: DoorEnv):
     assert state.obs.shape == (env.observation_size,) == (OBSERVED,)
     assert env.action_size == ACTIONS == 9
     assert not np.allclose(state.obs, env.reset(jax.random.key(2)).obs)
+
+
+def test_a_simulation_that_comes_apart_ends_the_episode_and_is_counted(env: DoorEnv):
+    """Also where it is still a number: one such observation would spoil the normalisation of all."""
+    step = jax.jit(env.step, compiler_options=runtime.compiler_options())
+    start = env.reset(jax.random.key(0))
+    usual = step(start, np.zeros(9))
+    assert (float(usual.done), float(usual.metrics["blown_up"])) == (0.0, 0.0)
+    for speed in (1e6, np.nan):
+        world = start.pipeline_state
+        fast = start.replace(pipeline_state=world._replace(qvel=world.qvel.at[2].set(speed)))
+        after = step(fast, np.zeros(9))
+        assert (float(after.done), float(after.metrics["blown_up"]), float(after.reward)) == (1.0, 1.0, 0.0)
+        expected = fast.pipeline_state.qpos
+        np.testing.assert_array_equal(after.pipeline_state.qpos, expected)
 
 
 def test_a_time_step_that_does_not_fit_is_refused():

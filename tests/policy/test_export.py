@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from droid_jax.policy import control
-from droid_jax.policy.control import ACTIONS, LAYOUT, OBSERVED, Interface, Policy, load
+from droid_jax.policy.control import ACTIONS, LAYOUT, OBSERVED, SHAPES, Interface, Policy, load
 from droid_jax.policy.export import CLOSE, difference, export, to_onnx
 
 onnx = pytest.importorskip("onnx")
@@ -25,7 +25,7 @@ def policy() -> Policy:
     sizes = (OBSERVED, 64, 64, 2 * ACTIONS)
     weights = tuple(np.float32(rng.normal(size=s) / np.sqrt(s[0])) for s in itertools.pairwise(sizes))
     biases = tuple(np.float32(0.1 * rng.normal(size=s)) for s in sizes[1:])
-    blank = {f: np.zeros(1) for f in Interface.__dataclass_fields__}
+    blank = {name: np.zeros(shape) for name, shape in SHAPES.items()}
     interface = Interface(**{**blank, "period": 0.02, "reach": 0.1, "width": 0.04})  # type: ignore[arg-type]
     mean, std = np.float32(rng.normal(size=OBSERVED)), np.float32(rng.uniform(0.1, 2, OBSERVED))
     return Policy(mean, std, weights, biases, interface)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import jax
 import numpy as np
@@ -17,7 +18,7 @@ from droid_jax.policy.control import OBSERVED
 from droid_jax.policy.door_env import DoorEnv
 from droid_jax.policy.randomise import randomised
 from droid_jax.policy.task import Task
-from droid_jax.policy.train import TrainConfig, _devices, from_tree, put_replicated, replicated, to_tree, train
+from droid_jax.policy.train import TrainConfig, _brax, _devices, from_tree, put_replicated, replicated, to_tree, train
 
 SHORT = TrainConfig(
     steps=1024, envs=32, unroll=4, batch=8, minibatches=4, epochs=2, evaluations=3, eval_envs=4, hidden=(8, 8)
@@ -74,6 +75,47 @@ def test_devices_that_do_not_divide_are_left_out(monkeypatch: pytest.MonkeyPatch
     assert _devices(SHORT) == 4
     with pytest.raises(ValueError, match="32 environments do not divide among 5 devices"):
         _devices(replace(SHORT, devices=5))
+
+
+def played(monkeypatch: pytest.MonkeyPatch, *evaluations: tuple[int, float, float, float]) -> list[int]:
+    """brax's PPO replaced by evaluations (step, success, reward, a weight of the actor); which of them ran."""
+    from droid_jax.policy import train as module
+
+    ran = list[int]()
+
+    def ppo(progress_fn, policy_params_fn, **_):
+        for step, success, reward, weight in evaluations:
+            if step:  # brax hands the first parameters on after the first evaluation
+                policy_params_fn(step, None, ({"mean": np.zeros(2)}, {"w": np.full(2, weight)}, {"v": np.zeros(1)}))
+            ran.append(step)
+            names = ("eval/episode_success", "eval/episode_reward", "eval/episode_blown_up")
+            progress_fn(step, dict(zip(names, (success, reward, 0.25), strict=True)))
+
+    monkeypatch.setattr(module.ppo, "train", ppo)
+    monkeypatch.setattr(module, "policy_of", lambda normaliser, actor, sizes, interface: actor["w"][0])
+    return ran
+
+
+MADE_UP: Any = SimpleNamespace(task=SimpleNamespace(steps=10), interface=None)
+
+
+def test_the_best_policy_is_kept_and_the_untrained_one_is_no_rival(monkeypatch: pytest.MonkeyPatch):
+    """Success counts first, then reward; what was not trained yet had the highest reward of those without success."""
+    played(monkeypatch, (0, 0.0, 900.0, 0.0), (100, 0.0, 5.0, 1.0), (200, 0.0, 8.0, 2.0), (300, 0.0, 7.0, 3.0))
+    found = _brax(MADE_UP, None, SHORT, None, 0, lambda now: None, lambda step, tree: None)
+    assert found.policy == 2.0
+    assert [(now.step, now.blown_up) for now in found.history] == [(0, 0.25), (100, 0.25), (200, 0.25), (300, 0.25)]
+
+
+def test_networks_that_are_no_numbers_end_the_training_and_the_best_stays(monkeypatch: pytest.MonkeyPatch):
+    untrained, good, none = (0, 0.0, 0.0, 0.0), (100, 0.5, 5.0, 1.0), (200, 0.0, np.nan, np.nan)
+    ran = played(monkeypatch, untrained, good, none, (300, 1.0, 1.0, 3.0))
+    saved = list[int]()
+    found = _brax(MADE_UP, None, SHORT, None, 0, lambda now: None, lambda step, tree: saved.append(step))
+    assert found.policy == 1.0 and ran == [0, 100, 200] and saved == [100]
+    played(monkeypatch, untrained, none)
+    with pytest.raises(ValueError, match="ended in numbers that are none"):
+        _brax(MADE_UP, None, SHORT, None, 0, lambda now: None, lambda step, tree: None)
 
 
 @pytest.mark.slow
