@@ -1,6 +1,6 @@
 """Does it pay to find a missing effect?  Policies trained on the base fit, and on the extended model.
 
-    python experiments/hidden_effect_policy.py [--quick] [--out DIR] [--hide closer=3] [--seeds 5] [--trials 100]
+    python experiments/hidden_effect_policy.py [--quick] [--out DIR] [--hide magnetic_catch=5] [--seeds 5]
 
 The stand-in robot hides an effect.  It is recorded in three motions and searched once (`gap`); the verdict, right or
 wrong, is taken as it comes.  Then policies are trained on draws of the base model's Gaussian and on draws of the
@@ -47,11 +47,11 @@ from droid_jax.policy.randomise import randomised  # noqa: E402
 from droid_jax.policy.task import Task  # noqa: E402
 from droid_jax.policy.transfer import TransferConfig, stand_in  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
-from experiments.policies.cases import TIMESTEP, Options, run_all, tried  # noqa: E402
+from experiments.policies.cases import TIMESTEP, Case, Options, found_of, run_all, tried  # noqa: E402
 from experiments.policies.table import PLACES, apart, column  # noqa: E402
 
 MODELS = ("base", "extended")
-BASE = "base.json"
+BASE, SETUP = "base.json", "setup.json"
 SPRINGS, ROBOT = 0, 21  # the stand-in's column of Table I, and the seed of its hidden errors
 
 
@@ -59,7 +59,7 @@ SPRINGS, ROBOT = 0, 21  # the stand-in's column of Table I, and the seed of its 
 class Arguments(Options):
     """Options of the experiment."""
 
-    hide: tuple[str, ...] = ("closer=3",)
+    hide: tuple[str, ...] = ("magnetic_catch=5",)
     """What the stand-in robot hides, name=amplitude."""
     steps_allowed: int = 512
     """Actions of an episode."""
@@ -67,11 +67,13 @@ class Arguments(Options):
 
 def search(arguments: Arguments, folder: Path) -> dict[str, Any]:
     """The verdict on the robot that hides an effect; base.json and extended.json are in the folder then."""
+    asked = {"hide": list(arguments.hide), "springs": SPRINGS, "robot": ROBOT, "quick": arguments.quick}
+    known = json.loads((folder / SETUP).read_text()) if (folder / SETUP).is_file() else asked
+    if known != asked:
+        raise SystemExit(f"error: {folder} is of another robot: {known}, now {asked}; choose another --out")
+    write_json(folder / SETUP, asked)
     if (folder / "verdict.json").is_file():
-        known = json.loads((folder / "verdict.json").read_text())
-        if known["hidden"] != list(arguments.hide):
-            raise SystemExit(f"error: {folder} is of a robot that hides {known['hidden']}; choose another --out")
-        return known
+        return json.loads((folder / "verdict.json").read_text())
     scene = door_scene(timestep=TIMESTEP)
     base = door_space(scene) + door_nuisances(scene)
     roles = record_stand_in(scene, hidden_effects(arguments.hide, scene), folder, SPRINGS, ROBOT, again=False)
@@ -107,17 +109,22 @@ def case(model: str, seed: int, folder: Path, arguments: Arguments) -> dict[str,
     robot = stand_in(door_scene(limits=True), env.start, truth, hidden, task, config)
     doors_of = repr((arguments.hide, gaussian.mean.tolist(), gaussian.cov.tolist()))
     found = tried(folder / f"{model}_{seed}", env, randomised(env.scene, gaussian), robot, seed, budget, doors_of)
-    return {"model": model, **found}
+    return found
+
+
+def planned_case(model: str, seed: int, arguments: Arguments) -> Case:
+    """A policy of a model, and what its file must say."""
+    folder, budget = arguments.cases("hidden_effect"), arguments.budget
+    of = {"model": model, "seed": seed, "hide": list(arguments.hide), "budget": budget.to_json()}
+    return Case(folder / f"{model}_{seed}.json", functools.partial(case, model, seed, folder, arguments), of)
 
 
 def main() -> None:
     arguments = tyro.cli(Arguments, description=__doc__)
     cases = arguments.cases("hidden_effect")
-    planned = {
-        cases / f"{model}_{seed}.json": functools.partial(case, model, seed, cases, arguments)
-        for seed, model in itertools.product(arguments.policies, MODELS)
-    }
-    found = run_all(planned, arguments.budget, arguments.at_most)
+    planned = [planned_case(model, seed, arguments) for seed, model in itertools.product(arguments.policies, MODELS)]
+    run_all(planned, arguments.at_most)
+    found = found_of(planned)
     of = {model: [c for c in found if c["model"] == model] for model in MODELS}
     table = {model: {place: column(own, place) for place in PLACES} for model, own in of.items() if own}
     better = {}

@@ -10,7 +10,7 @@ Every policy is one JSON file under DIR/knob_cases and is not trained again.  DI
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ from droid_jax.policy.randomise import randomised  # noqa: E402
 from droid_jax.policy.task import Task  # noqa: E402
 from droid_jax.policy.transfer import TransferConfig, stand_in  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
-from experiments.policies.cases import TIMESTEP, Budget, Options, run_all, tried  # noqa: E402
+from experiments.policies.cases import TIMESTEP, Budget, Case, Options, found_of, run_all, tried  # noqa: E402
 from experiments.policies.robots import GAUSSIAN, fitted, truth_of  # noqa: E402
 from experiments.policies.settings import SETTINGS  # noqa: E402
 from experiments.policies.table import PLACES, column  # noqa: E402
@@ -57,18 +57,23 @@ def case(knob: int, seed: int, folder: Path, budget: Budget) -> dict[str, Any]:
     robot = stand_in(door_scene(limits=True, knob=knob), env.start, truth_of(setting), (), env.task, config)
     randomise = randomised(env.scene, fitted(setting, folder, budget.quick))
     doors_of = repr((knob, (folder / GAUSSIAN).read_text()))
-    return {"knob": knob, **tried(folder / f"knob{knob}_{seed}", env, randomise, robot, seed, budget, doors_of)}
+    return tried(folder / f"knob{knob}_{seed}", env, randomise, robot, seed, budget, doors_of)
+
+
+def planned_case(knob: int, seed: int, arguments: Arguments) -> Case:
+    """A policy of a place, and what its file must say."""
+    folder, budget = arguments.cases("knob"), arguments.budget
+    of = {"knob": knob, "seed": seed, "setting": asdict(SETTINGS["paper"]), "budget": budget.to_json()}
+    return Case(folder / f"knob{knob}_{seed}.json", functools.partial(case, knob, seed, folder, budget), of)
 
 
 def main() -> None:
     arguments = tyro.cli(Arguments, description=__doc__)
-    cases, budget = arguments.cases("knob"), arguments.budget
     knobs = arguments.knobs[-1:] if arguments.quick else arguments.knobs
-    planned = {
-        cases / f"knob{knob}_{seed}.json": functools.partial(case, knob, seed, cases, budget)
-        for seed, knob in itertools.product(arguments.policies, knobs)
-    }
-    found = run_all(planned, budget, arguments.at_most)
+    places = knobs if arguments.quick else range(len(LEVERS))
+    planned = [planned_case(knob, seed, arguments) for seed, knob in itertools.product(arguments.policies, places)]
+    run_all([c for c in planned if c.of["knob"] in knobs], arguments.at_most)
+    found = found_of(planned)
     table = {}
     for knob in sorted({c["knob"] for c in found}):
         own = [c for c in found if c["knob"] == knob]

@@ -5,14 +5,15 @@
 For each setting: the stand-in robot is recorded and fitted once; then policies are trained on draws of the prior, on
 the fitted mean alone and on draws of the fitted Gaussian, alike in everything else, and tried in simulation and on the
 stand-in robot.  Every policy is one JSON file under DIR/table2_cases and is not trained again: the experiment can be
-stopped and goes on where it was.  DIR/table2.json sums them up, with intervals by bootstrap over policies.
+stopped and goes on where it was.  DIR/table2.json sums up all that are there, with intervals by bootstrap over
+policies; table2.md is laid out as in the paper, table2.png is its histogram.
 docs/paper.md says what was fixed before the runs.
 """
 
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -36,13 +37,14 @@ from droid_jax.policy.door_env import DoorEnv  # noqa: E402
 from droid_jax.policy.randomise import Randomise, fixed, randomised  # noqa: E402
 from droid_jax.policy.task import Task  # noqa: E402
 from droid_jax.policy.transfer import TransferConfig, stand_in  # noqa: E402
-from droid_jax.storage import write_json  # noqa: E402
-from experiments.policies.cases import TIMESTEP, Budget, Options, run_all, tried  # noqa: E402
+from droid_jax.report.export import png_bytes  # noqa: E402
+from droid_jax.storage import write_bytes, write_json, write_text  # noqa: E402
+from experiments.policies.cases import TIMESTEP, Budget, Case, Options, found_of, run_all, tried  # noqa: E402
+from experiments.policies.figure import as_text, histograms  # noqa: E402
 from experiments.policies.robots import GAUSSIAN, fitted, truth_of  # noqa: E402
 from experiments.policies.settings import SETTINGS, Setting  # noqa: E402
-from experiments.policies.table import summed_up  # noqa: E402
+from experiments.policies.table import METHODS, summed_up  # noqa: E402
 
-METHODS = ("prior", "mean", "fitted")
 Method = Literal["prior", "mean", "fitted"]
 
 
@@ -62,7 +64,7 @@ def doors(method: Method, setting: Setting, folder: Path, quick: bool, env: Door
     if method == "prior":
         return randomised(scene, prior(door_space(scene)))
     gaussian = fitted(setting, folder, quick)
-    return fixed(scene, gaussian.space, gaussian.physical_mean) if method == "mean" else randomised(scene, gaussian)
+    return fixed(scene, gaussian.space, gaussian.centre) if method == "mean" else randomised(scene, gaussian)
 
 
 def case(method: Method, seed: int, setting: Setting, folder: Path, budget: Budget) -> dict[str, Any]:
@@ -73,7 +75,15 @@ def case(method: Method, seed: int, setting: Setting, folder: Path, budget: Budg
     randomise = doors(method, setting, folder, budget.quick, env)
     doors_of = repr((setting, (folder / GAUSSIAN).read_text() if method != "prior" else "prior"))
     found = tried(folder / f"{method}_{seed}", env, randomise, robot, seed, budget, doors_of)
-    return {"setting": setting.name, "method": method, **found}
+    return found
+
+
+def planned_case(method: Method, seed: int, setting: Setting, arguments: Arguments) -> Case:
+    """A policy of a method in a setting, and what its file must say."""
+    folder, budget = arguments.cases("table2") / setting.name, arguments.budget
+    of = {"setting": asdict(setting), "method": method, "seed": seed, "budget": budget.to_json()}
+    make = functools.partial(case, method, seed, setting, folder, budget)
+    return Case(folder / f"{method}_{seed}.json", make, of)
 
 
 def main() -> None:
@@ -81,14 +91,18 @@ def main() -> None:
     unknown = [name for name in arguments.settings if name not in SETTINGS]
     if unknown:
         raise SystemExit(f"error: unknown setting {unknown[0]!r}; valid: {', '.join(SETTINGS)}")
-    settings = {name: SETTINGS[name] for name in arguments.settings[: 1 if arguments.quick else None]}
-    cases, budget = arguments.cases("table2"), arguments.budget
-    planned = {
-        cases / name / f"{method}_{seed}.json": functools.partial(case, method, seed, setting, cases / name, budget)
-        for (name, setting), seed, method in itertools.product(settings.items(), arguments.policies, arguments.methods)
-    }
-    summary = summed_up(run_all(planned, budget, arguments.at_most), settings)
+    settings = list(SETTINGS)[:1] if arguments.quick else list(SETTINGS)
+    asked = {(s, m) for s in arguments.settings for m in arguments.methods}
+    planned = [
+        planned_case(method, seed, SETTINGS[name], arguments)
+        for name, seed, method in itertools.product(settings, arguments.policies, METHODS)
+    ]
+    now = [c for c in planned if (c.of["setting"]["name"], c.of["method"]) in asked]
+    run_all(now, arguments.at_most)
+    summary = summed_up(found_of(planned), settings)
     write_json(arguments.summary("table2"), {**summary, **origin(0)})
+    write_text(arguments.summary("table2", ".md"), as_text(summary))
+    write_bytes(arguments.summary("table2", ".png"), png_bytes(histograms(found_of(planned), settings)))
     print(json.dumps(summary["line"]))
 
 

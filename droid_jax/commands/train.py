@@ -133,7 +133,7 @@ def randomise(method: str, scene: Scene, gaussian: Gaussian) -> Randomise:
     from droid_jax.policy.randomise import fixed, randomised
 
     if method == "mean":
-        return fixed(scene, gaussian.space, gaussian.physical_mean)
+        return fixed(scene, gaussian.space, gaussian.centre)
     return randomised(scene, gaussian)
 
 

@@ -135,6 +135,16 @@ class Gaussian:
         low, high = self.quantiles([(1 - level) / 2, (1 + level) / 2])
         return low, high
 
+    @property
+    def centre(self) -> np.ndarray:
+        """[D] the mean in physical units, inside the bounds: of a parameter in log coordinates its median.
+
+        What a fit found.  `physical_mean` is larger where a parameter in log coordinates is not told: 5.9 times for
+        the hinge stiffness of `door_space`'s prior.
+        """
+        values = self.space.from_search(self.mean) if self.coordinates == "search" else self.mean
+        return np.clip(values, self.space.low, self.space.high)
+
     @cached_property
     def physical_mean(self) -> np.ndarray:
         """[D] marginal means in physical units, over a fixed grid of equal-probability quantiles."""

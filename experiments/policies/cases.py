@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from benchmarks.common import origin
 from droid_jax.policy.door_env import DoorEnv
@@ -47,11 +48,15 @@ class Options:
     @property
     def policies(self) -> range:
         """Seeds of the policies."""
+        if self.seeds < 1:
+            raise SystemExit(f"error: --seeds must be 1 or more, got {self.seeds}")
         return range(self.first, self.first + (1 if self.quick else self.seeds))
 
     @property
     def budget(self) -> Budget:
         """What a policy costs."""
+        if self.trials < 1:
+            raise SystemExit(f"error: --trials must be 1 or more, got {self.trials}")
         config = PRESETS[self.preset] if self.steps is None else replace(PRESETS[self.preset], steps=self.steps)
         if not self.quick:
             return Budget(config, self.trials)
@@ -62,9 +67,10 @@ class Options:
         """Folder of the cases."""
         return self.out / f"{name}_cases{'_quick' if self.quick else ''}"
 
-    def summary(self, name: str) -> Path:
-        """File of the summary."""
-        return self.out / f"{name}{'_quick' if self.quick else ''}.json"
+    def summary(self, name: str, kind: str = ".json") -> Path:
+        """File of the summary; that of pilots has a name of its own."""
+        pilot = f"_from_{self.first}" if self.first else ""
+        return self.out / f"{name}{pilot}{'_quick' if self.quick else ''}{kind}"
 
 
 @dataclass(frozen=True)
@@ -92,31 +98,50 @@ def tried(
 
     origin_of: what the doors that it is trained on are made of, in words; checkpoints of others are refused.
     """
-    config = replace(budget.config, seed=seed)
+    config, code = replace(budget.config, seed=seed), origin(seed)  # of now: hours later the commit may be another
     found = train(env, randomise, config, checkpoints=place / "checkpoints", fingerprint={"doors": origin_of})
     save_policy(place / "policy.npz", found.policy)
     return {
-        "seed": seed,
-        "budget": budget.to_json(),
+        "doors_sha256": hashlib.sha256(origin_of.encode()).hexdigest(),
         "simulation": simulated(found.policy, env, randomise, budget.trials, seed).to_json(),
         "stand_in": transfer(found.policy, robot).to_json(),
         "history": [asdict(now) for now in found.history],
-        **origin(seed),
+        **code,
     }
 
 
-def run_all(cases: Mapping[Path, Callable[[], dict[str, Any]]], budget: Budget, at_most: int) -> list[dict[str, Any]]:
-    """Run what has no file yet, write it, and say what came of it; all of these cases that there are.
+class Case(NamedTuple):
+    """A policy's file, what makes its content, and what the file must say of it to count as done (plain data)."""
 
-    Raises ValueError for a file that was made with another budget.
+    path: Path
+    make: Callable[[], dict[str, Any]]
+    of: Mapping[str, Any]
+
+
+def run_all(cases: Sequence[Case], at_most: int) -> None:
+    """Make what has no file yet, and say what came of it.
+
+    Ends the program, before anything is made, where a file is there that was made with something else.
     """
-    for path, make in [(p, m) for p, m in cases.items() if not p.is_file()][:at_most]:
-        result = make()
-        write_json(path, result)
+    found_of(cases)
+    for case in [c for c in cases if not c.path.is_file()][:at_most]:
+        result = case.make()
+        write_json(case.path, {**case.of, **result})
         rates = {where: result[where]["success_rate"] for where in ("simulation", "stand_in")}
-        print(f"{path.parent.name}/{path.stem}: {rates}", flush=True)
-    found = {path: json.loads(path.read_text()) for path in cases if path.is_file()}
-    for path, result in found.items():
-        if result["budget"] != budget.to_json():
-            raise ValueError(f"{path} was made with another budget: {result['budget']}; choose another --out")
-    return list(found.values())
+        print(f"{case.path.parent.name}/{case.path.stem}: {rates}", flush=True)
+
+
+def found_of(cases: Sequence[Case]) -> list[dict[str, Any]]:
+    """Those of these cases that there are."""
+    found = []
+    for path, _, of in cases:
+        if not path.is_file():
+            continue
+        known = json.loads(path.read_text())
+        for name, value in json.loads(json.dumps(of)).items():
+            if known.get(name) != value:
+                raise SystemExit(
+                    f"error: {path} was made with another {name}: {known.get(name)}, now {value}; choose another --out"
+                )
+        found.append(known)
+    return found

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import asdict
 from pathlib import Path
 
 from droid_jax.identify.gaussian import Gaussian
@@ -10,11 +12,12 @@ from droid_jax.identify.pipeline import identify
 from droid_jax.measure.surrogate import stand_in_truth
 from droid_jax.model.door import door_nuisances, door_space
 from droid_jax.model.door_scene import door_scene
+from droid_jax.storage import write_json
 from experiments.identify_suite import recordings, settings
 from experiments.policies.cases import TIMESTEP
 from experiments.policies.settings import Setting
 
-GAUSSIAN = "gaussian.json"
+GAUSSIAN, SETTING = "gaussian.json", "setting.json"
 
 
 def truth_of(setting: Setting) -> dict[str, float]:
@@ -23,12 +26,17 @@ def truth_of(setting: Setting) -> dict[str, float]:
 
 
 def fitted(setting: Setting, folder: Path, quick: bool) -> Gaussian:
-    """What demonstrations A and C tell of the setting's robot; kept in the folder."""
-    path = folder / GAUSSIAN
-    if not path.is_file():
+    """What demonstrations A and C tell of the setting's robot; kept in the folder, with what it was made of."""
+    path, made_of = folder / GAUSSIAN, {"setting": asdict(setting), "quick": quick}
+    if path.is_file():
+        known = json.loads((folder / SETTING).read_text()) if (folder / SETTING).is_file() else None
+        if known != json.loads(json.dumps(made_of)):
+            raise SystemExit(f"error: {folder} holds the fit of another robot: {known}; choose another --out")
+    else:
         scene = door_scene(timestep=TIMESTEP)
         recorded = recordings(scene, truth_of(setting), "A" if quick else "AC", setting.robot)
         config = settings(quick, setting.robot)
         found = identify(scene, door_space(scene), recorded, nuisances=door_nuisances(scene), config=config)
+        write_json(folder / SETTING, made_of)
         found.gaussian.save(path)
     return load_gaussian(path)

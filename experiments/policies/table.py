@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import scipy.stats
 
-from experiments.policies.settings import Setting
-
+METHODS = ("prior", "mean", "fitted")
 PLACES = ("simulation", "stand_in")
 RESAMPLES = 4000
 LEVEL = 0.95
@@ -21,11 +21,11 @@ PAPER = {
 }
 
 
-def summed_up(cases: Sequence[Mapping[str, Any]], settings: Mapping[str, Setting]) -> dict[str, Any]:
+def summed_up(cases: Sequence[Mapping[str, Any]], settings: Sequence[str]) -> dict[str, Any]:
     """For each setting and method, both places; and how much better the fitted Gaussian is than the others."""
     table: dict[str, Any] = {}
     for name in settings:
-        of = {m: [c for c in cases if c["setting"] == name and c["method"] == m] for m in PAPER}
+        of = {m: [c for c in cases if c["setting"]["name"] == name and c["method"] == m] for m in METHODS}
         columns = {m: {place: column(own, place) for place in PLACES} for m, own in of.items() if own}
         others = [m for m in ("prior", "mean") if of[m] and of["fitted"]]
         better = {m: {what: apart(of["fitted"], of[m], what) for what in ("success", "angle")} for m in others}
@@ -45,7 +45,7 @@ def column(cases: Sequence[Mapping[str, Any]], place: str) -> dict[str, Any]:
         "trials": sum(len(t["success"]) for t in each),
         "seeds": [case["seed"] for case in cases],
         "success_rate": float(np.mean(np.concatenate([t["success"] for t in each]))),
-        "success_interval_95": span(resampled([t["success"] for t in each])),
+        "success_interval_95": rate_interval([t["success"] for t in each]),
         "success_of_each": [float(np.mean(t["success"])) for t in each],
         "angle_deg": spread([t["angle"] for t in each]),
         "steps": spread([t["steps"][t["success"] > 0] for t in each]),
@@ -54,11 +54,10 @@ def column(cases: Sequence[Mapping[str, Any]], place: str) -> dict[str, Any]:
 
 def spread(each: Sequence[np.ndarray]) -> dict[str, Any]:
     """Mean and deviation over all trials, interval of the mean; None where no policy has any."""
-    there = [values for values in each if len(values)]
-    if not there:
+    both = np.concatenate(each)
+    if not len(both):
         return {"mean": None, "std": None, "interval_95": None}
-    both = np.concatenate(there)
-    return {"mean": float(both.mean()), "std": float(both.std()), "interval_95": span(resampled(there))}
+    return {"mean": float(both.mean()), "std": float(both.std()), "interval_95": span(resampled(each), len(each))}
 
 
 def trials(case: Mapping[str, Any], place: str) -> dict[str, np.ndarray]:
@@ -72,25 +71,70 @@ def trials(case: Mapping[str, Any], place: str) -> dict[str, np.ndarray]:
 
 
 def apart(better: Sequence[Mapping[str, Any]], worse: Sequence[Mapping[str, Any]], what: str) -> dict[str, Any]:
-    """Difference of two methods' means on the stand-in robot, with its interval."""
+    """Difference of two methods' means on the stand-in robot, with its interval, and Welch's of the policies' means."""
     a, b = ([trials(case, "stand_in")[what] for case in own] for own in (better, worse))
     draws = resampled(a, 1) - resampled(b, 2)
     difference = float(np.mean(np.concatenate(a)) - np.mean(np.concatenate(b)))
-    return {"difference": difference, "interval_95": span(draws)}
+    means = [[float(t.mean()) for t in own] for own in (a, b)]
+    welch = None
+    if min(map(len, means)) > 1 and max(np.ptp(m) for m in means) > 0:
+        found = scipy.stats.ttest_ind(*means, equal_var=False).confidence_interval(LEVEL)
+        welch = [float(found.low), float(found.high)]
+    interval = span(draws, min(len(a), len(b)))
+    if what == "success" and np.ptp(draws) == 0.0:
+        interval = _newcombe(*(np.concatenate(own) for own in (a, b)))
+    return {"difference": difference, "interval_95": interval, "welch_95": welch}
+
+
+def rate_interval(each: Sequence[np.ndarray]) -> list[float]:
+    """Of a success rate: by bootstrap over policies, or Wilson's over all trials where they all ended alike."""
+    both = np.concatenate(each)
+    return list(_wilson(both)) if np.ptp(both) == 0.0 else span(resampled(each), len(each))
+
+
+def _wilson(success: np.ndarray) -> tuple[float, float]:
+    found = scipy.stats.binomtest(int(success.sum()), len(success)).proportion_ci(LEVEL, method="wilson")
+    return float(found.low), float(found.high)
+
+
+def _newcombe(a: np.ndarray, b: np.ndarray) -> list[float]:
+    """Of a difference of two shares, out of Wilson's intervals (Newcombe 1998, method 10)."""
+    (p, q), (low_a, high_a), (low_b, high_b) = (a.mean(), b.mean()), _wilson(a), _wilson(b)
+    low = p - q - np.hypot(p - low_a, high_b - q)
+    return [float(low), float(p - q + np.hypot(high_a - p, q - low_b))]
 
 
 def resampled(each: Sequence[np.ndarray], seed: int = 0) -> np.ndarray:
-    """[RESAMPLES] means over all trials, policies drawn with replacement and trials within them too."""
+    """[RESAMPLES] means over all trials, policies drawn with replacement and trials within them too.
+
+    A policy without a trial (no success has no number of steps) weighs nothing; NaN where none drawn has any.
+    """
     rng = np.random.default_rng(seed)
-    means = np.empty((RESAMPLES, len(each)))  # of every policy's trials, drawn again for each place it takes
-    policies = rng.integers(len(each), size=means.shape)
+    policies = rng.integers(len(each), size=(RESAMPLES, len(each)))
+    sums, counts = np.zeros(policies.shape), np.zeros(policies.shape)  # of every policy's trials, drawn anew each time
     for k, own in enumerate(each):
         taken = policies == k
-        means[taken] = rng.choice(own, (int(taken.sum()), len(own))).mean(axis=1)
-    return means.mean(axis=1)
+        if len(own):
+            sums[taken] = rng.choice(own, (int(taken.sum()), len(own))).sum(axis=1)
+            counts[taken] = len(own)
+    total = counts.sum(axis=1)
+    return np.where(total > 0, sums.sum(axis=1) / np.maximum(total, 1.0), np.nan)
 
 
-def span(draws: np.ndarray) -> list[float]:
-    """Equal-tailed interval of draws."""
-    low, high = np.quantile(draws, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+def span(draws: np.ndarray, policies: int) -> list[float]:
+    """Equal-tailed interval of draws over so many policies."""
+    tail = 0.5 * (1.0 - _expanded(policies))
+    low, high = np.nanquantile(draws, [tail, 1.0 - tail])
     return [float(low), float(high)]
+
+
+def _expanded(count: int) -> float:
+    """Level at which quantiles of a bootstrap over so few hold as much as Student's t does.
+
+    Hesterberg, What teachers should know about the bootstrap, Am. Stat. 2015: plain quantiles of five policies' held
+    the truth in 83 to 91 % of simulated tables.  Of one policy nothing is known but its trials.
+    """
+    if count < 2:
+        return LEVEL
+    reach = scipy.stats.t.ppf(0.5 * (1.0 + LEVEL), count - 1) * np.sqrt(count / (count - 1))
+    return float(2.0 * scipy.stats.norm.cdf(reach) - 1.0)

@@ -136,6 +136,7 @@ def test_physical_moments_against_the_log_normal():
     oracle = stats.lognorm(s=0.4, loc=-0.01, scale=1.01)
     np.testing.assert_allclose(g.physical_mean, [oracle.mean(), 2.0], rtol=1e-4)
     np.testing.assert_allclose(g.physical_std, [oracle.std(), 3.0], rtol=2e-3)
+    np.testing.assert_allclose(g.centre, [1.0, 2.0], rtol=1e-6)  # the median
 
 
 def test_marginal_follows_the_names(free):

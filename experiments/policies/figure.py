@@ -1,0 +1,81 @@
+"""Table II as a table and its histogram, this program's beside the paper's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from droid_jax.report.style import AFTER, BEFORE, INK, styled
+from experiments.policies.table import METHODS, trials
+
+WORDS = {"prior": "prior, randomised", "mean": "fitted mean alone", "fitted": "fitted, randomised"}
+BINS = np.arange(0.0, 100.0, 5.0)  # degrees
+
+
+def as_text(summary: Mapping[str, Any]) -> str:
+    """Markdown: for each setting a column for each method, simulation above robot, the paper's numbers last."""
+    lines = ["# Table II", ""]
+    for setting, found in summary["table"].items():
+        lines += [f"## Setting `{setting}`", "", *_rows(found["methods"], found["fitted_better_than"]), ""]
+    lines += ["## The paper (three policies of each method, ten trials each)", ""]
+    lines += ["| | prior | mean | fitted |", "|---|---|---|---|"]
+    for place, words in (("simulation", "simulation"), ("robot", "real robot")):
+        cells = [summary["paper"][m][place] for m in METHODS]
+        lines.append(f"| {words}: success, % | " + " | ".join(f"{c[0]:.1f}" for c in cells) + " |")
+        lines.append("| largest angle, degrees | " + " | ".join(f"{c[1][0]:.1f} ± {c[1][1]:.1f}" for c in cells) + " |")
+        lines.append("| steps | " + " | ".join(f"{c[2][0]:.1f} ± {c[2][1]:.1f}" for c in cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _rows(methods: Mapping[str, Any], better: Mapping[str, Any]) -> list[str]:
+    there = [m for m in METHODS if m in methods]
+    rows = ["| | " + " | ".join(there) + " |", "|---|" + "---|" * len(there)]
+    for place, words in (("simulation", "simulation"), ("stand_in", "stand-in robot")):
+        cells = [methods[m][place] for m in there]
+        rows.append(f"| {words}: success, % (95 %) | " + " | ".join(map(_success, cells)) + " |")
+        rows.append("| of each policy | " + " | ".join(_each(c) for c in cells) + " |")
+        rows.append("| largest angle, degrees | " + " | ".join(_spread(c["angle_deg"]) for c in cells) + " |")
+        rows.append("| steps of successes | " + " | ".join(_spread(c["steps"]) for c in cells) + " |")
+    for other, found in better.items():
+        low, high = found["success"]["interval_95"]
+        rows += ["", f"Fitted against {other}, stand-in robot: {_points(found['success']['difference'])} points of "
+                 f"success ({_points(low)} to {_points(high)})."]  # fmt: skip
+    return rows
+
+
+def _success(column: Mapping[str, Any]) -> str:
+    low, high = column["success_interval_95"]
+    return f"{100 * column['success_rate']:.1f} ({100 * low:.0f} to {100 * high:.0f})"
+
+
+def _each(column: Mapping[str, Any]) -> str:
+    return ", ".join(f"{100 * rate:.0f}" for rate in column["success_of_each"])
+
+
+def _spread(found: Mapping[str, Any]) -> str:
+    return "none" if found["mean"] is None else f"{found['mean']:.1f} ± {found['std']:.1f}"
+
+
+def _points(share: float) -> str:
+    return f"{100 * share:+.0f}"
+
+
+@styled
+def histograms(cases: Sequence[Mapping[str, Any]], settings: Sequence[str]) -> Figure:
+    """Largest angles on the stand-in robot: a row for each setting, a column for each method."""
+    figure = Figure(figsize=(7.0, 1.9 * len(settings) + 0.4), layout="constrained")
+    grid = figure.subplots(len(settings), len(METHODS), sharex=True, sharey=True, squeeze=False)
+    for row, setting in zip(grid, settings, strict=True):
+        for axes, method in zip(row, METHODS, strict=True):
+            own = [c for c in cases if c["setting"]["name"] == setting and c["method"] == method]
+            angles = np.concatenate([trials(c, "stand_in")["angle"] for c in own]) if own else np.zeros(0)
+            axes.hist(angles, BINS, color=BEFORE if method == "prior" else AFTER)
+            axes.axvline(30.0, color=INK, lw=0.8, ls=":")
+            axes.set_title(f"{setting}: {WORDS[method]}", fontsize=8)
+        row[0].set_ylabel("trials")
+    for axes in grid[-1]:
+        axes.set_xlabel("largest opening [degrees]")
+    return figure
