@@ -14,8 +14,8 @@ from droid_jax.measure.hidden_hooks import Hidden, Influence, Live, Place
 
 
 def dry_loss(a: float, q: np.ndarray) -> np.ndarray:
-    """a (1 + 0.15 sin(2 q + 0.5)): gears that run a little out of true; a in N m."""
-    return a * (1.0 + 0.15 * np.sin(2.0 * q + 0.5))
+    """a (1 + 0.2 sin(2 q + 0.5)): gears that run a little out of true; a in N m."""
+    return a * (1.0 + 0.2 * np.sin(2.0 * q + 0.5))
 
 
 def stribeck_loss(a: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
