@@ -26,6 +26,7 @@ from experiments.blind.scenes import ROLES, Setting, setting
 
 CHEAP = ("hinge", "bench", "arm")
 COMMIT = "0" * 40
+LIMITS = Path(__file__).resolve().parents[2] / "benchmarks" / "results" / "detection_limits.json"
 
 
 @pytest.fixture(scope="module")
@@ -214,6 +215,15 @@ def test_bounds_hold_what_the_base_model_absorbs():
     left, free = ground.left(np.array([200.0, 200.0, 5.0, 0.0, 0.0, 0.0]))
     np.testing.assert_allclose(left, [100.0, 0.0, 5.0, 0.0, 0.0, 0.0], atol=0.01)
     assert free.tolist() == [False, True]
+
+
+def test_the_stand_in_is_no_mirror_of_the_library():
+    """Of every hidden effect at least 5 % of its own root mean square is left by the library's form of it."""
+    scenes = json.loads(LIMITS.read_text())["scenes"]
+    assert {"hinge", "door"} <= set(scenes)
+    for scene, effects in scenes.items():
+        left = {name: e["form"]["left"] for name, e in effects.items() if "form" in e}
+        assert len(left) > 10 and min(left.values()) >= 0.05, (scene, sorted(left.items(), key=lambda e: e[1])[:3])
 
 
 # ----- scoring
