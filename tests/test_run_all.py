@@ -90,13 +90,38 @@ def test_a_stage_with_other_inputs_is_run_again(called, monkeypatch: pytest.Monk
     assert "other settings (recordings_sha256): it is run again" in capsys.readouterr().out
 
 
-def test_another_stand_in_is_recorded_anew(called, monkeypatch: pytest.MonkeyPatch):
-    again: list[bool] = []
-    monkeypatch.setattr(hidden, "kept_recording", lambda path, anew, name, record: again.append(anew))
-    for springs, expected in (("1", False), ("1", False), ("2", True)):
-        again.clear()
+def test_another_stand_in_is_recorded_anew(called, tmp_path: Path):
+    """Also where a stop left some recordings of the one before."""
+    files = [tmp_path / "runs" / "all" / "recordings" / f"{name}.npz" for name in "CB"]
+    for springs, kept in (("1", True), ("2", False), ("2", True)):
+        if not kept or springs == "1":
+            assert main(["all", "--stages", "gap", "--springs", "1"]) == 0
+            for file in files:
+                file.write_text("of this robot")
+        else:
+            for file in files:
+                file.write_text("of this robot")
         assert main(["all", "--stages", "gap", "--springs", springs]) == 0
-        assert again == [expected] * 3
+        assert [file.is_file() for file in files] == [kept] * 2
+
+
+def test_what_no_policy_can_be_tried_with_is_said_at_once(called, capsys):
+    assert main(["all", "--hide", "sensor_delay=0.01"]) == 2
+    said = capsys.readouterr().err
+    assert "hidden effects sensor_delay change whole traces" in said and "--stages identify gap train" in said
+    assert called == []
+    assert main(["all", "--hide", "sensor_delay=0.01", "--stages", "identify", "gap"]) == 0
+
+
+def test_a_search_in_other_recordings_is_not_trained_on(called, tmp_path: Path):
+    """The fit is of another robot by now, the search was not run again."""
+    for stage, recordings in (("identify", ["new C", "new B"]), ("gap", ["old C", "old B", "old A"])):
+        found(tmp_path / "run" / stage, ["latch at hinge"])
+        (tmp_path / "run" / stage / "setup.json").write_text(json.dumps({"recordings_sha256": recordings}))
+    assert main(["all", "--stages", "train", "--out", "run"]) == 0
+    (tmp_path / "run" / "gap" / "setup.json").write_text('{"recordings_sha256": ["new C", "new B", "new A"]}')
+    assert main(["all", "--stages", "train", "--out", "run"]) == 0
+    assert [c.fit for c in called] == [Path("run/identify"), Path("run/gap")]
 
 
 def test_your_own_recordings_know_no_stand_in(called, tmp_path: Path):

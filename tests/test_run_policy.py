@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from droid_jax import runtime
-from droid_jax.commands.evaluate import Evaluate, _robot
+from droid_jax.commands.evaluate import Evaluate, _robot, _task
 from droid_jax.commands.folder import setup_of
 from droid_jax.commands.source import extended_of, source, stand_in_of
 from droid_jax.commands.train import Train, _forget
@@ -116,6 +116,15 @@ def test_train_evaluate_export(scene, tmp_path: Path, capsys: pytest.CaptureFixt
     fit(folder, scene, springs=0, seed=1, recording=[])
     assert main(["train", "--fit", "fit", "--steps", "20000", "--out", "run"]) == 0
     assert main(["evaluate", "run", "--trials", "4", "--no-film"]) == 0
+    transfer_json = tmp_path / "run" / "transfer.json"
+    before = transfer_json.stat().st_mtime_ns
+    assert main(["evaluate", "run", "--trials", "4", "--no-film"]) == 0
+    said = capsys.readouterr().out
+    assert "holds these trials already" in said and said.count("stand-in robot: 0 % success") == 2
+    assert transfer_json.stat().st_mtime_ns == before
+    assert main(["evaluate", "run", "--trials", "3", "--no-film"]) == 0  # others are
+    assert json.loads(transfer_json.read_text())["stand_in"]["trials"] == 3
+    assert main(["evaluate", "run", "--trials", "4", "--no-film"]) == 0
     pytest.importorskip("onnxruntime")
     assert main(["export", "run"]) == 0
     said = capsys.readouterr().out
@@ -126,3 +135,18 @@ def test_train_evaluate_export(scene, tmp_path: Path, capsys: pytest.CaptureFixt
     assert "Learning" in (tmp_path / "run" / "report.html").read_text()
     assert main(["train", "--fit", "fit", "--steps", "20000", "--out", "run"]) == 0
     assert "holds this run already" in capsys.readouterr().out
+
+
+def test_a_policy_of_another_task_is_refused(tmp_path: Path):
+    with pytest.raises(ValueError, match="was trained for a task with patience; train it again"):
+        _task(tmp_path, {"steps": 10, "patience": 3})
+
+
+def test_a_moved_run_knows_its_stand_in(tmp_path: Path):
+    """Recordings are named as seen from where the command ran; those of `all` lie beside its stages."""
+    (tmp_path / "recordings").mkdir()
+    (tmp_path / "recordings" / "stand_in.json").write_text('{"springs": 2, "seed": 1, "hide": []}')
+    (tmp_path / "identify").mkdir()
+    named = ["elsewhere/recordings/C.npz", "elsewhere/recordings/B.npz"]
+    (tmp_path / "identify" / "setup.json").write_text(json.dumps({"command": "identify", "recording": named}))
+    assert stand_in_of(tmp_path / "identify") == {"springs": 2, "seed": 1, "hide": []}

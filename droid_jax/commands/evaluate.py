@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import shutil
+import hashlib
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,6 +22,7 @@ from droid_jax.report.files import FILMS, POLICY, TRANSFER
 if TYPE_CHECKING:
     from droid_jax.policy.control import Policy
     from droid_jax.policy.door_env import DoorEnv
+    from droid_jax.policy.task import Task
     from droid_jax.policy.transfer import StandIn
     from droid_jax.policy.trials import Trials
 
@@ -45,10 +46,12 @@ class Evaluate:
     """Seed of start poses and sensor noise."""
     film: bool = True
     """Film a good and a bad trial."""
+    again: bool = False
+    """Try again what was tried already."""
 
 
 def run(command: Evaluate) -> None:
-    """Try the policy, write transfer.json and the films, and build the page."""
+    """Try the policy, write transfer.json and the films, and build the page; not again where that was done."""
     needs_brax()
     if command.trials < 1:
         raise ValueError(f"--trials must be 1 or more, got {command.trials}")
@@ -58,39 +61,73 @@ def run(command: Evaluate) -> None:
     from droid_jax.policy.control import load
     from droid_jax.policy.door_env import DoorEnv
     from droid_jax.policy.simulated import simulated
-    from droid_jax.policy.task import Task
     from droid_jax.policy.transfer import transfer
     from droid_jax.report.policy_folder import read_training
-    from droid_jax.report.words import percent
-    from droid_jax.storage import write_json
+    from droid_jax.report.progress import counting
+    from droid_jax.storage import new_folder, write_json
 
     trained = read_training(command.run)
+    policy_sha256 = hashlib.sha256((command.run / POLICY).read_bytes()).hexdigest()
+    setup_now = {**setup_of(command), "policy_sha256": policy_sha256}
+    if not command.again and (done := _done(command.run, setup_now)):
+        print(f"{command.run} holds these trials already (start over with --again)")
+        _tell(done)
+        report.run(report.Report(command.run))
+        return
     setup, policy = trained["setup"], load(command.run / POLICY)
     scene, gaussian, effects = source(command.run, setup["knob"])
-    env = DoorEnv(scene, Task(**trained["task"]), effects)
+    env = DoorEnv(scene, _task(command.run, trained["task"]), effects)
     robot, truth = _robot(command, trained, env)
-    shutil.rmtree(command.run / FILMS, ignore_errors=True)
-    print(f"{command.trials} episodes in simulation ...", flush=True)
+    print(f"{command.trials} episodes in simulation, compiled first: about a minute ...", flush=True)
     inside = simulated(policy, env, randomise(setup["method"], scene, gaussian), command.trials, command.seed)
-    print(f"{command.trials} trials on the stand-in robot ...", flush=True)
-    outside = transfer(policy, robot)
-    write_json(
-        command.run / TRANSFER,
-        {
-            "simulation": inside.to_json(),
-            "stand_in": outside.to_json(),
-            "robot": {"truth": truth, "hidden": [dataclasses.asdict(a) for a in robot.hidden]},
-            "setup": setup_of(command),
-            "versions": runtime.versions(),
-            "device": runtime.device(),
-        },
-    )
-    if command.film:
-        _film(command.run, policy, robot, outside)
-    for where, found in (("simulation", inside), ("stand-in robot", outside)):
-        low, high = found.interval()
-        print(f"{where}: {percent(found.rate)} success ({percent(low)} to {percent(high)}), {_angle(found)}")
+    with counting("trials on the stand-in robot", command.trials) as count:
+        outside = transfer(policy, robot, count)
+    with new_folder(command.run / FILMS) as films:  # those of an earlier policy stay until these are there
+        if command.film:
+            _film(films, policy, robot, outside)
+    content = {
+        "simulation": inside.to_json(),
+        "stand_in": outside.to_json(),
+        "robot": {"truth": truth, "hidden": [dataclasses.asdict(a) for a in robot.hidden]},
+        "setup": setup_now,
+        "versions": runtime.versions(),
+        "device": runtime.device(),
+    }
+    write_json(command.run / TRANSFER, content)  # last: its presence says that the trials are whole
+    _tell(content)
     report.run(report.Report(command.run))
+
+
+def _done(folder: Path, setup: dict[str, Any]) -> Mapping[str, Any] | None:
+    """transfer.json of these very trials, where the folder holds it whole."""
+    from droid_jax.report.policy_folder import read_policy
+
+    try:
+        found = read_policy(folder).transfer
+    except ValueError:  # broken: it is made again
+        return None
+    return found if found is not None and found.get("setup") == setup else None
+
+
+def _task(folder: Path, known: Mapping[str, Any]) -> Task:
+    """The task that a policy was trained for; ValueError where this program knows another one."""
+    from droid_jax.policy.task import Task
+
+    strange = sorted(set(known) - {f.name for f in dataclasses.fields(Task)})
+    if strange:
+        raise ValueError(f"{folder}: the policy was trained for a task with {', '.join(strange)}; train it again")
+    return Task(**known)
+
+
+def _tell(found: Mapping[str, Any]) -> None:
+    """Two lines of transfer.json."""
+    from droid_jax.report.words import percent
+
+    for name, where in (("simulation", "simulation"), ("stand_in", "stand-in robot")):
+        of = found[name]
+        low, high = of["interval_95"]
+        angle = f"opened to {of['angle_deg']['mean']:.1f} ± {of['angle_deg']['std']:.1f} degrees"
+        print(f"{where}: {percent(of['success_rate'])} success ({percent(low)} to {percent(high)}), {angle}")
 
 
 def _robot(command: Evaluate, trained: Mapping[str, Any], env: DoorEnv) -> tuple[StandIn, dict[str, float]]:
@@ -109,13 +146,6 @@ def _robot(command: Evaluate, trained: Mapping[str, Any], env: DoorEnv) -> tuple
     return stand_in(scene, env.start, truth, listed(hidden_effects(own["hide"], scene)), env.task, config), truth
 
 
-def _angle(found: Trials) -> str:
-    import numpy as np
-
-    degrees = np.rad2deg(found.angle)
-    return f"opened to {degrees.mean():.1f} ± {degrees.std():.1f} degrees"
-
-
 def _film(folder: Path, policy: Policy, robot: StandIn, found: Trials) -> None:
     """good.webp and bad.webp: of the trials that succeeded and of those that failed, the one of median angle."""
     import numpy as np
@@ -128,7 +158,7 @@ def _film(folder: Path, policy: Policy, robot: StandIn, found: Trials) -> None:
     for name, numbers in chosen.items():
         if not len(numbers):
             continue
-        path = folder / FILMS / f"{name}.webp"
+        path = folder / f"{name}.webp"
         number = int(numbers[np.argsort(found.angle[numbers])[len(numbers) // 2]])
         try:
             film(path, robot.scene.visual_model(), [filmed(policy, robot, number)], robot.task.control)

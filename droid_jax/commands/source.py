@@ -62,8 +62,9 @@ def stand_in_of(folder: Path | None) -> dict[str, Any]:
     known = {} if folder is None else setup(folder)
     if known.get("command") == "train":
         return known.get("stand_in", {})
-    if known.get("recording"):
-        return known_stand_in(known["recording"])
+    if known.get("recording"):  # as named where the command ran; those of `all` lie beside its stages
+        beside = [folder.parent / "recordings" / Path(name).name for name in known["recording"]] if folder else []
+        return known_stand_in(known["recording"]) or known_stand_in(beside)
     return {k: known[k] for k in ("springs", "seed", "hide") if k in known}
 
 

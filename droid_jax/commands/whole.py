@@ -112,7 +112,7 @@ def _plan(command: All, out: Path, recordings: tuple[Path, ...]) -> dict[str, Ca
         _stage(train.run, train.Train(model_folder(out), preset=presets.train, out=out / "train", **common))
 
     def judge() -> None:
-        evaluate.run(evaluate.Evaluate(out / "train", trials=command.trials, seed=command.seed))
+        evaluate.run(evaluate.Evaluate(out / "train", trials=command.trials, **common))
 
     plan = {"identify": fit, "gap": search}
     if command.scene is None:
@@ -121,9 +121,14 @@ def _plan(command: All, out: Path, recordings: tuple[Path, ...]) -> dict[str, Ca
 
 
 def model_folder(out: Path) -> Path:
-    """Where the model is that a policy shall be trained on: the extended one where the search named an effect."""
+    """Where the model is that a policy shall be trained on: the extended one where the search named an effect.
+
+    A search in other recordings than the fit's, left over from an earlier run, does not count.
+    """
     found = _json(out / "gap" / "gap.json")
-    return out / ("gap" if found and found["effects"] else "identify")
+    fit, gap_ = ((_json(out / stage / "setup.json") or {}).get("recordings_sha256") for stage in ("identify", "gap"))
+    stale = fit is not None and gap_ is not None and gap_[: len(fit)] != fit
+    return out / ("gap" if found and found["effects"] and not stale else "identify")
 
 
 def told(out: Path) -> list[str]:
@@ -154,6 +159,14 @@ def _recorded(command: All) -> tuple[Path, ...]:
 
     scene = door_scene(timestep=TIMESTEP[PRESETS[command.preset].identify])
     hidden = hidden_effects(command.hide, scene)
+    if "evaluate" in command.stages:  # rather now than when the policy is there
+        from droid_jax.measure.hidden import listed
+        from droid_jax.policy.transfer import check_playable
+
+        try:
+            check_playable(scene, listed(hidden))
+        except ValueError as error:
+            raise ValueError(f"{error}; or leave the trials away: --stages identify gap train") from None
     record_stand_in(scene, hidden, command.out, command.springs, command.seed, command.again)
     return tuple(command.out / "recordings" / f"{name}.npz" for name in DEMONSTRATIONS.values())
 

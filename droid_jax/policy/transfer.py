@@ -75,14 +75,7 @@ def stand_in(
     whole traces: in a closed loop there are none yet.
     """
     task, config = task or Task(), config or TransferConfig()
-    for one in hidden:
-        check(one, scene)
-    unfit = [a.name for a in hidden if _acts_on_traces(scene, a)]
-    if unfit:
-        raise ValueError(
-            f"hidden effects {', '.join(unfit)} change whole traces, which a closed loop does not have yet: "
-            "choose others, or none"
-        )
+    check_playable(scene, hidden)
     if hidden:
         config = replace(config, timestep=min(config.timestep, LONGEST_STEP))
     space = door_space(scene) + door_nuisances(scene)
@@ -91,11 +84,29 @@ def stand_in(
     return StandIn(own, start, tuple(hidden), task, config)
 
 
-def transfer(policy: Policy, robot: StandIn) -> Trials:
-    """Trials of a policy on the stand-in robot.  ValueError for a policy that acts at another rate than the task's."""
+def check_playable(scene: Scene, hidden: Sequence[Applied]) -> None:
+    """ValueError for hidden effects that a policy cannot be tried with."""
+    for one in hidden:
+        check(one, scene)
+    unfit = [a.name for a in hidden if _acts_on_traces(scene, a)]
+    if unfit:
+        raise ValueError(
+            f"hidden effects {', '.join(unfit)} change whole traces, which a closed loop does not have yet: "
+            "choose others, or none"
+        )
+
+
+def transfer(policy: Policy, robot: StandIn, progress: Callable[[int], None] = lambda done: None) -> Trials:
+    """Trials of a policy on the stand-in robot.  ValueError for a policy that acts at another rate than the task's.
+
+    progress: is told how many trials are over.
+    """
     _check_rate(policy, robot.task)
+    done = []
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        done = list(pool.map(lambda number: _trial(policy, robot, number), range(robot.config.trials)))
+        for trial in pool.map(lambda number: _trial(policy, robot, number), range(robot.config.trials)):
+            done.append(trial)
+            progress(len(done))
     return Trials(*(np.array(column) for column in zip(*done, strict=True)))
 
 

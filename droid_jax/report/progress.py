@@ -90,6 +90,27 @@ def training(steps: int) -> Iterator[Callable[[Any], None]]:
         yield report
 
 
+@contextlib.contextmanager
+def counting(what: str, total: int) -> Iterator[Callable[[int], None]]:
+    """Show one bar for a number of equal things; yields the function that takes how many are done."""
+    if not Console().is_terminal:
+        lines = Lines()
+        lines.show(what, "", 0, total)
+        yield lambda done: lines.show(what, "", done, total)
+        return
+    columns = (
+        TextColumn(what),
+        BarColumn(bar_width=30),
+        TextColumn("{task.completed}/{task.total}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns) as bars:
+        task = bars.add_task(what, total=total)
+        yield lambda done: bars.update(task, completed=done)
+
+
 def _trained(now: Any) -> str:
     """What to show of a `TrainProgress`."""
     rate = f"{now.rate:,.0f} actions/s" if now.rate else "started"

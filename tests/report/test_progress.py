@@ -36,3 +36,11 @@ def test_stages_and_training_write_lines_where_there_is_no_terminal(capsys: pyte
     assert refine.startswith("refine 1/30 mean square 2 (noise: 1) (0 s")
     assert compiling == "training 0/100 compiling, a minute (0 s)"
     assert done.startswith("training 100/100 reward 3  success 50%  1,000 actions/s")
+
+
+def test_equal_things_are_counted(capsys: pytest.CaptureFixture) -> None:
+    with progress.counting("trials", 3) as count:
+        for done in (1, 2, 3):
+            count(done)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "trials 0/3 (0 s)" and lines[-1].startswith("trials 3/3 (0 s")
