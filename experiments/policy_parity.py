@@ -131,6 +131,7 @@ def main() -> None:
         },
         "mean_angle_deg": {name: float(a.mean()) for name, a in angle.items()},
         "success_rate": {name: trials.rate for name, trials in both.items()},
+        "stopped": {name: trials.to_json()["stopped"] for name, trials in both.items()},  # C runs the robot's own loop
     }
     name = "policy_parity_quick" if arguments.quick else "policy_parity"
     write_bytes(arguments.out / f"{name}.png", png_bytes(scatter(angle["mjx"], angle["c"])))

@@ -32,6 +32,7 @@ SCRIPTS: dict[str, tuple[str, ...]] = {
     "benchmarks/candidates.py": (),
     "benchmarks/step_accuracy.py": (),
     "benchmarks/time_to_fit.py": (),
+    "benchmarks/training.py": (),
     "benchmarks/peer_sysid.py": (),
 }
 READERS = ("experiments/pose_figure.py", "experiments/table1.py")  # of what identify_suite.py has left
