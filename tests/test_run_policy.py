@@ -54,6 +54,25 @@ def test_fits_for_another_servo_or_scene_are_refused(scene, tmp_path: Path):
         source(fit(tmp_path, scene, preset="quick", scene="own.xml"), knob=0)
 
 
+def test_a_gaussian_that_came_without_its_setup_is_known_by_its_parameters(scene, tmp_path: Path):
+    """Its entries exist in the door's model too, and mean other joints there."""
+    fit(tmp_path, scene)
+    whole = json.loads((tmp_path / "gaussian.json").read_text())
+    for changed, said in (
+        ("name", "elbow_damping is no parameter of the built-in door"),
+        ("index", "is not the built"),
+    ):
+        other = json.loads(json.dumps(whole))
+        damping = other["space"][1]
+        if what == "name":
+            damping["name"] = "elbow_damping"
+        else:
+            damping["writes"][0]["index"] = [1]
+        (tmp_path / "gaussian.json").write_text(json.dumps(other))
+        with pytest.raises(ValueError, match=f"gaussian.json belongs to another scene: .*{said}"):
+            source(tmp_path, knob=0)
+
+
 def test_a_trained_folder_hands_on_its_stand_in(scene, tmp_path: Path):
     fit(tmp_path, scene, command="train", seed=9, stand_in={"springs": 2, "seed": 3})
     assert stand_in_of(tmp_path) == {"springs": 2, "seed": 3}

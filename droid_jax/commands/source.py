@@ -42,11 +42,28 @@ def source(folder: Path | None, knob: int) -> tuple[Scene, Gaussian, tuple[Effec
     if model is None:
         if not at.is_file():
             raise ValueError(f"{folder} holds no {GAUSSIAN}: it is no folder of `identify`, `gap` or `train`")
-        return scene, load(at), ()
+        own = load(at)
+        _check_door(at, own, scene)
+        return scene, own, ()
     extended = load_extended(model, scene)
     own = load(at) if at.is_file() else extended.gaussian
     effects = {name for part in extended.parts for name in part.free}
     return extended.scene, own if effects <= set(own.space.names) else extended.gaussian, extended.effects
+
+
+def _check_door(path: Path, gaussian: Gaussian, scene: Scene) -> None:
+    """ValueError where a Gaussian speaks of something else than the built-in door's parameters.
+
+    Its entries of the model may exist here too and mean another joint.
+    """
+    from droid_jax.model.door import door_nuisances, door_space
+
+    known = {p.name: p for p in (door_space(scene) + door_nuisances(scene)).parameters}
+    for p in gaussian.space.parameters:
+        if p.name not in known:
+            raise ValueError(f"{path} belongs to another scene: {p.name} is no parameter of the built-in door")
+        if p.writes != known[p.name].writes:
+            raise ValueError(f"{path} belongs to another scene: its {p.name} is not the built-in door's")
 
 
 def extended_of(folder: Path) -> Path | None:
