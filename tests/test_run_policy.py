@@ -58,7 +58,7 @@ def test_a_gaussian_that_came_without_its_setup_is_known_by_its_parameters(scene
     """Its entries exist in the door's model too, and mean other joints there."""
     fit(tmp_path, scene)
     whole = json.loads((tmp_path / "gaussian.json").read_text())
-    for changed, said in (
+    for what, said in (
         ("name", "elbow_damping is no parameter of the built-in door"),
         ("index", "is not the built"),
     ):
