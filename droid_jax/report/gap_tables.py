@@ -104,7 +104,7 @@ def _joined(stood: str, candidate: str) -> str:
 
 def _row(found: Mapping[str, Any], name: str, entry: Any, trial: Mapping[str, Any] | None) -> Row:
     parts, effects = set(name.split(BETWEEN)), found["effects"]
-    rivals = {n for ties in found["tied"] for n in ties}
+    rivals = {part for ties in found["tied"] for n in ties for part in n.split(BETWEEN)}
     kept = trial is not None and trial["passed"] and parts <= set(effects)
     if trial is None:
         fate = "screened only: explains less"

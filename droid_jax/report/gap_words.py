@@ -39,7 +39,7 @@ def readable(text: str, found: Mapping[str, Any]) -> str:
     names = {r["candidate"] for screen in found["screens"] for r in screen["ranking"]}
     names |= {*found["effects"], *(name for rivals in found["tied"] for name in rivals)}
     for name in sorted(names, key=len, reverse=True):
-        text = text.replace(name, effect_words(name))
+        text = text.replace(name, model_words(name))
     return re.sub(r"\b\w+_\w+(\[\w+\])?", lambda m: label(m[0]).lower(), text)
 
 
@@ -51,7 +51,7 @@ def unit_words(unit: str) -> str:
 def gap_summary(gap: Gap) -> list[str]:
     """The sentences under the answer, from the numbers alone; the last says what to do."""
     sentences = [_fitted(gap), _significance(gap), _size(gap), *_added(gap.found["amplitudes"])]
-    said = [*sentences, *_ties(gap.found), *_trends(gap.found), gap.limits]
+    said = [*sentences, *_trends(gap.found), gap.limits]
     return [*(s for s in said if s), _next(gap)]
 
 
@@ -131,14 +131,6 @@ def _amplitude(a: Mapping[str, Any]) -> str:
     unit = f" {unit_words(a['unit'])}" if a["unit"] else ""
     name = label(a["name"]).lower()
     return f"{name} {number(a['value'])}{unit}, {number(a['low'])} to {number(a['high'])}{unit}"
-
-
-def _ties(found: Mapping[str, Any]) -> list[str]:
-    """What does as well as each effect; a verdict "tie" says so in its own sentence."""
-    if found["verdict"] == "tie":
-        return []
-    both = [(effect, ties) for effect, ties in zip(found["effects"], found["tied"], strict=False) if ties]
-    return [f"In place of {effect_words(e)}, {' or '.join(map(effect_words, t))} would do as well." for e, t in both]
 
 
 def _trends(found: Mapping[str, Any]) -> list[str]:
