@@ -10,6 +10,8 @@ from scripted import action, opening
 
 from droid_jax import runtime
 from droid_jax.model.door_scene import door_scene
+from droid_jax.model.effects.registry import library
+from droid_jax.model.physics import Physics
 from droid_jax.policy.control import ACTIONS, OBSERVED, Safety, limited
 from droid_jax.policy.door_env import DoorEnv
 from droid_jax.policy.hand import finger_forces_c, hand_of, looked
@@ -114,6 +116,37 @@ def test_a_simulation_that_comes_apart_ends_the_episode_and_is_counted(env: Door
         assert (float(after.done), float(after.metrics["blown_up"]), float(after.reward)) == (1.0, 1.0, 0.0)
         expected = fast.pipeline_state.qpos
         np.testing.assert_array_equal(after.pipeline_state.qpos, expected)
+
+
+@pytest.mark.slow
+def test_effects_of_an_extended_model_act_here_too(env: DoorEnv):
+    """At neutral nothing; a preload that pushes the door open; a command that comes an action late."""
+    scene = door_scene(timestep=0.004, limits=True)
+    extended = DoorEnv(scene, TASK, library(scene, ("hinge_preload", "command_delay")))
+    hinge, arm = scene.qpos("hinge"), scene.joint_qpos
+
+    def moved(env: DoorEnv, **theta: float) -> np.ndarray:
+        """[nq] how far two actions of one move everything."""
+
+        @jax.jit
+        def run(values):
+            env.sys = Physics(env.scene.mjx, values)
+            first = env.reset(jax.random.key(0))
+            state = env.step(env.step(first, jax.numpy.ones(9)), jax.numpy.ones(9))
+            return state.pipeline_state.qpos - first.pipeline_state.qpos
+
+        before = env.sys
+        try:
+            return np.asarray(run({name: jax.numpy.float32(value) for name, value in theta.items()}))
+        finally:
+            env.sys = before
+
+    plain, neutral = moved(env), moved(extended, hinge_preload=0.0, command_delay=0.0)
+    np.testing.assert_allclose(neutral, plain, atol=1e-5)
+    pushed = moved(extended, hinge_preload=-2.0, command_delay=0.0)
+    assert pushed[hinge] > plain[hinge] + 1e-4
+    late = moved(extended, hinge_preload=0.0, command_delay=TASK.control)
+    assert np.all(np.abs(late[arm]) < 0.7 * np.abs(plain[arm])) and np.all(np.abs(plain[arm]) > 1e-3)
 
 
 def test_a_time_step_that_does_not_fit_is_refused():
