@@ -39,7 +39,8 @@ def test_every_number_of_a_stage_is_a_scalar(tmp_path: Path):
     found = written(tmp_path)
     assert found["refine/mean_square"] == {3: 1.5}
     assert found["train/success"] == {1000: 0.5} and found["train/reward"] == {1000: 80.0}
-    assert set(found) == {"refine/mean_square", *(f"train/{n}" for n in ("seconds", "rate", "reward", "success"))}
+    names = ("seconds", "rate", "reward", "success", "blown_up")
+    assert set(found) == {"refine/mean_square", *(f"train/{n}" for n in names)}
 
 
 def test_limits_are_no_scalars():
