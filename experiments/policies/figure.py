@@ -19,6 +19,8 @@ def as_text(summary: Mapping[str, Any]) -> str:
     """Markdown: for each setting a column for each method, simulation above robot, the paper's numbers last."""
     lines = ["# Table II", ""]
     for setting, found in summary["table"].items():
+        if not found["methods"]:  # still to be run
+            continue
         lines += [f"## Setting `{setting}`", "", *_rows(found["methods"], found["fitted_better_than"]), ""]
     lines += ["## The paper (three policies of each method, ten trials each)", ""]
     lines += ["| | prior | mean | fitted |", "|---|---|---|---|"]
@@ -65,7 +67,8 @@ def _points(share: float) -> str:
 
 @styled
 def histograms(cases: Sequence[Mapping[str, Any]], settings: Sequence[str]) -> Figure:
-    """Largest angles on the stand-in robot: a row for each setting, a column for each method."""
+    """Largest angles on the stand-in robot: a row for each setting that was run, a column for each method."""
+    settings = [s for s in settings if any(c["setting"]["name"] == s for c in cases)] or list(settings[:1])
     figure = Figure(figsize=(7.0, 1.9 * len(settings) + 0.4), layout="constrained")
     grid = figure.subplots(len(settings), len(METHODS), sharex=True, sharey=True, squeeze=False)
     for row, setting in zip(grid, settings, strict=True):

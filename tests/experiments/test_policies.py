@@ -97,7 +97,7 @@ def test_resamples_of_one_policy_are_of_its_trials():
 
 def test_the_table_holds_what_was_run_and_the_papers_own():
     cases = [case(m, 0, 0.5) for m in ("prior", "fitted")]
-    found = summed_up(cases, ["paper"])
+    found = summed_up(cases, ["paper", "dry"])
     assert set(found["table"]["paper"]["methods"]) == {"prior", "fitted"}
     assert set(found["table"]["paper"]["fitted_better_than"]) == {"prior"}
     assert found["paper"]["mean"]["robot"][0] == 86.7
@@ -107,7 +107,8 @@ def test_the_table_holds_what_was_run_and_the_papers_own():
     assert "| stand-in robot: success, % (95 %) | 50.0 (36 to 64) | 50.0 (36 to 64) |" in text
     assert "| real robot: success, % | 20.0 | 86.7 | 80.0 |" in text
     assert "Fitted against prior, stand-in robot: +0 points of success (-2" in text
-    panels = histograms(cases, ["paper"]).axes
+    assert "## Setting `paper`" in text and "`dry`" not in text  # which is still to be run
+    panels = histograms(cases, ["paper", "dry"]).axes
     assert [sum(p.get_height() for p in panel.patches) for panel in panels] == [50, 0, 50]
 
 
