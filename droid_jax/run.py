@@ -55,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments = ["all", *arguments]
     script = Path(sys.argv[0]).name
     prog = script if script == SCRIPT else "python -m droid_jax.run"
-    command = tyro.cli(Command, args=arguments, prog=prog, description=WHAT)
+    command = tyro.cli(Command, default=whole.All(), args=arguments, prog=prog, description=WHAT)
     try:
         _ACTIONS[type(command)](command)
     except (ValueError, OSError) as error:

@@ -51,7 +51,7 @@ class Identify:
     extended: Path | None = None
     """extended.json of a gap search: the effects that it named are in the model and fitted too."""
     engine: Literal["mjx", "mujoco"] = "mjx"
-    """mjx: compiled, all devices.  mujoco: plain C, all cores."""
+    """mjx: compiled, all devices.  mujoco: plain C, all cores; for motor-side torques without gravity only."""
     population: int | None = None
     """Samples per generation; default: the preset's."""
     generations: int | None = None
