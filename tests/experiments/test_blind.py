@@ -20,7 +20,7 @@ from experiments.blind.baselines import bic_outcome
 from experiments.blind.cases import Counts, amplitude, key, keys, plans
 from experiments.blind.draws import commit_of, draw_truths, folder_of, seed_of
 from experiments.blind.make import Drawn, make, record
-from experiments.blind.marks import Ground
+from experiments.blind.marks import Ground, ground
 from experiments.blind.quiet import QUIET, around
 from experiments.blind.scenes import ROLES, Setting, setting
 
@@ -215,6 +215,15 @@ def test_bounds_hold_what_the_base_model_absorbs():
     left, free = ground.left(np.array([200.0, 200.0, 5.0, 0.0, 0.0, 0.0]))
     np.testing.assert_allclose(left, [100.0, 0.0, 5.0, 0.0, 0.0, 0.0], atol=0.01)
     assert free.tolist() == [False, True]
+
+
+def test_what_an_effect_adds_is_taken_on_the_same_robot_with_the_same_noise(hinge: Setting):
+    """Of an offset twice as large twice as much, per unit of it the same; a drift differs by repeat."""
+    where = ground(hinge, draw_truths(hinge, np.random.default_rng(3))["fit"], 7)
+    one, two = (where.hidden(Applied("torque_bias", size)) for size in (0.1, 0.2))
+    assert one.shape[0] == 10 and np.abs(one).max() > 1.0
+    np.testing.assert_allclose(two, one, atol=0.02 * np.abs(one).max())
+    assert np.ptp(one, axis=0).max() == 0.0 < np.ptp(where.hidden(Applied("torque_drift", 0.5)), axis=0).max()
 
 
 def test_the_stand_in_is_no_mirror_of_the_library():
