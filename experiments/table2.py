@@ -30,11 +30,12 @@ import json  # noqa: E402
 import tyro  # noqa: E402
 
 from benchmarks.common import origin  # noqa: E402
+from droid_jax.commands.train import randomise  # noqa: E402
 from droid_jax.identify.gaussian import prior  # noqa: E402
 from droid_jax.model.door import door_space  # noqa: E402
 from droid_jax.model.door_scene import door_scene  # noqa: E402
 from droid_jax.policy.door_env import DoorEnv  # noqa: E402
-from droid_jax.policy.randomise import Randomise, fixed, randomised  # noqa: E402
+from droid_jax.policy.randomise import Randomise  # noqa: E402
 from droid_jax.policy.task import Task  # noqa: E402
 from droid_jax.policy.transfer import TransferConfig, stand_in  # noqa: E402
 from droid_jax.report.export import png_bytes  # noqa: E402
@@ -60,11 +61,8 @@ class Arguments(Options):
 
 def doors(method: Method, setting: Setting, folder: Path, quick: bool, env: DoorEnv) -> Randomise:
     """What a method trains on: the one thing in which methods differ."""
-    scene = env.scene
-    if method == "prior":
-        return randomised(scene, prior(door_space(scene)))
-    gaussian = fitted(setting, folder, quick)
-    return fixed(scene, gaussian.space, gaussian.centre) if method == "mean" else randomised(scene, gaussian)
+    gaussian = prior(door_space(env.scene)) if method == "prior" else fitted(setting, folder, quick)
+    return randomise(method, env.scene, gaussian)
 
 
 def case(method: Method, seed: int, setting: Setting, folder: Path, budget: Budget) -> dict[str, Any]:
@@ -72,10 +70,9 @@ def case(method: Method, seed: int, setting: Setting, folder: Path, budget: Budg
     env = DoorEnv(door_scene(timestep=TIMESTEP, limits=True), budget.task(Task(**setting.task)))
     config = TransferConfig(trials=budget.trials, seed=setting.robot)
     robot = stand_in(door_scene(limits=True), env.start, truth_of(setting), (), env.task, config)
-    randomise = doors(method, setting, folder, budget.quick, env)
+    drawn = doors(method, setting, folder, budget.quick, env)
     doors_of = repr((setting, (folder / GAUSSIAN).read_text() if method != "prior" else "prior"))
-    found = tried(folder / f"{method}_{seed}", env, randomise, robot, seed, budget, doors_of)
-    return found
+    return tried(folder / f"{method}_{seed}", env, drawn, robot, seed, budget, doors_of)
 
 
 def planned_case(method: Method, seed: int, setting: Setting, arguments: Arguments) -> Case:
@@ -99,10 +96,11 @@ def main() -> None:
     ]
     now = [c for c in planned if (c.of["setting"]["name"], c.of["method"]) in asked]
     run_all(now, arguments.at_most)
-    summary = summed_up(found_of(planned), settings)
+    found = found_of(planned)
+    summary = summed_up(found, settings)
     write_json(arguments.summary("table2"), {**summary, **origin(0)})
     write_text(arguments.summary("table2", ".md"), as_text(summary))
-    write_bytes(arguments.summary("table2", ".png"), png_bytes(histograms(found_of(planned), settings)))
+    write_bytes(arguments.summary("table2", ".png"), png_bytes(histograms(found, settings)))
     print(json.dumps(summary["line"]))
 
 

@@ -67,6 +67,7 @@ def run(command: Evaluate) -> None:
     from droid_jax.storage import new_folder, write_json
 
     trained = read_training(command.run)
+    setup, policy = trained["setup"], load(command.run / POLICY)
     policy_sha256 = hashlib.sha256((command.run / POLICY).read_bytes()).hexdigest()
     setup_now = {**setup_of(command), "policy_sha256": policy_sha256}
     if not command.again and (done := _done(command.run, setup_now)):
@@ -74,7 +75,6 @@ def run(command: Evaluate) -> None:
         _tell(done)
         report.run(report.Report(command.run))
         return
-    setup, policy = trained["setup"], load(command.run / POLICY)
     scene, gaussian, effects = source(command.run, setup["knob"])
     env = DoorEnv(scene, _task(command.run, trained["task"]), effects)
     robot, truth = _robot(command, trained, env)

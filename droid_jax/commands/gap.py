@@ -132,8 +132,6 @@ def values_of(folder: Path, base: Space) -> np.ndarray:
 
     Raises ValueError where there is no whole fit, or one that lacks a parameter of this model.
     """
-    import numpy as np
-
     try:
         known = {p["name"]: float(p["best"]) for p in json.loads((folder / "fit.json").read_text())["parameters"]}
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -141,7 +139,7 @@ def values_of(folder: Path, base: Space) -> np.ndarray:
     lacking = [p.name for p in base.parameters if not p.nuisance and p.name not in known]
     if lacking:
         raise ValueError(f"--fit {folder} is of another model: it lacks {', '.join(lacking)}")
-    return np.clip(base.values({n: v for n, v in known.items() if n in base.names}), base.low, base.high)
+    return base.values({n: v for n, v in known.items() if n in base.names})
 
 
 def chosen_effects(command: Gap, scene: Scene, recordings: list[Recording]) -> tuple[Effect, ...]:

@@ -14,7 +14,7 @@ from droid_jax.commands import evaluate, gap, identify, report, train
 from droid_jax.commands.folder import OtherRun
 from droid_jax.commands.hidden import DEMONSTRATIONS, hidden_effects, record_stand_in
 from droid_jax.commands.scenes import needs_recording
-from droid_jax.commands.source import needs_brax
+from droid_jax.commands.source import needs_brax, setup
 from droid_jax.report.files import TRANSFER
 
 Stage = Literal["identify", "gap", "train", "evaluate"]
@@ -126,7 +126,7 @@ def model_folder(out: Path) -> Path:
     A search in other recordings than the fit's, left over from an earlier run, does not count.
     """
     found = _json(out / "gap" / "gap.json")
-    fit, gap_ = ((_json(out / stage / "setup.json") or {}).get("recordings_sha256") for stage in ("identify", "gap"))
+    fit, gap_ = (setup(out / stage).get("recordings_sha256") for stage in ("identify", "gap"))
     stale = fit is not None and gap_ is not None and gap_[: len(fit)] != fit
     return out / ("gap" if found and found["effects"] and not stale else "identify")
 

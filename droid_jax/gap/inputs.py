@@ -72,9 +72,6 @@ def _travels(recording: Recording, joint: str) -> np.ndarray | None:
         return None
     column = 0 if name == "object_angle" else channel.columns.index(joint)
     values = np.where(channel.mask, channel.values, np.nan)[:, :, column]
-    values = values[~np.isnan(values).all(axis=1)]  # what was not measured in a repeat is no missed grasp
-    if not len(values):
-        return None
     return np.subtract(*np.nanquantile(values, [0.99, 0.01], axis=1))
 
 
