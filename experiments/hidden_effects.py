@@ -13,6 +13,7 @@ The package `blind` says how it is kept honest.  Each command ends with one line
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -29,7 +30,7 @@ import subprocess  # noqa: E402
 import tyro  # noqa: E402
 
 from benchmarks.common import origin  # noqa: E402
-from droid_jax.storage import write_json  # noqa: E402
+from droid_jax.storage import write_json, write_text  # noqa: E402
 from experiments.blind.cases import Counts, plans  # noqa: E402
 from experiments.blind.draws import commit_of  # noqa: E402
 from experiments.blind.limits import scene_limits  # noqa: E402
@@ -38,6 +39,7 @@ from experiments.blind.oracle import oracle_all  # noqa: E402
 from experiments.blind.scenes import setting  # noqa: E402
 from experiments.blind.score import score_folder  # noqa: E402
 from experiments.blind.search import Bench, search_all  # noqa: E402
+from experiments.blind.table import score_table  # noqa: E402
 
 SceneName = Literal["hinge", "bench", "arm", "door"]
 RUNS = ROOT / "runs" / "hidden_effects"
@@ -121,7 +123,7 @@ class Score:
     limits: Path = LIMITS
     """Detection limits, for what a hidden amplitude is in the library's terms."""
     results: Path | None = None
-    """Folder of hidden_effects.json; default: OUT."""
+    """Folder of hidden_effects.json and of its table, hidden_effects.md; default: OUT."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +161,7 @@ def run_make(command: Make) -> dict[str, Any]:
             raise SystemExit(f"error: {command.out} holds cases of {known_cases['commit']}; choose another --out")
         made = known_cases["scenes"]
     for name in ("hinge",) if command.quick else command.scenes:
-        where, outcomes = setting(name, command.out / "door"), dict[str, list[str]]()
+        where, outcomes = setting(name, command.out / "door"), dict[str, str]()
         for plan in plans(where, counts, commit, known.get(name, {})):
             if command.classes and plan.kind not in command.classes:
                 continue
@@ -168,11 +170,19 @@ def run_make(command: Make) -> dict[str, Any]:
             if effects and plan.effects and not set(effects) & set(plan.effects):
                 continue
             outcome = make(where, plan, commit, known.get(name, {}), command.out / "cases", command.out / "sealed")
-            outcomes.setdefault(outcome, []).append(plan.name)
+            outcomes[plan.name] = outcome
             _tell(f"{plan.name}: {outcome}")
-        made[name] = outcomes
+        made[name] = _with(made.get(name, {}), outcomes)
         write_json(path, {"commit": commit, "scenes": made})
     return {scene: {outcome: len(names) for outcome, names in found.items()} for scene, found in made.items()}
+
+
+def _with(known: Mapping[str, list[str]], found: Mapping[str, str]) -> dict[str, list[str]]:
+    """Outcome -> names, of the plans made before and of those made now."""
+    out: dict[str, list[str]] = {o: [n for n in names if n not in found] for o, names in known.items()}
+    for name, outcome in found.items():
+        out.setdefault(outcome, []).append(name)
+    return {outcome: names for outcome, names in out.items() if names}
 
 
 def run_search(command: Search) -> dict[str, Any]:
@@ -194,7 +204,9 @@ def run_score(command: Score) -> dict[str, Any]:
     """Write hidden_effects.json and hand its headline figures on."""
     limits = json.loads(command.limits.read_text())["scenes"] if command.limits.is_file() else {}
     result = score_folder(command.out / "results", command.out / "sealed", limits, command.out / "oracle")
-    write_json((command.results or command.out) / "hidden_effects.json", {**origin(0), **result})
+    folder = command.results or command.out
+    write_json(folder / "hidden_effects.json", {**origin(0), **result})
+    write_text(folder / "hidden_effects.md", score_table(result["cases"]))
     return result["summary"]
 
 

@@ -27,6 +27,7 @@ import scipy.stats  # noqa: E402
 import tyro  # noqa: E402
 
 from benchmarks.common import origin  # noqa: E402
+from droid_jax import runtime  # noqa: E402
 from droid_jax.gap.candidates import candidates  # noqa: E402
 from droid_jax.gap.screen import questions_of  # noqa: E402
 from droid_jax.gap.workflow import ask, base_fit, find  # noqa: E402
@@ -66,6 +67,15 @@ class Arguments:
     """Folder of the cases and of null_calibration.json."""
 
 
+def case_of(plan: Plan, commit: str, bench: Bench) -> dict[str, Any]:
+    """One case; what fails is a result too, and counts as a case without an answer."""
+    try:
+        result = run_case(plan, commit, bench)
+    except (ValueError, RuntimeError, FloatingPointError) as error:
+        result = {"scene": plan.scene, "verdict": "error", "error": str(error), "seed": seed_of(commit, plan.name)}
+    return {**result, "code": runtime.versions().get("git")}
+
+
 def run_case(plan: Plan, commit: str, bench: Bench) -> dict[str, Any]:
     """Screen one case; search it to the end where the screening rejects."""
     scene, where, watch = plan.scene, bench.setting(plan.scene), Stopwatch()
@@ -87,10 +97,18 @@ def run_case(plan: Plan, commit: str, bench: Bench) -> dict[str, Any]:
 
 
 def summarise(cases: list[dict[str, Any]]) -> dict[str, Any]:
-    """False alarms with Wilson's intervals, and the p-values' distribution."""
+    """False alarms with Wilson's intervals, and the p-values' distribution.
+
+    Shares are of the cases that were answered; those that failed are counted beside them.
+    """
+    failed, cases = sum("p" not in c for c in cases), [c for c in cases if "p" in c]
+    if not cases:
+        return {"cases": 0, "errors": failed}
     p = np.array([c["p"] for c in cases])
     return {
         "cases": len(cases),
+        "errors": failed,
+        "codes": sorted({str(c.get("code")) for c in cases}),
         "screening_rejects": rate(cases, lambda c: c["p"] < SIGNIFICANT),
         "alarms": rate(cases, lambda c: c.get("verdict", "none") not in ("none", "fit not converged")),
         "names": rate(cases, lambda c: bool(c.get("effects"))),
@@ -101,6 +119,11 @@ def summarise(cases: list[dict[str, Any]]) -> dict[str, Any]:
         "gap_median": float(np.median([c["gap"] for c in cases])),
         "seconds_median": float(np.median([sum(c["seconds"].values()) for c in cases])),
     }
+
+
+def told(case: dict[str, Any]) -> str:
+    """One line."""
+    return f"p = {case['p']:.3f}" if "p" in case else f"error: {case['error']}"
 
 
 def main() -> None:
@@ -114,9 +137,9 @@ def main() -> None:
             name = f"{scene}/null/{number}"
             path = arguments.out / "null_cases" / f"{scene}_{number:03d}_{seed_of(commit, name):08x}.json"
             if not path.is_file():
-                write_json(path, run_case(Plan(name, scene, "none"), commit, bench))
+                write_json(path, case_of(Plan(name, scene, "none"), commit, bench))
             found.setdefault(scene, []).append(json.loads(path.read_text()))
-            print(f"{scene} {number}: p = {found[scene][-1]['p']:.3f}", flush=True)
+            print(f"{scene} {number}: {told(found[scene][-1])}", flush=True)
     scenes = {scene: summarise(cases) for scene, cases in found.items()}
     whole = summarise([c for cases in found.values() for c in cases])
     result = {**origin(0), "seeds_from": commit, "all": whole, "scenes": scenes}

@@ -141,6 +141,22 @@ def test_one_repeat_that_missed_its_grasp(place: Path, refused):
     assert "in repeat 4 the object joint 'door' moves by 0.0" in said and "leave that repeat away" in said
 
 
+@pytest.mark.parametrize(
+    ("turned", "said"), [(lambda v: 0.02 * v, "moves by 0.0"), (lambda v: v, "in repeat 4 the object joint 'door'")]
+)
+def test_an_angle_that_one_repeat_did_not_measure_hides_no_other_fault(place: Path, refused, turned, said: str):
+    recording = record("confirm")
+    position = recording.channels["position"]
+    mask = position.mask.copy()
+    mask[1, :, position.columns.index("door")] = False
+    values = position.values.copy()
+    values[..., position.columns.index("door")] = turned(values[..., position.columns.index("door")])
+    values[4, :, position.columns.index("door")] *= 0.1
+    channels = {"torque": recording.channels["torque"], "position": replace(position, values=values, mask=mask)}
+    save(replace(recording, channels=channels), place / "confirm.npz")
+    assert said in refused(arguments(place))
+
+
 def test_a_sensor_that_is_dead_in_one_repeat(place: Path, refused):
     def dead(values: np.ndarray) -> np.ndarray:
         values[2, :, 1] = 0.25

@@ -49,7 +49,7 @@ def _check_object(scene: Scene, recording: Recording, where: str) -> None:
     each = None if scene.object_joint is None else _travels(recording, scene.object_joint)
     if each is None:
         return
-    usual, least = float(np.median(each)), int(np.argmin(each))
+    usual, least = float(np.nanmedian(each)), int(np.nanargmin(each))
     if usual < SHUT:
         raise ValueError(
             f"{where}: the object joint {scene.object_joint!r} moves by {usual:.2g} only (at least {SHUT:g} is "
@@ -63,7 +63,10 @@ def _check_object(scene: Scene, recording: Recording, where: str) -> None:
 
 
 def _travels(recording: Recording, joint: str) -> np.ndarray | None:
-    """[N] how far the object's joint moves in each repeat, rad or m; None where nothing measured it."""
+    """[N] how far the object's joint moves in each repeat, rad or m, NaN where a repeat did not measure it.
+
+    None where no repeat did.
+    """
     name = "object_angle" if "object_angle" in recording.channels else "position"
     if name not in recording.channels:
         return None
@@ -71,8 +74,12 @@ def _travels(recording: Recording, joint: str) -> np.ndarray | None:
     if name == "position" and joint not in channel.columns:
         return None
     column = 0 if name == "object_angle" else channel.columns.index(joint)
-    values = np.where(channel.mask, channel.values, np.nan)[:, :, column]
-    return np.subtract(*np.nanquantile(values, [0.99, 0.01], axis=1))
+    values, seen = channel.values[:, :, column], channel.mask[:, :, column]
+    known = seen.any(axis=1)  # what was not measured in a repeat is no missed grasp
+    moved = np.full(len(values), np.nan)
+    spread = np.nanquantile(np.where(seen, values, np.nan)[known], [0.99, 0.01], axis=1)
+    moved[known] = spread[0] - spread[1]
+    return moved if known.any() else None
 
 
 def _check_timing(recording: Recording, where: str) -> None:

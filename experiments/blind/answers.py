@@ -7,8 +7,11 @@ benchmarks/results/detection_limits.json).
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+
+import numpy as np
+import scipy.optimize
 
 from droid_jax.measure.hidden import HIDDEN, Applied
 from droid_jax.model.scene import Scene
@@ -135,6 +138,19 @@ def right(scene: Scene, hidden: Applied) -> tuple[str, ...]:
         return ()
     names = (_at(scene, name, hidden.joint) for name in (answer.exact, *answer.ties))
     return tuple(dict.fromkeys(n for n in names if n))
+
+
+def matched(slots: Sequence[set[str]], right_names: Sequence[Sequence[str]]) -> list[bool]:
+    """For each hidden effect: whether a part of the answer (an effect with its ties) names it.
+
+    No part answers for two effects: "a or b" is one name, and of a and b it finds one.
+    """
+    fits = np.array([[bool(slot & set(names)) for slot in slots] for names in right_names], bool)
+    met = np.zeros(len(right_names), bool)
+    if fits.size:
+        effect, slot = scipy.optimize.linear_sum_assignment(fits, maximize=True)
+        met[effect] = fits[effect, slot]
+    return met.tolist()
 
 
 def parts(scene: Scene, hidden: Applied) -> tuple[str, ...]:

@@ -21,6 +21,7 @@ from droid_jax.gap.refit import Model
 from droid_jax.gap.screen import Screen, project
 from droid_jax.measure.noise import lowpass, smooth
 from droid_jax.measure.recording import Recording
+from experiments.blind.answers import matched
 from experiments.blind.units import torques, whitened
 
 MOST = 5  # effects that BIC may name
@@ -153,9 +154,11 @@ def _shaped(evidence: Evidence, rows: np.ndarray) -> np.ndarray:
     return rows.reshape(columns, -1).T
 
 
-def bic_outcome(named: Sequence[str], right: Sequence[Sequence[str]]) -> dict[str, bool]:
-    """Whether BIC named everything hidden, and anything that was not."""
+def bic_outcome(
+    named: Sequence[str], right: Sequence[Sequence[str]], allowed: Sequence[Sequence[str]]
+) -> dict[str, bool]:
+    """Whether BIC named everything hidden, and anything that is not among the names allowed beside it."""
     return {
-        "all": all(set(names) & set(named) for names in right if names) and any(right),
-        "false": any(not any(n in names for names in right) for n in named),
+        "all": any(right) and all(matched([{n} for n in named], [names for names in right if names])),
+        "false": any(not any(n in names for names in allowed) for n in named),
     }

@@ -12,7 +12,7 @@ import numpy as np
 import scipy.stats
 
 from droid_jax.measure.hidden import Applied
-from experiments.blind.answers import parts, right
+from experiments.blind.answers import matched, parts, right
 from experiments.blind.baselines import bic_outcome
 from experiments.blind.cases import key
 from experiments.blind.scenes import setting
@@ -57,8 +57,14 @@ def score_folder(results: Path, sealed: Path, limits: Mapping[str, Any], oracles
         "by_group": {name: summarise(cases) for name, cases in groups.items()},
         "confusion": confusion(judged),
         "commits": sorted({c["truth"]["commit"] for c in found}),
+        "searched_by_other_code": sorted(c["truth"]["name"] for c in found if not by_frozen_code(c)),
         "cases": judged,
     }
+
+
+def by_frozen_code(case: Case) -> bool:
+    """Whether the commit that searched is the one that the case's seed is of; results before 0e96fcd do not tell."""
+    return case["result"].get("code") in (None, case["truth"]["commit"])
 
 
 def judge(case: Case, limits: Mapping[str, Any]) -> dict[str, Any]:
@@ -68,7 +74,7 @@ def judge(case: Case, limits: Mapping[str, Any]) -> dict[str, Any]:
     slots = [{e, *ties} for e, ties in zip(result.get("effects", ()), result.get("tied", ()), strict=True)]
     if truth["kind"] == "left_out":
         right_names = [[] for _ in right_names]
-    met = [any(slot & set(names) for slot in slots) for names in right_names]
+    met = matched(slots, right_names)
     allowed = right_names if truth["kind"] == "left_out" else [*right_names, *case["parts"]]
     false = [sorted(slot) for slot in slots if not any(slot & set(names) for names in allowed)]
     exact = [any(e == names[0] for e in result.get("effects", ())) for names in right_names if names]
@@ -80,6 +86,8 @@ def judge(case: Case, limits: Mapping[str, Any]) -> dict[str, Any]:
         "class": truth["kind"],
         "factor": truth["factor"],
         "hidden": {key(h["name"], h["joint"]): h["amplitude"] for h in truth["hidden"]},
+        "times_limit": times_limit(truth, limits),
+        "code": result.get("code"),
         "verdict": verdict,
         "effects": list(result.get("effects", ())),
         "tied": [list(t) for t in result.get("tied", ())],
@@ -99,6 +107,13 @@ def judge(case: Case, limits: Mapping[str, Any]) -> dict[str, Any]:
         "baselines": against_baselines(case),
         "seconds": seconds,
     }
+
+
+def times_limit(truth: Mapping[str, Any], limits: Mapping[str, Any]) -> dict[str, float]:
+    """How many times its detection limit each hidden effect is: more than the factor where its worth sets its size."""
+    known = limits.get(truth["scene"], {})
+    names = {key(h["name"], h["joint"]): abs(h["amplitude"]) for h in truth["hidden"]}
+    return {n: size / known[n]["limit"] for n, size in names.items() if known.get(n, {}).get("limit")}
 
 
 def closed(result: Mapping[str, Any], role: str) -> float:
@@ -160,11 +175,13 @@ def against_baselines(case: Case) -> dict[str, Any] | None:
     found = case["result"].get("baselines")
     if not found:
         return None
-    names = [[] for _ in case["right"]] if case["truth"]["kind"] == "left_out" else case["right"]
+    left_out = case["truth"]["kind"] == "left_out"
+    names = [[] for _ in case["right"]] if left_out else case["right"]
+    allowed = names if left_out else [*names, *case["parts"]]
     boxes = {"gaps": found["black_box"], "floor": case["result"]["floor"]}
     return {
         "bic": found["bic"],
-        **{f"bic_{k}": v for k, v in bic_outcome(found["bic"], names).items()},
+        **{f"bic_{k}": v for k, v in bic_outcome(found["bic"], names, allowed).items()},
         "closed": {role: closed(boxes, role) for role in ("confirm", "sealed")},
     }
 

@@ -368,7 +368,29 @@ def test_confusion_and_errors():
 
 
 def test_bic_is_judged_by_the_same_answers():
-    assert bic_outcome(["a"], [["a", "b"]]) == {"all": True, "false": False}
-    assert bic_outcome(["a", "c"], [["a", "b"]]) == {"all": True, "false": True}
-    assert bic_outcome(["a"], [["a"], ["b"]]) == {"all": False, "false": False}
-    assert bic_outcome(["a"], []) == {"all": False, "false": True}
+    def outcome(named: list[str], right: list[list[str]], parts: list[list[str]] | None = None) -> dict[str, bool]:
+        return bic_outcome(named, right, [*right, *(parts or [])])
+
+    assert outcome(["a"], [["a", "b"]]) == {"all": True, "false": False}
+    assert outcome(["a", "c"], [["a", "b"]]) == {"all": True, "false": True}
+    assert outcome(["a", "c"], [["a", "b"]], [["c"]]) == {"all": True, "false": False}
+    assert outcome(["a"], [["a"], ["b"]]) == {"all": False, "false": False}
+    assert outcome(["b"], [["a", "b"], ["b"]]) == {"all": False, "false": False}
+    assert outcome(["a"], []) == {"all": False, "false": True}
+
+
+def test_one_tie_does_not_name_both_effects_of_a_pair():
+    right_names = [["check", "preload"], ["tilt", "preload"]]
+    one = score.judge(case("pair", "tie", ["preload"], right_names, tied=[["check", "tilt"]]), {})
+    two = score.judge(case("pair", "tie", ["preload", "check"], right_names, tied=[["tilt"], []]), {})
+    assert sum(one["met"]) == 1 and not one["named"] and not one["false_names"]
+    assert two["met"] == [True, True] and two["named"]
+
+
+def test_a_case_tells_its_multiple_of_the_limit_and_whose_code_searched():
+    known = {"s": {"h0": {"limit": 0.5}}}
+    given = case("single", "named", ["latch at door"], [["latch at door"]])
+    judged = score.judge(given, known)
+    assert judged["times_limit"] == {"h0": abs(given["truth"]["hidden"][0]["amplitude"]) / 0.5}
+    other = {**given, "result": {**given["result"], "code": "f" * 40}}
+    assert score.by_frozen_code(given) and not score.by_frozen_code(other)

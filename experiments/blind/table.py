@@ -1,0 +1,97 @@
+"""The score as a table: what was asked of the search, and what it reached in each scene, with 95 % intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+from experiments.blind.score import CLOSED, NAMEABLE, NAMING, closing, rate
+
+Case = Mapping[str, Any]
+Chosen = Callable[[Case], bool]
+
+
+def score_table(judged: Sequence[Mapping[str, Any]]) -> str:
+    """Markdown, one column for each scene.  judged: the `cases` of hidden_effects.json."""
+    scenes = sorted({c["scene"] for c in judged})
+    counts = [sum(c["scene"] == s for c in judged) for s in scenes]
+    heads = [f"{scene} ({count} cases)" for scene, count in zip(scenes, counts, strict=True)]
+    rows = [["", "asked for", *heads], ["---"] * (2 + len(scenes))]
+    for label, target, chosen, hit in _rows():
+        cells = [_share([c for c in judged if c["scene"] == s and chosen(c)], hit) for s in scenes]
+        if any(cells):
+            rows.append([label, target, *(c or "-" for c in cells)])
+    rows.append(["sealed gap closed, median", "80 %", *(_closed(judged, s) for s in scenes)])
+    rows.append(
+        ["amplitudes in their 90 % interval", "85 to 95 %", *(_amplitudes(judged, s) for s in scenes)],
+    )
+    return "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"
+
+
+def _kind(*kinds: str, factors: Sequence[float] = ()) -> Chosen:
+    return lambda c: c["class"] in kinds and (not factors or c["factor"] in factors)
+
+
+def _named(case: Case) -> bool:
+    return case["class"] in ("single", "pair") and bool(case["named"])
+
+
+def _reachable(case: Case) -> bool:
+    return _kind("single", factors=(3.0, 10.0))(case) and (case["reachable"] or 0.0) >= NAMEABLE
+
+
+def _hidden(case: Case) -> bool:
+    return case["class"] != "none"
+
+
+def _false(case: Case) -> bool:
+    return bool(case["false_names"])
+
+
+def _rows() -> Iterator[tuple[str, str, Chosen, Chosen]]:
+    """What is counted, what was asked for, of which cases, and which of them count."""
+    at_limit, above = _kind("single", factors=(1.0,)), _kind("single", factors=(3.0, 10.0))
+    yield "nothing hidden: an alarm", "under 1 %", _kind("none"), lambda c: c["verdict"] != "none"
+    yield "one at 10 times its limit: named, alone or in a tie", "95 %", _kind("single", factors=(10.0,)), _named
+    yield "one at 3 times: named, alone or in a tie", "90 %", _kind("single", factors=(3.0,)), _named
+    yield "one at its limit: named, alone or in a tie", "", at_limit, _named
+    yield "one at its limit: detected", "50 %", at_limit, lambda c: c["verdict"] in (*NAMING, "unexplained")
+    yield "one at 3 or 10 times: named alone, nothing left open", "80 %", above, lambda c: c["exact"]
+    yield "one whose right name closes half of the gap: named, alone or in a tie", "", _reachable, _named
+    yield "two: one named, nothing false", "90 %", _kind("pair"), lambda c: any(c["met"]) and not _false(c)
+    yield "two: both named, nothing false", "70 %", _kind("pair"), _named
+    yield "no form in the library: called open", "80 %", _kind("outside"), lambda c: c["open"]
+    yield "its form taken away: called open", "80 %", _kind("left_out"), lambda c: c["open"]
+    yield "either of these two: holds a false name", "", _kind("outside", "left_out"), _false
+    yield "anything hidden: wrong and confident", "at most 3 %", _hidden, lambda c: c["wrong_confident"]
+    yield "anything hidden: holds a false name", "", _hidden, _false
+    yield "anything hidden: stepwise BIC holds a false name", "", _judged_by_bic, lambda c: c["baselines"]["bic_false"]
+    closed = f"named: at least {CLOSED:.0%} of the sealed gap closed"
+    yield closed, "", _named, lambda c: c["closed"].get("sealed", 0.0) >= CLOSED
+    yield "named: sealed gap within two floors of the floor", "", _named, lambda c: bool(c["within_floor"])
+
+
+def _judged_by_bic(case: Case) -> bool:
+    return _hidden(case) and bool(case["baselines"])
+
+
+def _share(cases: Sequence[Case], hit: Chosen) -> str:
+    """ "22 of 25 (70 to 96 %)"; empty where there is no case."""
+    found = rate(cases, hit)
+    if found is None:
+        return ""
+    low, high = (100.0 * v for v in found["interval_95"])
+    return f"{found['hits']} of {found['of']} ({low:.0f} to {high:.0f} %)"
+
+
+def _closed(judged: Sequence[Mapping[str, Any]], scene: str) -> str:
+    found = closing([dict(c) for c in judged if c["scene"] == scene and _named(c)], "sealed")
+    if found is None:
+        return "-"
+    low, high = found["interval_95"]
+    return f"{found['median']:.0%} ({100 * low:.0f} to {100 * high:.0f} %)"
+
+
+def _amplitudes(judged: Sequence[Mapping[str, Any]], scene: str) -> str:
+    inside = [i for c in judged if c["scene"] == scene and _named(c) for i in c["coverage"]]
+    return _share([{"inside": i} for i in inside], lambda c: c["inside"]) or "-"
