@@ -23,7 +23,7 @@ import json  # noqa: E402
 import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 
-from benchmarks.common import interleave, origin  # noqa: E402
+from benchmarks.common import interleave, origin, stem  # noqa: E402
 from droid_jax.compare.cost import Cost, make_cost  # noqa: E402
 from droid_jax.gap.candidates import candidates  # noqa: E402
 from droid_jax.gap.case import GapConfig  # noqa: E402
@@ -103,7 +103,7 @@ def main() -> None:
         "refit_iteration_rows": refit_rows,
         "refit_s_at_most": config.refit.iterations * refit_rows * row,
     }
-    write_json(arguments.out / "candidates.json", result)
+    write_json(arguments.out / f"{stem('candidates', arguments.quick)}.json", result)
     print(json.dumps(result))
 
 

@@ -10,7 +10,7 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,16 @@ def origin(seed: int) -> dict[str, Any]:
         "seed": seed,
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
+
+
+def commits(cases: Iterable[Mapping[str, Any]]) -> list[str]:
+    """The commits that made some cases, which are kept from run to run: {"origin": {"commit": ...}, ...} each."""
+    return sorted({str(case["origin"]["commit"]) for case in cases})
+
+
+def stem(name: str, quick: bool) -> str:
+    """Name of a result: what --quick writes stands beside the figures that are kept, never over them."""
+    return f"{name}_quick" if quick else name
 
 
 def interleave(

@@ -26,7 +26,7 @@ import json  # noqa: E402
 
 import tyro  # noqa: E402
 
-from benchmarks.common import origin  # noqa: E402
+from benchmarks.common import commits, origin, stem  # noqa: E402
 from benchmarks.peers import doors, springs, sysid  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 
@@ -67,7 +67,7 @@ def main() -> None:
     unknown = [c for c in arguments.cases if c not in known]
     if unknown:
         raise SystemExit(f"unknown cases {', '.join(unknown)}; there are: {', '.join(known)}")
-    folder = arguments.out / ("peer_sysid_cases_quick" if arguments.quick else "peer_sysid_cases")
+    folder = arguments.out / stem("peer_sysid_cases", arguments.quick)
     for name in arguments.cases or known:
         path = folder / f"{name}.json"
         if not path.is_file():
@@ -75,8 +75,12 @@ def main() -> None:
             write_json(path, {**known[name](), "origin": origin(0)}, indent=2)
     done = {n: json.loads((folder / f"{n}.json").read_text()) for n in known if (folder / f"{n}.json").is_file()}
     figures = {n: {k: v for k, v in case.items() if k != "origin"} for n, case in done.items()}
-    name = "peer_sysid_quick" if arguments.quick else "peer_sysid"
-    write_json(arguments.out / f"{name}.json", {**origin(0), "cases": figures}, indent=2)
+    name = stem("peer_sysid", arguments.quick)
+    write_json(
+        arguments.out / f"{name}.json",
+        {**origin(0), "cases_from_commits": commits(done.values()), "cases": figures},
+        indent=2,
+    )
     print(json.dumps({"cases": figures}))
 
 

@@ -24,7 +24,7 @@ import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 
-from benchmarks.common import origin  # noqa: E402
+from benchmarks.common import origin, stem  # noqa: E402
 from droid_jax.compare.population import over_population  # noqa: E402
 from droid_jax.compare.replay import make_drive, servo_replay  # noqa: E402
 from droid_jax.compare.twin import twin_replay  # noqa: E402
@@ -96,7 +96,7 @@ def main() -> None:
         "parity_2ms_against_c_2ms": worst(coarse(values, 0.002, "parity"), in_c),
         "unit": "N m",
     }
-    name = "step_accuracy_quick" if arguments.quick else "step_accuracy"
+    name = stem("step_accuracy", arguments.quick)
     write_json(arguments.out / f"{name}.json", {**origin(0), **result})
     print(json.dumps(result))
 

@@ -22,7 +22,7 @@ from typing import Any, Literal
 import mujoco
 import numpy as np
 import tyro
-from common import in_process, interleave, origin, peak_memory_gib
+from common import in_process, interleave, origin, peak_memory_gib, stem
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -295,7 +295,7 @@ def main(config: Throughput) -> None:
         result = untuned_part(config) if config.part == "untuned" else memory_part(config)
     else:
         result = measure(config)
-        write_json(config.out / "throughput.json", result, indent=2)
+        write_json(config.out / f"{stem('throughput', config.quick)}.json", result, indent=2)
         rows = [Row(**{k: v for k, v in row.items() if k != "steps_per_s"}) for row in result["rows"]]
         Console().print(table_of(rows))
     print(json.dumps(result))

@@ -24,7 +24,7 @@ import json  # noqa: E402
 
 import tyro  # noqa: E402
 
-from benchmarks.common import origin  # noqa: E402
+from benchmarks.common import origin, stem  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 
 POPULATION, GENERATIONS, TIMESTEP = 30, 100, 0.002
@@ -98,7 +98,7 @@ def main() -> None:
     result: dict[str, Any] = {"paper_size_fit": json.loads(done.stdout.splitlines()[-1])}
     if not arguments.quick:
         result["quick_preset"] = preset()
-    name = "time_to_fit_quick" if arguments.quick else "time_to_fit"
+    name = stem("time_to_fit", arguments.quick)
     write_json(arguments.out / f"{name}.json", {**origin(0), **result})
     print(json.dumps(result))
 

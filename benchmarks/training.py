@@ -34,7 +34,7 @@ from dataclasses import asdict, replace  # noqa: E402
 import jax  # noqa: E402
 import tyro  # noqa: E402
 
-from benchmarks.common import origin  # noqa: E402
+from benchmarks.common import origin, stem  # noqa: E402
 from droid_jax.identify.gaussian import prior  # noqa: E402
 from droid_jax.measure.surrogate import stand_in_truth  # noqa: E402
 from droid_jax.model.door import door_space  # noqa: E402
@@ -105,7 +105,7 @@ def main() -> None:
     arguments = tyro.cli(Arguments, description=__doc__)
     code = origin(arguments.seed)
     result = {**measured(arguments), **code}
-    path = arguments.out / f"training{'_quick' if arguments.quick else ''}.json"
+    path = arguments.out / f"{stem('training', arguments.quick)}.json"
     known = json.loads(path.read_text()) if path.is_file() else {}
     write_json(path, {**known, f"{arguments.preset}, {code['device']}": result})
     rates = {where: result[where]["success_rate"] for where in ("simulation", "stand_in")}

@@ -49,7 +49,7 @@ from gap_single import (
 # isort: split
 import numpy as np
 import tyro
-from inverse_fit import RESULTS, make_recording, origin, read_npz, rms, run
+from inverse_fit import RESULTS, make_recording, origin, read_npz, rms, run, stem
 
 from droid_jax.gap.verdict import Verdict
 from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
@@ -154,7 +154,8 @@ def main(config: GapDoor) -> None:
         show(f"{effect} added", added[effect])
     swapped = answer(make_search(scene, base, effects, both[::-1], gap))
     show("the other log fitted", swapped)
-    alarms = false_alarms(search, verdict, 5 if config.quick else config.cases, config.seed)
+    logs = config.out / stem("gap_door_logs", config.quick)
+    alarms = false_alarms(search, verdict, 5 if config.quick else config.cases, config.seed, logs)
     print(f"  false alarms: {alarms['said_to_be_missing']}, named {alarms['named']}")
     result = {
         **origin(config.seed),
@@ -177,7 +178,7 @@ def main(config: GapDoor) -> None:
             "added_found": {effect: names_one_of(a, [effect]) for effect, a in added.items()},
         },
     }
-    write_json(config.out / "gap_door.json", result, indent=2)
+    write_json(config.out / f"{stem('gap_door', config.quick)}.json", result, indent=2)
     print(json.dumps(result))
 
 

@@ -38,7 +38,7 @@ from gap_single import (
 # isort: split
 import jax.numpy as jnp
 import tyro
-from inverse_fit import RESULTS, origin, rms, rounded, run
+from inverse_fit import RESULTS, origin, rms, rounded, run, stem
 from real_emps import FIT, JUDGE, MOTION_CUTOFF, SLIDE, SOURCE, emps_space, load_emps
 
 from droid_jax.gap.single import make_log
@@ -157,7 +157,8 @@ def main(config: GapEmps) -> None:
         log = adding(made["dry"].log, verdicts["dry"].base.values, amplitudes)
         added[effect] = {"added": amplitudes, **answer(made["dry"], log)}
         show(f"{effect} added", added[effect])
-    alarms = false_alarms(made["viscous"], verdicts["viscous"], 3 if config.quick else config.cases, config.seed)
+    logs = config.out / stem("gap_emps_logs", config.quick)
+    alarms = false_alarms(made["viscous"], verdicts["viscous"], 3 if config.quick else config.cases, config.seed, logs)
     print(f"  false alarms: {alarms['said_to_be_missing']}, named {alarms['named']}")
     before, after = found["viscous"][JUDGE]["rms_N"]
     result = {
@@ -179,7 +180,7 @@ def main(config: GapEmps) -> None:
             "added_found": {effect: names_one_of(a, [effect]) for effect, a in added.items()},
         },
     }
-    write_json(config.out / "gap_emps.json", result, indent=2)
+    write_json(config.out / f"{stem('gap_emps', config.quick)}.json", result, indent=2)
     print(json.dumps(result))
 
 

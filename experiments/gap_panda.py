@@ -40,7 +40,7 @@ from gap_single import (
 # isort: split
 import numpy as np
 import tyro
-from inverse_fit import RESULTS, origin, rounded, run
+from inverse_fit import RESULTS, origin, rounded, run, stem
 from real_panda import MOTION_CUTOFF, SOURCE, link_nuisances, load_panda, load_published
 
 from droid_jax.model.arm import panda_arm_scene
@@ -145,7 +145,8 @@ def main(config: GapPanda) -> None:
         log = searches["dry"].log
         added[effect] = {"added": amplitudes, **answer(searches["dry"], adding(log, log.space.mean, amplitudes))}
         show(f"{effect} added", added[effect])
-    alarms = false_alarms(searches["rigid"], verdict, 2 if config.quick else config.cases, config.seed)
+    logs = config.out / stem("gap_panda_logs", config.quick)
+    alarms = false_alarms(searches["rigid"], verdict, 2 if config.quick else config.cases, config.seed, logs)
     print(f"  false alarms: {alarms['said_to_be_missing']}, named {alarms['named']}")
     joints = by_joint(found["rigid"], published)
     for row in joints:
@@ -175,7 +176,7 @@ def main(config: GapPanda) -> None:
             "added_found": {effect: names_one_of(a, [effect]) for effect, a in added.items()},
         },
     }
-    write_json(config.out / "gap_panda.json", result, indent=2)
+    write_json(config.out / f"{stem('gap_panda', config.quick)}.json", result, indent=2)
     print(json.dumps(result))
 
 

@@ -14,17 +14,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import tuned  # noqa: F401  before anything that imports jax
 
 # isort: split
+import hashlib
+import json
+
 import numpy as np
 import scipy.linalg
 import scipy.signal
 import scipy.stats
 from inverse_fit import rms, rounded
 
+from droid_jax import runtime
 from droid_jax.compare.residuals import CompareConfig
 from droid_jax.gap.blocks import OUTSIDE, Blocks
 from droid_jax.gap.case import Case, GapConfig
@@ -40,6 +45,7 @@ from droid_jax.model.effects.registry import effect_space
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, Theta
+from droid_jax.storage import write_json
 
 ORDER = 20  # of the noise's autoregression, at 20 Hz: one second
 BURN = 400  # samples before the noise is stationary
@@ -155,10 +161,11 @@ def coloured(residuals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.stack(out, axis=1)
 
 
-def false_alarms(search: Search, verdict: Verdict, count: int, seed: int) -> dict[str, Any]:
+def false_alarms(search: Search, verdict: Verdict, count: int, seed: int, folder: Path) -> dict[str, Any]:
     """The whole search on `count` synthetic logs in which nothing is missing; shares are of those not refused.
 
     Torques of the fitted base model; noise like what the extended model leaves of the real log.
+    folder: what is said of each log is kept there, so that a run that was stopped goes on where it was.
     """
     rng = np.random.default_rng(seed)
     truth, left = verdict.base.values, search.log.left(verdict.model.values)
@@ -166,14 +173,15 @@ def false_alarms(search: Search, verdict: Verdict, count: int, seed: int) -> dic
     missing, named = [], []
     for number in range(count):
         log = search.log.holding(simulated + coloured(left, rng))
-        try:
-            case, found = run_search(search, log, truth)
-        except ValueError as error:  # too short for the residual's correlation time: nothing is said
-            print(f"  {number + 1:4d}: {error}", flush=True)
+        path = folder / f"{number:04d}_{_key(log)}.json"
+        if not path.is_file():
+            write_json(path, _said_of(search, log, truth))
+        said = json.loads(path.read_text())
+        print(f"  {number + 1:4d}: {said}", flush=True)
+        if "refused" in said:
             continue
-        missing.append(found.screens[0].p < SIGNIFICANT)
-        named.extend([{"case": number, "effects": list(found.effects)}] if found.effects else [])
-        print(f"  {number + 1:4d}: p {found.screens[0].p:.4f} {found.kind.value} {case.fit.units} blocks", flush=True)
+        missing.append(said["p"] < SIGNIFICANT)
+        named.extend([{"case": number, "effects": said["effects"]}] if said["effects"] else [])
     return {
         "cases": count,
         "refused": count - len(missing),
@@ -183,6 +191,22 @@ def false_alarms(search: Search, verdict: Verdict, count: int, seed: int) -> dic
         "noise": f"autoregression of order {ORDER} of the residual that the extended model leaves, column by column",
         "level": SIGNIFICANT,
     }
+
+
+def _said_of(search: Search, log: Log, start: np.ndarray) -> dict[str, Any]:
+    """What a search says of a log: p, verdict, effects, blocks; or why it says nothing."""
+    try:
+        case, found = run_search(search, log, start)
+    except ValueError as error:  # too short for the residual's correlation time
+        return {"refused": str(error)}
+    said = {"p": found.screens[0].p, "verdict": found.kind.value, "effects": list(found.effects)}
+    return {**said, "blocks": case.fit.units}
+
+
+def _key(log: Log) -> str:
+    """Of a log's torques and of the program: what is kept under it was said of this log by this program."""
+    code = str(runtime.versions().get("git")).encode()
+    return hashlib.sha256(np.ascontiguousarray(log.measured).tobytes() + code).hexdigest()[:12]
 
 
 def share(hits: int, count: int) -> dict[str, Any]:

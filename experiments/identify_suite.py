@@ -27,7 +27,7 @@ import numpy as np  # noqa: E402
 import scipy.stats  # noqa: E402
 import tyro  # noqa: E402
 
-from benchmarks.common import origin  # noqa: E402
+from benchmarks.common import commits, origin, stem  # noqa: E402
 from droid_jax.compare.cost import make_cost  # noqa: E402
 from droid_jax.identify.gaussian import prior  # noqa: E402
 from droid_jax.identify.pipeline import Identified, IdentifyConfig, cost_samples, identify  # noqa: E402
@@ -182,7 +182,7 @@ def parity_case(_: int, quick: bool) -> dict[str, Any]:
 
 
 def run_cases(arguments: Arguments) -> dict[str, dict[str, Any]]:
-    """Run what is missing; returns all cases by name."""
+    """Run what is missing of the chosen parts; returns all cases that there are, by name."""
     quick = arguments.quick
     cases: dict[str, Callable[[], dict[str, Any]]] = {}
     if "doors" in arguments.parts:
@@ -196,20 +196,18 @@ def run_cases(arguments: Arguments) -> dict[str, dict[str, Any]]:
     if "calibration" in arguments.parts:
         for k in range(1 if quick else arguments.calibration):
             cases[f"calibration_{k:02d}"] = lambda k=k: calibration_case(k, quick)
-    folder = arguments.out / ("identify_cases_quick" if quick else "identify_cases")
-    results = {}
+    folder = arguments.out / stem("identify_cases", quick)
     for number, (name, run) in enumerate(cases.items(), 1):
         path = folder / f"{name}.json"
         if not path.is_file():
             print(f"[{number}/{len(cases)}] {name} ...", flush=True)
             write_json(path, {**run(), "origin": origin(0)}, indent=2)
-        results[name] = json.loads(path.read_text())
-    return results
+    return {path.stem: json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))}
 
 
 def summarise(cases: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """The figures of issue and paper: gap closed, errors, coverage, agreement of the poses."""
-    out: dict[str, Any] = {}
+    out: dict[str, Any] = {"cases_from_commits": commits(cases.values())}
     doors = {n: c for n, c in cases.items() if n.startswith("door_")}
     if doors:
         out["doors"] = {n: _door_summary(c) for n, c in doors.items()}
@@ -281,7 +279,7 @@ def main() -> None:
     arguments = tyro.cli(Arguments, description=__doc__)
     cases = run_cases(arguments)
     result = {**origin(0), **summarise(cases)}
-    write_json(arguments.out / ("identify_quick.json" if arguments.quick else "identify.json"), result, indent=2)
+    write_json(arguments.out / f"{stem('identify', arguments.quick)}.json", result, indent=2)
     print(json.dumps(summarise(cases)))
 
 

@@ -224,12 +224,12 @@ def draw_fit(
     return figure
 
 
-def publish(folder: Path, stem: str, seed: int, result: Mapping[str, Any], figure: Figure) -> None:
-    """Write folder/stem.json, with its origin, and folder/stem.png; print the JSON as one last line."""
+def publish(folder: Path, name: str, seed: int, result: Mapping[str, Any], figure: Figure) -> None:
+    """Write folder/name.json, with its origin, and folder/name.png; print the JSON as one last line."""
     whole = {**origin(seed), **result}
-    write_json(folder / f"{stem}.json", whole, indent=2)
-    write_bytes(folder / f"{stem}.png", png_bytes(figure))
-    print(f"  wrote {folder / stem}.json and .png")
+    write_json(folder / f"{name}.json", whole, indent=2)
+    write_bytes(folder / f"{name}.png", png_bytes(figure))
+    print(f"  wrote {folder / name}.json and .png")
     print(json.dumps(whole))
 
 

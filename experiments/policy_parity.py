@@ -27,7 +27,7 @@ import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 
-from benchmarks.common import origin  # noqa: E402
+from benchmarks.common import origin, stem  # noqa: E402
 from droid_jax.identify.gaussian import Gaussian, prior  # noqa: E402
 from droid_jax.identify.gaussian import load as load_gaussian  # noqa: E402
 from droid_jax.model.door import door_nuisances, door_space  # noqa: E402
@@ -133,7 +133,7 @@ def main() -> None:
         "success_rate": {name: trials.rate for name, trials in both.items()},
         "stopped": {name: trials.to_json()["stopped"] for name, trials in both.items()},  # C runs the robot's own loop
     }
-    name = "policy_parity_quick" if arguments.quick else "policy_parity"
+    name = stem("policy_parity", arguments.quick)
     write_bytes(arguments.out / f"{name}.png", png_bytes(scatter(angle["mjx"], angle["c"])))
     every = {n: a.round(3).tolist() for n, a in angle.items()}
     write_json(arguments.out / f"{name}.json", {**result, "angles_deg": every, **origin(arguments.seed)})

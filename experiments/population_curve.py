@@ -26,7 +26,7 @@ import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 
-from benchmarks.common import origin  # noqa: E402
+from benchmarks.common import commits, origin, stem  # noqa: E402
 from droid_jax.compare.cost import Cost, make_cost  # noqa: E402
 from droid_jax.identify.pipeline import split  # noqa: E402
 from droid_jax.identify.search import SearchConfig, search  # noqa: E402
@@ -45,9 +45,9 @@ class Arguments:
     """Options of the comparison."""
 
     quick: bool = False
-    """Half a minute a search and one seed: shows that it runs."""
+    """Three seconds a search, one seed, two populations: shows that it runs."""
     out: Path = ROOT / "benchmarks" / "results"
-    """Folder of population_curve.json and .png."""
+    """Folder of population_curve.json and .png, and of the searches, which are not run again."""
     minutes: float = 2.0
     """Wall time of every search."""
     populations: tuple[int, ...] = (30, 128, 512)
@@ -120,24 +120,29 @@ def main() -> None:
     from droid_jax.report.export import png_bytes
 
     arguments = tyro.cli(Arguments, description=__doc__)
-    seconds = 30.0 if arguments.quick else 60.0 * arguments.minutes
+    seconds = 3.0 if arguments.quick else 60.0 * arguments.minutes
+    populations = arguments.populations[:2] if arguments.quick else arguments.populations
     cost, held = prepare()
     for compiled in (cost, held):
-        compiled(np.tile(cost.space.mean, (max(arguments.populations), 1)))
+        compiled(np.tile(cost.space.mean, (max(populations), 1)))
+    folder = arguments.out / stem("population_curve_runs", arguments.quick)
     runs = []
     for seed in range(1 if arguments.quick else arguments.seeds):
-        for population in arguments.populations:
-            runs.append(curve(cost, held, population, seconds, seed))
+        for population in populations:
+            path = folder / f"{population}_samples_{seconds:g}_s_{seed}.json"
+            if not path.is_file():
+                write_json(path, {**curve(cost, held, population, seconds, seed), "origin": origin(seed)})
+            runs.append(json.loads(path.read_text()))
             print(f"{population} samples, seed {seed}: held-out {runs[-1]['held_out'][-1]:.4f} N m", flush=True)
     shares = (0.25, 0.5, 1.0)
     table = {
         str(p): {f"{s * seconds:g} s": [at(r, s * seconds) for r in runs if r["population"] == p] for s in shares}
-        for p in arguments.populations
+        for p in populations
     }
-    summary = {"seconds": seconds, "held_out_by_population_and_time": table}
-    stem = "population_curve_quick" if arguments.quick else "population_curve"
-    write_json(arguments.out / f"{stem}.json", {**origin(0), **summary, "runs": runs})
-    write_bytes(arguments.out / f"{stem}.png", png_bytes(figure(runs)))
+    summary = {"seconds": seconds, "searches_from_commits": commits(runs), "held_out_by_population_and_time": table}
+    name = stem("population_curve", arguments.quick)
+    write_json(arguments.out / f"{name}.json", {**origin(0), **summary, "runs": runs})
+    write_bytes(arguments.out / f"{name}.png", png_bytes(figure(runs)))
     print(json.dumps(summary))
 
 

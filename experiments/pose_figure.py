@@ -22,6 +22,7 @@ from identify_suite import gaussian  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 from scipy import stats  # noqa: E402
 
+from benchmarks.common import stem  # noqa: E402
 from droid_jax.report.export import png_bytes  # noqa: E402
 from droid_jax.report.style import AFTER, BEFORE, TRUTH, WIDE, styled  # noqa: E402
 from droid_jax.report.words import label  # noqa: E402
@@ -66,14 +67,14 @@ def densities(a: dict[str, Any], b: dict[str, Any], width: float = WIDE) -> Figu
 
 def main() -> None:
     arguments = tyro.cli(Arguments, description=__doc__)
-    folder = arguments.out / ("identify_cases_quick" if arguments.quick else "identify_cases")
+    folder = arguments.out / stem("identify_cases", arguments.quick)
     missing = [p for p in "AB" if not (folder / f"pose_{p}.json").is_file()]
     if missing:
         raise SystemExit(
             f"error: no case pose_{missing[0]} in {folder}; run experiments/identify_suite.py --parts pose"
         )
     a, b = (json.loads((folder / f"pose_{p}.json").read_text())["parameters"] for p in "AB")
-    path = arguments.out / "pose_agreement.png"
+    path = arguments.out / f"{stem('pose_agreement', arguments.quick)}.png"
     write_bytes(path, png_bytes(densities(a, b)))
     print(json.dumps({"figure": str(path)}))
 

@@ -42,6 +42,7 @@ from inverse_fit import (
     rms,
     rounded,
     run,
+    stem,
     table,
 )
 
@@ -69,11 +70,13 @@ class RealEmps:
     """Identify the EMPS benchmark's carriage from its real log.
 
     data: folder with DATA_EMPS.npz and DATA_EMPS_PULSES.npz.
+    quick: a short search; its numbers are not for keeping.
     out: folder for real_emps.json and real_emps.png.
     seed: of the search.
     """
 
     data: Path
+    quick: bool = False
     out: Path = RESULTS
     seed: int = 0
 
@@ -150,7 +153,8 @@ def main(config: RealEmps) -> None:
     space = emps_space(scene)
     cost, judge = make_costs(scene, space, config.data)
     print(f"EMPS: {FIT} fitted, {JUDGE} judges", flush=True)
-    search = find(cost, space, SearchConfig(population=32, parents=None, generations=120, seed=config.seed))
+    generations = 10 if config.quick else 120
+    search = find(cost, space, SearchConfig(population=32, parents=None, generations=generations, seed=config.seed))
     found = estimate(cost, space, search.best, BLOCK)
     parameters = against_published(found)
     for name, p in parameters.items():
@@ -158,6 +162,7 @@ def main(config: RealEmps) -> None:
         print(f"  {name:22s} {p['value']:9.3f} [{low:.3f}, {high:.3f}] {p['unit']:8s} published {p['published']:.3f}")
     result = {
         "experiment": "real_emps",
+        "quick": config.quick,
         "source": SOURCE,
         "recordings": {name: load_emps(config.data, name).sha256 for name in (FIT, JUDGE)},
         "filter": {
@@ -181,7 +186,9 @@ def main(config: RealEmps) -> None:
         },
     }
     print(f"  {JUDGE}: {result['before'][JUDGE]} before, {result['after'][JUDGE]} after")
-    publish(config.out, "real_emps", config.seed, result, trace_figure(judge, space.mean, found.best))
+    publish(
+        config.out, stem("real_emps", config.quick), config.seed, result, trace_figure(judge, space.mean, found.best)
+    )
 
 
 if __name__ == "__main__":

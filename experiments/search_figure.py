@@ -25,7 +25,7 @@ import json  # noqa: E402
 
 import tyro  # noqa: E402
 
-from benchmarks.common import origin  # noqa: E402
+from benchmarks.common import origin, stem  # noqa: E402
 from droid_jax.commands.identify import Identify, run  # noqa: E402
 from droid_jax.report import search_figures, torque_figures  # noqa: E402
 from droid_jax.report.export import png_bytes  # noqa: E402
@@ -59,7 +59,7 @@ def figures(found: Run) -> dict[str, Any]:
 
 def main() -> None:
     arguments = tyro.cli(Arguments, description=__doc__)
-    folder = arguments.out / ("search_run_quick" if arguments.quick else "search_run")
+    folder = arguments.out / stem("search_run", arguments.quick)
     run(
         Identify(
             preset="paper",
@@ -70,7 +70,7 @@ def main() -> None:
     )
     found = read_run(folder)
     for name, figure in figures(found).items():
-        write_bytes(arguments.out / f"{name}.png", png_bytes(figure))
+        write_bytes(arguments.out / f"{stem(name, arguments.quick)}.png", png_bytes(figure))
     shown = {p["name"]: {k: p[k] for k in ("truth", "initial_mean", "mean", "std")} for p in found.parameters}
     result = {
         "cost": found.fit["cost"],
@@ -79,7 +79,7 @@ def main() -> None:
         "seconds": found.fit["seconds"],
         "parameters": shown,
     }
-    write_json(arguments.out / "search_figure.json", {**origin(0), **result}, indent=2)
+    write_json(arguments.out / f"{stem('search_figure', arguments.quick)}.json", {**origin(0), **result}, indent=2)
     print(json.dumps(result))
 
 

@@ -23,6 +23,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
 import tyro  # noqa: E402
 from identify_suite import gaussian  # noqa: E402
 
+from benchmarks.common import stem  # noqa: E402
 from droid_jax.report.words import label, like, number  # noqa: E402
 from droid_jax.storage import write_json, write_text  # noqa: E402
 
@@ -99,19 +100,20 @@ def _pair(mean: float, deviation: float) -> str:
 
 def main() -> None:
     arguments = tyro.cli(Arguments, description=__doc__)
-    folder = arguments.out / ("identify_cases_quick" if arguments.quick else "identify_cases")
+    folder = arguments.out / stem("identify_cases", arguments.quick)
     paths = {k: folder / f"door_{k}.json" for k in ((1,) if arguments.quick else (0, 1, 2))}
     missing = [p.stem for p in paths.values() if not p.is_file()]
     if missing:
         raise SystemExit(f"error: no case {missing[0]} in {folder}; run experiments/identify_suite.py --parts doors")
     cases = {k: json.loads(p.read_text()) for k, p in paths.items()}
     rows = table({k: case["parameters"] for k, case in cases.items()})
-    write_text(arguments.out / "table1.md", as_markdown(rows))
+    name = stem("table1", arguments.quick)
+    write_text(arguments.out / f"{name}.md", as_markdown(rows))
     origins = {str(k): case["origin"] for k, case in cases.items()}
-    write_json(arguments.out / "table1.json", {"parameters": rows, "origin": origins}, indent=2)
+    write_json(arguments.out / f"{name}.json", {"parameters": rows, "origin": origins}, indent=2)
     told = [d for r in rows.values() for d in r["doors"].values() if d["identifiable"]]
     inside = sum(bool(abs(d["mean"] - d["truth"]) <= 1.645 * d["std"]) for d in told)
-    print(json.dumps({"identifiable": len(told), "inside_90": inside, "table": str(arguments.out / "table1.md")}))
+    print(json.dumps({"identifiable": len(told), "inside_90": inside, "table": str(arguments.out / f"{name}.md")}))
 
 
 if __name__ == "__main__":

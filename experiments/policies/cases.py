@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from benchmarks.common import origin
+from benchmarks.common import origin, stem
 from droid_jax.policy.door_env import DoorEnv
 from droid_jax.policy.network import save_policy
 from droid_jax.policy.randomise import Randomise
@@ -65,12 +65,12 @@ class Options:
 
     def cases(self, name: str) -> Path:
         """Folder of the cases."""
-        return self.out / f"{name}_cases{'_quick' if self.quick else ''}"
+        return self.out / stem(f"{name}_cases", self.quick)
 
     def summary(self, name: str, kind: str = ".json") -> Path:
         """File of the summary; that of pilots has a name of its own."""
         pilot = f"_from_{self.first}" if self.first else ""
-        return self.out / f"{name}{pilot}{'_quick' if self.quick else ''}{kind}"
+        return self.out / f"{stem(f'{name}{pilot}', self.quick)}{kind}"
 
 
 @dataclass(frozen=True)

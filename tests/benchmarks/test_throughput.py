@@ -147,7 +147,7 @@ def test_a_quick_run_ends_in_one_line_of_json(tmp_path):
     arguments = ["--quick", "--repeats", "1", "--seed", "5", "--out", str(tmp_path / "results")]
     result = common.in_process(FOLDER / "throughput.py", arguments, 900)
     assert "error" not in result, result
-    assert json.loads((tmp_path / "results" / "throughput.json").read_text()) == result
+    assert json.loads((tmp_path / "results" / "throughput_quick.json").read_text()) == result
 
     assert (result["population"], result["steps"], result["seed"], result["quick"]) == (64, 200, 5, True)
     assert (result["timestep"], result["cone"], result["iterations"]) == (0.002, "pyramidal", 4)
