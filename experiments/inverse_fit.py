@@ -42,7 +42,7 @@ from droid_jax.report.export import png_bytes
 from droid_jax.storage import write_bytes, write_json
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-from common import origin  # pyright: ignore[reportMissingImports]
+from common import origin, stem  # noqa: F401  # pyright: ignore[reportMissingImports]
 
 RESULTS = Path(__file__).parent / "results"
 LEVEL = 0.9  # of all intervals
