@@ -44,6 +44,11 @@ def effect(request: pytest.FixtureRequest, scene: Scene) -> Effect:
     return made[0]
 
 
+def having(part: str) -> list[str]:
+    """Names of the effects of the small scene that have shapes, or a friction loss."""
+    return [effect.name for effect in library(mechanism()) if getattr(effect, part)]
+
+
 @pytest.fixture(params=[n for n in EFFECTS if n != "contact_compliance"])
 def built_in(request: pytest.FixtureRequest, small: Bench) -> Effect:
     """Each effect of the small scene, as its compiled replay has it."""
@@ -138,11 +143,12 @@ def test_each_function_changes_nothing_at_neutral(effect: Effect, scene: Scene, 
         jax.tree.map(np.testing.assert_array_equal, effect.observe(theta, rollout), rollout)
 
 
+@pytest.mark.parametrize("effect", having("shapes"), indirect=True)
 def test_a_shape_that_is_absent_is_at_its_mean(effect: Effect, scene: Scene):
     loud = {p.name: jnp.float32(typical(p)) for p in amplitudes(effect)}
     stated = loud | {name: jnp.float32(Space(effect.parameters)[name].mean) for name in effect.shapes}
     base = jnp.asarray(scene.model.dof_frictionloss, jnp.float32)
-    for state in moments(scene) if effect.shapes else ():
+    for state in moments(scene):
         if effect.force:
             np.testing.assert_array_equal(effect.force(loud, state), effect.force(stated, state))
         if effect.frictionloss:
@@ -150,10 +156,10 @@ def test_a_shape_that_is_absent_is_at_its_mean(effect: Effect, scene: Scene):
             np.testing.assert_array_equal(given, absent)
 
 
+@pytest.mark.parametrize("effect", having("frictionloss"), indirect=True)
 def test_friction_never_pushes(effect: Effect, scene: Scene):
     """At both bounds of every parameter the friction loss stays at or above zero, on more than one state."""
-    if not effect.frictionloss:
-        return
+    assert effect.frictionloss
     base = jnp.asarray(scene.model.dof_frictionloss, jnp.float32)
     for bound in ("low", "high"):
         theta = {p.name: jnp.float32(getattr(p, bound)) for p in effect.parameters}
