@@ -118,6 +118,44 @@ def test_networks_that_are_no_numbers_end_the_training_and_the_best_stays(monkey
         _brax(MADE_UP, None, SHORT, None, 0, lambda now: None, lambda step, tree: None)
 
 
+def made_up(scene: str = "one", effects: tuple[str, ...] = ()) -> Any:
+    """An environment as `train` reads it."""
+    own = SimpleNamespace(name="door", sha256=scene)
+    named = tuple(SimpleNamespace(name=e) for e in effects)
+    return SimpleNamespace(task=Task(steps=10), interface=None, scene=own, start=np.zeros(2), effects=named)
+
+
+@pytest.mark.parametrize(
+    ("env", "config", "differs"),
+    [
+        (made_up("another"), SHORT, "scene"),
+        (made_up(effects=("latch",)), SHORT, "effects"),
+        (made_up(), replace(SHORT, hidden=(4, 4)), "config"),
+    ],
+)
+def test_a_checkpoint_of_something_else_is_refused(monkeypatch, tmp_path: Path, env, config: TrainConfig, differs: str):
+    played(monkeypatch, (0, 0.0, 0.0, 0.0), (100, 0.5, 5.0, 1.0))
+    train(made_up(), None, SHORT, checkpoints=tmp_path)
+    with pytest.raises(ValueError, match=f"belongs to another run: it differs in {differs}"):
+        train(env, None, config, checkpoints=tmp_path)
+
+
+# orbax leaves cancelled reads behind when a file is damaged; their complaint is not ours
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_damaged_checkpoint_is_passed_over_and_training_goes_on_from_the_one_before(monkeypatch, tmp_path: Path):
+    blank = ({"mean": np.zeros(2)}, {"w": np.zeros(2)}, {"v": np.zeros(1)})
+    monkeypatch.setattr("droid_jax.policy.train._blank", lambda env, config: blank)
+    played(monkeypatch, (0, 0.0, 0.0, 0.0), (100, 0.5, 5.0, 1.0), (200, 0.6, 6.0, 2.0))
+    train(made_up(), None, SHORT, checkpoints=tmp_path)
+    for file in (p for p in (tmp_path / "200").rglob("*") if p.is_file()):
+        file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    ran = played(monkeypatch, (0, 0.5, 5.0, 1.0), (100, 0.4, 4.0, 3.0))
+    with pytest.warns(UserWarning, match="is damaged and was passed over"):
+        found = train(made_up(), None, SHORT, checkpoints=tmp_path)
+    assert ran == [0, 100] and [now.step for now in found.history] == [0, 100, 200]
+    assert [now.success for now in found.history] == [0.0, 0.5, 0.4] and found.policy == 1.0
+
+
 @pytest.mark.slow
 def test_a_short_run_is_kept_and_goes_on(tmp_path: Path):
     scene = door_scene(timestep=0.004, limits=True)
