@@ -131,8 +131,8 @@ def span(draws: np.ndarray, policies: int) -> list[float]:
 def _expanded(count: int) -> float:
     """Level at which quantiles of a bootstrap over so few hold as much as Student's t does.
 
-    Hesterberg, What teachers should know about the bootstrap, Am. Stat. 2015: plain quantiles of five policies' held
-    the truth in 83 to 91 % of simulated tables.  Of one policy nothing is known but its trials.
+    Hesterberg, What teachers should know about the bootstrap, Am. Stat. 2015: plain quantiles of five draws are
+    too narrow (a test simulates it).  Of one policy nothing is known but its trials.
     """
     if count < 2:
         return LEVEL
