@@ -31,7 +31,7 @@ import tyro  # noqa: E402
 
 from benchmarks.common import origin  # noqa: E402
 from droid_jax.storage import write_json, write_text  # noqa: E402
-from experiments.blind.cases import Counts, plans  # noqa: E402
+from experiments.blind.cases import FACTORS, Counts, plans  # noqa: E402
 from experiments.blind.draws import commit_of  # noqa: E402
 from experiments.blind.limits import scene_limits  # noqa: E402
 from experiments.blind.make import make  # noqa: E402
@@ -81,7 +81,7 @@ class Make:
     effects: tuple[str, ...] = ()
     """Only cases with one of these hidden effects (and none)."""
     factors: tuple[float, ...] = ()
-    """Only these multiples of the detection limit (and none); default: all."""
+    """Only these multiples of the detection limit (and none); default: 1, 3 and 10."""
     limits: Path = LIMITS
     """Detection limits, see the command limits."""
     out: Path = RUNS
@@ -162,7 +162,7 @@ def run_make(command: Make) -> dict[str, Any]:
         made = known_cases["scenes"]
     for name in ("hinge",) if command.quick else command.scenes:
         where, outcomes = setting(name, command.out / "door"), dict[str, str]()
-        for plan in plans(where, counts, commit, known.get(name, {})):
+        for plan in plans(where, counts, commit, known.get(name, {}), command.factors or FACTORS):
             if command.classes and plan.kind not in command.classes:
                 continue
             if command.factors and plan.effects and plan.factor not in command.factors:

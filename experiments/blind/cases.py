@@ -7,7 +7,7 @@ Classes: "none"; "single", one effect of the library's at 1, 3 and 10 times its 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -51,16 +51,22 @@ class Counts:
     left_out: int = 10
 
 
-def plans(setting: Setting, counts: Counts, commit: str, limits: Limits) -> list[Plan]:
-    """All cases of a scene.  Pairs and what is left out are drawn by the commit, among what is possible there."""
+def plans(
+    setting: Setting, counts: Counts, commit: str, limits: Limits, factors: Sequence[float] = FACTORS
+) -> list[Plan]:
+    """All cases of a scene.  Pairs and what is left out are drawn by the commit, among what is possible there.
+
+    factors: of single effects, and (those above one) of effects that the library has no form of.
+    """
     hidden = [n for n in ANSWERS if targets(setting, n)]
     named, strange = [(n,) for n in hidden if inside(n)], [(n,) for n in hidden if not inside(n)]
     rng = np.random.default_rng(seed_of(commit, f"{setting.name}/plans"))
     pairs = [(*a, *b) for a, b in itertools.combinations(named, 2) if _apart(setting.scene, *a, *b)]
     wanted = [("none", (), 0.0, k) for k in range(counts.none)]
-    wanted += [("single", *one, k) for one in itertools.product(named, FACTORS) for k in range(counts.single)]
+    wanted += [("single", *one, k) for one in itertools.product(named, factors) for k in range(counts.single)]
     wanted += [("pair", *one) for one in _some(rng, setting, [(p, 3.0) for p in pairs], limits, counts.pair)]
-    wanted += [("outside", *one, k) for one in itertools.product(strange, FACTORS[1:]) for k in range(counts.outside)]
+    above = [f for f in factors if f > 1.0]
+    wanted += [("outside", *one, k) for one in itertools.product(strange, above) for k in range(counts.outside)]
     left_out = list(itertools.product(named, FACTORS[1:]))
     wanted += [("left_out", *one) for one in _some(rng, setting, left_out, limits, counts.left_out)]
     return [_plan(setting.name, *one) for one in wanted]
