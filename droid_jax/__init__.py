@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from droid_jax.model.scene import load_scene as load_scene
     from droid_jax.policy.randomise import randomised as randomised
     from droid_jax.policy.randomise import randomised_model as randomised_model
+    from droid_jax.report.tables import frames as frames
     from droid_jax.runtime import tune as tune
 
 __all__ = [
@@ -59,6 +60,7 @@ __all__ = [
     "load_extended",
     "randomised",
     "randomised_model",
+    "frames",
 ]
 
 # Public name -> (module, name in it).  `identify` is missing: see `_Room`.
@@ -82,6 +84,7 @@ _HOMES = {
     "load_extended": ("gap.extended", "load_extended"),
     "randomised": ("policy.randomise", "randomised"),
     "randomised_model": ("policy.randomise", "randomised_model"),
+    "frames": ("report.tables", "frames"),
 }
 
 

@@ -6,6 +6,7 @@ and so that --help is quick.
 
 from __future__ import annotations
 
+import importlib.metadata
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -43,14 +44,18 @@ _ACTIONS: dict[type, Callable[[Any], None]] = {
 
 SCRIPT = "droid-jax"  # as pyproject.toml installs it
 WHOLE = ("-h", "--help", "--tyro-")  # options of the program itself: help, shell completion
+RESUMED = (whole.All, identify.Identify, gap.Gap, train.Train)  # commands that go on where they were stopped
 WHAT = """From recordings of a robot to a fitted simulation, to what that simulation lacks, and to a policy.
 
-Without a command: `all`, on a stand-in robot."""
+Without a command: `all`, on a stand-in robot.  --version says which version this is."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; bad input ends with one line on stderr and exit code 2."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments == ["--version"]:
+        print(f"droid_jax {importlib.metadata.version('droid_jax')}")
+        return 0
     if not arguments or (arguments[0].startswith("-") and not arguments[0].startswith(WHOLE)):
         arguments = ["all", *arguments]
     script = Path(sys.argv[0]).name
@@ -62,9 +67,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("interrupted; the same command goes on from here", file=sys.stderr)
+        print(f"interrupted{_going_on(command)}", file=sys.stderr)
         return 130
     return 0
+
+
+def _going_on(command: Any) -> str:
+    """How an interrupted command goes on, where it can."""
+    if not isinstance(command, RESUMED):
+        return ""
+    how = "the same command without --again" if command.again else "the same command"
+    return f"; {how} goes on from here"
 
 
 if __name__ == "__main__":

@@ -79,7 +79,7 @@ def tune(devices: int | None = None, cache_dir: str | Path | None = None) -> Run
         os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     import jax
 
-    count = devices or _configured_devices() or _cores()
+    count = devices or _configured_devices() or cores()
     flags = _with_emitters_off(os.environ.get("XLA_FLAGS", ""), root)
     try:
         jax.config.update("jax_num_cpu_devices", count)
@@ -133,10 +133,17 @@ def device() -> str:
     import jax
 
     if jax.default_backend() == "cpu":
-        cores = _cores()
-        return f"{_cpu_model()}, {cores} core{'s' if cores != 1 else ''}"
+        count = cores()
+        return f"{_cpu_model()}, {count} core{'s' if count != 1 else ''}"
     kinds = [d.device_kind for d in jax.local_devices()]
     return ", ".join(f"{kinds.count(k)} x {k}" if kinds.count(k) > 1 else k for k in dict.fromkeys(kinds))
+
+
+def cores() -> int:
+    """Cores this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 @contextlib.contextmanager
@@ -166,13 +173,6 @@ def start() -> None:
     print("starting jax ...", flush=True)
     tune()
     import_mjx()
-
-
-def _cores() -> int:
-    """Cores this process may run on."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _setting(name: str) -> Any:

@@ -2,6 +2,8 @@
 
 What is written stands beside its final name first and is then moved there: a reader sees the old
 content or the new one, and a run that is killed or finds the disk full leaves the old one behind.
+Folders alone have an instant between the two: a run killed then leaves old and new beside the name,
+in a folder that begins with a dot and it.
 Folders that are missing are made.  OSError where a place cannot be written.
 """
 
@@ -69,7 +71,7 @@ def new_folder(path: Path) -> Iterator[Path]:
         new = temporary / "new"
         new.mkdir()
         yield new
-        # A folder cannot be replaced in one step: the old one steps aside first.
+        # A folder cannot be replaced in one step: the old one steps aside first, and for an instant there is none.
         if path.exists():
             os.replace(path, temporary / "old")
         os.replace(new, path)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import importlib.metadata
+import importlib.util
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -12,7 +15,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from droid_jax import runtime
+from droid_jax import run, runtime
+from droid_jax.commands.folder import setup_of
+from droid_jax.commands.identify import Identify
+from droid_jax.commands.own_effects import load_effects
+from droid_jax.identify import pipeline
+from droid_jax.measure.formats import load, save
+from droid_jax.model.effects import registry
 from droid_jax.run import main
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -95,6 +104,46 @@ def test_a_recording_with_nan(refused, run_folder: Path, tmp_path: Path):
     np.savez(tmp_path / "nan.npz", **arrays)
     said = refused("--recording", tmp_path / "nan.npz", "--out", run_folder)
     assert "nan.npz" in said and "torque" in said and "4" in said
+
+
+@pytest.mark.parametrize("name", ["fit.bag", "fit/repeat_00.mcap", "fit/metadata.yaml", "fit/repeat_00/metadata.yaml"])
+@pytest.mark.parametrize("command", ["identify", "gap"])
+def test_bags_are_sent_through_convert(refused, tmp_path: Path, name: str, command: str):
+    """They do not say what their efforts are, and these commands have no option for it."""
+    (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / name).write_text("")
+    said = refused(command, "--recording", tmp_path / name.split("/")[0], "--out", tmp_path / "run")
+    assert "`python -m droid_jax.run convert BAGS --joints ... --torque ...` makes a recording of it" in said
+
+
+def test_two_recordings_of_one_name(refused, tmp_path: Path):
+    """Said before the folder is begun."""
+    first, second = tmp_path / "first.npz", tmp_path / "second.npz"
+    for path in (first, second):
+        save(load(small_recording(tmp_path), name="repeat_00"), path)
+    said = refused("identify", "--recording", first, second, "--out", tmp_path / "run")
+    assert f"{first} and {second} are both named 'repeat_00'" in said and f"convert {second} --name" in said
+    assert list((tmp_path / "run").iterdir()) == []
+
+
+def test_an_edited_nuisance_makes_another_run(refused, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The setup knows the whole parameter file, not only what is of interest in it."""
+
+    def stopped(*_, **__) -> None:
+        raise ValueError("stopped")
+
+    monkeypatch.setattr(pipeline, "identify", stopped)
+
+    def run(std: float) -> str:
+        nuisance = {**GOOD, "element": "shoulder", "nuisance": True, "std": std}
+        path = parameters(tmp_path, GOOD, nuisance)
+        recording = small_recording(tmp_path)
+        return refused(
+            "identify", "--scene", XML, "--parameters", path, "--recording", recording, "--out", tmp_path / "run"
+        )
+
+    assert "stopped" in run(0.5) and "stopped" in run(0.5)
+    assert "holds a run with other settings (parameters_sha256)" in run(0.6)
 
 
 # ----- results folders
@@ -199,8 +248,8 @@ def test_an_unknown_joint(refused, tmp_path: Path, options: list[str], expected:
         ({"field": "body_mass", "element": "hand", "std": 0.1, "high": 2.0}, "unknown body 'hand'"),
         ({**GOOD, "colour": "red"}, "unknown colour"),
         ({"field": "dof_damping", "element": "elbow"}, "missing std, high"),
-        ({**GOOD, "mode": "wobble"}, "wobble"),
-        ({**GOOD, "scaling": "cubic"}, "cubic"),
+        ({**GOOD, "mode": "sett"}, "mode must be one of set, negative, scale, divide, add, got 'sett'"),
+        ({**GOOD, "scaling": "cubic"}, "scaling must be one of linear, log, got 'cubic'"),
         ({**GOOD, "mean": 30.0}, "outside its bounds"),
         ({**GOOD, "std": -1.0}, "std must be positive"),
         ("dof_damping", "expected an object"),
@@ -236,6 +285,41 @@ def test_the_same_name_twice(refused, tmp_path: Path):
 
 
 # ----- options
+
+
+@pytest.mark.parametrize("command", ["all", "identify", "gap"])
+@pytest.mark.parametrize("option", [("--parameters", "p.json"), ("--joints", "elbow"), ("--object-joint", "lid")])
+def test_an_option_of_a_scene_without_a_scene(refused, tmp_path: Path, command: str, option: tuple[str, str]):
+    said = refused(command, *option, "--recording", "log.npz", "--out", tmp_path / "run")
+    assert f"{option[0]} is for a scene of your own: give --scene too" in said
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [
+        ("all", ("--hide", "closer=1")),
+        ("all", ("--springs", "1")),
+        ("gap", ("--hide", "closer=1")),
+        ("gap", ("--springs", "2")),
+        ("identify", ("--springs", "0")),
+        ("identify", ("--demonstrations", "A")),
+    ],
+)
+def test_an_option_of_the_stand_in_beside_recordings(refused, tmp_path: Path, command: str, option: tuple[str, str]):
+    said = refused(command, *option, "--recording", "log.npz", "--out", tmp_path / "run")
+    assert f"{option[0]} is for the stand-in robot, and --recording says that there is none" in said
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("command", ["all", "identify", "train"])
+def test_scalars_that_nothing_can_write_are_said_at_once(refused, tmp_path: Path, monkeypatch, command: str):
+    """Before anything is recorded."""
+    found = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "tensorboardX" else found(name))
+    said = refused(command, "--tensorboard", "--out", tmp_path / "run")
+    assert "--tensorboard needs tensorboardX: pip install -e '.[tensorboard]'" in said
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(
@@ -293,7 +377,117 @@ def test_help_is_quick(arguments: list[str]):
     assert ("--out" if arguments[0] in ("identify", "record") else "report") in run.stdout
 
 
+# ----- effects of one's own
+
+EFFECT = """
+from droid_jax.model.effects.registry import register
+
+@register
+def gasket(scene):
+    return None
+"""
+
+
+@pytest.fixture
+def library(monkeypatch: pytest.MonkeyPatch) -> Callable[[], tuple[str, ...]]:
+    """Names in the library of effects, which is as it was after the test."""
+    registry.registered()
+    monkeypatch.setattr(registry, "_MAKERS", dict(registry._MAKERS))
+    return registry.registered
+
+
+def test_a_file_of_effects_is_in_the_library_from_then_on(library, tmp_path: Path):
+    (tmp_path / "mine.py").write_text(EFFECT)
+    assert "gasket" not in library()
+    load_effects(tmp_path / "mine.py")
+    load_effects(tmp_path / "mine.py")  # the next stage of `all`
+    assert "gasket" in library()
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (None, "there is no file"),
+        ("def broken(", "SyntaxError"),
+        ("import nothing_of_this_name", "ModuleNotFoundError: No module named 'nothing_of_this_name'"),
+        (EFFECT.replace("gasket", "latch"), "an effect 'latch' is registered already"),
+    ],
+)
+def test_a_file_of_effects_that_cannot_be(refused, library, tmp_path: Path, text: str | None, expected: str):
+    if text is not None:
+        (tmp_path / "mine.py").write_text(text)
+    said = refused("identify", "--own-effects", tmp_path / "mine.py", "--out", tmp_path / "run")
+    assert "--own-effects" in said and expected in said
+
+
+def test_results_with_effects_of_ones_own_ask_for_them_and_run_nothing(refused, library, tmp_path: Path):
+    (tmp_path / "mine.py").write_text(EFFECT)
+    (tmp_path / "gap").mkdir()
+    (tmp_path / "gap" / "setup.json").write_text(json.dumps({"own_effects": str(tmp_path / "mine.py")}))
+    said = refused("identify", "--extended", tmp_path / "gap" / "extended.json", "--out", tmp_path / "run")
+    assert f"give --own-effects {tmp_path / 'mine.py'}" in said and "gasket" not in library()
+
+
+def test_a_changed_file_of_effects_makes_another_run(tmp_path: Path):
+    (tmp_path / "mine.py").write_text(EFFECT)
+    first = setup_of(Identify(own_effects=tmp_path / "mine.py"))
+    (tmp_path / "mine.py").write_text(EFFECT + "\n")
+    assert first != setup_of(Identify(own_effects=tmp_path / "mine.py"))
+    assert "own_effects_sha256" not in setup_of(Identify())
+
+
 # ----- the program itself
+
+
+def test_the_page_of_the_command_line_is_current():
+    """`python docs/command_line.py` writes it."""
+    spec = importlib.util.spec_from_file_location("command_line", ROOT / "docs" / "command_line.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    assert module.PAGE.read_text(encoding="utf-8") == module.page()
+    assert re.findall(r"^## (\w+)$", module.page(), re.MULTILINE) == [c.__name__.lower() for c in run._ACTIONS]
+
+
+def test_it_says_its_version(capsys: pytest.CaptureFixture[str]):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"droid_jax {importlib.metadata.version('droid_jax')}\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["identify"], "interrupted; the same command goes on from here"),
+        (["identify", "--again"], "interrupted; the same command without --again goes on from here"),
+        (["record"], "interrupted"),
+        (["evaluate", "--again"], "interrupted"),
+    ],
+)
+def test_what_an_interrupted_command_promises(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
+):
+    def stopped(command: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run, "_ACTIONS", dict.fromkeys(run._ACTIONS, stopped))
+    assert main(arguments) == 130
+    assert capsys.readouterr().err == f"{said}\n"
+
+
+def test_nothing_about_warp_is_printed(tmp_path: Path):
+    """In a process of its own: mujoco.mjx says it when it is first imported."""
+    command = [
+        sys.executable,
+        "-m",
+        "droid_jax.run",
+        "record",
+        "--demonstration",
+        "Z",
+        "--out",
+        str(tmp_path / "z.npz"),
+    ]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2 and "'Z'" in done.stderr and done.stdout == ""
 
 
 def test_it_completes_in_a_shell(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from droid_jax import runtime
@@ -16,6 +17,8 @@ from droid_jax.commands import evaluate, gap, hidden, identify, report, train, w
 from droid_jax.commands.folder import OtherRun
 from droid_jax.commands.hidden import known_stand_in
 from droid_jax.commands.source import stand_in_of
+from droid_jax.measure.formats import save
+from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
 from droid_jax.run import main
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -29,9 +32,35 @@ def called(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
     monkeypatch.setattr(runtime, "tune", lambda *a, **k: None)  # jax runs already in this process
     for module in (identify, gap, train, evaluate):
         monkeypatch.setattr(module, "run", commands.append)
-    monkeypatch.setattr(hidden, "kept_recording", lambda path, again, name, record: None)
+    monkeypatch.setattr(hidden, "kept_recordings", lambda paths, again, record: dict.fromkeys(paths))
     monkeypatch.setattr(report, "write", lambda folder: folder / "report.html")
     return commands
+
+
+def motions(*files: str, repeats: int = 8, commands: bool = True) -> tuple[str, ...]:
+    """Recordings of the built-in arm's first joint, each of another motion; the files' names."""
+    time = np.arange(400) * 0.01
+    rng = np.random.default_rng(0)
+    for k, file in enumerate(files):
+        motion = 0.3 * np.sin((1 + k) * time)[:, None]
+        torque = rng.normal(size=(repeats, 400, 1)) + motion
+        recording = Recording(
+            name=Path(file).stem,
+            time=time if commands else np.zeros(0),
+            command=motion if commands else np.zeros((0, 0)),
+            command_names=("panda_joint1",) if commands else (),
+            channels={
+                name: Channel(name, unit, ("panda_joint1",), time, values, np.isfinite(values))
+                for name, unit, values in (
+                    ("torque", "N m", torque),
+                    ("position", "rad", np.repeat(motion[None], repeats, axis=0)),
+                )
+            },
+            torque=TorqueConvention(TorqueSide.MOTOR, False),
+            qpos0={},
+        )
+        save(recording, file)
+    return files
 
 
 def found(folder: Path, effects: list[str]) -> None:
@@ -52,8 +81,10 @@ def test_without_arguments_every_stage_runs_on_one_recording(called, tmp_path: P
     assert known_stand_in(files) == {"springs": 1, "seed": 0, "hide": ["magnetic_catch=1.5"]}
     lines = capsys.readouterr().out.splitlines()
     assert [line for line in lines if line.startswith("[")] == [
-        "[1/4] identify", "[2/4] gap", "[3/4] train", "[4/4] evaluate",
-    ]  # fmt: skip
+        f"[{k}/5] {stage}{took}"
+        for k, stage in enumerate(("record", "identify", "gap", "train", "evaluate"), 1)
+        for took in ("", ": 0.0 minutes")
+    ]
     assert lines[-1] == "report: runs/all/report.html"
 
 
@@ -69,7 +100,7 @@ def test_a_policy_is_trained_on_the_extended_model_where_there_is_one(called, tm
     found(tmp_path / "runs" / "all" / "gap", ["latch at door_hinge"])
     assert main(["all", "--stages", "train"]) == 0
     assert called[0].fit == Path("runs/all/gap")
-    assert "gap: The model lacks: latch.; 70 % of the gap closed on the sealed motion" in capsys.readouterr().out
+    assert "gap: The model lacks: latch.; 70 % of the gap U closed on the sealed motion" in capsys.readouterr().out
 
 
 def test_without_a_named_effect_it_is_trained_on_the_fit(called, tmp_path: Path):
@@ -125,10 +156,62 @@ def test_a_search_in_other_recordings_is_not_trained_on(called, tmp_path: Path):
 
 
 def test_your_own_recordings_know_no_stand_in(called, tmp_path: Path):
+    motions("a.npz", "b.npz")
     assert main(["all", "--recording", "a.npz", "b.npz", "--stages", "identify", "gap"]) == 0
     assert called[0].recording == called[1].recording == (Path("a.npz"), Path("b.npz"))
     (tmp_path / "setup.json").write_text(json.dumps({"command": "identify", "recording": ["a.npz", "b.npz"]}))
     assert stand_in_of(tmp_path) == {}
+
+
+@pytest.mark.parametrize(
+    ("repeats", "count", "commands", "fitted", "begins_at_fit"),
+    [
+        (8, 3, True, 2, True),
+        (16, 1, True, 1, True),
+        (1, 2, False, 1, False),  # the second log is sealed; one in blocks is fitted without a start
+        (1, 1, False, 1, False),
+    ],
+)
+def test_a_sealed_recording_is_not_fitted(
+    called, tmp_path: Path, repeats: int, count: int, commands: bool, fitted: int, begins_at_fit: bool
+):
+    names = [f"{name}.npz" for name in "abc"[:count]]
+    motions(*names, repeats=repeats, commands=commands)
+    (tmp_path / "run" / "identify").mkdir(parents=True)
+    (tmp_path / "run" / "identify" / "fit.json").write_text("{}")
+    assert main(["all", "--recording", *names, "--stages", "identify", "gap", "--out", "run"]) == 0
+    fit, search = called
+    assert [str(path) for path in fit.recording] == names[:fitted]
+    assert len(search.recording) == count and search.fit == (Path("run/identify") if begins_at_fit else None)
+
+
+def test_recordings_are_checked_before_any_stage(called, capsys):
+    motions("a.npz", "b.npz", repeats=5)
+    assert main(["all", "--recording", "a.npz", "b.npz"]) == 2
+    assert "the fit recording 'a' has 5 repeats" in capsys.readouterr().err and called == []
+    assert main(["all", "--recording", "a.npz", "b.npz", "--stages", "identify"]) == 0
+    assert len(called[0].recording) == 2
+
+
+def test_where_a_stage_fails_the_page_shows_those_before(called, monkeypatch: pytest.MonkeyPatch, capsys):
+    def failing(command: gap.Gap) -> None:
+        raise ValueError("nothing can be searched here")
+
+    monkeypatch.setattr(gap, "run", failing)
+    assert main(["all", "--stages", "identify", "gap"]) == 2
+    said = capsys.readouterr()
+    assert "nothing can be searched here" in said.err
+    assert "report of what is done: runs/all/report.html" in said.out
+    assert main(["all", "--stages", "gap", "--recording", *motions("a.npz", "b.npz")]) == 2
+    assert "report of what is done" not in capsys.readouterr().out
+
+
+def test_options_reach_the_stages(called, tmp_path: Path):
+    (tmp_path / "mine.py").write_text("")
+    pytest.importorskip("tensorboardX")
+    assert main(["all", "--tensorboard", "--own-effects", "mine.py"]) == 0
+    assert [c.own_effects for c in called] == 4 * [Path("mine.py")]
+    assert called[0].tensorboard and called[2].tensorboard
 
 
 def test_presets_reach_the_stages(called):
@@ -143,7 +226,7 @@ def test_jax_is_tuned_before_the_stand_in_is_recorded(tmp_path: Path):
     """In a process of its own, where nothing has started jax: it could not be tuned afterwards."""
     code = (
         "from droid_jax.commands import hidden, identify, report, whole\n"
-        "hidden.kept_recording = lambda path, again, name, record: None\n"
+        "hidden.kept_recordings = lambda paths, again, record: dict.fromkeys(paths)\n"
         "def fit(command):\n"
         "    from droid_jax import runtime\n"
         "    runtime.tune()\n"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_gap import EFFECTS, FLOOR, JOINTS, PRELOAD, QUICK, SCENE, record, small, write_parameters
+from small_gap import EFFECTS, FLOOR, JOINTS, PRELOAD, QUICK, SCENE, record, small, small_scene, write_parameters
 
 from droid_jax import runtime
 from droid_jax.commands import gap, report
@@ -289,6 +290,18 @@ def test_what_cannot_be_hidden(tmp_path: Path, refused, options: list[str], expe
 
 def test_hiding_is_for_the_stand_in(place: Path, refused):
     assert "--hide is for the stand-in robot" in refused(arguments(place, "--hide", "closer=1"))
+
+
+def test_effects_of_ones_own_are_asked_about_like_the_others(place: Path, refused, monkeypatch: pytest.MonkeyPatch):
+    """The one that docs/method-gap.md shows."""
+    registry.registered()
+    monkeypatch.setattr(registry, "_MAKERS", dict(registry._MAKERS))
+    (code,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / "method-gap.md").read_text(), re.M | re.S)
+    (place / "gasket.py").write_text(code)
+    options = ("--own-effects", place / "gasket.py", "--effects", "gasket", "nothing")
+    assert "unknown effects nothing; valid:" in (said := refused(arguments(place, *options))) and "gasket" in said
+    chosen = gap.chosen_effects(gap.Gap(effects=("gasket",)), small_scene()[0], [])
+    assert [e.name for e in chosen] == ["gasket"] and "door" in chosen[0].places
 
 
 def test_a_scene_of_ones_own_needs_recordings(tmp_path: Path, refused):

@@ -206,7 +206,7 @@ def test_the_second_half_of_the_repeats_confirms(
     assert names == {"fit": "elbow, first 8 repeats", "confirm": "elbow, last 8 repeats"}
     assert answer["amplitudes"][0]["value"] == pytest.approx(COULOMB, rel=0.05)
     page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
-    assert "acts alike in this motion" in page and "No demonstration was kept sealed" in page
+    assert "acts alike in this motion" in page and "No recording was kept sealed" in page
     assert "there is no numerical floor" in page and "Numerical floor" not in page
 
 

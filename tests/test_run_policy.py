@@ -10,9 +10,9 @@ import pytest
 
 from droid_jax import runtime
 from droid_jax.commands.evaluate import Evaluate, _robot, _task
-from droid_jax.commands.folder import setup_of
+from droid_jax.commands.folder import setup_of, stage_folder
 from droid_jax.commands.source import extended_of, source, stand_in_of
-from droid_jax.commands.train import Train, _forget
+from droid_jax.commands.train import Train, _fit_folder, _forget
 from droid_jax.identify.gaussian import prior
 from droid_jax.model.door import door_space
 from droid_jax.model.door_scene import door_scene
@@ -100,10 +100,15 @@ def test_without_a_fit_there_is_the_prior(scene):
     ("arguments", "said"),
     [
         (["train", "--fit", "nowhere"], "nowhere holds no gaussian.json"),
-        (["train", "--method", "mean"], "--method mean needs a fit"),
+        (["train"], "there is no fit in runs/identify or runs/all: give --fit FOLDER, or --method prior"),
+        (["train", "--method", "mean"], "there is no fit in runs/identify or runs/all"),
         (["evaluate", "--trials", "0"], "--trials must be 1 or more, got 0"),
         (["evaluate", "nowhere"], "nowhere/training.json is missing; run `python -m droid_jax.run train` again"),
         (["export", "nowhere"], "nowhere/policy.npz: there is no such file"),
+        (["evaluate"], "runs/train/training.json is missing"),
+        (["export"], "runs/train/policy.npz: there is no such file"),
+        (["view"], "runs/identify holds no replay.npz"),
+        (["report"], "there is no folder runs/identify"),
     ],
 )
 def test_what_is_missing_is_said(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]):
@@ -126,6 +131,55 @@ def test_the_stand_in_is_the_fitted_one_unless_asked(scene, fitted, asked, stiff
     assert truth["hinge_stiffness"] == pytest.approx(stiffness, rel=0.3)
     assert tuple(a.name for a in robot.hidden) == hidden and robot.config.trials == 3
     assert robot.config.timestep <= (0.00025 if hidden else 0.0005)
+
+
+@pytest.mark.parametrize(
+    ("there", "given", "meant"),
+    [
+        ([], None, "runs/train"),
+        (["runs/all/train"], None, "runs/all/train"),
+        (["runs/all/train", "runs/train"], None, "runs/train"),
+        (["runs/all/train"], "runs/all", "runs/all/train"),
+        (["runs/all/train"], "runs/all/train", "runs/all/train"),
+        (["runs/all/train"], "elsewhere", "elsewhere"),
+    ],
+)
+def test_a_command_finds_what_the_default_command_left(tmp_path: Path, there: list[str], given: str | None, meant: str):
+    for folder in there:
+        (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder / "policy.npz").write_bytes(b"")
+    assert stage_folder(None if given is None else Path(given), "train", "policy.npz") == Path(meant)
+
+
+def test_a_page_without_a_path_is_that_of_the_default_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "runs" / "all").mkdir(parents=True)
+    assert main(["report"]) == 2
+    assert "runs/all/config.json is missing" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("there", "named", "options", "found"),
+    [
+        (["runs/identify", "runs/all/identify"], False, [], "runs/identify"),
+        (["runs/all/identify"], False, [], "runs/all/identify"),
+        (["runs/all/identify", "runs/all/gap"], True, [], "runs/all/gap"),
+        (["runs/all/identify", "runs/all/gap"], True, ["--fit", "runs/all"], "runs/all/gap"),
+        (["runs/all/identify", "runs/identify"], False, ["--fit", "runs/all"], "runs/all/identify"),
+        (["mine"], False, ["--fit", "mine"], "mine"),
+        ([], False, ["--method", "prior"], None),
+    ],
+)
+def test_which_fit_is_trained_on(tmp_path: Path, there: list[str], named: bool, options: list[str], found: str | None):
+    for folder in there:
+        (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder / "gaussian.json").write_text("{}")
+    if named:
+        (tmp_path / "runs/all/gap/gaussian.json").rename(tmp_path / "runs/all/gap/extended.json")
+        (tmp_path / "runs/all/gap/gap.json").write_text('{"effects": ["latch at door_hinge"]}')
+    asked = dict(zip(options[::2], options[1::2], strict=True))
+    fit = Path(asked["--fit"]) if "--fit" in asked else None
+    method = "prior" if "--method" in asked else "fitted"
+    assert _fit_folder(Train(fit=fit, method=method)) == (None if found is None else Path(found))
 
 
 @pytest.mark.slow

@@ -231,7 +231,7 @@ def test_device_has_a_name(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert runtime.device() == "2 x NVIDIA H200"
     monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
-    monkeypatch.setattr(runtime, "_cores", lambda: 1)
+    monkeypatch.setattr(runtime, "cores", lambda: 1)
     assert re.fullmatch(r".+, 1 core", runtime.device())
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,11 @@ import matplotlib
 import pytest
 
 from droid_jax import runtime
+from droid_jax.gap.extended import Extended
+from droid_jax.identify.gaussian import prior
+from droid_jax.measure.formats import load
+from droid_jax.model.effects.registry import effect_space, library, ready
+from droid_jax.model.own import load_parameters
 from droid_jax.run import main
 
 HERE = Path(__file__).resolve().parents[1] / "docs" / "tutorial"
@@ -38,11 +44,33 @@ def converted() -> list[str]:
 def test_its_bags_become_a_recording(copy: Path, capsys: pytest.CaptureFixture[str]):
     assert main(converted()) == 0
     assert "10 repeats of 4.0 s, channels torque (2 x 400), position (2 x 400)" in capsys.readouterr().out
+    assert load("runs/fit.npz").name == "fit"  # as the page of the search calls the motion
 
 
 def test_the_notebook_is_stored_without_outputs():
     cells = json.loads((HERE / "your_robot.ipynb").read_text())["cells"]
     assert [c for c in cells if c["cell_type"] == "code" and (c["outputs"] or c["execution_count"])] == []
+
+
+def test_the_arms_that_it_draws_rub_as_was_found(copy: Path):
+    """Its last cell, on a Gaussian that needs no search: with theta at zero the same arms fall otherwise."""
+    matplotlib.use("agg")
+    import jax
+    import matplotlib.pyplot as plt
+
+    import droid_jax as dj
+
+    scene = ready(dj.load_scene("arm.xml"))
+    effects = library(scene, ["joint_coulomb"])
+    space = load_parameters("parameters.json", scene) + effect_space(effects)
+    extended = Extended(scene, (), effects, space.mean, prior(space))
+    names: dict[str, Any] = {"dj": dj, "plt": plt, "extended": extended}
+    cell = [c for c in json.loads((copy / "your_robot.ipynb").read_text())["cells"] if c["cell_type"] == "code"][-1]
+    exec(compile("".join(cell["source"]), "your_robot.ipynb", "exec"), names)
+    physics, batched = names["physics"], names["batched"]
+    smooth = replace(physics, theta=jax.tree.map(jax.numpy.zeros_like, physics.theta))
+    apart = names["angles"] - jax.jit(jax.vmap(names["fall"], in_axes=(batched,)))(smooth)
+    assert names["angles"].shape == (16, 200, 2) and float(abs(apart).max()) > 0.05
 
 
 @pytest.mark.slow

@@ -51,6 +51,18 @@ def test_without_a_screen_it_names_the_film(folder: Path, monkeypatch: pytest.Mo
     assert f"a film in {folder / 'report.html'}" in capsys.readouterr().err
 
 
+def test_without_a_path_it_shows_what_the_default_command_left(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+):
+    (tmp_path / "runs" / "all").mkdir(parents=True)
+    (tmp_path / "runs" / "all" / "identify").symlink_to(folder)
+    monkeypatch.chdir(tmp_path)
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    assert main(["view"]) == 2
+    assert f"a film in {Path('runs/all/identify/report.html')}" in capsys.readouterr().err
+
+
 def test_a_folder_without_a_replay_is_refused(tmp_path: Path, capsys):
     assert main(["view", str(tmp_path)]) == 2
     assert f"{tmp_path} holds no replay.npz: `python -m droid_jax.run identify` writes one" in capsys.readouterr().err

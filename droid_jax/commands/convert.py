@@ -8,6 +8,8 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from droid_jax.commands.scenes import holds_bags
+
 
 @dataclass(frozen=True)
 class Convert:
@@ -20,6 +22,8 @@ class Convert:
     """ROS 1 .bag or ROS 2 bags, one per repeat (or a folder of them), a CSV folder, or an npz file."""
     out: Path = Path("runs/recording.npz")
     """File (npz) or folder (CSV) to write."""
+    name: str | None = None
+    """What runs and pages call the recording; default: of bags that of --out, otherwise the name that it has."""
     joints: tuple[str, ...] = ()
     """Bags: measured joints, in the order wanted."""
     torque: Literal["motor", "link"] | None = None
@@ -34,6 +38,18 @@ class Convert:
     """Bags: servo gains of the commanded joints, N m/rad."""
     damping: tuple[float, ...] = ()
     """Bags: servo damping of the commanded joints, N m s/rad."""
+    command_joints: tuple[str, ...] = ()
+    """Bags: commanded joints, in the order of commands that carry no names; default: --joints."""
+    command_tolerance: float = 5e-3
+    """Bags: how far the repeats' commands may differ, rad or m."""
+    rate: float | None = None
+    """Bags: rate of the common clock, Hz; default: the usual rate of the first bag's joint states."""
+    stamps: Literal["auto", "header", "bag"] = "auto"
+    """Bags: stamps that count: header, of the recorder (bag), or header where all messages have one (auto)."""
+    allow_jitter: bool = False
+    """Accept clocks of an irregular rate."""
+    resample: bool = False
+    """CSV: repeats with clocks of their own are interpolated onto the first one's."""
     start: float | None = None
     """Keep the part from here, s."""
     end: float | None = None
@@ -42,17 +58,17 @@ class Convert:
 
 def run(command: Convert) -> None:
     """Load whatever it is, validate, cut, and save."""
-    from droid_jax.measure.formats import load, save
+    from droid_jax.measure.formats import load, rosbag_reader, save
 
     if not command.source:
         raise ValueError("convert needs the files or folders to read")
     path, *others = command.source
     if others:
-        from droid_jax.measure.rosbag import read_bags
-
-        recording = read_bags(command.source, **_bag_options(command))
+        recording = rosbag_reader().read_bags(command.source, **_bag_options(command))
     else:
-        recording = load(path, **(_bag_options(command) if command.joints else {}))
+        usual = {"name": command.name, "allow_jitter": command.allow_jitter}
+        options = _bag_options(command) if command.joints or holds_bags(path) else usual
+        recording = load(path, resample=command.resample, **options)
     if command.start is not None or command.end is not None:
         first, last = recording.span
         start, end = command.start, command.end
@@ -73,10 +89,20 @@ def _bag_options(command: Convert) -> dict[str, Any]:
     if len(command.stiffness) != len(command.damping):
         raise ValueError(f"got {len(command.stiffness)} --stiffness and {len(command.damping)} --damping")
     gains = ServoGains(np.array(command.stiffness), np.array(command.damping)) if command.stiffness else None
-    return {
+    options = {
+        "name": command.name or command.out.stem,
+        "allow_jitter": command.allow_jitter,
         "joints": command.joints,
         "torque": TorqueConvention(TorqueSide(command.torque), command.gravity),
         "state_topic": command.state_topic,
         "command_topic": command.command_topic,
         "gains": gains,
+        "command_joints": command.command_joints or None,
+        "command_tolerance": command.command_tolerance,
+        "rate": command.rate,
     }
+    if command.stamps != "auto":
+        from droid_jax.measure.formats import rosbag_reader
+
+        options["stamps"] = rosbag_reader().Stamps(command.stamps)
+    return options

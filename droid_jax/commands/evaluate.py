@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from droid_jax.commands import report
-from droid_jax.commands.folder import setup_of
+from droid_jax.commands.folder import setup_of, stage_folder
 from droid_jax.commands.hidden import hidden_effects
+from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.source import needs_brax, source
 from droid_jax.commands.train import randomise
-from droid_jax.report.files import FILMS, POLICY, TRANSFER
+from droid_jax.report.files import FILMS, POLICY, TRAINING, TRANSFER
 
 if TYPE_CHECKING:
     from droid_jax.policy.control import Policy
@@ -32,8 +33,8 @@ class Evaluate:
     """Try a trained policy: in the simulation it was trained in, and on the stand-in robot (plain C MuJoCo with hidden
     physics, sensor noise and, where wanted, a hidden effect)."""
 
-    run: Annotated[Path, tyro.conf.Positional] = Path("runs/train")
-    """Folder of `train`."""
+    run: Annotated[Path | None, tyro.conf.Positional] = None
+    """Folder of `train` or of `all`. Default: runs/train where it holds a policy, else runs/all."""
     trials: int = 100
     """Trials on the stand-in robot, and episodes in simulation."""
     springs: Literal[0, 1, 2] | None = None
@@ -46,6 +47,8 @@ class Evaluate:
     """Seed of start poses and sensor noise."""
     film: bool = True
     """Film a good and a bad trial."""
+    own_effects: Path | None = None
+    """Python file that registers effects of your own (docs/method-gap.md); it is run."""
     again: bool = False
     """Try again what was tried already."""
 
@@ -66,23 +69,27 @@ def run(command: Evaluate) -> None:
     from droid_jax.report.progress import counting
     from droid_jax.storage import new_folder, write_json
 
-    trained = read_training(command.run)
-    setup, policy = trained["setup"], load(command.run / POLICY)
-    policy_sha256 = hashlib.sha256((command.run / POLICY).read_bytes()).hexdigest()
-    setup_now = {**setup_of(command), "policy_sha256": policy_sha256}
-    if not command.again and (done := _done(command.run, setup_now)):
-        print(f"{command.run} holds these trials already (start over with --again)")
+    folder = stage_folder(command.run, "train", TRAINING)
+    load_effects(command.own_effects, folder)
+    trained = read_training(folder)
+    setup, policy = trained["setup"], load(folder / POLICY)
+    policy_sha256 = hashlib.sha256((folder / POLICY).read_bytes()).hexdigest()
+    setup_now = {**setup_of(command), "run": str(folder), "policy_sha256": policy_sha256}
+    if not command.again and (done := _done(folder, setup_now)):
+        print(f"{folder} holds these trials already (start over with --again)")
         _tell(done)
-        report.run(report.Report(command.run))
+        report.run(report.Report(folder))
         return
-    scene, gaussian, effects = source(command.run, setup["knob"])
-    env = DoorEnv(scene, _task(command.run, trained["task"]), effects)
+    scene, gaussian, effects = source(folder, setup["knob"])
+    env = DoorEnv(scene, _task(folder, trained["task"]), effects)
     robot, truth = _robot(command, trained, env)
-    print(f"{command.trials} episodes in simulation, compiled first: about a minute ...", flush=True)
-    inside = simulated(policy, env, randomise(setup["method"], scene, gaussian), command.trials, command.seed)
+    # All of them are one compiled program, which does not say how far it is.
+    with counting("episodes in simulation, a minute of compiling first", command.trials) as count:
+        inside = simulated(policy, env, randomise(setup["method"], scene, gaussian), command.trials, command.seed)
+        count(command.trials)
     with counting("trials on the stand-in robot", command.trials) as count:
         outside = transfer(policy, robot, count)
-    with new_folder(command.run / FILMS) as films:  # those of an earlier policy stay until these are there
+    with new_folder(folder / FILMS) as films:  # those of an earlier policy stay until these are there
         if command.film:
             _film(films, policy, robot, outside)
     content = {
@@ -93,9 +100,9 @@ def run(command: Evaluate) -> None:
         "versions": runtime.versions(),
         "device": runtime.device(),
     }
-    write_json(command.run / TRANSFER, content)  # last: its presence says that the trials are whole
+    write_json(folder / TRANSFER, content)  # last: its presence says that the trials are whole
     _tell(content)
-    report.run(report.Report(command.run))
+    report.run(report.Report(folder))
 
 
 def _done(folder: Path, setup: dict[str, Any]) -> Mapping[str, Any] | None:

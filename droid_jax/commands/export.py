@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from droid_jax.commands.folder import stage_folder
 from droid_jax.report.files import POLICY
 
 
@@ -16,8 +17,8 @@ class Export:
     """Write a trained policy for a robot's computer: ONNX (checked against JAX), npz, and a control loop that needs
     numpy alone (docs/policy-on-a-robot.md)."""
 
-    run: Annotated[Path, tyro.conf.Positional] = Path("runs/train")
-    """Folder of `train`."""
+    run: Annotated[Path | None, tyro.conf.Positional] = None
+    """Folder of `train` or of `all`. Default: runs/train where it holds a policy, else runs/all."""
     out: Path | None = None
     """Folder to write; default: RUN/export."""
 
@@ -27,6 +28,7 @@ def run(command: Export) -> None:
     from droid_jax.policy.control import load
     from droid_jax.policy.export import export
 
-    out = command.out or command.run / "export"
-    apart = export(out, load(command.run / POLICY))
+    folder = stage_folder(command.run, "train", POLICY)
+    out = command.out or folder / "export"
+    apart = export(out, load(folder / POLICY))
     print(f"policy.npz, policy.onnx and control.py: {out}; ONNX and JAX differ by at most {apart:.1e} in an action")

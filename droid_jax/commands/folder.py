@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,17 +15,30 @@ if TYPE_CHECKING:
     from droid_jax.model.parameters import Space
     from droid_jax.model.scene import Scene
 
+RUNS = Path("runs")  # where results go unless --out says otherwise
+
 
 def setup_of(command: Any) -> dict[str, Any]:
     """What decides a run's results, as plain data: a finished run with the same is not run again."""
     fields = dataclasses.asdict(command)
     for name in ("out", "again", "tensorboard"):
         fields.pop(name, None)
+    if own := fields.get("own_effects"):  # a changed file makes another run
+        fields["own_effects_sha256"] = hashlib.sha256(own.read_bytes()).hexdigest()
     return {k: [str(v) for v in value] if isinstance(value, tuple) else _plain(value) for k, value in fields.items()}
 
 
 def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
+
+
+def stage_folder(given: Path | None, stage: str, file: str) -> Path:
+    """The folder of a stage that a command is to read.
+
+    given: it, or one of `all` that holds it; None: RUNS/STAGE, or where that lacks `file`, the one below RUNS/all.
+    """
+    tried = (RUNS / stage, RUNS / "all" / stage) if given is None else (given, given / stage)
+    return next((folder for folder in tried if (folder / file).is_file()), tried[0])
 
 
 def fingerprints(scene: Scene, space: Space, recordings: Iterable[Recording]) -> dict[str, Any]:
@@ -79,12 +92,21 @@ def begin(out: Path, setup: dict[str, Any], again: bool, last: str = "config.jso
     write_json(out / "setup.json", setup)
 
 
-def kept_recording(path: Path, again: bool, name: str, record: Callable[[], Recording]) -> Recording:
-    """What the stand-in robot recorded earlier into this run's folder; recorded now where it did not."""
-    from droid_jax.measure.formats import load, save
+def kept_recordings(
+    paths: Mapping[str, Path], again: bool, record: Callable[[int, str], Recording]
+) -> dict[str, Recording]:
+    """What the stand-in robot recorded earlier into this run's folder, by name; recorded now where it did not.
 
-    if again or not path.is_file():
-        print(f"recording the stand-in robot: demonstration {name}, 10 repeats ...", flush=True)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        save(record(), path)
-    return load(path, name=name)
+    paths: by name.  record: of a recording's place among them and its name.
+    """
+    from droid_jax.measure.formats import load, save
+    from droid_jax.report.progress import counting
+
+    absent = [(i, name) for i, (name, path) in enumerate(paths.items()) if again or not path.is_file()]
+    if absent:
+        with counting("recording the stand-in robot", len(absent)) as count:
+            for done, (i, name) in enumerate(absent, 1):
+                paths[name].parent.mkdir(parents=True, exist_ok=True)
+                save(record(i, name), paths[name])
+                count(done)
+    return {name: load(path, name=name) for name, path in paths.items()}

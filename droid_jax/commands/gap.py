@@ -11,14 +11,16 @@ from typing import TYPE_CHECKING, Any, Literal
 from droid_jax.commands import report
 from droid_jax.commands.folder import begin, fingerprints, finished, setup_of
 from droid_jax.commands.gap_search import searched
-from droid_jax.commands.hidden import hidden_effects, record_stand_in
+from droid_jax.commands.hidden import hidden_effects, record_stand_in, settled
+from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.presets import TIMESTEP, refine_config, search_config
-from droid_jax.commands.scenes import needs_recording, own_scene
+from droid_jax.commands.scenes import needs_recording, needs_scene, own_scene, recording_at
 
 if TYPE_CHECKING:
     import numpy as np
 
     from droid_jax.gap.case import GapConfig
+    from droid_jax.gap.split import Split
     from droid_jax.measure.recording import Recording
     from droid_jax.model.parameters import Space
     from droid_jax.model.scene import Scene
@@ -56,13 +58,15 @@ class Gap:
     """Effects of the library to ask about; default: all that the scene can have."""
     without: tuple[str, ...] = ()
     """Effects of the library to leave out."""
+    own_effects: Path | None = None
+    """Python file that registers effects of your own (docs/method-gap.md); it is run."""
     budget: float | None = None
     """Minutes after which no further candidate is tried; the report says what was left out."""
     hide: tuple[str, ...] | None = None
     """What the stand-in robot hides, name=amplitude or name[joint]=amplitude; none for nothing.
     Default: magnetic_catch=1.5 (N m)."""
-    springs: Literal[0, 1, 2] = 1
-    """Springs on the stand-in's door."""
+    springs: Literal[0, 1, 2] | None = None
+    """Springs on the stand-in's door. Default: 1."""
     seed: int = 0
     """Seed of the search, of the stand-in robot and of the resamples."""
     out: Path = Path("runs/gap")
@@ -75,16 +79,18 @@ def run(command: Gap) -> None:
     """Record or load, fit, search, write the run's folder and its page."""
     from droid_jax import runtime
 
+    command = settled(command)
+    needs_scene(command)
     runtime.start()
-    from droid_jax.gap.inputs import check_recordings
     from droid_jax.gap.results import write_gap
-    from droid_jax.gap.split import Split, roles_of, split_of
+    from droid_jax.gap.split import Split
     from droid_jax.identify.results import prepare_folder
     from droid_jax.measure.surrogate import is_stand_in
 
+    load_effects(command.own_effects, command.fit)
     out = prepare_folder(command.out)
     scene, base = model_of(command)
-    given, hidden = _given(command), hidden_effects(command.hide, scene)
+    given, hidden = given_to(command), hidden_effects(command.hide, scene)
     effects = chosen_effects(command, scene, given)
     start = None if command.fit is None else values_of(command.fit, base)
     setup = {**setup_of(command), "command": "gap", **fingerprints(scene, base, given)}
@@ -93,15 +99,12 @@ def run(command: Gap) -> None:
     if finished(out, setup, command.again, "gap.json"):
         _done(out)
         return
-    split, roles = Split.RECORDINGS, {}
-    if given:
-        split = split_of(given)
-        roles = roles_of(split, given)
-        check_recordings(scene, {"only": given[0]} if split is Split.REPEATS else roles)
+    split, roles = shared_out(scene, given) if given else (Split.RECORDINGS, {})
     if split is Split.BLOCKS and start is not None:
         print("a log without repeats is fitted without a search: --fit is not needed")
     config = config_of(command)
     begin(out, setup, command.again, "gap.json")
+    assert command.springs is not None  # settled
     roles = roles or record_stand_in(scene, hidden, out, command.springs, command.seed, command.again)
     case, verdict, seconds = searched(split, scene, base, effects, roles, config, out / "checkpoints", start)
     description = {
@@ -114,6 +117,17 @@ def run(command: Gap) -> None:
     write_gap(out, case, verdict, description)
     shutil.rmtree(out / "checkpoints" / "replays", ignore_errors=True)
     _done(out)
+
+
+def shared_out(scene: Scene, given: list[Recording]) -> tuple[Split, dict[str, Recording]]:
+    """How recordings share the work, and each by its role; ValueError where a search in them could not end well."""
+    from droid_jax.gap.inputs import check_recordings
+    from droid_jax.gap.split import Split, roles_of, split_of
+
+    split = split_of(given)
+    roles = roles_of(split, given)
+    check_recordings(scene, {"only": given[0]} if split is Split.REPEATS else roles)
+    return split, roles
 
 
 def model_of(command: Gap) -> tuple[Scene, Space]:
@@ -179,21 +193,15 @@ def config_of(command: Gap) -> GapConfig:
     )
 
 
-def _given(command: Gap) -> list[Recording]:
+def given_to(command: Gap) -> list[Recording]:
     """The recordings, none where the stand-in robot shall record."""
-    from droid_jax.measure.formats import load
-
     needs_recording(command)
-    if not command.recording:
-        return []
-    if command.hide is not None:
-        raise ValueError("--hide is for the stand-in robot, and --recording says that there is none")
     if len(command.recording) > 3:
         raise ValueError(
             f"--recording takes FIT CONFIRM [SEALED], or ONE with repeats, or LOG [SEALED] without, got "
             f"{len(command.recording)} recordings; `python -m droid_jax.run identify` fits any number"
         )
-    return [load(path) for path in command.recording]
+    return [recording_at(path) for path in command.recording]
 
 
 def _done(out: Path) -> None:

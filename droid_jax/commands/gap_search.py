@@ -49,7 +49,7 @@ def searched(
     from droid_jax.report.progress import stages
 
     names = IN_BLOCKS if split is Split.BLOCKS else STAGES if start is None else STAGES[1:]
-    with stages(names) as show:
+    with stages(names, {"look": config.looked, "refit": config.refitted}) as show:
         clock = Clock(names, show, checkpoints / "seconds.json")
         clock(names[0], None)
         case = remembering(_case(split, scene, base, effects, roles, config), checkpoints / "replays")

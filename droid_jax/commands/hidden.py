@@ -1,13 +1,14 @@
-"""The stand-in robot with something hidden in it, for a `gap` without recordings."""
+"""The stand-in robot: its options, and one with something hidden in it for a `gap` without recordings."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from droid_jax.commands.folder import kept_recording
+from droid_jax.commands.folder import kept_recordings
 
 if TYPE_CHECKING:
     from droid_jax.measure.recording import Recording
@@ -15,7 +16,23 @@ if TYPE_CHECKING:
 
 DEMONSTRATIONS = {"fit": "C", "confirm": "B", "sealed": "A"}
 HIDE = ("magnetic_catch=1.5",)  # N m
+OPTIONS = {"hide": None, "springs": 1, "demonstrations": ("A", "C")}  # of a stand-in, as they are where not given
 KNOWN = "stand_in.json"  # beside the stand-in's recordings: its springs, seed and hidden effects
+
+T = TypeVar("T")
+
+
+def settled(command: T) -> T:
+    """A command with the options of its stand-in robot filled in.
+
+    Raises ValueError where some were given beside recordings, which come from another robot.
+    """
+    usual = {name: value for name, value in OPTIONS.items() if hasattr(command, name)}
+    given = [name for name in usual if getattr(command, name) is not None]
+    if given and command.recording:  # type: ignore[attr-defined]
+        raise ValueError(f"--{given[0]} is for the stand-in robot, and --recording says that there is none")
+    missing = {name: value for name, value in usual.items() if name not in given}
+    return replace(command, **missing)  # type: ignore[type-var]
 
 
 def hidden_effects(entries: Sequence[str] | None, scene: Scene) -> dict[str, float]:
@@ -68,10 +85,8 @@ def record_stand_in(
         for path in paths.values():
             path.unlink(missing_ok=True)
     write_json(out / "recordings" / KNOWN, this)  # before the first: a stop leaves no recordings of an unknown robot
-    return {
-        role: kept_recording(paths[name], False, name, lambda i=index, n=name: recorded(i, n))
-        for index, (role, name) in enumerate(DEMONSTRATIONS.items())
-    }
+    found = kept_recordings(paths, False, recorded)
+    return {role: found[name] for role, name in DEMONSTRATIONS.items()}
 
 
 def stand_in_json(hidden: Mapping[str, float], springs: int, seed: int) -> dict[str, Any]:

@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from droid_jax.commands import report
-from droid_jax.commands.folder import begin, fingerprints, finished, kept_recording, setup_of
-from droid_jax.commands.hidden import known_stand_in
+from droid_jax.commands.folder import begin, fingerprints, finished, kept_recordings, setup_of
+from droid_jax.commands.hidden import known_stand_in, settled
+from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.pictures import draw
 from droid_jax.commands.presets import TIMESTEP, Preset, refine_config, search_config
-from droid_jax.commands.scenes import needs_recording, own_scene
+from droid_jax.commands.scenes import needs_recording, needs_scene, own_scene, recording_at
 
 if TYPE_CHECKING:
     from droid_jax.identify.pipeline import Identified, IdentifyConfig
@@ -35,11 +36,12 @@ class Identify:
     """quick: a laptop, minutes.  standard: 100 generations, 2 ms steps.  paper: the paper's own
     setting (Table I's servo, 30 samples, 5 parents, no refinement).  gpu: 1024 samples."""
     recording: tuple[Path, ...] = ()
-    """Recordings to fit (npz, CSV folder, ROS bag); several of the same robot and object are fitted together."""
-    demonstrations: tuple[str, ...] = ("A", "C")
-    """What the stand-in robot repeats when no recording is given (A, B or C; the paper preset uses A)."""
-    springs: Literal[0, 1, 2] = 1
-    """Springs on the stand-in's door (its values are the fitted columns of Table I)."""
+    """Recordings to fit (npz or CSV folder; ROS bags through convert); several of the same robot and object are
+    fitted together."""
+    demonstrations: tuple[str, ...] | None = None
+    """What the stand-in robot repeats when no recording is given (A, B or C). Default: A C, in the paper preset A."""
+    springs: Literal[0, 1, 2] | None = None
+    """Springs on the stand-in's door (its values are the fitted columns of Table I). Default: 1."""
     scene: Path | None = None
     """Your own MJCF instead of the built-in door."""
     parameters: Path | None = None
@@ -50,6 +52,8 @@ class Identify:
     """Joint of the thing that is moved, in your own scene."""
     extended: Path | None = None
     """extended.json of a gap search: the effects that it named are in the model and fitted too."""
+    own_effects: Path | None = None
+    """Python file that registers effects of your own (docs/method-gap.md); it is run."""
     engine: Literal["mjx", "mujoco"] = "mjx"
     """mjx: compiled, all devices.  mujoco: plain C, all cores; for motor-side torques without gravity only."""
     population: int | None = None
@@ -76,7 +80,11 @@ class Identify:
 def run(command: Identify) -> None:
     """Record or load, fit, write the run's folder and its page."""
     from droid_jax import runtime
+    from droid_jax.report.scalars import needs_writer
 
+    command = settled(command)
+    needs_scene(command)
+    needs_writer(command.tensorboard)
     runtime.start()
     from droid_jax.identify.pipeline import cost_samples, identify
     from droid_jax.identify.results import prepare_folder, write_run
@@ -84,11 +92,12 @@ def run(command: Identify) -> None:
     from droid_jax.report.progress import stages
     from droid_jax.report.scalars import FOLDER, scalars
 
+    load_effects(command.own_effects, None if command.extended is None else command.extended.parent)
     out = prepare_folder(command.out)
     scene, space, nuisances = model_of(command)
     scene, space, effects = _extended(command, scene, space)
     given = _given(command)
-    setup = {**setup_of(command), **fingerprints(scene, space, given)}
+    setup = {**setup_of(command), **fingerprints(scene, space if nuisances is None else space + nuisances, given)}
     if finished(out, setup, command.again):
         report.run(report.Report(out))
         return
@@ -107,31 +116,32 @@ def run(command: Identify) -> None:
             scene, space, recordings, nuisances=nuisances, config=config, checkpoints=out / "checkpoints",
             progress=progress, **effects,
         )  # fmt: skip
+        description = {
+            "command": "identify",
+            "preset": command.preset,
+            "scene": scene.name,
+            "engine": config.engine,
+            "recordings": [
+                {
+                    "name": r.name,
+                    "sha256": r.sha256,
+                    "repeats": r.repeats,
+                    "heldout": list(found.heldout_repeats[r.name]),
+                    "duration": r.duration,
+                }
+                for r in recordings
+            ],
+            "seed": command.seed,
+            "versions": runtime.versions(),
+            "device": runtime.device(),
+            "started": started,
+            "stand_in": all(is_stand_in(r) for r in recordings),
+            "setup": setup,
+        }
         progress("sample", None)
-        samples = cost_samples(found, config.samples, config.seed)
-    description = {
-        "command": "identify",
-        "preset": command.preset,
-        "scene": scene.name,
-        "engine": config.engine,
-        "recordings": [
-            {
-                "name": r.name,
-                "sha256": r.sha256,
-                "repeats": r.repeats,
-                "heldout": list(found.heldout_repeats[r.name]),
-                "duration": r.duration,
-            }
-            for r in recordings
-        ],
-        "seed": command.seed,
-        "versions": runtime.versions(),
-        "device": runtime.device(),
-        "started": started,
-        "stand_in": all(is_stand_in(r) for r in recordings),
-        "setup": setup,
-    }
-    write_run(out, found, description, truth=truth, samples=samples)
+        write_run(
+            out, found, description, truth=truth, samples=lambda: cost_samples(found, config.samples, config.seed)
+        )
     draw(out, found, recordings[0])
     report.run(report.Report(out))
     _summary(found, json.loads((out / "fit.json").read_text()))
@@ -181,11 +191,18 @@ def _extended(command: Identify, scene: Scene, space: Space) -> tuple[Scene, Spa
 
 
 def _given(command: Identify) -> list[Recording]:
-    """The recordings, none where the stand-in robot shall record."""
-    from droid_jax.measure.formats import load
-
+    """The recordings, none where the stand-in robot shall record; ValueError where two have one name."""
     needs_recording(command)
-    return [load(path) for path in command.recording]
+    files: dict[str, Path] = {}
+    recordings = [recording_at(path) for path in command.recording]
+    for path, recording in zip(command.recording, recordings, strict=True):
+        if recording.name in files:
+            raise ValueError(
+                f"{files[recording.name]} and {path} are both named {recording.name!r}, and results go by the name: "
+                f"`python -m droid_jax.run convert {path} --name OTHER --out other.npz` gives another"
+            )
+        files[recording.name] = path
+    return recordings
 
 
 def _recordings(
@@ -201,6 +218,7 @@ def _recordings(
     from droid_jax.measure.demonstration import demonstration_path
     from droid_jax.measure.surrogate import record
 
+    assert command.springs is not None and command.demonstrations is not None  # settled
     gains = "paper" if command.preset == "paper" else "impedance"
     names = command.demonstrations[:1] if command.preset == "paper" else command.demonstrations
     truth = stand_in_truth(scene, command.springs, command.seed, nuisances=command.preset != "paper")
@@ -209,11 +227,9 @@ def _recordings(
         demonstration = load(demonstration_path(name, gains=gains))
         return record(scene, demonstration, truth, seed=1000 * command.seed + index)
 
-    recordings = []
-    for index, name in enumerate(names):
-        path = out / "recordings" / f"{name}_springs{command.springs}_seed{command.seed}.npz"
-        recordings.append(kept_recording(path, command.again, name, lambda i=index, n=name: recorded(i, n)))
-    return recordings, truth
+    tag = f"springs{command.springs}_seed{command.seed}"
+    paths = {name: out / "recordings" / f"{name}_{tag}.npz" for name in names}
+    return list(kept_recordings(paths, command.again, recorded).values()), truth
 
 
 def _summary(found: Identified, fit: Mapping[str, Any]) -> None:
@@ -222,8 +238,9 @@ def _summary(found: Identified, fit: Mapping[str, Any]) -> None:
 
     for name, gap in found.gaps.items():
         way = "one repeat: what noise alone would leave is not known"
-        if gap.floor is not None and gap.closed is not None:
-            way = f"a perfect model: {gap.floor:.3f}; {percent(gap.closed)} of the gap closed"
+        if gap.floor is not None:
+            closed = "there was none to close" if gap.closed is None else f"{percent(gap.closed)} of the gap closed"
+            way = f"a perfect model: {gap.floor:.3f}; {closed}"
         unit = found.fit.comparisons[0].channel("torque").unit
         print(f"{name}: held-out torque distance {gap.before:.3f} -> {gap.after:.3f} {unit} ({way})")
     silent = [t.name for t in found.tells if not t.identifiable and not found.full[t.name].nuisance]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,8 +20,8 @@ AT = (0.0, 0.33, 0.6, 1.0)  # of the motion, where a frame is taken
 def draw(out: Path, found: Identified, recording: Recording) -> None:
     """Replay a recording's commands in plain C before and after the fit: replay.npz, films/ and frames/.
 
-    Without OpenGL only the states are written, and the report says that there are no pictures.  A recording
-    without commands has no replay to show.
+    Those of an earlier fit in this folder are removed first.  Without OpenGL only the states are written, and the
+    report says that there are no pictures.  A recording without commands has no replay to show.
     """
     import numpy as np
 
@@ -31,6 +32,7 @@ def draw(out: Path, found: Identified, recording: Recording) -> None:
     from droid_jax.report.render import NoOpenGL, frames, save_frames
     from droid_jax.storage import write_npz
 
+    _forget(out)
     if not recording.command.size:
         return
     drive = make_drive(found.scene, recording)
@@ -51,3 +53,10 @@ def draw(out: Path, found: Identified, recording: Recording) -> None:
         print(f"no pictures: {error}", file=sys.stderr)
         return
     save_frames(out / "frames", images, [float(time[r]) for r in rows], "after")
+
+
+def _forget(out: Path) -> None:
+    """Remove the pictures of an earlier fit."""
+    for path in (out / REPLAY, out / FILMS / REPLAY_FILM):
+        path.unlink(missing_ok=True)
+    shutil.rmtree(out / "frames", ignore_errors=True)

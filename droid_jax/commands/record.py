@@ -27,6 +27,9 @@ class Record:
 
 def run(command: Record) -> None:
     """Record the stand-in robot and save what it measured."""
+    from droid_jax import runtime
+
+    runtime.import_mjx()  # the first import of it prints two lines about warp
     from droid_jax.measure.demonstration import demonstration_path
     from droid_jax.measure.formats import load, save
     from droid_jax.measure.surrogate import SurrogateConfig, record, stand_in_truth

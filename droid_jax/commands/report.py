@@ -8,18 +8,21 @@ from typing import Annotated
 
 import tyro
 
+from droid_jax.commands.folder import RUNS
+
 
 @dataclass(frozen=True)
 class Report:
     """Build the HTML page of a finished run again."""
 
-    run: Annotated[Path, tyro.conf.Positional] = Path("runs/identify")
-    """The run's folder."""
+    run: Annotated[Path | None, tyro.conf.Positional] = None
+    """The run's folder. Default: runs/identify where there is one, else runs/all."""
 
 
 def run(command: Report) -> None:
     """Write RUN/report.html."""
-    print(f"report: {write(command.run)}")
+    usual = next((f for f in (RUNS / "identify", RUNS / "all") if f.is_dir()), RUNS / "identify")
+    print(f"report: {write(command.run or usual)}")
 
 
 def write(folder: Path) -> Path:

@@ -1,4 +1,4 @@
-"""A scene of one's own, as `identify` and `gap` take it from the command line."""
+"""A scene of one's own and recordings in it, as `identify` and `gap` take them from the command line."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
+    from droid_jax.measure.recording import Recording
     from droid_jax.model.parameters import Space
     from droid_jax.model.scene import Scene
+
+BAGS = (".bag", ".mcap", ".db3")
 
 
 class OwnScene(Protocol):
@@ -23,6 +26,13 @@ class OwnScene(Protocol):
     def joints(self) -> tuple[str, ...]: ...
     @property
     def object_joint(self) -> str | None: ...
+
+
+def needs_scene(options: OwnScene) -> None:
+    """ValueError for options that describe a scene of one's own where none is given."""
+    for name in ("parameters", "joints", "object_joint"):
+        if options.scene is None and getattr(options, name):
+            raise ValueError(f"--{name.replace('_', '-')} is for a scene of your own: give --scene too")
 
 
 def needs_recording(options: OwnScene) -> None:
@@ -45,3 +55,20 @@ def own_scene(options: OwnScene) -> tuple[Scene, Space]:
         friction_joints=friction_joints(options.parameters),
     )
     return scene, load_parameters(options.parameters, scene)
+
+
+def holds_bags(path: Path) -> bool:
+    """Whether a path is a ROS bag or a folder of such."""
+    return any(p.suffix in BAGS or (p / "metadata.yaml").is_file() for p in (path, *path.glob("*")))
+
+
+def recording_at(path: Path) -> Recording:
+    """A recording; ValueError for ROS bags, which do not say what a fit must know of them."""
+    from droid_jax.measure.formats import load
+
+    if holds_bags(path):
+        raise ValueError(
+            f"{path}: a ROS bag does not say which joints to read or what its efforts are; "
+            "`python -m droid_jax.run convert BAGS --joints ... --torque ...` makes a recording of it"
+        )
+    return load(path)

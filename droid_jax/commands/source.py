@@ -66,6 +66,26 @@ def _check_door(path: Path, gaussian: Gaussian, scene: Scene) -> None:
             raise ValueError(f"{path} belongs to another scene: its {p.name} is not the built-in door's")
 
 
+def model_folder(whole: Path) -> Path:
+    """Where, in a folder of `all`, the model is that a policy shall be trained on: the extended one, if an effect was
+    named.
+
+    A search in other recordings than the fit's, left over from an earlier run, does not count.
+    """
+    try:
+        named = bool(json.loads((whole / "gap" / "gap.json").read_text())["effects"])
+    except FileNotFoundError:
+        named = False
+    fit, gap = (setup(whole / stage).get("recordings_sha256") for stage in ("identify", "gap"))
+    stale = fit is not None and gap is not None and gap[: len(fit)] != fit
+    return whole / ("gap" if named and not stale else "identify")
+
+
+def has_model(folder: Path) -> bool:
+    """Whether there is something in a folder that a policy can be trained on."""
+    return (folder / GAUSSIAN).is_file() or extended_of(folder) is not None
+
+
 def extended_of(folder: Path) -> Path | None:
     """The extended model that a run's Gaussian belongs to: its own file, or the one that it was told to fit."""
     from droid_jax.gap.extended import FILE

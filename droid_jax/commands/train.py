@@ -9,8 +9,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from droid_jax.commands import report
-from droid_jax.commands.folder import begin, finished, setup_of
-from droid_jax.commands.source import GAUSSIAN, extended_of, fingerprint, needs_brax, source, stand_in_of
+from droid_jax.commands.folder import RUNS, begin, finished, setup_of
+from droid_jax.commands.own_effects import load_effects
+from droid_jax.commands.source import (
+    GAUSSIAN,
+    extended_of,
+    fingerprint,
+    has_model,
+    model_folder,
+    needs_brax,
+    source,
+    stand_in_of,
+)
 from droid_jax.report.files import FILMS, POLICY, TRAINING, TRANSFER
 
 if TYPE_CHECKING:
@@ -20,7 +30,6 @@ if TYPE_CHECKING:
     from droid_jax.policy.train import TrainConfig, TrainProgress
 
 Method = Literal["fitted", "mean", "prior"]
-USUAL = Path("runs/identify")
 
 
 @dataclass(frozen=True)
@@ -31,7 +40,7 @@ class Train:
     """
 
     fit: Path | None = None
-    """Folder of `identify` or `gap`. Default: runs/identify where there is one, else the prior."""
+    """Folder of `identify`, `gap` or `all`. Default: runs/identify where it holds a fit, else runs/all."""
     method: Method = "fitted"
     """fitted: every environment its own draw of the fitted Gaussian.  mean: all have its mean.  prior: draws of what
     was assumed before the fit (the three methods of the paper's Table II)."""
@@ -43,6 +52,8 @@ class Train:
     """Actions in all, rounded up to whole rounds; default: the preset's."""
     seed: int = 0
     """Seed of the networks and of the environments."""
+    own_effects: Path | None = None
+    """Python file that registers effects of your own (docs/method-gap.md); it is run."""
     tensorboard: bool = False
     """Write scalars for TensorBoard while it runs, to OUT/tensorboard."""
     out: Path = Path("runs/train")
@@ -55,7 +66,9 @@ def run(command: Train) -> None:
     """Train, and write the run's folder and its page."""
     needs_brax()
     from droid_jax import runtime
+    from droid_jax.report.scalars import FOLDER, needs_writer, scalars
 
+    needs_writer(command.tensorboard)
     runtime.start()
     from droid_jax.gap.extended import FILE
     from droid_jax.identify.results import prepare_folder
@@ -63,10 +76,10 @@ def run(command: Train) -> None:
     from droid_jax.policy.network import save_policy
     from droid_jax.policy.train import train
     from droid_jax.report.progress import training
-    from droid_jax.report.scalars import FOLDER, scalars
     from droid_jax.storage import write_json
 
     out, fit = prepare_folder(command.out), _fit_folder(command)
+    load_effects(command.own_effects, fit)
     scene, gaussian, effects = source(fit, command.knob)
     gaussian = _chosen(command, gaussian)
     origin = {"fit": None if fit is None else str(fit), "fit_sha256": fingerprint(fit), "stand_in": stand_in_of(fit)}
@@ -144,15 +157,20 @@ def _chosen(command: Train, gaussian: Gaussian) -> Gaussian:
 
 
 def _fit_folder(command: Train) -> Path | None:
-    """Where the Gaussian comes from; None for the prior of the built-in door."""
+    """Where the Gaussian comes from; None for the prior of the built-in door.
+
+    Raises ValueError where a fit is asked for and there is none.
+    """
     if command.fit is not None:
-        return command.fit
-    if (USUAL / GAUSSIAN).is_file():
-        what = "what was assumed before the fit" if command.method == "prior" else "the fit"
-        print(f"training on {what} in {USUAL} (another: --fit)")
-        return USUAL
-    if command.method == "mean":
-        raise ValueError(f"--method mean needs a fit: there is none in {USUAL}, and no --fit FOLDER was given")
-    if command.method == "fitted":
-        print(f"there is no fit in {USUAL}: training on the prior (--fit FOLDER of `identify` or `gap` for another)")
+        whole = model_folder(command.fit)
+        return whole if has_model(whole) else command.fit
+    for folder in (RUNS / "identify", model_folder(RUNS / "all")):
+        if has_model(folder):
+            what = "what was assumed before the fit" if command.method == "prior" else "the fit"
+            print(f"training on {what} in {folder} (another: --fit)")
+            return folder
+    if command.method != "prior":
+        raise ValueError(
+            f"there is no fit in {RUNS / 'identify'} or {RUNS / 'all'}: give --fit FOLDER, or --method prior"
+        )
     return None

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from droid_jax.commands.folder import stage_folder
 from droid_jax.report.files import FITTED, REPLAY
 
 if TYPE_CHECKING:
@@ -25,8 +26,8 @@ APART = 1.6  # times the scene's extent between the two
 class View:
     """Watch the replay in MuJoCo's viewer: before the fit on the left, after it on the right. Needs a screen."""
 
-    run: Annotated[Path, tyro.conf.Positional] = Path("runs/identify")
-    """Folder of `identify`, or of `all`."""
+    run: Annotated[Path | None, tyro.conf.Positional] = None
+    """Folder of `identify` or of `all`. Default: runs/identify where it holds a replay, else runs/all."""
     speed: float = 1.0
     """Times real time."""
 
@@ -35,10 +36,10 @@ def run(command: View) -> None:
     """Play the states of replay.npz over and over until the window is closed."""
     if not command.speed > 0:
         raise ValueError(f"--speed must be above 0, got {command.speed:g}")
-    folder = next((f for f in (command.run, command.run / "identify") if (f / REPLAY).is_file()), None)
-    if folder is None:
+    folder = stage_folder(command.run, "identify", REPLAY)
+    if not (folder / REPLAY).is_file():
         raise ValueError(
-            f"{command.run} holds no {REPLAY}: `python -m droid_jax.run identify` writes one for recordings that hold "
+            f"{folder} holds no {REPLAY}: `python -m droid_jax.run identify` writes one for recordings that hold "
             "commands"
         )
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):

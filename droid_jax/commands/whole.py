@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
 import typing
@@ -12,9 +13,10 @@ from typing import Any, Literal, NamedTuple
 
 from droid_jax.commands import evaluate, gap, identify, report, train
 from droid_jax.commands.folder import OtherRun
-from droid_jax.commands.hidden import DEMONSTRATIONS, hidden_effects, record_stand_in
-from droid_jax.commands.scenes import needs_recording
-from droid_jax.commands.source import needs_brax, setup
+from droid_jax.commands.hidden import DEMONSTRATIONS, hidden_effects, record_stand_in, settled
+from droid_jax.commands.own_effects import load_effects
+from droid_jax.commands.scenes import needs_recording, needs_scene
+from droid_jax.commands.source import model_folder, needs_brax
 from droid_jax.report.files import TRANSFER
 
 Stage = Literal["identify", "gap", "train", "evaluate"]
@@ -44,9 +46,11 @@ class All:
     """
 
     preset: Literal["quick", "paper", "gpu"] = "quick"
-    """quick: a laptop, half an hour.  paper: the paper's budgets (hours).  gpu: large batches."""
+    """quick: identify, gap and train with their own quick; a laptop, half an hour.  paper: identify and gap with
+    standard (100 generations; not identify's paper, whose servo no policy can be trained on), train with paper; hours.
+    gpu: all with gpu."""
     recording: tuple[Path, ...] = ()
-    """FIT CONFIRM [SEALED]: motions of your own robot, as in `gap`."""
+    """FIT CONFIRM [SEALED], ONE or LOG [SEALED], as in gap; with fewer repeats: --stages identify."""
     scene: Path | None = None
     """Your own MJCF instead of the built-in door: identify and gap, policies are trained at the built-in one."""
     parameters: Path | None = None
@@ -55,16 +59,20 @@ class All:
     """Measured joints of your own scene; default: all driven joints."""
     object_joint: str | None = None
     """Joint of the thing that is moved, in your own scene."""
+    own_effects: Path | None = None
+    """Python file that registers effects of your own (docs/method-gap.md); it is run."""
     hide: tuple[str, ...] | None = None
     """What the stand-in robot hides, name=amplitude; none for nothing. Default: magnetic_catch=1.5 (N m)."""
-    springs: Literal[0, 1, 2] = 1
-    """Springs on the stand-in's door."""
+    springs: Literal[0, 1, 2] | None = None
+    """Springs on the stand-in's door. Default: 1."""
     seed: int = 0
     """Seed of every stage and of the stand-in robot."""
     trials: int = 100
     """Trials of the policy on the stand-in robot, and episodes in simulation."""
     stages: tuple[Stage, ...] = STAGES
     """Which stages; those left out are read from the folder where they are in it."""
+    tensorboard: bool = False
+    """Write scalars for TensorBoard while it fits and trains, to OUT/identify/ and OUT/train/tensorboard."""
     out: Path = Path("runs/all")
     """Results folder, with one folder for each stage. A run that was interrupted goes on from where it was."""
     again: bool = False
@@ -72,21 +80,24 @@ class All:
 
 
 def run(command: All) -> None:
-    """Every stage in a folder of its own below OUT, then the page of all of them."""
+    """Every stage in a folder of its own below OUT, then the page of all of them; where one fails, of those before."""
     started = time.monotonic()
     from droid_jax import runtime
+    from droid_jax.report.scalars import needs_writer
 
+    command = settled(command)
+    needs_scene(command)
+    needs_recording(command)
+    needs_writer(command.tensorboard)
+    if command.scene is None and "train" in command.stages:
+        needs_brax()  # rather now than after the search
     runtime.start()  # before the recording, which would start jax untuned
     from droid_jax.identify.results import prepare_folder
 
+    load_effects(command.own_effects)
     out = prepare_folder(command.out)
-    if command.scene is None and "train" in command.stages:
-        needs_brax()  # rather now than after the search
-    needs_recording(command)
-    plan = _plan(command, out, command.recording or _recorded(command))
-    for number, (stage, run_stage) in enumerate(plan.items(), 1):
-        print(f"\n[{number}/{len(plan)}] {stage}", flush=True)
-        run_stage()
+    roles = _roles(command)
+    _run_stages(command, out, roles)
     page = report.write(out)
     print(f"\n{command.out}: {(time.monotonic() - started) / 60:.0f} minutes")
     for line in told(out):
@@ -94,22 +105,71 @@ def run(command: All) -> None:
     print(f"report: {page}")
 
 
-def _plan(command: All, out: Path, recordings: tuple[Path, ...]) -> dict[str, Callable[[], None]]:
+def _run_stages(command: All, out: Path, roles: tuple[str, ...]) -> None:
+    """Record where nothing was recorded, then the stages that were asked for; each says how long it took.
+
+    Where one fails, the page of those before it is written.
+    """
+    plan = _plan(command, out, command.recording or _recordings(out), roles)
+    if not command.recording:
+        plan = {"record": lambda: _record(command), **plan}
+    for number, (stage, run_stage) in enumerate(plan.items(), 1):
+        began = time.monotonic()
+        print(f"\n[{number}/{len(plan)}] {stage}", flush=True)
+        try:
+            run_stage()
+        except Exception:
+            if number > 1:
+                with contextlib.suppress(ValueError):  # the recording alone makes no page
+                    print(f"report of what is done: {report.write(out)}")
+            raise
+        print(f"[{number}/{len(plan)}] {stage}: {(time.monotonic() - began) / 60:.1f} minutes", flush=True)
+
+
+def _roles(command: All) -> tuple[str, ...]:
+    """What each recording is for: "fit", "confirm" or "sealed".
+
+    Raises ValueError, before anything long begins, where the search could not use them.  Without the search there is
+    nothing to seal, unless a search could be made later.
+    """
+    if not command.recording:
+        return tuple(DEMONSTRATIONS)
+    own = gap.Gap(command.recording, preset=PRESETS[command.preset].identify, **_own(command))
+    try:
+        _, roles = gap.shared_out(gap.model_of(own)[0], gap.given_to(own))
+    except ValueError:
+        if "gap" in command.stages:
+            raise
+        return ("fit",) * len(command.recording)
+    return tuple(roles)
+
+
+def _own(command: All) -> dict[str, Any]:
+    """The options of a scene and of effects of one's own, which all stages in it take."""
+    return {name: getattr(command, name) for name in ("scene", "parameters", "joints", "object_joint", "own_effects")}
+
+
+def _plan(
+    command: All, out: Path, recordings: tuple[Path, ...], roles: tuple[str, ...]
+) -> dict[str, Callable[[], None]]:
     """The stages that were asked for, as far as the scene has them."""
     presets = PRESETS[command.preset]
-    common: dict[str, Any] = {"seed": command.seed, "again": command.again}
-    own = {name: getattr(command, name) for name in ("scene", "parameters", "joints", "object_joint")}
-    seen = recordings[:2]  # a sealed one stays sealed until the search opens it
+    common: dict[str, Any] = {"seed": command.seed, "again": command.again, "own_effects": command.own_effects}
+    own, board = _own(command) | common, {"tensorboard": command.tensorboard}
+    # A sealed one stays sealed until the search opens it.
+    seen = tuple(path for path, role in zip(recordings, roles, strict=False) if role != "sealed")
 
     def fit() -> None:
-        _stage(identify.run, identify.Identify(presets.identify, recording=seen, out=out / "identify", **own, **common))
+        _stage(identify.run, identify.Identify(presets.identify, seen, out=out / "identify", **board, **own))
 
     def search() -> None:
-        fit = out / "identify" if (out / "identify" / "fit.json").is_file() else None
-        _stage(gap.run, gap.Gap(recordings, fit=fit, preset=presets.identify, out=out / "gap", **own, **common))
+        # A log in blocks of time has no confirming recording, and its base fit needs no start.
+        known = "confirm" in roles and (out / "identify" / "fit.json").is_file()
+        fit = out / "identify" if known else None
+        _stage(gap.run, gap.Gap(recordings, fit=fit, preset=presets.identify, out=out / "gap", **own))
 
     def learn() -> None:
-        _stage(train.run, train.Train(model_folder(out), preset=presets.train, out=out / "train", **common))
+        _stage(train.run, train.Train(model_folder(out), preset=presets.train, out=out / "train", **board, **common))
 
     def judge() -> None:
         evaluate.run(evaluate.Evaluate(out / "train", trials=command.trials, **common))
@@ -118,17 +178,6 @@ def _plan(command: All, out: Path, recordings: tuple[Path, ...]) -> dict[str, Ca
     if command.scene is None:
         plan |= {"train": learn, "evaluate": judge}
     return {stage: run_stage for stage, run_stage in plan.items() if stage in command.stages}
-
-
-def model_folder(out: Path) -> Path:
-    """Where the model is that a policy shall be trained on: the extended one where the search named an effect.
-
-    A search in other recordings than the fit's, left over from an earlier run, does not count.
-    """
-    found = _json(out / "gap" / "gap.json")
-    fit, gap_ = (setup(out / stage).get("recordings_sha256") for stage in ("identify", "gap"))
-    stale = fit is not None and gap_ is not None and gap_[: len(fit)] != fit
-    return out / ("gap" if found and found["effects"] and not stale else "identify")
 
 
 def told(out: Path) -> list[str]:
@@ -142,8 +191,9 @@ def told(out: Path) -> list[str]:
         lines.append(f"identify: torque distance on repeats that were not fitted: {', '.join(gaps)}")
     if found := _json(out / "gap" / "gap.json"):
         role, size = list(found["gaps"].items())[-1]
-        closed = "" if size["closed"] is None else f"; {percent(size['closed'])} of the gap closed on the {role} motion"
-        lines.append(f"gap: {found['sentence']}{closed}")
+        closed = size["closed"]
+        share = "" if closed is None else f"; {percent(closed)} of the gap U closed on the {role} motion"
+        lines.append(f"gap: {found['sentence']}{share}")
     for name, of in (_json(out / "train" / TRANSFER) or {}).items():
         if name in ("simulation", "stand_in"):
             low, high = of["interval_95"]
@@ -152,11 +202,17 @@ def told(out: Path) -> list[str]:
     return lines
 
 
-def _recorded(command: All) -> tuple[Path, ...]:
+def _recordings(out: Path) -> tuple[Path, ...]:
     """Files of the stand-in robot's motions: fit, confirm, sealed."""
+    return tuple(out / "recordings" / f"{name}.npz" for name in DEMONSTRATIONS.values())
+
+
+def _record(command: All) -> None:
+    """Let the stand-in robot record its motions."""
     from droid_jax.commands.presets import TIMESTEP
     from droid_jax.model.door_scene import door_scene
 
+    assert command.springs is not None  # settled
     scene = door_scene(timestep=TIMESTEP[PRESETS[command.preset].identify])
     hidden = hidden_effects(command.hide, scene)
     if "evaluate" in command.stages:  # rather now than when the policy is there
@@ -168,7 +224,6 @@ def _recorded(command: All) -> tuple[Path, ...]:
         except ValueError as error:
             raise ValueError(f"{error}; or leave the trials away: --stages identify gap train") from None
     record_stand_in(scene, hidden, command.out, command.springs, command.seed, command.again)
-    return tuple(command.out / "recordings" / f"{name}.npz" for name in DEMONSTRATIONS.values())
 
 
 def _stage(run_stage: Callable[[Any], None], command: Any) -> None:

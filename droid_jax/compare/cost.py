@@ -31,6 +31,7 @@ from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, Rollout
 
 ENGINES = ("mjx", "mujoco")
+SCATTER = 0.01  # rad or m: repeats of one motion whose start was measured begin no further apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,19 +86,16 @@ class Cost:
 
     def restated(self, values: np.ndarray) -> Cost:
         """The same replays, with the noise of single repeats restated from what `values` [D] leaves unexplained."""
-        simulated = self.smoothed(values[None])
-        made = [
-            c.restated(torque[0]) if c.repeats == 1 else c
-            for c, torque in zip(self.comparisons, simulated, strict=True)
-        ]
+        rollouts = [jax.tree.map(lambda a: a[0], r) for r in self.rollouts(values[None])]
+        made = [c.restated(r) if c.repeats == 1 else c for c, r in zip(self.comparisons, rollouts, strict=True)]
         return assemble(self.scene, self.space, made, self._replays, self.drives)
 
     def against(self, recordings: Sequence[Recording], config: CompareConfig | None = None) -> Cost:
         """The same compiled replays compared with other repeats of the same recordings, or in another way.
 
         A recording without commands may hold another motion: its replay is given it.
-        Raises ValueError unless these are as many, with the same commands (where there are none, as many
-        instants and the same torque convention) on the same clock.
+        Raises ValueError unless these are as many, with the same commands from the same start (where there are
+        none, as many instants on the same clock) and the same torque convention.
         """
         if len(recordings) != len(self.drives):
             raise ValueError(f"expected repeats of {len(self.drives)} replayed recordings, got {len(recordings)}")
@@ -105,9 +103,12 @@ class Cost:
         for recording, old, drive in zip(recordings, self.comparisons, self.drives, strict=True):
             new = followed(self.scene, recording, config or old.config)
             if not _same(new, drive):
-                raise ValueError(f"recording {recording.name!r} holds other commands than {old.name!r} had")
+                raise ValueError(
+                    f"recording {recording.name!r} holds other commands than {old.name!r} had, starts elsewhere "
+                    "(qpos0), or measured another torque (side, gravity)"
+                )
             made.append(make_comparison(self.scene, recording, _clock(recording, new), config or old.config))
-            drives.append(new)
+            drives.append(new if isinstance(new, Motion) else drive)
         replays = [_along(replay, new) for replay, new in zip(self._replays, drives, strict=True)]
         return assemble(self.scene, self.space, made, replays, drives)
 
@@ -142,7 +143,8 @@ def make_cost(
     if not recordings:
         raise ValueError("a cost needs at least one recording")
     drives = [followed(scene, r, config) for r in recordings]
-    effects = (*effects, *_sensor_effects(scene, space))
+    given = {e.name for e in effects}
+    effects = (*effects, *(e for e in _sensor_effects(scene, space) if e.name not in given))
     replays = tuple(_engine(engine, scene, space, d, effects) for d in drives)
     comparisons = tuple(
         make_comparison(scene, r, _clock(r, d), config) for r, d in zip(recordings, drives, strict=True)
@@ -180,7 +182,7 @@ def batch_replay(scene: Scene, space: Space, replay: Replay) -> Callable[[np.nda
 def followed(scene: Scene, recording: Recording, config: CompareConfig) -> Drive | Motion:
     """What a replay follows: the recording's commands or, where it holds none, its measured motion."""
     if recording.command.size:
-        return make_drive(scene, recording)
+        return make_drive(scene, recording, weigh="torque" in config.channels)
     return measured_motion(recording, scene.joints, cutoff=config.motion_cutoff)
 
 
@@ -202,9 +204,11 @@ def _along(replay: Callable[[np.ndarray], Rollout], follows: Drive | Motion) -> 
 
 def _same(new: Drive | Motion, old: Drive | Motion) -> bool:
     """Whether what was compiled for the one serves the other."""
-    if isinstance(new, Motion):
-        return isinstance(old, Motion) and new.torque == old.torque and np.array_equal(new.time, old.time)
-    return not isinstance(old, Motion) and np.array_equal(new.command, old.command)
+    if new.torque != old.torque:
+        return False
+    if isinstance(new, Motion) or isinstance(old, Motion):
+        return isinstance(new, Motion) and isinstance(old, Motion) and np.array_equal(new.time, old.time)
+    return np.array_equal(new.command, old.command) and np.allclose(new.qpos0, old.qpos0, rtol=0.0, atol=SCATTER)
 
 
 def _clock(recording: Recording, follows: Drive | Motion) -> np.ndarray:

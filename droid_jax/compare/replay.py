@@ -15,11 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
+from droid_jax.compare.start import check_weight, start_pose, weight_share
 from droid_jax.measure.checks import check_joints
 from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.model.physics import Physics
-from droid_jax.model.scene import Scene
+from droid_jax.model.scene import Scene, has_servo_damping
 from droid_jax.model.seam import Effect, Rollout, State, Theta, column
+from droid_jax.model.step import servo_force
 from droid_jax.model.step import step as simulate_step
 
 Replay = Callable[[Physics], Rollout]
@@ -48,10 +50,12 @@ class Drive:
         return np.arange(len(self.command)) * self.timestep
 
 
-def make_drive(scene: Scene, recording: Recording) -> Drive:
+def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True) -> Drive:
     """Resample a recording's command onto the simulation's clock and order its columns.
 
-    Raises ValueError where the recording has no commands or its joints do not fit the scene.
+    weigh: False where no torque is compared, so that it does not matter whether it contains the arm's weight.
+    Raises ValueError where the recording has no commands, its joints or the weight in its torque do not fit the
+    scene, or nothing tells where a joint starts (see `compare.start`).
     """
     if recording.command.size == 0:
         raise ValueError(
@@ -65,9 +69,12 @@ def make_drive(scene: Scene, recording: Recording) -> Drive:
     clock = start + np.arange(steps) * timestep
     command = np.stack([np.interp(clock, recording.time, recording.command[:, c]) for c in columns], axis=1)
     gains = recording.gains
+    qpos0 = start_pose(scene, recording)
+    if weigh:
+        check_weight(scene, recording, qpos0)
     return Drive(
         command=command,
-        qpos0=scene.initial_qpos(dict(recording.qpos0)),
+        qpos0=qpos0,
         timestep=timestep,
         torque=recording.torque,
         stiffness=None if gains is None else np.asarray(gains.stiffness, dtype=float)[columns],
@@ -112,6 +119,7 @@ def servo_replay(scene: Scene, drive: Drive, effects: Sequence[Effect] = (), *, 
     joints, positions = scene.joint_dofs, scene.joint_qpos
     hinge = scene.qpos(scene.object_joint) if scene.object_joint else None
     late = 0.5 if parity else 0.0  # steps; see `_command`
+    damping = has_servo_damping(scene.model)
 
     def replay(physics: Physics) -> Rollout:
         model, theta = physics.model, physics.theta
@@ -122,12 +130,17 @@ def servo_replay(scene: Scene, drive: Drive, effects: Sequence[Effect] = (), *, 
             ctrl = servo_given(_command(table, drive.timestep, k, late, theta, effects), theta, state, effects)
             before = template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm, ctrl=ctrl)
             after = simulate_step(
-                rubbing(model, theta, state, effects), pushed(before, theta, state, effects), parity=parity
+                rubbing(model, theta, state, effects),
+                pushed(before, theta, state, effects),
+                parity=parity,
+                servo_damping=damping,
             )
+            mean = 0.5 * (qvel + after.qvel)
+            servo = servo_force(model, after, mean) if damping and not parity else after.qfrc_actuator
             out = (
-                _joint_torque(model, before, after, joints, drive, parity),
+                _joint_torque(model, before, after, servo, joints, drive, parity),
                 qpos[positions] + late * drive.timestep * qvel[joints],
-                0.5 * (qvel + after.qvel)[joints],
+                mean[joints],
                 qpos[hinge] + late * drive.timestep * qvel[hinge] if hinge is not None else jnp.zeros(()),
                 _touching(after, fingers),
             )
@@ -206,8 +219,9 @@ def observed(rollout: Rollout, theta: Theta, effects: Sequence[Effect]) -> Rollo
     for effect in effects:
         if effect.observe is not None:
             rollout = effect.observe(theta, rollout)
-    finite = jnp.all(jnp.isfinite(rollout.torque)) & jnp.all(jnp.isfinite(rollout.position))
-    return replace(rollout, finite=finite & jnp.all(jnp.isfinite(rollout.object_angle)))
+    traces = (rollout.torque, rollout.position, rollout.velocity, rollout.object_angle)
+    finite = [jnp.all(jnp.isfinite(trace)) for trace in traces]
+    return replace(rollout, finite=jnp.all(jnp.stack(finite)))
 
 
 def torque_offset_effect(joints: Sequence[str]) -> Effect:
@@ -219,14 +233,15 @@ def torque_offset_effect(joints: Sequence[str]) -> Effect:
     return Effect("torque offset", observe=observe)
 
 
-def _joint_torque(model, before, after, joints: np.ndarray, drive: Drive, parity: bool) -> jax.Array:
+def _joint_torque(model, before, after, servo: jax.Array, joints: np.ndarray, drive: Drive, parity: bool) -> jax.Array:
     """[J] what the torque sensor reads: the motor's torque, or what reaches the link.
 
+    servo: [nv] N m, the actuators' forces of the step.
     Between the two lie rotor inertia (armature) and the damping and dry friction of the joint, as
     the step integrated them: with the velocity's difference over the step, and its mean (the C
     engine: its end).
     """
-    torque = after.qfrc_actuator[joints]
+    torque = servo[joints]
     if drive.torque.side is TorqueSide.LINK:
         gain = (after.qvel - before.qvel)[joints]
         velocity = after.qvel[joints] - (0.0 if parity else 0.5) * gain
@@ -234,9 +249,8 @@ def _joint_torque(model, before, after, joints: np.ndarray, drive: Drive, parity
         rows = after._impl
         dry = slice(rows.ne, rows.ne + rows.nf)
         torque = torque + (rows.efc_J[dry].T @ rows.efc_force[dry])[joints]
-    if drive.torque.gravity:
-        torque = torque + after.qfrc_gravcomp[joints]
-    return torque
+    share = weight_share(model, joints, drive.torque.gravity)
+    return torque + share * after.qfrc_gravcomp[joints] if share.any() else torque
 
 
 def _finger_geoms(scene: Scene) -> list[np.ndarray]:

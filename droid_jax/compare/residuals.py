@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy import sparse
 
 from droid_jax.measure.motion import CUTOFF
 from droid_jax.measure.noise import Noise, coarse_clock, discrepancy, estimate_noise, lowpass, smooth
@@ -134,15 +135,17 @@ class Comparison:
             parts.append(np.einsum("ckl,nlc->nck", c.noise.whitener, apart).reshape(len(apart), -1))
         return np.concatenate(parts, axis=1)
 
-    def restated(self, torque: np.ndarray) -> Comparison:
-        """The comparison with a noise of the torque that a model's own smoothed torque [K, C] leaves plausible.
+    def restated(self, rollout: Rollout) -> Comparison:
+        """The comparison with a noise of every channel that a model's own rollout of one sample leaves plausible.
 
         One repeat does not tell its noise, and what a model cannot explain is far larger anyway.
         """
-        channel = self.channel("torque")
-        left = discrepancy(channel.noise.mean - torque)
-        noise = channel.noise.stated(np.maximum(left, MINIMUM_NOISE["torque"]))
-        return replace(self, channels=tuple(replace(c, noise=noise) if c is channel else c for c in self.channels))
+
+        def stated(channel: Measured) -> Measured:
+            left = discrepancy(channel.noise.mean - np.asarray(_smooth(channel, _trace(rollout, channel))))
+            return replace(channel, noise=channel.noise.stated(np.maximum(left, MINIMUM_NOISE[channel.name])))
+
+        return replace(self, channels=tuple(stated(c) for c in self.channels))
 
     def smoothed(self, rollout: Rollout, channel: str = "torque") -> jax.Array:
         """[K, C] a channel of the rollout through the filter the data went through."""
@@ -246,7 +249,7 @@ def _measure(scene: Scene, channel: Channel, clock: np.ndarray, weight: float) -
     coarse = coarse_clock(float(time[0]), float(time[-1]))
     kernel = lowpass(time, coarse)
     repeats = smooth(values, mask, kernel)
-    seen = _same_filter(kernel, mask, ~np.isnan(repeats)) @ _resampling(clock, time)
+    seen = _same_filter(kernel, mask, ~np.isnan(repeats), _resampling(clock, time))
     repeats = _fill(repeats, channel.name)
     noise = estimate_noise(repeats, minimum=MINIMUM_NOISE[channel.name])
     step = clock[1] - clock[0]
@@ -264,27 +267,36 @@ def _measure(scene: Scene, channel: Channel, clock: np.ndarray, weight: float) -
     )
 
 
-def _resampling(clock: np.ndarray, time: np.ndarray) -> np.ndarray:
+def _resampling(clock: np.ndarray, time: np.ndarray) -> sparse.csr_array:
     """[Tc, T] linear interpolation from the replay's clock to a channel's."""
     at = np.clip((time - clock[0]) / (clock[1] - clock[0]), 0, len(clock) - 1)
     low = np.minimum(at.astype(int), len(clock) - 2)
-    rows, out = np.arange(len(time)), np.zeros((len(time), len(clock)))
-    out[rows, low], out[rows, low + 1] = 1 - (at - low), at - low
-    return out
+    rows, share = np.arange(len(time)), at - low
+    entries = np.concatenate([1 - share, share]), (np.tile(rows, 2), np.concatenate([low, low + 1]))
+    return sparse.csr_array(entries, shape=(len(time), len(clock)))
 
 
-def _same_filter(kernel: np.ndarray, mask: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """[C or 1, K, Tc] what smoothing with a mask and averaging over the repeats does to a trace.
+def _same_filter(kernel: np.ndarray, mask: np.ndarray, kept: np.ndarray, resampling: sparse.csr_array) -> np.ndarray:
+    """[C or 1, K, T] what resampling, smoothing with a mask and averaging over the repeats does to a replay's trace.
 
-    kernel [K, Tc]; mask [N, Tc, C]; kept [N, K, C], the outputs that enter the mean.
+    kernel [K, Tc]; mask [N, Tc, C]; kept [N, K, C], the outputs that enter the mean; resampling [Tc, T].
     """
     if mask.all():
-        return kernel[None]
-    weights = kernel[None, None] * mask.transpose(0, 2, 1)[:, :, None]  # [N, C, K, Tc]
-    total = weights.sum(axis=-1, keepdims=True)
-    kept = kept.transpose(0, 2, 1)[..., None]
-    weights = np.where(kept, weights / np.where(kept, total, 1.0), 0.0)
-    return weights.sum(axis=0) / np.maximum(kept.sum(axis=0), 1)
+        return (kernel @ resampling)[None]
+    columns = zip(mask.transpose(2, 0, 1), kept.transpose(2, 0, 1), strict=True)
+    return np.stack([_mean_filter(kernel, *column) @ resampling for column in columns])
+
+
+def _mean_filter(kernel: np.ndarray, mask: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """[K, Tc] the mean of one column's filters: kernel [K, Tc], renormalised over each repeat's mask [N, Tc].
+
+    A repeat at a time: all of them at once would take N times the memory.  kept: [N, K].
+    """
+    total = np.zeros_like(kernel)
+    for seen, own in zip(mask, kept, strict=True):
+        share = np.where(own, 1.0 / np.where(own, kernel @ seen, 1.0), 0.0)
+        total += kernel * seen * share[:, None]
+    return total / np.maximum(kept.sum(axis=0), 1)[:, None]
 
 
 def _refuse_constant(channel: Channel) -> None:

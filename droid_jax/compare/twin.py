@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from droid_jax.compare.replay import Drive, check_gains, check_stateless
+from droid_jax.compare.start import weight_share
 from droid_jax.measure.engine import instrument, simulate
 from droid_jax.measure.recording import TorqueSide
 from droid_jax.model.parameters import Space
@@ -25,7 +26,8 @@ def twin_replay(
     """values [P, D] -> Rollout with a leading [P], float64, on all cores.
 
     Effects with functions of their own raise ValueError, as does a recording whose torque is on the link
-    side or contains gravity (the C batch interface returns neither).
+    side, or contains the arm's weight where the actuators do not carry it, or the other way round (the C batch
+    interface returns the actuators' torque alone).
     """
     check_gains(scene, drive)
     check_stateless(scene)
@@ -33,8 +35,12 @@ def twin_replay(
     active = [e.name for e in effects if any(getattr(e, f) is not None for f in functions)]
     if active:
         raise ValueError(f"the C engine cannot run effects that depend on the state: {', '.join(active)}; use MJX")
-    if drive.torque.side is TorqueSide.LINK or drive.torque.gravity:
-        raise ValueError("the C engine replays motor-side torque without gravity only; use MJX for this recording")
+    share = weight_share(scene.model, scene.joint_dofs, drive.torque.gravity)
+    if drive.torque.side is TorqueSide.LINK or (scene.model.body_gravcomp.any() and share.any()):
+        raise ValueError(
+            "the C engine replays the actuators' torque alone: motor-side, and without gravity where the scene "
+            "compensates it; use MJX for this recording"
+        )
     base = instrument(scene)
     plain = Scene(scene.name, scene.spec, base, scene.joints, scene.command_names, scene.object_joint, scene.grip)
 
@@ -43,6 +49,7 @@ def twin_replay(
         thetas = [theta_of(space, row) for row in values]
         control = np.stack([_control(drive, t.get("time_offset", 0.0)) for t in thetas])
         trace = simulate(plain, models, drive.qpos0[None], control)
+        traces = (trace.torque, trace.position, trace.velocity, trace.object_angle[..., None])
         half = 0.5 * drive.timestep
         rollout = Rollout(
             time=np.broadcast_to(drive.time, trace.object_angle.shape),
@@ -51,7 +58,7 @@ def twin_replay(
             velocity=trace.velocity,
             object_angle=trace.object_angle + half * trace.object_velocity,
             contact=trace.contact,
-            finite=np.isfinite(trace.torque).all(axis=(1, 2)) & np.isfinite(trace.position).all(axis=(1, 2)),
+            finite=np.all([np.isfinite(t).all(axis=(1, 2)) for t in traces], axis=0),
         )
         return rollout
 

@@ -6,7 +6,8 @@ ones.  It carries the rule that set its width, because a covariance without its 
 judged: the one CMA-ES ends with shrinks with every generation and is no posterior.
 
 Bounds.  Draws of a linearly scaled parameter (and of every parameter in physical coordinates) that
-fall outside the bounds are drawn again, whole rows at a time, as the paper redraws negative values.
+fall outside the bounds are drawn again, whole rows at a time, as the paper redraws negative values; where
+hardly any row falls inside, Gibbs sampling draws from the same distribution (`identify.truncated`).
 A log-scaled parameter in search coordinates is clipped by its map instead, so that a bound of
 exactly zero keeps the probability that lies beyond it.
 
@@ -30,8 +31,8 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
-from scipy import stats
 
+from droid_jax.identify.truncated import gibbs, quantiles
 from droid_jax.model.parameters import Mode, Parameter, Scaling, Space, Write
 from droid_jax.storage import write_json
 
@@ -39,7 +40,7 @@ Coordinates = Literal["search", "physical"]
 
 FORMAT = "droid_jax.gaussian"
 VERSION = 1
-MIN_ACCEPTANCE = 1e-3  # below this share of draws inside the bounds, sampling gives up
+MIN_ACCEPTANCE = 1e-3  # below this share of draws inside the bounds, rows are no longer drawn again
 MOMENT_POINTS = 20_001  # equal-probability points behind physical_mean and physical_std
 
 
@@ -73,10 +74,7 @@ class Gaussian:
             object.__setattr__(self, name, array)
 
     def sample(self, seed: int | np.random.Generator, n: int) -> np.ndarray:
-        """[n, D] physical values, all inside the bounds; the same seed gives the same rows.
-
-        Raises ValueError when fewer than one draw in a thousand falls inside the bounds.
-        """
+        """[n, D] physical values, all inside the bounds; the same seed gives the same rows."""
         rng = np.random.default_rng(seed)
         low, high = self._box()
         out, filled, drawn = np.empty((n, len(self.space))), 0, 0
@@ -86,10 +84,8 @@ class Gaussian:
             out[filled : filled + len(kept)] = kept
             filled, drawn = filled + len(kept), drawn + len(draws)
             if drawn >= 20_000 and filled < MIN_ACCEPTANCE * drawn:
-                raise ValueError(
-                    f"only {filled} of {drawn} draws fell inside the bounds; the mean lies too far "
-                    f"outside for: {', '.join(self._far_outside()) or 'several parameters together'}"
-                )
+                out[filled:] = gibbs(rng, n - filled, self.mean, self.cov, low, high)
+                break
         return self._to_physical(out)
 
     def log_density(self, values: np.ndarray) -> np.ndarray:
@@ -207,13 +203,6 @@ class Gaussian:
         ]
         return self.space.to_search(values), np.sum(slopes, axis=0)
 
-    def _far_outside(self) -> list[str]:
-        """Names of the parameters whose own marginal leaves the bounds nearly always."""
-        low, high = self._box()
-        std = np.sqrt(np.diag(self.cov)).clip(1e-300)
-        kept = stats.norm.cdf((high - self.mean) / std) - stats.norm.cdf((low - self.mean) / std)
-        return [n for n, k in zip(self.space.names, kept, strict=True) if k < 0.05]
-
 
 def prior(space: Space) -> Gaussian:
     """The initial Gaussian of a space: one deviation per parameter, uncorrelated, search coordinates."""
@@ -327,4 +316,4 @@ def _truncated_quantiles(q: np.ndarray, mean: float, std: float, low: float, hig
     """[Q] quantiles of a normal truncated to [low, high]; a std of 0 is a point."""
     if std == 0:
         return np.full(q.shape, mean)
-    return stats.truncnorm.ppf(q, (low - mean) / std, (high - mean) / std, loc=mean, scale=std)
+    return mean + std * quantiles(q, np.asarray((low - mean) / std), np.asarray((high - mean) / std))

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from droid_jax.compare.cost import Cost, make_cost
-from droid_jax.compare.residuals import CompareConfig
+from droid_jax.compare.residuals import CompareConfig, Comparison, make_comparison
 from droid_jax.identify.fit import Fit
-from droid_jax.identify.gaussian import Gaussian, prior
+from droid_jax.identify.gaussian import Gaussian, prior, space_to_json
 from droid_jax.identify.refine import RefineConfig, Refined, refine
 from droid_jax.identify.search import SearchConfig, search
 from droid_jax.identify.uncertainty import Identifiability, identifiability, not_judged, posterior
@@ -21,6 +22,8 @@ from droid_jax.measure.recording import Recording
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
+
+WORTH = 0.1  # share of the floor by which the start must exceed it, else there was no gap to close
 
 
 @dataclass(frozen=True)
@@ -49,10 +52,11 @@ class IdentifyConfig:
 class Gap:
     """Disagreement with held-out repeats of one recording, N m, before and after the fit.
 
-    before, after, floor: equation 1 without penalty terms; floor is what a perfect model would
-    leave, estimated from the repeats' scatter about their mean.  closed: share of the way from
-    before to floor.  Floors and closed are None where there is one repeat only.
-    per_joint_*: [J] root mean square of the smoothed traces' difference.
+    before, after, floor: equation 1 without penalty terms, all compared channels; floor is what a perfect
+    model would leave, estimated from the scatter of all repeats, fitted and held out, about their mean.
+    closed: share of the way from before to floor; None where before does not exceed it by WORTH of it.
+    Floors and closed are None where there is one repeat only.
+    per_joint_*: [J] root mean square of the smoothed torques' difference.
     """
 
     before: float
@@ -133,12 +137,15 @@ def identify(
     effects: in the model beside what the scene has; their parameters are in `space` or stay at neutral.
     checkpoints: folder where the search saves itself and from which it resumes.
     progress: called with a stage's name and its progress value.
+    Raises ValueError for recordings of one name, and where no torque is compared.
     """
     config = config or IdentifyConfig()
     report = progress or (lambda stage, value: None)
     names = [r.name for r in recordings]
     if len(set(names)) != len(names):
         raise ValueError(f"recordings need different names, got {', '.join(names)}")
+    if "torque" not in config.compare.channels:
+        raise ValueError(f"an identification compares torques, got the channels {', '.join(config.compare.channels)}")
     parts = [split(r, config.heldout) for r in recordings]
     fitted, held = [p[0] for p in parts], [p[1] for p in parts]
     full = space if nuisances is None or config.refine is None else space + nuisances
@@ -152,7 +159,7 @@ def identify(
         space,
         config.search,
         checkpoint_dir=checkpoints,
-        fingerprint=fitted[0].sha256 + config.engine,
+        fingerprint=_fingerprint(scene, full, fitted[0], config, effects),
         progress=lambda p: report("search", p),
     )
     seconds["search"] = time.monotonic() - began
@@ -170,7 +177,7 @@ def identify(
     plain = replace(config.compare, whitened=False)
     commanded = all(r.command.size for r in recordings)
     heldout = base.against(held, plain) if commanded else make_cost(scene, full, held, config=plain, effects=effects)
-    gaps = _gaps(heldout, full.mean, best)
+    gaps = _gaps(heldout, recordings, full.mean, best)
     seconds["judge"] = time.monotonic() - began
     return Identified(
         scene=scene,
@@ -231,48 +238,82 @@ def grip_hypotheses(space: Space) -> list[dict[str, float]]:
     return [*alone, sliding] if len(sliding) > 1 else alone
 
 
-def _gaps(cost: Cost, before: np.ndarray, after: np.ndarray) -> list[Gap]:
+def _fingerprint(
+    scene: Scene, full: Space, recording: Recording, config: IdentifyConfig, effects: Sequence[Effect]
+) -> str:
+    """All that the search's cost is made from: a search of another cost is not gone on with."""
+    made_from = {
+        "recording": recording.sha256,
+        "scene": scene.sha256,
+        "space": space_to_json(full),
+        "engine": config.engine,
+        "compare": asdict(config.compare),
+        "effects": [effect.name for effect in effects],
+    }
+    return json.dumps(made_from, sort_keys=True)
+
+
+def _gaps(cost: Cost, recordings: Sequence[Recording], before: np.ndarray, after: np.ndarray) -> list[Gap]:
     """The gap of each recording's held-out repeats at two parameter vectors."""
     penalty_free = cost.distances(np.stack([before, after])) - cost.penalties(np.stack([before, after]))
     smoothed = cost.smoothed(np.stack([before, after]))
     out = []
-    for i, comparison in enumerate(cost.comparisons):
-        torque = comparison.channel("torque")
-        mean = torque.noise.mean
-        rms = np.sqrt(np.mean((smoothed[i] - mean) ** 2, axis=1))
-        floor = _floor(torque.values, torque.mask)
+    for i, (held, recording) in enumerate(zip(cost.comparisons, recordings, strict=True)):
+        rms = np.sqrt(np.mean((smoothed[i] - held.channel("torque").noise.mean) ** 2, axis=1))
+        everything = make_comparison(cost.scene, recording, held.clock, held.config) if recording.repeats > 1 else None
+        floor = None if everything is None else _floor(everything)
         first, last = penalty_free[0, i], penalty_free[1, i]
         out.append(
             Gap(
                 before=float(first),
                 after=float(last),
                 floor=floor,
-                closed=None if floor is None else float(1 - (last - floor) / max(first - floor, 1e-12)),
+                closed=_closed(float(first), float(last), floor),
                 per_joint_before=tuple(rms[0].tolist()),
                 per_joint_after=tuple(rms[1].tolist()),
-                per_joint_floor=_smooth_floor(torque.noise.repeats),
+                per_joint_floor=None if everything is None else _smooth_floor(everything, held.repeats),
             )
         )
     return out
 
 
-def _floor(values: np.ndarray, mask: np.ndarray) -> float | None:
-    """Equation 1 of a perfect model: the repeats' distance to their mean, corrected for the mean's own noise."""
-    count = len(values)
-    if count < 2:
+def _closed(before: float, after: float, floor: float | None) -> float | None:
+    """Share of the way from before to the floor that was gone; None where there was hardly any (WORTH)."""
+    if floor is None or before - floor <= WORTH * floor:
         return None
-    filled = np.where(mask, values, np.nan)
-    error = np.nan_to_num(filled - np.nanmean(filled, axis=0))
-    return float(np.mean(np.linalg.norm(error, axis=-1)) / np.sqrt(1 - 1 / count))
+    return 1 - (after - floor) / (before - floor)
 
 
-def _smooth_floor(repeats: np.ndarray) -> tuple[float, ...] | None:
-    """[J] what the noise of the repeats' mean leaves of a smoothed difference, N m."""
-    count = len(repeats)
-    if count < 2:
+def _floor(everything: Comparison) -> float | None:
+    """Equation 1 of a perfect model, from the scatter of all repeats; None where no instant was measured twice."""
+    total = 0.0
+    for channel in everything.channels:
+        scatter = _scatter(channel.values, channel.mask)
+        if scatter is None:
+            return None
+        total += channel.weight * scatter
+    return total
+
+
+def _scatter(values: np.ndarray, mask: np.ndarray) -> float | None:
+    """The repeats' [N, T, C] distance to their mean, corrected for the mean's own noise, where two or more measured."""
+    count = mask.sum(axis=0)  # [T, C]
+    filled = np.where(mask, values, 0.0)
+    mean = filled.sum(axis=0) / np.maximum(count, 1)
+    seen = mask & (count > 1)
+    error = np.where(seen, (filled - mean) / np.sqrt(1 - 1 / np.maximum(count, 2)), 0.0)
+    rows = seen.any(axis=-1)  # [N, T]
+    repeats = rows.any(axis=1)
+    if not repeats.any():
         return None
-    variance = np.var(repeats, axis=0, ddof=1).mean(axis=0)
-    return tuple(np.sqrt(variance / count).tolist())
+    distance = np.linalg.norm(error, axis=-1).sum(axis=1)[repeats] / rows.sum(axis=1)[repeats]
+    return float(np.mean(distance))
+
+
+def _smooth_floor(everything: Comparison, held: int) -> tuple[float, ...]:
+    """[J] N m, what the noise of the mean of `held` repeats leaves of a smoothed difference."""
+    variance = np.var(everything.channel("torque").noise.repeats, axis=0, ddof=1).mean(axis=0)
+    return tuple(np.sqrt(variance / held).tolist())
 
 
 def cost_samples(found: Identified, count: int, seed: int) -> dict[str, np.ndarray]:

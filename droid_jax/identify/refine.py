@@ -126,18 +126,24 @@ def refine(
       out there, and only the best goes on to all of it.
     hypotheses: assignments {name: value} that may lie in another basin (a finger that slips, say),
       each tried once from where the starts converged, if that leaves doubt.
-    Raises ValueError where no start gives finite residuals.
+    Raises ValueError where no start gives finite residuals; others that do not are left out.
     """
     config = config or RefineConfig()
     rough = _Problem(residuals if first is None else first, space, config, progress)
-    state = rough.start(rough.inside(space.to_search(space.check(np.atleast_2d(starts)))))
-    if not np.isfinite(state.objective).any():
+    begun = rough.start(rough.inside(space.to_search(space.check(np.atleast_2d(starts)))))
+    ended, alive = begun.objective, np.isfinite(begun.objective)
+    if not alive.any():
         raise ValueError("none of the starts could be replayed; widen the bounds or start nearer to the truth")
-    state, ended = rough.descend(state, config.rough)
+    state, ended[alive] = rough.descend(begun.rows(alive), config.rough)
     if hypotheses and np.mean(state.residual**2) > config.doubt:
         state, _ = rough.descend(rough.explore(state, hypotheses), config.rough)
     problem = _Problem(residuals, space, config, progress, rough)
-    state, _ = problem.descend(problem.start(state.x))
+    state = problem.start(state.x)
+    if not np.isfinite(state.objective[0]):
+        raise ValueError(
+            "the best start on the first recording could not be replayed on all; start nearer to the truth"
+        )
+    state, _ = problem.descend(state)
     settled, slopes = config.hops == 0, None
     for number in range(config.hops):
         slopes = problem.jacobian(state)[0]
@@ -385,6 +391,10 @@ class _Problem:
                 x[row, column] = self.space[name].to_search(value)
                 held[row, column] = True
         branches = self.start(self.inside(x))
+        alive = np.isfinite(branches.objective)
+        if not alive.any():
+            return state
+        branches, held = branches.rows(alive), held[alive]
         for iteration in range(self.config.hold + 1):
             branches, _ = self.step(branches, held if iteration < self.config.hold else None)
         found = branches.rows([int(np.argmin(branches.objective))])
@@ -410,8 +420,13 @@ class _Problem:
         )
 
     def _steps(self, state: _State, jacobian: np.ndarray, held: np.ndarray | None, row: int) -> np.ndarray:
-        """[dampings * lengths, D] Levenberg-Marquardt steps of one start, along the bounds it sits on."""
+        """[dampings * lengths, D] Levenberg-Marquardt steps of one start, along the bounds it sits on.
+
+        None from a start that could not be replayed.
+        """
         x = state.x[0]
+        if not np.isfinite(state.objective[0]):
+            return np.zeros((len(_DAMPINGS) * len(_LENGTHS), len(x)))
         hessian = _curvature(jacobian, self.prior)
         slope = jacobian.T @ state.residual[0] + x / self.prior**2
         free = ~(((x <= self.low) & (slope > 0)) | ((x >= self.high) & (slope < 0)))

@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from droid_jax.identify.fit import on_bound
 from droid_jax.identify.pipeline import Identified
-from droid_jax.model.mjcf import fitted_mjcf
+from droid_jax.model.mjcf import fitted_mjcf, unwritten
 from droid_jax.model.parameters import Space
 from droid_jax.storage import write_csv, write_json, write_npz, write_text
 
@@ -37,12 +38,13 @@ def write_run(
     config: Mapping[str, Any],
     *,
     truth: Mapping[str, float] | None = None,
-    samples: Mapping[str, np.ndarray] | None = None,
+    samples: Callable[[], Mapping[str, np.ndarray]] | None = None,
     notes: Iterable[str] = (),
 ) -> None:
     """Write all files of a run into `folder` (see the module's text).
 
-    truth: hidden values where they are known (the stand-in robot); samples: see `cost_samples`.
+    truth: hidden values where they are known (the stand-in robot); samples: draws them (see `cost_samples`), once
+      the fit itself is on disk.
     """
     write_json(folder / "fit.json", fit_json(found, truth or {}, list(notes)))
     found.gaussian.save(folder / "gaussian.json")
@@ -53,10 +55,11 @@ def write_run(
         np.outer(np.diag(found.full_gaussian.cov), np.diag(found.full_gaussian.cov))
     )
     write_npz(folder / "correlation.npz", {"names": np.array(found.full.names), "correlation": correlation})
-    if samples is not None:
-        write_npz(folder / "distribution.npz", samples)
-        write_csv(folder / "samples.csv", found.space.names, samples["fitted"].tolist())
     write_text(folder / "fitted.xml", fitted_mjcf(found.scene, found.full, found.best))
+    if samples is not None:
+        drawn = samples()
+        write_npz(folder / "distribution.npz", drawn)
+        write_csv(folder / "samples.csv", found.space.names, drawn["fitted"].tolist())
     write_json(folder / "config.json", dict(config))  # last: its presence says that the run is whole
 
 
@@ -64,11 +67,10 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
     """The fit as plain data: parameters with intervals, gaps, costs, why it stopped."""
     low, high = found.full_gaussian.interval(0.9)
     mean, std = found.full_gaussian.physical_mean, found.full_gaussian.physical_std
+    bound = on_bound(found.full, found.best)
     parameters = []
     for i, p in enumerate(found.full.parameters):
         tells = found.tells[i]
-        span = found.full.to_search(np.stack([found.full.low, found.full.high]))[:, i]
-        at = (found.full.to_search(found.best)[i] - span[0]) / (span[1] - span[0])
         parameters.append(
             {
                 "name": p.name,
@@ -86,7 +88,7 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
                 "identifiable": tells.identifiable,
                 "reason": tells.reason,
                 "truth": truth.get(p.name),
-                "on_bound": bool(at < 0.01 or at > 0.99),
+                "on_bound": p.name in bound,
                 "partners": [{"name": n, "correlation": c} for n, c in tells.partners],
             }
         )
@@ -105,14 +107,15 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
     }
     floors: list[Any] = [g.floor for g in found.gaps.values()]
     comparison = found.fit.comparisons[0]
+    whitened = comparison.config.whitened  # the gaps' floors are in the unit of the torque
     evaluations = found.search.evaluations + (found.refined.evaluations if found.refined else 0)
     return {
         "parameters": parameters,
         "cost": {
             "initial": float(costs[0]),
             "best": float(costs[1]),
-            "floor": None if None in floors else float(np.mean(floors)),
-            "unit": "noise units" if comparison.config.whitened else comparison.channel("torque").unit,
+            "floor": None if whitened or None in floors else float(np.mean(floors)),
+            "unit": "noise units" if whitened else comparison.channel("torque").unit,
         },
         "gap": gaps,
         "torque_unit": comparison.channel("torque").unit,
@@ -123,6 +126,7 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
         "evaluations": int(evaluations),
         "seconds": {**found.seconds, "total": sum(found.seconds.values())},
         "rule": found.gaussian.rule,
+        "mjcf_lacks": list(unwritten(found.scene, found.full)),
         "notes": notes,
     }
 

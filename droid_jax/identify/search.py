@@ -17,15 +17,17 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from droid_jax.identify.checkpoints import Checkpoints, Tree
 from droid_jax.identify.cma import Strategy, recombination
 from droid_jax.identify.fit import Fit, History, Progress, Restart, on_bound
 from droid_jax.identify.gaussian import space_to_json
 from droid_jax.model.parameters import Space
+
+if TYPE_CHECKING:
+    from droid_jax.identify.checkpoints import Checkpoints, Tree
 
 Cost = Callable[[np.ndarray], Any]  # [rows, D] float64 physical values -> [rows]; +inf is a failed row
 
@@ -328,6 +330,8 @@ def _checkpoints(folder: Path | None, space: Space, config: SearchConfig, centre
     """Checkpoints of this search as a context manager; of None when no folder is given."""
     if folder is None:
         return nullcontext(None)
+    from droid_jax.identify.checkpoints import Checkpoints  # only here: it imports orbax
+
     # what may change between two parts of one search without changing its path
     free = ("generations", "max_seconds", "checkpoint_every")
     texts = {

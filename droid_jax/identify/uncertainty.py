@@ -25,6 +25,7 @@ from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.refine import Refined
 
 IDENTIFIABLE = 0.25  # posterior deviation over prior deviation below which the data have spoken
+STATED = 1.0  # search units: the deviation of a parameter's stated prior, whatever wider one the refinement uses
 POOL = 12  # degrees of freedom with which the ratio over all parameters counts in each one's own
 PARTNER = 0.7  # absolute correlation from which two parameters are called partners
 
@@ -123,14 +124,15 @@ def not_judged(gaussian: Gaussian) -> tuple[Identifiability, ...]:
 def identifiability(gaussian: Gaussian, prior: np.ndarray) -> tuple[Identifiability, ...]:
     """What the demonstration tells about each parameter of a calibrated Gaussian.
 
-    prior: [D] prior deviations, search units.
+    It is judged against the stated prior, or the refinement's where that is narrower.
+    prior: [D] deviations of the refinement's prior, search units.
     """
     deviation = np.sqrt(np.diag(gaussian.cov))
     correlation = gaussian.cov / np.outer(deviation, deviation)
     space = gaussian.space
     out = []
     for i, name in enumerate(space.names):
-        shrinkage = float(deviation[i] / prior[i])
+        shrinkage = float(deviation[i] / min(prior[i], STATED))
         others = [(space.names[j], float(correlation[i, j])) for j in np.argsort(-np.abs(correlation[i])) if j != i]
         partners = tuple((n, c) for n, c in others if abs(c) > PARTNER)[:3]
         known = shrinkage < IDENTIFIABLE
@@ -143,5 +145,6 @@ def _reason(known: bool, shrinkage: float, partners: tuple[tuple[str, float], ..
     if known:
         return f"the data narrow the prior to {shrinkage:.0%}{trade}"
     if shrinkage > 0.9:
-        return f"this demonstration does not tell: it leaves {shrinkage:.0%} of the prior's width{trade}"
+        left = f"{shrinkage:.0%}" if shrinkage < 1 else "all"
+        return f"this demonstration does not tell: it leaves {left} of the prior's width{trade}"
     return f"this demonstration tells little: it leaves {shrinkage:.0%} of the prior's width{trade}"

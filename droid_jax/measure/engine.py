@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,7 +9,8 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from droid_jax.model.scene import LOOK_GROUP, Scene
+from droid_jax import runtime
+from droid_jax.model.scene import Scene, without_looks
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,10 +35,7 @@ def instrument(scene: Scene) -> mujoco.MjModel:
     Recompiled from the scene's spec, then given the scene's own numbers, so that options and
     fields changed after compilation are kept.
     """
-    spec = scene.spec.copy()
-    for geom in list(spec.geoms):
-        if geom.group == LOOK_GROUP:
-            spec.delete(geom)
+    spec = without_looks(scene.spec)
     for sensor in list(spec.sensors):  # the file's own would stand before ours
         spec.delete(sensor)
     for kind in ("JOINTACTFRC", "JOINTPOS", "JOINTVEL"):
@@ -93,7 +90,7 @@ def simulate(
 
     Where a rollout blows up, everything from there on is NaN (and no contact).
     """
-    threads = min(threads or os.cpu_count() or 1, len(models))
+    threads = min(threads or runtime.cores(), len(models))
     kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
     states = np.zeros((len(models), mujoco.mj_stateSize(models[0], kind)))
     data = mujoco.MjData(models[0])

@@ -7,10 +7,12 @@ was saved and loaded has the same `sha256`.
 
 from __future__ import annotations
 
+import importlib
 import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from droid_jax.measure.checks import validate
@@ -99,6 +101,16 @@ def _bags(path: Path) -> list[Path]:
     return []
 
 
+def rosbag_reader() -> ModuleType:
+    """`droid_jax.measure.rosbag`, imported where bags are read; ValueError where what it needs is not installed."""
+    try:
+        return importlib.import_module("droid_jax.measure.rosbag")
+    except ModuleNotFoundError as error:
+        if (error.name or "").split(".")[0] != "rosbags":
+            raise
+        raise ValueError("ROS bags need rosbags: pip install -c constraints.txt -e '.[ros]' in the checkout") from None
+
+
 def _load_bags(bags: list[Path], name: str | None, allow_jitter: bool, options: Mapping[str, Any]) -> Recording:
     missing = [key for key in ("joints", "torque") if key not in options]
     if missing:
@@ -106,10 +118,4 @@ def _load_bags(bags: list[Path], name: str | None, allow_jitter: bool, options: 
             f"{bags[0]}: a ROS bag does not say which joints to read or what its efforts are; "
             f"pass {' and '.join(missing)} as well"
         )
-    try:
-        from droid_jax.measure.rosbag import read_bags
-    except ModuleNotFoundError as error:
-        if (error.name or "").split(".")[0] != "rosbags":
-            raise
-        raise ImportError(f"{bags[0]}: reading ROS bags needs the package 'rosbags': pip install rosbags") from None
-    return read_bags(bags, name=name, allow_jitter=allow_jitter, **options)
+    return rosbag_reader().read_bags(bags, name=name, allow_jitter=allow_jitter, **options)

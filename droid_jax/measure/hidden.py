@@ -8,7 +8,6 @@ are in `hidden_door`, `hidden_friction`, `hidden_arm` and `hidden_signals`.
 from __future__ import annotations
 
 import math
-import os
 import re
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -16,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from droid_jax import runtime
 from droid_jax.measure.engine import split
 from droid_jax.measure.hidden_arm import ARM_EFFECTS
 from droid_jax.measure.hidden_door import DOOR
@@ -165,7 +165,7 @@ def _simulate(
         qpos0, own = stand_in.qpos0[repeat], gears[repeat] if link else None
         return step_through(models[repeat], qpos0, control, effects[repeat], own)
 
-    with ThreadPoolExecutor(max_workers=min(count, os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(max_workers=min(count, runtime.cores())) as pool:
         rows = np.stack(list(pool.map(one, range(count))))
     return rows, gears, effects, replace(stand_in, models=models)
 

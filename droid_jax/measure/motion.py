@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import signal
+from scipy import interpolate, signal
 
 from droid_jax.measure.recording import Recording, TorqueConvention
 
 CUTOFF = 20.0  # Hz, of the position before it is differentiated; above that of the torques, which are compared
 OVERSAMPLING = 6.0  # rows of a motion per period of its cutoff
+REGULAR = 0.01  # largest deviation of a clock's step from their mean, as a share, that a filter may overlook
 EDGE = 0.3  # s left out at both ends, where a zero-phase filter has no neighbours
 
 
@@ -40,8 +41,9 @@ def measured_motion(recording: Recording, joints: Sequence[str], *, cutoff: floa
 
     The position passes a zero-phase Butterworth filter of order 4 at `cutoff` Hz, then central
     differences at the log's own rate; measured velocities are not used.  EDGE s at both ends are left out.
+    A clock that jitters is made regular first, along a cubic spline.
     Raises ValueError where a joint's position was not measured throughout, the log is too slow for
-    the cutoff, or too short.
+    the cutoff (in one long step too), or too short.
     """
     channel = recording.channel("position")
     unknown = [j for j in joints if j not in channel.columns]
@@ -65,12 +67,29 @@ def measured_motion(recording: Recording, joints: Sequence[str], *, cutoff: floa
             f"state a motion cutoff below {rate / 2.5:.3g} Hz"
         )
     position = np.mean(channel.values[:, :, columns], axis=0, where=mask)
+    position = _regular(recording.name, channel.time, position, cutoff)
+    even = np.linspace(channel.time[0], channel.time[-1], len(channel.time))
     clock = _inner_clock(recording.name, channel.time, OVERSAMPLING * cutoff)
     q = signal.sosfiltfilt(signal.butter(4, cutoff, fs=rate, output="sos"), position, axis=0)
     qd = np.gradient(q, 1 / rate, axis=0)
     qdd = np.gradient(qd, 1 / rate, axis=0)
-    rows = (np.stack([np.interp(clock, channel.time, c) for c in a.T], axis=1) for a in (q, qd, qdd))
+    rows = (np.stack([np.interp(clock, even, c) for c in a.T], axis=1) for a in (q, qd, qdd))
     return Motion(clock, *rows, torque=recording.torque)
+
+
+def _regular(name: str, time: np.ndarray, position: np.ndarray, cutoff: float) -> np.ndarray:
+    """Positions [T, J] of a clock [T] s at as many even instants of its span; as they are where it is even already."""
+    steps = np.diff(time)
+    usual, longest = float(steps.mean()), int(np.argmax(steps))
+    if np.max(np.abs(steps - usual)) <= REGULAR * usual:
+        return position
+    if steps[longest] * 2.5 * cutoff > 1:
+        raise ValueError(
+            f"recording {name!r} holds no position for {steps[longest]:.3g} s from {time[longest]:g} s on, too long to "
+            f"be smoothed at {cutoff:g} Hz; cut the log there or state a motion cutoff below "
+            f"{1 / (2.5 * steps[longest]):.3g} Hz"
+        )
+    return interpolate.CubicSpline(time, position)(np.linspace(time[0], time[-1], len(time)))
 
 
 def _inner_clock(name: str, time: np.ndarray, rate: float) -> np.ndarray:

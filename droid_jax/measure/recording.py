@@ -19,6 +19,7 @@ import numpy as np
 
 from droid_jax.measure.clocks import SLACK
 
+START = 0.1  # s: a channel that begins no later than this after the command still tells where the motion started
 JOINT_CHANNELS = ("torque", "position", "velocity")  # channels whose columns are robot joints
 POSITION_CHANNELS = ("position", "object_angle")  # channels that say where a joint is
 
@@ -163,6 +164,11 @@ class Recording:
             have = ", ".join(sorted(self.channels))
             raise ValueError(f"unknown channel {name!r}; recording {self.name!r} has: {have}") from None
 
+    def measured_start(self) -> dict[str, float]:
+        """Joint -> measured position at the beginning of the motion, rad or m, mean over the repeats."""
+        first = float(self.time[0]) if len(self.time) else self.span[0]
+        return _measured_at(self, first, START)
+
     def repeats_subset(self, indices: Sequence[int]) -> Recording:
         """A copy that holds these repeats only (training against held-out repeats).
 
@@ -223,13 +229,7 @@ def _positions_at(recording: Recording, start: float, given: Mapping[str, float]
     first = float(recording.time[0]) if len(recording.time) else recording.span[0]
     if start <= first + SLACK:
         return {**recording.qpos0, **given}
-    measured: dict[str, float] = {}
-    for channel in (recording.channels[k] for k in POSITION_CHANNELS if k in recording.channels):
-        for c, joint in enumerate(channel.columns):
-            found = [_interpolate(channel, r, c, start) for r in range(recording.repeats)]
-            found = [v for v in found if v is not None]
-            if found:
-                measured[joint] = float(np.mean(found))
+    measured = _measured_at(recording, start)
     positions = {**{j: measured[j] for j in recording.qpos0 if j in measured}, **given}
     lacking = [j for j in recording.qpos0 if j not in positions]
     if lacking:
@@ -240,11 +240,23 @@ def _positions_at(recording: Recording, start: float, given: Mapping[str, float]
     return positions
 
 
-def _interpolate(channel: Channel, repeat: int, column: int, at: float) -> float | None:
-    """One column's value at an instant, or None outside what was measured."""
+def _measured_at(recording: Recording, instant: float, slack: float = SLACK) -> dict[str, float]:
+    """Joint -> measured position at an instant, mean over the repeats that were measured within `slack` s of it."""
+    measured: dict[str, float] = {}
+    for channel in (recording.channels[k] for k in POSITION_CHANNELS if k in recording.channels):
+        for c, joint in enumerate(channel.columns):
+            found = [_interpolate(channel, r, c, instant, slack) for r in range(recording.repeats)]
+            found = [v for v in found if v is not None]
+            if found and joint not in measured:  # a joint's own sensor before a camera
+                measured[joint] = float(np.mean(found))
+    return measured
+
+
+def _interpolate(channel: Channel, repeat: int, column: int, at: float, slack: float) -> float | None:
+    """One column's value at an instant, or None more than `slack` s outside what was measured."""
     seen = channel.mask[repeat, :, column]
     time = channel.time[seen]
-    if not len(time) or not time[0] - SLACK <= at <= time[-1] + SLACK:
+    if not len(time) or not time[0] - slack <= at <= time[-1] + slack:
         return None
     return float(np.interp(at, time, channel.values[repeat, seen, column]))
 

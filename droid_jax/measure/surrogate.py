@@ -168,9 +168,12 @@ def as_recording(
 
 
 def _carries_weight(scene: Scene) -> bool:
-    """Whether the measured torques contain the arm's weight: where no body of a measured joint is compensated."""
-    bodies = [scene.model.jnt_bodyid[scene.id("joint", j)] for j in scene.joints]
-    return bool(scene.model.opt.gravity.any()) and not scene.model.body_gravcomp[bodies].any()
+    """Whether the measured torques contain the arm's weight: where no body of a measured joint is compensated,
+    or where the joints' own motors do it (actuatorgravcomp)."""
+    model = scene.model
+    joints = [scene.id("joint", j) for j in scene.joints]
+    elsewhere = (model.body_gravcomp[model.jnt_bodyid[joints]] != 0) & (model.jnt_actgravcomp[joints] == 0)
+    return bool(model.opt.gravity.any()) and not elsewhere.any()
 
 
 def _hidden_scene(scene: Scene, config: SurrogateConfig) -> Scene:

@@ -13,8 +13,8 @@ from droid_jax.model.scene import LOOK_GROUP, Grip, Scene, compile_scene
 
 LEVERS = (0.30, 0.25, 0.20, 0.15)  # m, knob to hinge axis: four locations 5 cm apart (paper, IV-E)
 
-# Table I of the paper, fitted means: what an added spring does to the hinge.
-SPRINGS = {0: 0.01, 1: 1.06, 2: 1.24}  # N m/rad, by number of springs
+# Table I of the paper, N m/rad by number of springs: its initial mean, and its fitted means (see also door.truth).
+SPRINGS = {0: 0.01, 1: 1.06, 2: 1.24}
 
 # Joint damping carried by the simulated position servo, N m s/rad (see docs/paper.md).
 IMPEDANCE_STIFFNESS = (600.0, 600.0, 600.0, 600.0, 250.0, 150.0, 50.0)  # N m/rad

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from droid_jax.model.parameters import Mode, Parameter, Scaling, Write
-from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
+from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene, has_servo_damping
 
 _KIND = {
     "dof": "joint",
@@ -28,6 +28,7 @@ _KIND = {
     "pair": "pair",
     "actuator": "actuator",
 }
+_SERVO, _VELOCITY_GAIN = ("actuator_gainprm", "actuator_biasprm"), 2  # fields, and their column of the velocity gain
 
 
 def element_index(scene: Scene, field: str, element: str) -> int:
@@ -62,10 +63,15 @@ def model_parameter(
     mean: default is the model's own number (mode SET) or the mode's neutral value.
     options: further fields of `Parameter` (nuisance, group, scaling, floor, width).
     """
+    from droid_jax.model.physics import check_field  # only here: it imports jax, which may have to be tuned first
+
     if field == "dof_frictionloss":
         _check_frictionloss(scene, element)
     first = element_index(scene, field, element)
-    index = (first,) if column is None else (first, column)
+    check_field(scene, field)
+    index = (first, *_column(scene, field, column))
+    if field in _SERVO and column == _VELOCITY_GAIN:
+        _check_servo_damping(scene, element)
     if mean is None:
         neutral = {Mode.SCALE: 1.0, Mode.DIVIDE: 1.0, Mode.ADD: 0.0}
         nominal = np.asarray(getattr(scene.model, field))[index]
@@ -80,6 +86,30 @@ def model_parameter(
         writes=(Write(field, index, mode),),
         **options,
     )
+
+
+def _column(scene: Scene, field: str, column: int | None) -> tuple[int, ...]:
+    """The part of an index behind the element's: nothing, or the column, or ValueError that says which there are."""
+    width = np.asarray(getattr(scene.model, field)).shape[1:]
+    if not width:
+        if column is not None:
+            raise ValueError(f'{field} has one number for each {_KIND[field.split("_")[0]]}: leave "column" out')
+        return ()
+    if isinstance(column, bool) or not isinstance(column, (int, np.integer)) or not 0 <= column < width[0]:
+        got = "" if column is None else f", got {column!r}"
+        raise ValueError(
+            f"{field} has {width[0]} numbers for each {_KIND[field.split('_')[0]]}: "
+            f'give "column", 0 to {width[0] - 1}{got}'
+        )
+    return (int(column),)
+
+
+def _check_servo_damping(scene: Scene, actuator: str) -> None:
+    if not has_servo_damping(scene.model):
+        raise ValueError(
+            f"no actuator of scene {scene.name!r} was compiled with a velocity gain, and a replay is made without; "
+            f'give actuator {actuator!r} one in the MJCF (kv="1e-6")'
+        )
 
 
 def _check_frictionloss(scene: Scene, joint: str) -> None:

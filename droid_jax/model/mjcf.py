@@ -4,78 +4,126 @@ from __future__ import annotations
 
 import warnings
 import xml.etree.ElementTree as ElementTree
+from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from droid_jax.model.parameters import Space
+from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model
-from droid_jax.model.scene import Scene
+from droid_jax.model.scene import Scene, keep_inertia, look_geoms
 
-# Model fields that have an attribute, and are written.
-WORDS = frozenset({
-    "dof_damping", "dof_frictionloss", "jnt_stiffness", "body_pos", "body_quat", "body_mass", "body_inertia",
-    "body_gravcomp", "pair_friction", "pair_solref", "actuator_gainprm", "actuator_biasprm", "geom_size",
-})  # fmt: skip
+# Model field -> attribute of the element that holds a row of it, or its first numbers.
+_ATTRIBUTES = {
+    "dof_damping": "damping", "dof_frictionloss": "frictionloss", "dof_armature": "armature",
+    "dof_solref": "solref_friction", "dof_solimp": "solimp_friction",
+    "jnt_stiffness": "stiffness", "jnt_range": "range", "jnt_margin": "margin", "jnt_pos": "pos", "jnt_axis": "axis",
+    "jnt_solref": "solref_limit", "jnt_solimp": "solimp_limit", "jnt_actfrcrange": "actfrcrange",
+    "body_pos": "pos", "body_quat": "quat", "body_gravcomp": "gravcomp",
+    "geom_pos": "pos", "geom_quat": "quat", "geom_size": "size", "geom_friction": "friction",
+    "geom_solref": "solref", "geom_solimp": "solimp", "geom_margin": "margin", "geom_gap": "gap",
+    "geom_solmix": "solmix",
+    "pair_friction": "friction", "pair_solref": "solref", "pair_solreffriction": "solreffriction",
+    "pair_solimp": "solimp", "pair_margin": "margin", "pair_gap": "gap",
+    "actuator_gainprm": "gainprm", "actuator_biasprm": "biasprm", "actuator_gear": "gear",
+    "actuator_ctrlrange": "ctrlrange", "actuator_forcerange": "forcerange",
+}  # fmt: skip
+_WEIGHT = {"body_mass", "body_inertia", "body_ipos", "body_iquat"}  # written as the body's own <inertial>
+_FOLLOWING = {"geom_rbound", "geom_aabb"}  # the compiler works them out
+WORDS = frozenset({*_ATTRIBUTES, *_WEIGHT, *_FOLLOWING})  # model fields that MJCF can say
+_PLACE = {"body_pos", "body_quat"}  # written together
+_SHAPE = {"geom_pos", "geom_quat", "geom_size"}
 
 
 def fitted_mjcf(scene: Scene, space: Space, values: np.ndarray) -> str:
-    """The scene with the values [D] of `space` written in, as far as MJCF has attributes for them (`WORDS`).
+    """The scene with the values [D] of `space` written in; `unwritten` says which have no place in it.
 
-    What lives outside the model (offsets, laws of effects) is not in it.
+    Files of meshes and textures are named by their absolute paths, wherever the text is saved.
     """
     spec, model = scene.spec.copy(), make_c_model(scene, space, values)
-    spec.compile()  # numbers its elements, of which not all need a name
-    fields = {w.field for p in space.parameters for w in p.writes}
-    for joint in spec.joints:
-        dof, index = model.jnt_dofadr[joint.id], joint.id
-        if "dof_damping" in fields:
-            joint.damping = [float(model.dof_damping[dof]), 0, 0]
-        if "jnt_stiffness" in fields:
-            joint.stiffness = [float(model.jnt_stiffness[index]), 0, 0]
-        if "dof_frictionloss" in fields:
-            joint.frictionloss = float(model.dof_frictionloss[dof])
-    heavier = not (
-        np.allclose(model.body_mass, scene.model.body_mass, rtol=1e-12)
-        and np.allclose(model.body_inertia, scene.model.body_inertia, rtol=1e-12)
-    )
-    for body in spec.bodies[1:]:
-        index = body.id
-        if {"body_pos", "body_quat"} & fields:
-            body.pos, body.quat = model.body_pos[index].tolist(), model.body_quat[index].tolist()
-        if "body_gravcomp" in fields:
-            body.gravcomp = float(model.body_gravcomp[index])
-        if heavier and model.body_mass[index] > 0:
-            _weigh(body, model, index)
-    if heavier:  # every body says what it weighs, so none is left to its geoms
-        spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
-    for pair in spec.pairs:
-        index = pair.id
-        if "pair_friction" in fields:
-            pair.friction = model.pair_friction[index].tolist()
-        if "pair_solref" in fields:
-            pair.solref = model.pair_solref[index].tolist()
-    for index, actuator in enumerate(spec.actuators):
-        if {"actuator_gainprm", "actuator_biasprm"} & fields:
-            actuator.gainprm = model.actuator_gainprm[index].tolist()
-            actuator.biasprm = model.actuator_biasprm[index].tolist()
-    for geom in spec.geoms:
-        index = mujoco.mj_name2id(scene.model, mujoco.mjtObj.mjOBJ_GEOM, geom.name) if geom.name else -1
-        if "geom_size" in fields and index >= 0:
-            geom.size[0] += model.geom_size[index, 0] - scene.model.geom_size[index, 0]
     with warnings.catch_warnings():  # of what `_unwrapped` repairs
         warnings.simplefilter("ignore", UserWarning)
+        spec.compile()  # numbers its elements, of which not all need a name
+        for kind, elements in _elements(spec, model).items():
+            for row, element in elements.items():
+                _write_changed(kind, element, row, scene.model, model)
+        keep_inertia(spec, model)
+        _locate_assets(spec)
         spec.compile()
         return _unwrapped(spec.to_xml())
 
 
-def _weigh(body: Any, model: Any, index: int) -> None:
-    """Mass, centre and inertia of a body, its own and not its geoms'."""
-    body.explicitinertial = True
-    body.mass = float(model.body_mass[index])
-    body.ipos, body.iquat = model.body_ipos[index].tolist(), model.body_iquat[index].tolist()
-    body.inertia, body.fullinertia = model.body_inertia[index].tolist(), [np.nan] * 6
+def unwritten(scene: Scene, space: Space) -> tuple[str, ...]:
+    """Names of the parameters that MJCF has no words for: what lives outside the model (offsets, laws of effects),
+    fields without an attribute, and the shape of a mesh."""
+    return tuple(p.name for p in space.parameters if not p.writes or not _has_words(scene, p))
+
+
+def _has_words(scene: Scene, parameter: Parameter) -> bool:
+    files = [int(mujoco.mjtGeom.mjGEOM_MESH), int(mujoco.mjtGeom.mjGEOM_HFIELD)]
+    shaped = any(w.field in _SHAPE and scene.model.geom_type[w.index[0]] in files for w in parameter.writes)
+    return all(w.field in WORDS for w in parameter.writes) and not shaped
+
+
+def _elements(spec: mujoco.MjSpec, model: mujoco.MjModel) -> dict[str, dict[int, Any]]:
+    """For each beginning of a field's name, the elements by their row in the scene's model, which has no looks."""
+    looks = {g.id for g in look_geoms(spec)}
+    geoms = sorted((g for g in spec.geoms if g.id not in looks), key=lambda g: g.id)
+    return {
+        "dof": {int(model.jnt_dofadr[j.id]): j for j in spec.joints},
+        "jnt": {j.id: j for j in spec.joints},
+        "body": {b.id: b for b in spec.bodies[1:]},
+        "geom": dict(enumerate(geoms)),
+        "pair": {p.id: p for p in spec.pairs},
+        "actuator": {a.id: a for a in spec.actuators},
+    }
+
+
+def _write_changed(kind: str, element: Any, row: int, before: mujoco.MjModel, after: mujoco.MjModel) -> None:
+    """Write into an element what differs between its rows in two models."""
+    fields = [f for f in _ATTRIBUTES if f.startswith(f"{kind}_")]
+    changed = {f for f in fields if np.any(getattr(before, f)[row] != getattr(after, f)[row])}
+    for together in (_PLACE, _SHAPE):
+        if changed & together:
+            changed |= together
+            _unplace(element)
+    if kind == "actuator" and element.inheritrange:  # from its joint, whose range may be another now
+        element.inheritrange = 0
+        changed.add("actuator_ctrlrange")
+    for field in changed:
+        numbers = np.atleast_1d(getattr(after, field)[row])
+        if field == "jnt_range" and element.type != mujoco.mjtJoint.mjJNT_SLIDE and element.compiler.degree:
+            numbers = np.degrees(numbers)
+        _set(element, _ATTRIBUTES[field], numbers)
+
+
+def _unplace(element: Any) -> None:
+    """Take a body or geom out of its frame, and forget every other way in which its place was said."""
+    if element.frame is not None:
+        element.set_frame(element.parent.add_frame())
+    element.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+    if hasattr(element, "fromto"):
+        element.fromto = [np.nan] * 6
+
+
+def _set(element: Any, attribute: str, numbers: np.ndarray) -> None:
+    """Set an attribute's number, or its first ones (of a damping that is a polynomial in the speed, say)."""
+    old = np.array(getattr(element, attribute), dtype=float)
+    if old.ndim == 0:
+        setattr(element, attribute, float(numbers[0]))
+    else:
+        old[: len(numbers)] = numbers
+        setattr(element, attribute, old.tolist())
+
+
+def _locate_assets(spec: mujoco.MjSpec) -> None:
+    """Have the folders of meshes and textures be found from anywhere."""
+    files = [a.file for kind in (spec.meshes, spec.textures, spec.hfields, spec.skins) for a in kind]
+    if spec.modelfiledir and any(files):
+        folder = Path(spec.modelfiledir)
+        spec.meshdir = str((folder / spec.meshdir).resolve())
+        spec.texturedir = str((folder / spec.texturedir).resolve())
 
 
 def _unwrapped(xml: str) -> str:

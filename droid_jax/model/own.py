@@ -14,7 +14,10 @@ torque_offset of a joint (model/joint_friction.py), zero at first and between -h
 
 from __future__ import annotations
 
+import enum
 import json
+import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +27,9 @@ from droid_jax.model.parameters import Mode, Parameter, Scaling, Space
 from droid_jax.model.scene import Scene
 
 _NEEDED = ("element", "std", "high")
+_TEXTS = ("field", "sensor", "element", "name", "unit", "group")
+_NUMBERS = ("std", "high", "low", "mean", "floor", "width")
+_CHOICES = {"mode": Mode, "scaling": Scaling}
 _KNOWN = (
     *_NEEDED, "field", "sensor", "column", "name", "unit", "mean", "low", "mode", "scaling", "floor", "width",
     "nuisance", "group",
@@ -66,17 +72,39 @@ def _parameter(scene: Scene, entry: Any, where: str) -> Parameter:
             f"{where}: missing {', '.join(missing) or 'nothing'}; unknown {', '.join(unknown) or 'nothing'}; "
             f"known keys: {', '.join(_KNOWN)}"
         )
-    options = dict(entry)
-    field, sensor, element = options.pop("field", None), options.pop("sensor", None), options.pop("element")
     try:
-        if "scaling" in options:
-            options["scaling"] = Scaling(options["scaling"])
+        options = _read(entry)
+        field, sensor, element = options.pop("field", None), options.pop("sensor", None), options.pop("element")
         if sensor is not None:
             return sensor_parameter(scene.joints, sensor, element, **options)
-        if "mode" in options:
-            options["mode"] = Mode(options["mode"])
         if field == "body_mass" and "mode" not in options:
             return body_mass(scene, element, **options)
         return model_parameter(scene, field, element, options.pop("column", None), **{"unit": "", **options})
     except (ValueError, TypeError) as error:
         raise ValueError(f"{where}: {error}") from None
+
+
+def _read(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """An entry with its choices looked up, or ValueError for a value of the wrong kind."""
+    out = dict(entry)
+    for key, value in entry.items():
+        if key in _TEXTS and not isinstance(value, str):
+            raise ValueError(f"{key} must be text, got {value!r}")
+        if key in _NUMBERS and not _is_number(value):
+            raise ValueError(f"{key} must be a number, got {value!r}")
+        if key == "nuisance" and not isinstance(value, bool):
+            raise ValueError(f"nuisance must be true or false, got {value!r}")
+        if key in _CHOICES:
+            out[key] = _chosen(key, value, _CHOICES[key])
+    return out
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _chosen(key: str, value: Any, choices: type[enum.Enum]) -> enum.Enum:
+    valid = [choice.value for choice in choices]
+    if value not in valid:
+        raise ValueError(f"{key} must be one of {', '.join(valid)}, got {value!r}")
+    return choices(value)

@@ -23,6 +23,8 @@ from typing import Any
 
 import numpy as np
 
+ROUNDING = 1e-6  # share of a parameter's range by which a value may miss a bound
+
 
 class Mode(enum.Enum):
     """How a value enters a model field, given the field's nominal number."""
@@ -85,7 +87,7 @@ class Parameter:
     nuisance: fitted and marginalised, of no interest by itself.
     group:  heading in tables ("Door", "Robot", "Gripper", "Nuisance").
     scaling, floor: search coordinate.
-    width:  units of the search coordinate per prior deviation when scaling is LOG; None takes
+    width:  what one unit of the search coordinate is in log(v + floor) when scaling is LOG; None takes
             it from mean and std.
     """
 
@@ -117,6 +119,8 @@ class Parameter:
             raise ValueError(f"parameter {self.name!r}: std must be positive, got {self.std}")
         if self.scaling is Scaling.LOG and self.low + self.floor <= 0:
             raise ValueError(f"parameter {self.name!r}: log scaling needs low + floor > 0")
+        if self.width is not None and not self.width > 0:
+            raise ValueError(f"parameter {self.name!r}: width must be positive, got {self.width}")
 
     @property
     def log_width(self) -> float:
@@ -243,7 +247,10 @@ class Space:
         return out
 
     def check(self, values: np.ndarray) -> np.ndarray:
-        """values [..., D] as float64, or ValueError that says which entry is wrong and how."""
+        """values [..., D] as float64, or ValueError that says which entry is wrong and how.
+
+        What single precision made of a bound counts as on it, and is returned as the bound itself.
+        """
         values = np.asarray(values, dtype=np.float64)
         if values.shape[-1:] != (len(self),):
             raise ValueError(
@@ -251,12 +258,13 @@ class Space:
             )
         rows = values.reshape(-1, len(self))
         for i, p in enumerate(self.parameters):
-            bad = rows[:, i][~((rows[:, i] >= p.low) & (rows[:, i] <= p.high))]
+            slack = ROUNDING * (p.high - p.low)
+            bad = rows[:, i][~((rows[:, i] >= p.low - slack) & (rows[:, i] <= p.high + slack))]
             if bad.size:
                 raise ValueError(
                     f"parameter {p.name!r}: {bad[0]} {p.unit} is not inside its bounds [{p.low}, {p.high}]"
                 )
-        return values
+        return np.clip(values, self.low, self.high)
 
     def to_search(self, values: Any) -> Any:
         """[..., D] physical values -> [..., D] search coordinates (numpy or jax)."""

@@ -8,6 +8,8 @@ values equals compiling an MJCF that has them.
 from __future__ import annotations
 
 import copy
+import dataclasses
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +20,7 @@ import numpy as np
 from mujoco import mjx
 
 from droid_jax.model.parameters import Space, Write
-from droid_jax.model.scene import Scene
+from droid_jax.model.scene import IGNORED, Scene
 
 # Writing one of these changes what the compiler derives.
 _SOURCES = {"body_mass", "body_inertia", "body_pos", "body_quat", "body_ipos", "body_iquat", "dof_armature",
@@ -61,11 +63,28 @@ def written_fields(space: Space) -> tuple[str, ...]:
     return tuple(fields)
 
 
+def check_field(scene: Scene, field: str) -> None:
+    """Raise ValueError for a field of the C model that MJX does not have, takes as fixed, or does not read here."""
+    if field not in _varied_fields() or np.asarray(getattr(scene.model, field)).dtype.kind != "f":
+        raise ValueError(f"{field!r} cannot be a parameter: MJX does not simulate it, or takes it as fixed")
+    if field == "body_gravcomp" and not scene.model.body_gravcomp.any():
+        raise ValueError(
+            f"'body_gravcomp' cannot be a parameter: scene {scene.name!r} was compiled without gravity compensation, "
+            "which MJX then leaves out; give a body gravcomp in the MJCF"
+        )
+
+
+@functools.cache
+def _varied_fields() -> frozenset[str]:
+    """Fields of mjx.Model that are arrays of its program's input, not constants of the program, and are read."""
+    arrays = {f.name for f in dataclasses.fields(mjx.Model) if "jax.Array" in str(f.type)}
+    return frozenset(arrays - {field for field, _ in IGNORED})
+
+
 def make_physics(scene: Scene, space: Space, values: jax.Array) -> Physics:
     """The physics of one parameter vector [D]; traceable, so vmap it over samples.
 
-    Fields that exist only in C MuJoCo (bounding radii, boxes) are skipped: MJX does not read them
-    for the contact pairs it supports.
+    Raises ValueError for fields that MJX would not read (see `check_field`).
     """
     model = scene.mjx
     by_field: dict[str, list[tuple[int, Write]]] = {}
@@ -73,8 +92,7 @@ def make_physics(scene: Scene, space: Space, values: jax.Array) -> Physics:
         by_field.setdefault(write.field, []).append((column, write))
     changed = {}
     for field, writes in by_field.items():
-        if not hasattr(model, field):
-            continue
+        check_field(scene, field)
         nominal = jnp.asarray(getattr(model, field))
         new: dict[tuple[int, ...], jax.Array] = {}
         for column, w in writes:  # several parameters of one entry act one after the other

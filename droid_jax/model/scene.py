@@ -1,7 +1,7 @@
 """A scene: an MJCF compiled once, with its names turned into ids once.
 
 `load_scene` takes a user's own MJCF, `model.door_scene` composes the built-in one.  Replays use a
-model without the geoms of group 2, which are only for the eye.
+model without the geoms of group 2 that touch nothing: they are only for the eye (their mass counts).
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ import numpy as np
 
 LOOK_GROUP = 2
 TINY_FRICTIONLOSS = 1e-6  # N m: enough to give a joint its friction-loss row
-_ONE_DEGREE = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+ONE_DEGREE = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 # C MuJoCo's model arrays that MJX accepts in a file and then leaves out (mujoco-mjx 3.17.0):
 # field, and what it is.
-_IGNORED = (
+IGNORED = (
     ("jnt_stiffnesspoly", "polynomial joint stiffness"),
     ("dof_dampingpoly", "polynomial joint damping"),
     ("tendon_stiffnesspoly", "polynomial tendon stiffness"),
@@ -123,9 +123,7 @@ class Scene:
 
     def visual_model(self) -> mujoco.MjModel:
         """The same scene with its looks, for rendering."""
-        with warnings.catch_warnings():  # see door_scene._attach
-            warnings.simplefilter("ignore", UserWarning)
-            return self.spec.compile()
+        return compiled(self.spec)
 
     def initial_qpos(self, positions: dict[str, float] | Any) -> np.ndarray:
         """[nq] the model's reference pose with named joints set; unknown names raise."""
@@ -167,9 +165,14 @@ def _count(model: mujoco.MjModel, kind: str) -> int:
     }[kind]
 
 
+def has_servo_damping(model: mujoco.MjModel) -> bool:
+    """Whether any actuator has a velocity gain: its force then follows the joint's velocity."""
+    return bool(np.any(model.actuator_biasprm[:, 2]) or np.any(model.actuator_gainprm[:, 2]))
+
+
 def refuse_ignored(model: mujoco.MjModel, name: str) -> None:
     """Raise ValueError listing every feature of the model that MJX would silently leave out."""
-    found = [what for field, what in _IGNORED if _used(model, field)]
+    found = [what for field, what in IGNORED if _used(model, field)]
     if np.any(model.opt.disableactuator != 0):
         found.append("disabled actuator groups")
     if model.opt.noslip_iterations > 0:
@@ -184,6 +187,66 @@ def refuse_ignored(model: mujoco.MjModel, name: str) -> None:
 def _used(model: mujoco.MjModel, field: str) -> bool:
     array = getattr(model, field, None)
     return array is not None and np.size(array) > 0 and bool(np.any(np.asarray(array) != 0))
+
+
+def look_geoms(spec: mujoco.MjSpec) -> list[Any]:
+    """The geoms that are for the eye: of LOOK_GROUP, and nothing can touch them."""
+    paired = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
+    return [
+        g
+        for g in spec.geoms
+        if g.group == LOOK_GROUP and not g.contype and not g.conaffinity and (not g.name or g.name not in paired)
+    ]
+
+
+def without_looks(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """A copy without `look_geoms`, whose bodies weigh what they weighed with them."""
+    bare = spec.copy()
+    looks = look_geoms(bare)
+    if looks:
+        whole = compiled(spec.copy())
+        for geom in looks:
+            bare.delete(geom)
+        keep_inertia(bare, whole)
+    return bare
+
+
+def keep_inertia(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
+    """Have every body of a spec weigh what it weighs in `model` (of the same bodies), whatever its geoms would give."""
+    now = compiled(spec)  # numbers the bodies, of which not all need a name
+    fields = ("body_mass", "body_inertia", "body_ipos", "body_iquat")
+    same = np.all([_rows_close(getattr(now, f), getattr(model, f)) for f in fields], axis=0)
+    other = ~same & (model.body_mass > 0)
+    if not other.any():
+        return
+    always = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    for body in spec.bodies[1:]:
+        if other[body.id] or (always and model.body_mass[body.id] > 0):
+            _weigh(body, model, body.id)
+    if always:  # every body now says what it weighs, so none is left to its geoms
+        spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+
+
+def _rows_close(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """[n] bool, rows equal to rounding."""
+    close = np.isclose(a, b, rtol=1e-9, atol=1e-14)
+    return np.all(np.reshape(close, (len(a), -1)), axis=1)
+
+
+def _weigh(body: Any, model: mujoco.MjModel, index: int) -> None:
+    """Mass, centre and inertia of a body, its own and not its geoms'."""
+    body.explicitinertial = True
+    body.mass = float(model.body_mass[index])
+    body.ipos, body.iquat = model.body_ipos[index].tolist(), model.body_iquat[index].tolist()
+    body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT  # of several ways to say how the inertia is turned
+    body.inertia, body.fullinertia = model.body_inertia[index].tolist(), [np.nan] * 6
+
+
+def compiled(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """The model of a spec, without MuJoCo's warning of attached files that share a default (see door_scene._attach)."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        return spec.compile()
 
 
 def compile_scene(
@@ -204,15 +267,12 @@ def compile_scene(
     Raises ValueError for unknown names, for joints of several degrees of freedom and for
     features that MJX would silently ignore.
     """
-    bare = spec.copy()
-    for geom in list(bare.geoms):
-        if geom.group == LOOK_GROUP:
-            bare.delete(geom)
+    bare = without_looks(spec)
     for joint in bare.joints:
         if joint.name in set(unlimited):
             joint.limited = False
     for joint in bare.joints:  # MJX lays friction-loss rows out at compilation: zero could never be raised
-        if joint.name == object_joint and joint.type in _ONE_DEGREE and joint.frictionloss <= 0:
+        if joint.name == object_joint and joint.type in ONE_DEGREE and joint.frictionloss <= 0:
             joint.frictionloss = TINY_FRICTIONLOSS
     model = bare.compile()
     refuse_ignored(model, name)
@@ -228,7 +288,7 @@ def compile_scene(
     )
     for joint in (*scene.joints, *([object_joint] if object_joint else [])):
         kind = mujoco.mjtJoint(model.jnt_type[scene.id("joint", joint)])
-        if kind not in _ONE_DEGREE:
+        if kind not in ONE_DEGREE:
             raise ValueError(f"joint {joint!r} of scene {name!r} must be a hinge or a slide")
     _ = scene.finger_pairs  # unknown pair names fail here, not in the first replay
     return scene

@@ -43,7 +43,7 @@ class Rollout:
     velocity: [T, J] rad/s or m/s.
     object_angle: [T] rad, zeros where the scene has no object.
     contact:  [T, F] bool, True where finger f touches.
-    finite:   [] bool, False where any of the above became NaN or infinite.
+    finite:   [] bool, False where a number of the above became NaN or infinite.
     """
 
     time: Any

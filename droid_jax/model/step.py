@@ -30,13 +30,14 @@ _TOLERANCE = 3e-6  # of the acceleration's scale: what float32 can still tell ap
 _ROUNDING = 1e-5  # of a Newton step: how exactly float32 solves for it
 
 
-def step(model: Any, data: Any, *, parity: bool = False) -> Any:
+def step(model: Any, data: Any, *, parity: bool = False, servo_damping: bool = True) -> Any:
     """Advance mjx.Data by one time step; integrators Euler and implicitfast.
 
     parity=False: second order in the time step.  Positions belong to the time of the step,
       velocities to half a step before (leapfrog); joint damping and constraint damping use the mean
       velocity of the step, and constraints are solved with the inertia that follows, M + h/2 D.
     parity=True: what C MuJoCo's implicitfast and Euler do, first order, for comparisons step by step.
+    servo_damping: False spares what only actuators with a velocity gain need (see `scene.has_servo_damping`).
     Leaves out what no replay reads: sensors, cameras, lights.
     Raises ValueError for other integrators, and for elliptic cones unless parity.
     """
@@ -47,6 +48,8 @@ def step(model: Any, data: Any, *, parity: bool = False) -> Any:
     data = mjx.fwd_actuation(model, data)
     data = mjx.fwd_acceleration(model, data)
     inertia = mjx.full_m(model, data)
+    if servo_damping:
+        model = _without_held(model, data, parity)
     if not parity:
         slope = mjx.deriv_smooth_vel(model, data)
         inertia = inertia if slope is None else inertia - 0.5 * model.opt.timestep * slope
@@ -59,6 +62,37 @@ def step(model: Any, data: Any, *, parity: bool = False) -> Any:
     if not parity:
         return mjx.euler(_undamped(model), data)
     return mjx.euler(model, data) if _is_euler(model) else mjx.implicit(model, data)
+
+
+def servo_force(model: Any, data: Any, velocity: jax.Array) -> jax.Array:
+    """[nv] N m, the actuators' forces of the step that `data` comes from, had the joints moved at velocity [nv].
+
+    A step integrates velocity gains at its mean velocity, data.qfrc_actuator is at the one before it.
+    """
+    moving = data.tree_replace({"_impl.actuator_velocity": data._impl.actuator_moment @ velocity})
+    return mjx.fwd_actuation(model, moving).qfrc_actuator
+
+
+def _without_held(model: Any, data: Any, parity: bool) -> Any:
+    """The model without the velocity gains of servos whose force a limit holds: mjx's derivative counts them too."""
+    free = ~_held(model, data, parity)[:, None]
+    gains = ("actuator_biasprm", "actuator_gainprm")
+    return model.replace(**{g: jnp.where(free, getattr(model, g), getattr(model, g).at[:, 2].set(0.0)) for g in gains})
+
+
+def _held(model: Any, data: Any, parity: bool) -> jax.Array:
+    """[nu] bool, actuators of joints at their own force limit or (the C engine looks past it) at their joint's."""
+    held = model.actuator_forcelimited & _outside(data.actuator_force, model.actuator_forcerange)
+    if parity:
+        return held
+    joint = model.actuator_trnid[:, 0]
+    torque = data.qfrc_actuator[model.jnt_dofadr[joint]]
+    return held | (model.jnt_actfrclimited[joint] & _outside(torque, model.jnt_actfrcrange[joint]))
+
+
+def _outside(values: jax.Array, bounds: jax.Array) -> jax.Array:
+    """bool, values [n] at or beyond one of their bounds [n, 2]."""
+    return (values <= bounds[:, 0]) | (values >= bounds[:, 1])
 
 
 def _is_euler(model: Any) -> bool:

@@ -19,8 +19,12 @@ from droid_jax.report.words import label
 
 @dataclass(frozen=True)
 class Drawing:
-    """One figure as the page shows it: HTML for a wide and for a narrow screen, and a caption."""
+    """One figure as the page shows it: HTML for a wide and for a narrow screen, and a caption.
 
+    folder: where its PNG and PDF copies lie, as STEM.png and STEM.pdf.
+    """
+
+    folder: Path
     stem: str
     title: str
     caption: str
@@ -42,7 +46,8 @@ def draw(run: Run) -> dict[str, list[Drawing]]:
         bars = (traces["joints"], gap["per_joint_before"], gap["per_joint_after"], gap.get("floor"))
         add(
             "gap", f"gap_{i}", f"Torque difference of each joint{of}",
-            f"RMS difference between simulation and {robot} on held-out repeats, joint by joint.",
+            f"RMS difference between the smoothed torques of simulation and {robot} on held-out repeats, joint by "
+            "joint. The torque distance above is taken of torques as they were measured.",
             torque_figures.gap_per_joint, *bars, gap.get("per_joint_floor"), run.torque_unit,
         )  # fmt: skip
         add(
@@ -90,21 +95,22 @@ def drawing(folder: Path, stem: str, title: str, caption: str, make: Callable[..
     """The figure `make(*args, width=...)` draws, for the page; PNG and PDF copies go to FOLDER/figures/STEM.*."""
     wide, narrow = (export.settled(make(*args, width=width)) for width in (WIDE, NARROW))
     export.save(wide, folder / "figures", stem)
-    html = [_inline(f, f"{stem}-{kind}", title) for kind, f in (("wide", wide), ("narrow", narrow))]
-    return Drawing(stem, title, caption, *html)
+    html = [_inline(f, stem, kind, title) for kind, f in (("wide", wide), ("narrow", narrow))]
+    return Drawing(folder / "figures", stem, title, caption, *html)
 
 
-def _inline(figure: Figure, prefix: str, title: str) -> Markup:
-    """SVG, or PNG on a white card where the SVG would be too long."""
-    svg = export.inline_svg(figure, prefix)
+def _inline(figure: Figure, stem: str, kind: str, title: str) -> Markup:
+    """SVG, or PNG on a white card where the SVG would be too long; the caption describes it to those who cannot see."""
+    svg = export.inline_svg(figure, f"{stem}-{kind}")
     points = 72 * figure.get_figwidth()
     if len(svg) <= export.SVG_LIMIT:
         # Fixed points would not shrink on a phone; the viewBox keeps the proportions.
         svg = re.sub(r'(<svg [^>]*?) ?\bheight="[^"]*"', r"\1", svg, count=1)
         svg = re.sub(r'(<svg [^>]*?)\bwidth="[^"]*"', rf'\1style="max-width:{1.45 * points:.0f}px"', svg, count=1)
-        head = Markup('<svg role="img" aria-label="{}"').format(title)
+        head = Markup('<svg role="img" aria-label="{}" aria-describedby="{}-caption"').format(title, stem)
         return Markup(head + Markup(svg.removeprefix("<svg")))
-    return Markup('<img class="card" alt="{}" src="{}">').format(title, export.data_uri(export.png_bytes(figure)))
+    card = Markup('<img class="card" alt="{}" aria-describedby="{}-caption" src="{}">')
+    return card.format(title, stem, export.data_uri(export.png_bytes(figure)))
 
 
 def frame_rows(paths: Sequence[Path]) -> list[tuple[str, list[tuple[str, str]]]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,6 +20,7 @@ LONGEST = 150  # pictures
 SIZE = (270, 360)  # height, width
 QUALITY = 60  # of WebP
 LAST = 1.5  # s for which the last picture stays
+LOOPS = 3  # then it rests on the last picture: a page without scripts has no button that stops it (WCAG 2.2.2)
 
 
 def film(
@@ -41,9 +42,8 @@ def film(
     pictures = [Image.fromarray(image) for image in images]
     shown = [round(1e3 * every * period)] * (len(pictures) - 1) + [round(1e3 * LAST)]
     with io.BytesIO() as buffer:
-        pictures[0].save(
-            buffer, format="WEBP", save_all=True, append_images=pictures[1:], duration=shown, loop=0, quality=QUALITY
-        )
+        timing: dict[str, Any] = {"duration": shown, "loop": LOOPS}
+        pictures[0].save(buffer, format="WEBP", save_all=True, append_images=pictures[1:], quality=QUALITY, **timing)
         write_bytes(path, buffer.getvalue())
 
 

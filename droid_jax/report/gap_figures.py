@@ -27,7 +27,7 @@ def gap_bars(
     extended: bool = True,
     width: float = WIDE,
 ) -> Figure:
-    """U and torque distance of each demonstration, before and after.
+    """U and torque distance of each recording, before and after.
 
     names: [G]; gaps: [G] with before, after (dimensionless), torque_before, torque_after in `unit`.
     floor: U0 or None, a dashed line.  extended: False where no effect entered the model: no "after".

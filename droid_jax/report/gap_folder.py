@@ -66,7 +66,7 @@ class Gap:
 
     @property
     def roles(self) -> list[str]:
-        """The demonstrations there are, by what they were for: "fit", "confirm" and perhaps "sealed"."""
+        """The recordings there are, by what they were for: "fit", "confirm" and perhaps "sealed"."""
         return [r for r in ROLES if r in self.found["gaps"]]
 
     @property
@@ -112,7 +112,7 @@ class Gap:
         return self.found["setup"].get("stand_in", self.found["setup"].get("recording") == [])
 
     def recording(self, role: str) -> str:
-        """Name of the demonstration in a role."""
+        """Name of the recording in a role."""
         return self.found["gaps"][role]["recording"]
 
 

@@ -37,11 +37,11 @@ _RECORDINGS = Parts(
     "no part in it.",
     sigma="one repeat's noise",
     closed="so {share} of what can be closed was closed",
-    other="the other demonstration",
+    other="the other recording",
     flipped="repeats",
     lines="black line and band, the repeats' mean and two of their deviations; lines, the simulation.",
     places="Hatched: the sign-flip test (false discoveries 10 %) finds nothing there.",
-    more="more repeats, or a demonstration that also closes, moves at another speed or reaches further",
+    more="more repeats, or a motion that also closes, moves at another speed or reaches further",
 )
 _BLOCKS = Parts(
     gap="the gap U (the mean square of all that is left, noise included, in units of a noise that is itself taken from "

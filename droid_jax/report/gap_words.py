@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from droid_jax.report.gap_folder import Gap
-from droid_jax.report.gap_parts import PARTS, parts_of
+from droid_jax.report.gap_parts import parts_of
 from droid_jax.report.words import label, listed, number, percent
 
 SIGNIFICANT = 0.01  # p below which something is said to be missing
 DECISIVE = 6.0  # standardised difference from which ten repeats decide between rivals
-OTHER = PARTS["recordings"].other  # as the search calls it, whatever confirms
+OTHER = "the other demonstration"  # as the search calls what confirms, whatever it is
 BETWEEN = " + "  # between the effects in a model's name
 ROLES = {"fit": "fitted", "confirm": "confirming", "sealed": "sealed"}
 
@@ -154,10 +154,20 @@ def _next(gap: Gap) -> str:
         "that part has no name yet",
         "unexplained": f"look at the hardware {_where(gap)}. The library holds no effect that does this: write one "
         "of your own, or correct the scene there, and run again. Do not train on this part of the motion",
-        "fit not converged": "search longer (more generations, more restarts) or give the parameters tighter priors, "
-        "and run again; take no number from this page until the starts agree",
+        "fit not converged": f"{_longer(gap)}give the parameters tighter priors, and run again; take no number from "
+        "this page until the starts agree",
     }
     return f"Next: {steps[gap.found['verdict']]}."
+
+
+def _longer(gap: Gap) -> str:
+    """How to search longer than `gap` itself can; nothing in blocks, whose fit needs no search."""
+    if gap.parts.in_turns:
+        return ""
+    return (
+        f"fit “{gap.recording('fit')}” by python -m droid_jax.run identify --preset standard --restarts 3 and hand its "
+        "folder on (gap --fit FOLDER), or "
+    )
 
 
 def _file(gap: Gap) -> str:

@@ -10,6 +10,11 @@ from droid_jax.report.policy_words import policy_summary
 from droid_jax.report.run_folder import Run
 from droid_jax.report.words import listed, number, percent, summary
 
+WRONG = ("unexplained", "fit not converged")  # verdicts on which nothing should be trained
+ALL_THE_SAME = (
+    "The policy was trained all the same, on a model that is known to be wrong there: do not take it to a robot."
+)
+
 
 def lead(run: Run | None, gap: Gap | None, policy: Trained | None) -> list[str]:
     """From the numbers alone; the last sentence says what to do next."""
@@ -22,7 +27,8 @@ def lead(run: Run | None, gap: Gap | None, policy: Trained | None) -> list[str]:
         following = gap_summary(gap)[-1]
     if policy:
         sentences += [_opened(where, found["success_rate"]) for where, found in policy.trials.items()]
-        following = policy_summary(policy)[-1]
+        doubted = gap is not None and gap.found["verdict"] in WRONG
+        following = f"{following} {ALL_THE_SAME}" if doubted else policy_summary(policy)[-1]
     return [*sentences, following]
 
 

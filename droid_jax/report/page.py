@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+from markupsafe import Markup
 
 from droid_jax.report.drawings import draw, frame_rows
 from droid_jax.report.export import data_uri
@@ -86,6 +87,8 @@ def write_report(run: Path) -> Path:
         "effect": effect_words,
         "unit": unit_words,
         "speak": speaker(loaded) if loaded else str,
+        "from_page": lambda path: path.relative_to(folder).as_posix(),
+        "nested": _nested,
         "unbroken": lambda text: re.sub(r"(?<=\d) (?=N m|%)", "\u00a0", text).replace("N m", "N\u00a0m"),
     }
     parts = (_policy(policy) if policy else {}) | (_search(gap) if gap else {})
@@ -93,10 +96,10 @@ def write_report(run: Path) -> Path:
     if len([part for part in (loaded, gap, policy) if part]) > 1:
         parts |= _together(folder, loaded, gap, policy)
     parts_at = [part.folder for part in (loaded, gap, policy) if part]
-    downloads = [(path.relative_to(folder), text) for path, text in _downloads(parts_at)]
     html = environment.get_template("template.html.j2").render(
-        folder=folder, run=loaded, gap=gap, policy=policy, downloads=downloads, **{"lead": [], **parts}
-    )
+        folder=folder, run=loaded, gap=gap, policy=policy, downloads=list(_downloads(parts_at)),
+        **{"lead": [], **parts},
+    )  # fmt: skip
     path = folder / "report.html"
     write_text(path, html)
     return path
@@ -105,6 +108,11 @@ def write_report(run: Path) -> Path:
 def _part(folder: Path, has: Callable[[Path], bool]) -> Path | None:
     """Where a part of the page is: in the folder, or in a stage's folder in it."""
     return next((at for at in (folder, *(folder / stage for stage in STAGES)) if has(at)), None)
+
+
+def _nested(html: str) -> Markup:
+    """A part of a page with several: its headings one level deeper."""
+    return Markup(re.sub(r"(</?h)([2-5])\b", lambda found: f"{found[1]}{int(found[2]) + 1}", html))
 
 
 def _downloads(folders: Sequence[Path]) -> Iterator[tuple[Path, str]]:

@@ -9,9 +9,15 @@ from droid_jax.report.export import data_uri
 from droid_jax.report.policy_figures import angles, learning
 from droid_jax.report.policy_folder import Trained
 
-CAPTIONS = {
-    "good": "A trial that succeeded, on the stand-in robot",
-    "bad": "A trial that failed, on the stand-in robot",
+CAPTIONS = {  # of a film, and what it shows to those who cannot see it
+    "good": (
+        "A trial that succeeded, on the stand-in robot",
+        "Film of the arm in front of the door: it takes the knob, pulls the door open and holds it there",
+    ),
+    "bad": (
+        "A trial that failed, on the stand-in robot",
+        "Film of the arm in front of the door: it does not hold the door open far enough with the knob in hand",
+    ),
 }
 
 
@@ -38,9 +44,9 @@ def draw_policy(trained: Trained) -> dict[str, list[Drawing]]:
     return sections
 
 
-def film_row(trained: Trained) -> list[tuple[str, str]]:
-    """Films with their captions, as data URIs."""
+def film_row(trained: Trained) -> list[tuple[str, str, str]]:
+    """Films as data URIs, each behind its caption and its description."""
     return [
-        (CAPTIONS.get(name, name), data_uri(path.read_bytes(), "webp"))
+        (*CAPTIONS.get(name, (name, f"Film of the trial {name}")), data_uri(path.read_bytes(), "webp"))
         for name, path in sorted(trained.films.items(), reverse=True)
     ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from rich.console import Console
@@ -17,10 +17,15 @@ QUIET = 20.0  # s between two lines of one stage where there is no terminal
 
 
 @contextlib.contextmanager
-def stages(names: Sequence[str]) -> Iterator[Report]:
-    """Show one bar per stage; yields the function that stages report to: (stage, its progress value)."""
+def stages(names: Sequence[str], most: Mapping[str, int] | None = None) -> Iterator[Report]:
+    """Show one bar per stage; yields the function that stages report to: (stage, its progress value).
+
+    most: of stages that report a text as each of their steps begins, how many steps one round has at most; the time
+    left is that of so many.  A stage that comes again, after another, begins a round of its own.
+    """
+    line = Steps(most or {}).line
     if not Console().is_terminal:
-        yield Lines().report
+        yield Lines(line=line).report
         return
     columns = (
         TextColumn("{task.description:>8}"),
@@ -35,25 +40,44 @@ def stages(names: Sequence[str]) -> Iterator[Report]:
         tasks = {n: bars.add_task(n, total=1, text="", start=False) for n in names}
         current: list[str] = []
 
+        def finish() -> None:
+            for done in current:
+                bars.update(tasks[done], completed=bars.tasks[tasks[done]].total)
+                bars.stop_task(tasks[done])
+
         def report(stage: str, value: Any) -> None:
-            if stage not in current:
-                for done in current:
-                    bars.update(tasks[done], completed=bars.tasks[tasks[done]].total)
-                    bars.stop_task(tasks[done])
-                current.append(stage)
-                bars.start_task(tasks[stage])
-            if value is not None:
-                bars.update(tasks[stage], **_line(value))
+            if current != [stage]:
+                finish()
+                current[:] = [stage]
+                bars.reset(tasks[stage], total=1, text="")
+            if shown := line(stage, value):
+                bars.update(tasks[stage], **shown)
 
         yield report
-        for name in current:
-            bars.update(tasks[name], completed=bars.tasks[tasks[name]].total)
+        finish()
+
+
+class Steps:
+    """What to show of what stages report, with the steps counted of those that report a text for each."""
+
+    def __init__(self, most: Mapping[str, int]) -> None:
+        self._most = most
+        self._stage, self._begun = "", 0
+
+    def line(self, stage: str, value: Any) -> dict[str, Any]:
+        """Text, and how much is done of how much where that is known; empty where a stage only says that it began."""
+        if stage != self._stage:
+            self._stage, self._begun = stage, 0
+        if not isinstance(value, str):
+            return {} if value is None else _line(value)
+        self._begun += 1
+        if stage not in self._most:
+            return {"text": value}
+        return {"text": value, "completed": self._begun - 1, "total": max(self._begun, self._most[stage])}
 
 
 def _line(value: Any) -> dict[str, Any]:
-    """What to show of a stage's progress value, or a text in place of one."""
-    if isinstance(value, str):
-        return {"text": value}
+    """What to show of a stage's progress value."""
     if hasattr(value, "generation"):
         text = f"cost {value.best_cost:.4g}  sigma {value.sigma:.2g}"
         return {"completed": value.generation, "total": value.generations, "text": text}
@@ -120,15 +144,17 @@ def _trained(now: Any) -> str:
 class Lines:
     """Lines in place of bars: one where a stage begins, then at most one every QUIET seconds and one at its end."""
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
+    def __init__(
+        self, clock: Callable[[], float] = time.monotonic, line: Callable[[str, Any], dict[str, Any]] | None = None
+    ) -> None:
+        self._clock, self._line = clock, line or Steps({}).line
         self._stage = ""
         self._began = self._last = 0.0
         self._first = (0.0, 0.0)  # s and count of the stage's first line: what compiled before it tells no rate
 
     def report(self, stage: str, value: Any) -> None:
         """What `stages` yields."""
-        line = {} if value is None else _line(value)
+        line = self._line(stage, value)
         self.show(stage, line.get("text", ""), line.get("completed", 0), line.get("total", 0))
 
     def show(self, stage: str, text: str, done: float, total: float) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.report.files import FILMS, REPLAY_FILM
+from droid_jax.report.files import FILMS, REPLAY, REPLAY_FILM
 from droid_jax.report.reading import Reader
 
 _READ = Reader("identify")
@@ -36,6 +36,12 @@ _PARAMETER_KEYS = (
     *("interval", "identifiable", "reason", "truth", "on_bound", "partners"),
 )
 _TRACE_KEYS = ("time", "measured_mean", "measured_low", "measured_high", "before", "after", "joints")
+
+NO_REPLAY = "No pictures: a log without commands has no replay to show."
+NO_OPENGL = (
+    "No pictures: drawing needs OpenGL (Debian, Ubuntu: apt-get install libegl1 libgl1-mesa-dri). "
+    "The replay itself is in replay.npz."
+)
 
 
 @dataclass(frozen=True)
@@ -103,7 +109,7 @@ def read_run(run: Path) -> Run:
     frames = tuple(sorted((run / "frames").glob("*.png")))
     film = run / FILMS / REPLAY_FILM
     if not frames:
-        missing.append("frames/ holds no pictures: drawing needs OpenGL, see the documentation.")
+        missing.append(NO_OPENGL if (run / REPLAY).is_file() else NO_REPLAY)
     return Run(
         folder=run,
         config=config,

@@ -14,17 +14,22 @@ FOLDER = "tensorboard"
 _COUNTS = ("generation", "iteration", "step")  # what a progress value counts with
 
 
+def needs_writer(wanted: bool) -> None:
+    """ValueError that says what to install where scalars are wanted and nothing can write them."""
+    if wanted and importlib.util.find_spec("tensorboardX") is None:
+        raise ValueError("--tensorboard needs tensorboardX: pip install -e '.[tensorboard]' in the checkout")
+
+
 @contextlib.contextmanager
 def scalars(folder: Path | None) -> Iterator[Callable[[str, Any], None]]:
     """Write FOLDER/events*; yields the function that stages report to: (stage, its progress value).
 
     folder: None for nothing.  Raises ValueError where tensorboardX is not installed.
     """
+    needs_writer(folder is not None)
     if folder is None:
         yield lambda stage, value: None
         return
-    if importlib.util.find_spec("tensorboardX") is None:
-        raise ValueError("--tensorboard needs tensorboardX: pip install tensorboardX")
     from tensorboardX import SummaryWriter
 
     with SummaryWriter(str(folder)) as writer:

@@ -90,8 +90,8 @@ def _gap(run: Run, name: str) -> str:
     where = f"In “{name}”, on" if len(run.fit["gap"]) > 1 else "On"
     text = (
         f"{where} data that the fit did not see, simulation and {run.robot} differed by "
-        f"{number(gap['before'])} {run.torque_unit} before the fit (RMS over all joints) and differ by "
-        f"{number(gap['after'])} {run.torque_unit} after it"
+        f"{number(gap['before'])} {run.torque_unit} before the fit (norm over the joints, averaged over time) and "
+        f"differ by {number(gap['after'])} {run.torque_unit} after it"
     )
     floor, closed = gap.get("floor"), gap.get("closed")
     if gap["after"] > gap["before"]:

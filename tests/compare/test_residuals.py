@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from collections.abc import Mapping
 
 import mujoco
@@ -301,6 +302,32 @@ def test_holes_in_the_data_make_no_residual(scene: Scene):
     mask[0, 300:325] = False
     mask[1, 600:625] = False
     assert np.abs(without_noise(scene, CLOCK, mask)).max() < 3.0
+
+
+def test_holes_do_not_multiply_the_memory(scene: Scene):
+    """The filter of each column stands for all repeats: no array of repeats x columns x samples x samples."""
+    values = np.random.default_rng(0).normal(size=(12, STEPS, 3))
+    mask = np.random.default_rng(1).random(values.shape) > 0.05
+    tracemalloc.start()
+    comparison = compare(scene, recording(channel("torque", CLOCK, values, mask=mask)))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 4 * comparison.channels[0].kernel.nbytes
+
+
+def test_the_noise_of_a_single_repeat_is_restated_for_every_channel(scene: Scene):
+    """What is left of a replay, in the channel's own unit."""
+    values = rollout().torque[None], rollout().position[None]
+    channels = [channel(n, CLOCK, v) for n, v in zip(("torque", "position"), values, strict=True)]
+    comparison = compare(scene, recording(*channels), channels={"torque": 1.0, "position": 1.0})
+    wave = np.sin(2 * np.pi * 1.5 * CLOCK)[:, None]
+    tried = rollout(torque=rollout().torque + 0.5 * wave, position=rollout().position + 0.02 * wave)
+    restated = comparison.restated(tried)
+    torque, position = (1 / restated.channel(n).noise.whitener[:, 0, 0] for n in ("torque", "position"))
+    np.testing.assert_allclose(torque / position, 25.0, rtol=0.01)
+    assert np.all(torque > 0.3)
+    shape = restated.channel("position").noise.whitener.shape
+    assert np.mean(np.asarray(restated.whitened(tried)) ** 2) < 1.0 and shape == (3, shape[1], shape[1])
 
 
 # ----- what is refused

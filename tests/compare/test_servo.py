@@ -14,11 +14,13 @@ import pytest
 from droid_jax import runtime
 from droid_jax.compare.cost import make_cost
 from droid_jax.compare.population import over_population
-from droid_jax.compare.replay import Drive, check_gains, make_drive, servo_replay, torque_offset_effect
+from droid_jax.compare.replay import Drive, check_gains, make_drive, observed, servo_replay, torque_offset_effect
+from droid_jax.compare.residuals import CompareConfig
 from droid_jax.compare.twin import twin_replay
 from droid_jax.measure.recording import Channel, Recording, ServoGains, TorqueConvention, TorqueSide
 from droid_jax.model.door import time_offset, torque_offsets
 from droid_jax.model.fields import joint_damping
+from droid_jax.model.joint_friction import joint_friction_effect, joint_friction_space
 from droid_jax.model.parameters import Scaling, Space
 from droid_jax.model.physics import make_physics
 from droid_jax.model.scene import Scene, compile_scene, with_options
@@ -267,6 +269,160 @@ def test_motor_side_with_gravity_adds_the_compensated_weight(scene: Scene, drive
     np.testing.assert_allclose(heavy.torque[0] - rollout.torque[0], weight, atol=1e-4)
 
 
+def weighed(gravcomp: bool, motors: bool, gravity: bool) -> tuple[Rollout, np.ndarray]:
+    """A replay of the arm, and the weight [T, 2] N m at its poses; motors: actuatorgravcomp on the joints."""
+    xml = ARM.format(gravcomp='gravcomp="1"' if gravcomp else "", friction="", sensor="")
+    xml = xml.replace('axis="0 1 0"', f'axis="0 1 0" actuatorgravcomp="{str(motors).lower()}"')
+    scene = compile_scene(mujoco.MjSpec.from_string(xml), "arm", joints=JOINTS)
+    convention = TorqueConvention(TorqueSide.MOTOR, gravity)
+    got = run(scene, make_drive(scene, recording(torque=convention)), [{}])
+    q = got.position[0].astype(float)
+    return got, inverse(scene, q, 0 * q, 0 * q, armature=True, gravity=True)
+
+
+@pytest.mark.parametrize("gravity", [False, True])
+def test_weight_that_the_motors_compensate_is_counted_once(gravity: bool):
+    """With actuatorgravcomp the motors' torque contains the weight, and only then."""
+    (by_motors, weight), (elsewhere, _) = weighed(True, True, gravity), weighed(True, False, gravity)
+    np.testing.assert_allclose(by_motors.position[0], elsewhere.position[0], atol=1e-5)
+    np.testing.assert_allclose(by_motors.torque[0], elsewhere.torque[0], atol=1e-3)
+    servo = servo_torque(by_motors.position[0], 0.0) + gravity * weight
+    np.testing.assert_allclose(by_motors.torque[0], servo, atol=2e-4)
+    assert np.abs(weight).max() > 3.0
+
+
+def test_weight_that_nothing_compensates_is_refused_where_the_torque_holds_none(tmp_path: Path):
+    heavy = arm(gravcomp=False)
+    with pytest.raises(ValueError, match=r"'wave' says that its torque holds no weight.*shoulder, elbow.*gravcomp"):
+        make_drive(heavy, recording())
+    carried = TorqueConvention(TorqueSide.MOTOR, gravity=True)
+    torque = run(heavy, make_drive(heavy, recording(torque=carried)), [{}])
+    np.testing.assert_allclose(torque.torque[0], servo_torque(torque.position[0], 0.0), atol=2e-5)
+    make_drive(with_options(heavy, gravity=[0, 0, 0]), recording())
+    make_drive(arm(), recording())
+    make_cost(heavy, SPACE, [recording(channels=measured(0.2))], config=CompareConfig(channels={"position": 1.0}))
+
+
+def test_upright_axes_feel_no_weight():
+    xml = ARM.format(gravcomp="", friction="", sensor="").replace('axis="0 1 0"', 'axis="0 0 1"')
+    make_drive(compile_scene(mujoco.MjSpec.from_string(xml), "arm", joints=JOINTS), recording())
+
+
+# ----- servos with a velocity gain
+
+PENDULUM = """<mujoco><option timestep="{step}" integrator="implicitfast"/><worldbody>
+  <body gravcomp="1"><joint name="j" axis="0 1 0" armature="0.1" damping="0.5" {joint}/>
+    <geom type="capsule" size=".03" fromto="0 0 0 0 0 -.5" mass="2" contype="0" conaffinity="0"/></body>
+</worldbody><actuator><position name="j" joint="j" kp="600" kv="50" {actuator}/></actuator></mujoco>"""
+NOTHING = Space((time_offset(),))
+
+
+def pendulum(step: float = 0.004, *, joint: str = "", actuator: str = "") -> Scene:
+    spec = mujoco.MjSpec.from_string(PENDULUM.format(step=step, joint=joint, actuator=actuator))
+    return compile_scene(spec, "pendulum", joints=("j",))
+
+
+def swung(scene: Scene) -> tuple[Rollout, np.ndarray, np.ndarray]:
+    """The replay at 4 ms, and the torque and position of plain C at 0.05 ms."""
+    time = np.arange(251) * 0.004
+    command = 0.3 * np.sin(6 * time)[:, None] * np.clip(time / 0.3, 0, 1)[:, None]
+    drive = Drive(command, np.zeros(1), 0.004, MOTOR)
+    replay = servo_replay(scene, drive)
+    batch = over_population(lambda values: replay(make_physics(scene, NOTHING, values)))
+    fine = pendulum_c(scene, command, 5e-5)
+    return batch(NOTHING.mean[None]), *fine
+
+
+def pendulum_c(scene: Scene, command: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+    model = with_options(scene, timestep=step).model
+    data, sub = mujoco.MjData(model), round(0.004 / step)
+    out = np.empty((2, len(command)))
+    for k in range(len(command) * sub):
+        data.ctrl[:] = np.interp(k * step, np.arange(len(command)) * 0.004, command[:, 0])
+        position = data.qpos[0]
+        mujoco.mj_step(model, data)
+        if k % sub == 0:
+            out[:, k // sub] = data.qfrc_actuator[0], position
+    return out
+
+
+def test_a_servos_velocity_gain_acts_at_the_time_of_the_position():
+    """The torque is the servo's at the mean velocity of the step; at the velocity before it, it is 0.1 of it off."""
+    got, torque, _ = swung(pendulum())
+    assert rms(got.torque[0, :, 0] - torque) < 0.02 * rms(torque)
+
+
+@pytest.mark.parametrize("limit", [{"actuator": 'forcerange="-2 2"'}, {"joint": 'actuatorfrcrange="-2 2"'}])
+def test_a_servo_at_its_force_limit_damps_nothing(limit: dict[str, str]):
+    """What the limit holds does not follow the velocity: neither its torque nor the motion it makes."""
+    scene = pendulum(**limit)
+    got, torque, position = swung(scene)
+    assert np.mean(np.abs(torque) >= 2.0) > 0.2 and got.torque.max() <= 2.0
+    np.testing.assert_allclose(got.position[0, :, 0], position, atol=0.02 * np.ptp(position))
+
+
+def test_parity_with_a_velocity_gain_is_mj_step():
+    scene = pendulum(actuator='forcerange="-2 2"')
+    time = np.arange(251) * 0.004
+    command = 0.3 * np.sin(6 * time)[:, None]
+    replay = servo_replay(scene, Drive(command, np.zeros(1), 0.004, MOTOR), parity=True)
+    got = over_population(lambda values: replay(make_physics(scene, NOTHING, values)))(NOTHING.mean[None])
+    delayed = np.interp(time - 0.002, time, command[:, 0])[:, None]
+    torque, _ = pendulum_c(scene, delayed, 0.004)
+    np.testing.assert_allclose(got.torque[0, :, 0], torque, atol=1e-3)
+
+
+# ----- where a motion starts
+
+
+def measured(first: float, columns: tuple[str, ...] = JOINTS) -> dict[str, Channel]:
+    """Positions that begin at `first` and `first` + 0.1 in the two repeats, and torques."""
+    time, command = motion()
+    values = np.stack([command + first, command + first + 0.1]) - command[0]
+    position = Channel("position", "rad", columns, time, values[..., : len(columns)], np.ones_like(values, bool))
+    return {**recording().channels, "position": replace(position, mask=np.ones(position.values.shape, bool))}
+
+
+def test_a_motion_starts_where_it_says_else_where_it_was_measured_else_where_it_was_sent(scene: Scene):
+    _, command = motion()
+
+    def start(**changes) -> list[float]:
+        return make_drive(scene, recording(**changes)).qpos0.tolist()
+
+    assert start() == [0.0, -0.3]
+    assert start(qpos0={"elbow": 0.7}, channels=measured(0.2)) == pytest.approx([0.25, 0.7])
+    assert start(qpos0={}, channels=measured(0.2, ("shoulder",))) == pytest.approx([0.25, command[0, 1]])
+    assert start(qpos0={}) == pytest.approx([0.0, -0.3])
+
+
+def test_a_start_that_would_be_a_guess_is_refused():
+    xml = ARM.format(gravcomp='gravcomp="1"', friction="", sensor="")
+    xml = xml.replace('<position name="s" joint="shoulder" kp="60"/>', '<motor name="s" joint="shoulder"/>')
+    driven = compile_scene(mujoco.MjSpec.from_string(xml), "arm", joints=JOINTS)
+    with pytest.raises(ValueError, match="does not tell where shoulder starts"):
+        make_drive(driven, recording(qpos0={}, gains=None))
+    started = make_drive(driven, recording(qpos0={}, gains=None, channels=measured(0.2)))
+    np.testing.assert_allclose(started.qpos0, [0.25, 0.25])
+
+
+def test_an_object_starts_where_it_was_seen_unless_a_cameras_noise_is_all(scene: Scene):
+    spec = mujoco.MjSpec.from_string(ARM.format(gravcomp='gravcomp="1"', friction="", sensor=""))
+    door = spec.worldbody.add_body(name="door", pos=[0, 2, 0])
+    door.add_joint(name="hinge", axis=[0, 0, 1])
+    door.add_geom(size=[0.1, 0, 0])
+    scene = compile_scene(spec, "arm and door", joints=JOINTS, object_joint="hinge")
+    time, _ = motion()
+
+    def start(angle: float, **named: float) -> float:
+        seen = np.full((2, len(time), 1), angle) + 0.1 * time[:, None]
+        camera = Channel("object_angle", "rad", ("lid",), time, seen, np.ones(seen.shape, bool))
+        channels = {**recording().channels, "object_angle": camera}
+        drive = make_drive(scene, recording(channels=channels, qpos0={**recording().qpos0, **named}))
+        return float(drive.qpos0[scene.qpos("hinge")])
+
+    assert start(0.005) == 0.0 and start(0.4) == pytest.approx(0.4) and start(0.4, hinge=0.1) == 0.1
+
+
 # ----- effects
 
 
@@ -309,8 +465,34 @@ def test_the_twin_refuses_what_it_cannot_run(scene: Scene, drive: Drive):
     with pytest.raises(ValueError, match="cannot run effects that depend on the state: kick"):
         twin_replay(scene, SPACE, drive, [kick])
     for convention in (TorqueConvention(TorqueSide.LINK, False), TorqueConvention(TorqueSide.MOTOR, True)):
-        with pytest.raises(ValueError, match="motor-side torque without gravity only"):
+        with pytest.raises(ValueError, match="the actuators' torque alone: motor-side"):
             twin_replay(scene, SPACE, replace(drive, torque=convention))
+
+
+# ----- a cost over such replays
+
+
+def test_a_cost_serves_other_repeats_of_the_same_motion_alone(scene: Scene):
+    cost = make_cost(scene, SPACE, [recording()])
+    elsewhere = {"shoulder": 0.5, "elbow": -0.3}
+    for other in (
+        recording(command=motion()[1] + 0.1),
+        recording(qpos0=elsewhere),
+        recording(torque=TorqueConvention(TorqueSide.LINK, False)),
+        recording(torque=TorqueConvention(TorqueSide.MOTOR, True)),
+    ):
+        with pytest.raises(ValueError, match="other commands than 'wave' had, starts elsewhere"):
+            cost.against([other])
+    near = cost.against([recording(qpos0={"shoulder": 0.002, "elbow": -0.3})])  # measured starts scatter
+    np.testing.assert_array_equal(near.drives[0].qpos0, cost.drives[0].qpos0)  # pyright: ignore
+
+
+def test_joint_friction_that_is_given_as_an_effect_counts_once(scene: Scene):
+    friction = joint_friction_space(JOINTS).select(["coulomb[elbow]"])
+    values = np.array([[0.5]])
+    own = make_cost(scene, friction, [recording()]).rollouts(values)[0]
+    given = make_cost(scene, friction, [recording()], effects=(joint_friction_effect(JOINTS),)).rollouts(values)[0]
+    np.testing.assert_allclose(given.torque, own.torque, atol=1e-6)
 
 
 # ----- what is refused
@@ -366,9 +548,18 @@ def test_a_replay_that_blows_up_costs_the_penalty_and_harms_no_other(engine: str
     assert np.isfinite(z).all() and np.mean(z[1] ** 2) > 100 * np.mean(z[0] ** 2)
 
 
+@pytest.mark.parametrize("trace", ["torque", "position", "velocity", "object_angle"])
+def test_a_rollout_with_a_number_that_is_none_is_not_finite(trace: str):
+    still = Rollout(*np.zeros((7, 5, 2)))
+    assert observed(still, {}, ()).finite
+    broken = getattr(still, trace).copy()
+    broken[3, 1] = np.inf
+    assert not observed(replace(still, **{trace: broken}), {}, ()).finite
+
+
 def test_actuators_with_a_state_of_their_own_are_refused(tmp_path: Path):
     """The scan does not carry activations: a filtered actuator would be reset at every step."""
-    xml = ARM.format(gravcomp="", friction="", sensor="").replace(
+    xml = ARM.format(gravcomp='gravcomp="1"', friction="", sensor="").replace(
         '<position name="s" joint="shoulder" kp="60"/>',
         '<position name="s" joint="shoulder" kp="60" timeconst="0.1"/>',
     )

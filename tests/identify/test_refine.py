@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from droid_jax.identify.refine import HOP_POPULATION, RefineConfig, _Problem, refine
+from droid_jax.identify.refine import HOP_POPULATION, RefineConfig, _Problem, chord, refine
 from droid_jax.model.parameters import Parameter, Scaling, Space
 
 
@@ -310,12 +310,41 @@ def test_starts_that_all_fail_are_refused():
 def test_a_start_that_fails_is_dropped_while_another_wins():
     matrix = np.array([[2.0, 1.0], [1.0, 3.0], [1.0, -1.0]])
     solved = linear(matrix, matrix @ [1.0, 2.0])
-    recorder = Recorder(lambda v: np.where(v[:, :1] > 50.0, np.nan, solved(v)))
+
+    def replayed(values):
+        BASINS.check(values)  # as a cost does: no NaN among the values that it is asked for
+        return np.where(values[:, :1] > 50.0, np.nan, solved(values))
+
+    recorder = Recorder(replayed)
     fit = refine(recorder, BASINS, [[100.0, 0.0], [0.0, 0.0]], FLAT)
     np.testing.assert_allclose(fit.best, [1.0, 2.0], atol=1e-6)
     assert np.isinf(fit.starts[0]) and fit.starts[1] == pytest.approx(fit.objective, abs=1e-6)
-    assert len(recorder.asked[0]) == 2 and len(recorder.asked[1]) == 8  # both starts and their differences,
-    assert [len(rows) for rows in recorder.asked if len(rows) < 32].count(8) == 1  # then one start alone
+    assert len(recorder.asked[0]) == 2 and len(recorder.asked[1]) == 4  # both starts, then the differences of one
+
+
+def test_a_hypothesis_that_fails_is_dropped_while_another_wins():
+    """What lies beyond s = 50 cannot be replayed, and neither can steps from there be asked for."""
+
+    def replayed(values):
+        BASINS.check(values)
+        return np.where(values[:, :1] > 50.0, np.nan, two_basins(values))
+
+    hypotheses = [{"s": 90.0}, {"s": -3.0}]
+    fit = refine(replayed, BASINS, [3.2, 14.0], FLAT, hypotheses=hypotheses)
+    assert fit.best[0] == pytest.approx(-3.0, abs=1e-3)
+    alone = refine(replayed, BASINS, [3.2, 14.0], FLAT, hypotheses=hypotheses[:1])
+    assert alone.best[0] > 0
+
+
+def test_a_start_that_fails_on_all_the_data_is_refused():
+    with pytest.raises(ValueError, match="could not be replayed on all"):
+        refine(lambda v: np.full((len(v), 3), np.nan), BASINS, [3.2, 14.0], FLAT, first=two_basins)
+
+
+def test_a_first_look_from_where_nothing_can_be_replayed_stays_there():
+    values, objective = chord(lambda v: np.full((len(v), 2), np.nan), BASINS, np.array([1.0, 2.0]), np.eye(2))
+    np.testing.assert_allclose(values, [1.0, 2.0])
+    assert np.isinf(objective)
 
 
 def test_a_trial_that_fails_is_not_taken():

@@ -6,9 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 
+from droid_jax.measure import engine
 from droid_jax.measure.demonstration import demonstration_path
 from droid_jax.measure.engine import Trace, instrument, simulate
 from droid_jax.measure.formats import load
+from droid_jax.measure.surrogate import _carries_weight
 from droid_jax.model.door import door_space, truth
 from droid_jax.model.door_scene import door_scene
 from droid_jax.model.physics import make_c_model
@@ -44,6 +46,27 @@ def start(scene: Scene) -> np.ndarray:
 @pytest.fixture(scope="module")
 def trace(scene: Scene, models: list[mujoco.MjModel], control: np.ndarray, start: np.ndarray) -> Trace:
     return simulate(scene, models, start, control)
+
+
+def test_a_torque_holds_the_weight_that_nothing_but_the_motors_carries():
+    """No compensation, one outside the motors, and one by them (actuatorgravcomp)."""
+    xml = """<mujoco><worldbody><body {body}><joint name="j" axis="0 1 0" {joint}/><geom size=".1" pos=".3 0 0"/></body>
+    </worldbody><actuator><position joint="j" kp="9"/></actuator></mujoco>"""
+    lifted, own = 'gravcomp="1"', 'actuatorgravcomp="true"'
+    for body, joint, carried in (("", "", True), (lifted, "", False), (lifted, own, True), ("", own, True)):
+        scene = compile_scene(mujoco.MjSpec.from_string(xml.format(body=body, joint=joint)), "one")
+        assert _carries_weight(scene) is carried
+        assert not _carries_weight(with_options(scene, gravity=[0.0, 0.0, 0.0]))
+
+
+def test_no_more_threads_than_this_process_may_use(
+    scene: Scene, models: list[mujoco.MjModel], control: np.ndarray, start: np.ndarray, monkeypatch: pytest.MonkeyPatch
+):
+    asked, own = [], engine.rollout.Rollout
+    monkeypatch.setattr(engine.runtime, "cores", lambda: 1)
+    monkeypatch.setattr(engine.rollout, "Rollout", lambda nthread: asked.append(nthread) or own(nthread=nthread))
+    simulate(scene, models, start, control[:, :3])
+    assert asked == [1]
 
 
 def stepped(scene: Scene, model: mujoco.MjModel, qpos: np.ndarray, control: np.ndarray) -> dict[str, np.ndarray]:

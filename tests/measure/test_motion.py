@@ -53,6 +53,22 @@ def test_a_lower_cutoff_lets_less_noise_through():
     assert errors[1] < 0.1 * errors[0]
 
 
+def test_a_clock_that_jitters_is_no_other_motion():
+    """A filter that took the samples for evenly spaced would see hundreds of rad/s^2."""
+    jitter = np.random.default_rng(2).uniform(-0.45, 0.45, len(TIME)) * 1e-3
+    time = TIME + np.r_[0.0, jitter[1:-1], 0.0]
+    kept = np.r_[0:2000, 2010:4000, 4015:6000]  # and where 10 and 15 samples were lost
+    motion = measured_motion(log(sines(time[kept])[None], time[kept]), JOINTS)
+    np.testing.assert_allclose(motion.position, sines(motion.time), atol=1e-3)
+    np.testing.assert_allclose(motion.acceleration, sines(motion.time, 2), atol=0.15)
+
+
+def test_a_gap_that_no_filter_bridges_is_refused():
+    kept = np.r_[0:2000, 2200:6000]
+    with pytest.raises(ValueError, match=r"no position for 0\.201 s from 1\.999 s on.*cutoff below 1\.99 Hz"):
+        measured_motion(log(sines(TIME[kept])[None], TIME[kept]), JOINTS)
+
+
 def test_what_cannot_be_a_motion_is_refused():
     with pytest.raises(ValueError, match="lack wrist"):
         measured_motion(log(sines(TIME)[None]), ("a", "wrist"))

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from droid_jax.commands import convert
 from droid_jax.measure import csv_folder
 from droid_jax.measure.clocks import resample
 from droid_jax.measure.formats import load, save
@@ -161,8 +162,10 @@ def test_bags_without_the_package_say_what_to_install(tmp_path: Path, monkeypatc
     for name in ("rosbags", "rosbags.highlevel"):
         monkeypatch.setitem(sys.modules, name, None)
     (tmp_path / "a.bag").write_text("x")
-    with pytest.raises(ImportError, match=r"a\.bag: reading ROS bags needs .* pip install rosbags"):
+    with pytest.raises(ValueError, match=r"ROS bags need rosbags: pip install .* '\.\[ros\]' in the checkout"):
         load(tmp_path / "a.bag", joints=JOINTS, torque=make().torque)
+    with pytest.raises(ValueError, match="ROS bags need rosbags"):  # several, which convert reads by itself
+        convert.run(convert.Convert(source=(tmp_path / "a.bag", tmp_path / "a.bag"), joints=JOINTS, torque="link"))
 
 
 # npz

@@ -15,6 +15,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
+from droid_jax.measure import rosbag
 from droid_jax.measure.formats import load, save
 from droid_jax.measure.recording import TorqueConvention, TorqueSide
 from droid_jax.measure.rosbag import Stamps, read_bags
@@ -350,13 +351,49 @@ def test_convert_turns_bags_into_a_recording(tmp_path: Path, capsys: pytest.Capt
     assert (part.span, part.repeats) == (pytest.approx((0.2, 0.6)), 3)
 
 
+def test_a_converted_motion_is_called_as_its_file_unless_told_otherwise(tmp_path: Path) -> None:
+    """Bags of every motion are called alike, and a fit tells motions by their names."""
+    paths = [pulled(tmp_path, "ros1", f"repeat_{i:02d}") for i in range(2)]
+    said = ["--joints", *JOINTS, "--torque", "link"]
+    for bags in (paths, paths[:1]):
+        assert convert(*bags, *said, "--out", tmp_path / "door.npz") == 0
+        assert load(tmp_path / "door.npz").name == "door"
+    assert convert(*paths, *said, "--name", "slow", "--out", tmp_path / "door.npz") == 0
+    assert load(tmp_path / "door.npz").name == "slow"
+    assert convert(tmp_path / "door.npz", "--out", tmp_path / "csv") == 0  # a name that it has stays
+    assert load(tmp_path / "csv").name == "slow"
+
+
+def test_convert_hands_on_what_the_reader_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    paths = [pulled(tmp_path, "ros1", f"run{i}") for i in range(2)]
+    said = ["--joints", *JOINTS, "--torque", "link", "--command-topic", "/command", "--rate", "50", "--stamps", "bag"]
+    more = ["--command-joints", *JOINTS, "--command-tolerance", "0.5", "--allow-jitter"]
+    assert convert(*paths, *said, *more, "--out", tmp_path / "door.npz") == 0
+    found = load(tmp_path / "door.npz")
+    assert np.diff(found.time) == pytest.approx(0.02) and found.meta["stamps"] == "bag"
+    given = {}
+    monkeypatch.setattr(rosbag, "read_bags", lambda paths, **options: given.update(options) or found)
+    assert convert(*paths, *said, *more, "--out", tmp_path / "again.npz") == 0
+    assert given["command_tolerance"] == 0.5 and given["allow_jitter"] and given["command_joints"] == JOINTS
+
+
+def test_convert_resamples_tables_with_clocks_of_their_own(tmp_path: Path) -> None:
+    paths = [pulled(tmp_path, "ros1", f"run{i}") for i in range(2)]
+    assert convert(*paths, "--joints", *JOINTS, "--torque", "link", "--out", tmp_path / "csv") == 0
+    table = tmp_path / "csv" / "torque_01.csv"
+    table.write_text("".join(table.read_text().splitlines(keepends=True)[:-3]))
+    assert convert(tmp_path / "csv", "--out", tmp_path / "door.npz") == 2
+    assert convert(tmp_path / "csv", "--resample", "--out", tmp_path / "door.npz") == 0
+    assert load(tmp_path / "door.npz").repeats == 2
+
+
 def test_convert_says_what_a_bag_lacks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     paths = [pulled(tmp_path, "ros1", f"run{i}") for i in range(2)]
     out = tmp_path / "door.npz"
     named = ["--joints", *JOINTS, "--torque", "motor"]
     for arguments, expected in [
         (paths, "give --joints, --torque"),
-        (paths[:1], "pass joints and torque"),
+        (paths[:1], "give --joints, --torque"),
         ([*paths, *named, "--stiffness", "80", "40"], "got 2 --stiffness and 0 --damping"),
         ([*paths, *named, "--command-topic", "/nothing"], "/nothing"),
         ([], "needs the files or folders to read"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
@@ -9,10 +11,10 @@ import pytest
 import droid_jax as dj
 from droid_jax.model.door import door_nuisances
 from droid_jax.model.fields import body_mass
-from droid_jax.model.mjcf import fitted_mjcf
-from droid_jax.model.parameters import Space
+from droid_jax.model.mjcf import fitted_mjcf, unwritten
+from droid_jax.model.parameters import Parameter, Space, Write
 from droid_jax.model.physics import make_c_model
-from droid_jax.model.scene import compile_scene
+from droid_jax.model.scene import Scene, compile_scene, load_scene
 
 FIELDS = (
     "dof_damping",
@@ -64,6 +66,22 @@ def test_a_mass_that_geoms_make_up(heavier: str) -> None:
     assert expected.body(heavier).mass[0] == pytest.approx(1.3 * scene.model.body(heavier).mass[0])
 
 
+@pytest.mark.parametrize(
+    "turned", ['diaginertia=".03 .025 .02" euler="20 30 40"', 'fullinertia=".03 .025 .02 .001 .002 .003"']
+)
+def test_a_mass_that_the_body_states(turned: str) -> None:
+    """Its inertia is turned as the file says, in whatever words."""
+    stated = GEOMS.replace('<compiler inertiafromgeom="true"/>', "").replace(
+        '<joint name="swing"', f'<inertial pos="0 .1 .2" mass="2" {turned}/><joint name="swing"'
+    )
+    scene = compile_scene(mujoco.MjSpec.from_string(stated), "stated")
+    space = Space((body_mass(scene, "arm", std=0.2, high=50.0),))
+    written = mujoco.MjModel.from_xml_string(fitted_mjcf(scene, space, 1.3 * space.mean))
+    expected = make_c_model(scene, space, 1.3 * space.mean)
+    for field in (*FIELDS, "body_iquat"):
+        np.testing.assert_allclose(getattr(written, field), getattr(expected, field), rtol=1e-4, atol=1e-5)
+
+
 def test_what_has_no_name_is_written_too() -> None:
     """Bodies and contact pairs, as MJCF allows."""
     pairs = '<contact><pair geom1="bar" geom2="end" friction="1 1 0.1 0 0"/></contact></mujoco>'
@@ -77,3 +95,82 @@ def test_what_has_no_name_is_written_too() -> None:
     expected = make_c_model(scene, space, 1.3 * space.mean)
     for field in (*FIELDS, "pair_friction"):
         np.testing.assert_allclose(getattr(written, field), getattr(expected, field), rtol=1e-4, atol=1e-9)
+
+
+# Frames, Euler angles, degrees, ends of a capsule, a servo that inherits its range, and looks that weigh something.
+TURNED = """<mujoco>
+  <worldbody><frame pos="1 0 0" euler="0 0 90"><body name="arm" pos="0 1 0" euler="0 0 30">
+    <joint name="swing" axis="0 1 0" range="-45 60" damping="1" armature=".02"/>
+    <geom name="look" type="box" size=".03 .03 .03" pos=".2 0 0" group="2" contype="0" conaffinity="0"/>
+    <frame pos="0 0 .5"><geom name="bone" type="capsule" fromto="0 0 0 0 0 .2" size=".03"/></frame></body></frame>
+    <geom name="floor" type="plane" size="1 1 .1"/></worldbody>
+  <contact><pair geom1="bone" geom2="floor"/></contact>
+  <actuator><position name="swing" joint="swing" kp="50" inheritrange="1"/></actuator>
+</mujoco>"""
+WRITTEN = [
+    ("dof_armature", (0,), 0.07), ("dof_damping", (0,), 2.0), ("jnt_range", (0, 1), 0.9), ("jnt_axis", (0, 0), 0.1),
+    ("body_pos", (1, 0), 0.4), ("body_quat", (1, 3), 0.2), ("body_ipos", (1, 2), 0.55),
+    ("body_inertia", (1, 0), 0.0691),
+    ("geom_friction", (1, 0), 0.3), ("geom_size", (1, 1), 0.15), ("geom_pos", (1, 0), 0.01),
+    ("pair_solimp", (0, 2), 0.003), ("pair_solref", (0, 0), 0.03), ("actuator_gear", (0, 0), 1.2),
+    ("actuator_forcerange", (0, 1), 3.0), ("actuator_biasprm", (0, 2), -4.0),
+]  # fmt: skip
+
+
+def one(scene: Scene, field: str, index: tuple[int, ...], value: float) -> Space:
+    return Space((Parameter(field, "-", value, 0.1, value - 9.0, value + 9.0, writes=(Write(field, index),)),))
+
+
+@pytest.mark.parametrize(("field", "index", "value"), WRITTEN)
+def test_every_field_that_has_an_attribute_is_written(field: str, index: tuple[int, ...], value: float):
+    """And nothing else changes, however the file says where things are; without the looks, which lie behind."""
+    scene = compile_scene(mujoco.MjSpec.from_string(TURNED), "turned")
+    index = (scene.id("geom", "bone"), *index[1:]) if field.startswith("geom_") else index
+    space = one(scene, field, index, value)
+    assert unwritten(scene, space) == ()
+    expected = make_c_model(scene, space, space.mean)
+    assert getattr(expected, field)[index] != getattr(scene.model, field)[index]
+    written = compile_scene(mujoco.MjSpec.from_string(fitted_mjcf(scene, space, space.mean)), "written").model
+    for name in (*FIELDS, "dof_armature", "jnt_range", "jnt_axis", "geom_friction", "geom_size", "geom_pos",
+                 "pair_solimp", "pair_solref", "actuator_gear", "actuator_biasprm", "actuator_ctrlrange"):  # fmt: skip
+        axis = getattr(expected, name) / (np.linalg.norm(expected.jnt_axis) if name == "jnt_axis" else 1.0)
+        np.testing.assert_allclose(getattr(written, name), axis, rtol=1e-4, atol=1e-6, err_msg=name)
+
+
+def test_looks_keep_their_weight_in_what_is_written():
+    """The mass of what is only for the eye counts in the file as it does in the replay."""
+    scene = compile_scene(mujoco.MjSpec.from_string(TURNED), "turned")
+    space = one(scene, "dof_damping", (0,), 2.0)
+    written = mujoco.MjModel.from_xml_string(fitted_mjcf(scene, space, space.mean))
+    np.testing.assert_allclose(written.body_mass, scene.model.body_mass, rtol=1e-5)
+    assert written.body("arm").mass[0] > 0.2 + 1000 * 0.2 * np.pi * 0.03**2  # the bone alone, about
+
+
+def test_what_mjcf_cannot_say_is_named():
+    scene = compile_scene(mujoco.MjSpec.from_string(TURNED), "turned")
+    offset = Parameter("time_offset", "s", 0.0, 0.1, -1.0, 1.0)
+    space = one(scene, "dof_damping", (0,), 2.0) + one(scene, "actuator_acc0", (0,), 2.0) + Space((offset,))
+    assert unwritten(scene, space) == ("actuator_acc0", "time_offset")
+    fitted_mjcf(scene, space, space.mean)
+
+
+def test_meshes_are_found_from_any_folder(tmp_path: Path):
+    """meshdir is relative to the file that was read; what is written lies elsewhere."""
+    (tmp_path / "robot" / "parts").mkdir(parents=True)
+    corners = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1))
+    faces = (
+        "f 1 2 4\nf 1 4 3\nf 5 8 6\nf 5 7 8\nf 1 6 2\nf 1 5 6\nf 3 4 8\nf 3 8 7\nf 1 3 7\nf 1 7 5\nf 2 6 8\nf 2 8 4\n"
+    )
+    (tmp_path / "robot" / "parts" / "cube.obj").write_text(corners + faces)
+    (tmp_path / "robot" / "robot.xml").write_text(
+        """<mujoco><compiler meshdir="parts"/><asset><mesh name="cube" file="cube.obj" scale=".1 .1 .1"/></asset>
+        <worldbody><body name="arm"><joint name="swing" axis="0 1 0" damping="1"/><geom type="mesh" mesh="cube"/></body>
+        </worldbody><actuator><position joint="swing" kp="50"/></actuator></mujoco>"""
+    )
+    scene = load_scene(tmp_path / "robot" / "robot.xml")
+    space = one(scene, "dof_damping", (0,), 2.0)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "fitted.xml").write_text(fitted_mjcf(scene, space, space.mean))
+    written = mujoco.MjModel.from_xml_path(str(tmp_path / "run" / "fitted.xml"))
+    assert written.nmeshvert == 8 and written.dof_damping[0] == 2.0
+    assert unwritten(scene, one(scene, "geom_size", (0, 0), 0.2)) == ("geom_size",)

@@ -80,6 +80,7 @@ def test_numpy_and_jax_agree_and_keep_their_kind():
         (dict(low=3.0), "must be below high"),
         (dict(std=0.0), "std must be positive"),
         (dict(std=-1.0), "std must be positive"),
+        (dict(width=0.0), "width must be positive"),
         (dict(mean=math.nan), "must be finite"),
         (dict(high=math.inf), "must be finite"),
     ],
@@ -127,6 +128,17 @@ def test_check_says_which_value_is_outside(bad: float):
     values[2, 1] = bad
     with pytest.raises(ValueError, match=r"'damping'.*N m s/rad is not inside its bounds \[0.0, 20.0\]"):
         SPACE.check(values)
+
+
+def test_check_takes_a_bound_in_single_precision_for_the_bound():
+    """0.01 is 0.00999999978 in float32; a millionth of the range is no other value."""
+    space = Space((linear(mean=0.05, low=0.01, high=0.1),))
+    for bound in (0.01, 0.1):
+        single = np.array([np.float32(bound)])
+        assert not 0.01 <= float(single[0]) <= 0.1
+        np.testing.assert_array_equal(space.check(single), [bound])
+    with pytest.raises(ValueError, match="not inside its bounds"):
+        space.check(np.array([0.01 - 1e-5]))
 
 
 def test_check_refuses_other_lengths():

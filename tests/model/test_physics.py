@@ -17,7 +17,7 @@ from droid_jax.model.builtin import ARM
 from droid_jax.model.door import door_nuisances, door_space
 from droid_jax.model.door_scene import door_scene
 from droid_jax.model.fields import body_mass, model_parameter, servo_scale
-from droid_jax.model.parameters import Mode, Space
+from droid_jax.model.parameters import Mode, Parameter, Space, Write
 from droid_jax.model.physics import derive, make_c_model, make_physics, theta_of, written_fields
 from droid_jax.model.scene import LOOK_GROUP, Scene, compile_scene
 
@@ -314,3 +314,17 @@ def test_parameters_of_one_entry_act_one_after_the_other():
     np.testing.assert_allclose(in_mjx.actuator_gainprm[2, 0], expected, rtol=1e-6)
     np.testing.assert_allclose(in_c.actuator_gainprm[2, 0], expected, rtol=1e-12)
     np.testing.assert_allclose(in_c.actuator_biasprm[2, 1], -expected, rtol=1e-12)
+
+
+def test_what_mjx_would_leave_out_is_refused(scene: Scene):
+    """A hand-made write too: nothing is accepted and then never applied."""
+    for field, says in (("actuator_damping", "does not simulate it"), ("geom_fluid", "takes it as fixed")):
+        write = Write(field, (0,) if field == "actuator_damping" else (0, 0))
+        unread = Space((Parameter("unread", "-", 0.5, 0.1, 0.0, 1.0, writes=(write,)),))
+        with pytest.raises(ValueError, match=says):
+            make_physics(scene, unread, jnp.asarray([0.5]))
+    xml = "<mujoco><worldbody><body name='b'><joint name='j'/><geom size='.1'/></body></worldbody></mujoco>"
+    bare = compile_scene(mujoco.MjSpec.from_string(xml), "bare")
+    lift = Space((Parameter("lift", "-", 0.5, 0.1, 0.0, 1.0, writes=(Write("body_gravcomp", (1,)),)),))
+    with pytest.raises(ValueError, match="compiled without gravity compensation"):
+        make_physics(bare, lift, jnp.asarray([0.5]))

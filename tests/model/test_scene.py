@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from droid_jax.measure.engine import instrument
 from droid_jax.model.builtin import ARM, FINGERS
 from droid_jax.model.door import door_space, truth
 from droid_jax.model.door_scene import LEVERS, door_scene
@@ -297,6 +298,27 @@ def test_friction_loss_rows_exist_only_where_asked(tmp_path: Path):
     joint_frictionloss(scene, "j", std=1.0, mean=0.1, high=2.0)
     with pytest.raises(ValueError, match=r"unknown joint 'k'.*has: free, j"):
         load_scene(file, friction_joints=["k"])
+
+
+def test_what_is_only_for_the_eye_weighs_and_touches_as_before():
+    """Geoms of group 2 go where nothing can touch them; their mass stays with their body."""
+    xml = """<mujoco>{compiler}<worldbody><geom name="floor" type="plane" size="1 1 1"/>
+      <body name="arm" pos="0 0 1"><joint name="swing" axis="0 1 0"/>
+        <geom name="bone" type="capsule" size=".02 .2"/>
+        <geom name="cover" type="box" size=".1 .05 .05" pos=".1 0 0" group="2" contype="0" conaffinity="0" mass="0.7"/>
+        <geom name="bumper" type="sphere" size=".03" group="2"/>
+        <geom name="paired" type="sphere" size=".02" group="2" contype="0" conaffinity="0"/></body>
+      <body name="painted"><joint name="turn"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>
+        <geom type="sphere" size=".1" group="2" contype="0" conaffinity="0"/></body></worldbody>
+      <contact><pair geom1="paired" geom2="floor"/></contact>
+      <actuator><position name="swing" joint="swing" kp="9"/></actuator></mujoco>"""
+    for compiler in ("", '<compiler inertiafromgeom="true"/>'):
+        whole = mujoco.MjModel.from_xml_string(xml.format(compiler=compiler))
+        scene = compile_scene(mujoco.MjSpec.from_string(xml.format(compiler=compiler)), "covered")
+        for model in (scene.model, instrument(scene)):
+            assert [model.geom(i).name for i in range(model.ngeom)] == ["floor", "bone", "bumper", "paired"]
+            for field in ("body_mass", "body_inertia", "body_ipos", "body_iquat", "dof_M0"):
+                np.testing.assert_allclose(getattr(model, field), getattr(whole, field), rtol=1e-12)
 
 
 def test_a_file_that_is_missing_or_broken_is_named(tmp_path: Path):

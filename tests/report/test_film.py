@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from droid_jax.report import film as module
-from droid_jax.report.film import LONGEST, SIZE, film
+from droid_jax.report.film import LONGEST, LOOPS, SIZE, film
 
 MODEL = mujoco.MjModel.from_xml_string(
     "<mujoco><worldbody><body><joint name='hinge'/><geom size='.1'/></body></worldbody></mujoco>"
@@ -38,6 +38,7 @@ def test_two_sides_move_together(drawn, tmp_path: Path):
     film(tmp_path / "film.webp", MODEL, (states(40), states(40, 0.5)), 0.04, None)
     with Image.open(tmp_path / "film.webp") as found:
         assert found.size == (2 * SIZE[1], SIZE[0]) and found.n_frames == 20  # type: ignore[attr-defined]
+        assert found.info["loop"] == LOOPS > 0  # motion without end could not be stopped
         found.seek(19)
         last = np.asarray(found.convert("L"), float)
     left, right = last[:, : SIZE[1]].mean(), last[:, SIZE[1] :].mean()

@@ -63,7 +63,13 @@ def _console(stderr: str) -> list[str]:
 
 
 SIZES = pytest.mark.parametrize(
-    ("size", "shown", "hidden"), [((1200, 900), "wide", "narrow"), ((500, 900), "narrow", "wide")]
+    ("size", "shown", "hidden"),
+    [
+        ((1200, 900), "wide", "narrow"),
+        ((834, 1112), "wide", "narrow"),  # a tablet
+        ((720, 900), "wide", "narrow"),
+        ((500, 900), "narrow", "wide"),
+    ],
 )
 
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import io
+import re
 from types import SimpleNamespace
 
 import pytest
+from rich.console import Console
 
 from droid_jax.report import progress
 
@@ -36,6 +39,42 @@ def test_stages_and_training_write_lines_where_there_is_no_terminal(capsys: pyte
     assert refine.startswith("refine 1/30 mean square 2 (noise: 1) (0 s")
     assert compiling == "training 0/100 compiling, a minute (0 s)"
     assert done.startswith("training 100/100 reward 3  success 50%  1,000 actions/s")
+
+
+def test_steps_that_are_named_are_counted_against_the_most_that_a_round_has(capsys: pytest.CaptureFixture) -> None:
+    """A text says that a step begins; the time left is that of all the others of its round."""
+    times = iter([0.0, 0.0, 30.0, 60.0, 60.0, 90.0, 120.0, 120.0])
+    lines = progress.Lines(clock=lambda: next(times), line=progress.Steps({"look": 4, "refit": 1}).line)
+    for stage, value in (
+        ("screen", "base model"), ("look", "latch"), ("look", "drag"), ("look", "closer"),
+        ("refit", "latch"), ("refit", "drag"), ("look", "latch + drag"), ("judge", None),
+    ):  # fmt: skip
+        lines.report(stage, value)
+    assert capsys.readouterr().out.splitlines() == [
+        "screen base model (0 s)",
+        "look 0/4 latch (0 s)",
+        "look 1/4 drag (30 s)",
+        "look 2/4 closer (60 s, about 60 s left)",
+        "refit 0/1 latch (0 s)",
+        "refit 1/2 drag (30 s)",
+        "look 0/4 latch + drag (0 s)",
+        "judge (0 s)",
+    ]
+
+
+def test_bars_take_every_kind_of_progress(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a terminal; a stage that comes again begins anew."""
+    terminal = Console(force_terminal=True, file=io.StringIO(), width=120)
+    monkeypatch.setattr(progress, "Console", lambda: terminal)
+    monkeypatch.setattr("rich.progress.get_console", lambda: terminal)
+    with progress.stages(["search", "look", "judge"], {"look": 3}) as report:
+        report("search", SimpleNamespace(generation=1, generations=2, best_cost=0.5, sigma=1.0))
+        for name in ("latch", "drag"):
+            report("look", name)
+        report("judge", None)
+        report("look", "closer")
+    shown = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", terminal.file.getvalue())  # type: ignore[attr-defined]
+    assert re.search(r"look .* 3/3 closer", shown) and re.search(r"judge .* 1/1", shown)
 
 
 def test_equal_things_are_counted(capsys: pytest.CaptureFixture) -> None:

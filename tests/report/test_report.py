@@ -120,6 +120,13 @@ def test_texts_of_the_run_are_escaped(run: Path) -> None:
     assert "cold &lt;1 h" in text and "cold <1 h" not in text
 
 
+def test_two_kinds_of_torque_difference_are_told_apart(written: Page) -> None:
+    """Equation 1 over all joints; beside it bars, each of one joint's smoothed torques."""
+    assert "Euclidean norm over the joints of simulated minus measured torques, averaged over time" in written.text
+    assert "before the fit (norm over the joints, averaged over time)" in written.text
+    assert "RMS difference between the smoothed torques" in written.text and "RMS over all joints" not in written.text
+
+
 def test_several_recordings_each_have_their_own_gap_and_figure(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", recordings=("slow", "fast"))
     text = page.write_report(run).read_text(encoding="utf-8")
@@ -134,8 +141,10 @@ def test_what_is_optional_is_left_out_and_said(tmp_path: Path) -> None:
     for picture in (run / "frames").glob("*"):
         picture.unlink()
     text = read_page(page.write_report(run)).text
-    assert "distribution.npz is not there" in text and "frames/ holds no pictures" in text
+    assert "distribution.npz is not there" in text and "No pictures: a log without commands has no replay" in text
     assert "The two Gaussians, replayed" not in text
+    (run / "replay.npz").write_bytes(b"")  # there was something to draw
+    assert "apt-get install libegl1 libgl1-mesa-dri" in read_page(page.write_report(run)).text
 
 
 def test_drawing_leaves_the_callers_matplotlib_alone() -> None:

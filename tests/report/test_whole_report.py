@@ -43,10 +43,39 @@ def test_a_paragraph_says_what_was_fitted_what_is_missing_and_what_is_next(text:
     assert '<span class="next">Next: python -m droid_jax.run export' in lead
 
 
-def test_the_links_lead_to_files_of_the_stages(folder: Path, text: str):
-    links = re.findall(r'<a href="([^"#]+)" download>', text)
-    assert {"identify/fit.json", "gap/gap.json", "train/policy.npz"} <= set(links)
-    assert all((folder / link).is_file() for link in links)
+@pytest.mark.parametrize(("verdict", "warned"), [("unexplained", True), ("fit not converged", True), ("tie", False)])
+def test_a_policy_of_a_model_that_is_known_to_be_wrong_is_not_sent_to_a_robot(
+    tmp_path: Path, verdict: str, warned: bool
+):
+    make_gap(tmp_path / "gap", verdict)
+    make_policy(tmp_path / "train")
+    text = page.write_report(tmp_path).read_text().replace("\u00a0", " ")
+    (lead,) = re.findall(r'<p class="summary lead">(.*?)</p>', text, re.S)
+    assert ("do not take it to a robot" in lead) == warned
+    assert ("Next: python -m droid_jax.run export" in lead) != warned
+    if warned:
+        (own,) = re.findall(r'<p class="answer.*?<span class="next">(.*?)</span>', text, re.S)
+        assert own in lead
+
+
+def test_every_link_leads_to_a_file_of_a_stage(folder: Path):
+    links = [link for link in read_page(folder / "report.html").links if not link.startswith("#")]
+    assert {"identify/fit.json", "gap/gap.json", "train/policy.npz", "gap/figures/missing_gap.pdf"} <= set(links)
+    assert [link for link in links if not (folder / link).is_file()] == []
+
+
+def test_sections_lie_a_level_below_their_part(text: str):
+    levels = [int(level) for level in re.findall(r"<h(\d)", text)]
+    assert levels.count(1) == 1 and max(levels) == 4
+    sections = dict(re.findall(r"<h([23])>(How large the gap is|Search|Trials|Files)</h", text))
+    assert sections == {"3": "Trials", "2": "Files"}
+
+
+def test_pictures_are_described_and_not_called_by_their_title_alone(text: str):
+    described = re.findall(r'<(?:svg role="img"|img class="card")[^>]* aria-describedby="([^"]+)"', text)
+    assert described and all(text.count(f'id="{name}"') == 1 for name in described)
+    films = re.findall(r'<img alt="([^"]*)" src="data:image/webp[^>]*><figcaption>([^<]*)<', text)
+    assert films and all(seen != caption and "arm" in seen for seen, caption in films)
 
 
 def test_a_stage_alone_has_no_lead(tmp_path: Path):

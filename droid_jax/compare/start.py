@@ -1,0 +1,103 @@
+"""Where a recorded motion starts in the scene, and whether the scene carries the weight that its torque holds."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from droid_jax.measure.recording import Recording
+from droid_jax.model.scene import ONE_DEGREE, Scene
+
+AJAR = 0.02  # rad or m: an object seen no further than this from the scene's pose stands there, as cameras are noisy
+WEIGHT = 0.01  # N m or N: a joint that feels less uncompensated weight feels none (noise below it is never believed)
+POSES = 50  # of a motion, at which the weight is looked at
+
+
+def start_pose(scene: Scene, recording: Recording) -> np.ndarray:
+    """[nq] where the motion starts: as stated (qpos0), else as measured, else where its servos were sent first.
+
+    Joints that no actuator drives and nobody measured stand as in the scene.
+    Raises ValueError for a driven joint of which nothing says where it starts.
+    """
+    sent = {joint: path[0] for joint, path in _sent(scene, recording).items()}
+    told = {**sent, **_measured(scene, recording), **recording.qpos0}
+    guessed = [j for j in scene.command_names if j not in told]
+    if guessed:
+        raise ValueError(
+            f"recording {recording.name!r} does not tell where {', '.join(guessed)} starts: state it in qpos0 "
+            "or measure its position"
+        )
+    return scene.initial_qpos(told)
+
+
+def check_weight(scene: Scene, recording: Recording, qpos0: np.ndarray) -> None:
+    """Raise ValueError where a torque without the arm's weight is compared with joints that feel it.
+
+    Judged by the C engine along the motion: a joint with an upright axis feels none.
+    """
+    if recording.torque.gravity or "torque" not in recording.channels:
+        return
+    joints = [j for j in recording.channels["torque"].columns if j in scene.joints and j != scene.object_joint]
+    felt = _uncompensated(scene.model, _poses(scene, recording, qpos0))
+    heavy = [j for j in joints if felt[scene.dof(j)] > WEIGHT]
+    if heavy:
+        most = max(heavy, key=lambda j: felt[scene.dof(j)])
+        raise ValueError(
+            f"recording {recording.name!r} says that its torque holds no weight, but in scene {scene.name!r} nothing "
+            f"compensates that of {', '.join(heavy)} (up to {felt[scene.dof(most)]:.3g} N m at {most}): set "
+            'gravcomp="1" on the bodies they carry, or state that the torque contains gravity'
+        )
+
+
+def weight_share(model: Any, joints: np.ndarray, gravity: bool) -> np.ndarray:
+    """[J] 1, 0 or -1: how often the compensated weight (qfrc_gravcomp) is missing in the actuators' torque.
+
+    model: of the C engine or MJX; joints: [J] velocity addresses; gravity: the torque shall contain the weight.
+    Where the motors themselves compensate it (actuatorgravcomp), their torque contains it already.
+    """
+    contained = model.jnt_actgravcomp[model.dof_jntid[joints]].astype(float)
+    return (1.0 if gravity else 0.0) - contained
+
+
+def _uncompensated(model: mujoco.MjModel, poses: np.ndarray) -> np.ndarray:
+    """[nv] the largest torque over poses [K, nq] that gravity leaves to the actuators, N m or N."""
+    data, most = mujoco.MjData(model), np.zeros(model.nv)
+    for pose in poses:
+        data.qpos[:] = pose
+        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_fwdVelocity(model, data)
+        most = np.maximum(most, np.abs(data.qfrc_bias - data.qfrc_gravcomp))
+    return most
+
+
+def _poses(scene: Scene, recording: Recording, qpos0: np.ndarray) -> np.ndarray:
+    """[POSES, nq] along the motion, as commanded; joints without position servos stay at the start."""
+    poses = np.tile(qpos0, (POSES, 1))
+    rows = np.linspace(0, len(recording.time) - 1, POSES).round().astype(int)
+    for joint, path in _sent(scene, recording).items():
+        poses[:, scene.qpos(joint)] = path[rows]
+    return poses
+
+
+def _sent(scene: Scene, recording: Recording) -> dict[str, np.ndarray]:
+    """Joint -> the positions [T] its servo is sent to, rad or m; what drives no position (a motor) is left out."""
+    model = scene.model
+    kp, position_gain, gear = model.actuator_gainprm[:, 0], model.actuator_biasprm[:, 1], model.actuator_gear[:, 0]
+    servos = np.flatnonzero((kp != 0) & (position_gain == -kp))
+    columns = scene.command_index(recording.command_names)
+    return {scene.command_names[u]: recording.command[:, columns[u]] / gear[u] for u in servos}
+
+
+def _measured(scene: Scene, recording: Recording) -> dict[str, float]:
+    """Joint -> measured position at the start, rad or m, of the scene's joints of one degree."""
+    start = recording.measured_start()
+    hinge, channel = scene.object_joint, recording.channels.get("object_angle")
+    if hinge and hinge not in scene.joints and channel is not None:
+        seen, own = start.pop(channel.columns[0], None), scene.model.qpos0[scene.qpos(hinge)]
+        if seen is not None and abs(seen - own) > AJAR:
+            start[hinge] = seen
+    simple = [i for i, kind in enumerate(scene.model.jnt_type) if mujoco.mjtJoint(kind) in ONE_DEGREE]
+    known = {mujoco.mj_id2name(scene.model, mujoco.mjtObj.mjOBJ_JOINT, i) for i in simple}
+    return {joint: q for joint, q in start.items() if joint in known}

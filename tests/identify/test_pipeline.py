@@ -1,0 +1,150 @@
+"""What an identification says beside its fit: floors and what was closed, against closed forms; and when it resumes."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_log import COULOMB, elbow, elbow_log, elbow_space
+
+from droid_jax.compare.residuals import CompareConfig, make_comparison
+from droid_jax.identify.fit import on_bound
+from droid_jax.identify.pipeline import WORTH, Identified, IdentifyConfig, _closed, _floor, _scatter, identify
+from droid_jax.identify.results import write_run
+from droid_jax.identify.search import SearchConfig
+from droid_jax.measure.recording import Channel
+from droid_jax.model.scene import Scene
+
+QUICK = IdentifyConfig(search=SearchConfig(population=8, parents=None, generations=2), refine=None, samples=2)
+
+
+def repeats(count: int, seed: int = 0, noise: float = 0.3) -> np.ndarray:
+    """[N, T, 2] noise about a wave."""
+    wave = 5.0 * np.sin(np.linspace(0, 20, 4000))[:, None]
+    return wave + np.random.default_rng(seed).normal(0, noise, (count, 4000, 2))
+
+
+NORM = 0.3 * np.sqrt(np.pi / 2)  # mean norm of two normal numbers of deviation 0.3
+
+
+@pytest.mark.parametrize("count", [2, 3, 10])
+def test_the_floor_is_what_the_noise_leaves_of_the_truth(count: int):
+    values = repeats(count)
+    assert _scatter(values, np.ones(values.shape, bool)) == pytest.approx(NORM, rel=0.02)
+
+
+def test_what_was_not_measured_lowers_no_floor():
+    """Whole stretches of single repeats and half of all samples are missing; one repeat alone knows nothing."""
+    values = repeats(4)
+    mask = np.repeat(np.random.default_rng(1).random((4, 4000, 1)) > 0.5, 2, axis=2)
+    mask[0, :2000] = False
+    mask[1:, 3000:] = False
+    assert _scatter(np.where(mask, values, np.nan), mask) == pytest.approx(NORM, rel=0.03)
+    alone = np.zeros_like(mask)
+    alone[2] = True
+    assert _scatter(values, alone) is None
+
+
+def test_every_compared_channel_has_its_share_of_the_floor():
+    scene, recording = elbow(), elbow_log(0.0, seconds=8.0, repeats=5)
+    torque = recording.channels["torque"]
+    fast = np.random.default_rng(3).normal(0, 0.02, torque.values.shape) + np.sin(torque.time)[:, None]
+    velocity = Channel("velocity", "rad/s", ("elbow",), torque.time, fast, torque.mask)
+    both = dataclasses.replace(recording, channels={**recording.channels, "velocity": velocity})
+    config = CompareConfig(channels={"torque": 1.0, "velocity": 50.0})
+    alone = make_comparison(scene, recording, torque.time, CompareConfig())
+    together = make_comparison(scene, both, torque.time, config)
+    share = 50.0 * 0.02 * np.sqrt(2 / np.pi)  # 50 times the mean size of a normal number
+    assert _floor(together) == pytest.approx(_floor(alone) + share, rel=0.02)
+
+
+def test_a_gap_that_is_hardly_there_was_not_closed():
+    assert _closed(2.0, 1.0, 1.0) == 1.0 and _closed(2.0, 1.5, 1.0) == 0.5
+    for before in (1.0, 1.0 + 0.5 * WORTH, 0.3):
+        assert _closed(before, 0.9, 1.0) is None
+    assert _closed(2.0, 1.0, None) is None
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return elbow()
+
+
+@pytest.fixture(scope="module")
+def found(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Identified:
+    """Two repeats, of which one is fitted and one held out; whitened."""
+    config = dataclasses.replace(QUICK, compare=CompareConfig(whitened=True))
+    folder = tmp_path_factory.mktemp("checkpoints")
+    return identify(scene, elbow_space(scene), [elbow_log(COULOMB, 10.0, 2)], config=config, checkpoints=folder)
+
+
+def test_two_repeats_know_their_floor(found: Identified):
+    gap = found.gaps["elbow"]
+    recording = elbow_log(COULOMB, 10.0, 2)
+    torque = recording.channels["torque"].values[:, :, 0]
+    assert gap.floor == pytest.approx(np.mean(np.abs(torque[0] - torque[1])) / np.sqrt(2), rel=0.05)
+    assert gap.per_joint_floor is not None and gap.before > gap.floor
+
+
+def test_files_are_written_before_samples_are_drawn(found: Identified, tmp_path: Path):
+    """A run whose samples fail keeps its fit, and does not count as whole."""
+
+    def fails() -> dict[str, np.ndarray]:
+        raise ValueError("no samples")
+
+    with pytest.raises(ValueError, match="no samples"):
+        write_run(tmp_path, found, {}, samples=fails)
+    assert (tmp_path / "fit.json").is_file() and (tmp_path / "fitted.xml").is_file()
+    assert not (tmp_path / "config.json").exists()
+    fit = json.loads((tmp_path / "fit.json").read_text())
+    assert fit["mjcf_lacks"] == ["torque_offset[elbow]"]
+    assert [p["name"] for p in fit["parameters"] if p["on_bound"]] == list(on_bound(found.full, found.best))
+
+
+def test_a_floor_in_newton_metres_stands_beside_no_cost_in_noise_units(found: Identified, tmp_path: Path):
+    write_run(tmp_path, found, {})
+    fit = json.loads((tmp_path / "fit.json").read_text())
+    assert fit["cost"]["unit"] == "noise units" and fit["cost"]["floor"] is None
+    assert fit["gap"]["elbow"]["floor"] == found.gaps["elbow"].floor
+
+
+def test_a_search_of_another_cost_is_not_gone_on_with(scene: Scene, tmp_path: Path):
+    """Another scene, comparison or prior of a nuisance is another cost."""
+    recording, space = elbow_log(COULOMB, 10.0, 2), elbow_space(scene)
+    main, offset = space.select(["elbow_damping"]), space.select(["torque_offset[elbow]"])
+
+    def run(config: IdentifyConfig = QUICK, **changes) -> None:
+        given = {"scene": scene, "nuisances": None, **changes}
+        identify(given["scene"], main, [recording], nuisances=given["nuisances"], config=config, checkpoints=tmp_path)
+
+    run()
+    heavier = elbow()
+    heavier.model.body_mass[1] *= 2.0
+    refined = dataclasses.replace(QUICK, refine=IdentifyConfig().refine)
+    for changes in (
+        {"config": dataclasses.replace(QUICK, compare=CompareConfig(whitened=True))},
+        {"scene": heavier},
+        {"config": refined, "nuisances": offset},
+    ):
+        with pytest.raises(ValueError, match="belongs to another run: it differs in fingerprint"):
+            run(**changes)
+    run()
+
+
+def test_a_fit_without_torques_is_refused_at_once(scene: Scene):
+    config = dataclasses.replace(QUICK, compare=CompareConfig(channels={"position": 1.0}))
+    with pytest.raises(ValueError, match="compares torques, got the channels position"):
+        identify(scene, elbow_space(scene), [elbow_log(0.0, 10.0, 2)], config=config)
+
+
+def test_a_search_imports_nothing_that_it_may_not_need():
+    """Checkpoints and distributions of scipy take seconds to import."""
+    seen = "print('orbax' in sys.modules, 'scipy.stats' in sys.modules)"
+    code = f"import sys, droid_jax.identify.search, droid_jax.identify.gaussian; {seen}"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert run.stdout.splitlines()[-1] == "False False", run.stderr

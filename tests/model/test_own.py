@@ -1,0 +1,76 @@
+"""Parameters of a user's own scene from a file: what it says about mistakes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from droid_jax.model.own import load_parameters
+from droid_jax.model.parameters import Mode, Scaling
+from droid_jax.model.scene import Scene, compile_scene
+
+XML = """<mujoco><worldbody><body name="arm"><joint name="elbow" axis="0 1 0" damping="1"/>
+  <geom name="bone" type="capsule" size=".02 .1"/></body></worldbody>
+  <actuator><position name="elbow" joint="elbow" kp="20"/></actuator></mujoco>"""
+GOOD = {"field": "dof_damping", "element": "elbow", "std": 0.5, "high": 9}
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return compile_scene(mujoco.MjSpec.from_string(XML), "arm")
+
+
+def loaded(folder: Path, scene: Scene, entry: dict[str, Any]):
+    (folder / "parameters.json").write_text(json.dumps([entry]))
+    return load_parameters(folder / "parameters.json", scene)
+
+
+def test_an_entry_is_read_as_it_says(tmp_path: Path, scene: Scene):
+    more = {"mode": "scale", "scaling": "log", "floor": 0.1, "width": 0.5, "nuisance": True, "low": 0, "mean": 2}
+    parameter = loaded(tmp_path, scene, {**GOOD, **more, "name": "oil", "unit": "-", "group": "Arm"})["oil"]
+    assert parameter.writes[0].mode is Mode.SCALE and parameter.scaling is Scaling.LOG
+    assert (parameter.width, parameter.nuisance, parameter.group) == (0.5, True, "Arm")
+    height = {"field": "body_pos", "element": "arm", "std": 0.01, "low": -1, "high": 1, "column": 2}
+    assert loaded(tmp_path, scene, height)["arm_pos"].writes[0].index == (scene.id("body", "arm"), 2)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"column": 0}, 'dof_damping has one number for each joint: leave "column" out'),
+        ({"field": "body_pos", "element": "arm"}, 'body_pos has 3 numbers for each body: give "column", 0 to 2'),
+        ({"field": "body_pos", "element": "arm", "column": 7}, 'give "column", 0 to 2, got 7'),
+        ({"field": "body_inertia", "element": "arm", "column": -1}, 'give "column", 0 to 2, got -1'),
+        ({"field": "geom_size", "element": "bone", "column": "1"}, "give \"column\", 0 to 2, got '1'"),
+        ({"std": "a"}, "std must be a number, got 'a'"),
+        ({"std": True}, "std must be a number, got True"),
+        ({"width": "x", "scaling": "log", "floor": 0.1}, "width must be a number, got 'x'"),
+        ({"width": 0, "scaling": "log", "floor": 0.1}, "width must be positive, got 0"),
+        ({"floor": float("nan")}, "floor must be a number, got nan"),
+        ({"nuisance": "false"}, "nuisance must be true or false, got 'false'"),
+        ({"name": 5}, "name must be text, got 5"),
+        ({"element": 3}, "element must be text, got 3"),
+        ({"mode": "sett"}, "mode must be one of set, negative, scale, divide, add, got 'sett'"),
+        ({"scaling": 1}, "scaling must be one of linear, log, got 1"),
+        ({"field": "actuator_damping", "element": "elbow"}, "'actuator_damping' cannot be a parameter: MJX"),
+        ({"field": "jnt_stiffnesspoly", "column": 0}, "'jnt_stiffnesspoly' cannot be a parameter: MJX"),
+        ({"field": "geom_contype", "element": "bone"}, "'geom_contype' cannot be a parameter: MJX"),
+        ({"field": "body_gravcomp", "element": "arm"}, "compiled without gravity compensation"),
+        ({"field": "actuator_biasprm", "column": 2, "low": -9}, "was compiled with a velocity gain"),
+    ],
+)
+def test_a_mistake_is_named(tmp_path: Path, scene: Scene, changes: dict[str, Any], says: str):
+    with pytest.raises(ValueError) as caught:
+        loaded(tmp_path, scene, {**GOOD, **changes})
+    assert says in str(caught.value) and "parameters.json, entry 1: " in str(caught.value)
+
+
+def test_the_gravity_compensation_of_a_compensated_scene_is_a_parameter(tmp_path: Path):
+    spec = mujoco.MjSpec.from_string(XML.replace('<body name="arm">', '<body name="arm" gravcomp="1">'))
+    space = loaded(tmp_path, compile_scene(spec, "arm"), {**GOOD, "field": "body_gravcomp", "element": "arm"})
+    np.testing.assert_array_equal(space.mean, [1.0])

@@ -1,0 +1,36 @@
+"""A fit's tables as DataFrames, read back from what the run's writer writes."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+import droid_jax as dj
+from droid_jax.storage import write_csv
+
+HISTORY = ["generation", "best_cost", "median_cost", "sigma", "mean_mass", "std_mass"]
+
+
+def fit(folder: Path) -> Path:
+    write_csv(folder / "samples.csv", ["mass", "damping"], [[1.0, 2.0], [1.5, 2.5], [1.25, 2.25]])
+    write_csv(folder / "history.csv", HISTORY, [[1, 0.5, 0.7, 1.0, 1.2, 0.3], [2, 0.4, 0.5, 0.8, 1.3, 0.2]])
+    return folder
+
+
+@pytest.mark.parametrize("below", ["", "identify"])
+def test_the_tables_of_a_fit(tmp_path: Path, below: str):
+    pytest.importorskip("pandas")
+    fit(tmp_path / below)
+    found = dj.frames(tmp_path)
+    assert list(found.samples.columns) == ["mass", "damping"] and found.samples["mass"].mean() == 1.25
+    assert found.history.loc[2, "best_cost"] == 0.4 and list(found.history.columns) == HISTORY[1:]
+
+
+def test_what_is_missing_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    with pytest.raises(ValueError, match=r"holds no tables of a fit .*run `python -m droid_jax.run identify` again"):
+        dj.frames(tmp_path)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ImportError, match=r"droid_jax.frames needs pandas: pip install"):
+        dj.frames(tmp_path)
