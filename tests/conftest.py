@@ -52,6 +52,12 @@ runtime.tune(devices=2, cache_dir=os.environ.get(runtime.CACHE_VARIABLE) or CACH
 
 
 @pytest.fixture
+def tuned(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For commands that are called in this process, where jax runs already and could not be tuned any more."""
+    monkeypatch.setattr(runtime, "tune", lambda *a, **k: None)
+
+
+@pytest.fixture
 def gl() -> str:
     """The OpenGL backend; skips the test where nothing can draw."""
     if not HAS_GL:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from droid_jax import run, runtime
+from droid_jax import run
 from droid_jax.commands.folder import setup_of
 from droid_jax.commands.identify import Identify
 from droid_jax.commands.own_effects import load_effects
@@ -30,9 +30,8 @@ GOOD = {"field": "dof_damping", "element": "elbow", "std": 0.5, "high": 20.0}
 
 
 @pytest.fixture
-def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+def refused(tuned: None, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
     """Runs a command that must fail with exit code 2; returns its one line on stderr."""
-    monkeypatch.setattr(runtime, "tune", lambda *a, **k: None)  # jax runs already in this process
 
     def run(*arguments: str | Path) -> str:
         assert main([str(a) for a in arguments]) == 2

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from small_gap import EFFECTS, FLOOR, JOINTS, PRELOAD, QUICK, SCENE, record, small, small_scene, write_parameters
 
-from droid_jax import runtime
 from droid_jax.commands import gap, report
 from droid_jax.commands.hidden import hidden_effects, record_stand_in
 from droid_jax.gap import case as case_module
@@ -32,11 +31,7 @@ from droid_jax.model.seam import Effect
 from droid_jax.run import main
 
 ROOT = Path(__file__).resolve().parents[1]
-
-
-@pytest.fixture(autouse=True)
-def tuned(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(runtime, "tune", lambda *a, **k: None)  # jax runs already in this process
+pytestmark = pytest.mark.usefixtures("tuned")
 
 
 @pytest.fixture

@@ -29,11 +29,7 @@ from droid_jax.run import main
 
 SEARCH = replace(CONFIG, search=SearchConfig(population=8, parents=None, generations=2), most=1)
 LOG = elbow_log(COULOMB)
-
-
-@pytest.fixture(autouse=True)
-def tuned(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(runtime, "tune", lambda *a, **k: None)  # jax runs already in this process
+pytestmark = pytest.mark.usefixtures("tuned")
 
 
 def command(place: Path, recordings: Sequence[Recording], *options: str) -> list[str]:

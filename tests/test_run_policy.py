@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from droid_jax import runtime
 from droid_jax.commands.evaluate import Evaluate, _robot, _task
 from droid_jax.commands.folder import setup_of, stage_folder
 from droid_jax.commands.source import extended_of, source, stand_in_of
@@ -20,10 +19,11 @@ from droid_jax.policy.control import load
 from droid_jax.policy.door_env import DoorEnv
 from droid_jax.run import main
 
+pytestmark = pytest.mark.usefixtures("tuned")
+
 
 @pytest.fixture(autouse=True)
-def tuned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(runtime, "tune", lambda *a, **k: None)  # jax runs already in this process
+def elsewhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
 
 
