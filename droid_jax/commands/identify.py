@@ -55,7 +55,8 @@ class Identify:
     own_effects: Path | None = None
     """Python file that registers effects of your own (docs/method-gap.md); it is run."""
     engine: Literal["mjx", "mujoco"] = "mjx"
-    """mjx: compiled, all devices.  mujoco: plain C, all cores; for motor-side torques without gravity only."""
+    """mjx: compiled, all devices.  mujoco: plain C, all cores; for motor-side torques, without gravity where the
+    scene compensates it."""
     population: int | None = None
     """Samples per generation; default: the preset's."""
     generations: int | None = None
