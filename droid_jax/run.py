@@ -7,6 +7,7 @@ and so that --help is quick.
 from __future__ import annotations
 
 import importlib.metadata
+import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -60,7 +61,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments = ["all", *arguments]
     script = Path(sys.argv[0]).name
     prog = script if script == SCRIPT else "python -m droid_jax.run"
-    command = tyro.cli(Command, default=whole.All(), args=arguments, prog=prog, description=WHAT)
+    try:
+        command = tyro.cli(Command, default=whole.All(), args=arguments, prog=prog, description=WHAT)
+    except BrokenPipeError:  # --help | head: nobody reads on, which is no error
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is flushed at the end
+        return 0
     try:
         _ACTIONS[type(command)](command)
     except (ValueError, OSError) as error:

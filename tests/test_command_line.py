@@ -42,6 +42,13 @@ def refused(tuned: None, capsys: pytest.CaptureFixture[str]) -> Callable[..., st
     return run
 
 
+def test_help_into_a_pipe_that_is_closed_early():
+    script = f"{sys.executable} -m droid_jax.run identify --help | head -n 1"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(["bash", "-c", script], env=environment, capture_output=True, text=True, timeout=60)
+    assert done.stdout.startswith("usage:") and done.stderr == ""
+
+
 def content(folder: Path) -> dict[str, bytes]:
     """Every file below a folder."""
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
