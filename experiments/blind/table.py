@@ -68,7 +68,9 @@ def _rows() -> Iterator[tuple[str, str, Chosen, Chosen]]:
     yield "anything hidden: stepwise BIC holds a false name", "", _judged_by_bic, lambda c: c["baselines"]["bic_false"]
     closed = f"named: at least {CLOSED:.0%} of the sealed gap closed"
     yield closed, "", _named, lambda c: c["closed"].get("sealed", 0.0) >= CLOSED
-    yield "named: sealed gap within two floors of the floor", "", _named, lambda c: bool(c["within_floor"])
+    yield "named: sealed gap within two floors of the floor", "all", _named, lambda c: bool(c["within_floor"])
+    near = "nothing hidden: sealed gap within two floors of the floor"  # what the base model itself leaves
+    yield near, "", _kind("none"), lambda c: bool(c["within_floor"])
 
 
 def _judged_by_bic(case: Case) -> bool:
