@@ -14,7 +14,7 @@ from droid_jax.gap.refit import LEVEL, Model, deviations, intervals
 
 SIGNIFICANT = 0.01
 LESS = 0.2  # share of U that the first effect must take away on the confirming demonstration
-MORE = 0.6  # share of what is left that every further effect must: a wrong form of the first leaves something too
+MORE = 0.4  # share of what is left that every further effect must: a wrong form of the first leaves something too
 OF_ALL = 0.05  # and share of the base model's U: what a wrong form of the first effect leaves is no effect of its own
 DOUBT = 0.05  # share of the resamples in which a rival is better, from which it does as well
 CHOSEN = 0.8  # share of the resamples in which an effect, or one that does as well, must win

@@ -35,7 +35,7 @@ from droid_jax.gap.rank import proposals
 from droid_jax.gap.refit import Model, refit
 from droid_jax.gap.screen import Screen, questions_of
 from droid_jax.gap.select import LESS
-from droid_jax.gap.workflow import OPEN, ask
+from droid_jax.gap.workflow import ask
 from droid_jax.measure.motion import Motion
 from droid_jax.measure.noise import discrepancy
 from droid_jax.measure.recording import Recording
@@ -45,6 +45,7 @@ from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
 
 FITTED = 2 / 3  # of a recording whose rest is sealed
+EXPLAINED = 0.2  # share of the base's residual, in squares, below which what is left counts as noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +185,7 @@ def noise_of(
     found = ask(case, model, questions_of(candidates(effects)))
     whole = model.residuals.mean(axis=0)
     least = _least(found, whole, log.space, config.most)
-    noise = least if least @ least < OPEN * (whole @ whole) else whole
+    noise = least if least @ least < EXPLAINED * (whole @ whole) else whole
     left = (noise.reshape(len(deviation), -1).T * deviation)[inside]
     return discrepancy(left), block_length(left)
 

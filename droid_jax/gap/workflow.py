@@ -21,7 +21,7 @@ from droid_jax.identify.pipeline import grip_hypotheses, starts
 from droid_jax.identify.search import search
 
 Progress = Callable[[str, Any], None]
-OPEN = 0.2  # share of the gap left open from which a model explains it only partly
+OPEN = 0.1  # share of the gap left open from which a model explains it only partly
 
 
 def base_fit(case: Case, progress: Progress, start: np.ndarray | None = None) -> Model:

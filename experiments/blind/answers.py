@@ -89,7 +89,8 @@ ANSWERS: dict[str, Answer] = {
     "sensor_delay": Answer("sensor_delay", ("command_delay",), "positions are not scored"),
     "torque_bias": Answer(
         "torque_bias", ("hinge_preload", "tilted_frame", "cable_pull"),
-        "a constant torque is a preload on the hinge and a pull on a joint of the arm",
+        "a constant torque is a preload on the hinge and a pull on a joint of the arm; it settles, which is a drift",
+        parts=("torque_drift",),
     ),
     "torque_gain": Answer("torque_gain"),
     "torque_drift": Answer("torque_drift", ("torque_bias",), "it warms up mostly between the repeats"),
