@@ -19,11 +19,6 @@ from droid_jax import runtime
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def cores() -> int:
-    """Cores that this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def origin(seed: int) -> dict[str, Any]:
     """Where a result comes from: commit, versions, device, cores, seed, date.  Starts jax's backend."""
     import jax
@@ -35,7 +30,7 @@ def origin(seed: int) -> dict[str, Any]:
         "device": runtime.device(),
         "platform": jax.default_backend(),
         "jax_devices": jax.local_device_count(),
-        "cores": cores(),
+        "cores": runtime.cores(),
         "seed": seed,
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }

@@ -13,7 +13,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import cores
 from mujoco import mjx
 
 from droid_jax import runtime
@@ -94,7 +93,7 @@ def c_engine(case: Case, population: int) -> Callable[[], np.ndarray]:
     def run() -> np.ndarray:
         chunks = [models[i : i + C_CHUNK] for i in range(0, population, C_CHUNK)]
         start = case.drive.qpos0[None]
-        return np.concatenate([simulate(plain, c, start, control[None], threads=cores()).torque for c in chunks])
+        return np.concatenate([simulate(plain, c, start, control[None]).torque for c in chunks])
 
     return run
 

@@ -170,10 +170,11 @@ def false_alarms(search: Search, verdict: Verdict, count: int, seed: int, folder
     rng = np.random.default_rng(seed)
     truth, left = verdict.base.values, search.log.left(verdict.model.values)
     simulated = search.log.simulated(truth[None])[0]
+    code = str(runtime.versions().get("git"))
     missing, named = [], []
     for number in range(count):
         log = search.log.holding(simulated + coloured(left, rng))
-        path = folder / f"{number:04d}_{_key(log)}.json"
+        path = folder / f"{number:04d}_{_key(log, code)}.json"
         if not path.is_file():
             write_json(path, _said_of(search, log, truth))
         said = json.loads(path.read_text())
@@ -203,10 +204,9 @@ def _said_of(search: Search, log: Log, start: np.ndarray) -> dict[str, Any]:
     return {**said, "blocks": case.fit.units}
 
 
-def _key(log: Log) -> str:
-    """Of a log's torques and of the program: what is kept under it was said of this log by this program."""
-    code = str(runtime.versions().get("git")).encode()
-    return hashlib.sha256(np.ascontiguousarray(log.measured).tobytes() + code).hexdigest()[:12]
+def _key(log: Log, code: str) -> str:
+    """Of a log's torques and the program's commit: what is kept under it was said of this log by this program."""
+    return hashlib.sha256(np.ascontiguousarray(log.measured).tobytes() + code.encode()).hexdigest()[:12]
 
 
 def share(hits: int, count: int) -> dict[str, Any]:

@@ -58,6 +58,20 @@ def tuned(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
+def refused(tuned: None, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Runs a command that must fail with exit code 2; returns its one line on stderr."""
+    from droid_jax.run import main
+
+    def run(*arguments: str | Path) -> str:
+        assert main([str(a) for a in arguments]) == 2
+        lines = capsys.readouterr().err.splitlines()
+        assert len(lines) == 1 and lines[0].startswith("error: "), lines
+        return lines[0]
+
+    return run
+
+
+@pytest.fixture
 def gl() -> str:
     """The OpenGL backend; skips the test where nothing can draw."""
     if not HAS_GL:

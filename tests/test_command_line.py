@@ -29,19 +29,6 @@ XML = ROOT / "docs" / "examples" / "two_link.xml"
 GOOD = {"field": "dof_damping", "element": "elbow", "std": 0.5, "high": 20.0}
 
 
-@pytest.fixture
-def refused(tuned: None, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
-    """Runs a command that must fail with exit code 2; returns its one line on stderr."""
-
-    def run(*arguments: str | Path) -> str:
-        assert main([str(a) for a in arguments]) == 2
-        lines = capsys.readouterr().err.splitlines()
-        assert len(lines) == 1 and lines[0].startswith("error: "), lines
-        return lines[0]
-
-    return run
-
-
 def test_help_into_a_pipe_that_is_closed_early():
     script = f"{sys.executable} -m droid_jax.run identify --help | head -n 1"
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}

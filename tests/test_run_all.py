@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from droid_jax import runtime
 from droid_jax.commands import evaluate, gap, hidden, identify, report, train, whole
 from droid_jax.commands.folder import OtherRun
 from droid_jax.commands.hidden import known_stand_in
@@ -25,11 +24,10 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture
-def called(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
+def called(tuned: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
     """The stages' commands, in the order in which they were run; nothing is recorded or fitted."""
     commands: list[Any] = []
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(runtime, "tune", lambda *a, **k: None)  # jax runs already in this process
     for module in (identify, gap, train, evaluate):
         monkeypatch.setattr(module, "run", commands.append)
     monkeypatch.setattr(hidden, "kept_recordings", lambda paths, again, record: dict.fromkeys(paths))

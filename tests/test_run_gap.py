@@ -50,19 +50,6 @@ def arguments(place: Path, *options: str | Path, recordings: tuple[str, ...] = (
     return [str(a) for a in ("gap", "--recording", *files, *own, "--out", place / "run", *options)]
 
 
-@pytest.fixture
-def refused(capsys: pytest.CaptureFixture[str]) -> Callable[[list[str]], str]:
-    """Runs a command that must fail with exit code 2; returns its one line on stderr."""
-
-    def run(command: list[str]) -> str:
-        assert main(command) == 2
-        lines = capsys.readouterr().err.splitlines()
-        assert len(lines) == 1 and lines[0].startswith("error: "), lines
-        return lines[0]
-
-    return run
-
-
 def changed(recording: Recording, name: str, function: Callable[[np.ndarray], np.ndarray]) -> Recording:
     """A recording with other values [N, Tc, C] in one channel."""
     channel = recording.channels[name]
@@ -74,24 +61,24 @@ def changed(recording: Recording, name: str, function: Callable[[np.ndarray], np
 
 
 def test_four_recordings_are_too_many(place: Path, refused):
-    said = refused(arguments(place, recordings=("fit.npz", "confirm.npz", "fit.npz", "confirm.npz")))
+    said = refused(*arguments(place, recordings=("fit.npz", "confirm.npz", "fit.npz", "confirm.npz")))
     assert "FIT CONFIRM [SEALED]" in said and "got 4" in said and "identify" in said
 
 
 def test_too_few_repeats_say_what_can_still_be_concluded(place: Path, refused):
     save(record("fit").repeats_subset(range(5)), place / "fit.npz")
-    said = refused(arguments(place))
+    said = refused(*arguments(place))
     assert "the fit recording 'fit' has 5 repeats" in said and "fewer than 8" in said
     assert "droid_jax.run identify" in said and "in which joint and phase" in said
 
 
 def test_the_same_recording_twice(place: Path, refused):
-    said = refused(arguments(place, recordings=("fit.npz", "fit.npz")))
+    said = refused(*arguments(place, recordings=("fit.npz", "fit.npz")))
     assert "the fit and the confirm recording are the same" in said and "another motion" in said
 
 
 def test_the_sealed_recording_once_more(place: Path, refused):
-    said = refused(arguments(place, recordings=("fit.npz", "confirm.npz", "confirm.npz")))
+    said = refused(*arguments(place, recordings=("fit.npz", "confirm.npz", "confirm.npz")))
     assert "the confirm and the sealed recording are the same" in said
 
 
@@ -102,7 +89,7 @@ def test_a_repeat_that_runs_late(place: Path, refused):
         return values
 
     save(changed(record("confirm"), "position", late), place / "confirm.npz")
-    said = refused(arguments(place))
+    said = refused(*arguments(place))
     assert "the confirm recording 'confirm': repeat 3 runs 0.1" in said and "behind the others" in said
 
 
@@ -110,20 +97,20 @@ def test_repeats_with_clocks_of_their_own(place: Path, refused):
     save(record("confirm"), place / "csv")
     path = place / "csv" / "torque_02.csv"
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:-20]))
-    said = refused(arguments(place, recordings=("fit.npz", "csv")))
+    said = refused(*arguments(place, recordings=("fit.npz", "csv")))
     assert "torque_02.csv: repeat 2 has another clock than repeat 0" in said
 
 
 def test_a_robot_that_never_moves(place: Path, refused):
     save(changed(record("fit"), "position", lambda v: v[:, :1] + 1e-4 * np.sin(np.arange(v.shape[1]))[:, None]),
          place / "fit.npz")  # fmt: skip
-    said = refused(arguments(place))
+    said = refused(*arguments(place))
     assert "the fit recording 'fit' never moves" in said and "0.0002" in said
 
 
 def test_a_door_that_never_opens(place: Path, refused):
     save(changed(record("confirm"), "object_angle", lambda v: 0.02 * v), place / "confirm.npz")
-    said = refused(arguments(place))
+    said = refused(*arguments(place))
     assert "the object joint 'door' moves by 0.0" in said and "record a motion that opens it" in said
 
 
@@ -133,7 +120,7 @@ def test_one_repeat_that_missed_its_grasp(place: Path, refused):
         return values
 
     save(changed(record("confirm"), "object_angle", missed), place / "confirm.npz")
-    said = refused(arguments(place))
+    said = refused(*arguments(place))
     assert "in repeat 4 the object joint 'door' moves by 0.0" in said and "leave that repeat away" in said
 
 
@@ -150,7 +137,7 @@ def test_an_angle_that_one_repeat_did_not_measure_hides_no_other_fault(place: Pa
     values[4, :, position.columns.index("door")] *= 0.1
     channels = {"torque": recording.channels["torque"], "position": replace(position, values=values, mask=mask)}
     save(replace(recording, channels=channels), place / "confirm.npz")
-    assert said in refused(arguments(place))
+    assert said in refused(*arguments(place))
 
 
 def test_a_sensor_that_is_dead_in_one_repeat(place: Path, refused):
@@ -159,7 +146,7 @@ def test_a_sensor_that_is_dead_in_one_repeat(place: Path, refused):
         return values
 
     save(changed(record("fit"), "torque", dead), place / "fit.npz")
-    said = refused(arguments(place))
+    said = refused(*arguments(place))
     assert "never changes in repeat 2 (0.25 N m)" in said and "leave that repeat away" in said
 
 
@@ -169,7 +156,7 @@ def test_a_dead_sensor(place: Path, refused):
         return values
 
     save(changed(record("fit"), "torque", dead), place / "fit.npz")
-    said = refused(arguments(place, "--effects", "hinge_preload"))
+    said = refused(*arguments(place, "--effects", "hinge_preload"))
     assert "channel 'torque', column 'elbow' never changes (1.5 N m)" in said
 
 
@@ -178,7 +165,7 @@ def test_recordings_of_different_joints(place: Path, refused):
     torque = recording.channels["torque"]
     fewer = replace(torque, columns=JOINTS[:2], values=torque.values[..., :2], mask=torque.mask[..., :2])
     save(replace(recording, channels={**recording.channels, "torque": fewer}), place / "confirm.npz")
-    said = refused(arguments(place))
+    said = refused(*arguments(place))
     assert "different joints" in said and "fit shoulder, elbow, door; confirm shoulder, elbow" in said
 
 
@@ -209,17 +196,17 @@ def test_lags_are_measured_in_seconds():
 
 @pytest.mark.parametrize("option", ["--effects", "--without"])
 def test_unknown_effects_list_the_valid_ones(place: Path, refused, option: str):
-    said = refused(arguments(place, option, "gravity_waves"))
+    said = refused(*arguments(place, option, "gravity_waves"))
     assert "unknown effects gravity_waves; valid: " in said and "hinge_preload" in said
 
 
 def test_an_effect_that_the_scene_cannot_have(place: Path, refused):
-    said = refused(arguments(place, "--effects", "contact_compliance", "payload"))
+    said = refused(*arguments(place, "--effects", "contact_compliance", "payload"))
     assert "cannot have contact_compliance" in said and "payload" in said.split("it can have:")[1]
 
 
 def test_no_effect_left(place: Path, refused):
-    said = refused(arguments(place, "--effects", "payload", "--without", "payload"))
+    said = refused(*arguments(place, "--effects", "payload", "--without", "payload"))
     assert "is left without any effect" in said
 
 
@@ -259,11 +246,11 @@ def test_an_effect_that_cannot_be_neutral(
     def gasket(scene):
         return Effect("gasket", (make(),), force=lambda theta, state: state.qvel, places={"door": ("gasket",)})
 
-    assert expected in refused(arguments(place, "--effects", "gasket"))
+    assert expected in refused(*arguments(place, "--effects", "gasket"))
 
 
 def test_no_time_is_no_budget(place: Path, refused):
-    assert "--budget must be above 0 minutes, got 0" in refused(arguments(place, "--budget", "0"))
+    assert "--budget must be above 0 minutes, got 0" in refused(*arguments(place, "--budget", "0"))
 
 
 # ----- the stand-in
@@ -279,12 +266,12 @@ def test_no_time_is_no_budget(place: Path, refused):
     ],
 )
 def test_what_cannot_be_hidden(tmp_path: Path, refused, options: list[str], expected: str):
-    assert expected in refused(["gap", *options, "--out", str(tmp_path / "run")])
+    assert expected in refused("gap", *options, "--out", tmp_path / "run")
     assert list((tmp_path / "run").iterdir()) == []
 
 
 def test_hiding_is_for_the_stand_in(place: Path, refused):
-    assert "--hide is for the stand-in robot" in refused(arguments(place, "--hide", "closer=1"))
+    assert "--hide is for the stand-in robot" in refused(*arguments(place, "--hide", "closer=1"))
 
 
 def test_effects_of_ones_own_are_asked_about_like_the_others(place: Path, refused, monkeypatch: pytest.MonkeyPatch):
@@ -294,14 +281,14 @@ def test_effects_of_ones_own_are_asked_about_like_the_others(place: Path, refuse
     (code,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / "method-gap.md").read_text(), re.M | re.S)
     (place / "gasket.py").write_text(code)
     options = ("--own-effects", place / "gasket.py", "--effects", "gasket", "nothing")
-    assert "unknown effects nothing; valid:" in (said := refused(arguments(place, *options))) and "gasket" in said
+    assert "unknown effects nothing; valid:" in (said := refused(*arguments(place, *options))) and "gasket" in said
     chosen = gap.chosen_effects(gap.Gap(effects=("gasket",)), small_scene()[0], [])
     assert [e.name for e in chosen] == ["gasket"] and "door" in chosen[0].places
 
 
 def test_a_scene_of_ones_own_needs_recordings(tmp_path: Path, refused):
     command = ["gap", "--scene", str(SCENE), "--parameters", str(write_parameters(tmp_path)), "--out", str(tmp_path)]
-    assert "--scene needs --recording" in refused(command)
+    assert "--scene needs --recording" in refused(*command)
 
 
 def test_what_is_hidden():
@@ -376,9 +363,9 @@ def test_the_base_fit_begins_at_an_earlier_fit(place: Path, quick: None, monkeyp
 
 
 def test_a_fit_that_is_none_or_of_another_model(place: Path, quick: None, refused):
-    said = refused(arguments(place, "--fit", place / "nowhere"))
+    said = refused(*arguments(place, "--fit", place / "nowhere"))
     assert "nowhere is no folder of a finished `identify`" in said
-    said = refused(arguments(place, "--fit", fit_json(place / "other", door_mass=1.0)))
+    said = refused(*arguments(place, "--fit", fit_json(place / "other", door_mass=1.0)))
     assert "is of another model: it lacks" in said and "door_damping" in said
 
 
@@ -425,9 +412,9 @@ def test_a_run_goes_on_after_a_stop_and_is_whole(
     assert "holds this run already" in said and said.splitlines()[-5:] == lines
 
     before = (out / "gap.json").read_bytes()
-    assert "other settings (seed)" in refused([*command, "--seed", "1"])
+    assert "other settings (seed)" in refused(*command, "--seed", "1")
     save(record("sealed"), place / "confirm.npz")
-    assert "other settings (recordings_sha256)" in refused(command)
+    assert "other settings (recordings_sha256)" in refused(*command)
     assert (out / "gap.json").read_bytes() == before
 
 

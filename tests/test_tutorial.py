@@ -12,7 +12,6 @@ from typing import Any
 import matplotlib
 import pytest
 
-from droid_jax import runtime
 from droid_jax.gap.extended import Extended
 from droid_jax.identify.gaussian import prior
 from droid_jax.measure.formats import load
@@ -24,12 +23,11 @@ HERE = Path(__file__).resolve().parents[1] / "docs" / "tutorial"
 
 
 @pytest.fixture
-def copy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The tutorial's folder, elsewhere; jax runs already."""
+def copy(tuned: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The tutorial's folder, elsewhere."""
     pytest.importorskip("rosbags")
     shutil.copytree(HERE, tmp_path / "tutorial", ignore=shutil.ignore_patterns("runs"))
     monkeypatch.chdir(tmp_path / "tutorial")
-    monkeypatch.setattr(runtime, "tune", lambda *a, **k: None)
     return tmp_path / "tutorial"
 
 

@@ -76,10 +76,11 @@ def _travels(recording: Recording, joint: str) -> np.ndarray | None:
     column = 0 if name == "object_angle" else channel.columns.index(joint)
     values, seen = channel.values[:, :, column], channel.mask[:, :, column]
     known = seen.any(axis=1)  # what was not measured in a repeat is no missed grasp
+    if not known.any():
+        return None
     moved = np.full(len(values), np.nan)
-    spread = np.nanquantile(np.where(seen, values, np.nan)[known], [0.99, 0.01], axis=1)
-    moved[known] = spread[0] - spread[1]
-    return moved if known.any() else None
+    moved[known] = np.subtract(*np.nanquantile(np.where(seen, values, np.nan)[known], [0.99, 0.01], axis=1))
+    return moved
 
 
 def _check_timing(recording: Recording, where: str) -> None:

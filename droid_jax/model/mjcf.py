@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model
-from droid_jax.model.scene import Scene, keep_inertia, look_geoms
+from droid_jax.model.scene import Scene, compiled, keep_inertia, look_geoms
 
 # Model field -> attribute of the element that holds a row of it, or its first numbers.
 _ATTRIBUTES = {
@@ -42,16 +41,14 @@ def fitted_mjcf(scene: Scene, space: Space, values: np.ndarray) -> str:
     Files of meshes and textures are named by their absolute paths, wherever the text is saved.
     """
     spec, model = scene.spec.copy(), make_c_model(scene, space, values)
-    with warnings.catch_warnings():  # of what `_unwrapped` repairs
-        warnings.simplefilter("ignore", UserWarning)
-        spec.compile()  # numbers its elements, of which not all need a name
-        for kind, elements in _elements(spec, model).items():
-            for row, element in elements.items():
-                _write_changed(kind, element, row, scene.model, model)
-        keep_inertia(spec, model)
-        _locate_assets(spec)
-        spec.compile()
-        return _unwrapped(spec.to_xml())
+    compiled(spec)  # numbers its elements, of which not all need a name
+    for kind, elements in _elements(spec, model).items():
+        for row, element in elements.items():
+            _write_changed(kind, element, row, scene.model, model)
+    keep_inertia(spec, model)
+    _locate_assets(spec)
+    compiled(spec)
+    return _unwrapped(spec.to_xml())
 
 
 def unwritten(scene: Scene, space: Space) -> tuple[str, ...]:

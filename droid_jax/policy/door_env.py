@@ -16,7 +16,7 @@ from droid_jax.compare.replay import check_stateless, pushed, rubbing, servo_giv
 from droid_jax.measure.demonstration import OPEN, PLANS, Plan, grasp_pose, solve_pose
 from droid_jax.model.effects.registry import ready
 from droid_jax.model.physics import Physics
-from droid_jax.model.scene import Scene
+from droid_jax.model.scene import Scene, has_servo_damping
 from droid_jax.model.seam import Effect, State, Theta
 from droid_jax.model.step import step as simulate_step
 from droid_jax.policy.control import ACTIONS, OBSERVED, Safety, limited
@@ -70,6 +70,7 @@ class DoorEnv(Env):
         self.interface = interface_of(self.scene, self.task, self.start, plan)
         self._hand, self._template = hand_of(self.scene), mjx.make_data(self.scene.mjx)
         self._timestep = float(self.scene.model.opt.timestep)
+        self._servo_damping = has_servo_damping(self.scene.model)
         self._substeps = round(self.task.control / self._timestep)
         if abs(self._substeps * self._timestep - self.task.control) > 1e-9:
             raise ValueError(
@@ -148,7 +149,11 @@ class DoorEnv(Env):
             now = State(world.time + number * self._timestep, qpos, qvel, load)
             ctrl = self._servo(theta, now, world)
             data = self._template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm, ctrl=ctrl)
-            after = simulate_step(rubbing(model, theta, now, self.effects), pushed(data, theta, now, self.effects))
+            after = simulate_step(
+                rubbing(model, theta, now, self.effects),
+                pushed(data, theta, now, self.effects),
+                servo_damping=self._servo_damping,
+            )
             force = finger_forces(self._hand, after)
             return (after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator, force), None
 
