@@ -86,23 +86,6 @@ def smooth_scene() -> Scene:
     return replace(scene, model=model)
 
 
-def in_newtons(effect: Effect) -> Effect:
-    """An effect whose forces have a carriage's size and not a joint's torque's."""
-    scaled = {a for amplitudes in effect.places.values() for a in amplitudes if effect_unit(effect, a)[:3] == "N m"}
-    parameters = [
-        replace(p, unit=p.unit.replace("N m", "N"), std=NEWTONS * p.std, low=NEWTONS * p.low, high=NEWTONS * p.high)
-        if p.name in scaled
-        else p
-        for p in effect.parameters
-    ]
-    return replace(effect, parameters=tuple(parameters), smallest=effect.smallest * (NEWTONS if scaled else 1.0))
-
-
-def effect_unit(effect: Effect, amplitude: str) -> str:
-    """The unit of one of an effect's parameters."""
-    return next(p.unit for p in effect.parameters if p.name == amplitude)
-
-
 def uneven_damping(scene: Scene) -> Effect:
     """-d |v|: viscous friction c - d in one direction and c + d in the other, N s/m."""
     name, dof = "uneven_damping", scene.dof(SLIDE)
@@ -121,7 +104,7 @@ def uneven_damping(scene: Scene) -> Effect:
 def searches(config: GapEmps, scene: Scene) -> dict[str, Search]:
     """By what the base has and what is asked about."""
     recording, gap = load_emps(config.data, FIT), settings(MOTION_CUTOFF, config.seed)
-    effects = {e.name: in_newtons(e) for e in library(scene) if e.name not in NOT_ASKED}
+    effects = {e.name: e for e in library(scene, scale=NEWTONS) if e.name not in NOT_ASKED}
     known = [as_known(effects["joint_coulomb"])]
     own = [*effects.values(), uneven_damping(scene)]
     base = emps_space(scene).select(BASE)

@@ -220,6 +220,15 @@ def test_effects_are_restricted_and_left_out():
     assert [e.name for e in chosen] == ["latch"]
 
 
+def test_effects_of_a_larger_machine():
+    (usual,), (large,) = (
+        gap.chosen_effects(gap.Gap(effects=("joint_coulomb",), effect_scale=k), door_scene(), []) for k in (1.0, 20.0)
+    )
+    assert [p.high for p in large.parameters] == [20.0 * p.high for p in usual.parameters]
+    with pytest.raises(ValueError, match="the scale of the effects must be above 0, got -1"):
+        gap.chosen_effects(gap.Gap(effect_scale=-1.0), door_scene(), [])
+
+
 def test_a_log_without_commands_has_no_servo_to_suspect():
     scene = door_scene()
     log = replace(record("fit"), time=np.zeros(0), command=np.zeros((0, 0)), command_names=())

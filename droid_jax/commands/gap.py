@@ -58,6 +58,9 @@ class Gap:
     """Effects of the library to ask about; default: all that the scene can have."""
     without: tuple[str, ...] = ()
     """Effects of the library to leave out."""
+    effect_scale: float = 1.0
+    """Forces and torques of the library's effects, relative to an arm of a Panda's size: priors, bounds and the sizes
+    worth a name are taken times this. An axis that is driven with a kilonewton: 30."""
     own_effects: Path | None = None
     """Python file that registers effects of your own (docs/method-gap.md); it is run."""
     budget: float | None = None
@@ -164,13 +167,13 @@ def chosen_effects(command: Gap, scene: Scene, recordings: list[Recording]) -> t
     from droid_jax.model.effects.registry import library
 
     library(scene, command.without)  # names are checked there
-    possible = library(scene)
+    possible = library(scene, scale=command.effect_scale)
     if any(not r.command.size for r in recordings):  # a measured motion has no servo that an effect could change
         possible = tuple(e for e in possible if not e.command and not e.servo)
-    asked = library(scene, command.effects or None)
+    asked = {e.name for e in library(scene, command.effects or None)}
     names = {e.name for e in possible}
     impossible = [name for name in command.effects if name not in names]
-    left = tuple(e for e in asked if e.name in names and e.name not in command.without)
+    left = tuple(e for e in possible if e.name in asked and e.name not in command.without)
     if impossible or not left:
         what = f"cannot have {', '.join(impossible)}" if impossible else "is left without any effect"
         raise ValueError(f"scene {scene.name!r} {what} here; it can have: {', '.join(sorted(names))}")

@@ -59,6 +59,8 @@ class All:
     """Measured joints of your own scene; default: all driven joints."""
     object_joint: str | None = None
     """Joint of the thing that is moved, in your own scene."""
+    effect_scale: float = 1.0
+    """Forces and torques of the library's effects, relative to an arm of a Panda's size, as in gap."""
     own_effects: Path | None = None
     """Python file that registers effects of your own (docs/method-gap.md); it is run."""
     hide: tuple[str, ...] | None = None
@@ -166,7 +168,8 @@ def _plan(
         # A log in blocks of time has no confirming recording, and its base fit needs no start.
         known = "confirm" in roles and (out / "identify" / "fit.json").is_file()
         fit = out / "identify" if known else None
-        _stage(gap.run, gap.Gap(recordings, fit=fit, preset=presets.identify, out=out / "gap", **own))
+        sizes = {"effect_scale": command.effect_scale}
+        _stage(gap.run, gap.Gap(recordings, fit=fit, preset=presets.identify, out=out / "gap", **sizes, **own))
 
     def learn() -> None:
         _stage(train.run, train.Train(model_folder(out), preset=presets.train, out=out / "train", **board, **common))

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from droid_jax.model.effects.sizes import sized
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
 from droid_jax.model.seam import Effect
@@ -39,18 +40,32 @@ def registered() -> tuple[str, ...]:
     return tuple(sorted(_MAKERS))
 
 
-def library(scene: Scene, names: Iterable[str] | None = None) -> tuple[Effect, ...]:
+def library(scene: Scene, names: Iterable[str] | None = None, scale: float = 1.0) -> tuple[Effect, ...]:
     """The effects that a scene can have, in the order of their names; `names` chooses some.
 
-    Raises ValueError for unknown names, listing the valid ones, and for an effect that is not well made.
+    scale: forces and torques of the built-in effects relative to a light arm's, see `sized`; those of one's own have
+    the size they were given.
+
+    Raises ValueError for unknown names, listing the valid ones, for an effect that is not well made, and for a scale
+    that is not above zero.
     """
+    if not 0.0 < scale < np.inf:
+        raise ValueError(f"the scale of the effects must be above 0, got {scale:g}")
     known = registered()
     chosen = known if names is None else tuple(names)
     unknown = [n for n in chosen if n not in known]
     if unknown:
         raise ValueError(f"unknown effects {', '.join(unknown)}; valid: {', '.join(known)}")
-    made = (_MAKERS[name](scene) for name in chosen)
-    return tuple(_checked(effect) for effect in made if effect is not None)
+    made = (_made(_MAKERS[name], scene, scale) for name in chosen)
+    return tuple(effect for effect in made if effect is not None)
+
+
+def _made(maker: Maker, scene: Scene, scale: float) -> Effect | None:
+    effect = maker(scene)
+    if effect is None:
+        return None
+    built_in = maker.__module__.startswith(f"{__package__}.")
+    return sized(_checked(effect), scene, scale) if built_in else _checked(effect)
 
 
 def _checked(effect: Effect) -> Effect:

@@ -105,6 +105,43 @@ def test_no_two_effects_share_a_parameter():
     assert len(effect_space(library(mechanism()))) == sum(len(e.parameters) for e in library(mechanism()))
 
 
+# ----- sizes
+
+
+def test_sizes_are_those_of_another_machine():
+    """Torques grow, masses, gains and delays do not; neutral stays neutral."""
+    usual, large = (effect_space(library(mechanism(), scale=k)) for k in (1.0, 30.0))
+    assert usual.names == large.names
+    torques = np.array([p.unit.startswith("N m") for p in usual.parameters])
+    assert torques.any() and not torques.all()
+    factor = np.where(torques, 30.0, 1.0)
+    np.testing.assert_allclose(large.std, factor * usual.std)
+    np.testing.assert_allclose(large.low, factor * usual.low)
+    np.testing.assert_allclose(large.high, factor * usual.high)
+    np.testing.assert_array_equal(large.mean, usual.mean)
+    for before, after in zip(library(mechanism()), library(mechanism(), scale=30.0), strict=True):
+        grows = any(p.unit.startswith("N m") for p in before.parameters)
+        assert after.smallest == pytest.approx((30.0 if grows else 1.0) * before.smallest)
+
+
+def test_slides_are_driven_by_forces():
+    scene = edited('"elbow" axis', '"elbow" type="slide" axis', joints=["elbow"], object_joint=None)
+    space = effect_space(library(scene, ["cable_pull", "joint_coulomb", "torque_drift", "torque_gain"]))
+    assert {p.name.split("[")[0]: p.unit for p in space.parameters} == {
+        "cable_stiffness": "N/m",
+        "cable_pull": "N",
+        "joint_coulomb": "N",
+        "torque_drift": "N/s",
+        "torque_gain": "-",
+    }
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, np.inf, np.nan])
+def test_a_scale_is_a_positive_number(scale: float):
+    with pytest.raises(ValueError, match=r"the scale of the effects must be above 0, got"):
+        library(mechanism(), scale=scale)
+
+
 # ----- effects of one's own
 
 

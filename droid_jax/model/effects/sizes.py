@@ -1,0 +1,34 @@
+"""The library's sizes are a light arm's; here they become those of another machine."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import mujoco
+
+from droid_jax.model.parameters import Parameter
+from droid_jax.model.scene import Scene
+from droid_jax.model.seam import Effect
+
+TORQUE, FORCE = "N m", "N"
+
+
+def sized(effect: Effect, scene: Scene, scale: float) -> Effect:
+    """An effect whose forces and torques are `scale` times the library's: priors, bounds and the size worth a name.
+
+    Amplitudes that are no torques (masses, gains, delays) stay as they are.  At slides a torque is a force, in N.
+    """
+    of = {name: place for place, names in effect.places.items() for name in names}
+    torques = {p.name for p in effect.parameters if p.name in of and p.unit.startswith(TORQUE)}
+    parameters = (_sized(p, scale, _is_slide(scene, of[p.name])) if p.name in torques else p for p in effect.parameters)
+    return replace(effect, parameters=tuple(parameters), smallest=effect.smallest * (scale if torques else 1.0))
+
+
+def _sized(p: Parameter, scale: float, slide: bool) -> Parameter:
+    unit = p.unit.replace(TORQUE, FORCE).replace("rad", "m") if slide else p.unit
+    return replace(p, unit=unit, std=scale * p.std, low=scale * p.low, high=scale * p.high)
+
+
+def _is_slide(scene: Scene, place: str) -> bool:
+    """Whether a place is a joint that slides; places may also be "commands", "grip" or a body."""
+    return place in scene.joints and scene.model.jnt_type[scene.id("joint", place)] == mujoco.mjtJoint.mjJNT_SLIDE
