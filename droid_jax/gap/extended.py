@@ -81,9 +81,13 @@ def extended(case: Case, model: Model) -> Extended:
 
 
 def save_extended(folder: Path, model: Extended) -> None:
-    """Write extended.json and extended.xml into `folder`."""
-    write_text(folder / MJCF, fitted_mjcf(model.scene, model.space, model.values))
-    write_json(folder / FILE, _to_json(model))
+    """Write extended.json and extended.xml into `folder`; extended.json says why where there is no MJCF."""
+    mjcf: dict[str, Any] = {"file": MJCF, "lacks": list(model.lacking)}
+    try:
+        write_text(folder / MJCF, fitted_mjcf(model.scene, model.space, model.values))
+    except ValueError as error:
+        mjcf |= {"file": None, "error": str(error)}
+    write_json(folder / FILE, _to_json(model) | {"mjcf": mjcf})
 
 
 def load_extended(path: str | Path, scene: Scene) -> Extended:
@@ -125,7 +129,6 @@ def _to_json(model: Extended) -> dict[str, Any]:
             }
             for part in model.parts
         ],
-        "mjcf": {"file": MJCF, "lacks": list(model.lacking)},
         "values": dict(zip(model.space.names, model.values.tolist(), strict=True)),
         "gaussian": {
             "coordinates": gaussian.coordinates,

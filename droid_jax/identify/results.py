@@ -46,7 +46,12 @@ def write_run(
     truth: hidden values where they are known (the stand-in robot); samples: draws them (see `cost_samples`), once
       the fit itself is on disk.
     """
-    write_json(folder / "fit.json", fit_json(found, truth or {}, list(notes)))
+    mjcf, notes = None, list(notes)
+    try:
+        mjcf = fitted_mjcf(found.scene, found.full, found.best)
+    except ValueError as error:  # the fit itself is whole
+        notes.append(f"fitted.xml is not written: {error}")
+    write_json(folder / "fit.json", fit_json(found, truth or {}, notes))
     found.gaussian.save(folder / "gaussian.json")
     found.full_gaussian.save(folder / "gaussian_full.json")
     _write_history(folder, found)
@@ -55,7 +60,8 @@ def write_run(
         np.outer(np.diag(found.full_gaussian.cov), np.diag(found.full_gaussian.cov))
     )
     write_npz(folder / "correlation.npz", {"names": np.array(found.full.names), "correlation": correlation})
-    write_text(folder / "fitted.xml", fitted_mjcf(found.scene, found.full, found.best))
+    if mjcf is not None:
+        write_text(folder / "fitted.xml", mjcf)
     if samples is not None:
         drawn = samples()
         write_npz(folder / "distribution.npz", drawn)

@@ -39,6 +39,9 @@ def fitted_mjcf(scene: Scene, space: Space, values: np.ndarray) -> str:
     """The scene with the values [D] of `space` written in; `unwritten` says which have no place in it.
 
     Files of meshes and textures are named by their absolute paths, wherever the text is saved.
+
+    Raises ValueError where MuJoCo compiles no model of these values: a replay takes an inertia that no body can
+    have (fitted about one axis alone, say), the compiler does not.
     """
     spec, model = scene.spec.copy(), make_c_model(scene, space, values)
     compiled(spec)  # numbers its elements, of which not all need a name
@@ -47,7 +50,10 @@ def fitted_mjcf(scene: Scene, space: Space, values: np.ndarray) -> str:
             _write_changed(kind, element, row, scene.model, model)
     keep_inertia(spec, model)
     _locate_assets(spec)
-    compiled(spec)
+    try:
+        compiled(spec)
+    except ValueError as error:
+        raise ValueError(f"the fitted values make no MJCF: {' '.join(str(error).split())}") from None
     return _unwrapped(spec.to_xml())
 
 

@@ -20,7 +20,7 @@ from droid_jax.gap.extended import Extended, extended, load_extended, save_exten
 from droid_jax.identify.gaussian import prior
 from droid_jax.model.effects.registry import effect_space, library, ready
 from droid_jax.model.mjcf import fitted_mjcf
-from droid_jax.model.parameters import Space
+from droid_jax.model.parameters import Parameter, Space, Write
 from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene, load_scene
 
@@ -58,6 +58,18 @@ def _names(effect: Any) -> set[str]:
 
 
 # ----- there and back
+
+
+def test_a_model_that_makes_no_mjcf_is_saved_all_the_same(tmp_path: Path):
+    """An inertia about one axis that is larger than the other two together; the replay takes it."""
+    scene, _ = small_scene()
+    body = int(scene.model.jnt_bodyid[scene.id("joint", JOINTS[0])])
+    inertia = Parameter("inertia", "kg m^2", 50.0, 1.0, 0.0, 99.0, writes=(Write("body_inertia", (body, 1)),))
+    save_extended(tmp_path, with_effects(scene, Space((inertia,)), hinge_preload=0.7))
+    written = json.loads((tmp_path / "extended.json").read_text())["mjcf"]
+    assert written["file"] is None and "inertia" in written["error"] and not (tmp_path / "extended.xml").exists()
+    again = load_extended(tmp_path / "extended.json", scene)
+    assert dict(zip(again.space.names, again.values, strict=True)) == {"inertia": 50.0, "hinge_preload": 0.7}
 
 
 def test_the_cost_is_the_searchs_own(found: Small, saved: Path):

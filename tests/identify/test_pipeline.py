@@ -13,6 +13,7 @@ import pytest
 from small_log import COULOMB, elbow, elbow_log, elbow_space
 
 from droid_jax.compare.residuals import CompareConfig, make_comparison
+from droid_jax.identify import results
 from droid_jax.identify.fit import on_bound
 from droid_jax.identify.pipeline import WORTH, Identified, IdentifyConfig, _closed, _floor, _scatter, identify
 from droid_jax.identify.results import write_run
@@ -104,6 +105,22 @@ def test_files_are_written_before_samples_are_drawn(found: Identified, tmp_path:
     fit = json.loads((tmp_path / "fit.json").read_text())
     assert fit["mjcf_lacks"] == ["torque_offset[elbow]"]
     assert [p["name"] for p in fit["parameters"] if p["on_bound"]] == list(on_bound(found.full, found.best))
+
+
+def test_a_fit_that_makes_no_mjcf_keeps_everything_else(
+    found: Identified, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def refuses(*_: object) -> str:
+        raise ValueError("the fitted values make no MJCF: inertia must satisfy A + B >= C")
+
+    monkeypatch.setattr(results, "fitted_mjcf", refuses)
+    write_run(tmp_path, found, {}, notes=["a note"])
+    fit = json.loads((tmp_path / "fit.json").read_text())
+    assert fit["notes"] == [
+        "a note",
+        "fitted.xml is not written: " + "the fitted values make no MJCF: inertia must satisfy A + B >= C",
+    ]
+    assert (tmp_path / "config.json").is_file() and not (tmp_path / "fitted.xml").exists()
 
 
 def test_a_floor_in_newton_metres_stands_beside_no_cost_in_noise_units(found: Identified, tmp_path: Path):

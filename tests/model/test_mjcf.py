@@ -154,6 +154,14 @@ def test_what_mjcf_cannot_say_is_named():
     fitted_mjcf(scene, space, space.mean)
 
 
+def test_an_inertia_that_no_body_can_have_is_said():
+    """Fitted about one axis alone, beyond the sum of the other two: a replay takes it."""
+    scene = compile_scene(mujoco.MjSpec.from_string(TURNED), "turned")
+    space = one(scene, "body_inertia", (1, 1), 5.0)
+    with pytest.raises(ValueError, match=r"^the fitted values make no MJCF: .*inertia.*A \+ B >= C.*arm"):
+        fitted_mjcf(scene, space, space.mean)
+
+
 def test_meshes_are_found_from_any_folder(tmp_path: Path):
     """meshdir is relative to the file that was read; what is written lies elsewhere."""
     (tmp_path / "robot" / "parts").mkdir(parents=True)
