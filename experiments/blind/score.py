@@ -78,6 +78,7 @@ def judge(case: Case, limits: Mapping[str, Any]) -> dict[str, Any]:
     allowed = right_names if truth["kind"] == "left_out" else [*right_names, *case["parts"]]
     false = [sorted(slot) for slot in slots if not any(slot & set(names) for names in allowed)]
     exact = [any(e == names[0] for e in result.get("effects", ())) for names in right_names if names]
+    alone = bool(exact) and all(exact) and not false and not any(result.get("tied", ()))
     seconds = result.get("seconds", {})
     return {
         "name": truth["name"],
@@ -96,7 +97,8 @@ def judge(case: Case, limits: Mapping[str, Any]) -> dict[str, Any]:
         "wrong_confident": bool(false) and verdict in CLEAN,
         "met": met,
         "named": bool(met) and all(met) and not false and verdict in NAMING,
-        "exact": bool(exact) and all(exact) and not false and not any(result.get("tied", ())) and verdict == "named",
+        "alone": alone and verdict in NAMING,
+        "exact": alone and verdict == "named",
         "open": verdict in OPEN,
         "reachable": reachable(case),
         "gaps": result.get("gaps", {}),
@@ -215,6 +217,7 @@ def summarise(judged: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "false_names": rate([*single, *pair, *strange], lambda c: bool(c["false_names"])),
         "detected": rate(known, lambda c: c["verdict"] in (*NAMING, "unexplained")),
         "named_up_to_tie": rate(single, lambda c: c["named"]),
+        "named_alone": rate(single, lambda c: c["alone"]),
         "named_exactly": rate(single, lambda c: c["exact"]),
         "nameable": rate([c for c in known if c["reachable"] is not None], lambda c: c["reachable"] >= NAMEABLE),
         "nameable_named_up_to_tie": rate(alone, lambda c: c["named"]),

@@ -56,6 +56,7 @@ def _rows() -> Iterator[tuple[str, str, Chosen, Chosen]]:
     yield "one at 3 times: named, alone or in a tie", "90 %", _kind("single", factors=(3.0,)), _named
     yield "one at its limit: named, alone or in a tie", "", at_limit, _named
     yield "one at its limit: detected", "50 %", at_limit, lambda c: c["verdict"] in (*NAMING, "unexplained")
+    yield "one at 3 or 10 times: named alone, a remainder or not", "", above, lambda c: c["alone"]
     yield "one at 3 or 10 times: named alone, nothing left open", "80 %", above, lambda c: c["exact"]
     yield "one whose right name closes half of the gap: named, alone or in a tie", "", _reachable, _named
     yield "two: one named, nothing false", "90 %", _kind("pair"), lambda c: any(c["met"]) and not _false(c)

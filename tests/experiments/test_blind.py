@@ -277,7 +277,8 @@ def test_rates_of_what_is_named():
         case("none", "named", [latch], []),
     )
     expected = {
-        "named_up_to_tie": (3, 5), "named_exactly": (1, 5), "partly": (1, 5), "wrong_name_rate": (3, 10),
+        "named_up_to_tie": (3, 5), "named_alone": (2, 5), "named_exactly": (1, 5), "partly": (1, 5),
+        "wrong_name_rate": (3, 10),
         "false_names": (4, 10), "pair_one_named_none_false": (2, 2), "pair_both_named": (1, 2),
         "unexplained_recall": (1, 3),
         "false_alarm_rate": (1, 2), "false_names_where_nothing": (1, 2), "detected": (7, 7),
