@@ -64,7 +64,7 @@ def _made(maker: Maker, scene: Scene, scale: float) -> Effect | None:
     effect = maker(scene)
     if effect is None:
         return None
-    built_in = maker.__module__.startswith(f"{__package__}.")
+    built_in = str(maker.__module__).startswith(f"{__package__}.")  # None for code that was run as text
     return sized(_checked(effect), scene, scale) if built_in else _checked(effect)
 
 
