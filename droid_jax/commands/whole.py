@@ -168,8 +168,8 @@ def _plan(
         # A log in blocks of time has no confirming recording, and its base fit needs no start.
         known = "confirm" in roles and (out / "identify" / "fit.json").is_file()
         fit = out / "identify" if known else None
-        sizes = {"effect_scale": command.effect_scale}
-        _stage(gap.run, gap.Gap(recordings, fit=fit, preset=presets.identify, out=out / "gap", **sizes, **own))
+        scale = command.effect_scale
+        _stage(gap.run, gap.Gap(recordings, fit, presets.identify, effect_scale=scale, out=out / "gap", **own))
 
     def learn() -> None:
         _stage(train.run, train.Train(model_folder(out), preset=presets.train, out=out / "train", **board, **common))

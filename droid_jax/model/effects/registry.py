@@ -61,11 +61,12 @@ def library(scene: Scene, names: Iterable[str] | None = None, scale: float = 1.0
 
 
 def _made(maker: Maker, scene: Scene, scale: float) -> Effect | None:
-    effect = maker(scene)
-    if effect is None:
+    made = maker(scene)
+    if made is None:
         return None
+    effect = _checked(made)
     built_in = str(maker.__module__).startswith(f"{__package__}.")  # None for code that was run as text
-    return sized(_checked(effect), scene, scale) if built_in else _checked(effect)
+    return sized(effect, scene, scale) if built_in else effect
 
 
 def _checked(effect: Effect) -> Effect:
