@@ -94,6 +94,11 @@ def test_the_search_for_what_is_missing_begins_at_the_fit(called, tmp_path: Path
     assert [c.fit for c in called] == [None, Path("runs/all/identify")]
 
 
+def test_the_scale_of_effects_reaches_the_search(called):
+    assert main(["all", "--stages", "gap", "--effect-scale", "30"]) == 0
+    assert [c.effect_scale for c in called] == [30.0]
+
+
 def test_a_policy_is_trained_on_the_extended_model_where_there_is_one(called, tmp_path: Path, capsys):
     found(tmp_path / "runs" / "all" / "gap", ["latch at door_hinge"])
     assert main(["all", "--stages", "train"]) == 0

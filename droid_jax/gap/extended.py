@@ -87,6 +87,7 @@ def save_extended(folder: Path, model: Extended) -> None:
         write_text(folder / MJCF, fitted_mjcf(model.scene, model.space, model.values))
     except ValueError as error:
         mjcf |= {"file": None, "error": str(error)}
+        (folder / MJCF).unlink(missing_ok=True)  # of another run, started over in this folder
     write_json(folder / FILE, _to_json(model) | {"mjcf": mjcf})
 
 

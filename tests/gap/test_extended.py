@@ -65,6 +65,7 @@ def test_a_model_that_makes_no_mjcf_is_saved_all_the_same(tmp_path: Path):
     scene, _ = small_scene()
     body = int(scene.model.jnt_bodyid[scene.id("joint", JOINTS[0])])
     inertia = Parameter("inertia", "kg m^2", 50.0, 1.0, 0.0, 99.0, writes=(Write("body_inertia", (body, 1)),))
+    (tmp_path / "extended.xml").write_text("of a run before, started over")
     save_extended(tmp_path, with_effects(scene, Space((inertia,)), hinge_preload=0.7))
     written = json.loads((tmp_path / "extended.json").read_text())["mjcf"]
     assert written["file"] is None and "inertia" in written["error"] and not (tmp_path / "extended.xml").exists()
