@@ -163,7 +163,7 @@ def test_each_role_has_its_own_instants(found: GapFiles):
 
 def test_what_a_log_lacks_is_handed_on(run: tuple[Path, str]):
     model = load_extended(run[0] / "extended.json", elbow())
-    assert model.space.names[-1] == "joint_coulomb[elbow]" and model.lacking == ("joint_coulomb at elbow",)
+    assert model.space.names[-1] == "joint_coulomb[elbow]" and model.lacking == ()
     assert np.all(np.isfinite(model.gaussian.cov)) and (run[0] / "extended.xml").is_file()
 
 

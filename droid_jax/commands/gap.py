@@ -222,6 +222,8 @@ def _done(out: Path) -> None:
         closed = "" if gap["closed"] is None else f" ({percent(gap['closed'])} closed)"
         gaps.append(f"{role} {gap['before']:.3g} -> {gap['after']:.3g}{closed}")
     print(f"gap, noise units squared: {', '.join(gaps)}")
+    if found["cut"]:
+        print(f"left out for lack of time (--budget): {found['cut']}")
     if limits := found.get("split", {}).get("limits"):
         print(limits)
     shift, deviations = most_shifted(found["shifts"])

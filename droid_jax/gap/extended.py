@@ -22,8 +22,9 @@ from droid_jax.gap.refit import Model
 from droid_jax.identify.gaussian import Gaussian, space_from_json, space_to_json
 from droid_jax.identify.uncertainty import posterior
 from droid_jax.model.effects.registry import effect_space, library, ready
-from droid_jax.model.mjcf import WORDS, fitted_mjcf
+from droid_jax.model.mjcf import WORDS, fitted_mjcf, native
 from droid_jax.model.parameters import Space
+from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
 from droid_jax.storage import write_json, write_text
@@ -68,7 +69,10 @@ class Extended:
     def lacking(self) -> tuple[str, ...]:
         """Names of the parts that an MJCF cannot hold."""
         effects = {e.name: e for e in self.effects}
-        return tuple(p.name for p in self.parts if not _in_mjcf(effects[p.effect], self.space.select(p.free)))
+        model = make_c_model(self.scene, self.space, self.values)
+        said = {n for n, e in effects.items() if native(e, self.space, self.values, model) is not None}
+        parts = (p for p in self.parts if p.effect not in said)
+        return tuple(p.name for p in parts if not _in_mjcf(effects[p.effect], self.space.select(p.free)))
 
 
 def extended(case: Case, model: Model) -> Extended:
@@ -84,7 +88,7 @@ def save_extended(folder: Path, model: Extended) -> None:
     """Write extended.json and extended.xml into `folder`; extended.json says why where there is no MJCF."""
     mjcf: dict[str, Any] = {"file": MJCF, "lacks": list(model.lacking)}
     try:
-        write_text(folder / MJCF, fitted_mjcf(model.scene, model.space, model.values))
+        write_text(folder / MJCF, fitted_mjcf(model.scene, model.space, model.values, model.effects))
     except ValueError as error:
         mjcf |= {"file": None, "error": str(error)}
         (folder / MJCF).unlink(missing_ok=True)  # of another run, started over in this folder

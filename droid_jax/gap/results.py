@@ -84,6 +84,7 @@ def gap_json(case: Case, verdict: Verdict) -> dict[str, Any]:
         "screens": [
             {"p": found.p, "ranking": _ranking(found), "failed": list(found.failed)} for found in verdict.screens
         ],
+        "failed": list(verdict.failed),
         "trials": [_trial(trial) for trial in verdict.trials],
         "cells": {"before": _cells(verdict.before), "after": _cells(verdict.after)},
         "amplitudes": _amplitudes(case, verdict),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -15,7 +15,7 @@ from droid_jax.gap.rank import Proposal, collinear, proposals
 from droid_jax.gap.refit import Model, look, refit
 from droid_jax.gap.screen import Screen
 from droid_jax.gap.select import LESS, MORE, OF_ALL, Trial, judge
-from droid_jax.identify.refine import RefineConfig
+from droid_jax.identify.refine import NotReplayed, RefineConfig
 
 T = TypeVar("T")
 Progress = Callable[[str, Any], None]
@@ -82,13 +82,17 @@ class Budget:
 
 @dataclass(frozen=True, eq=False)
 class Hunt:
-    """What every round is given: the case, U of its base model on the confirming demonstration, the floor."""
+    """What every round is given: the case, U of its base model on the confirming demonstration, the floor.
+
+    failed: names of the models whose replay blew up where their refit was to begin; rounds add to it.
+    """
 
     case: Case
     whole_gap: float
     floor: float
     budget: Budget
     progress: Progress
+    failed: list[str] = field(default_factory=list)
 
     def look(self, model: Model, part: Candidate, found: Screen) -> tuple[np.ndarray, float]:
         """A first look at one more effect: values [D] and objective (see `refit.look`)."""
@@ -102,11 +106,14 @@ class Hunt:
         return refit(self.case.fit, self.case.base, parts, start[None], config)
 
     def race(self, starters: Iterable[Starter], aim: float, note: str = "") -> list[Model]:
-        """Refits one after the other; one that will reach neither `aim` nor the best so far is given up early."""
+        """Refits one after the other; one that will not reach `aim`, or the best so far, is given up early."""
         models = list[Model]()
         for parts, start in starters:
             aim = min([aim, *(m.refined.objective for m in models)])
-            models.append(self.refit(parts, start, replace(self.case.config.refit, aim=aim), note))
+            try:
+                models.append(self.refit(parts, start, replace(self.case.config.refit, aim=aim), note))
+            except NotReplayed:
+                self.failed.append(" + ".join(c.name for c in parts))
         return models
 
     def aim(self, model: Model) -> float:

@@ -8,6 +8,7 @@ computer models, JASA 2017.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -65,7 +66,8 @@ def marks(evidence: Evidence, values: np.ndarray, questions: Sequence[Question])
         for name, value in q.candidate.shapes.items():
             row[space.index(name)] = value
         p = space[q.amplitude]
-        size = min(SMALL * p.std, 0.5 * (p.high - p.mean))
+        room = p.high - p.mean or p.low - p.mean  # downwards where neutral is the upper bound
+        size = math.copysign(min(SMALL * p.std, 0.5 * abs(room)), room)
         row[space.index(q.amplitude)] = p.mean + size
         rows.append(row)
         sizes.append(size)

@@ -19,6 +19,7 @@ OF_ALL = 0.05  # and share of the base model's U: what a wrong form of the first
 DOUBT = 0.05  # share of the resamples in which a rival is better, from which it does as well
 CHOSEN = 0.8  # share of the resamples in which an effect, or one that does as well, must win
 RESAMPLES = 400
+TOO_SMALL = "too small to be worth a name"
 EDGE = 0.02  # share of a parameter's range that counts as its bound
 
 
@@ -136,7 +137,7 @@ def _too_small(
 ) -> list[str]:
     space = fit.cost.space
     small = all(abs(model.values[space.index(a)] - space[a].mean) < smallest[a] for a in spans)
-    return ["too small to be worth a name"] if small else []
+    return [TOO_SMALL] if small else []
 
 
 def _amplitude_reasons(fit: Evidence, model: Model, spans: Mapping[str, tuple[float, float]]) -> list[str]:
@@ -155,4 +156,4 @@ def _on_bound(fit: Evidence, model: Model, amplitude: str) -> bool:
     """At a bound that is not neutral."""
     p = fit.cost.space[amplitude]
     value, reach = model.values[fit.cost.space.index(amplitude)], EDGE * (p.high - p.low)
-    return value > p.high - reach or (p.low != p.mean and value < p.low + reach)
+    return (p.high != p.mean and value > p.high - reach) or (p.low != p.mean and value < p.low + reach)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from droid_jax.gap.localise import Localisation
 from droid_jax.gap.refit import Model
 from droid_jax.gap.screen import Screen
-from droid_jax.gap.select import Trial
+from droid_jax.gap.select import TOO_SMALL, Trial
 from droid_jax.gap.trend import Trend
 
 
@@ -42,7 +42,8 @@ class Verdict:
     kind; effects: names of what is in the model; tied: for each of them the names that do as well.
     base, model: before and after.  floor: U0, what the simulation's own step leaves.
     gaps: "fit", "confirm", "sealed" -> (U before, U after).  screens, trials: the grounds, in the order they
-    were made.  before, after: where the gap lives on the fitted recording.  rivals: models that do as well as
+    were made.  failed: models whose replay blew up where their refit was to begin.  before, after: where the gap
+    lives on the fitted recording.  rivals: models that do as well as
     `model`, refitted; experiments: what would tell them apart, the best first.  cut: in words what the
     budget left out, empty for nothing.  trend: what changes from repeat to repeat, None where nothing was asked.
     """
@@ -58,6 +59,7 @@ class Verdict:
     trials: tuple[Trial, ...]
     before: Localisation
     after: Localisation
+    failed: tuple[str, ...] = ()
     rivals: tuple[Model, ...] = ()
     experiments: tuple[Experiment, ...] = ()
     cut: str = ""
@@ -81,6 +83,12 @@ class Verdict:
         return ", and ".join([certain, *open_ones] if certain else open_ones)
 
     @property
+    def _or_small(self) -> str:
+        """Where a candidate lost for its size alone, it may be all there is."""
+        small = dict.fromkeys(t.name for t in self.trials if t.reasons == (TOO_SMALL,))
+        return f", or {' or '.join(small)}, too small to be worth a name" if small else ""
+
+    @property
     def sentence(self) -> str:
         """The answer in words."""
         return {
@@ -88,6 +96,6 @@ class Verdict:
             Kind.NAMED: f"The model lacks: {self._lacking}.",
             Kind.TIE: f"The model lacks {self._lacking}.",
             Kind.PARTLY: f"The model lacks {self._lacking}; a remainder is unexplained.",
-            Kind.UNEXPLAINED: "The model lacks something that is not in the library.",
+            Kind.UNEXPLAINED: f"The model lacks something that is not in the library{self._or_small}.",
             Kind.UNCONVERGED: f"The fit of {self._unsettled} did not converge; nothing can be concluded.",
         }[self.kind]

@@ -74,15 +74,24 @@ def ask(case: Case, model: Model, asked: tuple[Question, ...]) -> Screen:
 
 
 def find(case: Case, base: Model, floor: float, progress: Progress = lambda stage, value: None) -> Verdict:
-    """From a base fit to a verdict.  floor: U0, see `numerical_floor`."""
+    """From a base fit to a verdict.  floor: U0, see `numerical_floor`.
+
+    Raises ValueError where the case's effects have no place that could be asked about.
+    """
     hunt = Hunt(case, case.confirm.gap_at(base.values), floor, Budget(case.config.budget), progress)
     if not base.refined.converged:
         return _verdict(hunt, base, base, [], quiet=False)
     asked = questions_of(candidates(case.effects))
+    if not asked:
+        raise ValueError("there is nothing to ask about: none of the effects says its places (`Effect.places`)")
     model, rounds, quiet = base, list[Round](), False
     while len(model.parts) < case.config.most:
+        left = further(asked, model)
+        quiet = not left
+        if quiet:  # all that was asked about is in the model
+            break
         progress("screen", model.name)
-        found = ask(case, model, further(asked, model))
+        found = ask(case, model, left)
         quiet = found.p >= SIGNIFICANT or model.gap <= floor
         enough = not model.parts or hunt.gap(model) > OF_ALL * hunt.whole_gap
         done = forward(hunt, model, found) if enough and not quiet else Round(found)
@@ -90,7 +99,7 @@ def find(case: Case, base: Model, floor: float, progress: Progress = lambda stag
         if done.winner is None:
             break
         model = done.winner
-    if not quiet and _unsettled(hunt, model):
+    if not quiet and rounds[0].tried and _unsettled(hunt, model):
         if hunt.budget.spent:
             hunt.budget.skip("pairs of effects not tried")
         else:
@@ -151,6 +160,7 @@ def _verdict(hunt: Hunt, base: Model, model: Model, rounds: list[Round], quiet: 
         trials=tuple(t for r in rounds for t in r.trials),
         before=localise(case.fit, base.values, base.residuals),
         after=localise(case.fit, model.values, model.residuals),
+        failed=tuple(hunt.failed),
         rivals=next((r.rivals for r in reversed(rounds) if r.winner is not None), ()),
         cut=hunt.budget.cut,
         trend=trend(rounds[0].screen, base.residuals, case.config.seed) if rounds and case.fit.repeats > 1 else None,

@@ -100,6 +100,10 @@ class Refined:
         return _curvature(self.jacobian, self.prior)
 
 
+class NotReplayed(ValueError):
+    """Where a refinement was to begin the replay gave no numbers."""
+
+
 @dataclass(frozen=True)
 class RefineProgress:
     """Reported after every iteration: its number, of how many, and the best objective per residual."""
@@ -126,21 +130,21 @@ def refine(
       out there, and only the best goes on to all of it.
     hypotheses: assignments {name: value} that may lie in another basin (a finger that slips, say),
       each tried once from where the starts converged, if that leaves doubt.
-    Raises ValueError where no start gives finite residuals; others that do not are left out.
+    Raises NotReplayed where no start gives finite residuals; others that do not are left out.
     """
     config = config or RefineConfig()
     rough = _Problem(residuals if first is None else first, space, config, progress)
     begun = rough.start(rough.inside(space.to_search(space.check(np.atleast_2d(starts)))))
     ended, alive = begun.objective, np.isfinite(begun.objective)
     if not alive.any():
-        raise ValueError("none of the starts could be replayed; widen the bounds or start nearer to the truth")
+        raise NotReplayed("none of the starts could be replayed; widen the bounds or start nearer to the truth")
     state, ended[alive] = rough.descend(begun.rows(alive), config.rough)
     if hypotheses and np.mean(state.residual**2) > config.doubt:
         state, _ = rough.descend(rough.explore(state, hypotheses), config.rough)
     problem = _Problem(residuals, space, config, progress, rough)
     state = problem.start(state.x)
     if not np.isfinite(state.objective[0]):
-        raise ValueError(
+        raise NotReplayed(
             "the best start on the first recording could not be replayed on all; start nearer to the truth"
         )
     state, _ = problem.descend(state)

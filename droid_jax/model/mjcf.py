@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,13 @@ import numpy as np
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene, compiled, keep_inertia, look_geoms
+from droid_jax.model.seam import Effect
 
 # Model field -> attribute of the element that holds a row of it, or its first numbers.
 _ATTRIBUTES = {
     "dof_damping": "damping", "dof_frictionloss": "frictionloss", "dof_armature": "armature",
     "dof_solref": "solref_friction", "dof_solimp": "solimp_friction",
+    "qpos_spring": "springref",
     "jnt_stiffness": "stiffness", "jnt_range": "range", "jnt_margin": "margin", "jnt_pos": "pos", "jnt_axis": "axis",
     "jnt_solref": "solref_limit", "jnt_solimp": "solimp_limit", "jnt_actfrcrange": "actfrcrange",
     "body_pos": "pos", "body_quat": "quat", "body_gravcomp": "gravcomp",
@@ -31,12 +34,15 @@ _ATTRIBUTES = {
 _WEIGHT = {"body_mass", "body_inertia", "body_ipos", "body_iquat"}  # written as the body's own <inertial>
 _FOLLOWING = {"geom_rbound", "geom_aabb"}  # the compiler works them out
 WORDS = frozenset({*_ATTRIBUTES, *_WEIGHT, *_FOLLOWING})  # model fields that MJCF can say
+_ANGLES = {"jnt_range", "qpos_spring"}  # written in the compiler's unit
 _PLACE = {"body_pos", "body_quat"}  # written together
 _SHAPE = {"geom_pos", "geom_quat", "geom_size"}
 
 
-def fitted_mjcf(scene: Scene, space: Space, values: np.ndarray) -> str:
+def fitted_mjcf(scene: Scene, space: Space, values: np.ndarray, effects: Sequence[Effect] = ()) -> str:
     """The scene with the values [D] of `space` written in; `unwritten` says which have no place in it.
+
+    effects: in the model; of those that are laws, what MuJoCo says in numbers of its own (`Effect.native`).
 
     Files of meshes and textures are named by their absolute paths, wherever the text is saved.
 
@@ -44,6 +50,9 @@ def fitted_mjcf(scene: Scene, space: Space, values: np.ndarray) -> str:
     have (fitted about one axis alone, say), the compiler does not.
     """
     spec, model = scene.spec.copy(), make_c_model(scene, space, values)
+    for effect in effects:
+        for (field, row), more in (native(effect, space, values, model) or {}).items():
+            getattr(model, field)[row] += more
     compiled(spec)  # numbers its elements, of which not all need a name
     for kind, elements in _elements(spec, model).items():
         for row, element in elements.items():
@@ -55,6 +64,15 @@ def fitted_mjcf(scene: Scene, space: Space, values: np.ndarray) -> str:
     except ValueError as error:
         raise ValueError(f"the fitted values make no MJCF: {' '.join(str(error).split())}") from None
     return _unwrapped(spec.to_xml())
+
+
+def native(
+    effect: Effect, space: Space, values: np.ndarray, model: mujoco.MjModel
+) -> Mapping[tuple[str, int], float] | None:
+    """What an effect adds to the numbers (field, row) of a model; None where it acts in the replay alone."""
+    if effect.native is None:
+        return None
+    return effect.native(dict(zip(space.names, np.asarray(values).tolist(), strict=True)), model)
 
 
 def unwritten(scene: Scene, space: Space) -> tuple[str, ...]:
@@ -76,6 +94,7 @@ def _elements(spec: mujoco.MjSpec, model: mujoco.MjModel) -> dict[str, dict[int,
     return {
         "dof": {int(model.jnt_dofadr[j.id]): j for j in spec.joints},
         "jnt": {j.id: j for j in spec.joints},
+        "qpos": {int(model.jnt_qposadr[j.id]): j for j in spec.joints},
         "body": {b.id: b for b in spec.bodies[1:]},
         "geom": dict(enumerate(geoms)),
         "pair": {p.id: p for p in spec.pairs},
@@ -96,7 +115,7 @@ def _write_changed(kind: str, element: Any, row: int, before: mujoco.MjModel, af
         changed.add("actuator_ctrlrange")
     for field in changed:
         numbers = np.atleast_1d(getattr(after, field)[row])
-        if field == "jnt_range" and element.type != mujoco.mjtJoint.mjJNT_SLIDE and element.compiler.degree:
+        if field in _ANGLES and element.type != mujoco.mjtJoint.mjJNT_SLIDE and element.compiler.degree:
             numbers = np.degrees(numbers)
         _set(element, _ATTRIBUTES[field], numbers)
 

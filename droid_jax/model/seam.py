@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 
 from droid_jax.model.parameters import Parameter
 
@@ -67,6 +68,8 @@ class Effect:
     force:        (theta, State) -> [nv] generalised force added to qfrc_applied.
     frictionloss: (theta, State, base [nv]) -> [nv] N m, rewritten every step.
     observe:      (theta, Rollout) -> Rollout, what the sensor makes of the truth.
+    native:       (values by name, MjModel with the fitted values) -> (field, row) -> what to add there: the same law
+                  in MuJoCo's own numbers, for the MJCF; None where this model has none.
 
     For the gap search:
     what, mark:   a sentence each: what it is, and where its mark should appear.
@@ -84,6 +87,7 @@ class Effect:
     force: Callable[[Theta, State], jax.Array] | None = None
     frictionloss: Callable[[Theta, State, jax.Array], jax.Array] | None = None
     observe: Callable[[Theta, Rollout], Rollout] | None = None
+    native: Callable[[Mapping[str, float], mujoco.MjModel], Mapping[tuple[str, int], float] | None] | None = None
     what: str = ""
     mark: str = ""
     confused_with: tuple[str, ...] = ()

@@ -75,8 +75,8 @@ def _fitted(gap: Gap) -> str:
     tried = len({t["name"] for t in found["trials"]})
     if tried:
         text += f", and {tried} extended models were refitted and judged on “{gap.recording('confirm')}”"
-    failed = dict.fromkeys(name for s in found["screens"] for name in s["failed"])
-    left_out = f" Left out, because the simulation blew up with it: {listed([effect_words(f) for f in failed])}."
+    failed = dict.fromkeys([*(name for s in found["screens"] for name in s["failed"]), *found.get("failed", ())])
+    left_out = f" Left out, because the simulation blew up with it: {listed([model_words(f) for f in failed])}."
     return f"{text}.{left_out if failed else ''}"
 
 
@@ -150,8 +150,7 @@ def _next(gap: Gap) -> str:
         "none": f"go on with the base model; a smaller effect would need {gap.parts.more}",
         "named": f"look for the {named} on the hardware, and simulate with it{_file(gap)}",
         "tie": f"take no name for the cause yet. {_separate(gap)}",
-        "partly explained": f"keep the {named} in the model{_file(gap)}, and look at the hardware {_where(gap)}; "
-        "that part has no name yet",
+        "partly explained": f"{_kept(gap, named)}, and look at the hardware {_where(gap)}; that part has no name yet",
         "unexplained": f"look at the hardware {_where(gap)}. The library holds no effect that does this: write one "
         "of your own, or correct the scene there, and run again. Do not train on this part of the motion",
         "fit not converged": f"{_longer(gap)}give the parameters tighter priors, and run again; take no number from "
@@ -168,6 +167,12 @@ def _longer(gap: Gap) -> str:
         f"fit “{gap.recording('fit')}” by python -m droid_jax.run identify --preset standard --restarts 3 and hand its "
         "folder on (gap --fit FOLDER), or "
     )
+
+
+def _kept(gap: Gap, named: str) -> str:
+    """What to do with a part that was named, or that several effects explain as well."""
+    doubt = ", which need not be the cause: others do as well," if any(gap.found["tied"]) else ""
+    return f"keep the {named}{doubt} in the model{_file(gap)}"
 
 
 def _file(gap: Gap) -> str:

@@ -133,13 +133,47 @@ def test_shapes_and_places_come_back(tmp_path: Path):
 # ----- MJCF
 
 
-def test_what_mjcf_has_no_words_for_is_said(saved: Path):
+def test_what_mjcf_has_no_words_for_is_said(tmp_path: Path):
     """The base part as MJCF, nothing but JSON beside it."""
-    content = json.loads(saved.read_text())
-    assert content["mjcf"] == {"file": "extended.xml", "lacks": ["hinge_preload at door"]}
-    model = mujoco.MjModel.from_xml_path(str(saved.parent / "extended.xml"))
+    scene, base = small_scene()
+    save_extended(tmp_path, with_effects(scene, base, latch_torque=1.2, hinge_preload=0.5))
+    content = json.loads((tmp_path / "extended.json").read_text())
+    assert content["mjcf"] == {"file": "extended.xml", "lacks": ["latch at door"]}
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "extended.xml"))
     assert model.joint("door").damping[0] == pytest.approx(content["values"]["door_damping"], rel=1e-4)
     assert model.body("forearm").mass[0] == pytest.approx(content["values"]["forearm_mass"], rel=1e-4)
+
+
+@pytest.mark.parametrize("degrees", [False, True])
+def test_laws_that_mujoco_has_numbers_for_are_in_the_mjcf(degrees: bool):
+    """A preload is a spring whose rest lies elsewhere, dry friction a friction loss."""
+    scene, base = small_scene()
+    scene.spec.compiler.degree = degrees
+    values = {"hinge_preload": 0.5, "joint_coulomb[elbow]": 0.2}
+    without, model = (with_effects(scene, base, **v) for v in (dict.fromkeys(values, 0.0), values))
+    assert model.lacking == ()
+    plain, written = (
+        mujoco.MjModel.from_xml_string(fitted_mjcf(m.scene, m.space, m.values, m.effects)) for m in (without, model)
+    )
+    more = written.dof_frictionloss - plain.dof_frictionloss
+    assert more.tolist() == pytest.approx([0.0, 0.2, 0.0], abs=1e-6)
+    for angle in (-0.4, 0.0, 1.1):
+        passive = []
+        for m in (plain, written):
+            data = mujoco.MjData(m)
+            data.joint("door").qpos = angle
+            mujoco.mj_forward(m, data)
+            passive.append(data.joint("door").qfrc_passive[0])
+        assert passive[1] - passive[0] == pytest.approx(-0.5, abs=1e-5)
+
+
+def test_a_preload_without_a_spring_has_no_place_in_the_mjcf():
+    scene, base = small_scene()
+    stiff = base.select([n for n in base.names if n != "door_stiffness"])
+    scene.model.jnt_stiffness[:] = 0.0
+    model = with_effects(scene, stiff, hinge_preload=0.5)
+    assert model.lacking == ("hinge_preload at door",)
+    fitted_mjcf(model.scene, model.space, model.values, model.effects)
 
 
 @pytest.mark.parametrize(

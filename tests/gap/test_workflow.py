@@ -14,7 +14,11 @@ from small_gap import EFFECTS, FLOOR, QUICK, Small, record, small, small_scene
 from droid_jax.gap import workflow
 from droid_jax.gap.candidates import Candidate, candidates
 from droid_jax.gap.case import make_case
-from droid_jax.gap.screen import questions_of
+from droid_jax.gap.rank import proposals
+from droid_jax.gap.refit import Model
+from droid_jax.gap.rounds import Hunt
+from droid_jax.gap.screen import Screen, questions_of
+from droid_jax.gap.select import TOO_SMALL
 from droid_jax.gap.verdict import Kind
 from droid_jax.gap.workflow import ask, base_fit, find
 from droid_jax.model.effects.registry import library
@@ -56,6 +60,54 @@ def test_an_effect_that_blows_up_is_left_out_and_named():
     assert not any("bomb" in trial.name for trial in verdict.trials if trial.passed)
     row = next(k for k, q in enumerate(verdict.screens[0].questions) if q.amplitude == "bomb")
     assert verdict.screens[0].t[row] == verdict.screens[0].explained[row] == 0.0
+
+
+def late_bomb(scene: Scene) -> Effect:
+    """A preload that is neutral at its upper bound, and no number at the size that the preload has."""
+    dof = scene.dof("door")
+
+    def force(theta, state):
+        pull = jnp.where(theta["late_bomb"] < -0.3, jnp.nan, theta["late_bomb"])
+        return jnp.zeros_like(state.qvel).at[dof].set(pull)
+
+    return Effect(
+        "late_bomb",
+        (Parameter("late_bomb", "N m", 0.0, 0.5, -5.0, 0.0),),
+        force=force,
+        what="a preload that blows up",
+        places={"door": ("late_bomb",)},
+        smallest=0.1,
+    )
+
+
+def test_a_refit_that_blows_up_where_it_begins_is_left_out_and_named(monkeypatch: pytest.MonkeyPatch):
+    """The screening's small step is replayed, the proposal is not."""
+    monkeypatch.setattr(Hunt, "look", lambda hunt, model, part, found: (_proposed(hunt, model, part, found), -np.inf))
+    scene, space = small_scene()
+    case = make_case(scene, space, (late_bomb(scene),), record("fit"), record("confirm"), config=QUICK)
+    verdict = find(case, base_fit(case, lambda stage, value: None), FLOOR)
+    assert verdict.screens[0].failed == () and verdict.screens[0].explained[0] > 0.5
+    assert verdict.failed == ("late_bomb at door",) and verdict.trials == ()
+    assert verdict.kind is Kind.UNEXPLAINED
+
+
+def _proposed(hunt: Hunt, model: Model, part: Candidate, found: Screen) -> np.ndarray:
+    (proposal,) = proposals(found, model.residuals, hunt.case.whole)
+    return proposal.start(hunt.case.whole, model.values)
+
+
+def test_a_search_ends_where_all_that_was_asked_about_is_in_the_model():
+    scene, space = small_scene()
+    effects, config = library(scene, ["hinge_preload"]), replace(QUICK, most=2)
+    case = make_case(scene, space, effects, record("fit"), record("confirm"), config=config)
+    verdict = find(case, base_fit(case, lambda stage, value: None), FLOOR)
+    assert verdict.effects == ("hinge_preload at door",) and len(verdict.screens) == 1
+
+
+def test_effects_without_places_cannot_be_asked_about(found: Small):
+    placeless = tuple(replace(e, places={}) for e in found.case.effects)
+    with pytest.raises(ValueError, match="none of the effects says its places"):
+        find(replace(found.case, effects=placeless), found.base, FLOOR)
 
 
 def test_where_nothing_blows_up_nothing_is_left_out(found: Small):
@@ -184,3 +236,12 @@ def test_a_gap_below_the_floor_is_none(found: Small):
     assert verdict.kind is Kind.NONE
     assert verdict.screens[0].p < 0.01
     assert not verdict.effects and np.isfinite(verdict.closed("confirm"))
+
+
+def test_what_lost_for_its_size_alone_is_said(found: Small):
+    verdict = replace(found.verdict, kind=Kind.UNEXPLAINED, effects=(), tied=())
+    assert verdict.sentence == "The model lacks something that is not in the library."
+    tiny, both = (replace(verdict.trials[0], reasons=r) for r in ((TOO_SMALL,), (TOO_SMALL, "another reason")))
+    assert replace(verdict, trials=(both,)).sentence == verdict.sentence
+    said = replace(verdict, trials=(tiny, tiny)).sentence
+    assert said.endswith(f"not in the library, or {tiny.name}, too small to be worth a name.")

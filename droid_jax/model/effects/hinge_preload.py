@@ -14,10 +14,17 @@ def hinge_preload(scene: Scene) -> Effect | None:
     joint = a.hinge(scene)
     if joint is None:
         return None
+
+    def native(values, model):
+        """A spring pulls by as much more where its rest lies elsewhere; without a spring there is no such place."""
+        stiffness = model.jnt_stiffness[scene.id("joint", joint)]
+        return {("qpos_spring", scene.qpos(joint)): -values[NAME] / stiffness} if stiffness > 0 else None
+
     return Effect(
         NAME,
         (a.amplitude(NAME, "N m", 0.5, 5.0),),
         force=lambda theta, state: a.at_dof(scene, joint, -a.value(theta, NAME)),
+        native=native,
         what="a constant torque that closes (or opens) the door",
         mark="the whole opening, the same at every angle and speed",
         confused_with=("tilted_frame", "over_centre_spring"),

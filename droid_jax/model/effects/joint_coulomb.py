@@ -18,10 +18,14 @@ def joint_coulomb(scene: Scene) -> Effect | None:
     def frictionloss(theta, state, base):
         return base.at[dofs].add(column(theta, LOSS, joints))
 
+    def native(values, model):
+        return {("dof_frictionloss", d): values.get(f"{LOSS}[{j}]", 0.0) for j, d in zip(joints, dofs, strict=True)}
+
     return Effect(
         LOSS,
         a.of_joints(LOSS, joints, "N m", 0.3, 5.0, low=0.0),
         frictionloss=frictionloss,
+        native=native,
         what="dry friction in a joint of the arm",
         mark="a step at every reversal of that joint, in all phases",
         confused_with=("joint_stribeck", "joint_directional", "load_friction"),
