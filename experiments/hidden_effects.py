@@ -94,14 +94,14 @@ class Make:
 class Search:
     """Search case folders that have no result yet, one after the other in this process."""
 
-    cases: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
-    """Case folders; default: all in OUT/cases."""
+    cases: Annotated[tuple[Path, ...], tyro.conf.Positional] = (RUNS / "cases",)
+    """Case folders, or one that holds them.  Nothing else is read."""
     scenes: tuple[SceneName, ...] = ()
     """Only cases of these scenes."""
     at_most: int = 1000000
     """Stop after so many."""
-    out: Path = RUNS
-    """Folder that holds `cases`; what is found goes to `results` beside it."""
+    results: Path = RUNS / "results"
+    """Folder of what is found, a file a case."""
 
 
 @dataclass(frozen=True)
@@ -187,11 +187,12 @@ def _with(known: Mapping[str, list[str]], found: Mapping[str, str]) -> dict[str,
 
 def run_search(command: Search) -> dict[str, Any]:
     """All folders, those of one scene after each other."""
-    folders = command.cases or tuple(sorted((command.out / "cases").iterdir()))
+    folders = sorted(case.parent for given in command.cases for case in given.rglob("case.json"))
+    if not folders:
+        raise SystemExit(f"error: no case below {', '.join(map(str, command.cases))}; the command make records some")
     chosen = [f for f in folders if not command.scenes or f.name.split("_")[0] in command.scenes]
-    results = command.out / "results"
-    open_ones = [f for f in chosen if not (results / f"{f.name}.json").is_file()][: command.at_most]
-    return {"searched": search_all(open_ones, results, Bench(), _tell), "cases": len(chosen)}
+    open_ones = [f for f in chosen if not (command.results / f"{f.name}.json").is_file()][: command.at_most]
+    return {"searched": search_all(open_ones, command.results, Bench(), _tell), "cases": len(chosen)}
 
 
 def run_oracle(command: Oracle) -> dict[str, Any]:
@@ -211,10 +212,10 @@ def run_score(command: Score) -> dict[str, Any]:
 
 
 def run_all(command: All) -> dict[str, Any]:
-    """The search gets a process of its own, which knows the folder of the cases alone."""
+    """The search gets a process of its own, which is given the cases alone."""
     made = run_make(command)
     script = [sys.executable, str(Path(__file__).resolve()), "search"]
-    subprocess.run([*script, "--out", str(command.out)], check=True)
+    subprocess.run([*script, str(command.out / "cases"), "--results", str(command.out / "results")], check=True)
     run_oracle(Oracle(out=command.out))
     return {"made": made, **run_score(Score(out=command.out, limits=command.limits))}
 

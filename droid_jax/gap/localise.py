@@ -39,7 +39,7 @@ class Localisation:
 
 
 def localise(evidence: Evidence, values: np.ndarray, residuals: np.ndarray) -> Localisation:
-    """Cells by joint and phase, door angle, sign and size of the door's speed, and each joint's position.
+    """Cells by joint and phase, door angle, sign and size of the door's speed, and each joint's direction.
 
     values: [D] of the model; residuals: [N, M] of its repeats or blocks.
     """

@@ -14,11 +14,11 @@ Usage, from the root of the checkout:
 
     python experiments/hidden_effects.py make --commit development --scenes bench --out runs/dev
     python experiments/hidden_effects.py make --commit development --scenes hinge --effects closer --classes single
-    python experiments/hidden_effects.py search --out runs/dev [--at-most 5]      # goes on where it was
-    python experiments/hidden_effects.py search runs/dev/cases/bench_3fa91c02     # one case
+    python experiments/hidden_effects.py search runs/dev/cases --results runs/dev/results    # goes on where it was
+    python experiments/hidden_effects.py search runs/dev/cases/bench_3fa91c02 --results runs/dev/results  # one case
     python experiments/hidden_effects.py score --out runs/dev                     # runs/dev/hidden_effects.json
 
-Results go to OUT/results/, a file a case; deleting one runs its case again.  Within a process the replays of a
+A result is a file; deleting one runs its case again.  Within a process the replays of a
 scene are compiled once.
 
 Every case draws: the robot's and the door's nuisances from their priors (door pose 2 mm and 0.5 degree, knob

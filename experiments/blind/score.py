@@ -51,11 +51,11 @@ def score_folder(results: Path, sealed: Path, limits: Mapping[str, Any], oracles
             }
         )
     judged = [judge(case, limits) for case in found]
-    groups = grouped(judged)
+    by_scene = {s: [c for c in judged if c["scene"] == s] for s in sorted(scenes)}
     return {
-        "summary": summarise(judged),
-        "by_group": {name: summarise(cases) for name, cases in groups.items()},
-        "confusion": confusion(judged),
+        "summary": {scene: summarise(cases) for scene, cases in by_scene.items()},
+        "by_group": {name: summarise(cases) for name, cases in grouped(judged).items()},
+        "confusion": {scene: confusion(cases) for scene, cases in by_scene.items()},
         "commits": sorted({c["truth"]["commit"] for c in found}),
         "searched_by_other_code": sorted(c["truth"]["name"] for c in found if not by_frozen_code(c)),
         "cases": judged,
@@ -189,10 +189,10 @@ def against_baselines(case: Case) -> dict[str, Any] | None:
 
 
 def grouped(judged: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    """By scene, and by scene, class and factor."""
+    """By scene and class, and by factor too."""
     groups: dict[str, list[dict[str, Any]]] = {}
     for case in judged:
-        for name in (case["scene"], f"{case['scene']}/{case['class']}", _label(case)):
+        for name in (f"{case['scene']}/{case['class']}", _label(case)):
             groups.setdefault(name, []).append(case)
     return dict(sorted(groups.items()))
 

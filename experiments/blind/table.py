@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from experiments.blind.score import CLOSED, NAMEABLE, NAMING, closing, rate
 
 Case = Mapping[str, Any]
@@ -25,6 +27,8 @@ def score_table(judged: Sequence[Mapping[str, Any]]) -> str:
     rows.append(
         ["amplitudes in their 90 % interval", "85 to 95 %", *(_amplitudes(judged, s) for s in scenes)],
     )
+    minutes = "minutes of a search, median (least to most)"
+    rows.append([minutes, "6 on the door, 0.5", *(_minutes(judged, s) for s in scenes)])
     return "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"
 
 
@@ -93,6 +97,13 @@ def _closed(judged: Sequence[Mapping[str, Any]], scene: str) -> str:
         return "-"
     low, high = found["interval_95"]
     return f"{found['median']:.0%} ({100 * low:.0f} to {100 * high:.0f} %)"
+
+
+def _minutes(judged: Sequence[Mapping[str, Any]], scene: str) -> str:
+    """Base fit, floor and search, on whatever the machine had free; the baselines' time is not a search's."""
+    stages = ("prepare", "base", "floor", "find")
+    taken = [sum(c["seconds"].get(s, 0.0) for s in stages) / 60 for c in judged if c["scene"] == scene]
+    return f"{np.median(taken):.1f} ({min(taken):.1f} to {max(taken):.1f})"
 
 
 def _amplitudes(judged: Sequence[Mapping[str, Any]], scene: str) -> str:

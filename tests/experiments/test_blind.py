@@ -14,6 +14,7 @@ from droid_jax.measure.formats import load
 from droid_jax.measure.hidden import HIDDEN, Applied, possible
 from droid_jax.model.effects.registry import registered
 from droid_jax.model.parameters import Parameter, Space
+from experiments import hidden_effects
 from experiments.blind import limits, score
 from experiments.blind.answers import ANSWERS, inside, parts, right, targets, without
 from experiments.blind.baselines import bic_outcome
@@ -395,3 +396,17 @@ def test_a_case_tells_its_multiple_of_the_limit_and_whose_code_searched():
     assert judged["times_limit"] == {"h0": abs(given["truth"]["hidden"][0]["amplitude"]) / 0.5}
     other = {**given, "result": {**given["result"], "code": "f" * 40}}
     assert score.by_frozen_code(given) and not score.by_frozen_code(other)
+
+
+def test_a_search_is_given_the_cases_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """No folder that the process is told of holds a seal."""
+    told: list[str] = []
+    (tmp_path / "sealed").mkdir()
+    for name in ("run_make", "run_oracle", "run_score"):
+        monkeypatch.setattr(hidden_effects, name, lambda command: {})
+    monkeypatch.setattr(hidden_effects.subprocess, "run", lambda command, check: told.extend(command))
+    hidden_effects.run_all(hidden_effects.All(out=tmp_path))
+    given = [Path(word) for word in told if word.startswith(str(tmp_path))]
+    assert given == [tmp_path / "cases", tmp_path / "results"]
+    with pytest.raises(SystemExit, match="no case below"):
+        hidden_effects.run_search(hidden_effects.Search((tmp_path,), results=tmp_path / "results"))

@@ -23,6 +23,7 @@ DATA = {  # folders of real logs
 SCRIPTS: dict[str, tuple[str, ...]] = {
     "experiments/hidden_effects.py": ("all",),
     "experiments/null_calibration.py": (),
+    "experiments/cone_mismatch.py": (),
     "experiments/identify_suite.py": ("--parts", "doors", "pose"),
     "experiments/population_curve.py": (),
     "experiments/search_figure.py": (),

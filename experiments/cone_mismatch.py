@@ -1,0 +1,106 @@
+"""What does the search say where the robot's friction cone is another than the simulation's, and nothing is hidden?
+
+    python experiments/cone_mismatch.py [--quick] [--out DIR] [--cases 4] [--commit HASH]
+
+The stand-in's contacts get MuJoCo's elliptic cone; the simulation keeps its pyramid.  First the torques' difference of
+one robot with either cone, then the whole search on robots of the blind suite's nulls.  One small JSON a case under
+OUT/cone_cases: the run can be stopped and goes on where it was.  --quick leaves the searches out.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
+
+import tuned  # noqa: E402, F401  (before jax starts)
+
+# isort: split
+import json  # noqa: E402
+
+import mujoco  # noqa: E402
+import numpy as np  # noqa: E402
+import tyro  # noqa: E402
+
+from benchmarks.common import origin  # noqa: E402
+from droid_jax.measure.recording import Recording  # noqa: E402
+from droid_jax.model.scene import with_options  # noqa: E402
+from droid_jax.storage import write_json  # noqa: E402
+from experiments.blind.cases import Plan  # noqa: E402
+from experiments.blind.draws import commit_of, folder_of, seed_of  # noqa: E402
+from experiments.blind.make import draw, record, write_case  # noqa: E402
+from experiments.blind.scenes import Setting, setting  # noqa: E402
+from experiments.blind.search import Bench, search_case  # noqa: E402
+
+CONE = mujoco.mjtCone.mjCONE_ELLIPTIC
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Options."""
+
+    quick: bool = False
+    """The torques' difference alone."""
+    cases: int = 4
+    """Robots that are searched."""
+    commit: str = "HEAD"
+    """Commit that froze the method: seeds derive from it."""
+    out: Path = ROOT / "runs" / "cone_mismatch"
+    """Folder of the cases and of cone_mismatch.json."""
+
+
+def elliptic(where: Setting) -> Setting:
+    """The same setting with a robot whose contacts are elliptic."""
+    return replace(where, scene=with_options(where.scene, cone=int(CONE)))
+
+
+def plan_of(number: int) -> Plan:
+    """A robot with nothing hidden."""
+    return Plan(f"door/cone/{number}", "door", "none")
+
+
+def between_cones(where: Setting, seed: int) -> list[float]:
+    """Joint by joint the root mean square [N m] of what the cone alone changes: one robot, the same noise."""
+    drawn = draw(where, plan_of(0), {}, np.random.default_rng([seed, 0]))
+    assert drawn is not None  # nothing is hidden that might not be possible
+    torque = [_mean_torque(record(w, drawn, ("fit",))["fit"]) for w in (where, elliptic(where))]
+    return np.sqrt(np.mean((torque[1] - torque[0]) ** 2, axis=0)).tolist()
+
+
+def _mean_torque(recording: Recording) -> np.ndarray:
+    return np.nanmean(recording.channels["torque"].values, axis=0)
+
+
+def case(where: Setting, number: int, commit: str, out: Path, bench: Bench) -> dict[str, Any]:
+    """One robot: recorded once, searched once."""
+    plan, folder = plan_of(number), out / "cone_cases" / folder_of(commit, plan_of(number).name)
+    if not (folder / "result.json").is_file():
+        if not folder.is_dir():
+            drawn = draw(where, plan, {}, np.random.default_rng([seed_of(commit, plan.name), 0]))
+            assert drawn is not None
+            write_case(folder, "door", (), record(elliptic(where), drawn))
+        write_json(folder / "result.json", search_case(folder, bench))
+    return json.loads((folder / "result.json").read_text())
+
+
+def main() -> None:
+    arguments = tyro.cli(Arguments, description=__doc__)
+    commit, where = commit_of(arguments.commit), setting("door", arguments.out / "door")
+    difference = between_cones(where, seed_of(commit, plan_of(0).name))
+    result: dict[str, Any] = {**origin(0), "seeds_from": commit, "torque_difference": difference}
+    bench, found = Bench({"door": where}), list[dict[str, Any]]()
+    for number in range(0 if arguments.quick else arguments.cases):
+        found.append(case(where, number, commit, arguments.out, bench))
+        print(f"door {number}: {found[-1].get('sentence', found[-1].get('error'))}", flush=True)
+    keys = ("verdict", "sentence", "effects", "p", "gaps", "floor", "seconds", "code")
+    result["cases"] = [{k: c.get(k) for k in keys} for c in found]
+    write_json(arguments.out / "cone_mismatch.json", result)
+    print(json.dumps({"torque_difference": [round(d, 3) for d in difference], "said": [c["verdict"] for c in found]}))
+
+
+if __name__ == "__main__":
+    main()
