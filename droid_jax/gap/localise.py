@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +16,8 @@ FALSE_DISCOVERIES = 0.1
 BINS = 6
 STILL = 0.01  # rad/s
 ALONG = "hinge_preload"  # the amplitude whose mark says how a torque of the hinge shows in the measured joints
+POSITION, LOAD = "position of ", "load of "  # a joint
+LENGTH = {"N m": "rad", "N": "m"}  # of what a joint's torque or force works on
 HELD = 0.2  # of that mark's size where it is large: with less the door is not held
 
 
@@ -39,7 +43,9 @@ class Localisation:
 
 
 def localise(evidence: Evidence, values: np.ndarray, residuals: np.ndarray) -> Localisation:
-    """Cells by joint and phase, door angle, sign and size of the door's speed, and each joint's direction.
+    """Cells by joint and phase, door angle, sign and size of the door's speed, each joint's direction, angle and load.
+
+    What the repeats' order changes is no cell: U is what the repeats share (`trend`).
 
     values: [D] of the model; residuals: [N, M] of its repeats or blocks.
     """
@@ -115,12 +121,19 @@ def _cells(evidence: Evidence, values: np.ndarray) -> list[tuple[tuple[str, str]
         velocity = np.asarray(rollout.velocity[0])[at, column]
         for word, side in (("forward", velocity > 0.005), ("back", velocity < -0.005)):
             out.append(((f"direction of {joint}", word), mine & side))
+        unit = comparison.channel("torque").unit
+        out += _bins(f"{POSITION}{joint}", np.asarray(rollout.position[0])[at, column], LENGTH[unit], mine)
+        out += _bins(f"{LOAD}{joint}", np.asarray(rollout.torque[0])[at, column], unit, mine)
     return out
 
 
-def _bins(variable: str, x: np.ndarray, unit: str) -> list[tuple[tuple[str, str], np.ndarray]]:
-    edges = np.linspace(x.min(), x.max() + 1e-9, BINS + 1)
+def _bins(variable: str, x: np.ndarray, unit: str, mine: Any = True) -> list[tuple[tuple[str, str], np.ndarray]]:
+    """Equal bins of x [M] over its range in the cell `mine`; none where it has no range."""
+    least, most = np.min(x, where=mine, initial=np.inf), np.max(x, where=mine, initial=-np.inf)
+    if not most > least:
+        return []
+    digits = max(2, math.ceil(1 - math.log10((most - least) / BINS)))
     return [
-        ((variable, f"{low:.2f} to {high:.2f} {unit}"), (x >= low) & (x < high))
-        for low, high in itertools.pairwise(edges)
+        ((variable, f"{low:.{digits}f} to {high:.{digits}f} {unit}"), mine & (x >= low) & (x < high))
+        for low, high in itertools.pairwise(np.linspace(least, most + 1e-9, BINS + 1))
     ]

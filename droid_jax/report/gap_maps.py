@@ -16,13 +16,13 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
 from droid_jax.report.gap_figures import LOGARITHMIC, U_LABEL, as_floats, scale
-from droid_jax.report.gap_words import joint_phase, span_words
+from droid_jax.report.gap_words import joint_phase, span_words, variable_words
 from droid_jax.report.style import AFTER, BEFORE, LINE, MUTED, WIDE, panel_columns, panel_grid, styled
 from droid_jax.report.words import label, number
 
 Cell = Mapping[str, Any]
 TIME = "joint x phase"
-DIRECTION = "direction of "
+DIRECTION, POSITION, LOAD = "direction of ", "position of ", "load of "  # a joint
 _BLANK: dict[str, Any] = {"facecolor": "none", "edgecolor": LINE, "hatch": "////", "linewidth": 0}
 
 
@@ -107,14 +107,25 @@ class Bins:
     found: np.ndarray
 
 
-def state_bins(cells: Sequence[Cell]) -> list[Bins]:
-    """The variables that are not joint by phase, in order; both directions of all joints are one variable."""
+def state_bins(cells: Sequence[Cell], joints: Sequence[str] = ()) -> list[Bins]:
+    """The variables that are not joint by phase, in order; both directions of all joints are one variable.
+
+    joints: whose position and load are shown.
+    """
     groups: dict[str, list[Cell]] = {}
     for cell in cells:
-        if cell["variable"] != TIME:
-            name = cell["variable"]
+        name = cell["variable"]
+        of = next((name.removeprefix(what) for what in (POSITION, LOAD) if name.startswith(what)), None)
+        if name != TIME and (of is None or of in joints):
             groups.setdefault(DIRECTION if name.startswith(DIRECTION) else name, []).append(cell)
     return [_bins(name, group) for name, group in groups.items()]
+
+
+def most_at(cells: Sequence[Cell]) -> str:
+    """The joint at whose position most is found; empty where there is none."""
+    known = [c for c in cells if c["variable"].startswith(POSITION) and c["gap"] is not None]
+    known.sort(key=lambda c: (c["found"], c["gap"]))
+    return known[-1]["variable"].removeprefix(POSITION) if known else ""
 
 
 def _bins(name: str, cells: Sequence[Cell]) -> Bins:
@@ -127,17 +138,19 @@ def _bins(name: str, cells: Sequence[Cell]) -> Bins:
     spans = [re.fullmatch(r"(\S+) to (\S+)(?: (.+))?", span_words(c["where"])) for c in cells]
     labels = [f"{s[1]} to\n{s[2]}" if s else c["where"] for s, c in zip(spans, cells, strict=True)]
     unit = next((f" [{s[3]}]" for s in spans if s and s[3]), "")
-    return Bins(label(name) + unit, tuple(labels), gaps, found)
+    return Bins(variable_words(name) + unit, tuple(labels), gaps, found)
 
 
 @styled
 def state_bars(before: Sequence[Cell], after: Sequence[Cell] | None, width: float = WIDE) -> Figure:
-    """U over the door's angle, direction and speed and each joint's direction, one panel each, one scale.
+    """U over the door's angle, direction and speed, each joint's direction, and position and load of the joint where
+    the base model leaves most; one panel each, one scale.
 
     before, after: cells of gap.json, `after` None where no effect entered the model.  A bin that the
     test does not find is hatched.
     """
-    models = [state_bins(cells) for cells in (before, after) if cells is not None]
+    joints = (most_at(before),)
+    models = [state_bins(cells, joints) for cells in (before, after) if cells is not None]
     figure, panels = panel_grid(len(models[0]), width, height=1.9, sharex=False)
     everything = np.concatenate([b.gaps[b.found] for bins in models for b in bins])
     step, size = (0.4, 0.36) if len(models) == 2 else (0.0, 0.5)

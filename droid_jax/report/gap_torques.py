@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from droid_jax.report.gap_figures import as_floats
 from droid_jax.report.gap_maps import TIME, Cell
-from droid_jax.report.gap_words import joint_phase
+from droid_jax.report.gap_words import OF, joint_phase, variable_words
 from droid_jax.report.style import AFTER, BEFORE, LINE, MEASURED, WIDE, label_bottom, legend, panel_columns, styled
 from droid_jax.report.torque_figures import band, shade, thin
 from droid_jax.report.words import label
@@ -114,7 +114,8 @@ def _curve(axes: Axes, name: str, edges: np.ndarray, values: np.ndarray, found: 
     if not found.all():
         hollow = {"color": AFTER, "markerfacecolor": "none", "markersize": 5}
         axes.plot(centres[~found], values[~found], "o", label="not told from noise", **hollow)
-    axes.set(title="All joints", xlabel=name, ylabel="√U [σ]", ylim=(0, None))
+    title = "That joint alone" if OF in name else "All joints"
+    axes.set(title=title, xlabel=name, ylabel="√U [σ]", ylim=(0, None))
 
 
 def located(cells: Sequence[Cell], joints: Sequence[str]) -> str:
@@ -133,8 +134,8 @@ def located_bins(cells: Sequence[Cell]) -> tuple[str, np.ndarray, np.ndarray, np
     mine = [(span, c) for c in cells if c["variable"] == variable and (span := _span(c))]
     edges = np.array([float(mine[0][0][1]), *(float(span[2]) for span, _ in mine)])
     values = np.sqrt(np.maximum(as_floats([c["gap"] for _, c in mine]), 0.0))
-    return f"{label(variable)} [{mine[0][0][3]}]", edges, values, np.array([c["found"] for _, c in mine])
+    return f"{variable_words(variable)} [{mine[0][0][3]}]", edges, values, np.array([c["found"] for _, c in mine])
 
 
 def _span(cell: Cell) -> re.Match[str] | None:
-    return re.fullmatch(r"(-?[\d.]+) to (-?[\d.]+) (\S+)", cell["where"])
+    return re.fullmatch(r"(-?[\d.]+) to (-?[\d.]+) (.+)", cell["where"])

@@ -13,6 +13,7 @@ from droid_jax.report.words import label, listed, number, percent
 SIGNIFICANT = 0.01  # p below which something is said to be missing
 DECISIVE = 6.0  # standardised difference from which ten repeats decide between rivals
 OTHER = "the other demonstration"  # as the search calls what confirms, whatever it is
+OF = " of "  # between what is said of a joint and its name
 BETWEEN = " + "  # between the effects in a model's name
 ROLES = {"fit": "fitted", "confirm": "confirming", "sealed": "sealed"}
 
@@ -21,6 +22,12 @@ def effect_words(name: str) -> str:
     """ "latch at door_hinge" -> "latch at door hinge", "cable_pull at panda_joint3" -> "cable pull at joint 3"."""
     effect, at, place = name.partition(" at ")
     return label(effect).lower() + at + (label(place).lower() if at else "")
+
+
+def variable_words(name: str) -> str:
+    """ "object angle" -> "Object angle", "position of panda_joint2" -> "Position of joint 2"."""
+    what, of, joint = name.partition(OF)
+    return label(what) + of + (label(joint).lower() if of else "")
 
 
 def model_words(name: str) -> str:

@@ -10,7 +10,7 @@ import pytest
 
 from droid_jax.gap.evidence import gap
 from droid_jax.gap.flips import gap_p_values
-from droid_jax.gap.localise import _parts
+from droid_jax.gap.localise import _bins, _parts
 from droid_jax.model.parameters import Parameter, Space
 
 REPEATS, COLUMNS, INSTANTS, FREE = 10, 3, 80, 30
@@ -67,3 +67,13 @@ def test_a_hinge_with_a_sensor_of_its_own_needs_no_parts(evidence: Any) -> None:
     cost = SimpleNamespace(space=SPACE, scene=SimpleNamespace(object_joint="c", joints=("a", "b", "c")))
     one = SimpleNamespace(**{**vars(evidence), "cost": cost})
     assert _parts(one, SPACE.mean, residuals(np.zeros((COLUMNS, INSTANTS)))) == ()  # type: ignore[arg-type]
+
+
+def test_bins_cover_a_cell_and_nothing_else():
+    x, mine = np.array([0.0, 1.0, 2.0, 3.0, 9.0]), np.array([True, True, True, True, False])
+    names, masks = zip(*_bins("load of a", x, "N m", mine), strict=True)
+    assert np.array_equal(np.sum(masks, axis=0), mine)
+    assert names[0] == ("load of a", "0.00 to 0.50 N m") and names[-1] == ("load of a", "2.50 to 3.00 N m")
+    assert _bins("load of a", x, "N m", np.array([True, False, False, False, False])) == []
+    fine = _bins("position of a", 1e-3 * x, "rad")
+    assert [where for (_, where), _ in fine][:2] == ["0.0000 to 0.0015 rad", "0.0015 to 0.0030 rad"]

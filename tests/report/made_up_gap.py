@@ -132,6 +132,9 @@ def _cells(size: float) -> list[dict[str, Any]]:
     for j, joint in enumerate(JOINTS):
         add(f"direction of {joint}", "forward", size * 0.9 * 0.6**j)
         add(f"direction of {joint}", "back", size * 0.01)
+        for b in range(6):
+            add(f"position of {joint}", f"{0.1 * b:.2f} to {0.1 * (b + 1):.2f} rad", size * 0.9 * 0.6 ** (j + b))
+            add(f"load of {joint}", f"{b - 3:.2f} to {b - 2:.2f} N m", size * 0.5 * 0.6**j)
     return out
 
 

@@ -58,3 +58,16 @@ def test_shifts_are_counted_in_deviations() -> None:
     assert gap_figures.deviations(shift) == pytest.approx(-6.0)
     unknown = [{**shift, "deviation_before": d} for d in (None, 0.0)]
     assert gap_figures.largest_shifts([*unknown, shift]) == [shift]
+
+
+def test_position_and_load_are_shown_of_the_joint_with_the_most(named: Gap) -> None:
+    """Of the base model, in both models alike; a curve over a joint's load says that it is that joint's."""
+    cells = named.found["cells"]
+    joint = gap_maps.most_at(cells["before"])
+    loudest = max((c for c in cells["before"] if c["variable"].startswith("position of ")), key=lambda c: c["gap"])
+    assert loudest["variable"] == f"position of {joint}"
+    shown = [a.get_xlabel() for a in gap_maps.state_bars(cells["before"], cells["after"]).axes if a.get_visible()]
+    assert [name for name in shown if " of " in name] == ["Position of joint 1 [rad]", "Load of joint 1 [N m]"]
+    some = [c for c in cells["before"] if c["variable"] in (gap_maps.TIME, f"load of {joint}")]
+    curve = gap_torques.remainder(named.traces["fit"], some, "N m").axes[-1]
+    assert (curve.get_title("left"), curve.get_xlabel()) == ("That joint alone", "Load of joint 1 [N m]")
