@@ -122,7 +122,9 @@ def _cells(evidence: Evidence, values: np.ndarray) -> list[tuple[tuple[str, str]
         for word, side in (("forward", velocity > 0.005), ("back", velocity < -0.005)):
             out.append(((f"direction of {joint}", word), mine & side))
         unit = comparison.channel("torque").unit
-        out += _bins(f"{POSITION}{joint}", np.asarray(rollout.position[0])[at, column], LENGTH[unit], mine)
+        out += _bins(
+            f"{POSITION}{joint}", np.asarray(rollout.position[0])[at, column], LENGTH.get(unit, "rad or m"), mine
+        )
         out += _bins(f"{LOAD}{joint}", np.asarray(rollout.torque[0])[at, column], unit, mine)
     return out
 
