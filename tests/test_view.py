@@ -69,7 +69,8 @@ def test_without_a_screen_it_names_the_film(folder: Path, monkeypatch: pytest.Mo
     if screen:
         monkeypatch.setenv("DISPLAY", screen)
     assert main(["view", str(folder)]) == 2
-    assert f"no window can be opened here; the same replay is a film in {folder / 'report.html'}" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert f"no window can be opened here; the same replay is a film in {folder / 'report.html'}" in said
 
 
 def test_without_a_path_it_shows_what_the_default_command_left(
