@@ -94,7 +94,7 @@ def run(command: Identify) -> None:
     from droid_jax.report.scalars import FOLDER, scalars
 
     load_effects(command.own_effects, None if command.extended is None else command.extended.parent)
-    out = prepare_folder(command.out)
+    out = command.out
     scene, space, nuisances = model_of(command)
     scene, space, effects = _extended(command, scene, space)
     given = _given(command)
@@ -102,8 +102,9 @@ def run(command: Identify) -> None:
     if finished(out, setup, command.again):
         report.run(report.Report(out))
         return
-    recordings, truth = _recordings(command, scene, out, given)
     config = config_of(command)
+    prepare_folder(out)  # only now, with all input read
+    recordings, truth = _recordings(command, scene, out, given)
     begin(out, setup, command.again)
     started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     board = out / FOLDER if command.tensorboard else None

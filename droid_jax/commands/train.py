@@ -78,7 +78,7 @@ def run(command: Train) -> None:
     from droid_jax.report.progress import training
     from droid_jax.storage import write_json
 
-    out, fit = prepare_folder(command.out), _fit_folder(command)
+    out, fit = command.out, _fit_folder(command)
     load_effects(command.own_effects, fit)
     scene, gaussian, effects = source(fit, command.knob)
     gaussian = _chosen(command, gaussian)
@@ -89,6 +89,7 @@ def run(command: Train) -> None:
         return
     config = config_of(command)
     env = DoorEnv(scene, effects=effects)
+    prepare_folder(out)  # only now, with all input read
     begin(out, setup, command.again, TRAINING)
     _forget(out)
     gaussian.save(out / GAUSSIAN)
