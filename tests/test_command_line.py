@@ -12,10 +12,12 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
 from droid_jax import run
+from droid_jax.commands import presets
 from droid_jax.commands.folder import changed, setup_of
 from droid_jax.commands.identify import Identify
 from droid_jax.commands.own_effects import load_effects
@@ -107,6 +109,18 @@ def test_bags_are_sent_through_convert(refused, tmp_path: Path, name: str, comma
     (tmp_path / name).write_text("")
     said = refused(command, "--recording", tmp_path / name.split("/")[0], "--out", tmp_path / "run")
     assert "`python -m droid_jax.run convert BAGS --joints ... --torque ...` makes a recording of it" in said
+
+
+@pytest.mark.parametrize(("preset", "backend", "warned"), [("gpu", "cpu", 1), ("gpu", "gpu", 0), ("quick", "cpu", 0)])
+def test_a_gpu_that_is_not_there_is_said_once(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], preset: str, backend: str, warned: int
+):
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    presets.warn_of_cpu.cache_clear()
+    for _ in range(2):
+        presets.warn_of_cpu(preset)
+    assert capsys.readouterr().err.count("jax finds no GPU") == warned
+    presets.warn_of_cpu.cache_clear()
 
 
 def test_two_recordings_of_one_name(refused, tmp_path: Path):

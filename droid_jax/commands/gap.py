@@ -13,7 +13,7 @@ from droid_jax.commands.folder import begin, fingerprints, finished, setup_of, s
 from droid_jax.commands.gap_search import searched
 from droid_jax.commands.hidden import hidden_effects, record_stand_in, settled
 from droid_jax.commands.own_effects import load_effects
-from droid_jax.commands.presets import TIMESTEP, refine_config, search_config
+from droid_jax.commands.presets import TIMESTEP, refine_config, search_config, warn_of_cpu
 from droid_jax.commands.scenes import needs_recording, needs_scene, own_scene, recording_at
 
 if TYPE_CHECKING:
@@ -86,6 +86,7 @@ def run(command: Gap) -> None:
     command = settled(command)
     needs_scene(command)
     runtime.start()
+    warn_of_cpu(command.preset)
     from droid_jax.gap.results import write_gap
     from droid_jax.gap.split import Split
     from droid_jax.identify.results import prepare_folder

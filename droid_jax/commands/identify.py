@@ -14,7 +14,7 @@ from droid_jax.commands.folder import begin, fingerprints, finished, kept_record
 from droid_jax.commands.hidden import known_stand_in, settled
 from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.pictures import draw
-from droid_jax.commands.presets import TIMESTEP, Preset, refine_config, search_config
+from droid_jax.commands.presets import TIMESTEP, Preset, refine_config, search_config, warn_of_cpu
 from droid_jax.commands.scenes import needs_recording, needs_scene, own_scene, recording_at
 
 if TYPE_CHECKING:
@@ -87,6 +87,7 @@ def run(command: Identify) -> None:
     needs_scene(command)
     needs_writer(command.tensorboard)
     runtime.start()
+    warn_of_cpu(command.preset)
     from droid_jax.identify.pipeline import cost_samples, identify
     from droid_jax.identify.results import prepare_folder, write_run
     from droid_jax.measure.surrogate import is_stand_in

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal
 from droid_jax.commands import report
 from droid_jax.commands.folder import RUNS, begin, finished, setup_of
 from droid_jax.commands.own_effects import load_effects
+from droid_jax.commands.presets import warn_of_cpu
 from droid_jax.commands.source import (
     GAUSSIAN,
     extended_of,
@@ -70,6 +71,7 @@ def run(command: Train) -> None:
 
     needs_writer(command.tensorboard)
     runtime.start()
+    warn_of_cpu(command.preset)
     from droid_jax.gap.extended import FILE
     from droid_jax.identify.results import prepare_folder
     from droid_jax.policy.door_env import DoorEnv
