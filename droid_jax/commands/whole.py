@@ -21,6 +21,7 @@ from droid_jax.report.files import TRANSFER
 
 Stage = Literal["identify", "gap", "train", "evaluate"]
 STAGES: tuple[Stage, ...] = typing.get_args(Stage)
+IN_A_SCENE: tuple[Stage, ...] = ("identify", "gap")  # of one's own: policies are trained at the built-in door
 
 
 class _Presets(NamedTuple):
@@ -114,8 +115,8 @@ def run(command: All) -> None:
 
 def _stages(command: All) -> tuple[Stage, ...]:
     """The stages that were asked for, as far as the scene has them; ValueError where none is left."""
-    possible = STAGES if command.scene is None else STAGES[:2]
-    left = tuple(stage for stage in possible if stage in command.stages)
+    possible = STAGES if command.scene is None else IN_A_SCENE
+    left: tuple[Stage, ...] = tuple(stage for stage in possible if stage in command.stages)
     if not left:
         why = "" if command.scene is None else " with --scene: policies are trained at the built-in door"
         raise ValueError(f"--stages must name one of {', '.join(possible)}{why}")
