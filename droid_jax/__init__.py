@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from droid_jax.model.door import door_nuisances as door_nuisances
     from droid_jax.model.door import door_space as door_space
     from droid_jax.model.door_scene import door_scene as door_scene
+    from droid_jax.model.mjcf import fitted_mjcf as fitted_mjcf
     from droid_jax.model.parameters import Parameter as Parameter
     from droid_jax.model.parameters import Scaling as Scaling
     from droid_jax.model.parameters import Space as Space
@@ -57,6 +58,7 @@ __all__ = [
     "IdentifyConfig",
     "Gaussian",
     "load_gaussian",
+    "fitted_mjcf",
     "load_extended",
     "randomised",
     "randomised_model",
@@ -81,6 +83,7 @@ _HOMES = {
     "IdentifyConfig": ("identify.pipeline", "IdentifyConfig"),
     "Gaussian": ("identify.gaussian", "Gaussian"),
     "load_gaussian": ("identify.gaussian", "load"),
+    "fitted_mjcf": ("model.mjcf", "fitted_mjcf"),
     "load_extended": ("gap.extended", "load_extended"),
     "randomised": ("policy.randomise", "randomised"),
     "randomised_model": ("policy.randomise", "randomised_model"),

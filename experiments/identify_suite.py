@@ -10,7 +10,7 @@ derive from its number alone.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -54,7 +54,7 @@ class Arguments:
     """Options of the suite."""
 
     quick: bool = False
-    """One case of each part with a small budget: shows that it runs, says nothing about quality."""
+    """One case of each part (of the poses both) with a small budget: shows that it runs, says nothing about quality."""
     out: Path = ROOT / "benchmarks" / "results"
     """Folder of identify.json and of the cases."""
     parts: tuple[Part, ...] = ("doors", "calibration", "pose", "parity")
@@ -191,7 +191,7 @@ def run_cases(arguments: Arguments) -> dict[str, dict[str, Any]]:
     if "parity" in arguments.parts:
         cases["parity"] = lambda: parity_case(0, quick)
     if "pose" in arguments.parts:
-        for name in "A" if quick else "AB":
+        for name in "AB":
             cases[f"pose_{name}"] = lambda name=name: pose_case(name, quick)
     if "calibration" in arguments.parts:
         for k in range(1 if quick else arguments.calibration):
@@ -205,6 +205,15 @@ def run_cases(arguments: Arguments) -> dict[str, dict[str, Any]]:
     return {path.stem: json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))}
 
 
+def kept_cases(out: Path, quick: bool, part: Part, names: Sequence[str]) -> list[dict[str, Any]]:
+    """Cases that the suite left in `out`; SystemExit where one is missing says how to make it."""
+    paths = [out / stem("identify_cases", quick) / f"{name}.json" for name in names]
+    if missing := [path for path in paths if not path.is_file()]:
+        options = f"--parts {part}{' --quick' if quick else ''} --out {out}"
+        raise SystemExit(f"error: there is no {missing[0]}: run experiments/identify_suite.py {options}")
+    return [json.loads(path.read_text()) for path in paths]
+
+
 def summarise(cases: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """The figures of issue and paper: gap closed, errors, coverage, agreement of the poses."""
     out: dict[str, Any] = {"cases_from_commits": commits(cases.values())}
@@ -215,7 +224,7 @@ def summarise(cases: dict[str, dict[str, Any]]) -> dict[str, Any]:
     if calibration:
         out["calibration"] = _coverage(calibration)
     if {"pose_A", "pose_B"} <= set(cases):
-        out["pose_agreement"] = _agreement(cases["pose_A"], cases["pose_B"])
+        out["pose_agreement"] = agreement(cases["pose_A"], cases["pose_B"])
     if "parity" in cases:
         out["parity"] = {k: v for k, v in cases["parity"].items() if k != "origin"}
     return out
@@ -255,7 +264,7 @@ def _coverage(cases: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _agreement(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
+def agreement(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
     """Do the two poses agree on what both tell?  Their difference, in units of its own deviation, is normal if so."""
     names = [
         n for n, p in a["parameters"].items()

@@ -1,8 +1,8 @@
 """What two arm poses tell about one door: the paper's distribution figure (section IV-C), from the suite's cases.
 
-    python experiments/pose_figure.py [--out DIR]
+    python experiments/pose_figure.py [--quick] [--out DIR]
 
-Reads pose_A and pose_B of `identify_suite.py` from DIR/identify_cases; writes DIR/pose_agreement.png.
+Reads pose_A and pose_B of `identify_suite.py` from DIR/identify_cases; writes DIR/pose_agreement.png, .pdf and .json.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
 
 import numpy as np  # noqa: E402
 import tyro  # noqa: E402
-from identify_suite import gaussian  # noqa: E402
+from identify_suite import agreement, gaussian, kept_cases  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 from scipy import stats  # noqa: E402
 
 from benchmarks.common import stem  # noqa: E402
-from droid_jax.report.export import png_bytes  # noqa: E402
+from droid_jax.report.export import save  # noqa: E402
 from droid_jax.report.style import AFTER, BEFORE, TRUTH, WIDE, styled  # noqa: E402
 from droid_jax.report.words import label  # noqa: E402
-from droid_jax.storage import write_bytes  # noqa: E402
+from droid_jax.storage import write_json  # noqa: E402
 
 
 @dataclass(frozen=True)
@@ -39,12 +39,17 @@ class Arguments:
     """Read the cases of a quick suite."""
 
 
+def both_tell(a: dict[str, Any], b: dict[str, Any]) -> list[str]:
+    """Names of the parameters that both poses tell."""
+    return [n for n, p in a.items() if not p["nuisance"] and p["identifiable"] and b[n]["identifiable"]]
+
+
 @styled
 def densities(a: dict[str, Any], b: dict[str, Any], width: float = WIDE) -> Figure:
     """One panel for each parameter that both poses tell: the two Gaussians and the truth."""
-    names = [n for n, p in a.items() if not p["nuisance"] and p["identifiable"] and b[n]["identifiable"]]
+    names = both_tell(a, b)
     columns = 4
-    rows = -(-len(names) // columns)
+    rows = max(1, -(-len(names) // columns))
     figure = Figure(figsize=(width, 0.6 + 1.5 * rows), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for unused in panels[len(names) :]:
@@ -67,16 +72,15 @@ def densities(a: dict[str, Any], b: dict[str, Any], width: float = WIDE) -> Figu
 
 def main() -> None:
     arguments = tyro.cli(Arguments, description=__doc__)
-    folder = arguments.out / stem("identify_cases", arguments.quick)
-    missing = [p for p in "AB" if not (folder / f"pose_{p}.json").is_file()]
-    if missing:
-        raise SystemExit(
-            f"error: no case pose_{missing[0]} in {folder}; run experiments/identify_suite.py --parts pose"
-        )
-    a, b = (json.loads((folder / f"pose_{p}.json").read_text())["parameters"] for p in "AB")
-    path = arguments.out / f"{stem('pose_agreement', arguments.quick)}.png"
-    write_bytes(path, png_bytes(densities(a, b)))
-    print(json.dumps({"figure": str(path)}))
+    cases = kept_cases(arguments.out, arguments.quick, "pose", ["pose_A", "pose_B"])
+    a, b = (case["parameters"] for case in cases)
+    name = stem("pose_agreement", arguments.quick)
+    save(densities(a, b), arguments.out, name)
+    drawn = {n: {"truth": a[n]["truth"], "A": gaussian(a[n]), "B": gaussian(b[n])} for n in both_tell(a, b)}
+    origins = {pose: case["origin"] for pose, case in zip("AB", cases, strict=True)}
+    result = {"parameters": drawn, **agreement(*cases), "origin": origins}
+    write_json(arguments.out / f"{name}.json", result, indent=2)
+    print(json.dumps({"figure": str(arguments.out / f"{name}.png"), "within_90": result["within_90"]}))
 
 
 if __name__ == "__main__":

@@ -4,8 +4,9 @@
 
 Table I's distribution, 30 samples, the five best, linear coordinates, 100 generations on demonstration A of the door
 without a spring; the program's `identify --preset paper`, which goes on where it was stopped.  Writes
-search_torques.png, search_parameters.png, search_cost.png and search_figure.json into DIR, the run into
-DIR/search_run.  Some five minutes on two cores.
+search_torques, search_parameters and search_cost (.png and .pdf) and search_figure.json into DIR, the run into
+DIR/search_run.  The lines of the truth are the paper's fitted means; search_figure.json holds its deviations beside.
+Some five minutes on two cores.
 """
 
 from __future__ import annotations
@@ -24,13 +25,14 @@ import tuned  # noqa: E402, F401  (before jax starts)
 import json  # noqa: E402
 
 import tyro  # noqa: E402
+from table1 import PAPER  # noqa: E402
 
 from benchmarks.common import origin, stem  # noqa: E402
 from droid_jax.commands.identify import Identify, run  # noqa: E402
 from droid_jax.report import search_figures, torque_figures  # noqa: E402
-from droid_jax.report.export import png_bytes  # noqa: E402
+from droid_jax.report.export import save  # noqa: E402
 from droid_jax.report.run_folder import Run, read_run  # noqa: E402
-from droid_jax.storage import write_bytes, write_json  # noqa: E402
+from droid_jax.storage import write_json  # noqa: E402
 
 SHOWN = ("hinge_damping", "hinge_frictionloss", "knob_mass")
 
@@ -70,8 +72,12 @@ def main() -> None:
     )
     found = read_run(folder)
     for name, figure in figures(found).items():
-        write_bytes(arguments.out / f"{stem(name, arguments.quick)}.png", png_bytes(figure))
-    shown = {p["name"]: {k: p[k] for k in ("truth", "initial_mean", "mean", "std")} for p in found.parameters}
+        save(figure, arguments.out, stem(name, arguments.quick))
+    shown = {
+        p["name"]: {k: p[k] for k in ("truth", "initial_mean", "mean", "std")}
+        | {"paper": PAPER[p["name"]][arguments.springs + 1]}  # mean and deviation
+        for p in found.parameters
+    }
     result = {
         "cost": found.fit["cost"],
         "gap": {n: {k: g[k] for k in ("before", "after", "floor", "closed")} for n, g in found.fit["gap"].items()},

@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
 
 import tyro  # noqa: E402
-from identify_suite import gaussian  # noqa: E402
+from identify_suite import gaussian, kept_cases  # noqa: E402
 
 from benchmarks.common import stem  # noqa: E402
 from droid_jax.report.words import label, like, number  # noqa: E402
@@ -100,12 +100,9 @@ def _pair(mean: float, deviation: float) -> str:
 
 def main() -> None:
     arguments = tyro.cli(Arguments, description=__doc__)
-    folder = arguments.out / stem("identify_cases", arguments.quick)
-    paths = {k: folder / f"door_{k}.json" for k in ((1,) if arguments.quick else (0, 1, 2))}
-    missing = [p.stem for p in paths.values() if not p.is_file()]
-    if missing:
-        raise SystemExit(f"error: no case {missing[0]} in {folder}; run experiments/identify_suite.py --parts doors")
-    cases = {k: json.loads(p.read_text()) for k, p in paths.items()}
+    doors = (1,) if arguments.quick else (0, 1, 2)
+    found = kept_cases(arguments.out, arguments.quick, "doors", [f"door_{k}" for k in doors])
+    cases = dict(zip(doors, found, strict=True))
     rows = table({k: case["parameters"] for k, case in cases.items()})
     name = stem("table1", arguments.quick)
     write_text(arguments.out / f"{name}.md", as_markdown(rows))

@@ -12,11 +12,13 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
 from droid_jax import run
-from droid_jax.commands.folder import setup_of
+from droid_jax.commands import presets
+from droid_jax.commands.folder import changed, setup_of
 from droid_jax.commands.identify import Identify
 from droid_jax.commands.own_effects import load_effects
 from droid_jax.identify import pipeline
@@ -109,6 +111,18 @@ def test_bags_are_sent_through_convert(refused, tmp_path: Path, name: str, comma
     assert "`python -m droid_jax.run convert BAGS --joints ... --torque ...` makes a recording of it" in said
 
 
+@pytest.mark.parametrize(("preset", "backend", "warned"), [("gpu", "cpu", 1), ("gpu", "gpu", 0), ("quick", "cpu", 0)])
+def test_a_gpu_that_is_not_there_is_said_once(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], preset: str, backend: str, warned: int
+):
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    presets.warn_of_cpu.cache_clear()
+    for _ in range(2):
+        presets.warn_of_cpu(preset)
+    assert capsys.readouterr().err.count("jax finds no GPU") == warned
+    presets.warn_of_cpu.cache_clear()
+
+
 def test_two_recordings_of_one_name(refused, tmp_path: Path):
     """Said before the folder is begun."""
     first, second = tmp_path / "first.npz", tmp_path / "second.npz"
@@ -116,7 +130,40 @@ def test_two_recordings_of_one_name(refused, tmp_path: Path):
         save(load(small_recording(tmp_path), name="repeat_00"), path)
     said = refused("identify", "--recording", first, second, "--out", tmp_path / "run")
     assert f"{first} and {second} are both named 'repeat_00'" in said and f"convert {second} --name" in said
-    assert list((tmp_path / "run").iterdir()) == []
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_same_files_in_another_place_are_the_same_run(refused, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """What they say counts: an absolute path instead of a relative one, or a folder of another name."""
+
+    def stopped(*_, **__) -> None:
+        raise ValueError("stopped")
+
+    monkeypatch.setattr(pipeline, "identify", stopped)
+    monkeypatch.chdir(tmp_path)
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        parameters(tmp_path / name, GOOD)
+        small_recording(tmp_path / name)
+        (tmp_path / name / "two_link.xml").write_bytes(XML.read_bytes())
+        (tmp_path / name / "mine.py").write_text("")
+
+    def run(folder: Path) -> str:
+        files = {"scene": "two_link.xml", "parameters": "parameters.json", "recording": "small.npz"}
+        files |= {"own-effects": "mine.py"}
+        options = [text for option, name in files.items() for text in (f"--{option}", folder / name)]
+        return refused("identify", *options, "--out", tmp_path / "run")
+
+    assert "stopped" in run(Path("one")) and "stopped" in run(tmp_path / "one") and "stopped" in run(Path("two"))
+    assert json.loads((tmp_path / "run" / "setup.json").read_text())["scene"] == "two/two_link.xml"
+    (tmp_path / "two" / "mine.py").write_text("\n")
+    assert "other settings (own_effects_sha256)" in run(Path("two"))
+
+
+@pytest.mark.parametrize("command", ["identify", "gap", "all"])
+def test_input_that_cannot_be_read_leaves_no_folder(refused, tmp_path: Path, command: str):
+    refused(command, "--recording", tmp_path / "typo.npz", "--out", tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 def test_an_edited_nuisance_makes_another_run(refused, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -422,11 +469,12 @@ def test_results_with_effects_of_ones_own_ask_for_them_and_run_nothing(refused, 
 
 
 def test_a_changed_file_of_effects_makes_another_run(tmp_path: Path):
-    (tmp_path / "mine.py").write_text(EFFECT)
-    first = setup_of(Identify(own_effects=tmp_path / "mine.py"))
-    (tmp_path / "mine.py").write_text(EFFECT + "\n")
-    assert first != setup_of(Identify(own_effects=tmp_path / "mine.py"))
-    assert "own_effects_sha256" not in setup_of(Identify())
+    for option in ("own_effects", "extended"):
+        (tmp_path / "mine.py").write_text(EFFECT)
+        first = setup_of(Identify(**{option: tmp_path / "mine.py"}))
+        (tmp_path / "mine.py").write_text(EFFECT + "\n")
+        assert changed(first, setup_of(Identify(**{option: tmp_path / "mine.py"}))) == [f"{option}_sha256"]
+        assert f"{option}_sha256" not in setup_of(Identify())
 
 
 # ----- the program itself

@@ -76,7 +76,7 @@ def test_tune_can_follow_any_import_that_does_not_start_jax():
 
 
 def test_every_public_name_is_there_and_kept():
-    assert len(set(dj.__all__)) == len(dj.__all__) == 21
+    assert len(set(dj.__all__)) == len(dj.__all__) == 22
     for name in dj.__all__:
         assert getattr(dj, name) is getattr(dj, name)
         assert name in dir(dj)
@@ -215,6 +215,8 @@ def test_the_code_of_own_robot_runs(workplace: Path, capsys: pytest.CaptureFixtu
     assert "{'two-link': 0.99" in out and "(64, 600, 2)" in out
     assert dj.load_recording("wave.npz").repeats == 10
     assert np.shape(names["samples"]) == (1000, 4)
+    fitted = dj.load_scene("fitted.xml").model.body("forearm").mass[0]
+    assert fitted == pytest.approx(names["found"].best[0], rel=1e-4) != 0.8  # type: ignore[attr-defined]
     assert names["space"].names[-1] == "elbow_rotor"  # type: ignore[attr-defined]
 
 

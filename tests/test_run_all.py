@@ -99,6 +99,27 @@ def test_the_scale_of_effects_reaches_the_search(called):
     assert [c.effect_scale for c in called] == [30.0]
 
 
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--trials", "0"], "--trials must be 1 or more, got 0"),
+        (["--effect-scale", "0"], "the scale of the effects must be above 0, got 0"),
+        (
+            ["--scene", "my.xml", "--recording", "a.npz", "--stages", "train", "evaluate"],
+            "--stages must name one of identify, gap with --scene: policies are trained at the built-in door",
+        ),
+    ],
+)
+def test_what_a_later_stage_would_refuse_is_refused_at_once(called, capsys, options: list[str], said: str):
+    assert main(["all", *options]) == 2
+    assert said in capsys.readouterr().err
+    assert called == [] and not Path("runs").exists()
+
+
+def test_trials_count_where_they_are_made(called):
+    assert main(["all", "--trials", "0", "--stages", "identify"]) == 0
+
+
 def test_a_policy_is_trained_on_the_extended_model_where_there_is_one(called, tmp_path: Path, capsys):
     found(tmp_path / "runs" / "all" / "gap", ["latch at door_hinge"])
     assert main(["all", "--stages", "train"]) == 0

@@ -343,14 +343,17 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def fit_json(folder: Path, **values: float) -> Path:
     """A folder of `identify` with these best values."""
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     parameters = [{"name": name, "best": value} for name, value in values.items()]
     (folder / "fit.json").write_text(json.dumps({"parameters": parameters}))
     return folder
 
 
 def test_the_base_fit_begins_at_an_earlier_fit(place: Path, quick: None, monkeypatch: pytest.MonkeyPatch):
-    """No search, the known values (within bounds) as the one start, and what the fit does not know at its mean."""
+    """No search, the known values (within bounds) as the one start, and what the fit does not know at its mean.
+
+    The folder may be one of `all`.
+    """
     base = small().case.base
     monkeypatch.setattr(workflow, "search", lambda *a, **k: pytest.fail("there is nothing to search for"))
     begun = []
@@ -362,8 +365,8 @@ def test_the_base_fit_begins_at_an_earlier_fit(place: Path, quick: None, monkeyp
     monkeypatch.setattr(workflow, "refit", refit)
     known = {p.name: 0.5 * (p.mean + p.high) for p in base.parameters if not p.nuisance}
     first = next(iter(known))
-    folder = fit_json(place / "earlier", **{**known, first: 1e9, "of_another_model": 1.0})
-    assert main(arguments(place, "--fit", folder)) == 130
+    folder = fit_json(place / "all" / "identify", **{**known, first: 1e9, "of_another_model": 1.0})
+    assert main(arguments(place, "--fit", folder.parent)) == 130
     (start,) = begun[0]
     space = small().case.whole
     assert start[space.index(first)] == base[first].high

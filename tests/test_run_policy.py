@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from droid_jax.commands import report
 from droid_jax.commands.evaluate import Evaluate, _robot, _task
 from droid_jax.commands.folder import setup_of, stage_folder
 from droid_jax.commands.source import extended_of, source, stand_in_of
@@ -108,7 +110,7 @@ def test_without_a_fit_there_is_the_prior(scene):
         (["evaluate"], "runs/train/training.json is missing"),
         (["export"], "runs/train/policy.npz: there is no such file"),
         (["view"], "runs/identify holds no replay.npz"),
-        (["report"], "there is no folder runs/identify"),
+        (["report"], "there is no finished run in runs/identify, runs/gap, runs/train, runs/all"),
     ],
 )
 def test_what_is_missing_is_said(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]):
@@ -151,10 +153,22 @@ def test_a_command_finds_what_the_default_command_left(tmp_path: Path, there: li
     assert stage_folder(None if given is None else Path(given), "train", "policy.npz") == Path(meant)
 
 
-def test_a_page_without_a_path_is_that_of_the_default_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    (tmp_path / "runs" / "all").mkdir(parents=True)
-    assert main(["report"]) == 2
-    assert "runs/all/config.json is missing" in capsys.readouterr().err
+def test_a_page_without_a_path_is_that_of_the_run_that_was_finished_last(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """A folder without a finished run, as a refused command may leave one, does not count."""
+    monkeypatch.setattr(report, "write", lambda folder: folder)
+    (tmp_path / "runs" / "identify").mkdir(parents=True)
+    for age, (file, found) in enumerate((
+        ("all/gap/gap.json", "all"), ("gap/gap.json", "gap"), ("train/training.json", "train"),
+        ("all/identify/config.json", "all"), ("identify/config.json", "identify"),
+    )):  # fmt: skip
+        path = tmp_path / "runs" / file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("{}")
+        os.utime(path, (age, age))
+        assert main(["report"]) == 0
+        assert capsys.readouterr().out == f"report: runs/{found}\n"
 
 
 @pytest.mark.parametrize(
@@ -194,6 +208,8 @@ def test_train_evaluate_export(scene, tmp_path: Path, capsys: pytest.CaptureFixt
     assert main(["evaluate", "run", "--trials", "4", "--no-film"]) == 0
     said = capsys.readouterr().out
     assert "holds these trials already" in said and said.count("stand-in robot: 0 % success") == 2
+    assert transfer_json.stat().st_mtime_ns == before
+    assert main(["evaluate", str(tmp_path / "run"), "--trials", "4", "--no-film"]) == 0  # by another path
     assert transfer_json.stat().st_mtime_ns == before
     assert main(["evaluate", "run", "--trials", "3", "--no-film"]) == 0  # others are
     assert json.loads(transfer_json.read_text())["stand_in"]["trials"] == 3

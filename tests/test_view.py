@@ -31,10 +31,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_two_stand_side_by_side_and_move_as_they_did(folder: Path):
     clock, states = replay_of(folder)
-    model, one = side_by_side(folder / FITTED), mujoco.MjModel.from_xml_path(str(folder / FITTED))
+    (model, moved), one = side_by_side(folder / FITTED), mujoco.MjModel.from_xml_path(str(folder / FITTED))
     assert states.shape == (5, model.nq) == (len(clock), 2 * one.nq)
     both, alone = mujoco.MjData(model), mujoco.MjData(one)
-    both.qpos[:] = states[-1]
+    both.qpos[:] = states[-1] + moved
     mujoco.mj_kinematics(model, both)
     for name, side in (("before", states[-1][: one.nq]), ("after", states[-1][one.nq :])):
         alone.qpos[:] = side
@@ -44,11 +44,33 @@ def test_the_two_stand_side_by_side_and_move_as_they_did(folder: Path):
         assert apart[1] > 0.5 if name == "before" else apart[1] < -0.5
 
 
-def test_without_a_screen_it_names_the_film(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys):
+def test_free_bodies_stand_side_by_side_too_and_nothing_is_warned_of(tmp_path: Path, capfd):
+    """Their positions are the world's; and options that differ from MuJoCo's own are no conflict."""
+    (tmp_path / FITTED).write_text(
+        '<mujoco><option timestep="0.005" integrator="implicitfast"/><worldbody>'
+        '<body name="cube" pos="0.3 0.1 0.5" euler="0 0 30"><freejoint/><geom size="0.1"/></body>'
+        "</worldbody></mujoco>"
+    )
+    model, moved = side_by_side(tmp_path / FITTED)
+    data = mujoco.MjData(model)
+    data.qpos[:] = np.tile([1.0, 2.0, 3.0, 0.0, 1.0, 0.0, 0.0], 2) + moved
+    mujoco.mj_kinematics(model, data)
+    before, after = (data.body(f"{name}/cube").xpos for name in ("before", "after"))
+    np.testing.assert_allclose(0.5 * (before + after), [1.0, 2.0, 3.0])
+    assert before[1] - after[1] == pytest.approx(1.6 * mujoco.MjModel.from_xml_path(str(tmp_path / FITTED)).stat.extent)
+    assert "Attach conflict" not in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("screen", [None, ":99"])
+def test_without_a_screen_it_names_the_film(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys, screen: str | None):
+    """Also where one is named that cannot be opened."""
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
+    if screen:
+        monkeypatch.setenv("DISPLAY", screen)
     assert main(["view", str(folder)]) == 2
-    assert f"a film in {folder / 'report.html'}" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert f"no window can be opened here; the same replay is a film in {folder / 'report.html'}" in said
 
 
 def test_without_a_path_it_shows_what_the_default_command_left(

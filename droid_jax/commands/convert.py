@@ -8,8 +8,6 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from droid_jax.commands.scenes import holds_bags
-
 
 @dataclass(frozen=True)
 class Convert:
@@ -26,6 +24,8 @@ class Convert:
     """What runs and pages call the recording; default: of bags that of --out, otherwise the name that it has."""
     joints: tuple[str, ...] = ()
     """Bags: measured joints, in the order wanted."""
+    slides: tuple[str, ...] = ()
+    """Bags: those of --joints that slide: N, m and m/s instead of N m, rad and rad/s."""
     torque: Literal["motor", "link"] | None = None
     """Bags: motor (current, actuator force) or link (a sensor behind the gear, a Panda's tau_J)."""
     gravity: bool = False
@@ -33,11 +33,12 @@ class Convert:
     state_topic: str = "/joint_states"
     """Bags: topic of sensor_msgs/JointState."""
     command_topic: str | None = None
-    """Bags: topic of the position commands; without one the log is replayed by inverse dynamics."""
+    """Bags: topic of the position commands, or of a ros2_control controller's state; without one the log is replayed by
+    inverse dynamics."""
     stiffness: tuple[float, ...] = ()
-    """Bags: servo gains of the commanded joints, N m/rad."""
+    """Bags: servo gains of the commanded joints, N m/rad (N/m for slides)."""
     damping: tuple[float, ...] = ()
-    """Bags: servo damping of the commanded joints, N m s/rad."""
+    """Bags: servo damping of the commanded joints, N m s/rad (N s/m for slides)."""
     command_joints: tuple[str, ...] = ()
     """Bags: commanded joints, in the order of commands that carry no names; default: --joints."""
     command_tolerance: float = 5e-3
@@ -58,16 +59,20 @@ class Convert:
 
 def run(command: Convert) -> None:
     """Load whatever it is, validate, cut, and save."""
-    from droid_jax.measure.formats import load, rosbag_reader, save
+    from droid_jax.measure.formats import bags_at, load, rosbag_reader, save
 
     if not command.source:
         raise ValueError("convert needs the files or folders to read")
     path, *others = command.source
+    strange = [p for p in command.source if not bags_at(p)]
+    if others and strange:
+        what = "is no ROS bag" if strange[0].exists() else "does not exist"
+        raise ValueError(f"{strange[0]} {what}: of several sources each is the bag of one repeat; convert others alone")
     if others:
         recording = rosbag_reader().read_bags(command.source, **_bag_options(command))
     else:
         usual = {"name": command.name, "allow_jitter": command.allow_jitter}
-        options = _bag_options(command) if command.joints or holds_bags(path) else usual
+        options = _bag_options(command) if command.joints or not strange else usual
         recording = load(path, resample=command.resample, **options)
     if command.start is not None or command.end is not None:
         first, last = recording.span
@@ -93,6 +98,7 @@ def _bag_options(command: Convert) -> dict[str, Any]:
         "name": command.name or command.out.stem,
         "allow_jitter": command.allow_jitter,
         "joints": command.joints,
+        "slides": command.slides,
         "torque": TorqueConvention(TorqueSide(command.torque), command.gravity),
         "state_topic": command.state_topic,
         "command_topic": command.command_topic,

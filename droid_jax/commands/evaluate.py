@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from droid_jax.commands import report
-from droid_jax.commands.folder import setup_of, stage_folder
+from droid_jax.commands.folder import changed, setup_of, stage_folder
 from droid_jax.commands.hidden import hidden_effects
 from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.source import needs_brax, source
@@ -56,8 +56,7 @@ class Evaluate:
 def run(command: Evaluate) -> None:
     """Try the policy, write transfer.json and the films, and build the page; not again where that was done."""
     needs_brax()
-    if command.trials < 1:
-        raise ValueError(f"--trials must be 1 or more, got {command.trials}")
+    needs_trials(command.trials)
     from droid_jax import runtime
 
     runtime.start()
@@ -105,6 +104,12 @@ def run(command: Evaluate) -> None:
     report.run(report.Report(folder))
 
 
+def needs_trials(trials: int) -> None:
+    """ValueError where there is nothing to try."""
+    if trials < 1:
+        raise ValueError(f"--trials must be 1 or more, got {trials}")
+
+
 def _done(folder: Path, setup: dict[str, Any]) -> Mapping[str, Any] | None:
     """transfer.json of these very trials, where the folder holds it whole."""
     from droid_jax.report.policy_folder import read_policy
@@ -113,7 +118,7 @@ def _done(folder: Path, setup: dict[str, Any]) -> Mapping[str, Any] | None:
         found = read_policy(folder).transfer
     except ValueError:  # broken: it is made again
         return None
-    return found if found is not None and found.get("setup") == setup else None
+    return found if found is not None and not changed(found.get("setup", {}), setup) else None
 
 
 def _task(folder: Path, known: Mapping[str, Any]) -> Task:

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from droid_jax.model.scene import Scene
 
 RUNS = Path("runs")  # where results go unless --out says otherwise
+HASHED = ("own_effects", "extended")  # options whose file is in no other hash of a setup
+PATHS = ("recording", "scene", "parameters", "fit", "run", *HASHED)  # beside each a setup holds what the file says
 
 
 def setup_of(command: Any) -> dict[str, Any]:
@@ -23,8 +25,9 @@ def setup_of(command: Any) -> dict[str, Any]:
     fields = dataclasses.asdict(command)
     for name in ("out", "again", "tensorboard"):
         fields.pop(name, None)
-    if own := fields.get("own_effects"):  # a changed file makes another run
-        fields["own_effects_sha256"] = hashlib.sha256(own.read_bytes()).hexdigest()
+    for name in HASHED:  # a changed file makes another run
+        if path := fields.get(name):
+            fields[f"{name}_sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
     return {k: [str(v) for v in value] if isinstance(value, tuple) else _plain(value) for k, value in fields.items()}
 
 
@@ -52,6 +55,11 @@ def fingerprints(scene: Scene, space: Space, recordings: Iterable[Recording]) ->
     }
 
 
+def changed(before: Mapping[str, Any], setup: Mapping[str, Any]) -> list[str]:
+    """What differs between two setups; where a file lies does not count, what it says does."""
+    return sorted(k for k in {*before, *setup} - {*PATHS} if before.get(k) != setup.get(k))
+
+
 class OtherRun(ValueError):
     """The folder holds a run with other settings or inputs; `what` says which."""
 
@@ -70,11 +78,11 @@ def finished(out: Path, setup: dict[str, Any], again: bool, last: str = "config.
         return False
     try:
         before = json.loads(path.read_text())
-        changed = sorted(k for k in {*before, *setup} if before.get(k) != setup.get(k))
+        other = changed(before, setup)
     except (json.JSONDecodeError, UnicodeDecodeError, AttributeError, TypeError):
         raise ValueError(f"{path} is damaged; choose another --out, or start over with --again") from None
-    if changed:
-        raise OtherRun(out, changed)
+    if other:
+        raise OtherRun(out, other)
     if not (out / last).is_file():
         print(f"{out} holds this run unfinished; going on")
         return False

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from droid_jax.commands import report
-from droid_jax.commands.folder import begin, fingerprints, finished, setup_of
+from droid_jax.commands.folder import begin, fingerprints, finished, setup_of, stage_folder
 from droid_jax.commands.gap_search import searched
 from droid_jax.commands.hidden import hidden_effects, record_stand_in, settled
 from droid_jax.commands.own_effects import load_effects
-from droid_jax.commands.presets import TIMESTEP, refine_config, search_config
+from droid_jax.commands.presets import TIMESTEP, refine_config, search_config, warn_of_cpu
 from droid_jax.commands.scenes import needs_recording, needs_scene, own_scene, recording_at
 
 if TYPE_CHECKING:
@@ -43,7 +43,8 @@ class Gap:
     LOG [SEALED]: without repeats and commands; blocks of time fit and confirm in turns, the last third or the second
     log is sealed. Of one motion less can be concluded, and the report says what."""
     fit: Path | None = None
-    """Folder of a finished `identify` of this robot and object: the base fit begins there instead of with a search."""
+    """Folder of a finished `identify` (or `all`) of this robot and object: the base fit begins there instead of with a
+    search."""
     preset: Literal["quick", "standard", "gpu"] = "quick"
     """Of the base fit, as in identify."""
     scene: Path | None = None
@@ -85,17 +86,19 @@ def run(command: Gap) -> None:
     command = settled(command)
     needs_scene(command)
     runtime.start()
+    warn_of_cpu(command.preset)
     from droid_jax.gap.results import write_gap
     from droid_jax.gap.split import Split
     from droid_jax.identify.results import prepare_folder
     from droid_jax.measure.surrogate import is_stand_in
 
-    load_effects(command.own_effects, command.fit)
-    out = prepare_folder(command.out)
+    out = command.out
+    fit = None if command.fit is None else stage_folder(command.fit, "identify", "fit.json")
+    load_effects(command.own_effects, fit)
     scene, base = model_of(command)
     given, hidden = given_to(command), hidden_effects(command.hide, scene)
     effects = chosen_effects(command, scene, given)
-    start = None if command.fit is None else values_of(command.fit, base)
+    start = None if fit is None else values_of(fit, base)
     setup = {**setup_of(command), "command": "gap", **fingerprints(scene, base, given)}
     if start is not None:
         setup["start"] = start.tolist()
@@ -106,6 +109,7 @@ def run(command: Gap) -> None:
     if split is Split.BLOCKS and start is not None:
         print("a log without repeats is fitted without a search: --fit is not needed")
     config = config_of(command)
+    prepare_folder(out)  # only now, with all input read
     begin(out, setup, command.again, "gap.json")
     assert command.springs is not None  # settled
     roles = roles or record_stand_in(scene, hidden, out, command.springs, command.seed, command.again)

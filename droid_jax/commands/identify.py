@@ -14,7 +14,7 @@ from droid_jax.commands.folder import begin, fingerprints, finished, kept_record
 from droid_jax.commands.hidden import known_stand_in, settled
 from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.pictures import draw
-from droid_jax.commands.presets import TIMESTEP, Preset, refine_config, search_config
+from droid_jax.commands.presets import TIMESTEP, Preset, refine_config, search_config, warn_of_cpu
 from droid_jax.commands.scenes import needs_recording, needs_scene, own_scene, recording_at
 
 if TYPE_CHECKING:
@@ -87,6 +87,7 @@ def run(command: Identify) -> None:
     needs_scene(command)
     needs_writer(command.tensorboard)
     runtime.start()
+    warn_of_cpu(command.preset)
     from droid_jax.identify.pipeline import cost_samples, identify
     from droid_jax.identify.results import prepare_folder, write_run
     from droid_jax.measure.surrogate import is_stand_in
@@ -94,7 +95,7 @@ def run(command: Identify) -> None:
     from droid_jax.report.scalars import FOLDER, scalars
 
     load_effects(command.own_effects, None if command.extended is None else command.extended.parent)
-    out = prepare_folder(command.out)
+    out = command.out
     scene, space, nuisances = model_of(command)
     scene, space, effects = _extended(command, scene, space)
     given = _given(command)
@@ -102,8 +103,9 @@ def run(command: Identify) -> None:
     if finished(out, setup, command.again):
         report.run(report.Report(out))
         return
-    recordings, truth = _recordings(command, scene, out, given)
     config = config_of(command)
+    prepare_folder(out)  # only now, with all input read
+    recordings, truth = _recordings(command, scene, out, given)
     begin(out, setup, command.again)
     started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     board = out / FOLDER if command.tensorboard else None

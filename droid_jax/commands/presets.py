@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import sys
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
@@ -10,6 +12,18 @@ if TYPE_CHECKING:
 
 Preset = Literal["quick", "standard", "paper", "gpu"]
 TIMESTEP: dict[Preset, float] = {"quick": 0.004, "standard": 0.002, "paper": 0.002, "gpu": 0.002}  # s, built-in door
+
+
+@functools.cache
+def warn_of_cpu(preset: str) -> None:
+    """Say once where the preset for a GPU runs on a CPU; jax must be tuned already."""
+    import jax
+
+    if preset == "gpu" and jax.default_backend() == "cpu":
+        print(
+            "warning: --preset gpu, but jax finds no GPU: on a CPU it takes hours (README: jax with CUDA)",
+            file=sys.stderr,
+        )
 
 
 def search_config(preset: Preset, seed: int, **changes: int | None) -> SearchConfig:

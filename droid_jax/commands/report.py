@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from droid_jax.commands.folder import RUNS
+from droid_jax.report.files import STAGES
 
 
 @dataclass(frozen=True)
@@ -16,13 +17,23 @@ class Report:
     """Build the HTML page of a finished run again."""
 
     run: Annotated[Path | None, tyro.conf.Positional] = None
-    """The run's folder. Default: runs/identify where there is one, else runs/all."""
+    """The run's folder. Default: of runs/identify, runs/gap, runs/train and runs/all the one that was finished last."""
 
 
 def run(command: Report) -> None:
     """Write RUN/report.html."""
-    usual = next((f for f in (RUNS / "identify", RUNS / "all") if f.is_dir()), RUNS / "identify")
-    print(f"report: {write(command.run or usual)}")
+    print(f"report: {write(command.run or _latest())}")
+
+
+def _latest() -> Path:
+    """The folder below RUNS whose run was finished last; ValueError where there is none."""
+    files = {RUNS / stage / last: RUNS / stage for stage, last in STAGES.items()}
+    files |= {RUNS / "all" / stage / last: RUNS / "all" for stage, last in STAGES.items()}
+    whole = [file for file in files if file.is_file()]
+    if not whole:
+        folders = ", ".join(map(str, dict.fromkeys(files.values())))
+        raise ValueError(f"there is no finished run in {folders}: give the folder of one")
+    return files[max(whole, key=lambda file: file.stat().st_mtime)]
 
 
 def write(folder: Path) -> Path:

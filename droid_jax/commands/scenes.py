@@ -10,8 +10,6 @@ if TYPE_CHECKING:
     from droid_jax.model.parameters import Space
     from droid_jax.model.scene import Scene
 
-BAGS = (".bag", ".mcap", ".db3")
-
 
 class OwnScene(Protocol):
     """The options that describe it, and what was measured in it."""
@@ -57,16 +55,11 @@ def own_scene(options: OwnScene) -> tuple[Scene, Space]:
     return scene, load_parameters(options.parameters, scene)
 
 
-def holds_bags(path: Path) -> bool:
-    """Whether a path is a ROS bag or a folder of such."""
-    return any(p.suffix in BAGS or (p / "metadata.yaml").is_file() for p in (path, *path.glob("*")))
-
-
 def recording_at(path: Path) -> Recording:
     """A recording; ValueError for ROS bags, which do not say what a fit must know of them."""
-    from droid_jax.measure.formats import load
+    from droid_jax.measure.formats import bags_at, load
 
-    if holds_bags(path):
+    if bags_at(path):
         raise ValueError(
             f"{path}: a ROS bag does not say which joints to read or what its efforts are; "
             "`python -m droid_jax.run convert BAGS --joints ... --torque ...` makes a recording of it"

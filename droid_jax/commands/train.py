@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal
 from droid_jax.commands import report
 from droid_jax.commands.folder import RUNS, begin, finished, setup_of
 from droid_jax.commands.own_effects import load_effects
+from droid_jax.commands.presets import warn_of_cpu
 from droid_jax.commands.source import (
     GAUSSIAN,
     extended_of,
@@ -70,6 +71,7 @@ def run(command: Train) -> None:
 
     needs_writer(command.tensorboard)
     runtime.start()
+    warn_of_cpu(command.preset)
     from droid_jax.gap.extended import FILE
     from droid_jax.identify.results import prepare_folder
     from droid_jax.policy.door_env import DoorEnv
@@ -78,7 +80,7 @@ def run(command: Train) -> None:
     from droid_jax.report.progress import training
     from droid_jax.storage import write_json
 
-    out, fit = prepare_folder(command.out), _fit_folder(command)
+    out, fit = command.out, _fit_folder(command)
     load_effects(command.own_effects, fit)
     scene, gaussian, effects = source(fit, command.knob)
     gaussian = _chosen(command, gaussian)
@@ -89,6 +91,7 @@ def run(command: Train) -> None:
         return
     config = config_of(command)
     env = DoorEnv(scene, effects=effects)
+    prepare_folder(out)  # only now, with all input read
     begin(out, setup, command.again, TRAINING)
     _forget(out)
     gaussian.save(out / GAUSSIAN)

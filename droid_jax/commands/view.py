@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 import warnings
@@ -42,13 +41,13 @@ def run(command: View) -> None:
             f"{folder} holds no {REPLAY}: `python -m droid_jax.run identify` writes one for recordings that hold "
             "commands"
         )
-    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise ValueError(f"there is no screen here; the same replay is a film in {folder / 'report.html'}")
+    if not _opens():
+        raise ValueError(f"no window can be opened here; the same replay is a film in {folder / 'report.html'}")
     import mujoco
     import mujoco.viewer
 
     clock, states = replay_of(folder)
-    model = side_by_side(folder / FITTED)
+    model, moved = side_by_side(folder / FITTED)
     if states.shape[1] != model.nq:
         raise ValueError(f"{folder / REPLAY} has {states.shape[1]} positions, two of {folder / FITTED} have {model.nq}")
     data = mujoco.MjData(model)
@@ -56,7 +55,7 @@ def run(command: View) -> None:
         began = time.monotonic()
         while window.is_running():
             at = command.speed * (time.monotonic() - began) % (clock[-1] + 1.0)  # a second's pause at the end
-            data.qpos[:] = states[min(int(clock.searchsorted(at, "right")) - 1, len(states) - 1)]
+            data.qpos[:] = states[min(int(clock.searchsorted(at, "right")) - 1, len(states) - 1)] + moved
             mujoco.mj_forward(model, data)
             window.sync()
             time.sleep(0.02)
@@ -70,16 +69,36 @@ def replay_of(folder: Path) -> tuple[np.ndarray, np.ndarray]:
         return file["time"], np.concatenate([file["before"], file["after"]], axis=1)
 
 
-def side_by_side(mjcf: Path) -> mujoco.MjModel:
-    """A model of two copies of an MJCF, the first on the left; its positions are theirs, one after the other."""
+def side_by_side(mjcf: Path) -> tuple[mujoco.MjModel, np.ndarray]:
+    """A model of two copies of an MJCF, the first on the left; its positions are theirs, one after the other.
+
+    With it [2 nq], to be added to these positions: those of free bodies are the world's, and both would lie in one
+    place.
+    """
     import mujoco
+    import numpy as np
 
     one = mujoco.MjModel.from_xml_path(str(mjcf))
     half = 0.5 * APART * float(one.stat.extent)
     both = mujoco.MjSpec()
+    both.option = mujoco.MjSpec.from_file(str(mjcf)).option
     for name, y in (("before", half), ("after", -half)):
         frame = both.worldbody.add_frame(pos=[0.0, y, 0.0])
         both.attach(mujoco.MjSpec.from_file(str(mjcf)), prefix=f"{name}/", frame=frame)
     with warnings.catch_warnings():  # of settings that only matter where something is simulated
         warnings.simplefilter("ignore", UserWarning)
-        return both.compile()
+        model = both.compile()
+    return model, model.qpos0 - np.tile(one.qpos0, 2)
+
+
+def _opens() -> bool:
+    """Whether a window can be opened: where none can, MuJoCo's viewer ends the program."""
+    if not sys.platform.startswith("linux"):
+        return True
+    import glfw
+
+    with warnings.catch_warnings():  # glfw says so in a warning
+        warnings.simplefilter("ignore")
+        opens = bool(glfw.init())
+    glfw.terminate()
+    return opens

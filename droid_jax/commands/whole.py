@@ -21,6 +21,7 @@ from droid_jax.report.files import TRANSFER
 
 Stage = Literal["identify", "gap", "train", "evaluate"]
 STAGES: tuple[Stage, ...] = typing.get_args(Stage)
+IN_A_SCENE: tuple[Stage, ...] = ("identify", "gap")  # of one's own: policies are trained at the built-in door
 
 
 class _Presets(NamedTuple):
@@ -91,20 +92,35 @@ def run(command: All) -> None:
     needs_scene(command)
     needs_recording(command)
     needs_writer(command.tensorboard)
-    if command.scene is None and "train" in command.stages:
+    command = replace(command, stages=_stages(command))
+    if "train" in command.stages:
         needs_brax()  # rather now than after the search
+    if "evaluate" in command.stages:
+        evaluate.needs_trials(command.trials)
     runtime.start()  # before the recording, which would start jax untuned
     from droid_jax.identify.results import prepare_folder
+    from droid_jax.model.effects.registry import check_scale
 
+    check_scale(command.effect_scale)
     load_effects(command.own_effects)
-    out = prepare_folder(command.out)
     roles = _roles(command)
+    out = prepare_folder(command.out)
     _run_stages(command, out, roles)
     page = report.write(out)
     print(f"\n{command.out}: {(time.monotonic() - started) / 60:.0f} minutes")
     for line in told(out):
         print(line)
     print(f"report: {page}")
+
+
+def _stages(command: All) -> tuple[Stage, ...]:
+    """The stages that were asked for, as far as the scene has them; ValueError where none is left."""
+    possible = STAGES if command.scene is None else IN_A_SCENE
+    left: tuple[Stage, ...] = tuple(stage for stage in possible if stage in command.stages)
+    if not left:
+        why = "" if command.scene is None else " with --scene: policies are trained at the built-in door"
+        raise ValueError(f"--stages must name one of {', '.join(possible)}{why}")
+    return left
 
 
 def _run_stages(command: All, out: Path, roles: tuple[str, ...]) -> None:
@@ -154,7 +170,7 @@ def _own(command: All) -> dict[str, Any]:
 def _plan(
     command: All, out: Path, recordings: tuple[Path, ...], roles: tuple[str, ...]
 ) -> dict[str, Callable[[], None]]:
-    """The stages that were asked for, as far as the scene has them."""
+    """The stages that were asked for."""
     presets = PRESETS[command.preset]
     common: dict[str, Any] = {"seed": command.seed, "again": command.again, "own_effects": command.own_effects}
     own, board = _own(command) | common, {"tensorboard": command.tensorboard}
@@ -177,10 +193,8 @@ def _plan(
     def judge() -> None:
         evaluate.run(evaluate.Evaluate(out / "train", trials=command.trials, **common))
 
-    plan = {"identify": fit, "gap": search}
-    if command.scene is None:
-        plan |= {"train": learn, "evaluate": judge}
-    return {stage: run_stage for stage, run_stage in plan.items() if stage in command.stages}
+    plan = {"identify": fit, "gap": search, "train": learn, "evaluate": judge}
+    return {stage: plan[stage] for stage in command.stages}
 
 
 def told(out: Path) -> list[str]:

@@ -48,7 +48,7 @@ def load(
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"no recording at {path}: there is no such file or folder")
-    bags = _bags(path)
+    bags = bags_at(path)
     if bags:
         return _load_bags(bags, name, allow_jitter, bag_options)
     if bag_options:
@@ -88,15 +88,20 @@ def _supported() -> str:
     return f"supported are: {SUPPORTED}"
 
 
-def _bags(path: Path) -> list[Path]:
-    """The ROS bags meant by a path, one per repeat; none when it is something else."""
+def bags_at(path: Path) -> list[Path]:
+    """The ROS bags meant by a path, one per repeat; none when it is something else.
+
+    A folder with a recording.json is a recording, whatever lies beside its tables.
+    """
 
     def is_bag(p: Path) -> bool:
         return (p / "metadata.yaml").exists() if p.is_dir() else p.suffix in _BAG_SUFFIXES
 
+    if (path / "recording.json").exists():
+        return []
     if is_bag(path):
         return [path]
-    if path.is_dir() and not (path / "recording.json").exists():
+    if path.is_dir():
         return sorted(p for p in path.iterdir() if is_bag(p))
     return []
 

@@ -25,8 +25,12 @@ from droid_jax.measure.checks import validate
 from droid_jax.measure.clocks import check_clock
 from droid_jax.measure.recording import Channel, Phase, Recording, ServoGains, TorqueConvention
 
-# channel -> field of sensor_msgs/JointState and unit
-_FIELDS = {"torque": ("effort", "N m"), "position": ("position", "rad"), "velocity": ("velocity", "rad/s")}
+# channel -> field of sensor_msgs/JointState, and its unit at hinges and at slides
+_FIELDS = {
+    "torque": ("effort", "N m", "N"),
+    "position": ("position", "rad", "m"),
+    "velocity": ("velocity", "rad/s", "m/s"),
+}
 _GAP = 5.0  # usual steps; a longer silence of a topic counts as unmeasured
 
 
@@ -58,6 +62,7 @@ def read_bags(
     paths: Sequence[str | os.PathLike[str]],
     *,
     joints: Sequence[str],
+    slides: Sequence[str] = (),
     torque: TorqueConvention,
     state_topic: str = "/joint_states",
     command_topic: str | None = None,
@@ -74,10 +79,12 @@ def read_bags(
     """Reads one bag per repeat into a Recording.
 
     joints:            measured joints, in the order wanted.
+    slides:            those of them that slide; a bag does not say.
     torque:            what the efforts are; a bag does not say.
     state_topic:       sensor_msgs/JointState.
-    command_topic:     JointState, JointTrajectory, JointTrajectoryPoint or Float64MultiArray;
-                       None reads a log without commands.
+    command_topic:     JointState, JointTrajectory, JointTrajectoryPoint, Float64MultiArray or
+                       JointTrajectoryControllerState, of which the reference counts; None reads
+                       a log without commands.
     command_joints:    commanded joints, and the order of numbers in messages without names;
                        `joints` by default.
     rate:              Hz of the common clock; the usual rate of the first bag's joint states
@@ -97,6 +104,8 @@ def read_bags(
         raise ValueError("expected one ROS bag per repeat, got none")
     if command_topic == state_topic:
         raise ValueError(f"command and joint states need topics of their own, got {state_topic!r} for both")
+    if strange := [slide for slide in slides if slide not in joints]:
+        raise ValueError(f"slides must be among the joints {', '.join(joints)}, got {', '.join(strange)}")
     command_joints = tuple(joints if command_joints is None else command_joints)
     topics = {state_topic: tuple(joints)}
     if command_topic is not None:
@@ -112,7 +121,7 @@ def read_bags(
     commands = [] if command_topic is None else [topics[command_topic] for topics in timed]
     clock = _clock(states, rate, bags)
 
-    channels = _channels(states, clock, tuple(joints), bags)
+    channels = _channels(states, clock, tuple(joints), slides, bags)
     command = np.zeros((0, 0))
     if commands:
         command = _command(commands, clock, command_joints, command_tolerance, bags)
@@ -153,6 +162,11 @@ def _read_topic(reader: AnyReader, bag: Path, topic: str, joints: tuple[str, ...
     if not connections:
         have = ", ".join(sorted({c.topic for c in reader.connections})) or "none"
         raise ValueError(f"{bag}: no topic {topic!r}; the bag has: {have}")
+    for kind in {c.msgtype for c in connections} - set(reader.typestore.fielddefs):
+        raise ValueError(
+            f"{bag}, topic {topic!r}: the bag does not define {kind}, as bags in sqlite3 of ROS 2 before Iron do not; "
+            "`ros2 bag convert` makes an mcap of it that does"
+        )
     received, stamped, rows = [], [], []
     seen: set[str] = set()
     for number, (connection, nanoseconds, data) in enumerate(reader.messages(connections)):
@@ -188,19 +202,23 @@ def _samples(
 ) -> list[tuple[int, tuple[str, ...], dict[str, np.ndarray]]]:
     """The (offset in ns, joint names, field -> numbers) that one message holds."""
     if hasattr(message, "name") and hasattr(message, "position"):  # JointState
-        fields = {field: np.asarray(getattr(message, field), dtype=np.float64) for field, _ in _FIELDS.values()}
+        fields = {field: np.asarray(getattr(message, field), dtype=np.float64) for field, *_ in _FIELDS.values()}
         return [(0, tuple(message.name), fields)]
     if hasattr(message, "joint_names") and hasattr(message, "points"):  # JointTrajectory
         names = tuple(message.joint_names)
         return [(_nanoseconds(p.time_from_start), names, {"position": np.asarray(p.positions)}) for p in message.points]
+    if hasattr(message, "joint_names") and (hasattr(message, "reference") or hasattr(message, "desired")):
+        # JointTrajectoryControllerState, in older versions with the second name
+        point = message.reference if hasattr(message, "reference") else message.desired
+        return [(0, tuple(message.joint_names), {"position": np.asarray(point.positions)})]
     if hasattr(message, "positions"):  # JointTrajectoryPoint
         numbers = np.asarray(message.positions, dtype=np.float64)
     elif hasattr(message, "data") and np.ndim(message.data) == 1:  # Float64MultiArray
         numbers = np.asarray(message.data, dtype=np.float64)
     else:
         raise ValueError(
-            f"{where}: cannot read {kind}; expected JointState, JointTrajectory, JointTrajectoryPoint "
-            "or Float64MultiArray"
+            f"{where}: cannot read {kind}; expected JointState, JointTrajectory, JointTrajectoryPoint, "
+            "Float64MultiArray or JointTrajectoryControllerState"
         )
     if len(numbers) != len(joints):
         raise ValueError(f"{where}: expected {len(joints)} numbers ({', '.join(joints)}), got {len(numbers)}")
@@ -297,6 +315,7 @@ def _channels(
     states: Sequence[_Timed],
     clock: np.ndarray,
     joints: tuple[str, ...],
+    slides: Sequence[str],
     bags: Sequence[Path],
 ) -> dict[str, Channel]:
     """torque, position and velocity on the common clock, those of them that all bags hold."""
@@ -304,12 +323,13 @@ def _channels(
     if lacking:
         raise ValueError(f"{lacking[0]}: the joint states hold no effort, so there is no torque to compare")
     channels = {}
-    for name, (field, unit) in _FIELDS.items():
+    for name, (field, hinge, slide) in _FIELDS.items():
         if not all(field in fields for _, fields in states):
             continue
         values = np.stack([_interpolate(clock, t, fields[field]) for t, fields in states])
         seen = np.stack([~_in_gap(clock, t) for t, _ in states])
         mask = np.repeat(seen[:, :, None], len(joints), axis=2)
+        unit = " or ".join(dict.fromkeys(slide if joint in slides else hinge for joint in joints))
         channels[name] = Channel(name, unit, joints, clock, values, mask)
     return channels
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +15,9 @@ pytest.importorskip("rosbags")
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from droid_jax.commands.scenes import recording_at
 from droid_jax.measure import rosbag
 from droid_jax.measure.formats import load, save
 from droid_jax.measure.recording import TorqueConvention, TorqueSide
@@ -25,6 +28,7 @@ JOINTS = ("j1", "j2")
 TORQUE = TorqueConvention(TorqueSide.LINK, gravity=True)
 EPOCH = 1_700_000_000 * 10**9  # ns
 KINDS = ("ros1", "sqlite3", "mcap")
+CONTROLLER = "control_msgs/msg/JointTrajectoryControllerState"
 
 
 def position(t: np.ndarray) -> np.ndarray:
@@ -50,7 +54,7 @@ class Bag:
     def add(self, topic: str, kind: str, t: float, **fields) -> None:
         types = self.store.types
         nanoseconds = EPOCH + round(t * 1e9)
-        if kind in ("sensor_msgs/msg/JointState", "trajectory_msgs/msg/JointTrajectory"):
+        if kind in ("sensor_msgs/msg/JointState", "trajectory_msgs/msg/JointTrajectory", CONTROLLER):
             sec, nano = divmod(nanoseconds, 10**9) if self.headers else (0, 0)
             stamp = types["builtin_interfaces/msg/Time"](sec=sec, nanosec=nano)
             seq = {"seq": 0} if self.kind == "ros1" else {}
@@ -116,6 +120,20 @@ def multi_array(bag: Bag, t: float, q: np.ndarray) -> None:
     bag.add("/command", "std_msgs/msg/Float64MultiArray", t, layout=layout, data=q)
 
 
+def controller_state(bag: Bag, t: float, q: np.ndarray, names: tuple[str, str] = ("reference", "feedback")) -> None:
+    """What ros2_control publishes; its position lags behind its command."""
+    if CONTROLLER not in bag.store.types:
+        points = "".join(f"trajectory_msgs/JointTrajectoryPoint {name}\n" for name in names)
+        bag.store.register(get_types_from_msg(f"std_msgs/Header header\nstring[] joint_names\n{points}", CONTROLLER))
+    make = bag.store.types["trajectory_msgs/msg/JointTrajectoryPoint"]
+    command, measured = (make(**point_fields(bag, x, 0.0)) for x in (q[::-1].copy(), q[::-1] - 0.1))
+    bag.add("/command", CONTROLLER, t, joint_names=["j2", "j1"], **dict(zip(names, (command, measured), strict=True)))
+
+
+def older_state(bag: Bag, t: float, q: np.ndarray) -> None:
+    controller_state(bag, t, q, ("desired", "actual"))
+
+
 def pulled(
     folder: Path,
     kind: str,
@@ -158,13 +176,42 @@ def test_states_and_commands_come_back(tmp_path: Path, kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("command", [joint_state, point, multi_array])
+@pytest.mark.parametrize("command", [joint_state, point, multi_array, controller_state, older_state])
 def test_command_messages(tmp_path: Path, kind: str, command: Callable) -> None:
     recording = read_bags(
         [pulled(tmp_path, kind, command=command)], joints=JOINTS, torque=TORQUE, command_topic="/command"
     )
     t = recording.time
     np.testing.assert_allclose(recording.command, np.stack([t, 2 * t], axis=-1), atol=1e-7)
+
+
+def test_a_message_that_the_bag_does_not_define(tmp_path: Path) -> None:
+    """As bags of ROS 2 before Iron in sqlite3 are."""
+    path = pulled(tmp_path, "sqlite3", command=controller_state)
+    with closing(sqlite3.connect(next(path.glob("*.db3")))) as database:
+        database.execute("delete from message_definitions")
+        database.commit()
+    fails([path], "topic '/command': the bag does not define control_msgs", command_topic="/command")
+    assert read_bags([path], joints=JOINTS, torque=TORQUE).repeats == 1
+
+
+@pytest.mark.parametrize(
+    ("slides", "units"),
+    [
+        ((), ("N m", "rad", "rad/s")),
+        (JOINTS, ("N", "m", "m/s")),
+        (JOINTS[:1], ("N or N m", "m or rad", "m/s or rad/s")),
+    ],
+)
+def test_units_follow_the_slides(tmp_path: Path, slides: tuple[str, ...], units: tuple[str, ...]) -> None:
+    out, option = tmp_path / "axis.npz", ["--slides", *slides] if slides else []
+    said = ["--joints", *JOINTS, "--torque", "motor", "--command-topic", "/command", *option]
+    assert convert(pulled(tmp_path, "sqlite3"), *said, "--out", out) == 0
+    assert tuple(load(out).channel(name).unit for name in ("torque", "position", "velocity")) == units
+
+
+def test_slides_are_joints(tmp_path: Path) -> None:
+    fails([pulled(tmp_path, "sqlite3")], "slides must be among the joints j1, j2, got j3", slides=["j3"])
 
 
 def test_a_whole_trajectory_in_one_message(tmp_path: Path) -> None:
@@ -390,6 +437,7 @@ def test_convert_resamples_tables_with_clocks_of_their_own(tmp_path: Path) -> No
 def test_convert_says_what_a_bag_lacks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     paths = [pulled(tmp_path, "ros1", f"run{i}") for i in range(2)]
     out = tmp_path / "door.npz"
+    (tmp_path / "log.npz").write_bytes(b"")
     named = ["--joints", *JOINTS, "--torque", "motor"]
     for arguments, expected in [
         (paths, "give --joints, --torque"),
@@ -397,8 +445,19 @@ def test_convert_says_what_a_bag_lacks(tmp_path: Path, capsys: pytest.CaptureFix
         ([*paths, *named, "--stiffness", "80", "40"], "got 2 --stiffness and 0 --damping"),
         ([*paths, *named, "--command-topic", "/nothing"], "/nothing"),
         ([], "needs the files or folders to read"),
+        ([paths[0], tmp_path / "gone.npz"], "gone.npz does not exist"),
+        ([tmp_path / "log.npz", tmp_path / "log.npz"], "log.npz is no ROS bag: of several sources each is"),
     ]:
         assert convert(*arguments, "--out", out) == 2
         said = capsys.readouterr().err
         assert said.startswith("error: ") and said.count("\n") == 1 and expected in said
     assert not out.exists()
+
+
+def test_bags_beside_the_tables_of_a_recording_are_passed_over(tmp_path: Path) -> None:
+    """A folder with recording.json is a recording, also where its raw logs lie in it."""
+    bag = pulled(tmp_path, "ros1")
+    assert convert(bag, "--joints", *JOINTS, "--torque", "link", "--out", tmp_path / "csv") == 0
+    bag.rename(tmp_path / "csv" / "raw.bag")
+    assert recording_at(tmp_path / "csv").repeats == 1  # as identify and gap read it
+    assert convert(tmp_path / "csv", "--out", tmp_path / "door.npz") == 0

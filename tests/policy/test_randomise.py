@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import warnings
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -123,6 +124,25 @@ def test_mujoco_playground_takes_it():
         state = jax.jit(wrapped.step)(state, jnp.full((ENVS, 1), 0.3))
     assert np.isfinite(state.reward).all()
     assert len(np.unique(np.asarray(state.data.qpos)[:, 1])) == ENVS  # alike at the start, but not their physics
+
+
+@pytest.mark.slow
+def test_an_environment_of_brax_takes_it():
+    """A stock one with MJX behind it, through brax's own wrapper."""
+    envs = pytest.importorskip("brax.envs")
+    scene = load_scene(Path(envs.__file__).with_name("assets") / "inverted_pendulum.xml")
+    space = Space((joint_damping(scene, "hinge", std=0.5, high=5.0), body_mass(scene, "pole", std=1.0, high=10.0)))
+    keys = jax.random.split(jax.random.key(0), ENVS)
+    randomise = functools.partial(randomised_model(scene, prior(space)), rng=keys)
+    env = envs.get_environment("inverted_pendulum", backend="mjx")
+    wrapped = envs.training.wrap(env, episode_length=20, action_repeat=1, randomization_fn=randomise)
+    state = jax.jit(wrapped.reset)(jnp.tile(jax.random.key_data(jax.random.key(1)), (ENVS, 1)))
+    assert len(np.unique(np.asarray(state.obs)[:, 1])) == 1
+    step = jax.jit(wrapped.step)
+    for _ in range(5):
+        state = step(state, jnp.full((ENVS, 1), 0.3))
+    assert np.isfinite(state.obs).all()
+    assert len(np.unique(np.asarray(state.obs)[:, 1])) == ENVS  # the pole's angle: alike at the start alone
 
 
 def test_a_gaussian_of_another_scene_is_refused(scene, gaussian):

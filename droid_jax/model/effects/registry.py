@@ -49,8 +49,7 @@ def library(scene: Scene, names: Iterable[str] | None = None, scale: float = 1.0
     Raises ValueError for unknown names, listing the valid ones, for an effect that is not well made, and for a scale
     that is not above zero.
     """
-    if not 0.0 < scale < np.inf:
-        raise ValueError(f"the scale of the effects must be above 0, got {scale:g}")
+    check_scale(scale)
     known = registered()
     chosen = known if names is None else tuple(names)
     unknown = [n for n in chosen if n not in known]
@@ -58,6 +57,12 @@ def library(scene: Scene, names: Iterable[str] | None = None, scale: float = 1.0
         raise ValueError(f"unknown effects {', '.join(unknown)}; valid: {', '.join(known)}")
     made = (_made(_MAKERS[name], scene, scale) for name in chosen)
     return tuple(effect for effect in made if effect is not None)
+
+
+def check_scale(scale: float) -> None:
+    """ValueError for a scale of the built-in effects that is not above zero."""
+    if not 0.0 < scale < np.inf:
+        raise ValueError(f"the scale of the effects must be above 0, got {scale:g}")
 
 
 def _made(maker: Maker, scene: Scene, scale: float) -> Effect | None:
