@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from droid_jax.identify.gaussian import Gaussian
@@ -12,17 +12,31 @@ from droid_jax.identify.pipeline import identify
 from droid_jax.measure.surrogate import stand_in_truth
 from droid_jax.model.door import door_nuisances, door_space
 from droid_jax.model.door_scene import door_scene
+from droid_jax.policy.door_env import DoorEnv
+from droid_jax.policy.transfer import StandIn, TransferConfig, stand_in
 from droid_jax.storage import write_json
 from experiments.identify_suite import recordings, settings
 from experiments.policies.cases import TIMESTEP
 from experiments.policies.settings import Setting
 
 GAUSSIAN, SETTING = "gaussian.json", "setting.json"
+PADS = {"sliding_friction_left": 0.05, "sliding_friction_right": 0.05}  # too little for a grip to pull with
+SLIPPERY = 20  # trials with such pads: whether a policy needs its grip shows in a few
 
 
 def truth_of(setting: Setting) -> dict[str, float]:
     """The stand-in's hidden values."""
     return {**stand_in_truth(door_scene(), setting.springs, setting.robot), **setting.truth}
+
+
+def robots_of(setting: Setting, env: DoorEnv, trials: int) -> dict[str, StandIn]:
+    """The setting's robot, and the same robot with slippery pads."""
+    scene, truth, config = door_scene(limits=True), truth_of(setting), TransferConfig(trials=trials, seed=setting.robot)
+    few = replace(config, trials=min(trials, SLIPPERY))
+    return {
+        "stand_in": stand_in(scene, env.start, truth, (), env.task, config),
+        "slippery": stand_in(scene, env.start, {**truth, **PADS}, (), env.task, few),
+    }
 
 
 def fitted(setting: Setting, folder: Path, quick: bool) -> Gaussian:
