@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 from droid_jax.identify.gaussian import Gaussian
@@ -18,10 +18,10 @@ from droid_jax.storage import write_json
 from experiments.identify_suite import recordings, settings
 from experiments.policies.cases import TIMESTEP
 from experiments.policies.settings import Setting
+from experiments.policies.table import SLIPPERY
 
 GAUSSIAN, SETTING = "gaussian.json", "setting.json"
-PADS = {"sliding_friction_left": 0.05, "sliding_friction_right": 0.05}  # too little for a grip to pull with
-SLIPPERY = 20  # trials with such pads: whether a policy needs its grip shows in a few
+PADS = {"sliding_friction_left": 0.05, "sliding_friction_right": 0.05}  # the least that a search allows
 
 
 def truth_of(setting: Setting) -> dict[str, float]:
@@ -32,11 +32,8 @@ def truth_of(setting: Setting) -> dict[str, float]:
 def robots_of(setting: Setting, env: DoorEnv, trials: int) -> dict[str, StandIn]:
     """The setting's robot, and the same robot with slippery pads."""
     scene, truth, config = door_scene(limits=True), truth_of(setting), TransferConfig(trials=trials, seed=setting.robot)
-    few = replace(config, trials=min(trials, SLIPPERY))
-    return {
-        "stand_in": stand_in(scene, env.start, truth, (), env.task, config),
-        "slippery": stand_in(scene, env.start, {**truth, **PADS}, (), env.task, few),
-    }
+    of = {"stand_in": truth, SLIPPERY: {**truth, **PADS}}
+    return {name: stand_in(scene, env.start, hidden, (), env.task, config) for name, hidden in of.items()}
 
 
 def fitted(setting: Setting, folder: Path, quick: bool) -> Gaussian:
