@@ -31,7 +31,7 @@ def simulated(policy: Policy, env: DoorEnv, randomise: Randomise | None, episode
 
     @functools.partial(jax.jit, compiler_options=runtime.compiler_options())
     def run(policy, varied, keys):
-        sys = _filled(axes, varied, drawn), axes
+        sys: Any = _filled(axes, varied, drawn), axes
         many = VmapWrapper(env) if randomise is None else DomainRandomizationVmapWrapper(env, lambda _: sys)
 
         def step(carry, _):
