@@ -4,7 +4,8 @@
 
 One policy on doors drawn from the prior, on all devices, from an empty compilation cache; then it is tried in the
 simulation and on the stand-in robot (Table I's door without a spring).  Writes DIR/training.json, by preset and device:
-what the file holds of others stays.
+what the file holds of others stays.  The policy and the Gaussian of its doors are left in DIR/training_policy/PRESET,
+where experiments/policy_parity.py can take them.
 """
 
 from __future__ import annotations
@@ -40,10 +41,11 @@ from droid_jax.measure.surrogate import stand_in_truth  # noqa: E402
 from droid_jax.model.door import door_space  # noqa: E402
 from droid_jax.model.door_scene import door_scene  # noqa: E402
 from droid_jax.policy.door_env import DoorEnv  # noqa: E402
+from droid_jax.policy.network import save_policy  # noqa: E402
 from droid_jax.policy.randomise import randomised  # noqa: E402
 from droid_jax.policy.simulated import simulated  # noqa: E402
 from droid_jax.policy.task import Task  # noqa: E402
-from droid_jax.policy.train import TrainProgress, train  # noqa: E402
+from droid_jax.policy.train import PRESETS, TrainProgress, train  # noqa: E402
 from droid_jax.policy.transfer import TransferConfig, stand_in, transfer  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 from experiments.policies.cases import TIMESTEP, Options  # noqa: E402
@@ -69,14 +71,20 @@ class Arguments:
 
 
 def measured(arguments: Arguments) -> dict[str, Any]:
-    """One training and what came of it."""
-    budget = Options(quick=arguments.quick, preset=arguments.preset, trials=arguments.trials).budget
+    """One training and what came of it; the policy is saved."""
+    often = PRESETS[arguments.preset].evaluations  # the preset as it is
+    asked = Options(quick=arguments.quick, preset=arguments.preset, trials=arguments.trials, evaluations=often)
+    budget = asked.budget
     scene = door_scene(timestep=TIMESTEP, limits=True)
     began = time.perf_counter()
     env = DoorEnv(scene, budget.task(Task()))
-    doors, config = randomised(scene, prior(door_space(scene))), replace(budget.config, seed=arguments.seed)
+    gaussian, config = prior(door_space(scene)), replace(budget.config, seed=arguments.seed)
+    doors = randomised(scene, gaussian)
     found = train(env, doors, config, progress=_tell)
     seconds = time.perf_counter() - began
+    left = arguments.out / stem("training_policy", arguments.quick) / arguments.preset
+    save_policy(left / "policy.npz", found.policy)
+    gaussian.save(left / "gaussian.json")
     physics = round(env.task.control / TIMESTEP)  # steps of the simulation in an action
     rates = [now.rate for now in found.history[2:]] or [found.history[-1].rate]  # the first part compiles
     reached = [now for now in found.history if now.success >= ENOUGH]

@@ -4,14 +4,15 @@
 
 The stand-in robot hides an effect.  It is recorded in three motions and searched once (`gap`); the verdict, right or
 wrong, is taken as it comes.  Then policies are trained on draws of the base model's Gaussian and on draws of the
-extended model's, alike in everything else, and tried on the robot that hides the effect.  Every policy is one JSON file
-under DIR/hidden_effect_cases and is not trained again; DIR/hidden_effect_policy.json sums them up.
+extended model's, alike in everything else, and tried on the robot that hides the effect.  Where the search names no
+effect, there is nothing to compare.  Every policy is one JSON file under DIR/hidden_effect_cases and is not trained
+again; DIR/hidden_effect_policy.json sums them up.
 """
 
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ import json  # noqa: E402
 
 import tyro  # noqa: E402
 
-from benchmarks.common import origin  # noqa: E402
+from benchmarks.common import commits, origin  # noqa: E402
 from droid_jax.commands.gap_search import searched  # noqa: E402
 from droid_jax.commands.hidden import hidden_effects, record_stand_in  # noqa: E402
 from droid_jax.gap.case import GapConfig  # noqa: E402
@@ -45,14 +46,14 @@ from droid_jax.model.effects.registry import library  # noqa: E402
 from droid_jax.policy.door_env import DoorEnv  # noqa: E402
 from droid_jax.policy.randomise import randomised  # noqa: E402
 from droid_jax.policy.task import Task  # noqa: E402
-from droid_jax.policy.transfer import TransferConfig, stand_in  # noqa: E402
+from droid_jax.policy.transfer import TransferConfig, check_playable, stand_in  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
-from experiments.policies.cases import TIMESTEP, Case, Options, found_of, run_all, tried  # noqa: E402
+from experiments.policies.cases import TIMESTEP, Case, Options, finish, found_of, run_all, tried  # noqa: E402
 from experiments.policies.table import PLACES, apart, column  # noqa: E402
 
 MODELS = ("base", "extended")
 BASE, SETUP = "base.json", "setup.json"
-SPRINGS, ROBOT = 0, 21  # the stand-in's column of Table I, and the seed of its hidden errors
+SPRINGS, ROBOT = 0, 21  # the stand-in's column of Table I, and the seed of its hidden errors unless --robot is given
 
 
 @dataclass(frozen=True)
@@ -64,10 +65,21 @@ class Arguments(Options):
     steps_allowed: int = 512
     """Actions of an episode."""
 
+    @property
+    def seed_of_robot(self) -> int:
+        """Of the stand-in's hidden errors."""
+        return ROBOT if self.robot is None else self.robot
+
+    @property
+    def task(self) -> Task:
+        """Of every policy."""
+        return self.budget.task(Task(steps=self.steps_allowed))
+
 
 def search(arguments: Arguments, folder: Path) -> dict[str, Any]:
     """The verdict on the robot that hides an effect; base.json and extended.json are in the folder then."""
-    asked = {"hide": list(arguments.hide), "springs": SPRINGS, "robot": ROBOT, "quick": arguments.quick}
+    robot = arguments.seed_of_robot
+    asked = {"hide": list(arguments.hide), "springs": SPRINGS, "robot": robot, "quick": arguments.quick}
     known = json.loads((folder / SETUP).read_text()) if (folder / SETUP).is_file() else asked
     if known != asked:
         raise SystemExit(f"error: {folder} is of another robot: {known}, now {asked}; choose another --out")
@@ -76,7 +88,7 @@ def search(arguments: Arguments, folder: Path) -> dict[str, Any]:
         return json.loads((folder / "verdict.json").read_text())
     scene = door_scene(timestep=TIMESTEP)
     base = door_space(scene) + door_nuisances(scene)
-    roles = record_stand_in(scene, hidden_effects(arguments.hide, scene), folder, SPRINGS, ROBOT, again=False)
+    roles = record_stand_in(scene, hidden_effects(arguments.hide, scene), folder, SPRINGS, robot, again=False)
     config = GapConfig()
     if arguments.quick:
         small = RefineConfig(iterations=1, hops=0, spreads=0)
@@ -94,48 +106,66 @@ def search(arguments: Arguments, folder: Path) -> dict[str, Any]:
     return found
 
 
+def playable(arguments: Arguments) -> None:
+    """Ends the program where no policy can be tried with what is hidden: before the search, which takes hours."""
+    scene = door_scene()
+    try:
+        check_playable(scene, listed(hidden_effects(arguments.hide, scene)))
+    except ValueError as error:
+        raise SystemExit(f"error: {error}") from None
+
+
 def case(model: str, seed: int, folder: Path, arguments: Arguments) -> dict[str, Any]:
-    """One policy, trained on one of the two models."""
-    search(arguments, folder)
-    budget = arguments.budget
-    scene, task = door_scene(timestep=TIMESTEP, limits=True), budget.task(Task(steps=arguments.steps_allowed))
+    """One policy, trained on one of the two models that the search left in the folder."""
+    budget, robot = arguments.budget, arguments.seed_of_robot
+    scene, task = door_scene(timestep=TIMESTEP, limits=True), arguments.task
     if model == "base":
         env, gaussian = DoorEnv(scene, task), load_gaussian(folder / BASE)
     else:
         known = load_extended(folder / FILE, scene)
         env, gaussian = DoorEnv(known.scene, task, known.effects), known.gaussian
-    hidden, config = listed(hidden_effects(arguments.hide, scene)), TransferConfig(trials=budget.trials, seed=ROBOT)
-    truth = stand_in_truth(door_scene(), SPRINGS, ROBOT)
-    robot = stand_in(door_scene(limits=True), env.start, truth, hidden, task, config)
+    hidden, config = listed(hidden_effects(arguments.hide, scene)), TransferConfig(trials=budget.trials, seed=robot)
+    truth = stand_in_truth(door_scene(), SPRINGS, robot)
+    robots = {"stand_in": stand_in(door_scene(limits=True), env.start, truth, hidden, task, config)}
     doors_of = repr((arguments.hide, gaussian.mean.tolist(), gaussian.cov.tolist()))
-    found = tried(folder / f"{model}_{seed}", env, randomised(env.scene, gaussian), robot, seed, budget, doors_of)
-    return found
+    return tried(folder / f"{model}_{seed}", env, randomised(env.scene, gaussian), robots, seed, budget, doors_of)
 
 
 def planned_case(model: str, seed: int, arguments: Arguments) -> Case:
     """A policy of a model, and what its file must say."""
-    folder, budget = arguments.cases("hidden_effect"), arguments.budget
-    of = {"model": model, "seed": seed, "hide": list(arguments.hide), "budget": budget.to_json()}
-    return Case(folder / f"{model}_{seed}.json", functools.partial(case, model, seed, folder, arguments), of)
+    folder = arguments.cases("hidden_effect")
+    of = {
+        "model": model,
+        "seed": seed,
+        "hide": list(arguments.hide),
+        "robot": arguments.seed_of_robot,
+        "task": asdict(arguments.task),
+        "budget": arguments.budget.to_json(),
+    }
+    make = functools.partial(case, model, seed, folder, arguments)
+    return Case(folder / f"{model}_{seed}.json", make, of, model)
 
 
 def main() -> None:
-    arguments = tyro.cli(Arguments, description=__doc__)
-    cases = arguments.cases("hidden_effect")
+    arguments, code = tyro.cli(Arguments, description=__doc__), origin(0)
+    playable(arguments)
     planned = [planned_case(model, seed, arguments) for seed, model in itertools.product(arguments.policies, MODELS)]
-    run_all(planned, arguments.at_most)
+    verdict = search(arguments, arguments.cases("hidden_effect"))
+    if verdict["effects"] or arguments.quick:  # quick: a search this short seldom names one, and policies shall run too
+        failed = run_all(planned, arguments.at_most, code)
+    else:
+        print("The search named no effect: both models are the same, and no policy is trained.", file=sys.stderr)
+        failed, planned = [], []
     found = found_of(planned)
     of = {model: [c for c in found if c["model"] == model] for model in MODELS}
     table = {model: {place: column(own, place) for place in PLACES} for model, own in of.items() if own}
     better = {}
     if all(of.values()):
         better = {what: apart(of["extended"], of["base"], what) for what in ("success", "angle")}
-    verdict = search(arguments, cases)
-    write_json(
-        arguments.summary("hidden_effect_policy"),
-        {**verdict, "models": table, "extended_better_by": better, **origin(0)},
-    )
+    summary = {**verdict, "models": table, "extended_better_by": better, "cases_from_commits": commits(found), **code}
+    write_json(arguments.summary("hidden_effect_policy"), summary)
     print(json.dumps({m: {p: round(c[p]["success_rate"], 3) for p in PLACES} for m, c in table.items()}))
+    finish(failed)
 
 
 if __name__ == "__main__":

@@ -26,16 +26,16 @@ import json  # noqa: E402
 
 import tyro  # noqa: E402
 
-from benchmarks.common import origin  # noqa: E402
+from benchmarks.common import commits, origin  # noqa: E402
 from droid_jax.model.door_scene import LEVERS, door_scene  # noqa: E402
 from droid_jax.policy.door_env import DoorEnv  # noqa: E402
 from droid_jax.policy.randomise import randomised  # noqa: E402
 from droid_jax.policy.task import Task  # noqa: E402
 from droid_jax.policy.transfer import TransferConfig, stand_in  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
-from experiments.policies.cases import TIMESTEP, Budget, Case, Options, found_of, run_all, tried  # noqa: E402
+from experiments.policies.cases import TIMESTEP, Budget, Case, Options, finish, found_of, run_all, tried  # noqa: E402
 from experiments.policies.robots import GAUSSIAN, fitted, truth_of  # noqa: E402
-from experiments.policies.settings import SETTINGS  # noqa: E402
+from experiments.policies.settings import Setting, setting_of  # noqa: E402
 from experiments.policies.table import PLACES, column  # noqa: E402
 
 
@@ -49,38 +49,46 @@ class Arguments(Options):
     """Policies for each place."""
 
 
-def case(knob: int, seed: int, folder: Path, budget: Budget) -> dict[str, Any]:
+def case(knob: int, seed: int, setting: Setting, folder: Path, budget: Budget) -> dict[str, Any]:
     """One policy for one place of the knob."""
-    setting = SETTINGS["paper"]
     env = DoorEnv(door_scene(timestep=TIMESTEP, limits=True, knob=knob), budget.task(Task()))
     config = TransferConfig(trials=budget.trials, seed=setting.robot)
     robot = stand_in(door_scene(limits=True, knob=knob), env.start, truth_of(setting), (), env.task, config)
     randomise = randomised(env.scene, fitted(setting, folder, budget.quick))
-    doors_of = repr((knob, (folder / GAUSSIAN).read_text()))
-    return tried(folder / f"knob{knob}_{seed}", env, randomise, robot, seed, budget, doors_of)
+    doors_of = (folder / GAUSSIAN).read_text()
+    return tried(folder / f"knob{knob}_{seed}", env, randomise, {"stand_in": robot}, seed, budget, doors_of)
 
 
 def planned_case(knob: int, seed: int, arguments: Arguments) -> Case:
     """A policy of a place, and what its file must say."""
-    folder, budget = arguments.cases("knob"), arguments.budget
-    of = {"knob": knob, "seed": seed, "setting": asdict(SETTINGS["paper"]), "budget": budget.to_json()}
-    return Case(folder / f"knob{knob}_{seed}.json", functools.partial(case, knob, seed, folder, budget), of)
+    folder, budget, setting = arguments.cases("knob"), arguments.budget, setting_of("paper", arguments.robot)
+    of = {
+        "knob": knob,
+        "seed": seed,
+        "setting": asdict(setting),
+        "task": asdict(budget.task(Task())),
+        "budget": budget.to_json(),
+    }
+    make = functools.partial(case, knob, seed, setting, folder, budget)
+    return Case(folder / f"knob{knob}_{seed}.json", make, of, "fit")
 
 
 def main() -> None:
-    arguments = tyro.cli(Arguments, description=__doc__)
+    arguments, code = tyro.cli(Arguments, description=__doc__), origin(0)
     knobs = arguments.knobs[-1:] if arguments.quick else arguments.knobs
     places = knobs if arguments.quick else range(len(LEVERS))
     planned = [planned_case(knob, seed, arguments) for seed, knob in itertools.product(arguments.policies, places)]
-    run_all([c for c in planned if c.of["knob"] in knobs], arguments.at_most)
+    failed = run_all([c for c in planned if c.of["knob"] in knobs], arguments.at_most, code)
     found = found_of(planned)
     table = {}
     for knob in sorted({c["knob"] for c in found}):
         own = [c for c in found if c["knob"] == knob]
         table[f"{LEVERS[knob]:.2f} m"] = {place: column(own, place) for place in PLACES}
     line = {lever: {p: round(c[p]["success_rate"], 3) for p in PLACES} for lever, c in table.items()}
-    write_json(arguments.summary("knob_locations"), {"levers": table, **origin(0)})
+    summary = {"levers": table, "cases_from_commits": commits(found), **code}
+    write_json(arguments.summary("knob_locations"), summary)
     print(json.dumps(line))
+    finish(failed)
 
 
 if __name__ == "__main__":

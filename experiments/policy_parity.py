@@ -4,8 +4,8 @@
 
 A policy without any noise on doors drawn from the distribution that it was trained on (without effects): each once
 in MJX with the training's time step, and once in C at 1 ms with a solver that has converged.  Start pose and physics
-are the same, so what differs is the simulation.  Writes DIR/policy_parity.json and .png; the target is a largest
-opening angle within 3 degrees.
+are the same, so what differs is the simulation.  Writes DIR/policy_parity.json and .png, with the hashes of policy and
+distribution; the target is a largest opening angle within 3 degrees.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
 import tuned  # noqa: E402, F401  (before jax starts)
 
 # isort: split
+import hashlib  # noqa: E402
 import json  # noqa: E402
 
 import numpy as np  # noqa: E402
@@ -84,6 +85,13 @@ def untrained() -> tuple[Policy, DoorEnv, Gaussian]:
     return train(env, randomised(scene, gaussian), Options(quick=True).budget.config).policy, env, gaussian
 
 
+def named(path: Path) -> dict[str, str]:
+    """A file by its place in the project (elsewhere its name alone) and its hash."""
+    own = path.resolve()
+    where = own.relative_to(ROOT).as_posix() if own.is_relative_to(ROOT) else own.name
+    return {"file": where, "sha256": hashlib.sha256(own.read_bytes()).hexdigest()}
+
+
 def in_mjx(policy: Policy, env: DoorEnv, gaussian: Gaussian, values: np.ndarray) -> Trials:
     """An episode on each door [N, D]."""
     space = gaussian.space
@@ -122,6 +130,8 @@ def main() -> None:
     angle = {name: np.rad2deg(trials.angle) for name, trials in both.items()}
     apart = np.abs(angle["mjx"] - angle["c"])
     result: dict[str, Any] = {
+        "policy": "untrained" if arguments.quick else named(arguments.policy),
+        "gaussian": "prior" if arguments.quick else named(beside),
         "doors": len(values),
         "difference_deg": {
             "median": float(np.median(apart)),

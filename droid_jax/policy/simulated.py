@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,36 +14,58 @@ from droid_jax import runtime
 from droid_jax.policy.control import Policy
 from droid_jax.policy.door_env import DoorEnv
 from droid_jax.policy.randomise import Randomise
-from droid_jax.policy.trials import Trials
+from droid_jax.policy.trials import BLOWN_UP, Trials
+
+jax.tree_util.register_dataclass(  # not where it is defined: control.py needs numpy alone
+    Policy, data_fields=("mean", "std", "weights", "biases"), meta_fields=("interface",)
+)
 
 
 def simulated(policy: Policy, env: DoorEnv, randomise: Randomise | None, episodes: int, seed: int = 0) -> Trials:
-    """Episodes of the deterministic policy, each in its own draw of the physics (without, all in the scene's own)."""
-    start, physics = jax.random.split(jax.random.key(seed))
-    keys = jax.random.split(physics, episodes)
-    many = (
-        VmapWrapper(env) if randomise is None else DomainRandomizationVmapWrapper(env, lambda sys: randomise(sys, keys))
-    )
+    """Episodes of the deterministic policy, each in its own draw of the physics (without, all in the scene's own).
 
-    def step(carry, _):
-        state, won, best, grips, count, steps = carry
-        going = state.done == 0.0
-        after = many.step(state, policy.act(state.obs, jnp))
-        state = jax.tree.map(lambda new, old: jnp.where(_as(going, new), new, old), after, state)
-        best = jnp.maximum(best, state.metrics["angle"])
-        seen = going * after.metrics["success"], going * after.metrics["grip"]
-        return (state, won + seen[0], best, grips + seen[1], count + going, steps + (going & (won == 0.0))), None
+    The policy and what varies are arguments of the program, so that other policies and draws find it compiled.
+    """
+    start, physics = jax.random.split(jax.random.key(seed))
+    drawn, axes = (env.sys, None) if randomise is None else randomise(env.sys, jax.random.split(physics, episodes))
 
     @functools.partial(jax.jit, compiler_options=runtime.compiler_options())
-    def run(keys):
+    def run(policy, varied, keys):
+        sys: Any = _filled(axes, varied, drawn), axes
+        many = VmapWrapper(env) if randomise is None else DomainRandomizationVmapWrapper(env, lambda _: sys)
+
+        def step(carry, _):
+            state, won, best, grips, count, steps = carry
+            going = state.done == 0.0
+            after = many.step(state, policy.act(state.obs, jnp))
+            state = jax.tree.map(lambda new, old: jnp.where(_as(going, new), new, old), after, state)
+            best = jnp.maximum(best, state.metrics["angle"])
+            seen = going * after.metrics["success"], going * after.metrics["grip"]
+            return (state, won + seen[0], best, grips + seen[1], count + going, steps + (going & (won == 0.0))), None
+
         nothing = jnp.zeros(episodes)
         carry = (many.reset(keys), nothing, nothing, nothing, nothing, nothing)
         (state, won, best, grips, count, steps), _ = jax.lax.scan(step, carry, None, length=env.task.steps)
         return won, best, steps, grips / jnp.maximum(count, 1.0), state.metrics["blown_up"]
 
-    won, angle, steps, grip, blown_up = (np.asarray(a) for a in run(jax.random.split(start, episodes)))
-    stopped = np.where(blown_up > 0, "the simulation blew up", "")
+    found = run(policy, _varied(axes, drawn), jax.random.split(start, episodes))
+    won, angle, steps, grip, blown_up = (np.asarray(a) for a in found)
+    stopped = np.where(blown_up > 0, BLOWN_UP, "")
     return Trials(won > 0, angle.astype(float), steps.astype(int), grip.astype(float), stopped)
+
+
+def _varied(axes: Any, drawn: Any) -> Any:
+    """Physics with None for what all episodes share: that stays a constant of the program."""
+    return jax.tree.map(lambda axis, leaf: None if axis is None else leaf, axes, drawn, is_leaf=_shared)
+
+
+def _filled(axes: Any, varied: Any, drawn: Any) -> Any:
+    """The inverse of `_varied`."""
+    return jax.tree.map(lambda a, own, leaf: leaf if a is None else own, axes, varied, drawn, is_leaf=_shared)
+
+
+def _shared(axis: int | None) -> bool:
+    return axis is None
 
 
 def _as(going: jax.Array, like: jax.Array) -> jax.Array:

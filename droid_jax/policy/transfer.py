@@ -24,7 +24,7 @@ from droid_jax.model.scene import Scene
 from droid_jax.policy.control import Controller, Policy, Reading
 from droid_jax.policy.hand import finger_forces_c, hand_of, looked
 from droid_jax.policy.task import Task, gripped, holding, succeeded
-from droid_jax.policy.trials import Trials
+from droid_jax.policy.trials import BLOWN_UP, Trials
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ def _trial(
         advance(np.concatenate([asked.arm, asked.fingers]))
         made += 1
         if not np.isfinite(data.qpos).all() or data.time < (made - 0.5) * task.control:
-            stopped = "the simulation blew up"  # MuJoCo starts over then: its clock is late
+            stopped = BLOWN_UP  # MuJoCo starts over then: its clock is late
             break
         watch(data)
         seen = looked(hand, data, finger_forces_c(hand, model, data), seen.pads, task.control, np)

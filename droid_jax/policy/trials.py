@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import scipy.stats
 
+BLOWN_UP = "the simulation blew up"  # in `Trials.stopped`: says nothing of the policy
+
 
 @dataclass(frozen=True, eq=False)
 class Trials:
@@ -41,8 +43,8 @@ class Trials:
         Steps in sum are those of successes, None where there were none; why trials stopped, without its numbers.
         """
         degrees, steps = np.rad2deg(self.angle), self.steps[self.success.astype(bool)]
-        short = np.array([str(why).partition(":")[0] for why in self.stopped if why])
-        reasons, counts = np.unique(short, return_counts=True)
+        short = [str(why).partition(":")[0] for why in self.stopped]
+        reasons, counts = np.unique([why for why in short if why], return_counts=True)
         return {
             "trials": len(self.success),
             "success_rate": self.rate,
@@ -56,4 +58,5 @@ class Trials:
             "grip": {"mean": float(self.grip.mean()), "all": self.grip.round(3).tolist()},
             "success": self.success.astype(bool).tolist(),
             "stopped": dict(zip(reasons.tolist(), counts.tolist(), strict=True)),
+            "stopped_each": short,
         }

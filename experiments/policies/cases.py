@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import json
+import sys
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from benchmarks.common import origin, stem
+import jax
+
+from benchmarks.common import stem
 from droid_jax.policy.door_env import DoorEnv
 from droid_jax.policy.network import save_policy
 from droid_jax.policy.randomise import Randomise
@@ -18,6 +22,7 @@ from droid_jax.policy.task import Task
 from droid_jax.policy.train import PRESETS, TrainConfig, train
 from droid_jax.policy.transfer import StandIn, transfer
 from droid_jax.storage import write_json
+from experiments.policies.table import PLACES
 
 TIMESTEP = 0.004  # s, of the simulation that trains
 QUICK_STEPS = 20  # actions of an episode where nothing shall be learned
@@ -36,12 +41,16 @@ class Options:
     """Policies of each kind."""
     first: int = 0
     """Seed of the first policy: pilots use others than the runs that are reported."""
+    robot: int | None = None
+    """Seed of the stand-in robot's hidden errors and of its trials; default: the setting's. Pilots use another."""
     trials: int = 100
     """Trials of each policy on the stand-in robot, and episodes in simulation."""
     steps: int | None = None
     """Actions of each training; default: the preset's."""
     preset: Literal["quick", "paper", "gpu"] = "quick"
     """Of training."""
+    evaluations: int = 8
+    """Times that a policy is tried while it trains; 16 would cost a quarter of the training's own actions."""
     at_most: int = 1_000_000
     """Stop after so many policies."""
 
@@ -57,20 +66,25 @@ class Options:
         """What a policy costs."""
         if self.trials < 1:
             raise SystemExit(f"error: --trials must be 1 or more, got {self.trials}")
-        config = PRESETS[self.preset] if self.steps is None else replace(PRESETS[self.preset], steps=self.steps)
+        preset = replace(PRESETS[self.preset], evaluations=self.evaluations)
+        config = preset if self.steps is None else replace(preset, steps=self.steps)
         if not self.quick:
             return Budget(config, self.trials)
         small = replace(config, steps=8192, envs=64, batch=16, minibatches=4, evaluations=2, eval_envs=8)
         return Budget(small, 2, True)
 
     def cases(self, name: str) -> Path:
-        """Folder of the cases."""
-        return self.out / stem(f"{name}_cases", self.quick)
+        """Folder of the cases; those of another robot have a name of their own."""
+        return self.out / stem(f"{name}{self._of_robot}_cases", self.quick)
 
     def summary(self, name: str, kind: str = ".json") -> Path:
         """File of the summary; that of pilots has a name of its own."""
         pilot = f"_from_{self.first}" if self.first else ""
-        return self.out / f"{stem(f'{name}{pilot}', self.quick)}{kind}"
+        return self.out / f"{stem(f'{name}{self._of_robot}{pilot}', self.quick)}{kind}"
+
+    @property
+    def _of_robot(self) -> str:
+        return "" if self.robot is None else f"_robot_{self.robot}"
 
 
 @dataclass(frozen=True)
@@ -92,49 +106,74 @@ class Budget:
 
 
 def tried(
-    place: Path, env: DoorEnv, randomise: Randomise, robot: StandIn, seed: int, budget: Budget, origin_of: str
+    place: Path,
+    env: DoorEnv,
+    randomise: Randomise,
+    robots: Mapping[str, StandIn],
+    seed: int,
+    budget: Budget,
+    doors: str,
 ) -> dict[str, Any]:
-    """Train with checkpoints in a folder, and try: the figures of one policy.
+    """Train with checkpoints in a folder, and try in simulation and on robots by name: the figures of one policy.
 
-    origin_of: what the doors that it is trained on are made of, in words; checkpoints of others are refused.
+    doors: what those that it is trained on are made of, in words; checkpoints of others are refused.
     """
-    config, code = replace(budget.config, seed=seed), origin(seed)  # of now: hours later the commit may be another
-    found = train(env, randomise, config, checkpoints=place / "checkpoints", fingerprint={"doors": origin_of})
+    config = replace(budget.config, seed=seed)
+    found = train(env, randomise, config, checkpoints=place / "checkpoints", fingerprint={"doors": doors})
     save_policy(place / "policy.npz", found.policy)
     return {
-        "doors_sha256": hashlib.sha256(origin_of.encode()).hexdigest(),
+        "doors_sha256": hashlib.sha256(doors.encode()).hexdigest(),
         "simulation": simulated(found.policy, env, randomise, budget.trials, seed).to_json(),
-        "stand_in": transfer(found.policy, robot).to_json(),
+        **{name: transfer(found.policy, robot).to_json() for name, robot in robots.items()},
         "history": [asdict(now) for now in found.history],
-        **code,
     }
 
 
 class Case(NamedTuple):
-    """A policy's file, what makes its content, and what the file must say of it to count as done (plain data)."""
+    """A policy's file, what makes its content, and what the file must say of it to count as done (plain data).
+
+    doors: name of the distribution of the doors that it is trained on; cases of one name must come from one fit.
+    """
 
     path: Path
     make: Callable[[], dict[str, Any]]
     of: Mapping[str, Any]
+    doors: str
 
 
-def run_all(cases: Sequence[Case], at_most: int) -> None:
-    """Make what has no file yet, and say what came of it.
+def run_all(cases: Sequence[Case], at_most: int, code: Mapping[str, Any]) -> list[str]:
+    """Make what has no file yet, and say what came of it; returns the names of those that failed, which hold up none.
 
+    code: `origin` when the program started: what it imported then made all cases, whatever was committed since.
     Ends the program, before anything is made, where a file is there that was made with something else.
     """
     found_of(cases)
+    failed = []
     for case in [c for c in cases if not c.path.is_file()][:at_most]:
-        result = case.make()
-        write_json(case.path, {**case.of, **result})
-        rates = {where: result[where]["success_rate"] for where in ("simulation", "stand_in")}
-        print(f"{case.path.parent.name}/{case.path.stem}: {rates}", flush=True)
+        name = f"{case.path.parent.name}/{case.path.stem}"
+        try:
+            result = case.make()
+        except Exception:
+            print(f"{name} failed:\n{traceback.format_exc()}", file=sys.stderr, flush=True)
+            failed.append(name)
+        else:
+            write_json(case.path, {**case.of, **result, "origin": dict(code)})
+            rates = {where: result[where]["success_rate"] for where in PLACES}
+            print(f"{name}: {rates}", flush=True)
+        jax.clear_caches()  # no other case uses these programs, and what takes long to compile is kept on disk
+    return failed
+
+
+def finish(failed: Sequence[str]) -> None:
+    """Ends the program with an error where cases failed."""
+    if failed:
+        raise SystemExit(f"error: {len(failed)} failed and can be tried again: {', '.join(failed)}")
 
 
 def found_of(cases: Sequence[Case]) -> list[dict[str, Any]]:
-    """Those of these cases that there are."""
-    found = []
-    for path, _, of in cases:
+    """Those of these cases that there are.  Ends the program where they do not go together."""
+    found, fits = [], dict[str, tuple[str, Path]]()
+    for path, _, of, doors in cases:
         if not path.is_file():
             continue
         known = json.loads(path.read_text())
@@ -143,5 +182,10 @@ def found_of(cases: Sequence[Case]) -> list[dict[str, Any]]:
                 raise SystemExit(
                     f"error: {path} was made with another {name}: {known.get(name)}, now {value}; choose another --out"
                 )
+        fit, first = fits.setdefault(doors, (known["doors_sha256"], path))
+        if known["doors_sha256"] != fit:
+            raise SystemExit(
+                f"error: {path} and {first} were trained on different fits; remove one, or choose another --out"
+            )
         found.append(known)
     return found

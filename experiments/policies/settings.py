@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 
@@ -39,3 +39,8 @@ SETTINGS = {
         },
     ),
 }
+
+
+def setting_of(name: str, robot: int | None) -> Setting:
+    """A setting, with another robot's hidden errors where one is asked for (pilots)."""
+    return SETTINGS[name] if robot is None else replace(SETTINGS[name], robot=robot)

@@ -8,8 +8,11 @@ from typing import Any
 import numpy as np
 import scipy.stats
 
+from droid_jax.policy.trials import BLOWN_UP
+
 METHODS = ("prior", "mean", "fitted")
 PLACES = ("simulation", "stand_in")
+SLIPPERY = "slippery"  # the stand-in robot with pads that do not hold
 RESAMPLES = 4000
 LEVEL = 0.95
 # Table II of the paper: success in %, largest angle in degrees and steps (mean, deviation), in simulation and on the
@@ -26,7 +29,7 @@ def summed_up(cases: Sequence[Mapping[str, Any]], settings: Sequence[str]) -> di
     table: dict[str, Any] = {}
     for name in settings:
         of = {m: [c for c in cases if c["setting"]["name"] == name and c["method"] == m] for m in METHODS}
-        columns = {m: {place: column(own, place) for place in PLACES} for m, own in of.items() if own}
+        columns = {m: {place: column(own, place) for place in (*PLACES, SLIPPERY)} for m, own in of.items() if own}
         others = [m for m in ("prior", "mean") if of[m] and of["fitted"]]
         better = {m: {what: apart(of["fitted"], of[m], what) for what in ("success", "angle")} for m in others}
         table[name] = {"methods": columns, "fitted_better_than": better}
@@ -38,15 +41,22 @@ def summed_up(cases: Sequence[Mapping[str, Any]], settings: Sequence[str]) -> di
 
 
 def column(cases: Sequence[Mapping[str, Any]], place: str) -> dict[str, Any]:
-    """Success, largest angle and steps of one method's policies in one place; steps of the trials that succeeded."""
+    """Success, largest angle, grip and steps of one method's policies in one place; steps of those that succeeded.
+
+    Episodes that blew up are counted and are in nothing else.  stopped: share of trials that the control loop stopped;
+    in simulation there is none.  grip: share of a trial's actions with the grip on.
+    """
     each = [trials(case, place) for case in cases]
     return {
         "policies": len(each),
         "trials": sum(len(t["success"]) for t in each),
+        "blown_up": sum(len(case[place]["success"]) for case in cases) - sum(len(t["success"]) for t in each),
         "seeds": [case["seed"] for case in cases],
         "success_rate": float(np.mean(np.concatenate([t["success"] for t in each]))),
         "success_interval_95": rate_interval([t["success"] for t in each]),
         "success_of_each": [float(np.mean(t["success"])) for t in each],
+        "stopped": float(np.mean(np.concatenate([t["stopped"] for t in each]))),
+        "grip": spread([t["grip"] for t in each]),
         "angle_deg": spread([t["angle"] for t in each]),
         "steps": spread([t["steps"][t["success"] > 0] for t in each]),
     }
@@ -61,13 +71,22 @@ def spread(each: Sequence[np.ndarray]) -> dict[str, Any]:
 
 
 def trials(case: Mapping[str, Any], place: str) -> dict[str, np.ndarray]:
-    """One policy's trials: success [T], largest angle [T] in degrees, steps [T]."""
+    """One policy's trials, without those that blew up: success, largest angle in degrees, steps, share of actions with
+    the grip on, whether the control loop stopped it, [T] each.
+    """
     found = case[place]
-    return {
-        "success": np.array(found["success"], float),
-        "angle": np.array(found["angle_deg"]["all"], float),
-        "steps": np.array(found["steps"]["all"], float),
+    why = np.array(found["stopped_each"])
+    counted = why != BLOWN_UP
+    if not counted.any():
+        raise SystemExit(f"error: all trials of the policy of seed {case['seed']} blew up ({place})")
+    every = {
+        "success": found["success"],
+        "angle": found["angle_deg"]["all"],
+        "steps": found["steps"]["all"],
+        "grip": found["grip"]["all"],
+        "stopped": why != "",
     }
+    return {name: np.array(values, float)[counted] for name, values in every.items()}
 
 
 def apart(better: Sequence[Mapping[str, Any]], worse: Sequence[Mapping[str, Any]], what: str) -> dict[str, Any]:

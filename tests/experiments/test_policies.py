@@ -3,37 +3,47 @@
 from __future__ import annotations
 
 import functools
+import importlib
 import json
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import scipy.stats
 
+from benchmarks.common import commits
+from droid_jax.model.door_scene import door_scene
+from droid_jax.policy.task import Task
 from droid_jax.policy.trials import Trials
-from experiments.policies.cases import Case, Options, found_of, run_all
+from experiments.policies.cases import Case, Options, finish, found_of, run_all
 from experiments.policies.figure import as_text, histograms
-from experiments.policies.robots import fitted
-from experiments.policies.settings import SETTINGS, Setting
-from experiments.policies.table import apart, column, rate_interval, resampled, spread, summed_up
+from experiments.policies.robots import fitted, robots_of
+from experiments.policies.settings import SETTINGS, Setting, setting_of
+from experiments.policies.table import PLACES, apart, column, rate_interval, resampled, spread, summed_up
 
 ROOT = Path(__file__).resolve().parents[2]
+CODE = {"commit": "one"}
 
 
-def case(method: str, seed: int, rate: float, count: int = 50) -> dict[str, Any]:
-    """A policy that succeeds in so many of its trials."""
+def case(
+    method: str, seed: int, rate: float, count: int = 50, stopped: Sequence[str] = (), fit: str = "one"
+) -> dict[str, Any]:
+    """A policy that succeeds in so many of its trials.  stopped: why the last of them were stopped."""
     won = np.arange(count) < rate * count
-    found = Trials(won, np.deg2rad(np.where(won, 40.0, 10.0)), np.where(won, 100, 512), won + 0.0, np.full(count, ""))
+    why = np.array([""] * (count - len(stopped)) + list(stopped))
+    found = Trials(won, np.deg2rad(np.where(won, 40.0, 10.0)), np.where(won, 100, 512), won + 0.0, why)
     return {
         "setting": {"name": "paper"},
         "method": method,
         "seed": seed,
-        "simulation": found.to_json(),
-        "stand_in": found.to_json(),
+        "doors_sha256": fit,
+        **{place: found.to_json() for place in ("simulation", "stand_in", "slippery")},
     }
 
 
@@ -44,6 +54,18 @@ def test_a_column_is_the_mean_over_all_trials():
     assert found["angle_deg"]["mean"] == pytest.approx(25.0) and found["angle_deg"]["std"] == pytest.approx(15.0)
     assert found["steps"]["mean"] == 100.0  # of successes
     assert column([case("mean", 0, 0.0)], "stand_in")["steps"] == {"mean": None, "std": None, "interval_95": None}
+
+
+def test_what_blew_up_is_counted_and_in_no_rate():
+    """Ten trials of fifty: half of the others succeed, and one in eight of them was stopped by the control loop."""
+    why = ["too fast: joint 1"] * 5 + ["the simulation blew up"] * 10
+    found = column([case("mean", 0, 0.4, stopped=why)], "stand_in")
+    assert (found["trials"], found["blown_up"], found["success_rate"]) == (40, 10, pytest.approx(0.5))
+    assert found["stopped"] == pytest.approx(5 / 40) and found["grip"]["mean"] == pytest.approx(0.5)
+    whole = column([case("mean", 0, 0.4)], "stand_in")
+    assert (whole["trials"], whole["blown_up"], whole["stopped"]) == (50, 0, 0.0)
+    with pytest.raises(SystemExit, match=r"all trials of the policy of seed 3 blew up \(stand_in\)"):
+        column([case("mean", 3, 0.4, 2, why[-2:])], "stand_in")
 
 
 def test_policies_that_differ_widen_the_interval():
@@ -112,6 +134,49 @@ def test_the_table_holds_what_was_run_and_the_papers_own():
     assert [sum(p.get_height() for p in panel.patches) for panel in panels] == [50, 0, 50]
 
 
+def test_the_table_shows_stops_slippery_pads_and_what_blew_up():
+    text = as_text(summed_up([case("prior", 0, 0.5, stopped=["late: 9 ms"] * 5)], ["paper"]))
+    assert "| stopped by the control loop, % | 10.0 |" in text and "| actions with the grip on, % | 50 |" in text
+    assert "| stand-in robot, pads with a friction of 0.05: success, % (95 %) | 50.0 (36 to 64) |" in text
+    assert "blew up" not in text
+    blown = as_text(summed_up([case("prior", 0, 0.5, stopped=["the simulation blew up"])], ["paper"]))
+    assert "| blew up, not counted above | 1 |" in blown
+
+
+def test_a_hidden_effect_is_the_tables_last_part():
+    cases = {model: [case("mean", 0, rate)] for model, rate in (("base", 0.2), ("extended", 0.6))}
+    found = summed_up([case("prior", 0, 0.5)], ["paper"])
+    found["hidden_effect"] = {
+        "hidden": ["closer=3"],
+        "sentence": "It lacks a closer.",
+        "models": {m: {place: column(own, place) for place in PLACES} for m, own in cases.items()},
+        "extended_better_by": {"success": apart(cases["extended"], cases["base"], "success")},
+    }
+    text = as_text(found)
+    assert "## A robot that hides closer=3: base fit against extended model" in text and "It lacks a closer." in text
+    assert "| | base | extended |" in text and "Extended against base, stand-in robot: +40 points of success (" in text
+    found["hidden_effect"]["models"] = {}  # nothing was named
+    assert "hides" not in as_text(found)
+
+
+def test_a_door_that_opens_to_its_stop_is_in_the_histogram():
+    wide = case("prior", 0, 0.5)
+    wide["stand_in"]["angle_deg"]["all"] = [100.3] * 50
+    assert sum(p.get_height() for p in histograms([wide], ["paper"]).axes[0].patches) == 50
+
+
+def test_slippery_pads_are_all_that_differs_from_the_settings_robot():
+    env: Any = SimpleNamespace(start=door_scene().initial_qpos({}), task=Task())
+    robots = robots_of(SETTINGS["paper"], env, 100)
+    usual, slippery = (robots[name].scene.model for name in ("stand_in", "slippery"))
+    assert usual.pair_friction[:, 0].min() > 0.4 and not np.array_equal(usual.pair_friction, slippery.pair_friction)
+    fingers = np.concatenate(door_scene().finger_pairs)
+    np.testing.assert_allclose(slippery.pair_friction[fingers, :2], 0.05)
+    np.testing.assert_array_equal(slippery.pair_friction[:, 2:], usual.pair_friction[:, 2:])
+    np.testing.assert_array_equal(slippery.dof_damping, usual.dof_damping)
+    assert robots["slippery"].config == robots["stand_in"].config
+
+
 def test_settings_have_their_names():
     assert all(name == setting.name and isinstance(setting, Setting) for name, setting in SETTINGS.items())
 
@@ -120,13 +185,83 @@ def test_what_is_there_is_not_made_again(tmp_path: Path):
     made = list[str]()
 
     def planned(**of: Any) -> list[Case]:
-        return [Case(tmp_path / f"{n}.json", lambda n=n: made.append(n) or case("mean", 0, 0.5), of) for n in "abc"]
+        return [
+            Case(tmp_path / f"{n}.json", lambda n=n: made.append(n) or case("mean", 0, 0.5), of, "fit") for n in "abc"
+        ]
 
-    run_all(planned(budget={"steps": 1000}), 2)
+    run_all(planned(budget={"steps": 1000}), 2, CODE)
     assert made == ["a", "b"] and len(found_of(planned(budget={"steps": 1000}))) == 2
     (tmp_path / "pilot_100.json").write_text("{}")  # lies beside them and is none of them
-    run_all(planned(budget={"steps": 1000}), 9)
+    run_all(planned(budget={"steps": 1000}), 9, {"commit": "another"})
     assert made == ["a", "b", "c"]
+    assert commits(found_of(planned(budget={"steps": 1000}))) == ["another", "one"]
+
+
+def test_a_case_that_fails_holds_up_no_other_and_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    def fail() -> dict[str, Any]:
+        raise ValueError("lost the grasp")
+
+    made = {"a": lambda: case("mean", 0, 0.5), "b": fail, "c": lambda: case("mean", 2, 0.5)}
+    planned = [Case(tmp_path / "dry" / f"{n}.json", make, {}, "fit") for n, make in made.items()]
+    failed = run_all(planned, 9, CODE)
+    assert failed == ["dry/b"] and len(found_of(planned)) == 2
+    told = capsys.readouterr().err
+    assert "dry/b failed" in told and "ValueError: lost the grasp" in told
+    with pytest.raises(SystemExit, match="1 failed and can be tried again: dry/b"):
+        finish(failed)
+    finish([])
+
+
+def test_policies_of_different_fits_are_not_summed(tmp_path: Path):
+    """The fitted Gaussian and its mean are of one fit; the prior is another matter."""
+    made = {"mean_0": ("fit", "one"), "fitted_0": ("fit", "one"), "prior_0": ("prior", "none")}
+    planned = [
+        Case(tmp_path / f"{name}.json", functools.partial(case, "mean", 0, 0.5, fit=fit), {}, doors)
+        for name, (doors, fit) in made.items()
+    ]
+    assert run_all(planned, 9, CODE) == [] and len(found_of(planned)) == 3
+    other = Case(tmp_path / "fitted_1.json", functools.partial(case, "mean", 1, 0.5, fit="two"), {}, "fit")
+    run_all([other], 9, CODE)
+    with pytest.raises(SystemExit, match=r"fitted_1.json and .*mean_0.json were trained on different fits"):
+        found_of([*planned, other])
+
+
+@pytest.mark.parametrize(
+    ("script", "which"),
+    [("table2", ("mean", 0, "dry")), ("knob_locations", (1, 0)), ("hidden_effect_policy", ("base", 0))],
+)
+def test_pilots_on_another_robot_never_mix_with_what_is_reported(script: str, which: tuple[Any, ...]):
+    module = importlib.import_module(f"experiments.{script}")
+    usual, pilot = (module.planned_case(*which, module.Arguments(robot=robot)) for robot in (None, 100))
+    assert usual.of != pilot.of and usual.path.parent != pilot.path.parent
+    assert usual.of["task"] == asdict(Task()) and usual.of["budget"]["evaluations"] == 8
+    assert pilot.of == json.loads(json.dumps(pilot.of))
+
+
+def test_an_effect_that_no_policy_can_be_tried_with_is_refused_before_the_search():
+    module = importlib.import_module("experiments.hidden_effect_policy")
+    module.playable(module.Arguments())
+    with pytest.raises(SystemExit, match="error: hidden effects command_delay change whole traces"):
+        module.playable(module.Arguments(hide=("command_delay=0.01",)))
+
+
+def test_where_the_search_names_nothing_no_policy_is_trained(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    module = importlib.import_module("experiments.hidden_effect_policy")
+    verdict = {"hidden": ["none"], "verdict": "none", "sentence": "It lacks nothing.", "effects": []}
+    monkeypatch.setattr(module, "search", lambda arguments, folder: verdict)
+    monkeypatch.setattr(module, "run_all", lambda *a: pytest.fail("a policy was trained"))
+    monkeypatch.setattr(sys, "argv", ["hidden_effect_policy.py", "--out", str(tmp_path)])
+    module.main()
+    found = json.loads((tmp_path / "hidden_effect_policy.json").read_text())
+    assert found["effects"] == [] and found["models"] == {} and found["commit"]
+
+
+def test_quick_runs_the_setting_that_is_asked_for(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    module, planned = importlib.import_module("experiments.table2"), list[Case]()
+    monkeypatch.setattr(module, "run_all", lambda cases, *_: planned.extend(cases) or [])
+    monkeypatch.setattr(sys, "argv", ["table2.py", "--quick", "--settings", "dry", "--out", str(tmp_path)])
+    module.main()
+    assert [c.of["setting"]["name"] for c in planned] == ["dry"] * 3
 
 
 def test_what_was_made_with_something_else_is_refused_before_anything_is_made(tmp_path: Path):
@@ -138,11 +273,11 @@ def test_what_was_made_with_something_else_is_refused_before_anything_is_made(tm
             return case("mean", 0, 0.5)
 
         of = {"budget": {"steps": steps}}
-        return [Case(tmp_path / f"{n}.json", functools.partial(make, n), of) for n in "ab"]
+        return [Case(tmp_path / f"{n}.json", functools.partial(make, n), of, "fit") for n in "ab"]
 
-    run_all(planned(1000), 1)
+    run_all(planned(1000), 1, CODE)
     with pytest.raises(SystemExit, match=r"a.json was made with another budget: .*1000.*, now .*2000.*choose another"):
-        run_all(planned(2000), 9)
+        run_all(planned(2000), 9, CODE)
     assert made == ["a"]
 
 
@@ -155,6 +290,10 @@ def test_nothing_to_sum_up_is_refused(option: str):
 def test_pilots_have_a_summary_of_their_own(tmp_path: Path):
     assert Options(out=tmp_path).summary("table2").name == "table2.json"
     assert Options(out=tmp_path, first=100).summary("table2", ".md").name == "table2_from_100.md"
+    other = Options(out=tmp_path, first=100, robot=100)
+    assert other.summary("table2").name == "table2_robot_100_from_100.json"
+    assert other.cases("table2").name == "table2_robot_100_cases"
+    assert setting_of("dry", 100) == replace(SETTINGS["dry"], robot=100) and setting_of("dry", None) == SETTINGS["dry"]
 
 
 def test_the_fit_of_another_setting_is_not_taken(tmp_path: Path):

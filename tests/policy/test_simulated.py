@@ -3,20 +3,85 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from brax.envs.base import Env, State
 
 from droid_jax.identify.gaussian import prior
 from droid_jax.model.door import door_space
 from droid_jax.model.door_scene import door_scene
+from droid_jax.policy.control import Policy
 from droid_jax.policy.door_env import DoorEnv
 from droid_jax.policy.randomise import randomised
 from droid_jax.policy.simulated import simulated
 from droid_jax.policy.task import Task
 
 
+class Door(NamedTuple):
+    """One field that varies, one that does not."""
+
+    width: Any
+    height: Any
+
+
+class Opening(Env):
+    """A door that opens by its width and its height, and by what the policy does."""
+
+    sys: Any = Door(jnp.zeros(()), jnp.ones(()))
+    task = SimpleNamespace(steps=2)
+    observation_size, action_size, backend = 1, 1, "none"
+
+    def reset(self, rng):
+        nothing = jnp.zeros(())
+        metrics = dict.fromkeys(("angle", "success", "grip", "blown_up"), nothing)
+        return State(None, jnp.ones(1), nothing, nothing, metrics)
+
+    def step(self, state, action):
+        angle = self.sys.width + self.sys.height + action[0]
+        return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
+            metrics={**state.metrics, "angle": angle}
+        )
+
+
+def network(weight: float) -> Policy:
+    """What it sees times a weight, before tanh."""
+    weights = (np.full((1, 18), weight),)
+    return Policy(np.zeros(1), np.ones(1), weights, (np.zeros(18),), SimpleNamespace())  # type: ignore[arg-type]
+
+
+def draws(sys: Door, rng: Any) -> tuple[Door, Door]:
+    return Door(jax.vmap(jax.random.uniform)(rng), sys.height), Door(0, None)  # type: ignore[arg-type]
+
+
+def test_another_policy_on_other_doors_is_the_same_program(monkeypatch: pytest.MonkeyPatch):
+    """Its numbers would make it another one to the compiler, which takes longer than the episodes."""
+    programs, jit = list[str](), jax.jit
+
+    def spied(function: Any, **options: Any) -> Any:
+        made = jit(function, **options)
+
+        def run(*arguments: Any) -> Any:
+            programs.append(made.lower(*arguments).as_text())
+            return made(*arguments)
+
+        return run if function.__name__ == "run" else made
+
+    monkeypatch.setattr(jax, "jit", spied)
+    env: Any = Opening()
+    found = [simulated(network(weight), env, draws, 3, seed) for weight, seed in ((0.5, 0), (0.2, 1))]
+    assert programs[0] == programs[1]
+    widths = [trials.angle - 1.0 - np.tanh(weight) for trials, weight in zip(found, (0.5, 0.2), strict=True)]
+    assert len(np.unique(np.round(widths, 5))) == 6 and np.min(widths) > 0 and np.max(widths) < 1
+    alone = simulated(network(0.5), env, None, 2)
+    np.testing.assert_allclose(alone.angle, 1.0 + np.tanh(0.5), rtol=1e-6)
+
+
+@jax.tree_util.register_static
 class Still:
     """A policy that keeps the arm where it is and the fingers open."""
 

@@ -172,3 +172,21 @@ def test_a_short_run_is_kept_and_goes_on(tmp_path: Path):
     np.testing.assert_array_equal(done.policy.weights[0], longer.policy.weights[0])
     with pytest.raises(ValueError, match="belongs to another run: it differs in task"):
         train(DoorEnv(scene, Task(steps=30)), randomise, SHORT, checkpoints=tmp_path)
+
+
+@pytest.mark.slow
+def test_a_door_that_blows_up_is_counted_and_training_goes_on():
+    """The first door is pushed open without end: its episodes end at once, the others' and the networks go on."""
+    scene = door_scene(timestep=0.004, limits=True)
+    usual, hinge = randomised(scene, prior(door_space(scene))), scene.dof("hinge")
+
+    def randomise(sys: Any, rng: Any) -> tuple[Any, Any]:
+        physics, axes = usual(sys, rng)
+        damping = physics.model.dof_damping.at[0, hinge].set(-1e6)
+        return replace(physics, model=physics.model.replace(dof_damping=damping)), axes
+
+    found = train(DoorEnv(scene, Task(steps=20)), randomise, SHORT)
+    assert [(now.step, now.blown_up) for now in found.history] == [(0, 0.25), (512, 0.25), (1024, 0.25)]
+    assert all(np.isfinite(now.reward) for now in found.history)
+    layers = (found.policy.mean, found.policy.std, *found.policy.weights, *found.policy.biases)
+    assert all(np.isfinite(layer).all() for layer in layers) and np.abs(found.policy.mean).max() < 10.0

@@ -134,7 +134,7 @@ def test_sums_leave_out_what_failed_and_reasons_their_numbers():
     )
     content = found.to_json()
     assert content["steps"]["mean"] == 150.0 and content["steps"]["all"] == [100, 200, 3, 5]
-    assert content["stopped"] == {"too fast": 2}
+    assert content["stopped"] == {"too fast": 2} and content["stopped_each"] == ["", "", "too fast", "too fast"]
     nothing = Trials(np.zeros(2, bool), np.zeros(2), np.ones(2), np.zeros(2), np.full(2, "")).to_json()
     assert nothing["steps"]["mean"] is None and nothing["stopped"] == {}
 
