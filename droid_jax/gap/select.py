@@ -50,9 +50,18 @@ class Trial:
 
 
 def one_sided_p(gain: np.ndarray) -> float:
-    """p-value of gains [N] being above zero on average, by sign flips."""
-    t = t_values(gain[None], sign_flips(len(gain)))[:, 0]
+    """p-value of gains [N] being above zero on average, by sign flips.  What grows or fades steadily is no noise."""
+    t = t_values(steady(gain)[None], sign_flips(len(gain)))[:, 0]
     return float(np.mean(t >= t[0] - 1e-12))
+
+
+def steady(x: np.ndarray) -> np.ndarray:
+    """x [N] without its trend over the order: the same mean, and the scatter of N - 2 degrees of freedom."""
+    if len(x) < 3:
+        return x
+    order = np.arange(len(x)) - (len(x) - 1) / 2
+    left = x - x.mean() - order * (order @ x) / (order @ order)
+    return x.mean() + left * np.sqrt((len(x) - 1) / (len(x) - 2))
 
 
 def resamples(count: int, seed: int = 0) -> np.ndarray:

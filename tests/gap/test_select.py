@@ -10,7 +10,7 @@ from small_gap import FLOOR, Small, small
 
 from droid_jax.gap.candidates import candidates
 from droid_jax.gap.refit import deviations, intervals, refit
-from droid_jax.gap.select import _gap_reasons, judge, one_sided_p
+from droid_jax.gap.select import _gap_reasons, judge, one_sided_p, steady
 
 
 @pytest.fixture(scope="module")
@@ -81,3 +81,15 @@ def test_reasons_of_the_gap(before: float, after: float, said: str | None):
 
 def test_gains_of_every_repeat_are_no_chance_and_of_half_of_them_are():
     assert one_sided_p(np.full(10, 1.0)) < 0.01 < 0.3 < one_sided_p(np.array([1.0, -1.0] * 5))
+
+
+def test_a_gain_that_fades_steadily_is_significant_and_chance_is_not():
+    """A friction that warms up: its mean helps every repeat but by less and less, in the end not at all."""
+    rng = np.random.default_rng(0)
+    fading = np.linspace(9.0, -1.0, 10) + 0.1 * rng.normal(size=10)
+    assert one_sided_p(fading) == 1 / 512
+    assert steady(fading).mean() == pytest.approx(fading.mean())
+    assert np.std(steady(fading)) < 0.5
+    chance = np.array([one_sided_p(rng.normal(size=10)) for _ in range(2000)])
+    for level in (0.01, 0.05, 0.2):
+        assert np.mean(chance <= level) == pytest.approx(level, abs=4 * np.sqrt(level / 2000))

@@ -8,7 +8,9 @@ from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, column
 
 SINE, COSINE, PERIODS = "ripple_sine", "ripple_cosine", "ripple_periods"
-COUNTS = (6.0, 12.0, 24.0, 48.0)  # periods a turn
+# Periods a turn.  Between two of them the phase drifts by a radian and a half over one radian of motion: more, and a
+# ripple between two counts looks like neither.
+COUNTS = tuple(float(n) for n in range(6, 49, 3))
 
 
 @register
@@ -20,7 +22,7 @@ def torque_ripple(scene: Scene) -> Effect | None:
     dofs = a.arm_dofs(scene)
 
     def force(theta, state):
-        phase = a.value(theta, PERIODS, COUNTS[2]) * state.qpos[positions]
+        phase = a.value(theta, PERIODS, COUNTS[len(COUNTS) // 2]) * state.qpos[positions]
         torque = column(theta, SINE, joints) * jnp.sin(phase)
         torque = torque + column(theta, COSINE, joints) * jnp.cos(phase)
         return jnp.zeros_like(state.qvel).at[dofs].add(torque)
