@@ -8,9 +8,10 @@ from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, column
 
 SINE, COSINE, PERIODS = "ripple_sine", "ripple_cosine", "ripple_periods"
-# Periods a turn.  Between two of them the phase drifts by a radian and a half over one radian of motion: more, and a
-# ripple between two counts looks like neither.
-COUNTS = tuple(float(n) for n in range(6, 49, 3))
+# Periods a turn.  Between two of them the phase drifts by four radians over one radian of motion: were it more, a
+# ripple between two counts would look like neither.  Fewer than FEWEST make a curve that mimics anything smooth.
+COUNTS = tuple(float(n) for n in range(12, 61, 4))
+FEWEST = 10.0
 
 
 @register
@@ -32,7 +33,7 @@ def torque_ripple(scene: Scene) -> Effect | None:
         (
             *a.of_joints(SINE, joints, "N m", 0.1, 1.0),
             *a.of_joints(COSINE, joints, "N m", 0.1, 1.0),
-            a.shape(PERIODS, "1/turn", COUNTS, 2.0, 80.0),
+            a.shape(PERIODS, "1/turn", COUNTS, FEWEST, 80.0),
         ),
         force=force,
         what="torque ripple of a joint's motor or gear",
