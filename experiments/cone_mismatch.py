@@ -32,7 +32,7 @@ from droid_jax.model.scene import with_options  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 from experiments.blind.cases import Plan  # noqa: E402
 from experiments.blind.draws import commit_of, folder_of, seed_of  # noqa: E402
-from experiments.blind.make import draw, record, write_case  # noqa: E402
+from experiments.blind.make import draw, record, recorded, write_case  # noqa: E402
 from experiments.blind.scenes import Setting, setting  # noqa: E402
 from experiments.blind.search import Bench, search_case  # noqa: E402
 
@@ -80,9 +80,10 @@ def case(where: Setting, number: int, commit: str, out: Path, bench: Bench) -> d
     plan, folder = plan_of(number), out / "cone_cases" / folder_of(commit, plan_of(number).name)
     if not (folder / "result.json").is_file():
         if not folder.is_dir():
-            drawn = draw(where, plan, {}, np.random.default_rng([seed_of(commit, plan.name), 0]))
-            assert drawn is not None
-            write_case(folder, "door", (), record(elliptic(where), drawn))
+            found = recorded(elliptic(where), plan, {}, seed_of(commit, plan.name))
+            if isinstance(found, str):
+                raise SystemExit(f"error: case {plan.name}: {found}")
+            write_case(folder, "door", (), found[2])
         write_json(folder / "result.json", search_case(folder, bench))
     return json.loads((folder / "result.json").read_text())
 

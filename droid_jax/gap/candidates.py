@@ -38,6 +38,11 @@ class Candidate:
         return (*self.amplitudes, *self.shapes)
 
 
+def joined(parts: Iterable[Candidate]) -> str:
+    """ "latch at door_hinge + drag at door_hinge"."""
+    return " + ".join(part.name for part in parts)
+
+
 def candidates(effects: Iterable[Effect]) -> tuple[Candidate, ...]:
     """Every effect at every place with every combination of its shapes' values."""
     out = []

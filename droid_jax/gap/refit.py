@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from droid_jax.gap.candidates import Candidate
+from droid_jax.gap.candidates import Candidate, joined
 from droid_jax.gap.evidence import Evidence
 from droid_jax.identify.refine import Hypotheses, RefineConfig, Refined, RefineProgress, chord, refine
 from droid_jax.identify.uncertainty import posterior
@@ -40,7 +40,7 @@ class Model:
     @property
     def name(self) -> str:
         """ "base", "latch at door_hinge", "latch at door_hinge + drag at door_hinge"."""
-        return " + ".join(c.name for c in self.parts) or "base"
+        return joined(self.parts) or "base"
 
     @property
     def amplitudes(self) -> tuple[str, ...]:

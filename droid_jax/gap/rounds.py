@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from droid_jax.gap.candidates import Candidate
+from droid_jax.gap.candidates import Candidate, joined
 from droid_jax.gap.case import Case
 from droid_jax.gap.rank import Proposal, collinear, proposals
 from droid_jax.gap.refit import Model, look, refit
@@ -96,13 +96,13 @@ class Hunt:
 
     def look(self, model: Model, part: Candidate, found: Screen) -> tuple[np.ndarray, float]:
         """A first look at one more effect: values [D] and objective (see `refit.look`)."""
-        self.progress("look", " + ".join(c.name for c in (*model.parts, part)))
+        self.progress("look", joined((*model.parts, part)))
         rows = {q.amplitude: k for k, q in enumerate(found.questions) if q.candidate.key == part.key}
         return look(self.case.fit, model, part, {a: found.raw[k] for a, k in rows.items()})
 
     def refit(self, parts: Sequence[Candidate], start: np.ndarray, config: RefineConfig, note: str = "") -> Model:
         """Base parameters and parts from a start [D] over the whole space."""
-        self.progress("refit", " + ".join(c.name for c in parts) + note)
+        self.progress("refit", joined(parts) + note)
         return refit(self.case.fit, self.case.base, parts, start[None], config)
 
     def race(self, starters: Iterable[Starter], aim: float, note: str = "") -> list[Model]:
@@ -113,7 +113,7 @@ class Hunt:
             try:
                 models.append(self.refit(parts, start, replace(self.case.config.refit, aim=aim), note))
             except NotReplayed:
-                self.failed.append(" + ".join(c.name for c in parts))
+                self.failed.append(joined(parts))
         return models
 
     def aim(self, model: Model) -> float:
