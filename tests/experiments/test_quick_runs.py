@@ -26,6 +26,7 @@ SCRIPTS: dict[str, tuple[str, ...]] = {
     "experiments/identify_suite.py": ("--parts", "doors", "pose"),
     "experiments/population_curve.py": (),
     "experiments/search_figure.py": (),
+    "experiments/effects_on_policy.py": (),
     "experiments/hidden_effect_policy.py": (),
     "experiments/policy_parity.py": (),
     **dict.fromkeys(DATA, ()),

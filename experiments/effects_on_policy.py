@@ -1,0 +1,129 @@
+"""Which missing effects does a policy notice?  One policy that knows of none, on robots that hide one each.
+
+    python experiments/effects_on_policy.py [--quick] [--out DIR] [--springs 0] [--trials 12]
+
+A policy is trained on draws of the prior.  Then the stand-in robot hides each effect of the blind suite in turn, at the
+largest amplitude that is usual and at three times that, and the policy is tried on it; and it is asked whether the
+demonstration still holds its grasp there, for what cannot be recorded cannot be searched either.  A pilot: robot and
+seeds are others than those of the runs that are reported, and hidden_effect_policy.py's effect was chosen with it.
+The policy lies in DIR/effects_on_policy_robot_100_cases, the table in DIR/effects_on_policy_robot_100_from_100.json.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
+
+import tuned  # noqa: E402, F401  (before jax starts)
+
+# isort: split
+import functools  # noqa: E402
+import json  # noqa: E402
+
+import tyro  # noqa: E402
+from rich.console import Console  # noqa: E402
+from rich.progress import track  # noqa: E402
+
+from benchmarks.common import origin  # noqa: E402
+from droid_jax.measure.demonstration import demonstration_path  # noqa: E402
+from droid_jax.measure.formats import load as load_recording  # noqa: E402
+from droid_jax.measure.hidden import HIDDEN, LONGEST_STEP, Applied, possible, record_hidden  # noqa: E402
+from droid_jax.measure.surrogate import SurrogateConfig  # noqa: E402
+from droid_jax.model.door_scene import door_scene  # noqa: E402
+from droid_jax.model.scene import Scene  # noqa: E402
+from droid_jax.policy.control import Policy, load  # noqa: E402
+from droid_jax.policy.door_env import DoorEnv  # noqa: E402
+from droid_jax.policy.task import Task  # noqa: E402
+from droid_jax.policy.transfer import TransferConfig, check_playable, stand_in, transfer  # noqa: E402
+from droid_jax.storage import write_json  # noqa: E402
+from experiments.policies.cases import TIMESTEP, Case, Options, finish, run_all  # noqa: E402
+from experiments.policies.robots import truth_of  # noqa: E402
+from experiments.policies.settings import Setting, setting_of  # noqa: E402
+from experiments.table2 import case as policy_case  # noqa: E402
+
+FACTORS = (1.0, 3.0)  # of the largest amplitude that is usual
+PILOT = 100  # seed of the policy, and of the robot's hidden errors
+
+
+@dataclass(frozen=True)
+class Arguments(Options):
+    """Options of the experiment."""
+
+    springs: int = 0
+    """The stand-in's column of Table I."""
+    first: int = PILOT
+    """Seed of the policy."""
+    robot: int | None = PILOT
+    """Seed of the stand-in robot's hidden errors and of its trials."""
+    trials: int = 12
+    """Trials with each effect."""
+
+
+def applicable(scene: Scene, quick: bool) -> list[Applied]:
+    """Every effect that a policy can be tried with, at its amplitudes; on the hinge too where it can act there."""
+    found = []
+    for name in possible(scene):
+        try:
+            check_playable(scene, [Applied(name, HIDDEN[name].typical[1])])
+        except ValueError:
+            continue  # changes whole traces: nothing a closed loop has
+        places = ("", str(scene.object_joint)) if HIDDEN[name].on == "joint" else ("",)
+        found += [Applied(name, HIDDEN[name].typical[1] * factor, p) for p in places for factor in FACTORS]
+    return found[:2] if quick else found
+
+
+def recordable(scene: Scene, setting: Setting, hidden: Applied) -> bool:
+    """Whether demonstration A keeps its grasp on a robot with the effect."""
+    once, shown = SurrogateConfig(timestep=LONGEST_STEP, repeats=1), load_recording(demonstration_path("A"))
+    try:
+        record_hidden(scene, shown, truth_of(setting), [hidden], seed=setting.robot, config=once)
+    except ValueError:
+        return False
+    return True
+
+
+def rows(policy: Policy, setting: Setting, task: Task, arguments: Arguments) -> Iterator[dict[str, Any]]:
+    """What the policy does with nothing hidden, and with each effect."""
+    scene, demonstrated = door_scene(limits=True), door_scene(timestep=TIMESTEP)
+    start = DoorEnv(door_scene(timestep=TIMESTEP, limits=True), task).start
+    config = TransferConfig(trials=arguments.trials, seed=setting.robot)
+    effects: list[Applied | None] = [None, *applicable(scene, arguments.quick)]
+    for hidden in track(effects, "effects", console=Console(stderr=True)):
+        robot = stand_in(scene, start, truth_of(setting), [hidden] if hidden else (), task, config)
+        found = transfer(policy, robot).to_json()
+        yield {
+            "hidden": hidden.name if hidden else "nothing",
+            "joint": hidden.joint if hidden else "",
+            "amplitude": hidden.amplitude if hidden else 0.0,
+            "unit": HIDDEN[hidden.name].unit if hidden else "",
+            "success_rate": found["success_rate"],
+            "interval_95": found["interval_95"],
+            "angle_deg": found["angle_deg"]["mean"],
+            "grip": found["grip"]["mean"],
+            "recordable": recordable(demonstrated, setting, hidden) if hidden else True,
+        }
+
+
+def main() -> None:
+    arguments, code = tyro.cli(Arguments, description=__doc__), origin(0)
+    folder, budget, seed = arguments.cases("effects_on_policy"), arguments.budget, arguments.first
+    setting = replace(setting_of("paper", arguments.robot), springs=arguments.springs)
+    of = {"springs": arguments.springs, "seed": seed, "budget": budget.to_json()}
+    make = functools.partial(policy_case, "prior", seed, setting, folder, budget)
+    finish(run_all([Case(folder / f"prior_{seed}.json", make, of, "prior")], 1, code))
+    policy = load(folder / f"prior_{seed}" / "policy.npz")
+    table = list(rows(policy, setting, budget.task(Task()), arguments))
+    write_json(arguments.summary("effects_on_policy"), {"springs": arguments.springs, "rows": table, **code})
+    felt = [r for r in table if r["success_rate"] < table[0]["success_rate"] - 0.2]
+    names = [f"{r['hidden']}{'[' + r['joint'] + ']' if r['joint'] else ''}={r['amplitude']:g}" for r in felt]
+    print(json.dumps({"effects": len(table) - 1, "felt": names}))
+
+
+if __name__ == "__main__":
+    main()
