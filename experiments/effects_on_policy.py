@@ -1,18 +1,19 @@
 """Which missing effects does a policy notice?  One policy that knows of none, on robots that hide one each.
 
     python experiments/effects_on_policy.py [--quick] [--out DIR] [--springs 0] [--trials 12]
+    python experiments/effects_on_policy.py --policy runs/train/policy.npz --hide closer=2 grip_compliance=0.01
 
-A policy is trained on draws of the prior.  Then the stand-in robot hides each effect of the blind suite in turn, at the
-largest amplitude that is usual and at three times that, and the policy is tried on it; and it is asked whether the
-demonstration still holds its grasp there, for what cannot be recorded cannot be searched either.  A pilot: robot and
-seeds are others than those of the runs that are reported, and hidden_effect_policy.py's effect was chosen with it.
-The policy lies in DIR/effects_on_policy_robot_100_cases, the table in DIR/effects_on_policy_robot_100_from_100.json.
+A policy is trained on draws of the prior, unless one is given.  Then the stand-in robot hides each effect of the blind
+suite in turn, at the largest amplitude that is usual and at three times that, and the policy is tried on it; and it is
+asked whether the demonstration still holds its grasp there, for what cannot be recorded cannot be searched either.
+A pilot: robot and seeds are others than those of the runs that are reported; hidden_effect_policy.py's effect was
+chosen with it.  DIR/effects_on_policy_robot_100_from_100.json is the table, and the policy lies beside it.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ import tuned  # noqa: E402, F401  (before jax starts)
 
 # isort: split
 import functools  # noqa: E402
+import hashlib  # noqa: E402
 import json  # noqa: E402
 
 import tyro  # noqa: E402
@@ -31,9 +33,10 @@ from rich.console import Console  # noqa: E402
 from rich.progress import track  # noqa: E402
 
 from benchmarks.common import origin  # noqa: E402
+from droid_jax.commands.hidden import hidden_effects  # noqa: E402
 from droid_jax.measure.demonstration import demonstration_path  # noqa: E402
 from droid_jax.measure.formats import load as load_recording  # noqa: E402
-from droid_jax.measure.hidden import HIDDEN, LONGEST_STEP, Applied, possible, record_hidden  # noqa: E402
+from droid_jax.measure.hidden import HIDDEN, LONGEST_STEP, Applied, listed, possible, record_hidden  # noqa: E402
 from droid_jax.measure.surrogate import SurrogateConfig  # noqa: E402
 from droid_jax.model.door_scene import door_scene  # noqa: E402
 from droid_jax.model.scene import Scene  # noqa: E402
@@ -57,6 +60,10 @@ class Arguments(Options):
 
     springs: int = 0
     """The stand-in's column of Table I."""
+    policy: Path | None = None
+    """A policy.npz of any run, instead of one that is trained."""
+    hide: tuple[str, ...] = ()
+    """name=amplitude or name[joint]=amplitude; default: every effect that a policy can be tried with."""
     first: int = PILOT
     """Seed of the policy."""
     robot: int | None = PILOT
@@ -65,8 +72,10 @@ class Arguments(Options):
     """Trials with each effect."""
 
 
-def applicable(scene: Scene, quick: bool) -> list[Applied]:
-    """Every effect that a policy can be tried with, at its amplitudes; on the hinge too where it can act there."""
+def applicable(scene: Scene, arguments: Arguments) -> list[Applied]:
+    """What is asked for, or every effect that a policy can be tried with, on the hinge too where it can act there."""
+    if arguments.hide:
+        return [one for entry in arguments.hide for one in listed(hidden_effects([entry], scene))]
     found = []
     for name in possible(scene):
         try:
@@ -75,7 +84,7 @@ def applicable(scene: Scene, quick: bool) -> list[Applied]:
             continue  # changes whole traces: nothing a closed loop has
         places = ("", str(scene.object_joint)) if HIDDEN[name].on == "joint" else ("",)
         found += [Applied(name, HIDDEN[name].typical[1] * factor, p) for p in places for factor in FACTORS]
-    return found[:2] if quick else found
+    return found[:2] if arguments.quick else found
 
 
 def recordable(scene: Scene, setting: Setting, hidden: Applied) -> bool:
@@ -93,7 +102,7 @@ def rows(policy: Policy, setting: Setting, task: Task, arguments: Arguments) -> 
     scene, demonstrated = door_scene(limits=True), door_scene(timestep=TIMESTEP)
     start = DoorEnv(door_scene(timestep=TIMESTEP, limits=True), task).start
     config = TransferConfig(trials=arguments.trials, seed=setting.robot)
-    effects: list[Applied | None] = [None, *applicable(scene, arguments.quick)]
+    effects: list[Applied | None] = [None, *applicable(scene, arguments)]
     for hidden in track(effects, "effects", console=Console(stderr=True)):
         robot = stand_in(scene, start, truth_of(setting), [hidden] if hidden else (), task, config)
         found = transfer(policy, robot).to_json()
@@ -110,16 +119,32 @@ def rows(policy: Policy, setting: Setting, task: Task, arguments: Arguments) -> 
         }
 
 
-def main() -> None:
-    arguments, code = tyro.cli(Arguments, description=__doc__), origin(0)
+def trained(arguments: Arguments, setting: Setting, code: Mapping[str, Any]) -> Path:
+    """File of a policy of the prior; made where there is none yet."""
     folder, budget, seed = arguments.cases("effects_on_policy"), arguments.budget, arguments.first
-    setting = replace(setting_of("paper", arguments.robot), springs=arguments.springs)
     of = {"springs": arguments.springs, "seed": seed, "budget": budget.to_json()}
     make = functools.partial(policy_case, "prior", seed, setting, folder, budget)
     finish(run_all([Case(folder / f"prior_{seed}.json", make, of, "prior")], 1, code))
-    policy = load(folder / f"prior_{seed}" / "policy.npz")
-    table = list(rows(policy, setting, budget.task(Task()), arguments))
-    write_json(arguments.summary("effects_on_policy"), {"springs": arguments.springs, "rows": table, **code})
+    return folder / f"prior_{seed}" / "policy.npz"
+
+
+def sha256(path: Path) -> str:
+    """Of a file's bytes."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def main() -> None:
+    arguments, code = tyro.cli(Arguments, description=__doc__), origin(0)
+    setting = replace(setting_of("paper", arguments.robot), springs=arguments.springs)
+    path = arguments.policy or trained(arguments, setting, code)
+    policy = load(path)
+    table = list(rows(policy, setting, arguments.budget.task(Task()), arguments))
+    of = {
+        "springs": arguments.springs,
+        "policy": arguments.policy.parent.name if arguments.policy else "prior",
+        "policy_sha256": sha256(path),
+    }
+    write_json(arguments.summary("effects_on_policy"), {**of, "rows": table, **code})
     felt = [r for r in table if r["success_rate"] < table[0]["success_rate"] - 0.2]
     names = [f"{r['hidden']}{'[' + r['joint'] + ']' if r['joint'] else ''}={r['amplitude']:g}" for r in felt]
     print(json.dumps({"effects": len(table) - 1, "felt": names}))
