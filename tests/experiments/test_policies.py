@@ -18,6 +18,7 @@ import pytest
 import scipy.stats
 
 from benchmarks.common import commits
+from droid_jax.measure.hidden import Applied, possible
 from droid_jax.model.door_scene import door_scene
 from droid_jax.policy.task import Task
 from droid_jax.policy.trials import Trials
@@ -243,6 +244,21 @@ def test_an_effect_that_no_policy_can_be_tried_with_is_refused_before_the_search
     module.playable(module.Arguments())
     with pytest.raises(SystemExit, match="error: hidden effects command_delay change whole traces"):
         module.playable(module.Arguments(hide=("command_delay=0.01",)))
+
+
+def test_a_policy_is_tried_with_every_effect_that_a_closed_loop_can_have():
+    module, scene = importlib.import_module("experiments.effects_on_policy"), door_scene()
+    found = module.applicable(scene, module.Arguments())
+    names = {one.name for one in found}
+    on_traces = {"command_delay", "sensor_delay", "backlash", "torque_bias", "torque_gain", "torque_drift"}
+    assert names <= set(possible(scene)) - on_traces and {"closer", "payload", "grip_compliance"} <= names
+    assert [o.amplitude for o in found if o == replace(o, name="dry_friction", joint="hinge")] == [1.5, 4.5]
+    assert module.applicable(scene, module.Arguments(hide=("closer=2", "dry_friction[hinge]=1"))) == [
+        Applied("closer", 2.0),
+        Applied("dry_friction", 1.0, "hinge"),
+    ]
+    with pytest.raises(ValueError, match="unknown hidden effect 'magic'"):
+        module.applicable(scene, module.Arguments(hide=("magic=1",)))
 
 
 def test_where_the_search_names_nothing_no_policy_is_trained(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
