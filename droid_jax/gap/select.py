@@ -20,6 +20,7 @@ DOUBT = 0.05  # share of the resamples in which a rival is better, from which it
 CHOSEN = 0.8  # share of the resamples in which an effect, or one that does as well, must win
 RESAMPLES = 400
 TOO_SMALL = "too small to be worth a name"
+AT_BOUND = "ran into its bound"
 EDGE = 0.02  # share of a parameter's range that counts as its bound
 
 
@@ -158,7 +159,7 @@ def _amplitude_reasons(fit: Evidence, model: Model, spans: Mapping[str, tuple[fl
 
     new = [c for c in model.parts if set(c.amplitudes) <= set(spans)]
     reasons = ["its amplitude may be zero"] if any(all(map(vanishing, c.amplitudes)) for c in new) else []
-    return reasons + [f"{a} ran into its bound" for a in spans if _on_bound(fit, model, a)]
+    return reasons + [f"{a} {AT_BOUND}" for a in spans if _on_bound(fit, model, a)]
 
 
 def _on_bound(fit: Evidence, model: Model, amplitude: str) -> bool:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from droid_jax.gap.localise import Localisation
 from droid_jax.gap.refit import Model
 from droid_jax.gap.screen import Screen
-from droid_jax.gap.select import TOO_SMALL, Trial
+from droid_jax.gap.select import AT_BOUND, TOO_SMALL, Trial
 from droid_jax.gap.trend import Trend
 
 
@@ -83,10 +83,15 @@ class Verdict:
         return ", and ".join([certain, *open_ones] if certain else open_ones)
 
     @property
-    def _or_small(self) -> str:
+    def _or_lost(self) -> str:
         """Where a candidate lost for its size alone, it may be all there is."""
         small = dict.fromkeys(t.name for t in self.trials if t.reasons == (TOO_SMALL,))
-        return f", or {' or '.join(small)}, too small to be worth a name" if small else ""
+        large = dict.fromkeys(t.name for t in self.trials if t.reasons and all(map(_at_bound, t.reasons)))
+        return "".join(
+            f", or {' or '.join(names)}, {why}"
+            for names, why in ((small, TOO_SMALL), (large, "larger than its bounds allow"))
+            if names
+        )
 
     @property
     def sentence(self) -> str:
@@ -96,6 +101,10 @@ class Verdict:
             Kind.NAMED: f"The model lacks: {self._lacking}.",
             Kind.TIE: f"The model lacks {self._lacking}.",
             Kind.PARTLY: f"The model lacks {self._lacking}; a remainder is unexplained.",
-            Kind.UNEXPLAINED: f"The model lacks something that is not in the library{self._or_small}.",
+            Kind.UNEXPLAINED: f"The model lacks something that is not in the library{self._or_lost}.",
             Kind.UNCONVERGED: f"The fit of {self._unsettled} did not converge; nothing can be concluded.",
         }[self.kind]
+
+
+def _at_bound(reason: str) -> bool:
+    return reason.endswith(AT_BOUND)

@@ -18,7 +18,7 @@ from droid_jax.gap.rank import proposals
 from droid_jax.gap.refit import Model
 from droid_jax.gap.rounds import Hunt
 from droid_jax.gap.screen import Screen, questions_of
-from droid_jax.gap.select import TOO_SMALL
+from droid_jax.gap.select import AT_BOUND, TOO_SMALL
 from droid_jax.gap.verdict import Kind
 from droid_jax.gap.workflow import ask, base_fit, find
 from droid_jax.model.effects.registry import library
@@ -245,3 +245,6 @@ def test_what_lost_for_its_size_alone_is_said(found: Small):
     assert replace(verdict, trials=(both,)).sentence == verdict.sentence
     said = replace(verdict, trials=(tiny, tiny)).sentence
     assert said.endswith(f"not in the library, or {tiny.name}, too small to be worth a name.")
+    large = replace(tiny, reasons=(f"its_torque {AT_BOUND}",))
+    said = replace(verdict, trials=(large, replace(large, reasons=(*large.reasons, "another reason")))).sentence
+    assert said.endswith(f"not in the library, or {large.name}, larger than its bounds allow.")
