@@ -18,7 +18,7 @@ def contact_compliance(scene: Scene) -> Effect | None:
     writes = tuple(Write("pair_solref", (pair, 0), Mode.SCALE, offset=1.0) for pair in pairs)
     return Effect(
         "contact_compliance",
-        (Parameter(SOFTNESS, "-", 0.0, 0.5, -0.5, 5.0, writes=writes, group=a.GROUP),),
+        (Parameter(SOFTNESS, "-", 0.0, 0.5, -0.5, 12.0, writes=writes, group=a.GROUP),),
         what="fingertips or a knob that give way more than the model's",
         mark="grasp and breakaway, the peaks of the load",
         confused_with=("hinge_stribeck", "joint_compliance"),
