@@ -1,10 +1,10 @@
-"""Does it pay to find a missing effect?  Policies trained on the base fit, and on the extended model.
+"""Does it pay to find a missing effect?  Policies trained on the prior, on the base fit, and on the extended model.
 
-    python experiments/hidden_effect_policy.py [--quick] [--out DIR] [--hide magnetic_catch=5] [--seeds 5]
+    python experiments/hidden_effect_policy.py [--quick] [--out DIR] [--hide magnetic_catch=12] [--seeds 5]
 
 The stand-in robot hides an effect.  It is recorded in three motions and searched once (`gap`); the verdict, right or
-wrong, is taken as it comes.  Then policies are trained on draws of the base model's Gaussian and on draws of the
-extended model's, alike in everything else, and tried on the robot that hides the effect.  Where the search names no
+wrong, is taken as it comes.  Then policies are trained on draws of the base model's Gaussian, of the extended model's
+and of the prior, alike in everything else, and tried on the robot that hides the effect.  Where the search names no
 effect, there is nothing to compare.  Every policy is one JSON file under DIR/hidden_effect_cases and is not trained
 again; DIR/hidden_effect_policy.json sums them up.
 """
@@ -35,6 +35,7 @@ from droid_jax.gap.case import GapConfig  # noqa: E402
 from droid_jax.gap.extended import FILE, extended, load_extended, save_extended  # noqa: E402
 from droid_jax.gap.split import Split  # noqa: E402
 from droid_jax.identify.gaussian import load as load_gaussian  # noqa: E402
+from droid_jax.identify.gaussian import prior  # noqa: E402
 from droid_jax.identify.refine import RefineConfig  # noqa: E402
 from droid_jax.identify.search import SearchConfig  # noqa: E402
 from droid_jax.identify.uncertainty import posterior  # noqa: E402
@@ -51,7 +52,7 @@ from droid_jax.storage import write_json  # noqa: E402
 from experiments.policies.cases import TIMESTEP, Case, Options, finish, found_of, run_all, tried  # noqa: E402
 from experiments.policies.table import PLACES, apart, column  # noqa: E402
 
-MODELS = ("base", "extended")
+MODELS = ("prior", "base", "extended")
 BASE, SETUP = "base.json", "setup.json"
 SPRINGS, ROBOT = 0, 21  # the stand-in's column of Table I, and the seed of its hidden errors unless --robot is given
 
@@ -60,7 +61,7 @@ SPRINGS, ROBOT = 0, 21  # the stand-in's column of Table I, and the seed of its 
 class Arguments(Options):
     """Options of the experiment."""
 
-    hide: tuple[str, ...] = ("magnetic_catch=5",)
+    hide: tuple[str, ...] = ("magnetic_catch=12",)
     """What the stand-in robot hides, name=amplitude."""
     steps_allowed: int = 512
     """Actions of an episode."""
@@ -116,11 +117,12 @@ def playable(arguments: Arguments) -> None:
 
 
 def case(model: str, seed: int, folder: Path, arguments: Arguments) -> dict[str, Any]:
-    """One policy, trained on one of the two models that the search left in the folder."""
+    """One policy, trained on the prior or on one of the two models that the search left in the folder."""
     budget, robot = arguments.budget, arguments.seed_of_robot
     scene, task = door_scene(timestep=TIMESTEP, limits=True), arguments.task
-    if model == "base":
-        env, gaussian = DoorEnv(scene, task), load_gaussian(folder / BASE)
+    if model != "extended":
+        env = DoorEnv(scene, task)
+        gaussian = load_gaussian(folder / BASE) if model == "base" else prior(door_space(env.scene))
     else:
         known = load_extended(folder / FILE, scene)
         env, gaussian = DoorEnv(known.scene, task, known.effects), known.gaussian
@@ -159,10 +161,9 @@ def main() -> None:
     found = found_of(planned)
     of = {model: [c for c in found if c["model"] == model] for model in MODELS}
     table = {model: {place: column(own, place) for place in PLACES} for model, own in of.items() if own}
-    better = {}
-    if all(of.values()):
-        better = {what: apart(of["extended"], of["base"], what) for what in ("success", "angle")}
-    summary = {**verdict, "models": table, "extended_better_by": better, "cases_from_commits": commits(found), **code}
+    others = [m for m in ("base", "prior") if of[m] and of["extended"]]
+    better = {m: {what: apart(of["extended"], of[m], what) for what in ("success", "angle")} for m in others}
+    summary = {**verdict, "models": table, "extended_better_than": better, "cases_from_commits": commits(found), **code}
     write_json(arguments.summary("hidden_effect_policy"), summary)
     print(json.dumps({m: {p: round(c[p]["success_rate"], 3) for p in PLACES} for m, c in table.items()}))
     finish(failed)

@@ -40,12 +40,12 @@ def as_text(summary: Mapping[str, Any]) -> str:
 
 
 def _hidden(found: Mapping[str, Any]) -> list[str]:
-    """The fourth comparison: policies of the base fit and of the extended model on a robot that hides an effect."""
-    title = f"## A robot that hides {', '.join(found['hidden'])}: base fit against extended model"
+    """The fourth comparison: policies of prior, base fit and extended model on a robot that hides an effect."""
+    title = f"## A robot that hides {', '.join(found['hidden'])}: prior, base fit and extended model"
     sentence = f"What the search said: {found['sentence']}"
     rows = _columns(found["models"])
-    if found["extended_better_by"]:
-        rows += ["", _apart("Extended against base", found["extended_better_by"]["success"])]
+    for other, better in found["extended_better_than"].items():
+        rows += ["", _apart(f"Extended against {other}", better["success"])]
     return [title, "", sentence, "", *rows, ""]
 
 

@@ -151,10 +151,10 @@ def test_a_hidden_effect_is_the_tables_last_part():
         "hidden": ["closer=3"],
         "sentence": "It lacks a closer.",
         "models": {m: {place: column(own, place) for place in PLACES} for m, own in cases.items()},
-        "extended_better_by": {"success": apart(cases["extended"], cases["base"], "success")},
+        "extended_better_than": {"base": {"success": apart(cases["extended"], cases["base"], "success")}},
     }
     text = as_text(found)
-    assert "## A robot that hides closer=3: base fit against extended model" in text and "It lacks a closer." in text
+    assert "## A robot that hides closer=3: prior, base fit and extended model" in text and "It lacks a closer." in text
     assert "| | base | extended |" in text and "Extended against base, stand-in robot: +40 points of success (" in text
     found["hidden_effect"]["models"] = {}  # nothing was named
     assert "hides" not in as_text(found)
