@@ -13,7 +13,7 @@ chosen with it.  DIR/effects_on_policy_robot_100_from_100.json is the table, and
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -87,11 +87,11 @@ def applicable(scene: Scene, arguments: Arguments) -> list[Applied]:
     return found[:2] if arguments.quick else found
 
 
-def recordable(scene: Scene, setting: Setting, hidden: Applied) -> bool:
-    """Whether demonstration A keeps its grasp on a robot with the effect."""
+def recordable(scene: Scene, setting: Setting, hidden: Sequence[Applied]) -> bool:
+    """Whether demonstration A keeps its grasp on a robot with these effects."""
     once, shown = SurrogateConfig(timestep=LONGEST_STEP, repeats=1), load_recording(demonstration_path("A"))
     try:
-        record_hidden(scene, shown, truth_of(setting), [hidden], seed=setting.robot, config=once)
+        record_hidden(scene, shown, truth_of(setting), hidden, seed=setting.robot, config=once)
     except ValueError:
         return False
     return True
@@ -104,7 +104,8 @@ def rows(policy: Policy, setting: Setting, task: Task, arguments: Arguments) -> 
     config = TransferConfig(trials=arguments.trials, seed=setting.robot)
     effects: list[Applied | None] = [None, *applicable(scene, arguments)]
     for hidden in track(effects, "effects", console=Console(stderr=True)):
-        robot = stand_in(scene, start, truth_of(setting), [hidden] if hidden else (), task, config)
+        applied = [hidden] if hidden else []
+        robot = stand_in(scene, start, truth_of(setting), applied, task, config)
         found = transfer(policy, robot).to_json()
         yield {
             "hidden": hidden.name if hidden else "nothing",
@@ -115,7 +116,7 @@ def rows(policy: Policy, setting: Setting, task: Task, arguments: Arguments) -> 
             "interval_95": found["interval_95"],
             "angle_deg": found["angle_deg"]["mean"],
             "grip": found["grip"]["mean"],
-            "recordable": recordable(demonstrated, setting, hidden) if hidden else True,
+            "recordable": recordable(demonstrated, setting, applied),
         }
 
 
