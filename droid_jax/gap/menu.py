@@ -1,15 +1,18 @@
 """Which experiment would tell tied effects apart: what each of them predicts for it.
 
 Every entry of the menu is within reach of whoever gave the fitted demonstration: the same motion on another clock
-(slower, faster, there and back, with a stop half-way), or the same motion with a known weight at the hand.
+(slower, faster, there and back, with a stop half-way), with a known weight at the hand, or in the air, away from
+what the hand held.
 """
 
 from __future__ import annotations
 
+import copy
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import mujoco
 import numpy as np
 
 from droid_jax.compare.cost import Cost, make_cost
@@ -17,8 +20,10 @@ from droid_jax.gap.case import Case
 from droid_jax.gap.refit import Model
 from droid_jax.gap.verdict import Experiment
 from droid_jax.measure.recording import Channel, Recording
+from droid_jax.model.scene import Scene
 
 STOP = 2.0  # s
+IN_THE_AIR = "the same motion in the air, away from what the hand held"
 WEIGHT, CARRIED = 0.5, "payload_mass"  # kg, and the library's parameter that stands for it
 
 
@@ -68,6 +73,13 @@ def warped(recording: Recording, entry: Entry) -> Recording:
     return replace(recording, name=entry.what, time=time, command=command, channels=channels, phases=())
 
 
+def untouched(scene: Scene) -> Scene:
+    """A scene whose hand grips by contact, without any contact: the robot moves as if nothing stood around it."""
+    model = copy.copy(scene.model)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    return replace(scene, model=model, grip=None)
+
+
 def separating(case: Case, models: Sequence[Model], recording: Recording) -> tuple[Experiment, ...]:
     """Experiments by how far apart they put the two models that they tell apart least, the best first.
 
@@ -78,11 +90,17 @@ def separating(case: Case, models: Sequence[Model], recording: Recording) -> tup
         return ()
     values = np.stack([m.values for m in models])
     known = case.fit.cost
+    config = known.comparisons[0].config
     found = []
     for entry in MENU:
         other = warped(recording, entry)
-        cost = make_cost(known.scene, case.whole, [other], config=known.comparisons[0].config, effects=case.effects)
+        cost = make_cost(known.scene, case.whole, [other], config=config, effects=case.effects)
         found += _experiment(entry.what, cost, values)
+    seen = {name: weight for name, weight in config.channels.items() if name != "object_angle"}
+    if known.scene.grip is not None and seen:
+        alone = replace(config, channels=seen)
+        cost = make_cost(untouched(known.scene), case.whole, [recording], config=alone, effects=case.effects)
+        found += _experiment(IN_THE_AIR, cost, values)
     if CARRIED in case.whole.names:
         what = f"the same motion with {WEIGHT:g} kg more, weighed, at the hand"
         found += _experiment(what, known, _carrying(case, values))

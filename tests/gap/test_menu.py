@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
 from small_gap import record, small
 
 from droid_jax.gap import menu
-from droid_jax.gap.menu import CARRIED, MENU, STOP, WEIGHT, separating, warped
+from droid_jax.gap.menu import CARRIED, IN_THE_AIR, MENU, STOP, WEIGHT, separating, untouched, warped
 from droid_jax.gap.refit import Model
+from droid_jax.measure.demonstration import PLANS, grasp_pose, solve_pose
+from droid_jax.model.door_scene import door_scene
+from droid_jax.model.scene import Grip
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +72,33 @@ def test_a_known_weight_tells_only_what_acts_through_it(demonstration, monkeypat
     plain = case.fit.cost.whitened(np.stack([m.values for m in rivals])).astype(float)
     assert f"{WEIGHT:g} kg" in found.what
     assert found.apart == pytest.approx(np.linalg.norm(plain[0] - plain[1]), rel=0.2)
+
+
+def test_in_the_air_only_the_robot_is_seen(demonstration, monkeypatch):
+    """Two payloads part without the held thing, and as in the plain model: the small scene's hand holds nothing."""
+    monkeypatch.setattr(menu, "MENU", ())
+    case = small().case
+    cost = replace(case.fit.cost, scene=replace(case.fit.cost.scene, grip=Grip(())))
+    gripping = replace(case, fit=replace(case.fit, cost=cost))
+    rivals = (model(CARRIED, 0.0), model(CARRIED, 0.2))
+    found = {e.what: e.apart for e in separating(gripping, rivals, demonstration)}
+    plain = cost.whitened(np.stack([m.values for m in rivals])).astype(float)
+    assert found[IN_THE_AIR] == pytest.approx(np.linalg.norm(plain[0] - plain[1]), rel=0.2)
+    assert IN_THE_AIR not in {e.what for e in separating(case, rivals, demonstration)}
+
+
+def test_an_untouched_scene_has_no_contact():
+    """The C engine: fingers closed on the knob press and pull with contacts, and pass through it without."""
+    scene, plan = door_scene(springs=1), PLANS["A"]
+    alone = untouched(scene)
+    assert alone.grip is None and scene.grip is not None
+    touching = []
+    for each in (scene, alone):
+        data = mujoco.MjData(each.model)  # fingers shut
+        data.qpos[each.joint_qpos] = solve_pose(each, np.array(plan.pose), *grasp_pose(each, 0.0, 0.0, plan.roll))
+        mujoco.mj_forward(each.model, data)
+        touching.append(data.ncon)
+    assert touching[0] > 0 and touching[1] == 0
 
 
 def test_one_model_needs_no_experiment(demonstration):
