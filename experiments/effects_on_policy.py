@@ -7,7 +7,7 @@ A policy is trained on draws of the prior, unless one is given.  Then the stand-
 suite in turn, at the largest amplitude that is usual and at three times that, and the policy is tried on it; and it is
 asked whether the demonstration still holds its grasp there, for what cannot be recorded cannot be searched either.
 A pilot: robot and seeds are others than those of the runs that are reported; hidden_effect_policy.py's effect was
-chosen with it.  DIR/effects_on_policy_robot_100_from_100.json is the table, and the policy lies beside it.
+chosen with it.  DIR/effects_on_policy_robot_100_from_100.json is the table.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from droid_jax.policy.door_env import DoorEnv  # noqa: E402
 from droid_jax.policy.task import Task  # noqa: E402
 from droid_jax.policy.transfer import TransferConfig, check_playable, stand_in, transfer  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
-from experiments.policies.cases import TIMESTEP, Case, Options, finish, run_all  # noqa: E402
+from experiments.policies.cases import POLICY, TIMESTEP, Case, Options, finish, run_all  # noqa: E402
 from experiments.policies.robots import truth_of  # noqa: E402
 from experiments.policies.settings import Setting, setting_of  # noqa: E402
 from experiments.table2 import case as policy_case  # noqa: E402
@@ -116,6 +116,7 @@ def rows(policy: Policy, setting: Setting, task: Task, arguments: Arguments) -> 
             "interval_95": found["interval_95"],
             "angle_deg": found["angle_deg"]["mean"],
             "grip": found["grip"]["mean"],
+            "stopped": found["stopped"],
             "recordable": recordable(demonstrated, setting, applied),
         }
 
@@ -124,9 +125,10 @@ def trained(arguments: Arguments, setting: Setting, code: Mapping[str, Any]) -> 
     """File of a policy of the prior; made where there is none yet."""
     folder, budget, seed = arguments.cases("effects_on_policy"), arguments.budget, arguments.first
     of = {"springs": arguments.springs, "seed": seed, "budget": budget.to_json()}
-    make = functools.partial(policy_case, "prior", seed, setting, folder, budget)
-    finish(run_all([Case(folder / f"prior_{seed}.json", make, of, "prior")], 1, code))
-    return folder / f"prior_{seed}" / "policy.npz"
+    make = functools.partial(policy_case, "prior", seed, setting, arguments, code)
+    path = folder / f"prior_{seed}.json"
+    finish(run_all([Case(path, make, of, "prior")], 1, code))
+    return arguments.trained / json.loads(path.read_text())["trained"] / POLICY
 
 
 def sha256(path: Path) -> str:

@@ -12,6 +12,7 @@ again; DIR/hidden_effect_policy.json sums them up.
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ import json  # noqa: E402
 
 import tyro  # noqa: E402
 
-from benchmarks.common import commits, origin  # noqa: E402
+from benchmarks.common import origin  # noqa: E402
 from droid_jax.commands.gap_search import searched  # noqa: E402
 from droid_jax.commands.hidden import hidden_effects, record_stand_in  # noqa: E402
 from droid_jax.gap.case import GapConfig  # noqa: E402
@@ -45,11 +46,11 @@ from droid_jax.model.door import door_nuisances, door_space  # noqa: E402
 from droid_jax.model.door_scene import door_scene  # noqa: E402
 from droid_jax.model.effects.registry import library  # noqa: E402
 from droid_jax.policy.door_env import DoorEnv  # noqa: E402
-from droid_jax.policy.randomise import randomised  # noqa: E402
 from droid_jax.policy.task import Task  # noqa: E402
 from droid_jax.policy.transfer import TransferConfig, check_playable, stand_in  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
-from experiments.policies.cases import TIMESTEP, Case, Options, finish, found_of, run_all, tried  # noqa: E402
+from experiments.policies.cases import TIMESTEP, Case, Doors, Options, finish, found_of, made_by, run_all, tried  # noqa: E402
+from experiments.policies.sharing import claimed  # noqa: E402
 from experiments.policies.table import PLACES, apart, column  # noqa: E402
 
 MODELS = ("prior", "base", "extended")
@@ -77,8 +78,16 @@ class Arguments(Options):
         return self.budget.task(Task(steps=self.steps_allowed))
 
 
-def search(arguments: Arguments, folder: Path) -> dict[str, Any]:
-    """The verdict on the robot that hides an effect; base.json and extended.json are in the folder then."""
+def search(arguments: Arguments, folder: Path, code: Mapping[str, Any]) -> dict[str, Any]:
+    """The verdict on the robot that hides an effect; base.json and extended.json are in the folder then.
+
+    A search that was stopped goes on with the same code only: what other code left half-done is not taken.
+    """
+    with claimed(folder / "verdict.json", wait=True):
+        return _searched(arguments, folder, code)
+
+
+def _searched(arguments: Arguments, folder: Path, code: Mapping[str, Any]) -> dict[str, Any]:
     robot = arguments.seed_of_robot
     asked = {"hide": list(arguments.hide), "springs": SPRINGS, "robot": robot, "quick": arguments.quick}
     known = json.loads((folder / SETUP).read_text()) if (folder / SETUP).is_file() else asked
@@ -94,7 +103,8 @@ def search(arguments: Arguments, folder: Path) -> dict[str, Any]:
     if arguments.quick:
         small = RefineConfig(iterations=1, hops=0, spreads=0)
         config = GapConfig(SearchConfig(population=8, parents=None, generations=1), small, small, 1, 1, 1)
-    case, verdict, _ = searched(Split.RECORDINGS, scene, base, library(scene), roles, config, folder / "checkpoints")
+    kept = folder / "checkpoints" / str(code["commit"])
+    case, verdict, _ = searched(Split.RECORDINGS, scene, base, library(scene), roles, config, kept)
     posterior(verdict.base.refined, case.fit.cost.comparisons).save(folder / BASE)
     save_extended(folder, extended(case, verdict.model))
     found = {
@@ -102,6 +112,7 @@ def search(arguments: Arguments, folder: Path) -> dict[str, Any]:
         "verdict": verdict.kind.value,
         "sentence": verdict.sentence,
         "effects": list(verdict.effects),
+        "searched_by": dict(code),
     }
     write_json(folder / "verdict.json", found)
     return found
@@ -116,24 +127,27 @@ def playable(arguments: Arguments) -> None:
         raise SystemExit(f"error: {error}") from None
 
 
-def case(model: str, seed: int, folder: Path, arguments: Arguments) -> dict[str, Any]:
-    """One policy, trained on the prior or on one of the two models that the search left in the folder."""
+def case(model: str, seed: int, folder: Path, arguments: Arguments, code: Mapping[str, Any]) -> dict[str, Any]:
+    """One policy, trained on the prior or on one of the two models that the search left in the folder.
+
+    All three are over the parameters and nuisances of the search, the extended model's over its effects too.
+    """
     budget, robot = arguments.budget, arguments.seed_of_robot
     scene, task = door_scene(timestep=TIMESTEP, limits=True), arguments.task
     if model != "extended":
         env = DoorEnv(scene, task)
-        gaussian = load_gaussian(folder / BASE) if model == "base" else prior(door_space(env.scene))
+        space = door_space(env.scene) + door_nuisances(env.scene)
+        gaussian = load_gaussian(folder / BASE) if model == "base" else prior(space)
     else:
         known = load_extended(folder / FILE, scene)
         env, gaussian = DoorEnv(known.scene, task, known.effects), known.gaussian
     hidden, config = listed(hidden_effects(arguments.hide, scene)), TransferConfig(trials=budget.trials, seed=robot)
     truth = stand_in_truth(door_scene(), SPRINGS, robot)
     robots = {"stand_in": stand_in(door_scene(limits=True), env.start, truth, hidden, task, config)}
-    doors_of = repr((arguments.hide, gaussian.mean.tolist(), gaussian.cov.tolist()))
-    return tried(folder / f"{model}_{seed}", env, randomised(env.scene, gaussian), robots, seed, budget, doors_of)
+    return tried(arguments, env, Doors(gaussian), robots, seed, code)
 
 
-def planned_case(model: str, seed: int, arguments: Arguments) -> Case:
+def planned_case(model: str, seed: int, arguments: Arguments, code: Mapping[str, Any]) -> Case:
     """A policy of a model, and what its file must say."""
     folder = arguments.cases("hidden_effect")
     of = {
@@ -144,15 +158,16 @@ def planned_case(model: str, seed: int, arguments: Arguments) -> Case:
         "task": asdict(arguments.task),
         "budget": arguments.budget.to_json(),
     }
-    make = functools.partial(case, model, seed, folder, arguments)
+    make = functools.partial(case, model, seed, folder, arguments, code)
     return Case(folder / f"{model}_{seed}.json", make, of, model)
 
 
 def main() -> None:
     arguments, code = tyro.cli(Arguments, description=__doc__), origin(0)
     playable(arguments)
-    planned = [planned_case(model, seed, arguments) for seed, model in itertools.product(arguments.policies, MODELS)]
-    verdict = search(arguments, arguments.cases("hidden_effect"))
+    every = itertools.product(arguments.policies, MODELS)
+    planned = [planned_case(model, seed, arguments, code) for seed, model in every]
+    verdict = search(arguments, arguments.cases("hidden_effect"), code)
     if verdict["effects"] or arguments.quick:  # quick: a search this short seldom names one, and policies shall run too
         failed = run_all(planned, arguments.at_most, code)
     else:
@@ -163,7 +178,7 @@ def main() -> None:
     table = {model: {place: column(own, place) for place in PLACES} for model, own in of.items() if own}
     others = [m for m in ("base", "prior") if of[m] and of["extended"]]
     better = {m: {what: apart(of["extended"], of[m], what) for what in ("success", "angle")} for m in others}
-    summary = {**verdict, "models": table, "extended_better_than": better, "cases_from_commits": commits(found), **code}
+    summary = {**verdict, "models": table, "extended_better_than": better, **made_by(found), **code}
     write_json(arguments.summary("hidden_effect_policy"), summary)
     print(json.dumps({m: {p: round(c[p]["success_rate"], 3) for p in PLACES} for m, c in table.items()}))
     finish(failed)

@@ -1,15 +1,17 @@
 """Four knob places, one fit: section IV-E of the paper.
 
-    python experiments/knob_locations.py [--quick] [--out DIR] [--seeds 3] [--trials 100]
+    python experiments/knob_locations.py [--quick] [--out DIR] [--seeds 5] [--trials 100]
 
 The door is demonstrated and fitted with the knob in its first place.  For each of the four places, 5 cm apart along the
 lever, policies are trained on doors drawn from that one Gaussian and tried on the stand-in robot with the knob there.
-Every policy is one JSON file under DIR/knob_cases and is not trained again.  DIR/knob_locations.json sums them up.
+Every policy is one JSON file under DIR/knob_cases and is not trained again; the fit, and the policies of the first
+place, are those of table2.py's setting "paper".  DIR/knob_locations.json sums them up.
 """
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -26,15 +28,14 @@ import json  # noqa: E402
 
 import tyro  # noqa: E402
 
-from benchmarks.common import commits, origin  # noqa: E402
+from benchmarks.common import origin  # noqa: E402
 from droid_jax.model.door_scene import LEVERS, door_scene  # noqa: E402
 from droid_jax.policy.door_env import DoorEnv  # noqa: E402
-from droid_jax.policy.randomise import randomised  # noqa: E402
 from droid_jax.policy.task import Task  # noqa: E402
 from droid_jax.policy.transfer import TransferConfig, stand_in  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
-from experiments.policies.cases import TIMESTEP, Budget, Case, Options, finish, found_of, run_all, tried  # noqa: E402
-from experiments.policies.robots import GAUSSIAN, fitted, truth_of  # noqa: E402
+from experiments.policies.cases import TIMESTEP, Case, Doors, Options, finish, found_of, made_by, run_all, tried  # noqa: E402
+from experiments.policies.robots import fitted, truth_of  # noqa: E402
 from experiments.policies.settings import Setting, setting_of  # noqa: E402
 from experiments.policies.table import PLACES, column  # noqa: E402
 
@@ -45,21 +46,18 @@ class Arguments(Options):
 
     knobs: tuple[int, ...] = (0, 1, 2, 3)
     """Which places."""
-    seeds: int = 3
-    """Policies for each place."""
 
 
-def case(knob: int, seed: int, setting: Setting, folder: Path, budget: Budget) -> dict[str, Any]:
+def case(knob: int, seed: int, setting: Setting, arguments: Arguments, code: Mapping[str, Any]) -> dict[str, Any]:
     """One policy for one place of the knob."""
+    budget = arguments.budget
     env = DoorEnv(door_scene(timestep=TIMESTEP, limits=True, knob=knob), budget.task(Task()))
     config = TransferConfig(trials=budget.trials, seed=setting.robot)
     robot = stand_in(door_scene(limits=True, knob=knob), env.start, truth_of(setting), (), env.task, config)
-    randomise = randomised(env.scene, fitted(setting, folder, budget.quick))
-    doors_of = (folder / GAUSSIAN).read_text()
-    return tried(folder / f"knob{knob}_{seed}", env, randomise, {"stand_in": robot}, seed, budget, doors_of)
+    return tried(arguments, env, Doors(fitted(setting, arguments, code)), {"stand_in": robot}, seed, code)
 
 
-def planned_case(knob: int, seed: int, arguments: Arguments) -> Case:
+def planned_case(knob: int, seed: int, arguments: Arguments, code: Mapping[str, Any]) -> Case:
     """A policy of a place, and what its file must say."""
     folder, budget, setting = arguments.cases("knob"), arguments.budget, setting_of("paper", arguments.robot)
     of = {
@@ -69,7 +67,7 @@ def planned_case(knob: int, seed: int, arguments: Arguments) -> Case:
         "task": asdict(budget.task(Task())),
         "budget": budget.to_json(),
     }
-    make = functools.partial(case, knob, seed, setting, folder, budget)
+    make = functools.partial(case, knob, seed, setting, arguments, code)
     return Case(folder / f"knob{knob}_{seed}.json", make, of, "fit")
 
 
@@ -77,7 +75,9 @@ def main() -> None:
     arguments, code = tyro.cli(Arguments, description=__doc__), origin(0)
     knobs = arguments.knobs[-1:] if arguments.quick else arguments.knobs
     places = knobs if arguments.quick else range(len(LEVERS))
-    planned = [planned_case(knob, seed, arguments) for seed, knob in itertools.product(arguments.policies, places)]
+    planned = [
+        planned_case(knob, seed, arguments, code) for seed, knob in itertools.product(arguments.policies, places)
+    ]
     failed = run_all([c for c in planned if c.of["knob"] in knobs], arguments.at_most, code)
     found = found_of(planned)
     table = {}
@@ -85,7 +85,7 @@ def main() -> None:
         own = [c for c in found if c["knob"] == knob]
         table[f"{LEVERS[knob]:.2f} m"] = {place: column(own, place) for place in PLACES}
     line = {lever: {p: round(c[p]["success_rate"], 3) for p in PLACES} for lever, c in table.items()}
-    summary = {"levers": table, "cases_from_commits": commits(found), **code}
+    summary = {"levers": table, **made_by(found), **code}
     write_json(arguments.summary("knob_locations"), summary)
     print(json.dumps(line))
     finish(failed)

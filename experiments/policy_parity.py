@@ -122,13 +122,14 @@ def scatter(mjx: np.ndarray, c: np.ndarray) -> Figure:
 
 
 def main() -> None:
-    arguments = tyro.cli(Arguments, description=__doc__)
+    arguments, code = tyro.cli(Arguments, description=__doc__), origin(0)
     beside = arguments.gaussian or arguments.policy.with_name("gaussian.json")
     policy, env, gaussian = untrained() if arguments.quick else trained(arguments.policy, beside)
     values = gaussian.sample(arguments.seed, 2 if arguments.quick else arguments.doors)
     both = {"mjx": in_mjx(policy, env, gaussian, values), "c": in_c(policy, env, gaussian, values)}
     angle = {name: np.rad2deg(trials.angle) for name, trials in both.items()}
     apart = np.abs(angle["mjx"] - angle["c"])
+    whole = (both["mjx"].stopped == "") & (both["c"].stopped == "")
     result: dict[str, Any] = {
         "policy": "untrained" if arguments.quick else named(arguments.policy),
         "gaussian": "prior" if arguments.quick else named(beside),
@@ -139,14 +140,16 @@ def main() -> None:
             "largest": float(apart.max()),
             "within_target": float(np.mean(apart <= WITHIN)),
         },
+        "neither_stopped": int(whole.sum()),
+        "median_of_these_deg": float(np.median(apart[whole])) if whole.any() else None,
         "mean_angle_deg": {name: float(a.mean()) for name, a in angle.items()},
         "success_rate": {name: trials.rate for name, trials in both.items()},
         "stopped": {name: trials.to_json()["stopped"] for name, trials in both.items()},  # C runs the robot's own loop
     }
     name = stem("policy_parity", arguments.quick)
-    write_bytes(arguments.out / f"{name}.png", png_bytes(scatter(angle["mjx"], angle["c"])))
     every = {n: a.round(3).tolist() for n, a in angle.items()}
-    write_json(arguments.out / f"{name}.json", {**result, "angles_deg": every, **origin(arguments.seed)})
+    write_json(arguments.out / f"{name}.json", {**result, "angles_deg": every, **code, "seed": arguments.seed})
+    write_bytes(arguments.out / f"{name}.png", png_bytes(scatter(angle["mjx"], angle["c"])))
     print(json.dumps(result))
 
 

@@ -4,8 +4,9 @@
 
 For each setting: the stand-in robot is recorded and fitted once; then policies are trained on draws of the prior, on
 the fitted mean alone and on draws of the fitted Gaussian, alike in everything else, and tried in simulation and on the
-stand-in robot.  Every policy is one JSON file under DIR/table2_cases and is not trained again: the experiment can be
-stopped and goes on where it was.  DIR/table2.json sums up all that are there, with intervals by bootstrap over
+stand-in robot.  Every policy is one JSON file under DIR/table2_cases and is not trained again (nor is one that another
+experiment has trained, DIR/trained_cases): the experiment can be stopped and goes on where it was, and the same
+command started twice shares the work.  DIR/table2.json sums up all that are there, with intervals by bootstrap over
 policies; table2.md is laid out as in the paper, table2.png is its histogram.  Where hidden_effect_policy.json lies
 beside them, it is the table's last part.  Pilots take another robot and other seeds (--robot 100 --first 100).
 docs/paper.md says what was fixed before the runs.
@@ -14,6 +15,7 @@ docs/paper.md says what was fixed before the runs.
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -30,19 +32,17 @@ import json  # noqa: E402
 
 import tyro  # noqa: E402
 
-from benchmarks.common import commits, origin  # noqa: E402
-from droid_jax.commands.train import randomise  # noqa: E402
+from benchmarks.common import origin  # noqa: E402
 from droid_jax.identify.gaussian import prior  # noqa: E402
 from droid_jax.model.door import door_space  # noqa: E402
 from droid_jax.model.door_scene import door_scene  # noqa: E402
 from droid_jax.policy.door_env import DoorEnv  # noqa: E402
-from droid_jax.policy.randomise import Randomise  # noqa: E402
 from droid_jax.policy.task import Task  # noqa: E402
 from droid_jax.report.export import png_bytes  # noqa: E402
 from droid_jax.storage import write_bytes, write_json, write_text  # noqa: E402
-from experiments.policies.cases import TIMESTEP, Budget, Case, Options, finish, found_of, run_all, tried  # noqa: E402
+from experiments.policies.cases import TIMESTEP, Case, Doors, Options, finish, found_of, made_by, run_all, tried  # noqa: E402
 from experiments.policies.figure import as_text, histograms  # noqa: E402
-from experiments.policies.robots import GAUSSIAN, fitted, robots_of  # noqa: E402
+from experiments.policies.robots import fitted, robots_of  # noqa: E402
 from experiments.policies.settings import SETTINGS, Setting, setting_of  # noqa: E402
 from experiments.policies.table import METHODS, summed_up  # noqa: E402
 
@@ -59,27 +59,20 @@ class Arguments(Options):
     """Which methods."""
 
 
-def doors(method: Method, setting: Setting, folder: Path, quick: bool, env: DoorEnv) -> Randomise:
-    """What a method trains on: the one thing in which methods differ."""
-    gaussian = prior(door_space(env.scene)) if method == "prior" else fitted(setting, folder, quick)
-    return randomise(method, env.scene, gaussian)
-
-
-def case(method: Method, seed: int, setting: Setting, folder: Path, budget: Budget) -> dict[str, Any]:
-    """One policy of one method."""
+def case(method: Method, seed: int, setting: Setting, arguments: Options, code: Mapping[str, Any]) -> dict[str, Any]:
+    """One policy of one method: what it is trained on is the one thing in which methods differ."""
+    budget = arguments.budget
     env = DoorEnv(door_scene(timestep=TIMESTEP, limits=True), budget.task(Task(**setting.task)))
-    drawn = doors(method, setting, folder, budget.quick, env)
-    doors_of = repr((setting, (folder / GAUSSIAN).read_text() if method != "prior" else "prior"))
-    robots = robots_of(setting, env, budget.trials)
-    return tried(folder / f"{method}_{seed}", env, drawn, robots, seed, budget, doors_of)
+    gaussian = prior(door_space(env.scene)) if method == "prior" else fitted(setting, arguments, code)
+    return tried(arguments, env, Doors(gaussian, method), robots_of(setting, env, budget.trials), seed, code)
 
 
-def planned_case(method: Method, seed: int, name: str, arguments: Arguments) -> Case:
+def planned_case(method: Method, seed: int, name: str, arguments: Arguments, code: Mapping[str, Any]) -> Case:
     """A policy of a method in a setting, and what its file must say."""
     setting, folder, budget = setting_of(name, arguments.robot), arguments.cases("table2") / name, arguments.budget
     task = asdict(budget.task(Task(**setting.task)))
     of = {"setting": asdict(setting), "task": task, "method": method, "seed": seed, "budget": budget.to_json()}
-    make = functools.partial(case, method, seed, setting, folder, budget)
+    make = functools.partial(case, method, seed, setting, arguments, code)
     return Case(folder / f"{method}_{seed}.json", make, of, f"{name}, {'prior' if method == 'prior' else 'fit'}")
 
 
@@ -91,7 +84,7 @@ def main() -> None:
     settings = list(arguments.settings[:1]) if arguments.quick else list(SETTINGS)
     asked = {(s, m) for s in arguments.settings for m in arguments.methods}
     planned = [
-        planned_case(method, seed, name, arguments)
+        planned_case(method, seed, name, arguments, code)
         for name, seed, method in itertools.product(settings, arguments.policies, METHODS)
     ]
     now = [c for c in planned if (c.of["setting"]["name"], c.of["method"]) in asked]
@@ -100,7 +93,7 @@ def main() -> None:
     summary, hidden = summed_up(found, settings), arguments.summary("hidden_effect_policy")
     if hidden.is_file():
         summary["hidden_effect"] = json.loads(hidden.read_text())
-    write_json(arguments.summary("table2"), {**summary, "cases_from_commits": commits(found), **code})
+    write_json(arguments.summary("table2"), {**summary, **made_by(found), **code})
     write_text(arguments.summary("table2", ".md"), as_text(summary))
     write_bytes(arguments.summary("table2", ".png"), png_bytes(histograms(found, settings)))
     print(json.dumps(summary["line"]))

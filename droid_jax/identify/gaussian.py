@@ -158,9 +158,9 @@ class Gaussian:
         cov = self.cov[np.ix_(index, index)]
         return Gaussian(self.space.select(names), self.mean[index], cov, self.rule, self.coordinates)
 
-    def save(self, path: str | Path) -> None:
-        """Write the JSON file described in the module's text, whole or not at all."""
-        content = {
+    def to_json(self) -> dict[str, Any]:
+        """The content of the JSON file described in the module's text."""
+        return {
             "format": FORMAT,
             "version": VERSION,
             "coordinates": self.coordinates,
@@ -169,7 +169,10 @@ class Gaussian:
             "cov": self.cov.tolist(),
             "space": space_to_json(self.space),
         }
-        write_json(Path(path), content)
+
+    def save(self, path: str | Path) -> None:
+        """Write the JSON file described in the module's text, whole or not at all."""
+        write_json(Path(path), self.to_json())
 
     @cached_property
     def _grid(self) -> np.ndarray:

@@ -216,7 +216,7 @@ def _brax(
             gae_lambda=config.gae,
             network_factory=_networks(config),
             seed=config.seed + done,
-            num_evals=max(2, round(config.evaluations * steps / config.steps)),
+            num_evals=evaluations_left(config, steps),
             num_eval_envs=config.eval_envs,
             deterministic_eval=True,
             randomization_fn=randomise,
@@ -259,6 +259,11 @@ def _blank(env: DoorEnv, config: TrainConfig) -> Any:
     nets, key = _networks(config)(env.observation_size, env.action_size), jax.random.key(0)
     normaliser = running_statistics.init_state(specs.Array((env.observation_size,), jnp.dtype("float32")))
     return normaliser, nets.policy_network.init(key), nets.value_network.init(key)
+
+
+def evaluations_left(config: TrainConfig, steps: int) -> int:
+    """Evaluations of the last `steps` actions, with the one before them that brax counts too: parts stay as long."""
+    return max(2, 1 + round((config.evaluations - 1) * steps / config.steps))
 
 
 def _rank(now: TrainProgress) -> tuple[float, float]:

@@ -13,19 +13,23 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 
-from benchmarks.common import stem
+from benchmarks.common import commits, stem
+from droid_jax.commands.train import randomise
+from droid_jax.identify.gaussian import Gaussian
+from droid_jax.policy.control import load
 from droid_jax.policy.door_env import DoorEnv
 from droid_jax.policy.network import save_policy
-from droid_jax.policy.randomise import Randomise
 from droid_jax.policy.simulated import simulated
 from droid_jax.policy.task import Task
 from droid_jax.policy.train import PRESETS, TrainConfig, train
 from droid_jax.policy.transfer import StandIn, transfer
 from droid_jax.storage import write_json
+from experiments.policies.sharing import claimed
 from experiments.policies.table import PLACES
 
 TIMESTEP = 0.004  # s, of the simulation that trains
 QUICK_STEPS = 20  # actions of an episode where nothing shall be learned
+GAUSSIAN, POLICY, TRAINING = "gaussian.json", "policy.npz", "training.json"
 RESULTS = Path(__file__).resolve().parents[1] / "results"
 
 
@@ -77,6 +81,11 @@ class Options:
         """Folder of the cases; those of another robot have a name of their own."""
         return self.out / stem(f"{name}{self._of_robot}_cases", self.quick)
 
+    @property
+    def trained(self) -> Path:
+        """Folder of the policies, which experiments share: one that two of them need is trained once."""
+        return self.out / stem("trained_cases", self.quick)
+
     def summary(self, name: str, kind: str = ".json") -> Path:
         """File of the summary; that of pilots has a name of its own."""
         pilot = f"_from_{self.first}" if self.first else ""
@@ -105,28 +114,64 @@ class Budget:
         return replace(task, steps=QUICK_STEPS) if self.quick else task
 
 
+@dataclass(frozen=True)
+class Doors:
+    """What a policy is trained on: draws of a Gaussian, or its mean alone where the method is "mean"."""
+
+    gaussian: Gaussian
+    method: str = "fitted"
+
+
 def tried(
-    place: Path,
+    arguments: Options,
     env: DoorEnv,
-    randomise: Randomise,
+    doors: Doors,
     robots: Mapping[str, StandIn],
     seed: int,
-    budget: Budget,
-    doors: str,
+    code: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Train with checkpoints in a folder, and try in simulation and on robots by name: the figures of one policy.
-
-    doors: what those that it is trained on are made of, in words; checkpoints of others are refused.
-    """
-    config = replace(budget.config, seed=seed)
-    found = train(env, randomise, config, checkpoints=place / "checkpoints", fingerprint={"doors": doors})
-    save_policy(place / "policy.npz", found.policy)
+    """Train (where no experiment has done so), and try in simulation and on robots by name: a policy's figures."""
+    budget = arguments.budget
+    place, made = trained(arguments.trained, env, doors, replace(budget.config, seed=seed), code)
+    policy, drawn = load(place / POLICY), randomise(doors.method, env.scene, doors.gaussian)
     return {
-        "doors_sha256": hashlib.sha256(doors.encode()).hexdigest(),
-        "simulation": simulated(found.policy, env, randomise, budget.trials, seed).to_json(),
-        **{name: transfer(found.policy, robot).to_json() for name, robot in robots.items()},
-        "history": [asdict(now) for now in found.history],
+        "doors_sha256": _sha256(doors.gaussian.to_json()),
+        "simulation": simulated(policy, env, drawn, budget.trials, seed).to_json(),
+        **{name: transfer(policy, robot).to_json() for name, robot in robots.items()},
+        **made,
     }
+
+
+def trained(
+    store: Path, env: DoorEnv, doors: Doors, config: TrainConfig, code: Mapping[str, Any]
+) -> tuple[Path, dict[str, Any]]:
+    """Folder of the policy that training comes to, named after all that decides it, and what is known of the training.
+
+    Another process that trains the same is waited for; what a stopped one left behind is continued.
+    """
+    of = {
+        "scene": [env.scene.sha256, env.start.tolist(), [e.name for e in env.effects]],
+        "task": asdict(env.task),
+        "doors": ["mean" if doors.method == "mean" else "draws", doors.gaussian.to_json()],
+        "config": asdict(config),
+    }
+    key = _sha256(of)[:16]
+    place = store / key
+    with claimed(place, wait=True):
+        if not (place / TRAINING).is_file():
+            drawn = randomise(doors.method, env.scene, doors.gaussian)
+            found = train(env, drawn, config, checkpoints=place / "checkpoints", fingerprint={"key": key})
+            place.mkdir(exist_ok=True)
+            save_policy(place / POLICY, found.policy)
+            doors.gaussian.save(place / GAUSSIAN)
+            history = [asdict(now) for now in found.history]
+            write_json(place / TRAINING, {"trained": key, "history": history, "trained_by": dict(code)})
+        return place, json.loads((place / TRAINING).read_text())
+
+
+def _sha256(of: Any) -> str:
+    """Of plain data."""
+    return hashlib.sha256(json.dumps(of).encode()).hexdigest()
 
 
 class Case(NamedTuple):
@@ -144,24 +189,46 @@ class Case(NamedTuple):
 def run_all(cases: Sequence[Case], at_most: int, code: Mapping[str, Any]) -> list[str]:
     """Make what has no file yet, and say what came of it; returns the names of those that failed, which hold up none.
 
+    Processes that run the same command share the cases: each takes those that no other is making.
     code: `origin` when the program started: what it imported then made all cases, whatever was committed since.
     Ends the program, before anything is made, where a file is there that was made with something else.
     """
     found_of(cases)
-    failed = []
-    for case in [c for c in cases if not c.path.is_file()][:at_most]:
-        name = f"{case.path.parent.name}/{case.path.stem}"
-        try:
-            result = case.make()
-        except Exception:
-            print(f"{name} failed:\n{traceback.format_exc()}", file=sys.stderr, flush=True)
-            failed.append(name)
-        else:
-            write_json(case.path, {**case.of, **result, "origin": dict(code)})
-            rates = {where: result[where]["success_rate"] for where in PLACES}
-            print(f"{name}: {rates}", flush=True)
-        jax.clear_caches()  # no other case uses these programs, and what takes long to compile is kept on disk
+    failed = list[str]()
+    for case in cases:
+        if case.path.is_file():
+            continue
+        if not at_most:
+            break
+        with claimed(case.path, wait=False) as mine:
+            if mine and not case.path.is_file():  # which another process may have made meanwhile
+                at_most -= 1
+                failed += _make(case, code)
     return failed
+
+
+def _make(case: Case, code: Mapping[str, Any]) -> list[str]:
+    """Write a case's file; its name where that failed."""
+    name = f"{case.path.parent.name}/{case.path.stem}"
+    try:
+        result = case.make()
+    except Exception:
+        print(f"{name} failed:\n{traceback.format_exc()}", file=sys.stderr, flush=True)
+        return [name]
+    else:
+        write_json(case.path, {**case.of, **result, "origin": dict(code)})
+        print(f"{name}: { {where: result[where]['success_rate'] for where in PLACES} }", flush=True)
+        return []
+    finally:
+        jax.clear_caches()  # no other case uses these programs, and what takes long to compile is kept on disk
+
+
+def made_by(found: Sequence[Mapping[str, Any]]) -> dict[str, list[str]]:
+    """The commits that tried the policies, and those that trained them, which may have been another experiment's."""
+    return {
+        "cases_from_commits": commits(found),
+        "policies_from_commits": commits([{"origin": case["trained_by"]} for case in found]),
+    }
 
 
 def finish(failed: Sequence[str]) -> None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict
-from pathlib import Path
+from typing import Any
 
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.gaussian import load as load_gaussian
@@ -15,12 +16,13 @@ from droid_jax.model.door_scene import door_scene
 from droid_jax.policy.door_env import DoorEnv
 from droid_jax.policy.transfer import StandIn, TransferConfig, stand_in
 from droid_jax.storage import write_json
-from experiments.identify_suite import recordings, settings
-from experiments.policies.cases import TIMESTEP
+from experiments.identify_suite import describe, recordings, settings
+from experiments.policies.cases import GAUSSIAN, TIMESTEP, Options
 from experiments.policies.settings import Setting
+from experiments.policies.sharing import claimed
 from experiments.policies.table import SLIPPERY
 
-GAUSSIAN, SETTING = "gaussian.json", "setting.json"
+FIT = "fit.json"
 PADS = {"sliding_friction_left": 0.05, "sliding_friction_right": 0.05}  # the least that a search allows
 
 
@@ -36,18 +38,23 @@ def robots_of(setting: Setting, env: DoorEnv, trials: int) -> dict[str, StandIn]
     return {name: stand_in(scene, env.start, hidden, (), env.task, config) for name, hidden in of.items()}
 
 
-def fitted(setting: Setting, folder: Path, quick: bool) -> Gaussian:
-    """What demonstrations A and C tell of the setting's robot; kept in the folder, with what it was made of."""
+def fitted(setting: Setting, arguments: Options, code: Mapping[str, Any]) -> Gaussian:
+    """What demonstrations A and C tell of the setting's robot; kept, with what it was made of and how good it is.
+
+    Experiments share it, and another process that makes it is waited for.
+    """
+    folder, quick = arguments.cases(f"fit_{setting.name}"), arguments.quick
     path, made_of = folder / GAUSSIAN, {"setting": asdict(setting), "quick": quick}
-    if path.is_file():
-        known = json.loads((folder / SETTING).read_text()) if (folder / SETTING).is_file() else None
-        if known != json.loads(json.dumps(made_of)):
-            raise SystemExit(f"error: {folder} holds the fit of another robot: {known}; choose another --out")
-    else:
-        scene = door_scene(timestep=TIMESTEP)
-        recorded = recordings(scene, truth_of(setting), "A" if quick else "AC", setting.robot)
-        config = settings(quick, setting.robot)
-        found = identify(scene, door_space(scene), recorded, nuisances=door_nuisances(scene), config=config)
-        write_json(folder / SETTING, made_of)
-        found.gaussian.save(path)
+    with claimed(path, wait=True):
+        if path.is_file():
+            known = json.loads((folder / FIT).read_text()) if (folder / FIT).is_file() else {}
+            if {name: known.get(name) for name in made_of} != json.loads(json.dumps(made_of)):
+                raise SystemExit(f"error: {folder} holds the fit of another robot: {known}; choose another --out")
+        else:
+            scene, truth = door_scene(timestep=TIMESTEP), truth_of(setting)
+            recorded = recordings(scene, truth, "A" if quick else "AC", setting.robot)
+            config = settings(quick, setting.robot)
+            found = identify(scene, door_space(scene), recorded, nuisances=door_nuisances(scene), config=config)
+            write_json(folder / FIT, {**made_of, "fit": describe(found, truth), "origin": dict(code)})
+            found.gaussian.save(path)
     return load_gaussian(path)

@@ -63,11 +63,15 @@ def column(cases: Sequence[Mapping[str, Any]], place: str) -> dict[str, Any]:
 
 
 def spread(each: Sequence[np.ndarray]) -> dict[str, Any]:
-    """Mean and deviation over all trials, interval of the mean; None where no policy has any."""
-    both = np.concatenate(each)
+    """Mean and deviation over all trials, interval of the mean; None where no policy has any.
+
+    The interval is None too where only one of several has any: how policies differ is not known then.
+    """
+    both, counted = np.concatenate(each), sum(len(own) > 0 for own in each)
     if not len(both):
         return {"mean": None, "std": None, "interval_95": None}
-    return {"mean": float(both.mean()), "std": float(both.std()), "interval_95": span(resampled(each), len(each))}
+    interval = span(resampled(each), counted) if counted > 1 or len(each) == 1 else None
+    return {"mean": float(both.mean()), "std": float(both.std()), "interval_95": interval}
 
 
 def trials(case: Mapping[str, Any], place: str) -> dict[str, np.ndarray]:

@@ -17,15 +17,19 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from benchmarks.common import commits
+from droid_jax.identify.gaussian import prior
 from droid_jax.measure.hidden import Applied, possible
+from droid_jax.model.door import door_space
 from droid_jax.model.door_scene import door_scene
 from droid_jax.policy.task import Task
+from droid_jax.policy.train import TrainConfig
 from droid_jax.policy.trials import Trials
-from experiments.policies.cases import Case, Options, finish, found_of, run_all
+from experiments.policies import cases
+from experiments.policies.cases import Case, Doors, Options, finish, found_of, made_by, run_all, trained
 from experiments.policies.figure import as_text, histograms
 from experiments.policies.robots import fitted, robots_of
 from experiments.policies.settings import SETTINGS, Setting, setting_of
+from experiments.policies.sharing import claimed
 from experiments.policies.table import PLACES, apart, column, rate_interval, resampled, spread, summed_up
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -44,6 +48,7 @@ def case(
         "method": method,
         "seed": seed,
         "doors_sha256": fit,
+        "trained_by": {"commit": "an older one"},
         **{place: found.to_json() for place in ("simulation", "stand_in", "slippery")},
     }
 
@@ -111,6 +116,12 @@ def test_a_difference_has_a_sign_and_an_interval():
     assert found["difference"] == pytest.approx(0.6) and 0.4 < found["interval_95"][0] < 0.6 < found["interval_95"][1]
     same = apart(better, [case("prior", k, 0.9) for k in range(5)], "success")
     assert same["interval_95"][0] < 0 < same["interval_95"][1]
+
+
+def test_steps_of_one_policy_among_several_have_no_interval():
+    found = spread([np.array([100.0, 110.0, 120.0]), np.zeros(0), np.zeros(0)])
+    assert found["mean"] == 110.0 and found["interval_95"] is None
+    assert spread([np.array([100.0, 110.0, 120.0])])["interval_95"] is not None
 
 
 def test_resamples_of_one_policy_are_of_its_trials():
@@ -195,7 +206,10 @@ def test_what_is_there_is_not_made_again(tmp_path: Path):
     (tmp_path / "pilot_100.json").write_text("{}")  # lies beside them and is none of them
     run_all(planned(budget={"steps": 1000}), 9, {"commit": "another"})
     assert made == ["a", "b", "c"]
-    assert commits(found_of(planned(budget={"steps": 1000}))) == ["another", "one"]
+    assert made_by(found_of(planned(budget={"steps": 1000}))) == {
+        "cases_from_commits": ["another", "one"],
+        "policies_from_commits": ["an older one"],
+    }
 
 
 def test_a_case_that_fails_holds_up_no_other_and_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -233,7 +247,7 @@ def test_policies_of_different_fits_are_not_summed(tmp_path: Path):
 )
 def test_pilots_on_another_robot_never_mix_with_what_is_reported(script: str, which: tuple[Any, ...]):
     module = importlib.import_module(f"experiments.{script}")
-    usual, pilot = (module.planned_case(*which, module.Arguments(robot=robot)) for robot in (None, 100))
+    usual, pilot = (module.planned_case(*which, module.Arguments(robot=robot), CODE) for robot in (None, 100))
     assert usual.of != pilot.of and usual.path.parent != pilot.path.parent
     assert usual.of["task"] == asdict(Task()) and usual.of["budget"]["evaluations"] == 8
     assert pilot.of == json.loads(json.dumps(pilot.of))
@@ -264,7 +278,7 @@ def test_a_policy_is_tried_with_every_effect_that_a_closed_loop_can_have():
 def test_where_the_search_names_nothing_no_policy_is_trained(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     module = importlib.import_module("experiments.hidden_effect_policy")
     verdict = {"hidden": ["none"], "verdict": "none", "sentence": "It lacks nothing.", "effects": []}
-    monkeypatch.setattr(module, "search", lambda arguments, folder: verdict)
+    monkeypatch.setattr(module, "search", lambda *_: verdict)
     monkeypatch.setattr(module, "run_all", lambda *a: pytest.fail("a policy was trained"))
     monkeypatch.setattr(sys, "argv", ["hidden_effect_policy.py", "--out", str(tmp_path)])
     module.main()
@@ -313,10 +327,62 @@ def test_pilots_have_a_summary_of_their_own(tmp_path: Path):
 
 
 def test_the_fit_of_another_setting_is_not_taken(tmp_path: Path):
-    (tmp_path / "gaussian.json").write_text("{}")
-    (tmp_path / "setting.json").write_text(json.dumps({"setting": asdict(SETTINGS["paper"]), "quick": False}))
+    options = Options(out=tmp_path)
+    folder = options.cases("fit_paper")
+    folder.mkdir()
+    (folder / "gaussian.json").write_text("{}")
+    (folder / "fit.json").write_text(json.dumps({"setting": asdict(SETTINGS["paper"]), "quick": False}))
     with pytest.raises(SystemExit, match="holds the fit of another robot"):
-        fitted(replace(SETTINGS["paper"], robot=99), tmp_path, False)
+        fitted(replace(SETTINGS["paper"], robot=99), options, CODE)
+
+
+def test_what_another_process_makes_is_left_to_it(tmp_path: Path):
+    made = list[str]()
+    planned = [
+        Case(tmp_path / f"{n}.json", lambda n=n: made.append(n) or case("mean", 0, 0.5), {}, "fit") for n in "abc"
+    ]
+    holds = (
+        "import sys, time; from pathlib import Path; from experiments.policies.sharing import claimed\n"
+        f"with claimed(Path({str(tmp_path / 'a.json')!r}), wait=False) as mine: print(mine, flush=True); time.sleep(60)"
+    )
+    other = subprocess.Popen([sys.executable, "-c", holds], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    try:
+        assert other.stdout is not None and other.stdout.readline() == "True\n"
+        run_all(planned, 1, CODE)
+        assert made == ["b"]
+        with claimed(tmp_path / "a.json", wait=False) as mine:
+            assert not mine
+    finally:
+        other.kill()
+        other.wait()
+    run_all(planned, 9, CODE)  # a claim ends with its process
+    assert made == ["b", "a", "c"]
+
+
+def test_a_policy_that_two_experiments_need_is_trained_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """Named after all that decides it: doors, method, seed, task; not after who asks."""
+    scene = door_scene(timestep=0.004, limits=True)
+    env: Any = SimpleNamespace(scene=scene, start=scene.initial_qpos({}), effects=(), task=Task())
+    seeds = list[int]()
+
+    def train(env: Any, randomise: Any, config: TrainConfig, **_: Any) -> Any:
+        seeds.append(config.seed)
+        return SimpleNamespace(policy="policy", history=())
+
+    monkeypatch.setattr(cases, "train", train)
+    monkeypatch.setattr(cases, "save_policy", lambda path, policy: path.write_text(policy))
+    known, config = Doors(prior(door_space(scene)), "prior"), TrainConfig()
+    first, made = trained(tmp_path, env, known, config, CODE)
+    assert trained(tmp_path, env, replace(known, method="fitted"), config, {"commit": "two"}) == (first, made)
+    assert made["trained_by"] == CODE and made["trained"] == first.name and seeds == [0]
+    wider = replace(known.gaussian, cov=2 * known.gaussian.cov)
+    others = [
+        (env, known, replace(config, seed=1)),
+        (env, replace(known, method="mean"), config),
+        (env, Doors(wider), config),
+        (SimpleNamespace(**{**vars(env), "task": Task(steps=100)}), known, config),
+    ]
+    assert len({trained(tmp_path, *other, CODE)[0] for other in others} | {first}) == 5
 
 
 @pytest.mark.slow

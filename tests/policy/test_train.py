@@ -18,7 +18,17 @@ from droid_jax.policy.control import OBSERVED
 from droid_jax.policy.door_env import DoorEnv
 from droid_jax.policy.randomise import randomised
 from droid_jax.policy.task import Task
-from droid_jax.policy.train import TrainConfig, _brax, _devices, from_tree, put_replicated, replicated, to_tree, train
+from droid_jax.policy.train import (
+    TrainConfig,
+    _brax,
+    _devices,
+    evaluations_left,
+    from_tree,
+    put_replicated,
+    replicated,
+    to_tree,
+    train,
+)
 
 SHORT = TrainConfig(
     steps=1024, envs=32, unroll=4, batch=8, minibatches=4, epochs=2, evaluations=3, eval_envs=4, hidden=(8, 8)
@@ -105,6 +115,15 @@ def test_the_best_policy_is_kept_and_the_untrained_one_is_no_rival(monkeypatch: 
     found = _brax(MADE_UP, None, SHORT, None, 0, lambda now: None, lambda step, tree: None)
     assert found.policy == 2.0
     assert [(now.step, now.blown_up) for now in found.history] == [(0, 0.25), (100, 0.25), (200, 0.25), (300, 0.25)]
+
+
+@pytest.mark.parametrize("evaluations", [2, 8, 16])
+def test_a_run_that_was_stopped_has_as_many_evaluations_as_one_that_was_not(evaluations: int):
+    config = TrainConfig(evaluations=evaluations)
+    part = config.steps // (evaluations - 1)
+    for over in range(evaluations - 1):
+        assert over + evaluations_left(config, config.steps - over * part) == evaluations
+    assert evaluations_left(config, 1) == 2
 
 
 def test_networks_that_are_no_numbers_end_the_training_and_the_best_stays(monkeypatch: pytest.MonkeyPatch):
