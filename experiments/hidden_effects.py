@@ -197,17 +197,27 @@ def run_search(command: Search) -> dict[str, Any]:
 
 def run_oracle(command: Oracle) -> dict[str, Any]:
     """Every case that the library has forms of."""
-    names = command.cases or tuple(sorted(p.name for p in (command.out / "cases").iterdir()))
+    folder = command.out / "cases"
+    if not folder.is_dir():
+        raise SystemExit(f"error: {folder} is not there; make records the cases again, the same ones for one commit")
+    names = command.cases or tuple(sorted(p.name for p in folder.iterdir()))
     return {"oracles": oracle_all(command.out, names, Bench(), _tell)}
 
 
 def run_score(command: Score) -> dict[str, Any]:
     """Write hidden_effects.json and hand its headline figures on."""
-    limits = json.loads(command.limits.read_text())["scenes"] if command.limits.is_file() else {}
+    if not command.limits.is_file():
+        raise SystemExit(f"error: no detection limits at {command.limits}: give the file of this run (--limits)")
+    limits = json.loads(command.limits.read_text())["scenes"]
     result = score_folder(command.out / "results", command.out / "sealed", limits, command.out / "oracle")
     folder = command.results or command.out
-    write_json(folder / "hidden_effects.json", {**origin(0), **result})
-    write_text(folder / "hidden_effects.md", score_table(result["cases"]))
+    planned = (
+        json.loads((command.out / "made.json").read_text())["scenes"] if (command.out / "made.json").is_file() else {}
+    )
+    unmade = {s: {o: names for o, names in found.items() if o not in ("made", "there")} for s, found in planned.items()}
+    seeds = "each case's own, of the frozen commit's hash and its name"
+    write_json(folder / "hidden_effects.json", {**origin(0), "seed": seeds, "not_made": unmade, **result})
+    write_text(folder / "hidden_effects.md", score_table(result["cases"], result["not_searched"]))
     return result["summary"]
 
 

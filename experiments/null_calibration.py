@@ -4,7 +4,8 @@
 
 Every case draws a robot with all its nuisances and records it; base fit and screening follow.  Only where the
 screening rejects are the other demonstrations recorded and the search taken to its end.  One small JSON a case
-under OUT/null_cases: the run can be stopped and goes on where it was.  Truths and seeds come as in the blind suite.
+under OUT/null_cases: the run can be stopped and goes on where it was, or be made in pieces, scene by scene; every
+summary is of all cases of the commit that are there.  Truths and seeds come as in the blind suite.
 """
 
 from __future__ import annotations
@@ -61,6 +62,8 @@ class Arguments:
     """Two cases of the lone hinge."""
     counts: Counts = field(default_factory=Counts)
     """Cases of each scene."""
+    sum_only: bool = False
+    """Make no case: sum up those that are there."""
     commit: str = "HEAD"
     """Commit that froze the method: seeds derive from it.  "development" draws cases to tune with."""
     out: Path = ROOT / "runs" / "null_calibration"
@@ -121,6 +124,26 @@ def summarise(cases: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
+def name_of(scene: str, number: int) -> str:
+    """Of a case: its seed derives from it."""
+    return f"{scene}/null/{number}"
+
+
+def file_of(scene: str, number: int, commit: str) -> str:
+    """Name of a case's file."""
+    return f"{scene}_{number:03d}_{seed_of(commit, name_of(scene, number)):08x}.json"
+
+
+def cases_of(folder: Path, commit: str) -> dict[str, list[dict[str, Any]]]:
+    """Scene -> its cases that are there; those of other commits, which have other seeds, are left out."""
+    found = dict[str, list[dict[str, Any]]]()
+    for path in sorted(folder.glob("*.json")):
+        scene, number, _ = path.stem.split("_")
+        if path.name == file_of(scene, int(number), commit):
+            found.setdefault(scene, []).append(json.loads(path.read_text()))
+    return found
+
+
 def told(case: dict[str, Any]) -> str:
     """One line."""
     return f"p = {case['p']:.3f}" if "p" in case else f"error: {case['error']}"
@@ -130,19 +153,21 @@ def main() -> None:
     arguments = tyro.cli(Arguments, description=__doc__)
     commit = commit_of(arguments.commit)
     wanted = {"hinge": 2} if arguments.quick else asdict(arguments.counts)
-    found: dict[str, list[dict[str, Any]]] = {}
-    for scene, count in wanted.items():
+    folder = arguments.out / "null_cases"
+    for scene, count in wanted.items() if not arguments.sum_only else ():
         bench = Bench({scene: setting(scene, arguments.out / "door")})
         for number in range(count):
-            name = f"{scene}/null/{number}"
-            path = arguments.out / "null_cases" / f"{scene}_{number:03d}_{seed_of(commit, name):08x}.json"
+            path = folder / file_of(scene, number, commit)
             if not path.is_file():
-                write_json(path, case_of(Plan(name, scene, "none"), commit, bench))
-            found.setdefault(scene, []).append(json.loads(path.read_text()))
-            print(f"{scene} {number}: {told(found[scene][-1])}", flush=True)
+                write_json(path, case_of(Plan(name_of(scene, number), scene, "none"), commit, bench))
+                print(f"{scene} {number}: {told(json.loads(path.read_text()))}", flush=True)
+    found = cases_of(folder, commit)
+    if not found:
+        raise SystemExit(f"error: {folder} holds no case of commit {commit}")
     scenes = {scene: summarise(cases) for scene, cases in found.items()}
     whole = summarise([c for cases in found.values() for c in cases])
-    result = {**origin(0), "seeds_from": commit, "all": whole, "scenes": scenes}
+    other = sum(c.get("code") != commit for cases in found.values() for c in cases)
+    result = {**origin(0), "seeds_from": commit, "by_other_code": other, "all": whole, "scenes": scenes}
     write_json(arguments.out / "null_calibration.json", result)
     print(json.dumps(whole))
 

@@ -139,16 +139,20 @@ def block_length(residuals: np.ndarray) -> float:
     return max(SHORTEST, LENGTH * float(np.median(correlation_time(residuals))))
 
 
-def interleaved(clock: np.ndarray, first: float, end: float, length: float, parts: int = 1) -> np.ndarray:
+def interleaved(
+    clock: np.ndarray, first: float, end: float, length: float, parts: int = 1, share: float = 1.0
+) -> np.ndarray:
     """[parts, K] block of each instant, from `first` to `end`, for parts that take turns.
 
-    Blocks are at least `length` s long.  Raises ValueError where a part would get fewer than FEWEST blocks.
+    Blocks are at least `length` s long.  share: of the log that `first` to `end` is.  Raises ValueError where a part
+    would get fewer than FEWEST blocks; it says how long the log should be.
     """
     each = int((end - first) / length) // parts
     if each < FEWEST:
+        needed = parts * FEWEST * length / share
         raise ValueError(
             f"{end - first:.3g} s hold {each} blocks of {length:.3g} s for each of {parts} parts; "
-            f"{FEWEST} are needed to tell an effect from noise: record for {parts * FEWEST * length:.3g} s or longer"
+            f"{FEWEST} are needed to tell an effect from noise: record for {np.ceil(needed):g} s or longer"
         )
     at = np.floor((clock - first) / (end - first) * parts * each).astype(int)
     inside = (clock >= first) & (clock < end)

@@ -136,8 +136,7 @@ def _before_after(evidence: Evidence, verdict: Verdict) -> np.ndarray:
     rows[:, own] = space.mean[own]
     left = -evidence.cost.whitened(rows).astype(np.float64) / np.sqrt(evidence.repeats)
     normal = columns.T @ columns + np.eye(len(own)) / evidence.repeats  # as in `Evidence.common`
-    best = space.mean[own] - space.std[own] * np.linalg.solve(normal, columns.T @ left.T).T
-    rows[:, own] = np.clip(best, space.low[own], space.high[own])
+    rows[:, own] = space.mean[own] - space.std[own] * np.linalg.solve(normal, columns.T @ left.T).T
     return rows
 
 

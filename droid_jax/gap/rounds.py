@@ -180,11 +180,17 @@ def pruned(hunt: Hunt, model: Model) -> Model:
         start = model.values.copy()
         free = [hunt.case.whole.index(a) for a in part.amplitudes]
         start[free] = hunt.case.whole.mean[free]
-        rest = tuple(c for c in model.parts if c is not part)
-        less = hunt.refit(rest, start, hunt.case.config.refit, f" without {part.name}")
+        less = hunt.refit(without(part, model.parts), start, hunt.case.config.refit, f" without {part.name}")
         if hunt.gap(less) - hunt.gap(model) < OF_ALL * hunt.whole_gap:
             return pruned(hunt, less)
     return model
+
+
+def without(part: Candidate, parts: Sequence[Candidate]) -> tuple[Candidate, ...]:
+    """The other parts; where one of them shares the part's shapes (a speed, a period), it has them from now on."""
+    rest = [c for c in parts if c is not part]
+    heir = next((c for c in rest if c.effect == part.effect and part.shapes and not c.shapes), None)
+    return tuple(replace(c, shapes=part.shapes) if c is heir else c for c in rest)
 
 
 def polished(hunt: Hunt, model: Model) -> Model:

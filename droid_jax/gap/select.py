@@ -21,6 +21,7 @@ CHOSEN = 0.8  # share of the resamples in which an effect, or one that does as w
 RESAMPLES = 400
 TOO_SMALL = "too small to be worth a name"
 AT_BOUND = "ran into its bound"
+UNCONFIRMED = "not confirmed by the other demonstration"
 EDGE = 0.02  # share of a parameter's range that counts as its bound
 
 
@@ -97,7 +98,7 @@ def judge(
         p = one_sided_p(0.5 * (squares[0] - squares[k + 1]))
         chosen = float(winners[same[k]].sum())
         spans = {a: s for a, s in intervals(fit, model).items() if a not in before.amplitudes}
-        weak = [f"not confirmed by the other demonstration (p = {p:.2g})"] if p >= SIGNIFICANT else []
+        weak = [f"{UNCONFIRMED} (p = {p:.2g})"] if p >= SIGNIFICANT else []
         weak += _too_small(fit, model, spans, smallest)
         reasons = _gap_reasons(left[0], left[k + 1], whole_gap, MORE if before.parts else LESS, floor)
         reasons += _amplitude_reasons(fit, model, spans)

@@ -152,9 +152,10 @@ def single_case(
     """
     config = config or GapConfig()
     clock = log.clock
-    end = clock[-1] + 1e-6 if sealed is not None else clock[0] + FITTED * (clock[-1] - clock[0])
+    share = 1.0 if sealed is not None else FITTED
+    end = clock[-1] + 1e-6 if sealed is not None else clock[0] + share * (clock[-1] - clock[0])
     deviation, length = noise_of(log, base, effects, end, config, start)
-    parts = interleaved(clock, clock[0], end, length, 2)
+    parts = interleaved(clock, clock[0], end, length, 2, share)
     name = only_comparison(log).name
     turns = (f"{name}, every other block", f"{name}, the blocks between")
     fit, confirm = (_blocks(log.part(n), deviation, part) for n, part in zip(turns, parts, strict=True))

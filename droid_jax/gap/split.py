@@ -100,9 +100,11 @@ def _check_halves(recording: Recording) -> None:
 def _check_repeats(role: str, recording: Recording) -> None:
     if recording.repeats >= FEWEST:
         return
+    log = recording.repeats == 1 and not recording.command.size
     raise ValueError(
         f"the {role} recording {recording.name!r} has {_repeats(recording)}: with fewer than {FEWEST} no effect can be "
         f"told from chance. {ELSE}"
+        + ("; and one log without repeats and commands, or two of them, are searched in blocks of time" if log else "")
     )
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from droid_jax.gap.localise import Localisation
 from droid_jax.gap.refit import Model
 from droid_jax.gap.screen import Screen
-from droid_jax.gap.select import AT_BOUND, TOO_SMALL, Trial
+from droid_jax.gap.select import AT_BOUND, TOO_SMALL, UNCONFIRMED, Trial
 from droid_jax.gap.trend import Trend
 
 
@@ -84,12 +84,14 @@ class Verdict:
 
     @property
     def _or_lost(self) -> str:
-        """Where a candidate lost for its size alone, it may be all there is."""
-        small = dict.fromkeys(t.name for t in self.trials if t.reasons == (TOO_SMALL,))
-        large = dict.fromkeys(t.name for t in self.trials if t.reasons and all(map(_at_bound, t.reasons)))
+        """Where a candidate lost for its size or its significance alone, it may be all there is."""
+        lost = [t for t in self.trials if t.reasons]
+        small = dict.fromkeys(t.name for t in lost if t.reasons == (TOO_SMALL,))
+        large = dict.fromkeys(t.name for t in lost if all(r.endswith(AT_BOUND) for r in t.reasons))
+        chance = dict.fromkeys(t.name for t in lost if all(r.startswith(UNCONFIRMED) for r in t.reasons))
         return "".join(
             f", or {' or '.join(names)}, {why}"
-            for names, why in ((small, TOO_SMALL), (large, "larger than its bounds allow"))
+            for names, why in ((small, TOO_SMALL), (large, "larger than its bounds allow"), (chance, UNCONFIRMED))
             if names
         )
 
@@ -104,7 +106,3 @@ class Verdict:
             Kind.UNEXPLAINED: f"The model lacks something that is not in the library{self._or_lost}.",
             Kind.UNCONVERGED: f"The fit of {self._unsettled} did not converge; nothing can be concluded.",
         }[self.kind]
-
-
-def _at_bound(reason: str) -> bool:
-    return reason.endswith(AT_BOUND)

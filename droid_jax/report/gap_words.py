@@ -158,8 +158,9 @@ def _next(gap: Gap) -> str:
         "named": f"look for the {named} on the hardware, and simulate with it{_file(gap)}",
         "tie": f"take no name for the cause yet. {_separate(gap)}",
         "partly explained": f"{_kept(gap, named)}, and look at the hardware {_where(gap)}; that part has no name yet",
-        "unexplained": f"look at the hardware {_where(gap)}. The library holds no effect that does this: write one "
-        "of your own, or correct the scene there, and run again. Do not train on this part of the motion",
+        "unexplained": f"look at the hardware {_where(gap)}. No effect of the library passed its trial: where one came "
+        f"close it needs {gap.parts.more}, else write one of your own or correct the scene there, and run again. Do not "
+        "train on this part of the motion",
         "fit not converged": f"{_longer(gap)}give the parameters tighter priors, and run again; take no number from "
         "this page until the starts agree",
     }

@@ -60,15 +60,18 @@ def plans(
     """
     hidden = [n for n in ANSWERS if targets(setting, n)]
     named, strange = [(n,) for n in hidden if inside(n)], [(n,) for n in hidden if not inside(n)]
-    rng = np.random.default_rng(seed_of(commit, f"{setting.name}/plans"))
+
+    def rng(kind: str) -> np.random.Generator:  # one for each class: how many pairs are asked for decides nothing else
+        return np.random.default_rng(seed_of(commit, f"{setting.name}/plans/{kind}"))
+
     pairs = [(*a, *b) for a, b in itertools.combinations(named, 2) if _apart(setting.scene, *a, *b)]
     wanted = [("none", (), 0.0, k) for k in range(counts.none)]
     wanted += [("single", *one, k) for one in itertools.product(named, factors) for k in range(counts.single)]
-    wanted += [("pair", *one) for one in _some(rng, setting, [(p, 3.0) for p in pairs], limits, counts.pair)]
+    wanted += [("pair", *one) for one in _some(rng("pair"), setting, [(p, 3.0) for p in pairs], limits, counts.pair)]
     above = [f for f in factors if f > 1.0]
     wanted += [("outside", *one, k) for one in itertools.product(strange, above) for k in range(counts.outside)]
     left_out = list(itertools.product(named, FACTORS[1:]))
-    wanted += [("left_out", *one) for one in _some(rng, setting, left_out, limits, counts.left_out)]
+    wanted += [("left_out", *one) for one in _some(rng("left_out"), setting, left_out, limits, counts.left_out)]
     return [_plan(setting.name, *one) for one in wanted]
 
 

@@ -22,6 +22,8 @@ CLEAN = ("named", "tie")  # and say that this is all
 OPEN = ("unexplained", "partly explained")
 CLOSED = 0.8  # share of a gap that a named effect has to close
 NAMEABLE = 0.5  # share of the gap that the right names have to close from the truth: less explains nothing
+ANSWERED = ("none", *NAMING, "unexplained")  # verdicts that say something; an error or an unconverged fit does not
+ABOVE = 3.0  # multiple of its detection limit from which an effect counts in the rates of what is named
 SEEN = 0.02  # U above the floor below which a recording shows no gap
 COMPARABLE = 0.5  # of an effect's own size, left over by its library form, up to which amplitudes are compared
 
@@ -32,12 +34,12 @@ Case = Mapping[str, Any]
 def score_folder(results: Path, sealed: Path, limits: Mapping[str, Any], oracles: Path | None = None) -> dict[str, Any]:
     """Everything about all cases with a result.  oracles: folder of what the right names could reach, if known."""
     scenes: dict[str, Any] = {}
-    found = []
+    found, missing = [], dict[str, list[str]]()
     for path in sorted(sealed.glob("*.json")):
-        result = results / path.name
+        result, truth = results / path.name, json.loads(path.read_text())
         if not result.is_file():
+            missing.setdefault(truth["scene"], []).append(path.stem)
             continue
-        truth = json.loads(path.read_text())
         scene = scenes.setdefault(truth["scene"], setting(truth["scene"]).scene)
         names = [list(right(scene, Applied(**h))) for h in truth["hidden"]]
         known = oracles / path.name if oracles else None
@@ -52,8 +54,11 @@ def score_folder(results: Path, sealed: Path, limits: Mapping[str, Any], oracles
         )
     judged = [judge(case, limits) for case in found]
     by_scene = {s: [c for c in judged if c["scene"] == s] for s in sorted(scenes)}
+    hidden = [c for c in judged if c["class"] != "none"]
     return {
         "summary": {scene: summarise(cases) for scene, cases in by_scene.items()},
+        "all_scenes": {"wrong_name_rate": rate(hidden, lambda c: c["wrong_confident"])},
+        "not_searched": missing,
         "by_group": {name: summarise(cases) for name, cases in grouped(judged).items()},
         "confusion": {scene: confusion(cases) for scene, cases in by_scene.items()},
         "commits": sorted({c["truth"]["commit"] for c in found}),
@@ -71,14 +76,15 @@ def judge(case: Case, limits: Mapping[str, Any]) -> dict[str, Any]:
     """One case: what is right and wrong about its verdict."""
     truth, result, right_names = case["truth"], case["result"], case["right"]
     verdict = result["verdict"]
-    slots = [{e, *ties} for e, ties in zip(result.get("effects", ()), result.get("tied", ()), strict=True)]
     if truth["kind"] == "left_out":
         right_names = [[] for _ in right_names]
+    slots = slots_of(result, right_names)
     met = matched(slots, right_names)
     allowed = right_names if truth["kind"] == "left_out" else [*right_names, *case["parts"]]
     false = [sorted(slot) for slot in slots if not any(slot & set(names) for names in allowed)]
     exact = [any(e == names[0] for e in result.get("effects", ())) for names in right_names if names]
-    alone = bool(exact) and all(exact) and not false and not any(result.get("tied", ()))
+    names = result.get("effects", ())
+    alone = bool(exact) and all(exact) and len(names) == len(exact) and not any(result.get("tied", ()))
     seconds = result.get("seconds", {})
     return {
         "name": truth["name"],
@@ -109,6 +115,20 @@ def judge(case: Case, limits: Mapping[str, Any]) -> dict[str, Any]:
         "baselines": against_baselines(case),
         "seconds": seconds,
     }
+
+
+def slots_of(result: Mapping[str, Any], right_names: Sequence[Sequence[str]]) -> list[set[str]]:
+    """The parts of an answer: each effect with its ties.
+
+    A tie of several at once ("a + b" does as well) gives as many answers, where each of them is right.
+    """
+    known, out = {name for names in right_names for name in names}, list[set[str]]()
+    for effect, ties in zip(result.get("effects", ()), result.get("tied", ()), strict=True):
+        slot = {effect, *ties}
+        several = [t.split(" + ") for t in ties if " + " in t]
+        whole = next((names for names in several if known.issuperset(names)), None)
+        out += [slot | {name} for name in whole] if whole else [slot]
+    return out
 
 
 def times_limit(truth: Mapping[str, Any], limits: Mapping[str, Any]) -> dict[str, float]:
@@ -202,9 +222,12 @@ def _label(case: Mapping[str, Any]) -> str:
 
 
 def summarise(judged: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """All rates of some cases, those that do not apply left away."""
-    none = [c for c in judged if c["class"] == "none"]
-    known = [c for c in judged if c["class"] in ("single", "pair")]
+    """All rates of some cases, those that do not apply left away.
+
+    What is named is counted of effects at three times their limit or more; at the limit half shall be detected at all.
+    """
+    none = [c for c in judged if c["class"] == "none" and c["verdict"] in ANSWERED]
+    known = [c for c in judged if c["class"] in ("single", "pair") and c["factor"] >= ABOVE]
     single, pair = [c for c in known if c["class"] == "single"], [c for c in known if c["class"] == "pair"]
     nameable = [c for c in known if (c["reachable"] or 0.0) >= NAMEABLE]
     alone, both = [c for c in nameable if c["class"] == "single"], [c for c in nameable if c["class"] == "pair"]
@@ -232,6 +255,7 @@ def summarise(judged: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "unconverged_or_error": rate(judged, lambda c: c["verdict"] in ("fit not converged", "error")),
         "gap_closed_confirm": closing(named, "confirm"),
         "gap_closed": closing(named, "sealed"),
+        "gap_closed_whatever_was_named": closing([c for c in judged if c["effects"]], "sealed"),
         "within_floor": rate(named, lambda c: bool(c["within_floor"])),
         **{
             f"amplitude_{key}": rate([{"inside": i} for c in named for i in c[key]], lambda c: c["inside"])

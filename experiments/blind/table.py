@@ -7,23 +7,30 @@ from typing import Any
 
 import numpy as np
 
-from experiments.blind.score import CLOSED, NAMEABLE, NAMING, closing, rate
+from experiments.blind.score import ANSWERED, CLOSED, NAMEABLE, NAMING, closing, rate
 
 Case = Mapping[str, Any]
 Chosen = Callable[[Case], bool]
 
 
-def score_table(judged: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown, one column for each scene.  judged: the `cases` of hidden_effects.json."""
+def score_table(judged: Sequence[Mapping[str, Any]], missing: Mapping[str, Sequence[str]]) -> str:
+    """Markdown, one column for each scene.
+
+    judged: the `cases` of hidden_effects.json; missing: scene -> those made and not searched.  Targets are those that
+    were set before the first run.
+    """
     scenes = sorted({c["scene"] for c in judged})
     counts = [sum(c["scene"] == s for c in judged) for s in scenes]
-    heads = [f"{scene} ({count} cases)" for scene, count in zip(scenes, counts, strict=True)]
-    rows = [["", "asked for", *heads], ["---"] * (2 + len(scenes))]
+    heads = [_head(scene, count, len(missing.get(scene, ()))) for scene, count in zip(scenes, counts, strict=True)]
+    rows = [["", "target", *heads], ["---"] * (2 + len(scenes))]
     for label, target, chosen, hit in _rows():
         cells = [_share([c for c in judged if c["scene"] == s and chosen(c)], hit) for s in scenes]
         if any(cells):
             rows.append([label, target, *(c or "-" for c in cells)])
-    rows.append(["sealed gap closed, median", "80 %", *(_closed(judged, s) for s in scenes)])
+    rows.append(
+        ["sealed gap closed where rightly named, median", "80 %", *(_closed(judged, s, _named) for s in scenes)]
+    )
+    rows.append(["the same, whatever was named", "", *(_closed(judged, s, _names) for s in scenes)])
     rows.append(
         ["amplitudes in their 90 % interval", "85 to 95 %", *(_amplitudes(judged, s) for s in scenes)],
     )
@@ -32,12 +39,24 @@ def score_table(judged: Sequence[Mapping[str, Any]]) -> str:
     return "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"
 
 
+def _head(scene: str, count: int, missing: int) -> str:
+    return f"{scene} ({f'{count} of {count + missing}' if missing else count} cases)"
+
+
 def _kind(*kinds: str, factors: Sequence[float] = ()) -> Chosen:
     return lambda c: c["class"] in kinds and (not factors or c["factor"] in factors)
 
 
 def _named(case: Case) -> bool:
     return case["class"] in ("single", "pair") and bool(case["named"])
+
+
+def _names(case: Case) -> bool:
+    return bool(case["effects"])
+
+
+def _answered(case: Case) -> bool:
+    return case["class"] == "none" and case["verdict"] in ANSWERED
 
 
 def _reachable(case: Case) -> bool:
@@ -55,7 +74,7 @@ def _false(case: Case) -> bool:
 def _rows() -> Iterator[tuple[str, str, Chosen, Chosen]]:
     """What is counted, what was asked for, of which cases, and which of them count."""
     at_limit, above = _kind("single", factors=(1.0,)), _kind("single", factors=(3.0, 10.0))
-    yield "nothing hidden: an alarm", "under 1 %", _kind("none"), lambda c: c["verdict"] != "none"
+    yield "nothing hidden: an alarm", "under 1 %", _answered, lambda c: c["verdict"] != "none"
     yield "one at 10 times its limit: named, alone or in a tie", "95 %", _kind("single", factors=(10.0,)), _named
     yield "one at 3 times: named, alone or in a tie", "90 %", _kind("single", factors=(3.0,)), _named
     yield "one at its limit: named, alone or in a tie", "", at_limit, _named
@@ -71,9 +90,10 @@ def _rows() -> Iterator[tuple[str, str, Chosen, Chosen]]:
     yield "anything hidden: wrong and confident", "at most 3 %", _hidden, lambda c: c["wrong_confident"]
     yield "anything hidden: holds a false name", "", _hidden, _false
     yield "anything hidden: stepwise BIC holds a false name", "", _judged_by_bic, lambda c: c["baselines"]["bic_false"]
-    closed = f"named: at least {CLOSED:.0%} of the sealed gap closed"
+    yield "any: error, or fit not converged", "", lambda c: True, lambda c: c["verdict"] not in ANSWERED
+    closed = f"rightly named: at least {CLOSED:.0%} of the sealed gap closed"
     yield closed, "", _named, lambda c: c["closed"].get("sealed", 0.0) >= CLOSED
-    yield "named: sealed gap within two floors of the floor", "all", _named, lambda c: bool(c["within_floor"])
+    yield "rightly named: sealed gap within two floors of the floor", "all", _named, lambda c: bool(c["within_floor"])
     near = "nothing hidden: sealed gap within two floors of the floor"  # what the base model itself leaves
     yield near, "", _kind("none"), lambda c: bool(c["within_floor"])
 
@@ -91,8 +111,8 @@ def _share(cases: Sequence[Case], hit: Chosen) -> str:
     return f"{found['hits']} of {found['of']} ({low:.0f} to {high:.0f} %)"
 
 
-def _closed(judged: Sequence[Mapping[str, Any]], scene: str) -> str:
-    found = closing([dict(c) for c in judged if c["scene"] == scene and _named(c)], "sealed")
+def _closed(judged: Sequence[Mapping[str, Any]], scene: str, chosen: Chosen) -> str:
+    found = closing([dict(c) for c in judged if c["scene"] == scene and chosen(c)], "sealed")
     if found is None:
         return "-"
     low, high = found["interval_95"]

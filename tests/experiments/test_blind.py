@@ -14,7 +14,7 @@ from droid_jax.measure.formats import load
 from droid_jax.measure.hidden import HIDDEN, Applied, possible
 from droid_jax.model.effects.registry import registered
 from droid_jax.model.parameters import Parameter, Space
-from experiments import hidden_effects
+from experiments import hidden_effects, null_calibration
 from experiments.blind import limits, score
 from experiments.blind.answers import ANSWERS, inside, parts, right, targets, without
 from experiments.blind.baselines import bic_outcome
@@ -24,6 +24,7 @@ from experiments.blind.make import Drawn, make, record
 from experiments.blind.marks import Ground, ground
 from experiments.blind.quiet import QUIET, around
 from experiments.blind.scenes import ROLES, Setting, setting
+from experiments.blind.table import score_table
 
 CHEAP = ("hinge", "bench", "arm")
 COMMIT = "0" * 40
@@ -389,6 +390,50 @@ def test_one_tie_does_not_name_both_effects_of_a_pair():
     assert two["met"] == [True, True] and two["named"]
 
 
+def test_a_tie_of_two_effects_at_once_names_both():
+    """ "a, or b and c together": the hidden pair b and c is named, and where only b is hidden c is a false name."""
+    found = case("pair", "tie", ["a"], [["b"], ["c"]], tied=[["b + c"]])
+    judged = score.judge(found, {})
+    assert judged["met"] == [True, True] and judged["named"] and not judged["wrong_confident"] and not judged["alone"]
+    other = score.judge(case("single", "tie", ["a"], [["b"]], tied=[["b + c"]]), {})
+    assert other["met"] == [False] and other["false_names"]
+
+
+def test_two_names_for_one_effect_are_not_named_alone():
+    given = {**case("single", "named", ["bias", "drift"], [["bias"]]), "parts": [["drift"]]}
+    judged = score.judge(given, {})
+    assert judged["named"] and not judged["alone"] and not judged["exact"]
+
+
+def test_no_answer_is_no_alarm_and_the_limit_is_counted_apart():
+    at_limit = case("single", "unexplained", [], [["latch"]])
+    at_limit["truth"]["factor"] = 1.0
+    found = rates(
+        case("none", "none", [], []),
+        case("none", "fit not converged", [], []),
+        case("single", "named", ["latch"], [["latch"]]),
+        at_limit,
+    )
+    assert (found["false_alarm_rate"]["hits"], found["false_alarm_rate"]["of"]) == (0, 1)
+    assert found["named_up_to_tie"]["of"] == 1 and found["unconverged_or_error"]["hits"] == 1
+
+
+def test_the_table_says_how_many_were_not_searched():
+    judged = [score.judge(case("single", "named", ["latch"], [["latch"]]), {})]
+    assert "| s (1 of 3 cases) |" in score_table(judged, {"s": ["s_1", "s_2"]}) and "| s (1 cases) |" in score_table(
+        judged, {}
+    )
+
+
+def test_how_many_pairs_are_asked_for_decides_nothing_else(hinge: Setting):
+    limits = json.loads(LIMITS.read_text())["scenes"]["hinge"]
+    few, many = (plans(hinge, Counts(pair=n), COMMIT, limits) for n in (2, 10))
+    left = [[p.name for p in found if p.kind == "left_out"] for found in (few, many)]
+    assert left[0] == left[1] and left[0]
+    pairs = [[p.name for p in found if p.kind == "pair"] for found in (few, many)]
+    assert pairs[1][:2] == pairs[0]
+
+
 def test_a_case_tells_its_multiple_of_the_limit_and_whose_code_searched():
     known = {"s": {"h0": {"limit": 0.5}}}
     given = case("single", "named", ["latch at door"], [["latch at door"]])
@@ -396,6 +441,35 @@ def test_a_case_tells_its_multiple_of_the_limit_and_whose_code_searched():
     assert judged["times_limit"] == {"h0": abs(given["truth"]["hidden"][0]["amplitude"]) / 0.5}
     other = {**given, "result": {**given["result"], "code": "f" * 40}}
     assert score.by_frozen_code(given) and not score.by_frozen_code(other)
+
+
+def test_a_null_that_was_made_in_pieces_is_summed_up_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """Scene by scene, in any order; cases of another commit lie beside them and do not count."""
+    made = list[str]()
+
+    def case_of(plan: Any, commit: str, bench: Any) -> dict[str, Any]:
+        made.append(plan.name)
+        return {"scene": plan.scene, "p": 0.5, "gap": 0.0, "converged": True, "seconds": {"base": 1.0}, "code": commit}
+
+    def run(*words: str) -> dict[str, Any]:
+        monkeypatch.setattr("sys.argv", ["null_calibration.py", "--out", str(tmp_path), *words])
+        null_calibration.main()
+        return json.loads((tmp_path / "null_calibration.json").read_text())
+
+    def counts(hinge: int, bench: int) -> list[str]:
+        given = {"hinge": hinge, "bench": bench, "arm": 0, "door": 0}
+        return [word for name, n in given.items() for word in (f"--counts.{name}", str(n))]
+
+    monkeypatch.setattr(null_calibration, "case_of", case_of)
+    monkeypatch.setattr(null_calibration, "commit_of", lambda name: name)
+    run("--commit", "b" * 40, *counts(2, 0))
+    run("--commit", COMMIT, *counts(3, 0))
+    found = run("--commit", COMMIT, *counts(0, 2))
+    assert {scene: of["cases"] for scene, of in found["scenes"].items()} == {"hinge": 3, "bench": 2}
+    assert found["all"]["cases"] == 5 and found["by_other_code"] == 0 and len(made) == 7
+    assert run("--commit", COMMIT, "--sum-only")["all"] == found["all"] and len(made) == 7
 
 
 def test_a_search_is_given_the_cases_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -32,9 +32,13 @@ def test_parts_take_turns():
             assert np.all(np.diff(at) == 1) and len(at) >= 1.0 * RATE - 1
 
 
-def test_too_short_a_log_says_how_long_it_should_be():
-    with pytest.raises(ValueError, match="record for 32 s"):
-        interleaved(coarse_clock(0.0, 30.0), 0.0, 20.0, 2.0, 2)
+@pytest.mark.parametrize(("share", "needed"), [(1.0, 32.0), (2 / 3, 48.0)])
+def test_too_short_a_log_says_how_long_it_should_be(share: float, needed: float):
+    """A log of that length is long enough, where the rest of it is sealed too."""
+    with pytest.raises(ValueError, match=f"record for {needed:g} s"):
+        interleaved(coarse_clock(0.0, 30.0), 0.0, 20.0, 2.0, 2, share)
+    clock = coarse_clock(0.0, needed)
+    assert interleaved(clock, 0.0, share * needed + 1e-6, 2.0, 2, share).max() == 7
 
 
 def test_blocks_are_longer_than_the_correlation():

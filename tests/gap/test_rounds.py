@@ -11,7 +11,7 @@ import pytest
 from droid_jax.gap.blocks import OUTSIDE, Blocks
 from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.evidence import Evidence
-from droid_jax.gap.rounds import Budget, Hunt, plainest
+from droid_jax.gap.rounds import Budget, Hunt, plainest, without
 
 
 def model(effect: str, amplitudes: int, shapes: int, left: float) -> Any:
@@ -26,6 +26,18 @@ def test_the_fewest_parameters_lead_and_among_equals_the_smallest_gap() -> None:
     )
     assert plainest([stribeck, coulomb, bias]) == coulomb
     assert plainest([stribeck]) == stribeck
+
+
+def test_a_shape_stays_where_its_effect_does() -> None:
+    """A ripple asked about elsewhere has the count of the one in the model, and keeps it when that one goes."""
+    first = Candidate("ripple", "elbow", ("ripple_elbow",), {"periods": 48.0})
+    second, drag = Candidate("ripple", "wrist", ("ripple_wrist",)), Candidate("drag", "hinge", ("drag",))
+    assert without(first, (first, drag, second)) == (
+        drag,
+        Candidate("ripple", "wrist", ("ripple_wrist",), {"periods": 48.0}),
+    )
+    assert without(second, (first, drag, second)) == (first, drag)
+    assert without(drag, (first, drag)) == (first,)
 
 
 def test_a_budget_says_what_it_left_out() -> None:

@@ -18,7 +18,7 @@ from droid_jax.gap.rank import proposals
 from droid_jax.gap.refit import Model
 from droid_jax.gap.rounds import Hunt
 from droid_jax.gap.screen import Screen, questions_of
-from droid_jax.gap.select import AT_BOUND, TOO_SMALL
+from droid_jax.gap.select import AT_BOUND, TOO_SMALL, UNCONFIRMED
 from droid_jax.gap.verdict import Kind
 from droid_jax.gap.workflow import ask, base_fit, find
 from droid_jax.model.effects.registry import library
@@ -248,3 +248,6 @@ def test_what_lost_for_its_size_alone_is_said(found: Small):
     large = replace(tiny, reasons=(f"its_torque {AT_BOUND}",))
     said = replace(verdict, trials=(large, replace(large, reasons=(*large.reasons, "another reason")))).sentence
     assert said.endswith(f"not in the library, or {large.name}, larger than its bounds allow.")
+    chance = replace(tiny, reasons=(f"{UNCONFIRMED} (p = 0.014)",))
+    said = replace(verdict, trials=(chance, replace(chance, reasons=(*chance.reasons, "another reason")))).sentence
+    assert said.endswith(f"not in the library, or {chance.name}, {UNCONFIRMED}.")
