@@ -159,8 +159,8 @@ def _next(gap: Gap) -> str:
         "tie": f"take no name for the cause yet. {_separate(gap)}",
         "partly explained": f"{_kept(gap, named)}, and look at the hardware {_where(gap)}; that part has no name yet",
         "unexplained": f"look at the hardware {_where(gap)}. No effect of the library passed its trial: where one came "
-        f"close it needs {gap.parts.more}, else write one of your own or correct the scene there, and run again. Do not "
-        "train on this part of the motion",
+        f"close it needs {gap.parts.more}, else write one of your own or correct the scene there, and run again. Do "
+        "not train on this part of the motion",
         "fit not converged": f"{_longer(gap)}give the parameters tighter priors, and run again; take no number from "
         "this page until the starts agree",
     }
