@@ -31,8 +31,8 @@ python -m droid_jax.run [COMMAND] [OPTIONS]
 
 Without a command: [`all`](#all). `droid-jax` is the same program. `--version` says which version it is, `--help` what \
 there is, `--tyro-print-completion bash` (`zsh`, `tcsh`) completes it in a shell. An option with dots takes several \
-values; a switch `--film` is turned off by `--no-film`. Bad input ends with one sentence on stderr and exit code 2, \
-Ctrl-C with exit code 130.
+values; a switch `--film` is turned off by `--no-film`. Bad input ends with one sentence on stderr \
+(an option that does not exist, with those that do) and exit code 2, Ctrl-C with exit code 130.
 """
 
 

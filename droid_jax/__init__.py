@@ -13,6 +13,7 @@ docs/own-robot.md shows the names at work.
 from __future__ import annotations
 
 import importlib
+import inspect
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -123,6 +124,13 @@ class _Room(ModuleType):
         """`droid_jax.identify.pipeline.identify`."""
         return _load("identify.pipeline", "identify")(*args, **kwargs)
 
+    @property
+    def __signature__(self) -> inspect.Signature:
+        """The function's own, for help() and editors."""
+        return inspect.signature(_load("identify.pipeline", "identify"))
+
 
 # The room's own file is empty: importing it loads nothing.
-importlib.import_module(f"{__name__}.identify").__class__ = _Room
+_room = importlib.import_module(f"{__name__}.identify")
+_room.__class__ = _Room
+_room.__doc__ = "The fit; called, it is `droid_jax.identify.pipeline.identify`, whose text says more."

@@ -16,6 +16,7 @@ from typing import Annotated, Any
 import tyro
 
 from droid_jax.commands import convert, evaluate, export, gap, identify, record, report, train, view, whole
+from droid_jax.commands.folder import BEGUN
 
 Command = (
     Annotated[whole.All, tyro.conf.subcommand("all")]
@@ -81,7 +82,7 @@ def _going_on(command: Any) -> str:
     """How an interrupted command goes on, where it can."""
     if not isinstance(command, RESUMED):
         return ""
-    how = "the same command without --again" if command.again else "the same command"
+    how = "the same command without --again" if command.again and BEGUN else "the same command"
     return f"; {how} goes on from here"
 
 

@@ -16,7 +16,7 @@ from droid_jax.commands import evaluate, gap, hidden, identify, report, train, w
 from droid_jax.commands.folder import OtherRun
 from droid_jax.commands.hidden import known_stand_in
 from droid_jax.commands.source import stand_in_of
-from droid_jax.measure.formats import save
+from droid_jax.measure.formats import load, save
 from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
 from droid_jax.run import main
 
@@ -185,6 +185,34 @@ def test_your_own_recordings_know_no_stand_in(called, tmp_path: Path):
     assert called[0].recording == called[1].recording == (Path("a.npz"), Path("b.npz"))
     (tmp_path / "setup.json").write_text(json.dumps({"command": "identify", "recording": ["a.npz", "b.npz"]}))
     assert stand_in_of(tmp_path) == {}
+
+
+def test_a_stand_in_left_over_in_the_folder_is_not_the_robot_of_your_recordings(tmp_path: Path, monkeypatch):
+    """`all` made recordings of its own before: the same names do not make them those of the fit."""
+    monkeypatch.chdir(tmp_path)
+    motions("a.npz", "b.npz")
+    made, stage = tmp_path / "recordings", tmp_path / "identify"
+    made.mkdir()
+    stage.mkdir()
+    (made / "stand_in.json").write_text(json.dumps({"springs": 1, "seed": 0, "hide": []}))
+    own = [load(Path(name)).sha256 for name in ("a.npz", "b.npz")]
+    told = {"command": "identify", "recording": ["a.npz", "b.npz"], "recordings_sha256": own}
+    (stage / "setup.json").write_text(json.dumps(told))
+    assert stand_in_of(stage) == {}
+    for name in ("a.npz", "b.npz"):
+        (tmp_path / name).rename(made / name)
+    assert stand_in_of(stage) == {"springs": 1, "seed": 0, "hide": []}  # moved with the folder
+    (stage / "setup.json").write_text(json.dumps({**told, "recordings_sha256": ["another", "two"]}))
+    assert stand_in_of(stage) == {}
+
+
+def test_nothing_is_recorded_for_stages_that_need_no_recording(called, tmp_path: Path):
+    found(tmp_path / "run" / "identify", [])
+    assert main(["all", "--stages", "train", "evaluate", "--out", "run"]) == 0
+    assert not (tmp_path / "run" / "recordings").exists()
+    assert main(["all", "--hide", "magnetic_catch", "--out", "new"]) == 2
+    assert main(["all", "--hide", "closer[elbow]=1", "--out", "new"]) == 2
+    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize(

@@ -12,13 +12,14 @@ import pytest
 from droid_jax.commands import report
 from droid_jax.commands.evaluate import Evaluate, _robot, _task
 from droid_jax.commands.folder import setup_of, stage_folder
-from droid_jax.commands.source import extended_of, source, stand_in_of
+from droid_jax.commands.source import source, stand_in_of
 from droid_jax.commands.train import Train, _fit_folder, _forget
 from droid_jax.identify.gaussian import prior
 from droid_jax.model.door import door_space
 from droid_jax.model.door_scene import door_scene
 from droid_jax.policy.control import load
 from droid_jax.policy.door_env import DoorEnv
+from droid_jax.report.stages import extended_of
 from droid_jax.run import main
 
 pytestmark = pytest.mark.usefixtures("tuned")

@@ -60,6 +60,7 @@ def run(command: Evaluate) -> None:
     from droid_jax import runtime
 
     runtime.start()
+    from droid_jax.measure.hidden import HIDDEN
     from droid_jax.policy.control import load
     from droid_jax.policy.door_env import DoorEnv
     from droid_jax.policy.simulated import simulated
@@ -94,7 +95,10 @@ def run(command: Evaluate) -> None:
     content = {
         "simulation": inside.to_json(),
         "stand_in": outside.to_json(),
-        "robot": {"truth": truth, "hidden": [dataclasses.asdict(a) for a in robot.hidden]},
+        "robot": {
+            "truth": truth,
+            "hidden": [{**dataclasses.asdict(a), "unit": HIDDEN[a.name].unit} for a in robot.hidden],
+        },
         "setup": setup_now,
         "versions": runtime.versions(),
         "device": runtime.device(),

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from droid_jax.model.scene import Scene
 
 RUNS = Path("runs")  # where results go unless --out says otherwise
+BEGUN = set[Path]()  # folders of the runs that this process began
 HASHED = ("own_effects", "extended")  # options whose file is in no other hash of a setup
 PATHS = ("recording", "scene", "parameters", "fit", "run", *HASHED)  # beside each a setup holds what the file says
 
@@ -98,6 +99,7 @@ def begin(out: Path, setup: dict[str, Any], again: bool, last: str = "config.jso
         shutil.rmtree(out / "checkpoints", ignore_errors=True)
         (out / last).unlink(missing_ok=True)
     write_json(out / "setup.json", setup)
+    BEGUN.add(out)
 
 
 def kept_recordings(

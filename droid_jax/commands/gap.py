@@ -15,6 +15,7 @@ from droid_jax.commands.hidden import hidden_effects, record_stand_in, settled
 from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.presets import TIMESTEP, refine_config, search_config, warn_of_cpu
 from droid_jax.commands.scenes import needs_recording, needs_scene, own_scene, recording_at
+from droid_jax.report.stages import needs_whole
 
 if TYPE_CHECKING:
     import numpy as np
@@ -153,6 +154,7 @@ def values_of(folder: Path, base: Space) -> np.ndarray:
 
     Raises ValueError where there is no whole fit, or one that lacks a parameter of this model.
     """
+    needs_whole(folder)
     try:
         known = {p["name"]: float(p["best"]) for p in json.loads((folder / "fit.json").read_text())["parameters"]}
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -39,9 +39,9 @@ def hidden_effects(entries: Sequence[str] | None, scene: Scene) -> dict[str, flo
     """What --hide says: name or name[joint] -> amplitude.
 
     entries: "name=amplitude" each, or "none" alone; None: one effect of this program's choice.
-    Raises ValueError for what they cannot mean, listing the valid names.
+    Raises ValueError for what they cannot mean, listing the valid names, and for what the scene cannot have.
     """
-    from droid_jax.measure.hidden import hidden_effect, possible
+    from droid_jax.measure.hidden import check, hidden_effect, listed, possible
 
     entries = HIDE if entries is None else tuple(entries)
     if entries in ((), ("none",)):
@@ -57,6 +57,8 @@ def hidden_effects(entries: Sequence[str] | None, scene: Scene) -> dict[str, flo
                 f"There are: {', '.join(possible(scene))}"
             ) from None
         hidden_effect(name.partition("[")[0])
+    for one in listed(found):
+        check(one, scene)
     return found
 
 

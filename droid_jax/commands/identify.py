@@ -104,6 +104,7 @@ def run(command: Identify) -> None:
         report.run(report.Report(out))
         return
     config = config_of(command)
+    _needs_demonstrations(command, given)
     prepare_folder(out)  # only now, with all input read
     recordings, truth = _recordings(command, scene, out, given)
     begin(out, setup, command.again)
@@ -208,6 +209,14 @@ def _given(command: Identify) -> list[Recording]:
     return recordings
 
 
+def _needs_demonstrations(command: Identify, given: list[Recording]) -> None:
+    """ValueError for a demonstration that there is none of."""
+    from droid_jax.measure.demonstration import demonstration_path
+
+    for name in () if given else command.demonstrations or ():
+        demonstration_path(name)
+
+
 def _recordings(
     command: Identify, scene: Scene, out: Path, given: list[Recording]
 ) -> tuple[list[Recording], dict[str, float] | None]:
@@ -230,7 +239,7 @@ def _recordings(
         demonstration = load(demonstration_path(name, gains=gains))
         return record(scene, demonstration, truth, seed=1000 * command.seed + index)
 
-    tag = f"springs{command.springs}_seed{command.seed}"
+    tag = f"springs{command.springs}_seed{command.seed}" + ("_paper" if gains == "paper" else "")
     paths = {name: out / "recordings" / f"{name}_{tag}.npz" for name in names}
     return list(kept_recordings(paths, command.again, recorded).values()), truth
 

@@ -6,7 +6,7 @@ import importlib.util
 import sys
 from pathlib import Path
 
-from droid_jax.commands.source import setup
+from droid_jax.report.stages import setup
 
 
 def load_effects(path: Path | None, *folders: Path | None) -> None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib.util
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from droid_jax.commands.hidden import known_stand_in
+from droid_jax.report.files import GAUSSIAN
+from droid_jax.report.stages import extended_of, left_over, needs_whole, setup, unfinished
 
 if TYPE_CHECKING:
     from droid_jax.identify.gaussian import Gaussian
@@ -16,14 +18,13 @@ if TYPE_CHECKING:
     from droid_jax.model.seam import Effect
 
 TIMESTEP = 0.004  # s
-GAUSSIAN = "gaussian.json"
 
 
 def source(folder: Path | None, knob: int) -> tuple[Scene, Gaussian, tuple[Effect, ...]]:
     """The scene to train in, the Gaussian in a folder of `identify`, `gap` or `train`, and the effects of its model.
 
     folder: None for the prior of the built-in door.
-    Raises ValueError where the folder holds no Gaussian, or one of another scene or servo.
+    Raises ValueError where the folder holds no Gaussian, one of another scene or servo, or a run that is not whole.
     """
     from droid_jax.gap.extended import load_extended
     from droid_jax.identify.gaussian import load, prior
@@ -33,6 +34,7 @@ def source(folder: Path | None, knob: int) -> tuple[Scene, Gaussian, tuple[Effec
     scene = door_scene(timestep=TIMESTEP, limits=True, knob=knob)
     if folder is None:
         return scene, prior(door_space(scene)), ()
+    needs_whole(folder)
     other = setup(folder)
     if other.get("preset") == "paper" and "generations" in other:
         raise ValueError(f"{folder} was fitted with the paper's stiff servo: train on a fit of another preset")
@@ -71,27 +73,21 @@ def model_folder(whole: Path) -> Path:
     named.
 
     A search in other recordings than the fit's, left over from an earlier run, does not count.
+    Raises ValueError for a verdict that cannot be read.
     """
+    path = whole / "gap" / "gap.json"
     try:
-        named = bool(json.loads((whole / "gap" / "gap.json").read_text())["effects"])
-    except FileNotFoundError:
-        named = False
-    fit, gap = (setup(whole / stage).get("recordings_sha256") for stage in ("identify", "gap"))
-    stale = fit is not None and gap is not None and gap[: len(fit)] != fit
-    return whole / ("gap" if named and not stale else "identify")
+        named = path.is_file() and bool(json.loads(path.read_text())["effects"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} is damaged ({error}): run gap again with --again") from None
+    return whole / ("gap" if named and "gap" not in left_over(whole) else "identify")
 
 
 def has_model(folder: Path) -> bool:
     """Whether there is something in a folder that a policy can be trained on."""
+    if unfinished(folder):
+        return False
     return (folder / GAUSSIAN).is_file() or extended_of(folder) is not None
-
-
-def extended_of(folder: Path) -> Path | None:
-    """The extended model that a run's Gaussian belongs to: its own file, or the one that it was told to fit."""
-    from droid_jax.gap.extended import FILE
-
-    told = setup(folder).get("extended")
-    return folder / FILE if (folder / FILE).is_file() else Path(told) if told else None
 
 
 def stand_in_of(folder: Path | None) -> dict[str, Any]:
@@ -101,27 +97,22 @@ def stand_in_of(folder: Path | None) -> dict[str, Any]:
         return known.get("stand_in", {})
     if known.get("recording"):  # as named where the command ran; those of `all` lie beside its stages
         beside = [folder.parent / "recordings" / Path(name).name for name in known["recording"]] if folder else []
-        return known_stand_in(known["recording"]) or known_stand_in(beside)
+        hashes = known.get("recordings_sha256", [])
+        return next((known_stand_in(at) for at in (known["recording"], beside) if _hold(at, hashes)), {})
     return {k: known[k] for k in ("springs", "seed", "hide") if k in known}
 
 
-def fingerprint(folder: Path | None) -> str | None:
-    """Hash of what a policy is trained on; None for the prior."""
-    if folder is None:
-        return None
-    files = [folder / GAUSSIAN, extended_of(folder)]
-    return hashlib.sha256(b"".join(f.read_bytes() for f in files if f is not None and f.is_file())).hexdigest()
+def _hold(paths: Sequence[str | Path], hashes: Sequence[str]) -> bool:
+    """Whether these files are there and hold the recordings of these hashes: others may have their names."""
+    from droid_jax.measure.formats import load
+
+    try:
+        return [load(path).sha256 for path in paths] == list(hashes)
+    except (OSError, ValueError):
+        return False
 
 
 def needs_brax() -> None:
     """ValueError that says what to install where brax is not."""
     if importlib.util.find_spec("brax") is None:
-        raise ValueError("policies need brax: pip install -e '.[train]' in the checkout")
-
-
-def setup(folder: Path) -> dict[str, Any]:
-    """setup.json of a run's folder; empty where there is none."""
-    try:
-        return json.loads((folder / "setup.json").read_text())
-    except (OSError, ValueError):
-        return {}
+        raise ValueError("policies need brax: in the checkout, pip install -c constraints.txt -e '.[train]'")

@@ -12,17 +12,9 @@ from droid_jax.commands import report
 from droid_jax.commands.folder import RUNS, begin, finished, setup_of
 from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.presets import warn_of_cpu
-from droid_jax.commands.source import (
-    GAUSSIAN,
-    extended_of,
-    fingerprint,
-    has_model,
-    model_folder,
-    needs_brax,
-    source,
-    stand_in_of,
-)
-from droid_jax.report.files import FILMS, POLICY, TRAINING, TRANSFER
+from droid_jax.commands.source import has_model, model_folder, needs_brax, source, stand_in_of
+from droid_jax.report.files import FILMS, GAUSSIAN, POLICY, TRAINING, TRANSFER
+from droid_jax.report.stages import extended_of, fingerprint
 
 if TYPE_CHECKING:
     from droid_jax.identify.gaussian import Gaussian
@@ -78,7 +70,7 @@ def run(command: Train) -> None:
     from droid_jax.policy.network import save_policy
     from droid_jax.policy.train import train
     from droid_jax.report.progress import training
-    from droid_jax.storage import write_json
+    from droid_jax.storage import write_bytes, write_json
 
     out, fit = command.out, _fit_folder(command)
     load_effects(command.own_effects, fit)
@@ -97,7 +89,7 @@ def run(command: Train) -> None:
     gaussian.save(out / GAUSSIAN)
     model = None if fit is None else extended_of(fit)
     if model is not None:
-        shutil.copyfile(model, out / FILE)
+        write_bytes(out / FILE, model.read_bytes())
     board = out / FOLDER if command.tensorboard else None
     with training(config.steps) as show, scalars(board) as write:
 
@@ -165,6 +157,8 @@ def _fit_folder(command: Train) -> Path | None:
     Raises ValueError where a fit is asked for and there is none.
     """
     if command.fit is not None:
+        if not command.fit.is_dir():
+            raise ValueError(f"--fit {command.fit} is no folder")
         whole = model_folder(command.fit)
         return whole if has_model(whole) else command.fit
     for folder in (RUNS / "identify", model_folder(RUNS / "all")):

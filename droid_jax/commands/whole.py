@@ -18,6 +18,7 @@ from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.scenes import needs_recording, needs_scene
 from droid_jax.commands.source import model_folder, needs_brax
 from droid_jax.report.files import TRANSFER
+from droid_jax.report.stages import left_over
 
 Stage = Literal["identify", "gap", "train", "evaluate"]
 STAGES: tuple[Stage, ...] = typing.get_args(Stage)
@@ -75,7 +76,7 @@ class All:
     stages: tuple[Stage, ...] = STAGES
     """Which stages; those left out are read from the folder where they are in it."""
     tensorboard: bool = False
-    """Write scalars for TensorBoard while it fits and trains, to OUT/identify/ and OUT/train/tensorboard."""
+    """Write scalars for TensorBoard while it fits and trains, to OUT/identify/tensorboard and OUT/train/tensorboard."""
     out: Path = Path("runs/all")
     """Results folder, with one folder for each stage. A run that was interrupted goes on from where it was."""
     again: bool = False
@@ -104,6 +105,7 @@ def run(command: All) -> None:
     check_scale(command.effect_scale)
     load_effects(command.own_effects)
     roles = _roles(command)
+    _needs_hidden(command)
     out = prepare_folder(command.out)
     _run_stages(command, out, roles)
     page = report.write(out)
@@ -129,7 +131,7 @@ def _run_stages(command: All, out: Path, roles: tuple[str, ...]) -> None:
     Where one fails, the page of those before it is written.
     """
     plan = _plan(command, out, command.recording or _recordings(out), roles)
-    if not command.recording:
+    if _records(command):
         plan = {"record": lambda: _record(command), **plan}
     for number, (stage, run_stage) in enumerate(plan.items(), 1):
         began = time.monotonic()
@@ -142,6 +144,19 @@ def _run_stages(command: All, out: Path, roles: tuple[str, ...]) -> None:
                     print(f"report of what is done: {report.write(out)}")
             raise
         print(f"[{number}/{len(plan)}] {stage}: {(time.monotonic() - began) / 60:.1f} minutes", flush=True)
+
+
+def _records(command: All) -> bool:
+    """Whether the stand-in robot records: the stages after the search need no recording."""
+    return not command.recording and bool({*IN_A_SCENE} & {*command.stages})
+
+
+def _needs_hidden(command: All) -> None:
+    """ValueError for what the stand-in robot cannot hide, rather now than when the folder is there."""
+    from droid_jax.model.door_scene import door_scene
+
+    if _records(command):
+        hidden_effects(command.hide, door_scene())
 
 
 def _roles(command: All) -> tuple[str, ...]:
@@ -201,17 +216,19 @@ def told(out: Path) -> list[str]:
     """One line for each stage that has a result."""
     from droid_jax.report.words import percent
 
-    lines = []
+    lines, old = [], left_over(out)
+    if old:
+        lines.append(f"not on the page: {' and '.join(sorted(old))}, of an earlier run in this folder")
     if fit := _json(out / "identify" / "fit.json"):
         unit = fit.get("torque_unit", "N m")
         gaps = [f"{name} {g['before']:.3f} -> {g['after']:.3f} {unit}" for name, g in fit["gap"].items()]
         lines.append(f"identify: torque distance on repeats that were not fitted: {', '.join(gaps)}")
-    if found := _json(out / "gap" / "gap.json"):
+    if found := None if "gap" in old else _json(out / "gap" / "gap.json"):
         role, size = list(found["gaps"].items())[-1]
         closed = size["closed"]
         share = "" if closed is None else f"; {percent(closed)} of the gap U closed on the {role} motion"
         lines.append(f"gap: {found['sentence']}{share}")
-    for name, of in (_json(out / "train" / TRANSFER) or {}).items():
+    for name, of in {} if "train" in old else (_json(out / "train" / TRANSFER) or {}).items():
         if name in ("simulation", "stand_in"):
             low, high = of["interval_95"]
             where = {"simulation": "in simulation", "stand_in": "on the stand-in robot"}[name]

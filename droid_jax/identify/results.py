@@ -62,6 +62,8 @@ def write_run(
     write_npz(folder / "correlation.npz", {"names": np.array(found.full.names), "correlation": correlation})
     if mjcf is not None:
         write_text(folder / "fitted.xml", mjcf)
+    else:
+        (folder / "fitted.xml").unlink(missing_ok=True)  # of a fit before
     if samples is not None:
         drawn = samples()
         write_npz(folder / "distribution.npz", drawn)

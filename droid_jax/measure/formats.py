@@ -113,7 +113,7 @@ def rosbag_reader() -> ModuleType:
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] != "rosbags":
             raise
-        raise ValueError("ROS bags need rosbags: pip install -c constraints.txt -e '.[ros]' in the checkout") from None
+        raise ValueError("ROS bags need rosbags: in the checkout, pip install -c constraints.txt -e '.[ros]'") from None
 
 
 def _load_bags(bags: list[Path], name: str | None, allow_jitter: bool, options: Mapping[str, Any]) -> Recording:

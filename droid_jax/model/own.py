@@ -56,7 +56,8 @@ def _entries(path: Path) -> list[Any]:
     except json.JSONDecodeError as error:
         raise ValueError(f"{path}: not JSON ({error})") from None
     if not isinstance(entries, list) or not entries:
-        raise ValueError(f"{path}: expected a list of parameters, got {type(entries).__name__}")
+        got = "an empty one" if entries == [] else type(entries).__name__
+        raise ValueError(f"{path}: expected a list of parameters, got {got}")
     return entries
 
 

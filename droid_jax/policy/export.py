@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +31,9 @@ def export(folder: Path, policy: Policy) -> float:
     """
     missing = [name for name in ("onnx", "onnxruntime") if importlib.util.find_spec(name) is None]
     if missing:
-        raise ValueError(f"export needs {' and '.join(missing)}: pip install -e '.[export]' in the checkout")
+        raise ValueError(
+            f"export needs {' and '.join(missing)}: in the checkout, pip install -c constraints.txt -e '.[export]'"
+        )
     model = to_onnx(policy)
     apart = difference(policy, model)
     if not apart <= CLOSE:
@@ -40,7 +41,7 @@ def export(folder: Path, policy: Policy) -> float:
     folder.mkdir(parents=True, exist_ok=True)
     save_policy(folder / "policy.npz", policy)
     write_bytes(folder / "policy.onnx", model)
-    shutil.copyfile(control.__file__, folder / "control.py")
+    write_bytes(folder / "control.py", Path(control.__file__).read_bytes())
     return apart
 
 

@@ -1,6 +1,7 @@
 """Names of files that commands write and the page or another command reads; light, for the command line."""
 
 FITTED, REPLAY, REPLAY_FILM = "fitted.xml", "replay.npz", "replay.webp"
+GAUSSIAN, EXTENDED = "gaussian.json", "extended.json"
 POLICY, TRAINING, TRANSFER, FILMS = "policy.npz", "training.json", "transfer.json", "films"
 # Folders in one of `all`, and what is written last in each: its presence says that the run is whole.
 STAGES = {"identify": "config.json", "gap": "gap.json", "train": TRAINING}

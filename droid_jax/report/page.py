@@ -41,6 +41,7 @@ from droid_jax.report.policy_drawings import draw_policy, film_row
 from droid_jax.report.policy_folder import Trained, has_policy, read_policy
 from droid_jax.report.policy_words import policy_summary
 from droid_jax.report.run_folder import Run, has_run, read_run
+from droid_jax.report.stages import left_over
 from droid_jax.report.words import grouped, label, like, number, percent, speaker, summary
 from droid_jax.storage import write_text
 
@@ -106,8 +107,9 @@ def write_report(run: Path) -> Path:
 
 
 def _part(folder: Path, has: Callable[[Path], bool]) -> Path | None:
-    """Where a part of the page is: in the folder, or in a stage's folder in it."""
-    return next((at for at in (folder, *(folder / stage for stage in STAGES)) if has(at)), None)
+    """Where a part of the page is: in the folder, or in a stage's folder in it unless that is of an earlier run."""
+    stages = [folder / stage for stage in STAGES if stage not in left_over(folder)]
+    return next((at for at in (folder, *stages) if has(at)), None)
 
 
 def _nested(html: str) -> Markup:

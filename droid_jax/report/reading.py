@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,7 +46,7 @@ class Reader:
                 arrays = {k: file[k] for k in file.files}
         except FileNotFoundError:
             raise self.fault(f"{path} is missing") from None
-        except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
             raise self.fault(f"{path} cannot be read ({error})") from None
         self.need(arrays, keys, path.name)
         return arrays

@@ -17,7 +17,9 @@ _COUNTS = ("generation", "iteration", "step")  # what a progress value counts wi
 def needs_writer(wanted: bool) -> None:
     """ValueError that says what to install where scalars are wanted and nothing can write them."""
     if wanted and importlib.util.find_spec("tensorboardX") is None:
-        raise ValueError("--tensorboard needs tensorboardX: pip install -e '.[tensorboard]' in the checkout")
+        raise ValueError(
+            "--tensorboard needs tensorboardX: in the checkout, pip install -c constraints.txt -e '.[tensorboard]'"
+        )
 
 
 @contextlib.contextmanager

@@ -31,7 +31,9 @@ def frames(folder: str | Path) -> Frames:
     Raises ImportError where pandas is not installed, ValueError where the folder holds no whole fit.
     """
     if importlib.util.find_spec("pandas") is None:
-        raise ImportError("droid_jax.frames needs pandas: pip install -e '.[frames]' in the checkout")
+        raise ImportError(
+            "droid_jax.frames needs pandas: in the checkout, pip install -c constraints.txt -e '.[frames]'"
+        )
     import pandas as pd
 
     folder = Path(folder)

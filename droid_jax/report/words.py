@@ -9,18 +9,20 @@ from typing import Any
 
 from droid_jax.report.run_folder import Run
 
+SIDES = {"left", "right"}  # of a robot with two arms, whose joints the number alone does not tell
+
 
 def label(name: str) -> str:
     """A name as it is read: "hinge_stiffness" -> "Hinge stiffness", "panda_joint3" -> "Joint 3".
 
-    "torque_offset[panda_joint3]" -> "Torque offset, joint 3".
+    "torque_offset[panda_joint3]" -> "Torque offset, joint 3"; "left_joint3" stays "Left joint3".
     """
     indexed = re.fullmatch(r"(.+)\[(.+)\]", name)
     if indexed:
         return f"{label(indexed[1])}, {label(indexed[2]).lower()}"
-    joint = re.fullmatch(r"(?:\w+_)?joint_?(\d+)", name)
-    if joint:
-        return f"Joint {joint[1]}"
+    joint = re.fullmatch(r"(?:(\w+)_)?joint_?(\d+)", name)
+    if joint and not SIDES & set((joint[1] or "").split("_")):
+        return f"Joint {joint[2]}"
     words = name.replace("_", " ").strip()
     return words[:1].upper() + words[1:]
 

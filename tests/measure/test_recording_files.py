@@ -162,7 +162,7 @@ def test_bags_without_the_package_say_what_to_install(tmp_path: Path, monkeypatc
     for name in ("rosbags", "rosbags.highlevel"):
         monkeypatch.setitem(sys.modules, name, None)
     (tmp_path / "a.bag").write_text("x")
-    with pytest.raises(ValueError, match=r"ROS bags need rosbags: pip install .* '\.\[ros\]' in the checkout"):
+    with pytest.raises(ValueError, match=r"ROS bags need rosbags: in the checkout, pip install .* '\.\[ros\]'"):
         load(tmp_path / "a.bag", joints=JOINTS, torque=make().torque)
     with pytest.raises(ValueError, match="ROS bags need rosbags"):  # several, which convert reads by itself
         convert.run(convert.Convert(source=(tmp_path / "a.bag", tmp_path / "a.bag"), joints=JOINTS, torque="link"))

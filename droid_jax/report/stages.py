@@ -1,0 +1,71 @@
+"""Runs' folders to one another: what a run was told, whether it is whole, what a policy's doors came from.
+
+Light: commands ask before anything is imported that takes time.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from droid_jax.report.files import EXTENDED, GAUSSIAN, STAGES
+
+
+def setup(folder: Path) -> dict[str, Any]:
+    """setup.json of a run's folder; empty where there is none."""
+    try:
+        return json.loads((folder / "setup.json").read_text())
+    except (OSError, ValueError):
+        return {}
+
+
+def unfinished(folder: Path) -> bool:
+    """Whether a run began in a folder and is not whole: what lies there may be an earlier run's."""
+    return bool(setup(folder)) and not any((folder / last).is_file() for last in STAGES.values())
+
+
+def needs_whole(folder: Path) -> None:
+    """ValueError for a folder whose run is not whole."""
+    if unfinished(folder):
+        raise ValueError(f"{folder} holds a run that is not whole: run its command again, it goes on from where it was")
+
+
+def extended_of(folder: Path) -> Path | None:
+    """The extended model that a run's Gaussian belongs to: its own file, or the one that it was told to fit."""
+    told = setup(folder).get("extended")
+    return folder / EXTENDED if (folder / EXTENDED).is_file() else Path(told) if told else None
+
+
+def fingerprint(folder: Path | None) -> str | None:
+    """Hash of what a policy is trained on; None for the prior."""
+    if folder is None:
+        return None
+    files = [folder / GAUSSIAN, extended_of(folder)]
+    return hashlib.sha256(b"".join(f.read_bytes() for f in files if f is not None and f.is_file())).hexdigest()
+
+
+def left_over(whole: Path) -> frozenset[str]:
+    """Stages in a folder of `all` that belong to an earlier run of it.
+
+    A search in other recordings, or with another scene, than the fit's; a policy of another fit than the folder's.
+    """
+    fit, gap, train = (setup(whole / stage) for stage in STAGES)
+    out = set[str]()
+    if fit and gap and _apart(fit, gap):
+        out.add("gap")
+    trained_on = Path(train.get("fit") or "").name
+    if trained_on in ("identify", "gap"):
+        stale = trained_on in out or train.get("fit_sha256") != fingerprint(whole / trained_on)
+        out |= {"train"} if stale else set()
+    return frozenset(out)
+
+
+def _apart(fit: dict[str, Any], gap: dict[str, Any]) -> bool:
+    """Whether a search was made in something else than was fitted; presets have time steps of their own."""
+    recorded, searched = (of.get("recordings_sha256") for of in (fit, gap))
+    if recorded is None or searched is None:
+        return False
+    same_scene = fit.get("preset") != gap.get("preset") or fit.get("scene_sha256") == gap.get("scene_sha256")
+    return searched[: len(recorded)] != recorded or not same_scene

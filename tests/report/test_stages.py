@@ -1,0 +1,71 @@
+"""What belongs together in a folder of `all`, and which runs are whole."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from droid_jax.gap import extended
+from droid_jax.report.files import EXTENDED, GAUSSIAN, STAGES
+from droid_jax.report.stages import extended_of, fingerprint, left_over, needs_whole, unfinished
+
+
+def run(whole: Path, stage: str, last: bool = True, files: dict[str, str] | None = None, **setup: Any) -> Path:
+    """A stage's folder with a setup, results and what is written last."""
+    folder = whole / stage
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "setup.json").write_text(json.dumps({"preset": "quick", **setup}))
+    for name, text in (files or {}).items():
+        (folder / name).write_text(text)
+    if last:
+        (folder / STAGES[stage]).write_text("{}")
+    return folder
+
+
+def whole_run(place: Path, robot: str = "one") -> Path:
+    run(place, "identify", recordings_sha256=[robot], files={GAUSSIAN: robot})
+    gap = run(place, "gap", recordings_sha256=[robot, "sealed"], files={EXTENDED: robot})
+    run(place, "train", fit=str(gap), fit_sha256=fingerprint(gap))
+    return place
+
+
+def test_what_was_made_together_belongs_together(tmp_path: Path):
+    assert left_over(whole_run(tmp_path)) == frozenset()
+    assert left_over(tmp_path / "nothing") == frozenset()
+
+
+def test_stages_of_an_earlier_robot_are_left_over(tmp_path: Path):
+    run(whole_run(tmp_path), "identify", recordings_sha256=["two"])
+    assert left_over(tmp_path) == {"gap", "train"}
+    run(tmp_path, "gap", recordings_sha256=["two", "sealed"], files={EXTENDED: "two"})
+    assert left_over(tmp_path) == {"train"}  # of another model now
+
+
+def test_a_search_in_another_scene_is_left_over(tmp_path: Path):
+    run(tmp_path, "identify", recordings_sha256=["one"], scene_sha256="a")
+    run(tmp_path, "gap", recordings_sha256=["one"], scene_sha256="b")
+    assert left_over(tmp_path) == {"gap"}
+    run(tmp_path, "gap", recordings_sha256=["one"], scene_sha256="b", preset="standard")  # with a time step of its own
+    assert left_over(tmp_path) == frozenset()
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_run_is_whole_with_what_is_written_last(tmp_path: Path, stage: str):
+    folder = run(tmp_path, stage, last=False, files={GAUSSIAN: "of an earlier run"})
+    assert unfinished(folder)
+    with pytest.raises(ValueError, match="holds a run that is not whole: run its command again"):
+        needs_whole(folder)
+    run(tmp_path, stage)
+    assert not unfinished(folder)
+    (tmp_path / GAUSSIAN).write_text("given by hand")
+    assert not unfinished(tmp_path)
+
+
+def test_the_extended_model_is_the_folders_own_or_the_one_that_was_fitted(tmp_path: Path):
+    assert extended.FILE == EXTENDED
+    told = run(tmp_path, "identify", extended="elsewhere/extended.json")
+    assert extended_of(told) == Path("elsewhere/extended.json") and extended_of(tmp_path) is None
+    assert extended_of(run(tmp_path, "gap", files={EXTENDED: "{}"})) == tmp_path / "gap" / EXTENDED
