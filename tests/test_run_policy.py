@@ -39,7 +39,16 @@ def fit(folder: Path, door, **setup) -> Path:
     """A folder as `identify` leaves one."""
     prior(door_space(door).select(["hinge_stiffness", "hinge_damping"])).save(folder / "gaussian.json")
     (folder / "setup.json").write_text(json.dumps(setup))
+    (folder / "config.json").write_text("{}")
     return folder
+
+
+def test_a_fit_that_is_not_whole_is_refused(scene, tmp_path: Path):
+    """Started over and stopped: what lies there is of the run before."""
+    folder = fit(tmp_path, scene, springs=2, seed=7, recording=[])
+    (folder / "config.json").unlink()
+    with pytest.raises(ValueError, match="holds a run that is not whole"):
+        source(folder, knob=0)
 
 
 def test_a_fit_brings_its_gaussian_and_its_stand_in(scene, tmp_path: Path):
@@ -102,7 +111,7 @@ def test_without_a_fit_there_is_the_prior(scene):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["train", "--fit", "nowhere"], "nowhere holds no gaussian.json"),
+        (["train", "--fit", "nowhere"], "--fit nowhere is no folder"),
         (["train"], "there is no fit in runs/identify or runs/all: give --fit FOLDER, or --method prior"),
         (["train", "--method", "mean"], "there is no fit in runs/identify or runs/all"),
         (["evaluate", "--trials", "0"], "--trials must be 1 or more, got 0"),
@@ -230,13 +239,3 @@ def test_train_evaluate_export(scene, tmp_path: Path, capsys: pytest.CaptureFixt
 def test_a_policy_of_another_task_is_refused(tmp_path: Path):
     with pytest.raises(ValueError, match="was trained for a task with patience; train it again"):
         _task(tmp_path, {"steps": 10, "patience": 3})
-
-
-def test_a_moved_run_knows_its_stand_in(tmp_path: Path):
-    """Recordings are named as seen from where the command ran; those of `all` lie beside its stages."""
-    (tmp_path / "recordings").mkdir()
-    (tmp_path / "recordings" / "stand_in.json").write_text('{"springs": 2, "seed": 1, "hide": []}')
-    (tmp_path / "identify").mkdir()
-    named = ["elsewhere/recordings/C.npz", "elsewhere/recordings/B.npz"]
-    (tmp_path / "identify" / "setup.json").write_text(json.dumps({"command": "identify", "recording": named}))
-    assert stand_in_of(tmp_path / "identify") == {"springs": 2, "seed": 1, "hide": []}
