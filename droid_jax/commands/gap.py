@@ -112,6 +112,8 @@ def run(command: Gap) -> None:
     config = config_of(command)
     prepare_folder(out)  # only now, with all input read
     begin(out, setup, command.again, "gap.json")
+    if command.again:
+        _forget(out)
     assert command.springs is not None  # settled
     roles = roles or record_stand_in(scene, hidden, out, command.springs, command.seed, command.again)
     case, verdict, seconds = searched(split, scene, base, effects, roles, config, out / "checkpoints", start)
@@ -125,6 +127,14 @@ def run(command: Gap) -> None:
     write_gap(out, case, verdict, description)
     shutil.rmtree(out / "checkpoints" / "replays", ignore_errors=True)
     _done(out)
+
+
+def _forget(out: Path) -> None:
+    """Remove what belongs to a search that was made here before."""
+    from droid_jax.gap.extended import FILE, MJCF
+
+    for name in ("gap.npz", FILE, MJCF):
+        (out / name).unlink(missing_ok=True)
 
 
 def shared_out(scene: Scene, given: list[Recording]) -> tuple[Split, dict[str, Recording]]:

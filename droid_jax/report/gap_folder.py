@@ -117,8 +117,8 @@ class Gap:
 
 
 def has_gap(folder: Path) -> bool:
-    """Whether a folder holds a search for a missing effect that came to its end."""
-    return (folder / "gap.json").exists()
+    """Whether a folder holds, or should hold, a search for a missing effect."""
+    return any((folder / name).exists() for name in ("gap.json", "gap.npz"))
 
 
 def read_gap(folder: Path) -> Gap:

@@ -32,5 +32,5 @@ def test_what_is_missing_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     with pytest.raises(ValueError, match=r"holds no tables of a fit .*run `python -m droid_jax.run identify` again"):
         dj.frames(tmp_path)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ImportError, match=r"droid_jax.frames needs pandas: pip install"):
+    with pytest.raises(ImportError, match=r"droid_jax.frames needs pandas: in the checkout, pip install"):
         dj.frames(tmp_path)
