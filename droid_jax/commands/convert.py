@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
+
+OF_BAGS = (
+    "joints", "slides", "torque", "gravity", "state_topic", "command_topic", "stiffness", "damping", "command_joints",
+    "command_tolerance", "rate", "stamps",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -68,11 +73,12 @@ def run(command: Convert) -> None:
     if others and strange:
         what = "is no ROS bag" if strange[0].exists() else "does not exist"
         raise ValueError(f"{strange[0]} {what}: of several sources each is the bag of one repeat; convert others alone")
+    _needs_effect(command, bags=not strange)
     if others:
         recording = rosbag_reader().read_bags(command.source, **_bag_options(command))
     else:
         usual = {"name": command.name, "allow_jitter": command.allow_jitter}
-        options = _bag_options(command) if command.joints or not strange else usual
+        options = usual if strange else _bag_options(command)
         recording = load(path, resample=command.resample, **options)
     if command.start is not None or command.end is not None:
         first, last = recording.span
@@ -81,6 +87,15 @@ def run(command: Convert) -> None:
     path = save(recording, command.out)
     channels = ", ".join(f"{n} ({len(c.columns)} x {len(c.time)})" for n, c in recording.channels.items())
     print(f"{recording.repeats} repeats of {recording.duration:.1f} s, channels {channels}: {path}")
+
+
+def _needs_effect(command: Convert, bags: bool) -> None:
+    """ValueError for options that would change nothing; a path that does not exist is told as such."""
+    if bags and command.resample:
+        raise ValueError("--resample is for CSV folders; the repeats of ROS bags have one clock already (--rate)")
+    given = [f.name for f in fields(Convert) if f.name in OF_BAGS and getattr(command, f.name) != f.default]
+    if given and not bags and command.source[0].exists():
+        raise ValueError(f"--{given[0].replace('_', '-')} is for ROS bags, and {command.source[0]} is none")
 
 
 def _bag_options(command: Convert) -> dict[str, Any]:

@@ -96,7 +96,8 @@ def begin(out: Path, setup: dict[str, Any], again: bool, last: str = "config.jso
     from droid_jax.storage import write_json
 
     if again:
-        shutil.rmtree(out / "checkpoints", ignore_errors=True)
+        for name in ("checkpoints", "tensorboard"):
+            shutil.rmtree(out / name, ignore_errors=True)
         (out / last).unlink(missing_ok=True)
     write_json(out / "setup.json", setup)
     BEGUN.add(out)

@@ -411,6 +411,21 @@ def test_a_converted_motion_is_called_as_its_file_unless_told_otherwise(tmp_path
     assert load(tmp_path / "csv").name == "slow"
 
 
+def test_options_that_would_change_nothing_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag, out = pulled(tmp_path, "ros1", "run0"), tmp_path / "door.npz"
+    assert convert(bag, "--joints", *JOINTS, "--torque", "link", "--out", out) == 0
+    refused = {
+        (out, "--torque", "link"): f"--torque is for ROS bags, and {out} is none",
+        (out, "--command-topic", "/command"): f"--command-topic is for ROS bags, and {out} is none",
+        (bag, "--joints", *JOINTS, "--torque", "link", "--resample"): "--resample is for CSV folders",
+        (tmp_path / "nowhere", "--torque", "link"): "there is no such file or folder",
+    }
+    for words, said in refused.items():
+        assert convert(*words, "--out", tmp_path / "again.npz") == 2
+        assert said in capsys.readouterr().err
+    assert not (tmp_path / "again.npz").exists()
+
+
 def test_convert_hands_on_what_the_reader_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     paths = [pulled(tmp_path, "ros1", f"run{i}") for i in range(2)]
     said = ["--joints", *JOINTS, "--torque", "link", "--command-topic", "/command", "--rate", "50", "--stamps", "bag"]
