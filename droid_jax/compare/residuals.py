@@ -21,6 +21,7 @@ from droid_jax.measure.recording import Channel, Phase, Recording
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Rollout
 
+ENOUGH = 0.1  # share of the time that two repeats must have measured
 BLOWN_UP = 1e3  # noise units: worse than any replay that kept its numbers
 # Deviation below which a channel's noise is never believed, in the channel's unit.
 MINIMUM_NOISE = {"torque": 0.01, "position": 2e-5, "velocity": 5e-4, "object_angle": 2e-4}
@@ -250,8 +251,8 @@ def _measure(scene: Scene, channel: Channel, clock: np.ndarray, weight: float) -
     kernel = lowpass(time, coarse)
     repeats = smooth(values, mask, kernel)
     seen = _same_filter(kernel, mask, ~np.isnan(repeats), _resampling(clock, time))
-    repeats = _fill(repeats, channel.name)
-    noise = estimate_noise(repeats, minimum=MINIMUM_NOISE[channel.name])
+    repeats, measured = _fill(repeats, channel, coarse)
+    noise = estimate_noise(repeats, minimum=MINIMUM_NOISE[channel.name], measured=measured)
     step = clock[1] - clock[0]
     return Measured(
         name=channel.name,
@@ -311,11 +312,25 @@ def _refuse_constant(channel: Channel) -> None:
             )
 
 
-def _fill(repeats: np.ndarray, name: str) -> np.ndarray:
-    """Gaps in one repeat take the other repeats' mean there; a gap in all is an error."""
+def _fill(repeats: np.ndarray, channel: Channel, clock: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Repeats [N, K, C] whose gaps take the other repeats' mean there, and what was measured.
+
+    Raises ValueError for a gap in all repeats, and for a column that hardly two of several measured: nothing says then
+    how noisy it is.
+    """
     measured = ~np.isnan(repeats)
-    if measured.all():
-        return repeats
-    if not measured.any(axis=0).all():
-        raise ValueError(f"channel {name!r} has a stretch that no repeat measured")
-    return np.where(measured, repeats, np.nanmean(repeats, axis=0)[None])
+    count = measured.sum(axis=0)
+    gaps = np.argwhere(count == 0)
+    if len(gaps):
+        instant, column = gaps[0]
+        raise ValueError(
+            f"channel {channel.name!r}, column {channel.columns[column]!r} has a stretch that no repeat measured, at "
+            f"{clock[instant]:.3g} s: cut the recording there (window), or leave the column away"
+        )
+    alone = np.flatnonzero((count - 1).sum(axis=0) < ENOUGH * len(clock))
+    if len(repeats) > 1 and len(alone):
+        raise ValueError(
+            f"channel {channel.name!r}, column {channel.columns[alone[0]]!r} was measured by one repeat only for most "
+            "of the time, so its noise is not known: leave the column away, or the other repeats"
+        )
+    return (repeats if measured.all() else np.where(measured, repeats, np.nanmean(repeats, axis=0)[None])), measured

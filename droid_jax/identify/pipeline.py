@@ -153,9 +153,18 @@ def identify(
 
     began = time.monotonic()
     base = make_cost(scene, full, fitted, engine=config.engine, config=config.compare, effects=effects)
+    # now, since what is held out may have faults of its own, and those are to be told before anything long
+    plain = replace(config.compare, whitened=False)
+    commanded = all(r.command.size for r in recordings)
+    heldout = base.against(held, plain) if commanded else make_cost(scene, full, held, config=plain, effects=effects)
     first = base.first()
+
+    def cost(rows: np.ndarray) -> np.ndarray:
+        found = np.asarray(first(full.embed(space, rows)), np.float64)
+        return np.where(found == config.compare.non_finite_cost, np.inf, found)  # no parent, whatever others cost
+
     found = search(
-        lambda rows: first(full.embed(space, rows)),
+        cost,
         space,
         config.search,
         checkpoint_dir=checkpoints,
@@ -174,9 +183,6 @@ def identify(
 
     began = time.monotonic()
     report("judge", None)
-    plain = replace(config.compare, whitened=False)
-    commanded = all(r.command.size for r in recordings)
-    heldout = base.against(held, plain) if commanded else make_cost(scene, full, held, config=plain, effects=effects)
     gaps = _gaps(heldout, recordings, full.mean, best)
     seconds["judge"] = time.monotonic() - began
     return Identified(
@@ -219,13 +225,15 @@ def _refined(
 
 
 def starts(full: Space, space: Space, found: Fit) -> np.ndarray:
-    """[3, F] where the refinement begins: the search's best, the initial means, and these with a firm grip.
+    """[2 or 3, F] where the refinement begins: the search's best, the initial means, and these with a firm grip, where
+    the space has the friction of one.
 
     A grip that slips and one that never does are different basins, and neither start finds the other's.
     """
     searched = full.embed(space, found.best[None])[0]
-    firm = {p.name: min(p.high, 4.0 * p.mean) for p in space.parameters if p.name.startswith(("sliding", "torsional"))}
-    return np.stack([searched, full.mean, full.values(firm)])
+    pads = ("sliding_friction", "torsional_friction")
+    firm = {p.name: min(p.high, 4.0 * p.mean) for p in space.parameters if p.name.startswith(pads)}
+    return np.stack([searched, full.mean, *([full.values(firm)] if firm else [])])
 
 
 def grip_hypotheses(space: Space) -> list[dict[str, float]]:
@@ -312,7 +320,9 @@ def _scatter(values: np.ndarray, mask: np.ndarray) -> float | None:
 
 def _smooth_floor(everything: Comparison, held: int) -> tuple[float, ...]:
     """[J] N m, what the noise of the mean of `held` repeats leaves of a smoothed difference."""
-    variance = np.var(everything.channel("torque").noise.repeats, axis=0, ddof=1).mean(axis=0)
+    noise = everything.channel("torque").noise
+    squares = ((noise.repeats - noise.mean) ** 2).sum(axis=0)
+    variance = squares.sum(axis=0) / (noise.count - 1).sum(axis=0)
     return tuple(np.sqrt(variance / held).tolist())
 
 

@@ -254,7 +254,7 @@ class _Problem:
         """[P, D] -> residuals [P, M]; NaN throughout where a replay failed."""
         self.evaluations += len(x)
         residual = np.asarray(self.residuals(self.space.from_search(x)), dtype=np.float64)
-        failed = ~np.isfinite(residual).all(axis=1) | (residual == BLOWN_UP).all(axis=1)
+        failed = ~np.isfinite(residual).all(axis=1) | (residual == BLOWN_UP).any(axis=1)  # of one recording of several
         return np.where(failed[:, None], np.nan, residual)
 
     def differences(self, up: np.ndarray, down: np.ndarray, state: _State) -> tuple[np.ndarray, np.ndarray]:

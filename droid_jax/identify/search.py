@@ -45,7 +45,8 @@ class SearchConfig:
                 draws what a single search with seed + r would draw.
     sigma:      initial step in search coordinates; 1 starts from the prior.
     bounds:     "resample" redraws rows in which a linearly scaled parameter is out of bounds and clips
-                what is still outside after cma.REDRAWS draws; "clip" clips.  Log-scaled ones always clip.
+                what is still outside after cma.REDRAWS draws, and mirrors log-scaled ones at their bounds;
+                "clip" clips both, which leads nowhere where several optima lie beyond their bounds.
     active:     negative weights for the worst rows; None: only when `parents` is None.
     tol_cost:   a restart stops when its best cost fell by less than this share over `patience`
                 generations; 0 never.
@@ -200,7 +201,8 @@ def _generation(run: _Run, cost: Cost, strategy: Strategy, config: SearchConfig)
     space = strategy.space
     running = run.stopped == 0
     x, state = strategy.ask(run.state, run.generation)  # [R, P, D]
-    values = space.from_search(np.asarray(x, np.float64))
+    drawn = np.asarray(x, np.float64)
+    values = space.from_search(drawn if config.bounds == "clip" else mirrored(space, drawn))
     costs = _evaluate(cost, values)  # [R, P]
     if not np.isfinite(costs[running]).any():
         raise ValueError(
@@ -216,6 +218,16 @@ def _generation(run: _Run, cost: Cost, strategy: Strategy, config: SearchConfig)
     _record(run, costs, space.from_search(np.asarray(run.state.mean, np.float64)))
     run.records["seconds"].append(np.full(config.restarts, time.perf_counter() - started))
     _judge(run, config)
+
+
+def mirrored(space: Space, x: np.ndarray) -> np.ndarray:
+    """Search coordinates [..., D] with what lies beyond a bound mirrored at it, and held at the other one.
+
+    The algebra is told the raw draw: were draws beyond a bound evaluated on it, all of them would look alike, selection
+    would pull outwards, and the step size would grow without end where the optimum lies at or beyond a bound.
+    """
+    low, high = space.to_search(space.low), space.to_search(space.high)
+    return np.clip(np.where(x < low, 2 * low - x, np.where(x > high, 2 * high - x, x)), low, high)
 
 
 def _evaluate(cost: Cost, values: np.ndarray) -> np.ndarray:

@@ -10,13 +10,15 @@ stationary in time.  Two sandwiches H^-1 S H^-1 (Huber 1967) ask the data what t
 * within the residual: what the model leaves over is more than noise, and correlated.  S is the
   scatter of the scores of contiguous blocks of time (Kuensch 1989), per column.
 
-Each deviation becomes the largest of the three; correlations stay those of H^-1.
+Each deviation becomes the largest of the three; correlations stay those of H^-1.  The refinement may have
+used a wider prior than the stated one, so as not to be pulled by it; the stated one is what is known of
+that which the demonstration does not tell, and it is put back at the end.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,7 +27,7 @@ from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.refine import Refined
 
 IDENTIFIABLE = 0.25  # posterior deviation over prior deviation below which the data have spoken
-STATED = 1.0  # search units: the deviation of a parameter's stated prior, whatever wider one the refinement uses
+STATED = 1.0  # search units: the deviation of a parameter's stated prior
 POOL = 12  # degrees of freedom with which the ratio over all parameters counts in each one's own
 PARTNER = 0.7  # absolute correlation from which two parameters are called partners
 
@@ -46,7 +48,15 @@ def posterior(refined: Refined, comparisons: Sequence[Comparison]) -> Gaussian:
     channels = [c for comparison in comparisons for c in comparison.channels]
     shapes = [(len(c.columns), c.noise.mean.shape[0]) for c in channels]
     durations = [c.span[1] - c.span[0] for c in channels]
-    return calibrated(refined, [c.deviations() for c in comparisons], time_blocks(shapes, durations))
+    wide = calibrated(refined, [c.deviations() for c in comparisons], time_blocks(shapes, durations))
+    return with_stated_prior(wide, refined.prior)
+
+
+def with_stated_prior(gaussian: Gaussian, used: np.ndarray) -> Gaussian:
+    """The same Gaussian with the stated prior where a wider one was used [D], search units; its mean stays."""
+    missing = 1.0 / np.minimum(used, STATED) ** 2 - 1.0 / used**2
+    cov = np.linalg.inv(np.linalg.inv(gaussian.cov) + np.diag(missing))
+    return replace(gaussian, cov=0.5 * (cov + cov.T))
 
 
 def calibrated(refined: Refined, deviations: Sequence[np.ndarray], block_ids: np.ndarray) -> Gaussian:

@@ -57,41 +57,48 @@ class Noise:
     """Noise of the mean of the repeats, per column, over the coarse clock.
 
     mean: [K, C] of the smoothed repeats.  whitener: [C, K, K]; whitener @ (x - mean) has unit
-    covariance when x is the truth.  repeats: [N, K, C], smoothed.
+    covariance when x is the truth.  repeats: [N, K, C], smoothed; count: [K, C] how many of them were measured.
     """
 
     mean: np.ndarray
     whitener: np.ndarray
     repeats: np.ndarray
+    count: np.ndarray
 
     def stated(self, deviation: np.ndarray) -> Noise:
         """White noise of a stated deviation [C], in the channel's unit, in place of the estimated one."""
         return replace(self, whitener=np.eye(len(self.mean)) / deviation[:, None, None])
 
 
-def estimate_noise(repeats: np.ndarray, *, minimum: float, shrink: float = 0.1) -> Noise:
+def estimate_noise(
+    repeats: np.ndarray, *, minimum: float, shrink: float = 0.1, measured: np.ndarray | None = None
+) -> Noise:
     """Noise of smoothed repeats [N, K, C], whole in time.
+
+    measured: [N, K, C] bool, all unless given; what was not holds the mean of the others, and counts for nothing.
 
     The autocovariance of the repeats about their mean is estimated per column (biased, hence
     positive semi-definite), shrunk towards white noise of the same variance, and never less than
     `minimum` (a deviation in the channel's unit: what one repeat alone would have).  With one
     repeat only `minimum` is used, as white noise.
     """
-    count, length, columns = repeats.shape
+    _, length, columns = repeats.shape
     mean = repeats.mean(axis=0)
+    count = np.full(mean.shape, len(repeats)) if measured is None else measured.sum(axis=0)
+    freedom = (count - 1).sum(axis=0)
     whitener = np.empty((columns, length, length))
     for c in range(columns):
         lags = np.zeros(length)
-        if count > 1:
-            error = repeats[:, :, c] - mean[:, c]
+        if freedom[c] > 0:
+            error = repeats[:, :, c] - mean[:, c]  # zero where it was not measured
             spectrum = np.abs(np.fft.rfft(error, 2 * length, axis=1)) ** 2
-            lags = np.fft.irfft(spectrum.sum(axis=0), 2 * length)[:length] / (length * (count - 1))
+            lags = np.fft.irfft(spectrum.sum(axis=0), 2 * length)[:length] / freedom[c]
         variance = max(lags[0], minimum**2)
         lags = (1 - shrink) * lags
         lags[0] = variance
-        covariance = scipy.linalg.toeplitz(lags) / count
-        whitener[c] = np.linalg.inv(np.linalg.cholesky(covariance))
-    return Noise(mean, whitener, repeats)
+        of_mean = scipy.linalg.toeplitz(lags) / np.sqrt(np.outer(count[:, c], count[:, c]))
+        whitener[c] = np.linalg.inv(np.linalg.cholesky(of_mean))
+    return Noise(mean, whitener, repeats, count)
 
 
 def correlation_time(residuals: np.ndarray, rate: float = RATE) -> np.ndarray:

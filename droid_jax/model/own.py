@@ -78,7 +78,8 @@ def _parameter(scene: Scene, entry: Any, where: str) -> Parameter:
         field, sensor, element = options.pop("field", None), options.pop("sensor", None), options.pop("element")
         if sensor is not None:
             return sensor_parameter(scene.joints, sensor, element, **options)
-        if field == "body_mass" and "mode" not in options:
+        if field == "body_mass" and options.get("mode", Mode.SET) is Mode.SET:
+            options.pop("mode", None)
             return body_mass(scene, element, **options)
         return model_parameter(scene, field, element, options.pop("column", None), **{"unit": "", **options})
     except (ValueError, TypeError) as error:

@@ -7,7 +7,14 @@ import pytest
 
 from droid_jax.identify.gaussian import Gaussian, prior
 from droid_jax.identify.refine import Refined
-from droid_jax.identify.uncertainty import POOL, calibrated, identifiability, not_judged, time_blocks
+from droid_jax.identify.uncertainty import (
+    POOL,
+    calibrated,
+    identifiability,
+    not_judged,
+    time_blocks,
+    with_stated_prior,
+)
 from droid_jax.model.parameters import Parameter, Space
 
 
@@ -337,6 +344,19 @@ def test_a_parameter_without_any_effect_keeps_its_prior():
     fit = fitted(SQUARE * [1.0, 0.0])
     g = calibrated(fit, [exactly(2.0, 20, 16)], one_block(SQUARE))
     np.testing.assert_allclose(np.sqrt(np.diag(g.cov)), [2 / np.sqrt(200), 4.0], rtol=1e-3)
+
+
+def test_what_is_not_seen_is_handed_on_as_wide_as_its_stated_prior():
+    """The refinement's own prior is four times as wide; what the data tell keeps its width and its partners."""
+    fit = fitted(SQUARE * [1.0, 0.0])
+    wide = calibrated(fit, [exactly(2.0, 20, 16)], one_block(SQUARE))
+    handed = with_stated_prior(wide, fit.prior)
+    np.testing.assert_allclose(np.sqrt(np.diag(handed.cov)), [2 / np.sqrt(200), 1.0], rtol=0.02)
+    np.testing.assert_array_equal(handed.mean, wide.mean)
+    np.testing.assert_allclose(with_stated_prior(wide, np.ones(2)).cov, wide.cov, rtol=1e-9)  # none wider was used
+    skewed = fitted(100 * SKEW)
+    told = calibrated(skewed, [exactly(2.0, 40, 30)], one_block(SKEW))
+    np.testing.assert_allclose(with_stated_prior(told, skewed.prior).cov, told.cov, rtol=0.02)
 
 
 def test_loud_repeats_never_leave_more_than_the_prior_of_what_is_not_seen():

@@ -184,6 +184,35 @@ def test_one_repeat_has_the_minimum_as_white_noise():
     np.testing.assert_array_equal(noise.mean, values[0])
 
 
+@pytest.mark.parametrize("absent", [2, 4])
+def test_repeats_that_did_not_measure_a_column_count_for_nothing(absent: int):
+    """Its mean is of fewer repeats, and what fills the gaps says nothing about noise: as if they had not been made."""
+    repeats = np.random.default_rng(3).normal(0, 0.3, (7, 60, 1))
+    repeats[:absent] = repeats[absent:].mean(axis=0)
+    measured = np.ones((7, 60, 1), bool)
+    measured[:absent] = False
+    found, expected = (
+        estimate_noise(repeats, minimum=1e-3, measured=measured),
+        estimate_noise(repeats[absent:], minimum=1e-3),
+    )
+    np.testing.assert_allclose(found.mean, expected.mean)
+    np.testing.assert_allclose(found.whitener, expected.whitener, rtol=1e-6, atol=1e-9)
+    assert (found.count == 7 - absent).all()
+
+
+def test_a_stretch_that_some_repeats_missed_is_believed_less_there():
+    rng, left = np.random.default_rng(4), []
+    measured = np.ones((5, 60, 1), bool)
+    measured[:3, 20:40] = False
+    for _ in range(300):
+        repeats = rng.normal(0, 0.3, (5, 60, 1))
+        repeats = np.where(measured, repeats, np.where(measured, repeats, 0).sum(axis=0) / measured.sum(axis=0))
+        noise = estimate_noise(repeats, minimum=1e-3, measured=measured)
+        left.append(noise.whitener[0] @ -noise.mean[:, 0])
+    square = np.mean(np.square(left), axis=0)
+    assert square[:20].mean() == pytest.approx(1.0, abs=0.15) and square[20:40].mean() == pytest.approx(1.0, abs=0.15)
+
+
 def test_columns_are_estimated_apart():
     rng = np.random.default_rng(1)
     repeats = rng.normal(size=(50, 200, 2)) * [0.1, 1.0]
