@@ -170,9 +170,18 @@ def test_recordings_of_different_joints(place: Path, refused):
 
 
 def test_good_recordings_are_not_refused():
-    scene = door_scene()
+    scene, _ = small_scene()
     roles = {name: record(name) for name in ("fit", "confirm")}
     check_recordings(replace(scene, object_joint="door"), roles)
+
+
+def test_a_hinge_that_opens_downwards_is_refused():
+    """Half of the library would be neutral on it, without a word."""
+    scene, recording = replace(small_scene()[0], object_joint="door"), record("fit")
+    angle = recording.channels["object_angle"]
+    turned = replace(recording, channels={**recording.channels, "object_angle": replace(angle, values=-angle.values)})
+    with pytest.raises(ValueError, match=r"'door' opens towards negative angles .* turn the joint's axis and range"):
+        check_recordings(scene, {"fit": turned, "confirm": record("confirm")})
 
 
 def test_lags_are_measured_in_seconds():

@@ -30,7 +30,7 @@ def run(command: Record) -> None:
     from droid_jax import runtime
 
     runtime.import_mjx()  # the first import of it prints two lines about warp
-    from droid_jax.measure.demonstration import demonstration_path
+    from droid_jax.measure.demonstration import PLANS, demonstration_path
     from droid_jax.measure.formats import load, save
     from droid_jax.measure.surrogate import SurrogateConfig, record, stand_in_truth
     from droid_jax.model.door_scene import door_scene
@@ -38,7 +38,9 @@ def run(command: Record) -> None:
     scene = door_scene(springs=command.springs, gains=command.gains)
     demonstration = load(demonstration_path(command.demonstration, gains=command.gains))
     truth = stand_in_truth(scene, command.springs, command.seed)
-    recording = record(scene, demonstration, truth, seed=command.seed, config=SurrogateConfig(repeats=command.repeats))
+    # one robot, whose demonstrations have noise and errors of grasp of their own
+    seed = 1000 * command.seed + sorted(PLANS).index(command.demonstration)
+    recording = record(scene, demonstration, truth, seed=seed, config=SurrogateConfig(repeats=command.repeats))
     command.out.parent.mkdir(parents=True, exist_ok=True)
     path = save(recording, command.out)
     print(f"stand-in robot recorded {recording.repeats} repeats of {recording.duration:.1f} s: {path}")

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import mujoco
 import numpy as np
 
 from droid_jax.measure.recording import Channel, Recording
 from droid_jax.model.scene import Scene
 
 STILL = 0.01  # rad or m: a robot whose joints all move less stood still
+BACKWARDS = 0.25  # share of the way down that a hinge may also go up and still open downwards
 SHUT = 0.05  # rad or m: the same for the thing that is moved, whose camera is noisy
 MISSED = 0.5  # of the usual travel: a repeat that moves the object by less has missed its grasp
 APART = 0.05  # s: repeats that are further apart in time were not cut alike
@@ -46,27 +48,38 @@ def _check_moves(recording: Recording, where: str) -> None:
 
 
 def _check_object(scene: Scene, recording: Recording, where: str) -> None:
-    each = None if scene.object_joint is None else _travels(recording, scene.object_joint)
-    if each is None:
+    path = None if scene.object_joint is None else _object_path(recording, scene.object_joint)
+    if path is None:
         return
-    usual, least = float(np.nanmedian(each)), int(np.nanargmin(each))
+    _check_direction(scene, path, where)
+    low, high = _ends(path)
+    usual, least = float(np.nanmedian(high - low)), int(np.nanargmin(high - low))
     if usual < SHUT:
         raise ValueError(
             f"{where}: the object joint {scene.object_joint!r} moves by {usual:.2g} only (at least {SHUT:g} is "
             "needed), so nothing about it can be told; record a motion that opens it"
         )
-    if each[least] < MISSED * usual:
+    if (high - low)[least] < MISSED * usual:
         raise ValueError(
-            f"{where}: in repeat {least} the object joint {scene.object_joint!r} moves by {each[least]:.2g}, in most "
-            f"repeats by {usual:.2g}; leave that repeat away if the grasp was missed"
+            f"{where}: in repeat {least} the object joint {scene.object_joint!r} moves by {(high - low)[least]:.2g}, "
+            f"in most repeats by {usual:.2g}; leave that repeat away if the grasp was missed"
         )
 
 
-def _travels(recording: Recording, joint: str) -> np.ndarray | None:
-    """[N] how far the object's joint moves in each repeat, rad or m, NaN where a repeat did not measure it.
+def _check_direction(scene: Scene, path: np.ndarray, where: str) -> None:
+    """A latch, a closer, a spring that peaks: all are written for a hinge that is closed at 0 and opens upwards."""
+    kind = scene.model.jnt_type[scene.id("joint", str(scene.object_joint))]
+    low, high = (float(np.nanmedian(end)) for end in _ends(path))
+    if kind == mujoco.mjtJoint.mjJNT_HINGE and -low > SHUT and max(high, 0.0) < BACKWARDS * -low:
+        raise ValueError(
+            f"{where}: the object joint {scene.object_joint!r} opens towards negative angles (to {low:.2g} rad), and "
+            "the library's effects of a hinge count from 0 towards positive ones: turn the joint's axis and range "
+            "round in the MJCF, and the sign of what was measured"
+        )
 
-    None where no repeat did.
-    """
+
+def _object_path(recording: Recording, joint: str) -> np.ndarray | None:
+    """[N, T] where the object's joint is, rad or m, NaN where it was not measured; None where no repeat did."""
     name = "object_angle" if "object_angle" in recording.channels else "position"
     if name not in recording.channels:
         return None
@@ -74,13 +87,16 @@ def _travels(recording: Recording, joint: str) -> np.ndarray | None:
     if name == "position" and joint not in channel.columns:
         return None
     column = 0 if name == "object_angle" else channel.columns.index(joint)
-    values, seen = channel.values[:, :, column], channel.mask[:, :, column]
-    known = seen.any(axis=1)  # what was not measured in a repeat is no missed grasp
-    if not known.any():
-        return None
-    moved = np.full(len(values), np.nan)
-    moved[known] = np.subtract(*np.nanquantile(np.where(seen, values, np.nan)[known], [0.99, 0.01], axis=1))
-    return moved
+    path = np.where(channel.mask[:, :, column], channel.values[:, :, column], np.nan)
+    return None if np.isnan(path).all() else path
+
+
+def _ends(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least and largest [N] of each repeat but for strays; NaN for one that measured nothing: no missed grasp."""
+    low, high = np.full(len(path), np.nan), np.full(len(path), np.nan)
+    known = ~np.isnan(path).all(axis=1)
+    low[known], high[known] = np.nanquantile(path[known], [0.01, 0.99], axis=1)
+    return low, high
 
 
 def _check_timing(recording: Recording, where: str) -> None:

@@ -15,6 +15,14 @@ import numpy as np
 from droid_jax.measure.clocks import SLACK, check_clock
 from droid_jax.measure.recording import JOINT_CHANNELS, Channel, ObjectPose, Recording, ServoGains
 
+# Of the channels that a replay has, at hinges and at slides; a channel of both says "N m or N".
+UNITS = {
+    "torque": ("N m", "N"),
+    "position": ("rad", "m"),
+    "velocity": ("rad/s", "m/s"),
+    "object_angle": ("rad", "m"),
+}
+
 
 def validate(recording: Recording, *, source: str = "", allow_jitter: bool = False) -> Recording:
     """The recording itself, or ValueError that says what is wrong and where.
@@ -127,8 +135,9 @@ def _check_channel(channel: Channel, key: str, where: str, allow_jitter: bool) -
     here = f"{where}, channel {key!r}"
     if channel.name != key or not re.fullmatch(r"[A-Za-z]\w*", key):
         raise ValueError(f"{here}: a channel's name must be an identifier and equal its key, got {channel.name!r}")
-    if not channel.unit or channel.unit.startswith("deg"):
-        raise ValueError(f"{here}: expected an SI unit such as 'N m', 'rad' or 'm', got {channel.unit!r}")
+    valid = UNITS.get(key, ())
+    if not channel.unit or (valid and not set(channel.unit.split(" or ")) <= set(valid)):
+        raise ValueError(f"{here}: expected the unit {' or '.join(map(repr, valid)) or 'of SI'}, got {channel.unit!r}")
     _check_names(channel.columns, here, "column names")
     n_columns = len(channel.columns)
     _check_array(channel.time, (None,), "f", here, "time [Tc]")

@@ -12,14 +12,20 @@ import numpy as np
 
 from droid_jax.measure.clocks import SLACK, check_clock, resample
 from droid_jax.measure.metadata import metadata_from_json, metadata_to_json, recording_of
-from droid_jax.measure.recording import Channel, Recording
+from droid_jax.measure.recording import JITTER, Channel, Recording
 from droid_jax.storage import new_folder, write_csv, write_text
+
+_TABLES = re.compile(r"recording\.json|command\.csv|\w+_\d+\.csv")  # what a recording's folder consists of
 
 
 def save_csv(recording: Recording, path: Path) -> None:
     """Write a recording, which is taken to be valid; ValueError where the folder holds something else."""
     if path.exists() and not (path / "recording.json").exists() and (path.is_file() or any(path.iterdir())):
         raise ValueError(f"{path}: exists and is not a recording's folder, it is not replaced")
+    if strange := sorted(p.name for p in path.iterdir() if not _TABLES.fullmatch(p.name)) if path.is_dir() else []:
+        raise ValueError(
+            f"{path}: holds {strange[0]} beside a recording, which would be lost: write to another folder, or move it"
+        )
     with new_folder(path) as new:
         write_text(new / "recording.json", metadata_to_json(recording) + "\n")
         if recording.command_names:
@@ -57,6 +63,7 @@ def load_csv(path: Path, interpolate: bool, allow_jitter: bool) -> Recording:
     allow_jitter: accept irregular clocks.
     """
     meta = metadata_from_json(_text(path / "recording.json"), str(path / "recording.json"))
+    allow_jitter = allow_jitter or JITTER in meta.meta
     time, command, names = np.zeros(0), np.zeros((0, 0)), ()
     if meta.commands:
         if not (path / "command.csv").exists():
@@ -123,8 +130,9 @@ def _read_table(path: Path, expected: Sequence[str], full: bool, allow_jitter: b
 
 def _column_order(path: Path, header: list[str], expected: Sequence[str]) -> list[int]:
     """Where the wanted columns stand in the file."""
-    if header[0] != "time":
-        raise ValueError(f"{path}, line 1: the first column must be 'time' (comma separated), got {header[0]!r}")
+    first = header[0] if header else "an empty line"
+    if first != "time":
+        raise ValueError(f"{path}, line 1: the first column must be 'time' (comma separated), got {first!r}")
     names = header[1:]
     twice = sorted({n for n in names if names.count(n) > 1})
     if twice or not names or "" in names:

@@ -7,6 +7,7 @@ was saved and loaded has the same `sha256`.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import os
 from collections.abc import Mapping
@@ -18,7 +19,7 @@ from typing import Any
 from droid_jax.measure.checks import validate
 from droid_jax.measure.csv_folder import load_csv, save_csv
 from droid_jax.measure.npz_file import load_npz, save_npz
-from droid_jax.measure.recording import Recording
+from droid_jax.measure.recording import JITTER, Recording
 
 SUPPORTED = (
     ".npz, a folder with recording.json and CSV files, a ROS 1 .bag, a ROS 2 .mcap or .db3, "
@@ -39,7 +40,8 @@ def load(
 
     name:         replaces the stored name.
     resample:     CSV only: repeats with clocks of their own are interpolated onto the first's.
-    allow_jitter: accept irregular clocks, see `validate`.
+    allow_jitter: accept irregular clocks, see `validate`; a recording that was accepted says so in its `meta`, and is
+                  read without being asked again once it is saved.
     bag_options:  passed to `rosbag.read_bags`; `joints` and `torque` are required for bags.
 
     Raises FileNotFoundError when there is no such path, ValueError for everything in the
@@ -63,7 +65,12 @@ def load(
         raise ValueError(f"{path}: unknown suffix {path.suffix!r}; {_supported()}")
     if name is not None:
         recording = replace(recording, name=name)
-    return validate(recording, source=str(path), allow_jitter=allow_jitter)
+    if not allow_jitter:
+        return validate(recording, source=str(path), allow_jitter=JITTER in recording.meta)
+    with contextlib.suppress(ValueError):
+        return validate(recording, source=str(path))
+    accepted = replace(recording, meta={**recording.meta, JITTER: "accepted when it was read"})
+    return validate(accepted, source=str(path), allow_jitter=True)
 
 
 def save(recording: Recording, path: str | os.PathLike[str]) -> Path:

@@ -31,6 +31,9 @@ class TorqueSide(enum.Enum):
     LINK = "link"  # what arrives behind the gear (a joint torque sensor, a Panda's tau_J)
 
 
+JITTER = "allow_jitter"  # in `meta` of a recording whose irregular clocks were accepted
+
+
 @dataclass(frozen=True)
 class TorqueConvention:
     """What the torque channel holds.

@@ -16,9 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rosbags.highlevel import AnyReader, AnyReaderError
-from rosbags.rosbag1 import ReaderError as Ros1Error
-from rosbags.rosbag2 import ReaderError as Ros2Error
+from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from droid_jax.measure.checks import validate
@@ -107,9 +105,9 @@ def read_bags(
     if strange := [slide for slide in slides if slide not in joints]:
         raise ValueError(f"slides must be among the joints {', '.join(joints)}, got {', '.join(strange)}")
     command_joints = tuple(joints if command_joints is None else command_joints)
-    topics = {state_topic: tuple(joints)}
+    topics = {state_topic: (tuple(joints), "effort")}
     if command_topic is not None:
-        topics[command_topic] = command_joints
+        topics[command_topic] = (command_joints, "position")
     tracks = [_read_bag(bag, topics) for bag in bags]
     use_header = _use_header(tracks, stamps, bags)
 
@@ -145,19 +143,22 @@ def read_bags(
     return validate(recording, source=", ".join(str(bag) for bag in bags))
 
 
-def _read_bag(bag: Path, topics: Mapping[str, tuple[str, ...]]) -> dict[str, _Track]:
-    """topic -> track of one bag."""
+def _read_bag(bag: Path, topics: Mapping[str, tuple[tuple[str, ...], str]]) -> dict[str, _Track]:
+    """topic -> track of one bag.  topics: of each its joints, and the field whose numbers must all be finite."""
     if not bag.exists():
         raise FileNotFoundError(f"no ROS bag at {bag}: there is no such file or folder")
     try:
         # Bags of ROS 2 before Iron in sqlite3 hold no message definitions of their own.
         with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            return {topic: _read_topic(reader, bag, topic, joints) for topic, joints in topics.items()}
-    except (AnyReaderError, Ros1Error, Ros2Error, OSError) as error:
-        raise ValueError(f"{bag}: not a readable ROS bag, or one that was cut off: {error}") from error
+            return {topic: _read_topic(reader, bag, topic, *wanted) for topic, wanted in topics.items()}
+    except Exception as error:  # damaged bags fail in many ways: AssertionError, OverflowError, UnicodeDecodeError, ...
+        if isinstance(error, ValueError) and str(error).startswith(str(bag)):
+            raise
+        what = f"{type(error).__name__}: {error}"
+        raise ValueError(f"{bag}: not a readable ROS bag, or one that was cut off ({what})") from error
 
 
-def _read_topic(reader: AnyReader, bag: Path, topic: str, joints: tuple[str, ...]) -> _Track:
+def _read_topic(reader: AnyReader, bag: Path, topic: str, joints: tuple[str, ...], needed: str) -> _Track:
     connections = [c for c in reader.connections if c.topic == topic]
     if not connections:
         have = ", ".join(sorted({c.topic for c in reader.connections})) or "none"
@@ -174,7 +175,7 @@ def _read_topic(reader: AnyReader, bag: Path, topic: str, joints: tuple[str, ...
         where = f"{bag}, topic {topic!r}, message {number}"
         for offset, names, fields in _samples(message, joints, connection.msgtype, where):
             seen.update(names)
-            picked = _pick(fields, names, joints, where)
+            picked = _pick(fields, names, joints, needed, where)
             if picked is None:
                 continue
             rows.append(picked)
@@ -230,9 +231,9 @@ def _nanoseconds(duration: Any) -> int:
 
 
 def _pick(
-    fields: Mapping[str, np.ndarray], names: tuple[str, ...], joints: tuple[str, ...], where: str
+    fields: Mapping[str, np.ndarray], names: tuple[str, ...], joints: tuple[str, ...], needed: str, where: str
 ) -> dict[str, np.ndarray] | None:
-    """field -> [J] numbers of the joints wanted, without empty fields.
+    """field -> [J] numbers of the joints wanted, without empty fields; finite in the field `needed`.
 
     None when the message has none of them: arm and gripper often share a topic.
     """
@@ -249,7 +250,7 @@ def _pick(
         if len(numbers) != len(names):
             raise ValueError(f"{where}: expected {len(names)} numbers in {field!r}, got {len(numbers)}")
         bad = [j for j, i in zip(joints, order, strict=True) if not np.isfinite(numbers[i])]
-        if bad:
+        if bad and field == needed:
             raise ValueError(f"{where}: {field} of joint {bad[0]!r} is {numbers[names.index(bad[0])]}, not finite")
         picked[field] = numbers[order]
     return picked
@@ -328,7 +329,9 @@ def _channels(
             continue
         values = np.stack([_interpolate(clock, t, fields[field]) for t, fields in states])
         seen = np.stack([~_in_gap(clock, t) for t, _ in states])
-        mask = np.repeat(seen[:, :, None], len(joints), axis=2)
+        mask = seen[:, :, None] & np.isfinite(values)
+        if not mask.any():  # a driver that does not measure it says NaN
+            continue
         unit = " or ".join(dict.fromkeys(slide if joint in slides else hinge for joint in joints))
         channels[name] = Channel(name, unit, joints, clock, values, mask)
     return channels
@@ -372,8 +375,9 @@ def _command(
 
 
 def _initial(channels: Mapping[str, Channel]) -> dict[str, float]:
-    """Joint -> first measured position, mean over repeats; nothing without positions."""
+    """Joint -> first measured position, mean over the repeats that measured it; nothing without positions."""
     if "position" not in channels:
         return {}
     position = channels["position"]
-    return {joint: float(position.values[:, 0, c].mean()) for c, joint in enumerate(position.columns)}
+    first, seen = position.values[:, 0], position.mask[:, 0]
+    return {joint: float(first[seen[:, c], c].mean()) for c, joint in enumerate(position.columns) if seen[:, c].any()}

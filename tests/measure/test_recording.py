@@ -129,7 +129,9 @@ def test_names() -> None:
     r = make()
     refuses(replace(r, command_names=("j1", "j1")), "command", "unique", "j1")
     refuses(with_channel(r, "torque", columns=("j2", "j2")), "'torque'", "unique", "j2")
-    refuses(with_channel(r, "torque", unit="deg"), "'torque'", "SI unit", "'deg'")
+    for wrong in ("mN m", "Nmm", "kg", "°"):
+        refuses(with_channel(r, "torque", unit=wrong), "'torque'", "'N m' or 'N'", repr(wrong))
+    refuses(with_channel(r, "torque", unit="deg"), "'torque'", "'N m' or 'N'", "'deg'")
     refuses(with_channel(r, "torque", name="effort"), "'torque'", "'effort'")
     refuses(replace(r, channels={"a/b": replace(r.channels["torque"], name="a/b")}), "'a/b'", "identifier")
 

@@ -115,6 +115,36 @@ def test_saving_again_replaces_and_leaves_nothing_behind(tmp_path: Path, where: 
     assert os.listdir(tmp_path) == [where]
 
 
+def test_what_lies_beside_a_recording_is_never_lost(tmp_path: Path) -> None:
+    folder = save(make(), tmp_path / "wave")
+    (folder / "raw.bag").write_bytes(b"the only one")
+    with pytest.raises(ValueError, match=r"wave: holds raw\.bag beside a recording, which would be lost"):
+        save(make(), folder)
+    assert (folder / "raw.bag").read_bytes() == b"the only one"
+    (folder / "raw.bag").unlink()
+    save(make(), folder)
+
+
+@pytest.mark.parametrize("where", ["door", "door.npz"])
+def test_an_irregular_clock_is_accepted_once(tmp_path: Path, where: str) -> None:
+    """Who accepted it when it was read need not do so again: `identify` and `gap` have no such option."""
+    recording = make()
+    time = recording.time.copy()
+    time[10:] += 0.02
+    channels = {
+        name: replace(c, time=time) if len(c.time) == len(time) else c for name, c in recording.channels.items()
+    }
+    rough = replace(recording, time=time, channels=channels)
+    path = save(rough, tmp_path / where)
+    with pytest.raises(ValueError, match="irregular rate"):
+        load(path)
+    accepted = load(path, allow_jitter=True)
+    assert load(save(accepted, tmp_path / f"again_{where}")).sha256 == rough.sha256
+    assert (
+        "allow_jitter" not in load(save(make(), tmp_path / where), allow_jitter=True).meta
+    )  # there was nothing to accept
+
+
 @pytest.mark.parametrize("where", ["pull.npz", "pull"])
 def test_a_failed_save_keeps_the_old_file(tmp_path: Path, where: str, monkeypatch) -> None:
     save(make(), tmp_path / where)

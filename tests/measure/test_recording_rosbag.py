@@ -411,6 +411,40 @@ def test_a_converted_motion_is_called_as_its_file_unless_told_otherwise(tmp_path
     assert load(tmp_path / "csv").name == "slow"
 
 
+@pytest.mark.parametrize("field", ["velocity", "position"])
+def test_what_a_driver_does_not_measure_is_masked_and_efforts_must_be_there(tmp_path: Path, field: str) -> None:
+    """joint_state_broadcaster says NaN for interfaces that are not there."""
+    bag = Bag(tmp_path, "ros1", "run")
+    for k, t in enumerate(grid(0.0, 1.0)):
+        bag.state(t, **{field: np.full(2, np.nan) if field == "velocity" or k == 3 else position(np.array([t]))[0]})
+    found = read_bags([bag.write()], joints=JOINTS, torque=TORQUE)
+    if field == "velocity":
+        assert "velocity" not in found.channels and "position" in found.channels
+    else:
+        assert 0 < (~found.channels["position"].mask).sum() <= 6
+    assert found.channels["torque"].mask.all()
+    bad = Bag(tmp_path, "ros1", "bad")
+    for t in grid(0.0, 1.0):
+        bad.state(t, effort=np.array([np.nan, 1.0]))
+    fails([bad.write()], "effort of joint", "not finite")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_damaged_bag_is_one_sentence_with_its_name(tmp_path: Path, kind: str) -> None:
+    path = pulled(tmp_path, kind)
+    file = path if path.is_file() else next(p for p in path.iterdir() if p.suffix != ".yaml")
+    whole, rng = file.read_bytes(), np.random.default_rng(0)
+    for _ in range(30):
+        broken = bytearray(whole)
+        at = int(rng.integers(len(whole)))
+        broken[at : at + 64] = rng.bytes(64)
+        file.write_bytes(bytes(broken[: int(rng.integers(len(whole) // 2, len(whole) + 64))]))
+        try:
+            read_bags([path], joints=JOINTS, torque=TORQUE)
+        except ValueError as error:  # nothing else may come out; some damage is none
+            assert str(path) in str(error) or "clock" in str(error) or "repeats" in str(error), error
+
+
 def test_options_that_would_change_nothing_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag, out = pulled(tmp_path, "ros1", "run0"), tmp_path / "door.npz"
     assert convert(bag, "--joints", *JOINTS, "--torque", "link", "--out", out) == 0
