@@ -97,7 +97,8 @@ def run(command: Gap) -> None:
     fit = None if command.fit is None else stage_folder(command.fit, "identify", "fit.json")
     load_effects(command.own_effects, fit)
     scene, base = model_of(command)
-    given, hidden = given_to(command), hidden_effects(command.hide, scene)
+    given = given_to(command)
+    hidden = {} if given else hidden_effects(command.hide, scene)
     effects = chosen_effects(command, scene, given)
     start = None if fit is None else values_of(fit, base)
     setup = {**setup_of(command), "command": "gap", **fingerprints(scene, base, given)}

@@ -14,7 +14,7 @@ import numpy as np
 from droid_jax.gap.candidates import Candidate, joined
 from droid_jax.gap.evidence import Evidence
 from droid_jax.identify.refine import Hypotheses, RefineConfig, Refined, RefineProgress, chord, refine
-from droid_jax.identify.uncertainty import posterior
+from droid_jax.identify.uncertainty import told
 from droid_jax.model.parameters import Space
 
 REFIT = RefineConfig(iterations=8, hops=0, spreads=0)
@@ -101,11 +101,11 @@ def look(
 
 def deviations(evidence: Evidence, model: Model) -> dict[str, float]:
     """Posterior deviation of every free amplitude, in its own unit, bounds or no bounds."""
-    std = np.sqrt(np.diag(posterior(model.refined, evidence.cost.comparisons).cov))
+    std = np.sqrt(np.diag(told(model.refined, evidence.cost.comparisons).cov))
     return {a: float(std[model.space.index(a)] * model.space[a].std) for a in model.amplitudes}
 
 
 def intervals(evidence: Evidence, model: Model) -> dict[str, tuple[float, float]]:
     """Interval of every free amplitude, in its own unit."""
-    low, high = posterior(model.refined, evidence.cost.comparisons).interval(LEVEL)
+    low, high = told(model.refined, evidence.cost.comparisons).interval(LEVEL)
     return {a: (float(low[model.space.index(a)]), float(high[model.space.index(a)])) for a in model.amplitudes}

@@ -25,7 +25,7 @@ from droid_jax.gap.screen import Screen
 from droid_jax.gap.select import Trial
 from droid_jax.gap.split import ROLES
 from droid_jax.gap.verdict import Verdict
-from droid_jax.identify.uncertainty import posterior
+from droid_jax.identify.uncertainty import told
 from droid_jax.storage import write_json, write_npz
 
 TRACES = ("time", "measured", "scatter", "before", "after")
@@ -215,7 +215,7 @@ def _amplitudes(case: Case, verdict: Verdict) -> list[dict[str, Any]]:
 def _shifts(case: Case, verdict: Verdict) -> list[dict[str, Any]]:
     """How the base parameters moved when the effects came in, against what the base fit thought it knew."""
     columns = case.whole.columns(case.base)
-    deviation = posterior(verdict.base.refined, case.fit.cost.comparisons).physical_std
+    deviation = told(verdict.base.refined, case.fit.cost.comparisons).physical_std
     before, after = verdict.base.values[columns], verdict.model.values[columns]
     return [
         {"name": p.name, "unit": p.unit, "before": b, "after": a, "deviation_before": s}

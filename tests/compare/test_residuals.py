@@ -358,7 +358,7 @@ def test_a_stretch_that_nobody_measured_is_refused(scene: Scene):
     values = np.random.default_rng(0).normal(size=(2, STEPS, 3))
     mask = np.ones(values.shape, bool)
     mask[:, 200:600, 1] = False
-    with pytest.raises(ValueError, match="'torque' has a stretch that no repeat measured"):
+    with pytest.raises(ValueError, match=r"'torque', column 'b' has a stretch that no repeat measured, at 0\.45 s"):
         compare(scene, recording(channel("torque", CLOCK, values, mask=mask)))
 
 

@@ -7,15 +7,16 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from small_log import COULOMB, elbow, elbow_log, elbow_space
 
 from droid_jax.compare.residuals import CompareConfig, make_comparison
-from droid_jax.identify import results
+from droid_jax.identify import pipeline, results
 from droid_jax.identify.fit import on_bound
-from droid_jax.identify.pipeline import WORTH, Identified, IdentifyConfig, _closed, _floor, _scatter, identify
+from droid_jax.identify.pipeline import WORTH, Identified, IdentifyConfig, _closed, _floor, _scatter, identify, split
 from droid_jax.identify.results import write_run
 from droid_jax.identify.search import SearchConfig
 from droid_jax.measure.recording import Channel
@@ -157,6 +158,38 @@ def test_a_fit_without_torques_is_refused_at_once(scene: Scene):
     config = dataclasses.replace(QUICK, compare=CompareConfig(channels={"position": 1.0}))
     with pytest.raises(ValueError, match="compares torques, got the channels position"):
         identify(scene, elbow_space(scene), [elbow_log(0.0, 10.0, 2)], config=config)
+
+
+def test_faults_of_what_is_held_out_are_told_before_the_search(scene: Scene, monkeypatch: pytest.MonkeyPatch):
+    recording = elbow_log(0.0, 10.0, 2)
+    torque = recording.channels["torque"]
+    (held,) = split(recording, QUICK.heldout)[2]
+    mask = torque.mask.copy()
+    mask[held, 300:900] = False
+    faulty = dataclasses.replace(
+        recording, channels={**recording.channels, "torque": dataclasses.replace(torque, mask=mask)}
+    )
+    monkeypatch.setattr(pipeline, "search", lambda *a, **k: pytest.fail("the search began"))
+    with pytest.raises(ValueError, match="'elbow' has a stretch that no repeat measured"):
+        identify(scene, elbow_space(scene), [faulty], config=QUICK)
+
+
+def test_a_replay_that_blows_up_is_no_parent_whatever_the_others_cost(scene: Scene, monkeypatch: pytest.MonkeyPatch):
+    """Forces of kilonewtons cost more than what a blown-up replay is charged."""
+    asked = list[np.ndarray]()
+
+    def search(cost, space, *_, **__):
+        asked.append(cost(np.stack([space.mean, space.mean])))
+        raise KeyboardInterrupt
+
+    def cost_of(*_, **__):
+        return SimpleNamespace(first=lambda: lambda rows: np.array([5000.0, 1000.0]), against=lambda *a: None)
+
+    monkeypatch.setattr(pipeline, "search", search)
+    monkeypatch.setattr(pipeline, "make_cost", cost_of)
+    with pytest.raises(KeyboardInterrupt):
+        identify(scene, elbow_space(scene), [elbow_log(0.0, 10.0, 2)], config=QUICK)
+    np.testing.assert_array_equal(asked[0], [5000.0, np.inf])
 
 
 def test_a_search_imports_nothing_that_it_may_not_need():

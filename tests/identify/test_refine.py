@@ -408,6 +408,24 @@ def test_blown_up_replays_next_door_are_no_information():
     )
 
 
+def test_a_replay_that_blows_up_on_one_recording_of_two_is_no_information():
+    """Of b nothing is known: one side of its difference blows up on the second recording only, and that is no slope."""
+    matrix = np.array([[5.0, 0.0], [1.0, 0.0], [2.0, 0.0]])
+    solved = linear(matrix, matrix @ [0.0, 0.0])
+
+    def both(v, where):
+        one, two = solved(v), np.where(v[:, 1:] > 0.02, 1e3, solved(v))
+        return np.concatenate([two, two] if where == "both" else [one, two], axis=1)
+
+    deviation = {
+        where: np.sqrt(np.diag(np.linalg.inv(refine(lambda v, w=where: both(v, w), BASINS, [1.0, 0.0], FLAT).hessian)))
+        for where in ("both", "second")
+    }
+    np.testing.assert_allclose(deviation["second"], deviation["both"], rtol=0.05)
+    with pytest.raises(ValueError, match="none of the starts could be replayed"):
+        refine(lambda v: np.concatenate([solved(v), np.full((len(v), 3), 1e3)], axis=1), BASINS, [1.0, 0.0], FLAT)
+
+
 def test_what_a_hop_has_found_is_kept():
     def step(v):
         return np.stack([v[:, 0] - 0.7, v[:, 1] + 0.4, np.sqrt(2 * np.where(v[:, 0] < 1.9, 2.0, 0.0))], axis=1)

@@ -39,6 +39,12 @@ def test_an_entry_is_read_as_it_says(tmp_path: Path, scene: Scene):
     assert loaded(tmp_path, scene, height)["arm_pos"].writes[0].index == (scene.id("body", "arm"), 2)
 
 
+def test_a_mass_takes_its_inertia_along_also_where_the_usual_mode_is_stated(tmp_path: Path, scene: Scene):
+    entry = {"field": "body_mass", "element": "arm", "std": 0.1, "high": 3.0}
+    plain, stated = loaded(tmp_path, scene, entry), loaded(tmp_path, scene, {**entry, "mode": "set"})
+    assert plain == stated and len(stated["arm_mass"].writes) == 4 and stated["arm_mass"].unit == "kg"
+
+
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
