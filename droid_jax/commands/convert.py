@@ -57,7 +57,7 @@ class Convert:
     resample: bool = False
     """CSV: repeats with clocks of their own are interpolated onto the first one's."""
     start: float | None = None
-    """Keep the part from here, s."""
+    """Keep the part from here, s. A replay of commands begins at rest: cut where the robot stands still."""
     end: float | None = None
     """Keep the part up to here, s."""
 
