@@ -44,8 +44,9 @@ from droid_jax.policy.control import Policy, load  # noqa: E402
 from droid_jax.policy.door_env import DoorEnv  # noqa: E402
 from droid_jax.policy.task import Task  # noqa: E402
 from droid_jax.policy.transfer import TransferConfig, check_playable, stand_in, transfer  # noqa: E402
+from droid_jax.report.files import POLICY  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
-from experiments.policies.cases import POLICY, TIMESTEP, Case, Options, finish, run_all  # noqa: E402
+from experiments.policies.cases import TIMESTEP, Case, Options, finish, run_all  # noqa: E402
 from experiments.policies.robots import truth_of  # noqa: E402
 from experiments.policies.settings import Setting, setting_of  # noqa: E402
 from experiments.table2 import case as policy_case  # noqa: E402

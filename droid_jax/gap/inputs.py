@@ -51,8 +51,8 @@ def _check_object(scene: Scene, recording: Recording, where: str) -> None:
     path = None if scene.object_joint is None else _object_path(recording, scene.object_joint)
     if path is None:
         return
-    _check_direction(scene, path, where)
     low, high = _ends(path)
+    _check_direction(scene, float(np.nanmedian(low)), float(np.nanmedian(high)), where)
     usual, least = float(np.nanmedian(high - low)), int(np.nanargmin(high - low))
     if usual < SHUT:
         raise ValueError(
@@ -66,10 +66,9 @@ def _check_object(scene: Scene, recording: Recording, where: str) -> None:
         )
 
 
-def _check_direction(scene: Scene, path: np.ndarray, where: str) -> None:
+def _check_direction(scene: Scene, low: float, high: float, where: str) -> None:
     """A latch, a closer, a spring that peaks: all are written for a hinge that is closed at 0 and opens upwards."""
     kind = scene.model.jnt_type[scene.id("joint", str(scene.object_joint))]
-    low, high = (float(np.nanmedian(end)) for end in _ends(path))
     if kind == mujoco.mjtJoint.mjJNT_HINGE and -low > SHUT and max(high, 0.0) < BACKWARDS * -low:
         raise ValueError(
             f"{where}: the object joint {scene.object_joint!r} opens towards negative angles (to {low:.2g} rad), and "

@@ -69,9 +69,11 @@ def write_report(run: Path) -> Path:
     Raises ValueError that names the file when a required one is missing or broken.
     """
     folder = Path(run)
-    gap = read_gap(at) if (at := _part(folder, has_gap)) else None
-    policy = read_policy(at) if (at := _part(folder, has_policy)) else None
-    at = _part(folder, has_run)
+    old = left_over(folder)
+    places = [folder, *(folder / stage for stage in STAGES if stage not in old)]
+    gap = read_gap(at) if (at := _part(places, has_gap)) else None
+    policy = read_policy(at) if (at := _part(places, has_policy)) else None
+    at = _part(places, has_run)
     loaded = read_run(at or folder) if at or not (gap or policy) else None
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
@@ -106,10 +108,9 @@ def write_report(run: Path) -> Path:
     return path
 
 
-def _part(folder: Path, has: Callable[[Path], bool]) -> Path | None:
-    """Where a part of the page is: in the folder, or in a stage's folder in it unless that is of an earlier run."""
-    stages = [folder / stage for stage in STAGES if stage not in left_over(folder)]
-    return next((at for at in (folder, *stages) if has(at)), None)
+def _part(places: Sequence[Path], has: Callable[[Path], bool]) -> Path | None:
+    """Where a part of the page is: in the run's folder, or in that of one of its stages."""
+    return next((at for at in places if has(at)), None)
 
 
 def _nested(html: str) -> Markup:

@@ -252,7 +252,7 @@ def summarise(judged: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "pair_one_named_none_false": rate(pair, lambda c: any(c["met"]) and not c["false_names"]),
         "pair_both_named": rate(pair, lambda c: c["named"]),
         "unexplained_recall": rate(strange, lambda c: c["open"]),
-        "unconverged_or_error": rate(judged, lambda c: c["verdict"] in ("fit not converged", "error")),
+        "unconverged_or_error": rate(judged, lambda c: c["verdict"] not in ANSWERED),
         "gap_closed_confirm": closing(named, "confirm"),
         "gap_closed": closing(named, "sealed"),
         "gap_closed_whatever_was_named": closing([c for c in judged if c["effects"]], "sealed"),

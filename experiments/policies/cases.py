@@ -23,13 +23,13 @@ from droid_jax.policy.simulated import simulated
 from droid_jax.policy.task import Task
 from droid_jax.policy.train import PRESETS, TrainConfig, train
 from droid_jax.policy.transfer import StandIn, transfer
+from droid_jax.report.files import GAUSSIAN, POLICY, TRAINING
 from droid_jax.storage import write_json
 from experiments.policies.sharing import claimed
 from experiments.policies.table import PLACES
 
 TIMESTEP = 0.004  # s, of the simulation that trains
 QUICK_STEPS = 20  # actions of an episode where nothing shall be learned
-GAUSSIAN, POLICY, TRAINING = "gaussian.json", "policy.npz", "training.json"
 RESULTS = Path(__file__).resolve().parents[1] / "results"
 
 

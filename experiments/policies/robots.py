@@ -15,9 +15,10 @@ from droid_jax.model.door import door_nuisances, door_space
 from droid_jax.model.door_scene import door_scene
 from droid_jax.policy.door_env import DoorEnv
 from droid_jax.policy.transfer import StandIn, TransferConfig, stand_in
+from droid_jax.report.files import GAUSSIAN
 from droid_jax.storage import write_json
 from experiments.identify_suite import describe, recordings, settings
-from experiments.policies.cases import GAUSSIAN, TIMESTEP, Options
+from experiments.policies.cases import TIMESTEP, Options
 from experiments.policies.settings import Setting
 from experiments.policies.sharing import claimed
 from experiments.policies.table import SLIPPERY
