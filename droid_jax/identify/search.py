@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 Cost = Callable[[np.ndarray], Any]  # [rows, D] float64 physical values -> [rows]; +inf is a failed row
 
+_NEAR = 1.0  # search coordinates, one prior deviation: so near to a bound the best is tried on it
+
 _REASONS = ("", "tol_cost", "tol_sigma")  # why a restart stopped, by the code kept in checkpoints
 
 
@@ -45,7 +47,8 @@ class SearchConfig:
                 draws what a single search with seed + r would draw.
     sigma:      initial step in search coordinates; 1 starts from the prior.
     bounds:     "resample" redraws rows in which a linearly scaled parameter is out of bounds and clips
-                what is still outside after cma.REDRAWS draws, and mirrors log-scaled ones at their bounds;
+                what is still outside after cma.REDRAWS draws, and mirrors log-scaled ones at their bounds; at the
+                end the best is asked for once more with what lies near a bound on it;
                 "clip" clips both, which leads nowhere where several optima lie beyond their bounds.
     active:     negative weights for the worst rows; None: only when `parents` is None.
     tol_cost:   a restart stops when its best cost fell by less than this share over `patience`
@@ -133,7 +136,8 @@ def search(
                 checkpoints.save(run.generation, run.tree())
             if progress:
                 progress(_progress(run, config))
-    return _fit(run, space, config)
+        asked = _try_bounds(run, cost, space, config)
+    return _fit(run, space, config, asked)
 
 
 def _strategy(space: Space, config: SearchConfig) -> Strategy:
@@ -230,6 +234,32 @@ def mirrored(space: Space, x: np.ndarray) -> np.ndarray:
     return np.clip(np.where(x < low, 2 * low - x, np.where(x > high, 2 * high - x, x)), low, high)
 
 
+def _try_bounds(run: _Run, cost: Cost, space: Space, config: SearchConfig) -> int:
+    """Ask once more for every restart's best, moved onto bounds it lies near; how many rows were asked.
+
+    Mirrored draws come near a bound and never lie on it.  A row that costs no more becomes the best.  Nothing of this
+    is in a checkpoint, so that a search that is continued goes on as it would have.
+    """
+    if config.bounds == "clip" or not np.isfinite(run.best).all():
+        return 0
+    values = np.stack([_moved_onto_bounds(space, best, config.population) for best in run.best])  # [R, P, D]
+    if (values == run.best[:, None]).all():
+        return 0
+    _keep_best(run, values, _evaluate(cost, values), np.ones(config.restarts, bool), ties=True)
+    return values.shape[0] * values.shape[1]
+
+
+def _moved_onto_bounds(space: Space, best: np.ndarray, rows: int) -> np.ndarray:
+    """Values [rows, D]: the best [D] with all its near coordinates on their bounds, then with ever fewer."""
+    x, low, high = (space.to_search(values) for values in (best, space.low, space.high))
+    gap = np.minimum(x - low, high - x)
+    values = np.tile(best, (rows, 1))
+    farthest = [i for i in np.argsort(-gap) if gap[i] <= _NEAR]
+    for k, i in enumerate(farthest[-rows:], start=1):
+        values[:k, i] = (space.low if x[i] - low[i] == gap[i] else space.high)[i]
+    return values
+
+
 def _evaluate(cost: Cost, values: np.ndarray) -> np.ndarray:
     """Costs [R, P] float64 of values [R, P, D] in one batch; +inf where NaN or infinite."""
     rows = values.reshape(-1, values.shape[-1])
@@ -239,11 +269,11 @@ def _evaluate(cost: Cost, values: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(costs), costs, np.inf).reshape(values.shape[:2])
 
 
-def _keep_best(run: _Run, values: np.ndarray, costs: np.ndarray, running: np.ndarray) -> None:
-    """Bring every running restart's best row up to date."""
+def _keep_best(run: _Run, values: np.ndarray, costs: np.ndarray, running: np.ndarray, *, ties: bool = False) -> None:
+    """Bring every running restart's best row up to date, with `ties` also by a row that costs the same."""
     for r in np.flatnonzero(running):
         i = int(np.argmin(costs[r]))
-        if costs[r, i] < run.best_cost[r]:
+        if costs[r, i] < run.best_cost[r] or (ties and costs[r, i] == run.best_cost[r]):
             run.best[r], run.best_cost[r] = values[r, i], costs[r, i]
 
 
@@ -296,8 +326,8 @@ def _progress(run: _Run, config: SearchConfig) -> Progress:
     return Progress(run.generation, config.generations, float(run.best_cost[leader]), median, sigma, run.seconds, left)
 
 
-def _fit(run: _Run, space: Space, config: SearchConfig) -> Fit:
-    """The result, led by the restart with the lowest cost."""
+def _fit(run: _Run, space: Space, config: SearchConfig, asked: int) -> Fit:
+    """The result, led by the restart with the lowest cost; `asked` rows came after the generations."""
     overall = "max_seconds" if run.generation < config.generations else "generations"
     covs, means = run.cov, run.records["mean"][-1]
     restarts = tuple(
@@ -320,7 +350,7 @@ def _fit(run: _Run, space: Space, config: SearchConfig) -> Fit:
         mean=winner.mean,
         cov=winner.cov,
         history=winner.history,
-        evaluations=run.generation * config.restarts * config.population,
+        evaluations=run.generation * config.restarts * config.population + asked,
         failed=run.failed,
         stop=winner.stop,
         on_bound=on_bound(space, winner.best),
