@@ -75,12 +75,12 @@ def demonstration(name: str) -> Recording:
 
 
 @functools.cache
-def record(name: str, repeats: int = 8, preload: float = PRELOAD) -> Recording:
+def record(name: str, repeats: int = 8, preload: float = PRELOAD, friction: float = 0.0) -> Recording:
     """What the stand-in measures."""
     scene, space = small_scene()
     seed = 1 + ("fit", "confirm", "sealed").index(name)
     config = SurrogateConfig(repeats=repeats, timestep=0.00025)
-    hidden = {"hinge_preload": preload} if preload else {}
+    hidden = {name: size for name, size in (("hinge_preload", preload), ("dry_friction[elbow]", friction)) if size}
     return record_hidden(scene, demonstration(name), TRUTH, hidden, seed=seed, config=config, name=name, space=space)
 
 
