@@ -1,76 +1,32 @@
 """Which experiment would tell tied effects apart: what each of them predicts for it.
 
 Every entry of the menu is within reach of whoever gave the fitted demonstration: the same motion on another clock
-(slower, faster, there and back, with a stop half-way), with a known weight at the hand, or in the air, away from
-what the hand held.
+(slower, faster, there and back, with a stop half-way), opened further, with a known weight at the hand, or in the air,
+away from what the hand held.
 """
 
 from __future__ import annotations
 
 import copy
 import itertools
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
+import jax
 import mujoco
 import numpy as np
 
 from droid_jax.compare.cost import Cost, make_cost
 from droid_jax.gap.case import Case
+from droid_jax.gap.reach import FURTHER, opened_further
 from droid_jax.gap.refit import Model
 from droid_jax.gap.verdict import Experiment
-from droid_jax.measure.recording import Channel, Recording
+from droid_jax.gap.warp import MENU, warped
+from droid_jax.measure.recording import Recording
 from droid_jax.model.scene import Scene
 
-STOP = 2.0  # s
 IN_THE_AIR = "the same motion in the air, away from what the hand held"
 WEIGHT, CARRIED = 0.5, "payload_mass"  # kg, and the library's parameter that stands for it
-
-
-@dataclass(frozen=True)
-class Entry:
-    """An experiment of the menu.
-
-    what: in words.  seconds: duration of a motion of `duration` s on the new clock; clock: (new instants [K],
-    duration) -> instants of the demonstration, s from its start.
-    """
-
-    what: str
-    seconds: Callable[[float], float]
-    clock: Callable[[np.ndarray, float], np.ndarray]
-
-
-MENU = (
-    Entry("the same motion three times slower", lambda d: 3 * d, lambda t, d: t / 3),
-    Entry("the same motion twice as fast", lambda d: d / 2, lambda t, d: 2 * t),
-    Entry("the same motion there and back again", lambda d: 2 * d, lambda t, d: np.minimum(t, 2 * d - t)),
-    Entry(
-        f"the same motion with a stop of {STOP:.0f} s half-way",
-        lambda d: d + STOP,
-        lambda t, d: np.where(t < d / 2, t, np.maximum(d / 2, t - STOP)),
-    ),
-)
-
-
-def warped(recording: Recording, entry: Entry) -> Recording:
-    """A recording as if its motion had been made on another clock; its noise comes along."""
-    first, duration = recording.time[0], recording.duration
-
-    def instants(clock: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        step = np.median(np.diff(clock))
-        new = np.arange(0.0, entry.seconds(duration) + 0.5 * step, step)
-        return first + new, first + np.clip(entry.clock(new, duration), 0.0, duration)
-
-    def channel(c: Channel) -> Channel:
-        new, old = instants(c.time)
-        near = np.clip(np.searchsorted(c.time, old), 0, len(c.time) - 1)
-        values = np.nan_to_num(c.values)[:, near]
-        return replace(c, time=new, values=values, mask=c.mask[:, near])
-
-    time, old = instants(recording.time)
-    command = np.stack([np.interp(old, recording.time, column) for column in recording.command.T], axis=1)
-    channels = {name: channel(c) for name, c in recording.channels.items()}
-    return replace(recording, name=entry.what, time=time, command=command, channels=channels, phases=())
 
 
 def untouched(scene: Scene) -> Scene:
@@ -96,6 +52,10 @@ def separating(case: Case, models: Sequence[Model], recording: Recording) -> tup
         other = warped(recording, entry)
         cost = make_cost(known.scene, case.whole, [other], config=config, effects=case.effects)
         found += _experiment(entry.what, cost, values)
+    further = opened_further(known.scene, recording, jax.tree.map(lambda a: a[0], known.rollouts(values[:1])[0]))
+    if further is not None:
+        cost = make_cost(known.scene, case.whole, [further], config=config, effects=case.effects)
+        found += _experiment(FURTHER, cost, values)
     seen = {name: weight for name, weight in config.channels.items() if name != "object_angle"}
     if known.scene.grip is not None and seen:
         alone = replace(config, channels=seen)

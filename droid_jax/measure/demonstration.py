@@ -123,11 +123,21 @@ def grasp_pose(scene: Scene, angle: float, standoff: float, roll: int) -> tuple[
 
 
 def solve_pose(
-    scene: Scene, q: np.ndarray, position: np.ndarray, rotation: np.ndarray, *, iterations: int = 100
+    scene: Scene,
+    q: np.ndarray,
+    position: np.ndarray,
+    rotation: np.ndarray,
+    *,
+    body: str | None = None,
+    iterations: int = 100,
 ) -> np.ndarray:
-    """Damped least squares from q [7] to the pinch pose; raises ValueError where it does not get there."""
+    """Damped least squares from q [J] to a pose of a body's frame, or of the pinch point where none is named.
+
+    Raises ValueError where it does not get there.
+    """
     model, data = scene.model, mujoco.MjData(scene.model)
-    site = scene.id("site", "pinch")
+    frame = data.site("pinch") if body is None else data.body(body)
+    carrier = int(model.site_bodyid[scene.id("site", "pinch")] if body is None else scene.id("body", body))
     jacobian = np.zeros((6, model.nv))
     q = np.array(q, dtype=float)
     error = np.zeros(6)
@@ -135,12 +145,12 @@ def solve_pose(
         data.qpos[scene.joint_qpos] = q
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
-        current = data.site_xmat[site].reshape(3, 3)
-        error[:3] = position - data.site_xpos[site]
+        current = frame.xmat.reshape(3, 3)
+        error[:3] = position - frame.xpos
         error[3:] = 0.5 * np.sum(np.cross(current, rotation, axisa=0, axisb=0), axis=0)
         if np.linalg.norm(error) < 1e-7:
             return q
-        mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], site)
+        mujoco.mj_jac(model, data, jacobian[:3], jacobian[3:], frame.xpos, carrier)
         arm = jacobian[:, scene.joint_dofs]
         q = q + arm.T @ np.linalg.solve(arm @ arm.T + 1e-8 * np.eye(6), error)
     raise ValueError(f"inverse kinematics ended {np.linalg.norm(error):.1e} away from the pose at {position} m")

@@ -10,8 +10,10 @@ import pytest
 from small_gap import record, small
 
 from droid_jax.gap import menu
-from droid_jax.gap.menu import CARRIED, IN_THE_AIR, MENU, STOP, WEIGHT, separating, untouched, warped
+from droid_jax.gap.menu import CARRIED, IN_THE_AIR, WEIGHT, separating, untouched
+from droid_jax.gap.reach import FURTHER
 from droid_jax.gap.refit import Model
+from droid_jax.gap.warp import MENU, STOP, warped
 from droid_jax.measure.demonstration import PLANS, grasp_pose, solve_pose
 from droid_jax.model.door_scene import door_scene
 from droid_jax.model.scene import Grip
@@ -85,6 +87,17 @@ def test_in_the_air_only_the_robot_is_seen(demonstration, monkeypatch):
     plain = cost.whitened(np.stack([m.values for m in rivals])).astype(float)
     assert found[IN_THE_AIR] == pytest.approx(np.linalg.norm(plain[0] - plain[1]), rel=0.2)
     assert IN_THE_AIR not in {e.what for e in separating(case, rivals, demonstration)}
+
+
+def test_a_motion_within_reach_is_on_the_menu(demonstration, monkeypatch):
+    """Where the hand could go on, what the rivals do on that motion counts (here the same motion again)."""
+    monkeypatch.setattr(menu, "MENU", ())
+    monkeypatch.setattr(menu, "opened_further", lambda scene, recording, replayed: recording)
+    case = small().case
+    rivals = (model("drag", 0.0), model("drag", 0.8))
+    found = {e.what: e.apart for e in separating(case, rivals, demonstration)}
+    plain = case.fit.cost.whitened(np.stack([m.values for m in rivals])).astype(float)
+    assert found[FURTHER] == pytest.approx(np.linalg.norm(plain[0] - plain[1]), rel=1e-3)
 
 
 def test_an_untouched_scene_has_no_contact():
