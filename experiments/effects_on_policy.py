@@ -49,6 +49,7 @@ from droid_jax.storage import write_json  # noqa: E402
 from experiments.policies.cases import TIMESTEP, Case, Options, finish, run_all  # noqa: E402
 from experiments.policies.robots import truth_of  # noqa: E402
 from experiments.policies.settings import Setting, setting_of  # noqa: E402
+from experiments.policies.table import column  # noqa: E402
 from experiments.table2 import case as policy_case  # noqa: E402
 
 FACTORS = (1.0, 3.0)  # of the largest amplitude that is usual
@@ -107,14 +108,15 @@ def rows(policy: Policy, setting: Setting, task: Task, arguments: Arguments) -> 
     for hidden in track(effects, "effects", console=Console(stderr=True)):
         applied = [hidden] if hidden else []
         robot = stand_in(scene, start, truth_of(setting), applied, task, config)
-        found = transfer(policy, robot).to_json()
+        found = column([{"stand_in": transfer(policy, robot).to_json(), "seed": setting.robot}], "stand_in")
         yield {
             "hidden": hidden.name if hidden else "nothing",
             "joint": hidden.joint if hidden else "",
             "amplitude": hidden.amplitude if hidden else 0.0,
             "unit": HIDDEN[hidden.name].unit if hidden else "",
             "success_rate": found["success_rate"],
-            "interval_95": found["interval_95"],
+            "interval_95": found["success_interval_95"],
+            "blown_up": found["blown_up"],
             "angle_deg": found["angle_deg"]["mean"],
             "grip": found["grip"]["mean"],
             "stopped": found["stopped"],
@@ -142,14 +144,17 @@ def main() -> None:
     setting = replace(setting_of("paper", arguments.robot), springs=arguments.springs)
     path = arguments.policy or trained(arguments, setting, code)
     policy = load(path)
-    table = list(rows(policy, setting, arguments.budget.task(Task()), arguments))
     of = {
         "springs": arguments.springs,
         "policy": arguments.policy.parent.name if arguments.policy else "prior",
         "policy_sha256": sha256(path),
     }
-    write_json(arguments.summary("effects_on_policy"), {**of, "rows": table, **code})
-    felt = [r for r in table if r["success_rate"] < table[0]["success_rate"] - 0.2]
+    table = list[dict[str, Any]]()
+    for row in rows(policy, setting, arguments.budget.task(Task()), arguments):
+        table.append(row)
+        write_json(arguments.summary("effects_on_policy"), {**of, "rows": table, **code})
+    known, usual = [r for r in table if r["success_rate"] is not None], table[0]["success_rate"] or 0.0
+    felt = [r for r in known if r["success_rate"] < usual - 0.2]
     names = [f"{r['hidden']}{'[' + r['joint'] + ']' if r['joint'] else ''}={r['amplitude']:g}" for r in felt]
     print(json.dumps({"effects": len(table) - 1, "felt": names}))
 

@@ -51,7 +51,7 @@ from droid_jax.policy.transfer import TransferConfig, check_playable, stand_in  
 from droid_jax.storage import write_json  # noqa: E402
 from experiments.policies.cases import TIMESTEP, Case, Doors, Options, finish, found_of, made_by, run_all, tried  # noqa: E402
 from experiments.policies.sharing import claimed  # noqa: E402
-from experiments.policies.table import PLACES, apart, column  # noqa: E402
+from experiments.policies.table import PLACES, apart, column, rates  # noqa: E402
 
 MODELS = ("prior", "base", "extended")
 BASE, SETUP = "base.json", "setup.json"
@@ -167,11 +167,12 @@ def main() -> None:
     playable(arguments)
     every = itertools.product(arguments.policies, MODELS)
     planned = [planned_case(model, seed, arguments, code) for seed, model in every]
+    found_of(planned)  # ends here, and not after the search, where they were made with something else
     verdict = search(arguments, arguments.cases("hidden_effect"), code)
     if verdict["effects"] or arguments.quick:  # quick: a search this short seldom names one, and policies shall run too
         failed = run_all(planned, arguments.at_most, code)
     else:
-        print("The search named no effect: both models are the same, and no policy is trained.", file=sys.stderr)
+        print(f"{verdict['sentence']} Both models are the same, and no policy is trained.", file=sys.stderr)
         failed, planned = [], []
     found = found_of(planned)
     of = {model: [c for c in found if c["model"] == model] for model in MODELS}
@@ -180,7 +181,7 @@ def main() -> None:
     better = {m: {what: apart(of["extended"], of[m], what) for what in ("success", "angle")} for m in others}
     summary = {**verdict, "models": table, "extended_better_than": better, **made_by(found), **code}
     write_json(arguments.summary("hidden_effect_policy"), summary)
-    print(json.dumps({m: {p: round(c[p]["success_rate"], 3) for p in PLACES} for m, c in table.items()}))
+    print(json.dumps({m: rates(columns) for m, columns in table.items()}))
     finish(failed)
 
 

@@ -37,7 +37,7 @@ from droid_jax.storage import write_json  # noqa: E402
 from experiments.policies.cases import TIMESTEP, Case, Doors, Options, finish, found_of, made_by, run_all, tried  # noqa: E402
 from experiments.policies.robots import fitted, truth_of  # noqa: E402
 from experiments.policies.settings import Setting, setting_of  # noqa: E402
-from experiments.policies.table import PLACES, column  # noqa: E402
+from experiments.policies.table import PLACES, column, rates  # noqa: E402
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def main() -> None:
     for knob in sorted({c["knob"] for c in found}):
         own = [c for c in found if c["knob"] == knob]
         table[f"{LEVERS[knob]:.2f} m"] = {place: column(own, place) for place in PLACES}
-    line = {lever: {p: round(c[p]["success_rate"], 3) for p in PLACES} for lever, c in table.items()}
+    line = {lever: rates(columns) for lever, columns in table.items()}
     summary = {"levers": table, **made_by(found), **code}
     write_json(arguments.summary("knob_locations"), summary)
     print(json.dumps(line))

@@ -10,9 +10,10 @@ stationary in time.  Two sandwiches H^-1 S H^-1 (Huber 1967) ask the data what t
 * within the residual: what the model leaves over is more than noise, and correlated.  S is the
   scatter of the scores of contiguous blocks of time (Kuensch 1989), per column.
 
-Each deviation becomes the largest of the three; correlations stay those of H^-1.  The refinement may have
-used a wider prior than the stated one, so as not to be pulled by it; the stated one is what is known of
-that which the demonstration does not tell, and it is put back at the end.
+Each deviation becomes the largest of the three; correlations stay those of H^-1.  So the data's information and
+the prior's are widened alike.  But what a poor model leaves over makes its data less certain, and not what was stated
+before them; and the refinement may have used a wider prior, so as not to be pulled by it.  The Gaussian that is
+handed on holds the data's information as it was widened, and the stated prior as it was stated.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ class Identifiability:
 
 def posterior(refined: Refined, comparisons: Sequence[Comparison]) -> Gaussian:
     """The Gaussian to hand on, in search coordinates over the refined space: `told` with the stated prior."""
-    return with_stated_prior(told(refined, comparisons), refined.prior)
+    return with_stated_prior(told(refined, comparisons), refined)
 
 
 def told(refined: Refined, comparisons: Sequence[Comparison]) -> Gaussian:
@@ -59,14 +60,17 @@ def told(refined: Refined, comparisons: Sequence[Comparison]) -> Gaussian:
     return calibrated(refined, [c.deviations() for c in comparisons], time_blocks(shapes, durations))
 
 
-def with_stated_prior(gaussian: Gaussian, used: np.ndarray) -> Gaussian:
-    """The same Gaussian with the stated prior where a wider one was used [D], search units.
+def with_stated_prior(gaussian: Gaussian, refined: Refined) -> Gaussian:
+    """A calibrated Gaussian with the stated prior in place of the refinement's, which was widened with the data.
 
+    With D the widening of every deviation, C = D H^-1 D and H = J^T J + P: C^-1 - D^-1 P D^-1 + P_stated.
     Its mean stays, lest a value that is far from the prior and well told be pulled: between told and untold (a
     deviation of about one prior) the width is up to a third too small for that.
     """
-    missing = 1.0 / np.minimum(used, STATED) ** 2 - 1.0 / used**2
-    cov = np.linalg.inv(np.linalg.inv(gaussian.cov) + np.diag(missing))
+    widened = np.diag(gaussian.cov) / np.diag(np.linalg.inv(refined.hessian))  # variances
+    stated = np.minimum(refined.prior, STATED) ** -2.0
+    precision = np.linalg.inv(gaussian.cov) - np.diag(refined.prior**-2.0 / widened) + np.diag(stated)
+    cov = np.linalg.inv(precision)
     return replace(gaussian, cov=0.5 * (cov + cov.T))
 
 

@@ -7,6 +7,7 @@ And it draws them anew for every part of a training that was interrupted.
 from __future__ import annotations
 
 import contextlib
+import itertools
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -21,26 +22,31 @@ AXIS = "i"  # brax's name for its devices
 
 
 def wrapped(randomise: Randomise | None, devices: int, seed: int) -> Callable[..., Env]:
-    """What brax's PPO shall do with an environment before it trains or tries in it."""
+    """What brax's PPO shall do with an environment before it trains in it, and again before it tries in it.
+
+    Tried are other doors than those it trains on, lest the best of several policies is chosen for its own doors.
+    """
+    uses = itertools.count()
 
     def wrap_env(env: Env, episode_length: int, action_repeat: int, randomization_fn: Any) -> Env:
         if randomise is None:
             return wrap(env, episode_length, action_repeat)
         count = len(randomization_fn.keywords["rng"])  # of environments on one device
-        doors = Doors(env, randomise, count, devices, seed)
+        key = jax.random.fold_in(jax.random.PRNGKey(seed), next(uses))
+        doors = Doors(env, randomise, count, devices, key)
         return AutoResetWrapper(EpisodeWrapper(doors, episode_length, action_repeat))
 
     return wrap_env
 
 
 class Doors(Wrapper):
-    """`count` environments on each device; physics are drawn once, for all devices, from the seed alone."""
+    """`count` environments on each device; physics are drawn once, for all devices, from the key alone."""
 
-    def __init__(self, env: Env, randomise: Randomise, count: int, devices: int, seed: int) -> None:
+    def __init__(self, env: Env, randomise: Randomise, count: int, devices: int, key: jax.Array) -> None:
         super().__init__(env)
         self.count = count
         sys: Any = env.sys  # type: ignore[attr-defined]
-        self.physics, self.axes = randomise(sys, jax.random.split(jax.random.PRNGKey(seed), count * devices))
+        self.physics, self.axes = randomise(sys, jax.random.split(key, count * devices))
 
     def reset(self, rng: jax.Array) -> State:
         """rng: [count] keys."""

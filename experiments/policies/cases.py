@@ -147,7 +147,7 @@ def trained(
 ) -> tuple[Path, dict[str, Any]]:
     """Folder of the policy that training comes to, named after all that decides it, and what is known of the training.
 
-    Another process that trains the same is waited for; what a stopped one left behind is continued.
+    Another process that trains the same is waited for; what a stopped one of the same code left is continued.
     """
     of = {
         "scene": [env.scene.sha256, env.start.tolist(), [e.name for e in env.effects]],
@@ -160,7 +160,8 @@ def trained(
     with claimed(place, wait=True):
         if not (place / TRAINING).is_file():
             drawn = randomise(doors.method, env.scene, doors.gaussian)
-            found = train(env, drawn, config, checkpoints=place / "checkpoints", fingerprint={"key": key})
+            kept = place / "checkpoints" / str(code["commit"])  # what other code left half-done is not gone on with
+            found = train(env, drawn, config, checkpoints=kept, fingerprint={"key": key})
             place.mkdir(exist_ok=True)
             save_policy(place / POLICY, found.policy)
             doors.gaussian.save(place / GAUSSIAN)

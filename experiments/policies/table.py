@@ -33,29 +33,35 @@ def summed_up(cases: Sequence[Mapping[str, Any]], settings: Sequence[str]) -> di
         others = [m for m in ("prior", "mean") if of[m] and of["fitted"]]
         better = {m: {what: apart(of["fitted"], of[m], what) for what in ("success", "angle")} for m in others}
         table[name] = {"methods": columns, "fitted_better_than": better}
-    line = {
-        name: {m: {place: round(c[place]["success_rate"], 3) for place in PLACES} for m, c in found["methods"].items()}
-        for name, found in table.items()
-    }
+    line = {name: {m: rates(columns) for m, columns in found["methods"].items()} for name, found in table.items()}
     return {"table": table, "paper": PAPER, "line": line}
+
+
+def rates(columns: Mapping[str, Any]) -> dict[str, float | None]:
+    """Success of a method's policies by place, for one line."""
+    of = {place: columns[place]["success_rate"] for place in PLACES}
+    return {place: None if rate is None else round(rate, 3) for place, rate in of.items()}
 
 
 def column(cases: Sequence[Mapping[str, Any]], place: str) -> dict[str, Any]:
     """Success, largest angle, grip and steps of one method's policies in one place; steps of those that succeeded.
 
     Episodes that blew up are counted and are in nothing else.  stopped: share of trials that the control loop stopped;
-    in simulation there is none.  grip: share of a trial's actions with the grip on.
+    in simulation there is none.  grip: share of a trial's actions with the grip on.  None where nothing is left to
+    count.
     """
     each = [trials(case, place) for case in cases]
+    success, stopped = ([t[what] for t in each] for what in ("success", "stopped"))
+    counted = sum(map(len, success))
     return {
         "policies": len(each),
-        "trials": sum(len(t["success"]) for t in each),
-        "blown_up": sum(len(case[place]["success"]) for case in cases) - sum(len(t["success"]) for t in each),
+        "trials": counted,
+        "blown_up": sum(len(case[place]["success"]) for case in cases) - counted,
         "seeds": [case["seed"] for case in cases],
-        "success_rate": float(np.mean(np.concatenate([t["success"] for t in each]))),
-        "success_interval_95": rate_interval([t["success"] for t in each]),
-        "success_of_each": [float(np.mean(t["success"])) for t in each],
-        "stopped": float(np.mean(np.concatenate([t["stopped"] for t in each]))),
+        "success_rate": float(np.mean(np.concatenate(success))) if counted else None,
+        "success_interval_95": rate_interval(success) if counted else None,
+        "success_of_each": [float(np.mean(own)) if len(own) else None for own in success],
+        "stopped": float(np.mean(np.concatenate(stopped))) if counted else None,
         "grip": spread([t["grip"] for t in each]),
         "angle_deg": spread([t["angle"] for t in each]),
         "steps": spread([t["steps"][t["success"] > 0] for t in each]),
@@ -76,13 +82,11 @@ def spread(each: Sequence[np.ndarray]) -> dict[str, Any]:
 
 def trials(case: Mapping[str, Any], place: str) -> dict[str, np.ndarray]:
     """One policy's trials, without those that blew up: success, largest angle in degrees, steps, share of actions with
-    the grip on, whether the control loop stopped it, [T] each.
+    the grip on, whether the control loop stopped it, [T] each; T is 0 where all of them blew up.
     """
     found = case[place]
     why = np.array(found["stopped_each"])
     counted = why != BLOWN_UP
-    if not counted.any():
-        raise SystemExit(f"error: all trials of the policy of seed {case['seed']} blew up ({place})")
     every = {
         "success": found["success"],
         "angle": found["angle_deg"]["all"],
@@ -95,7 +99,9 @@ def trials(case: Mapping[str, Any], place: str) -> dict[str, np.ndarray]:
 
 def apart(better: Sequence[Mapping[str, Any]], worse: Sequence[Mapping[str, Any]], what: str) -> dict[str, Any]:
     """Difference of two methods' means on the stand-in robot, with its interval, and Welch's of the policies' means."""
-    a, b = ([trials(case, "stand_in")[what] for case in own] for own in (better, worse))
+    a, b = ([t for case in own if len(t := trials(case, "stand_in")[what])] for own in (better, worse))
+    if not (a and b):  # nothing is left to compare
+        return {"difference": None, "interval_95": None, "welch_95": None}
     draws = resampled(a, 1) - resampled(b, 2)
     difference = float(np.mean(np.concatenate(a)) - np.mean(np.concatenate(b)))
     means = [[float(t.mean()) for t in own] for own in (a, b)]
@@ -112,7 +118,8 @@ def apart(better: Sequence[Mapping[str, Any]], worse: Sequence[Mapping[str, Any]
 def rate_interval(each: Sequence[np.ndarray]) -> list[float]:
     """Of a success rate: by bootstrap over policies, or Wilson's over all trials where they all ended alike."""
     both = np.concatenate(each)
-    return list(_wilson(both)) if np.ptp(both) == 0.0 else span(resampled(each), len(each))
+    counted = sum(len(own) > 0 for own in each)
+    return list(_wilson(both)) if np.ptp(both) == 0.0 else span(resampled(each), counted)
 
 
 def _wilson(success: np.ndarray) -> tuple[float, float]:

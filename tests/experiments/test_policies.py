@@ -70,8 +70,17 @@ def test_what_blew_up_is_counted_and_in_no_rate():
     assert found["stopped"] == pytest.approx(5 / 40) and found["grip"]["mean"] == pytest.approx(0.5)
     whole = column([case("mean", 0, 0.4)], "stand_in")
     assert (whole["trials"], whole["blown_up"], whole["stopped"]) == (50, 0, 0.0)
-    with pytest.raises(SystemExit, match=r"all trials of the policy of seed 3 blew up \(stand_in\)"):
-        column([case("mean", 3, 0.4, 2, why[-2:])], "stand_in")
+    lost, kept = case("mean", 3, 0.4, 2, why[-2:]), [case("mean", k, 0.5) for k in range(2)]
+    found = column([lost, *kept], "stand_in")
+    assert (found["policies"], found["trials"], found["blown_up"]) == (3, 100, 2)
+    assert found["success_of_each"] == [None, 0.5, 0.5] and found["success_rate"] == 0.5
+    none = column([lost], "stand_in")
+    assert none["success_rate"] is none["stopped"] is none["success_interval_95"] is none["angle_deg"]["mean"] is None
+    assert apart([lost], kept, "success")["difference"] is None
+    lost["setting"] = kept[0]["setting"]
+    text = as_text(summed_up([lost, case("fitted", 0, 0.5)], ["paper"]))
+    assert "nothing to compare" in text and "| none |" in text
+    json.dumps(summed_up([lost], ["paper"]), allow_nan=False)
 
 
 def test_policies_that_differ_widen_the_interval():
@@ -162,13 +171,15 @@ def test_a_hidden_effect_is_the_tables_last_part():
         "hidden": ["closer=3"],
         "sentence": "It lacks a closer.",
         "models": {m: {place: column(own, place) for place in PLACES} for m, own in cases.items()},
-        "extended_better_than": {"base": {"success": apart(cases["extended"], cases["base"], "success")}},
+        "extended_better_than": {
+            "base": {what: apart(cases["extended"], cases["base"], what) for what in ("success", "angle")}
+        },
     }
     text = as_text(found)
     assert "## A robot that hides closer=3: prior, base fit and extended model" in text and "It lacks a closer." in text
     assert "| | base | extended |" in text and "Extended against base, stand-in robot: +40 points of success (" in text
     found["hidden_effect"]["models"] = {}  # nothing was named
-    assert "hides" not in as_text(found)
+    assert "It lacks a closer." in as_text(found) and "No policy was trained." in as_text(found)
 
 
 def test_a_door_that_opens_to_its_stop_is_in_the_histogram():

@@ -350,13 +350,27 @@ def test_what_is_not_seen_is_handed_on_as_wide_as_its_stated_prior():
     """The refinement's own prior is four times as wide; what the data tell keeps its width and its partners."""
     fit = fitted(SQUARE * [1.0, 0.0])
     wide = calibrated(fit, [exactly(2.0, 20, 16)], one_block(SQUARE))
-    handed = with_stated_prior(wide, fit.prior)
+    handed = with_stated_prior(wide, fit)
     np.testing.assert_allclose(np.sqrt(np.diag(handed.cov)), [2 / np.sqrt(200), 1.0], rtol=0.02)
     np.testing.assert_array_equal(handed.mean, wide.mean)
-    np.testing.assert_allclose(with_stated_prior(wide, np.ones(2)).cov, wide.cov, rtol=1e-9)  # none wider was used
     skewed = fitted(100 * SKEW)
     told = calibrated(skewed, [exactly(2.0, 40, 30)], one_block(SKEW))
-    np.testing.assert_allclose(with_stated_prior(told, skewed.prior).cov, told.cov, rtol=0.02)
+    np.testing.assert_allclose(with_stated_prior(told, skewed).cov, told.cov, rtol=0.02)
+    plain = fitted(SQUARE, width=1.0)  # none wider was used, nothing widened
+    alone = calibrated(plain, [exactly(0.5, 20, 16)], one_block(SQUARE))
+    np.testing.assert_allclose(with_stated_prior(alone, plain).cov, alone.cov, rtol=1e-9)
+
+
+def test_a_poor_model_leaves_nothing_wider_than_what_was_stated_before():
+    """What is left over looks like both parameters: the data are widened, the prior is not."""
+    jacobian = SQUARE * 0.5
+    residual = 200.0 * jacobian[:, 0] + 200.0 * jacobian[:, 1]
+    fit = fitted(jacobian, residual, nuisances=1)
+    wide = calibrated(fit, [exactly(1.0, 20, 16)], one_block(jacobian))
+    handed = with_stated_prior(wide, fit)
+    assert (deviations(wide) > 4.0).all()  # beyond both priors that the refinement used
+    np.testing.assert_allclose(deviations(handed), 1.0, rtol=0.05)
+    assert (deviations(handed) <= 1.0 + 1e-9).all()
 
 
 def test_loud_repeats_never_leave_more_than_the_prior_of_what_is_not_seen():

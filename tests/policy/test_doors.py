@@ -62,17 +62,27 @@ def stiffnesses(doors: Doors, devices: int, act: bool) -> np.ndarray:
 def test_every_environment_of_every_device_has_its_own_physics(act: bool):
     assert jax.local_device_count() >= 2
     env = Spring()
-    found = stiffnesses(Doors(env, randomise, COUNT, 2, seed=1), 2, act)
+    found = stiffnesses(Doors(env, randomise, COUNT, 2, jax.random.PRNGKey(1)), 2, act)
     assert len(np.unique(found)) == 2 * COUNT
-    np.testing.assert_array_equal(stiffnesses(Doors(env, randomise, COUNT, 2, seed=1), 2, act), found)
-    assert not np.intersect1d(stiffnesses(Doors(env, randomise, COUNT, 2, seed=2), 2, act), found).size
+    np.testing.assert_array_equal(stiffnesses(Doors(env, randomise, COUNT, 2, jax.random.PRNGKey(1)), 2, act), found)
+    assert not np.intersect1d(stiffnesses(Doors(env, randomise, COUNT, 2, jax.random.PRNGKey(2)), 2, act), found).size
     assert env.sys is Spring.sys  # as it was
 
 
 def test_outside_of_braxs_devices_there_is_one():
-    doors = Doors(Spring(), randomise, COUNT, 2, seed=1)
+    doors = Doors(Spring(), randomise, COUNT, 2, jax.random.PRNGKey(1))
     alone = jax.jit(doors.reset)(jax.random.split(jax.random.PRNGKey(0), COUNT)).obs[:, 2]
     np.testing.assert_array_equal(alone, doors.physics.stiffness[:COUNT])
+
+
+def test_what_is_tried_is_not_what_is_trained_on():
+    """brax wraps the environment twice, and gives both the same keys where they are as many."""
+    keys = jax.random.split(jax.random.PRNGKey(0), COUNT)
+    wrap_env = wrapped(randomise, 2, 1)
+    trained, tried = (wrap_env(Spring(), 10, 1, partial(randomise, rng=keys)).reset(keys).obs[:, 2] for _ in range(2))
+    assert not np.intersect1d(trained, tried).size
+    again = wrapped(randomise, 2, 1)(Spring(), 10, 1, partial(randomise, rng=keys)).reset(keys).obs[:, 2]
+    np.testing.assert_array_equal(again, trained)
 
 
 def test_brax_gets_one_environment_for_each_of_its_keys():
