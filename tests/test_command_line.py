@@ -10,6 +10,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -19,9 +20,11 @@ import pytest
 from droid_jax import run
 from droid_jax.commands import presets
 from droid_jax.commands.folder import changed, setup_of
+from droid_jax.commands.hidden import known_stand_in
 from droid_jax.commands.identify import Identify
 from droid_jax.commands.own_effects import load_effects
 from droid_jax.identify import pipeline
+from droid_jax.measure.demonstration import demonstration_path
 from droid_jax.measure.formats import load, save
 from droid_jax.model.effects import registry
 from droid_jax.run import main
@@ -389,6 +392,17 @@ def small_recording(tmp_path: Path) -> Path:
 def test_a_demonstration_that_does_not_exist(refused, tmp_path: Path):
     assert "'Z'" in refused("record", "--demonstration", "Z", "--out", tmp_path / "z.npz")
     assert not (tmp_path / "z.npz").exists()
+
+
+def test_what_record_wrote_says_which_robot_it_was(tmp_path: Path):
+    """A fit of it knows its truth, and a policy is tried on this robot and no other."""
+    recording = replace(load(demonstration_path("A")), meta={"springs": "2", "robot": "7"})
+    save(recording, tmp_path / "c.npz")
+    assert known_stand_in([tmp_path / "c.npz"]) == {"springs": 2, "seed": 7, "hide": []}
+    save(replace(recording, meta={"springs": "1", "robot": "7"}), tmp_path / "d.npz")
+    assert known_stand_in([tmp_path / "c.npz", tmp_path / "d.npz"]) == {}
+    save(replace(recording, meta={}), tmp_path / "d.npz")
+    assert known_stand_in([tmp_path / "d.npz"]) == {}
 
 
 @pytest.mark.parametrize(

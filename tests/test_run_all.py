@@ -156,8 +156,25 @@ def test_another_stand_in_is_recorded_anew(called, tmp_path: Path):
         else:
             for file in files:
                 file.write_text("of this robot")
-        assert main(["all", "--stages", "gap", "--springs", springs]) == 0
+        anew = () if kept else ("--again",)
+        assert main(["all", "--stages", "gap", "--springs", springs, *anew]) == 0
         assert [file.is_file() for file in files] == [kept] * 2
+
+
+def test_another_runs_results_are_not_written_over(called, capsys):
+    """They may have taken hours; what is left out, or tried more often, makes no other run."""
+    assert main(["all", "--preset", "paper"]) == 0
+    assert main(["all", "--preset", "paper", "--stages", "identify", "gap"]) == 0
+    assert main(["all", "--preset", "paper", "--trials", "7"]) == 0
+    before = len(called)
+    motions("a.npz", "b.npz", "c.npz")
+    for other in ((), ("--preset", "paper", "--seed", "1"), ("--preset", "paper", "--recording", "a.npz", "b.npz")):
+        assert main(["all", *other]) == 2
+        assert "runs/all holds a run with other settings" in capsys.readouterr().err
+    assert len(called) == before
+    assert main(["all", "--stages", "train"]) == 0  # of what lies there
+    assert main(["all", "--again"]) == 0
+    assert main(["all"]) == 0
 
 
 def test_what_no_policy_can_be_tried_with_is_said_at_once(called, capsys):

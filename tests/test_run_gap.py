@@ -77,6 +77,14 @@ def test_the_same_recording_twice(place: Path, refused):
     assert "the fit and the confirm recording are the same" in said and "another motion" in said
 
 
+def test_two_recordings_of_one_name(place: Path, refused):
+    other = place / "day2"
+    other.mkdir()
+    save(record("confirm"), other / "fit.npz")
+    said = refused(*arguments(place, recordings=("fit.npz", "day2/fit.npz")))
+    assert "the fit and the confirm recording have one name, 'fit'" in said
+
+
 def test_the_sealed_recording_once_more(place: Path, refused):
     said = refused(*arguments(place, recordings=("fit.npz", "confirm.npz", "confirm.npz")))
     assert "the confirm and the sealed recording are the same" in said

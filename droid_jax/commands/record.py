@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -41,6 +41,8 @@ def run(command: Record) -> None:
     # one robot, whose demonstrations have noise and errors of grasp of their own
     seed = 1000 * command.seed + sorted(PLANS).index(command.demonstration)
     recording = record(scene, demonstration, truth, seed=seed, config=SurrogateConfig(repeats=command.repeats))
+    of = {"springs": str(command.springs), "robot": str(command.seed)}
+    recording = replace(recording, meta={**recording.meta, **of})
     command.out.parent.mkdir(parents=True, exist_ok=True)
     path = save(recording, command.out)
     print(f"stand-in robot recorded {recording.repeats} repeats of {recording.duration:.1f} s: {path}")

@@ -12,16 +12,18 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from droid_jax.commands import evaluate, gap, identify, report, train
-from droid_jax.commands.folder import OtherRun
+from droid_jax.commands.folder import OtherRun, changed, setup_of
 from droid_jax.commands.hidden import DEMONSTRATIONS, hidden_effects, record_stand_in, settled
 from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.scenes import needs_recording, needs_scene
 from droid_jax.commands.source import model_folder, needs_brax
 from droid_jax.report.files import TRANSFER
 from droid_jax.report.stages import left_over
+from droid_jax.storage import write_json
 
 Stage = Literal["identify", "gap", "train", "evaluate"]
 STAGES: tuple[Stage, ...] = typing.get_args(Stage)
+ASKED = "all.json"  # the options of a run of all stages, beside their folders
 IN_A_SCENE: tuple[Stage, ...] = ("identify", "gap")  # of one's own: policies are trained at the built-in door
 
 
@@ -107,12 +109,29 @@ def run(command: All) -> None:
     roles = _roles(command)
     _needs_hidden(command)
     out = prepare_folder(command.out)
+    if {*IN_A_SCENE} & {*command.stages}:
+        _remember(command, out)
     _run_stages(command, out, roles)
     page = report.write(out)
     print(f"\n{command.out}: {(time.monotonic() - started) / 60:.0f} minutes")
     for line in told(out):
         print(line)
     print(f"report: {page}")
+
+
+def _remember(command: All, out: Path) -> None:
+    """Keep what was asked for; OtherRun where the folder holds what other options made, which may have taken hours.
+
+    Stages that are left out or added make no other run, nor do more trials, nor does a policy of what lies there.
+    """
+    asked = {k: v for k, v in setup_of(command).items() if k not in ("stages", "trials")}
+    files = [*command.recording, *filter(None, (command.scene, command.parameters))]
+    asked["files"] = [str(path.resolve()) for path in files]
+    path = out / ASKED
+    before = _json(path) if not command.again else None
+    if before is not None and (other := changed(before, asked)):
+        raise OtherRun(out, other)
+    write_json(path, asked)
 
 
 def _stages(command: All) -> tuple[Stage, ...]:
@@ -214,15 +233,15 @@ def _plan(
 
 def told(out: Path) -> list[str]:
     """One line for each stage that has a result."""
-    from droid_jax.report.words import percent
+    from droid_jax.report.words import judged, percent
 
     lines, old = [], left_over(out)
     if old:
         lines.append(f"not on the page: {' and '.join(sorted(old))}, of an earlier run in this folder")
     if fit := _json(out / "identify" / "fit.json"):
         unit = fit.get("torque_unit", "N m")
-        gaps = [f"{name} {g['before']:.3f} -> {g['after']:.3f} {unit}" for name, g in fit["gap"].items()]
-        lines.append(f"identify: torque distance on repeats that were not fitted: {', '.join(gaps)}")
+        gaps = [f"{name} {g['before']:.3f} -> {g['after']:.3f} {unit} {judged(g)}" for name, g in fit["gap"].items()]
+        lines.append(f"identify: torque distance {', '.join(gaps)}")
     if found := None if "gap" in old else _json(out / "gap" / "gap.json"):
         role, size = list(found["gaps"].items())[-1]
         closed = size["closed"]

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from scipy import sparse
 
@@ -222,10 +223,23 @@ def _grip_window(recording: Recording) -> tuple[float, float] | None:
     return named["grasp"].end, float(end)
 
 
+def _of_joints(scene: Scene, channel: Channel) -> Channel:
+    """The columns of a channel that the scene's measured joints are: others that it has were left out on purpose."""
+    joints = [mujoco.mj_id2name(scene.model, mujoco.mjtObj.mjOBJ_JOINT, i) for i in range(scene.model.njnt)]
+    unknown = [c for c in channel.columns if c not in joints]
+    kept = [i for i, c in enumerate(channel.columns) if c in scene.joints]
+    if unknown or not kept:
+        raise ValueError(
+            f"channel {channel.name!r}: unknown joints {', '.join(unknown or channel.columns)}; "
+            f"valid: {', '.join(scene.joints)}"
+        )
+    columns = tuple(channel.columns[i] for i in kept)
+    return replace(channel, columns=columns, values=channel.values[..., kept], mask=channel.mask[..., kept])
+
+
 def _measure(scene: Scene, channel: Channel, clock: np.ndarray, weight: float) -> Measured:
     if channel.name not in MINIMUM_NOISE:
         raise ValueError(f"channel {channel.name!r} has no simulated counterpart; known: {', '.join(MINIMUM_NOISE)}")
-    _refuse_constant(channel)
     if channel.name == "object_angle":
         if scene.object_joint is None or len(channel.columns) != 1:
             raise ValueError(
@@ -234,12 +248,9 @@ def _measure(scene: Scene, channel: Channel, clock: np.ndarray, weight: float) -
             )
         columns = np.zeros(1, dtype=int)
     else:
-        unknown = [c for c in channel.columns if c not in scene.joints]
-        if unknown:
-            raise ValueError(
-                f"channel {channel.name!r}: unknown joints {', '.join(unknown)}; valid: {', '.join(scene.joints)}"
-            )
+        channel = _of_joints(scene, channel)
         columns = np.array([scene.joints.index(c) for c in channel.columns], dtype=int)
+    _refuse_constant(channel)
     inside = (channel.time >= clock[0] - 1e-9) & (channel.time <= clock[-1] + 1e-9)
     if inside.sum() < 2:
         raise ValueError(
@@ -308,7 +319,8 @@ def _refuse_constant(channel: Channel) -> None:
             where = "" if len(still) == len(repeats) else f" in repeat {still[0]}"
             raise ValueError(
                 f"channel {channel.name!r}, column {column!r} never changes{where} ({repeats[still[0]][0]:g} "
-                f"{channel.unit}): a dead sensor? mask it out or leave {'that repeat' if where else 'the column'} away"
+                f"{channel.unit}): a dead sensor? mask it out or leave {'that repeat' if where else 'the joint'} away"
+                f"{'' if where else ' (--joints)'}"
             )
 
 

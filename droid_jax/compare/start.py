@@ -1,4 +1,5 @@
-"""Where a recorded motion starts in the scene, and whether the scene carries the weight that its torque holds."""
+"""Where a recorded motion starts in the scene, whether its joints can make it, and whether the scene carries the weight
+that its torque holds."""
 
 from __future__ import annotations
 
@@ -49,6 +50,28 @@ def check_weight(scene: Scene, recording: Recording, qpos0: np.ndarray) -> None:
             f"compensates that of {', '.join(heavy)} (up to {felt[scene.dof(most)]:.3g} N m at {most}): set "
             'gravcomp="1" on the bodies they carry, or state that the torque contains gravity'
         )
+
+
+def check_range(scene: Scene, recording: Recording) -> None:
+    """Raise ValueError where a measured joint goes, or is sent, so far outside its range that the unit is wrong."""
+    sent = _sent(scene, recording) if recording.command.size else {}
+    paths = [("is sent to", joint, path) for joint, path in sent.items()]
+    if channel := recording.channels.get("position"):
+        seen = np.where(channel.mask, channel.values, np.nan).reshape(-1, len(channel.columns))
+        paths += [("is measured at", joint, seen[:, i]) for i, joint in enumerate(channel.columns)]
+    for what, joint, path in paths:
+        index = scene.id("joint", joint) if joint in scene.joints else -1
+        if index < 0 or not scene.model.jnt_limited[index] or np.isnan(path).all():
+            continue
+        low, high = scene.model.jnt_range[index]
+        beyond = np.maximum(low - path, path - high)
+        worst = int(np.nanargmax(beyond))
+        if beyond[worst] > high - low:
+            slide = scene.model.jnt_type[index] == mujoco.mjtJoint.mjJNT_SLIDE
+            raise ValueError(
+                f"recording {recording.name!r}: {joint} {what} {path[worst]:.4g}, far outside its range {low:.4g} .. "
+                f"{high:.4g} {'m: are these millimetres' if slide else 'rad: are these degrees'}?"
+            )
 
 
 def weight_share(model: Any, joints: np.ndarray, gravity: bool) -> np.ndarray:

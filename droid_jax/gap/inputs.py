@@ -126,6 +126,13 @@ def _check_different(roles: Mapping[str, Recording]) -> None:
                 f"the {first} and the {role} recording are the same ({recording.name!r}): an effect must be confirmed "
                 "on a recording that it was not fitted to, of another motion"
             )
+    names: dict[str, str] = {}
+    for role, recording in roles.items():
+        if (first := names.setdefault(recording.name, role)) != role:
+            raise ValueError(
+                f"the {first} and the {role} recording have one name, {recording.name!r}: rename a file, since answers "
+                "name recordings"
+            )
 
 
 def _check_same_joints(roles: Mapping[str, Recording]) -> None:

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -48,6 +48,9 @@ class IdentifyConfig:
     compare: CompareConfig = field(default_factory=CompareConfig)
 
 
+Judged = Literal["repeats", "time", "same"]
+
+
 @dataclass(frozen=True)
 class Gap:
     """Disagreement with held-out repeats of one recording, N m, before and after the fit.
@@ -57,6 +60,8 @@ class Gap:
     closed: share of the way from before to floor; None where before does not exceed it by WORTH of it.
     Floors and closed are None where there is one repeat only.
     per_joint_*: [J] root mean square of the smoothed torques' difference.
+    judged: on what: "repeats" that were held out, the last part in "time" of a log, or the "same" one repeat that was
+    fitted.
     """
 
     before: float
@@ -66,6 +71,7 @@ class Gap:
     per_joint_before: tuple[float, ...]
     per_joint_after: tuple[float, ...]
     per_joint_floor: tuple[float, ...] | None
+    judged: Judged
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +143,8 @@ def identify(
     effects: in the model beside what the scene has; their parameters are in `space` or stay at neutral.
     checkpoints: folder where the search saves itself and from which it resumes.
     progress: called with a stage's name and its progress value.
-    Raises ValueError for recordings of one name, and where no torque is compared.
+    Raises ValueError for recordings of one name, where no torque is compared, where several recordings are to be fitted
+    without the refinement (the search sees the first alone), and where the initial means cannot be simulated.
     """
     config = config or IdentifyConfig()
     report = progress or (lambda stage, value: None)
@@ -146,6 +153,11 @@ def identify(
         raise ValueError(f"recordings need different names, got {', '.join(names)}")
     if "torque" not in config.compare.channels:
         raise ValueError(f"an identification compares torques, got the channels {', '.join(config.compare.channels)}")
+    if config.refine is None and len(recordings) > 1:
+        raise ValueError(
+            f"without the refinement (as in preset paper) one recording is fitted, got {len(recordings)}: "
+            f"{', '.join(names)}; give the first alone, or another preset"
+        )
     parts = [split(r, config.heldout) for r in recordings]
     fitted, held = [p[0] for p in parts], [p[1] for p in parts]
     full = space if nuisances is None or config.refine is None else space + nuisances
@@ -157,6 +169,7 @@ def identify(
     plain = replace(config.compare, whitened=False)
     commanded = all(r.command.size for r in recordings)
     heldout = base.against(held, plain) if commanded else make_cost(scene, full, held, config=plain, effects=effects)
+    _check_start(base, full)
     first = base.first()
 
     def cost(rows: np.ndarray) -> np.ndarray:
@@ -183,7 +196,7 @@ def identify(
 
     began = time.monotonic()
     report("judge", None)
-    gaps = _gaps(heldout, recordings, full.mean, best)
+    gaps = _gaps(heldout, recordings, [_judged(r, h) for r, h in zip(recordings, held, strict=True)], full.mean, best)
     seconds["judge"] = time.monotonic() - began
     return Identified(
         scene=scene,
@@ -201,6 +214,17 @@ def identify(
         heldout_repeats={n: p[2] for n, p in zip(names, parts, strict=True)},
         seconds=seconds,
     )
+
+
+def _check_start(cost: Cost, space: Space) -> None:
+    """ValueError where the means cannot be simulated: nothing could be said of what the fit gained."""
+    twice = np.stack([space.mean, space.mean])  # as many rows as are judged at the end: compiled once
+    for comparison, rollout in zip(cost.comparisons, cost.rollouts(twice), strict=True):
+        if not np.all(rollout.finite):
+            raise ValueError(
+                f"the simulation of {comparison.name!r} blows up at the parameters' initial means: shorten the scene's "
+                "time step, or begin at other means (stiff servos on light links are the usual cause)"
+            )
 
 
 def _refined(
@@ -261,7 +285,16 @@ def _fingerprint(
     return json.dumps(made_from, sort_keys=True)
 
 
-def _gaps(cost: Cost, recordings: Sequence[Recording], before: np.ndarray, after: np.ndarray) -> list[Gap]:
+def _judged(recording: Recording, held: Recording) -> Judged:
+    """What `split` held out of a recording."""
+    if held is recording:
+        return "same"
+    return "time" if recording.repeats == 1 else "repeats"
+
+
+def _gaps(
+    cost: Cost, recordings: Sequence[Recording], judged: Sequence[Judged], before: np.ndarray, after: np.ndarray
+) -> list[Gap]:
     """The gap of each recording's held-out repeats at two parameter vectors."""
     penalty_free = cost.distances(np.stack([before, after])) - cost.penalties(np.stack([before, after]))
     smoothed = cost.smoothed(np.stack([before, after]))
@@ -280,6 +313,7 @@ def _gaps(cost: Cost, recordings: Sequence[Recording], before: np.ndarray, after
                 per_joint_before=tuple(rms[0].tolist()),
                 per_joint_after=tuple(rms[1].tolist()),
                 per_joint_floor=None if everything is None else _smooth_floor(everything, held.repeats),
+                judged=judged[i],
             )
         )
     return out

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from droid_jax.identify.fit import on_bound
+from droid_jax.identify.gaussian import prior
 from droid_jax.identify.pipeline import Identified
 from droid_jax.model.mjcf import fitted_mjcf, unwritten
 from droid_jax.model.parameters import Space
@@ -74,6 +75,7 @@ def write_run(
 def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) -> dict[str, Any]:
     """The fit as plain data: parameters with intervals, gaps, costs, why it stopped."""
     low, high = found.full_gaussian.interval(0.9)
+    initial = np.stack(prior(found.full).interval(0.9), axis=1)
     mean, std = found.full_gaussian.physical_mean, found.full_gaussian.physical_std
     bound = on_bound(found.full, found.best)
     parameters = []
@@ -87,6 +89,7 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
                 "nuisance": p.nuisance,
                 "initial_mean": p.mean,
                 "initial_std": p.std,
+                "initial_interval": initial[i].tolist(),
                 "low": p.low,
                 "high": p.high,
                 "best": float(found.best[i]),
@@ -110,6 +113,7 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
             "per_joint_before": list(g.per_joint_before),
             "per_joint_after": list(g.per_joint_after),
             "per_joint_floor": None if g.per_joint_floor is None else list(g.per_joint_floor),
+            "judged": g.judged,
         }
         for name, g in found.gaps.items()
     }

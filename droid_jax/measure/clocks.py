@@ -40,7 +40,8 @@ def check_clock(
         if abs(steps[i] - typical) > _JITTER * typical:
             raise ValueError(
                 f"{where}, {label(i + 1)}: irregular rate, a step of {steps[i]:.6g} s where "
-                f"{typical:.6g} s is usual; resample the log or pass allow_jitter=True"
+                f"{typical:.6g} s is usual; resample the log, or accept it with --allow-jitter of `convert` "
+                "(allow_jitter=True)"
             )
 
 

@@ -184,7 +184,7 @@ def _same_clock(tables: Sequence[_Table], interpolate: bool) -> bool:
         if not interpolate:
             raise ValueError(
                 f"{table.path}: repeat {i} has another clock than repeat 0, {what}; "
-                "load with resample=True to interpolate it"
+                "--resample of `convert` interpolates it (load_recording(..., resample=True))"
             )
         return False
     return True

@@ -238,7 +238,7 @@ def _positions_at(recording: Recording, start: float, given: Mapping[str, float]
     if lacking:
         raise ValueError(
             f"a window from {start} s needs initial positions that were not measured: "
-            f"give qpos0 for {', '.join(lacking)}"
+            f"{', '.join(lacking)}; begin it at the recording's start, or state them (window(..., qpos0=...))"
         )
     return positions
 

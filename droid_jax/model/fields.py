@@ -28,6 +28,7 @@ _KIND = {
     "pair": "pair",
     "actuator": "actuator",
 }
+_POSITION_GAIN = (("actuator_gainprm", 0), ("actuator_biasprm", 1))  # both of them, with opposite signs
 _SERVO, _VELOCITY_GAIN = ("actuator_gainprm", "actuator_biasprm"), 2  # fields, and their column of the velocity gain
 
 
@@ -72,6 +73,8 @@ def model_parameter(
     index = (first, *_column(scene, field, column))
     if field in _SERVO and column == _VELOCITY_GAIN:
         _check_servo_damping(scene, element)
+    if (field, column) in _POSITION_GAIN:
+        _check_whole_servo(scene, element, first)
     if mean is None:
         neutral = {Mode.SCALE: 1.0, Mode.DIVIDE: 1.0, Mode.ADD: 0.0}
         nominal = np.asarray(getattr(scene.model, field))[index]
@@ -109,6 +112,15 @@ def _check_servo_damping(scene: Scene, actuator: str) -> None:
         raise ValueError(
             f"no actuator of scene {scene.name!r} was compiled with a velocity gain, and a replay is made without; "
             f'give actuator {actuator!r} one in the MJCF (kv="1e-6")'
+        )
+
+
+def _check_whole_servo(scene: Scene, actuator: str, index: int) -> None:
+    gain, bias = scene.model.actuator_gainprm[index, 0], scene.model.actuator_biasprm[index, 1]
+    if gain and bias == -gain:
+        raise ValueError(
+            f"actuator {actuator!r} is a position servo, whose gain is in gainprm and in biasprm: one of them alone "
+            'would pull it towards zero; vary both with servo_scale(scene, joint) ({"servo": joint, "std": 0.03})'
         )
 
 

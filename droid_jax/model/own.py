@@ -10,6 +10,12 @@ Every entry needs field, element, std and high; optional: column, name, unit, me
 
 What a torque sensor sees beyond the model has "sensor" in place of "field": viscous, coulomb or
 torque_offset of a joint (model/joint_friction.py), zero at first and between -high and high.
+
+    {"sensor": "time_offset", "std": 0.001, "high": 0.05}
+    {"servo": "elbow", "std": 0.03}
+
+The delay of the commands, s, a nuisance unless it says otherwise, and a factor on the position gain of a joint's
+servo have no element.
 """
 
 from __future__ import annotations
@@ -18,20 +24,23 @@ import enum
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from droid_jax.model.fields import body_mass, model_parameter
+from droid_jax.model.door import time_offset
+from droid_jax.model.fields import body_mass, model_parameter, servo_scale
 from droid_jax.model.joint_friction import sensor_parameter
 from droid_jax.model.parameters import Mode, Parameter, Scaling, Space
 from droid_jax.model.scene import Scene
 
 _NEEDED = ("element", "std", "high")
-_TEXTS = ("field", "sensor", "element", "name", "unit", "group")
+_TIME = "time_offset"
+_TEXTS = ("field", "sensor", "servo", "element", "name", "unit", "group")
 _NUMBERS = ("std", "high", "low", "mean", "floor", "width")
 _CHOICES = {"mode": Mode, "scaling": Scaling}
 _KNOWN = (
-    *_NEEDED, "field", "sensor", "column", "name", "unit", "mean", "low", "mode", "scaling", "floor", "width",
+    *_NEEDED, "field", "sensor", "servo", "column", "name", "unit", "mean", "low", "mode", "scaling", "floor", "width",
     "nuisance", "group",
 )  # fmt: skip
 
@@ -64,9 +73,10 @@ def _entries(path: Path) -> list[Any]:
 def _parameter(scene: Scene, entry: Any, where: str) -> Parameter:
     if not isinstance(entry, dict):
         raise ValueError(f"{where}: expected an object, got {type(entry).__name__}")
-    missing = [k for k in _NEEDED if k not in entry]
-    if ("field" in entry) == ("sensor" in entry):
-        missing.insert(0, "one of field and sensor")
+    needed = ("std",) if "servo" in entry else ("std", "high") if entry.get("sensor") == _TIME else _NEEDED
+    missing = [k for k in needed if k not in entry]
+    if sum(kind in entry for kind in ("field", "sensor", "servo")) != 1:
+        missing.insert(0, "one of field, sensor and servo")
     unknown = [k for k in entry if k not in _KNOWN]
     if missing or unknown:
         raise ValueError(
@@ -75,7 +85,12 @@ def _parameter(scene: Scene, entry: Any, where: str) -> Parameter:
         )
     try:
         options = _read(entry)
-        field, sensor, element = options.pop("field", None), options.pop("sensor", None), options.pop("element")
+        field, sensor, servo = (options.pop(kind, None) for kind in ("field", "sensor", "servo"))
+        if servo is not None:
+            return servo_scale(scene, servo, **options)
+        if sensor == _TIME:
+            return replace(time_offset(options.pop("std"), options.pop("high")), **options)
+        element = options.pop("element")
         if sensor is not None:
             return sensor_parameter(scene.joints, sensor, element, **options)
         if field == "body_mass" and options.get("mode", Mode.SET) is Mode.SET:

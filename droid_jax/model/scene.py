@@ -107,12 +107,18 @@ class Scene:
 
     @functools.cached_property
     def mjx(self) -> Any:
-        """The mjx.Model on the default device."""
+        """The mjx.Model on the default device; ValueError for a model that MJX has not everything for."""
         import jax
         from mujoco import mjx
 
-        with jax.ensure_compile_time_eval():  # else a first use inside jit would keep that trace's values
-            return mjx.put_model(self.model)
+        try:
+            with jax.ensure_compile_time_eval():  # else a first use inside jit would keep that trace's values
+                return mjx.put_model(self.model)
+        except NotImplementedError as error:
+            raise ValueError(
+                f"scene {self.name!r} uses something that MJX has not: {error}; change it in the MJCF "
+                "(https://mujoco.readthedocs.io/en/stable/mjx.html#feature-parity lists what there is)"
+            ) from None
 
     @functools.cached_property
     def sha256(self) -> str:
@@ -120,6 +126,14 @@ class Scene:
         model = np.empty(mujoco.mj_sizeModel(self.model), np.uint8)
         mujoco.mj_saveModel(self.model, None, model)
         return hashlib.sha256(model.tobytes()).hexdigest()
+
+    @functools.cached_property
+    def geoms_among_looks(self) -> np.ndarray:
+        """[ngeom] the id that each geom of the model has where the looks are there too: in the MJCF as it was given."""
+        spec = self.spec.copy()
+        compiled(spec)  # numbers the geoms
+        looks = {geom.id for geom in look_geoms(spec)}
+        return np.array([geom.id for geom in spec.geoms if geom.id not in looks], dtype=int)
 
     def visual_model(self) -> mujoco.MjModel:
         """The same scene with its looks, for rendering."""

@@ -40,7 +40,8 @@ def randomised(scene: Scene, gaussian: Gaussian) -> Randomise:
 def randomised_model(scene: Scene, gaussian: Gaussian) -> Randomise:
     """The same for environments that know an mjx.Model only (mujoco_playground's): the model fields alone.
 
-    scene: of the same MJCF.  Fields that no parameter writes stay the environment's own.
+    scene: of the same MJCF, whose geoms that are for the eye alone the environment may have.  Fields that no parameter
+    writes stay the environment's own.
     Warns of parameters that live outside the model: they have no place there and stay at neutral.
     Raises ValueError for a Gaussian of another scene, and when called with a model of another scene.
     """
@@ -53,16 +54,23 @@ def randomised_model(scene: Scene, gaussian: Gaussian) -> Randomise:
         )
 
     def randomise(model: Any, rng: jax.Array) -> tuple[Any, Any]:
+        looks = model.ngeom != scene.model.ngeom and len(scene.spec.geoms) == model.ngeom
+        rows = {field: scene.geoms_among_looks for field in fields if looks and field.startswith("geom_")}
         for field in fields:
             own, given = (jax.tree.map(jnp.shape, getattr(m, field)) for m in (scene.mjx, model))
+            if field in rows and own[1:] == given[1:]:
+                continue
             if own != given:
                 raise ValueError(
                     f"the environment's model has {field} of shape {given}, the scene {scene.name!r} of {own}: the "
                     "scene must be of the environment's MJCF"
                 )
         physics, _ = both(Physics(scene.mjx, {}), rng)
-        drawn = model.replace(**{field: getattr(physics.model, field) for field in fields})
-        return drawn, _zeros(model, fields)
+        values = {field: getattr(physics.model, field) for field in fields}
+        for field, kept in rows.items():
+            every = jnp.repeat(getattr(model, field)[None], _count(rng), axis=0)
+            values[field] = every.at[:, kept].set(values[field])
+        return model.replace(**values), _zeros(model, fields)
 
     return randomise
 

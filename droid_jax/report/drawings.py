@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from droid_jax.report import export, parameter_figures, search_figures, torque_figures
 from droid_jax.report.run_folder import Run
 from droid_jax.report.style import NARROW, WIDE
-from droid_jax.report.words import label
+from droid_jax.report.words import judged, label
 
 
 @dataclass(frozen=True)
@@ -46,19 +46,19 @@ def draw(run: Run) -> dict[str, list[Drawing]]:
         bars = (traces["joints"], gap["per_joint_before"], gap["per_joint_after"], gap.get("floor"))
         add(
             "gap", f"gap_{i}", f"Torque difference of each joint{of}",
-            f"RMS difference between the smoothed torques of simulation and {robot} on held-out repeats, joint by "
+            f"RMS difference between the smoothed torques of simulation and {robot}, {judged(gap)}, joint by "
             "joint. The torque distance above is taken of torques as they were measured.",
             torque_figures.gap_per_joint, *bars, gap.get("per_joint_floor"), run.torque_unit,
         )  # fmt: skip
         add(
             "torque", f"torque_{i}", f"Torque over time{of}",
-            f"Thick line and band: the {robot}'s held-out repeats. Dashed: the simulation with the initial "
+            f"Thick line and band: what the {robot} measured ({judged(gap)}). Dashed: the simulation with the initial "
             "means. Thin blue line: with the fitted values. Shaded: every other phase of the motion.",
             torque_figures.torque_traces, traces, traces["phases"], run.torque_unit,
         )  # fmt: skip
     add(
         "parameters", "intervals", "What is known about each parameter",
-        "90 % intervals in units of the initial deviation: 0 is where the fit started, the shaded band is "
+        "90 % intervals in units of the initial deviation: 0 is where the fit started, the light bar is "
         "what was assumed before it. Narrow is well known; grey is not told by this demonstration.",
         parameter_figures.intervals, run.parameters,
     )  # fmt: skip
@@ -80,11 +80,12 @@ def draw(run: Run) -> dict[str, list[Drawing]]:
         search_figures.cost_history, run.history, fit["cost"],
     )  # fmt: skip
     if run.distribution is not None:
+        first = next(iter(fit["gap"].values()))
         samples = (run.distribution["initial_cost"], run.distribution["fitted_cost"])
         add(
             "search", "cost_distribution", "The two Gaussians, replayed",
             f"Parameter sets drawn from the initial and from the fitted Gaussian ({samples[0].size} and "
-            f"{samples[1].size}), replayed against data that the fit did not see. Lines: medians. "
+            f"{samples[1].size}), replayed and judged {judged(first)}. Lines: medians. "
             "A failed replay counts with its penalty.",
             search_figures.cost_histograms, *samples, run.torque_unit,
         )  # fmt: skip

@@ -8,7 +8,7 @@ from droid_jax.report.gap_words import gap_summary, readable
 from droid_jax.report.policy_folder import Trained
 from droid_jax.report.policy_words import policy_summary
 from droid_jax.report.run_folder import Run
-from droid_jax.report.words import listed, number, percent, summary
+from droid_jax.report.words import judged, listed, number, percent, summary
 
 WRONG = ("unexplained", "fit not converged")  # verdicts on which nothing should be trained
 ALL_THE_SAME = (
@@ -21,23 +21,27 @@ def lead(run: Run | None, gap: Gap | None, policy: Trained | None) -> list[str]:
     sentences, following = [], ""
     if run:
         sentences.append(_fitted(run))
-        following = summary(run)[-1]
+        following = summary(run, gap is not None)[-1]
     if gap:
         sentences += [readable(gap.found["sentence"], gap.found), *_closed(gap)]
         following = gap_summary(gap)[-1]
     if policy:
         sentences += [_opened(where, found["success_rate"]) for where, found in policy.trials.items()]
         doubted = gap is not None and gap.found["verdict"] in WRONG
-        following = f"{following} {ALL_THE_SAME}" if doubted else policy_summary(policy)[-1]
+        following = f"{following} {ALL_THE_SAME}" if doubted else policy_summary(policy, gap is not None)[-1]
     return [*sentences, following]
 
 
 def _fitted(run: Run) -> str:
     gaps = run.fit["gap"]
-    sizes = [f"{number(g['before'])} to {number(g['after'])} {run.torque_unit} in “{name}”" for name, g in gaps.items()]
+    sizes = [
+        f"from {number(g['before'])} to {number(g['after'])} {run.torque_unit} in “{name}” ({judged(g)})"
+        for name, g in gaps.items()
+    ]
+    went = "fell" if all(g["after"] < g["before"] for g in gaps.values()) else "went"
     return (
-        f"{len(run.parameters)} parameters were fitted to what the {run.robot} measured: on repeats that the fit did "
-        f"not see, the distance between measured and simulated torques fell from {listed(sizes)}."
+        f"{len(run.parameters)} parameters were fitted to what the {run.robot} measured: the distance between measured "
+        f"and simulated torques {went} {listed(sizes)}."
     )
 
 

@@ -42,11 +42,11 @@ from droid_jax.report.policy_folder import Trained, has_policy, read_policy
 from droid_jax.report.policy_words import policy_summary
 from droid_jax.report.run_folder import Run, has_run, read_run
 from droid_jax.report.stages import left_over
-from droid_jax.report.words import grouped, label, like, number, percent, speaker, summary
+from droid_jax.report.words import grouped, judged, label, like, number, percent, speaker, summary
 from droid_jax.storage import write_text
 
 _DOWNLOADS = (
-    ("gaussian.json", "the fitted Gaussian, for training"),
+    ("gaussian.json", "the Gaussian of the model's parameters, for training"),
     ("extended.json", "the extended model: effects, values and Gaussian, for fits and training"),
     ("extended.xml", "the extended model as MJCF, as far as MJCF has words for it"),
     (FITTED, "the scene with the fitted values"),
@@ -87,6 +87,7 @@ def write_report(run: Path) -> Path:
         "like": like,
         "percent": percent,
         "label": label,
+        "judged": judged,
         "effect": effect_words,
         "unit": unit_words,
         "speak": speaker(loaded) if loaded else str,
@@ -95,7 +96,7 @@ def write_report(run: Path) -> Path:
         "unbroken": lambda text: re.sub(r"(?<=\d) (?=N m|%)", "\u00a0", text).replace("N m", "N\u00a0m"),
     }
     parts = (_policy(policy) if policy else {}) | (_search(gap) if gap else {})
-    parts |= _identification(loaded) if loaded else {}
+    parts |= _identification(loaded, gap is not None) if loaded else {}
     if len([part for part in (loaded, gap, policy) if part]) > 1:
         parts |= _together(folder, loaded, gap, policy)
     parts_at = [part.folder for part in (loaded, gap, policy) if part]
@@ -137,19 +138,19 @@ def _together(folder: Path, run: Run | None, gap: Gap | None, policy: Trained | 
     }
 
 
-def _identification(run: Run) -> dict[str, Any]:
+def _identification(run: Run, searched: bool) -> dict[str, Any]:
     """What the page says of an identification; the head of the page is its, also where both are there."""
     config = run.config
     count = len(config["recordings"])
     meta = [f"Preset {config['preset']}", f"{count} recording{'s' if count != 1 else ''}"]
     if "started" in config:
-        meta.append(str(config["started"])[:16].replace("T", " "))
+        meta.append(f"{str(config['started'])[:16].replace('T', ' ')} UTC")
     return {
         "title": f"Identification of {config['scene']}",
         "heading": f"Identification report: {config['scene']}",
         "meta": [*meta, run.folder.resolve().name],
         "stand_in": config["stand_in"],
-        "summary": summary(run),
+        "summary": summary(run, searched),
         "groups": grouped(run.parameters),
         "nuisances": grouped(p for p in run.fit["parameters"] if p["nuisance"]),
         "drawings": draw(run),

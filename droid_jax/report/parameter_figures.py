@@ -24,18 +24,19 @@ def intervals(parameters: Sequence[Mapping[str, Any]], width: float = WIDE) -> F
     n = len(parameters)
     figure = Figure(figsize=(width, 0.9 + 0.27 * n), layout="constrained")
     axes = figure.add_subplot()
-    axes.axvspan(-1.645, 1.645, color=BEFORE, alpha=0.13, linewidth=0, label="initial 90 %")
     axes.axvline(0, color=BEFORE, linewidth=1, linestyle=(0, (4, 1.5)))
     reach = 3.0
     for y, p in enumerate(parameters):
         at = _prior_units(p)
         low, high = (at(v) for v in p["interval"])
+        assumed = [at(v) for v in p["initial_interval"]] if "initial_interval" in p else [-1.645, 1.645]
+        axes.plot(assumed, [y, y], color=BEFORE, linewidth=8, alpha=0.25, solid_capstyle="butt")
         colour = AFTER if p["identifiable"] else MUTED
         axes.plot([low, high], [y, y], color=colour, linewidth=3.2, alpha=0.55, solid_capstyle="butt")
         axes.plot(at(p["mean"]), y, "s" if p["on_bound"] else "o", color=colour, markersize=5)
         if p["truth"] is not None:
             axes.plot(at(p["truth"]), y, "D", markersize=5.5, color=TRUTH, markerfacecolor="none")
-        marks = [low, high, at(p["mean"]), *([] if p["truth"] is None else [at(p["truth"])])]
+        marks = [*assumed, low, high, at(p["mean"]), *([] if p["truth"] is None else [at(p["truth"])])]
         reach = max(reach, *(abs(m) for m in marks if math.isfinite(m)))
     if reach > 12:
         axes.set_xscale("symlog", linthresh=3)
@@ -93,12 +94,13 @@ def _prior_units(p: Mapping[str, Any]) -> Callable[[float], float]:
 
 def _interval_legend(figure: Figure, parameters: Sequence[Mapping[str, Any]], width: float) -> None:
     """The forest plot's legend: only what the drawing holds."""
-    entries = [("initial 90 %", {"color": BEFORE, "alpha": 0.3, "linewidth": 6})]
+    entries = [("initial 90 %", {"color": BEFORE, "alpha": 0.25, "linewidth": 8})]
     bar = {"linewidth": 3.2, "marker": "o", "markersize": 5}
     if any(p["identifiable"] for p in parameters):
         entries.append(("fitted, 90 % interval", {"color": AFTER, **bar}))
     if any(not p["identifiable"] for p in parameters):
-        entries.append(("not told by this demonstration", {"color": MUTED, **bar}))
+        judged = not all(p["reason"].startswith("not judged") for p in parameters)
+        entries.append(("not told by this demonstration" if judged else "fitted, not judged", {"color": MUTED, **bar}))
     if any(p["on_bound"] for p in parameters):
         entries.append(("on a bound", {"color": AFTER, "marker": "s", "linestyle": "none", "markersize": 5}))
     if any(p["truth"] is not None for p in parameters):

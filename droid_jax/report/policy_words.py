@@ -18,8 +18,11 @@ METHODS = {
 ENOUGH = 0.8  # success on the stand-in from which the next step is the robot
 
 
-def policy_summary(trained: Trained) -> list[str]:
-    """The sentences at the top, from the numbers alone; the last says what to do next."""
+def policy_summary(trained: Trained, searched: bool = False) -> list[str]:
+    """The sentences at the top, from the numbers alone; the last says what to do next.
+
+    searched: the page holds a search of the gap too.
+    """
     training = trained.training
     history = training["history"]
     known = training["setup"]["fit"] is not None
@@ -36,7 +39,7 @@ def policy_summary(trained: Trained) -> list[str]:
     sentences += [_tried(where, found, training["task"]) for where, found in trained.trials.items()]
     if own and trained.trials:
         sentences.append("The fit is of your own recordings: the stand-in robot is another one, and says little of it.")
-    return [*sentences, _next(trained, own)]
+    return [*sentences, _next(trained, own, searched or bool(training["effects"]))]
 
 
 def _with(effects: list[str]) -> str:
@@ -56,7 +59,7 @@ def _tried(where: str, found: Mapping[str, Any], task: Mapping[str, Any]) -> str
     )
 
 
-def _next(trained: Trained, own: bool) -> str:
+def _next(trained: Trained, own: bool, searched: bool) -> str:
     if trained.transfer is None:
         return f"Next: python -m droid_jax.run evaluate {trained.folder}"
     if trained.transfer["stand_in"]["success_rate"] >= ENOUGH:
@@ -65,4 +68,7 @@ def _next(trained: Trained, own: bool) -> str:
         return "It has not learned the task in simulation yet: train longer (--steps), or with another --seed."
     if own:
         return "It works in simulation and not on a robot that it was not fitted to, which was to be expected."
-    return "It works in simulation and not on the stand-in robot: search the gap (python -m droid_jax.run gap)."
+    where = "It works in simulation and not on the stand-in robot"
+    if searched:
+        return f"{where}, although what the model lacks was searched for: look at the film of a bad trial."
+    return f"{where}: search the gap (python -m droid_jax.run gap)."

@@ -120,7 +120,7 @@ def cost_histograms(initial: np.ndarray, fitted: np.ndarray, unit: str = "N m", 
     if logarithmic:
         axes.set_xscale("log")
         axes.xaxis.set_major_formatter("{x:g}")
-    axes.set(xlabel=f"Cost on data that the fit did not see [{unit}]", ylabel="Samples")
+    axes.set(xlabel=f"Cost [{unit}]", ylabel="Samples")
     legend(figure, axes, width, columns=2)
     return figure
 

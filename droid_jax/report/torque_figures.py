@@ -46,7 +46,7 @@ def torque_traces(
             color=MEASURED,
             alpha=0.16,
             linewidth=0,
-            label="measured, 5 to 95 % of held-out repeats",
+            label="measured, 5 to 95 % of repeats",
         )
         axes.plot(*thin(time, line["measured_mean"]), color=MEASURED, linewidth=2.4, label="measured, mean")
         axes.plot(*thin(time, line["before"]), color=BEFORE, linestyle=(0, (4, 1.5)), label="before the fit")
@@ -68,7 +68,7 @@ def gap_per_joint(
     unit: str = "N m",
     width: float = WIDE,
 ) -> Figure:
-    """RMS torque difference of each joint [J] in N m on held-out repeats, before and after the fit.
+    """RMS torque difference of each joint [J] in N m, before and after the fit.
 
     floor: what repeats differ among themselves over all joints, N m, a dashed line; floors [J]
     N m, the same joint by joint, small marks, where known.

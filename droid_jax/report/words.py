@@ -9,7 +9,14 @@ from typing import Any
 
 from droid_jax.report.run_folder import Run
 
-SIDES = {"left", "right"}  # of a robot with two arms, whose joints the number alone does not tell
+# Words before "joint" of which a robot has several: the number alone does not tell its joints apart.
+SEVERAL = re.compile(r"left|right|[lr]|\w*finger\w*|(arm|robot|leg)\d+")
+JUDGED = {  # by `judged` of a fit.json's gap
+    "repeats": "on repeats that the fit did not see",
+    "time": "on the last part of the log, which the fit did not see",
+    "same": "on its one repeat, which was fitted too",
+}
+GAP_REPEATS = 16  # repeats of one motion that `gap` needs to split it
 
 
 def label(name: str) -> str:
@@ -21,7 +28,7 @@ def label(name: str) -> str:
     if indexed:
         return f"{label(indexed[1])}, {label(indexed[2]).lower()}"
     joint = re.fullmatch(r"(?:(\w+)_)?joint_?(\d+)", name)
-    if joint and not SIDES & set((joint[1] or "").split("_")):
+    if joint and not any(SEVERAL.fullmatch(word) for word in (joint[1] or "").split("_")):
         return f"Joint {joint[2]}"
     words = name.replace("_", " ").strip()
     return words[:1].upper() + words[1:]
@@ -64,13 +71,18 @@ def listed(names: Sequence[str]) -> str:
     return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
-def summary(run: Run) -> list[str]:
-    """The sentences at the top of the page, from the numbers alone."""
-    sentences = [_what(run), *(_gap(run, name) for name in run.fit["gap"]), _told(run), *_truth(run)]
+def judged(gap: Mapping[str, Any]) -> str:
+    """On what a fit.json's gap was measured; a fit from before it said so held repeats out."""
+    return JUDGED[gap.get("judged", "repeats")]
+
+
+def summary(run: Run, searched: bool = False) -> list[str]:
+    """The sentences at the top of the page, from the numbers alone; searched: the page has a search of the gap too."""
+    sentences = [_what(run), *(_gap(run, name) for name in run.fit["gap"]), *_settled(run), _told(run), *_truth(run)]
     bound = [_bound(p) for p in run.fit["parameters"] if p["on_bound"]]
     if bound:
         sentences.append(f"On a bound of its range: {listed(bound)}.")
-    return [*sentences, _next(run)]
+    return [*sentences, _next(run, searched)]
 
 
 def _what(run: Run) -> str:
@@ -89,9 +101,10 @@ def _what(run: Run) -> str:
 
 def _gap(run: Run, name: str) -> str:
     gap = run.fit["gap"][name]
-    where = f"In “{name}”, on" if len(run.fit["gap"]) > 1 else "On"
+    on = judged(gap)
+    where = f"In “{name}”, {on}" if len(run.fit["gap"]) > 1 else on[:1].upper() + on[1:]
     text = (
-        f"{where} data that the fit did not see, simulation and {run.robot} differed by "
+        f"{where}, simulation and {run.robot} differed by "
         f"{number(gap['before'])} {run.torque_unit} before the fit (norm over the joints, averaged over time) and "
         f"differ by {number(gap['after'])} {run.torque_unit} after it"
     )
@@ -104,7 +117,15 @@ def _gap(run: Run, name: str) -> str:
     return f"{text}; repeats differ among themselves by {number(floor)} {run.torque_unit}{share}."
 
 
+def _settled(run: Run) -> list[str]:
+    if run.fit.get("converged") is not False:
+        return []
+    return ["The refinement did not converge: take values and intervals with care, and fit again with a longer preset."]
+
+
 def _told(run: Run) -> str:
+    if unjudged(run.fit):
+        return "Which of them the demonstration tells was not judged: this preset ends with the search."
     untold = [label(p["name"]).lower() for p in run.parameters if not p["identifiable"]]
     if not untold:
         return "Every parameter of interest can be told from this demonstration."
@@ -134,23 +155,37 @@ def which_bound(p: Mapping[str, Any]) -> str:
     return f"{'lower' if low else 'upper'} bound {value} {p['unit']}".strip()
 
 
-def _next(run: Run) -> str:
+def unjudged(fit: Mapping[str, Any]) -> bool:
+    """Whether a fit.json is of a search without refinement, which tells no widths."""
+    return "converged" in fit and fit["converged"] is None
+
+
+def _next(run: Run, searched: bool) -> str:
     steps = []
     gaps = list(run.fit["gap"].values())
     if any(g["after"] > g["before"] for g in gaps):
         steps.append("do not train on this fit; check the recording and the scene first")
     if any(p["on_bound"] for p in run.fit["parameters"]):
         steps.append("ask whether the bound is real; if not, widen it and fit again")
-    if any(not p["identifiable"] for p in run.parameters):
+    if unjudged(run.fit):
+        steps.append("fit with another preset (quick, standard, gpu) to know how sure the values are")
+    elif any(not p["identifiable"] for p in run.parameters):
         steps.append("record a motion that moves what is not told, or leave it at its initial spread")
     if lacks_something(run.fit):
         steps.append(
-            "what is left is well above noise, so the model lacks something: see below in which joint and phase, "
-            "and let python -m droid_jax.run gap look for the missing effect"
+            "what is left is well above noise, so the model lacks something: see below in which joint and phase"
+            + ("" if searched else f", and let python -m droid_jax.run gap look for the missing effect{_needed(run)}")
         )
     elif not steps:
         steps.append("draw the simulations you train on from gaussian.json")
     return "Next: " + "; ".join(steps) + "."
+
+
+def _needed(run: Run) -> str:
+    """What gap needs beside what was fitted here."""
+    recordings = run.config["recordings"]
+    few = len(recordings) == 1 and 1 < recordings[0]["repeats"] < GAP_REPEATS
+    return f" (it takes a second motion, or {GAP_REPEATS} repeats of this one)" if few else ""
 
 
 def lacks_something(fit: Mapping[str, Any]) -> bool:

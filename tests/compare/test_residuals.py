@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 from collections.abc import Mapping
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -352,6 +353,17 @@ def test_unknown_channels_and_joints_are_named(scene: Scene):
         compare(scene, recording(channel("torque", CLOCK, values, ("a", "b", "d"))))
     with pytest.raises(ValueError, match="'position' is not compared; compared: torque"):
         compare(scene, recording(torque)).channel("position")
+
+
+def test_joints_that_were_left_out_are_not_compared(scene: Scene):
+    """A dead sensor among them harms nobody."""
+    values = np.random.default_rng(0).normal(size=(2, STEPS, 3))
+    values[:, :, 1] = 0.0
+    of = compare(replace(scene, joints=("c", "a")), recording(channel("torque", CLOCK, values)))
+    measured = of.channel("torque")
+    np.testing.assert_array_equal(measured.columns, [1, 0])  # a and c, in the recording's order
+    alone = compare(scene, recording(channel("torque", CLOCK, values[:, :, [0, 2]], ("a", "c"))))
+    np.testing.assert_allclose(measured.noise.mean, alone.channel("torque").noise.mean)
 
 
 def test_a_stretch_that_nobody_measured_is_refused(scene: Scene):

@@ -395,6 +395,22 @@ def test_a_motion_starts_where_it_says_else_where_it_was_measured_else_where_it_
     assert start(qpos0={}) == pytest.approx([0.0, -0.3])
 
 
+@pytest.mark.parametrize("measured", [False, True])
+def test_degrees_are_no_radians(measured: bool):
+    xml = ARM.format(gravcomp='gravcomp="1"', friction='limited="true" range="-2 2"', sensor="")
+    scene = compile_scene(mujoco.MjSpec.from_string(xml), "arm", joints=JOINTS)
+    fine = recording()
+    make_cost(scene, SPACE, [fine])
+    wrong = np.rad2deg(fine.command)
+    if measured:
+        seen = Channel("position", "rad", JOINTS, fine.time, wrong[None].repeat(2, 0), np.ones((2, *wrong.shape), bool))
+        wrong = replace(fine, channels={**fine.channels, "position": seen})
+    else:
+        wrong = replace(fine, command=wrong)
+    with pytest.raises(ValueError, match=r"elbow is .* far outside its range -2 \.\. 2 rad: are these degrees"):
+        make_cost(scene, SPACE, [wrong])
+
+
 def test_a_start_that_would_be_a_guess_is_refused():
     xml = ARM.format(gravcomp='gravcomp="1"', friction="", sensor="")
     xml = xml.replace('<position name="s" joint="shoulder" kp="60"/>', '<motor name="s" joint="shoulder"/>')

@@ -183,13 +183,42 @@ def test_a_replay_that_blows_up_is_no_parent_whatever_the_others_cost(scene: Sce
         raise KeyboardInterrupt
 
     def cost_of(*_, **__):
-        return SimpleNamespace(first=lambda: lambda rows: np.array([5000.0, 1000.0]), against=lambda *a: None)
+        costs = SimpleNamespace(first=lambda: lambda rows: np.array([5000.0, 1000.0]), against=lambda *a: None)
+        return SimpleNamespace(**vars(costs), comparisons=(), rollouts=lambda rows: ())
 
     monkeypatch.setattr(pipeline, "search", search)
     monkeypatch.setattr(pipeline, "make_cost", cost_of)
     with pytest.raises(KeyboardInterrupt):
         identify(scene, elbow_space(scene), [elbow_log(0.0, 10.0, 2)], config=QUICK)
     np.testing.assert_array_equal(asked[0], [5000.0, np.inf])
+
+
+def test_means_that_cannot_be_simulated_are_refused_before_the_search(scene: Scene, monkeypatch: pytest.MonkeyPatch):
+    blown = SimpleNamespace(finite=np.array([False, False]))
+    cost = SimpleNamespace(
+        first=lambda: None,
+        against=lambda *a: None,
+        comparisons=(SimpleNamespace(name="elbow"),),
+        rollouts=lambda rows: (blown,),
+    )
+    monkeypatch.setattr(pipeline, "make_cost", lambda *_, **__: cost)
+    monkeypatch.setattr(pipeline, "search", lambda *a, **k: pytest.fail("the search began"))
+    with pytest.raises(ValueError, match="'elbow' blows up at the parameters' initial means"):
+        identify(scene, elbow_space(scene), [elbow_log(0.0, 10.0, 2)], config=QUICK)
+
+
+def test_without_the_refinement_one_recording_is_fitted(scene: Scene):
+    both = [elbow_log(0.0, 10.0, 2), dataclasses.replace(elbow_log(0.0, 12.0, 2), name="other")]
+    with pytest.raises(ValueError, match="one recording is fitted, got 2: elbow, other"):
+        identify(scene, elbow_space(scene), both, config=dataclasses.replace(QUICK, refine=None))
+
+
+@pytest.mark.parametrize(("repeats", "judged"), [(1, "time"), (3, "repeats")])
+def test_a_fit_says_what_it_is_judged_on(scene: Scene, repeats: int, judged: str):
+    log = elbow_log(0.0, 9.0, repeats)
+    assert pipeline._judged(log, split(log, 0.3)[1]) == judged
+    commanded = dataclasses.replace(log, time=np.arange(3.0), command=np.zeros((3, 1)), command_names=("elbow",))
+    assert pipeline._judged(commanded, split(commanded, 0.3)[1]) == ("repeats" if repeats > 1 else "same")
 
 
 def test_a_search_imports_nothing_that_it_may_not_need():

@@ -331,6 +331,6 @@ def test_window_says_what_it_lacks() -> None:
     with pytest.raises(ValueError, match=r"start < end, got 0.6 and 0.3"):
         r.window(0.6, 0.3)
     blind = replace(r, channels={"torque": r.channels["torque"]})
-    with pytest.raises(ValueError, match=r"give qpos0 for j1, j2, hinge"):
+    with pytest.raises(ValueError, match=r"not measured: j1, j2, hinge; begin it at the recording's start"):
         blind.window(0.3, 0.6)
     assert blind.window(0.3, 0.6, qpos0={"j1": 1.0, "j2": 2.0, "hinge": 0.0}).qpos0["j2"] == 2.0

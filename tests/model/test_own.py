@@ -45,6 +45,25 @@ def test_a_mass_takes_its_inertia_along_also_where_the_usual_mode_is_stated(tmp_
     assert plain == stated and len(stated["arm_mass"].writes) == 4 and stated["arm_mass"].unit == "kg"
 
 
+def test_a_servos_gain_and_the_commands_delay_have_no_element(tmp_path: Path, scene: Scene):
+    gain = loaded(tmp_path, scene, {"servo": "elbow", "std": 0.05, "high": 2.0})["elbow_servo_scale"]
+    assert (gain.mean, gain.low, gain.high) == (1.0, 0.5, 2.0)
+    assert {w.field for w in gain.writes} == {"actuator_gainprm", "actuator_biasprm"}
+    delay = loaded(tmp_path, scene, {"sensor": "time_offset", "std": 0.002, "high": 0.1})["time_offset"]
+    assert (delay.mean, delay.std, delay.low, delay.high, delay.nuisance) == (0.0, 0.002, -0.1, 0.1, True)
+    assert not loaded(tmp_path, scene, {"sensor": "time_offset", "std": 1e-3, "high": 0.1, "nuisance": False}).nuisance[
+        0
+    ]
+    for entry, says in (
+        ({"servo": "wrist", "std": 0.05}, "no actuator drives 'wrist'"),
+        ({"servo": "elbow"}, "missing std"),
+        ({"servo": "elbow", "sensor": "coulomb", "std": 0.05}, "missing one of field, sensor and servo"),
+        ({"sensor": "time_offset", "std": 0.05}, "missing high"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            loaded(tmp_path, scene, entry)
+
+
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
@@ -68,6 +87,8 @@ def test_a_mass_takes_its_inertia_along_also_where_the_usual_mode_is_stated(tmp_
         ({"field": "geom_contype", "element": "bone"}, "'geom_contype' cannot be a parameter: MJX"),
         ({"field": "body_gravcomp", "element": "arm"}, "compiled without gravity compensation"),
         ({"field": "actuator_biasprm", "column": 2, "low": -9}, "was compiled with a velocity gain"),
+        ({"field": "actuator_gainprm", "column": 0, "high": 99}, "vary both with servo_scale"),
+        ({"field": "actuator_biasprm", "column": 1, "low": -99}, "vary both with servo_scale"),
     ],
 )
 def test_a_mistake_is_named(tmp_path: Path, scene: Scene, changes: dict[str, Any], says: str):

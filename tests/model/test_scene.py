@@ -315,10 +315,19 @@ def test_what_is_only_for_the_eye_weighs_and_touches_as_before():
     for compiler in ("", '<compiler inertiafromgeom="true"/>'):
         whole = mujoco.MjModel.from_xml_string(xml.format(compiler=compiler))
         scene = compile_scene(mujoco.MjSpec.from_string(xml.format(compiler=compiler)), "covered")
+        assert [whole.geom(int(i)).name for i in scene.geoms_among_looks] == ["floor", "bone", "bumper", "paired"]
         for model in (scene.model, instrument(scene)):
             assert [model.geom(i).name for i in range(model.ngeom)] == ["floor", "bone", "bumper", "paired"]
             for field in ("body_mass", "body_inertia", "body_ipos", "body_iquat", "dof_M0"):
                 np.testing.assert_allclose(getattr(model, field), getattr(whole, field), rtol=1e-12)
+
+
+@pytest.mark.parametrize("option", ['integrator="implicit"', 'solver="PGS"'])
+def test_what_mjx_has_not_is_said_in_a_sentence(option: str):
+    xml = f"""<mujoco><option {option}/><worldbody><body><joint name="j"/><geom size=".1"/></body></worldbody>
+      <actuator><position name="j" joint="j" kp="9"/></actuator></mujoco>"""
+    with pytest.raises(ValueError, match="scene 'new' uses something that MJX has not"):
+        compile_scene(mujoco.MjSpec.from_string(xml), "new").mjx  # noqa: B018
 
 
 def test_a_file_that_is_missing_or_broken_is_named(tmp_path: Path):

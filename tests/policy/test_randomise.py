@@ -9,17 +9,19 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
+from mujoco import mjx
 
 from droid_jax.identify.gaussian import Gaussian, prior
 from droid_jax.model.door import door_space
 from droid_jax.model.door_scene import door_scene
 from droid_jax.model.effects.registry import effect_space, library
-from droid_jax.model.fields import body_mass, joint_damping
+from droid_jax.model.fields import body_mass, joint_damping, model_parameter
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import Physics, make_physics, written_fields
-from droid_jax.model.scene import load_scene
+from droid_jax.model.scene import compile_scene, load_scene
 from droid_jax.policy.randomise import fixed, randomised, randomised_model
 
 ENVS = 5
@@ -105,6 +107,25 @@ def test_an_environments_own_model_is_kept_but_for_what_varies(scene, gaussian, 
     assert batched.qpos0 is None and model.body_mass.shape == (ENVS, scene.model.nbody)
     with pytest.raises(ValueError, match=r"has dof_damping of shape \(3,\).*must be of the environment's MJCF"):
         randomised_model(scene, gaussian)(own.replace(dof_damping=own.dof_damping[:3]), keys)
+
+
+def test_an_environment_with_geoms_for_the_eye_takes_it(keys):
+    """The scene leaves them out, and numbers those behind them otherwise."""
+    xml = """<mujoco><worldbody><body><joint name="j"/>
+      <geom name="shell" type="box" size=".1 .1 .1" group="2" contype="0" conaffinity="0" mass="0"/>
+      <geom name="tip" size=".1" friction="0.7"/></body></worldbody>
+      <actuator><position name="j" joint="j" kp="9"/></actuator></mujoco>"""
+    scene = compile_scene(mujoco.MjSpec.from_string(xml), "covered")
+    grip = model_parameter(scene, "geom_friction", "tip", 0, unit="-", std=0.2, high=4.0)
+    own = mjx.put_model(mujoco.MjModel.from_xml_string(xml))
+    model, batched = randomised_model(scene, prior(Space((grip,))))(own, keys)
+    assert batched.geom_friction == 0 and model.geom_friction.shape == (ENVS, 2, 3)
+    np.testing.assert_array_equal(model.geom_friction[:, 0], np.tile(own.geom_friction[0], (ENVS, 1)))
+    assert len(np.unique(model.geom_friction[:, 1, 0])) == ENVS
+    more = xml.replace('<geom name="tip"', '<geom size=".2"/><geom name="tip"')
+    other = mjx.put_model(mujoco.MjModel.from_xml_string(more))
+    with pytest.raises(ValueError, match="must be of the environment's MJCF"):
+        randomised_model(scene, prior(Space((grip,))))(other, keys)
 
 
 @pytest.mark.slow

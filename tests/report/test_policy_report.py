@@ -52,6 +52,8 @@ def test_it_says_what_to_do_next(tmp_path: Path, successes: int | None, simulate
         content["simulation"]["success_rate"] = simulated
         (made / "transfer.json").write_text(json.dumps(content))
     assert next_step in policy_summary(read_policy(made))[-1]
+    if next_step == "search the gap":
+        assert next_step not in policy_summary(read_policy(made), searched=True)[-1]
 
 
 def test_a_stand_in_that_was_not_fitted_says_little(tmp_path: Path):

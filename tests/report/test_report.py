@@ -15,9 +15,10 @@ from reader import Page, read_page
 
 from droid_jax.report import page, render, search_figures, torque_figures
 from droid_jax.report.export import inline_svg
+from droid_jax.report.lead import lead
 from droid_jax.report.run_folder import read_run
 from droid_jax.report.style import BEFORE
-from droid_jax.report.words import like, number, percent, summary
+from droid_jax.report.words import JUDGED, label, like, number, percent, summary
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +70,54 @@ def test_summary_is_made_from_the_numbers(run: Path) -> None:
     assert "known for 7 of the parameters" in text and "for 6 of them" in text
     assert "hinge friction loss (lower bound 0 N m)" in text
     assert "Next:" in text and "droid_jax.run gap" not in text
+
+
+@pytest.mark.parametrize("judged", [None, *JUDGED])
+def test_the_page_says_what_the_fit_was_judged_on(tmp_path: Path, judged: str | None) -> None:
+    run = make_run(tmp_path / "run")
+    fit = json.loads((run / "fit.json").read_text())
+    if judged:
+        fit["gap"]["open_close"]["judged"] = judged
+        (run / "fit.json").write_text(json.dumps(fit))
+    said = JUDGED[judged or "repeats"]
+    loaded = read_run(run)
+    assert said in " ".join(summary(loaded)).replace("On ", "on ") and said in lead(loaded, None, None)[0]
+    assert "fell from 1.22 to 0.119 N m" in lead(loaded, None, None)[0]
+    fit["gap"]["open_close"]["after"] = 2.0
+    (run / "fit.json").write_text(json.dumps(fit))
+    assert "went from 1.22 to 2.00 N m" in lead(read_run(run), None, None)[0]
+
+
+def test_a_search_alone_judges_no_parameter(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run")
+    fit = json.loads((run / "fit.json").read_text())
+    for p in fit["parameters"]:
+        p |= {"identifiable": False, "reason": "not judged: the search's covariance depends on when it stopped"}
+    (run / "fit.json").write_text(json.dumps({**fit, "converged": None}))
+    text = " ".join(summary(read_run(run)))
+    assert "was not judged" in text and "does not tell" not in text and "record a motion" not in text
+    (run / "fit.json").write_text(json.dumps({**fit, "converged": False}))
+    assert "The refinement did not converge" in " ".join(summary(read_run(run)))
+
+
+def test_what_gap_needs_is_said_and_not_where_it_ran(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run")
+    fit = json.loads((run / "fit.json").read_text())
+    (run / "fit.json").write_text(json.dumps({**fit, "mean_square": 90.0}))
+    assert "(it takes a second motion, or 16 repeats of this one)" in summary(read_run(run))[-1]
+    assert "droid_jax.run gap" not in summary(read_run(run), searched=True)[-1]
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("panda_joint3", "Joint 3"), ("joint_3", "Joint 3"), ("panda_finger_joint1", "Panda finger joint1"),
+        ("arm2_joint2", "Arm2 joint2"), ("fr3_joint2", "Joint 2"), ("left_joint3", "Left joint3"),
+        ("torque_offset[panda_joint3]", "Torque offset, joint 3"),
+    ],
+)  # fmt: skip
+def test_joints_of_different_names_have_different_labels(name: str, words: str) -> None:
+    assert label(name) == words
 
 
 def test_summary_says_when_the_fit_made_it_worse(tmp_path: Path) -> None:
@@ -130,7 +179,7 @@ def test_two_kinds_of_torque_difference_are_told_apart(written: Page) -> None:
 def test_several_recordings_each_have_their_own_gap_and_figure(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", recordings=("slow", "fast"))
     text = page.write_report(run).read_text(encoding="utf-8")
-    assert "In “slow”, on data" in text and "In “fast”, on data" in text
+    assert "In “slow”, on repeats that" in text and "In “fast”, on repeats that" in text
     assert (run / "figures" / "torque_0.pdf").read_bytes().startswith(b"%PDF")
     assert (run / "figures" / "torque_1.png").read_bytes().startswith(b"\x89PNG")
 
