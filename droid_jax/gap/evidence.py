@@ -67,14 +67,28 @@ class Evidence:
 
     def common(self, values: np.ndarray) -> np.ndarray:
         """[P, D] -> [P, M] mean of the repeats minus simulation, the recording's own nuisances at their best."""
+        _, common, best = self._own_fitted(values)
+        return common if self.own_columns is None else common + best @ self.own_columns.T
+
+    def with_own_at_best(self, values: np.ndarray) -> np.ndarray:
+        """[P, D] -> [P, D] with the recording's own nuisances where `common` has them."""
+        rows, _, best = self._own_fitted(values)
+        space, own = self.cost.space, [self.cost.space.index(name) for name in self.own]
+        rows[:, own] += space.std[own] * best
+        return rows
+
+    def _own_fitted(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rows [P, D] with own nuisances at their means, their residuals [P, M], and these nuisances' best values
+        [P, own] in prior deviations.
+        """
         rows = np.array(np.atleast_2d(values), dtype=np.float64)
         space = self.cost.space
         rows[:, [space.index(name) for name in self.own]] = [space[name].mean for name in self.own]
         common = self._common(rows)
         if self.own_columns is None:
-            return common
+            return rows, common, np.zeros((len(rows), 0))
         normal = self.own_columns.T @ self.own_columns + np.eye(len(self.own)) / self.repeats
-        return common - np.linalg.solve(normal, self.own_columns.T @ common.T).T @ self.own_columns.T
+        return rows, common, -np.linalg.solve(normal, self.own_columns.T @ common.T).T
 
     def _common(self, rows: np.ndarray) -> np.ndarray:
         return -self.cost.whitened(rows).astype(np.float64) / np.sqrt(self.repeats)

@@ -129,16 +129,7 @@ def _instants(evidence: Evidence) -> np.ndarray:
 
 def _before_after(evidence: Evidence, verdict: Verdict) -> np.ndarray:
     """[2, D] values of the base model and of the extended one, the recording's own nuisances at their best."""
-    rows = np.stack([verdict.base.values, verdict.model.values])
-    if evidence.own_columns is None:
-        return rows
-    space, columns = evidence.cost.space, evidence.own_columns
-    own = [space.index(name) for name in evidence.own]
-    rows[:, own] = space.mean[own]
-    left = -evidence.cost.whitened(rows).astype(np.float64) / np.sqrt(evidence.repeats)
-    normal = columns.T @ columns + np.eye(len(own)) / evidence.repeats  # as in `Evidence.common`
-    rows[:, own] = space.mean[own] - space.std[own] * np.linalg.solve(normal, columns.T @ left.T).T
-    return rows
+    return evidence.with_own_at_best(np.stack([verdict.base.values, verdict.model.values]))
 
 
 def _joints(evidence: Evidence) -> list[str]:

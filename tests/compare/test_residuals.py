@@ -331,6 +331,29 @@ def test_the_noise_of_a_single_repeat_is_restated_for_every_channel(scene: Scene
     assert np.mean(np.asarray(restated.whitened(tried)) ** 2) < 1.0 and shape == (3, shape[1], shape[1])
 
 
+def test_repeats_deviate_as_they_are_whitened(scene: Scene):
+    """A model that is one repeat leaves what the model that is the mean leaves, and that repeat's deviation."""
+    clean = smooth_traces(3, 2)
+    values = clean + np.array([0.2, -0.5, 0.3])[:, None, None] * smooth_traces(3, 5) + 0.01
+    comparison = compare(scene, recording(channel("torque", CLOCK, values)))
+    mean = np.asarray(comparison.whitened(rollout(torque=values.mean(axis=0))))
+    deviations = comparison.deviations()
+    assert np.abs(deviations).max() > 1.0
+    for n in range(3):
+        own = np.asarray(comparison.whitened(rollout(torque=values[n])))
+        np.testing.assert_allclose(deviations[n], own - mean, atol=0.02 * np.abs(deviations).max())
+
+
+@pytest.mark.parametrize("start", [0.0, 100.0])
+def test_the_grasp_is_looked_at_on_the_recordings_own_clock(door: Scene, start: float):
+    phases = tuple(Phase(p.name, p.start + start, p.end + start) for p in PHASES)
+    values = np.random.default_rng(0).normal(size=(2, STEPS, 7))
+    torque = channel("torque", start + CLOCK, values, [f"panda_joint{i}" for i in range(1, 8)])
+    data = recording(torque, start=start, phases=phases)
+    found = make_comparison(door, data, rows(data), CompareConfig())
+    assert found.grip_rows == door_comparison(door).grip_rows
+
+
 # ----- what is refused
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from small_log import ASKED, CONFIG, COULOMB, elbow, elbow_log, elbow_space
 
 from droid_jax.compare.cost import make_cost
 from droid_jax.gap.blocks import OUTSIDE, Blocks, block_length, blocks, interleaved
+from droid_jax.gap.case import make_case
 from droid_jax.gap.flips import largest_t
 from droid_jax.gap.screen import project
 from droid_jax.gap.select import resamples
@@ -159,6 +162,15 @@ def elbow_torque(log: Log) -> np.ndarray:
     return log.measured - (with_it - without)
 
 
-def test_repeats_need_no_blocks(log: Log):
+def test_repeats_need_no_blocks():
+    scene = elbow()
+    with pytest.raises(ValueError, match="'elbow' has 2 repeats: use make_case"):
+        make_log(scene, elbow_space(scene), library(scene, ASKED), elbow_log(COULOMB, 8.0, 2), CONFIG)
+    few = {"fit": elbow_log(COULOMB, 8.0, 5), "confirm": replace(elbow_log(COULOMB, 9.0, 5), name="other")}
+    with pytest.raises(ValueError, match="recordings elbow, other: at least 8 repeats are needed"):
+        make_case(scene, elbow_space(scene), library(scene, ASKED), **few, config=CONFIG)
+
+
+def test_too_few_blocks_are_refused(log: Log):
     with pytest.raises(ValueError, match="3 blocks, at least 8"):
         blocks(log, np.minimum(np.arange(len(log.clock)) // 100, 2))

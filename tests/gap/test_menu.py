@@ -114,5 +114,28 @@ def test_an_untouched_scene_has_no_contact():
     assert touching[0] > 0 and touching[1] == 0
 
 
+def test_an_experiment_is_as_good_as_what_it_tells_apart_least():
+    at = {0.0: 0.0, 1.0: 1.0, 2.0: 6.0}
+
+    class Cost:
+        def failed(self, values):
+            return values[:, 0] < 0
+
+        def whitened(self, values):
+            return np.array([[at[abs(v)], 0.0] for v in values[:, 0]])
+
+    rivals = np.array([[0.0], [1.0], [2.0]])
+    (found,) = menu._experiment("so", Cost(), rivals)  # type: ignore[arg-type]
+    assert (found.what, found.apart) == ("so", 1.0)
+    assert menu._experiment("so", Cost(), -rivals) == []  # type: ignore[arg-type]  # one cannot be replayed
+
+
+def test_the_best_experiment_comes_first(demonstration, monkeypatch):
+    monkeypatch.setattr(menu, "MENU", MENU[:2])
+    found = separating(small().case, (model("drag", 0.0), model("drag", 0.8)), demonstration)
+    apart = [e.apart for e in found]
+    assert apart == sorted(apart, reverse=True) and apart[0] > apart[-1]
+
+
 def test_one_model_needs_no_experiment(demonstration):
     assert separating(small().case, (model("drag", 0.0),), demonstration) == ()

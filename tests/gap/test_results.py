@@ -73,6 +73,11 @@ def test_traces_have_one_shape_and_their_clock(found: Small, folder: Path):
         assert 0.001 < np.median(traces["scatter"]) < 0.1
 
 
+def replace_own(evidence):
+    """Without nuisances of the recording's own."""
+    return dataclasses.replace(evidence, own=(), own_columns=None)
+
+
 def test_a_recordings_own_offset_is_no_gap_of_the_traces(found: Small):
     """A sensor that was 0.15 N m off on the second day: U fits that, and so do the traces beside it."""
     recording = found.recordings["confirm"]
@@ -83,6 +88,9 @@ def test_a_recordings_own_offset_is_no_gap_of_the_traces(found: Small):
     arrays = gap_arrays(case, found.verdict)
     left = (arrays["confirm.after"] - arrays["confirm.measured"]).mean(axis=0)
     np.testing.assert_allclose(left, 0.0, atol=0.02)
+    values = found.verdict.model.values
+    assert case.confirm.gap_at(values) == pytest.approx(found.case.confirm.gap_at(values), abs=0.05)
+    assert replace_own(case.confirm).gap_at(values) > 1.0  # the offset is no small thing
     before = gap_json(found.case, found.verdict)["gaps"]["confirm"]["torque_after"]
     assert gap_json(case, found.verdict)["gaps"]["confirm"]["torque_after"] == pytest.approx(before, rel=0.05)
 

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from small_gap import FLOOR, Small, small
 
+from droid_jax.gap import select
 from droid_jax.gap.candidates import candidates
 from droid_jax.gap.refit import deviations, intervals, refit
-from droid_jax.gap.select import _gap_reasons, judge, one_sided_p, steady
+from droid_jax.gap.select import UNCONFIRMED, _gap_reasons, judge, one_sided_p, steady
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +62,43 @@ def test_an_amplitude_at_its_other_bound_has_run_into_it(found: Small):
     values = model.values.copy()
     values[found.case.whole.index(name)] = found.case.whole[name].high
     assert f"{name} ran into its bound" in tried(found, replace(model, values=values)).reasons
+
+
+def test_what_the_repeats_do_not_agree_on_is_not_confirmed(found: Small):
+    """The same mean gain, in repeats that differ by fifty times as much."""
+    case, model = found.case, extended(found, "hinge_preload at door")
+    loud = replace(case.confirm, deviations=50 * case.confirm.deviations)
+    (trial,) = judge(case.fit, loud, found.base, [model], case.smallest, loud.gap_at(found.base.values), -1e9)
+    assert trial.p >= 0.01 and trial.weak
+    assert [r.partition(" (")[0] for r in trial.reasons] == [UNCONFIRMED]
+
+
+def test_a_further_effect_must_take_more_than_the_first(found: Small):
+    """Half-way to what it would take: enough for the first effect of a model, too little for a second."""
+    case, model = found.case, extended(found, "hinge_preload at door")
+    share = 1 - np.sqrt(0.7)  # the gap is square in what is left
+    values = (1 - share) * found.base.values + share * model.values
+    whole = case.confirm.gap_at(found.base.values)
+    some = replace(model, values=values)
+    assert 0.6 < case.confirm.gap_at(values) / whole < 0.8
+    for parts, says in (((), False), ((replace(model.parts[0], amplitudes=("drag",)),), True)):
+        before = replace(found.base, parts=parts)
+        (trial,) = judge(case.fit, case.confirm, before, [some], case.smallest, whole, FLOOR)
+        assert any("of the gap away on the other demonstration" in r for r in trial.reasons) is says
+
+
+def test_one_that_another_beats_in_the_resamples_is_not_named(found: Small, monkeypatch: pytest.MonkeyPatch):
+    """Were they not alike: the right preload against one that is a third too small."""
+    case, right = found.case, extended(found, "hinge_preload at door")
+    values = right.values.copy()
+    values[case.whole.index("hinge_preload")] *= 2 / 3
+    monkeypatch.setattr(select, "alike", lambda left, *_: np.eye(len(left), dtype=bool))
+    whole = case.confirm.gap_at(found.base.values)
+    wrong = replace(right, values=values)
+    best, worse = judge(case.fit, case.confirm, found.base, [right, wrong], case.smallest, whole, FLOOR)
+    assert best.passed and best.chosen == 1.0
+    assert worse.chosen == 0.0 and worse.reasons == (f"wins only 0% of the resamples; {right.name} does better",)
+    assert not worse.weak
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -38,6 +40,14 @@ def log(repeats: int, side: TorqueSide = TorqueSide.MOTOR) -> Recording:
 
     channels = {"position": channel("position", "m", x, 2e-6), "torque": channel("torque", "N", force, 0.05)}
     return Recording("log", np.zeros(0), np.zeros((0, 0)), (), channels, TorqueConvention(side, True), qpos0={})
+
+
+def another() -> Recording:
+    """Of another sensor, which shows 2 N more."""
+    recording = log(4)
+    torque = recording.channels["torque"]
+    channels = {**recording.channels, "torque": replace(torque, values=torque.values + 2.0)}
+    return replace(recording, name="second", channels=channels)
 
 
 @pytest.fixture(scope="module")
@@ -91,6 +101,31 @@ def test_repeats_are_split_by_number(scene: Scene, space: Space):
     truth = space.values({"carriage_mass": MASS, "slide_damping": DAMPING, "coulomb[slide]": COULOMB})
     near, far = cost(np.stack([truth, space.mean]))
     assert near < 0.3 < far
+
+
+def test_a_cost_of_two_recordings_is_that_of_each(scene: Scene, space: Space):
+    first, second = log(3), another()
+    both = make_cost(scene, space, [first, second])
+    each = [make_cost(scene, space, [recording]) for recording in (first, second)]
+    rows = np.stack([space.mean, space.values({"carriage_mass": MASS}), space.values({"slide_damping": DAMPING})])
+    alone = np.stack([cost(rows) for cost in each])
+    assert np.abs(alone[0] - alone[1]).min() > 0.01
+    np.testing.assert_allclose(both(rows), alone.mean(axis=0), rtol=1e-6)
+    np.testing.assert_allclose(both.distances(rows), alone.T, rtol=1e-6)
+    np.testing.assert_allclose(both.whitened(rows), np.hstack([cost.whitened(rows) for cost in each]), atol=1e-4)
+    np.testing.assert_array_equal(both.first()(rows), alone[0])
+    assert both.first().whitened(rows).shape == each[0].whitened(rows).shape
+
+
+def test_every_recordings_gap_is_its_own(scene: Scene, space: Space):
+    config = IdentifyConfig(search=SearchConfig(population=8, parents=None, generations=2), samples=4)
+    found = identify(scene, space, [log(3), another()], config=config)
+    assert found.refined is not None and len(found.refined.residual) == found.fit.whitened(space.mean[None]).shape[1]
+    for recording in (log(3), another()):
+        held = make_cost(scene, space, [split(recording, config.heldout)[1]])
+        before, after = held.distances(np.stack([space.mean, found.best]))[:, 0]
+        gap = found.gaps[recording.name]
+        assert (gap.before, gap.after) == (pytest.approx(before, rel=1e-5), pytest.approx(after, rel=1e-3))
 
 
 def test_another_motion_on_the_same_clock_compiles_no_replay(scene: Scene, space: Space):

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,10 +17,25 @@ from small_log import COULOMB, elbow, elbow_log, elbow_space
 from droid_jax.compare.residuals import CompareConfig, make_comparison
 from droid_jax.identify import pipeline, results
 from droid_jax.identify.fit import on_bound
-from droid_jax.identify.pipeline import WORTH, Identified, IdentifyConfig, _closed, _floor, _scatter, identify, split
-from droid_jax.identify.results import write_run
+from droid_jax.identify.gaussian import prior
+from droid_jax.identify.pipeline import (
+    WORTH,
+    Identified,
+    IdentifyConfig,
+    _closed,
+    _floor,
+    _scatter,
+    cost_samples,
+    grip_hypotheses,
+    identify,
+    split,
+    starts,
+)
+from droid_jax.identify.results import traces, write_run
 from droid_jax.identify.search import SearchConfig
 from droid_jax.measure.recording import Channel
+from droid_jax.model.door import door_space
+from droid_jax.model.door_scene import door_scene
 from droid_jax.model.scene import Scene
 
 QUICK = IdentifyConfig(search=SearchConfig(population=8, parents=None, generations=2), refine=None, samples=2)
@@ -91,6 +107,53 @@ def test_two_repeats_know_their_floor(found: Identified):
     torque = recording.channels["torque"].values[:, :, 0]
     assert gap.floor == pytest.approx(np.mean(np.abs(torque[0] - torque[1])) / np.sqrt(2), rel=0.05)
     assert gap.per_joint_floor is not None and gap.before > gap.floor
+
+
+def test_traces_and_joints_are_of_the_held_out_repeat(found: Identified):
+    held = found.heldout.comparisons[0].channel("torque")
+    before, after = found.heldout.smoothed(np.stack([found.start, found.best]))[0]
+    kept = traces(found)
+    np.testing.assert_allclose(kept["elbow/before"], before)
+    np.testing.assert_allclose(kept["elbow/after"], after)
+    np.testing.assert_allclose(kept["elbow/measured_mean"], held.noise.mean)
+    gap = found.gaps["elbow"]
+    for curve, size in ((before, gap.per_joint_before), (after, gap.per_joint_after)):
+        assert size == pytest.approx(np.sqrt(np.mean((curve - held.noise.mean) ** 2, axis=0)), rel=1e-5)
+    assert gap.per_joint_before[0] > 1.1 * gap.per_joint_after[0]
+    everything = make_comparison(elbow(), elbow_log(COULOMB, 10.0, 2), held.clock, CompareConfig(whitened=True))
+    apart = np.diff(everything.channel("torque").noise.repeats[..., 0], axis=0)  # of two, one of which is held out
+    assert gap.per_joint_floor == pytest.approx([np.sqrt(np.mean(apart**2) / 2)], rel=0.02)
+
+
+def test_samples_are_of_both_gaussians_with_the_cost_of_each(found: Identified):
+    drawn = cost_samples(found, 40, 3)
+    names = drawn["names"].tolist()
+    assert names == list(found.space.names)
+    for which, gaussian in (("initial", prior(found.space)), ("fitted", found.gaussian)):
+        low, high = gaussian.interval(0.998)
+        assert np.mean((drawn[which] >= low) & (drawn[which] <= high)) > 0.95
+        again = found.heldout(found.full.embed(found.space, drawn[which]))
+        np.testing.assert_allclose(drawn[f"{which}_cost"], again, rtol=1e-4)
+    assert np.median(drawn["fitted_cost"]) < np.median(drawn["initial_cost"])
+
+
+def test_the_refinement_also_begins_at_a_firm_grip_and_asks_which_fingers_slip():
+    scene = door_scene()
+    space = door_space(scene)
+    searched: Any = SimpleNamespace(best=space.mean * 1.1)
+    begin = starts(space, space, searched)
+    np.testing.assert_allclose(begin[:2], [space.mean * 1.1, space.mean])
+    pads = [n for n in space.names if n.startswith(("sliding_friction", "torsional_friction"))]
+    assert len(pads) == 4
+    for i, p in enumerate(space.parameters):
+        assert begin[2, i] == pytest.approx(min(p.high, 4.0 * p.mean) if p.name in pads else p.mean)
+    sliding = [n for n in pads if n.startswith("sliding")]
+    slips = [set(h) for h in grip_hypotheses(space)]
+    assert slips == [{sliding[0]}, {sliding[1]}, set(sliding)]
+    assert all(h[n] == space[n].mean for h in grip_hypotheses(space) for n in h)
+    rest = space.select([n for n in space.names if n not in pads])
+    searched.best = rest.mean
+    assert len(starts(rest, rest, searched)) == 2 and grip_hypotheses(rest) == []
 
 
 def test_files_are_written_before_samples_are_drawn(found: Identified, tmp_path: Path):

@@ -353,6 +353,19 @@ def test_stop_reasons():
     assert hurried.stop == "max_seconds" and len(hurried.history.sigma) == 1
 
 
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e4])
+def test_a_search_stalls_by_shares_of_its_cost(size: float):
+    """Falling by one in a hundred a generation is no stall, by one in a hundred thousand is one, whatever the unit."""
+
+    def falling(share: float):
+        generation = iter(range(1000))
+        return lambda values: np.full(len(values), size * (1 - share) ** next(generation))
+
+    config = endless(tol_cost=1e-3, patience=5, generations=12)
+    assert search(falling(0.01), box(2), config).stop == "generations"
+    assert search(falling(1e-5), box(2), config).stop == "tol_cost"
+
+
 def test_history_says_what_the_cost_said():
     recorder = Recorder(sphere([1.0, 2.0]))
     seen = []

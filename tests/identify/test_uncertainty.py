@@ -1,10 +1,13 @@
 """The calibrated Gaussian against sandwiches in closed form, and how often its intervals hold the truth."""
 
 import dataclasses
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from droid_jax.identify import uncertainty
 from droid_jax.identify.gaussian import Gaussian, prior
 from droid_jax.identify.refine import Refined
 from droid_jax.identify.uncertainty import (
@@ -12,6 +15,7 @@ from droid_jax.identify.uncertainty import (
     calibrated,
     identifiability,
     not_judged,
+    posterior,
     time_blocks,
     with_stated_prior,
 )
@@ -359,6 +363,23 @@ def test_what_is_not_seen_is_handed_on_as_wide_as_its_stated_prior():
     plain = fitted(SQUARE, width=1.0)  # none wider was used, nothing widened
     alone = calibrated(plain, [exactly(0.5, 20, 16)], one_block(SQUARE))
     np.testing.assert_allclose(with_stated_prior(alone, plain).cov, alone.cov, rtol=1e-9)
+
+
+def test_the_gaussian_to_hand_on_holds_the_stated_prior_and_the_blocks_of_a_second():
+    """One column of six seconds; what is left is constant within a second; the second parameter is not seen."""
+    count, per_second = 60, 10
+    jacobian = np.stack([np.ones(count), np.zeros(count)], axis=1)
+    residual = np.repeat([1.0, -1.0, 2.0, -2.0, 3.0, -3.0], per_second)
+    fit = fitted(jacobian, residual)
+    noise = SimpleNamespace(mean=np.zeros((count, 1)))
+    channel = SimpleNamespace(columns=np.zeros(1), noise=noise, span=(0.0, 6.0))
+    comparison: Any = SimpleNamespace(channels=(channel,), deviations=lambda: exactly(1.0, 60, count))
+    scores = per_second * np.array([1.0, -1.0, 2.0, -2.0, 3.0, -3.0])
+    expected = np.sqrt(np.sum(scores**2)) / count
+    np.testing.assert_allclose(deviations(uncertainty.told(fit, [comparison])), [expected, 4.0], rtol=0.01)
+    with_prior = 1 / np.sqrt(expected**-2 + 1)
+    np.testing.assert_allclose(deviations(posterior(fit, [comparison])), [with_prior, 1.0], rtol=0.01)
+    assert deviations(posterior(fit, [comparison]))[1] <= 1.0
 
 
 def test_a_poor_model_leaves_nothing_wider_than_what_was_stated_before():

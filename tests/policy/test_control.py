@@ -168,6 +168,18 @@ def test_a_knob_that_is_elsewhere_is_no_beginning(policy, still, moved):
         Controller(policy).act(replace(still, knob=knob))
 
 
+@pytest.mark.parametrize(("turned", "begins"), [(0.1, True), (0.3, False), (np.pi / 2, False)])
+def test_a_knob_that_is_turned_is_no_beginning(policy, still, turned, begins):
+    """A camera's frame that is not the base's would drive the arm."""
+    knob, c, s = still.knob.copy(), np.cos(turned), np.sin(turned)
+    knob[:3, :3] = knob[:3, :3] @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    if begins:
+        assert Controller(policy).act(replace(still, knob=knob)).stopped is None
+        return
+    with pytest.raises(ValueError, match=rf"0.00 m and {turned:.2f} rad from where it was"):
+        Controller(policy).act(replace(still, knob=knob))
+
+
 def test_later_the_knob_may_go_with_its_door(policy, still):
     loop, knob = Controller(policy), still.knob.copy()
     loop.act(still)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
+from droid_jax.commands import train
 from droid_jax.identify.gaussian import Gaussian, prior
 from droid_jax.model.door import door_space
 from droid_jax.model.door_scene import door_scene
@@ -76,10 +77,28 @@ def test_only_what_is_written_is_batched(scene, gaussian, keys):
 
 
 def test_without_randomisation_all_are_alike(scene, gaussian, keys):
-    values = gaussian.space.mean
+    values = gaussian.space.values({"hinge_damping": 3.3})
     physics, _ = fixed(scene, gaussian.space, values)(Physics(scene.mjx, {}), keys)
     hinge = np.asarray(physics.model.dof_damping)[:, scene.dof("hinge")]
-    np.testing.assert_allclose(hinge, gaussian.space["hinge_damping"].mean, rtol=1e-6)
+    np.testing.assert_allclose(hinge, np.full(ENVS, 3.3), rtol=1e-6)
+
+
+def test_the_three_methods_are_the_prior_the_fits_middle_and_its_draws(scene, gaussian, keys):
+    """Of a fit that is far from its prior."""
+    at = gaussian.space.index("hinge_damping")
+    fit = replace(gaussian, mean=gaussian.mean + 3.0 * np.eye(len(gaussian.mean))[at], cov=gaussian.cov / 100)
+    middle = fit.centre[at]
+    assert middle > 2.0 * gaussian.space.mean[at]
+
+    def hinge(method: str) -> np.ndarray:
+        of = train._chosen(train.Train(method=method), fit)  # type: ignore[arg-type]
+        physics, _ = train.randomise(method, scene, of)(Physics(scene.mjx, {}), keys)
+        return np.asarray(physics.model.dof_damping)[:, scene.dof("hinge")]
+
+    np.testing.assert_allclose(hinge("mean"), middle, rtol=1e-5)
+    drawn = hinge("fitted")
+    assert len(np.unique(drawn)) == ENVS and np.abs(np.log(drawn / middle)).max() < 0.5
+    assert np.median(hinge("prior")) < 0.7 * middle
 
 
 def test_effects_ride_in_theta(scene, keys):

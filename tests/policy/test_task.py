@@ -67,9 +67,16 @@ def test_distances_count_below_thirty_degrees_only():
 
 
 def test_the_reward_is_the_weighted_sum():
-    seen = HELD._replace(yaw=0.1, normal=0.9, sliding=0.3)
-    expected = sum(getattr(TASK, name) * float(value) for name, value in terms(TASK, seen).items())
-    assert float(reward(TASK, seen)) == pytest.approx(expected)
+    """Five numbers by hand; a hand that is turned, to either side, pays less."""
+    seen = HELD._replace(yaw=-0.1, normal=0.9, sliding=0.3)
+    for yaw in (-0.1, 0.1):
+        assert float(terms(TASK, seen._replace(yaw=yaw))["orientation"]) == pytest.approx(0.8)
+    weights = Task(door=2.0, orientation=3.0, distance=5.0, log_distance=7.0, slip=11.0)
+    by_hand = (
+        2.0 * (0.25 + 0.2 / np.deg2rad(30)) + 3.0 * 0.8 - 5.0 * 0.005 - 7.0 * np.log(0.005 + TASK.near) - 11.0 * 0.3
+    )
+    assert float(reward(weights, seen)) == pytest.approx(by_hand, rel=1e-5)
+    expected = float(reward(TASK, seen))
     without_slip = replace(TASK, slip=0.0)
     assert float(reward(without_slip, seen)) == pytest.approx(expected + 0.2 * 0.3)
 

@@ -16,7 +16,7 @@ from droid_jax.model.door_scene import door_scene
 from droid_jax.policy.door_env import start_pose
 from droid_jax.policy.interface import interface_of
 from droid_jax.policy.task import Task
-from droid_jax.policy.transfer import TransferConfig, _trial, filmed, stand_in, transfer
+from droid_jax.policy.transfer import TransferConfig, _senses, _trial, filmed, stand_in, transfer
 from droid_jax.policy.trials import Trials
 
 TASK = Task(steps=260, spread=0.0)
@@ -147,3 +147,21 @@ def test_amplitudes_that_cannot_be_are_refused(scene, start):
 def test_effects_on_whole_traces_are_refused(scene, start, commands):
     with pytest.raises(ValueError, match="hidden effects command_delay change whole traces"):
         tried(scene, start, commands, hidden=(Applied("command_delay", 0.01),))
+
+
+def test_the_sensors_are_as_noisy_as_they_say(scene):
+    """The camera is wrong by the same all along a trial, and by something else in the next."""
+    config = TransferConfig(position_noise=1e-3, velocity_noise=2e-2, knob_noise=3e-3)
+    data = mujoco.MjData(scene.model)
+    mujoco.mj_forward(scene.model, data)
+    seen = []
+    for trial in range(30):
+        sense = _senses(scene, data, config, np.random.default_rng(trial))
+        readings = [sense(0.02 * k) for k in range(50)]
+        position, velocity = (np.array([getattr(r, what) for r in readings]) for what in ("position", "velocity"))
+        assert np.std(position - data.qpos[scene.joint_qpos]) == pytest.approx(1e-3, rel=0.15)
+        assert np.std(velocity - data.qvel[scene.joint_dofs]) == pytest.approx(2e-2, rel=0.15)
+        knobs = np.array([sense(0.02 * k).knob[:3, 3].copy() for k in range(3)])
+        np.testing.assert_array_equal(knobs, knobs[:1].repeat(3, axis=0))
+        seen.append(knobs[0] - data.site("knob").xpos)
+    assert np.std(seen) == pytest.approx(3e-3, rel=0.25) and abs(np.mean(seen)) < 1e-3
