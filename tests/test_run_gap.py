@@ -80,7 +80,7 @@ def test_the_same_recording_twice(place: Path, refused):
 def test_two_recordings_of_one_name(place: Path, refused):
     other = place / "day2"
     other.mkdir()
-    save(record("confirm"), other / "fit.npz")
+    save(replace(record("confirm"), name="fit"), other / "fit.npz")
     said = refused(*arguments(place, recordings=("fit.npz", "day2/fit.npz")))
     assert "the fit and the confirm recording have one name, 'fit'" in said
 

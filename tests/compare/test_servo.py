@@ -407,7 +407,8 @@ def test_degrees_are_no_radians(measured: bool):
         wrong = replace(fine, channels={**fine.channels, "position": seen})
     else:
         wrong = replace(fine, command=wrong)
-    with pytest.raises(ValueError, match=r"elbow is .* far outside its range -2 \.\. 2 rad: are these degrees"):
+    said = "shoulder is measured at" if measured else "elbow is sent to"
+    with pytest.raises(ValueError, match=said + r" .* far outside its range -2 \.\. 2 rad: are these degrees"):
         make_cost(scene, SPACE, [wrong])
 
 
