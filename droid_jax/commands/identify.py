@@ -246,7 +246,7 @@ def _recordings(
 
 def _summary(found: Identified, fit: Mapping[str, Any]) -> None:
     """A few lines that say how it went; fit: of fit.json."""
-    from droid_jax.report.words import JUDGED, lacks_something, percent
+    from droid_jax.report.words import judged, lacks_something, percent
 
     for name, gap in found.gaps.items():
         way = "one repeat: what noise alone would leave is not known"
@@ -254,7 +254,7 @@ def _summary(found: Identified, fit: Mapping[str, Any]) -> None:
             closed = "there was none to close" if gap.closed is None else f"{percent(gap.closed)} of the gap closed"
             way = f"a perfect model: {gap.floor:.3f}; {closed}"
         unit = found.fit.comparisons[0].channel("torque").unit
-        on = JUDGED[gap.judged]
+        on = judged(fit["gap"][name])
         print(f"{name}: torque distance {gap.before:.3f} -> {gap.after:.3f} {unit} {on} ({way})")
     silent = [t.name for t in found.tells if not t.identifiable and not found.full[t.name].nuisance]
     if silent and found.refined is not None:

@@ -18,7 +18,7 @@ import numpy as np
 
 from droid_jax.compare.cost import Cost, make_cost
 from droid_jax.gap.case import Case
-from droid_jax.gap.reach import FURTHER, opened_further
+from droid_jax.gap.reach import opened_further
 from droid_jax.gap.refit import Model
 from droid_jax.gap.verdict import Experiment
 from droid_jax.gap.warp import MENU, warped
@@ -48,14 +48,9 @@ def separating(case: Case, models: Sequence[Model], recording: Recording) -> tup
     known = case.fit.cost
     config = known.comparisons[0].config
     found = []
-    for entry in MENU:
-        other = warped(recording, entry)
-        cost = make_cost(known.scene, case.whole, [other], config=config, effects=case.effects)
-        found += _experiment(entry.what, cost, values)
-    further = opened_further(known.scene, recording, jax.tree.map(lambda a: a[0], known.rollouts(values[:1])[0]))
-    if further is not None:
-        cost = make_cost(known.scene, case.whole, [further], config=config, effects=case.effects)
-        found += _experiment(FURTHER, cost, values)
+    for motion in (*(warped(recording, entry) for entry in MENU), *_further(known, recording, values[:1])):
+        cost = make_cost(known.scene, case.whole, [motion], config=config, effects=case.effects)
+        found += _experiment(motion.name, cost, values)
     seen = {name: weight for name, weight in config.channels.items() if name != "object_angle"}
     if known.scene.grip is not None and seen:
         alone = replace(config, channels=seen)
@@ -65,6 +60,14 @@ def separating(case: Case, models: Sequence[Model], recording: Recording) -> tup
         what = f"the same motion with {WEIGHT:g} kg more, weighed, at the hand"
         found += _experiment(what, known, _carrying(case, values))
     return tuple(sorted(found, key=lambda e: -e.apart))
+
+
+def _further(known: Cost, recording: Recording, values: np.ndarray) -> list[Recording]:
+    """The motion opened further, as a model [1, D] made it; none where nothing grips or the hand does not get there."""
+    if known.scene.grip is None:
+        return []
+    longer = opened_further(known.scene, recording, jax.tree.map(lambda a: a[0], known.rollouts(values)[0]))
+    return [] if longer is None else [longer]
 
 
 def _experiment(what: str, cost: Cost, values: np.ndarray) -> list[Experiment]:

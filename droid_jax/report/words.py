@@ -16,7 +16,6 @@ JUDGED = {  # by `judged` of a fit.json's gap
     "time": "on the last part of the log, which the fit did not see",
     "same": "on its one repeat, which was fitted too",
 }
-GAP_REPEATS = 16  # repeats of one motion that `gap` needs to split it
 
 
 def label(name: str) -> str:
@@ -183,9 +182,11 @@ def _next(run: Run, searched: bool) -> str:
 
 def _needed(run: Run) -> str:
     """What gap needs beside what was fitted here."""
+    from droid_jax.gap.split import HALVES  # only here: it imports distributions of scipy
+
     recordings = run.config["recordings"]
-    few = len(recordings) == 1 and 1 < recordings[0]["repeats"] < GAP_REPEATS
-    return f" (it takes a second motion, or {GAP_REPEATS} repeats of this one)" if few else ""
+    few = len(recordings) == 1 and 1 < recordings[0]["repeats"] < HALVES
+    return f" (it takes a second motion, or {HALVES} repeats of this one)" if few else ""
 
 
 def lacks_something(fit: Mapping[str, Any]) -> bool:

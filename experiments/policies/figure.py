@@ -94,11 +94,10 @@ def _apart(what: str, found: Mapping[str, Any]) -> str:
     success, angle = found["success"], found["angle"]
     if success["difference"] is None:
         return f"{what}, stand-in robot: nothing to compare, all trials of one of them blew up."
-    points = [f"{_points(success['difference'])} points of success ({_between(success['interval_95'], _points)}"]
-    if success["welch_95"]:
-        points.append(f"; Welch's {_between(success['welch_95'], _points)}")
+    welch = f"; Welch's {_between(success['welch_95'], _points)}" if success["welch_95"] else ""
+    points = f"{_points(success['difference'])} points of success ({_between(success['interval_95'], _points)}{welch})"
     degrees = f"{angle['difference']:+.1f} degrees ({_between(angle['interval_95'], '{:+.1f}'.format)})"
-    return f"{what}, stand-in robot: {''.join(points)}), {degrees}."
+    return f"{what}, stand-in robot: {points}, {degrees}."
 
 
 def _between(interval: Sequence[float], words: Callable[[float], str]) -> str:

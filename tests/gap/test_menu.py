@@ -10,6 +10,7 @@ import pytest
 from small_gap import record, small
 
 from droid_jax.gap import menu
+from droid_jax.gap.case import Case
 from droid_jax.gap.menu import CARRIED, IN_THE_AIR, WEIGHT, separating, untouched
 from droid_jax.gap.reach import FURTHER
 from droid_jax.gap.refit import Model
@@ -76,15 +77,19 @@ def test_a_known_weight_tells_only_what_acts_through_it(demonstration, monkeypat
     assert found.apart == pytest.approx(np.linalg.norm(plain[0] - plain[1]), rel=0.2)
 
 
+def gripping(case: Case) -> Case:
+    """The small scene as if its hand, which holds nothing, gripped by contact."""
+    cost = replace(case.fit.cost, scene=replace(case.fit.cost.scene, grip=Grip(())))
+    return replace(case, fit=replace(case.fit, cost=cost))
+
+
 def test_in_the_air_only_the_robot_is_seen(demonstration, monkeypatch):
     """Two payloads part without the held thing, and as in the plain model: the small scene's hand holds nothing."""
     monkeypatch.setattr(menu, "MENU", ())
     case = small().case
-    cost = replace(case.fit.cost, scene=replace(case.fit.cost.scene, grip=Grip(())))
-    gripping = replace(case, fit=replace(case.fit, cost=cost))
     rivals = (model(CARRIED, 0.0), model(CARRIED, 0.2))
-    found = {e.what: e.apart for e in separating(gripping, rivals, demonstration)}
-    plain = cost.whitened(np.stack([m.values for m in rivals])).astype(float)
+    found = {e.what: e.apart for e in separating(gripping(case), rivals, demonstration)}
+    plain = case.fit.cost.whitened(np.stack([m.values for m in rivals])).astype(float)
     assert found[IN_THE_AIR] == pytest.approx(np.linalg.norm(plain[0] - plain[1]), rel=0.2)
     assert IN_THE_AIR not in {e.what for e in separating(case, rivals, demonstration)}
 
@@ -92,10 +97,11 @@ def test_in_the_air_only_the_robot_is_seen(demonstration, monkeypatch):
 def test_a_motion_within_reach_is_on_the_menu(demonstration, monkeypatch):
     """Where the hand could go on, what the rivals do on that motion counts (here the same motion again)."""
     monkeypatch.setattr(menu, "MENU", ())
-    monkeypatch.setattr(menu, "opened_further", lambda scene, recording, replayed: recording)
+    monkeypatch.setattr(menu, "opened_further", lambda scene, recording, replayed: replace(recording, name=FURTHER))
     case = small().case
     rivals = (model("drag", 0.0), model("drag", 0.8))
-    found = {e.what: e.apart for e in separating(case, rivals, demonstration)}
+    found = {e.what: e.apart for e in separating(gripping(case), rivals, demonstration)}
+    assert FURTHER not in {e.what for e in separating(case, rivals, demonstration)}
     plain = case.fit.cost.whitened(np.stack([m.values for m in rivals])).astype(float)
     assert found[FURTHER] == pytest.approx(np.linalg.norm(plain[0] - plain[1]), rel=1e-3)
 
