@@ -45,7 +45,8 @@ class RefineConfig:
       number holds from there on).
     doubt: hypotheses are tried where the residuals' mean square stays above this.
     hold: iterations for which the values of a hypothesis are held while all else settles.
-    hops: searches at most for a better basin around where the iterations stood still.
+    hops: searches at most for a better basin around where the iterations stood still; with none of them nothing is
+      put back to its initial mean either (see `STRAYED`).
     hop_generations: generations of each.
     spreads: times that the slopes are taken over the width of the posterior at the end; 0 leaves the narrow ones.
     """
@@ -148,6 +149,8 @@ def refine(
             "the best start on the first recording could not be replayed on all; start nearer to the truth"
         )
     state, _ = problem.descend(state)
+    if config.hops:
+        state = problem.back(state)
     settled, slopes = config.hops == 0, None
     for number in range(config.hops):
         slopes = problem.jacobian(state)[0]
@@ -213,6 +216,9 @@ HOP_POPULATION = 32
 HOP_SIGMA = 1.5  # posterior deviations
 HOP_TOLERANCE = 2.0  # of the objective: a hop that finds less ends the refinement
 FAR, HOP_FAR = 5e-4, 4e-3  # the same as shares of what the objective is above noise alone
+# Search units: what strayed further from its initial mean, though the data tell it no better, is put back once.
+STRAYED, UNTOLD = 1.0, 0.05
+FOLLOWED = 2  # hypotheses: once all else has settled a little, the best go on
 AT_BOUND = 1e-4  # search units: no further from it a parameter counts as stuck there
 HOP_LONGEST = 1.0  # search units: what the data do not tell is not searched far
 _SHORTEST = 0.05  # a straight path in physical units never takes a parameter below this share of itself
@@ -305,6 +311,30 @@ class _Problem:
             state, alive = state.rows(good), alive[good]
         return state.rows([int(np.argmin(state.objective))]), ended
 
+    def back(self, state: _State) -> _State:
+        """Leave a basin that the data hardly chose: put back to its initial mean what strayed, and follow that.
+
+        In logarithms a small mass is a plateau, and a finger that sticks is one in its friction: where another
+        parameter pushed them there, no slope leads back.
+        """
+        tried: set[str] = set()
+        while strayed := [name for name in self.strayed(state) if name not in tried]:
+            tried.update(strayed)
+            means = {name: self.space[name].mean for name in strayed}
+            alone = [{name: mean} for name, mean in means.items()]
+            found = self.explore(state, [*alone, means] if len(alone) > 1 else alone)
+            if found is state:
+                break
+            state, _ = self.descend(found)
+        return state
+
+    def strayed(self, state: _State) -> list[str]:
+        """Parameters of interest far from their initial means, though the data tell them hardly better than that."""
+        slopes = self.jacobian(state)[0]
+        deviation = np.sqrt(np.diag(np.linalg.inv(_curvature(slopes, self.prior))))
+        which = ~self.space.nuisance & (np.abs(state.x[0]) > STRAYED) & (deviation > UNTOLD)
+        return [self.space.names[k] for k in np.flatnonzero(which)]
+
     def hop(self, state: _State, jacobian: np.ndarray, seed: int) -> _State:
         """Leave a small basin: CMA-ES in the metric of the posterior, from a start that stands still.
 
@@ -385,7 +415,7 @@ class _Problem:
     def explore(self, state: _State, hypotheses: Hypotheses) -> _State:
         """Follow each hypothesis from a converged start: hold its values while all else settles, then free them.
 
-        Returns the better of what was found and `state`, as one start.
+        After one iteration only the best of them go on.  Returns the better of what they found and `state`, one start.
         """
         x = np.repeat(state.x, len(hypotheses), axis=0)
         held = np.zeros(x.shape, bool)
@@ -401,8 +431,12 @@ class _Problem:
         branches, held = branches.rows(alive), held[alive]
         for iteration in range(self.config.hold + 1):
             branches, _ = self.step(branches, held if iteration < self.config.hold else None)
+            ahead = np.argsort(branches.objective)[:FOLLOWED]
+            branches, held = branches.rows(ahead), held[ahead]
         found = branches.rows([int(np.argmin(branches.objective))])
-        return found if found.objective[0] < state.objective[0] else state
+        best = found if found.objective[0] < state.objective[0] else state
+        self._report(best.objective[0], best.residual.shape[1])
+        return best
 
     def _try(self, state: _State, jacobian: np.ndarray, held: np.ndarray | None) -> _State:
         """All trials of all starts in one batch; each start takes its best, or stays."""

@@ -39,7 +39,7 @@ class Task:
     reach: float = 0.1
     width: float = 0.04
     door: float = 2.0
-    orientation: float = 0.2
+    orientation: float = 1.0
     distance: float = 1.0
     log_distance: float = 0.1
     slip: float = 0.2

@@ -176,6 +176,39 @@ def test_hypotheses_are_tried_only_where_the_residuals_leave_doubt():
         np.testing.assert_allclose(fit.best, end, atol=1e-4)
 
 
+HOPPING = dataclasses.replace(FLAT, hops=1, hop_generations=1)
+
+
+def two_untold(values):
+    """The same two minima, told to half a deviation: from the upper one the way down leads through s = 0."""
+    s, g = values[:, 0], values[:, 1]
+    return np.stack([0.3 * (s**2 - 9.0), 0.5 * (s + 3.0), 3.0 * (g - 4.0 * s)], axis=1)
+
+
+def test_what_strayed_though_hardly_told_is_put_back_to_its_mean_and_followed_from_there():
+    recorder = Recorder(two_untold)
+    stood = refine(two_untold, BASINS, [3.2, 12.0], FLAT)
+    assert stood.best[0] == pytest.approx(2.5, abs=0.6) and stood.objective > 3.0
+    fit = refine(recorder, BASINS, [3.2, 12.0], HOPPING)
+    assert np.any(np.isclose(recorder.rows[:, 0], 0.0, rtol=0, atol=1e-9))
+    np.testing.assert_allclose(fit.best, [-3.0, -12.0], atol=1e-3)
+    assert fit.objective < 1e-6 and fit.converged
+
+
+@pytest.mark.parametrize(
+    ("space", "sharper"),
+    [
+        (Space((line("s", nuisance=True), line("g", std=5.0, nuisance=True))), 1.0),  # of no interest
+        (BASINS, 1000.0),  # told well
+        (Space((line("s", mean=2.5), line("g", mean=12.0, std=5.0))), 1.0),  # where they were expected
+    ],
+)
+def test_nothing_else_is_put_back(space, sharper):
+    recorder = Recorder(lambda v: sharper * two_untold(v))
+    refine(recorder, space, [3.2, 12.0], HOPPING)
+    assert not np.any(np.isclose(recorder.rows[:, 0], space.mean[0], rtol=0, atol=1e-9))
+
+
 def test_the_best_of_several_starts_wins_and_each_says_where_it_ended():
     fit = refine(two_basins, BASINS, [[3.2, 12.0], [-3.3, -10.0]], dataclasses.replace(FLAT, keep=(1e9,)))
     np.testing.assert_allclose(fit.best, [-3.0, -12.0], atol=1e-4)
