@@ -24,7 +24,13 @@ from experiments.policies.sharing import claimed
 from experiments.policies.table import SLIPPERY
 
 FIT = "fit.json"
-PADS = {"sliding_friction_left": 0.05, "sliding_friction_right": 0.05}  # the least that a search allows
+SLIDING = 0.05  # friction of slippery pads
+TORSION = 0.005 * SLIDING  # m: of a pad that touches over half a centimetre.  Table I's would turn the door by twisting
+PADS = {
+    f"{kind}_friction_{side}": mu
+    for kind, mu in (("sliding", SLIDING), ("torsional", TORSION))
+    for side in ("left", "right")
+}
 
 
 def truth_of(setting: Setting) -> dict[str, float]:
