@@ -76,11 +76,13 @@ def refit(
 
 
 def look(
-    evidence: Evidence, model: Model, part: Candidate, marks: Mapping[str, np.ndarray]
+    evidence: Evidence, model: Model, part: Candidate, marks: Mapping[str, np.ndarray], proposed: np.ndarray
 ) -> tuple[np.ndarray, float]:
     """A first look at a model with one more effect, with slopes that are known already: values [D], objective.
 
     marks: amplitude -> [M] what a unit of it adds to the simulation at `model`, in one repeat's noise.
+    proposed: [D] the model with the effect's amplitudes at their linear best.  It begins there where that is better
+    than without the effect: a step takes parameters two prior deviations at most, and a strong effect is many.
     """
     whole = evidence.cost.space
     space = whole.select(dict.fromkeys((*model.space.names, *part.free)))
@@ -88,15 +90,15 @@ def look(
     jacobian[:, space.columns(model.space)] = model.refined.jacobian
     for name in part.amplitudes:
         jacobian[:, space.index(name)] = marks[name] * space[name].std * np.sqrt(evidence.repeats)
-    begin = model.values.copy()
-    for name, value in part.shapes.items():
-        begin[whole.index(name)] = value
+    without, amplitudes = proposed.copy(), [whole.index(name) for name in part.amplitudes]
+    without[amplitudes] = model.values[amplitudes]
 
     def residuals(rows: np.ndarray) -> np.ndarray:
-        return evidence.cost.whitened(whole.embed(space, rows, begin))
+        return evidence.cost.whitened(whole.embed(space, rows, without))
 
-    values, objective = chord(residuals, space, begin[whole.columns(space)], jacobian)
-    return whole.embed(space, values[None], begin)[0], objective
+    starts = np.stack([without, proposed])[:, whole.columns(space)]
+    values, objective = chord(residuals, space, starts, jacobian)
+    return whole.embed(space, values[None], without)[0], objective
 
 
 def deviations(evidence: Evidence, model: Model) -> dict[str, float]:

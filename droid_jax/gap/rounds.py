@@ -94,11 +94,12 @@ class Hunt:
     progress: Progress
     failed: list[str] = field(default_factory=list)
 
-    def look(self, model: Model, part: Candidate, found: Screen) -> tuple[np.ndarray, float]:
+    def look(self, model: Model, proposal: Proposal, found: Screen) -> tuple[np.ndarray, float]:
         """A first look at one more effect: values [D] and objective (see `refit.look`)."""
+        (part,), proposed = proposal.parts, proposal.start(self.case.whole, model.values)
         self.progress("look", joined((*model.parts, part)))
         rows = {q.amplitude: k for k, q in enumerate(found.questions) if q.candidate.key == part.key}
-        return look(self.case.fit, model, part, {a: found.raw[k] for a, k in rows.items()})
+        return look(self.case.fit, model, part, {a: found.raw[k] for a, k in rows.items()}, proposed)
 
     def refit(self, parts: Sequence[Candidate], start: np.ndarray, config: RefineConfig, note: str = "") -> Model:
         """Base parameters and parts from a start [D] over the whole space."""
@@ -131,8 +132,7 @@ def forward(hunt: Hunt, model: Model, found: Screen) -> Round:
     case, config = hunt.case, hunt.case.config
     ranked = proposals(found, model.residuals, case.whole)
     looks = [
-        (hunt.look(model, p.parts[0], found), p)
-        for p in hunt.budget.within("candidates not looked at", ranked[: config.looked])
+        (hunt.look(model, p, found), p) for p in hunt.budget.within("candidates not looked at", ranked[: config.looked])
     ]
     best = sorted(looks, key=lambda look: look[0][1])[: config.refitted]
     left = hunt.budget.within("candidates not refitted", best)

@@ -12,7 +12,8 @@ from droid_jax.gap.evidence import Evidence
 from droid_jax.gap.flips import sign_flips, t_values
 from droid_jax.gap.refit import LEVEL, Model, deviations, intervals
 
-SIGNIFICANT = 0.01
+SIGNIFICANT = 0.01  # p below which something is missing
+CONFIRMED = 0.05  # and below which one effect's gain on the other demonstration is no chance, among all other gates
 LESS = 0.2  # share of U that the first effect must take away on the confirming demonstration
 MORE = 0.4  # share of what is left that every further effect must: a wrong form of the first leaves something too
 OF_ALL = 0.05  # and share of the base model's U: what a wrong form of the first effect leaves is no effect of its own
@@ -98,7 +99,7 @@ def judge(
         p = one_sided_p(0.5 * (squares[0] - squares[k + 1]))
         chosen = float(winners[same[k]].sum())
         spans = {a: s for a, s in intervals(fit, model).items() if a not in before.amplitudes}
-        weak = [f"{UNCONFIRMED} (p = {p:.2g})"] if p >= SIGNIFICANT else []
+        weak = [f"{UNCONFIRMED} (p = {p:.2g})"] if p >= CONFIRMED else []
         weak += _too_small(fit, model, spans, smallest)
         reasons = _gap_reasons(left[0], left[k + 1], whole_gap, MORE if before.parts else LESS, floor)
         reasons += _amplitude_reasons(fit, model, spans)

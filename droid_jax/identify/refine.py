@@ -178,14 +178,14 @@ def refine(
     )
 
 
-def chord(residuals: Residuals, space: Space, start: np.ndarray, jacobian: np.ndarray) -> tuple[np.ndarray, float]:
-    """What steps with a Jacobian [M, D] known from elsewhere reach from a start [D]: values [D], objective.
+def chord(residuals: Residuals, space: Space, starts: np.ndarray, jacobian: np.ndarray) -> tuple[np.ndarray, float]:
+    """What steps with a Jacobian [M, D] known from elsewhere reach from the best start [S, D]: values [D], objective.
 
     A few batches of trials and no differences: a first look at what a refinement would find.
     """
     problem = _Problem(residuals, space, RefineConfig())
-    state = problem.start(problem.inside(space.to_search(space.check(start[None]))))
-    state = problem.trials(state, jacobian[None])
+    state = problem.start(problem.inside(space.to_search(space.check(starts))))
+    state = problem.trials(state.rows([int(np.argmin(state.objective))]), jacobian[None])
     return space.from_search(state.x[0]), float(state.objective[0])
 
 

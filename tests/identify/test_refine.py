@@ -375,9 +375,19 @@ def test_a_start_that_fails_on_all_the_data_is_refused():
 
 
 def test_a_first_look_from_where_nothing_can_be_replayed_stays_there():
-    values, objective = chord(lambda v: np.full((len(v), 2), np.nan), BASINS, np.array([1.0, 2.0]), np.eye(2))
+    values, objective = chord(lambda v: np.full((len(v), 2), np.nan), BASINS, np.array([[1.0, 2.0]]), np.eye(2))
     np.testing.assert_allclose(values, [1.0, 2.0])
     assert np.isinf(objective)
+
+
+def test_a_first_look_begins_at_the_best_of_its_starts():
+    """Steps of two units at most lead no further than a few from the first; the second is nearly there."""
+    space, slopes = Space((line("a"),)), np.ones((1, 1))
+    far, _ = chord(linear(slopes, [40.0]), space, np.array([[0.0]]), slopes)
+    assert 0.0 < far[0] < 10.0
+    values, objective = chord(linear(slopes, [40.0]), space, np.array([[0.0], [39.0]]), slopes)
+    assert values[0] == pytest.approx(40.0 / (1 + 1 / 16), abs=0.01)  # the prior is four deviations wide
+    assert objective == pytest.approx(0.5 * 40.0**2 / 17, rel=1e-4)
 
 
 def test_a_trial_that_fails_is_not_taken():
