@@ -4,8 +4,9 @@
 
 Every case draws a robot with all its nuisances and records it; base fit and screening follow.  Only where the
 screening rejects are the other demonstrations recorded and the search taken to its end.  One small JSON a case
-under OUT/null_cases: the run can be stopped and goes on where it was, or be made in pieces, scene by scene; every
-summary is of all cases of the commit that are there.  Truths and seeds come as in the blind suite.
+under OUT/null_cases: the run can be stopped and goes on where it was, or be made in pieces, scene by scene, and the
+same command started twice shares the cases; every summary is of all cases of the commit that are there.  Truths and
+seeds come as in the blind suite.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ from experiments.blind.make import recorded  # noqa: E402
 from experiments.blind.scenes import setting  # noqa: E402
 from experiments.blind.score import rate  # noqa: E402
 from experiments.blind.search import Bench, Stopwatch, silent  # noqa: E402
+from experiments.sharing import claimed  # noqa: E402
 
 SIGNIFICANT = 0.01
 LEVELS = (0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9)
@@ -158,7 +160,9 @@ def main() -> None:
         bench = Bench({scene: setting(scene, arguments.out / "door")})
         for number in range(count):
             path = folder / file_of(scene, number, commit)
-            if not path.is_file():
+            with claimed(path, wait=False) as mine:
+                if not mine or path.is_file():
+                    continue
                 write_json(path, case_of(Plan(name_of(scene, number), scene, "none"), commit, bench))
                 print(f"{scene} {number}: {told(json.loads(path.read_text()))}", flush=True)
     found = cases_of(folder, commit)

@@ -26,6 +26,7 @@ from experiments.blind.answers import right
 from experiments.blind.quiet import settled
 from experiments.blind.scenes import ROLES
 from experiments.blind.search import Bench
+from experiments.sharing import claimed
 
 FROM_TRUTH = RefineConfig(iterations=12, hops=0, spreads=0)
 SIZES = np.geomspace(3e-3, 0.8, 12)  # of the way from neutral to a bound
@@ -87,10 +88,12 @@ def oracle_all(runs: Path, chosen: Iterable[str], bench: Bench, tell: Callable[[
     for name in chosen:
         path, sealed, known = (runs / folder / f"{name}.json" for folder in ("oracle", "sealed", "results"))
         truth = json.loads(sealed.read_text())
-        if path.is_file() or truth["kind"] not in KINDS:
-            continue
-        found = oracle(runs / "cases" / name, truth, json.loads(known.read_text()) if known.is_file() else None, bench)
-        write_json(path, found)
+        with claimed(path, wait=False) as mine:
+            if not mine or path.is_file() or truth["kind"] not in KINDS:
+                continue
+            result = json.loads(known.read_text()) if known.is_file() else None
+            found = oracle(runs / "cases" / name, truth, result, bench)
+            write_json(path, found)
         count += 1
         tell(f"{name}: {found['model']}, U {', '.join(f'{role} {u:.3g}' for role, u in found['gaps'].items())}")
     return count

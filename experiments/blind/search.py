@@ -25,6 +25,7 @@ from droid_jax.measure.recording import Recording
 from droid_jax.storage import write_json
 from experiments.blind.baselines import baselines
 from experiments.blind.scenes import ROLES, Setting, setting
+from experiments.sharing import claimed
 
 
 @dataclass
@@ -135,14 +136,18 @@ def describe(case: Case, verdict: Verdict) -> dict[str, Any]:
 
 
 def search_all(folders: Iterable[Path], results: Path, bench: Bench, tell: Callable[[str], None] = print) -> int:
-    """Search every folder that has no result yet in the folder `results`; how many there were."""
+    """Search every folder that has no result yet in the folder `results`; how many there were.
+
+    Processes that run the same command share them.
+    """
     count = 0
     for folder in folders:
         path = results / f"{folder.name}.json"
-        if path.is_file():
-            continue
-        result = search_case(folder, bench)
-        write_json(path, result)
+        with claimed(path, wait=False) as mine:
+            if not mine or path.is_file():
+                continue
+            result = search_case(folder, bench)
+            write_json(path, result)
         count += 1
         taken = ", ".join(f"{stage} {seconds:.0f}" for stage, seconds in result["seconds"].items())
         tell(f"{folder.name}: {result.get('sentence', result.get('error'))} ({taken} s)")

@@ -25,8 +25,8 @@ from droid_jax.policy.train import PRESETS, TrainConfig, train
 from droid_jax.policy.transfer import StandIn, transfer
 from droid_jax.report.files import GAUSSIAN, POLICY, TRAINING
 from droid_jax.storage import write_json
-from experiments.policies.sharing import claimed
 from experiments.policies.table import PLACES
+from experiments.sharing import claimed
 
 TIMESTEP = 0.004  # s, of the simulation that trains
 QUICK_STEPS = 20  # actions of an episode where nothing shall be learned

@@ -20,8 +20,8 @@ from droid_jax.storage import write_json
 from experiments.identify_suite import describe, recordings, settings
 from experiments.policies.cases import TIMESTEP, Options
 from experiments.policies.settings import Setting
-from experiments.policies.sharing import claimed
 from experiments.policies.table import SLIPPERY
+from experiments.sharing import claimed
 
 FIT = "fit.json"
 SLIDING = 0.05  # friction of slippery pads
