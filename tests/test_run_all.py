@@ -66,7 +66,7 @@ def found(folder: Path, effects: list[str]) -> None:
     folder.mkdir(parents=True)
     gaps = {role: {"closed": 0.5 + 0.1 * k} for k, role in enumerate(("fit", "confirm", "sealed"))}
     (folder / "gap.json").write_text(
-        json.dumps({"effects": effects, "sentence": "The model lacks: latch.", "gaps": gaps})
+        json.dumps({"effects": effects, "tied": [], "screens": [], "sentence": "The model lacks: latch.", "gaps": gaps})
     )
 
 
@@ -124,7 +124,14 @@ def test_a_policy_is_trained_on_the_extended_model_where_there_is_one(called, tm
     found(tmp_path / "runs" / "all" / "gap", ["latch at door_hinge"])
     assert main(["all", "--stages", "train"]) == 0
     assert called[0].fit == Path("runs/all/gap")
-    assert "gap: The model lacks: latch.; 70 % of the gap U closed on the sealed motion" in capsys.readouterr().out
+    assert "gap: The model lacks: latch; 70 % of the gap U closed on the sealed motion" in capsys.readouterr().out
+
+
+def test_the_last_lines_say_what_was_hidden(called, tmp_path: Path, capsys):
+    found(tmp_path / "runs" / "all" / "gap", ["latch at door_hinge"])
+    assert main([]) == 0
+    said = capsys.readouterr().out
+    assert "hidden in the stand-in robot: magnetic catch (1.5 N m; in the library: latch)" in said
 
 
 def test_without_a_named_effect_it_is_trained_on_the_fit(called, tmp_path: Path):

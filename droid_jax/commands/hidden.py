@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from droid_jax.commands.folder import kept_recordings
+from droid_jax.report.files import STAND_IN
 
 if TYPE_CHECKING:
     from droid_jax.measure.recording import Recording
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
 DEMONSTRATIONS = {"fit": "C", "confirm": "B", "sealed": "A"}
 HIDE = ("magnetic_catch=1.5",)  # N m
 OPTIONS = {"hide": None, "springs": 1, "demonstrations": ("A", "C")}  # of a stand-in, as they are where not given
-KNOWN = "stand_in.json"  # beside the stand-in's recordings: its springs, seed and hidden effects
 
 T = TypeVar("T")
 
@@ -86,7 +86,7 @@ def record_stand_in(
     if again or known_stand_in(list(paths.values())) != this:
         for path in paths.values():
             path.unlink(missing_ok=True)
-    write_json(out / "recordings" / KNOWN, this)  # before the first: a stop leaves no recordings of an unknown robot
+    write_json(out / "recordings" / STAND_IN, this)  # before the first: a stop leaves no recordings of an unknown robot
     found = kept_recordings(paths, False, recorded)
     return {role: found[name] for role, name in DEMONSTRATIONS.items()}
 
@@ -100,7 +100,7 @@ def known_stand_in(recordings: Sequence[str | Path]) -> dict[str, Any]:
     """Springs, seed and hidden effects of the stand-in robot that made these files; empty where that is not known."""
     folders = {Path(path).resolve().parent for path in recordings}
     try:
-        return json.loads((folders.pop() / KNOWN).read_text()) if len(folders) == 1 else {}
+        return json.loads((folders.pop() / STAND_IN).read_text()) if len(folders) == 1 else {}
     except (OSError, ValueError):
         return _of_meta(recordings)
 

@@ -233,7 +233,9 @@ def _plan(
 
 def told(out: Path) -> list[str]:
     """One line for each stage that has a result."""
-    from droid_jax.report.words import judged, percent
+    from droid_jax.report.gap_words import readable
+    from droid_jax.report.page import hidden_in
+    from droid_jax.report.words import hidden_words, judged, percent
 
     lines, old = [], left_over(out)
     if old:
@@ -246,7 +248,9 @@ def told(out: Path) -> list[str]:
         role, size = list(found["gaps"].items())[-1]
         closed = size["closed"]
         share = "" if closed is None else f"; {percent(closed)} of the gap U closed on the {role} motion"
-        lines.append(f"gap: {found['sentence']}{share}")
+        lines.append(f"gap: {readable(found['sentence'], found).rstrip('.')}{share}")
+        if hidden := hidden_words(hidden_in(out)):
+            lines.append(f"hidden in the stand-in robot: {hidden}")
     for name, of in {} if "train" in old else (_json(out / "train" / TRANSFER) or {}).items():
         if name in ("simulation", "stand_in"):
             low, high = of["interval_95"]

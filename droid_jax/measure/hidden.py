@@ -28,6 +28,35 @@ from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 
 HIDDEN: dict[str, Hidden] = {h.name: h for h in (*DOOR, *FRICTION, *ARM_EFFECTS, *SIGNALS)}
+# What the library of effects calls them; what is missing here it has no form of.  No two forms are the same.
+LIBRARY = {
+    "hinge_preload": "hinge_preload",
+    "binding_spring": "hardening_spring",
+    "over_centre": "over_centre_spring",
+    "magnetic_catch": "latch",
+    "closer": "door_closer",
+    "opening_check": "opening_check",
+    "air_drag": "drag",
+    "floor_friction": "angle_friction",
+    "tilted_frame": "tilted_frame",
+    "dry_friction": "joint_coulomb",
+    "stribeck_friction": "joint_stribeck",
+    "directional_friction": "joint_directional",
+    "load_friction": "load_friction",
+    "bristle_friction": "joint_coulomb",
+    "warm_up_friction": "joint_coulomb",
+    "payload": "payload",
+    "cable_pull": "cable_pull",
+    "torque_ripple": "torque_ripple",
+    "joint_elasticity": "joint_compliance",
+    "servo_gains": "servo_gain",
+    "grip_compliance": "contact_compliance",
+    "command_delay": "command_delay",
+    "sensor_delay": "sensor_delay",
+    "torque_bias": "torque_bias",
+    "torque_gain": "torque_gain",
+    "torque_drift": "torque_drift",
+}
 LONGEST_STEP = 0.00025  # s: the explicit torques of hidden effects want a step this short
 PAUSE = 5.0  # s between repeats, for what warms up or drifts
 

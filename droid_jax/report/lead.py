@@ -16,14 +16,18 @@ ALL_THE_SAME = (
 )
 
 
-def lead(run: Run | None, gap: Gap | None, policy: Trained | None) -> list[str]:
-    """From the numbers alone; the last sentence says what to do next."""
+def lead(run: Run | None, gap: Gap | None, policy: Trained | None, hidden: str = "") -> list[str]:
+    """From the numbers alone; the last sentence says what to do next.
+
+    hidden: what the stand-in robot hides, in words.
+    """
     sentences, following = [], ""
     if run:
         sentences.append(_fitted(run))
         following = summary(run, gap is not None)[-1]
     if gap:
         sentences += [readable(gap.found["sentence"], gap.found), *_closed(gap)]
+        sentences += [f"What the stand-in robot hid: {hidden}."] if hidden else []
         following = gap_summary(gap)[-1]
     if policy:
         sentences += [_opened(where, found["success_rate"]) for where, found in policy.trials.items()]

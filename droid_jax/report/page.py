@@ -12,6 +12,7 @@ training.json.
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -22,7 +23,7 @@ from markupsafe import Markup
 
 from droid_jax.report.drawings import draw, frame_rows
 from droid_jax.report.export import data_uri
-from droid_jax.report.files import FITTED, POLICY, STAGES, TRAINING, TRANSFER
+from droid_jax.report.files import FITTED, POLICY, STAGES, STAND_IN, TRAINING, TRANSFER
 from droid_jax.report.gap_drawings import draw_gap
 from droid_jax.report.gap_folder import Gap, has_gap, read_gap
 from droid_jax.report.gap_tables import groups
@@ -38,11 +39,11 @@ from droid_jax.report.gap_words import (
 )
 from droid_jax.report.lead import lead
 from droid_jax.report.policy_drawings import draw_policy, film_row
-from droid_jax.report.policy_folder import Trained, has_policy, read_policy
+from droid_jax.report.policy_folder import NO_FILMS, Trained, has_policy, read_policy
 from droid_jax.report.policy_words import policy_summary
 from droid_jax.report.run_folder import Run, has_run, read_run
 from droid_jax.report.stages import left_over
-from droid_jax.report.words import grouped, judged, label, like, number, percent, speaker, summary
+from droid_jax.report.words import grouped, hidden_words, judged, label, like, number, percent, speaker, summary
 from droid_jax.storage import write_text
 
 _DOWNLOADS = (
@@ -109,6 +110,12 @@ def write_report(run: Path) -> Path:
     return path
 
 
+def hidden_in(folder: Path) -> list[str]:
+    """What the stand-in robot hid that was recorded into a run's folder: "name=amplitude" each."""
+    path = folder / "recordings" / STAND_IN
+    return json.loads(path.read_text())["hide"] if path.is_file() else []
+
+
 def _part(places: Sequence[Path], has: Callable[[Path], bool]) -> Path | None:
     """Where a part of the page is: in the run's folder, or in that of one of its stages."""
     return next((at for at in places if has(at)), None)
@@ -134,7 +141,7 @@ def _together(folder: Path, run: Run | None, gap: Gap | None, policy: Trained | 
     return {
         "title": f"Report: {name}",
         "heading": f"Report: {scene or name}",
-        "lead": lead(run, gap, policy),
+        "lead": lead(run, gap, policy, hidden_words(hidden_in(folder))),
     }
 
 
@@ -188,4 +195,5 @@ def _policy(trained: Trained) -> dict[str, Any]:
         "policy_summary": policy_summary(trained),
         "policy_drawings": draw_policy(trained),
         "films": film_row(trained),
+        "no_films": NO_FILMS,
     }

@@ -28,6 +28,9 @@ _TRIALS = {
 _TRANSFER = {"simulation": _TRIALS, "stand_in": _TRIALS, "robot": {"hidden": [{"name": str, "amplitude": _NUMBER}]}}
 
 
+NO_FILMS = "No films: drawing needs OpenGL (Debian, Ubuntu: apt-get install libegl1 libgl1-mesa-dri)."
+
+
 @dataclass(frozen=True)
 class Trained:
     """What a folder of `train` holds.

@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
+from droid_jax.measure.hidden import HIDDEN, LIBRARY
 from droid_jax.report.run_folder import Run
 
 # Words before "joint" of which a robot has several: the number alone does not tell its joints apart.
@@ -63,6 +64,19 @@ def percent(share: float) -> str:
     if nearest == 0 and share > 0.0:
         return "< 1 %"
     return f"{nearest} %".replace("-", "−")
+
+
+def hidden_words(hide: Sequence[str]) -> str:
+    """["magnetic_catch=1.5"] -> "magnetic catch (1.5 N m; in the library: latch)"; empty for nothing."""
+    said = []
+    for entry in hide:
+        name, _, amplitude = entry.partition("=")
+        effect = HIDDEN.get(name.partition("[")[0])
+        called = LIBRARY.get(name.partition("[")[0])
+        size = f"{amplitude} {effect.unit}".removesuffix(" -") if effect else amplitude
+        library = f"in the library: {label(called).lower()}" if called else "the library has no form of it"
+        said.append(f"{label(name).lower()} ({size}; {library})")
+    return listed(said)
 
 
 def listed(names: Sequence[str]) -> str:

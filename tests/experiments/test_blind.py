@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from droid_jax.measure.formats import load
-from droid_jax.measure.hidden import HIDDEN, Applied, possible
+from droid_jax.measure.hidden import HIDDEN, LIBRARY, Applied, possible
 from droid_jax.model.effects.registry import registered
 from droid_jax.model.parameters import Parameter, Space
 from experiments import hidden_effects, null_calibration
@@ -123,6 +123,7 @@ def test_motions_differ_and_begin_at_rest(name: str):
 
 def test_every_hidden_effect_has_an_answer():
     assert set(ANSWERS) == set(HIDDEN)
+    assert {name: answer.exact for name, answer in ANSWERS.items() if answer.exact} == LIBRARY  # what users are told
     known = set(registered())
     for name, answer in ANSWERS.items():
         assert {n for n in (answer.exact, *answer.ties) if n} <= known, name

@@ -43,6 +43,24 @@ def test_a_paragraph_says_what_was_fitted_what_is_missing_and_what_is_next(text:
     assert '<span class="next">Next: python -m droid_jax.run export' in lead
 
 
+def test_what_the_stand_in_robot_hid_is_said_in_the_librarys_words_too(tmp_path: Path):
+    make_gap(tmp_path / "gap")
+    make_policy(tmp_path / "train")
+
+    def lead() -> str:
+        text = page.write_report(tmp_path).read_text().replace("\u00a0", " ")
+        (found,) = re.findall(r'<p class="summary lead">(.*?)</p>', text, re.S)
+        return found
+
+    assert "hid" not in lead()
+    (tmp_path / "recordings").mkdir()
+    (tmp_path / "recordings" / "stand_in.json").write_text('{"hide": ["magnetic_catch=1.5", "detent=0.5"]}')
+    assert (
+        "What the stand-in robot hid: magnetic catch (1.5 N m; in the library: latch) and detent (0.5 N m; the library "
+        "has no form of it)." in lead()
+    )
+
+
 @pytest.mark.parametrize(("verdict", "warned"), [("unexplained", True), ("fit not converged", True), ("tie", False)])
 def test_a_policy_of_a_model_that_is_known_to_be_wrong_is_not_sent_to_a_robot(
     tmp_path: Path, verdict: str, warned: bool
