@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -127,7 +127,8 @@ def rows(policy: Policy, setting: Setting, task: Task, arguments: Arguments) -> 
 def trained(arguments: Arguments, setting: Setting, code: Mapping[str, Any]) -> Path:
     """File of a policy of the prior; made where there is none yet."""
     folder, budget, seed = arguments.cases("effects_on_policy"), arguments.budget, arguments.first
-    of = {"springs": arguments.springs, "seed": seed, "budget": budget.to_json()}
+    task = asdict(budget.task(Task(**setting.task)))
+    of = {"setting": asdict(setting), "task": task, "seed": seed, "budget": budget.to_json()}
     make = functools.partial(policy_case, "prior", seed, setting, arguments, code)
     path = folder / f"prior_{seed}.json"
     finish(run_all([Case(path, make, of, "prior")], 1, code))

@@ -35,6 +35,7 @@ from droid_jax.commands.hidden import hidden_effects, record_stand_in  # noqa: E
 from droid_jax.gap.case import GapConfig  # noqa: E402
 from droid_jax.gap.extended import FILE, extended, load_extended, save_extended  # noqa: E402
 from droid_jax.gap.split import Split  # noqa: E402
+from droid_jax.gap.verdict import Kind  # noqa: E402
 from droid_jax.identify.gaussian import load as load_gaussian  # noqa: E402
 from droid_jax.identify.gaussian import prior  # noqa: E402
 from droid_jax.identify.refine import RefineConfig  # noqa: E402
@@ -107,6 +108,8 @@ def _searched(arguments: Arguments, folder: Path, code: Mapping[str, Any]) -> di
     case, verdict, _ = searched(Split.RECORDINGS, scene, base, library(scene), roles, config, kept)
     posterior(verdict.base.refined, case.fit.cost.comparisons).save(folder / BASE)
     save_extended(folder, extended(case, verdict.model))
+    if verdict.kind is Kind.UNCONVERGED and not arguments.quick:  # no verdict: nothing is kept of it
+        raise SystemExit(f"error: {verdict.sentence}")
     found = {
         "hidden": list(arguments.hide),
         "verdict": verdict.kind.value,

@@ -34,7 +34,7 @@ import tyro  # noqa: E402
 
 from benchmarks.common import origin  # noqa: E402
 from droid_jax.identify.gaussian import prior  # noqa: E402
-from droid_jax.model.door import door_space  # noqa: E402
+from droid_jax.model.door import door_nuisances, door_space  # noqa: E402
 from droid_jax.model.door_scene import door_scene  # noqa: E402
 from droid_jax.policy.door_env import DoorEnv  # noqa: E402
 from droid_jax.policy.task import Task  # noqa: E402
@@ -63,7 +63,8 @@ def case(method: Method, seed: int, setting: Setting, arguments: Options, code: 
     """One policy of one method: what it is trained on is the one thing in which methods differ."""
     budget = arguments.budget
     env = DoorEnv(door_scene(timestep=TIMESTEP, limits=True), budget.task(Task(**setting.task)))
-    gaussian = prior(door_space(env.scene)) if method == "prior" else fitted(setting, arguments, code)
+    space = door_space(env.scene) + door_nuisances(env.scene)  # those of the fit
+    gaussian = prior(space) if method == "prior" else fitted(setting, arguments, code)
     return tried(arguments, env, Doors(gaussian, method), robots_of(setting, env, budget.trials), seed, code)
 
 
@@ -76,6 +77,13 @@ def planned_case(method: Method, seed: int, name: str, arguments: Arguments, cod
     return Case(folder / f"{method}_{seed}.json", make, of, f"{name}, {'prior' if method == 'prior' else 'fit'}")
 
 
+def seeds(name: str, arguments: Options) -> range:
+    """Of the policies of each method in a setting."""
+    return range(
+        arguments.first, arguments.first + len(arguments.policies) * (1 if arguments.quick else SETTINGS[name].times)
+    )
+
+
 def main() -> None:
     arguments, code = tyro.cli(Arguments, description=__doc__), origin(0)
     unknown = [name for name in arguments.settings if name not in SETTINGS]
@@ -85,7 +93,8 @@ def main() -> None:
     asked = {(s, m) for s in arguments.settings for m in arguments.methods}
     planned = [
         planned_case(method, seed, name, arguments, code)
-        for name, seed, method in itertools.product(settings, arguments.policies, METHODS)
+        for name in settings
+        for seed, method in itertools.product(seeds(name, arguments), METHODS)
     ]
     now = [c for c in planned if (c.of["setting"]["name"], c.of["method"]) in asked]
     failed = run_all(now, arguments.at_most, code)

@@ -81,8 +81,8 @@ def look(
     """A first look at a model with one more effect, with slopes that are known already: values [D], objective.
 
     marks: amplitude -> [M] what a unit of it adds to the simulation at `model`, in one repeat's noise.
-    proposed: [D] the model with the effect's amplitudes at their linear best.  It begins there where that is better
-    than without the effect: a step takes parameters two prior deviations at most, and a strong effect is many.
+    proposed: [D] the model with the effect's amplitudes at their linear best.  It begins there and without the effect,
+    and the better end counts: a step takes parameters two prior deviations at most, and a strong effect is many.
     """
     whole = evidence.cost.space
     space = whole.select(dict.fromkeys((*model.space.names, *part.free)))

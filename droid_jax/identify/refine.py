@@ -185,8 +185,9 @@ def chord(residuals: Residuals, space: Space, starts: np.ndarray, jacobian: np.n
     """
     problem = _Problem(residuals, space, RefineConfig())
     state = problem.start(problem.inside(space.to_search(space.check(starts))))
-    state = problem.trials(state.rows([int(np.argmin(state.objective))]), jacobian[None])
-    return space.from_search(state.x[0]), float(state.objective[0])
+    state = problem.trials(state, np.repeat(jacobian[None], len(state.x), axis=0))
+    best = int(np.argmin(state.objective))
+    return space.from_search(state.x[best]), float(state.objective[best])
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +217,7 @@ HOP_POPULATION = 32
 HOP_SIGMA = 1.5  # posterior deviations
 HOP_TOLERANCE = 2.0  # of the objective: a hop that finds less ends the refinement
 FAR, HOP_FAR = 5e-4, 4e-3  # the same as shares of what the objective is above noise alone
-# Search units: what strayed further from its initial mean, though the data tell it no better, is put back once.
+# Search units: what strayed further from its initial mean, and is not told to much less than that, is put back once.
 STRAYED, UNTOLD = 1.0, 0.05
 FOLLOWED = 2  # hypotheses: once all else has settled a little, the best go on
 AT_BOUND = 1e-4  # search units: no further from it a parameter counts as stuck there
@@ -302,8 +303,7 @@ class _Problem:
             ended[alive] = state.objective
             leader = int(np.argmin(state.objective))
             self._report(state.objective[leader], state.residual.shape[1])
-            least = max(self.config.tolerance, FAR * self.excess(state)[leader], rough * state.objective[leader])
-            if gain[leader] <= least:
+            if gain[leader] <= max(self.least(state), rough * state.objective[leader]):
                 break
             if HOPELESS * gain[leader] < state.objective[leader] - self.config.aim:
                 break
@@ -315,21 +315,28 @@ class _Problem:
         """Leave a basin that the data hardly chose: put back to its initial mean what strayed, and follow that.
 
         In logarithms a small mass is a plateau, and a finger that sticks is one in its friction: where another
-        parameter pushed them there, no slope leads back.
+        parameter pushed them there, no slope leads back.  Not with the last iterations: they are for what is there.
         """
         tried: set[str] = set()
         while strayed := [name for name in self.strayed(state) if name not in tried]:
+            if self.iterations + 2 * (self.config.hold + 1) > self.config.iterations:
+                break
             tried.update(strayed)
             means = {name: self.space[name].mean for name in strayed}
             alone = [{name: mean} for name, mean in means.items()]
             found = self.explore(state, [*alone, means] if len(alone) > 1 else alone)
-            if found is state:
+            if _fall(state.objective, found.objective)[0] <= self.least(state):
                 break
             state, _ = self.descend(found)
         return state
 
+    def least(self, state: _State) -> float:
+        """By how much the best objective must fall for it to be worth an iteration."""
+        leader = int(np.argmin(state.objective))
+        return max(self.config.tolerance, FAR * float(self.excess(state)[leader]))
+
     def strayed(self, state: _State) -> list[str]:
-        """Parameters of interest far from their initial means, though the data tell them hardly better than that."""
+        """Parameters of interest far from their initial means that the data do not tell sharply."""
         slopes = self.jacobian(state)[0]
         deviation = np.sqrt(np.diag(np.linalg.inv(_curvature(slopes, self.prior))))
         which = ~self.space.nuisance & (np.abs(state.x[0]) > STRAYED) & (deviation > UNTOLD)

@@ -12,7 +12,7 @@ class Setting:
     """A robot and its door, and what is asked for.
 
     springs: column of Table I for the hidden values; truth: what differs from it; robot: seed of the hidden errors.
-    task: what differs from the usual task.
+    task: what differs from the usual task.  times: how many times --seeds policies there are of each method.
     """
 
     name: str
@@ -20,6 +20,7 @@ class Setting:
     robot: int
     truth: Mapping[str, float] = field(default_factory=dict)
     task: Mapping[str, Any] = field(default_factory=dict)
+    times: int = 1
 
 
 SETTINGS = {
@@ -37,6 +38,7 @@ SETTINGS = {
             "torsional_friction_left": 1.0,
             "torsional_friction_right": 1.0,
         },
+        times=2,  # policies differ more there
     ),
 }
 
