@@ -156,6 +156,7 @@ def _trial(
             stopped = BLOWN_UP  # MuJoCo starts over then: its clock is late
             break
         watch(data)
+        mujoco.mj_kinematics(model, data)  # mj_step leaves places as they were before its last step
         seen = looked(hand, data, finger_forces_c(hand, model, data), seen.pads, task.control, np)
         grips += bool(gripped(task, seen))
         angle, held = max(angle, float(seen.angle)), float(holding(task, seen, held))

@@ -13,7 +13,9 @@ from droid_jax.measure.demonstration import PLANS
 from droid_jax.measure.hidden import Applied
 from droid_jax.measure.surrogate import stand_in_truth
 from droid_jax.model.door_scene import door_scene
+from droid_jax.policy import transfer as module
 from droid_jax.policy.door_env import start_pose
+from droid_jax.policy.hand import looked
 from droid_jax.policy.interface import interface_of
 from droid_jax.policy.task import Task
 from droid_jax.policy.transfer import TransferConfig, _senses, _trial, filmed, stand_in, transfer
@@ -62,6 +64,22 @@ def test_a_film_shows_the_same_trial(scene, start, commands):
     assert films[0].shape == (13, scene.model.nq)
     np.testing.assert_array_equal(films[0], films[1])
     assert np.abs(films[0][0] - films[2][0]).max() > 1e-3
+
+
+def test_places_and_joints_that_are_seen_are_of_one_instant(scene, start, commands, monkeypatch: pytest.MonkeyPatch):
+    task, late = replace(TASK, steps=12), []
+    robot = stand_in(scene, start, stand_in_truth(scene, 0, 0), (), task, ONE)
+
+    def looking(hand, data, *rest):
+        fresh = mujoco.MjData(robot.scene.model)
+        fresh.qpos[:] = data.qpos
+        mujoco.mj_kinematics(robot.scene.model, fresh)
+        late.append(np.abs(fresh.site_xpos - data.site_xpos).max())
+        return looked(hand, data, *rest)
+
+    monkeypatch.setattr(module, "looked", looking)
+    transfer(Script(task, commands, interface_of(scene, task, start)), robot)  # type: ignore[arg-type]
+    assert len(late) == 13 and max(late) < 1e-9
 
 
 def test_a_policy_of_another_rate_is_refused(scene, start, commands):
