@@ -61,12 +61,21 @@ def motions(*files: str, repeats: int = 8, commands: bool = True) -> tuple[str, 
     return files
 
 
-def found(folder: Path, effects: list[str]) -> None:
+def found(folder: Path, effects: list[str], stand_in: bool = True) -> None:
     """A folder with the results of a search."""
     folder.mkdir(parents=True)
     gaps = {role: {"closed": 0.5 + 0.1 * k} for k, role in enumerate(("fit", "confirm", "sealed"))}
     (folder / "gap.json").write_text(
-        json.dumps({"effects": effects, "tied": [], "screens": [], "sentence": "The model lacks: latch.", "gaps": gaps})
+        json.dumps(
+            {
+                "effects": effects,
+                "tied": [],
+                "screens": [],
+                "sentence": "The model lacks: latch.",
+                "gaps": gaps,
+                "setup": {"stand_in": stand_in},
+            }
+        )
     )
 
 
@@ -127,11 +136,13 @@ def test_a_policy_is_trained_on_the_extended_model_where_there_is_one(called, tm
     assert "gap: The model lacks: latch; 70 % of the gap U closed on the sealed motion" in capsys.readouterr().out
 
 
-def test_the_last_lines_say_what_was_hidden(called, tmp_path: Path, capsys):
-    found(tmp_path / "runs" / "all" / "gap", ["latch at door_hinge"])
+@pytest.mark.parametrize("stand_in", [True, False])
+def test_the_last_lines_say_what_was_hidden_in_what_was_searched(called, tmp_path: Path, capsys, stand_in: bool):
+    """Recordings of a stand-in may lie beside a search in a robot's own."""
+    found(tmp_path / "runs" / "all" / "gap", ["latch at door_hinge"], stand_in)
     assert main([]) == 0
     said = capsys.readouterr().out
-    assert "hidden in the stand-in robot: magnetic catch (1.5 N m; in the library: latch)" in said
+    assert ("hidden in the stand-in robot: magnetic catch (1.5 N m; in the library: latch)" in said) == stand_in
 
 
 def test_without_a_named_effect_it_is_trained_on_the_fit(called, tmp_path: Path):

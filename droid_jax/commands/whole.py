@@ -249,7 +249,7 @@ def told(out: Path) -> list[str]:
         closed = size["closed"]
         share = "" if closed is None else f"; {percent(closed)} of the gap U closed on the {role} motion"
         lines.append(f"gap: {readable(found['sentence'], found).rstrip('.')}{share}")
-        if hidden := hidden_words(hidden_in(out)):
+        if found["setup"].get("stand_in") and (hidden := hidden_words(hidden_in(out))):
             lines.append(f"hidden in the stand-in robot: {hidden}")
     for name, of in {} if "train" in old else (_json(out / "train" / TRANSFER) or {}).items():
         if name in ("simulation", "stand_in"):

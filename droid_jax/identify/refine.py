@@ -317,10 +317,8 @@ class _Problem:
         In logarithms a small mass is a plateau, and a finger that sticks is one in its friction: where another
         parameter pushed them there, no slope leads back.  Not with the last iterations: they are for what is there.
         """
-        tried: set[str] = set()
-        while strayed := [name for name in self.strayed(state) if name not in tried]:
-            if self.iterations + 2 * (self.config.hold + 1) > self.config.iterations:
-                break
+        tried, last = set[str](), self.config.iterations - 2 * (self.config.hold + 1)
+        while self.iterations <= last and (strayed := [n for n in self.strayed(state) if n not in tried]):
             tried.update(strayed)
             means = {name: self.space[name].mean for name in strayed}
             alone = [{name: mean} for name, mean in means.items()]

@@ -27,7 +27,7 @@ def lead(run: Run | None, gap: Gap | None, policy: Trained | None, hidden: str =
         following = summary(run, gap is not None)[-1]
     if gap:
         sentences += [readable(gap.found["sentence"], gap.found), *_closed(gap)]
-        sentences += [f"What the stand-in robot hid: {hidden}."] if hidden else []
+        sentences += [f"What the stand-in robot hid: {hidden}."] if hidden and gap.stand_in else []
         following = gap_summary(gap)[-1]
     if policy:
         sentences += [_opened(where, found["success_rate"]) for where, found in policy.trials.items()]

@@ -9,6 +9,7 @@ from typing import Any
 
 from droid_jax.report.files import FILMS, TRAINING, TRANSFER
 from droid_jax.report.reading import Reader
+from droid_jax.report.run_folder import OPENGL
 
 _READ = Reader("train")
 _NUMBER = (int, float)
@@ -28,7 +29,7 @@ _TRIALS = {
 _TRANSFER = {"simulation": _TRIALS, "stand_in": _TRIALS, "robot": {"hidden": [{"name": str, "amplitude": _NUMBER}]}}
 
 
-NO_FILMS = "No films: drawing needs OpenGL (Debian, Ubuntu: apt-get install libegl1 libgl1-mesa-dri)."
+NO_FILMS = f"No films: {OPENGL}"
 
 
 @dataclass(frozen=True)

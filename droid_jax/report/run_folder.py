@@ -38,10 +38,8 @@ _PARAMETER_KEYS = (
 _TRACE_KEYS = ("time", "measured_mean", "measured_low", "measured_high", "before", "after", "joints")
 
 NO_REPLAY = "No pictures: a log without commands has no replay to show."
-NO_OPENGL = (
-    "No pictures: drawing needs OpenGL (Debian, Ubuntu: apt-get install libegl1 libgl1-mesa-dri). "
-    "The replay itself is in replay.npz."
-)
+OPENGL = "drawing needs OpenGL (Debian, Ubuntu: apt-get install libegl1 libgl1-mesa-dri)."
+NO_OPENGL = f"No pictures: {OPENGL} The replay itself is in replay.npz."
 
 
 @dataclass(frozen=True)

@@ -78,7 +78,7 @@ def test_the_reward_is_the_weighted_sum():
     assert float(reward(weights, seen)) == pytest.approx(by_hand, rel=1e-5)
     expected = float(reward(TASK, seen))
     without_slip = replace(TASK, slip=0.0)
-    assert float(reward(without_slip, seen)) == pytest.approx(expected + TASK.slip * 0.3)
+    assert float(reward(without_slip, seen)) == pytest.approx(expected + 0.2 * 0.3)
 
 
 def test_sliding_past_a_knob_that_is_not_touched_costs_nothing():
