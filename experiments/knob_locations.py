@@ -5,7 +5,8 @@
 The door is demonstrated and fitted with the knob in its first place.  For each of the four places, 5 cm apart along the
 lever, policies are trained on doors drawn from that one Gaussian and tried on the stand-in robot with the knob there.
 Every policy is one JSON file under DIR/knob_cases and is not trained again; the fit, and the policies of the first
-place, are those of table2.py's setting "paper".  DIR/knob_locations.json sums them up.
+place, are those of table2.py's setting "paper".  DIR/knob_locations.json sums them up; knob_locations.md is the
+table, knob_locations.png and .pdf are histograms of the angles.
 """
 
 from __future__ import annotations
@@ -33,8 +34,9 @@ from droid_jax.model.door_scene import LEVERS, door_scene  # noqa: E402
 from droid_jax.policy.door_env import DoorEnv  # noqa: E402
 from droid_jax.policy.task import Task  # noqa: E402
 from droid_jax.policy.transfer import TransferConfig, stand_in  # noqa: E402
-from droid_jax.storage import write_json  # noqa: E402
+from droid_jax.storage import write_json, write_text  # noqa: E402
 from experiments.policies.cases import TIMESTEP, Case, Doors, Options, finish, found_of, made_by, run_all, tried  # noqa: E402
+from experiments.policies.figure import knob_histograms, knobs_as_text  # noqa: E402
 from experiments.policies.robots import fitted, truth_of  # noqa: E402
 from experiments.policies.settings import Setting, setting_of  # noqa: E402
 from experiments.policies.table import PLACES, column, rates  # noqa: E402
@@ -80,13 +82,13 @@ def main() -> None:
     ]
     failed = run_all([c for c in planned if c.of["knob"] in knobs], arguments.at_most, code)
     found = found_of(planned)
-    table = {}
-    for knob in sorted({c["knob"] for c in found}):
-        own = [c for c in found if c["knob"] == knob]
-        table[f"{LEVERS[knob]:.2f} m"] = {place: column(own, place) for place in PLACES}
+    of = {f"{LEVERS[k]:.2f} m": [c for c in found if c["knob"] == k] for k in sorted({c["knob"] for c in found})}
+    table = {lever: {place: column(own, place) for place in PLACES} for lever, own in of.items()}
     line = {lever: rates(columns) for lever, columns in table.items()}
     summary = {"levers": table, **made_by(found), **code}
     write_json(arguments.summary("knob_locations"), summary)
+    write_text(arguments.summary("knob_locations", ".md"), knobs_as_text(table))
+    arguments.draw("knob_locations", knob_histograms(of))
     print(json.dumps(line))
     finish(failed)
 

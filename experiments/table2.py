@@ -7,8 +7,9 @@ the fitted mean alone and on draws of the fitted Gaussian, alike in everything e
 stand-in robot.  Every policy is one JSON file under DIR/table2_cases and is not trained again (nor is one that another
 experiment has trained, DIR/trained_cases): the experiment can be stopped and goes on where it was, and the same
 command started twice shares the work.  DIR/table2.json sums up all that are there, with intervals by bootstrap over
-policies; table2.md is laid out as in the paper, table2.png is its histogram.  Where hidden_effect_policy.json lies
-beside them, it is the table's last part.  Pilots take another robot and other seeds (--robot 100 --first 100).
+policies; table2.md is laid out as in the paper, table2.png and table2.pdf are its histogram.  Where
+hidden_effect_policy.json lies beside them, it is the table's last part.  Pilots take another robot and other seeds
+(--robot 100 --first 100).
 docs/paper.md says what was fixed before the runs.
 """
 
@@ -38,8 +39,7 @@ from droid_jax.model.door import door_nuisances, door_space  # noqa: E402
 from droid_jax.model.door_scene import door_scene  # noqa: E402
 from droid_jax.policy.door_env import DoorEnv  # noqa: E402
 from droid_jax.policy.task import Task  # noqa: E402
-from droid_jax.report.export import png_bytes  # noqa: E402
-from droid_jax.storage import write_bytes, write_json, write_text  # noqa: E402
+from droid_jax.storage import write_json, write_text  # noqa: E402
 from experiments.policies.cases import TIMESTEP, Case, Doors, Options, finish, found_of, made_by, run_all, tried  # noqa: E402
 from experiments.policies.figure import as_text, histograms  # noqa: E402
 from experiments.policies.robots import fitted, robots_of  # noqa: E402
@@ -104,7 +104,7 @@ def main() -> None:
         summary["hidden_effect"] = json.loads(hidden.read_text())
     write_json(arguments.summary("table2"), {**summary, **made_by(found), **code})
     write_text(arguments.summary("table2", ".md"), as_text(summary))
-    write_bytes(arguments.summary("table2", ".png"), png_bytes(histograms(found, settings)))
+    arguments.draw("table2", histograms(found, settings))
     print(json.dumps(summary["line"]))
     finish(failed)
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import jax
+from matplotlib.figure import Figure
 
 from benchmarks.common import commits, stem
 from droid_jax.commands.train import randomise
@@ -23,6 +24,7 @@ from droid_jax.policy.simulated import simulated
 from droid_jax.policy.task import Task
 from droid_jax.policy.train import PRESETS, TrainConfig, train
 from droid_jax.policy.transfer import StandIn, transfer
+from droid_jax.report.export import save
 from droid_jax.report.files import GAUSSIAN, POLICY, TRAINING
 from droid_jax.storage import write_json
 from experiments.policies.table import PLACES
@@ -90,6 +92,11 @@ class Options:
         """File of the summary; that of pilots has a name of its own."""
         pilot = f"_from_{self.first}" if self.first else ""
         return self.out / f"{stem(f'{name}{self._of_robot}{pilot}', self.quick)}{kind}"
+
+    def draw(self, name: str, figure: Figure) -> None:
+        """Write the figure that belongs to a summary, as PNG and PDF."""
+        path = self.summary(name, "")
+        save(figure, path.parent, path.name)
 
     @property
     def _of_robot(self) -> str:

@@ -1,9 +1,9 @@
-"""Table II as a table and its histogram, this program's beside the paper's."""
+"""Tables of policies and their histograms: Table II, this program's beside the paper's, and the knob places."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -40,6 +40,15 @@ def as_text(summary: Mapping[str, Any]) -> str:
         lines.append(f"| {words}: success, % | " + " | ".join(f"{c[0]:.1f}" for c in cells) + " |")
         lines.append("| largest angle, degrees | " + " | ".join(f"{c[1][0]:.1f} ± {c[1][1]:.1f}" for c in cells) + " |")
         lines.append("| steps | " + " | ".join(f"{c[2][0]:.1f} ± {c[2][1]:.1f}" for c in cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def knobs_as_text(levers: Mapping[str, Any]) -> str:
+    """Markdown of the knob places: a column for each, simulation above robot.  levers: columns by place."""
+    lines = ["# Four knob places, one fit (section IV-E)", ""]
+    lines += ["Policies for the knob at each distance from the hinge, all on the fit of the first place.", ""]
+    lines += [*_columns(levers), ""]
+    lines += ["The paper gives no numbers: its policies opened the door at all of its places."]
     return "\n".join(lines) + "\n"
 
 
@@ -139,15 +148,39 @@ def _points(share: float) -> str:
 def histograms(cases: Sequence[Mapping[str, Any]], settings: Sequence[str]) -> Figure:
     """Largest angles on the stand-in robot: a row for each setting that was run, a column for each method."""
     settings = [s for s in settings if any(c["setting"]["name"] == s for c in cases)] or list(settings[:1])
-    figure = Figure(figsize=(7.0, 1.9 * len(settings) + 0.4), layout="constrained")
-    grid = figure.subplots(len(settings), len(METHODS), sharex=True, sharey=True, squeeze=False)
-    for row, setting in zip(grid, settings, strict=True):
-        for axes, method in zip(row, METHODS, strict=True):
-            own = [c for c in cases if c["setting"]["name"] == setting and c["method"] == method]
-            angles = np.concatenate([trials(c, "stand_in")["angle"] for c in own]) if own else np.zeros(0)
-            axes.hist(angles, BINS, color=BEFORE if method == "prior" else AFTER)
+
+    def panel(setting: str, method: str) -> Panel:
+        own = [c for c in cases if c["setting"]["name"] == setting and c["method"] == method]
+        return Panel(f"{setting}: {WORDS[method]}", own, BEFORE if method == "prior" else AFTER)
+
+    return _panels([[panel(setting, method) for method in METHODS] for setting in settings])
+
+
+@styled
+def knob_histograms(places: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
+    """Largest angles on the stand-in robot, a panel for each place of the knob (its name: its policies)."""
+    panels = [Panel(f"knob {lever} from the hinge", own, AFTER) for lever, own in places.items()]
+    return _panels([panels])
+
+
+class Panel(NamedTuple):
+    """A histogram: its title, the policies whose trials it counts, and its colour."""
+
+    title: str
+    cases: Sequence[Mapping[str, Any]]
+    colour: str
+
+
+def _panels(rows: Sequence[Sequence[Panel]]) -> Figure:
+    """Histograms of the largest angle on the stand-in robot, on common axes."""
+    figure = Figure(figsize=(7.0, 1.9 * len(rows) + 0.4), layout="constrained")
+    grid = figure.subplots(len(rows), len(rows[0]), sharex=True, sharey=True, squeeze=False)
+    for row, panels in zip(grid, rows, strict=True):
+        for axes, panel in zip(row, panels, strict=True):
+            each = [trials(case, "stand_in")["angle"] for case in panel.cases]
+            axes.hist(np.concatenate(each) if each else np.zeros(0), BINS, color=panel.colour)
             axes.axvline(30.0, color=INK, lw=0.8, ls=":")
-            axes.set_title(f"{setting}: {WORDS[method]}", fontsize=8)
+            axes.set_title(panel.title, fontsize=8)
         row[0].set_ylabel("trials")
     for axes in grid[-1]:
         axes.set_xlabel("largest opening [degrees]")

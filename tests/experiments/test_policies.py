@@ -26,7 +26,7 @@ from droid_jax.policy.train import TrainConfig
 from droid_jax.policy.trials import Trials
 from experiments.policies import cases
 from experiments.policies.cases import Case, Doors, Options, finish, found_of, made_by, run_all, trained
-from experiments.policies.figure import as_text, histograms
+from experiments.policies.figure import as_text, histograms, knob_histograms, knobs_as_text
 from experiments.policies.robots import fitted, robots_of
 from experiments.policies.settings import SETTINGS, Setting, setting_of
 from experiments.policies.table import PLACES, apart, column, rate_interval, resampled, spread, summed_up
@@ -180,6 +180,22 @@ def test_a_hidden_effect_is_the_tables_last_part():
     assert "| | base | extended |" in text and "Extended against base, stand-in robot: +40 points of success (" in text
     found["hidden_effect"]["models"] = {}  # nothing was named
     assert "It lacks a closer." in as_text(found) and "No policy was trained." in as_text(found)
+
+
+def test_every_knob_place_has_a_column_and_a_panel():
+    of = {"0.30 m": [case("fitted", 0, 1.0)], "0.25 m": [case("fitted", k, 0.5) for k in range(2)]}
+    text = knobs_as_text({lever: {place: column(own, place) for place in PLACES} for lever, own in of.items()})
+    assert "| | 0.30 m | 0.25 m |" in text and "| of each policy | 100 | 50, 50 |" in text
+    panels = knob_histograms(of).axes
+    assert [panel.get_title("left") for panel in panels] == [f"knob {lever} from the hinge" for lever in of]
+    assert [sum(p.get_height() for p in panel.patches) for panel in panels] == [50, 100]
+
+
+def test_a_summarys_figure_lies_beside_it_in_both_forms(tmp_path: Path):
+    arguments = Options(out=tmp_path, robot=100, first=100)
+    arguments.draw("table2", histograms([case("prior", 0, 0.5)], ["paper"]))
+    both = sorted(path.name for path in tmp_path.iterdir())
+    assert both == sorted(arguments.summary("table2", kind).name for kind in (".png", ".pdf"))
 
 
 def test_a_door_that_opens_to_its_stop_is_in_the_histogram():
