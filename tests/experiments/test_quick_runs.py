@@ -31,6 +31,7 @@ SCRIPTS: dict[str, tuple[str, ...]] = {
     "experiments/policy_parity.py": (),
     **dict.fromkeys(DATA, ()),
     "benchmarks/candidates.py": (),
+    "benchmarks/default_run.py": (),
     "benchmarks/step_accuracy.py": (),
     "benchmarks/time_to_fit.py": (),
     "benchmarks/training.py": (),

@@ -1,0 +1,133 @@
+"""The default command as a new user has it: how long until it speaks, what each stage takes, what comes of it.
+
+    python benchmarks/default_run.py [--quick] [--out DIR]
+
+Starts `python -m droid_jax.run` without options but its folder, in a process of its own and with an empty compilation
+cache, and keeps what it prints with the time of every line.  Writes DIR/default_run.json; the run's folder, with the
+page, is left in DIR/default_run.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
+
+import tempfile  # noqa: E402
+
+import tyro  # noqa: E402
+
+from benchmarks.common import origin, stem  # noqa: E402
+from benchmarks.time_to_fit import empty_cache  # noqa: E402
+from droid_jax.report.files import STAND_IN, TRANSFER  # noqa: E402
+from droid_jax.storage import write_json  # noqa: E402
+
+STAGE = re.compile(r"\[\d+/\d+\] (?P<stage>\w+): (?P<minutes>[\d.]+) minutes")  # as the command says that one ended
+PROGRESS = re.compile(r"\[1/\d+\]")  # its first stage began
+HELPS = 5
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Options."""
+
+    quick: bool = False
+    """Stop the command where its first stage begins: shows that it starts, and how fast."""
+    out: Path = ROOT / "benchmarks" / "results"
+    """Folder of default_run.json."""
+
+
+class Line(NamedTuple):
+    """What the command printed, and how many seconds after it was started."""
+
+    seconds: float
+    text: str
+
+
+def command_lines(out: Path, cache: str) -> Iterator[Line]:
+    """Lines of the command as they come; the one who stops asking stops it.  RuntimeError where it fails."""
+    began = time.perf_counter()
+    command = [sys.executable, "-u", "-m", "droid_jax.run", "--out", str(out)]
+    streams: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    with subprocess.Popen(command, cwd=ROOT, env=empty_cache(cache), **streams) as process:
+        assert process.stdout is not None
+        try:
+            last = ""
+            for text in process.stdout:
+                last = text.rstrip()
+                yield Line(time.perf_counter() - began, last)
+            if process.wait():
+                raise RuntimeError(f"the command ended with {process.returncode}: {last}")
+        finally:
+            process.terminate()
+
+
+def help_seconds() -> float:
+    """s of `--help`, the least of several."""
+    return min(_seconds([sys.executable, "-m", "droid_jax.run", "--help"]) for _ in range(HELPS))
+
+
+def _seconds(command: Sequence[str]) -> float:
+    began = time.perf_counter()
+    subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+    return time.perf_counter() - began
+
+
+def figures(lines: Sequence[Line]) -> dict[str, Any]:
+    """What the lines tell of time: s until the first one and until the first stage begins, the longest silence, minutes
+    of each stage and of the whole."""
+    times = [0.0, *(line.seconds for line in lines)]
+    ended = [found for line in lines if (found := STAGE.match(line.text))]
+    return {
+        "first_line_s": lines[0].seconds,
+        "first_stage_s": next((line.seconds for line in lines if PROGRESS.match(line.text)), None),
+        "longest_silence_s": max(after - before for before, after in itertools.pairwise(times)),
+        "minutes": {found["stage"]: float(found["minutes"]) for found in ended},
+        "whole_minutes": lines[-1].seconds / 60,
+    }
+
+
+def results(out: Path) -> dict[str, Any]:
+    """What a run found: the gap before and after, the verdict beside what was hidden, success of the policy."""
+    fit, gap, transfer = (
+        json.loads((out / name).read_text()) for name in ("identify/fit.json", "gap/gap.json", f"train/{TRANSFER}")
+    )
+    return {
+        "hidden": json.loads((out / "recordings" / STAND_IN).read_text())["hide"],
+        "torque_gap": fit["gap"],
+        "verdict": gap["verdict"],
+        "effects": gap["effects"],
+        "sentence": gap["sentence"],
+        "success": {place: transfer[place]["success_rate"] for place in ("simulation", "stand_in")},
+    }
+
+
+def main() -> None:
+    arguments = tyro.cli(Arguments, description=__doc__)
+    name = stem("default_run", arguments.quick)
+    lines = list[Line]()
+    with tempfile.TemporaryDirectory() as cache:
+        for line in command_lines(arguments.out / name, cache):
+            print(line.text, flush=True)
+            lines.append(line)
+            if arguments.quick and PROGRESS.match(line.text):
+                break
+    found = {"help_s": help_seconds(), **figures(lines)}
+    result = found if arguments.quick else {**found, **results(arguments.out / name)}
+    printed = [[round(line.seconds, 1), line.text] for line in lines]
+    write_json(arguments.out / f"{name}.json", {**result, "printed": printed, **origin(0)})
+    print(json.dumps({k: result[k] for k in result if k not in ("torque_gap", "sentence")}))
+
+
+if __name__ == "__main__":
+    main()
