@@ -161,15 +161,11 @@ def identifiability(gaussian: Gaussian, prior: np.ndarray) -> tuple[Identifiabil
         others = [(space.names[j], float(correlation[i, j])) for j in np.argsort(-np.abs(correlation[i])) if j != i]
         partners = tuple((n, c) for n, c in others if abs(c) > PARTNER)[:3]
         known = shrinkage < IDENTIFIABLE
-        out.append(Identifiability(name, known, shrinkage, partners, _reason(known, shrinkage, partners)))
+        out.append(Identifiability(name, known, shrinkage, partners, _reason(known, shrinkage)))
     return tuple(out)
 
 
-def _reason(known: bool, shrinkage: float, partners: tuple[tuple[str, float], ...]) -> str:
-    trade = f"; trades with {', '.join(n for n, _ in partners)}" if partners else ""
+def _reason(known: bool, shrinkage: float) -> str:
     if known:
-        return f"the data narrow the prior to {shrinkage:.0%}{trade}"
-    if shrinkage > 0.9:
-        left = f"{shrinkage:.0%}" if shrinkage < 1 else "all"
-        return f"this demonstration does not tell: it leaves {left} of the prior's width{trade}"
-    return f"this demonstration tells little: it leaves {shrinkage:.0%} of the prior's width{trade}"
+        return f"the data narrow the prior to {shrinkage:.0%}"
+    return f"the data leave {f'{shrinkage:.0%}' if shrinkage < 1 else 'all'} of the prior's width"

@@ -185,9 +185,12 @@ def _next(run: Run, searched: bool) -> str:
     elif any(not p["identifiable"] for p in run.parameters):
         steps.append("record a motion that moves what is not told, or leave it at its initial spread")
     if lacks_something(run.fit):
+        lacks = "what is left is well above noise, so the model lacks something"
         steps.append(
-            "what is left is well above noise, so the model lacks something: see below in which joint and phase"
-            + ("" if searched else f", and let python -m droid_jax.run gap look for the missing effect{_needed(run)}")
+            f"{lacks}, and these values are bent by it: go on with the search for it, below"
+            if searched
+            else f"{lacks}: see below in which joint and phase, and let python -m droid_jax.run gap look for the "
+            f"missing effect{_needed(run)}"
         )
     elif not steps:
         steps.append("draw the simulations you train on from gaussian.json")
