@@ -87,10 +87,11 @@ def test_without_arguments_every_stage_runs_on_one_recording(called, tmp_path: P
     assert policy.fit == fit.out and policy.out == trials.run == Path("runs/all/train")
     assert known_stand_in(files) == {"springs": 1, "seed": 0, "hide": ["magnetic_catch=1.5"]}
     lines = capsys.readouterr().out.splitlines()
+    stages = {"record": 23, "identify": 23, "gap": 19, "train": 10, "evaluate": 2}
     assert [line for line in lines if line.startswith("[")] == [
-        f"[{k}/5] {stage}{took}"
-        for k, stage in enumerate(("record", "identify", "gap", "train", "evaluate"), 1)
-        for took in ("", ": 0.0 minutes")
+        f"[{k}/5] {stage}{said}"
+        for k, (stage, left) in enumerate(stages.items(), 1)
+        for said in (f" (about {left} min left on two cores)", ": 0.0 minutes")
     ]
     assert lines[-1] == "report: runs/all/report.html"
 
@@ -301,12 +302,13 @@ def test_options_reach_the_stages(called, tmp_path: Path):
     assert called[0].tensorboard and called[2].tensorboard
 
 
-def test_presets_reach_the_stages(called):
+def test_presets_reach_the_stages(called, capsys):
     assert main(["all", "--preset", "paper", "--seed", "3"]) == 0
     fit, search, policy, _ = called
     assert (fit.preset, search.preset, policy.preset) == ("standard", "standard", "paper")
     assert {c.seed for c in called} == {3}
     assert whole.PRESETS["gpu"] == ("gpu", "gpu")
+    assert "left on two cores" not in capsys.readouterr().out  # which was measured for quick alone
 
 
 def test_jax_is_tuned_before_the_stand_in_is_recorded(tmp_path: Path):

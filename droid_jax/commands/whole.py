@@ -6,7 +6,7 @@ import contextlib
 import json
 import time
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -39,6 +39,9 @@ PRESETS = {
     "paper": _Presets("standard", "paper"),
     "gpu": _Presets("gpu", "gpu"),
 }
+
+MINUTES = {"record": 0.2, "identify": 4.6, "gap": 8.6, "train": 8.2, "evaluate": 1.9}
+"""Of each stage in the preset "quick", on two cores with nothing compiled before (benchmarks/default_run.py)."""
 
 
 @dataclass(frozen=True)
@@ -154,7 +157,7 @@ def _run_stages(command: All, out: Path, roles: tuple[str, ...]) -> None:
         plan = {"record": lambda: _record(command), **plan}
     for number, (stage, run_stage) in enumerate(plan.items(), 1):
         began = time.monotonic()
-        print(f"\n[{number}/{len(plan)}] {stage}", flush=True)
+        print(f"\n[{number}/{len(plan)}] {stage}{_left(command, list(plan)[number - 1 :])}", flush=True)
         try:
             run_stage()
         except Exception:
@@ -163,6 +166,13 @@ def _run_stages(command: All, out: Path, roles: tuple[str, ...]) -> None:
                     print(f"report of what is done: {report.write(out)}")
             raise
         print(f"[{number}/{len(plan)}] {stage}: {(time.monotonic() - began) / 60:.1f} minutes", flush=True)
+
+
+def _left(command: All, stages: Sequence[str]) -> str:
+    """How long these stages take, in words, where that has been measured; each shows its own progress besides."""
+    if command.preset != "quick" or command.scene is not None or command.recording:
+        return ""
+    return f" (about {max(1, round(sum(MINUTES[stage] for stage in stages)))} min left on two cores)"
 
 
 def _records(command: All) -> bool:
