@@ -21,11 +21,26 @@ from droid_jax.identify.gaussian import prior
 from droid_jax.measure.hidden import Applied, possible
 from droid_jax.model.door import door_space
 from droid_jax.model.door_scene import door_scene
+from droid_jax.policy.control import load
+from droid_jax.policy.door_env import DoorEnv
 from droid_jax.policy.task import Task
 from droid_jax.policy.train import TrainConfig
+from droid_jax.policy.transfer import transfer
 from droid_jax.policy.trials import Trials
+from droid_jax.report.files import POLICY
 from experiments.policies import cases
-from experiments.policies.cases import Case, Doors, Options, finish, found_of, made_by, run_all, trained
+from experiments.policies.cases import (
+    RESULTS,
+    TIMESTEP,
+    Case,
+    Doors,
+    Options,
+    finish,
+    found_of,
+    made_by,
+    run_all,
+    trained,
+)
 from experiments.policies.figure import as_text, histograms, knob_histograms, knobs_as_text
 from experiments.policies.robots import fitted, robots_of
 from experiments.policies.settings import SETTINGS, Setting, setting_of
@@ -216,6 +231,17 @@ def test_slippery_pads_are_all_that_differs_from_the_settings_robot():
     np.testing.assert_array_equal(slippery.pair_friction[:, 3:], usual.pair_friction[:, 3:])
     np.testing.assert_array_equal(slippery.dof_damping, usual.dof_damping)
     assert robots["slippery"].config == robots["stand_in"].config
+
+
+def test_a_trained_policy_opens_by_its_grip():
+    """A policy of the reported run on the dry door: with slippery pads a hook or a push would still open it."""
+    kept = json.loads((RESULTS / "table2_cases" / "paper" / "prior_0.json").read_text())
+    policy = load(RESULTS / "trained_cases" / kept["trained"] / POLICY)
+    env = DoorEnv(door_scene(timestep=TIMESTEP, limits=True), Task())
+    rates = {
+        name: transfer(policy, robot).success.mean() for name, robot in robots_of(SETTINGS["dry"], env, 10).items()
+    }
+    assert rates["stand_in"] >= 0.8 and rates["slippery"] < 0.2
 
 
 def test_settings_have_their_names():
