@@ -187,7 +187,7 @@ def _next(run: Run, searched: bool) -> str:
     if lacks_something(run.fit):
         lacks = "what is left is well above noise, so the model lacks something"
         steps.append(
-            f"{lacks}, and these values are bent by it: go on with the search for it, below"
+            f"{lacks}, and these values may be bent by it: go on with the search for it, below"
             if searched
             else f"{lacks}: see below in which joint and phase, and let python -m droid_jax.run gap look for the "
             f"missing effect{_needed(run)}"
