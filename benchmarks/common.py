@@ -46,6 +46,11 @@ def stem(name: str, quick: bool) -> str:
     return f"{name}_quick" if quick else name
 
 
+def empty_cache(folder: str) -> dict[str, str]:
+    """An environment, for a process of its own, in which nothing has been compiled yet."""
+    return {**os.environ, runtime.CACHE_VARIABLE: f"{folder}/cache", "PYTHONPATH": str(ROOT)}
+
+
 def interleave(
     runs: Mapping[str, Callable[[], Any]],
     repeats: int,

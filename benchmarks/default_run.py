@@ -2,9 +2,9 @@
 
     python benchmarks/default_run.py [--quick] [--out DIR]
 
-Starts `python -m droid_jax.run` without options but its folder, in a process of its own and with an empty compilation
-cache, and keeps what it prints with the time of every line.  Writes DIR/default_run.json; the run's folder, with the
-page, is left in DIR/default_run.
+Starts `python -m droid_jax.run` anew without options but its folder, in a process of its own and with an empty
+compilation cache, and keeps what it prints with the time of every line.  Writes DIR/default_run.json; the run's
+folder, with the page, is left in DIR/default_run.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ import tempfile  # noqa: E402
 
 import tyro  # noqa: E402
 
-from benchmarks.common import origin, stem  # noqa: E402
-from benchmarks.time_to_fit import empty_cache  # noqa: E402
-from droid_jax.report.files import STAND_IN, TRANSFER  # noqa: E402
+from benchmarks.common import empty_cache, origin, stem  # noqa: E402
+from droid_jax.report.files import TRANSFER  # noqa: E402
+from droid_jax.report.page import hidden_in  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 
 STAGE = re.compile(r"\[\d+/\d+\] (?P<stage>\w+): (?P<minutes>[\d.]+) minutes")  # as the command says that one ended
@@ -55,11 +55,15 @@ class Line(NamedTuple):
 
 
 def command_lines(out: Path, cache: str) -> Iterator[Line]:
-    """Lines of the command as they come; the one who stops asking stops it.  RuntimeError where it fails."""
+    """Lines of the command as they come; the one who stops asking stops it.  RuntimeError where it fails.
+
+    It starts over where the folder holds a run, and in the folder above, so that no line names this machine's folders.
+    """
+    out.parent.mkdir(parents=True, exist_ok=True)
     began = time.perf_counter()
-    command = [sys.executable, "-u", "-m", "droid_jax.run", "--out", str(out)]
+    command = [sys.executable, "-u", "-m", "droid_jax.run", "all", "--out", out.name, "--again"]
     streams: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    with subprocess.Popen(command, cwd=ROOT, env=empty_cache(cache), **streams) as process:
+    with subprocess.Popen(command, cwd=out.parent, env=empty_cache(cache), **streams) as process:
         assert process.stdout is not None
         try:
             last = ""
@@ -103,7 +107,7 @@ def results(out: Path) -> dict[str, Any]:
         json.loads((out / name).read_text()) for name in ("identify/fit.json", "gap/gap.json", f"train/{TRANSFER}")
     )
     return {
-        "hidden": json.loads((out / "recordings" / STAND_IN).read_text())["hide"],
+        "hidden": hidden_in(out),
         "torque_gap": fit["gap"],
         "verdict": gap["verdict"],
         "effects": gap["effects"],

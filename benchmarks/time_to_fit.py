@@ -8,7 +8,6 @@ preset: `python -m droid_jax.run` in a process of its own.  Both start with an e
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import tempfile
@@ -24,7 +23,7 @@ import json  # noqa: E402
 
 import tyro  # noqa: E402
 
-from benchmarks.common import origin, stem  # noqa: E402
+from benchmarks.common import empty_cache, origin, stem  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 
 POPULATION, GENERATIONS, TIMESTEP = 30, 100, 0.002
@@ -80,11 +79,6 @@ def preset() -> dict[str, Any]:
         seconds = time.perf_counter() - began
         stages = json.loads((Path(folder) / "run" / "fit.json").read_text())["seconds"]
     return {"seconds": seconds, "stages": stages}
-
-
-def empty_cache(folder: str) -> dict[str, str]:
-    """An environment in which nothing has been compiled yet."""
-    return {**os.environ, "XDG_CACHE_HOME": f"{folder}/cache", "PYTHONPATH": str(ROOT)}
 
 
 def main() -> None:
