@@ -10,9 +10,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
+from scipy.signal.windows import parzen
 
 CUTOFF = 8.0  # Hz; real Panda residuals double between 8 and 20 Hz
 RATE = 20.0  # Hz of the coarse clock
+# Lags beyond this are noise of the estimate: ten repeats tell a hundred of them with nine degrees of freedom each, the
+# weights then depend on the mean that they weigh, and p-values of nothing are too small (tests/gap/test_null.py).
+LONGEST = 1.0  # s
 
 
 def coarse_clock(start: float, end: float, rate: float = RATE) -> np.ndarray:
@@ -77,28 +81,45 @@ def estimate_noise(
 
     measured: [N, K, C] bool, all unless given; what was not holds the mean of the others, and counts for nothing.
 
-    The autocovariance of the repeats about their mean is estimated per column (biased, hence
-    positive semi-definite), shrunk towards white noise of the same variance, and never less than
-    `minimum` (a deviation in the channel's unit: what one repeat alone would have).  With one
-    repeat only `minimum` is used, as white noise.
+    Per column, the repeats' deviations from their mean are a constant of each repeat and a stationary rest.
+    The rest's autocovariance (biased, hence positive semi-definite) is tapered to LONGEST by a Parzen window,
+    shrunk towards white noise of the same variance, and never less than `minimum` (a deviation in the channel's
+    unit: what one repeat alone would have); the constants' variance is added to it.  With one repeat only `minimum`
+    is used, as white noise.  Source of the window: Parzen, Mathematical considerations in the estimation of
+    spectra, Technometrics 1961.
     """
     _, length, columns = repeats.shape
     mean = repeats.mean(axis=0)
     count = np.full(mean.shape, len(repeats)) if measured is None else measured.sum(axis=0)
-    freedom = (count - 1).sum(axis=0)
     whitener = np.empty((columns, length, length))
     for c in range(columns):
-        lags = np.zeros(length)
-        if freedom[c] > 0:
-            error = repeats[:, :, c] - mean[:, c]  # zero where it was not measured
-            spectrum = np.abs(np.fft.rfft(error, 2 * length, axis=1)) ** 2
-            lags = np.fft.irfft(spectrum.sum(axis=0), 2 * length)[:length] / freedom[c]
+        seen = np.ones(repeats.shape[:2], bool) if measured is None else measured[:, :, c]
+        lags, constant = _lags(repeats[:, :, c] - mean[:, c], seen)
         variance = max(lags[0], minimum**2)
         lags = (1 - shrink) * lags
         lags[0] = variance
-        of_mean = scipy.linalg.toeplitz(lags) / np.sqrt(np.outer(count[:, c], count[:, c]))
+        of_mean = (scipy.linalg.toeplitz(lags) + constant) / np.sqrt(np.outer(count[:, c], count[:, c]))
         whitener[c] = np.linalg.inv(np.linalg.cholesky(of_mean))
     return Noise(mean, whitener, repeats, count)
+
+
+def _lags(error: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, float]:
+    """[K] tapered autocovariance of what repeats [N, K] are apart, and the variance of their constants beside it.
+
+    seen: [N, K] bool; both are zero for what but one repeat measured.
+    """
+    length = error.shape[1]
+    lengths, freedom = seen.sum(axis=1, keepdims=True), (seen.sum(axis=0) - 1).clip(0).sum()
+    if freedom == 0:
+        return np.zeros(length), 0.0
+    constants = error.sum(axis=1, where=seen, keepdims=True) / np.maximum(lengths, 1)
+    rest = np.where(seen, error - constants, 0.0)
+    spectrum = np.abs(np.fft.rfft(rest, 2 * length, axis=1)) ** 2
+    lags = np.fft.irfft(spectrum.sum(axis=0), 2 * length)[:length] / freedom
+    longest = round(LONGEST * RATE)
+    window = np.zeros(length)
+    window[: longest + 1] = parzen(2 * longest + 1)[longest : longest + length]
+    return lags * window, float(np.sum(lengths * constants**2) / freedom)
 
 
 def correlation_time(residuals: np.ndarray, rate: float = RATE) -> np.ndarray:
