@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from droid_jax import runtime
-from droid_jax.compare.inverse import path_of, path_replay
+from droid_jax.compare.inverse import Path, path_of, path_replay
 from droid_jax.compare.population import blocks, over_block
 from droid_jax.compare.replay import Drive, Replay, make_drive, servo_replay, torque_offset_effect
 from droid_jax.compare.residuals import CompareConfig, Comparison, make_comparison
@@ -100,17 +100,17 @@ class Cost:
         """
         if len(recordings) != len(self.drives):
             raise ValueError(f"expected repeats of {len(self.drives)} replayed recordings, got {len(recordings)}")
-        made, drives = [], []
-        for recording, old, drive in zip(recordings, self.comparisons, self.drives, strict=True):
+        made, drives, replays = [], [], []
+        for recording, old, drive, replay in zip(recordings, self.comparisons, self.drives, self._replays, strict=True):
             new = followed(self.scene, recording, config or old.config)
             if not _same(new, drive):
                 raise ValueError(
                     f"recording {recording.name!r} holds other commands than {old.name!r} had, starts elsewhere "
                     "(qpos0), or measured another torque (side, gravity)"
                 )
-            made.append(make_comparison(self.scene, recording, _clock(recording, new), config or old.config))
             drives.append(new if isinstance(new, Motion) else drive)
-        replays = [_along(replay, new) for replay, new in zip(self._replays, drives, strict=True)]
+            replays.append(_along(replay, drives[-1]))
+            made.append(_compared(self.scene, recording, new, replays[-1], config or old.config))
         return assemble(self.scene, self.space, made, replays, drives)
 
     def _blockwise(self, values: Any, functions: Sequence[Callable], join: Callable) -> Any:
@@ -148,7 +148,8 @@ def make_cost(
     effects = (*effects, *(e for e in _sensor_effects(scene, space) if e.name not in given))
     replays = tuple(_engine(engine, scene, space, d, effects) for d in drives)
     comparisons = tuple(
-        make_comparison(scene, r, _clock(r, d), config) for r, d in zip(recordings, drives, strict=True)
+        _compared(scene, recording, drive, replay, config)
+        for recording, drive, replay in zip(recordings, drives, replays, strict=True)
     )
     return assemble(scene, space, comparisons, replays, drives)
 
@@ -190,10 +191,14 @@ def followed(scene: Scene, recording: Recording, config: CompareConfig) -> Drive
 
 @dataclass(frozen=True, eq=False)
 class Along:
-    """A compiled batch of inverse replays along a motion: [B, D] -> Rollout [B, ...]."""
+    """A compiled batch of inverse replays along a motion: [B, D] -> Rollout [B, ...].
+
+    torques: the torques [N, T, J] of N paths at the space's means.
+    """
 
     compiled: Callable[..., Rollout]
     motion: Motion
+    torques: Callable[[Path], jax.Array]
 
     def __call__(self, values: np.ndarray) -> Rollout:
         return self.compiled(values, path_of(self.motion))
@@ -201,7 +206,31 @@ class Along:
 
 def _along(replay: Callable[[np.ndarray], Rollout], follows: Drive | Motion) -> Callable[[np.ndarray], Rollout]:
     """The same compiled batch along another motion."""
-    return Along(replay.compiled, follows) if isinstance(replay, Along) and isinstance(follows, Motion) else replay
+    return replace(replay, motion=follows) if isinstance(replay, Along) and isinstance(follows, Motion) else replay
+
+
+def _compared(
+    scene: Scene, recording: Recording, follows: Drive | Motion, replay: Callable, config: CompareConfig
+) -> Comparison:
+    """What a recording is compared with its replay by."""
+    apart = _apart(replay, scene, recording, config) if isinstance(replay, Along) else None
+    return make_comparison(scene, recording, _clock(recording, follows), config, apart)
+
+
+def _apart(along: Along, scene: Scene, recording: Recording, config: CompareConfig) -> np.ndarray | None:
+    """[N, T, J] N m: torques of the repeats' own measured motions, less their mean; None unless each measured its own.
+
+    A replay follows the mean of the measured positions, whose noise, differentiated twice, all repeats share.  What
+    the repeats' own motions would take tells how large it is (errors in variables).
+    """
+    if recording.repeats == 1 or not recording.channel("position").mask.all():
+        return None
+    motions = [
+        measured_motion(recording.repeats_subset([n]), scene.joints, cutoff=config.motion_cutoff)
+        for n in range(recording.repeats)
+    ]
+    torques = np.asarray(along.torques(jax.tree.map(lambda *a: jnp.stack(a), *map(path_of, motions))), np.float64)
+    return torques - torques.mean(axis=0)
 
 
 def _same(new: Drive | Motion, old: Drive | Motion) -> bool:
@@ -234,7 +263,12 @@ def _engine(
         if engine != "mjx":
             raise ValueError("a recording without commands is replayed by inverse dynamics, which needs engine 'mjx'")
         along = path_replay(scene, drive.torque, effects)
-        return Along(over_block(lambda values, path: along(make_physics(scene, space, values), path)), drive)
+        means = jnp.asarray(space.mean, jnp.float32)
+        return Along(
+            over_block(lambda values, path: along(make_physics(scene, space, values), path)),
+            drive,
+            _compiled(lambda path: along(make_physics(scene, space, means), path).torque),
+        )
     if engine == "mjx":
         return batch_replay(scene, space, servo_replay(scene, drive, effects))
     twin = twin_replay(scene, space, drive, [e for e in effects if e.name != "torque offset"])
@@ -245,5 +279,6 @@ def _single(array: np.ndarray) -> jax.Array:
     return jnp.asarray(array, jnp.float32) if np.issubdtype(array.dtype, np.floating) else jnp.asarray(array)
 
 
-def _compiled(function: Callable[[Rollout], jax.Array]) -> Callable[[Rollout], jax.Array]:
+def _compiled(function: Callable[[Any], jax.Array]) -> Callable[[Any], jax.Array]:
+    """Of one row of a batch, a Rollout or a Path -> of all, in one compiled piece."""
     return jax.jit(jax.vmap(function), compiler_options=runtime.compiler_options())

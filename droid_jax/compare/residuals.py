@@ -190,14 +190,19 @@ def _distance(channel: Measured, trace: jax.Array) -> jax.Array:
     return jnp.mean(jnp.sum(norm * measured, axis=1) / jnp.maximum(jnp.sum(measured, axis=1), 1))
 
 
-def make_comparison(scene: Scene, recording: Recording, clock: np.ndarray, config: CompareConfig) -> Comparison:
+def make_comparison(
+    scene: Scene, recording: Recording, clock: np.ndarray, config: CompareConfig, apart: np.ndarray | None = None
+) -> Comparison:
     """Prepare a recording's channels for comparison with a replay whose rows have the times `clock` [T] s, regular.
 
+    apart: [N, T, J] N m by which the repeats' torques may differ because they moved, or measured their motion,
+    differently, with mean zero; it is taken off them where their noise is estimated.
     Raises ValueError for a channel the recording does not have, one that no replay produces, or a
     constant (dead) channel.
     """
     channels = tuple(
-        _measure(scene, recording.channel(name), clock, weight) for name, weight in config.channels.items()
+        _measure(scene, recording.channel(name), clock, weight, apart if name == "torque" else None)
+        for name, weight in config.channels.items()
     )
     grip = _grip_window(recording) if scene.grip else None
     shut = None
@@ -237,7 +242,7 @@ def _of_joints(scene: Scene, channel: Channel) -> Channel:
     return replace(channel, columns=columns, values=channel.values[..., kept], mask=channel.mask[..., kept])
 
 
-def _measure(scene: Scene, channel: Channel, clock: np.ndarray, weight: float) -> Measured:
+def _measure(scene: Scene, channel: Channel, clock: np.ndarray, weight: float, apart: np.ndarray | None) -> Measured:
     if channel.name not in MINIMUM_NOISE:
         raise ValueError(f"channel {channel.name!r} has no simulated counterpart; known: {', '.join(MINIMUM_NOISE)}")
     if channel.name == "object_angle":
@@ -260,8 +265,10 @@ def _measure(scene: Scene, channel: Channel, clock: np.ndarray, weight: float) -
     time, values, mask = channel.time[inside], channel.values[:, inside], channel.mask[:, inside]
     coarse = coarse_clock(float(time[0]), float(time[-1]))
     kernel = lowpass(time, coarse)
-    repeats = smooth(values, mask, kernel)
-    seen = _same_filter(kernel, mask, ~np.isnan(repeats), _resampling(clock, time))
+    resampling = _resampling(clock, time)
+    off = 0.0 if apart is None else np.stack([resampling @ a[:, columns] for a in apart])
+    repeats = smooth(values - off, mask, kernel)
+    seen = _same_filter(kernel, mask, ~np.isnan(repeats), resampling)
     repeats, measured = _fill(repeats, channel, coarse)
     noise = estimate_noise(repeats, minimum=MINIMUM_NOISE[channel.name], measured=measured)
     step = clock[1] - clock[0]
