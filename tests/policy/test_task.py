@@ -44,10 +44,22 @@ def test_a_grip_takes_both_fingers_and_a_hand_that_faces_the_door(changes, is_on
 
 
 def test_the_door_pays_only_while_it_is_gripped():
-    hooked = HELD._replace(force=np.array([9.0, 0.0]))
+    hooked = HELD._replace(force=np.array([9.0, 0.0]), pads=np.array([[0.0, 0.017, 0.0], [0.0, -0.04, 0.0]]))
     assert float(terms(TASK, HELD)["door"]) == pytest.approx(0.25 + 0.2 / np.deg2rad(30))
-    assert float(terms(TASK, hooked)["door"]) == pytest.approx(0.125)
+    assert float(terms(TASK, hooked)["door"]) == pytest.approx(0.125 * (1.0 + np.exp(-2.0)))
     assert float(reward(TASK, HELD)) > float(reward(TASK, hooked))
+
+
+def test_a_finger_on_its_way_to_the_knob_pays_more_and_more():
+    """The other one presses already; the hand faces the door, or nothing of it counts."""
+
+    def worth(gap: float, yaw: float = 0.0) -> float:
+        pads = np.array([[0.0, 0.017, 0.0], [0.0, -gap, 0.0]])
+        pressed = HELD._replace(pads=pads, force=np.array([5.0, 5.0 if gap <= 0.017 else 0.0]), yaw=yaw)
+        return float(terms(TASK, pressed._replace(angle=0.0))["door"])
+
+    assert np.all(np.diff([worth(gap) for gap in (0.04, 0.035, 0.03, 0.025, 0.02, 0.017)]) > 0)
+    assert worth(0.02, yaw=0.5) == 0.0
 
 
 def test_an_open_door_pays_more_than_one_just_short_of_it():
