@@ -234,8 +234,8 @@ def test_slippery_pads_are_all_that_differs_from_the_settings_robot():
 
 
 def test_a_trained_policy_opens_by_its_grip():
-    """A policy of the reported run on the dry door: with slippery pads a hook or a push would still open it."""
-    kept = json.loads((RESULTS / "table2_cases" / "paper" / "prior_0.json").read_text())
+    """A policy of a pilot on the dry door: with slippery pads a hook or a push would still open it."""
+    kept = json.loads((RESULTS / "pilots" / "one_finger" / "prior_0.json").read_text())
     policy = load(RESULTS / "trained_cases" / kept["trained"] / POLICY)
     env = DoorEnv(door_scene(timestep=TIMESTEP, limits=True), Task())
     rates = {
