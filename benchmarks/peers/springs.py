@@ -93,7 +93,8 @@ def recover(name: str, data_step: float, fit_step: float) -> dict[str, Any]:
     rows = clock[::every], force(clock)[::every], position[::every], velocity[::every]
     scene = _scene(spec)
     space, truth = _unknowns(name, scene)
-    ours = {engine: _ours(scene, space, _log(joints, *rows), engine) for engine in ENGINES}
+    log, how = _log(joints, *rows), {"": False, "_mj_step": True}
+    ours = {f"{e}{suffix}": _ours(scene, space, log, e, steps) for e in ENGINES for suffix, steps in how.items()}
     theirs = _theirs(spec, space, rows[0], rows[1], _sensors(model, *rows[2:]))
     found = {**ours, "sysid": (theirs.values, theirs.seconds)}
     return {
@@ -158,10 +159,10 @@ def _log(
     return Recording("log", clock, force, names, channels, convention, qpos0=dict.fromkeys(names, 0.0))
 
 
-def _ours(scene: Scene, space: Space, recording: Recording, engine: str) -> tuple[np.ndarray, float]:
+def _ours(scene: Scene, space: Space, recording: Recording, engine: str, mj_step: bool) -> tuple[np.ndarray, float]:
     """Values [D] and s of the refinement alone, from the same start, compared in position and velocity."""
     began = time.perf_counter()
-    config = CompareConfig(channels={"position": 1.0, "velocity": 1.0}, whitened=True)
+    config = CompareConfig(channels={"position": 1.0, "velocity": 1.0}, whitened=True, mj_step=mj_step)
     cost = make_cost(scene, space, [recording], engine=engine, config=config)
     found = refine(cost.whitened, space, space.mean[None], RefineConfig(hops=0, spreads=0))
     return found.best, time.perf_counter() - began

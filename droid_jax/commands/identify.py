@@ -68,6 +68,9 @@ class Identify:
     In your own scene: those of your parameters that say "nuisance": true."""
     whitened: bool = False
     """The search counts torques in units of their noise instead of N m (the refinement always does)."""
+    mj_step: bool = False
+    """The recordings are a MuJoCo program's own, of this scene and time step: replay them by mj_step's steps of first
+    order, row by row."""
     seed: int = 0
     """Seed of the search, of the stand-in robot and of the samples."""
     tensorboard: bool = False
@@ -180,7 +183,7 @@ def config_of(command: Identify) -> IdentifyConfig:
         search=search_config(command.preset, command.seed, **changes),
         refine=refine_config(command.preset),
         seed=command.seed,
-        compare=CompareConfig(whitened=command.whitened),
+        compare=CompareConfig(whitened=command.whitened, mj_step=command.mj_step),
     )
 
 

@@ -146,7 +146,7 @@ def make_cost(
     drives = [followed(scene, r, config) for r in recordings]
     given = {e.name for e in effects}
     effects = (*effects, *(e for e in _sensor_effects(scene, space) if e.name not in given))
-    replays = tuple(_engine(engine, scene, space, d, effects) for d in drives)
+    replays = tuple(_engine(engine, scene, space, d, effects, config.mj_step) for d in drives)
     comparisons = tuple(
         _compared(scene, recording, drive, replay, config)
         for recording, drive, replay in zip(recordings, drives, replays, strict=True)
@@ -255,11 +255,14 @@ def _sensor_effects(scene: Scene, space: Space) -> tuple[Effect, ...]:
 
 
 def _engine(
-    engine: str, scene: Scene, space: Space, drive: Drive | Motion, effects: Sequence[Effect]
+    engine: str, scene: Scene, space: Space, drive: Drive | Motion, effects: Sequence[Effect], mj_step: bool
 ) -> Callable[[np.ndarray], Rollout]:
     if engine not in ENGINES:
         raise ValueError(f"unknown engine {engine!r}; valid: {', '.join(ENGINES)}")
+    late = 0.0 if mj_step else 0.5
     if isinstance(drive, Motion):
+        if mj_step:
+            raise ValueError("mj_step replays commands; this recording has none")
         if engine != "mjx":
             raise ValueError("a recording without commands is replayed by inverse dynamics, which needs engine 'mjx'")
         along = path_replay(scene, drive.torque, effects)
@@ -270,8 +273,8 @@ def _engine(
             _compiled(lambda path: along(make_physics(scene, space, means), path).torque),
         )
     if engine == "mjx":
-        return batch_replay(scene, space, servo_replay(scene, drive, effects))
-    twin = twin_replay(scene, space, drive, [e for e in effects if e.name != "torque offset"])
+        return batch_replay(scene, space, servo_replay(scene, drive, effects, parity=mj_step, late=late))
+    twin = twin_replay(scene, space, drive, [e for e in effects if e.name != "torque offset"], late=late)
     return lambda values: jax.tree.map(_single, twin(values))
 
 

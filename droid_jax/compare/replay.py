@@ -103,12 +103,15 @@ def check_stateless(scene: Scene) -> None:
         )
 
 
-def servo_replay(scene: Scene, drive: Drive, effects: Sequence[Effect] = (), *, parity: bool = False) -> Replay:
+def servo_replay(
+    scene: Scene, drive: Drive, effects: Sequence[Effect] = (), *, parity: bool = False, late: float = 0.5
+) -> Replay:
     """The scan over time steps that follows the command. Torques carry the time of the state they act on.
 
     The scan carries only position, velocity and the solver's warm start: everything else in
     mjx.Data is rebuilt each step, so that XLA drops what nobody reads.
-    parity: step exactly as the C engine does (see `droid_jax.model.step`), for comparisons with it.
+    parity: step exactly as the C engine does (see `droid_jax.model.step`), for comparisons with it; then
+      `late` steps late (see `_command`).
     """
     check_gains(scene, drive)
     check_stateless(scene)
@@ -118,7 +121,8 @@ def servo_replay(scene: Scene, drive: Drive, effects: Sequence[Effect] = (), *, 
     start = jnp.asarray(drive.qpos0, jnp.float32)
     joints, positions = scene.joint_dofs, scene.joint_qpos
     hinge = scene.qpos(scene.object_joint) if scene.object_joint else None
-    late = 0.5 if parity else 0.0  # steps; see `_command`
+    shift = late if parity else 0.0  # steps, of the command; of positions in the other direction
+    half = late if parity else 0.5  # steps from the velocity before a step to the one that is told
     damping = has_servo_damping(scene.model)
 
     def replay(physics: Physics) -> Rollout:
@@ -127,7 +131,7 @@ def servo_replay(scene: Scene, drive: Drive, effects: Sequence[Effect] = (), *, 
         def step(carry, k):
             qpos, qvel, warm, load = carry
             state = State(k * drive.timestep, qpos, qvel, load)
-            ctrl = servo_given(_command(table, drive.timestep, k, late, theta, effects), theta, state, effects)
+            ctrl = servo_given(_command(table, drive.timestep, k, shift, theta, effects), theta, state, effects)
             before = template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm, ctrl=ctrl)
             after = simulate_step(
                 rubbing(model, theta, state, effects),
@@ -139,9 +143,9 @@ def servo_replay(scene: Scene, drive: Drive, effects: Sequence[Effect] = (), *, 
             servo = servo_force(model, after, mean) if damping and not parity else after.qfrc_actuator
             out = (
                 _joint_torque(model, before, after, servo, joints, drive, parity),
-                qpos[positions] + late * drive.timestep * qvel[joints],
-                mean[joints],
-                qpos[hinge] + late * drive.timestep * qvel[hinge] if hinge is not None else jnp.zeros(()),
+                qpos[positions] + shift * drive.timestep * qvel[joints],
+                (qvel + half * (after.qvel - qvel))[joints],
+                qpos[hinge] + shift * drive.timestep * qvel[hinge] if hinge is not None else jnp.zeros(()),
                 _touching(after, fingers),
             )
             return (after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator), out

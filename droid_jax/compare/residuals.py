@@ -39,6 +39,9 @@ class CompareConfig:
     grip_share: share of the gripping time that all fingers must touch.
     whitened: the cost is the root mean square of the whitened residuals instead of N m.
     motion_cutoff: Hz, filter of the measured positions of a recording without commands.
+    mj_step: replay as a MuJoCo program logs itself: mj_step's own steps of first order, each row the state before a
+      step and the command of that step.  For recordings that MuJoCo made with the scene's own time step; of a real
+      robot, or of a finer simulation, the default is the better one by far.
     """
 
     channels: Mapping[str, float] = field(default_factory=lambda: {"torque": 1.0})
@@ -48,6 +51,7 @@ class CompareConfig:
     grip_share: float = 0.95
     whitened: bool = False
     motion_cutoff: float = CUTOFF
+    mj_step: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,10 +21,12 @@ from droid_jax.model.seam import Effect, Rollout
 
 
 def twin_replay(
-    scene: Scene, space: Space, drive: Drive, effects: Sequence[Effect] = (), *, chunk: int = 64
+    scene: Scene, space: Space, drive: Drive, effects: Sequence[Effect] = (), *, late: float = 0.5, chunk: int = 64
 ) -> Callable[[np.ndarray], Rollout]:
     """values [P, D] -> Rollout with a leading [P], float64, on all cores.
 
+    late: steps by which commands come late and positions are told ahead, which takes most of the first-order error
+    of C's steps out; 0 for what mj_step itself logs.
     Effects with functions of their own raise ValueError, as does a recording whose torque is on the link
     side, or contains the arm's weight where the actuators do not carry it, or the other way round (the C batch
     interface returns the actuators' torque alone).
@@ -47,16 +49,16 @@ def twin_replay(
     def piece(values: np.ndarray) -> Rollout:
         models = [make_c_model(plain, space, row) for row in values]
         thetas = [theta_of(space, row) for row in values]
-        control = np.stack([_control(drive, t.get("time_offset", 0.0)) for t in thetas])
+        control = np.stack([_control(drive, t.get("time_offset", 0.0), late) for t in thetas])
         trace = simulate(plain, models, drive.qpos0[None], control)
         traces = (trace.torque, trace.position, trace.velocity, trace.object_angle[..., None])
-        half = 0.5 * drive.timestep
+        ahead = late * drive.timestep
         rollout = Rollout(
             time=np.broadcast_to(drive.time, trace.object_angle.shape),
             torque=trace.torque + _offsets(scene, thetas)[:, None],
-            position=trace.position + half * trace.velocity,
+            position=trace.position + ahead * trace.velocity,
             velocity=trace.velocity,
-            object_angle=trace.object_angle + half * trace.object_velocity,
+            object_angle=trace.object_angle + ahead * trace.object_velocity,
             contact=trace.contact,
             finite=np.all([np.isfinite(t).all(axis=(1, 2)) for t in traces], axis=0),
         )
@@ -71,9 +73,9 @@ def twin_replay(
     return replay
 
 
-def _control(drive: Drive, time_offset: float) -> np.ndarray:
-    """[T, U] the command half a step (and the time offset) late, as the MJX replay applies it."""
-    at = drive.time - 0.5 * drive.timestep - time_offset
+def _control(drive: Drive, time_offset: float, late: float) -> np.ndarray:
+    """[T, U] the command so many steps (and the time offset) late."""
+    at = drive.time - late * drive.timestep - time_offset
     return np.stack([np.interp(at, drive.time, c) for c in drive.command.T], axis=1)
 
 

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from droid_jax.report.style import AFTER, BEFORE, INK, styled
-from experiments.policies.table import METHODS, SLIPPERY, trials
+from droid_jax.report.style import AFTER, BEFORE, INK, MUTED, styled
+from experiments.policies.table import METHODS, PAPER, SLIPPERY, trials
 
 WORDS = {"prior": "prior, randomised", "mean": "fitted mean alone", "fitted": "fitted, randomised"}
 WHERE = {
@@ -146,12 +146,16 @@ def _points(share: float) -> str:
 
 @styled
 def histograms(cases: Sequence[Mapping[str, Any]], settings: Sequence[str]) -> Figure:
-    """Largest angles on the stand-in robot: a row for each setting that was run, a column for each method."""
+    """Largest angles on the stand-in robot: a row for each setting that was run, a column for each method.
+
+    A bar above each panel is the paper's mean and deviation on its real robot, whose doors are none of these.
+    """
     settings = [s for s in settings if any(c["setting"]["name"] == s for c in cases)] or list(settings[:1])
 
     def panel(setting: str, method: str) -> Panel:
         own = [c for c in cases if c["setting"]["name"] == setting and c["method"] == method]
-        return Panel(f"{setting}: {WORDS[method]}", own, BEFORE if method == "prior" else AFTER)
+        colour = BEFORE if method == "prior" else AFTER
+        return Panel(f"{setting}: {WORDS[method]}", own, colour, PAPER[method]["robot"][1])
 
     return _panels([[panel(setting, method) for method in METHODS] for setting in settings])
 
@@ -164,11 +168,12 @@ def knob_histograms(places: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure
 
 
 class Panel(NamedTuple):
-    """A histogram: its title, the policies whose trials it counts, and its colour."""
+    """A histogram: its title, the policies whose trials it counts, its colour, and the paper's mean and deviation."""
 
     title: str
     cases: Sequence[Mapping[str, Any]]
     colour: str
+    paper: tuple[float, float] | None = None
 
 
 def _panels(rows: Sequence[Sequence[Panel]]) -> Figure:
@@ -180,6 +185,11 @@ def _panels(rows: Sequence[Sequence[Panel]]) -> Figure:
             each = [trials(case, "stand_in")["angle"] for case in panel.cases]
             axes.hist(np.concatenate(each) if each else np.zeros(0), BINS, color=panel.colour)
             axes.axvline(30.0, color=INK, lw=0.8, ls=":")
+            if panel.paper:
+                high = axes.get_xaxis_transform()  # degrees, and a share of the panel's height
+                mean, std = panel.paper
+                axes.errorbar(mean, 0.93, xerr=std, fmt="o", ms=3, lw=1, capsize=2, color=MUTED, transform=high)
+                axes.annotate("paper", (mean + std + 2.0, 0.93), xycoords=high, va="center", fontsize=6, color=MUTED)
             axes.set_title(panel.title, fontsize=8)
         row[0].set_ylabel("trials")
     for axes in grid[-1]:

@@ -201,6 +201,42 @@ def test_the_twin_is_mj_step(scene: Scene, drive: Drive):
     np.testing.assert_allclose(got.velocity[0], velocity, atol=1e-12)
 
 
+def test_without_delay_both_tell_what_mj_step_logs(scene: Scene, drive: Drive):
+    logged = c_rollout(scene, drive, delay=0.0)
+    twin = twin_replay(scene, SPACE, drive, late=0.0)(SPACE.mean[None])
+    mjx = run(scene, drive, [{}], parity=True, late=0.0)
+    for rollout, atol in ((twin, (1e-12, 1e-12, 1e-12)), (mjx, (2e-6, 1e-4, 5e-5))):
+        told = (rollout.position[0], rollout.velocity[0], rollout.torque[0])
+        for got, expected, within in zip(told, logged, atol, strict=True):
+            np.testing.assert_allclose(got, expected, atol=within)
+
+
+@pytest.mark.parametrize("engine", ["mjx", "mujoco"])
+def test_a_cost_can_replay_as_mj_step_logs(scene: Scene, drive: Drive, engine: str):
+    """What MuJoCo itself logged with these steps costs nothing then, a hundred times less than as a robot's log."""
+    *_, torque = c_rollout(scene, drive, delay=0.0)
+    values = np.stack([torque, torque])
+    channel = Channel("torque", "N m", JOINTS, drive.time, values, np.ones(values.shape, bool))
+    logged = recording(channels={"torque": channel})
+
+    def cost(mj_step: bool) -> float:
+        made = make_cost(scene, SPACE, [logged], engine=engine, config=CompareConfig(mj_step=mj_step))
+        return float(made(SPACE.mean[None])[0])
+
+    assert cost(True) < 2e-5
+    assert cost(True) < 0.01 * cost(False)
+
+
+def test_mj_step_needs_commands(scene: Scene):
+    time, path = motion(2.0)
+    values = np.stack([path, path])
+    position = Channel("position", "rad", JOINTS, time, values, np.ones(values.shape, bool))
+    channels = {"position": position, "torque": replace(position, name="torque", unit="N m")}
+    alone = recording(time=np.zeros(0), command=np.zeros((0, 2)), channels=channels)
+    with pytest.raises(ValueError, match="mj_step replays commands"):
+        make_cost(scene, SPACE, [alone], config=CompareConfig(mj_step=True))
+
+
 def test_the_replay_is_closer_to_the_continuous_arm_than_the_c_engine(scene: Scene, drive: Drive, rollout: Rollout):
     """Against C at 20 microseconds; C at 2 ms is off by its first-order error, delayed command or not."""
     _, _, truth = c_rollout(scene, drive, delay=0.0, timestep=2e-5, integrator=mujoco.mjtIntegrator.mjINT_RK4)
