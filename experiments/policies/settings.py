@@ -1,4 +1,4 @@
-"""The doors on which methods are compared.  docs/paper.md gives their reasons; nothing here changes after a run."""
+"""The doors on which methods are compared.  docs/pilots.md gives their reasons; nothing here changes after a run."""
 
 from __future__ import annotations
 
