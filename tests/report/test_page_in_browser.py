@@ -1,18 +1,23 @@
-"""The page in a real browser: it renders without complaints, its pictures load, nothing overflows.
+"""The page in a real browser: it renders without complaints, its pictures load, its links lead somewhere, nothing
+overflows, on a desk as on a phone.
 
 Skipped where no Chromium is on the path.
 """
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 import pytest
 from made_up_gap import make_gap
+from made_up_policy import make_policy
 from made_up_run import make_run
 
 from droid_jax.report import page
@@ -27,14 +32,26 @@ pytestmark = [
 PROBE = """<script>
 addEventListener('load', () => {
   const images = [...document.images], seen = e => e.getClientRects().length > 0;
-  const set = (k, v) => document.documentElement.setAttribute('data-' + k, v);
-  set('images', images.length);
-  set('loaded', images.filter(i => i.complete && i.naturalWidth > 0).length);
-  set('wide', [...document.querySelectorAll('figure .wide')].filter(seen).length);
-  set('narrow', [...document.querySelectorAll('figure .narrow')].filter(seen).length);
-  set('drawn', [...document.querySelectorAll('svg')].filter(s => seen(s) && s.getBBox().width > 50).length);
-  set('overflow', document.documentElement.scrollWidth - document.documentElement.clientWidth);
+  const links = [...document.links], here = a => a.hash && a.pathname === location.pathname;
+  const found = {
+    images: images.length,
+    loaded: images.filter(i => i.complete && i.naturalWidth > 0).length,
+    wide: [...document.querySelectorAll('figure .wide')].filter(seen).length,
+    narrow: [...document.querySelectorAll('figure .narrow')].filter(seen).length,
+    drawn: [...document.querySelectorAll('svg')].filter(s => seen(s) && s.getBBox().width > 50).length,
+    overflow: document.documentElement.scrollWidth - document.documentElement.clientWidth,
+    width: document.documentElement.clientWidth,
+    anchors: links.filter(here).length,
+    dangling: links.filter(a => here(a) && !document.getElementById(decodeURIComponent(a.hash.slice(1)))).length,
+    files: links.filter(a => a.protocol === 'file:' && !here(a)).map(a => decodeURIComponent(a.pathname)),
+  };
+  parent.postMessage(encodeURIComponent(JSON.stringify(found)), '*');
 });
+</script></body>"""
+# Chromium makes no window as narrow as a phone; a frame can be.
+FRAME = """<!doctype html><body style="margin:0"><iframe src="{src}" style="border:0;width:{width}px;height:{height}px">
+</iframe><script>
+addEventListener('message', e => document.documentElement.setAttribute('data-found', e.data));
 </script></body>"""
 
 
@@ -46,6 +63,18 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def gap_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return page.write_report(make_gap(tmp_path_factory.mktemp("browser") / "gap", "partly explained"))
+
+
+@pytest.fixture(scope="module")
+def whole_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of all stages, as the command without arguments leaves it."""
+    folder = tmp_path_factory.mktemp("browser") / "all"
+    make_run(folder / "identify")
+    make_gap(folder / "gap")
+    make_policy(folder / "train")
+    for part in ("identify", "gap", "train"):
+        page.write_report(folder / part)
+    return page.write_report(folder)
 
 
 def _browse(url: Path, *options: str, size: tuple[int, int]) -> subprocess.CompletedProcess[str]:
@@ -69,26 +98,31 @@ SIZES = pytest.mark.parametrize(
         ((834, 1112), "wide", "narrow"),  # a tablet
         ((720, 900), "wide", "narrow"),
         ((500, 900), "narrow", "wide"),
+        ((375, 812), "narrow", "wide"),  # a phone
     ],
 )
 
 
-def _probe(report: Path, size: tuple[int, int], name: str) -> dict[str, int]:
+def _probe(report: Path, size: tuple[int, int]) -> dict[str, Any]:
     """What the browser draws of a page at this size; its console must be silent."""
-    probe = report.with_name(f"probe_{name}.html")
+    probe, frame = report.with_name("probe.html"), report.with_name("frame.html")
     text = report.read_text(encoding="utf-8")
     opened = text.replace("default-src 'none';", "default-src 'none'; script-src 'unsafe-inline';")
     probe.write_text(opened.replace("</body>", PROBE), encoding="utf-8")
-    done = _browse(probe, "--dump-dom", size=size)
+    frame.write_text(FRAME.format(src=probe.name, width=size[0], height=size[1]), encoding="utf-8")
+    done = _browse(frame, "--dump-dom", size=(max(size[0], 500), size[1]))
     assert not _console(done.stderr)
-    return {k: int(v) for k, v in re.findall(r'data-(\w+)="(-?\d+)"', done.stdout[:2000])}
+    (said,) = re.findall(r'data-found="([^"]*)"', done.stdout[:10_000])
+    found = json.loads(unquote(said))
+    assert found["width"] == size[0]
+    return found
 
 
 @SIZES
 def test_everything_is_drawn_and_nothing_overflows(
     report: Path, size: tuple[int, int], shown: str, hidden: str
 ) -> None:
-    found = _probe(report, size, shown)
+    found = _probe(report, size)
     assert found["images"] == found["loaded"] == 4
     assert found[shown] == 7 and found[hidden] == 0
     assert found["drawn"] == 7
@@ -99,10 +133,33 @@ def test_everything_is_drawn_and_nothing_overflows(
 def test_the_search_for_a_missing_effect_is_drawn_too(
     gap_report: Path, size: tuple[int, int], shown: str, hidden: str
 ) -> None:
-    found = _probe(gap_report, size, shown)
+    found = _probe(gap_report, size)
     assert found["images"] == 0  # every figure is short enough to be an SVG
     assert found[shown] == found["drawn"] == 8 and found[hidden] == 0  # closed ones have a size too
     assert found["overflow"] == 0
+
+
+@SIZES
+def test_the_page_of_all_stages_is_drawn_and_its_links_lead_somewhere(
+    whole_report: Path, size: tuple[int, int], shown: str, hidden: str
+) -> None:
+    found = _probe(whole_report, size)
+    assert found["images"] == found["loaded"] > 0
+    assert found[shown] == found["drawn"] > 15 and found[hidden] == 0
+    assert found["overflow"] == 0
+    assert found["anchors"] == 3 and found["dangling"] == 0  # the list of its parts
+    lost = [file for file in found["files"] if not Path(file).exists()]
+    assert not lost and len(found["files"]) > 2
+
+
+def test_a_link_that_leads_nowhere_is_seen(whole_report: Path) -> None:
+    """The check above can fail."""
+    text = whole_report.read_text(encoding="utf-8")
+    broken = whole_report.with_name("broken.html")
+    broken.write_text(text.replace("</body>", '<a href="#nowhere">a</a><a href="no.html">b</a></body>'), "utf-8")
+    found = _probe(broken, (1200, 900))
+    assert found["dangling"] == 1
+    assert [Path(file).name for file in found["files"] if not Path(file).exists()] == ["no.html"]
 
 
 def test_the_page_as_it_is_renders_without_a_complaint(report: Path) -> None:
