@@ -416,19 +416,24 @@ def test_an_option_that_does_not_exist(arguments: list[str], capsys: pytest.Capt
     assert arguments[-1] in said.err + said.out and "Traceback" not in said.err
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["identify", "--help"], ["record", "--help"], ["report", "--help"]])
-def test_help_is_quick(arguments: list[str]):
+COMMANDS = ("all", "identify", "gap", "train", "evaluate", "export", "record", "convert", "report", "view")
+
+
+@pytest.mark.parametrize("command", ["", *COMMANDS])
+def test_help_is_quick(command: str):
     """It loads nothing that takes time, and names what it is about."""
+    arguments = [*command.split(), "--help"]
     code = (
         "import sys\nfrom droid_jax.run import main\n"
         f"try:\n    main({arguments!r})\nexcept SystemExit as stop:\n    assert stop.code == 0\n"
-        "heavy = [m for m in ('jax', 'mujoco', 'scipy', 'matplotlib', 'evosax') if m in sys.modules]\n"
+        "heavy = [m for m in ('numpy', 'jax', 'mujoco', 'scipy', 'matplotlib', 'brax') if m in sys.modules]\n"
         "assert not heavy, heavy"
     )
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "120"}
     run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60)
     assert run.returncode == 0, run.stderr
-    assert ("--out" if arguments[0] in ("identify", "record") else "report") in run.stdout
+    said = [f"{command} [-h]"] if command else [",".join(COMMANDS)]
+    assert all(text in run.stdout for text in said), run.stdout
 
 
 # ----- effects of one's own
