@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 from droid_jax import runtime
-from droid_jax.compare.cost import make_cost
+from droid_jax.compare.cost import followed, make_cost
 from droid_jax.compare.population import over_population
 from droid_jax.compare.replay import Drive, check_gains, make_drive, observed, servo_replay, torque_offset_effect
 from droid_jax.compare.residuals import CompareConfig
@@ -429,6 +430,23 @@ def test_a_motion_starts_where_it_says_else_where_it_was_measured_else_where_it_
     assert start(qpos0={"elbow": 0.7}, channels=measured(0.2)) == pytest.approx([0.25, 0.7])
     assert start(qpos0={}, channels=measured(0.2, ("shoulder",))) == pytest.approx([0.25, command[0, 1]])
     assert start(qpos0={}) == pytest.approx([0.0, -0.3])
+
+
+@pytest.mark.parametrize(("late", "warned"), [(0.0, False), (0.15, True)])
+def test_a_recording_that_begins_in_motion_is_warned_of(scene: Scene, late: float, warned: bool):
+    """Cut where the robot moves, it is not what a replay from rest does; noise of the sensors is no motion."""
+    time, _ = motion(2.0)
+    path = np.stack([0.4 * (1 - np.cos(2 * (time + late))), np.full_like(time, -0.3)], axis=1)
+    values = path + np.random.default_rng(2).normal(0, 2e-5, (3, *path.shape))
+    position = Channel("position", "rad", JOINTS, time, values, np.ones(values.shape, bool))
+    torque = replace(position, name="torque", unit="N m")
+    cut = recording(time=time, command=path, channels={"position": position, "torque": torque}, qpos0={})
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        followed(scene, cut, CompareConfig())
+    found = [str(w.message) for w in said if "begins at rest" in str(w.message)]
+    assert len(found) == warned
+    assert all("'wave' begins while shoulder moves" in text for text in found)
 
 
 @pytest.mark.parametrize("measured", [False, True])
