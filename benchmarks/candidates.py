@@ -28,7 +28,7 @@ from droid_jax.compare.cost import Cost, make_cost  # noqa: E402
 from droid_jax.gap.candidates import candidates  # noqa: E402
 from droid_jax.gap.case import GapConfig  # noqa: E402
 from droid_jax.gap.screen import questions_of  # noqa: E402
-from droid_jax.identify.refine import TRIALS  # noqa: E402
+from droid_jax.identify.damped import TRIALS  # noqa: E402
 from droid_jax.measure.demonstration import demonstration_path  # noqa: E402
 from droid_jax.measure.formats import load  # noqa: E402
 from droid_jax.measure.recording import Recording  # noqa: E402

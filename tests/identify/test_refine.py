@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from droid_jax.identify.refine import HOP_POPULATION, RefineConfig, _Problem, chord, refine
+from droid_jax.identify.damped import Problem
+from droid_jax.identify.refine import HOP_POPULATION, RefineConfig, chord, refine
 from droid_jax.model.parameters import Parameter, Scaling, Space
 
 
@@ -118,7 +119,7 @@ def test_differences_at_a_bound_are_divided_by_what_is_left_of_their_span(a):
     space = Space((line("a", low=0.0, mean=1.0, high=9.0), line("b")))
     matrix = np.array([[3.0, 2.5], [2.5, 3.0], [1.0, -1.0]])
     recorder = Recorder(linear(matrix, [1.0, 2.0, 3.0]))
-    problem = _Problem(recorder, space, EXACT)
+    problem = Problem(recorder, space, EXACT)
     state = problem.start(space.to_search(np.array([[a, 0.0]])))
     np.testing.assert_allclose(problem.jacobian(state)[0], matrix, atol=1e-9)
     np.testing.assert_allclose(problem.wide_jacobian(state, problem.jacobian(state)[0]), matrix, atol=1e-9)
@@ -292,7 +293,7 @@ def test_slopes_over_the_posterior_s_width_do_not_take_rounding_for_information(
     truth = np.stack([APART + TOGETHER, TOGETHER - APART], axis=1)
     true = deviation_of_the_sum(truth, fit.prior)
 
-    problem = _Problem(rounded, space, config)
+    problem = Problem(rounded, space, config)
     state = problem.start(fit.x[None])
     narrow = dataclasses.replace(state, widths=np.full((1, 2), config.smallest_step))
     assert deviation_of_the_sum(problem.jacobian(narrow)[0], fit.prior) < 0.5 * true

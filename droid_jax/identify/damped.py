@@ -1,0 +1,221 @@
+"""Levenberg-Marquardt in batches: one iteration of several starts at once, in search coordinates.
+
+An iteration is one batch of central differences, then batches of trial steps with that Jacobian for as long as they
+pay.  A trial differs from the next in its damping, its length and its path: straight in search coordinates, or straight
+in physical units.  Residuals are close to linear in masses, springs and damping, whose search coordinate is their
+logarithm; where two of them trade with each other (door and knob turn about the same hinge), the valley between them is
+straight in physical units alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from droid_jax.compare.residuals import BLOWN_UP
+from droid_jax.model.parameters import Scaling, Space
+
+Residuals = Callable[[np.ndarray], np.ndarray]
+
+# A batch of trials for each start: damping factors x lengths x paths, 32 in all, the block of a CPU.
+_DAMPINGS = 10.0 ** np.arange(-3.0, 5.0)
+_LENGTHS = (1.0, 0.5)
+TRIALS = 2 * len(_DAMPINGS) * len(_LENGTHS)
+_LONGEST = 2.0  # search units: the longest component of a step
+CHORDS = 3  # batches of trials at most with one Jacobian
+WIDE = 1.5  # posterior deviations: half-width of those differences
+SPREAD_LONGEST = 1.0  # search units
+_SHORTEST = 0.05  # a straight path in physical units never takes a parameter below this share of itself
+
+
+@dataclass(frozen=True)
+class StepConfig:
+    """Settings of an iteration.
+
+    step: half-width of the first central differences, search units.
+    smallest_step: and of later ones at least, search units (below it solver noise would show).
+    main_prior: prior deviation of parameters of interest, search units.
+    chord: a Jacobian serves another batch of trials while the last lowered the objective by this share.
+    spreads: times that the slopes are taken over the width of the posterior at the end; 0 leaves the narrow ones.
+    """
+
+    step: float = 0.3
+    smallest_step: float = 0.03
+    main_prior: float = 4.0
+    chord: float = 0.03
+    spreads: int = 2
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Live starts: x [S, D], residual [S, M], objective [S], damping [S], difference widths [S, D]."""
+
+    x: np.ndarray
+    residual: np.ndarray
+    objective: np.ndarray
+    damping: np.ndarray
+    widths: np.ndarray
+
+    def rows(self, keep: Any) -> State:
+        """The starts that `keep` indexes."""
+        return State(*(getattr(self, f)[keep] for f in State.__dataclass_fields__))
+
+
+def curvature(jacobian: np.ndarray, prior: np.ndarray) -> np.ndarray:
+    """[D, D] Gauss-Newton curvature of the objective from slopes [M, D] and prior deviations [D]."""
+    return jacobian.T @ jacobian + np.diag(prior**-2)
+
+
+def fall(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """[S] by how much the objectives fell; 0 for a start that could not be replayed and still cannot."""
+    return np.where(np.isinf(after), 0.0, before - np.where(np.isinf(after), 0.0, after))
+
+
+class Problem:
+    """Residuals and prior in search coordinates, with what an iteration does; counts iterations and replays.
+
+    before: a problem whose counts are gone on with.
+    """
+
+    def __init__(self, residuals: Residuals, space: Space, config: StepConfig, before: Problem | None = None) -> None:
+        self.residuals, self.space = residuals, space
+        self._config = config
+        self.prior = np.where(space.nuisance, 1.0, config.main_prior)
+        self.low, self.high = space.to_search(space.low), space.to_search(space.high)
+        self.log_width = np.array([p.log_width if p.scaling is Scaling.LOG else 0.0 for p in space.parameters])
+        self.evaluations = before.evaluations if before else 0
+        self.iterations = before.iterations if before else 0
+
+    def inside(self, x: np.ndarray) -> np.ndarray:
+        """x clipped to the bounds."""
+        return np.clip(x, self.low, self.high)
+
+    def replay(self, x: np.ndarray) -> np.ndarray:
+        """[P, D] -> residuals [P, M]; NaN throughout where a replay failed."""
+        self.evaluations += len(x)
+        residual = np.asarray(self.residuals(self.space.from_search(x)), dtype=np.float64)
+        failed = ~np.isfinite(residual).all(axis=1) | (residual == BLOWN_UP).any(axis=1)  # of one recording of several
+        return np.where(failed[:, None], np.nan, residual)
+
+    def differences(self, up: np.ndarray, down: np.ndarray, state: State) -> tuple[np.ndarray, np.ndarray]:
+        """Spans [S, N, D] and residual differences [S, N, M] between up and down, both [S, N, D].
+
+        The start itself takes the place of a replay that failed.
+        """
+        points = np.stack([up, down])
+        residual = self.replay(points.reshape(-1, points.shape[-1])).reshape(*points.shape[:3], -1)
+        failed = np.isnan(residual[..., :1])
+        points = np.where(failed, state.x[:, None], points)
+        residual = np.where(failed, state.residual[:, None], residual)
+        return points[0] - points[1], residual[0] - residual[1]
+
+    def objective(self, x: np.ndarray, residual: np.ndarray) -> np.ndarray:
+        """[P]; infinite where a replay gave no numbers."""
+        value = 0.5 * np.sum(residual**2, axis=-1) + 0.5 * np.sum((x / self.prior) ** 2, axis=-1)
+        return np.where(np.isfinite(value), value, np.inf)
+
+    def start(self, x: np.ndarray) -> State:
+        """The state of fresh starts [S, D]."""
+        residual = self.replay(x)
+        widths = np.full(x.shape, self._config.step)
+        return State(x, residual, self.objective(x, residual), np.full(len(x), 1e-3), widths)
+
+    def step(self, state: State, held: np.ndarray | None = None) -> tuple[State, np.ndarray]:
+        """One iteration of all starts, and by how much each objective fell. held: [S, D] bool, stay put."""
+        jacobian = self.jacobian(state)
+        before = state.objective
+        self.iterations += 1
+        state = self.trials(state, jacobian, held)
+        curvature = np.einsum("smd,smd->sd", jacobian, jacobian) + self.prior**-2
+        # About one deviation wide, the others given; a start that stood still looks from elsewhere.
+        widths = np.where((state.objective < before)[:, None], 1.0, 3.0) / np.sqrt(curvature)
+        widths = np.clip(widths, self._config.smallest_step, self._config.step)
+        return replace(state, widths=widths), fall(before, state.objective)
+
+    def trials(self, state: State, jacobian: np.ndarray, held: np.ndarray | None = None) -> State:
+        """Batches of trials with one Jacobian [S, M, D] for as long as they pay."""
+        for _ in range(CHORDS):
+            last = state.objective
+            state = self._try(state, jacobian, held)
+            if np.all(fall(last, state.objective) <= self._config.chord * state.objective):
+                break
+        return state
+
+    def jacobian(self, state: State) -> np.ndarray:
+        """[S, M, D] differences of every start in one batch; one-sided where a bound is in the way."""
+        steps = np.eye(state.x.shape[1]) * state.widths[:, None, :]
+        up, down = self.inside(state.x[:, None] + steps), self.inside(state.x[:, None] - steps)
+        spans, apart = self.differences(up, down, state)
+        span = np.einsum("sii->si", spans)[..., None]
+        return np.swapaxes(np.where(span > 0, apart / np.where(span > 0, span, 1.0), 0.0), 1, 2)
+
+    def axes(self, jacobian: np.ndarray, longest: float) -> np.ndarray:
+        """[D, D] columns: the posterior's principal axes, one deviation long, no entry beyond `longest`."""
+        variance, axes = np.linalg.eigh(np.linalg.inv(curvature(jacobian, self.prior)))
+        return axes * np.minimum(np.sqrt(np.maximum(variance, 0.0)), longest / np.max(np.abs(axes), axis=0))
+
+    def wide_jacobian(self, state: State, jacobian: np.ndarray) -> np.ndarray:
+        """[M, D] slopes of one start over the width of its posterior, from narrow ones, along the posterior's own axes.
+
+        Differences of one parameter at a time carry the solver's rounding, which looks like
+        information where two parameters trade with each other: their slopes cancel, its does not.
+        Along the axes each difference is WIDE deviations of the result; as the first axes suffer from
+        that rounding themselves, they are improved `spreads` times.
+        """
+        for _ in range(self._config.spreads):
+            steps = WIDE * self.axes(jacobian, SPREAD_LONGEST).T
+            spans, apart = self.differences(
+                self.inside(state.x[:, None] + steps), self.inside(state.x[:, None] - steps), state
+            )
+            if np.any(np.all(spans[0] == 0, axis=1)):  # failed on both sides: the narrow differences are all there is
+                return jacobian
+            jacobian = np.linalg.lstsq(spans[0], apart[0])[0].T
+        return jacobian
+
+    def _try(self, state: State, jacobian: np.ndarray, held: np.ndarray | None) -> State:
+        """All trials of all starts in one batch; each start takes its best, or stays."""
+        starts, dims = state.x.shape
+        steps = np.stack([self._steps(state.rows([s]), jacobian[s], held, s) for s in range(starts)])
+        paths = [self.inside(state.x[:, None] + steps), self.inside(self._straight(state.x[:, None], steps))]
+        trials = np.concatenate(paths, axis=1)
+        residual = self.replay(trials.reshape(-1, dims)).reshape(*trials.shape[:2], -1)
+        objective = self.objective(trials, residual)
+        rows, pick = np.arange(starts), np.argmin(objective, axis=1)
+        better = objective[rows, pick] < state.objective
+        factor = np.tile(np.repeat(_DAMPINGS, len(_LENGTHS)), len(paths))[pick]
+        return State(
+            x=np.where(better[:, None], trials[rows, pick], state.x),
+            residual=np.where(better[:, None], residual[rows, pick], state.residual),
+            objective=np.where(better, objective[rows, pick], state.objective),
+            damping=np.clip(np.where(better, state.damping * factor, state.damping), 1e-8, 1e4),
+            widths=state.widths,
+        )
+
+    def _steps(self, state: State, jacobian: np.ndarray, held: np.ndarray | None, row: int) -> np.ndarray:
+        """[dampings * lengths, D] Levenberg-Marquardt steps of one start, along the bounds it sits on.
+
+        None from a start that could not be replayed.
+        """
+        x = state.x[0]
+        if not np.isfinite(state.objective[0]):
+            return np.zeros((len(_DAMPINGS) * len(_LENGTHS), len(x)))
+        hessian = curvature(jacobian, self.prior)
+        slope = jacobian.T @ state.residual[0] + x / self.prior**2
+        free = ~(((x <= self.low) & (slope > 0)) | ((x >= self.high) & (slope < 0)))
+        free &= True if held is None else ~held[row]
+        out = np.zeros((len(_DAMPINGS), len(_LENGTHS), len(x)))
+        for k, factor in enumerate(_DAMPINGS):
+            damped = hessian + state.damping[0] * factor * np.diag(np.diag(hessian))
+            step = -np.linalg.solve(damped[np.ix_(free, free)], slope[free])
+            step *= min(1.0, _LONGEST / max(np.max(np.abs(step), initial=0.0), 1e-12))
+            out[k][:, free] = np.outer(_LENGTHS, step)
+        return out.reshape(-1, len(x))
+
+    def _straight(self, x: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """x moved by `step` along straight lines in physical units instead of search coordinates."""
+        width = np.where(self.log_width > 0, self.log_width, 1.0)
+        path = np.log(np.maximum(1.0 + width * step, _SHORTEST)) / width
+        return x + np.where(self.log_width > 0, path, step)
