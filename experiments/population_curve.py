@@ -28,7 +28,7 @@ from matplotlib.figure import Figure  # noqa: E402
 
 from benchmarks.common import commits, origin, stem  # noqa: E402
 from droid_jax.compare.cost import Cost, make_cost  # noqa: E402
-from droid_jax.identify.pipeline import split  # noqa: E402
+from droid_jax.identify.judge import split  # noqa: E402
 from droid_jax.identify.search import SearchConfig, search  # noqa: E402
 from droid_jax.measure.demonstration import demonstration_path  # noqa: E402
 from droid_jax.measure.formats import load  # noqa: E402

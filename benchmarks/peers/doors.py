@@ -18,7 +18,8 @@ from identify_suite import recordings, settings
 from benchmarks.peers import sysid as peer
 from benchmarks.peers.gap import run_gap
 from droid_jax.compare.cost import make_cost
-from droid_jax.identify.pipeline import identify, split
+from droid_jax.identify.judge import split
+from droid_jax.identify.pipeline import identify
 from droid_jax.measure.demonstration import demonstration_path
 from droid_jax.measure.formats import load
 from droid_jax.measure.hidden import record_hidden

@@ -7,14 +7,15 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from droid_jax.compare.cost import Cost, make_cost
-from droid_jax.compare.residuals import CompareConfig, Comparison, make_comparison
+from droid_jax.compare.residuals import CompareConfig
 from droid_jax.identify.fit import Fit
 from droid_jax.identify.gaussian import Gaussian, prior, space_to_json
+from droid_jax.identify.judge import Gap, gaps_of, split
 from droid_jax.identify.refine import RefineConfig, Refined, refine
 from droid_jax.identify.search import SearchConfig, search
 from droid_jax.identify.uncertainty import Identifiability, identifiability, not_judged, posterior
@@ -22,8 +23,6 @@ from droid_jax.measure.recording import Recording
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
-
-WORTH = 0.1  # share of the floor by which the start must exceed it, else there was no gap to close
 
 
 @dataclass(frozen=True)
@@ -46,32 +45,6 @@ class IdentifyConfig:
     samples: int = 200
     seed: int = 0
     compare: CompareConfig = field(default_factory=CompareConfig)
-
-
-Judged = Literal["repeats", "time", "same"]
-
-
-@dataclass(frozen=True)
-class Gap:
-    """Disagreement with held-out repeats of one recording, N m, before and after the fit.
-
-    before, after, floor: equation 1 without penalty terms, all compared channels; floor is what a perfect
-    model would leave, estimated from the scatter of all repeats, fitted and held out, about their mean.
-    closed: share of the way from before to floor; None where before does not exceed it by WORTH of it.
-    Floors and closed are None where there is one repeat only.
-    per_joint_*: [J] root mean square of the smoothed torques' difference.
-    judged: on what: "repeats" that were held out, the last part in "time" of a log, or the "same" one repeat that was
-    fitted.
-    """
-
-    before: float
-    after: float
-    floor: float | None
-    closed: float | None
-    per_joint_before: tuple[float, ...]
-    per_joint_after: tuple[float, ...]
-    per_joint_floor: tuple[float, ...] | None
-    judged: Judged
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,23 +82,6 @@ class Identified:
 Progress = Callable[[str, Any], None]
 
 
-def split(recording: Recording, share: float) -> tuple[Recording, Recording, tuple[int, ...]]:
-    """Fitted and held-out repeats (the last ones), and the latter's indices.
-
-    Of one repeat without commands the last part in time is held out; with commands, one serves as both.
-    """
-    count = recording.repeats
-    if count == 1 and not recording.command.size:
-        first, last = recording.span
-        cut = last - max(share, 1 / 3) * (last - first)
-        return recording.window(first, cut), recording.window(cut, last), (0,)
-    held = min(count - 1, max(1, round(share * count))) if count > 1 else 0
-    if held == 0:
-        return recording, recording, tuple(range(count))
-    rows = tuple(range(count - held, count))
-    return recording.repeats_subset(range(count - held)), recording.repeats_subset(rows), rows
-
-
 def identify(
     scene: Scene,
     space: Space,
@@ -149,15 +105,7 @@ def identify(
     config = config or IdentifyConfig()
     report = progress or (lambda stage, value: None)
     names = [r.name for r in recordings]
-    if len(set(names)) != len(names):
-        raise ValueError(f"recordings need different names, got {', '.join(names)}")
-    if "torque" not in config.compare.channels:
-        raise ValueError(f"an identification compares torques, got the channels {', '.join(config.compare.channels)}")
-    if config.refine is None and len(recordings) > 1:
-        raise ValueError(
-            f"without the refinement (as in preset paper) one recording is fitted, got {len(recordings)}: "
-            f"{', '.join(names)}; give the first alone, or another preset"
-        )
+    _check_names(names, config)
     parts = [split(r, config.heldout) for r in recordings]
     fitted, held = [p[0] for p in parts], [p[1] for p in parts]
     full = space if nuisances is None or config.refine is None else space + nuisances
@@ -196,7 +144,7 @@ def identify(
 
     began = time.monotonic()
     report("judge", None)
-    gaps = _gaps(heldout, recordings, [_judged(r, h) for r, h in zip(recordings, held, strict=True)], full.mean, best)
+    gaps = gaps_of(heldout, recordings, held, full.mean, best)
     seconds["judge"] = time.monotonic() - began
     return Identified(
         scene=scene,
@@ -214,6 +162,19 @@ def identify(
         heldout_repeats={n: p[2] for n, p in zip(names, parts, strict=True)},
         seconds=seconds,
     )
+
+
+def _check_names(names: Sequence[str], config: IdentifyConfig) -> None:
+    """ValueError for recordings that cannot be fitted together, or not to torques."""
+    if len(set(names)) != len(names):
+        raise ValueError(f"recordings need different names, got {', '.join(names)}")
+    if "torque" not in config.compare.channels:
+        raise ValueError(f"an identification compares torques, got the channels {', '.join(config.compare.channels)}")
+    if config.refine is None and len(names) > 1:
+        raise ValueError(
+            f"without the refinement (as in preset paper) one recording is fitted, got {len(names)}: "
+            f"{', '.join(names)}; give the first alone, or another preset"
+        )
 
 
 def _check_start(cost: Cost, space: Space) -> None:
@@ -283,81 +244,6 @@ def _fingerprint(
         "effects": [effect.name for effect in effects],
     }
     return json.dumps(made_from, sort_keys=True)
-
-
-def _judged(recording: Recording, held: Recording) -> Judged:
-    """What `split` held out of a recording."""
-    if held is recording:
-        return "same"
-    return "time" if recording.repeats == 1 else "repeats"
-
-
-def _gaps(
-    cost: Cost, recordings: Sequence[Recording], judged: Sequence[Judged], before: np.ndarray, after: np.ndarray
-) -> list[Gap]:
-    """The gap of each recording's held-out repeats at two parameter vectors."""
-    penalty_free = cost.distances(np.stack([before, after])) - cost.penalties(np.stack([before, after]))
-    smoothed = cost.smoothed(np.stack([before, after]))
-    out = []
-    for i, (held, recording) in enumerate(zip(cost.comparisons, recordings, strict=True)):
-        rms = np.sqrt(np.mean((smoothed[i] - held.channel("torque").noise.mean) ** 2, axis=1))
-        everything = make_comparison(cost.scene, recording, held.clock, held.config) if recording.repeats > 1 else None
-        floor = None if everything is None else _floor(everything)
-        first, last = penalty_free[0, i], penalty_free[1, i]
-        out.append(
-            Gap(
-                before=float(first),
-                after=float(last),
-                floor=floor,
-                closed=_closed(float(first), float(last), floor),
-                per_joint_before=tuple(rms[0].tolist()),
-                per_joint_after=tuple(rms[1].tolist()),
-                per_joint_floor=None if everything is None else _smooth_floor(everything, held.repeats),
-                judged=judged[i],
-            )
-        )
-    return out
-
-
-def _closed(before: float, after: float, floor: float | None) -> float | None:
-    """Share of the way from before to the floor that was gone; None where there was hardly any (WORTH)."""
-    if floor is None or before - floor <= WORTH * floor:
-        return None
-    return 1 - (after - floor) / (before - floor)
-
-
-def _floor(everything: Comparison) -> float | None:
-    """Equation 1 of a perfect model, from the scatter of all repeats; None where no instant was measured twice."""
-    total = 0.0
-    for channel in everything.channels:
-        scatter = _scatter(channel.values, channel.mask)
-        if scatter is None:
-            return None
-        total += channel.weight * scatter
-    return total
-
-
-def _scatter(values: np.ndarray, mask: np.ndarray) -> float | None:
-    """The repeats' [N, T, C] distance to their mean, corrected for the mean's own noise, where two or more measured."""
-    count = mask.sum(axis=0)  # [T, C]
-    filled = np.where(mask, values, 0.0)
-    mean = filled.sum(axis=0) / np.maximum(count, 1)
-    seen = mask & (count > 1)
-    error = np.where(seen, (filled - mean) / np.sqrt(1 - 1 / np.maximum(count, 2)), 0.0)
-    rows = seen.any(axis=-1)  # [N, T]
-    repeats = rows.any(axis=1)
-    if not repeats.any():
-        return None
-    distance = np.linalg.norm(error, axis=-1).sum(axis=1)[repeats] / rows.sum(axis=1)[repeats]
-    return float(np.mean(distance))
-
-
-def _smooth_floor(everything: Comparison, held: int) -> tuple[float, ...]:
-    """[J] N m, what the noise of the mean of `held` repeats leaves of a smoothed difference."""
-    noise = everything.channel("torque").noise
-    squares = ((noise.repeats - noise.mean) ** 2).sum(axis=0)
-    variance = squares.sum(axis=0) / (noise.count - 1).sum(axis=0)
-    return tuple(np.sqrt(variance / held).tolist())
 
 
 def cost_samples(found: Identified, count: int, seed: int) -> dict[str, np.ndarray]:

@@ -10,7 +10,8 @@ import pytest
 
 from droid_jax.compare.cost import Along, make_cost
 from droid_jax.compare.residuals import CompareConfig
-from droid_jax.identify.pipeline import Identified, IdentifyConfig, identify, split
+from droid_jax.identify.judge import split
+from droid_jax.identify.pipeline import Identified, IdentifyConfig, identify
 from droid_jax.identify.search import SearchConfig
 from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
 from droid_jax.model.fields import body_mass, joint_damping

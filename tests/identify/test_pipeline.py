@@ -18,19 +18,8 @@ from droid_jax.compare.residuals import CompareConfig, make_comparison
 from droid_jax.identify import pipeline, results
 from droid_jax.identify.fit import on_bound
 from droid_jax.identify.gaussian import prior
-from droid_jax.identify.pipeline import (
-    WORTH,
-    Identified,
-    IdentifyConfig,
-    _closed,
-    _floor,
-    _scatter,
-    cost_samples,
-    grip_hypotheses,
-    identify,
-    split,
-    starts,
-)
+from droid_jax.identify.judge import WORTH, _closed, _floor, _scatter, judged_on, split
+from droid_jax.identify.pipeline import Identified, IdentifyConfig, cost_samples, grip_hypotheses, identify, starts
 from droid_jax.identify.results import traces, write_run
 from droid_jax.identify.search import SearchConfig
 from droid_jax.measure.recording import Channel
@@ -279,9 +268,9 @@ def test_without_the_refinement_one_recording_is_fitted(scene: Scene):
 @pytest.mark.parametrize(("repeats", "judged"), [(1, "time"), (3, "repeats")])
 def test_a_fit_says_what_it_is_judged_on(scene: Scene, repeats: int, judged: str):
     log = elbow_log(0.0, 9.0, repeats)
-    assert pipeline._judged(log, split(log, 0.3)[1]) == judged
+    assert judged_on(log, split(log, 0.3)[1]) == judged
     commanded = dataclasses.replace(log, time=np.arange(3.0), command=np.zeros((3, 1)), command_names=("elbow",))
-    assert pipeline._judged(commanded, split(commanded, 0.3)[1]) == ("repeats" if repeats > 1 else "same")
+    assert judged_on(commanded, split(commanded, 0.3)[1]) == ("repeats" if repeats > 1 else "same")
 
 
 def test_a_search_imports_nothing_that_it_may_not_need():
