@@ -17,7 +17,7 @@ File format (JSON, version 1)::
      "rule": str, "mean": [D], "cov": [D][D],
      "space": [{"name", "unit", "mean", "std", "low", "high", "nuisance", "group",
                 "scaling": "linear" | "log", "floor", "width": number | null,
-                "writes": [{"field", "index": [...], "mode", "gain", "offset"}]}]}
+                "writes": [{"field", "index": [...], "mode", "gain", "offset", "element"}]}]}
 """
 
 from __future__ import annotations
@@ -279,7 +279,8 @@ def _parameter_from_json(position: int, entry: Any) -> Parameter:
 def _write_from_json(entry: dict[str, Any]) -> Write:
     """One write of a parameter."""
     index = tuple(int(i) for i in entry["index"])
-    return Write(str(entry["field"]), index, Mode(entry["mode"]), float(entry["gain"]), float(entry.get("offset", 0.0)))
+    numbers = float(entry["gain"]), float(entry.get("offset", 0.0))
+    return Write(str(entry["field"]), index, Mode(entry["mode"]), *numbers, str(entry.get("element", "")))
 
 
 def _entry(content: dict[str, Any], key: str, where: str) -> Any:

@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from droid_jax.model.parameters import Mode, Parameter, Scaling, Write
@@ -41,6 +42,22 @@ def element_index(scene: Scene, field: str, element: str) -> int:
             f"fields start with {', '.join(f'{k}_' for k in _KIND)} and are arrays of mujoco.MjModel"
         )
     return scene.dof(element) if field.startswith("dof_") else scene.id(kind, element)
+
+
+def element_name(model: mujoco.MjModel, field: str, index: Sequence[int]) -> str:
+    """Name of the element that an entry of a model field belongs to, "" where it has none."""
+    kind = field.split("_")[0]
+    if kind not in _KIND:
+        return ""
+    number = model.dof_jntid[index[0]] if kind == "dof" else index[0]
+    return getattr(model, _KIND[kind])(number).name
+
+
+def write(
+    scene: Scene, field: str, index: tuple[int, ...], mode: Mode = Mode.SET, *, gain: float = 1.0, offset: float = 0.0
+) -> Write:
+    """A `Write` that knows the name of its element."""
+    return Write(field, index, mode, gain, offset, element_name(scene.model, field, index))
 
 
 def model_parameter(
@@ -86,7 +103,7 @@ def model_parameter(
         std,
         low,
         high,
-        writes=(Write(field, index, mode),),
+        writes=(write(scene, field, index, mode),),
         **options,
     )
 
@@ -175,7 +192,7 @@ def body_mass(
         raise ValueError(f"body {body!r} has no mass of its own in this scene")
     mean = nominal if mean is None else mean
     options = {"name": f"{body}_mass", "unit": "kg", "scaling": Scaling.LOG, "floor": mean, **options}
-    writes = (Write("body_mass", (index,)), *_inertia(index, Mode.SCALE, 1.0 / nominal))
+    writes = (write(scene, "body_mass", (index,)), *_inertia(scene, index, Mode.SCALE, 1.0 / nominal))
     return Parameter(mean=mean, std=std, low=low, high=high, writes=writes, **options)
 
 
@@ -186,9 +203,9 @@ def body_mass_scale(scene: Scene, body: str, *, std: float = 0.03, **options: An
     divided by the factor), so an error of the factor is felt as gravity torque.
     """
     index = scene.id("body", body)
-    writes = (Write("body_mass", (index,), Mode.SCALE), *_inertia(index, Mode.SCALE, 1.0))
+    writes = (write(scene, "body_mass", (index,), Mode.SCALE), *_inertia(scene, index, Mode.SCALE, 1.0))
     if scene.model.body_gravcomp[index] != 0:
-        writes += (Write("body_gravcomp", (index,), Mode.DIVIDE),)
+        writes += (write(scene, "body_gravcomp", (index,), Mode.DIVIDE),)
     options = {"name": f"{body}_mass_scale", "unit": "-", "mean": 1.0, "low": 0.5, "high": 1.5, **options}
     return Parameter(std=std, writes=writes, **options)
 
@@ -199,8 +216,8 @@ def servo_scale(scene: Scene, joint: str, *, std: float = 0.03, **options: Any) 
         raise ValueError(f"no actuator drives {joint!r}; driven joints: {', '.join(scene.command_names)}")
     actuator = scene.command_names.index(joint)
     writes = (
-        Write("actuator_gainprm", (actuator, 0), Mode.SCALE),
-        Write("actuator_biasprm", (actuator, 1), Mode.SCALE),
+        write(scene, "actuator_gainprm", (actuator, 0), Mode.SCALE),
+        write(scene, "actuator_biasprm", (actuator, 1), Mode.SCALE),
     )
     options = {"name": f"{joint}_servo_scale", "unit": "-", "mean": 1.0, "low": 0.5, "high": 1.5, **options}
     return Parameter(std=std, writes=writes, **options)
@@ -217,7 +234,7 @@ def body_position(scene: Scene, body: str, axis: int, *, std: float, limit: floa
         "high": limit,
         **options,
     }
-    return Parameter(std=std, writes=(Write("body_pos", (index, axis), Mode.ADD),), **options)
+    return Parameter(std=std, writes=(write(scene, "body_pos", (index, axis), Mode.ADD),), **options)
 
 
 def body_yaw(scene: Scene, body: str, *, std: float, limit: float, **options: Any) -> Parameter:
@@ -231,7 +248,7 @@ def body_yaw(scene: Scene, body: str, *, std: float, limit: float, **options: An
     if not np.allclose(scene.model.body_quat[index], [1, 0, 0, 0]):
         raise ValueError(f"body {body!r} is rotated in its parent; its yaw cannot be a parameter")
     options = {"name": f"{body}_yaw", "unit": "rad", "mean": 0.0, "low": -limit, "high": limit, **options}
-    return Parameter(std=std, writes=(Write("body_quat", (index, 3), Mode.SET, gain=0.5),), **options)
+    return Parameter(std=std, writes=(write(scene, "body_quat", (index, 3), Mode.SET, gain=0.5),), **options)
 
 
 def capsule_radius(scene: Scene, geom: str, *, std: float, limit: float, **options: Any) -> Parameter:
@@ -239,7 +256,7 @@ def capsule_radius(scene: Scene, geom: str, *, std: float, limit: float, **optio
     index = scene.id("geom", geom)
     fields = [("geom_size", (index, 0)), ("geom_rbound", (index,))]
     fields += [("geom_aabb", (index, k)) for k in (3, 4, 5)]
-    writes = tuple(Write(f, i, Mode.ADD) for f, i in fields)
+    writes = tuple(write(scene, f, i, Mode.ADD) for f, i in fields)
     options = {"name": f"{geom}_radius", "unit": "m", "mean": 0.0, "low": -limit, "high": limit, **options}
     return Parameter(std=std, writes=writes, **options)
 
@@ -253,11 +270,11 @@ def pair_friction(
     Below 0.05 a pyramidal cone is too steep for float32 (its rows scale with the friction squared).
     """
     ids = [scene.id("pair", p) for p in pairs]
-    writes = tuple(Write("pair_friction", (i, c)) for i in ids for c in columns)
+    writes = tuple(write(scene, "pair_friction", (i, c)) for i in ids for c in columns)
     nominal = float(scene.model.pair_friction[ids[0], columns[0]])
     options = {"mean": nominal, "low": 0.05, "high": 6.0, "scaling": Scaling.LOG, **options}
     return Parameter(std=std, writes=writes, **options)
 
 
-def _inertia(body: int, mode: Mode, gain: float) -> tuple[Write, ...]:
-    return tuple(Write("body_inertia", (body, k), mode, gain) for k in range(3))
+def _inertia(scene: Scene, body: int, mode: Mode, gain: float) -> tuple[Write, ...]:
+    return tuple(write(scene, "body_inertia", (body, k), mode, gain=gain) for k in range(3))

@@ -15,6 +15,7 @@ friction loss).
 
 from __future__ import annotations
 
+import dataclasses
 import enum
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -46,6 +47,7 @@ class Write:
     gain:  the value is multiplied by this first (mode SET of a mass uses 1; the inertia that
            scales with it uses SCALE with gain 1 / nominal mass).
     offset: added after the gain (a relative error e enters as SCALE by 1 + e).
+    element: name of the MJCF's element whose entry it is, "" where it has none: so that another scene's is noticed.
     """
 
     field: str
@@ -53,6 +55,7 @@ class Write:
     mode: Mode = Mode.SET
     gain: float = 1.0
     offset: float = 0.0
+    element: str = dataclasses.field(default="", compare=False)
 
     def new(self, nominal: Any, value: Any) -> Any:
         """The field's new number(s) for a value; works on numpy and jax arrays alike."""

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from droid_jax.identify.gaussian import Gaussian
+from droid_jax.model.fields import element_name
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import Physics, make_physics, model_writes, written_fields
 from droid_jax.model.scene import Scene
@@ -110,7 +111,7 @@ def _zeros(model: Any, fields: Sequence[str]) -> Any:
 
 
 def check_scene(scene: Scene, space: Space) -> None:
-    """ValueError where a space writes entries that the scene's model does not have."""
+    """ValueError where a space writes entries that the scene's model does not have, or has of another element."""
     for column, write in model_writes(space):
         array = getattr(scene.model, write.field, None)
         name = space.parameters[column].name
@@ -123,6 +124,12 @@ def check_scene(scene: Scene, space: Space) -> None:
             raise ValueError(
                 f"parameter {name!r} writes {write.field}[{', '.join(map(str, write.index))}], but in {scene.name!r} "
                 f"that field has shape {shape}: the Gaussian belongs to another scene"
+            )
+        own = element_name(scene.model, write.field, write.index)
+        if write.element and write.element != own:
+            raise ValueError(
+                f"parameter {name!r} writes {write.field} of {write.element!r}, but in {scene.name!r} that entry is of "
+                f"{own or 'an element without a name'!r}: the Gaussian belongs to another scene"
             )
 
 

@@ -15,7 +15,7 @@ import pytest
 from mujoco import mjx
 
 from droid_jax.commands import train
-from droid_jax.identify.gaussian import Gaussian, prior
+from droid_jax.identify.gaussian import Gaussian, load, prior
 from droid_jax.model.door import door_space
 from droid_jax.model.door_scene import door_scene
 from droid_jax.model.effects.registry import effect_space, library
@@ -191,3 +191,22 @@ def test_a_gaussian_of_another_scene_is_refused(scene, gaussian):
     other = Space((replace(first, writes=(write,)), *gaussian.space.parameters[1:]))
     with pytest.raises(ValueError, match=rf"{first.name}.*\[99\].*belongs to another scene"):
         randomised(scene, prior(other))
+
+
+def test_a_gaussian_of_a_scene_of_the_same_shapes_is_refused_by_its_names(tmp_path: Path):
+    """Two arms of two joints: what was fitted to the one's elbow is no damping of the other's wrist."""
+    scenes = {}
+    for name in ("elbow", "wrist"):
+        joint = f'<joint name="{name}" axis="0 1 0" damping="1"/><geom size=".05" mass="1"/>'
+        path = tmp_path / f"{name}.xml"
+        path.write_text(
+            f'<mujoco><worldbody><body name="link">{joint}</body></worldbody><actuator><position joint="{name}" '
+            'kp="5"/></actuator></mujoco>'
+        )
+        scenes[name] = load_scene(path)
+    fitted = prior(Space((joint_damping(scenes["elbow"], "elbow", std=0.1, high=5.0),)))
+    fitted.save(tmp_path / "gaussian.json")
+    kept = load(tmp_path / "gaussian.json")
+    randomised(scenes["elbow"], kept)
+    with pytest.raises(ValueError, match=r"of 'elbow', but in 'wrist' that entry is of 'wrist'.*another scene"):
+        randomised(scenes["wrist"], kept)

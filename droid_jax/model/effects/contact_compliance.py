@@ -2,7 +2,8 @@
 
 from droid_jax.model.effects import amplitudes as a
 from droid_jax.model.effects.registry import register
-from droid_jax.model.parameters import Mode, Parameter, Write
+from droid_jax.model.fields import write
+from droid_jax.model.parameters import Mode, Parameter
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
 
@@ -15,7 +16,7 @@ def contact_compliance(scene: Scene) -> Effect | None:
     if scene.grip is None:
         return None
     pairs = [scene.id("pair", pair) for finger in scene.grip.fingers for pair in finger]
-    writes = tuple(Write("pair_solref", (pair, 0), Mode.SCALE, offset=1.0) for pair in pairs)
+    writes = tuple(write(scene, "pair_solref", (pair, 0), Mode.SCALE, offset=1.0) for pair in pairs)
     return Effect(
         "contact_compliance",
         (Parameter(SOFTNESS, "-", 0.0, 0.5, -0.5, 12.0, writes=writes, group=a.GROUP),),

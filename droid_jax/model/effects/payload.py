@@ -2,7 +2,8 @@
 
 from droid_jax.model.effects import amplitudes as a
 from droid_jax.model.effects.registry import register
-from droid_jax.model.parameters import Mode, Parameter, Write
+from droid_jax.model.fields import write
+from droid_jax.model.parameters import Mode, Parameter
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
 
@@ -24,9 +25,9 @@ def payload(scene: Scene) -> Effect | None:
     if mass <= 0:
         return None
     share = dict(gain=1.0 / mass, offset=1.0)
-    writes = [Write("body_mass", (body,), Mode.SCALE, **share)]
+    writes = [write(scene, "body_mass", (body,), Mode.SCALE, **share)]
     if scene.model.body_gravcomp[body] != 0:
-        writes.append(Write("body_gravcomp", (body,), Mode.DIVIDE, **share))
+        writes.append(write(scene, "body_gravcomp", (body,), Mode.DIVIDE, **share))
     low = -0.9 * min(mass, 1.0)
     return Effect(
         "payload",
