@@ -355,7 +355,7 @@ def test_an_option_of_the_stand_in_beside_recordings(refused, tmp_path: Path, co
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("command", ["all", "identify", "train"])
+@pytest.mark.parametrize("command", ["all", "identify", "gap", "train"])
 def test_scalars_that_nothing_can_write_are_said_at_once(refused, tmp_path: Path, monkeypatch, command: str):
     """Before anything is recorded."""
     found = importlib.util.find_spec

@@ -402,7 +402,8 @@ def test_a_run_goes_on_after_a_stop_and_is_whole(
     place: Path, quick: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], refused
 ):
     """Killed in the search; then with the base fit gone missing, were it asked for again; then finished."""
-    command = arguments(place, "--effects", *EFFECTS)
+    pytest.importorskip("tensorboardX")
+    command = arguments(place, "--effects", *EFFECTS, "--tensorboard")
     find = workflow.find
 
     def killed(case, base, floor, progress):
@@ -413,7 +414,9 @@ def test_a_run_goes_on_after_a_stop_and_is_whole(
     assert main(command) == 130
     assert "the same command goes on from here" in capsys.readouterr().err
     out = place / "run"
-    assert sorted(p.name for p in out.iterdir()) == ["checkpoints", "setup.json"]
+    assert sorted(p.name for p in out.iterdir()) == ["checkpoints", "setup.json", "tensorboard"]
+    (events,) = (out / "tensorboard").iterdir()
+    assert b"refine/mean_square" in events.read_bytes()
 
     monkeypatch.setattr(workflow, "find", find)
     monkeypatch.setattr(workflow, "base_fit", lambda *a: pytest.fail("the base fit was kept"))
@@ -427,7 +430,8 @@ def test_a_run_goes_on_after_a_stop_and_is_whole(
     assert lines[3].startswith("shifted most: door_stiffness ") and lines[3].endswith(" deviations)")
     assert lines[4] == f"report: {out / 'report.html'}"
     files = {p.name for p in out.iterdir()}
-    assert files == {"checkpoints", "setup.json", "gap.json", "gap.npz", "extended.json", "extended.xml"}
+    written = {"gap.json", "gap.npz", "extended.json", "extended.xml"}
+    assert files == {"checkpoints", "setup.json", "tensorboard", *written}
     assert not (out / "checkpoints" / "replays").exists()
     answer = load_gap(out).answer
     assert answer["amplitudes"][0]["value"] == pytest.approx(PRELOAD, rel=0.05)

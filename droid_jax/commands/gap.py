@@ -74,6 +74,8 @@ class Gap:
     """Springs on the stand-in's door. Default: 1."""
     seed: int = 0
     """Seed of the search, of the stand-in robot and of the resamples."""
+    tensorboard: bool = False
+    """Write scalars of the base fit for TensorBoard while it runs, to OUT/tensorboard."""
     out: Path = Path("runs/gap")
     """Results folder. A run that was interrupted goes on from where it was."""
     again: bool = False
@@ -83,9 +85,11 @@ class Gap:
 def run(command: Gap) -> None:
     """Record or load, fit, search, write the run's folder and its page."""
     from droid_jax import runtime
+    from droid_jax.report.scalars import FOLDER, needs_writer
 
     command = settled(command)
     needs_scene(command)
+    needs_writer(command.tensorboard)
     runtime.start()
     warn_of_cpu(command.preset)
     from droid_jax.gap.results import write_gap
@@ -117,7 +121,8 @@ def run(command: Gap) -> None:
         _forget(out)
     assert command.springs is not None  # settled
     roles = roles or record_stand_in(scene, hidden, out, command.springs, command.seed, command.again)
-    case, verdict, seconds = searched(split, scene, base, effects, roles, config, out / "checkpoints", start)
+    board = out / FOLDER if command.tensorboard else None
+    case, verdict, seconds = searched(split, scene, base, effects, roles, config, out / "checkpoints", start, board)
     description = {
         "split": {"by": split.value, "limits": split.limits},
         "seconds": seconds,

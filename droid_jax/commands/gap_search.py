@@ -35,10 +35,12 @@ def searched(
     config: GapConfig,
     checkpoints: Path,
     start: np.ndarray | None = None,
+    board: Path | None = None,
 ) -> tuple[Case, Verdict, dict[str, float]]:
     """Case and verdict of recordings by role, going on from `checkpoints`; and each stage's seconds.
 
     start: [F] values of the base parameters from which their fit begins, instead of a search.
+    board: folder for scalars of the base fit.
     """
     from droid_jax.gap.floor import numerical_floor
     from droid_jax.gap.menu import separating
@@ -47,10 +49,11 @@ def searched(
     from droid_jax.gap.split import Split
     from droid_jax.gap.workflow import base_fit, find
     from droid_jax.report.progress import stages
+    from droid_jax.report.scalars import scalars
 
     names = IN_BLOCKS if split is Split.BLOCKS else STAGES if start is None else STAGES[1:]
-    with stages(names, {"look": config.looked, "refit": config.refitted}) as show:
-        clock = Clock(names, show, checkpoints / "seconds.json")
+    with stages(names, {"look": config.looked, "refit": config.refitted}) as show, scalars(board) as write:
+        clock = Clock(names, (show, write), checkpoints / "seconds.json")
         clock(names[0], None)
         case = remembering(_case(split, scene, base, effects, roles, config), checkpoints / "replays")
         if split is Split.BLOCKS:
@@ -91,8 +94,8 @@ def _case(
 class Clock:
     """Hands progress on, and counts the seconds of each stage; those of an earlier part of this run are in `kept`."""
 
-    def __init__(self, stages: Sequence[str], show: Callable[[str, Any], None], kept: Path) -> None:
-        self.stages, self.show, self.kept = stages, show, kept
+    def __init__(self, stages: Sequence[str], tell: Sequence[Callable[[str, Any], None]], kept: Path) -> None:
+        self.stages, self.tell, self.kept = stages, tell, kept
         self.seconds: dict[str, float] = _seconds(kept)
         self._stage, self._since = stages[0], time.monotonic()
 
@@ -103,7 +106,8 @@ class Clock:
             write_json(self.kept, self.seconds)
         self._stage, self._since = stage, now
         if stage in self.stages:
-            self.show(stage, value)
+            for tell in self.tell:
+                tell(stage, value)
 
 
 def _seconds(kept: Path) -> dict[str, float]:

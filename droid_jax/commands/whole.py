@@ -81,7 +81,7 @@ class All:
     stages: tuple[Stage, ...] = STAGES
     """Which stages; those left out are read from the folder where they are in it."""
     tensorboard: bool = False
-    """Write scalars for TensorBoard while it fits and trains, to OUT/identify/tensorboard and OUT/train/tensorboard."""
+    """Write scalars for TensorBoard while it fits and trains, to OUT/identify/tensorboard and so on."""
     out: Path = Path("runs/all")
     """Results folder, with one folder for each stage. A run that was interrupted goes on from where it was."""
     again: bool = False
@@ -229,7 +229,7 @@ def _plan(
         known = "confirm" in roles and (out / "identify" / "fit.json").is_file()
         fit = out / "identify" if known else None
         scale = command.effect_scale
-        _stage(gap.run, gap.Gap(recordings, fit, presets.identify, effect_scale=scale, out=out / "gap", **own))
+        _stage(gap.run, gap.Gap(recordings, fit, presets.identify, effect_scale=scale, out=out / "gap", **board, **own))
 
     def learn() -> None:
         _stage(train.run, train.Train(model_folder(out), preset=presets.train, out=out / "train", **board, **common))
