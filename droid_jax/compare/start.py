@@ -15,7 +15,7 @@ from droid_jax.model.scene import ONE_DEGREE, Scene
 AJAR = 0.02  # rad or m: an object seen no further than this from the scene's pose stands there, as cameras are noisy
 WEIGHT = 0.01  # N m or N: a joint that feels less uncompensated weight feels none (noise below it is never believed)
 POSES = 50  # of a motion, at which the weight is looked at
-BEGINNING = 0.1  # s, in which the speed at the start is looked at
+BEGINNING = 0.02  # s (six rows at least), in which the speed at the start is looked at
 MOVING = 0.25  # of the motion's largest speed: a joint that is faster at the start does not begin at rest
 
 
@@ -58,8 +58,8 @@ def check_weight(scene: Scene, recording: Recording, qpos0: np.ndarray) -> None:
 def warn_if_moving(recording: Recording) -> None:
     """Warn where joints were measured to move already when the motion begins: a replay of commands begins at rest.
 
-    The speed at the start is that of a parabola through the mean of the repeats over 0.1 s, so that a servo that sets
-    off quickly is none; it must be five times its own error.
+    The speed at the start is that of a line through the mean of the repeats over so short a time that a servo that sets
+    off from rest is not fast yet; it must be five times its own error.
     """
     channel = recording.channels.get("position")
     if channel is None or not recording.command.size:
@@ -77,13 +77,14 @@ def _moves(begin: float, channel: Channel, column: int) -> bool:
     """Whether a position's path has a speed of its own where the motion begins."""
     time, seen = channel.time - begin, channel.mask[..., column].all(axis=0)
     path = channel.values[..., column].mean(axis=0)
-    first = seen & (time >= 0.0) & (time <= BEGINNING)
-    if first.sum() < 6:  # a parabola through three points has no error to be judged by
+    rows = np.flatnonzero(seen & (time >= 0.0))
+    first = rows[: max(6, int(np.sum(time[rows] <= BEGINNING)))]
+    if len(first) < 6:  # a line through two points has no error to be judged by
         return False
-    (_, speed, _), covariance = np.polyfit(time[first], path[first], 2, cov=True)
-    steps = time[seen & (time >= 0.0)][:: first.sum()]  # as far apart as the beginning is long
+    (speed, _), covariance = np.polyfit(time[first], path[first], 1, cov=True)
+    steps = time[rows][:: len(first)]  # as far apart as the beginning is long
     fastest = np.abs(np.diff(np.interp(steps, time[seen], path[seen])) / np.diff(steps)).max(initial=0.0)
-    return bool(abs(speed) > max(MOVING * fastest, 5.0 * np.sqrt(covariance[1, 1])))
+    return bool(abs(speed) > max(MOVING * fastest, 5.0 * np.sqrt(covariance[0, 0])))
 
 
 def check_range(scene: Scene, recording: Recording) -> None:

@@ -432,11 +432,13 @@ def test_a_motion_starts_where_it_says_else_where_it_was_measured_else_where_it_
     assert start(qpos0={}) == pytest.approx([0.0, -0.3])
 
 
-@pytest.mark.parametrize(("late", "warned"), [(0.0, False), (0.15, True)])
-def test_a_recording_that_begins_in_motion_is_warned_of(scene: Scene, late: float, warned: bool):
-    """Cut where the robot moves, it is not what a replay from rest does; noise of the sensors is no motion."""
+@pytest.mark.parametrize(("late", "jerky", "warned"), [(0.0, 0, False), (0.15, 0, True), (0.0, 1, False)])
+def test_a_recording_that_begins_in_motion_is_warned_of(scene: Scene, late: float, jerky: int, warned: bool):
+    """Cut where the robot moves, it is not what a replay from rest does; neither noise of the sensors is a motion, nor
+    a quick start from rest."""
     time, _ = motion(2.0)
-    path = np.stack([0.4 * (1 - np.cos(2 * (time + late))), np.full_like(time, -0.3)], axis=1)
+    swing = 0.4 * (1 - np.cos(2 * (time + late))) + jerky * 0.2 * np.clip(time / 0.15, 0, 1) ** 4
+    path = np.stack([swing, np.full_like(time, -0.3)], axis=1)
     values = path + np.random.default_rng(2).normal(0, 2e-5, (3, *path.shape))
     position = Channel("position", "rad", JOINTS, time, values, np.ones(values.shape, bool))
     torque = replace(position, name="torque", unit="N m")
