@@ -426,13 +426,14 @@ def test_help_is_quick(command: str):
     code = (
         "import sys\nfrom droid_jax.run import main\n"
         f"try:\n    main({arguments!r})\nexcept SystemExit as stop:\n    assert stop.code == 0\n"
-        "heavy = [m for m in ('numpy', 'jax', 'mujoco', 'scipy', 'matplotlib', 'brax') if m in sys.modules]\n"
+        "heavy = [m for m in ('numpy', 'jax', 'mujoco', 'scipy', 'matplotlib', 'evosax') if m in sys.modules]\n"
         "assert not heavy, heavy"
     )
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "120"}
     run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60)
     assert run.returncode == 0, run.stderr
     said = [f"{command} [-h]"] if command else [",".join(COMMANDS)]
+    said += ["--out"] if command in ("identify", "record") else ["report"] if command in ("", "report") else []
     assert all(text in run.stdout for text in said), run.stdout
 
 

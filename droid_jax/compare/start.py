@@ -56,13 +56,13 @@ def check_weight(scene: Scene, recording: Recording, qpos0: np.ndarray) -> None:
 
 
 def warn_if_moving(recording: Recording) -> None:
-    """Warn where joints were measured to move already when the motion begins: a replay of commands begins at rest.
+    """Warn where joints were measured to move already when a recording with commands begins: its replay is at rest.
 
     The speed at the start is that of a line through the mean of the repeats over so short a time that a servo that sets
     off from rest is not fast yet; it must be five times its own error.
     """
     channel = recording.channels.get("position")
-    if channel is None or not recording.command.size:
+    if channel is None:
         return
     moving = [j for i, j in enumerate(channel.columns) if _moves(recording.time[0], channel, i)]
     if moving:
@@ -82,8 +82,8 @@ def _moves(begin: float, channel: Channel, column: int) -> bool:
     if len(first) < 6:  # a line through two points has no error to be judged by
         return False
     (speed, _), covariance = np.polyfit(time[first], path[first], 1, cov=True)
-    steps = time[rows][:: len(first)]  # as far apart as the beginning is long
-    fastest = np.abs(np.diff(np.interp(steps, time[seen], path[seen])) / np.diff(steps)).max(initial=0.0)
+    steps = rows[:: len(first)]  # as far apart as the beginning is long
+    fastest = np.abs(np.diff(path[steps]) / np.diff(time[steps])).max(initial=0.0)
     return bool(abs(speed) > max(MOVING * fastest, 5.0 * np.sqrt(covariance[0, 0])))
 
 

@@ -437,7 +437,7 @@ def test_a_recording_that_begins_in_motion_is_warned_of(scene: Scene, late: floa
     """Cut where the robot moves, it is not what a replay from rest does; neither noise of the sensors is a motion, nor
     a quick start from rest."""
     time, _ = motion(2.0)
-    swing = 0.4 * (1 - np.cos(2 * (time + late))) + jerky * 0.2 * np.clip(time / 0.15, 0, 1) ** 4
+    swing = 0.4 * (1 - np.cos(2 * (time + late))) + jerky * 0.3 * np.clip(time / 0.1, 0, 1) ** 3
     path = np.stack([swing, np.full_like(time, -0.3)], axis=1)
     values = path + np.random.default_rng(2).normal(0, 2e-5, (3, *path.shape))
     position = Channel("position", "rad", JOINTS, time, values, np.ones(values.shape, bool))

@@ -17,8 +17,8 @@ from urllib.parse import unquote
 import numpy as np
 import pytest
 from made_up_gap import make_gap
-from made_up_policy import make_policy
 from made_up_run import make_run
+from made_up_whole import make_whole
 
 from droid_jax.report import page
 
@@ -69,9 +69,7 @@ def gap_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def whole_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of all stages, as the command without arguments leaves it."""
     folder = tmp_path_factory.mktemp("browser") / "all"
-    make_run(folder / "identify")
-    make_gap(folder / "gap")
-    make_policy(folder / "train")
+    make_whole(folder)
     for part in ("identify", "gap", "train"):
         page.write_report(folder / part)
     return page.write_report(folder)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from made_up_gap import make_gap
 from made_up_policy import make_policy
-from made_up_run import make_run
+from made_up_whole import make_whole
 from reader import read_page
 
 from droid_jax.report import page
@@ -18,10 +18,7 @@ from droid_jax.report import page
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     whole = tmp_path_factory.mktemp("whole") / "run"
-    make_run(whole / "identify")
-    make_gap(whole / "gap")
-    make_policy(whole / "train")
-    (whole / "train" / "policy.npz").write_bytes(b"")
+    make_whole(whole)
     page.write_report(whole)
     return whole
 
