@@ -1,16 +1,18 @@
-"""Does a policy open the door as far in plain C MuJoCo as in the simulation that trained it?
+"""Do policies open the door as far in plain C MuJoCo as in the simulation that trained them?
 
-    python experiments/policy_parity.py [--policy runs/train/policy.npz] [--gaussian FILE] [--quick] [--out DIR]
+    python experiments/policy_parity.py [--policies runs/train/policy.npz ...] [--quick] [--out DIR]
 
-A policy without any noise on doors drawn from the distribution that it was trained on (without effects): each once
-in MJX with the training's time step, and once in C at 1 ms with a solver that has converged.  Start pose and physics
-are the same, so what differs is the simulation.  Writes DIR/policy_parity.json and .png, with the hashes of policy and
-distribution; the target is a largest opening angle within 3 degrees.
+Each policy without any noise on doors drawn from the distribution that it was trained on (without effects, the
+gaussian.json beside it): each door once in MJX with the training's time step, and once in C at 1 ms with a solver that
+has converged.  Start pose and physics are the same, so what differs is the simulation.  Writes DIR/policy_parity.json
+and .png, with the hashes of policy and distribution; the target is a largest opening angle within 3 degrees on every
+door.
 """
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,16 +56,14 @@ EXACT = TransferConfig(trials=1, timestep=0.001, position_noise=0.0, velocity_no
 class Arguments:
     """Options."""
 
-    policy: Path = ROOT / "runs" / "train" / "policy.npz"
-    """As `train` writes it, or an experiment with policies."""
-    gaussian: Path | None = None
-    """What it was trained on; default: gaussian.json beside the policy."""
+    policies: tuple[Path, ...] = (ROOT / "runs" / "train" / "policy.npz",)
+    """As `train` writes them, or an experiment with policies; what each was trained on lies beside it."""
     quick: bool = False
     """A policy that has learned nothing, on two doors: shows that it runs."""
     out: Path = RESULTS
     """Folder of the results."""
     doors: int = 50
-    """Doors, one episode each."""
+    """Doors of each policy, one episode each."""
     seed: int = 0
     """Of the doors."""
 
@@ -110,30 +110,27 @@ def in_c(policy: Policy, env: DoorEnv, gaussian: Gaussian, values: np.ndarray) -
 
 
 @styled
-def scatter(mjx: np.ndarray, c: np.ndarray) -> Figure:
-    """Largest angles [N] in degrees, one against the other, with the band of the target."""
+def scatter(angles: Sequence[Mapping[str, np.ndarray]]) -> Figure:
+    """Largest angles [N] in degrees in either engine, one against the other, with the band of the target."""
     figure = Figure(figsize=(3.6, 3.4), layout="constrained")
     axes_ = figure.add_subplot()
+    mjx, c = (np.concatenate([a[engine] for a in angles]) for engine in ("mjx", "c"))
     line = np.array([0.0, 1.05 * max(mjx.max(), c.max())])
     axes_.fill_between(line, line - WITHIN, line + WITHIN, color=INK, alpha=0.12, linewidth=0)
-    axes_.plot(mjx, c, "o", color=AFTER, ms=4)
+    axes_.plot(mjx, c, "o", color=AFTER, ms=4, alpha=0.4, markeredgewidth=0)
     axes_.set(xlabel="MJX, 4 ms [degrees]", ylabel="C, 1 ms [degrees]", xlim=line, ylim=line, aspect="equal")
     return figure
 
 
-def main() -> None:
-    arguments, code = tyro.cli(Arguments, description=__doc__), origin(0)
-    beside = arguments.gaussian or arguments.policy.with_name("gaussian.json")
-    policy, env, gaussian = untrained() if arguments.quick else trained(arguments.policy, beside)
-    values = gaussian.sample(arguments.seed, 2 if arguments.quick else arguments.doors)
+def compared(policy: Policy, env: DoorEnv, gaussian: Gaussian, doors: int, seed: int) -> dict[str, Any]:
+    """How far a policy opens each of so many doors in either engine, and how far apart that is."""
+    values = gaussian.sample(seed, doors)
     both = {"mjx": in_mjx(policy, env, gaussian, values), "c": in_c(policy, env, gaussian, values)}
     angle = {name: np.rad2deg(trials.angle) for name, trials in both.items()}
     apart = np.abs(angle["mjx"] - angle["c"])
     whole = (both["mjx"].stopped == "") & (both["c"].stopped == "")
-    result: dict[str, Any] = {
-        "policy": "untrained" if arguments.quick else named(arguments.policy),
-        "gaussian": "prior" if arguments.quick else named(beside),
-        "doors": len(values),
+    return {
+        "doors": doors,
         "difference_deg": {
             "median": float(np.median(apart)),
             "quantile_90": float(np.quantile(apart, 0.9)),
@@ -145,12 +142,26 @@ def main() -> None:
         "mean_angle_deg": {name: float(a.mean()) for name, a in angle.items()},
         "success_rate": {name: trials.rate for name, trials in both.items()},
         "stopped": {name: trials.to_json()["stopped"] for name, trials in both.items()},  # C runs the robot's own loop
+        "angles_deg": {n: a.round(3).tolist() for n, a in angle.items()},
     }
+
+
+def main() -> None:
+    arguments, code = tyro.cli(Arguments, description=__doc__), origin(0)
+    results: list[dict[str, Any]] = []
+    if arguments.quick:
+        results.append({"policy": "untrained", "gaussian": "prior", **compared(*untrained(), 2, arguments.seed)})
+    for policy in () if arguments.quick else arguments.policies:
+        beside = policy.with_name("gaussian.json")
+        of = {"policy": named(policy), "gaussian": named(beside)}
+        results.append({**of, **compared(*trained(policy, beside), arguments.doors, arguments.seed)})
     name = stem("policy_parity", arguments.quick)
-    every = {n: a.round(3).tolist() for n, a in angle.items()}
-    write_json(arguments.out / f"{name}.json", {**result, "angles_deg": every, **code, "seed": arguments.seed})
-    write_bytes(arguments.out / f"{name}.png", png_bytes(scatter(angle["mjx"], angle["c"])))
-    print(json.dumps(result))
+    every = [r["difference_deg"] for r in results]
+    worst = {"largest_deg": max(d["largest"] for d in every), "within_target": min(d["within_target"] for d in every)}
+    write_json(arguments.out / f"{name}.json", {**worst, "policies": results, **code, "seed": arguments.seed})
+    angles = [{engine: np.array(a) for engine, a in r["angles_deg"].items()} for r in results]
+    write_bytes(arguments.out / f"{name}.png", png_bytes(scatter(angles)))
+    print(json.dumps({**worst, "policies": [{k: v for k, v in r.items() if k != "angles_deg"} for r in results]}))
 
 
 if __name__ == "__main__":
