@@ -30,8 +30,8 @@ def draw_gap(gap: Gap) -> dict[str, list[Drawing]]:
     names = [f"{gap.recording(role)}\n{ROLES[role]}".replace(", ", ",\n") for role in gap.roles]
     add(
         "size", "gap", "U and torque distance",
-        f"Left: {gap.parts.bars}{floor} "
-        "Right: the paper's distance between simulated and measured torques, with noise.",
+        f"First: {gap.parts.bars}{floor} "
+        "Second: the paper's distance between simulated and measured torques, with noise.",
         gap_figures.gap_bars, names, [found["gaps"][r] for r in gap.roles], gap.floor, gap.unit, extended,
     )  # fmt: skip
     for roles, traces in gap.sheets:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import itertools
 import json
 import subprocess
 import sys
@@ -339,6 +340,41 @@ def test_where_the_search_names_nothing_no_policy_is_trained(monkeypatch: pytest
     module.main()
     found = json.loads((tmp_path / "hidden_effect_policy.json").read_text())
     assert found["effects"] == [] and found["models"] == {} and found["commit"]
+
+
+def made_up(planned: Case, rate: float) -> None:
+    """Write a planned policy's file, as if it had succeeded in so many of its trials."""
+    planned.path.parent.mkdir(parents=True, exist_ok=True)
+    planned.path.write_text(json.dumps({**case("any", 0, rate), "origin": CODE, **planned.of}))
+
+
+def test_policies_of_the_extended_model_are_compared_with_both_others(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    module = importlib.import_module("experiments.hidden_effect_policy")
+    verdict = {"hidden": ["it"], "verdict": "named", "sentence": "It lacks a catch.", "effects": ["latch[hinge]"]}
+    monkeypatch.setattr(module, "search", lambda *_: verdict)
+    arguments = module.Arguments(out=tmp_path, at_most=0)
+    for seed, (model, rate) in itertools.product(range(5), {"prior": 0.3, "base": 0.5, "extended": 0.9}.items()):
+        made_up(module.planned_case(model, seed, arguments, CODE), rate)
+    monkeypatch.setattr(sys, "argv", ["hidden_effect_policy.py", "--out", str(tmp_path), "--at-most", "0"])
+    module.main()
+    found = json.loads((tmp_path / "hidden_effect_policy.json").read_text())
+    assert {m: c["stand_in"]["trials"] for m, c in found["models"].items()} == dict.fromkeys(module.MODELS, 250)
+    better = {m: what["success"] for m, what in found["extended_better_than"].items()}
+    assert [better[m]["difference"] for m in ("base", "prior")] == pytest.approx([0.4, 0.6])
+    assert all(what["interval_95"][0] > 0.1 for what in better.values())
+
+
+def test_knob_places_are_summed_up_each_for_itself(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    module = importlib.import_module("experiments.knob_locations")
+    arguments = module.Arguments(out=tmp_path, at_most=0)
+    for seed, (knob, rate) in itertools.product(range(2), enumerate((1.0, 0.8, 0.6))):  # the fourth is not made yet
+        made_up(module.planned_case(knob, seed, arguments, CODE), rate)
+    monkeypatch.setattr(sys, "argv", ["knob_locations.py", "--out", str(tmp_path), "--at-most", "0"])
+    module.main()
+    levers = json.loads((tmp_path / "knob_locations.json").read_text())["levers"]
+    assert [c["stand_in"]["success_rate"] for c in levers.values()] == pytest.approx([1.0, 0.8, 0.6])
+    assert list(levers) == [f"{lever:.2f} m" for lever in module.LEVERS[:3]]
+    assert (tmp_path / "knob_locations.png").is_file()
 
 
 def test_quick_runs_the_setting_that_is_asked_for(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
