@@ -25,12 +25,7 @@ from experiments.sharing import claimed
 
 FIT = "fit.json"
 SLIDING = 0.05  # friction of slippery pads
-TORSION = 0.005 * SLIDING  # m: of a pad that touches over half a centimetre.  Table I's would turn the door by twisting
-PADS = {
-    f"{kind}_friction_{side}": mu
-    for kind, mu in (("sliding", SLIDING), ("torsional", TORSION))
-    for side in ("left", "right")
-}
+CONTACT = 0.005  # m over which a pad touches.  Table I's torsional friction would turn the door by twisting
 
 
 def truth_of(setting: Setting) -> dict[str, float]:
@@ -38,10 +33,16 @@ def truth_of(setting: Setting) -> dict[str, float]:
     return {**stand_in_truth(door_scene(), setting.springs, setting.robot), **setting.truth}
 
 
+def pads_of(sliding: float) -> dict[str, float]:
+    """Pads with a sliding friction, and the torsional friction in m that goes with it."""
+    kinds = {"sliding": sliding, "torsional": CONTACT * sliding}
+    return {f"{kind}_friction_{side}": mu for kind, mu in kinds.items() for side in ("left", "right")}
+
+
 def robots_of(setting: Setting, env: DoorEnv, trials: int) -> dict[str, StandIn]:
     """The setting's robot, and the same robot with slippery pads."""
     scene, truth, config = door_scene(limits=True), truth_of(setting), TransferConfig(trials=trials, seed=setting.robot)
-    of = {"stand_in": truth, SLIPPERY: {**truth, **PADS}}
+    of = {"stand_in": truth, SLIPPERY: {**truth, **pads_of(SLIDING)}}
     return {name: stand_in(scene, env.start, hidden, (), env.task, config) for name, hidden in of.items()}
 
 

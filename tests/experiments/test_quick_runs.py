@@ -28,6 +28,7 @@ SCRIPTS: dict[str, tuple[str, ...]] = {
     "experiments/search_figure.py": (),
     "experiments/effects_on_policy.py": (),
     "experiments/hidden_effect_policy.py": (),
+    "experiments/pad_friction.py": (),
     "experiments/policy_parity.py": (),
     **dict.fromkeys(DATA, ()),
     "benchmarks/candidates.py": (),
