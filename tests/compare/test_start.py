@@ -1,0 +1,102 @@
+"""Where a motion starts, and what is said where that is a guess."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+from two_link import ARM, JOINTS, arm, measured, motion, recording
+
+from droid_jax.compare.cost import followed, make_cost
+from droid_jax.compare.replay import make_drive
+from droid_jax.compare.residuals import CompareConfig
+from droid_jax.measure.recording import Channel
+from droid_jax.model.fields import joint_damping
+from droid_jax.model.parameters import Space
+from droid_jax.model.scene import Scene, compile_scene
+
+SPACE = Space((joint_damping(arm(), "elbow", name="elbow_damping", std=0.1, high=50.0),))
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return arm()
+
+
+def test_a_motion_starts_where_it_says_else_where_it_was_measured_else_where_it_was_sent(scene: Scene):
+    _, command = motion()
+
+    def start(**changes) -> list[float]:
+        return make_drive(scene, recording(**changes)).qpos0.tolist()
+
+    assert start() == [0.0, -0.3]
+    assert start(qpos0={"elbow": 0.7}, channels=measured(0.2)) == pytest.approx([0.25, 0.7])
+    assert start(qpos0={}, channels=measured(0.2, ("shoulder",))) == pytest.approx([0.25, command[0, 1]])
+    assert start(qpos0={}) == pytest.approx([0.0, -0.3])
+
+
+@pytest.mark.parametrize(("late", "jerky", "warned"), [(0.0, 0, False), (0.15, 0, True), (0.0, 1, False)])
+def test_a_recording_that_begins_in_motion_is_warned_of(scene: Scene, late: float, jerky: int, warned: bool):
+    """Cut where the robot moves, it is not what a replay from rest does; neither noise of the sensors is a motion, nor
+    a quick start from rest."""
+    time, _ = motion(2.0)
+    swing = 0.4 * (1 - np.cos(2 * (time + late))) + jerky * 0.3 * np.clip(time / 0.1, 0, 1) ** 3
+    path = np.stack([swing, np.full_like(time, -0.3)], axis=1)
+    values = path + np.random.default_rng(2).normal(0, 2e-5, (3, *path.shape))
+    position = Channel("position", "rad", JOINTS, time, values, np.ones(values.shape, bool))
+    torque = replace(position, name="torque", unit="N m")
+    cut = recording(time=time, command=path, channels={"position": position, "torque": torque}, qpos0={})
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        followed(scene, cut, CompareConfig())
+    found = [str(w.message) for w in said if "begins at rest" in str(w.message)]
+    assert len(found) == warned
+    assert all("'wave' begins while shoulder moves" in text for text in found)
+
+
+@pytest.mark.parametrize("measured", [False, True])
+def test_degrees_are_no_radians(measured: bool):
+    xml = ARM.format(gravcomp='gravcomp="1"', friction='limited="true" range="-2 2"', sensor="")
+    scene = compile_scene(mujoco.MjSpec.from_string(xml), "arm", joints=JOINTS)
+    fine = recording()
+    make_cost(scene, SPACE, [fine])
+    wrong = np.rad2deg(fine.command)
+    if measured:
+        seen = Channel("position", "rad", JOINTS, fine.time, wrong[None].repeat(2, 0), np.ones((2, *wrong.shape), bool))
+        wrong = replace(fine, channels={**fine.channels, "position": seen})
+    else:
+        wrong = replace(fine, command=wrong)
+    said = "shoulder is measured at" if measured else "elbow is sent to"
+    with pytest.raises(ValueError, match=said + r" .* far outside its range -2 \.\. 2 rad: are these degrees"):
+        make_cost(scene, SPACE, [wrong])
+
+
+def test_a_start_that_would_be_a_guess_is_refused():
+    xml = ARM.format(gravcomp='gravcomp="1"', friction="", sensor="")
+    xml = xml.replace('<position name="s" joint="shoulder" kp="60"/>', '<motor name="s" joint="shoulder"/>')
+    driven = compile_scene(mujoco.MjSpec.from_string(xml), "arm", joints=JOINTS)
+    with pytest.raises(ValueError, match="does not tell where shoulder starts"):
+        make_drive(driven, recording(qpos0={}, gains=None))
+    started = make_drive(driven, recording(qpos0={}, gains=None, channels=measured(0.2)))
+    np.testing.assert_allclose(started.qpos0, [0.25, 0.25])
+
+
+def test_an_object_starts_where_it_was_seen_unless_a_cameras_noise_is_all(scene: Scene):
+    spec = mujoco.MjSpec.from_string(ARM.format(gravcomp='gravcomp="1"', friction="", sensor=""))
+    door = spec.worldbody.add_body(name="door", pos=[0, 2, 0])
+    door.add_joint(name="hinge", axis=[0, 0, 1])
+    door.add_geom(size=[0.1, 0, 0])
+    scene = compile_scene(spec, "arm and door", joints=JOINTS, object_joint="hinge")
+    time, _ = motion()
+
+    def start(angle: float, **named: float) -> float:
+        seen = np.full((2, len(time), 1), angle) + 0.1 * time[:, None]
+        camera = Channel("object_angle", "rad", ("lid",), time, seen, np.ones(seen.shape, bool))
+        channels = {**recording().channels, "object_angle": camera}
+        drive = make_drive(scene, recording(channels=channels, qpos0={**recording().qpos0, **named}))
+        return float(drive.qpos0[scene.qpos("hinge")])
+
+    assert start(0.005) == 0.0 and start(0.4) == pytest.approx(0.4) and start(0.4, hinge=0.1) == 0.1
