@@ -114,10 +114,15 @@ def transfer(policy: Policy, robot: StandIn, progress: Callable[[int], None] = l
 
 def filmed(policy: Policy, robot: StandIn, number: int) -> np.ndarray:
     """[K, nq] the states of one of `transfer`'s trials, before each action and at the end."""
-    _check_rate(policy, robot.task)
     states: list[np.ndarray] = []
-    _trial(policy, robot, number, lambda data: states.append(data.qpos.copy()))
+    watched(policy, robot, number, lambda data: states.append(data.qpos.copy()))
     return np.array(states)
+
+
+def watched(policy: Policy, robot: StandIn, number: int, watch: Callable[[mujoco.MjData], None]) -> None:
+    """One of `transfer`'s trials again; watch: sees the simulation before each action and at the end."""
+    _check_rate(policy, robot.task)
+    _trial(policy, robot, number, watch)
 
 
 def _check_rate(policy: Policy, task: Task) -> None:
