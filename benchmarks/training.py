@@ -38,7 +38,7 @@ import tyro  # noqa: E402
 from benchmarks.common import origin, stem  # noqa: E402
 from droid_jax.identify.gaussian import prior  # noqa: E402
 from droid_jax.measure.surrogate import stand_in_truth  # noqa: E402
-from droid_jax.model.door import door_space  # noqa: E402
+from droid_jax.model.door import door_nuisances, door_space  # noqa: E402
 from droid_jax.model.door_scene import door_scene  # noqa: E402
 from droid_jax.policy.door_env import DoorEnv  # noqa: E402
 from droid_jax.policy.network import save_policy  # noqa: E402
@@ -78,7 +78,7 @@ def measured(arguments: Arguments) -> dict[str, Any]:
     scene = door_scene(timestep=TIMESTEP, limits=True)
     began = time.perf_counter()
     env = DoorEnv(scene, budget.task(Task()))
-    gaussian, config = prior(door_space(scene)), replace(budget.config, seed=arguments.seed)
+    gaussian, config = prior(door_space(scene) + door_nuisances(scene)), replace(budget.config, seed=arguments.seed)
     doors = randomised(scene, gaussian)
     found = train(env, doors, config, progress=_tell)
     seconds = time.perf_counter() - began

@@ -5,20 +5,25 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from droid_jax.commands import report
-from droid_jax.commands.evaluate import Evaluate, _robot, _task
+from droid_jax.commands.evaluate import Evaluate, _film, _robot, _task
 from droid_jax.commands.folder import setup_of, stage_folder
 from droid_jax.commands.source import source, stand_in_of
 from droid_jax.commands.train import Train, _fit_folder, _forget
 from droid_jax.identify.gaussian import prior
-from droid_jax.model.door import door_space
+from droid_jax.model.door import door_nuisances, door_space
 from droid_jax.model.door_scene import door_scene
 from droid_jax.policy.control import load
 from droid_jax.policy.door_env import DoorEnv
+from droid_jax.policy.task import Task
+from droid_jax.policy.trials import BLOWN_UP, Trials
+from droid_jax.report.render import NoOpenGL
 from droid_jax.report.stages import extended_of
 from droid_jax.run import main
 
@@ -105,7 +110,9 @@ def test_a_new_training_forgets_the_old_policy(tmp_path: Path):
 
 def test_without_a_fit_there_is_the_prior(scene):
     _, gaussian, _ = source(None, knob=0)
-    assert gaussian.space.names == door_space(scene).names and stand_in_of(None) == {}
+    of_a_fit = door_space(scene) + door_nuisances(scene)  # Table II's three methods differ in nothing but the ranges
+    assert gaussian.space.names == of_a_fit.names and stand_in_of(None) == {}
+    np.testing.assert_array_equal(gaussian.cov, prior(of_a_fit).cov)
 
 
 @pytest.mark.parametrize(
@@ -204,6 +211,59 @@ def test_which_fit_is_trained_on(tmp_path: Path, there: list[str], named: bool, 
     fit = Path(asked["--fit"]) if "--fit" in asked else None
     method = "prior" if "--method" in asked else "fitted"
     assert _fit_folder(Train(fit=fit, method=method)) == (None if found is None else Path(found))
+
+
+class Killed(RuntimeError):
+    """What a kill is to a test."""
+
+
+def test_a_killed_training_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """brax's PPO is played; checkpoints, resuming and what is written in the end are the command's own."""
+    from droid_jax.policy import train as module
+
+    asked = list[tuple[int, bool]]()
+
+    def ppo(environment, num_timesteps, restore_params, progress_fn, policy_params_fn, **_):
+        asked.append((num_timesteps, restore_params is not None))
+        blank = module._blank(environment, module.PRESETS["quick"])
+        for step in (0, 1_000_000, 2_000_000):
+            policy_params_fn(step, None, restore_params or blank)
+            names = ("eval/episode_success", "eval/episode_reward", "eval/episode_blown_up")
+            progress_fn(step, dict(zip(names, (0.5, step, 0.0), strict=True)))
+            if step and len(asked) == 1:
+                raise Killed
+
+    monkeypatch.setattr(module.ppo, "train", ppo)
+    command = ["train", "--method", "prior", "--out", "run"]
+    with pytest.raises(Killed):
+        main(command)
+    assert not (tmp_path / "run" / "training.json").exists() and not (tmp_path / "run" / "policy.npz").exists()
+    assert main(command) == 0
+    assert asked == [(4_000_000, False), (3_000_000, True)]
+    history = json.loads((tmp_path / "run" / "training.json").read_text())["history"]
+    assert [now["step"] for now in history] == [0, 1_000_000, 2_000_000, 3_000_000]
+    load(tmp_path / "run" / "policy.npz")
+    assert main(command) == 0 and len(asked) == 2  # it is done
+
+
+@pytest.mark.parametrize("opengl", [True, False])
+def test_films_are_of_the_trials_of_median_angle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, opengl: bool, capsys):
+    success = np.array([True, True, True, False, False, False])
+    why = np.array(["", "", "", "", "", BLOWN_UP])
+    trials = Trials(success, np.array([0.9, 0.6, 0.7, 0.1, 0.2, 9.0]), np.ones(6, int), np.ones(6), why)
+    made = dict[str, int]()
+
+    def film(path: Path, model, states, period):
+        if not opengl:
+            raise NoOpenGL("no OpenGL here")
+        made[path.name] = states[0]
+
+    monkeypatch.setattr("droid_jax.report.film.film", film)
+    monkeypatch.setattr("droid_jax.policy.transfer.filmed", lambda policy, robot, number: number)
+    robot: Any = SimpleNamespace(scene=SimpleNamespace(visual_model=lambda: None), task=Task())
+    _film(tmp_path, None, robot, trials)  # type: ignore[arg-type]
+    assert made == ({"good.webp": 2, "bad.webp": 4} if opengl else {})
+    assert ("no films: no OpenGL here" in capsys.readouterr().err) is not opengl
 
 
 @pytest.mark.slow

@@ -17,7 +17,6 @@ from droid_jax.commands.folder import changed, setup_of, stage_folder
 from droid_jax.commands.hidden import hidden_effects
 from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.source import needs_brax, source
-from droid_jax.commands.train import randomise
 from droid_jax.report.files import FILMS, POLICY, TRAINING, TRANSFER
 
 if TYPE_CHECKING:
@@ -63,6 +62,7 @@ def run(command: Evaluate) -> None:
     from droid_jax.measure.hidden import HIDDEN
     from droid_jax.policy.control import load
     from droid_jax.policy.door_env import DoorEnv
+    from droid_jax.policy.randomise import of_method
     from droid_jax.policy.simulated import simulated
     from droid_jax.policy.transfer import transfer
     from droid_jax.report.policy_folder import read_training
@@ -85,10 +85,12 @@ def run(command: Evaluate) -> None:
     robot, truth = _robot(command, trained, env)
     # All of them are one compiled program, which does not say how far it is.
     with counting("episodes in simulation, a minute of compiling first", command.trials) as count:
-        inside = simulated(policy, env, randomise(setup["method"], scene, gaussian), command.trials, command.seed)
+        inside = simulated(policy, env, of_method(setup["method"], scene, gaussian), command.trials, command.seed)
         count(command.trials)
     with counting("trials on the stand-in robot", command.trials) as count:
         outside = transfer(policy, robot, count)
+    for found in (inside, outside):
+        _ = found.rate  # ValueError where all of them blew up
     with new_folder(folder / FILMS) as films:  # those of an earlier policy stay until these are there
         if command.film:
             _film(films, policy, robot, outside)
@@ -163,14 +165,17 @@ def _robot(command: Evaluate, trained: Mapping[str, Any], env: DoorEnv) -> tuple
 
 
 def _film(folder: Path, policy: Policy, robot: StandIn, found: Trials) -> None:
-    """good.webp and bad.webp: of the trials that succeeded and of those that failed, the one of median angle."""
+    """good.webp and bad.webp: of the trials that succeeded and of those that failed, the one of median angle.
+
+    Trials that blew up are no failures.
+    """
     import numpy as np
 
     from droid_jax.policy.transfer import filmed
     from droid_jax.report.film import film
     from droid_jax.report.render import NoOpenGL
 
-    chosen = {"good": np.flatnonzero(found.success), "bad": np.flatnonzero(~found.success)}
+    chosen = {"good": np.flatnonzero(found.success), "bad": np.flatnonzero(~found.success & found.counted)}
     for name, numbers in chosen.items():
         if not len(numbers):
             continue

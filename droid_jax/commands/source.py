@@ -28,12 +28,12 @@ def source(folder: Path | None, knob: int) -> tuple[Scene, Gaussian, tuple[Effec
     """
     from droid_jax.gap.extended import load_extended
     from droid_jax.identify.gaussian import load, prior
-    from droid_jax.model.door import door_space
+    from droid_jax.model.door import door_nuisances, door_space
     from droid_jax.model.door_scene import door_scene
 
     scene = door_scene(timestep=TIMESTEP, limits=True, knob=knob)
-    if folder is None:
-        return scene, prior(door_space(scene)), ()
+    if folder is None:  # over what a fit is over, so that what a policy meets differs in nothing but the ranges
+        return scene, prior(door_space(scene) + door_nuisances(scene)), ()
     needs_whole(folder)
     other = setup(folder)
     if other.get("preset") == "paper" and "generations" in other:

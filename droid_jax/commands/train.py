@@ -18,8 +18,6 @@ from droid_jax.report.stages import extended_of, fingerprint
 
 if TYPE_CHECKING:
     from droid_jax.identify.gaussian import Gaussian
-    from droid_jax.model.scene import Scene
-    from droid_jax.policy.randomise import Randomise
     from droid_jax.policy.train import TrainConfig, TrainProgress
 
 Method = Literal["fitted", "mean", "prior"]
@@ -68,6 +66,7 @@ def run(command: Train) -> None:
     from droid_jax.identify.results import prepare_folder
     from droid_jax.policy.door_env import DoorEnv
     from droid_jax.policy.network import save_policy
+    from droid_jax.policy.randomise import of_method
     from droid_jax.policy.train import train
     from droid_jax.report.progress import training
     from droid_jax.storage import write_bytes, write_json
@@ -98,7 +97,7 @@ def run(command: Train) -> None:
             write("train", now)
 
         found = train(
-            env, randomise(command.method, scene, gaussian), config, checkpoints=out / "checkpoints",
+            env, of_method(command.method, scene, gaussian), config, checkpoints=out / "checkpoints",
             fingerprint={"method": command.method, "gaussian": (out / GAUSSIAN).read_text()},
             progress=progress,
         )  # fmt: skip
@@ -134,15 +133,6 @@ def config_of(command: Train) -> TrainConfig:
 
     asked = {} if command.steps is None else {"steps": command.steps}
     return dataclasses.replace(PRESETS[command.preset], seed=command.seed, **asked)
-
-
-def randomise(method: str, scene: Scene, gaussian: Gaussian) -> Randomise:
-    """Draws of the Gaussian, or its mean alone where the method is "mean"."""
-    from droid_jax.policy.randomise import fixed, randomised
-
-    if method == "mean":
-        return fixed(scene, gaussian.space, gaussian.centre)
-    return randomised(scene, gaussian)
 
 
 def _chosen(command: Train, gaussian: Gaussian) -> Gaussian:

@@ -35,6 +35,7 @@ SHAPES: dict[str, tuple[int, ...]] = {  # of an `Interface`
     "stiffness": (ARM,), "damping": (ARM,), "workspace": (2, 3), "chain": (ARM + 1, 4, 4), "pads": (FINGERS, 3),
     "slides": (FINGERS, 3), "start": (ARM + FINGERS,), "knob": (4, 4),
 }  # fmt: skip
+POSITIVE = ("period", "reach", "width", "speed", "effort", "stiffness")  # of these
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +67,12 @@ class Interface:
     slides: np.ndarray
     start: np.ndarray
     knob: np.ndarray
+
+
+def differing(one: Interface, other: Interface) -> list[str]:
+    """Names of the fields in which two interfaces differ by more than single precision does."""
+    both = ((f.name, getattr(one, f.name), getattr(other, f.name)) for f in fields(Interface))
+    return [name for name, a, b in both if not np.allclose(a, b, rtol=1e-5, atol=1e-6)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,19 +114,19 @@ def load(path: str | Path) -> Policy:
         raise ValueError(f"{path} cannot be read: {error}") from None
     if str(found.get("format")) != FORMAT:
         raise ValueError(f"{path} is no policy: expected format {FORMAT!r}, got {str(found.get('format'))!r}")
+    layers = range(sum(name.startswith("weight_") for name in found))
+    names = [f"{kind}_{k}" for kind in ("weight", "bias") for k in layers]
+    numeric = ("mean", "std", *names, *(f.name for f in fields(Interface)))
+    lacking = [name for name in dict.fromkeys(("layout", *numeric, "weight_0")) if name not in found]
+    if lacking:
+        raise ValueError(f"{path} lacks {', '.join(lacking)}")
     if tuple(found["layout"].tolist()) != LAYOUT:
         other = [name for name in found["layout"].tolist() if name not in LAYOUT] or ["another order"]
         raise ValueError(f"{path} was trained on another observation: {', '.join(other[:3])}")
-    layers = range(sum(name.startswith("weight_") for name in found))
-    names = [f"{kind}_{k}" for kind in ("weight", "bias") for k in layers]
-    lacking = [n for n in ("mean", "std", "weight_0", *names, *(f.name for f in fields(Interface))) if n not in found]
-    if lacking:
-        raise ValueError(f"{path} lacks {', '.join(lacking)}")
-    numeric = ("mean", "std", *names, *(f.name for f in fields(Interface)))
     broken = [n for n in numeric if found[n].dtype.kind not in "fiu" or not np.isfinite(found[n]).all()]
     if broken:
         raise ValueError(f"{path}: {', '.join(broken)} hold values that are no numbers; train again")
-    wrong = _misshapen(found, len(layers))
+    wrong = _misshapen(found, len(layers)) or _not_above_zero(found)
     if wrong:
         raise ValueError(f"{path} is damaged: {wrong}; train or export again")
     weights, biases = (tuple(found[f"{kind}_{k}"] for k in layers) for kind in ("weight", "bias"))
@@ -140,13 +147,22 @@ def _misshapen(found: Mapping[str, np.ndarray], layers: int) -> str | None:
     return None
 
 
+def _not_above_zero(found: Mapping[str, np.ndarray]) -> str | None:
+    """The first array of a policy's file that must be above zero and is not, in words."""
+    for name in ("std", *POSITIVE):
+        if (found[name] <= 0.0).any():
+            return f"{name} must be above zero, got {found[name].min():g}"
+    return None
+
+
 @dataclass(frozen=True, eq=False)
 class Reading:
     """What a robot says of itself at one instant.
 
     time: s, any clock that runs on.  position: [7] rad, velocity: [7] rad/s, of the arm.  torque: [7] N m, without
     what carries the arm's own weight, or None.  fingers: [2] m, how far each stands from shut.  knob: [4, 4] pose of
-    the knob in the robot's base frame, m: x the door's inward normal, z up.
+    the knob in the robot's base frame, m: x the door's inward normal, z up.  sight: s, when the knob was there, on the
+    same clock; None where it is as new as the rest (a pose computed from an encoder of the hinge, say).
     """
 
     time: float
@@ -155,6 +171,7 @@ class Reading:
     torque: np.ndarray | None
     fingers: np.ndarray
     knob: np.ndarray
+    sight: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +208,7 @@ class Safety:
     late, early: shares of the period by which a reading may come late or early.  speed, effort: shares of the arm's
     limits that measured velocities and torques may reach.  margin: rad that targets keep from the ends of the joints'
     ranges, and by which a joint may be beyond them.  off, turned: m and rad by which the knob may be away from where
-    it was in training when the loop begins.
+    it was in training when the loop begins.  old: s by which the sight of the knob may be older than its reading.
     """
 
     late: float = 0.5
@@ -199,8 +216,9 @@ class Safety:
     speed: float = 1.0
     effort: float = 1.1
     margin: float = 0.02
-    off: float = 0.05
+    off: float = 0.03
     turned: float = 0.2
+    old: float = 0.1
 
 
 class Controller:
@@ -208,9 +226,9 @@ class Controller:
 
     Targets stay inside the joints' ranges and so near to where the arm is that the spring torque of the servo,
     stiffness times distance, stays inside the joints' limits.  The loop stops, and from then on commands the pose of
-    the last good reading, when a reading is stale, late, early, of a wrong shape or no number, when a joint is beyond
-    its range, a measured velocity or torque beyond its limit, the hand outside the workspace, or the command no number;
-    `stopped` says why.
+    the last good reading, when a reading (or its sight of the knob) is stale, late, early, of a wrong shape or no
+    number, when a joint is beyond its range, a measured velocity or torque beyond its limit, the hand outside the
+    workspace, or the command no number; `stopped` says why.
     """
 
     def __init__(self, policy: Policy, safety: Safety | None = None):
@@ -255,6 +273,7 @@ def _copied(reading: Reading) -> Reading:
         torque=None if reading.torque is None else np.array(reading.torque, float),
         fingers=np.array(reading.fingers, float),
         knob=np.array(reading.knob, float),
+        sight=reading.sight,
     )
 
 
@@ -283,6 +302,8 @@ def fault(interface: Interface, safety: Safety, reading: Reading, before: float)
         return f"early: {1e3 * (reading.time - before):.0f} ms between readings, expected {1e3 * interface.period:.0f}"
     if reading.time - before > (1.0 + safety.late) * interface.period and np.isfinite(before):
         return f"late: {1e3 * (reading.time - before):.0f} ms between readings, expected {1e3 * interface.period:.0f}"
+    if reading.sight is not None and not abs(reading.time - reading.sight) <= safety.old:  # no number is stale too
+        return f"stale sight of the knob: it is of {reading.sight:g} s, the reading of {reading.time:g} s"
     middle, half = interface.ranges.mean(axis=1), np.ptp(interface.ranges, axis=1) / 2 + safety.margin
     outside = _beyond(reading.position - middle, half, "rad from the middle of its range")
     if outside is not None:

@@ -38,6 +38,11 @@ def randomised(scene: Scene, gaussian: Gaussian) -> Randomise:
     return randomise
 
 
+def of_method(method: str, scene: Scene, gaussian: Gaussian) -> Randomise:
+    """Draws of the Gaussian, or its middle alone where the method of Table II is "mean"."""
+    return fixed(scene, gaussian.space, gaussian.centre) if method == "mean" else randomised(scene, gaussian)
+
+
 def randomised_model(scene: Scene, gaussian: Gaussian) -> Randomise:
     """The same for environments that know an mjx.Model only (mujoco_playground's): the model fields alone.
 

@@ -11,7 +11,7 @@ import numpy as np
 from brax.envs.wrappers.training import DomainRandomizationVmapWrapper, VmapWrapper
 
 from droid_jax import runtime
-from droid_jax.policy.control import Policy
+from droid_jax.policy.control import Policy, differing
 from droid_jax.policy.door_env import DoorEnv
 from droid_jax.policy.randomise import Randomise
 from droid_jax.policy.trials import BLOWN_UP, Trials
@@ -25,7 +25,10 @@ def simulated(policy: Policy, env: DoorEnv, randomise: Randomise | None, episode
     """Episodes of the deterministic policy, each in its own draw of the physics (without, all in the scene's own).
 
     The policy and what varies are arguments of the program, so that other policies and draws find it compiled.
+    Raises ValueError for a policy of another robot, door or task than the environment's.
     """
+    if other := differing(policy.interface, env.interface):
+        raise ValueError(f"the policy was trained for another robot, door or task: {', '.join(other)} differ")
     start, physics = jax.random.split(jax.random.key(seed))
     drawn, axes = (env.sys, None) if randomise is None else randomise(env.sys, jax.random.split(physics, episodes))
 

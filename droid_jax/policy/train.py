@@ -23,7 +23,7 @@ from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.agents.ppo import train as ppo
 
 from droid_jax.identify.checkpoints import Checkpoints
-from droid_jax.policy.control import Policy
+from droid_jax.policy.control import LAYOUT, Policy
 from droid_jax.policy.door_env import DoorEnv
 from droid_jax.policy.doors import wrapped
 from droid_jax.policy.network import layer_sizes, policy_of
@@ -125,7 +125,8 @@ def train(
     config = replace(config, devices=_devices(config))
     scene = f"{env.scene.name}, {env.scene.sha256}, {env.start.tolist()}"
     of = {"scene": scene, "effects": ", ".join(e.name for e in env.effects), "task": repr(asdict(env.task))}
-    texts = {"config": repr(replace(config, steps=0, devices=None)), **of, **(fingerprint or {})}
+    texts = {"config": repr(replace(config, steps=0, devices=None)), "observation": repr(LAYOUT), **of}
+    texts |= fingerprint or {}
     run = functools.partial(_brax, env, randomise, config)
     if checkpoints is None:
         return run(None, 0, progress, lambda step, params: None)

@@ -18,6 +18,7 @@ class Trials:
     A trial goes on after success until its time is up, as a trial of the paper does.
     success: [N] bool.  angle: [N] rad, the largest; steps: [N] actions until success, or all that were made;
     grip: [N] share of actions with the knob gripped.  stopped: [N] why a trial was stopped, "" where it was not.
+    Trials whose simulation blew up say nothing of the policy: they are in no rate and in no mean.
     """
 
     success: np.ndarray
@@ -27,36 +28,52 @@ class Trials:
     stopped: np.ndarray
 
     @property
+    def counted(self) -> np.ndarray:
+        """[N] bool: all but those that blew up."""
+        return self.stopped != BLOWN_UP
+
+    @property
     def rate(self) -> float:
-        """Share of trials that succeeded."""
-        return float(np.mean(self.success))
+        """Share of trials that succeeded; ValueError where all of them blew up."""
+        self._needs_any()
+        return float(np.mean(self.success[self.counted]))
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
-        """Of the success rate.  Wilson, JASA 1927."""
-        count = scipy.stats.binomtest(int(np.sum(self.success)), len(self.success))
-        span = count.proportion_ci(level, method="wilson")
+        """Of the success rate.  Wilson, JASA 1927.  ValueError where all trials blew up."""
+        self._needs_any()
+        success = self.success[self.counted]
+        span = scipy.stats.binomtest(int(np.sum(success)), len(success)).proportion_ci(level, method="wilson")
         return float(span.low), float(span.high)
 
     def to_json(self) -> dict[str, Any]:
         """As plain data, angles in degrees; trial by trial and in sum.
 
-        Steps in sum are those of successes, None where there were none; why trials stopped, without its numbers.
+        Steps in sum are those of successes; sums are None where nothing is left to count; why trials stopped, without
+        its numbers.
         """
-        degrees, steps = np.rad2deg(self.angle), self.steps[self.success.astype(bool)]
+        counted, degrees = self.counted, np.rad2deg(self.angle)
+        some = bool(counted.any())
         short = [str(why).partition(":")[0] for why in self.stopped]
         reasons, counts = np.unique([why for why in short if why], return_counts=True)
         return {
             "trials": len(self.success),
-            "success_rate": self.rate,
-            "interval_95": list(self.interval()),
-            "angle_deg": {"mean": float(degrees.mean()), "std": float(degrees.std()), "all": degrees.round(2).tolist()},
-            "steps": {
-                "mean": float(steps.mean()) if len(steps) else None,
-                "std": float(steps.std()) if len(steps) else None,
-                "all": self.steps.tolist(),
-            },
-            "grip": {"mean": float(self.grip.mean()), "all": self.grip.round(3).tolist()},
+            "success_rate": self.rate if some else None,
+            "interval_95": list(self.interval()) if some else None,
+            "angle_deg": {**_spread(degrees[counted]), "all": degrees.round(2).tolist()},
+            "steps": {**_spread(self.steps[counted & self.success.astype(bool)]), "all": self.steps.tolist()},
+            "grip": {"mean": _spread(self.grip[counted])["mean"], "all": self.grip.round(3).tolist()},
             "success": self.success.astype(bool).tolist(),
             "stopped": dict(zip(reasons.tolist(), counts.tolist(), strict=True)),
             "stopped_each": short,
         }
+
+    def _needs_any(self) -> None:
+        if not self.counted.any():
+            raise ValueError(
+                f"the simulation blew up in all {len(self.success)} trials: they say nothing of the policy"
+            )
+
+
+def _spread(values: np.ndarray) -> dict[str, float | None]:
+    """Mean and deviation, None where there are no values."""
+    return {"mean": float(values.mean()), "std": float(values.std())} if len(values) else {"mean": None, "std": None}

@@ -15,11 +15,12 @@ import jax
 from matplotlib.figure import Figure
 
 from benchmarks.common import commits, stem
-from droid_jax.commands.train import randomise
+from droid_jax.commands.source import TIMESTEP as TIMESTEP
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.policy.control import load
 from droid_jax.policy.door_env import DoorEnv
 from droid_jax.policy.network import save_policy
+from droid_jax.policy.randomise import of_method
 from droid_jax.policy.simulated import simulated
 from droid_jax.policy.task import Task
 from droid_jax.policy.train import PRESETS, TrainConfig, train
@@ -30,7 +31,6 @@ from droid_jax.storage import write_json
 from experiments.policies.table import PLACES
 from experiments.sharing import claimed
 
-TIMESTEP = 0.004  # s, of the simulation that trains
 QUICK_STEPS = 20  # actions of an episode where nothing shall be learned
 RESULTS = Path(__file__).resolve().parents[1] / "results"
 
@@ -140,7 +140,7 @@ def tried(
     """Train (where no experiment has done so), and try in simulation and on robots by name: a policy's figures."""
     budget = arguments.budget
     place, made = trained(arguments.trained, env, doors, replace(budget.config, seed=seed), code)
-    policy, drawn = load(place / POLICY), randomise(doors.method, env.scene, doors.gaussian)
+    policy, drawn = load(place / POLICY), of_method(doors.method, env.scene, doors.gaussian)
     return {
         "doors_sha256": _sha256(doors.gaussian.to_json()),
         "simulation": simulated(policy, env, drawn, budget.trials, seed).to_json(),
@@ -166,7 +166,7 @@ def trained(
     place = store / key
     with claimed(place, wait=True):
         if not (place / TRAINING).is_file():
-            drawn = randomise(doors.method, env.scene, doors.gaussian)
+            drawn = of_method(doors.method, env.scene, doors.gaussian)
             kept = place / "checkpoints" / str(code["commit"])  # what other code left half-done is not gone on with
             found = train(env, drawn, config, checkpoints=kept, fingerprint={"key": key})
             place.mkdir(exist_ok=True)

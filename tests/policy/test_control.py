@@ -139,6 +139,8 @@ def test_a_good_reading_is_acted_on(policy, still):
         (lambda r: replace(r, position=r.position + 2 * np.pi * np.eye(7)[6]), "out of range: joint 7"),
         (lambda r: replace(r, position=r.position - 0.5 * np.eye(7)[0]), "the hand has left its workspace"),
         (lambda r: replace(r, knob=1e3 * r.knob), "the knob's pose is no pose"),
+        (lambda r: replace(r, sight=-0.09), "stale sight of the knob: it is of -0.09 s, the reading of 0.02 s"),
+        (lambda r: replace(r, sight=np.nan), "stale sight of the knob"),
     ],
 )  # fmt: skip
 def test_it_stops_and_holds_the_pose(policy, still, spoil, why: str):
@@ -178,6 +180,23 @@ def test_a_knob_that_is_turned_is_no_beginning(policy, still, turned, begins):
         return
     with pytest.raises(ValueError, match=rf"0.00 m and {turned:.2f} rad from where it was"):
         Controller(policy).act(replace(still, knob=knob))
+
+
+def test_a_policy_for_the_next_place_of_the_knob_does_not_begin(policy, scene):
+    next_place = door_scene(limits=True, knob=1)
+    own = interface_of(next_place, TASK, start_pose(next_place, TASK))
+    data = mujoco.MjData(scene.model)
+    data.qpos[:] = start_pose(scene, TASK)
+    mujoco.mj_forward(scene.model, data)
+    at_the_limit = replace(reading(scene, data), position=own.start[:7], fingers=own.start[7:])
+    with pytest.raises(ValueError, match=r"cannot begin: the knob is elsewhere: 0\.05 m"):
+        Controller(replace(policy, interface=own)).act(at_the_limit)
+
+
+def test_a_camera_may_be_a_little_behind(policy, still):
+    loop = Controller(policy)
+    assert loop.act(replace(still, sight=-0.05)).stopped is None
+    assert loop.act(replace(still, time=0.02, sight=-0.05)).stopped is None
 
 
 def test_later_the_knob_may_go_with_its_door(policy, still):

@@ -13,7 +13,7 @@ from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks as ppo_networks
 
 from droid_jax.model.door_scene import door_scene
-from droid_jax.policy.control import ACTIONS, LAYOUT, OBSERVED, Interface, Policy, load
+from droid_jax.policy.control import ACTIONS, FORMAT, LAYOUT, OBSERVED, Interface, Policy, load
 from droid_jax.policy.door_env import start_pose
 from droid_jax.policy.interface import interface_of
 from droid_jax.policy.network import layer_sizes, policy_of, save_policy
@@ -90,6 +90,13 @@ def rewritten(path: Path, change) -> None:
         (lambda path: path.write_bytes(path.read_bytes()[:200]), "cannot be read"),
         (lambda path: np.savez(path, format="something else"), "is no policy"),
         (lambda path: rewritten(path, lambda found: found.pop("bias_1")), "lacks bias_1"),
+        (lambda path: rewritten(path, lambda found: found.pop("layout")), "lacks layout"),
+        (lambda path: np.savez(path, format=FORMAT), "lacks layout, mean, std, .*weight_0"),
+        (lambda path: rewritten(path, lambda found: found["std"].put(3, 0.0)), "std must be above zero, got 0"),
+        (
+            lambda path: rewritten(path, lambda found: found["period"].fill(-0.02)),
+            "period must be above zero, got -0.02",
+        ),
         (
             lambda path: rewritten(path, lambda found: found["mean"].fill(np.nan)),
             "mean hold values that are no",

@@ -23,7 +23,7 @@ from droid_jax.model.fields import body_mass, joint_damping, model_parameter
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import Physics, make_physics, written_fields
 from droid_jax.model.scene import compile_scene, load_scene
-from droid_jax.policy.randomise import fixed, randomised, randomised_model
+from droid_jax.policy.randomise import fixed, of_method, randomised, randomised_model
 
 ENVS = 5
 
@@ -92,7 +92,7 @@ def test_the_three_methods_are_the_prior_the_fits_middle_and_its_draws(scene, ga
 
     def hinge(method: str) -> np.ndarray:
         of = train._chosen(train.Train(method=method), fit)  # type: ignore[arg-type]
-        physics, _ = train.randomise(method, scene, of)(Physics(scene.mjx, {}), keys)
+        physics, _ = of_method(method, scene, of)(Physics(scene.mjx, {}), keys)
         return np.asarray(physics.model.dof_damping)[:, scene.dof("hinge")]
 
     np.testing.assert_allclose(hinge("mean"), middle, rtol=1e-5)

@@ -15,7 +15,7 @@ from brax.envs.base import Env, State
 from droid_jax.identify.gaussian import prior
 from droid_jax.model.door import door_space
 from droid_jax.model.door_scene import door_scene
-from droid_jax.policy.control import Policy
+from droid_jax.policy.control import SHAPES, Interface, Policy
 from droid_jax.policy.door_env import DoorEnv
 from droid_jax.policy.randomise import randomised
 from droid_jax.policy.simulated import simulated
@@ -29,11 +29,14 @@ class Door(NamedTuple):
     height: Any
 
 
+BLANK: Any = Interface(**{name: np.zeros(shape) for name, shape in SHAPES.items()})  # type: ignore[arg-type]
+
+
 class Opening(Env):
     """A door that opens by its width and its height, and by what the policy does."""
 
     sys: Any = Door(jnp.zeros(()), jnp.ones(()))
-    task = SimpleNamespace(steps=2)
+    task, interface = SimpleNamespace(steps=2), BLANK
     observation_size, action_size, backend = 1, 1, "none"
 
     def reset(self, rng):
@@ -51,7 +54,7 @@ class Opening(Env):
 def network(weight: float) -> Policy:
     """What it sees times a weight, before tanh."""
     weights = (np.full((1, 18), weight),)
-    return Policy(np.zeros(1), np.ones(1), weights, (np.zeros(18),), SimpleNamespace())  # type: ignore[arg-type]
+    return Policy(np.zeros(1), np.ones(1), weights, (np.zeros(18),), BLANK)
 
 
 def draws(sys: Door, rng: Any) -> tuple[Door, Door]:
@@ -81,9 +84,19 @@ def test_another_policy_on_other_doors_is_the_same_program(monkeypatch: pytest.M
     np.testing.assert_allclose(alone.angle, 1.0 + np.tanh(0.5), rtol=1e-6)
 
 
+def test_a_policy_of_another_robot_is_refused():
+    env: Any = Opening()
+    other = replace(network(0.5), interface=replace(BLANK, knob=np.eye(4), reach=0.2))
+    with pytest.raises(ValueError, match="trained for another robot, door or task: reach, knob differ"):
+        simulated(other, env, None, 2)
+
+
 @jax.tree_util.register_static
 class Still:
     """A policy that keeps the arm where it is and the fingers open."""
+
+    def __init__(self, interface: Interface):
+        self.interface = interface
 
     def act(self, observation: Any, numbers: Any) -> Any:
         return numbers.concatenate([numbers.zeros((len(observation), 7)), numbers.ones((len(observation), 2))], axis=1)
@@ -93,9 +106,9 @@ class Still:
 def test_a_hand_that_stays_opens_nothing_and_steps_count_until_success():
     scene = door_scene(timestep=0.004, limits=True)
     env, randomise = DoorEnv(scene, Task(steps=10)), randomised(scene, prior(door_space(scene)))
-    found = simulated(Still(), env, randomise, 3)  # type: ignore[arg-type]
+    found = simulated(Still(env.interface), env, randomise, 3)  # type: ignore[arg-type]
     assert not found.success.any() and (found.steps == 10).all() and (found.grip == 0).all()
     assert (np.abs(found.angle) < 0.01).all() and (found.stopped == "").all()
     env.task = replace(env.task, opened=-1.0, force=0.0, held=0.06)  # any hand that faces the door succeeds
-    at_once = simulated(Still(), env, None, 2)  # type: ignore[arg-type]
+    at_once = simulated(Still(env.interface), env, None, 2)  # type: ignore[arg-type]
     assert at_once.success.all() and (at_once.steps == 3).all() and (at_once.grip == 1).all()

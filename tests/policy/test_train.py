@@ -19,7 +19,9 @@ from droid_jax.policy.door_env import DoorEnv
 from droid_jax.policy.randomise import randomised
 from droid_jax.policy.task import Task
 from droid_jax.policy.train import (
+    PRESETS,
     TrainConfig,
+    TrainProgress,
     _brax,
     _devices,
     evaluations_left,
@@ -85,6 +87,18 @@ def test_devices_that_do_not_divide_are_left_out(monkeypatch: pytest.MonkeyPatch
     assert _devices(SHORT) == 4
     with pytest.raises(ValueError, match="32 environments do not divide among 5 devices"):
         _devices(replace(SHORT, devices=5))
+
+
+@pytest.mark.parametrize("devices", [1, 2, 4, 8])
+@pytest.mark.parametrize("preset", PRESETS)
+def test_presets_use_all_devices(monkeypatch: pytest.MonkeyPatch, preset: str, devices: int):
+    monkeypatch.setattr(jax, "local_device_count", lambda: devices)
+    assert _devices(PRESETS[preset]) == devices
+
+
+def test_the_time_left_is_what_the_rest_takes_at_this_rate():
+    now = TrainProgress(step=1000, of=4000, seconds=9.0, rate=0.0, reward=0.0, success=0.0)
+    assert replace(now, rate=150.0).left == 20.0 and now.left == float("inf")
 
 
 def played(monkeypatch: pytest.MonkeyPatch, *evaluations: tuple[int, float, float, float]) -> list[int]:

@@ -19,7 +19,7 @@ from droid_jax.policy.hand import looked
 from droid_jax.policy.interface import interface_of
 from droid_jax.policy.task import Task
 from droid_jax.policy.transfer import TransferConfig, _senses, _trial, filmed, stand_in, transfer
-from droid_jax.policy.trials import Trials
+from droid_jax.policy.trials import BLOWN_UP, Trials
 
 TASK = Task(steps=260, spread=0.0)
 ONE = TransferConfig(trials=1)
@@ -155,6 +155,21 @@ def test_sums_leave_out_what_failed_and_reasons_their_numbers():
     assert content["stopped"] == {"too fast": 2} and content["stopped_each"] == ["", "", "too fast", "too fast"]
     nothing = Trials(np.zeros(2, bool), np.zeros(2), np.ones(2), np.zeros(2), np.full(2, "")).to_json()
     assert nothing["steps"]["mean"] is None and nothing["stopped"] == {}
+
+
+def test_trials_that_blew_up_are_in_no_rate_and_no_mean():
+    """Eight of eight that say something succeeded; two say nothing."""
+    blown = np.arange(10) >= 8
+    found = Trials(~blown, np.where(blown, 9.0, 1.0), np.full(10, 7), 1.0 * ~blown, np.where(blown, BLOWN_UP, ""))
+    content, alone = found.to_json(), Trials(*(a[:8] for a in (found.success, found.angle, found.steps, found.grip)),
+                                             found.stopped[:8])  # fmt: skip
+    assert found.rate == 1.0 and found.interval() == alone.interval()
+    assert content["trials"] == 10 and content["stopped"] == {BLOWN_UP: 2} and len(content["success"]) == 10
+    assert content["angle_deg"]["mean"] == pytest.approx(np.rad2deg(1.0)) and content["grip"]["mean"] == 1.0
+    nothing = Trials(*(a[8:] for a in (found.success, found.angle, found.steps, found.grip)), found.stopped[8:])
+    with pytest.raises(ValueError, match="blew up in all 2 trials"):
+        _ = nothing.rate
+    assert nothing.to_json()["success_rate"] is None and nothing.to_json()["angle_deg"]["mean"] is None
 
 
 def test_amplitudes_that_cannot_be_are_refused(scene, start):
