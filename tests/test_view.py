@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import mujoco
@@ -14,6 +19,33 @@ from droid_jax.model.door_scene import door_scene
 from droid_jax.model.mjcf import fitted_mjcf
 from droid_jax.report.files import FITTED, REPLAY
 from droid_jax.run import main
+
+ROOT = Path(__file__).resolve().parents[1]
+OPENS_A_WINDOW = "import glfw; assert glfw.init() and glfw.create_window(9, 9, '', None, None)"
+# The command as it is; its window closes once the door has stood open and the screen shows more than the panels of the
+# viewer, which have less than a hundred colours.
+WATCHED = """
+import sys, threading, time
+import mujoco.viewer
+import numpy as np
+from droid_jax.run import main
+
+folder, screen = sys.argv[1:]
+shown, began, sync = [], time.monotonic(), mujoco.viewer.Handle.sync
+
+def watched(window, *arguments):
+    sync(window, *arguments)
+    shown.append(window.d.qpos.copy())
+    colours = len(np.unique(np.fromfile(screen, np.uint32)[-1280 * 720:]))  # behind the header of an X window dump
+    opened = np.ptp(shown, axis=0).max()
+    if opened > 0.79 and colours > 500 or time.monotonic() - began > 60.0:
+        print(opened, colours)
+        window.close()
+
+mujoco.viewer.Handle.sync = watched
+assert main(["view", folder]) == 0
+assert threading.active_count() == 1  # the window is down, or the end of the program may be a segmentation fault
+"""
 
 
 @pytest.fixture(scope="module")
@@ -88,3 +120,39 @@ def test_without_a_path_it_shows_what_the_default_command_left(
 def test_a_folder_without_a_replay_is_refused(tmp_path: Path, capsys):
     assert main(["view", str(tmp_path)]) == 2
     assert f"{tmp_path} holds no replay.npz: `python -m droid_jax.run identify` writes one" in capsys.readouterr().err
+
+
+@pytest.fixture
+def screen(tmp_path: Path) -> Iterator[tuple[dict[str, str], Path]]:
+    """A screen in memory: the environment of a program that shall use it, and the file of its pixels.
+
+    Skips where there is none, or no OpenGL on it.
+    """
+    if shutil.which("Xvfb") is None:
+        pytest.skip("no Xvfb on the path")
+    reader, writer = os.pipe()
+    options = ["-displayfd", str(writer), "-screen", "0", "1280x720x24", "-fbdir", str(tmp_path), "-noreset"]
+    with subprocess.Popen(["Xvfb", *options], pass_fds=[writer], stderr=subprocess.DEVNULL) as server:
+        os.close(writer)
+        with os.fdopen(reader) as told:
+            number = told.readline().strip()
+        environment = {k: v for k, v in os.environ.items() if k not in ("WAYLAND_DISPLAY", "MUJOCO_GL")}
+        environment |= {"DISPLAY": f":{number}", "PYTHONPATH": str(ROOT)}
+        try:
+            tried = subprocess.run(
+                [sys.executable, "-c", OPENS_A_WINDOW], env=environment, capture_output=True, timeout=60
+            )
+            if not number or tried.returncode:
+                pytest.skip("Xvfb opens no window with OpenGL here")
+            yield environment, tmp_path / "Xvfb_screen0"
+        finally:
+            server.terminate()
+
+
+def test_on_a_screen_it_plays_until_the_window_is_closed(folder: Path, screen: tuple[dict[str, str], Path]):
+    environment, pixels = screen
+    command = [sys.executable, "-c", WATCHED, str(folder), str(pixels)]
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+    assert run.returncode == 0, run.stderr
+    opened, colours = map(float, run.stdout.split())
+    assert opened == pytest.approx(0.8) and colours > 500

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
+import threading
 import time
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -44,14 +47,13 @@ def run(command: View) -> None:
     if not _opens():
         raise ValueError(f"no window can be opened here; the same replay is a film in {folder / 'report.html'}")
     import mujoco
-    import mujoco.viewer
 
     clock, states = replay_of(folder)
     model, moved = side_by_side(folder / FITTED)
     if states.shape[1] != model.nq:
         raise ValueError(f"{folder / REPLAY} has {states.shape[1]} positions, two of {folder / FITTED} have {model.nq}")
     data = mujoco.MjData(model)
-    with mujoco.viewer.launch_passive(model, data) as window:
+    with _window(model, data) as window:
         began = time.monotonic()
         while window.is_running():
             at = command.speed * (time.monotonic() - began) % (clock[-1] + 1.0)  # a second's pause at the end
@@ -89,6 +91,24 @@ def side_by_side(mjcf: Path) -> tuple[mujoco.MjModel, np.ndarray]:
         warnings.simplefilter("ignore", UserWarning)
         model = both.compile()
     return model, model.qpos0 - np.tile(one.qpos0, 2)
+
+
+@contextlib.contextmanager
+def _window(model: mujoco.MjModel, data: mujoco.MjData) -> Iterator[Any]:
+    """MuJoCo's viewer.
+
+    Its own thread takes the window down; a program that ends meanwhile ends in a segmentation fault
+    (google-deepmind/mujoco#1265), so it is waited for.
+    """
+    import mujoco.viewer
+
+    others = set(threading.enumerate())
+    try:
+        with mujoco.viewer.launch_passive(model, data) as window:
+            yield window
+    finally:
+        for thread in set(threading.enumerate()) - others:
+            thread.join(timeout=10.0)
 
 
 def _opens() -> bool:

@@ -33,9 +33,13 @@ def angles(trials: Mapping[str, Mapping[str, Any]], opened: float, width: float 
     axes = figure.add_subplot()
     widest = max(max(found["angle_deg"]["all"]) for found in trials.values())
     bins = np.arange(0.0, max(widest, opened) + 4.0, 2.0).tolist()
-    for where, found in trials.items():
-        weights = np.full(found["trials"], 100.0 / found["trials"])
-        axes.hist(found["angle_deg"]["all"], bins, weights=weights, color=COLOURS[where], alpha=0.65, label=where)
+    axes.hist(  # beside each other: over each other they would make a third colour
+        [found["angle_deg"]["all"] for found in trials.values()],
+        bins,
+        weights=[np.full(found["trials"], 100.0 / found["trials"]) for found in trials.values()],
+        color=[COLOURS[where] for where in trials],
+        label=list(trials),
+    )
     axes.axvline(opened, color=MUTED, linewidth=1.1, linestyle=(0, (5, 2)), label="asked for")
     axes.set(xlabel="Largest angle of a trial [degrees]", ylabel="Trials [%]")
     legend(figure, axes, width, columns=3)

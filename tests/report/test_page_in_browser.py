@@ -1,5 +1,5 @@
 """The page in a real browser: it renders without complaints, its pictures load, its links lead somewhere, nothing
-overflows, on a desk as on a phone.
+overflows, on a desk as on a phone, and it prints.
 
 Skipped where no Chromium is on the path.
 """
@@ -23,10 +23,7 @@ from made_up_whole import make_whole
 from droid_jax.report import page
 
 BROWSER = next((b for b in ("chromium", "chromium-browser", "google-chrome") if shutil.which(b)), None)
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(BROWSER is None, reason="no chromium or google-chrome on the path"),
-]
+pytestmark = pytest.mark.skipif(BROWSER is None, reason="no chromium or google-chrome on the path")
 
 # The page itself runs no script and forbids it; the probe is a copy with the policy opened for this one.
 PROBE = """<script>
@@ -127,6 +124,7 @@ def test_everything_is_drawn_and_nothing_overflows(
     assert found["overflow"] == 0
 
 
+@pytest.mark.slow
 @SIZES
 def test_the_search_for_a_missing_effect_is_drawn_too(
     gap_report: Path, size: tuple[int, int], shown: str, hidden: str
@@ -137,6 +135,7 @@ def test_the_search_for_a_missing_effect_is_drawn_too(
     assert found["overflow"] == 0
 
 
+@pytest.mark.slow
 @SIZES
 def test_the_page_of_all_stages_is_drawn_and_its_links_lead_somewhere(
     whole_report: Path, size: tuple[int, int], shown: str, hidden: str
@@ -150,6 +149,7 @@ def test_the_page_of_all_stages_is_drawn_and_its_links_lead_somewhere(
     assert not lost and len(found["files"]) > 2
 
 
+@pytest.mark.slow
 def test_a_link_that_leads_nowhere_is_seen(whole_report: Path) -> None:
     """The check above can fail."""
     text = whole_report.read_text(encoding="utf-8")
@@ -181,8 +181,24 @@ def test_the_console_is_really_read(report: Path) -> None:
     assert _console(_browse(broken, "--dump-dom", size=(800, 600)).stderr)
 
 
-def test_it_prints(report: Path) -> None:
-    paper = report.with_name("report.pdf")
+def _pages(report: Path) -> int:
+    """Sheets of paper that a page takes."""
+    paper = report.with_suffix(".pdf")
     _browse(report, f"--print-to-pdf={paper}", "--no-pdf-header-footer", size=(1200, 900))
     content = paper.read_bytes()
-    assert content.startswith(b"%PDF") and 3 <= len(re.findall(rb"/Type\s*/Page\b", content)) <= 14
+    assert content.startswith(b"%PDF")
+    return len(re.findall(rb"/Type\s*/Page\b", content))
+
+
+@pytest.mark.slow
+def test_it_prints(report: Path) -> None:
+    assert 3 <= _pages(report) <= 14
+
+
+@pytest.mark.slow
+def test_the_page_of_all_stages_prints_with_what_is_folded(whole_report: Path) -> None:
+    text = whole_report.read_text(encoding="utf-8")
+    assert "<details>" in text
+    opened = whole_report.with_name("opened.html")
+    opened.write_text(text.replace("<details>", "<details open>"), encoding="utf-8")
+    assert 12 <= _pages(whole_report) == _pages(opened) <= 26
