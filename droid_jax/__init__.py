@@ -19,7 +19,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from droid_jax.compare.cost import make_cost as make_cost
+    from droid_jax.gap.case import GapConfig as GapConfig
     from droid_jax.gap.extended import load_extended as load_extended
+    from droid_jax.gap.missing import find_missing as find_missing
     from droid_jax.identify.gaussian import Gaussian as Gaussian
     from droid_jax.identify.gaussian import load as load_gaussian
     from droid_jax.identify.pipeline import IdentifyConfig as IdentifyConfig
@@ -60,6 +62,8 @@ __all__ = [
     "Gaussian",
     "load_gaussian",
     "fitted_mjcf",
+    "find_missing",
+    "GapConfig",
     "load_extended",
     "randomised",
     "randomised_model",
@@ -85,6 +89,8 @@ _HOMES = {
     "Gaussian": ("identify.gaussian", "Gaussian"),
     "load_gaussian": ("identify.gaussian", "load"),
     "fitted_mjcf": ("model.mjcf", "fitted_mjcf"),
+    "find_missing": ("gap.missing", "find_missing"),
+    "GapConfig": ("gap.case", "GapConfig"),
     "load_extended": ("gap.extended", "load_extended"),
     "randomised": ("policy.randomise", "randomised"),
     "randomised_model": ("policy.randomise", "randomised_model"),

@@ -17,8 +17,7 @@ from small_gap import EFFECTS, FLOOR, JOINTS, PRELOAD, QUICK, SCENE, record, sma
 
 from droid_jax.commands import gap, report
 from droid_jax.commands.hidden import hidden_effects, record_stand_in
-from droid_jax.gap import case as case_module
-from droid_jax.gap import floor, menu, workflow
+from droid_jax.gap import missing, workflow
 from droid_jax.gap.inputs import check_recordings, lags
 from droid_jax.gap.results import load_gap
 from droid_jax.gap.verdict import Experiment
@@ -353,8 +352,8 @@ def test_the_stand_in_records_each_demonstration_once(tmp_path: Path, monkeypatc
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """A case compiled already, of small budgets; no replays at a quarter of the time step, and no page."""
     monkeypatch.setattr(gap, "config_of", lambda command: QUICK)
-    monkeypatch.setattr(case_module, "make_case", lambda *arguments, **roles: small().case)
-    monkeypatch.setattr(floor, "numerical_floor", lambda *arguments: FLOOR)
+    monkeypatch.setattr(missing, "make_case", lambda *arguments, **roles: small().case)
+    monkeypatch.setattr(missing, "numerical_floor", lambda *arguments: FLOOR)
     monkeypatch.setattr(report, "write", lambda folder: folder / "report.html")
 
 
@@ -404,13 +403,13 @@ def test_a_run_goes_on_after_a_stop_and_is_whole(
     """Killed in the search; then with the base fit gone missing, were it asked for again; then finished."""
     pytest.importorskip("tensorboardX")
     command = arguments(place, "--effects", *EFFECTS, "--tensorboard")
-    find = workflow.find
+    find = missing.find
 
     def killed(case, base, floor, progress):
         find(case, base, floor, progress)  # what it computed is remembered
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(workflow, "find", killed)
+    monkeypatch.setattr(missing, "find", killed)
     assert main(command) == 130
     assert "the same command goes on from here" in capsys.readouterr().err
     out = place / "run"
@@ -418,8 +417,8 @@ def test_a_run_goes_on_after_a_stop_and_is_whole(
     (events,) = (out / "tensorboard").iterdir()
     assert b"refine/mean_square" in events.read_bytes()
 
-    monkeypatch.setattr(workflow, "find", find)
-    monkeypatch.setattr(workflow, "base_fit", lambda *a: pytest.fail("the base fit was kept"))
+    monkeypatch.setattr(missing, "find", find)
+    monkeypatch.setattr(missing, "base_fit", lambda *a: pytest.fail("the base fit was kept"))
     assert main(command) == 0
     said = capsys.readouterr().out
     assert "holds this run unfinished; going on" in said
@@ -439,7 +438,7 @@ def test_a_run_goes_on_after_a_stop_and_is_whole(
     assert answer["setup"]["stand_in"] is True and answer["setup"]["command"] == "gap"
     assert answer["versions"]["jax"] and answer["device"]
 
-    monkeypatch.setattr(workflow, "find", lambda *a: pytest.fail("this run is whole"))
+    monkeypatch.setattr(missing, "find", lambda *a: pytest.fail("this run is whole"))
     assert main(command) == 0
     said = capsys.readouterr().out
     assert "holds this run already" in said and said.splitlines()[-5:] == lines
@@ -459,9 +458,9 @@ def test_ties_come_with_an_experiment(place: Path, quick: None, monkeypatch: pyt
         asked.append(([m.name for m in models], recording.name))
         return (Experiment("the same motion twice as fast", 8.5),)
 
-    monkeypatch.setattr(workflow, "base_fit", lambda *a: done.base)
-    monkeypatch.setattr(workflow, "find", lambda *a: replace(done.verdict, rivals=(done.base,)))
-    monkeypatch.setattr(menu, "separating", apart)
+    monkeypatch.setattr(missing, "base_fit", lambda *a: done.base)
+    monkeypatch.setattr(missing, "find", lambda *a: replace(done.verdict, rivals=(done.base,)))
+    monkeypatch.setattr(missing, "separating", apart)
     assert main(arguments(place, "--effects", *EFFECTS)) == 0
     assert asked == [(["hinge_preload at door", "base"], "fit")]
     assert load_gap(place / "run").answer["experiments"] == [{"what": "the same motion twice as fast", "apart": 8.5}]

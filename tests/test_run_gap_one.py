@@ -16,7 +16,7 @@ from small_log import ASKED, CONFIG, COULOMB, elbow, elbow_log, write_elbow
 from droid_jax import runtime
 from droid_jax.commands import gap
 from droid_jax.commands.gap_search import IN_BLOCKS
-from droid_jax.gap import workflow
+from droid_jax.gap import missing
 from droid_jax.gap.extended import load_extended
 from droid_jax.gap.results import GapFiles, load_gap
 from droid_jax.gap.single import Log
@@ -106,7 +106,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """A log's search, stopped and taken up again: its folder and what was printed at last."""
     place = tmp_path_factory.mktemp("log")
     words = command(place, [LOG], "--effects", *ASKED)
-    find = workflow.find
+    find = missing.find
 
     def killed(*arguments):
         find(*arguments)
@@ -119,9 +119,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(runtime, "tune", lambda *a, **k: None)
-        patch.setattr(workflow, "find", killed)
+        patch.setattr(missing, "find", killed)
         assert main(words) == 130
-        patch.setattr(workflow, "find", remembered)
+        patch.setattr(missing, "find", remembered)
         with contextlib.redirect_stdout(io.StringIO()) as said:
             assert main(words) == 0
     return place / "run", said.getvalue()

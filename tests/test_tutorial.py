@@ -96,5 +96,6 @@ def test_the_commands_of_the_page_run(copy: Path, capsys: pytest.CaptureFixture[
     (command,) = re.findall(r"^python -m droid_jax\.run (--scene .*)$", text, re.MULTILINE)
     assert main(command.split()) == 0
     out = capsys.readouterr().out
-    assert "gap: The model lacks: joint_coulomb at shoulder." in out and "[2/2] gap" in out
+    assert "The model lacks: joint_coulomb at shoulder." in out and "[2/2] gap" in out
+    assert "gap: The model lacks: joint coulomb at shoulder; " in out
     assert (copy / "runs" / "arm" / "report.html").is_file()

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     import numpy as np
 
     from droid_jax.gap.case import GapConfig
-    from droid_jax.gap.split import Split
     from droid_jax.measure.recording import Recording
     from droid_jax.model.parameters import Space
     from droid_jax.model.scene import Scene
@@ -92,6 +91,7 @@ def run(command: Gap) -> None:
     needs_writer(command.tensorboard)
     runtime.start()
     warn_of_cpu(command.preset)
+    from droid_jax.gap.inputs import shared_out
     from droid_jax.gap.results import write_gap
     from droid_jax.gap.split import Split
     from droid_jax.identify.results import prepare_folder
@@ -143,17 +143,6 @@ def _forget(out: Path) -> None:
         (out / name).unlink(missing_ok=True)
 
 
-def shared_out(scene: Scene, given: list[Recording]) -> tuple[Split, dict[str, Recording]]:
-    """How recordings share the work, and each by its role; ValueError where a search in them could not end well."""
-    from droid_jax.gap.inputs import check_recordings
-    from droid_jax.gap.split import Split, roles_of, split_of
-
-    split = split_of(given)
-    roles = roles_of(split, given)
-    check_recordings(scene, {"only": given[0]} if split is Split.REPEATS else roles)
-    return split, roles
-
-
 def model_of(command: Gap) -> tuple[Scene, Space]:
     """The scene and all that is fitted without any effect, nuisances among it."""
     from droid_jax.model.door import door_nuisances, door_space
@@ -186,16 +175,15 @@ def chosen_effects(command: Gap, scene: Scene, recordings: list[Recording]) -> t
 
     Raises ValueError for unknown names, for effects that this scene cannot have, and where none is left.
     """
+    from droid_jax.gap.candidates import possible
     from droid_jax.model.effects.registry import library
 
     library(scene, command.without)  # names are checked there
-    possible = library(scene, scale=command.effect_scale)
-    if any(not r.command.size for r in recordings):  # a measured motion has no servo that an effect could change
-        possible = tuple(e for e in possible if not e.command and not e.servo)
+    here = possible(scene, recordings, command.effect_scale)
     asked = {e.name for e in library(scene, command.effects or None)}
-    names = {e.name for e in possible}
+    names = {e.name for e in here}
     impossible = [name for name in command.effects if name not in names]
-    left = tuple(e for e in possible if e.name in asked and e.name not in command.without)
+    left = tuple(e for e in here if e.name in asked and e.name not in command.without)
     if impossible or not left:
         what = f"cannot have {', '.join(impossible)}" if impossible else "is left without any effect"
         raise ValueError(f"scene {scene.name!r} {what} here; it can have: {', '.join(sorted(names))}")

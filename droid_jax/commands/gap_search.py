@@ -1,11 +1,10 @@
-"""The search behind `gap`, from top to bottom, going on from what an earlier part of the run kept."""
+"""The search behind `gap` as its command makes it: shown while it runs, timed, going on after a stop."""
 
 from __future__ import annotations
 
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,12 +41,8 @@ def searched(
     start: [F] values of the base parameters from which their fit begins, instead of a search.
     board: folder for scalars of the base fit.
     """
-    from droid_jax.gap.floor import numerical_floor
-    from droid_jax.gap.menu import separating
-    from droid_jax.gap.resume import kept_model, kept_number, remembering
-    from droid_jax.gap.single import base_model
+    from droid_jax.gap.missing import answer
     from droid_jax.gap.split import Split
-    from droid_jax.gap.workflow import base_fit, find
     from droid_jax.report.progress import stages
     from droid_jax.report.scalars import scalars
 
@@ -55,40 +50,9 @@ def searched(
     with stages(names, {"look": config.looked, "refit": config.refitted}) as show, scalars(board) as write:
         clock = Clock(names, (show, write), checkpoints / "seconds.json")
         clock(names[0], None)
-        case = remembering(_case(split, scene, base, effects, roles, config), checkpoints / "replays")
-        if split is Split.BLOCKS:
-            model, floor = kept_model(checkpoints / "base", case.base, lambda: base_model(case)), 0.0
-        else:
-            model = kept_model(checkpoints / "base", case.base, lambda: base_fit(case, clock, start))
-            clock("floor", None)
-            floor = kept_number(checkpoints / "floor", lambda: numerical_floor(case.fit, model, roles["fit"]))
-        verdict = find(case, model, floor, clock)
-        clock("judge", None)
-        if verdict.rivals:
-            tied = (verdict.model, *verdict.rivals)
-            verdict = replace(verdict, experiments=separating(case, tied, roles["fit"]))
+        case, verdict = answer(split, scene, base, effects, roles, config, start, clock, checkpoints)
         clock("judge", None)  # its seconds count
     return case, verdict, clock.seconds
-
-
-def _case(
-    split: Split,
-    scene: Scene,
-    base: Space,
-    effects: Sequence[Effect],
-    roles: Mapping[str, Recording],
-    config: GapConfig,
-) -> Case:
-    """Of recordings with repeats, or of one or two logs without."""
-    from droid_jax.gap.case import make_case
-    from droid_jax.gap.single import make_log, single_case
-    from droid_jax.gap.split import Split
-
-    if split is not Split.BLOCKS:
-        return make_case(scene, base, effects, **roles, config=config)
-    config = replace(config, refine=replace(config.refine, hops=0, spreads=0))  # inverse dynamics is smooth
-    logs = {role: make_log(scene, base, effects, recording, config) for role, recording in roles.items()}
-    return single_case(logs["fit"], base, effects, logs.get("sealed"), config)
 
 
 class Clock:

@@ -196,9 +196,11 @@ def _roles(command: All) -> tuple[str, ...]:
     """
     if not command.recording:
         return tuple(DEMONSTRATIONS)
+    from droid_jax.gap.inputs import shared_out
+
     own = gap.Gap(command.recording, preset=PRESETS[command.preset].identify, **_own(command))
     try:
-        _, roles = gap.shared_out(gap.model_of(own)[0], gap.given_to(own))
+        _, roles = shared_out(gap.model_of(own)[0], gap.given_to(own))
     except ValueError:
         if "gap" in command.stages:
             raise

@@ -7,6 +7,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from droid_jax.measure.recording import Recording
+from droid_jax.model.effects.registry import library
+from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
 
 
@@ -41,6 +44,15 @@ class Candidate:
 def joined(parts: Iterable[Candidate]) -> str:
     """ "latch at door_hinge + drag at door_hinge"."""
     return " + ".join(part.name for part in parts)
+
+
+def possible(scene: Scene, recordings: Iterable[Recording], scale: float = 1.0) -> tuple[Effect, ...]:
+    """The library's effects that could show: a motion without commands has no servo that an effect could change.
+
+    scale: of their forces and torques, see `library`.
+    """
+    commanded = all(r.command.size for r in recordings)
+    return tuple(e for e in library(scene, scale=scale) if commanded or not (e.command or e.servo))
 
 
 def candidates(effects: Iterable[Effect]) -> tuple[Candidate, ...]:

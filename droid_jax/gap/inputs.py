@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
 
+from droid_jax.gap.split import Split, roles_of, split_of
 from droid_jax.measure.recording import Channel, Recording
 from droid_jax.model.scene import Scene
 
@@ -15,6 +16,14 @@ BACKWARDS = 0.25  # share of the way down that a hinge may also go up and still 
 SHUT = 0.05  # rad or m: the same for the thing that is moved, whose camera is noisy
 MISSED = 0.5  # of the usual travel: a repeat that moves the object by less has missed its grasp
 APART = 0.05  # s: repeats that are further apart in time were not cut alike
+
+
+def shared_out(scene: Scene, recordings: Sequence[Recording]) -> tuple[Split, dict[str, Recording]]:
+    """How recordings share the work, and each by its role; ValueError where a search in them could not end well."""
+    split = split_of(recordings)
+    roles = roles_of(split, recordings)
+    check_recordings(scene, {"only": recordings[0]} if split is Split.REPEATS else roles)
+    return split, roles
 
 
 def check_recordings(scene: Scene, roles: Mapping[str, Recording]) -> None:

@@ -73,18 +73,23 @@ class Remembered(Cost):
         return out
 
 
-def kept_model(folder: Path, base: Space, fit: Callable[[], Model]) -> Model:
-    """The base model over the space `base`, from its folder or, where that holds none that is whole, fitted now."""
+def kept_model(folder: Path | None, base: Space, fit: Callable[[], Model]) -> Model:
+    """The base model over the space `base`, from its folder or, where that holds none that is whole, fitted now.
+
+    None: nothing is kept.
+    """
     return _model(base, _kept(folder, lambda: _tree(fit())))
 
 
-def kept_number(folder: Path, compute: Callable[[], float]) -> float:
-    """A number from its folder, computed now where that holds none that is whole."""
+def kept_number(folder: Path | None, compute: Callable[[], float]) -> float:
+    """A number from its folder, computed now where that holds none that is whole; None: nothing is kept."""
     return float(_kept(folder, lambda: {"value": np.array(compute())})["value"])
 
 
-def _kept(folder: Path, make: Callable[[], Tree]) -> Tree:
+def _kept(folder: Path | None, make: Callable[[], Tree]) -> Tree:
     """Damage is reported as a warning that names the checkpoint."""
+    if folder is None:
+        return make()
     with Checkpoints(folder, keep=1) as checkpoints:
         found = checkpoints.restore()
         if found is None:

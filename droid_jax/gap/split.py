@@ -45,8 +45,10 @@ class Split(enum.Enum):
 def split_of(recordings: Sequence[Recording]) -> Split:
     """How one to three recordings are to be used.
 
-    Raises ValueError where they hold too few repeats for any way; it says what can still be done.
+    Raises ValueError where they are more or fewer, or hold too few repeats for any way; it says what can still be done.
     """
+    if not 1 <= len(recordings) <= len(ROLES):
+        raise ValueError(f"recordings: one to three are searched ({', '.join(ROLES)}), got {len(recordings)}")
     first, *others = recordings
     if first.repeats == 1 and not first.command.size and len(others) < 2:
         for other in others:

@@ -1,0 +1,116 @@
+"""The search for a missing effect as one call, however recordings share its work.
+
+The command `gap` makes the same search, goes on after a stop and leaves a folder and a page.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from droid_jax.gap.candidates import possible
+from droid_jax.gap.case import Case, GapConfig, make_case
+from droid_jax.gap.extended import Extended, extended
+from droid_jax.gap.floor import numerical_floor
+from droid_jax.gap.inputs import shared_out
+from droid_jax.gap.menu import separating
+from droid_jax.gap.resume import kept_model, kept_number, remembering
+from droid_jax.gap.single import base_model, make_log, single_case
+from droid_jax.gap.split import Split
+from droid_jax.gap.verdict import Verdict
+from droid_jax.gap.workflow import Progress, base_fit, find
+from droid_jax.measure.recording import Recording
+from droid_jax.model.parameters import Space
+from droid_jax.model.scene import Scene
+from droid_jax.model.seam import Effect
+
+
+def find_missing(
+    scene: Scene,
+    space: Space,
+    recordings: Sequence[Recording],
+    *,
+    effects: Sequence[Effect] | None = None,
+    start: np.ndarray | None = None,
+    config: GapConfig | None = None,
+    progress: Progress | None = None,
+) -> tuple[Verdict, Extended]:
+    """Which physical effect the model lacks, and the model with it (docs/method-gap.md).
+
+    space: all that is fitted without any effect, nuisances among it: `found.full` of an identification.
+    recordings: fit, confirm and perhaps sealed, eight repeats or more of each; or one, sixteen repeats or more, whose
+    second half confirms; or a log of one repeat without commands, alone or with another one that is sealed.
+    effects: to ask about; None for all of the library (`droid_jax.model.effects.registry`) that could show in these.
+    start: [D] physical values over `space`, `found.best`, where the base fit begins instead of with a search; a log
+    without repeats needs neither.
+    progress: called with a stage's name and its progress value.
+
+    The verdict's gaps are in squared noise units of one repeat.  Only another motion tells effects apart that act
+    alike in this one (`Split.limits`).
+    Raises ValueError for recordings in which a search could not end well, and for effects that are none or that a
+    recording without commands cannot have.
+    """
+    split, roles = shared_out(scene, recordings)
+    asked = possible(scene, recordings) if effects is None else tuple(effects)
+    if not asked:
+        raise ValueError("effects: there is none to ask about; None asks about all of the library")
+    start = None if start is None else space.check(start)
+    case, verdict = answer(split, scene, space, asked, roles, config or GapConfig(), start, progress)
+    return verdict, extended(case, verdict.model)
+
+
+def answer(
+    split: Split,
+    scene: Scene,
+    base: Space,
+    effects: Sequence[Effect],
+    roles: Mapping[str, Recording],
+    config: GapConfig,
+    start: np.ndarray | None = None,
+    progress: Progress | None = None,
+    checkpoints: Path | None = None,
+) -> tuple[Case, Verdict]:
+    """Case and verdict of recordings by role (see `shared_out`).
+
+    start: [F] values of the base parameters from which their fit begins, instead of a search.
+    checkpoints: folder of this search alone, from which it goes on after a stop; None keeps nothing.
+    """
+    tell = progress or (lambda stage, value: None)
+
+    def at(name: str) -> Path | None:
+        return None if checkpoints is None else checkpoints / name
+
+    case = _case(split, scene, base, effects, roles, config)
+    if checkpoints is not None:
+        case = remembering(case, checkpoints / "replays")
+    if split is Split.BLOCKS:
+        model, floor = kept_model(at("base"), case.base, lambda: base_model(case)), 0.0
+    else:
+        model = kept_model(at("base"), case.base, lambda: base_fit(case, tell, start))
+        tell("floor", None)
+        floor = kept_number(at("floor"), lambda: numerical_floor(case.fit, model, roles["fit"]))
+    verdict = find(case, model, floor, tell)
+    tell("judge", None)
+    if verdict.rivals:
+        tied = (verdict.model, *verdict.rivals)
+        verdict = replace(verdict, experiments=separating(case, tied, roles["fit"]))
+    return case, verdict
+
+
+def _case(
+    split: Split,
+    scene: Scene,
+    base: Space,
+    effects: Sequence[Effect],
+    roles: Mapping[str, Recording],
+    config: GapConfig,
+) -> Case:
+    """Of recordings with repeats, or of one or two logs without."""
+    if split is not Split.BLOCKS:
+        return make_case(scene, base, effects, **roles, config=config)
+    config = replace(config, refine=replace(config.refine, hops=0, spreads=0))  # inverse dynamics is smooth
+    logs = {role: make_log(scene, base, effects, recording, config) for role, recording in roles.items()}
+    return single_case(logs["fit"], base, effects, logs.get("sealed"), config)

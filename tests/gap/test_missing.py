@@ -1,0 +1,90 @@
+"""The search for a missing effect in one call: one joint, three ways to share the work."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from small_log import CONFIG, COULOMB, elbow, elbow_log, elbow_space
+
+import droid_jax as dj
+from droid_jax.gap import missing
+from droid_jax.gap.candidates import possible
+from droid_jax.gap.split import Split
+from droid_jax.gap.verdict import Kind
+from droid_jax.identify.search import SearchConfig
+from droid_jax.measure.recording import Recording
+from droid_jax.model.effects.registry import library
+from droid_jax.model.parameters import Parameter
+from droid_jax.model.seam import Effect
+
+SEARCH = replace(CONFIG, search=SearchConfig(population=8, parents=None, generations=2), most=1)
+
+LATE = Effect("late", (Parameter("late", "s", 0.0, 0.01, -0.1, 0.1),), command=lambda theta, time, look: look(time))
+THREE = [replace(elbow_log(COULOMB, seconds, 8), name=f"{seconds:g} s") for seconds in (7.0, 6.0, 5.0)]
+
+
+@pytest.mark.parametrize(
+    ("recordings", "judged", "searched"),
+    [
+        (THREE, ["fit", "confirm", "sealed"], True),
+        ([elbow_log(COULOMB, 7.0, repeats=16)], ["fit", "confirm"], True),
+        ([elbow_log(COULOMB)], ["fit", "confirm", "sealed"], False),
+    ],
+    ids=["recordings", "repeats", "blocks"],
+)
+def test_hidden_friction_is_named_and_in_the_extended_model(
+    recordings: Sequence[Recording], judged: list[str], searched: bool
+):
+    scene, stages = elbow(), []
+    verdict, extended = dj.find_missing(
+        scene,
+        elbow_space(scene),
+        recordings,
+        effects=library(scene, ["joint_coulomb", "cable_pull"]),
+        config=SEARCH,
+        progress=lambda stage, value: stages.append(stage),
+    )
+    assert (verdict.kind, verdict.effects) == (Kind.NAMED, ("joint_coulomb at elbow",))
+    assert list(verdict.gaps) == judged and all(verdict.closed(role) > 0.9 for role in judged)
+    assert [part.name for part in extended.parts] == ["joint_coulomb at elbow"]
+    assert extended.space.names == ("elbow_damping", "torque_offset[elbow]", "joint_coulomb[elbow]")
+    np.testing.assert_allclose(extended.values, [0.6, 0.1, COULOMB], rtol=0.1, atol=0.02)
+    assert ("search" in stages) is searched and {"screen", "refit", "judge"} <= set(stages)
+
+
+def test_unless_told_it_asks_about_all_that_could_show(monkeypatch: pytest.MonkeyPatch):
+    scene, begin = elbow(), np.array([0.6, 0.1])
+
+    def answer(split, scene, base, effects, roles, config, start, progress):
+        assert split is Split.RECORDINGS and list(roles) == ["fit", "confirm", "sealed"]
+        assert [e.name for e in effects] == [e.name for e in possible(scene, THREE)] and len(effects) > 5
+        assert config == dj.GapConfig()
+        np.testing.assert_array_equal(start, begin)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(missing, "answer", answer)
+    with pytest.raises(KeyboardInterrupt):
+        dj.find_missing(scene, elbow_space(scene), THREE, start=begin)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"recordings": []}, "one to three are searched (fit, confirm, sealed), got 0"),
+        ({"recordings": [elbow_log(0.0, 2.0, 8)] * 4}, "got 4"),
+        ({"recordings": [elbow_log(0.0, 2.0, 15)]}, "is the only one and has 15 repeats"),
+        ({"recordings": [elbow_log(0.0, 2.0, 8)] * 2}, "the fit and the confirm recording are the same"),
+        ({"effects": ()}, "effects: there is none to ask about"),
+        ({"effects": [LATE]}, "no commands that an effect could change: late"),
+        ({"start": np.zeros(3)}, "expected parameter vectors [..., 2]"),
+    ],
+)
+def test_what_could_not_end_well_is_refused_first(changes: dict[str, Any], said: str):
+    scene = elbow()
+    with pytest.raises(ValueError) as refused:
+        dj.find_missing(scene, elbow_space(scene), **{"recordings": [elbow_log(0.0, 2.0, 16)], **changes})
+    assert said in str(refused.value)
