@@ -13,7 +13,7 @@ import numpy as np
 
 from droid_jax.compare.cost import Cost
 from droid_jax.compare.residuals import Comparison
-from droid_jax.gap.flips import gap_p_values, largest_t
+from droid_jax.gap.flips import gap_p_values, largest_t, steady
 from droid_jax.measure.noise import coarse_clock
 
 # A parameter off its prior's mean is held back by that prior, and what is left of it all repeats share: with the
@@ -114,26 +114,26 @@ class Evidence:
         return self.gap(self.residuals(self.common(values)[0]))
 
     def gap(self, residuals: np.ndarray) -> float:
-        """U of residuals [N, M]."""
-        return gap(residuals)
+        """U of residuals [N, M], without what grows or fades steadily over the repeats."""
+        return gap(steady(residuals))
 
     def gaps(self, residuals: np.ndarray, cells: np.ndarray) -> np.ndarray:
         """[K] U of each cell; cells: [K, M] bool."""
-        return gaps(residuals, cells)
+        return gaps(steady(residuals), cells)
 
     def cell_p_values(self, residuals: np.ndarray, cells: np.ndarray) -> np.ndarray:
         """[K] p-value of each cell's U being above zero."""
-        return gap_p_values(residuals, cells)
+        return gap_p_values(steady(residuals), cells)
 
     def largest(
         self, scores: np.ndarray, marks: np.ndarray, base: np.ndarray, prior: np.ndarray, seed: int = 0
     ) -> tuple[np.ndarray, float]:
         """[K] t of K questions, and the p-value of the largest |t| under flips of whole repeats.
 
-        scores: [K, N] of projected marks [K, M].  base: [M, D] columns they were projected on, with
-        prior deviations [D]; repeats need neither.
+        scores: [K, N] of projected marks [K, M], of which what grows or fades steadily over the repeats is left out.
+        base: [M, D] columns they were projected on, with prior deviations [D]; repeats need neither.
         """
-        return largest_t(scores, seed)
+        return largest_t(steady(scores.T).T, seed)
 
     def losses(self, commons: np.ndarray, draws: np.ndarray) -> np.ndarray:
         """[R, K] squared mean residual of K models in resamples of the repeats, up to what all models share.

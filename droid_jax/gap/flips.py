@@ -10,9 +10,22 @@ from __future__ import annotations
 import numpy as np
 import scipy.stats
 
+from droid_jax.measure.noise import untrended
+
 EXACT = 12  # up to this many repeats all flips are tried
 DRAWS = 4096
 FEWEST = 8  # repeats; with six the smallest possible p is 0.03
+
+
+def steady(x: np.ndarray) -> np.ndarray:
+    """x [N, ...] of repeats without its trend over their order: the same mean, the scatter of N - 2 degrees of freedom.
+
+    What grows or fades steadily over the repeats (a friction or a sensor that warms up) is no noise.
+    """
+    if len(x) < 3:
+        return x
+    mean = x.mean(axis=0)
+    return mean + (untrended(x) - mean) * np.sqrt((len(x) - 1) / (len(x) - 2))
 
 
 def sign_flips(repeats: int, seed: int = 0) -> np.ndarray:

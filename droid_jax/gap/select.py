@@ -9,7 +9,7 @@ import numpy as np
 import scipy.stats
 
 from droid_jax.gap.evidence import Evidence
-from droid_jax.gap.flips import sign_flips, t_values
+from droid_jax.gap.flips import sign_flips, steady, t_values
 from droid_jax.gap.refit import LEVEL, Model, deviations, intervals
 
 SIGNIFICANT = 0.01  # p below which something is missing
@@ -20,6 +20,7 @@ OF_ALL = 0.05  # and share of the base model's U: what a wrong form of the first
 DOUBT = 0.05  # share of the resamples in which a rival is better, from which it does as well
 CHOSEN = 0.8  # share of the resamples in which an effect, or one that does as well, must win
 RESAMPLES = 400
+GENERAL = 0.9  # times what an effect leaves above the floor, below which one that holds it as a special case must get
 TOO_SMALL = "too small to be worth a name"
 AT_BOUND = "ran into its bound"
 UNCONFIRMED = "not confirmed by the other demonstration"
@@ -56,15 +57,6 @@ def one_sided_p(gain: np.ndarray) -> float:
     """p-value of gains [N] being above zero on average, by sign flips.  What grows or fades steadily is no noise."""
     t = t_values(steady(gain)[None], sign_flips(len(gain)))[:, 0]
     return float(np.mean(t >= t[0] - 1e-12))
-
-
-def steady(x: np.ndarray) -> np.ndarray:
-    """x [N] without its trend over the order: the same mean, and the scatter of N - 2 degrees of freedom."""
-    if len(x) < 3:
-        return x
-    order = np.arange(len(x)) - (len(x) - 1) / 2
-    left = x - x.mean() - order * (order @ x) / (order @ order)
-    return x.mean() + left * np.sqrt((len(x) - 1) / (len(x) - 2))
 
 
 def resamples(count: int, seed: int = 0) -> np.ndarray:

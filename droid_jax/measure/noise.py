@@ -17,6 +17,8 @@ RATE = 20.0  # Hz of the coarse clock
 # Lags beyond this are noise of the estimate: ten repeats tell a hundred of them with nine degrees of freedom each, the
 # weights then depend on the mean that they weigh, and p-values of nothing are too small (tests/gap/test_null.py).
 LONGEST = 1.0  # s
+# Repeats from which on what grows or fades steadily from one to the next (a sensor that warms up) is no noise.
+STEADY = 5
 
 
 def coarse_clock(start: float, end: float, rate: float = RATE) -> np.ndarray:
@@ -81,7 +83,8 @@ def estimate_noise(
 
     measured: [N, K, C] bool, all unless given; what was not holds the mean of the others, and counts for nothing.
 
-    Per column, the repeats' deviations from their mean are a constant of each repeat and a stationary rest.
+    Per column, the repeats' deviations from their mean, from STEADY repeats on without their trend over the order, are
+    a constant of each repeat and a stationary rest.
     The rest's autocovariance (biased, hence positive semi-definite) is tapered to LONGEST by a Parzen window,
     shrunk towards white noise of the same variance, and never less than `minimum` (a deviation in the channel's
     unit: what one repeat alone would have); the constants' variance is added to it.  With one repeat only `minimum`
@@ -108,8 +111,10 @@ def _lags(error: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, float]:
 
     seen: [N, K] bool; both are zero for what but one repeat measured.
     """
-    length = error.shape[1]
-    lengths, freedom = seen.sum(axis=1, keepdims=True), (seen.sum(axis=0) - 1).clip(0).sum()
+    length, count = error.shape[1], seen.sum(axis=0)
+    enough = count >= STEADY
+    error = np.where(enough, untrended(error, seen), error)
+    lengths, freedom = seen.sum(axis=1, keepdims=True), (count - 1 - enough).clip(0).sum()
     if freedom == 0:
         return np.zeros(length), 0.0
     constants = error.sum(axis=1, where=seen, keepdims=True) / np.maximum(lengths, 1)
@@ -120,6 +125,19 @@ def _lags(error: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, float]:
     window = np.zeros(length)
     window[: longest + 1] = parzen(2 * longest + 1)[longest : longest + length]
     return lags * window, float(np.sum(lengths * constants**2) / freedom)
+
+
+def untrended(x: np.ndarray, seen: np.ndarray | None = None) -> np.ndarray:
+    """x [N, ...] without its straight line over the order of the rows; their mean stays.
+
+    seen: bool of the same shape, which entries count; all unless given.  Where fewer than two do, x stays.
+    """
+    seen = np.ones(x.shape, bool) if seen is None else seen
+    count = np.maximum(seen.sum(axis=0), 1)
+    order = np.arange(len(x)).reshape(-1, *[1] * (x.ndim - 1))
+    order = np.where(seen, order - np.sum(order * seen, axis=0) / count, 0.0)
+    slope = np.sum(order * x, axis=0) / np.maximum(np.sum(order**2, axis=0), 1e-30)
+    return x - order * slope
 
 
 def correlation_time(residuals: np.ndarray, rate: float = RATE) -> np.ndarray:

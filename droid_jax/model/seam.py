@@ -74,6 +74,8 @@ class Effect:
     For the gap search:
     what, mark:   a sentence each: what it is, and where its mark should appear.
     confused_with: names of effects that look alike on some data.
+    holds:        names of those that are special cases of it, or nearly so over the range of a motion: where one of
+                  them does as well, this one is no rival of it.
     places:       place -> the amplitudes there, e.g. {"joint3": ("joint_coulomb[joint3]",)}; without
                   them the effect is of no interest to the search.
     shapes:       parameters that matter only beside an amplitude, and the values to try.
@@ -91,6 +93,7 @@ class Effect:
     what: str = ""
     mark: str = ""
     confused_with: tuple[str, ...] = ()
+    holds: tuple[str, ...] = ()
     places: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     shapes: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     smallest: float = 0.0

@@ -71,7 +71,10 @@ ANSWERS: dict[str, Answer] = {
     "bristle_friction": Answer("joint_coulomb", why="bristles bend by milliradians before they slip"),
     "warm_up_friction": Answer("joint_coulomb", why="what its repeats share is dry friction; the rest counts as noise"),
     "payload": Answer("payload", scenes=("arm", "door")),
-    "cable_pull": Answer("cable_pull"),
+    "cable_pull": Answer(
+        "cable_pull", parts=("joint_directional", "joint_coulomb", "joint_stribeck"),
+        why="it rubs in its clamps with a tenth of its pull, which is friction",
+    ),
     "torque_ripple": Answer("torque_ripple"),
     "joint_elasticity": Answer(
         "joint_compliance", ("servo_gain",), "1 / (1 + k c) on a position servo is exactly a lower gain", SERVO

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from droid_jax.gap.flips import largest_t
+from droid_jax.gap.flips import largest_t, steady
 from droid_jax.gap.screen import project
 from droid_jax.measure.noise import RATE, estimate_noise
 
@@ -28,20 +28,26 @@ def sensor_noise(rng: np.random.Generator) -> np.ndarray:
     return slow + rng.normal(size=(REPEATS, LENGTH))
 
 
-def case(seed: int, missing: float) -> tuple[float, int]:
-    """The screening's p, and which of twelve questions it answers with; the third is there, `missing` of it."""
+def case(seed: int, missing: float, drift: float = 0.0) -> tuple[float, int]:
+    """The screening's p, and which of twelve questions it answers with; the third is there, `missing` of it.
+
+    drift: by which every repeat lies above the one before it.
+    """
     rng = np.random.default_rng(seed)
     base, marks = smooth_curves(rng, 5), smooth_curves(rng, 12)
     prior = np.full(5, 10.0)  # far wider than what the data tell
     marks = marks - base @ np.linalg.lstsq(base, marks, rcond=None)[0]
-    noise = estimate_noise((sensor_noise(rng) + missing * marks[:, 2])[:, :, None], minimum=1e-3)
+    repeats = sensor_noise(rng) + missing * marks[:, 2]
+    if drift:
+        repeats += drift * (np.arange(REPEATS)[:, None] - (REPEATS - 1) / 2)
+    noise = estimate_noise(repeats[:, :, None], minimum=1e-3)
     of_repeat = noise.whitener[0] / np.sqrt(REPEATS)
     columns, questions = of_repeat @ base, project((of_repeat @ marks).T, of_repeat @ base, prior)
     residuals = noise.repeats[:, :, 0] @ of_repeat.T
     common = residuals.mean(axis=0)
     weights = columns.T @ columns + np.diag(prior**-2) / REPEATS
     residuals = residuals - columns @ np.linalg.solve(weights, columns.T @ common)
-    t, p = largest_t(questions @ residuals.T)
+    t, p = largest_t(steady(residuals @ questions.T).T)
     return p, int(np.argmax(np.abs(t)))
 
 
@@ -60,3 +66,10 @@ def test_where_nothing_is_missing_p_values_are_uniform(nothing: np.ndarray, leve
 def test_what_is_missing_is_found():
     found = [case(seed, 0.3) for seed in range(100)]
     assert np.mean([p < 0.01 and best == 2 for p, best in found]) > 0.9
+
+
+def test_a_sensor_that_warms_up_from_repeat_to_repeat_hides_nothing():
+    """Its drift is no noise: all that is found without it is found with it, and nothing is found where nothing is."""
+    found = [case(seed, 0.3, drift=1.0) for seed in range(100)]
+    assert np.mean([p < 0.01 and best == 2 for p, best in found]) > 0.9
+    assert np.mean([case(seed, 0.0, drift=1.0)[0] < 0.05 for seed in range(200)]) < 0.1

@@ -11,7 +11,7 @@ import pytest
 from droid_jax.gap.blocks import OUTSIDE, Blocks
 from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.evidence import Evidence
-from droid_jax.gap.rounds import Budget, Hunt, plainest, without
+from droid_jax.gap.rounds import Budget, Hunt, holding, plainest, without
 
 
 def model(effect: str, amplitudes: int, shapes: int, left: float) -> Any:
@@ -26,6 +26,27 @@ def test_the_fewest_parameters_lead_and_among_equals_the_smallest_gap() -> None:
     )
     assert plainest([stribeck, coulomb, bias]) == coulomb
     assert plainest([stribeck]) == stribeck
+
+
+def test_one_that_holds_the_leader_as_a_special_case_is_told_from_other_rivals() -> None:
+    """Stribeck's friction holds dry friction at its own joint, and no other; the same in a model of two effects."""
+    effects: Any = [
+        SimpleNamespace(name="coulomb", holds=()),
+        SimpleNamespace(name="stribeck", holds=("coulomb",)),
+        SimpleNamespace(name="bias", holds=()),
+    ]
+
+    def of(*parts: tuple[str, str]) -> Any:
+        return SimpleNamespace(parts=[Candidate(effect, place, ()) for effect, place in parts])
+
+    plain = of(("coulomb", "elbow"))
+    others = [plain, of(("stribeck", "elbow")), of(("stribeck", "wrist")), of(("bias", "elbow"))]
+    assert holding(effects, plain, [*others, of(("stribeck", "elbow"), ("bias", "elbow"))]) == [
+        False, True, False, False, False
+    ]  # fmt: skip
+    both = of(("bias", "hinge"), ("coulomb", "elbow"))
+    assert holding(effects, both, [of(("bias", "hinge"), ("stribeck", "elbow")), others[1]]) == [True, False]
+    assert holding(effects, others[1], [plain]) == [False]  # not the other way round
 
 
 def test_a_shape_stays_where_its_effect_does() -> None:

@@ -10,8 +10,9 @@ from small_gap import FLOOR, Small, small
 
 from droid_jax.gap import select
 from droid_jax.gap.candidates import candidates
+from droid_jax.gap.flips import steady
 from droid_jax.gap.refit import deviations, intervals, refit
-from droid_jax.gap.select import UNCONFIRMED, _gap_reasons, judge, one_sided_p, steady
+from droid_jax.gap.select import UNCONFIRMED, _gap_reasons, judge, one_sided_p
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from droid_jax.measure.noise import RATE, coarse_clock, correlation_time, discrepancy, estimate_noise, lowpass, smooth
+from droid_jax.measure.noise import (
+    RATE,
+    coarse_clock,
+    correlation_time,
+    discrepancy,
+    estimate_noise,
+    lowpass,
+    smooth,
+    untrended,
+)
 
 CLOCK = np.arange(0, 6.0, 0.002)
 COARSE = coarse_clock(0.0, float(CLOCK[-1]))
@@ -237,3 +246,28 @@ def test_the_stated_deviation_makes_correlated_residuals_count_once():
     np.testing.assert_allclose(discrepancy(averaged), [0.3, 3.0], rtol=0.25)
     noise = estimate_noise(averaged[None, :30], minimum=0.01).stated(np.array([0.3, 3.0]))
     np.testing.assert_allclose(noise.whitener, np.eye(30) / np.array([0.3, 3.0])[:, None, None])
+
+
+def test_a_trend_over_the_order_is_taken_away_and_the_mean_stays():
+    rng = np.random.default_rng(5)
+    rest, slope = rng.normal(size=(9, 4)), np.array([2.0, 0.0, -1.0, 30.0])
+    with_trend = rest + (np.arange(9)[:, None] - 4.0) * slope
+    np.testing.assert_allclose(untrended(with_trend), untrended(rest), atol=1e-12)
+    np.testing.assert_allclose(untrended(with_trend).mean(axis=0), rest.mean(axis=0), atol=1e-12)
+    seen = rng.uniform(size=(9, 4)) < 0.7
+    found = untrended(np.where(seen, with_trend, 0.0), seen)
+    for k in range(4):
+        at = np.flatnonzero(seen[:, k])
+        line = np.polynomial.Polynomial.fit(at, with_trend[at, k], 1)
+        expected = with_trend[at, k] - line(at) + with_trend[at, k].mean()
+        np.testing.assert_allclose(found[at, k], expected, atol=1e-10)
+
+
+@pytest.mark.parametrize(("repeats", "forgiven"), [(10, True), (4, False)])
+def test_what_warms_up_from_repeat_to_repeat_is_no_noise(repeats: int, forgiven: bool):
+    """Of few repeats a trend is not told from chance."""
+    rng = np.random.default_rng(6)
+    calm = rng.normal(0, 0.1, (repeats, 200, 1))
+    warming = calm + 0.5 * (np.arange(repeats) - (repeats - 1) / 2)[:, None, None]
+    still, moving = (estimate_noise(r, minimum=1e-3).whitener[0] @ np.ones(200) for r in (calm, warming))
+    assert bool(np.linalg.norm(moving) > 0.95 * np.linalg.norm(still)) is forgiven

@@ -30,6 +30,7 @@ def cable_pull(scene: Scene) -> Effect | None:
         what="a cable or hose that pulls on a joint of the arm",
         mark="smooth in the position of one joint, the same at every speed",
         confused_with=("payload", "torque_bias"),
+        holds=("torque_bias",),  # a pull that does not change with the angle
         places=a.places(joints, STIFFNESS, PULL),
         smallest=0.1,
     )

@@ -43,6 +43,7 @@ def joint_stribeck(scene: Scene) -> Effect | None:
         what="friction of a joint of the arm that is higher at rest than in motion",
         mark="breakaway and reversals of that joint",
         confused_with=("joint_coulomb",),
+        holds=("joint_coulomb",),  # a speed beyond all that the joint has
         places=a.places(joints, JOINT),
         shapes={JOINT_SPEED: SPEEDS, JOINT_EXPONENT: a.EXPONENTS},
         smallest=0.05,

@@ -28,6 +28,7 @@ def tilted_frame(scene: Scene) -> Effect | None:
         what="a frame out of plumb, so that gravity moves the door",
         mark="smooth over the angle, the same at every speed and in both directions",
         confused_with=("hinge_preload", "hardening_spring"),
+        holds=("hinge_preload",),  # its cosine, over a small angle
         places={joint: (SINE, COSINE)},
         smallest=0.05,
     )

@@ -33,7 +33,8 @@ class Oracle:
     """An effect at some values of its parameters.
 
     edit:  what it is in an MJCF, where MuJoCo has it.
-    force: torque on joints.  loss: friction loss on top of theirs, the sum at least zero.
+    force: torque on joints; beside: what `edit` has no words for.
+    loss:  friction loss on top of theirs, the sum at least zero.
     late:  s, of the command.  lead: rad by which motors are ahead of their links.
     read:  (values, time [T], torque [T,J]) -> [T,J], what the sensor makes of it.
     joints: those to compare.
@@ -42,6 +43,7 @@ class Oracle:
     values: Values
     edit: Callable[[mujoco.MjSpec, Values], None] | None = None
     force: Callable[[Values, Now], ByJoint] | None = None
+    beside: Callable[[Values, Now], ByJoint] | None = None
     loss: Callable[[Values, Now], ByJoint] | None = None
     late: Callable[[Values], float] | None = None
     lead: Callable[[Values, Now], ByJoint] | None = None
@@ -93,6 +95,12 @@ def lump(spec: mujoco.MjSpec, v: Values) -> None:
     spec.body("hand").add_body(name="lump").add_geom(
         type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-3, 0, 0], mass=v["payload_mass"], contype=0, conaffinity=0
     )
+
+
+def hangs_further_out(v: Values, now: Now) -> ByJoint:
+    """The hand's centre lies straight below the elbow where all angles are zero, and so does what hangs further out."""
+    leans = now.q["shoulder"] + now.q["elbow"] - ELBOW_REFERENCE
+    return dict.fromkeys(ARM, -GRAVITY * v["payload_moment"] * np.sin(leans))
 
 
 def other_gains(spec: mujoco.MjSpec, share: Callable[[float, str], float]) -> None:
@@ -189,7 +197,7 @@ ORACLES = {
     ),
     "opening_check": Oracle({"check_damping": 2.5, "check_angle": 0.4, "check_exponent": 1.7}, force=at_door(check)),
     "over_centre_spring": Oracle({"over_centre_torque": 1.5, "over_centre_angle": 0.25}, force=at_door(over_centre)),
-    "payload": Oracle({"payload_mass": 0.3}, edit=lump),
+    "payload": Oracle({"payload_mass": 0.3, "payload_moment": -0.04}, edit=lump, beside=hangs_further_out),
     "sensor_delay": Oracle(
         {"sensor_delay": 0.0077},
         read=lambda v, t, torque: np.stack([np.interp(t - v["sensor_delay"], t, c) for c in torque.T], axis=1),

@@ -94,6 +94,10 @@ def test_what_it_may_be_confused_with_exists(effect: Effect):
     assert len(set(effect.confused_with)) == len(effect.confused_with)
 
 
+def test_what_it_holds_is_among_what_it_may_be_confused_with(effect: Effect):
+    assert set(effect.holds) <= set(effect.confused_with)
+
+
 def test_it_does_something(effect: Effect):
     functions = (effect.command, effect.servo, effect.force, effect.frictionloss, effect.observe)
     assert any(functions) or all(p.writes for p in effect.parameters)

@@ -49,7 +49,8 @@ def in_c(drive: Drive, oracle: Oracle, *, late: float) -> np.ndarray:
         data.ctrl[:] = ctrl
         for joint, lead in (oracle.lead(v, now) if oracle.lead else {}).items():
             data.ctrl[servos[joint]] -= lead
-        for joint, push in (oracle.force(v, now) if oracle.force and by_hand else {}).items():
+        pushes = oracle.force if by_hand else oracle.beside
+        for joint, push in (pushes(v, now) if pushes else {}).items():
             data.qfrc_applied[dofs[joint]] = push
         for joint, more in (oracle.loss(v, now) if oracle.loss and by_hand else {}).items():
             model.dof_frictionloss[dofs[joint]] = max(losses[dofs[joint]] + more, 0.0)
