@@ -129,7 +129,8 @@ def describe(case: Case, verdict: Verdict) -> dict[str, Any]:
             name: float(verdict.model.values[space.index(name)]) for part in verdict.model.parts for name in part.shapes
         },
         "trials": [
-            {"name": t.name, "gap_fit": t.gap_fit, "gap_confirm": t.gap_confirm, "reasons": list(t.reasons)}
+            {"name": t.name, "gap_fit": t.gap_fit, "gap_confirm": t.gap_confirm, "p": t.p, "chosen": t.chosen}
+            | {"rivals": list(t.rivals), "reasons": list(t.reasons)}
             for t in verdict.trials
         ],
     }
