@@ -2,12 +2,16 @@
 
     python experiments/pad_friction.py [--quick] [--out DIR] [--setting paper] [--frictions 0.05 0.005]
 
-Two fingers of about 36 N pull with 72 N times the pads' friction at a lever of 0.3 m: 1.1 N m at 0.05, 0.1 at 0.005.  A
-policy that still opens a door which takes more than that hooks or pushes it.  Which of the two forces of the pads opens
-the door with the robot's own pads, the pull of friction or the push across the pads, is measured as work.
+What opens the door is measured as work, at every step of the simulation: the torque about the hinge of what the pads
+do to the knob, over the hinge's motion until the door is open.  Its four parts add up to all that the contacts do:
+across, of the pads' normal forces at right angles to the knob's axis (they push or turn the knob sideways, on the lever
+by which it stands out from the door); along, of normal forces along that axis (on the knob's round ends); sliding, of
+friction (the pull of a grip); torsional, of friction's couple about the normals (a twist).
 
-Writes DIR/pad_friction_SETTING.json: success of every policy that has been made, by friction, beside its success with
-the robot's own pads, which is Table II's; and the work in J until the door is open.
+Writes DIR/pad_friction_SETTING.json, for every policy that has been made and every kind of pads ("own": the setting's,
+whose trials are Table II's; else by sliding friction): success_rate; grip_time_share, of a trial's time, in which the
+grip is on; largest_angle_deg; and of the first few trials opened, how many opened the door, and for each of these
+grip_way_share, of the door's way to open, that it goes with the grip on, and work_j by part.
 """
 
 from __future__ import annotations
@@ -24,6 +28,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
 import tuned  # noqa: E402, F401  (before jax starts)
 
 # isort: split
+import copy  # noqa: E402
 import json  # noqa: E402
 
 import mujoco  # noqa: E402
@@ -36,7 +41,8 @@ from benchmarks.common import origin, stem  # noqa: E402
 from droid_jax.model.door_scene import door_scene  # noqa: E402
 from droid_jax.policy.control import Policy, load  # noqa: E402
 from droid_jax.policy.door_env import DoorEnv  # noqa: E402
-from droid_jax.policy.task import Task  # noqa: E402
+from droid_jax.policy.hand import finger_forces_c, hand_of, looked  # noqa: E402
+from droid_jax.policy.task import Task, gripped  # noqa: E402
 from droid_jax.policy.transfer import StandIn, TransferConfig, stand_in, transfer, watched  # noqa: E402
 from droid_jax.report.files import POLICY  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
@@ -45,7 +51,9 @@ from experiments.policies.robots import pads_of, truth_of  # noqa: E402
 from experiments.policies.settings import SETTINGS, Setting  # noqa: E402
 from experiments.policies.table import METHODS  # noqa: E402
 
-WATCHED = 5  # trials of each policy with the robot's own pads
+PARTS = ("across", "along", "sliding", "torsional")
+WATCHED = 5  # trials of each policy with each kind of pads
+NEEDED = 0.2  # a policy that succeeds more often without friction does not need its grip
 
 
 @dataclass(frozen=True)
@@ -66,45 +74,84 @@ class Arguments:
     """Folder of the result."""
 
 
-def robots(setting: Setting, arguments: Arguments) -> tuple[StandIn, dict[float, StandIn]]:
-    """The setting's robot, and the same with pads of each friction; it hears the same noise with all."""
+def robots(setting: Setting, arguments: Arguments) -> dict[str, StandIn]:
+    """The setting's robot ("own") and the same with pads of each friction; it hears the same noise with all."""
     task = Task(**{**setting.task, **({"steps": QUICK_STEPS} if arguments.quick else {})})
     start = DoorEnv(door_scene(timestep=TIMESTEP, limits=True), task).start
     config = TransferConfig(trials=1 if arguments.quick else arguments.trials, seed=setting.robot)
     scene, truth = door_scene(limits=True), truth_of(setting)
-
-    def robot(pads: Mapping[str, float]) -> StandIn:
-        return stand_in(scene, start, {**truth, **pads}, (), task, config)
-
-    return robot({}), {mu: robot(pads_of(mu)) for mu in arguments.frictions}
+    pads: dict[str, Mapping[str, float]] = {"own": {}, **{f"{mu:g}": pads_of(mu) for mu in arguments.frictions}}
+    return {name: stand_in(scene, start, {**truth, **of}, (), task, config) for name, of in pads.items()}
 
 
 def hinge_torques(model: mujoco.MjModel, data: mujoco.MjData, knob: int, hinge: int) -> np.ndarray:
-    """[2] N m on the hinge, of what presses the knob: across its surfaces, and along them (friction)."""
-    found, wrench = np.zeros(2), np.zeros(6)
+    """[4] N m about the hinge of what the pads do to the knob in MuJoCo's last step, by PARTS."""
+    found, wrench, stem_axis = np.zeros(4), np.zeros(6), data.geom_xmat[knob].reshape(3, 3)[:, 2]
     for index, contact in enumerate(data.contact):
         if knob not in (contact.geom1, contact.geom2):
             continue
         mujoco.mj_contactForce(model, data, index, wrench)
         axes = contact.frame.reshape(3, 3) * (1.0 if contact.geom2 == knob else -1.0)
-        lever, axis = contact.pos - data.xanchor[hinge], data.xaxis[hinge]
-        found += [np.cross(lever, wrench[part] @ axes[part]) @ axis for part in (slice(0, 1), slice(1, 3))]
+        normal, sliding, couple = wrench[0] * axes[0], wrench[1:3] @ axes[1:], wrench[3:] @ axes
+        along = (normal @ stem_axis) * stem_axis
+        turning = np.cross(data.xaxis[hinge], contact.pos - data.xanchor[hinge])  # m of the contact's path per rad
+        found += [(normal - along) @ turning, along @ turning, sliding @ turning, couple @ data.xaxis[hinge]]
     return found
 
 
-def work(policy: Policy, robot: StandIn, number: int) -> np.ndarray:
-    """[2] J that both forces of the pads do on the hinge in a trial, until the door is open."""
-    model = robot.scene.model
-    knob, hinge = robot.scene.id("geom", "knob"), robot.scene.id("joint", str(robot.scene.object_joint))
-    seen: list[np.ndarray] = []
+class Opening:
+    """Watches a trial until the door is open, step by step on a copy that takes the same actions.
 
-    def watch(data: mujoco.MjData) -> None:
-        seen.append(np.append(hinge_torques(model, data, knob, hinge), data.qpos[model.jnt_qposadr[hinge]]))
+    opened: whether it is.  way: rad that the door has come from where it was shut, and of these held: with the grip
+    on.  work: [4] J by PARTS.
+    """
 
-    watched(policy, robot, number, watch)
-    path = np.array(seen)
-    opened = np.argmax(path[:, 2] > robot.task.opened) or len(path)
-    return (path[1:opened, :2] * np.diff(path[:opened, 2:], axis=0)).sum(axis=0)
+    def __init__(self, robot: StandIn):
+        self.robot, self.hand = robot, hand_of(robot.scene)
+        self.knob, self.hinge = robot.scene.id("geom", "knob"), robot.scene.id("joint", str(robot.scene.object_joint))
+        self.opened, self.way, self.held, self.work = False, 0.0, 0.0, np.zeros(4)
+        self.copy: mujoco.MjData | None = None
+
+    def __call__(self, data: mujoco.MjData) -> None:
+        """What `watched` calls before each action and at the end."""
+        if self.copy is None:
+            self.copy = copy.copy(data)
+        elif not self.opened:
+            self.copy.ctrl[:] = data.ctrl
+            self._step(self.robot.scene.model, self.copy)
+            if not self.opened and not np.array_equal(self.copy.qpos, data.qpos):
+                raise RuntimeError(f"the copy has left the trial at {data.time:g} s")
+
+    def _step(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        """One action; the copy needs no more than the opening's part of the last one."""
+        task, before = self.robot.task, self.way
+        for _ in range(round(task.control / self.robot.config.timestep)):
+            angle = data.qpos[self.hand.hinge]
+            mujoco.mj_step(model, data)
+            moved = data.qpos[self.hand.hinge] - angle
+            self.work += moved * hinge_torques(model, data, self.knob, self.hinge)
+            self.way = max(self.way, angle + moved)
+            self.opened = angle + moved >= task.opened
+            if self.opened:
+                break
+        mujoco.mj_kinematics(model, data)  # mj_step leaves places as they were before its last step
+        forces = finger_forces_c(self.hand, model, data)
+        seen = looked(self.hand, data, forces, np.zeros((2, 3)), task.control, np)
+        self.held += (self.way - before) * bool(gripped(task, seen))
+
+
+def openings(policy: Policy, robot: StandIn, trials: int) -> dict[str, Any]:
+    """What opens the door in a policy's first trials."""
+    each = [Opening(robot) for _ in range(trials)]
+    for number, opening in enumerate(each):
+        watched(policy, robot, number, opening)
+    done = [opening for opening in each if opening.opened]
+    joule = np.array([opening.work for opening in done]).reshape(-1, len(PARTS)).round(4)
+    return {
+        "opened": len(done),
+        "grip_way_share": [round(opening.held / opening.way, 3) for opening in done],
+        "work_j": {part: joule[:, k].tolist() for k, part in enumerate(PARTS)},
+    }
 
 
 def made(arguments: Arguments) -> list[dict[str, Any]]:
@@ -118,23 +165,21 @@ def made(arguments: Arguments) -> list[dict[str, Any]]:
     return list(first.values()) if arguments.quick else by_method
 
 
-def rows(arguments: Arguments) -> Iterator[Mapping[str, Any]]:
-    """Success, share of actions with the grip on and largest angle of each policy, by friction; work of own pads."""
-    own, by_friction = robots(SETTINGS[arguments.setting], arguments)
+def rows(arguments: Arguments) -> Iterator[dict[str, Any]]:
+    """Each policy, by pads."""
+    by_pads, few = robots(SETTINGS[arguments.setting], arguments), 1 if arguments.quick else WATCHED
     for case in track(made(arguments), "policies", console=Console(stderr=True)):
         policy = load(arguments.policies / "trained_cases" / case["trained"] / POLICY)
-        tried = {mu: transfer(policy, robot) for mu, robot in by_friction.items()}
-        joule = np.array([work(policy, own, number) for number in range(1 if arguments.quick else WATCHED)])
-        yield {
-            "method": case["method"],
-            "seed": case["seed"],
-            "trained": case["trained"],
-            "own_pads": case["stand_in"]["success_rate"],
-            "work_j": {"across": joule[:, 0].round(4).tolist(), "friction": joule[:, 1].round(4).tolist()},
-            "success_rate": {f"{mu:g}": trials.rate for mu, trials in tried.items()},
-            "grip": {f"{mu:g}": float(trials.grip.mean()) for mu, trials in tried.items()},
-            "angle_deg": {f"{mu:g}": trials.to_json()["angle_deg"]["mean"] for mu, trials in tried.items()},
-        }
+        row = {"policy": f"{case['method']} {case['seed']}", "trained": case["trained"], "pads": {}}
+        for name, robot in by_pads.items():
+            tried = case["stand_in"] if name == "own" else transfer(policy, robot).to_json()
+            row["pads"][name] = {
+                "success_rate": tried["success_rate"],
+                "grip_time_share": tried["grip"]["mean"],
+                "largest_angle_deg": tried["angle_deg"]["mean"],
+                **openings(policy, robot, few),
+            }
+        yield row
 
 
 def main() -> None:
@@ -142,10 +187,12 @@ def main() -> None:
     if arguments.setting not in SETTINGS:
         raise SystemExit(f"error: unknown setting {arguments.setting!r}; valid: {', '.join(SETTINGS)}")
     found = list(rows(arguments))
-    most = {f"{mu:g}": max(row["success_rate"][f"{mu:g}"] for row in found) for mu in arguments.frictions}
-    summary = {"setting": arguments.setting, "policies": len(found), "most_successful": most}
+    by_friction = (f"{mu:g}" for mu in arguments.frictions)
+    free = {mu: [row["policy"] for row in found if row["pads"][mu]["success_rate"] >= NEEDED] for mu in by_friction}
+    summary = {"setting": arguments.setting, "policies": len(found), "do_not_need_their_grip": free}
+    counts = {"trials": 1 if arguments.quick else arguments.trials, "watched": 1 if arguments.quick else WATCHED}
     path = arguments.out / f"{stem('pad_friction', arguments.quick)}_{arguments.setting}.json"
-    write_json(path, {**summary, "trials": 1 if arguments.quick else arguments.trials, "rows": found, **code})
+    write_json(path, {**summary, **counts, "rows": found, **code})
     print(json.dumps(summary))
 
 
