@@ -15,8 +15,8 @@ from droid_jax.report.style import (
     MEASURED,
     TRUTH,
     WIDE,
+    label_bottom,
     legend,
-    panel_columns,
     panel_grid,
     styled,
 )
@@ -42,7 +42,7 @@ def parameter_history(
     generation = np.asarray(history["generation"], dtype=float)
     figure, panels = panel_grid(len(chosen), width, height=1.8)
     end = generation[-1] + 0.04 * (generation[-1] - generation[0] + 1)
-    for i, (axes, name) in enumerate(zip(panels, chosen, strict=True)):
+    for axes, name in zip(panels, chosen, strict=True):
         p, d = of[name], column[name]
         mean, std = np.asarray(history["mean"])[:, d], np.asarray(history["std"])[:, d]
         axes.fill_between(generation, mean - std, mean + std, color=AFTER, alpha=0.2, linewidth=0, label="± deviation")
@@ -53,7 +53,7 @@ def parameter_history(
         axes.set_title(label(name))
         axes.set_ylabel(f"[{p['unit'] or '–'}]")
         axes.locator_params(axis="y", nbins=5)
-        axes.set_xlabel("Generation" if i >= len(chosen) - panel_columns(width) else "")
+    label_bottom(panels, width, "Generation")
     legend(figure, panels, width, columns=4)
     return figure
 
