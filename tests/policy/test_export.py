@@ -25,8 +25,8 @@ def policy() -> Policy:
     sizes = (OBSERVED, 64, 64, 2 * ACTIONS)
     weights = tuple(np.float32(rng.normal(size=s) / np.sqrt(s[0])) for s in itertools.pairwise(sizes))
     biases = tuple(np.float32(0.1 * rng.normal(size=s)) for s in sizes[1:])
-    blank = {name: np.zeros(shape) for name, shape in SHAPES.items()}
-    interface = Interface(**{**blank, "period": 0.02, "reach": 0.1, "width": 0.04})  # type: ignore[arg-type]
+    ones = {name: np.ones(shape) for name, shape in SHAPES.items()}  # limits of zero would be refused
+    interface = Interface(**{**ones, "period": 0.02, "reach": 0.1, "width": 0.04})  # type: ignore[arg-type]
     mean, std = np.float32(rng.normal(size=OBSERVED)), np.float32(rng.uniform(0.1, 2, OBSERVED))
     return Policy(mean, std, weights, biases, interface)
 
