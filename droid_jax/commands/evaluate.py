@@ -89,8 +89,8 @@ def run(command: Evaluate) -> None:
         count(command.trials)
     with counting("trials on the stand-in robot", command.trials) as count:
         outside = transfer(policy, robot, count)
-    for found in (inside, outside):
-        _ = found.rate  # ValueError where all of them blew up
+    inside.check()
+    outside.check()
     with new_folder(folder / FILMS) as films:  # those of an earlier policy stay until these are there
         if command.film:
             _film(films, policy, robot, outside)

@@ -32,15 +32,20 @@ class Trials:
         """[N] bool: all but those that blew up."""
         return self.stopped != BLOWN_UP
 
+    def check(self) -> None:
+        """ValueError where all trials blew up."""
+        if not self.counted.any():
+            raise ValueError(f"the simulation blew up in all {len(self.success)} trials: they say nothing of a policy")
+
     @property
     def rate(self) -> float:
         """Share of trials that succeeded; ValueError where all of them blew up."""
-        self._needs_any()
+        self.check()
         return float(np.mean(self.success[self.counted]))
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
         """Of the success rate.  Wilson, JASA 1927.  ValueError where all trials blew up."""
-        self._needs_any()
+        self.check()
         success = self.success[self.counted]
         span = scipy.stats.binomtest(int(np.sum(success)), len(success)).proportion_ci(level, method="wilson")
         return float(span.low), float(span.high)
@@ -66,12 +71,6 @@ class Trials:
             "stopped": dict(zip(reasons.tolist(), counts.tolist(), strict=True)),
             "stopped_each": short,
         }
-
-    def _needs_any(self) -> None:
-        if not self.counted.any():
-            raise ValueError(
-                f"the simulation blew up in all {len(self.success)} trials: they say nothing of the policy"
-            )
 
 
 def _spread(values: np.ndarray) -> dict[str, float | None]:

@@ -10,7 +10,8 @@ from made_up_gap import make_gap
 from made_up_policy import make_policy
 from reader import read_page
 
-from droid_jax.report import page
+from droid_jax.policy.trials import BLOWN_UP
+from droid_jax.report import page, policy_words
 from droid_jax.report.policy_folder import read_policy
 from droid_jax.report.policy_words import policy_summary
 
@@ -93,3 +94,16 @@ def test_broken_files_are_named(tmp_path: Path, name: str, content: str, fault: 
     (made / name).write_text(content)
     with pytest.raises(ValueError, match=fault):
         page.write_report(made)
+
+
+def test_trials_that_blew_up_are_said_and_not_counted() -> None:
+    angle = {"mean": 40.0, "std": 1.0}
+    found = {
+        "trials": 10,
+        "stopped": {BLOWN_UP: 2},
+        "interval_95": [0.68, 1.0],
+        "success_rate": 1.0,
+        "angle_deg": angle,
+    }
+    said = policy_words._tried("simulation", found, {"held": 0.5, "opened": 0.52})
+    assert "in 100 % of 8 trials" in said and f"2 stopped: {BLOWN_UP}" in said
