@@ -192,6 +192,7 @@ def _panels(rows: Sequence[Sequence[Panel]]) -> Figure:
                 axes.annotate("paper", (mean + std + 2.0, 0.93), xycoords=high, va="center", fontsize=6, color=MUTED)
             axes.set_title(panel.title, fontsize=8)
         row[0].set_ylabel("trials")
+    grid[0, 0].set_ylim(top=1.15 * grid[0, 0].get_ylim()[1])  # of all: room for the paper's above the bars
     for axes in grid[-1]:
         axes.set_xlabel("largest opening [degrees]")
     return figure
