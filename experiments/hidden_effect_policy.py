@@ -50,7 +50,8 @@ from droid_jax.policy.door_env import DoorEnv  # noqa: E402
 from droid_jax.policy.task import Task  # noqa: E402
 from droid_jax.policy.transfer import TransferConfig, check_playable, stand_in  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
-from experiments.policies.cases import TIMESTEP, Case, Doors, Options, finish, found_of, made_by, run_all, tried  # noqa: E402
+from experiments.policies.cases import TIMESTEP, Case, Options, finish, found_of, made_by, run_all, tried  # noqa: E402
+from experiments.policies.store import Doors  # noqa: E402
 from experiments.policies.table import PLACES, apart, column, rates  # noqa: E402
 from experiments.sharing import claimed  # noqa: E402
 

@@ -35,10 +35,11 @@ from droid_jax.policy.door_env import DoorEnv  # noqa: E402
 from droid_jax.policy.task import Task  # noqa: E402
 from droid_jax.policy.transfer import TransferConfig, stand_in  # noqa: E402
 from droid_jax.storage import write_json, write_text  # noqa: E402
-from experiments.policies.cases import TIMESTEP, Case, Doors, Options, finish, found_of, made_by, run_all, tried  # noqa: E402
+from experiments.policies.cases import TIMESTEP, Case, Options, finish, found_of, made_by, run_all, tried  # noqa: E402
 from experiments.policies.figure import knob_histograms, knobs_as_text  # noqa: E402
 from experiments.policies.robots import fitted, truth_of  # noqa: E402
 from experiments.policies.settings import Setting, setting_of  # noqa: E402
+from experiments.policies.store import Doors  # noqa: E402
 from experiments.policies.table import PLACES, column, rates  # noqa: E402
 
 

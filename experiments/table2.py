@@ -40,10 +40,11 @@ from droid_jax.model.door_scene import door_scene  # noqa: E402
 from droid_jax.policy.door_env import DoorEnv  # noqa: E402
 from droid_jax.policy.task import Task  # noqa: E402
 from droid_jax.storage import write_json, write_text  # noqa: E402
-from experiments.policies.cases import TIMESTEP, Case, Doors, Options, finish, found_of, made_by, run_all, tried  # noqa: E402
+from experiments.policies.cases import TIMESTEP, Case, Options, finish, found_of, made_by, run_all, tried  # noqa: E402
 from experiments.policies.figure import as_text, histograms  # noqa: E402
 from experiments.policies.robots import fitted, robots_of  # noqa: E402
 from experiments.policies.settings import SETTINGS, Setting, setting_of  # noqa: E402
+from experiments.policies.store import Doors  # noqa: E402
 from experiments.policies.table import METHODS, summed_up  # noqa: E402
 
 Method = Literal["prior", "mean", "fitted"]

@@ -16,18 +16,17 @@ from matplotlib.figure import Figure
 
 from benchmarks.common import commits, stem
 from droid_jax.commands.source import TIMESTEP as TIMESTEP
-from droid_jax.identify.gaussian import Gaussian
 from droid_jax.policy.control import load
 from droid_jax.policy.door_env import DoorEnv
-from droid_jax.policy.network import save_policy
 from droid_jax.policy.randomise import of_method
 from droid_jax.policy.simulated import simulated
 from droid_jax.policy.task import Task
-from droid_jax.policy.train import PRESETS, TrainConfig, train
+from droid_jax.policy.train import PRESETS, TrainConfig
 from droid_jax.policy.transfer import StandIn, transfer
 from droid_jax.report.export import save
-from droid_jax.report.files import GAUSSIAN, POLICY, TRAINING
+from droid_jax.report.files import POLICY
 from droid_jax.storage import write_json
+from experiments.policies.store import Doors, trained
 from experiments.policies.table import PLACES
 from experiments.sharing import claimed
 
@@ -121,14 +120,6 @@ class Budget:
         return replace(task, steps=QUICK_STEPS) if self.quick else task
 
 
-@dataclass(frozen=True)
-class Doors:
-    """What a policy is trained on: draws of a Gaussian, or its mean alone where the method is "mean"."""
-
-    gaussian: Gaussian
-    method: str = "fitted"
-
-
 def tried(
     arguments: Options,
     env: DoorEnv,
@@ -147,34 +138,6 @@ def tried(
         **{name: transfer(policy, robot).to_json() for name, robot in robots.items()},
         **made,
     }
-
-
-def trained(
-    store: Path, env: DoorEnv, doors: Doors, config: TrainConfig, code: Mapping[str, Any]
-) -> tuple[Path, dict[str, Any]]:
-    """Folder of the policy that training comes to, named after all that decides it, and what is known of the training.
-
-    Another process that trains the same is waited for; what a stopped one of the same code left is continued.
-    """
-    of = {
-        "scene": [env.scene.sha256, env.start.tolist(), [e.name for e in env.effects]],
-        "task": asdict(env.task),
-        "doors": ["mean" if doors.method == "mean" else "draws", doors.gaussian.to_json()],
-        "config": asdict(config),
-    }
-    key = _sha256(of)[:16]
-    place = store / key
-    with claimed(place, wait=True):
-        if not (place / TRAINING).is_file():
-            drawn = of_method(doors.method, env.scene, doors.gaussian)
-            kept = place / "checkpoints" / str(code["commit"])  # what other code left half-done is not gone on with
-            found = train(env, drawn, config, checkpoints=kept, fingerprint={"key": key})
-            place.mkdir(exist_ok=True)
-            save_policy(place / POLICY, found.policy)
-            doors.gaussian.save(place / GAUSSIAN)
-            history = [asdict(now) for now in found.history]
-            write_json(place / TRAINING, {"trained": key, "history": history, "trained_by": dict(code)})
-        return place, json.loads((place / TRAINING).read_text())
 
 
 def _sha256(of: Any) -> str:

@@ -18,9 +18,10 @@ import numpy as np
 import pytest
 import scipy.stats
 
+from droid_jax.identify.gaussian import load as load_gaussian
 from droid_jax.identify.gaussian import prior
 from droid_jax.measure.hidden import Applied, possible
-from droid_jax.model.door import door_space
+from droid_jax.model.door import door_nuisances, door_space
 from droid_jax.model.door_scene import door_scene
 from droid_jax.policy.control import load
 from droid_jax.policy.door_env import DoorEnv
@@ -28,23 +29,22 @@ from droid_jax.policy.task import Task
 from droid_jax.policy.train import TrainConfig
 from droid_jax.policy.transfer import transfer
 from droid_jax.policy.trials import Trials
-from droid_jax.report.files import POLICY
-from experiments.policies import cases
+from droid_jax.report.files import GAUSSIAN, POLICY
+from experiments.policies import store
 from experiments.policies.cases import (
     RESULTS,
     TIMESTEP,
     Case,
-    Doors,
     Options,
     finish,
     found_of,
     made_by,
     run_all,
-    trained,
 )
 from experiments.policies.figure import as_text, histograms, knob_histograms, knobs_as_text
 from experiments.policies.robots import fitted, robots_of
 from experiments.policies.settings import SETTINGS, Setting, setting_of
+from experiments.policies.store import Doors, decided_by, place_of, trained
 from experiments.policies.table import PLACES, apart, column, rate_interval, resampled, spread, summed_up
 from experiments.sharing import claimed
 
@@ -469,20 +469,34 @@ def test_a_policy_that_two_experiments_need_is_trained_once(monkeypatch: pytest.
         seeds.append(config.seed)
         return SimpleNamespace(policy="policy", history=())
 
-    monkeypatch.setattr(cases, "train", train)
-    monkeypatch.setattr(cases, "save_policy", lambda path, policy: path.write_text(policy))
+    monkeypatch.setattr(store, "train", train)
+    monkeypatch.setattr(store, "save_policy", lambda path, policy: path.write_text(policy))
     known, config = Doors(prior(door_space(scene)), "prior"), TrainConfig()
     first, made = trained(tmp_path, env, known, config, CODE)
     assert trained(tmp_path, env, replace(known, method="fitted"), config, {"commit": "two"}) == (first, made)
     assert made["trained_by"] == CODE and made["trained"] == first.name and seeds == [0]
     wider = replace(known.gaussian, cov=2 * known.gaussian.cov)
-    others = [
+    near: Any = SimpleNamespace(**{**vars(env), "start": np.nextafter(env.start, 9.0)})  # as another machine computes it
+    assert trained(tmp_path, near, known, config, CODE) == (first, made) and seeds == [0]
+    others: list[Any] = [
+        (SimpleNamespace(**{**vars(env), "start": env.start + 1e-6}), known, config),
         (env, known, replace(config, seed=1)),
         (env, replace(known, method="mean"), config),
         (env, Doors(wider), config),
         (SimpleNamespace(**{**vars(env), "task": Task(steps=100)}), known, config),
     ]
-    assert len({trained(tmp_path, *other, CODE)[0] for other in others} | {first}) == 5
+    assert len({trained(tmp_path, *other, CODE)[0] for other in others} | {first}) == 6
+
+
+@pytest.mark.parametrize(("name", "method"), [("paper", "prior"), ("paper", "fitted"), ("dry", "mean")])
+def test_the_reported_policies_are_found_by_what_decided_them(name: str, method: str):
+    case = json.loads((RESULTS / "table2_cases" / name / f"{method}_3.json").read_text())
+    task, options = Task(**setting_of(name, None).task), Options()
+    env = DoorEnv(door_scene(timestep=TIMESTEP, limits=True), task)
+    space = door_space(env.scene) + door_nuisances(env.scene)
+    gaussian = prior(space) if method == "prior" else load_gaussian(RESULTS / f"fit_{name}_cases" / GAUSSIAN)
+    of = decided_by(env, Doors(gaussian, method), replace(options.budget.config, seed=3))
+    assert place_of(options.trained, of).name == case["trained"]
 
 
 @pytest.mark.slow
