@@ -80,6 +80,7 @@ def gap_json(case: Case, verdict: Verdict) -> dict[str, Any]:
         "floor": verdict.floor,
         "converged": verdict.base.refined.converged,
         "cut": verdict.cut,
+        "remainder": verdict.remainder,
         "gaps": {role: _gap(role, e, verdict) for role, e in case.judged.items()},
         "phases": {role: _phases(e) for role, e in case.judged.items()},
         "screens": [

@@ -41,11 +41,12 @@ class Verdict:
 
     kind; effects: names of what is in the model; tied: for each of them the names that do as well.
     base, model: before and after.  floor: U0, what the simulation's own step leaves.
-    gaps: "fit", "confirm", "sealed" -> (U before, U after).  screens, trials: the grounds, in the order they
-    were made.  failed: models whose replay blew up where their refit was to begin.  before, after: where the gap
-    lives on the fitted recording.  rivals: models that do as well as
-    `model`, refitted; experiments: what would tell them apart, the best first.  cut: in words what the
-    budget left out, empty for nothing.  trend: what changes from repeat to repeat, None where nothing was asked.
+    gaps: "fit", "confirm", "sealed" -> (U before, U after).  remainder: U on the confirming demonstration that neither
+    `model` nor the uncertainty of its fit explains (`transfer.beyond`), None where no fit converged.  screens, trials:
+    the grounds, in the order they were made.  failed: models whose replay blew up where their refit was to begin.
+    before, after: where the gap lives on the fitted recording.  rivals: models that do as well as `model`, refitted;
+    experiments: what would tell them apart, the best first.  cut: in words what the budget left out, empty for nothing.
+    trend: what changes from repeat to repeat, None where nothing was asked.
     """
 
     kind: Kind
@@ -59,6 +60,7 @@ class Verdict:
     trials: tuple[Trial, ...]
     before: Localisation
     after: Localisation
+    remainder: float | None = None
     failed: tuple[str, ...] = ()
     rivals: tuple[Model, ...] = ()
     experiments: tuple[Experiment, ...] = ()

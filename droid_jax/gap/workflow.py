@@ -15,6 +15,7 @@ from droid_jax.gap.refit import Model, refit
 from droid_jax.gap.rounds import Budget, Hunt, Round, forward, pairs, polished, pruned
 from droid_jax.gap.screen import Question, Screen, marks, project, questions_of, screen
 from droid_jax.gap.select import OF_ALL, SIGNIFICANT
+from droid_jax.gap.transfer import beyond
 from droid_jax.gap.trend import trend
 from droid_jax.gap.verdict import Kind, Verdict
 from droid_jax.identify.pipeline import grip_hypotheses, starts
@@ -126,12 +127,20 @@ def further(asked: Sequence[Question], model: Model) -> tuple[Question, ...]:
 
 def _unsettled(hunt: Hunt, model: Model) -> bool:
     """Nothing named yet, several effects, or much left over: one that mimics two may have stood in their way."""
-    return len(model.parts) != 1 or _open(hunt.gap(model), hunt.whole_gap, hunt.floor) > OPEN
+    return len(model.parts) != 1 or _open(hunt, left_over(hunt.case, model)) > OPEN
 
 
-def _open(after: float, before: float, floor: float) -> float:
-    """Share of a gap that is left."""
-    return (after - floor) / max(before - floor, 1e-12)
+def left_over(case: Case, model: Model) -> np.ndarray:
+    """[N, M] residuals of the confirming demonstration, less what the fit's own uncertainty leaves there."""
+    confirm = case.confirm
+    if case.fit.repeats > 1:
+        return confirm.residuals(beyond(case.fit, confirm, model))
+    return confirm.residuals(confirm.common(model.values)[0])  # blocks of one log are of one motion
+
+
+def _open(hunt: Hunt, residuals: np.ndarray) -> float:
+    """Share of the gap on the confirming demonstration that these residuals still hold."""
+    return (hunt.case.confirm.gap(residuals) - hunt.floor) / max(hunt.whole_gap - hunt.floor, 1e-12)
 
 
 def _verdict(hunt: Hunt, base: Model, model: Model, rounds: list[Round], quiet: bool) -> Verdict:
@@ -143,11 +152,12 @@ def _verdict(hunt: Hunt, base: Model, model: Model, rounds: list[Round], quiet: 
     gaps = {role: (e.gap_at(base.values), e.gap_at(model.values)) for role, e in case.judged.items()}
     missing = bool(rounds) and rounds[0].screen.p < SIGNIFICANT and base.gap > floor
     tied = tuple(_tied(part.name, model, rounds) for part in model.parts)
+    left = left_over(case, model) if converged else None
     kind = Kind.NONE if not missing else Kind.UNEXPLAINED
-    if not converged:
+    if left is None:
         kind = Kind.UNCONVERGED
     elif model.parts:
-        kind = Kind.PARTLY if _remains(hunt, model, quiet) else Kind.TIE if any(tied) else Kind.NAMED
+        kind = Kind.PARTLY if _remains(hunt, left, quiet) else Kind.TIE if any(tied) else Kind.NAMED
     return Verdict(
         kind=kind,
         effects=tuple(c.name for c in model.parts),
@@ -156,6 +166,7 @@ def _verdict(hunt: Hunt, base: Model, model: Model, rounds: list[Round], quiet: 
         model=model,
         floor=floor,
         gaps=gaps,
+        remainder=None if left is None else case.confirm.gap(left),
         screens=tuple(r.screen for r in rounds),
         trials=tuple(t for r in rounds for t in r.trials),
         before=localise(case.fit, base.values, base.residuals),
@@ -167,17 +178,15 @@ def _verdict(hunt: Hunt, base: Model, model: Model, rounds: list[Round], quiet: 
     )
 
 
-def _remains(hunt: Hunt, model: Model, quiet: bool) -> bool:
-    """Whether much of the gap is left on the confirming demonstration, and more than chance leaves.
+def _remains(hunt: Hunt, residuals: np.ndarray, quiet: bool) -> bool:
+    """Whether residuals of the confirming demonstration hold much of its gap, and more than chance leaves.
 
     An effect that no candidate looks like is seen by no screening, but by every repeat.
     """
-    confirm = hunt.case.confirm
-    residuals = confirm.residuals(confirm.common(model.values)[0])
-    if _open(confirm.gap(residuals), hunt.whole_gap, hunt.floor) <= OPEN:
+    if _open(hunt, residuals) <= OPEN:
         return False
     everywhere = np.ones((1, residuals.shape[1]), bool)
-    return not quiet or float(confirm.cell_p_values(residuals, everywhere)[0]) < SIGNIFICANT
+    return not quiet or float(hunt.case.confirm.cell_p_values(residuals, everywhere)[0]) < SIGNIFICANT
 
 
 def _tied(part: str, model: Model, rounds: Sequence[Round]) -> tuple[str, ...]:

@@ -49,15 +49,17 @@ def posterior(refined: Refined, comparisons: Sequence[Comparison]) -> Gaussian:
     return with_stated_prior(told(refined, comparisons), refined)
 
 
-def told(refined: Refined, comparisons: Sequence[Comparison]) -> Gaussian:
+def told(refined: Refined, comparisons: Sequence[Comparison], *, misfit: bool = True) -> Gaussian:
     """What the recordings that were refined on tell by themselves, but for the refinement's wide prior.
 
     For questions to the data alone, as whether an amplitude may be zero.
+    misfit: whether what the model leaves over beyond noise widens it too; without it the model is taken to be right.
     """
     channels = [c for comparison in comparisons for c in comparison.channels]
     shapes = [(len(c.columns), c.noise.mean.shape[0]) for c in channels]
     durations = [c.span[1] - c.span[0] for c in channels]
-    return calibrated(refined, [c.deviations() for c in comparisons], time_blocks(shapes, durations))
+    blocks = time_blocks(shapes, durations) if misfit else None
+    return calibrated(refined, [c.deviations() for c in comparisons], blocks)
 
 
 def with_stated_prior(gaussian: Gaussian, refined: Refined) -> Gaussian:
@@ -74,22 +76,24 @@ def with_stated_prior(gaussian: Gaussian, refined: Refined) -> Gaussian:
     return replace(gaussian, cov=0.5 * (cov + cov.T))
 
 
-def calibrated(refined: Refined, deviations: Sequence[np.ndarray], block_ids: np.ndarray) -> Gaussian:
+def calibrated(refined: Refined, deviations: Sequence[np.ndarray], block_ids: np.ndarray | None) -> Gaussian:
     """The rule of the width on plain arrays.
 
     deviations: per recording [N, M_i] whitened deviations of its repeats from their mean (see
-      `Comparison.deviations`); block_ids: [M] integer block of each residual (see `time_blocks`).
+      `Comparison.deviations`); block_ids: [M] integer block of each residual (see `time_blocks`), or None: what the
+      model leaves over widens nothing.
     """
     plain = np.linalg.inv(refined.hessian)
     variance = np.diag(plain)
     repeats = variance * np.maximum(1.0, _repeat_ratio(refined, plain, deviations))
-    blocks = np.diag(_sandwich(refined, plain, block_ids))
+    blocks = variance if block_ids is None else np.diag(_sandwich(refined, plain, block_ids))
     factor = np.sqrt(np.maximum(repeats, blocks) / variance)
     cov = plain * np.outer(factor, factor)
     main = ~refined.space.nuisance
+    left = "" if block_ids is None else " and to the block scores of the residuals"
     rule = (
-        "Gauss-Newton around the best, nuisances marginalised, deviations widened to the scatter between repeats and "
-        f"to the block scores of the residuals (x{np.median(factor[main]):.2f} in the median)"
+        "Gauss-Newton around the best, nuisances marginalised, deviations widened to the scatter between repeats"
+        f"{left} (x{np.median(factor[main]):.2f} in the median)"
     )
     return Gaussian(refined.space, refined.x, 0.5 * (cov + cov.T), rule, "search")
 

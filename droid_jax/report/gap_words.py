@@ -12,6 +12,7 @@ from droid_jax.report.words import label, listed, number, percent
 
 SIGNIFICANT = 0.01  # p below which something is said to be missing
 DECISIVE = 6.0  # standardised difference from which ten repeats decide between rivals
+TOLD = 0.8  # share of what is left on the confirming motion: where more is left beyond the fit's uncertainty, no word
 OTHER = "the other demonstration"  # as the search calls what confirms, whatever it is
 OF = " of "  # between what is said of a joint and its name
 BETWEEN = " + "  # between the effects in a model's name
@@ -57,7 +58,7 @@ def unit_words(unit: str) -> str:
 
 def gap_summary(gap: Gap) -> list[str]:
     """The sentences under the answer, from the numbers alone; the last says what to do."""
-    sentences = [_fitted(gap), _significance(gap), _size(gap), *_added(gap.found["amplitudes"])]
+    sentences = [_fitted(gap), _significance(gap), _size(gap), _allowed(gap), *_added(gap.found["amplitudes"])]
     said = [*sentences, *_trends(gap.found), gap.limits]
     return [*(s for s in said if s), _next(gap)]
 
@@ -114,6 +115,18 @@ def _size(gap: Gap) -> str:
     text = f"{where} {size} was {number(one['before'])} before and is {number(one['after'])} after{share}; {at}"
     torque = f"{number(one['torque_before'])} to {number(one['torque_after'])} {gap.unit}"
     return f"{text}. The torque distance went from {torque}."
+
+
+def _allowed(gap: Gap) -> str:
+    """What of the confirming motion's gap is the fit's own uncertainty, where that is worth a word."""
+    left, confirm = gap.found.get("remainder"), gap.found["gaps"].get("confirm")
+    if left is None or confirm is None or not gap.extended or left > TOLD * confirm["after"]:
+        return ""
+    after, share = number(confirm["after"]), percent(1.0 - max(left, 0.0) / confirm["after"])
+    return (
+        f"Of U = {after} that is left on “{confirm['recording']}”, {share} is no more than the fit does not tell of "
+        "its parameters: that motion asks for others than the fitted one shows."
+    )
 
 
 def _floor(gap: Gap) -> str:

@@ -117,6 +117,7 @@ def describe(case: Case, verdict: Verdict) -> dict[str, Any]:
         "sentence": verdict.sentence,
         "effects": list(verdict.effects),
         "tied": [list(t) for t in verdict.tied],
+        "remainder": verdict.remainder,
         "p": verdict.screens[0].p if verdict.screens else None,
         "gaps": {role: list(pair) for role, pair in verdict.gaps.items()},
         "floor": verdict.floor,

@@ -476,7 +476,7 @@ def test_a_policy_that_two_experiments_need_is_trained_once(monkeypatch: pytest.
     assert trained(tmp_path, env, replace(known, method="fitted"), config, {"commit": "two"}) == (first, made)
     assert made["trained_by"] == CODE and made["trained"] == first.name and seeds == [0]
     wider = replace(known.gaussian, cov=2 * known.gaussian.cov)
-    near: Any = SimpleNamespace(**{**vars(env), "start": np.nextafter(env.start, 9.0)})  # as another machine computes it
+    near: Any = SimpleNamespace(**{**vars(env), "start": np.nextafter(env.start, 9.0)})  # another machine's
     assert trained(tmp_path, near, known, config, CODE) == (first, made) and seeds == [0]
     others: list[Any] = [
         (SimpleNamespace(**{**vars(env), "start": env.start + 1e-6}), known, config),

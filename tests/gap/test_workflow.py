@@ -153,19 +153,23 @@ def test_no_name_from_an_extended_fit_that_did_not_converge(found: Small, monkey
     assert any(trial.passed for trial in verdict.trials)  # the grounds are told
 
 
+def replace_gap(evidence: Any, gap: float) -> Any:
+    """Evidence whose every U is this."""
+    return SimpleNamespace(gap=lambda residuals: gap, cell_p_values=evidence.cell_p_values)
+
+
 def test_what_is_left_counts_where_chance_would_not_leave_it(found: Small):
     """A remainder that no candidate looks like is one: half of what was there, or half of noise."""
     case = found.case
-    hunt: Any = SimpleNamespace(case=case, floor=FLOOR, whole_gap=2.0 * found.base.gap)
-    assert workflow._remains(hunt, found.base, quiet=True)
-    assert not workflow._remains(SimpleNamespace(**{**vars(hunt), "whole_gap": 1e3}), found.base, quiet=False)
+    left = workflow.left_over(case, found.base)
+    hunt: Any = SimpleNamespace(case=case, floor=FLOOR, whole_gap=2.0 * case.confirm.gap(left))
+    assert workflow._remains(hunt, left, quiet=True)
+    vast: Any = SimpleNamespace(case=case, floor=FLOOR, whole_gap=1e3)
+    assert not workflow._remains(vast, left, quiet=False)
     signs = np.where(np.arange(case.confirm.repeats) % 2, 1.0, -1.0)[:, None]
-    chance: Any = SimpleNamespace(
-        common=lambda values: [None], residuals=lambda common: signs * np.ones((case.confirm.repeats, 6)),
-        gap=lambda residuals: found.base.gap, cell_p_values=case.confirm.cell_p_values,
-    )  # fmt: skip
-    hunt.case = SimpleNamespace(confirm=chance)
-    assert not workflow._remains(hunt, found.base, quiet=True) and workflow._remains(hunt, found.base, quiet=False)
+    by_chance = signs * np.ones((case.confirm.repeats, 6))
+    hunt.case = SimpleNamespace(confirm=replace_gap(case.confirm, found.base.gap))
+    assert not workflow._remains(hunt, by_chance, quiet=True) and workflow._remains(hunt, by_chance, quiet=False)
 
 
 def candidate(name: str, place: str = "door", **shapes: float) -> Candidate:

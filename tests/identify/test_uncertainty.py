@@ -163,6 +163,15 @@ def test_residuals_constant_within_blocks_widen_as_their_sandwich_says():
     assert gaussian.cov[0, 0] == pytest.approx(BLOCK / hessian, rel=1e-2)
 
 
+def test_a_model_that_is_taken_to_be_right_is_not_widened_by_what_it_leaves_over():
+    fit = fitted(COLUMN, SIGNS)
+    assert deviations(calibrated(fit, SINGLE, None)) == pytest.approx(np.sqrt(np.diag(np.linalg.inv(fit.hessian))))
+    loud = [exactly(2.0, 40, 30)]
+    assert np.array_equal(
+        deviations(calibrated(fitted(SKEW), loud, None)), deviations(calibrated(fitted(SKEW), loud, one_block(SKEW)))
+    )
+
+
 def test_residuals_that_alternate_within_blocks_widen_nothing():
     alternating = np.tile([1.0, -1.0], len(COLUMN) // 2)
     gaussian = calibrated(fitted(COLUMN, alternating), SINGLE, IDS)

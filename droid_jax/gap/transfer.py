@@ -1,0 +1,41 @@
+"""What a fit leaves on another motion without anything missing: its parameters are uncertain, and it asks for others.
+
+The fitted demonstration tells some directions of the parameters poorly, and another motion may show just these.  What
+that adds to U there is no missing effect: on a door with nothing hidden it was 0.025 where U0 is 0.0005, and the
+fit's own uncertainty says 0.016 to 0.031.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from droid_jax.gap.evidence import Evidence
+from droid_jax.gap.refit import Model
+from droid_jax.gap.screen import project
+from droid_jax.identify.uncertainty import told
+
+LONGEST = 1.0  # search units: what the fit did not tell at all is no further from it than that
+
+
+def beyond(fitted: Evidence, other: Evidence, model: Model) -> np.ndarray:
+    """[M] common residual of a model on another recording than the fitted one, less what its uncertainty allows.
+
+    The parameters move once more, along slopes, to where the other recording wants them; how far is held by what the
+    fitted one tells of them (`told`), as if both had been fitted.  The other recording's own nuisances are at their
+    best throughout.
+    """
+    slopes = spread(fitted, other, model)
+    held = np.full(len(slopes.T), other.repeats**0.5)  # the residual is that of the mean of so many repeats
+    return project(other.common(model.values), slopes, held)[0]
+
+
+def spread(fitted: Evidence, other: Evidence, model: Model) -> np.ndarray:
+    """[M, D] by how much one deviation of the fit, along each of its principal axes, changes the common residual."""
+    space, whole, x = model.space, other.cost.space, model.refined.x
+    known = told(model.refined, fitted.cost.comparisons, misfit=False)
+    variance, axes = np.linalg.eigh(known.cov)
+    steps = (axes * np.sqrt(np.maximum(variance, 0.0))).T
+    steps *= np.minimum(1.0, LONGEST / np.max(np.abs(steps), axis=1, keepdims=True))
+    ends = [np.clip(x + sign * steps, *map(space.to_search, (space.low, space.high))) for sign in (1.0, -1.0)]
+    up, down = np.split(other.common(whole.embed(space, space.from_search(np.concatenate(ends)), model.values)), 2)
+    return (0.5 * (up - down)).T

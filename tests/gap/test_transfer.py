@@ -1,0 +1,91 @@
+"""What a fit leaves on another motion: only what its own uncertainty cannot be is something missing."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from small_gap import FLOOR, Small, record, small
+
+from droid_jax.gap import workflow
+from droid_jax.gap.case import Case, make_case
+from droid_jax.gap.refit import Model, refit
+from droid_jax.gap.screen import project
+from droid_jax.gap.transfer import beyond, spread
+
+
+@pytest.fixture(scope="module")
+def found() -> Small:
+    return small()
+
+
+@pytest.fixture(scope="module")
+def whole(found: Small) -> tuple[Case, Model]:
+    """Nothing is hidden."""
+    case = make_case(
+        found.scene, found.case.base, found.case.effects, record("fit", preload=0.0), record("confirm", preload=0.0),
+        config=found.case.config,
+    )  # fmt: skip
+    return case, workflow.base_fit(case, lambda stage, value: None)
+
+
+def kept(case: Case, model: Model, off: np.ndarray) -> float:
+    """Share that stays of what the other recording does otherwise by `off` [M]."""
+    confirm = case.confirm
+    other: Any = SimpleNamespace(
+        cost=confirm.cost, repeats=confirm.repeats, common=lambda values: confirm.common(values) + off
+    )
+    left = beyond(case.fit, other, model) - beyond(case.fit, confirm, model)
+    return float(np.sum(left**2) / np.sum(off**2))
+
+
+def test_what_the_fit_does_not_tell_is_allowed_for_and_nothing_else(whole: tuple[Case, Model]):
+    """Two deviations along the axis that the other recording shows best, and something that no axis does."""
+    case, model = whole
+    slopes = spread(case.fit, case.confirm, model)
+    shown = slopes[:, np.argmax(np.linalg.norm(slopes, axis=0))]
+    else_ = np.random.default_rng(0).normal(size=len(slopes))
+    else_ -= slopes @ np.linalg.lstsq(slopes, else_, rcond=None)[0]
+    assert kept(case, model, 2.0 * shown) < 0.3
+    assert kept(case, model, else_) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_the_slopes_are_of_one_deviation(whole: tuple[Case, Model]):
+    """As a fit to a tenth of the noise would have a tenth of the deviations, and so of the slopes."""
+    case, model = whole
+    slopes, refined = spread(case.fit, case.confirm, model), model.refined
+    assert slopes.shape == (len(case.confirm.common(model.values)[0]), len(refined.x))
+    step = np.zeros(len(refined.x))
+    step[0] = 0.01
+    here, there = (case.whole.embed(model.space, model.space.from_search(x)[None], model.values)
+                   for x in (refined.x, refined.x + step))  # fmt: skip
+    moved = (case.confirm.common(there) - case.confirm.common(here))[0]
+    # What one parameter does is inside the span of what all axes do, as far as they are told.
+    assert np.linalg.norm(project(moved[None], slopes, np.full(len(slopes.T), 1e6))[0]) < 0.1 * np.linalg.norm(moved)
+
+
+def test_what_is_really_missing_stays(found: Small):
+    """The hidden preload acts on the other motion in a way that no uncertain parameter does."""
+    case, base = found.case, found.base
+    whole_gap, left = case.confirm.gap_at(base.values), workflow.left_over(case, base)
+    assert whole_gap > FLOOR and case.confirm.gap(left) > 0.5 * whole_gap
+
+
+def test_the_verdict_says_what_remains(found: Small):
+    case, verdict = found.case, found.verdict
+    assert verdict.remainder == pytest.approx(case.confirm.gap(workflow.left_over(case, verdict.model)))
+    assert verdict.remainder is not None and verdict.remainder <= verdict.gaps["confirm"][1] + 1e-6
+
+
+def test_more_repeats_of_the_fit_allow_less(found: Small):
+    """What is told better may be off by less."""
+
+    def size(repeats: int) -> float:
+        made = {role: record(role, repeats, preload=0.0) for role in ("fit", "confirm")}
+        case = make_case(found.scene, found.case.base, found.case.effects, **made, config=found.case.config)
+        model = refit(case.fit, case.base, (), case.whole.mean[None], case.config.refine)
+        return float(np.mean(np.sum(spread(case.fit, case.confirm, model) ** 2, axis=1)))
+
+    assert size(32) < 0.6 * size(8)
