@@ -11,20 +11,18 @@ import numpy as np
 
 from droid_jax.gap.candidates import Candidate, joined
 from droid_jax.gap.case import Case
+from droid_jax.gap.choose import winning, without_idle
 from droid_jax.gap.rank import Proposal, collinear, proposals
 from droid_jax.gap.refit import Model, look, refit
 from droid_jax.gap.screen import Screen
-from droid_jax.gap.select import GENERAL, LESS, MORE, OF_ALL, Trial, judge
+from droid_jax.gap.select import LESS, MORE, OF_ALL, Trial, judge
 from droid_jax.identify.refine import NotReplayed, RefineConfig
-from droid_jax.model.seam import Effect
 
 T = TypeVar("T")
 Progress = Callable[[str, Any], None]
 Starter = tuple[Sequence[Candidate], np.ndarray]  # effects, and values [D] to start from
 POLISH = RefineConfig(iterations=12, hops=0)
 PAIRS = 4  # pairs refitted
-PLAIN = 1.25  # times what the best leaves above the floor: up to here a plainer model is preferred
-NOTHING = 0.01  # share of the first gap that is no difference
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,38 +206,9 @@ def _decided(hunt: Hunt, before: Model, found: Screen, tried: Sequence[Model]) -
     trials = judge(
         case.fit, case.confirm, before, tried, case.smallest, hunt.whole_gap, floor=hunt.floor, seed=case.config.seed
     )
-    standing = [(m, t) for m, t in zip(tried, trials, strict=True) if t.passed or t.weak]
-    winner, chosen = min(standing, key=lambda mt: mt[1].gap_confirm, default=(None, None))
-    if (
-        winner is None or chosen is None or chosen.weak
-    ):  # what does best is too weak, and nothing worse is named instead
+    judged = list(zip(tried, trials, strict=True))
+    won = winning(judged, hunt.floor, hunt.whole_gap)
+    if won is None:
         return Round(found, stood, tuple(tried), tuple(trials))
-    enough = hunt.floor + PLAIN * max(chosen.gap_confirm - hunt.floor, 0.0) + NOTHING * hunt.whole_gap
-    alike = [(m, t) for m, t in standing if t.passed and t.name in (chosen.name, *chosen.rivals)]
-    winner, chosen = plainest([(m, t) for m, t in alike if t.gap_confirm <= enough])
-    left = hunt.floor + GENERAL * max(chosen.gap_confirm - hunt.floor, 0.0)
-    general = holding(case.effects, winner, tried)
-    idle = f"holds {winner.name} as a special case and leaves no less"
-    trials = [
-        replace(t, reasons=(idle,), weak=False) if more and t.gap_confirm > left and (t.passed or t.weak) else t
-        for t, more in zip(trials, general, strict=True)
-    ]
-    return Round(found, stood, tuple(tried), tuple(trials), winner, chosen)
-
-
-def holding(effects: Sequence[Effect], plain: Model, models: Sequence[Model]) -> list[bool]:
-    """Which models are a plain one but for effects that hold one of its own, at the same place, as a special case."""
-    holds = {e.name: e.holds for e in effects}
-
-    def more_general(model: Model) -> bool:
-        ours, theirs = ({(c.effect, c.place) for c in m.parts} for m in (plain, model))
-        own, other = sorted(ours - theirs, key=lambda c: c[1]), sorted(theirs - ours, key=lambda c: c[1])
-        pairs = zip(own, other, strict=False)
-        return 0 < len(own) == len(other) and all(a[1] == b[1] and a[0] in holds[b[0]] for a, b in pairs)
-
-    return [more_general(m) for m in models]
-
-
-def plainest(tied: Sequence[tuple[Model, Trial]]) -> tuple[Model, Trial]:
-    """Of models that do as well, the one with the fewest parameters: a flexible form mimics a plain one."""
-    return min(tied, key=lambda mt: (sum(len(c.free) for c in mt[0].parts), mt[1].gap_confirm))
+    trials = without_idle(judged, won, case.effects, hunt.floor)
+    return Round(found, stood, tuple(tried), tuple(trials), *won)

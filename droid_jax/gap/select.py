@@ -20,7 +20,6 @@ OF_ALL = 0.05  # and share of the base model's U: what a wrong form of the first
 DOUBT = 0.05  # share of the resamples in which a rival is better, from which it does as well
 CHOSEN = 0.8  # share of the resamples in which an effect, or one that does as well, must win
 RESAMPLES = 400
-GENERAL = 0.9  # times what an effect leaves above the floor, below which one that holds it as a special case must get
 TOO_SMALL = "too small to be worth a name"
 AT_BOUND = "ran into its bound"
 UNCONFIRMED = "not confirmed by the other demonstration"

@@ -1,4 +1,4 @@
-"""Which of several models leads."""
+"""One round of the search: its budget, its aim, and what is taken out again."""
 
 from __future__ import annotations
 
@@ -11,42 +11,7 @@ import pytest
 from droid_jax.gap.blocks import OUTSIDE, Blocks
 from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.evidence import Evidence
-from droid_jax.gap.rounds import Budget, Hunt, holding, plainest, without
-
-
-def model(effect: str, amplitudes: int, shapes: int, left: float) -> Any:
-    names = tuple(f"{effect}_{k}" for k in range(amplitudes))
-    part = Candidate(effect, "slide", names, {f"{effect}_shape_{k}": 1.0 for k in range(shapes)})
-    return SimpleNamespace(parts=(part,), name=part.name), SimpleNamespace(gap_confirm=left)
-
-
-def test_the_fewest_parameters_lead_and_among_equals_the_smallest_gap() -> None:
-    stribeck, coulomb, bias = (
-        model(*args) for args in (("stribeck", 1, 2, 0.140), ("coulomb", 1, 0, 0.148), ("bias", 1, 0, 0.15))
-    )
-    assert plainest([stribeck, coulomb, bias]) == coulomb
-    assert plainest([stribeck]) == stribeck
-
-
-def test_one_that_holds_the_leader_as_a_special_case_is_told_from_other_rivals() -> None:
-    """Stribeck's friction holds dry friction at its own joint, and no other; the same in a model of two effects."""
-    effects: Any = [
-        SimpleNamespace(name="coulomb", holds=()),
-        SimpleNamespace(name="stribeck", holds=("coulomb",)),
-        SimpleNamespace(name="bias", holds=()),
-    ]
-
-    def of(*parts: tuple[str, str]) -> Any:
-        return SimpleNamespace(parts=[Candidate(effect, place, ()) for effect, place in parts])
-
-    plain = of(("coulomb", "elbow"))
-    others = [plain, of(("stribeck", "elbow")), of(("stribeck", "wrist")), of(("bias", "elbow"))]
-    assert holding(effects, plain, [*others, of(("stribeck", "elbow"), ("bias", "elbow"))]) == [
-        False, True, False, False, False
-    ]  # fmt: skip
-    both = of(("bias", "hinge"), ("coulomb", "elbow"))
-    assert holding(effects, both, [of(("bias", "hinge"), ("stribeck", "elbow")), others[1]]) == [True, False]
-    assert holding(effects, others[1], [plain]) == [False]  # not the other way round
+from droid_jax.gap.rounds import Budget, Hunt, without
 
 
 def test_a_shape_stays_where_its_effect_does() -> None:
