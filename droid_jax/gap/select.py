@@ -20,6 +20,7 @@ OF_ALL = 0.05  # and share of the base model's U: what a wrong form of the first
 DOUBT = 0.05  # share of the resamples in which a rival is better, from which it does as well
 CHOSEN = 0.8  # share of the resamples in which an effect, or one that does as well, must win
 RESAMPLES = 400
+AS_FITTED = 0.05  # share of the gap on the fitted demonstration that is no difference there
 TOO_SMALL = "too small to be worth a name"
 AT_BOUND = "ran into its bound"
 UNCONFIRMED = "not confirmed by the other demonstration"
@@ -83,7 +84,8 @@ def judge(
     left = np.array([confirm.gap(r) for r in repeats])
     squares = np.array([np.sum(r**2, axis=1) for r in repeats])
     losses = np.nan_to_num(confirm.losses(commons[1:], resamples(confirm.units, seed)), nan=np.inf)
-    same = alike(left[1:], losses, floor, confirm.tie)
+    fitted = np.array([m.gap for m in models])
+    same = alike(left[1:], fitted, losses, floor, confirm.tie, AS_FITTED * before.gap)
     winners = np.bincount(np.argmin(losses, axis=1), minlength=len(models)) / len(losses)
     out = []
     for k, model in enumerate(models):
@@ -107,14 +109,18 @@ def judge(
     return out
 
 
-def alike(left: np.ndarray, losses: np.ndarray, floor: float, tie: float) -> np.ndarray:
+def alike(
+    left: np.ndarray, fitted: np.ndarray, losses: np.ndarray, floor: float, tie: float, nothing: float
+) -> np.ndarray:
     """[K, K] bool, which models cannot be told apart.
 
-    left: [K] U on the confirming demonstration; losses: [R, K] in resamples of its repeats.  What two
-    wrong forms leave says little about which is nearer the truth, so a ratio `tie` counts and not significance.
+    left, fitted: [K] U on the confirming and on the fitted demonstration; losses: [R, K] in resamples of the confirming
+    one's repeats.  What two wrong forms leave says little about which is nearer the truth, so a ratio `tie` counts and
+    not significance; on the fitted one differences up to `nothing` are none.
     """
-    above = np.maximum(left - floor, 1e-12)
+    above, above_fitted = (np.maximum(u - floor, 1e-12) for u in (left, fitted))
     near = above[None, :] <= tie * above[:, None]
+    near &= above_fitted[None, :] <= tie * above_fitted[:, None] + nothing
     better = np.mean(losses[:, None, :] < losses[:, :, None], axis=0) > DOUBT
     as_good = near | better
     return (as_good & as_good.T) | np.eye(len(left), dtype=bool)

@@ -108,15 +108,21 @@ def test_one_sided_p():
 def test_models_that_leave_much_the_same_are_ties():
     left = np.array([1.0, 2.5, 10.0, 1.0])
     losses = np.tile([1.0, 2.0, 9.0, 1.5], (400, 1))
-    same = alike(left, losses, floor=0.0, tie=3.0)
+    same = alike(left, np.zeros(4), losses, 0.0, 3.0, 0.1)
     np.testing.assert_array_equal(same, same.T)
     assert same[0].tolist() == [True, True, False, True]
-    assert alike(left, losses, floor=0.9, tie=3.0)[0].tolist() == [
-        True,
-        False,
-        False,
-        True,
-    ]  # above the floor it is 16 times
+    above = alike(left, np.zeros(4), losses, 0.9, 3.0, 0.1)  # above the floor it is 16 times
+    assert above[0].tolist() == [True, False, False, True]
+
+
+def test_what_the_fitted_demonstration_tells_apart_is_no_tie():
+    """The same on the other one; on the fitted one more than three times as much, by more than is no difference."""
+    left, fitted = np.full(4, 1.0), np.array([0.1, 0.35, 0.45, -0.2])
+    losses = np.tile([1.0, 2.0, 3.0, 4.0], (400, 1))
+    same = alike(left, fitted, losses, 0.0, 3.0, 0.1)
+    assert same[0].tolist() == [True, True, False, True]
+    noise = np.where(np.arange(400)[:, None] % 2, losses, losses[:, ::-1])  # better half of the time: no fit decides
+    assert alike(left, fitted, noise, 0.0, 3.0, 0.1)[0].all()
 
 
 def test_models_that_noise_cannot_separate_are_ties():
@@ -127,7 +133,7 @@ def test_models_that_noise_cannot_separate_are_ties():
     commons[2] += 1.0
     deviations = rng.normal(size=(REPEATS, SIZE))
     losses = measured(deviations - deviations.mean(axis=0)).losses(commons, resamples(REPEATS))
-    same = alike(np.array([1e-4, 1e-3, 1.0]), losses, floor=0.0, tie=3.0)
+    same = alike(np.array([1e-4, 1e-3, 1.0]), np.zeros(3), losses, 0.0, 3.0, 0.1)
     assert same[0].tolist() == [True, True, False]
 
 
