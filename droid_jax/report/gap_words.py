@@ -124,8 +124,8 @@ def _allowed(gap: Gap) -> str:
         return ""
     after, share = number(confirm["after"]), percent(1.0 - max(left, 0.0) / confirm["after"])
     return (
-        f"Of U = {after} that is left on “{confirm['recording']}”, {share} is no more than the fit does not tell of "
-        "its parameters: that motion asks for others than the fitted one shows."
+        f"Of U = {after} that is left on “{confirm['recording']}”, {share} lies within the uncertainty of the fitted "
+        "parameters: that motion shows some that the fitted one does not tell."
     )
 
 

@@ -144,6 +144,17 @@ def test_significant_but_below_the_floor_is_said(tmp_path: Path) -> None:
     assert "no larger than what the simulation's own time step leaves" in " ".join(gap_words.gap_summary(gap))
 
 
+def test_what_the_fit_does_not_tell_is_said_where_it_is_much(tmp_path: Path) -> None:
+    after = gap_json("named", ("fit", "confirm", "sealed"))["gaps"]["confirm"]["after"]
+
+    def said(name: str, **changes: Any) -> str:
+        return " ".join(gap_words.gap_summary(read_gap(make_gap(tmp_path / name, "named", **changes))))
+
+    assert "75 % lies within the uncertainty" in said("much", remainder=0.25 * after).replace("\u00a0", " ")
+    for name, remainder in (("little", 0.9 * after), ("unknown", None)):
+        assert "lies within the uncertainty" not in said(name, remainder=remainder)
+
+
 BLOCKS = {"by": "blocks", "limits": "The confirming blocks are of the same motion."}
 HALVES = {"by": "repeats", "limits": "The confirming repeats repeat the fitted motion."}
 
@@ -261,6 +272,7 @@ def test_one_page_for_a_folder_with_both(tmp_path: Path) -> None:
         (lambda f: f["gaps"]["fit"].update(before="4"), r"'gaps', 'fit', 'before' must be a number or null, got str"),
         (lambda f: f["cells"].update(after={}), r"'cells', 'after' must be a list, got dict"),
         (lambda f: f.update(verdict="maybe"), r"'verdict' must be one of none, named.*got 'maybe'"),
+        (lambda f: f.update(remainder="much"), r"'remainder' must be a number or null, got 'much'"),
         (lambda f: f.update(split={"by": "halves", "limits": ""}), r"'by' must be one of recordings.*got 'halves'"),
         (lambda f: f.update(split={"by": "blocks"}), r"'split' lacks 'limits'"),
         (lambda f: f.update(tied=[[], []]), r"'tied' has 2 lists for 1 effects"),
