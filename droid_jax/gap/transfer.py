@@ -1,8 +1,8 @@
 """What a fit leaves on another motion without anything missing: its parameters are uncertain, and it asks for others.
 
 The fitted demonstration tells some directions of the parameters poorly, and another motion may show just these.  What
-that adds to U there is no missing effect: on a door with nothing hidden it was 0.025 where U0 is 0.0005, and the
-fit's own uncertainty says 0.016 to 0.031.
+that adds to U there is no missing effect: on a door with nothing hidden it was 0.025 where U0 is 0.0005, and
+one deviation that the fit's noise leaves along every axis makes 0.016.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import numpy as np
 from droid_jax.gap.evidence import Evidence
 from droid_jax.gap.refit import Model
 from droid_jax.gap.screen import project
+from droid_jax.identify.damped import principal_axes
 from droid_jax.identify.uncertainty import told
 
 LONGEST = 1.0  # search units: what the fit did not tell at all is no further from it than that
@@ -32,10 +33,7 @@ def beyond(fitted: Evidence, other: Evidence, model: Model) -> np.ndarray:
 def spread(fitted: Evidence, other: Evidence, model: Model) -> np.ndarray:
     """[M, D] by how much one deviation of the fit, along each of its principal axes, changes the common residual."""
     space, whole, x = model.space, other.cost.space, model.refined.x
-    known = told(model.refined, fitted.cost.comparisons, misfit=False)
-    variance, axes = np.linalg.eigh(known.cov)
-    steps = (axes * np.sqrt(np.maximum(variance, 0.0))).T
-    steps *= np.minimum(1.0, LONGEST / np.max(np.abs(steps), axis=1, keepdims=True))
+    steps = principal_axes(told(model.refined, fitted.cost.comparisons, misfit=False).cov, LONGEST).T
     ends = [np.clip(x + sign * steps, *map(space.to_search, (space.low, space.high))) for sign in (1.0, -1.0)]
     up, down = np.split(other.common(whole.embed(space, space.from_search(np.concatenate(ends)), model.values)), 2)
     return (0.5 * (up - down)).T

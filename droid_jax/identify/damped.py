@@ -69,6 +69,12 @@ def curvature(jacobian: np.ndarray, prior: np.ndarray) -> np.ndarray:
     return jacobian.T @ jacobian + np.diag(prior**-2)
 
 
+def principal_axes(cov: np.ndarray, longest: float) -> np.ndarray:
+    """[D, D] columns: principal axes of a covariance, one deviation long, no entry beyond `longest`."""
+    variance, axes = np.linalg.eigh(cov)
+    return axes * np.minimum(np.sqrt(np.maximum(variance, 0.0)), longest / np.max(np.abs(axes), axis=0))
+
+
 def fall(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """[S] by how much the objectives fell; 0 for a start that could not be replayed and still cannot."""
     return np.where(np.isinf(after), 0.0, before - np.where(np.isinf(after), 0.0, after))
@@ -154,8 +160,7 @@ class Problem:
 
     def axes(self, jacobian: np.ndarray, longest: float) -> np.ndarray:
         """[D, D] columns: the posterior's principal axes, one deviation long, no entry beyond `longest`."""
-        variance, axes = np.linalg.eigh(np.linalg.inv(curvature(jacobian, self.prior)))
-        return axes * np.minimum(np.sqrt(np.maximum(variance, 0.0)), longest / np.max(np.abs(axes), axis=0))
+        return principal_axes(np.linalg.inv(curvature(jacobian, self.prior)), longest)
 
     def wide_jacobian(self, state: State, jacobian: np.ndarray) -> np.ndarray:
         """[M, D] slopes of one start over the width of its posterior, from narrow ones, along the posterior's own axes.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import sys
 import traceback
@@ -26,7 +25,7 @@ from droid_jax.policy.transfer import StandIn, transfer
 from droid_jax.report.export import save
 from droid_jax.report.files import POLICY
 from droid_jax.storage import write_json
-from experiments.policies.store import Doors, trained
+from experiments.policies.store import Doors, sha256, trained
 from experiments.policies.table import PLACES
 from experiments.sharing import claimed
 
@@ -133,16 +132,11 @@ def tried(
     place, made = trained(arguments.trained, env, doors, replace(budget.config, seed=seed), code)
     policy, drawn = load(place / POLICY), of_method(doors.method, env.scene, doors.gaussian)
     return {
-        "doors_sha256": _sha256(doors.gaussian.to_json()),
+        "doors_sha256": sha256(json.dumps(doors.gaussian.to_json())),
         "simulation": simulated(policy, env, drawn, budget.trials, seed).to_json(),
         **{name: transfer(policy, robot).to_json() for name, robot in robots.items()},
         **made,
     }
-
-
-def _sha256(of: Any) -> str:
-    """Of plain data."""
-    return hashlib.sha256(json.dumps(of).encode()).hexdigest()
 
 
 class Case(NamedTuple):

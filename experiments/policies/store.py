@@ -66,7 +66,7 @@ def trained(
 def decided_by(env: DoorEnv, doors: Doors, config: TrainConfig) -> dict[str, Any]:
     """All that decides what training comes to, as plain data."""
     of = {
-        "scene": _sha256(_text(env.scene)),
+        "scene": sha256(_text(env.scene)),
         "effects": [effect.name for effect in env.effects],
         "start": env.start.tolist(),
         "task": asdict(env.task),
@@ -80,7 +80,7 @@ def decided_by(env: DoorEnv, doors: Doors, config: TrainConfig) -> dict[str, Any
 def place_of(store: Path, of: Mapping[str, Any]) -> Path:
     """The folder of the policy that this decides: the one that is there, or where it shall be."""
     there = (path.parent for path in sorted(store.glob(f"*/{OF}")) if alike(json.loads(path.read_text()), of))
-    return next(there, store / _sha256(json.dumps(of))[:16])
+    return next(there, store / sha256(json.dumps(of))[:16])
 
 
 def alike(one: Any, other: Any) -> bool:
@@ -102,5 +102,6 @@ def _text(scene: Scene) -> str:
         return scene.spec.to_xml()
 
 
-def _sha256(text: str) -> str:
+def sha256(text: str) -> str:
+    """Of a text, in hexadecimal digits."""
     return hashlib.sha256(text.encode()).hexdigest()

@@ -53,7 +53,7 @@ def test_what_the_fit_does_not_tell_is_allowed_for_and_nothing_else(whole: tuple
 
 
 def test_the_slopes_are_of_one_deviation(whole: tuple[Case, Model]):
-    """As a fit to a tenth of the noise would have a tenth of the deviations, and so of the slopes."""
+    """One for each axis; together they span what any one parameter does."""
     case, model = whole
     slopes, refined = spread(case.fit, case.confirm, model), model.refined
     assert slopes.shape == (len(case.confirm.common(model.values)[0]), len(refined.x))

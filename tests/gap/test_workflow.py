@@ -153,7 +153,7 @@ def test_no_name_from_an_extended_fit_that_did_not_converge(found: Small, monkey
     assert any(trial.passed for trial in verdict.trials)  # the grounds are told
 
 
-def replace_gap(evidence: Any, gap: float) -> Any:
+def of_gap(evidence: Any, gap: float) -> Any:
     """Evidence whose every U is this."""
     return SimpleNamespace(gap=lambda residuals: gap, cell_p_values=evidence.cell_p_values)
 
@@ -168,7 +168,7 @@ def test_what_is_left_counts_where_chance_would_not_leave_it(found: Small):
     assert not workflow._remains(vast, left, quiet=False)
     signs = np.where(np.arange(case.confirm.repeats) % 2, 1.0, -1.0)[:, None]
     by_chance = signs * np.ones((case.confirm.repeats, 6))
-    hunt.case = SimpleNamespace(confirm=replace_gap(case.confirm, found.base.gap))
+    hunt.case = SimpleNamespace(confirm=of_gap(case.confirm, found.base.gap))
     assert not workflow._remains(hunt, by_chance, quiet=True) and workflow._remains(hunt, by_chance, quiet=False)
 
 
