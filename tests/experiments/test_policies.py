@@ -38,6 +38,7 @@ from experiments.policies.cases import (
     Options,
     finish,
     found_of,
+    learned,
     made_by,
     run_all,
 )
@@ -415,6 +416,31 @@ def test_what_was_made_with_something_else_is_refused_before_anything_is_made(tm
 def test_nothing_to_sum_up_is_refused(option: str):
     with pytest.raises(SystemExit, match=f"--{option} must be 1 or more, got 0"):
         _ = (options := Options(**{option: 0})).budget, options.policies
+
+
+def test_a_training_that_has_not_learned_is_made_anew_with_twice_the_actions(tmp_path: Path):
+    made = list[tuple[int, int]]()
+
+    def training(rates: Sequence[float]):
+        def train(config: TrainConfig) -> tuple[Path, dict[str, Any]]:
+            made.append((config.seed, config.steps))
+            return tmp_path, {"history": [{"success": 0.0}, {"success": rates[len(made) - 1]}, {"success": 0.5}]}
+
+        made.clear()
+        return train
+
+    for again, rates, steps in [
+        (0, [0.0], [1]),
+        (1, [0.95], [1]),
+        (1, [0.94, 0.0], [1, 2]),
+        (2, [0.0, 0.0, 0.0], [1, 2, 4]),
+        (2, [0.0, 1.0], [1, 2]),
+    ]:
+        budget = Options(again=again).budget
+        learned(budget, 7, training(rates))
+        assert made == [(7, n * budget.config.steps) for n in steps]
+    once, twice = Options().budget.to_json(), Options(again=1).budget.to_json()
+    assert twice == {**once, "again": 1}, "files that were made before the rule stay valid"
 
 
 def test_pilots_have_a_summary_of_their_own(tmp_path: Path):
