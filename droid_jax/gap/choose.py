@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -42,7 +43,9 @@ def without_idle(judged: Sequence[Judged], winner: Judged, effects: Sequence[Eff
     general = holding(effects, plain, [m for m, _ in judged])
     idle = f"holds {plain.name} as a special case and leaves no less"
     return [
-        replace(t, reasons=(idle,), weak=False) if more and t.gap_confirm > left and (t.passed or t.weak) else t
+        replace(t, reasons=(idle,), weak=False)
+        if more and max(t.gap_confirm, floor) >= left and (t.passed or t.weak)
+        else t
         for (_, t), more in zip(judged, general, strict=True)
     ]
 
@@ -53,8 +56,8 @@ def holding(effects: Sequence[Effect], plain: Model, models: Sequence[Model]) ->
 
     def more_general(model: Model) -> bool:
         ours, theirs = ({(c.effect, c.place) for c in m.parts} for m in (plain, model))
-        own, other = sorted(ours - theirs, key=lambda c: c[1]), sorted(theirs - ours, key=lambda c: c[1])
-        pairs = zip(own, other, strict=False)
-        return 0 < len(own) == len(other) and all(a[1] == b[1] and a[0] in holds[b[0]] for a, b in pairs)
+        own, other = tuple(ours - theirs), itertools.permutations(theirs - ours)
+        pairs = (zip(own, order, strict=True) for order in other if 0 < len(own) == len(order))
+        return any(all(a[1] == b[1] and a[0] in holds[b[0]] for a, b in some) for some in pairs)
 
     return [more_general(m) for m in models]

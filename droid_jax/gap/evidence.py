@@ -13,7 +13,7 @@ import numpy as np
 
 from droid_jax.compare.cost import Cost
 from droid_jax.compare.residuals import Comparison
-from droid_jax.gap.flips import gap_p_values, largest_t, steady
+from droid_jax.gap.flips import gap_p_values, largest_steady_t, steady
 from droid_jax.measure.noise import coarse_clock
 
 # A parameter off its prior's mean is held back by that prior, and what is left of it all repeats share: with the
@@ -133,14 +133,15 @@ class Evidence:
         scores: [K, N] of projected marks [K, M], of which what grows or fades steadily over the repeats is left out.
         base: [M, D] columns they were projected on, with prior deviations [D]; repeats need neither.
         """
-        return largest_t(steady(scores.T).T, seed)
+        return largest_steady_t(scores, seed)
 
     def losses(self, commons: np.ndarray, draws: np.ndarray) -> np.ndarray:
         """[R, K] squared mean residual of K models in resamples of the repeats, up to what all models share.
 
-        commons: [K, M] common part of each model's residuals; draws: [R, N] weights, each row summing to one.
+        commons: [K, M] common part of each model's residuals; draws: [R, N] weights, each row summing to one.  What
+        grows or fades steadily over the repeats is no scatter.
         """
-        return np.sum(commons**2, axis=1) + 2 * draws @ (self.deviations @ commons.T)
+        return np.sum(commons**2, axis=1) + 2 * draws @ (steady(self.deviations) @ commons.T)
 
 
 def evidence(cost: Cost) -> Evidence:

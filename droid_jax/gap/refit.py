@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.stats
 
 from droid_jax.gap.candidates import Candidate, joined
 from droid_jax.gap.evidence import Evidence
@@ -99,6 +100,17 @@ def look(
     starts = np.stack([without, proposed])[:, whole.columns(space)]
     values, objective = chord(residuals, space, starts, jacobian)
     return whole.embed(space, values[None], without)[0], objective
+
+
+def vanishing(evidence: Evidence, model: Model, part: Candidate) -> bool:
+    """Whether all amplitudes of a part may be zero together, by their posterior covariance, bounds or no bounds.
+
+    Together, because two that trade with each other (a friction's slope and curve) may each be zero and not both.
+    """
+    at, space = [model.space.index(a) for a in part.amplitudes], evidence.cost.space
+    away = [(model.values[space.index(a)] - space[a].mean) / space[a].std for a in part.amplitudes]
+    cov = told(model.refined, evidence.cost.comparisons).cov[np.ix_(at, at)]
+    return bool(away @ np.linalg.solve(cov, away) <= scipy.stats.chi2.ppf(LEVEL, len(at)))
 
 
 def deviations(evidence: Evidence, model: Model) -> dict[str, float]:

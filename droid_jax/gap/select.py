@@ -6,11 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.stats
 
 from droid_jax.gap.evidence import Evidence
 from droid_jax.gap.flips import sign_flips, steady, t_values
-from droid_jax.gap.refit import LEVEL, Model, deviations, intervals
+from droid_jax.gap.refit import Model, intervals, vanishing
 
 SIGNIFICANT = 0.01  # p below which something is missing
 CONFIRMED = 0.05  # and below which one effect's gain on the other demonstration is no chance, among all other gates
@@ -151,13 +150,8 @@ def _too_small(
 
 def _amplitude_reasons(fit: Evidence, model: Model, spans: Mapping[str, tuple[float, float]]) -> list[str]:
     """An interval ends at its bound, often neutral: whether an amplitude may be zero is asked of its deviation."""
-    space, deviation, reach = fit.cost.space, deviations(fit, model), scipy.stats.norm.ppf(0.5 + 0.5 * LEVEL)
-
-    def vanishing(a: str) -> bool:
-        return bool(abs(model.values[space.index(a)] - space[a].mean) <= reach * deviation[a])
-
     new = [c for c in model.parts if set(c.amplitudes) <= set(spans)]
-    reasons = ["its amplitude may be zero"] if any(all(map(vanishing, c.amplitudes)) for c in new) else []
+    reasons = ["its amplitude may be zero"] if any(vanishing(fit, model, c) for c in new) else []
     return reasons + [f"{a} {AT_BOUND}" for a in spans if _on_bound(fit, model, a)]
 
 

@@ -19,15 +19,15 @@ LONGEST = 1.0  # search units: what the fit did not tell at all is no further fr
 
 
 def beyond(fitted: Evidence, other: Evidence, model: Model) -> np.ndarray:
-    """[M] common residual of a model on another recording than the fitted one, less what its uncertainty allows.
+    """[N, M] residuals of a model on another recording than the fitted one, less what its uncertainty allows.
 
     The parameters move once more, along slopes, to where the other recording wants them; how far is held by what the
     fitted one tells of them (`told`), as if both had been fitted.  The other recording's own nuisances are at their
-    best throughout.
+    best throughout.  Every repeat is projected and not their mean alone, whose noise U tells from their scatter.
     """
     slopes = spread(fitted, other, model)
     held = np.full(len(slopes.T), other.repeats**0.5)  # the residual is that of the mean of so many repeats
-    return project(other.common(model.values), slopes, held)[0]
+    return project(other.residuals(other.common(model.values)[0]), slopes, held)
 
 
 def spread(fitted: Evidence, other: Evidence, model: Model) -> np.ndarray:

@@ -134,7 +134,7 @@ def left_over(case: Case, model: Model) -> np.ndarray:
     """[N, M] residuals of the confirming demonstration, less what the fit's own uncertainty leaves there."""
     confirm = case.confirm
     if case.fit.repeats > 1:
-        return confirm.residuals(beyond(case.fit, confirm, model))
+        return beyond(case.fit, confirm, model)
     return confirm.residuals(confirm.common(model.values)[0])  # blocks of one log are of one motion
 
 

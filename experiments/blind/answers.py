@@ -157,6 +157,11 @@ def matched(slots: Sequence[set[str]], right_names: Sequence[Sequence[str]]) -> 
     return met.tolist()
 
 
+def beside(parts_of: Sequence[Sequence[str]], met: Sequence[bool]) -> list[Sequence[str]]:
+    """Names that are not wrong beside a right one: parts of each hidden effect (none for any: empty) that is named."""
+    return [names for names, named in zip(parts_of, met, strict=False) if named]
+
+
 def parts(scene: Scene, hidden: Applied) -> tuple[str, ...]:
     """Names "effect at place" of what is only a part of what was hidden."""
     names = (_at(scene, name, hidden.joint) for name in ANSWERS[hidden.name].parts)

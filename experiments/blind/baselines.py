@@ -21,7 +21,7 @@ from droid_jax.gap.refit import Model
 from droid_jax.gap.screen import Screen, project
 from droid_jax.measure.noise import lowpass, smooth
 from droid_jax.measure.recording import Recording
-from experiments.blind.answers import matched
+from experiments.blind.answers import beside, matched
 from experiments.blind.units import torques, whitened
 
 MOST = 5  # effects that BIC may name
@@ -155,10 +155,12 @@ def _shaped(evidence: Evidence, rows: np.ndarray) -> np.ndarray:
 
 
 def bic_outcome(
-    named: Sequence[str], right: Sequence[Sequence[str]], allowed: Sequence[Sequence[str]]
+    named: Sequence[str], right: Sequence[Sequence[str]], parts_of: Sequence[Sequence[str]]
 ) -> dict[str, bool]:
-    """Whether BIC named everything hidden, and anything that is not among the names allowed beside it."""
+    """Whether BIC named everything hidden, and anything that is neither that nor a part of what it named rightly."""
+    met = matched([{n} for n in named], right)
+    allowed = [*right, *beside(parts_of, met)]
     return {
-        "all": any(right) and all(matched([{n} for n in named], [names for names in right if names])),
+        "all": any(right) and all(found for found, names in zip(met, right, strict=True) if names),
         "false": any(not any(n in names for names in allowed) for n in named),
     }

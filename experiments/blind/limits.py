@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from droid_jax.gap.candidates import candidates
-from droid_jax.gap.flips import largest_t, steady
+from droid_jax.gap.flips import largest_steady_t
 from droid_jax.gap.screen import questions_of
 from droid_jax.measure.hidden import HIDDEN, Applied
 from droid_jax.storage import write_json
@@ -57,7 +57,7 @@ class Power:
         left, free = self.where.left(amplitude * common)
         marks, noise = self._projected(free)
         scores = marks @ (left + amplitude * (added - common)).T
-        p = [largest_t(steady((scores + noise[:, rows]).T).T)[1] for rows in self.chosen]  # as `Evidence.largest`
+        p = [largest_steady_t(scores + noise[:, rows])[1] for rows in self.chosen]  # as `Evidence.largest`
         return float(np.mean(np.array(p) < SIGNIFICANT))
 
     def limit(self, added: np.ndarray, largest: float) -> float | None:

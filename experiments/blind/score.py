@@ -12,7 +12,7 @@ import numpy as np
 import scipy.stats
 
 from droid_jax.measure.hidden import Applied
-from experiments.blind.answers import matched, parts, right
+from experiments.blind.answers import beside, matched, parts, right
 from experiments.blind.baselines import bic_outcome
 from experiments.blind.cases import key
 from experiments.blind.scenes import setting
@@ -76,11 +76,12 @@ def judge(case: Case, limits: Mapping[str, Any]) -> dict[str, Any]:
     """One case: what is right and wrong about its verdict."""
     truth, result, right_names = case["truth"], case["result"], case["right"]
     verdict = result["verdict"]
-    if truth["kind"] == "left_out":
+    left_out = truth["kind"] == "left_out"
+    if left_out:
         right_names = [[] for _ in right_names]
     slots = slots_of(result, right_names)
     met = matched(slots, right_names)
-    allowed = right_names if truth["kind"] == "left_out" else [*right_names, *case["parts"]]
+    allowed = [*right_names, *beside([] if left_out else case["parts"], met)]
     false = [sorted(slot) for slot in slots if not any(slot & set(names) for names in allowed)]
     exact = [any(e == names[0] for e in result.get("effects", ())) for names in right_names if names]
     names = result.get("effects", ())
@@ -199,11 +200,10 @@ def against_baselines(case: Case) -> dict[str, Any] | None:
         return None
     left_out = case["truth"]["kind"] == "left_out"
     names = [[] for _ in case["right"]] if left_out else case["right"]
-    allowed = names if left_out else [*names, *case["parts"]]
     boxes = {"gaps": found["black_box"], "floor": case["result"]["floor"]}
     return {
         "bic": found["bic"],
-        **{f"bic_{k}": v for k, v in bic_outcome(found["bic"], names, allowed).items()},
+        **{f"bic_{k}": v for k, v in bic_outcome(found["bic"], names, [] if left_out else case["parts"]).items()},
         "closed": {role: closed(boxes, role) for role in ("confirm", "sealed")},
     }
 

@@ -313,11 +313,13 @@ def test_cases_are_nameable_where_the_right_names_close_half_of_the_gap():
     assert score.reachable(shut) == 0.0  # no gap to speak of
 
 
-def test_a_part_of_what_was_hidden_is_no_false_name_and_not_enough():
+def test_a_part_of_what_was_hidden_is_no_false_name_beside_it_but_alone():
     whole, part = "joint_directional at j", "joint_coulomb at j"
     both, alone = case("single", "named", [whole, part], [[whole]]), case("single", "named", [part], [[whole]])
     judged = [score.judge({**c, "parts": [[part]]}, {}) for c in (both, alone)]
-    assert [j["named"] for j in judged] == [True, False] and not any(j["false_names"] for j in judged)
+    assert [j["named"] for j in judged] == [True, False]
+    assert [j["false_names"] for j in judged] == [[], [[part]]]
+    assert [j["wrong_confident"] for j in judged] == [False, True]
     assert parts(setting("arm").scene, Applied("directional_friction", 1.0, "panda_joint2")) == (
         "joint_coulomb at panda_joint2",
         "joint_stribeck at panda_joint2",
@@ -373,11 +375,12 @@ def test_confusion_and_errors():
 
 def test_bic_is_judged_by_the_same_answers():
     def outcome(named: list[str], right: list[list[str]], parts: list[list[str]] | None = None) -> dict[str, bool]:
-        return bic_outcome(named, right, [*right, *(parts or [])])
+        return bic_outcome(named, right, parts or [])
 
     assert outcome(["a"], [["a", "b"]]) == {"all": True, "false": False}
     assert outcome(["a", "c"], [["a", "b"]]) == {"all": True, "false": True}
     assert outcome(["a", "c"], [["a", "b"]], [["c"]]) == {"all": True, "false": False}
+    assert outcome(["c"], [["a", "b"]], [["c"]]) == {"all": False, "false": True}
     assert outcome(["a"], [["a"], ["b"]]) == {"all": False, "false": False}
     assert outcome(["b"], [["a", "b"], ["b"]]) == {"all": False, "false": False}
     assert outcome(["a"], []) == {"all": False, "false": True}

@@ -50,6 +50,17 @@ def test_one_that_holds_the_leader_as_a_special_case_is_told_from_other_rivals()
     assert holding(effects, others[1], [plain]) == [False]  # not the other way round
 
 
+def test_which_of_two_at_one_joint_holds_which_does_not_depend_on_their_order() -> None:
+    effects: Any = [SimpleNamespace(name=n, holds=h) for n, h in zip("abAB", ((), (), ("a",), ("b",)), strict=True)]
+
+    def of(*names: str) -> Any:
+        return SimpleNamespace(parts=[Candidate(name, "elbow", ()) for name in names])
+
+    for first, second in (("AB", "ab"), ("BA", "ab"), ("AB", "ba"), ("BA", "ba")):
+        assert holding(effects, of(*second), [of(*first)]) == [True]
+    assert holding(effects, of(*"ab"), [of(*"AA")]) == [False]
+
+
 def test_the_one_that_leaves_least_wins_and_a_plainer_one_that_does_as_well_before_it() -> None:
     """A quarter more above the floor, and a hundredth of the whole gap, is as well: 0.235 for a best of 0.2."""
     flexible = model("stribeck", 1, 2, 0.2, "coulomb", "bias")
@@ -76,3 +87,11 @@ def test_what_holds_the_winner_loses_unless_it_leaves_a_tenth_less() -> None:
         kept, judged = without_idle([winner, other], winner, effects, FLOOR)
         assert kept == winner[1] and (judged == other[1]) is stays
         assert stays or judged.reasons == ("holds coulomb at slide as a special case and leaves no less",)
+
+
+def test_where_neither_leaves_anything_what_holds_the_winner_loses() -> None:
+    effects: Any = [SimpleNamespace(name="coulomb", holds=()), SimpleNamespace(name="stribeck", holds=("coulomb",))]
+    winner = model("coulomb", 1, 0, 0.5 * FLOOR)
+    for left in (-0.1 * FLOOR, 0.4 * FLOOR, FLOOR):
+        _, judged = without_idle([winner, model("stribeck", 1, 2, left)], winner, effects, FLOOR)
+        assert not judged.passed

@@ -9,7 +9,15 @@ import pytest
 import scipy.stats
 
 from droid_jax.gap.evidence import gap, gaps
-from droid_jax.gap.flips import benjamini_hochberg, gap_p_values, largest_t, sign_flips, t_values
+from droid_jax.gap.flips import (
+    benjamini_hochberg,
+    gap_p_values,
+    largest_steady_t,
+    largest_t,
+    sign_flips,
+    steady,
+    t_values,
+)
 
 
 def test_all_flips_up_to_twelve_repeats():
@@ -35,6 +43,20 @@ def test_the_largest_t_keeps_its_level():
     mixing = rng.normal(size=(30, 10))
     p = [largest_t(mixing @ rng.normal(size=(10, 8)))[1] for _ in range(1000)]
     assert 0.03 < np.mean(np.array(p) < 0.05) < 0.07
+
+
+def test_without_a_trend_the_largest_t_keeps_its_level():
+    """3,000 times nothing, 40 independent questions each; with the degree of freedom forgotten 6.5 % lie below 0.05."""
+    rng = np.random.default_rng(5)
+    noise = [rng.normal(size=(40, 10)) for _ in range(3000)]
+    p, forgotten = (np.array([of(scores)[1] for scores in noise]) for of in (
+        largest_steady_t, lambda scores: largest_t(steady(scores.T).T)
+    ))  # fmt: skip
+    assert np.mean(p < 0.01) < 0.0135 and 0.04 < np.mean(p < 0.05) < 0.058  # two deviations of the counts
+    assert np.mean(forgotten < 0.05) > np.mean(p < 0.05) + 0.008
+    trend = 5.0 * (np.arange(10) - 4.5)
+    assert largest_steady_t(noise[0] + trend)[1] == pytest.approx(p[0])
+    assert largest_steady_t(np.tile(np.r_[np.ones(7), 1.1], (2, 1)))[1] == pytest.approx(1 / 128)  # eight can reject
 
 
 def test_the_largest_t_finds_what_is_there():

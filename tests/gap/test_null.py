@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from droid_jax.gap.flips import largest_t, steady
+from droid_jax.gap.flips import largest_steady_t
 from droid_jax.gap.screen import project
 from droid_jax.measure.noise import RATE, estimate_noise
 
@@ -47,7 +47,7 @@ def case(seed: int, missing: float, drift: float = 0.0) -> tuple[float, int]:
     common = residuals.mean(axis=0)
     weights = columns.T @ columns + np.diag(prior**-2) / REPEATS
     residuals = residuals - columns @ np.linalg.solve(weights, columns.T @ common)
-    t, p = largest_t(steady(residuals @ questions.T).T)
+    t, p = largest_steady_t(questions @ residuals.T)
     return p, int(np.argmax(np.abs(t)))
 
 

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from small_gap import FLOOR, Small, small
 
+from droid_jax.gap import refit as refit_module
 from droid_jax.gap import select
 from droid_jax.gap.candidates import candidates
 from droid_jax.gap.flips import steady
-from droid_jax.gap.refit import deviations, intervals, refit
+from droid_jax.gap.refit import deviations, intervals, refit, vanishing
 from droid_jax.gap.select import UNCONFIRMED, _gap_reasons, judge, one_sided_p
 
 
@@ -55,6 +57,23 @@ def test_an_amplitude_at_its_neutral_bound_may_be_zero(found: Small):
         values = model.values.copy()
         values[at] = factor * deviation
         assert ("its amplitude may be zero" in tried(found, replace(model, values=values)).reasons) is zero
+
+
+@pytest.mark.parametrize(("signs", "zero"), [((1.2, 1.2), False), ((1.2, -1.2), True), ((0.0, 2.0), False)])
+def test_of_two_amplitudes_that_trade_each_may_be_zero_and_not_both(
+    found: Small, monkeypatch: pytest.MonkeyPatch, signs: tuple[float, float], zero: bool
+):
+    """Posterior deviations of one, correlation -0.99: along their sum a tenth of a deviation is told."""
+    model = extended(found, "payload at elbow")
+    (part,) = model.parts
+    at = [model.space.index(a) for a in part.amplitudes]
+    cov = np.eye(len(model.space))
+    cov[np.ix_(at, at)] = [[1.0, -0.99], [-0.99, 1.0]]
+    monkeypatch.setattr(refit_module, "told", lambda *args: SimpleNamespace(cov=cov))
+    space, values = found.case.whole, model.values.copy()
+    for name, sign in zip(part.amplitudes, signs, strict=True):
+        values[space.index(name)] = space[name].mean + sign * space[name].std
+    assert vanishing(found.case.fit, replace(model, values=values), part) is zero
 
 
 def test_an_amplitude_at_its_other_bound_has_run_into_it(found: Small):
