@@ -163,7 +163,7 @@ def histograms(cases: Sequence[Mapping[str, Any]], settings: Sequence[str]) -> F
 @styled
 def knob_histograms(places: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
     """Largest angles on the stand-in robot, a panel for each place of the knob (its name: its policies)."""
-    panels = [Panel(f"knob {lever} from the hinge", own, AFTER) for lever, own in places.items()]
+    panels = [Panel(f"{lever} from the hinge", own, AFTER) for lever, own in places.items()]
     return _panels([panels])
 
 
@@ -193,6 +193,5 @@ def _panels(rows: Sequence[Sequence[Panel]]) -> Figure:
             axes.set_title(panel.title, fontsize=8)
         row[0].set_ylabel("trials")
     grid[0, 0].set_ylim(top=1.15 * grid[0, 0].get_ylim()[1])  # of all: room for the paper's above the bars
-    for axes in grid[-1]:
-        axes.set_xlabel("largest opening [degrees]")
+    figure.supxlabel("largest opening [degrees]", fontsize="medium")
     return figure
