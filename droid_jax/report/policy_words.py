@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.policy.trials import BLOWN_UP
+from droid_jax.policy.trials import BLOWN_UP, LEARNED
 from droid_jax.report.policy_folder import Trained
 from droid_jax.report.words import label, listed, number, percent
 
@@ -62,12 +62,14 @@ def _tried(where: str, found: Mapping[str, Any], task: Mapping[str, Any]) -> str
 
 
 def _next(trained: Trained, own: bool, searched: bool) -> str:
+    longer = "It has not learned the task in simulation yet: train longer (--steps), or with another --seed."
     if trained.transfer is None:
-        return f"Next: python -m droid_jax.run evaluate {trained.folder}"
+        learned = any(now["success"] >= LEARNED for now in trained.training["history"])
+        return f"Next: python -m droid_jax.run evaluate {trained.folder}" if learned else longer
     if trained.transfer["stand_in"]["success_rate"] >= ENOUGH:
         return f"Next: python -m droid_jax.run export {trained.folder}, and docs/policy-on-a-robot.md."
     if trained.transfer["simulation"]["success_rate"] < ENOUGH:
-        return "It has not learned the task in simulation yet: train longer (--steps), or with another --seed."
+        return longer
     if own:
         return "It works in simulation and not on a robot that it was not fitted to, which was to be expected."
     where = "It works in simulation and not on the stand-in robot"

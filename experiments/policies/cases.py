@@ -22,6 +22,7 @@ from droid_jax.policy.simulated import simulated
 from droid_jax.policy.task import Task
 from droid_jax.policy.train import PRESETS, TrainConfig
 from droid_jax.policy.transfer import StandIn, transfer
+from droid_jax.policy.trials import LEARNED
 from droid_jax.report.export import save
 from droid_jax.report.files import POLICY
 from droid_jax.storage import write_json
@@ -29,7 +30,6 @@ from experiments.policies.store import Doors, sha256, trained
 from experiments.policies.table import PLACES
 from experiments.sharing import claimed
 
-LEARNED = 0.95  # success in one of a training's evaluations, from which it has learned to open
 QUICK_STEPS = 20  # actions of an episode where nothing shall be learned
 RESULTS = Path(__file__).resolve().parents[1] / "results"
 

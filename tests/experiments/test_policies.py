@@ -204,7 +204,7 @@ def test_every_knob_place_has_a_column_and_a_panel():
     text = knobs_as_text({lever: {place: column(own, place) for place in PLACES} for lever, own in of.items()})
     assert "| | 0.30 m | 0.25 m |" in text and "| of each policy | 100 | 50, 50 |" in text
     panels = knob_histograms(of).axes
-    assert [panel.get_title("left") for panel in panels] == [f"knob {lever} from the hinge" for lever in of]
+    assert [panel.get_title("left") for panel in panels] == [f"{lever} from the hinge" for lever in of]
     assert [sum(p.get_height() for p in panel.patches) for panel in panels] == [50, 100]
 
 

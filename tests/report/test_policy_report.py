@@ -57,6 +57,14 @@ def test_it_says_what_to_do_next(tmp_path: Path, successes: int | None, simulate
         assert next_step not in policy_summary(read_policy(made), searched=True)[-1]
 
 
+def test_a_training_that_reached_95_percent_in_no_evaluation_is_not_tried_but_made_longer(tmp_path: Path):
+    """One evaluation at 95 % is enough: the best policy is kept."""
+    for best, learned in ((0.94, False), (0.95, True)):
+        history = [{"step": 1, "seconds": 1.0, "rate": 1.0, "reward": 1.0, "success": s} for s in (0.0, best, 0.5)]
+        said = policy_summary(read_policy(make_policy(tmp_path / f"{best}", None, history=history)))[-1]
+        assert ("has not learned" in said) is not learned and ("droid_jax.run evaluate" in said) is learned
+
+
 def test_a_stand_in_that_was_not_fitted_says_little(tmp_path: Path):
     said = policy_summary(read_policy(make_policy(tmp_path / "run", 10, stand_in={})))
     assert "The fit is of your own recordings" in said[-2] and "was to be expected" in said[-1]
