@@ -10,6 +10,7 @@ import pytest
 from droid_jax.compare.cost import Cost
 from droid_jax.gap.candidates import Candidate, candidates
 from droid_jax.gap.evidence import Evidence
+from droid_jax.gap.flips import steady
 from droid_jax.gap.rank import proposals
 from droid_jax.gap.screen import Question, project, screen
 from droid_jax.gap.select import alike, one_sided_p, resamples
@@ -138,13 +139,16 @@ def test_models_that_noise_cannot_separate_are_ties():
 
 
 def test_resampled_losses_are_the_squared_means_of_resamples():
+    """What grows or fades steadily over the repeats is no scatter, as everywhere else: a trend changes nothing."""
     rng = np.random.default_rng(7)
     commons, deviations = rng.normal(size=(2, 30)), rng.normal(size=(REPEATS, 30))
     deviations -= deviations.mean(axis=0)
     draws = resamples(REPEATS, seed=8)
     losses = measured(deviations).losses(commons, draws)
-    expected = np.sum((commons[:, None] + draws @ deviations) ** 2, axis=2).T
+    expected = np.sum((commons[:, None] + draws @ steady(deviations)) ** 2, axis=2).T
     np.testing.assert_allclose(losses[:, 0] - losses[:, 1], expected[:, 0] - expected[:, 1])
+    trend = np.linspace(-3.0, 3.0, REPEATS)[:, None] * rng.normal(size=30)
+    np.testing.assert_allclose(measured(deviations + trend).losses(commons, draws), losses)
 
 
 def test_candidates_are_effects_at_places_with_shapes():
