@@ -50,8 +50,7 @@ def t_values(scores: np.ndarray, flips: np.ndarray) -> np.ndarray:
 def largest_t(scores: np.ndarray, seed: int = 0) -> tuple[np.ndarray, float]:
     """[K] t of each of K questions with scores [K, N], and the p-value of the largest |t| among them."""
     t = t_values(scores, sign_flips(scores.shape[1], seed))
-    largest = np.max(np.abs(t), axis=1)
-    return t[0], float(np.mean(largest >= largest[0] * (1 - 1e-12)))
+    return t[0], _p_value(t, np.max(np.abs(t[0])))
 
 
 def largest_steady_t(scores: np.ndarray, seed: int = 0) -> tuple[np.ndarray, float]:
@@ -63,9 +62,13 @@ def largest_steady_t(scores: np.ndarray, seed: int = 0) -> tuple[np.ndarray, flo
     """
     count = scores.shape[1]
     t = t_values(steady(scores.T).T, sign_flips(count, seed))
-    largest = np.max(np.abs(t), axis=1)
     own, flipped = scipy.stats.t(max(count - 2, 1)), scipy.stats.t(count - 1)
-    return t[0], float(np.mean(largest >= flipped.isf(own.sf(largest[0])) * (1 - 1e-12)))
+    return t[0], _p_value(t, flipped.isf(own.sf(np.max(np.abs(t[0])))))
+
+
+def _p_value(t: np.ndarray, found: float) -> float:
+    """Share of flips in which the largest |t| [F, K] is as large as what was found."""
+    return float(np.mean(np.max(np.abs(t), axis=1) >= found * (1 - 1e-12)))
 
 
 def gap_p_values(residuals: np.ndarray, cells: np.ndarray, seed: int = 0) -> np.ndarray:

@@ -2,8 +2,8 @@
 
 Computed from the stand-in's noise before the method is frozen.  What a hidden effect adds is recorded once, small,
 with and without it and with the same noise; what the base model cannot absorb of it grows with the amplitude.
-Repeats are drawn, with replacement, from those of a long recording with nothing hidden; the test is `largest_t` over
-the full list of candidates.
+Repeats are drawn, with replacement, from those of a long recording with nothing hidden; the test is `largest_steady_t`
+over the full list of candidates.
 """
 
 from __future__ import annotations
