@@ -25,7 +25,7 @@ from droid_jax.measure.formats import save
 from droid_jax.measure.recording import Channel, Recording
 from droid_jax.model.door_scene import door_scene
 from droid_jax.model.effects import registry
-from droid_jax.model.parameters import Parameter
+from droid_jax.model.parameters import Parameter, Scaling
 from droid_jax.model.seam import Effect
 from droid_jax.run import main
 
@@ -259,6 +259,10 @@ def test_a_log_without_commands_has_no_servo_to_suspect():
     [
         (lambda: Parameter("gasket", "N m", 0.0, 0.5, 0.1, 5.0), "parameter 'gasket': the start 0.0 N m lies outside"),
         (lambda: Parameter("gasket", "N m", 0.5, 0.5, 0.1, 5.0), "neutral at 0, but 'gasket' starts at 0.5 N m"),
+        (
+            lambda: Parameter("gasket", "N m", 0.0, 0.5, 0.0, 5.0, scaling=Scaling.LOG, floor=0.05),
+            "'gasket' must be scaled linearly",
+        ),
         (lambda: Parameter("seal", "N m", 0.0, 0.5, 0.0, 5.0), "speaks of a parameter 'gasket' that it does not have"),
     ],
 )

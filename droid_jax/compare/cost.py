@@ -19,7 +19,7 @@ import numpy as np
 from droid_jax import runtime
 from droid_jax.compare.inverse import Path, path_of, path_replay
 from droid_jax.compare.population import blocks, over_block
-from droid_jax.compare.replay import Drive, Replay, make_drive, servo_replay, torque_offset_effect
+from droid_jax.compare.replay import Drive, Replay, check_gains, make_drive, servo_replay, torque_offset_effect
 from droid_jax.compare.residuals import CompareConfig, Comparison, make_comparison
 from droid_jax.compare.start import check_range, warn_if_moving
 from droid_jax.compare.twin import twin_replay
@@ -103,6 +103,8 @@ class Cost:
         made, drives, replays = [], [], []
         for recording, old, drive, replay in zip(recordings, self.comparisons, self.drives, self._replays, strict=True):
             new = followed(self.scene, recording, config or old.config)
+            if isinstance(new, Drive):
+                check_gains(self.scene, new)
             if not _same(new, drive):
                 raise ValueError(
                     f"recording {recording.name!r} holds other commands than {old.name!r} had, starts elsewhere "

@@ -177,7 +177,7 @@ def _command(
         part = at - low
         return table[low] * (1 - part) + table[low + 1] * part
 
-    # In steps first: float32 seconds would lose a tenth of a step after ten seconds.
+    # In steps first: seconds that are added up in float32 lose a fifth of a step in ten seconds.
     delay = late + jnp.asarray(theta.get("time_offset", 0.0), jnp.float32) / timestep
     whole = jnp.floor(delay)
     low = jnp.clip(k - whole.astype(jnp.int32) - 1, 0, last)

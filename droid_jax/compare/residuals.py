@@ -23,7 +23,6 @@ from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Rollout
 
 ENOUGH = 0.1  # share of the time that two repeats must have measured
-BLOWN_UP = 1e3  # noise units: worse than any replay that kept its numbers
 # Deviation below which a channel's noise is never believed, in the channel's unit.
 MINIMUM_NOISE = {"torque": 0.01, "position": 2e-5, "velocity": 5e-4, "object_angle": 2e-4}
 
@@ -35,7 +34,8 @@ class CompareConfig:
     channels: weight of each compared channel in the distance (per unit of the channel).
     failure_cost: c of equation 1, N m, added where the grasp is lost or the door stays shut.
     non_finite_cost: N m, the cost of a replay that blew up.
-    shut_angle: rad; a door that never opens this far (or half as far as the measured one) stayed shut.
+    shut_angle: rad; a door that moves less than this (or half of what the measured one does) stayed shut; of a slide
+      only the measured one tells.
     grip_share: share of the gripping time that all fingers must touch.
     whitened: the cost is the root mean square of the whitened residuals instead of N m.
     motion_cutoff: Hz, filter of the measured positions of a recording without commands.
@@ -88,7 +88,7 @@ class Comparison:
     clock: np.ndarray
     channels: tuple[Measured, ...]
     grip_rows: tuple[int, int] | None
-    shut_angle: float | None
+    shut_travel: float | None
     phases: tuple[Phase, ...]
     config: CompareConfig
 
@@ -111,12 +111,12 @@ class Comparison:
         if self.grip_rows is not None and rollout.contact.shape[-1]:
             held = jnp.all(rollout.contact[self.grip_rows[0] : self.grip_rows[1]], axis=-1)
             failed = failed | (jnp.mean(held) < self.config.grip_share) | ~held[-1]
-        if self.shut_angle is not None:
-            failed = failed | (jnp.max(rollout.object_angle) < self.shut_angle)
+        if self.shut_travel is not None:
+            failed = failed | (jnp.ptp(rollout.object_angle) < self.shut_travel)
         return failed
 
     def whitened(self, rollout: Rollout) -> jax.Array:
-        """[M] residuals of the repeats' mean in noise units; BLOWN_UP throughout where a replay blew up."""
+        """[M] residuals of the repeats' mean in noise units; NaN throughout where the replay blew up."""
         parts = [
             jnp.einsum(
                 "ckl,lc->ck",
@@ -126,7 +126,7 @@ class Comparison:
             for c in self.channels
         ]
         residual = jnp.concatenate(parts)
-        return jnp.where(rollout.finite & jnp.all(jnp.isfinite(residual)), residual, BLOWN_UP)
+        return jnp.where(rollout.finite & jnp.all(jnp.isfinite(residual)), residual, jnp.nan)
 
     @property
     def repeats(self) -> int:
@@ -208,19 +208,27 @@ def make_comparison(
         _measure(scene, recording.channel(name), clock, weight, apart if name == "torque" else None)
         for name, weight in config.channels.items()
     )
-    grip = _grip_window(recording) if scene.grip else None
-    shut = None
-    if scene.object_joint and scene.grip:
-        shut = config.shut_angle
-        if "object_angle" in recording.channels:
-            angle = recording.channels["object_angle"]
-            shut = max(shut, 0.5 * float(np.max(np.where(angle.mask, angle.values, -np.inf))))
+    acts = scene.grip is not None and recording.command.size > 0  # along a prescribed motion nothing is gripped
+    grip = _grip_window(recording) if acts else None
+    shut = _shut_travel(scene, recording, config) if acts else None
     rows = None
     if grip is not None:
         steps, timestep = len(clock), clock[1] - clock[0]
         first, end = (int(np.clip(round((t - clock[0]) / timestep), 0, steps)) for t in grip)
         rows = (min(first, steps - 1), max(end, first + 1))
     return Comparison(recording.name, clock, channels, rows, shut, recording.phases, config)
+
+
+def _shut_travel(scene: Scene, recording: Recording, config: CompareConfig) -> float | None:
+    """rad (m of a slide): an object that moves less than this stayed shut; None where nothing tells what is little."""
+    if scene.object_joint is None:
+        return None
+    kind = scene.model.jnt_type[scene.id("joint", scene.object_joint)]
+    least = None if kind == mujoco.mjtJoint.mjJNT_SLIDE else config.shut_angle
+    if "object_angle" not in recording.channels:
+        return least
+    angle = recording.channels["object_angle"]
+    return max(least or 0.0, 0.5 * float(np.ptp(angle.values[angle.mask])))
 
 
 def _grip_window(recording: Recording) -> tuple[float, float] | None:

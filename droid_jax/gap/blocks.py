@@ -24,7 +24,7 @@ import numpy as np
 
 from droid_jax.compare.cost import Cost
 from droid_jax.gap.evidence import Evidence, only_comparison, places
-from droid_jax.gap.flips import FEWEST, sign_flips
+from droid_jax.gap.flips import FEWEST, one_sided_p, sign_flips
 from droid_jax.measure.noise import correlation_time
 
 LENGTH = 1.5  # correlation times of the residual, its columns' median: a block at least
@@ -85,6 +85,10 @@ class Blocks(Evidence):
     def cell_p_values(self, residuals: np.ndarray, cells: np.ndarray) -> np.ndarray:
         """Ones: squares do not change sign, so no flip tells a cell's gap from its noise."""
         return np.ones(len(cells))
+
+    def gain_p_value(self, gains: np.ndarray) -> float:
+        """p-value of gains [B]: blocks follow in time, and what moves more towards one end says nothing of noise."""
+        return one_sided_p(gains)
 
     def losses(self, commons: np.ndarray, draws: np.ndarray) -> np.ndarray:
         """[R, K] squared residual of K models in resamples of the blocks; draws [R, B]."""

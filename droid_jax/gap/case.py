@@ -42,6 +42,14 @@ class GapConfig:
     compare: CompareConfig = field(default_factory=CompareConfig)
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        for name in ("looked", "refitted", "most"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if set(self.compare.channels) != {"torque"}:
+            names = ", ".join(self.compare.channels)
+            raise ValueError(f"a search for missing effects compares torques alone, got the channels {names}")
+
 
 @dataclass(frozen=True, eq=False)
 class Case:

@@ -13,7 +13,8 @@ import numpy as np
 
 from droid_jax.compare.cost import Cost
 from droid_jax.compare.residuals import Comparison
-from droid_jax.gap.flips import gap_p_values, largest_steady_t, steady
+from droid_jax.gap.flips import gap_p_values, largest_steady_t, one_sided_p, steady
+from droid_jax.identify.refine import NotReplayed
 from droid_jax.measure.noise import coarse_clock
 
 # A parameter off its prior's mean is held back by that prior, and what is left of it all repeats share: with the
@@ -66,7 +67,10 @@ class Evidence:
         return SLACK
 
     def common(self, values: np.ndarray) -> np.ndarray:
-        """[P, D] -> [P, M] mean of the repeats minus simulation, the recording's own nuisances at their best."""
+        """[P, D] -> [P, M] mean of the repeats minus simulation, the recording's own nuisances at their best.
+
+        NaN throughout where a replay blew up.
+        """
         _, common, best = self._own_fitted(values)
         return common if self.own_columns is None else common + best @ self.own_columns.T
 
@@ -110,8 +114,14 @@ class Evidence:
         return common + self.deviations
 
     def gap_at(self, values: np.ndarray) -> float:
-        """U of the model at `values` [D]."""
-        return self.gap(self.residuals(self.common(values)[0]))
+        """U of the model at `values` [D]; NotReplayed where its replay blows up."""
+        common = self.common(values)[0]
+        if not np.isfinite(common).all():
+            name = only_comparison(self.cost).name
+            raise NotReplayed(
+                f"the simulation of {name!r} blows up with parameters that were fitted to another recording"
+            )
+        return self.gap(self.residuals(common))
 
     def gap(self, residuals: np.ndarray) -> float:
         """U of residuals [N, M], without what grows or fades steadily over the repeats."""
@@ -124,6 +134,10 @@ class Evidence:
     def cell_p_values(self, residuals: np.ndarray, cells: np.ndarray) -> np.ndarray:
         """[K] p-value of each cell's U being above zero."""
         return gap_p_values(steady(residuals), cells)
+
+    def gain_p_value(self, gains: np.ndarray) -> float:
+        """p-value of gains [N], one of each repeat, being above zero; what grows or fades steadily is no noise."""
+        return one_sided_p(steady(gains))
 
     def largest(
         self, scores: np.ndarray, marks: np.ndarray, base: np.ndarray, prior: np.ndarray, seed: int = 0

@@ -47,6 +47,12 @@ def t_values(scores: np.ndarray, flips: np.ndarray) -> np.ndarray:
     return mean / np.sqrt(variance / count)
 
 
+def one_sided_p(gains: np.ndarray) -> float:
+    """p-value of gains [N] being above zero on average."""
+    t = t_values(gains[None], sign_flips(len(gains)))[:, 0]
+    return float(np.mean(t >= t[0] - 1e-12))
+
+
 def largest_t(scores: np.ndarray, seed: int = 0) -> tuple[np.ndarray, float]:
     """[K] t of each of K questions with scores [K, N], and the p-value of the largest |t| among them."""
     t = t_values(scores, sign_flips(scores.shape[1], seed))

@@ -13,6 +13,7 @@ from droid_jax.compare.replay import Drive
 from droid_jax.gap.evidence import Evidence
 from droid_jax.gap.refit import Model
 from droid_jax.gap.screen import project
+from droid_jax.identify.refine import NotReplayed
 from droid_jax.measure.recording import Recording
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import with_options
@@ -33,6 +34,7 @@ def numerical_floor(evidence: Evidence, model: Model, recording: Recording, fine
     """U0 of a fitted base model on the recording it was fitted to; zero in inverse mode.
 
     fine: what `finer` made, of this recording or of another with the same commands, to spare a compilation.
+    Raises NotReplayed where the finer replay blows up.
     """
     cost = evidence.cost
     fine = finer(evidence, model.space, recording) if fine is None else fine.against([recording])
@@ -41,5 +43,7 @@ def numerical_floor(evidence: Evidence, model: Model, recording: Recording, fine
     values = model.values[cost.space.columns(model.space)]
     count = evidence.repeats
     off = (fine.whitened(values[None])[0] - cost.whitened(model.values[None])[0]).astype(np.float64) / np.sqrt(count)
+    if not np.isfinite(off).all():
+        raise NotReplayed(f"the simulation of {recording.name!r} blows up at a quarter of its time step")
     left = project(off[None], model.refined.jacobian / np.sqrt(count), model.refined.prior * np.sqrt(count))[0]
     return float(left @ left / len(left))

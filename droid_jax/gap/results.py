@@ -172,7 +172,7 @@ def _trial(trial: Trial) -> dict[str, Any]:
         "round": trial.name.count(" + "),
         "name": trial.name,
         "gap_fit": trial.gap_fit,
-        "gap_confirm": trial.gap_confirm,
+        "gap_confirm": trial.gap_confirm if np.isfinite(trial.gap_confirm) else None,
         "p": trial.p,
         "chosen": trial.chosen,
         "passed": trial.passed,

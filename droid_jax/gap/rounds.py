@@ -179,8 +179,12 @@ def pruned(hunt: Hunt, model: Model) -> Model:
         start = model.values.copy()
         free = [hunt.case.whole.index(a) for a in part.amplitudes]
         start[free] = hunt.case.whole.mean[free]
-        less = hunt.refit(without(part, model.parts), start, hunt.case.config.refit, f" without {part.name}")
-        if hunt.gap(less) - hunt.gap(model) < OF_ALL * hunt.whole_gap:
+        try:
+            less = hunt.refit(without(part, model.parts), start, hunt.case.config.refit, f" without {part.name}")
+            pays = hunt.gap(less) - hunt.gap(model) >= OF_ALL * hunt.whole_gap
+        except NotReplayed:  # it cannot do without the part
+            continue
+        if not pays:
             return pruned(hunt, less)
     return model
 

@@ -57,7 +57,7 @@ class Screen:
 def marks(evidence: Evidence, values: np.ndarray, questions: Sequence[Question]) -> np.ndarray:
     """[K, M] what each amplitude adds to the simulation, per unit of it, in units of one repeat's noise.
 
-    values: [D] the base fit, effects at neutral.  One batch for all.  NaN where the replay blew up.
+    values: [D] the fitted model.  One batch for all.  NaN where the replay blew up.
     """
     space = evidence.cost.space
     rows, sizes = [values], []
@@ -73,8 +73,7 @@ def marks(evidence: Evidence, values: np.ndarray, questions: Sequence[Question])
         sizes.append(size)
     simulated = -evidence.common(np.stack(rows))
     found = (simulated[1:] - simulated[0]) / np.array(sizes)[:, None]
-    constant = np.ptp(simulated[1:], axis=1) == 0.0  # `BLOWN_UP` throughout
-    return np.where((constant | ~np.isfinite(found).all(axis=1))[:, None], np.nan, found)
+    return np.where(np.isfinite(found).all(axis=1, keepdims=True), found, np.nan)
 
 
 def questions_of(candidates: Sequence[Candidate]) -> tuple[Question, ...]:

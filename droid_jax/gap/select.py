@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from droid_jax.gap.evidence import Evidence
-from droid_jax.gap.flips import sign_flips, steady, t_values
 from droid_jax.gap.refit import Model, intervals, vanishing
 
 SIGNIFICANT = 0.01  # p below which something is missing
@@ -52,12 +51,6 @@ class Trial:
         return not self.reasons
 
 
-def one_sided_p(gain: np.ndarray) -> float:
-    """p-value of gains [N] being above zero on average, by sign flips.  What grows or fades steadily is no noise."""
-    t = t_values(steady(gain)[None], sign_flips(len(gain)))[:, 0]
-    return float(np.mean(t >= t[0] - 1e-12))
-
-
 def resamples(count: int, seed: int = 0) -> np.ndarray:
     """[R, N] weights of the repeats in R resamples, each row summing to one."""
     return np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), size=RESAMPLES) / count
@@ -76,11 +69,11 @@ def judge(
     """Put extended models on trial against the one without their last effects, and against each other.
 
     before: that model.  smallest: amplitude -> size worth naming.  whole_gap: U of the model without
-    any effect on the confirming demonstration.  One batch of replays.
+    any effect on the confirming demonstration.  One batch of replays; U of one that blows up is infinite.
     """
     commons = confirm.common(np.stack([before.values, *(m.values for m in models)]))
     repeats = [confirm.residuals(c) for c in commons]
-    left = np.array([confirm.gap(r) for r in repeats])
+    left = np.nan_to_num([confirm.gap(r) for r in repeats], nan=np.inf)
     squares = np.array([np.sum(r**2, axis=1) for r in repeats])
     losses = np.nan_to_num(confirm.losses(commons[1:], resamples(confirm.units, seed)), nan=np.inf)
     fitted = np.array([m.gap for m in models])
@@ -88,7 +81,7 @@ def judge(
     winners = np.bincount(np.argmin(losses, axis=1), minlength=len(models)) / len(losses)
     out = []
     for k, model in enumerate(models):
-        p = one_sided_p(0.5 * (squares[0] - squares[k + 1]))
+        p = confirm.gain_p_value(0.5 * (squares[0] - squares[k + 1])) if np.isfinite(left[k + 1]) else 1.0
         chosen = float(winners[same[k]].sum())
         spans = {a: s for a, s in intervals(fit, model).items() if a not in before.amplitudes}
         weak = [f"{UNCONFIRMED} (p = {p:.2g})"] if p >= CONFIRMED else []
@@ -128,7 +121,7 @@ def alike(
 def _gap_reasons(before: float, after: float, whole_gap: float, least: float, floor: float) -> list[str]:
     reasons = []
     if not np.isfinite(after):
-        reasons.append("its replay of the other demonstration is no number")
+        reasons.append("its replay of the other demonstration blew up")
     elif before <= floor:
         reasons.append("the other demonstration shows no gap that it could take away")
     elif after > before:

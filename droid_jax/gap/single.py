@@ -82,6 +82,11 @@ class Log(Cost):
         return replace(self, comparisons=(replace(only_comparison(self), name=name),))
 
     @property
+    def columns(self) -> list[int]:
+        """[C] measured joint of each torque column."""
+        return only_comparison(self).channel("torque").columns.tolist()
+
+    @property
     def measured(self) -> np.ndarray:
         """[K, C] measured torques, filtered."""
         return only_comparison(self).channel("torque").noise.mean
@@ -160,7 +165,11 @@ def single_case(
     turns = (f"{name}, every other block", f"{name}, the blocks between")
     fit, confirm = (_blocks(log.part(n), deviation, part) for n, part in zip(turns, parts, strict=True))
     rest = log.part(f"{name}, last third") if sealed is None else sealed
-    judged = _blocks(rest, deviation, _any_blocks(rest.clock, end if sealed is None else rest.clock[0]))
+    judged = _blocks(
+        rest,
+        deviation[[log.columns.index(c) for c in rest.columns]],
+        _any_blocks(rest.clock, end if sealed is None else rest.clock[0]),
+    )
     return Case(fit, confirm, judged, restrained(base), tuple(effects), config)
 
 

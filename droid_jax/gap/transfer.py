@@ -31,9 +31,12 @@ def beyond(fitted: Evidence, other: Evidence, model: Model) -> np.ndarray:
 
 
 def spread(fitted: Evidence, other: Evidence, model: Model) -> np.ndarray:
-    """[M, D] by how much one deviation of the fit, along each of its principal axes, changes the common residual."""
+    """[M, D] by how much one deviation of the fit, along each of its principal axes, changes the common residual.
+
+    Zero along an axis on which a replay blows up: nothing is allowed for there.
+    """
     space, whole, x = model.space, other.cost.space, model.refined.x
     steps = principal_axes(told(model.refined, fitted.cost.comparisons, misfit=False).cov, LONGEST).T
     ends = [np.clip(x + sign * steps, *map(space.to_search, (space.low, space.high))) for sign in (1.0, -1.0)]
     up, down = np.split(other.common(whole.embed(space, space.from_search(np.concatenate(ends)), model.values)), 2)
-    return (0.5 * (up - down)).T
+    return np.nan_to_num(0.5 * (up - down)).T

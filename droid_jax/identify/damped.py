@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.compare.residuals import BLOWN_UP
 from droid_jax.model.parameters import Scaling, Space
 
 Residuals = Callable[[np.ndarray], np.ndarray]
@@ -103,8 +102,8 @@ class Problem:
         """[P, D] -> residuals [P, M]; NaN throughout where a replay failed."""
         self.evaluations += len(x)
         residual = np.asarray(self.residuals(self.space.from_search(x)), dtype=np.float64)
-        failed = ~np.isfinite(residual).all(axis=1) | (residual == BLOWN_UP).any(axis=1)  # of one recording of several
-        return np.where(failed[:, None], np.nan, residual)
+        whole = np.isfinite(residual).all(axis=1, keepdims=True)  # of one recording of several it may not be
+        return np.where(whole, residual, np.nan)
 
     def differences(self, up: np.ndarray, down: np.ndarray, state: State) -> tuple[np.ndarray, np.ndarray]:
         """Spans [S, N, D] and residual differences [S, N, M] between up and down, both [S, N, D].

@@ -34,7 +34,7 @@ class IdentifyConfig:
     search: CMA-ES settings; it sees the first recording alone, the refinement sees all of them.
     refine: refinement settings, or None: the search's own covariance is the distribution, as in the paper.
     samples: replays drawn from the initial and from the fitted Gaussian to compare their costs.
-    seed: of the split and of those samples (the search has its own).
+    seed: of those samples (the search has its own).
     compare: how simulation and measurement are compared.
     """
 
@@ -122,7 +122,9 @@ def identify(
 
     def cost(rows: np.ndarray) -> np.ndarray:
         found = np.asarray(first(full.embed(space, rows)), np.float64)
-        return np.where(found == config.compare.non_finite_cost, np.inf, found)  # no parent, whatever others cost
+        return np.where(
+            found == np.float32(config.compare.non_finite_cost), np.inf, found
+        )  # no parent, whatever others cost
 
     found = search(
         cost,

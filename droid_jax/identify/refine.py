@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from droid_jax.identify.damped import Problem, Residuals, State, StepConfig, curvature, fall
-from droid_jax.identify.search import SearchConfig, search
+from droid_jax.identify.search import NotReplayed, SearchConfig, search
 from droid_jax.model.parameters import Parameter, Space
 
 Hypotheses = Sequence[Mapping[str, float]]
@@ -70,7 +70,7 @@ class Refined:
     space; x [D] search coordinates and best [D] physical values of the best start;
     objective: |r|^2 / 2 plus the prior's part; residual [M] and jacobian [M, D] there;
     prior [D] deviations, search units; starts: objective each start ended at; evaluations: replays;
-    iterations; converged: the last iteration met the tolerance.
+    iterations; converged: it ended before its iterations ran out, since they no longer paid or `aim` was out of reach.
     """
 
     space: Space
@@ -95,10 +95,6 @@ class Refined:
     def hessian(self) -> np.ndarray:
         """[D, D] Gauss-Newton curvature, prior included."""
         return curvature(self.jacobian, self.prior)
-
-
-class NotReplayed(ValueError):
-    """Where a refinement was to begin the replay gave no numbers."""
 
 
 @dataclass(frozen=True)
@@ -272,7 +268,10 @@ class _Descent(Problem):
         settings = SearchConfig(
             population=HOP_POPULATION, parents=None, generations=self.config.hop_generations, sigma=HOP_SIGMA, seed=seed
         )
-        return self.start(around(search(cost, unit, settings).best[None]))
+        try:
+            return self.start(around(search(cost, unit, settings).best[None]))
+        except NotReplayed:  # nothing around here can be
+            return state
 
     def explore(self, state: State, hypotheses: Hypotheses) -> State:
         """Follow each hypothesis from a converged start: hold its values while all else settles, then free them.

@@ -36,6 +36,10 @@ _NEAR = 1.0  # search coordinates, one prior deviation: so near to a bound the b
 _REASONS = ("", "tol_cost", "tol_sigma")  # why a restart stopped, by the code kept in checkpoints
 
 
+class NotReplayed(ValueError):
+    """No replay gave numbers where a search or a refinement needed some."""
+
+
 @dataclass(frozen=True)
 class SearchConfig:
     """Settings of a search; the defaults are the paper's population with stated stops.
@@ -123,8 +127,8 @@ def search(
     fingerprint: says what the cost was made from (recording, scene, ...); a checkpoint made with another
                  space, configuration, start or fingerprint is refused.
 
-    Raises ValueError when a whole generation failed, on a cost of the wrong shape, a start out of
-    bounds, or somebody else's checkpoint.
+    Raises NotReplayed, a ValueError, when a whole generation failed; ValueError on a cost of the wrong shape, a start
+    out of bounds, or somebody else's checkpoint.
     """
     strategy = _strategy(space, config)
     centre = _start(space, config, start)
@@ -209,7 +213,7 @@ def _generation(run: _Run, cost: Cost, strategy: Strategy, config: SearchConfig)
     values = space.from_search(drawn if config.bounds == "clip" else mirrored(space, drawn))
     costs = _evaluate(cost, values)  # [R, P]
     if not np.isfinite(costs[running]).any():
-        raise ValueError(
+        raise NotReplayed(
             f"generation {run.generation}: all {costs.size} rows of the cost are infinite or NaN; evaluate "
             "the cost at space.mean to see why it fails, then start nearer to values that work (a smaller "
             "sigma, another start, tighter bounds) or shorten the time step"

@@ -63,7 +63,9 @@ def door_space(scene: Scene, *, preset: str = "impedance") -> Space:
     """
     if preset not in ("impedance", "paper"):
         raise ValueError(f"preset must be 'impedance' or 'paper', got {preset!r}")
-    left, right = scene.grip.fingers if scene.grip else ((), ())
+    if scene.grip is None:
+        raise ValueError(f"scene {scene.name!r} has no grip, whose fingers' friction is part of Table I")
+    left, right = scene.grip.fingers
     door = dict(group="Door")
     grip = dict(group="Gripper", width=0.5)
     parameters = (

@@ -34,6 +34,8 @@ DERIVED = (
     "tendon_invweight0",
     "stat",
 )
+# Writes set one component of these at a time; a compiler, and engines in their own ways, make them unit vectors.
+_UNIT = ("body_quat", "body_iquat", "geom_quat", "site_quat", "jnt_axis")
 _SLIDES_ONLY = 2  # MjModel.body_simple of a body whose inertia is its mass alone
 
 
@@ -99,8 +101,8 @@ def make_physics(scene: Scene, space: Space, values: jax.Array) -> Physics:
             new[w.index] = w.new(new.get(w.index, nominal[w.index]), values[column])
         index = tuple(np.array(axis) for axis in zip(*new, strict=True))
         changed[field] = nominal.at[index].set(jnp.stack(list(new.values())).astype(nominal.dtype))
-    if "body_quat" in changed:  # a write sets one component; engines differ in what they do with the norm
-        changed["body_quat"] /= jnp.linalg.norm(changed["body_quat"], axis=1, keepdims=True)
+    for field in set(_UNIT) & set(changed):
+        changed[field] /= jnp.linalg.norm(changed[field], axis=1, keepdims=True)
     model = model.replace(**changed)
     if _SOURCES & set(by_field):
         model = derive(model)
@@ -190,8 +192,10 @@ def make_c_model(scene: Scene, space: Space, values: np.ndarray) -> mujoco.MjMod
     for column, write in model_writes(space):
         array = getattr(model, write.field)
         array[write.index] = write.new(array[write.index], float(values[column]))
-    model.body_quat /= np.linalg.norm(model.body_quat, axis=1, keepdims=True)
-    if _SOURCES & {w.field for _, w in model_writes(space)}:
+    written = {w.field for _, w in model_writes(space)}
+    for array in (getattr(model, field) for field in written.intersection(_UNIT)):
+        array /= np.linalg.norm(array, axis=1, keepdims=True)
+    if _SOURCES & written:
         mujoco.mj_setConst(model, mujoco.MjData(model))
         # mj_setConst leaves the statistics alone; the solver scales its tolerance with them.
         model.stat.meaninertia = model.dof_M0.mean()

@@ -281,9 +281,9 @@ def compile_scene(
     Raises ValueError for unknown names, for joints of several degrees of freedom and for
     features that MJX would silently ignore.
     """
-    bare = without_looks(spec)
+    bare, free = without_looks(spec), set(unlimited)
     for joint in bare.joints:
-        if joint.name in set(unlimited):
+        if joint.name in free:
             joint.limited = False
     for joint in bare.joints:  # MJX lays friction-loss rows out at compilation: zero could never be raised
         if joint.name == object_joint and joint.type in ONE_DEGREE and joint.frictionloss <= 0:

@@ -1,6 +1,6 @@
 """Where effects enter a replay: the protocol every effect follows.
 
-An effect is a named set of parameters in theta and up to four pure functions.  A replay is
+An effect is a named set of parameters in theta and pure functions.  A replay is
 specialised on its effects when it is traced: one that asks for none pays for none.
 """
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from small_log import ASKED, CONFIG, COULOMB, elbow, elbow_log, elbow_space
 
 from droid_jax.compare.cost import make_cost
+from droid_jax.gap import single
 from droid_jax.gap.blocks import OUTSIDE, Blocks, block_length, blocks, interleaved
 from droid_jax.gap.case import make_case
 from droid_jax.gap.flips import largest_t
@@ -160,6 +163,27 @@ def elbow_torque(log: Log) -> np.ndarray:
     values = np.stack([log.space.mean, log.space.values({"joint_coulomb[elbow]": COULOMB})])
     without, with_it = log.simulated(values)
     return log.measured - (with_it - without)
+
+
+def test_each_joint_of_a_sealed_log_has_its_own_noise(monkeypatch: pytest.MonkeyPatch):
+    """Whatever the order of its columns."""
+    given: dict[str, np.ndarray] = {}
+    clock = np.arange(0.0, 40.0, 0.02)
+
+    def stand_in(name: str, *columns: int) -> Any:
+        return SimpleNamespace(
+            name=name, clock=clock, columns=list(columns), part=lambda turn: stand_in(turn, *columns)
+        )
+
+    monkeypatch.setattr(single, "noise_of", lambda *_: (np.array([1.0, 2.0]), 1.0))
+    monkeypatch.setattr(single, "only_comparison", lambda log: log)
+    monkeypatch.setattr(single, "_blocks", lambda log, deviation, block: given.update({log.name: deviation}))
+    single_case(stand_in("log", 0, 1), elbow_space(elbow()), (), stand_in("sealed", 1, 0))
+    assert {name: noise.tolist() for name, noise in given.items()} == {
+        "log, every other block": [1.0, 2.0],
+        "log, the blocks between": [1.0, 2.0],
+        "sealed": [2.0, 1.0],
+    }
 
 
 def test_repeats_need_no_blocks():

@@ -11,6 +11,7 @@ from small_gap import Small, small
 
 from droid_jax.gap import floor
 from droid_jax.gap.floor import numerical_floor
+from droid_jax.identify.refine import NotReplayed
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +40,12 @@ def test_what_a_base_parameter_can_do_is_none(found: Small):
     told = int(np.argmax(np.linalg.norm(jacobian, axis=0)))
     off = 0.5 * jacobian[:, told]
     assert of(found, off) < 0.01 * np.mean(off**2) / found.case.fit.repeats
+
+
+def test_a_finer_simulation_that_blows_up_is_no_floor(found: Small):
+    """It would be so high that nothing could be missing."""
+    with pytest.raises(NotReplayed, match="blows up at a quarter of its time step"):
+        of(found, np.full(len(found.base.refined.jacobian), np.nan))
 
 
 def test_the_finer_simulation_has_a_quarter_of_the_step(found: Small, monkeypatch: pytest.MonkeyPatch):

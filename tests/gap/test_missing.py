@@ -11,6 +11,7 @@ import pytest
 from small_log import CONFIG, COULOMB, elbow, elbow_log, elbow_space
 
 import droid_jax as dj
+from droid_jax.compare.residuals import CompareConfig
 from droid_jax.gap import missing
 from droid_jax.gap.candidates import possible
 from droid_jax.gap.split import Split
@@ -69,6 +70,18 @@ def test_unless_told_it_asks_about_all_that_could_show(monkeypatch: pytest.Monke
     monkeypatch.setattr(missing, "answer", answer)
     with pytest.raises(KeyboardInterrupt):
         dj.find_missing(scene, elbow_space(scene), THREE, start=begin)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"most": 0}, "most must be at least 1, got 0"),
+        ({"compare": CompareConfig(channels={"torque": 1.0, "position": 1.0})}, "got the channels torque, position"),
+    ],
+)
+def test_settings_that_no_search_could_use_are_refused(changes: dict[str, Any], said: str):
+    with pytest.raises(ValueError, match=said):
+        dj.GapConfig(**changes)
 
 
 @pytest.mark.parametrize(

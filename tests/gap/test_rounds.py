@@ -11,7 +11,9 @@ import pytest
 from droid_jax.gap.blocks import OUTSIDE, Blocks
 from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.evidence import Evidence
-from droid_jax.gap.rounds import Budget, Hunt, without
+from droid_jax.gap.rounds import Budget, Hunt, pruned, without
+from droid_jax.identify.refine import NotReplayed
+from droid_jax.model.parameters import Parameter, Space
 
 
 def test_a_shape_stays_where_its_effect_does() -> None:
@@ -24,6 +26,22 @@ def test_a_shape_stays_where_its_effect_does() -> None:
     )
     assert without(second, (first, drag, second)) == (first, drag)
     assert without(drag, (first, drag)) == (first,)
+
+
+def test_a_part_that_the_replay_cannot_do_without_stays() -> None:
+    """A damper keeps the simulation whole; drag takes next to nothing away and goes."""
+    damper, drag = Candidate("closer", "hinge", ("closer",)), Candidate("drag", "hinge", ("drag",))
+
+    def refit(parts: Any, start: Any, config: Any, note: str) -> Any:
+        if damper not in parts:
+            raise NotReplayed("none of the starts could be replayed")
+        return SimpleNamespace(parts=parts, values=start, left=1.01)
+
+    whole = Space(tuple(Parameter(name, "N m", 0.0, 1.0, -5.0, 5.0) for name in ("closer", "drag")))
+    case = SimpleNamespace(whole=whole, config=SimpleNamespace(refit=None))
+    hunt: Any = SimpleNamespace(case=case, refit=refit, gap=lambda model: model.left, whole_gap=10.0)
+    model: Any = SimpleNamespace(parts=(damper, drag), values=np.array([2.0, 1.0]), left=1.0)
+    assert pruned(hunt, model).parts == (damper,)
 
 
 def test_a_budget_says_what_it_left_out() -> None:

@@ -10,10 +10,10 @@ import pytest
 from droid_jax.compare.cost import Cost
 from droid_jax.gap.candidates import Candidate, candidates
 from droid_jax.gap.evidence import Evidence
-from droid_jax.gap.flips import steady
+from droid_jax.gap.flips import one_sided_p, steady
 from droid_jax.gap.rank import proposals
 from droid_jax.gap.screen import Question, project, screen
-from droid_jax.gap.select import alike, one_sided_p, resamples
+from droid_jax.gap.select import alike, resamples
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.seam import Effect
 
@@ -104,6 +104,7 @@ def test_shapes_are_not_rivals_of_each_other():
 def test_one_sided_p():
     assert one_sided_p(np.full(10, 2.0) + np.linspace(-0.1, 0.1, 10)) == pytest.approx(1 / 512)
     assert one_sided_p(-np.arange(1.0, 11.0)) > 0.9
+    assert one_sided_p(np.full(10, 1.0)) < 0.01 < 0.3 < one_sided_p(np.array([1.0, -1.0] * 5))
 
 
 def test_models_that_leave_much_the_same_are_ties():

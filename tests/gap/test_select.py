@@ -14,7 +14,8 @@ from droid_jax.gap import select
 from droid_jax.gap.candidates import candidates
 from droid_jax.gap.flips import steady
 from droid_jax.gap.refit import deviations, intervals, refit, vanishing
-from droid_jax.gap.select import UNCONFIRMED, _gap_reasons, judge, one_sided_p
+from droid_jax.gap.select import UNCONFIRMED, _gap_reasons, judge
+from droid_jax.identify.refine import NotReplayed
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +129,7 @@ def test_one_that_another_beats_in_the_resamples_is_not_named(found: Small, monk
         (1.0, 1.1, "makes the gap on the other demonstration larger"),
         (1.0, 0.9, "takes only 10% of the gap away on the other demonstration"),
         (0.04, 0.001, "takes only 3.9% of the first gap away"),
-        (1.0, np.nan, "its replay of the other demonstration is no number"),
+        (1.0, np.nan, "its replay of the other demonstration blew up"),
         (0.005, 0.001, "the other demonstration shows no gap that it could take away"),
         (-0.01, -0.012, "the other demonstration shows no gap that it could take away"),
     ],
@@ -137,17 +138,34 @@ def test_reasons_of_the_gap(before: float, after: float, said: str | None):
     assert _gap_reasons(before, after, 1.0, 0.2, 0.01) == ([] if said is None else [said])
 
 
-def test_gains_of_every_repeat_are_no_chance_and_of_half_of_them_are():
-    assert one_sided_p(np.full(10, 1.0)) < 0.01 < 0.3 < one_sided_p(np.array([1.0, -1.0] * 5))
+def test_a_model_that_blows_up_on_the_other_demonstration_loses(found: Small, monkeypatch: pytest.MonkeyPatch):
+    case, model = found.case, extended(found, "hinge_preload at door")
+    wild = replace(model, values=model.values + 1.0)
+    cost = case.confirm.cost
+    replayed = type(cost).whitened
+
+    def whitened(self, rows):
+        gone = np.isclose(np.atleast_2d(rows)[:, -1], wild.values[-1])
+        return np.where(gone[:, None], np.nan, replayed(self, np.where(gone[:, None], model.values, rows)))
+
+    monkeypatch.setattr(type(cost), "whitened", whitened)
+    whole = case.confirm.gap_at(found.base.values)
+    with pytest.raises(NotReplayed, match="blows up with parameters that were fitted to another recording"):
+        case.confirm.gap_at(wild.values)
+    worse, best = judge(case.fit, case.confirm, found.base, [wild, model], case.smallest, whole, FLOOR)
+    assert best.passed and best.rivals == ()
+    assert (worse.gap_confirm, worse.p, worse.chosen) == (np.inf, 1.0, 0.0)
+    assert "its replay of the other demonstration blew up" in worse.reasons
 
 
-def test_a_gain_that_fades_steadily_is_significant_and_chance_is_not():
+def test_a_gain_that_fades_steadily_is_significant_and_chance_is_not(found: Small):
     """A friction that warms up: its mean helps every repeat but by less and less, in the end not at all."""
     rng = np.random.default_rng(0)
     fading = np.linspace(9.0, -1.0, 10) + 0.1 * rng.normal(size=10)
-    assert one_sided_p(fading) == 1 / 512
+    p_value = found.case.confirm.gain_p_value
+    assert p_value(fading) == 1 / 512
     assert steady(fading).mean() == pytest.approx(fading.mean())
     assert np.std(steady(fading)) < 0.5
-    chance = np.array([one_sided_p(rng.normal(size=10)) for _ in range(2000)])
+    chance = np.array([p_value(rng.normal(size=10)) for _ in range(2000)])
     for level in (0.01, 0.05, 0.2):
         assert np.mean(chance <= level) == pytest.approx(level, abs=4 * np.sqrt(level / 2000))

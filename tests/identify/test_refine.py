@@ -442,10 +442,19 @@ def test_a_failed_replay_within_the_posterior_does_not_end_the_refinement():
     np.testing.assert_allclose(fit.best, [0.0, 1.0], atol=1e-3)
 
 
+def test_a_fit_that_nothing_around_it_can_be_replayed_beside_is_kept():
+    """A hop draws far from where the iterations stood still, and finds no number there."""
+    inside = linear(np.eye(2), [0.0, 1.0])
+    near = Recorder(lambda v: np.where(np.linalg.norm(v - [0.0, 1.0], axis=1, keepdims=True) > 0.02, np.nan, inside(v)))
+    fit = refine(near, BASINS, [0.01, 1.0], dataclasses.replace(FLAT, hops=2, step=1e-3))
+    np.testing.assert_allclose(fit.best, [0.0, 1.0], atol=1e-3)
+    assert fit.converged and np.any(np.linalg.norm(near.rows - [0.0, 1.0], axis=1) > 0.1)
+
+
 def test_blown_up_replays_next_door_are_no_information():
     matrix = np.array([[5.0, 1.0], [1.0, 4.0], [2.0, 2.0]])
     solved = linear(matrix, matrix @ [0.0, 1.0])
-    fit = refine(lambda v: np.where(v[:, :1] > 0.03, 1e3, solved(v)), BASINS, [-1.0, 0.0], FLAT)
+    fit = refine(lambda v: np.where(v[:, :1] > 0.03, np.nan, solved(v)), BASINS, [-1.0, 0.0], FLAT)
     truth = matrix * [1, 5]
     np.testing.assert_allclose(
         np.sqrt(np.diag(np.linalg.inv(fit.hessian))), np.sqrt(np.diag(np.linalg.inv(truth.T @ truth))), rtol=0.3
@@ -458,7 +467,7 @@ def test_a_replay_that_blows_up_on_one_recording_of_two_is_no_information():
     solved = linear(matrix, matrix @ [0.0, 0.0])
 
     def both(v, where):
-        one, two = solved(v), np.where(v[:, 1:] > 0.02, 1e3, solved(v))
+        one, two = solved(v), np.where(v[:, 1:] > 0.02, np.nan, solved(v))
         return np.concatenate([two, two] if where == "both" else [one, two], axis=1)
 
     deviation = {
@@ -467,7 +476,7 @@ def test_a_replay_that_blows_up_on_one_recording_of_two_is_no_information():
     }
     np.testing.assert_allclose(deviation["second"], deviation["both"], rtol=0.05)
     with pytest.raises(ValueError, match="none of the starts could be replayed"):
-        refine(lambda v: np.concatenate([solved(v), np.full((len(v), 3), 1e3)], axis=1), BASINS, [1.0, 0.0], FLAT)
+        refine(lambda v: np.concatenate([solved(v), np.full((len(v), 3), np.nan)], axis=1), BASINS, [1.0, 0.0], FLAT)
 
 
 def test_what_a_hop_has_found_is_kept():

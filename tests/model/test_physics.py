@@ -296,6 +296,21 @@ def test_a_moved_joint_axis_is_derived_too():
     np.testing.assert_allclose(model.dof_invweight0, expected.dof_invweight0, rtol=1e-6)
 
 
+def test_a_tilted_axis_stays_a_unit_vector():
+    """Of (0, 0, 1) with x set to a half: a compiler scales it, and what is applied equals what it compiles."""
+    xml = """<mujoco><worldbody><body><joint name="j" axis="0 0 1"/><geom size=".1 .2 .3" type="box" pos=".1 0 0"/>
+      </body></worldbody><actuator><position joint="j" kp="1"/></actuator></mujoco>"""
+    scene = compile_scene(mujoco.MjSpec.from_string(xml), "rod")
+    space = Space((model_parameter(scene, "jnt_axis", "j", 0, unit="-", std=0.1, low=-1, high=1),))
+    spec = mujoco.MjSpec.from_string(xml)
+    spec.joint("j").axis = [0.5, 0, 1]
+    expected = spec.compile()
+    model = make_physics(scene, space, np.array([0.5], np.float32)).model
+    for applied in (make_c_model(scene, space, np.array([0.5])), model):
+        np.testing.assert_allclose(applied.jnt_axis, expected.jnt_axis, rtol=1e-6)
+        np.testing.assert_allclose(applied.dof_M0, expected.dof_M0, rtol=1e-6)
+
+
 def test_parameters_without_masses_derive_nothing(scene: Scene):
     space = Space((model_parameter(scene, "dof_damping", "hinge", unit="-", std=1.0, high=5.0, mode=Mode.SET),))
     assert written_fields(space) == ("dof_damping",)

@@ -242,6 +242,22 @@ def mechanism(**filled: str) -> mujoco.MjSpec:
     return mujoco.MjSpec.from_string(TEMPLATE.format(**{**slots, **filled}))
 
 
+def test_joints_are_freed_of_their_ranges_by_name():
+    """All that are named, out of a generator too."""
+    xml = """<mujoco><compiler autolimits="true"/><worldbody>
+      <body><joint name="a" range="-9 9"/><geom size=".1"/><body pos="0 0 1"><joint name="b" range="-9 9"/>
+      <geom size=".1"/><body pos="0 0 1"><joint name="c" range="-9 9"/><geom size=".1"/></body></body></body>
+      </worldbody>
+      <actuator><motor joint="a"/><motor joint="b"/><motor joint="c"/></actuator></mujoco>"""
+    scene = compile_scene(mujoco.MjSpec.from_string(xml), "chain", unlimited=(name for name in ("a", "b")))
+    assert scene.model.jnt_limited.tolist() == [0, 0, 1]
+
+
+def test_table_i_needs_fingers():
+    with pytest.raises(ValueError, match="scene 'rod' has no grip"):
+        door_space(compile_scene(mechanism(), "rod"))
+
+
 def test_a_plain_mechanism_is_accepted():
     scene = compile_scene(mechanism(joint='stiffness="2" damping="3"', tendon='stiffness="1"'), "rod")
     assert scene.joints == scene.command_names == ("j",)

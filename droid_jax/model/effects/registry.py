@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from droid_jax.model.effects.sizes import sized
-from droid_jax.model.parameters import Space
+from droid_jax.model.parameters import Scaling, Space
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
 from droid_jax.model.seam import Effect
 
@@ -75,7 +75,7 @@ def _made(maker: Maker, scene: Scene, scale: float) -> Effect | None:
 
 
 def _checked(effect: Effect) -> Effect:
-    """The effect; ValueError where it names parameters that it does not have, or cannot be neutral."""
+    """The effect; ValueError for parameters that it does not have, and amplitudes that cannot be neutral or linear."""
     own = {p.name: p for p in effect.parameters}
     amplitudes = [name for place in effect.places.values() for name in place]
     for name in (*amplitudes, *effect.shapes):
@@ -89,6 +89,8 @@ def _checked(effect: Effect) -> Effect:
                 f"effect {effect.name!r}: an amplitude is neutral at 0, but {p.name!r} starts at {p.mean:g} {p.unit} "
                 f"with bounds [{p.low:g}, {p.high:g}]; let its bounds hold 0 and its mean be 0"
             )
+        if p.scaling is not Scaling.LINEAR:
+            raise ValueError(f"effect {effect.name!r}: the amplitude {p.name!r} must be scaled linearly, as marks are")
     return effect
 
 
