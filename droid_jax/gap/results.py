@@ -81,6 +81,7 @@ def gap_json(case: Case, verdict: Verdict) -> dict[str, Any]:
         "converged": verdict.base.refined.converged,
         "cut": verdict.cut,
         "remainder": verdict.remainder,
+        "explained": verdict.explained if verdict.effects else None,
         "gaps": {role: _gap(role, e, verdict) for role, e in case.judged.items()},
         "phases": {role: _phases(e) for role, e in case.judged.items()},
         "screens": [

@@ -11,6 +11,8 @@ from droid_jax.gap.screen import Screen
 from droid_jax.gap.select import AT_BOUND, TOO_SMALL, UNCONFIRMED, Trial
 from droid_jax.gap.trend import Trend
 
+HALF = 0.5  # share of the gap: an effect that explains less may only imitate what is missing
+
 
 class Kind(enum.Enum):
     """The answers there are."""
@@ -73,6 +75,13 @@ class Verdict:
         return 1.0 - (after - self.floor) / max(before - self.floor, 1e-12)
 
     @property
+    def explained(self) -> float:
+        """Share of the gap on the confirming demonstration that the model, or its fit's uncertainty, explains."""
+        before, after = self.gaps["confirm"]
+        left = after if self.remainder is None else self.remainder
+        return 1.0 - (left - self.floor) / max(before - self.floor, 1e-12)
+
+    @property
     def _unsettled(self) -> str:
         return "the model with the effects" if self.base.refined.converged else "the base model"
 
@@ -98,13 +107,22 @@ class Verdict:
         )
 
     @property
+    def _partly(self) -> str:
+        if self.explained >= HALF:
+            return f"The model lacks {self._lacking}; a remainder is unexplained."
+        return (
+            "Most of what the model lacks is not in the library; what there is explains or imitates "
+            f"{max(self.explained, 0.0):.0%} of it: {self._lacking}."
+        )
+
+    @property
     def sentence(self) -> str:
         """The answer in words."""
         return {
             Kind.NONE: "Nothing is missing that these recordings could tell.",
             Kind.NAMED: f"The model lacks: {self._lacking}.",
             Kind.TIE: f"The model lacks {self._lacking}.",
-            Kind.PARTLY: f"The model lacks {self._lacking}; a remainder is unexplained.",
+            Kind.PARTLY: self._partly,
             Kind.UNEXPLAINED: f"The model lacks something that is not in the library{self._or_lost}.",
             Kind.UNCONVERGED: f"The fit of {self._unsettled} did not converge; nothing can be concluded.",
         }[self.kind]

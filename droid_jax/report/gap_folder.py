@@ -139,8 +139,9 @@ def _faults(found: Mapping[str, Any]) -> Iterator[str]:
     by = split_of(found)["by"]
     if by not in PARTS:
         yield f"'split', 'by' must be one of {', '.join(PARTS)}, got {by!r}"
-    if not isinstance(found.get("remainder"), _MAYBE):  # older files have none
-        yield f"'remainder' must be a number or null, got {found['remainder']!r}"
+    for name in ("remainder", "explained"):  # older files have none
+        if not isinstance(found.get(name), _MAYBE):
+            yield f"{name!r} must be a number or null, got {found[name]!r}"
     absent = [r for r in ROLES[:2] if r not in found["gaps"]]
     if absent:
         yield f"'gaps' lacks {', '.join(map(repr, absent))}"

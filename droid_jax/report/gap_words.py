@@ -170,7 +170,7 @@ def _next(gap: Gap) -> str:
         "none": f"go on with the base model; a smaller effect would need {gap.parts.more}",
         "named": f"look for the {named} on the hardware, and simulate with it{_file(gap)}",
         "tie": f"take no name for the cause yet. {_separate(gap)}",
-        "partly explained": f"{_kept(gap, named)}, and look at the hardware {_where(gap)}; that part has no name yet",
+        "partly explained": _partly(gap, named),
         "unexplained": f"look at the hardware {_where(gap)}. No effect of the library passed its trial: where one came "
         f"close it needs {gap.parts.more}, else write one of your own or correct the scene there, and run again. Do "
         "not train on this part of the motion",
@@ -187,6 +187,19 @@ def _longer(gap: Gap) -> str:
     return (
         f"fit “{gap.recording('fit')}” by python -m droid_jax.run identify --preset standard --restarts 3 and hand its "
         "folder on (gap --fit FOLDER), or "
+    )
+
+
+def _partly(gap: Gap, named: str) -> str:
+    from droid_jax.gap.verdict import HALF  # only here: it imports what computes
+
+    explained = gap.found.get("explained")
+    if explained is None or explained >= HALF:
+        return f"{_kept(gap, named)}, and look at the hardware {_where(gap)}; that part has no name yet"
+    return (
+        f"look at the hardware {_where(gap)}, and take no name for the cause yet: the {named} may only imitate what is "
+        "there (of blind answers that left more than half open, two in five held a wrong name). Write an effect of "
+        "your own or correct the scene there, and run again. Do not train on this part of the motion"
     )
 
 

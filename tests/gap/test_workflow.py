@@ -230,8 +230,15 @@ def test_the_sentence_keeps_what_is_certain(found: Small, tied: Any, said: str):
     verdict = find(found.case, found.base, 2.0 * found.base.gap)
     kind = Kind.TIE if any(tied) else Kind.NAMED
     assert replace(verdict, kind=kind, effects=("a", "b"), tied=tied).sentence == said
-    partly = replace(verdict, kind=Kind.PARTLY, effects=("a", "b"), tied=tied).sentence
-    assert partly == said.replace("lacks: ", "lacks ")[:-1] + "; a remainder is unexplained."
+    before = verdict.gaps["confirm"][0]
+    partly = replace(verdict, kind=Kind.PARTLY, effects=("a", "b"), tied=tied, floor=0.0, remainder=0.4 * before)
+    assert partly.explained == pytest.approx(0.6)
+    assert partly.sentence == said.replace("lacks: ", "lacks ")[:-1] + "; a remainder is unexplained."
+    little = replace(partly, remainder=0.77 * before).sentence
+    assert little.startswith(
+        "Most of what the model lacks is not in the library; what there is explains or imitates 23%"
+    )
+    assert little.endswith(said.removeprefix("The model lacks").removeprefix(":")[1:])
 
 
 def test_a_gap_below_the_floor_is_none(found: Small):

@@ -155,6 +155,15 @@ def test_what_the_fit_does_not_tell_is_said_where_it_is_much(tmp_path: Path) -> 
         assert "lies within the uncertainty" not in said(name, remainder=remainder)
 
 
+def test_what_leaves_most_of_the_gap_open_is_kept_by_nobody(tmp_path: Path) -> None:
+    for explained, keeps in ((0.49, False), (0.51, True), (None, True)):
+        folder = make_gap(tmp_path / f"run{explained}", "partly explained", explained=explained)
+        said = gap_words.gap_summary(read_gap(folder))[-1]
+        assert ("keep the latch at door hinge" in said) is keeps
+        assert ("may only imitate what is there" in said) is not keeps
+        assert NEXT["partly explained"] in said
+
+
 BLOCKS = {"by": "blocks", "limits": "The confirming blocks are of the same motion."}
 HALVES = {"by": "repeats", "limits": "The confirming repeats repeat the fitted motion."}
 
