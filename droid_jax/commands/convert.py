@@ -22,7 +22,7 @@ class Convert:
     """
 
     source: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """ROS 1 .bag or ROS 2 bags, one per repeat (or a folder of them), a CSV folder, or an npz file."""
+    """ROS 1 .bag or ROS 2 bags, one per repeat (or folders of them), a CSV folder, or an npz file."""
     out: Path = Path("runs/recording.npz")
     """File (npz) or folder (CSV) to write."""
     name: str | None = None
@@ -69,13 +69,16 @@ def run(command: Convert) -> None:
     if not command.source:
         raise ValueError("convert needs the files or folders to read")
     path, *others = command.source
-    strange = [p for p in command.source if not bags_at(p)]
+    bags = [bags_at(p) for p in command.source]
+    strange = [p for p, found in zip(command.source, bags, strict=True) if not found]
     if others and strange:
         what = "is no ROS bag" if strange[0].exists() else "does not exist"
-        raise ValueError(f"{strange[0]} {what}: of several sources each is the bag of one repeat; convert others alone")
+        raise ValueError(
+            f"{strange[0]} {what}: of several sources each is a bag or a folder of bags; convert others alone"
+        )
     _needs_effect(command, bags=not strange)
     if others:
-        recording = rosbag_reader().read_bags(command.source, **_bag_options(command))
+        recording = rosbag_reader().read_bags([bag for found in bags for bag in found], **_bag_options(command))
     else:
         usual = {"name": command.name, "allow_jitter": command.allow_jitter}
         options = usual if strange else _bag_options(command)

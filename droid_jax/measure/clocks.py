@@ -16,11 +16,13 @@ def check_clock(
     where: str,
     *,
     allow_jitter: bool = False,
+    seconds: bool = True,
     label: Callable[[int], str] = lambda i: f"row {i}",
 ) -> None:
     """ValueError unless time [T] is finite, in seconds, strictly increasing and regular.
 
-    where: what the clock belongs to; label: row index -> how the message calls that row.
+    where: what the clock belongs to; seconds: whether its unit is in question; label: row index -> how the message
+    calls that row.
     """
     bad = np.flatnonzero(~np.isfinite(time))
     if bad.size:
@@ -33,7 +35,8 @@ def check_clock(
         raise ValueError(
             f"{where}, {label(i)}: time must increase, it {what} {float(time[i])!r} s after {float(time[i - 1])!r} s"
         )
-    _check_seconds(time, steps, where)
+    if seconds:
+        _check_seconds(time, steps, where)
     if steps.size and not allow_jitter:
         typical = float(np.median(steps))
         i = int(np.argmax(np.abs(steps - typical)))

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -96,7 +97,7 @@ def _supported() -> str:
 
 
 def bags_at(path: Path) -> list[Path]:
-    """The ROS bags meant by a path, one per repeat; none when it is something else.
+    """The ROS bags meant by a path, one per repeat, run_2 before run_10; none when it is something else.
 
     A folder with a recording.json is a recording, whatever lies beside its tables.
     """
@@ -104,12 +105,15 @@ def bags_at(path: Path) -> list[Path]:
     def is_bag(p: Path) -> bool:
         return (p / "metadata.yaml").exists() if p.is_dir() else p.suffix in _BAG_SUFFIXES
 
+    def numbered(p: Path) -> list[str | int]:  # texts and numbers by turns
+        return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", p.name)]
+
     if (path / "recording.json").exists():
         return []
     if is_bag(path):
         return [path]
     if path.is_dir():
-        return sorted(p for p in path.iterdir() if is_bag(p))
+        return sorted((p for p in path.iterdir() if is_bag(p)), key=numbered)
     return []
 
 

@@ -2,13 +2,15 @@
 
 The joint state topic gives torque (effort), position and velocity; an optional command topic
 gives the position command.  Every bag starts at its first command (at its first joint state
-when there is no command topic), and all are interpolated onto one uniform clock.  Nothing is
-invented: samples that fall into a gap of the log are masked out.
+when there is no command topic), and all are interpolated onto one uniform clock.  Repeats are in
+the order in which they were recorded.  Nothing is invented: samples that fall into a gap of the
+log are masked out.
 """
 
 from __future__ import annotations
 
 import enum
+import itertools
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -76,6 +78,8 @@ def read_bags(
 ) -> Recording:
     """Reads one bag per repeat into a Recording.
 
+    The repeats are in the order of recording, or in that of `paths` where the bags' times overlap.
+
     joints:            measured joints, in the order wanted.
     slides:            those of them that slide; a bag does not say.
     torque:            what the efforts are; a bag does not say.
@@ -109,6 +113,8 @@ def read_bags(
     if command_topic is not None:
         topics[command_topic] = (command_joints, "position")
     tracks = [_read_bag(bag, topics) for bag in bags]
+    order = _as_recorded([track[state_topic].received for track in tracks])
+    bags, tracks = [bags[i] for i in order], [tracks[i] for i in order]
     use_header = _use_header(tracks, stamps, bags)
 
     timed = [
@@ -256,6 +262,16 @@ def _pick(
     return picked
 
 
+def _as_recorded(received: Sequence[np.ndarray]) -> list[int]:
+    """The bags with these recorder's stamps [M] ns in order of time, or as they are.
+
+    Bags whose times overlap have clocks that do not compare, as simulations that each begin at zero.
+    """
+    order = sorted(range(len(received)), key=lambda i: received[i][0])
+    apart = all(received[i][-1] < received[j][0] for i, j in itertools.pairwise(order))
+    return order if apart else list(range(len(received)))
+
+
 def _use_header(tracks: Sequence[Mapping[str, _Track]], stamps: Stamps, bags: Sequence[Path]) -> bool:
     """Whether header stamps count: one choice for all, two clocks would shift the topics."""
     bare = [(bag, topic) for bag, t in zip(bags, tracks, strict=True) for topic in t if t[topic].stamped is None]
@@ -282,9 +298,10 @@ def _timed(
     for topic, track in tracks.items():
         time = 1e-9 * (stamps(track) - start)
         where = f"{bag}, topic {topic!r} ({'header' if use_header else 'bag'} stamps)"
-        # Commands may pause while the robot holds still: their rate is not checked.
-        lenient = allow_jitter or topic != state_topic
-        check_clock(time, where, allow_jitter=lenient, label=lambda i: f"message {i}")
+        # Commands may pause while the robot holds still, or be waypoints seconds apart: their rate is not checked.
+        state = topic == state_topic
+        jitter = allow_jitter or not state
+        check_clock(time, where, allow_jitter=jitter, seconds=state, label=lambda i: f"message {i}")
         timed[topic] = (time, track.fields)
     return timed
 

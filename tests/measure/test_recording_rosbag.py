@@ -227,6 +227,44 @@ def test_a_whole_trajectory_in_one_message(tmp_path: Path) -> None:
     np.testing.assert_allclose(recording.command, np.stack([held, -held], axis=-1), atol=1e-7)
 
 
+def test_waypoints_may_be_seconds_apart(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "sqlite3")
+    for t in grid(0.0, 6.0):
+        bag.state(t)
+    for t in (0.0, 2.0, 4.0, 6.0):
+        point(bag, t, np.array([t, -t]))
+    recording = read_bags([bag.write()], joints=JOINTS, torque=TORQUE, command_topic="/command")
+    np.testing.assert_allclose(recording.command, np.stack([recording.time, -recording.time], axis=-1), atol=1e-7)
+
+
+def loaded(folder: Path, name: str, start: float) -> Path:
+    """A bag from `start` s on, whose first effort is `start` N m."""
+    bag = Bag(folder, "ros1", name)
+    for t in grid(start, start + 1.0):
+        bag.state(t, effort=np.full(2, start))
+    return bag.write()
+
+
+def test_repeats_are_in_the_order_of_recording(tmp_path: Path) -> None:
+    """The shell hands over run_1, run_10, run_2."""
+    paths = sorted(loaded(tmp_path, f"run_{i}", 2.0 * i) for i in range(1, 11))
+    assert [path.stem for path in paths[:3]] == ["run_1", "run_10", "run_2"]
+    recording = read_bags(paths, joints=JOINTS, torque=TORQUE)
+    np.testing.assert_array_equal(recording.channel("torque").values[:, 0, 0], 2.0 * np.arange(1, 11))
+    assert recording.meta["bags"].startswith("run_1.bag, run_2.bag")
+
+
+def test_bags_that_overlap_keep_their_order(tmp_path: Path) -> None:
+    """Simulations that each begin at zero: nothing but a rounding says which was first."""
+    paths = [loaded(tmp_path, f"run_{i}", 0.001 * (11 - i)) for i in range(1, 11)]
+    expected = 0.001 * (11 - np.arange(1, 11))
+    for recording in (
+        read_bags(paths, joints=JOINTS, torque=TORQUE),
+        load(tmp_path, joints=JOINTS, torque=TORQUE),  # a folder: run_2 before run_10
+    ):
+        np.testing.assert_array_equal(recording.channel("torque").values[:, 0, 0], expected)
+
+
 def test_without_commands(tmp_path: Path) -> None:
     recording = read_bags([pulled(tmp_path, "mcap")], joints=["j2"], torque=TORQUE, rate=50.0)
     assert recording.command.shape == (0, 0)
@@ -396,6 +434,16 @@ def test_convert_turns_bags_into_a_recording(tmp_path: Path, capsys: pytest.Capt
     assert convert(out, "--start", "0.2", "--end", "0.6", "--out", tmp_path / "part") == 0
     part = load(tmp_path / "part")
     assert (part.span, part.repeats) == (pytest.approx((0.2, 0.6)), 3)
+
+
+def test_convert_takes_several_folders_of_bags(tmp_path: Path) -> None:
+    for day in ("day1", "day2"):
+        (tmp_path / day).mkdir()
+        for i in range(2):
+            pulled(tmp_path / day, "ros1", f"run{i}")
+    said = ["--joints", *JOINTS, "--torque", "link", "--out", tmp_path / "door.npz"]
+    assert convert(tmp_path / "day1", tmp_path / "day2", *said) == 0
+    assert load(tmp_path / "door.npz").repeats == 4
 
 
 def test_a_converted_motion_is_called_as_its_file_unless_told_otherwise(tmp_path: Path) -> None:
