@@ -136,6 +136,12 @@ def test_two_recordings_of_one_name(refused, tmp_path: Path):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize("command", ["identify", "gap"])
+def test_a_cutoff_that_filters_nothing(refused, tmp_path: Path, command: str):
+    said = refused(command, "--recording", demonstration_path("A"), "--motion-cutoff", "12", "--out", tmp_path / "run")
+    assert "--motion-cutoff is for logs without commands, and no recording is one" in said
+
+
 def test_the_same_files_in_another_place_are_the_same_run(refused, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """What they say counts: an absolute path instead of a relative one, or a folder of another name."""
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from small_log import elbow_log, write_elbow
 
 from droid_jax.commands import evaluate, gap, hidden, identify, report, train, whole
 from droid_jax.commands.folder import OtherRun
@@ -113,6 +114,8 @@ def test_the_scale_of_effects_reaches_the_search(called):
     ("options", "said"),
     [
         (["--trials", "0"], "--trials must be 1 or more, got 0"),
+        (["--motion-cutoff", "12"], "--motion-cutoff is for logs without commands, and no recording is one"),
+        (["--motion-cutoff", "0"], "--motion-cutoff must be above 0 Hz, got 0"),
         (["--effect-scale", "0"], "the scale of the effects must be above 0, got 0"),
         (
             ["--scene", "my.xml", "--recording", "a.npz", "--stages", "train", "evaluate"],
@@ -124,6 +127,15 @@ def test_what_a_later_stage_would_refuse_is_refused_at_once(called, capsys, opti
     assert main(["all", *options]) == 2
     assert said in capsys.readouterr().err
     assert called == [] and not Path("runs").exists()
+
+
+def test_the_cutoff_of_a_log_reaches_fit_and_search(called, tmp_path: Path):
+    save(elbow_log(0.0), tmp_path / "log.npz")
+    options = ["--recording", str(tmp_path / "log.npz"), *write_elbow(tmp_path), "--motion-cutoff", "12"]
+    assert main(["all", *options]) == 0
+    assert [c.motion_cutoff for c in called] == [12.0, 12.0]
+    fit, search = called
+    assert identify.config_of(fit).compare.motion_cutoff == gap.config_of(search).compare.motion_cutoff == 12.0
 
 
 def test_trials_count_where_they_are_made(called):

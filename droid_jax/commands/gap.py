@@ -14,7 +14,7 @@ from droid_jax.commands.gap_search import searched
 from droid_jax.commands.hidden import hidden_effects, record_stand_in, settled
 from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.presets import TIMESTEP, refine_config, search_config, warn_of_cpu
-from droid_jax.commands.scenes import needs_recording, needs_scene, own_scene, recording_at
+from droid_jax.commands.scenes import compared, needs_log, needs_recording, needs_scene, own_scene, recording_at
 from droid_jax.report.stages import needs_whole
 
 if TYPE_CHECKING:
@@ -55,6 +55,8 @@ class Gap:
     """Measured joints of your own scene; default: all driven joints."""
     object_joint: str | None = None
     """Joint of the thing that is moved, in your own scene; without it no effect of a door is asked about."""
+    motion_cutoff: float | None = None
+    """Logs without commands: cutoff of the filter of the measured positions, Hz; default: 20."""
     effects: tuple[str, ...] = ()
     """Effects of the library to ask about; default: all that the scene can have."""
     without: tuple[str, ...] = ()
@@ -102,6 +104,7 @@ def run(command: Gap) -> None:
     load_effects(command.own_effects, fit)
     scene, base = model_of(command)
     given = given_to(command)
+    needs_log(command.motion_cutoff, given)
     hidden = {} if given else hidden_effects(command.hide, scene)
     effects = chosen_effects(command, scene, given)
     start = None if fit is None else values_of(fit, base)
@@ -201,6 +204,7 @@ def config_of(command: Gap) -> GapConfig:
     return GapConfig(
         search=search_config(command.preset, command.seed),
         refine=refine_config(command.preset) or RefineConfig(),
+        compare=compared(command.motion_cutoff),
         seed=command.seed,
         **asked,
     )

@@ -15,7 +15,7 @@ from droid_jax.commands.hidden import known_stand_in, settled
 from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.pictures import draw
 from droid_jax.commands.presets import TIMESTEP, Preset, refine_config, search_config, warn_of_cpu
-from droid_jax.commands.scenes import needs_recording, needs_scene, own_scene, recording_at
+from droid_jax.commands.scenes import compared, needs_log, needs_recording, needs_scene, own_scene, recording_at
 
 if TYPE_CHECKING:
     from droid_jax.identify.pipeline import Identified, IdentifyConfig
@@ -71,6 +71,8 @@ class Identify:
     mj_step: bool = False
     """The recordings are a MuJoCo program's own, of this scene and time step: replay them by mj_step's steps of first
     order, row by row."""
+    motion_cutoff: float | None = None
+    """Logs without commands: cutoff of the filter of the measured positions, Hz; default: 20."""
     seed: int = 0
     """Seed of the search, of the stand-in robot and of the samples."""
     tensorboard: bool = False
@@ -102,6 +104,7 @@ def run(command: Identify) -> None:
     scene, space, nuisances = model_of(command)
     scene, space, effects = _extended(command, scene, space)
     given = _given(command)
+    needs_log(command.motion_cutoff, given)
     setup = {**setup_of(command), **fingerprints(scene, space if nuisances is None else space + nuisances, given)}
     if finished(out, setup, command.again):
         report.run(report.Report(out))
@@ -174,7 +177,6 @@ def model_of(command: Identify) -> tuple[Scene, Space, Space | None]:
 
 def config_of(command: Identify) -> IdentifyConfig:
     """The preset with the command's own numbers."""
-    from droid_jax.compare.residuals import CompareConfig
     from droid_jax.identify.pipeline import IdentifyConfig
 
     changes = {k: getattr(command, k) for k in ("population", "generations", "restarts")}
@@ -183,7 +185,7 @@ def config_of(command: Identify) -> IdentifyConfig:
         search=search_config(command.preset, command.seed, **changes),
         refine=refine_config(command.preset),
         seed=command.seed,
-        compare=CompareConfig(whitened=command.whitened, mj_step=command.mj_step),
+        compare=compared(command.motion_cutoff, whitened=command.whitened, mj_step=command.mj_step),
     )
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
+    from droid_jax.compare.residuals import CompareConfig
     from droid_jax.measure.recording import Recording
     from droid_jax.model.parameters import Space
     from droid_jax.model.scene import Scene
@@ -37,6 +40,24 @@ def needs_recording(options: OwnScene) -> None:
     """ValueError for a scene of one's own in which nothing was measured."""
     if options.scene is not None and not options.recording:
         raise ValueError("--scene needs --recording: the stand-in robot only knows the built-in door")
+
+
+def needs_log(motion_cutoff: float | None, recordings: Sequence[Recording]) -> None:
+    """ValueError for a --motion-cutoff that is none, or that filters nothing: a stand-in robot has commands."""
+    if motion_cutoff is None:
+        return
+    if not motion_cutoff > 0:
+        raise ValueError(f"--motion-cutoff must be above 0 Hz, got {motion_cutoff:g}")
+    if all(recording.command_names for recording in recordings):
+        raise ValueError("--motion-cutoff is for logs without commands, and no recording is one")
+
+
+def compared(motion_cutoff: float | None, **changes: Any) -> CompareConfig:
+    """How recordings are compared, with what the command line says of it."""
+    from droid_jax.compare.residuals import CompareConfig
+
+    usual = CompareConfig(**changes)
+    return usual if motion_cutoff is None else replace(usual, motion_cutoff=motion_cutoff)
 
 
 def own_scene(options: OwnScene) -> tuple[Scene, Space]:

@@ -15,7 +15,7 @@ from droid_jax.commands import evaluate, gap, identify, report, train
 from droid_jax.commands.folder import OtherRun, changed, setup_of
 from droid_jax.commands.hidden import DEMONSTRATIONS, hidden_effects, record_stand_in, settled
 from droid_jax.commands.own_effects import load_effects
-from droid_jax.commands.scenes import needs_recording, needs_scene
+from droid_jax.commands.scenes import needs_log, needs_recording, needs_scene
 from droid_jax.commands.source import model_folder, needs_brax
 from droid_jax.report.files import TRANSFER
 from droid_jax.report.stages import left_over
@@ -66,6 +66,8 @@ class All:
     """Measured joints of your own scene; default: all driven joints."""
     object_joint: str | None = None
     """Joint of the thing that is moved, in your own scene."""
+    motion_cutoff: float | None = None
+    """Logs without commands: cutoff of the filter of the measured positions, Hz; default: 20."""
     effect_scale: float = 1.0
     """Forces and torques of the library's effects, relative to an arm of a Panda's size, as in gap."""
     own_effects: Path | None = None
@@ -195,6 +197,7 @@ def _roles(command: All) -> tuple[str, ...]:
     nothing to seal, unless a search could be made later.
     """
     if not command.recording:
+        needs_log(command.motion_cutoff, ())
         return tuple(DEMONSTRATIONS)
     from droid_jax.gap.inputs import shared_out
 
@@ -209,8 +212,9 @@ def _roles(command: All) -> tuple[str, ...]:
 
 
 def _own(command: All) -> dict[str, Any]:
-    """The options of a scene and of effects of one's own, which all stages in it take."""
-    return {name: getattr(command, name) for name in ("scene", "parameters", "joints", "object_joint", "own_effects")}
+    """The options of recordings, a scene and effects of one's own, which both stages with them take."""
+    names = ("scene", "parameters", "joints", "object_joint", "motion_cutoff", "own_effects")
+    return {name: getattr(command, name) for name in names}
 
 
 def _plan(

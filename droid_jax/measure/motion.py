@@ -64,7 +64,7 @@ def measured_motion(recording: Recording, joints: Sequence[str], *, cutoff: floa
     if rate < 2.5 * cutoff:
         raise ValueError(
             f"recording {recording.name!r} holds positions at {rate:.4g} Hz, too slow to be smoothed at {cutoff:g} Hz; "
-            f"state a motion cutoff below {rate / 2.5:.3g} Hz"
+            f"give --motion-cutoff (CompareConfig.motion_cutoff) below {rate / 2.5:.3g} Hz"
         )
     position = np.mean(channel.values[:, :, columns], axis=0, where=mask)
     position = _regular(recording.name, channel.time, position, cutoff)
@@ -86,8 +86,8 @@ def _regular(name: str, time: np.ndarray, position: np.ndarray, cutoff: float) -
     if steps[longest] * 2.5 * cutoff > 1:
         raise ValueError(
             f"recording {name!r} holds no position for {steps[longest]:.3g} s from {time[longest]:g} s on, too long to "
-            f"be smoothed at {cutoff:g} Hz; cut the log there or state a motion cutoff below "
-            f"{1 / (2.5 * steps[longest]):.3g} Hz"
+            f"be smoothed at {cutoff:g} Hz; cut the log there or give --motion-cutoff (CompareConfig.motion_cutoff) "
+            f"below {1 / (2.5 * steps[longest]):.3g} Hz"
         )
     return interpolate.CubicSpline(time, position)(np.linspace(time[0], time[-1], len(time)))
 

@@ -65,7 +65,9 @@ def test_a_clock_that_jitters_is_no_other_motion():
 
 def test_a_gap_that_no_filter_bridges_is_refused():
     kept = np.r_[0:2000, 2200:6000]
-    with pytest.raises(ValueError, match=r"no position for 0\.201 s from 1\.999 s on.*cutoff below 1\.99 Hz"):
+    with pytest.raises(
+        ValueError, match=r"no position for 0\.201 s from 1\.999 s on.*--motion-cutoff .*below 1\.99 Hz"
+    ):
         measured_motion(log(sines(TIME[kept])[None], TIME[kept]), JOINTS)
 
 
@@ -77,7 +79,9 @@ def test_what_cannot_be_a_motion_is_refused():
     with pytest.raises(ValueError, match=r"column .b.: not measured at 1\.234 s"):
         measured_motion(log(sines(TIME)[None], mask=mask), JOINTS)
     slow = TIME[::40]
-    with pytest.raises(ValueError, match=r"25 Hz, too slow to be smoothed at 20 Hz.*below 10 Hz"):
+    with pytest.raises(
+        ValueError, match=r"25 Hz, too slow to be smoothed at 20 Hz; give --motion-cutoff .*below 10 Hz"
+    ):
         measured_motion(log(sines(slow)[None], slow), JOINTS)
     with pytest.raises(ValueError, match=r"1\.2 s long; a motion needs 1\.6 s"):
         measured_motion(log(sines(TIME[:1201])[None], TIME[:1201]), JOINTS)
