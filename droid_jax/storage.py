@@ -14,7 +14,9 @@ import csv
 import io
 import json
 import os
+import secrets
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -22,16 +24,17 @@ from typing import Any
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """A file of these bytes; an existing one is replaced."""
+    """A file of these bytes; an existing one is replaced, and who may read it stays as it was."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     try:
-        with os.fdopen(handle, "wb") as file:
+        with temporary.open("xb") as file:  # not mkstemp: that keeps others out, whatever the umask says
             file.write(content)
-        os.chmod(temporary, 0o644)  # mkstemp keeps others out; what is written here is for others
+        if path.exists():
+            temporary.chmod(stat.S_IMODE(path.stat().st_mode))
         os.replace(temporary, path)
     finally:
-        Path(temporary).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:

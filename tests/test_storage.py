@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -41,11 +42,24 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(
     assert target.read_bytes() != b"old" and list(tmp_path.iterdir()) == [target]
 
 
-def test_missing_folders_are_made_and_others_may_read(tmp_path: Path):
+def test_missing_folders_are_made(tmp_path: Path):
     path = tmp_path / "a" / "b" / "text"
     storage.write_text(path, "m²\n")
     assert path.read_bytes() == "m²\n".encode()
-    assert path.stat().st_mode & 0o777 == 0o644
+
+
+def test_who_may_read_is_as_the_user_has_it(tmp_path: Path):
+    """The umask decides of a new file, its mode of an existing one."""
+    path = tmp_path / "result"
+    before = os.umask(0o007)
+    try:
+        storage.write_text(path, "first")
+        assert path.stat().st_mode & 0o777 == 0o660
+        path.chmod(0o604)
+        storage.write_text(path, "second")
+        assert path.stat().st_mode & 0o777 == 0o604
+    finally:
+        os.umask(before)
 
 
 def test_json_has_no_word_for_nan(tmp_path: Path):

@@ -61,7 +61,9 @@ def _entries(path: Path) -> list[Any]:
     if not path.is_file():
         raise FileNotFoundError(f"no parameter file at {path}")
     try:
-        entries = json.loads(path.read_text())
+        entries = json.loads(path.read_text(encoding="utf-8-sig"))
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: not a text file in UTF-8, byte {error.start} cannot be read") from None
     except json.JSONDecodeError as error:
         raise ValueError(f"{path}: not JSON ({error})") from None
     if not isinstance(entries, list) or not entries:

@@ -30,6 +30,16 @@ def loaded(folder: Path, scene: Scene, entry: dict[str, Any]):
     return load_parameters(folder / "parameters.json", scene)
 
 
+def test_a_file_is_utf_8_whatever_wrote_it(tmp_path: Path, scene: Scene):
+    """Editors on Windows put a byte order mark first, or write another encoding."""
+    path, text = tmp_path / "parameters.json", json.dumps([{**GOOD, "name": "Öl"}], ensure_ascii=False)
+    path.write_text(text, encoding="utf-8-sig")
+    assert load_parameters(path, scene).names == ("Öl",)
+    path.write_text(text, encoding="latin-1")
+    with pytest.raises(ValueError, match=r"parameters\.json: not a text file in UTF-8, byte \d+ cannot be read"):
+        load_parameters(path, scene)
+
+
 def test_an_entry_is_read_as_it_says(tmp_path: Path, scene: Scene):
     more = {"mode": "scale", "scaling": "log", "floor": 0.1, "width": 0.5, "nuisance": True, "low": 0, "mean": 2}
     parameter = loaded(tmp_path, scene, {**GOOD, **more, "name": "oil", "unit": "-", "group": "Arm"})["oil"]
