@@ -40,7 +40,7 @@ PRESETS = {
     "gpu": _Presets("gpu", "gpu"),
 }
 
-MINUTES = {"record": 0.2, "identify": 4.6, "gap": 8.6, "train": 8.2, "evaluate": 1.9}
+MINUTES = {"record": 0.2, "identify": 5.1, "gap": 8.7, "train": 8.3, "evaluate": 2.1}
 """Of each stage in the preset "quick", on two cores with nothing compiled before (benchmarks/default_run.py)."""
 
 

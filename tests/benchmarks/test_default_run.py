@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 
 from benchmarks import default_run
 from benchmarks.default_run import Line, command_lines, figures
+from droid_jax.commands import whole
 
 
 def test_times_are_those_of_the_lines():
@@ -16,6 +18,11 @@ def test_times_are_those_of_the_lines():
     assert (found["first_line_s"], found["first_stage_s"], found["longest_silence_s"]) == (2.0, 9.0, 361.0)
     assert found["minutes"] == {"record": 0.5, "gap": 6.0} and found["whole_minutes"] == pytest.approx(400 / 60)
     assert figures([Line(3.0, "starting jax ...")])["longest_silence_s"] == 3.0  # the one before the first counts
+
+
+def test_the_time_that_is_said_to_be_left_is_the_measured_one():
+    measured = json.loads((default_run.ROOT / "benchmarks" / "results" / "default_run.json").read_text())
+    assert measured["minutes"] == whole.MINUTES
 
 
 def test_a_command_that_fails_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
