@@ -23,6 +23,8 @@ from matplotlib.figure import Figure  # noqa: E402
 from scipy import stats  # noqa: E402
 
 from benchmarks.common import stem  # noqa: E402
+from droid_jax.model.door import door_space  # noqa: E402
+from droid_jax.model.door_scene import door_scene  # noqa: E402
 from droid_jax.report.export import save  # noqa: E402
 from droid_jax.report.style import AFTER, BEFORE, TRUTH, WIDE, styled  # noqa: E402
 from droid_jax.report.words import label  # noqa: E402
@@ -48,6 +50,7 @@ def both_tell(a: dict[str, Any], b: dict[str, Any]) -> list[str]:
 def densities(a: dict[str, Any], b: dict[str, Any], width: float = WIDE) -> Figure:
     """One panel for each parameter that both poses tell: the two Gaussians and the truth."""
     names = both_tell(a, b)
+    units = {p.name: p.unit for p in door_space(door_scene()).parameters}
     columns = 4
     rows = max(1, -(-len(names) // columns))
     figure = Figure(figsize=(width, 0.6 + 1.5 * rows), layout="constrained")
@@ -63,7 +66,7 @@ def densities(a: dict[str, Any], b: dict[str, Any], width: float = WIDE) -> Figu
             axes.fill_between(x, density, color=colour, alpha=0.35, linewidth=0, label=f"pose {pose}")
             axes.plot(x, density, color=colour, linewidth=1.2)
         axes.axvline(a[name]["truth"], color=TRUTH, linewidth=1.4, linestyle=(0, (4, 1.5)), label="truth")
-        axes.set(title=label(name), yticks=[], xlim=(x[0], x[-1]))
+        axes.set(title=label(name), xlabel=f"[{units[name]}]", yticks=[], xlim=(x[0], x[-1]))
         axes.locator_params(axis="x", nbins=3)
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper left", ncols=3, frameon=False)

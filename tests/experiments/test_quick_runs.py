@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import subprocess
 import sys
@@ -59,6 +60,15 @@ def test_a_script_that_lacks_a_case_says_how_to_make_it(tmp_path: Path, script: 
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode and f"there is no {tmp_path / 'identify_cases_quick' / case}.json" in done.stderr
     assert f"run experiments/identify_suite.py --parts {part} --quick --out {tmp_path}" in done.stderr
+
+
+def test_the_poses_panels_say_their_units(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "experiments"))
+    figure = importlib.import_module("pose_figure")
+    cases = [json.loads((ROOT / f"benchmarks/results/identify_cases/pose_{pose}.json").read_text()) for pose in "AB"]
+    panels = [axes for axes in figure.densities(*(case["parameters"] for case in cases)).axes if axes.get_visible()]
+    said = {axes.get_title("left"): axes.get_xlabel() for axes in panels}
+    assert said["Hinge stiffness"] == "[N m/rad]" and all(said.values())
 
 
 def test_every_script_is_run_by_some_test() -> None:
