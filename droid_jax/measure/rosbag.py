@@ -276,7 +276,9 @@ def _use_header(tracks: Sequence[Mapping[str, _Track]], stamps: Stamps, bags: Se
     """Whether header stamps count: one choice for all, two clocks would shift the topics."""
     bare = [(bag, topic) for bag, t in zip(bags, tracks, strict=True) for topic in t if t[topic].stamped is None]
     if stamps is Stamps.HEADER and bare:
-        raise ValueError(f"{bare[0][0]}, topic {bare[0][1]!r}: messages have no header stamp; use Stamps.BAG")
+        raise ValueError(
+            f"{bare[0][0]}, topic {bare[0][1]!r}: messages have no header stamp; use --stamps bag (Stamps.BAG)"
+        )
     return stamps is not Stamps.BAG and not bare
 
 
@@ -385,8 +387,8 @@ def _command(
         if gap[i, j] > tolerance:
             raise ValueError(
                 f"{bag}: its command is not that of {bags[0]}, joint {joints[j]!r} differs by "
-                f"{gap[i, j]:.4g} at {clock[i]:.3f} s (command_tolerance is {tolerance:g}); "
-                "repeats must replay one motion"
+                f"{gap[i, j]:.4g} at {clock[i]:.3f} s; repeats must replay one motion, within "
+                f"--command-tolerance {tolerance:g} (command_tolerance)"
             )
     return every[0]
 

@@ -125,7 +125,7 @@ def load(path: str | Path) -> Policy:
         raise ValueError(f"{path} was trained on another observation: {', '.join(other[:3])}")
     broken = [n for n in numeric if found[n].dtype.kind not in "fiu" or not np.isfinite(found[n]).all()]
     if broken:
-        raise ValueError(f"{path}: {', '.join(broken)} hold values that are no numbers; train again")
+        raise ValueError(f"{path}: {', '.join(broken)} hold NaN, infinite values or text; train again")
     wrong = _misshapen(found, len(layers)) or _not_above_zero(found)
     if wrong:
         raise ValueError(f"{path} is damaged: {wrong}; train or export again")
@@ -254,7 +254,7 @@ class Controller:
             if np.isfinite(command.arm).all() and np.isfinite(command.fingers).all():
                 self._held, self._time = Command(reading.position, command.fingers), reading.time
                 return command
-            self.stopped = "the policy's command holds a value that is no number"
+            self.stopped = "the policy's command holds a value that is NaN or infinite"
         return self.hold()
 
     def hold(self) -> Command:
@@ -342,7 +342,7 @@ def _unusable(values: Mapping[str, tuple[Any, tuple[int, ...]]]) -> str | None:
         if np.shape(value) != shape:
             return f"{name} must have shape {list(shape)}, got {list(np.shape(value))}"
         if not np.isfinite(value).all():
-            return f"{name} holds a value that is no number"
+            return f"{name} holds a value that is NaN or infinite"
     return None
 
 

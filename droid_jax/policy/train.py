@@ -233,16 +233,19 @@ def _brax(
             blank = _blank(env, config)
             params, best = (from_tree(blank, tree[name]) for name in ("latest", "best"))
         if done < config.steps:
-            with contextlib.suppress(_Diverged):  # numbers that are none do not come back: the best so far stays
+            with contextlib.suppress(_Diverged):  # NaN does not go away again: the best so far stays
                 run(config.steps - done, params, progress_fn=tell, policy_params_fn=keep)
     if best is None:
-        raise ValueError("training ended in numbers that are none: try another seed, or a smaller learning rate")
+        raise ValueError(
+            "training ended in NaN or infinite weights: try another --seed "
+            "(in Python, a smaller TrainConfig.learning_rate too)"
+        )
     normaliser, actor, _ = best
     return Trained(policy_of(normaliser, actor, layer_sizes(config.hidden), env.interface), tuple(history))
 
 
 class _Diverged(Exception):
-    """The networks are no numbers any more."""
+    """The networks' weights are NaN or infinite."""
 
 
 def _networks(config: TrainConfig) -> Callable[..., Any]:

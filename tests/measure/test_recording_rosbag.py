@@ -287,7 +287,9 @@ def test_header_and_bag_stamps(tmp_path: Path) -> None:
     recording = read_bags([path], **options)
     assert recording.meta["stamps"] == "bag"
     np.testing.assert_allclose(recording.channel("torque").values[0], torque(recording.time + 0.16), atol=1e-6)
-    fails([path], "topic '/command'", "no header stamp", stamps=Stamps.HEADER, command_topic="/command")
+    fails(
+        [path], "topic '/command'", "no header stamp; use --stamps bag", stamps=Stamps.HEADER, command_topic="/command"
+    )
     alone = read_bags([path], joints=JOINTS, torque=TORQUE, stamps=Stamps.BAG)
     assert alone.meta["stamps"] == "bag"
 
@@ -361,7 +363,14 @@ def test_effort_errors(tmp_path: Path, kind: str) -> None:
 def test_repeats_must_replay_one_motion(tmp_path: Path) -> None:
     one = pulled(tmp_path, "ros1", "one")
     other = pulled(tmp_path, "ros1", "other", command=lambda b, t, q: joint_state(b, t, q * 1.1))
-    fails([one, other], "other.bag", "one.bag", "joint 'j2' differs by 0.2 at 1.000 s", command_topic="/command")
+    fails(
+        [one, other],
+        "other.bag",
+        "one.bag",
+        "joint 'j2' differs by 0.2 at 1.000 s; ",
+        "--command-tolerance 0.005",
+        command_topic="/command",
+    )
     kept = read_bags([one, other], joints=JOINTS, torque=TORQUE, command_topic="/command", command_tolerance=0.3)
     assert kept.repeats == 2
 

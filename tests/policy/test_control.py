@@ -130,8 +130,8 @@ def test_a_good_reading_is_acted_on(policy, still):
         (lambda r: replace(r, time=0.0), "stale reading"),
         (lambda r: replace(r, time=np.nan), "stale reading"),
         (lambda r: replace(r, time=0.1), "late: 100 ms between readings, expected 20"),
-        (lambda r: replace(r, position=np.full(7, np.nan)), "position holds a value that is no number"),
-        (lambda r: replace(r, knob=np.full((4, 4), np.inf)), "knob holds a value that is no number"),
+        (lambda r: replace(r, position=np.full(7, np.nan)), "position holds a value that is NaN or infinite"),
+        (lambda r: replace(r, knob=np.full((4, 4), np.inf)), "knob holds a value that is NaN or infinite"),
         (lambda r: replace(r, velocity=np.zeros(6)), r"velocity must have shape \[7\], got \[6\]"),
         (lambda r: replace(r, velocity=np.array([0, 0, 0, 0, 2.7, 0, 0])), "too fast: joint 5 at 2.7 rad/s"),
         (lambda r: replace(r, torque=np.array([0, 99, 0, 0, 0, 0, 0])), "too much torque: joint 2 at 99 N m"),
@@ -158,7 +158,7 @@ def test_it_stops_and_holds_the_pose(policy, still, spoil, why: str):
 
 
 def test_there_is_no_beginning_from_a_bad_reading(policy, still):
-    with pytest.raises(ValueError, match="cannot begin: position holds a value that is no number"):
+    with pytest.raises(ValueError, match="cannot begin: position holds a value that is NaN or infinite"):
         Controller(policy).act(replace(still, position=np.full(7, np.nan)))
 
 
@@ -220,7 +220,7 @@ def test_a_policy_that_gives_no_numbers_is_stopped(policy, still):
     loop.act(still)
     loop.policy = replace(policy, biases=(policy.biases[0], np.full(2 * ACTIONS, np.nan)))
     held = loop.act(replace(still, time=0.02))
-    assert held.stopped == "the policy's command holds a value that is no number"
+    assert held.stopped == "the policy's command holds a value that is NaN or infinite"
     np.testing.assert_array_equal(held.arm, still.position)
 
 
@@ -229,7 +229,9 @@ def test_a_command_that_is_no_number_is_stopped(policy, still):
     loop.act(still)
     loop.policy = replace(policy, interface=replace(policy.interface, width=np.nan))
     held = loop.act(replace(still, time=0.02))
-    assert held.stopped == "the policy's command holds a value that is no number" and np.isfinite(held.fingers).all()
+    assert (
+        held.stopped == "the policy's command holds a value that is NaN or infinite" and np.isfinite(held.fingers).all()
+    )
 
 
 def test_readings_that_come_too_fast_stop_it(policy, still):
@@ -247,7 +249,7 @@ def test_readings_that_come_too_fast_stop_it(policy, still):
         ({"weight_0": np.zeros((20, 16))}, r"weight_0 has shape \(20, 16\), expected \(23, 16\)"),
         ({"bias_1": np.zeros(9)}, r"bias_1 has shape \(9,\), expected \(18,\)"),
         ({"effort": np.zeros(6)}, r"effort has shape \(6,\), expected \(7,\)"),
-        ({"effort": np.full(7, np.nan)}, "effort hold values that are no numbers"),
+        ({"effort": np.full(7, np.nan)}, "effort hold NaN"),
     ],
 )
 def test_a_damaged_file_is_refused(policy, tmp_path: Path, changes, said: str):
