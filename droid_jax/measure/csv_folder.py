@@ -11,21 +11,17 @@ from pathlib import Path
 import numpy as np
 
 from droid_jax.measure.clocks import SLACK, check_clock, resample
-from droid_jax.measure.metadata import metadata_from_json, metadata_to_json, recording_of
+from droid_jax.measure.metadata import Metadata, metadata_from_json, metadata_to_json, recording_of
 from droid_jax.measure.recording import JITTER, Channel, Recording
 from droid_jax.storage import new_folder, write_csv, write_text
-
-_TABLES = re.compile(r"recording\.json|command\.csv|\w+_\d+\.csv")  # what a recording's folder consists of
 
 
 def save_csv(recording: Recording, path: Path) -> None:
     """Write a recording, which is taken to be valid; ValueError where the folder holds something else."""
-    if path.exists() and not (path / "recording.json").exists() and (path.is_file() or any(path.iterdir())):
-        raise ValueError(f"{path}: exists and is not a recording's folder, it is not replaced")
-    if strange := sorted(p.name for p in path.iterdir() if not _TABLES.fullmatch(p.name)) if path.is_dir() else []:
-        raise ValueError(
-            f"{path}: holds {strange[0]} beside a recording, which would be lost: write to another folder, or move it"
-        )
+    if path.is_file() or (path.is_dir() and any(path.iterdir())):
+        if not (path / "recording.json").exists():
+            raise ValueError(f"{path}: exists and is not a recording's folder, it is not replaced")
+        _only_a_recording(path)
     with new_folder(path) as new:
         write_text(new / "recording.json", metadata_to_json(recording) + "\n")
         if recording.command_names:
@@ -34,6 +30,21 @@ def save_csv(recording: Recording, path: Path) -> None:
             for r in range(recording.repeats):
                 values = np.where(c.mask[r], c.values[r], np.nan)
                 _write_table(new / f"{key}_{r:02d}.csv", c.columns, c.time, values)
+
+
+def _only_a_recording(path: Path) -> None:
+    """ValueError where a folder holds more than the recording that its recording.json describes."""
+    channels = "|".join(map(re.escape, _metadata(path).units))
+    own = re.compile(rf"recording\.json|command\.csv|(?:{channels})_\d+\.csv")
+    if strange := sorted(p.name for p in path.iterdir() if not own.fullmatch(p.name)):
+        raise ValueError(
+            f"{path}: holds {strange[0]} beside a recording, which would be lost: write to another folder, or move it"
+        )
+
+
+def _metadata(path: Path) -> Metadata:
+    """What the recording.json of a folder says; ValueError names what is wrong with it."""
+    return metadata_from_json(_text(path / "recording.json"), str(path / "recording.json"))
 
 
 def _write_table(path: Path, columns: Sequence[str], time: np.ndarray, values: np.ndarray) -> None:
@@ -62,7 +73,7 @@ def load_csv(path: Path, interpolate: bool, allow_jitter: bool) -> Recording:
     interpolate:  put repeats with clocks of their own on the first one's clock.
     allow_jitter: accept irregular clocks.
     """
-    meta = metadata_from_json(_text(path / "recording.json"), str(path / "recording.json"))
+    meta = _metadata(path)
     allow_jitter = allow_jitter or JITTER in meta.meta
     time, command, names = np.zeros(0), np.zeros((0, 0)), ()
     if meta.commands:

@@ -17,7 +17,7 @@ import numpy as np
 class Reader:
     """Reads what one command wrote; every fault is a ValueError that names the file.
 
-    command: "identify" or "gap", to run again where something is missing or broken.
+    command: "identify", "gap", "train" or "evaluate", to run again where something is missing or broken.
     """
 
     command: str

@@ -4,7 +4,8 @@ MuJoCo chooses its OpenGL library once, when it is first imported, from the envi
 variable MUJOCO_GL, and a broken library can end the process instead of raising.  So the
 pictures are made in a child process: this one may have imported mujoco in any state, a crash
 costs only the pictures, and the caller's environment stays as it is.  Which library works is
-found out once per process, by trying: MUJOCO_GL as it is set, then EGL, then OSMesa.
+found out once per process, also that none does, by trying: MUJOCO_GL as it is set, then EGL,
+then OSMesa.
 """
 
 from __future__ import annotations
@@ -91,22 +92,30 @@ def save_image(path: Path, image: np.ndarray) -> None:
         write_bytes(path, buffer.getvalue())
 
 
-@cache
 def working_backend() -> str:
     """The value of MUJOCO_GL that draws on this machine, found once by drawing an empty scene.
 
     Raises NoOpenGL, which says what was tried and what to install.
     """
+    backend, tried = _first_to_draw(tuple(_candidates(os.environ.get("MUJOCO_GL", ""), sys.platform)))
+    if backend is None:
+        raise NoOpenGL(
+            f"no OpenGL library could draw; tried {'; '.join(tried)}. On Debian or Ubuntu: "
+            "apt-get install libegl1 libgl1-mesa-dri  (or libosmesa6)"
+        )
+    return backend
+
+
+@cache
+def _first_to_draw(backends: tuple[str, ...]) -> tuple[str | None, list[str]]:
+    """The first of these that draws, None where none does (kept too: each may take a minute); what failed, and why."""
     tried = []
-    for backend in _candidates(os.environ.get("MUJOCO_GL", ""), sys.platform):
+    for backend in backends:
         error = _child(backend, None, _PROBE_SECONDS)
         if not error:
-            return backend
+            return backend, tried
         tried.append(f"{backend or 'default'} ({error})")
-    raise NoOpenGL(
-        f"no OpenGL library could draw; tried {'; '.join(tried)}. On Debian or Ubuntu: "
-        "apt-get install libegl1 libgl1-mesa-dri  (or libosmesa6)"
-    )
+    return None, tried
 
 
 def _candidates(wish: str, platform: str) -> list[str]:

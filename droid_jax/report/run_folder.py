@@ -131,7 +131,7 @@ def _traces(path: Path, recordings: Sequence[str]) -> dict[str, dict[str, Any]]:
         shape = (len(one["time"]), len(one["joints"]))
         for key in _TRACE_KEYS[1:-1]:
             if one[key].shape != shape:
-                raise ValueError(f"report: {path}, {r}/{key} must be [time, joints] = {shape}, got {one[key].shape}")
+                raise _READ.fault(f"{path}, {r}/{key} must be [time, joints] = {shape}, got {one[key].shape}")
         one["phases"] = json.loads(str(arrays[f"{r}/phases"])) if f"{r}/phases" in arrays else []
         traces[r] = one
     return traces

@@ -117,11 +117,12 @@ def test_saving_again_replaces_and_leaves_nothing_behind(tmp_path: Path, where: 
 
 def test_what_lies_beside_a_recording_is_never_lost(tmp_path: Path) -> None:
     folder = save(make(), tmp_path / "wave")
-    (folder / "raw.bag").write_bytes(b"the only one")
-    with pytest.raises(ValueError, match=r"wave: holds raw\.bag beside a recording, which would be lost"):
-        save(make(), folder)
-    assert (folder / "raw.bag").read_bytes() == b"the only one"
-    (folder / "raw.bag").unlink()
+    for name in ("raw.bag", "notes_1.csv"):
+        (folder / name).write_bytes(b"the only one")
+        with pytest.raises(ValueError, match=rf"wave: holds {re.escape(name)} beside a recording, which would be lost"):
+            save(make(), folder)
+        assert (folder / name).read_bytes() == b"the only one"
+        (folder / name).unlink()
     save(make(), folder)
 
 
