@@ -68,20 +68,16 @@ def _check_seconds(time: np.ndarray, steps: np.ndarray, where: str) -> None:
         )
 
 
-def resample(
-    times: Sequence[np.ndarray], values: Sequence[np.ndarray], clock: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
+def resample(times: Sequence[np.ndarray], values: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Repeats with clocks of their own -> one clock [Tc] s and values [N, Tc, C].
 
     times:  N arrays [T_r] s;  values: N arrays [T_r, C], NaN where nothing was measured.
-    clock:  where values are wanted, s; the first repeat's clock by default.
 
-    The clock is cut to the part that all repeats cover; in between, values are interpolated
+    The clock is the first repeat's, cut to the part that all repeats cover; in between, values are interpolated
     linearly and are NaN where either neighbour is.  Raises ValueError when no part is common.
     """
-    clock = times[0] if clock is None else clock
     first, last = max(float(t[0]) for t in times), min(float(t[-1]) for t in times)
-    clock = clock[(clock >= first - SLACK) & (clock <= last + SLACK)]
+    clock = times[0][(times[0] >= first - SLACK) & (times[0] <= last + SLACK)]
     if not len(clock):
         spans = ", ".join(f"{t[0]:g} .. {t[-1]:g} s" for t in times)
         raise ValueError(f"the repeats cover no common part of the clock: {spans}")

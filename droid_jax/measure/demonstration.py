@@ -129,7 +129,6 @@ def solve_pose(
     rotation: np.ndarray,
     *,
     body: str | None = None,
-    iterations: int = 100,
 ) -> np.ndarray:
     """Damped least squares from q [J] to a pose of a body's frame, or of the pinch point where none is named.
 
@@ -141,7 +140,7 @@ def solve_pose(
     jacobian = np.zeros((6, model.nv))
     q = np.array(q, dtype=float)
     error = np.zeros(6)
-    for _ in range(iterations):
+    for _ in range(100):
         data.qpos[scene.joint_qpos] = q
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
@@ -232,13 +231,13 @@ def _check_path(scene: Scene, plan: Plan, path: np.ndarray, velocity: np.ndarray
             raise ValueError(f"demonstration {plan.name}: {joint} needs {need:.0%} of its torque limit for its damping")
 
 
-def demonstration_path(name: str, knob: int = 0, gains: str = "impedance") -> Path:
+def demonstration_path(name: str, gains: str = "impedance") -> Path:
     """File of a shipped demonstration; an unknown one raises and lists what there is."""
     folder = mjcf_dir() / "demonstrations"
-    path = folder / f"{name}_{gains}_knob{knob}.npz"
+    path = folder / f"{name}_{gains}_knob0.npz"
     if not path.is_file():
         there = ", ".join(sorted(p.stem for p in folder.glob("*.npz"))) or "none"
-        raise ValueError(f"no demonstration {name!r} for knob {knob} and {gains!r} gains; shipped: {there}")
+        raise ValueError(f"no demonstration {name!r} for {gains!r} gains; shipped: {there}")
     return path
 
 

@@ -83,14 +83,12 @@ def simulate(
     models: Sequence[mujoco.MjModel],
     qpos0: np.ndarray,
     control: np.ndarray,
-    *,
-    threads: int | None = None,
 ) -> Trace:
     """Roll out instrumented models [P] from qpos0 [P or 1, nq] under control [P or 1, T, U].
 
     Where a rollout blows up, everything from there on is NaN (and no contact).
     """
-    threads = min(threads or runtime.cores(), len(models))
+    threads = min(runtime.cores(), len(models))
     kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
     states = np.zeros((len(models), mujoco.mj_stateSize(models[0], kind)))
     data = mujoco.MjData(models[0])

@@ -66,7 +66,7 @@ class Live:
 
     Before each step `control` holds the command, `applied` and `gear` zeros and `loss` the model's
     own friction loss; an effect changes them.  `gear` is the part of `applied` between motor and
-    link, which a sensor on the link side sees.  `motor` and `constraint` are the last step's torques.
+    link, which a sensor on the link side sees.  `motor` is the last step's torque.
     """
 
     model: mujoco.MjModel
@@ -77,7 +77,6 @@ class Live:
     applied: np.ndarray
     loss: np.ndarray
     motor: np.ndarray
-    constraint: np.ndarray
     control: np.ndarray
     gear: np.ndarray
 
@@ -86,7 +85,7 @@ class Live:
         """Views of a model and its data."""
         return cls(
             model, data, float(model.opt.timestep), data.qpos, data.qvel, data.qfrc_applied, model.dof_frictionloss,
-            data.qfrc_actuator, data.qfrc_constraint, data.ctrl, np.zeros(model.nv),
+            data.qfrc_actuator, data.ctrl, np.zeros(model.nv),
         )  # fmt: skip
 
 

@@ -17,6 +17,7 @@ RATE = 20.0  # Hz of the coarse clock
 # Lags beyond this are noise of the estimate: ten repeats tell a hundred of them with nine degrees of freedom each, the
 # weights then depend on the mean that they weigh, and p-values of nothing are too small (tests/gap/test_null.py).
 LONGEST = 1.0  # s
+SHRINK = 0.1
 # Repeats from which on what grows or fades steadily from one to the next (a sensor that warms up) is no noise.
 STEADY = 5
 
@@ -76,9 +77,7 @@ class Noise:
         return replace(self, whitener=np.eye(len(self.mean)) / deviation[:, None, None])
 
 
-def estimate_noise(
-    repeats: np.ndarray, *, minimum: float, shrink: float = 0.1, measured: np.ndarray | None = None
-) -> Noise:
+def estimate_noise(repeats: np.ndarray, *, minimum: float, measured: np.ndarray | None = None) -> Noise:
     """Noise of smoothed repeats [N, K, C], whole in time.
 
     measured: [N, K, C] bool, all unless given; what was not holds the mean of the others, and counts for nothing.
@@ -86,9 +85,9 @@ def estimate_noise(
     Per column, the repeats' deviations from their mean, from STEADY repeats on without their trend over the order, are
     a constant of each repeat and a stationary rest.
     The rest's autocovariance (biased, hence positive semi-definite) is tapered to LONGEST by a Parzen window,
-    shrunk towards white noise of the same variance, and never less than `minimum` (a deviation in the channel's
-    unit: what one repeat alone would have); the constants' variance is added to it.  With one repeat only `minimum`
-    is used, as white noise.  Source of the window: Parzen, Mathematical considerations in the estimation of
+    shrunk by SHRINK towards white noise of the same variance, and never less than `minimum` (a deviation in the
+    channel's unit: what one repeat alone would have); the constants' variance is added to it.  With one repeat only
+    `minimum` is used, as white noise.  Source of the window: Parzen, Mathematical considerations in the estimation of
     spectra, Technometrics 1961.
     """
     _, length, columns = repeats.shape
@@ -99,7 +98,7 @@ def estimate_noise(
         seen = np.ones(repeats.shape[:2], bool) if measured is None else measured[:, :, c]
         lags, constant = _lags(repeats[:, :, c] - mean[:, c], seen)
         variance = max(lags[0], minimum**2)
-        lags = (1 - shrink) * lags
+        lags = (1 - SHRINK) * lags
         lags[0] = variance
         of_mean = (scipy.linalg.toeplitz(lags) + constant) / np.sqrt(np.outer(count[:, c], count[:, c]))
         whitener[c] = np.linalg.inv(np.linalg.cholesky(of_mean))
@@ -140,17 +139,17 @@ def untrended(x: np.ndarray, seen: np.ndarray | None = None) -> np.ndarray:
     return x - order * slope
 
 
-def correlation_time(residuals: np.ndarray, rate: float = RATE) -> np.ndarray:
-    """[C] s, how long residuals [K, C] at `rate` Hz stay correlated: their autocorrelation's sum up to its first zero.
+def correlation_time(residuals: np.ndarray) -> np.ndarray:
+    """[C] s, how long residuals [K, C] at RATE stay correlated: their autocorrelation's sum up to its first zero.
 
-    Two-sided, so that K / (rate * this) is about the number of independent samples.
+    Two-sided, so that K / (RATE * this) is about the number of independent samples.
     """
     times = []
     for column in (residuals - residuals.mean(axis=0)).T:
         lags = np.correlate(column, column, "full")[len(column) - 1 :]
         lags = lags / max(lags[0], 1e-30)
         end = int(np.argmax(lags <= 0)) or len(lags)
-        times.append((2 * lags[:end].sum() - 1) / rate)
+        times.append((2 * lags[:end].sum() - 1) / RATE)
     return np.array(times)
 
 

@@ -85,10 +85,10 @@ DRIFT_TIME = 0.15  # s
 _WRIST = 4  # joints from here on have the smaller noise
 
 
-def draw_nuisances(scene: Scene, seed: int, *, scale: float = 1.0) -> dict[str, float]:
+def draw_nuisances(scene: Scene, seed: int) -> dict[str, float]:
     """One draw from the nuisances' priors: the same robot and door for all recordings made with it."""
     space = door_nuisances(scene)
-    draw = np.random.default_rng([seed, 1]).normal(space.mean, scale * space.std)
+    draw = np.random.default_rng([seed, 1]).normal(space.mean, space.std)
     return dict(zip(space.names, np.clip(draw, space.low, space.high).tolist(), strict=True))
 
 

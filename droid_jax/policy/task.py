@@ -111,9 +111,9 @@ def reward(task: Task, seen: Seen) -> Any:
     return sum(getattr(task, name) * value for name, value in terms(task, seen).items())
 
 
-def observation(position: Any, velocity: Any, seen: Seen, numbers: Any = jnp) -> Any:
-    """[23] as `control.LAYOUT` says, from joint positions and velocities [7]; numbers: jax.numpy or numpy."""
-    return numbers.concatenate([position, velocity, seen.pinch, seen.pads.reshape(-1)])
+def observation(position: Any, velocity: Any, seen: Seen) -> Any:
+    """[23] as `control.LAYOUT` says, from joint positions and velocities [7]."""
+    return jnp.concatenate([position, velocity, seen.pinch, seen.pads.reshape(-1)])
 
 
 def holding(task: Task, seen: Seen, before: Any) -> Any:

@@ -176,5 +176,7 @@ def test_a_path_too_close_to_a_limit_is_refused(scene: Scene):
 
 
 def test_unknown_demonstrations_list_the_shipped_ones():
-    with pytest.raises(ValueError, match=r"no demonstration 'Z' for knob 0.*A_impedance_knob0.*B_impedance_knob0"):
+    with pytest.raises(
+        ValueError, match=r"no demonstration 'Z' for 'impedance' gains.*A_impedance_knob0.*B_impedance_knob0"
+    ):
         demonstration_path("Z")

@@ -99,10 +99,16 @@ def test_rollouts_are_mj_step(
 
 
 def test_the_order_of_models_is_kept_on_any_number_of_threads(
-    scene: Scene, models: list[mujoco.MjModel], control: np.ndarray, start: np.ndarray, trace: Trace
+    scene: Scene,
+    models: list[mujoco.MjModel],
+    control: np.ndarray,
+    start: np.ndarray,
+    trace: Trace,
+    monkeypatch: pytest.MonkeyPatch,
 ):
+    monkeypatch.setattr(engine.runtime, "cores", lambda: 3)
     many = [models[0], models[1], models[1], models[0], models[0]]
-    again = simulate(scene, many, start, control[:, :300], threads=3)
+    again = simulate(scene, many, start, control[:, :300])
     for i, k in enumerate((0, 1, 1, 0, 0)):
         np.testing.assert_array_equal(again.torque[i], trace.torque[k, :300])
 
