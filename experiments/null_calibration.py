@@ -32,6 +32,7 @@ from benchmarks.common import origin  # noqa: E402
 from droid_jax import runtime  # noqa: E402
 from droid_jax.gap.candidates import candidates  # noqa: E402
 from droid_jax.gap.screen import questions_of  # noqa: E402
+from droid_jax.gap.select import SIGNIFICANT  # noqa: E402
 from droid_jax.gap.workflow import ask, base_fit, find  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 from experiments.blind.cases import Plan  # noqa: E402
@@ -42,7 +43,6 @@ from experiments.blind.score import rate  # noqa: E402
 from experiments.blind.search import Bench, Stopwatch, silent  # noqa: E402
 from experiments.sharing import claimed  # noqa: E402
 
-SIGNIFICANT = 0.01
 LEVELS = (0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9)
 
 

@@ -43,7 +43,7 @@ from droid_jax.policy.control import Policy, load  # noqa: E402
 from droid_jax.policy.door_env import DoorEnv  # noqa: E402
 from droid_jax.policy.hand import finger_forces_c, hand_of, looked  # noqa: E402
 from droid_jax.policy.task import Task, gripped  # noqa: E402
-from droid_jax.policy.transfer import StandIn, TransferConfig, stand_in, transfer, watched  # noqa: E402
+from droid_jax.policy.transfer import TransferConfig, TrialRobot, stand_in, transfer, watched  # noqa: E402
 from droid_jax.report.files import POLICY  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 from experiments.policies.cases import QUICK_STEPS, RESULTS, TIMESTEP  # noqa: E402
@@ -74,7 +74,7 @@ class Arguments:
     """Folder of the result."""
 
 
-def robots(setting: Setting, arguments: Arguments) -> dict[str, StandIn]:
+def robots(setting: Setting, arguments: Arguments) -> dict[str, TrialRobot]:
     """The setting's robot ("own") and the same with pads of each friction; it hears the same noise with all."""
     task = Task(**{**setting.task, **({"steps": QUICK_STEPS} if arguments.quick else {})})
     start = DoorEnv(door_scene(timestep=TIMESTEP, limits=True), task).start
@@ -106,7 +106,7 @@ class Opening:
     on.  work: [4] J by PARTS.
     """
 
-    def __init__(self, robot: StandIn):
+    def __init__(self, robot: TrialRobot):
         self.robot, self.hand = robot, hand_of(robot.scene)
         self.knob, self.hinge = robot.scene.id("geom", "knob"), robot.scene.id("joint", str(robot.scene.object_joint))
         self.opened, self.way, self.held, self.work = False, 0.0, 0.0, np.zeros(4)
@@ -140,7 +140,7 @@ class Opening:
         self.held += (self.way - before) * bool(gripped(task, seen))
 
 
-def openings(policy: Policy, robot: StandIn, trials: int) -> dict[str, Any]:
+def openings(policy: Policy, robot: TrialRobot, trials: int) -> dict[str, Any]:
     """What opens the door in a policy's first trials."""
     each = [Opening(robot) for _ in range(trials)]
     for number, opening in enumerate(each):

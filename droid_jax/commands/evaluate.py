@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from droid_jax.policy.control import Policy
     from droid_jax.policy.door_env import DoorEnv
     from droid_jax.policy.task import Task
-    from droid_jax.policy.transfer import StandIn
+    from droid_jax.policy.transfer import TrialRobot
     from droid_jax.policy.trials import Trials
 
 
@@ -148,7 +148,7 @@ def _tell(found: Mapping[str, Any]) -> None:
         print(f"{where}: {percent(of['success_rate'])} success ({percent(low)} to {percent(high)}), {angle}")
 
 
-def _robot(command: Evaluate, trained: Mapping[str, Any], env: DoorEnv) -> tuple[StandIn, dict[str, float]]:
+def _robot(command: Evaluate, trained: Mapping[str, Any], env: DoorEnv) -> tuple[TrialRobot, dict[str, float]]:
     """The stand-in robot, the one that was fitted unless asked for another; and its hidden values."""
     from droid_jax.measure.hidden import listed
     from droid_jax.measure.surrogate import stand_in_truth
@@ -164,7 +164,7 @@ def _robot(command: Evaluate, trained: Mapping[str, Any], env: DoorEnv) -> tuple
     return stand_in(scene, env.start, truth, listed(hidden_effects(own["hide"], scene)), env.task, config), truth
 
 
-def _film(folder: Path, policy: Policy, robot: StandIn, found: Trials) -> None:
+def _film(folder: Path, policy: Policy, robot: TrialRobot, found: Trials) -> None:
     """good.webp and bad.webp: of the trials that succeeded and of those that failed, the one of median angle.
 
     Trials that blew up are no failures.

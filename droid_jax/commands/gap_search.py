@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from droid_jax.model.scene import Scene
     from droid_jax.model.seam import Effect
 
-STAGES = ("search", "refine", "floor", "screen", "look", "refit", "judge")
+BARS = ("search", "refine", "floor", "screen", "look", "refit", "judge")
 IN_BLOCKS = ("refine", "screen", "look", "refit", "judge")  # of a log: no search, and no time step to refine
 
 
@@ -46,7 +46,7 @@ def searched(
     from droid_jax.report.progress import stages
     from droid_jax.report.scalars import scalars
 
-    names = IN_BLOCKS if split is Split.BLOCKS else STAGES if start is None else STAGES[1:]
+    names = IN_BLOCKS if split is Split.BLOCKS else BARS if start is None else BARS[1:]
     with stages(names, {"look": config.looked, "refit": config.refitted}) as show, scalars(board) as write:
         clock = Clock(names, (show, write), checkpoints / "seconds.json")
         clock(names[0], None)
@@ -78,6 +78,6 @@ def _seconds(kept: Path) -> dict[str, float]:
     """What was counted before; nothing where that cannot be read, it decides nothing."""
     try:
         before = json.loads(kept.read_text())
-        return {stage: float(before[stage]) for stage in STAGES if stage in before}
+        return {stage: float(before[stage]) for stage in BARS if stage in before}
     except (OSError, ValueError, TypeError):
         return {}

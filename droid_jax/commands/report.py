@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from droid_jax.commands.folder import RUNS
-from droid_jax.report.files import STAGES
+from droid_jax.report.files import LAST_FILES
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ def run(command: Report) -> None:
 
 def _latest() -> Path:
     """The folder below RUNS whose run was finished last; ValueError where there is none."""
-    files = {RUNS / stage / last: RUNS / stage for stage, last in STAGES.items()}
-    files |= {RUNS / "all" / stage / last: RUNS / "all" for stage, last in STAGES.items()}
+    files = {RUNS / stage / last: RUNS / stage for stage, last in LAST_FILES.items()}
+    files |= {RUNS / "all" / stage / last: RUNS / "all" for stage, last in LAST_FILES.items()}
     whole = [file for file in files if file.is_file()]
     if not whole:
         folders = ", ".join(map(str, dict.fromkeys(files.values())))

@@ -47,7 +47,7 @@ class TransferConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class StandIn:
+class TrialRobot:
     """The stand-in robot before a trial; `stand_in` makes it.
 
     scene: with the hidden values, at the robot's own time step, integrator and solver effort.  start: [nq].
@@ -68,7 +68,7 @@ def stand_in(
     hidden: Sequence[Applied] = (),
     task: Task | None = None,
     config: TransferConfig | None = None,
-) -> StandIn:
+) -> TrialRobot:
     """A robot with hidden values and effects.
 
     start: [nq] as in training (`DoorEnv.start`), off by `Task.spread` in every trial.  truth: hidden values, of the
@@ -83,7 +83,7 @@ def stand_in(
     space = door_space(scene) + door_nuisances(scene)
     model = make_c_model(scene, space, space.values(dict(truth)))
     own = replace(scene, model=own_engine(model, config.timestep))
-    return StandIn(own, start, tuple(hidden), task, config)
+    return TrialRobot(own, start, tuple(hidden), task, config)
 
 
 def check_playable(scene: Scene, hidden: Sequence[Applied]) -> None:
@@ -98,7 +98,7 @@ def check_playable(scene: Scene, hidden: Sequence[Applied]) -> None:
         )
 
 
-def transfer(policy: Policy, robot: StandIn, progress: Callable[[int], None] = lambda done: None) -> Trials:
+def transfer(policy: Policy, robot: TrialRobot, progress: Callable[[int], None] = lambda done: None) -> Trials:
     """Trials of a policy on the stand-in robot.  ValueError for a policy that acts at another rate than the task's.
 
     progress: is told how many trials are over.
@@ -112,14 +112,14 @@ def transfer(policy: Policy, robot: StandIn, progress: Callable[[int], None] = l
     return Trials(*(np.array(column) for column in zip(*done, strict=True)))
 
 
-def filmed(policy: Policy, robot: StandIn, number: int) -> np.ndarray:
+def filmed(policy: Policy, robot: TrialRobot, number: int) -> np.ndarray:
     """[K, nq] the states of one of `transfer`'s trials, before each action and at the end."""
     states: list[np.ndarray] = []
     watched(policy, robot, number, lambda data: states.append(data.qpos.copy()))
     return np.array(states)
 
 
-def watched(policy: Policy, robot: StandIn, number: int, watch: Callable[[mujoco.MjData], None]) -> None:
+def watched(policy: Policy, robot: TrialRobot, number: int, watch: Callable[[mujoco.MjData], None]) -> None:
     """One of `transfer`'s trials again; watch: sees the simulation before each action and at the end."""
     _check_rate(policy, robot.task)
     _trial(policy, robot, number, watch)
@@ -131,7 +131,7 @@ def _check_rate(policy: Policy, task: Task) -> None:
 
 
 def _trial(
-    policy: Policy, robot: StandIn, number: int, watch: Callable[[mujoco.MjData], None] = lambda data: None
+    policy: Policy, robot: TrialRobot, number: int, watch: Callable[[mujoco.MjData], None] = lambda data: None
 ) -> tuple[bool, float, int, float, str]:
     """Success, largest angle, actions, share of them with the grip on, why the loop stopped."""
     scene, task, config = robot.scene, robot.task, robot.config

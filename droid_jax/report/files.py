@@ -5,4 +5,4 @@ GAUSSIAN, EXTENDED = "gaussian.json", "extended.json"
 POLICY, TRAINING, TRANSFER, FILMS = "policy.npz", "training.json", "transfer.json", "films"
 STAND_IN = "stand_in.json"  # beside the stand-in's recordings: its springs, seed and hidden effects
 # Folders in one of `all`, and what is written last in each: its presence says that the run is whole.
-STAGES = {"identify": "config.json", "gap": "gap.json", "train": TRAINING}
+LAST_FILES = {"identify": "config.json", "gap": "gap.json", "train": TRAINING}

@@ -10,7 +10,6 @@ from droid_jax.report.gap_folder import Gap
 from droid_jax.report.gap_parts import parts_of
 from droid_jax.report.words import label, listed, number, percent
 
-SIGNIFICANT = 0.01  # p below which something is said to be missing
 DECISIVE = 6.0  # standardised difference from which ten repeats decide between rivals
 TOLD = 0.8  # share of what is left on the confirming motion: where more is left beyond the fit's uncertainty, no word
 OTHER = "the other demonstration"  # as the search calls what confirms, whatever it is
@@ -89,6 +88,8 @@ def _fitted(gap: Gap) -> str:
 
 
 def _significance(gap: Gap) -> str:
+    from droid_jax.gap.select import SIGNIFICANT  # only here: it imports the search
+
     p, bar = gap.found["p"], number(SIGNIFICANT, 1)
     if p is None:
         return ""
@@ -155,6 +156,8 @@ def _amplitude(a: Mapping[str, Any]) -> str:
 
 def _trends(found: Mapping[str, Any]) -> list[str]:
     """What changes from repeat to repeat, which is in no gap: the repeats pass for the same."""
+    from droid_jax.gap.select import SIGNIFICANT  # only here: it imports the search
+
     return [
         f"The repeats are not alike: {effect_words(t['candidate'])} changes by about "
         f"{number(t['per_repeat'], 2)} {unit_words(t['unit'])} from one to the next (p = {number(t['p'], 2)} if their "

@@ -23,7 +23,7 @@ from markupsafe import Markup
 
 from droid_jax.report.drawings import draw, frame_rows
 from droid_jax.report.export import data_uri
-from droid_jax.report.files import FITTED, POLICY, STAGES, STAND_IN, TRAINING, TRANSFER
+from droid_jax.report.files import FITTED, LAST_FILES, POLICY, STAND_IN, TRAINING, TRANSFER
 from droid_jax.report.gap_drawings import draw_gap
 from droid_jax.report.gap_folder import Gap, has_gap, read_gap
 from droid_jax.report.gap_tables import groups
@@ -71,7 +71,7 @@ def write_report(run: Path) -> Path:
     """
     folder = Path(run)
     old = left_over(folder)
-    places = [folder, *(folder / stage for stage in STAGES if stage not in old)]
+    places = [folder, *(folder / stage for stage in LAST_FILES if stage not in old)]
     gap = read_gap(at) if (at := _part(places, has_gap)) else None
     policy = read_policy(at) if (at := _part(places, has_policy)) else None
     at = _part(places, has_run)

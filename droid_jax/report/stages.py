@@ -10,7 +10,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from droid_jax.report.files import EXTENDED, GAUSSIAN, STAGES
+from droid_jax.report.files import EXTENDED, GAUSSIAN, LAST_FILES
 
 
 def setup(folder: Path) -> dict[str, Any]:
@@ -23,7 +23,7 @@ def setup(folder: Path) -> dict[str, Any]:
 
 def unfinished(folder: Path) -> bool:
     """Whether a run began in a folder and is not whole: what lies there may be an earlier run's."""
-    return bool(setup(folder)) and not any((folder / last).is_file() for last in STAGES.values())
+    return bool(setup(folder)) and not any((folder / last).is_file() for last in LAST_FILES.values())
 
 
 def needs_whole(folder: Path) -> None:
@@ -51,7 +51,7 @@ def left_over(whole: Path) -> frozenset[str]:
 
     A search in other recordings, or with another scene, than the fit's; a policy of another fit than the folder's.
     """
-    fit, gap, train = (setup(whole / stage) for stage in STAGES)
+    fit, gap, train = (setup(whole / stage) for stage in LAST_FILES)
     out = set[str]()
     if fit and gap and _apart(fit, gap):
         out.add("gap")

@@ -19,6 +19,7 @@ import numpy as np
 from droid_jax.gap.candidates import candidates
 from droid_jax.gap.flips import largest_steady_t
 from droid_jax.gap.screen import questions_of
+from droid_jax.gap.select import SIGNIFICANT
 from droid_jax.measure.hidden import HIDDEN, Applied
 from droid_jax.storage import write_json
 from experiments.blind.cases import SAFE, key, keys
@@ -27,7 +28,7 @@ from experiments.blind.forms import Forms, forms_of
 from experiments.blind.marks import REPEATS, Ground, ground
 from experiments.blind.scenes import Setting
 
-SIGNIFICANT, POWER = 0.01, 0.5
+POWER = 0.5
 DRAWS = 60
 LOWEST, HALVINGS = 1e-5, 9  # of the largest amplitude; halvings of the logarithm
 RECORDED = 3  # times an effect is recorded at most

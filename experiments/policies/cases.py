@@ -21,7 +21,7 @@ from droid_jax.policy.randomise import of_method
 from droid_jax.policy.simulated import simulated
 from droid_jax.policy.task import Task
 from droid_jax.policy.train import PRESETS, TrainConfig
-from droid_jax.policy.transfer import StandIn, transfer
+from droid_jax.policy.transfer import TrialRobot, transfer
 from droid_jax.policy.trials import LEARNED
 from droid_jax.report.export import save
 from droid_jax.report.files import POLICY
@@ -128,7 +128,7 @@ def tried(
     arguments: Options,
     env: DoorEnv,
     doors: Doors,
-    robots: Mapping[str, StandIn],
+    robots: Mapping[str, TrialRobot],
     seed: int,
     code: Mapping[str, Any],
 ) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from droid_jax.measure.surrogate import stand_in_truth
 from droid_jax.model.door import door_nuisances, door_space
 from droid_jax.model.door_scene import door_scene
 from droid_jax.policy.door_env import DoorEnv
-from droid_jax.policy.transfer import StandIn, TransferConfig, stand_in
+from droid_jax.policy.transfer import TransferConfig, TrialRobot, stand_in
 from droid_jax.report.files import GAUSSIAN
 from droid_jax.storage import write_json
 from experiments.identify_suite import describe, recordings, settings
@@ -39,7 +39,7 @@ def pads_of(sliding: float) -> dict[str, float]:
     return {f"{kind}_friction_{side}": mu for kind, mu in kinds.items() for side in ("left", "right")}
 
 
-def robots_of(setting: Setting, env: DoorEnv, trials: int) -> dict[str, StandIn]:
+def robots_of(setting: Setting, env: DoorEnv, trials: int) -> dict[str, TrialRobot]:
     """The setting's robot, and the same robot with slippery pads."""
     scene, truth, config = door_scene(limits=True), truth_of(setting), TransferConfig(trials=trials, seed=setting.robot)
     of = {"stand_in": truth, SLIPPERY: {**truth, **pads_of(SLIDING)}}

@@ -10,7 +10,7 @@ from droid_jax.measure.demonstration import PLANS, joint_path
 from droid_jax.measure.surrogate import stand_in_truth
 from droid_jax.model.door_scene import door_scene
 from droid_jax.policy.task import Task
-from droid_jax.policy.transfer import StandIn, TransferConfig, stand_in
+from droid_jax.policy.transfer import TransferConfig, TrialRobot, stand_in
 from experiments.pad_friction import PARTS, Opening, hinge_torques
 from experiments.policies.robots import pads_of
 
@@ -34,7 +34,7 @@ KNOB = """
 """
 
 
-def around_the_knob(pads: dict[str, float]) -> StandIn:
+def around_the_knob(pads: dict[str, float]) -> TrialRobot:
     """A robot whose open hand is around the knob."""
     scene, task = door_scene(limits=True), Task(opened=float(np.deg2rad(10.0)))
     arm = dict(zip(scene.joints, joint_path(scene, PLANS["A"], np.zeros(1), np.zeros(1))[0], strict=True))

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from droid_jax.gap import extended
-from droid_jax.report.files import EXTENDED, GAUSSIAN, STAGES
+from droid_jax.report.files import EXTENDED, GAUSSIAN, LAST_FILES
 from droid_jax.report.stages import extended_of, fingerprint, left_over, needs_whole, unfinished
 
 
@@ -21,7 +21,7 @@ def run(whole: Path, stage: str, last: bool = True, files: dict[str, str] | None
     for name, text in (files or {}).items():
         (folder / name).write_text(text)
     if last:
-        (folder / STAGES[stage]).write_text("{}")
+        (folder / LAST_FILES[stage]).write_text("{}")
     return folder
 
 
@@ -52,7 +52,7 @@ def test_a_search_in_another_scene_is_left_over(tmp_path: Path):
     assert left_over(tmp_path) == frozenset()
 
 
-@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("stage", LAST_FILES)
 def test_a_run_is_whole_with_what_is_written_last(tmp_path: Path, stage: str):
     folder = run(tmp_path, stage, last=False, files={GAUSSIAN: "of an earlier run"})
     assert unfinished(folder)
