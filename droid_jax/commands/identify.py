@@ -93,6 +93,7 @@ def run(command: Identify) -> None:
     needs_writer(command.tensorboard)
     runtime.start()
     warn_of_cpu(command.preset)
+    from droid_jax.compare.start import open_loop
     from droid_jax.identify.pipeline import cost_samples, identify
     from droid_jax.identify.results import prepare_folder, write_run
     from droid_jax.measure.surrogate import is_stand_in
@@ -150,8 +151,9 @@ def run(command: Identify) -> None:
         }
         progress("sample", None)
         write_run(
-            out, found, description, truth=truth, samples=lambda: cost_samples(found, config.samples, config.seed)
-        )
+            out, found, description, truth=truth, samples=lambda: cost_samples(found, config.samples, config.seed),
+            notes=filter(None, (open_loop(scene, recording) for recording in recordings)),
+        )  # fmt: skip
     draw(out, found, recordings[0])
     report.run(report.Report(out))
     _summary(found, json.loads((out / "fit.json").read_text()))

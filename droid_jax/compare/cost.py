@@ -21,7 +21,7 @@ from droid_jax.compare.inverse import Path, path_of, path_replay
 from droid_jax.compare.population import blocks, over_block
 from droid_jax.compare.replay import Drive, Replay, check_gains, make_drive, servo_replay, torque_offset_effect
 from droid_jax.compare.residuals import CompareConfig, Comparison, make_comparison
-from droid_jax.compare.start import check_range, warn_if_moving
+from droid_jax.compare.start import check_range, warn_if_moving, warn_if_open_loop
 from droid_jax.compare.twin import twin_replay
 from droid_jax.measure.motion import Motion, measured_motion
 from droid_jax.measure.recording import Recording
@@ -187,6 +187,7 @@ def followed(scene: Scene, recording: Recording, config: CompareConfig) -> Drive
     """What a replay follows: the recording's commands or, where it holds none, its measured motion."""
     check_range(scene, recording)
     if recording.command.size:
+        warn_if_open_loop(scene, recording)
         warn_if_moving(recording)
         return make_drive(scene, recording, weigh="torque" in config.channels)
     return measured_motion(recording, scene.joints, cutoff=config.motion_cutoff)

@@ -17,6 +17,7 @@ WEIGHT = 0.01  # N m or N: a joint that feels less uncompensated weight feels no
 POSES = 50  # of a motion, at which the weight is looked at
 BEGINNING = 0.02  # s (six rows at least), in which the speed at the start is looked at
 MOVING = 0.25  # of the motion's largest speed: a joint that is faster at the start does not begin at rest
+TURNS = 4  # from its zero, that a hinge without a range is believed to make; degrees look like that from 25 on
 
 
 def start_pose(scene: Scene, recording: Recording) -> np.ndarray:
@@ -73,6 +74,26 @@ def warn_if_moving(recording: Recording) -> None:
         )
 
 
+def open_loop(scene: Scene, recording: Recording) -> str:
+    """What is to be known where the recording's commands drive actuators without position feedback; else empty."""
+    model = scene.model
+    feedback = (model.actuator_biastype != mujoco.mjtBias.mjBIAS_NONE) & (model.actuator_biasprm[:, 1] != 0)
+    joints = [joint for joint, held in zip(scene.command_names, feedback, strict=True) if not held]
+    if not joints or not recording.command.size:
+        return ""
+    return (
+        f"the actuators of {', '.join(joints)} have no position feedback: the commands of recording "
+        f"{recording.name!r} are taken as their torques (or forces, or speeds); for position commands use "
+        "<position> servos"
+    )
+
+
+def warn_if_open_loop(scene: Scene, recording: Recording) -> None:
+    """Warn where commands are no positions: a <motor> in place of a <position> takes radians for torques."""
+    if text := open_loop(scene, recording):
+        warnings.warn(text, stacklevel=2)
+
+
 def _moves(begin: float, channel: Channel, column: int) -> bool:
     """Whether a position's path has a speed of its own where the motion begins."""
     time, seen = channel.time - begin, channel.mask[..., column].all(axis=0)
@@ -88,25 +109,38 @@ def _moves(begin: float, channel: Channel, column: int) -> bool:
 
 
 def check_range(scene: Scene, recording: Recording) -> None:
-    """Raise ValueError where a measured joint goes, or is sent, so far outside its range that the unit is wrong."""
+    """Raise ValueError where a measured joint goes, or is sent, so far outside its range that the unit is wrong.
+
+    A hinge without a range, which may be a wheel, is warned of where it goes more than TURNS from its zero.
+    """
     sent = _sent(scene, recording) if recording.command.size else {}
     paths = [("is sent to", joint, path) for joint, path in sent.items()]
     if channel := recording.channels.get("position"):
         seen = np.where(channel.mask, channel.values, np.nan).reshape(-1, len(channel.columns))
         paths += [("is measured at", joint, seen[:, i]) for i, joint in enumerate(channel.columns)]
     for what, joint, path in paths:
-        index = scene.id("joint", joint) if joint in scene.joints else -1
-        if index < 0 or not scene.model.jnt_limited[index] or np.isnan(path).all():
-            continue
+        if joint in scene.joints and not np.isnan(path).all():
+            _check_reach(scene, joint, path, f"recording {recording.name!r}: {joint} {what}")
+
+
+def _check_reach(scene: Scene, joint: str, path: np.ndarray, begin: str) -> None:
+    """As `check_range`, of one joint's path [K], NaN where it was not seen; begin: of what is said."""
+    index = scene.id("joint", joint)
+    slide = scene.model.jnt_type[index] == mujoco.mjtJoint.mjJNT_SLIDE
+    if scene.model.jnt_limited[index]:
         low, high = scene.model.jnt_range[index]
         beyond = np.maximum(low - path, path - high)
         worst = int(np.nanargmax(beyond))
         if beyond[worst] > high - low:
-            slide = scene.model.jnt_type[index] == mujoco.mjtJoint.mjJNT_SLIDE
             raise ValueError(
-                f"recording {recording.name!r}: {joint} {what} {path[worst]:.4g}, far outside its range {low:.4g} .. "
-                f"{high:.4g} {'m: are these millimetres' if slide else 'rad: are these degrees'}?"
+                f"{begin} {path[worst]:.4g}, far outside its range {low:.4g} .. {high:.4g} "
+                f"{'m: are these millimetres' if slide else 'rad: are these degrees'}?"
             )
+    elif not slide:
+        turns = np.abs(path) / (2 * np.pi)
+        worst = int(np.nanargmax(turns))
+        if turns[worst] > TURNS:
+            warnings.warn(f"{begin} {path[worst]:.4g} rad, {turns[worst]:.3g} turns: are these degrees?", stacklevel=3)
 
 
 def weight_share(model: Any, joints: np.ndarray, gravity: bool) -> np.ndarray:

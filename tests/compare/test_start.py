@@ -13,6 +13,7 @@ from two_link import ARM, JOINTS, arm, measured, motion, recording
 from droid_jax.compare.cost import followed, make_cost
 from droid_jax.compare.replay import make_drive
 from droid_jax.compare.residuals import CompareConfig
+from droid_jax.compare.start import check_range, open_loop
 from droid_jax.measure.recording import Channel
 from droid_jax.model.fields import joint_damping
 from droid_jax.model.parameters import Space
@@ -74,10 +75,40 @@ def test_degrees_are_no_radians(measured: bool):
         make_cost(scene, SPACE, [wrong])
 
 
-def test_a_start_that_would_be_a_guess_is_refused():
+@pytest.mark.parametrize("measured", [False, True])
+def test_degrees_are_no_radians_of_a_hinge_without_a_range_either(scene: Scene, measured: bool):
+    """A wheel may turn often, so it is a warning."""
+    fine = recording()
+    wrong = np.rad2deg(fine.command)
+    if measured:
+        seen = Channel("position", "rad", JOINTS, fine.time, wrong[None].repeat(2, 0), np.ones((2, *wrong.shape), bool))
+        wrong = replace(fine, channels={**fine.channels, "position": seen})
+    else:
+        wrong = replace(fine, command=wrong)
+    said = "elbow is measured at" if measured else "elbow is sent to"
+    with pytest.warns(UserWarning, match=rf"'wave': {said} .* turns: are these degrees\?"):
+        check_range(scene, wrong)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_range(scene, fine)
+
+
+def motors() -> Scene:
+    """The arm whose shoulder a motor drives, not a servo."""
     xml = ARM.format(gravcomp='gravcomp="1"', friction="", sensor="")
     xml = xml.replace('<position name="s" joint="shoulder" kp="60"/>', '<motor name="s" joint="shoulder"/>')
-    driven = compile_scene(mujoco.MjSpec.from_string(xml), "arm", joints=JOINTS)
+    return compile_scene(mujoco.MjSpec.from_string(xml), "arm", joints=JOINTS)
+
+
+def test_commands_of_an_actuator_without_position_feedback_are_said_to_be_torques(scene: Scene):
+    said = "the actuators of shoulder have no position feedback: the commands of recording 'wave' are taken as"
+    with pytest.warns(UserWarning, match=said):
+        followed(motors(), recording(gains=None), CompareConfig())
+    assert not open_loop(scene, recording())
+
+
+def test_a_start_that_would_be_a_guess_is_refused():
+    driven = motors()
     with pytest.raises(ValueError, match="does not tell where shoulder starts"):
         make_drive(driven, recording(qpos0={}, gains=None))
     started = make_drive(driven, recording(qpos0={}, gains=None, channels=measured(0.2)))
