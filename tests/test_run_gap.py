@@ -426,12 +426,13 @@ def test_a_run_goes_on_after_a_stop_and_is_whole(
     assert main(command) == 0
     said = capsys.readouterr().out
     assert "holds this run unfinished; going on" in said
-    lines = said.splitlines()[-5:]
+    lines = said.splitlines()[-6:]
     assert lines[0] == "The model lacks: hinge_preload at door."
-    assert lines[1] == "p = 0.0078 if nothing were missing; base fit converged: yes"
-    assert lines[2].startswith("gap, noise units squared: fit ") and " % closed), confirm " in lines[2]
-    assert lines[3].startswith("shifted most: door_stiffness ") and lines[3].endswith(" deviations)")
-    assert lines[4] == f"report: {out / 'report.html'}"
+    assert re.fullmatch(r"hinge_preload at door: hinge preload \S+ N m, \S+ to \S+ N m \(90 % interval\)", lines[1])
+    assert lines[2] == "p = 0.0078 if nothing were missing; base fit converged: yes"
+    assert lines[3].startswith("gap, noise units squared: fit ") and " % closed), confirm " in lines[3]
+    assert lines[4].startswith("shifted most: door_stiffness ") and lines[4].endswith(" deviations)")
+    assert lines[5] == f"report: {out / 'report.html'}"
     files = {p.name for p in out.iterdir()}
     written = {"gap.json", "gap.npz", "extended.json", "extended.xml"}
     assert files == {"checkpoints", "setup.json", "tensorboard", *written}

@@ -224,11 +224,14 @@ def given_to(command: Gap) -> list[Recording]:
 def _done(out: Path) -> None:
     """Build the page, and say in a few lines what was found."""
     from droid_jax.gap.results import load_gap, most_shifted
+    from droid_jax.report.gap_words import size_words
     from droid_jax.report.words import percent
 
     found = load_gap(out).answer
     page = report.write(out)
     print(found["sentence"])
+    for size in (*found["amplitudes"], *found.get("shapes", ())):
+        print(f"{size['effect']}: {size_words(size)} (90 % interval)")
     p = "nothing was asked" if found["p"] is None else f"p = {found['p']:.2g} if nothing were missing"
     print(f"{p}; base fit converged: {'yes' if found['converged'] else 'no'}")
     gaps = []

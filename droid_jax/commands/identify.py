@@ -260,9 +260,8 @@ def _summary(found: Identified, fit: Mapping[str, Any]) -> None:
         if gap.floor is not None:
             closed = "there was none to close" if gap.closed is None else f"{percent(gap.closed)} of the gap closed"
             way = f"a perfect model: {gap.floor:.3f}; {closed}"
-        unit = found.fit.comparisons[0].channel("torque").unit
         on = judged(fit["gap"][name])
-        print(f"{name}: torque distance {gap.before:.3f} -> {gap.after:.3f} {unit} {on} ({way})")
+        print(f"{name}: torque distance {gap.before:.3f} -> {gap.after:.3f} {fit['torque_unit']} {on} ({way})")
     silent = [t.name for t in found.tells if not t.identifiable and not found.full[t.name].nuisance]
     if silent and found.refined is not None:
         print(f"this demonstration tells little about: {', '.join(silent)}")

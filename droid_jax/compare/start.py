@@ -126,7 +126,7 @@ def check_range(scene: Scene, recording: Recording) -> None:
 def _check_reach(scene: Scene, joint: str, path: np.ndarray, begin: str) -> None:
     """As `check_range`, of one joint's path [K], NaN where it was not seen; begin: of what is said."""
     index = scene.id("joint", joint)
-    slide = scene.model.jnt_type[index] == mujoco.mjtJoint.mjJNT_SLIDE
+    slide = scene.slides(joint)
     if scene.model.jnt_limited[index]:
         low, high = scene.model.jnt_range[index]
         beyond = np.maximum(low - path, path - high)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import mujoco
 import numpy as np
 
 from droid_jax.gap.split import Split, roles_of, split_of
@@ -77,8 +76,7 @@ def _check_object(scene: Scene, recording: Recording, where: str) -> None:
 
 def _check_direction(scene: Scene, low: float, high: float, where: str) -> None:
     """A latch, a closer, a spring that peaks: all are written for a hinge that is closed at 0 and opens upwards."""
-    kind = scene.model.jnt_type[scene.id("joint", str(scene.object_joint))]
-    if kind == mujoco.mjtJoint.mjJNT_HINGE and -low > SHUT and max(high, 0.0) < BACKWARDS * -low:
+    if not scene.slides(str(scene.object_joint)) and -low > SHUT and max(high, 0.0) < BACKWARDS * -low:
         raise ValueError(
             f"{where}: the object joint {scene.object_joint!r} opens towards negative angles (to {low:.2g} rad), and "
             "the library's effects of a hinge count from 0 towards positive ones: turn the joint's axis and range "

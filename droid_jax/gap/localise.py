@@ -11,13 +11,13 @@ import numpy as np
 
 from droid_jax.gap.evidence import Evidence
 from droid_jax.gap.flips import benjamini_hochberg
+from droid_jax.model.scene import Scene
 
 FALSE_DISCOVERIES = 0.1
 BINS = 6
-STILL = 0.01  # rad/s
+STILL = 0.01  # rad/s or m/s
 ALONG = "hinge_preload"  # the amplitude whose mark says how a torque of the hinge shows in the measured joints
 POSITION, LOAD = "position of ", "load of "  # a joint
-LENGTH = {"N m": "rad", "N": "m"}  # of what a joint's torque or force works on
 HELD = 0.2  # of that mark's size where it is large: with less the door is not held
 
 
@@ -96,8 +96,8 @@ def _parts(evidence: Evidence, values: np.ndarray, residuals: np.ndarray) -> tup
 
 
 def _cells(evidence: Evidence, values: np.ndarray) -> list[tuple[tuple[str, str], np.ndarray]]:
-    comparison = evidence.cost.comparisons[0]
-    joints = [evidence.cost.scene.joints[c] for c in comparison.channel("torque").columns]
+    comparison, scene = evidence.cost.comparisons[0], evidence.cost.scene
+    joints = [scene.joints[c] for c in comparison.channel("torque").columns]
     (rollout,) = evidence.cost.rollouts(values[None])
     clock = evidence.time
     out: list[tuple[tuple[str, str], np.ndarray]] = []
@@ -110,23 +110,27 @@ def _cells(evidence: Evidence, values: np.ndarray) -> list[tuple[tuple[str, str]
     angle = np.asarray(rollout.object_angle[0])
     speed = np.gradient(angle, comparison.clock)
     if np.ptp(angle) > 0:
-        out += _bins("object angle", angle[at], "rad")
+        length = _length(scene, str(scene.object_joint))
+        out += _bins("object angle", angle[at], length)
         w = speed[at]
         sides = {"opening": w > STILL, "closing": w < -STILL, "still": np.abs(w) <= STILL}
         out += [(("object direction", word), side) for word, side in sides.items()]
-        out += _bins("object speed", np.abs(w), "rad/s")
+        out += _bins("object speed", np.abs(w), f"{length}/s")
     for j, joint in enumerate(joints):
         mine = evidence.column == j
         column = comparison.channel("torque").columns[j]
         velocity = np.asarray(rollout.velocity[0])[at, column]
         for word, side in (("forward", velocity > 0.005), ("back", velocity < -0.005)):
             out.append(((f"direction of {joint}", word), mine & side))
-        unit = comparison.channel("torque").unit
-        out += _bins(
-            f"{POSITION}{joint}", np.asarray(rollout.position[0])[at, column], LENGTH.get(unit, "rad or m"), mine
-        )
-        out += _bins(f"{LOAD}{joint}", np.asarray(rollout.torque[0])[at, column], unit, mine)
+        position, load = np.asarray(rollout.position[0])[at, column], np.asarray(rollout.torque[0])[at, column]
+        out += _bins(f"{POSITION}{joint}", position, _length(scene, joint), mine)
+        out += _bins(f"{LOAD}{joint}", load, scene.torque_unit([joint]), mine)
     return out
+
+
+def _length(scene: Scene, joint: str) -> str:
+    """Unit of a joint's position."""
+    return "m" if scene.slides(joint) else "rad"
 
 
 def _bins(variable: str, x: np.ndarray, unit: str, mine: Any = True) -> list[tuple[tuple[str, str], np.ndarray]]:

@@ -6,7 +6,7 @@ measured only after everything else has been allowed to move.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -119,7 +119,8 @@ def deviations(evidence: Evidence, model: Model) -> dict[str, float]:
     return {a: float(std[model.space.index(a)] * model.space[a].std) for a in model.amplitudes}
 
 
-def intervals(evidence: Evidence, model: Model) -> dict[str, tuple[float, float]]:
-    """Interval of every free amplitude, in its own unit."""
+def intervals(evidence: Evidence, model: Model, names: Iterable[str] | None = None) -> dict[str, tuple[float, float]]:
+    """Interval of free parameters, each in its own unit; of every amplitude unless named."""
     low, high = told(model.refined, evidence.cost.comparisons).interval(LEVEL)
-    return {a: (float(low[model.space.index(a)]), float(high[model.space.index(a)])) for a in model.amplitudes}
+    asked = model.amplitudes if names is None else names
+    return {a: (float(low[model.space.index(a)]), float(high[model.space.index(a)])) for a in asked}

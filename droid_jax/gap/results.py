@@ -11,11 +11,12 @@ import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from droid_jax.gap.blocks import OUTSIDE, Blocks
+from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.case import Case
 from droid_jax.gap.evidence import Evidence
 from droid_jax.gap.extended import extended, save_extended
@@ -90,11 +91,12 @@ def gap_json(case: Case, verdict: Verdict) -> dict[str, Any]:
         "failed": list(verdict.failed),
         "trials": [_trial(trial) for trial in verdict.trials],
         "cells": {"before": _cells(verdict.before), "after": _cells(verdict.after)},
-        "amplitudes": _amplitudes(case, verdict),
+        "amplitudes": _sizes(case, verdict, "amplitudes"),
+        "shapes": _sizes(case, verdict, "shapes"),
         "shifts": _shifts(case, verdict),
         "experiments": [{"what": e.what, "apart": e.apart} for e in verdict.experiments],
         "trends": [{**asdict(t), "unit": case.whole[t.amplitude].unit} for t in (verdict.trend,) if t is not None],
-        "units": case.fit.cost.comparisons[0].channel("torque").unit,
+        "units": case.fit.cost.scene.torque_unit(_joints(case.fit)),
     }
 
 
@@ -186,10 +188,14 @@ def _cells(found: Localisation) -> list[dict[str, Any]]:
     return [{"variable": c.variable, "where": c.where, "gap": c.gap, "p": c.p, "found": c.found} for c in found.cells]
 
 
-def _amplitudes(case: Case, verdict: Verdict) -> list[dict[str, Any]]:
-    """Every amplitude of the final model with its interval."""
+def _sizes(case: Case, verdict: Verdict, kind: Literal["amplitudes", "shapes"]) -> list[dict[str, Any]]:
+    """Amplitudes or shapes of the final model with intervals, each at the first of the parts that share it."""
     model, what = verdict.model, {e.name: e.what for e in case.effects}
-    spans = intervals(case.fit, model)
+    first: dict[str, Candidate] = {}
+    for part in model.parts:
+        for name in getattr(part, kind):
+            first.setdefault(name, part)
+    spans = intervals(case.fit, model, first)
     return [
         {
             "name": name,
@@ -200,8 +206,7 @@ def _amplitudes(case: Case, verdict: Verdict) -> list[dict[str, Any]]:
             "effect": part.name,
             "what": what[part.effect],
         }
-        for part in model.parts
-        for name in part.amplitudes
+        for name, part in first.items()
     ]
 
 

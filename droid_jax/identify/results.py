@@ -120,6 +120,7 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
     floors: list[Any] = [g.floor for g in found.gaps.values()]
     comparison = found.fit.comparisons[0]
     whitened = comparison.config.whitened  # the gaps' floors are in the unit of the torque
+    unit = found.scene.torque_unit(found.scene.joints[c] for c in comparison.channel("torque").columns)
     evaluations = found.search.evaluations + (found.refined.evaluations if found.refined else 0)
     return {
         "parameters": parameters,
@@ -127,10 +128,10 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
             "initial": float(costs[0]),
             "best": float(costs[1]),
             "floor": None if whitened or None in floors else float(np.mean(floors)),
-            "unit": "noise units" if whitened else comparison.channel("torque").unit,
+            "unit": "noise units" if whitened else unit,
         },
         "gap": gaps,
-        "torque_unit": comparison.channel("torque").unit,
+        "torque_unit": unit,
         "stop": found.search.stop,
         "converged": None if found.refined is None else found.refined.converged,
         "mean_square": None if found.refined is None else float(np.mean(found.refined.residual**2)),

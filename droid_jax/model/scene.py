@@ -84,6 +84,15 @@ class Scene:
         """Address of a (one-degree) joint in position vectors."""
         return int(self.model.jnt_qposadr[self.id("joint", joint)])
 
+    def slides(self, joint: str) -> bool:
+        """Whether a joint is a slide (m, N), not a hinge (rad, N m)."""
+        return bool(self.model.jnt_type[self.id("joint", joint)] == mujoco.mjtJoint.mjJNT_SLIDE)
+
+    def torque_unit(self, joints: Iterable[str]) -> str:
+        """Of what joints are driven with: N m for hinges, N for slides, "N m or N" for both."""
+        kinds = {self.slides(joint) for joint in joints}
+        return " or ".join(unit for unit, slides in (("N m", False), ("N", True)) if slides in kinds)
+
     @functools.cached_property
     def joint_dofs(self) -> np.ndarray:
         """[J] velocity addresses of `joints`."""

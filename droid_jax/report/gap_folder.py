@@ -26,7 +26,7 @@ _TRIAL = {
     **{"round": int, "name": str, "passed": bool, "reasons": [str]},
     **dict.fromkeys(("gap_fit", "gap_confirm", "p", "chosen"), _MAYBE),
 }
-_AMPLITUDE = {
+_SIZE = {
     **dict.fromkeys(("name", "unit", "effect", "what"), str),
     **dict.fromkeys(("value", "low", "high"), _MAYBE),
 }
@@ -39,7 +39,7 @@ _SCHEMA = {
     "screens": [{"p": _MAYBE, "ranking": [{"candidate": str, "t": _MAYBE, "explained": _MAYBE}], "failed": [str]}],
     "trials": [_TRIAL],
     "cells": {"before": [_CELL], "after": [_CELL]},
-    **{"amplitudes": [_AMPLITUDE], "shifts": [_SHIFT], "experiments": [{"what": str, "apart": _MAYBE}]},
+    **{"amplitudes": [_SIZE], "shifts": [_SHIFT], "experiments": [{"what": str, "apart": _MAYBE}]},
     "trends": [_TREND],
     **{"units": str, "versions": dict, "device": str, "setup": dict},
 }
@@ -61,7 +61,7 @@ class Gap:
 
     @property
     def unit(self) -> str:
-        """Of torques: N m, or N where slides are measured."""
+        """Of torques: N m, N where slides are measured, "N m or N" for both."""
         return self.found["units"]
 
     @property
@@ -88,6 +88,11 @@ class Gap:
     def timeless(self) -> bool:
         """Whether a measured motion was replayed, which has no time step and whose floor is exactly zero."""
         return self.found["floor"] == 0
+
+    @property
+    def sizes(self) -> list[Mapping[str, Any]]:
+        """Amplitudes of the effects in the model, then their shapes; an older search does not tell these."""
+        return [*self.found["amplitudes"], *self.found.get("shapes", [])]
 
     @property
     def parts(self) -> Parts:
@@ -126,6 +131,7 @@ def read_gap(folder: Path) -> Gap:
     found = _READ.json(folder / "gap.json")
     _READ.check(found, _SCHEMA, "gap.json")
     _READ.check(split_of(found), _SPLIT, "gap.json, 'split'")
+    _READ.check(found.get("shapes", []), [_SIZE], "gap.json, 'shapes'")
     for fault in _faults(found):
         raise _READ.fault(f"gap.json, {fault}")
     roles = [r for r in ROLES if r in found["gaps"]]

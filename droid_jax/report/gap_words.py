@@ -57,7 +57,7 @@ def unit_words(unit: str) -> str:
 
 def gap_summary(gap: Gap) -> list[str]:
     """The sentences under the answer, from the numbers alone; the last says what to do."""
-    sentences = [_fitted(gap), _significance(gap), _size(gap), _allowed(gap), *_added(gap.found["amplitudes"])]
+    sentences = [_fitted(gap), _significance(gap), _size(gap), _allowed(gap), *_added(gap.sizes)]
     said = [*sentences, *_trends(gap.found), gap.limits]
     return [*(s for s in said if s), _next(gap)]
 
@@ -136,19 +136,20 @@ def _floor(gap: Gap) -> str:
     return "the numerical floor is not known" if gap.floor is None else f"the numerical floor is {number(gap.floor)}"
 
 
-def _added(amplitudes: Sequence[Mapping[str, Any]]) -> list[str]:
+def _added(sizes: Sequence[Mapping[str, Any]]) -> list[str]:
     """One sentence per effect."""
     effects: dict[str, list[Mapping[str, Any]]] = {}
-    for a in amplitudes:
+    for a in sizes:
         effects.setdefault(a["effect"], []).append(a)
     out = []
     for name, mine in effects.items():
         words = effect_words(name)
-        out.append(f"The {words} is {mine[0]['what']}: {listed([_amplitude(a) for a in mine])} (90 % intervals).")
+        out.append(f"The {words} is {mine[0]['what']}: {listed([size_words(a) for a in mine])} (90 % intervals).")
     return out
 
 
-def _amplitude(a: Mapping[str, Any]) -> str:
+def size_words(a: Mapping[str, Any]) -> str:
+    """ "latch 0.72 N m, 0.60 to 0.84 N m": an amplitude or a shape of gap.json with its interval."""
     unit = f" {unit_words(a['unit'])}" if a["unit"] else ""
     name = label(a["name"]).lower()
     return f"{name} {number(a['value'])}{unit}, {number(a['low'])} to {number(a['high'])}{unit}"

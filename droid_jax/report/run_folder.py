@@ -70,7 +70,7 @@ class Run:
 
     @property
     def torque_unit(self) -> str:
-        """N m, or N where slides are measured."""
+        """N m, N where slides are measured, "N m or N" for both."""
         return self.fit.get("torque_unit", "N m")
 
     @property

@@ -5,13 +5,15 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 
 from droid_jax.gap.evidence import gap
 from droid_jax.gap.flips import gap_p_values
-from droid_jax.gap.localise import _bins, _parts
+from droid_jax.gap.localise import _bins, _cells, _parts
 from droid_jax.model.parameters import Parameter, Space
+from droid_jax.model.scene import compile_scene
 
 REPEATS, COLUMNS, INSTANTS, FREE = 10, 3, 80, 30
 SPACE = Space(
@@ -67,6 +69,29 @@ def test_a_hinge_with_a_sensor_of_its_own_needs_no_parts(evidence: Any) -> None:
     cost = SimpleNamespace(space=SPACE, scene=SimpleNamespace(object_joint="c", joints=("a", "b", "c")))
     one = SimpleNamespace(**{**vars(evidence), "cost": cost})
     assert _parts(one, SPACE.mean, residuals(np.zeros((COLUMNS, INSTANTS)))) == ()  # type: ignore[arg-type]
+
+
+MIXED = """<mujoco><worldbody>
+  <body><joint name="pan"/><geom size="1"/><body><joint name="extend" type="slide"/><geom size="1"/></body></body>
+  <body pos="9 0 0"><joint name="drawer" type="slide"/><geom size="1"/></body></worldbody>
+  <actuator><position joint="pan"/><position joint="extend"/></actuator></mujoco>"""
+
+
+def test_a_place_has_the_unit_of_its_joints_type():
+    """Whatever unit the whole channel states: an arm of hinges and slides, and a drawer."""
+    scene = compile_scene(mujoco.MjSpec.from_string(MIXED), "mixed", object_joint="drawer")
+    clock = np.linspace(0.0, 1.0, 40)
+    path = np.stack([clock, clock], axis=1)[None]
+    rollout = SimpleNamespace(object_angle=clock[None] ** 2, position=path, velocity=path, torque=path)
+    channel = SimpleNamespace(columns=np.array([0, 1]), unit="N m")
+    comparison = SimpleNamespace(clock=clock, phases=(), channel=lambda name: channel)
+    cost = SimpleNamespace(comparisons=(comparison,), scene=scene, rollouts=lambda values: (rollout,))
+    evidence: Any = SimpleNamespace(cost=cost, time=np.tile(clock, 2), column=np.repeat([0, 1], 40))
+    units = {variable: where.split(maxsplit=3)[-1] for (variable, where), _ in _cells(evidence, SPACE.mean)}
+    assert (units["position of pan"], units["load of pan"]) == ("rad", "N m")
+    assert (units["position of extend"], units["load of extend"]) == ("m", "N")
+    assert (units["object angle"], units["object speed"]) == ("m", "m/s")
+    assert (scene.torque_unit(["pan"]), scene.torque_unit(scene.joints)) == ("N m", "N m or N")
 
 
 def test_bins_cover_a_cell_and_nothing_else():

@@ -168,6 +168,19 @@ def test_ties_experiments_and_cuts_come_along(found: Small):
     assert answer["experiments"] == [{"what": "open further", "apart": 7.5}]
 
 
+def test_shapes_come_once_with_their_intervals(found: Small):
+    """An effect's shape is one at all its places; a nuisance plays one here."""
+    name, (part,) = "torque_offset[elbow]", found.verdict.model.parts
+    shaped = dataclasses.replace(part, shapes={name: 0.0})
+    twice = (shaped, dataclasses.replace(shaped, place="elsewhere", amplitudes=()))
+    model = dataclasses.replace(found.verdict.model, parts=twice)
+    answer = gap_json(found.case, dataclasses.replace(found.verdict, model=model))
+    assert [a["name"] for a in answer["amplitudes"]] == list(part.amplitudes)
+    (shape,) = answer["shapes"]
+    assert (shape["name"], shape["unit"], shape["effect"]) == (name, "N m", part.name)
+    assert shape["low"] < shape["value"] == model.values[found.case.whole.index(name)] < shape["high"]
+
+
 def test_where_nothing_was_asked_or_found_there_are_no_numbers(found: Small):
     """An unconverged fit, and a gap below the floor: null, never a made-up share."""
     nothing = dataclasses.replace(

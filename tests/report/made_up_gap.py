@@ -65,7 +65,8 @@ def gap_json(verdict: str, roles: tuple[str, ...]) -> dict[str, Any]:
         "screens": [_screen(k, verdict) for k in range(asked + len(effects))],
         "trials": _trials(verdict, first, left) if asked and verdict != "none" else [],
         "cells": {"before": _cells(first), "after": _cells(first if left is None else left)},
-        "amplitudes": _amplitudes() if effects else [],
+        "amplitudes": [_size("latch", "N m", 0.7213, 0.6012, 0.8421)] if effects else [],
+        "shapes": [_size("latch_width", "rad", 0.0512, 0.0431, 0.0603)] if effects else [],
         "shifts": [dict(zip(("name", "unit", "before", "after", "deviation_before"), s, strict=True)) for s in SHIFTS],
         "experiments": _experiments() if verdict == "tie" else [], "trends": _trends(verdict), "units": "N m",
         "versions": {"mujoco": "3.17.0", "jax": "0.9.2"}, "device": "2 CPU cores",
@@ -138,13 +139,9 @@ def _cells(size: float) -> list[dict[str, Any]]:
     return out
 
 
-def _amplitudes() -> list[dict[str, Any]]:
+def _size(*size: Any) -> dict[str, Any]:
     what = "a magnetic catch or latch that holds the door in its first degrees"
-    sizes = (("latch", "N m", 0.7213, 0.6012, 0.8421), ("latch_width", "rad", 0.0512, 0.0431, 0.0603))
-    return [
-        dict(zip(("name", "unit", "value", "low", "high"), s, strict=True)) | {"effect": LATCH, "what": what}
-        for s in sizes
-    ]
+    return dict(zip(("name", "unit", "value", "low", "high"), size, strict=True)) | {"effect": LATCH, "what": what}
 
 
 def _trends(verdict: str) -> list[dict[str, Any]]:

@@ -96,10 +96,10 @@ def test_the_tables_hold_the_numbers_of_the_file(named: Path) -> None:
             assert _shown(cells[f"gap:{role}", field], gap[field])
         assert _shown(cells[f"gap:{role}", "closed"], gap["closed"], percent)
     assert _shown(cells["gap:floor", "before"], found["floor"])
-    for a in found["amplitudes"]:
-        assert _shown(cells[f"amplitude:{a['name']}", "value"], a["value"])
-        assert cells[f"amplitude:{a['name']}", "interval"]["values"] == [a["low"], a["high"]]
-        assert a["what"] in cells[f"amplitude:{a['name']}", "effect"]["text"]
+    for a in (*found["amplitudes"], *found["shapes"]):
+        assert _shown(cells[f"size:{a['name']}", "value"], a["value"])
+        assert cells[f"size:{a['name']}", "interval"]["values"] == [a["low"], a["high"]]
+        assert a["what"] in cells[f"size:{a['name']}", "effect"]["text"]
     for s in found["shifts"]:
         for field, key in (("before", "before"), ("after", "after"), ("deviation", "deviation_before")):
             assert _shown(cells[f"shift:{s['name']}", field], s[key])

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import mujoco
-
 from droid_jax.model.parameters import Parameter
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
@@ -31,4 +29,4 @@ def _sized(p: Parameter, scale: float, slide: bool) -> Parameter:
 
 def _is_slide(scene: Scene, place: str) -> bool:
     """Whether a place is a joint that slides; places may also be "commands", "grip" or a body."""
-    return place in scene.joints and scene.model.jnt_type[scene.id("joint", place)] == mujoco.mjtJoint.mjJNT_SLIDE
+    return place in scene.joints and scene.slides(place)
