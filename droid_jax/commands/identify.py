@@ -253,7 +253,7 @@ def _recordings(
 
 def _summary(found: Identified, fit: Mapping[str, Any]) -> None:
     """A few lines that say how it went; fit: of fit.json."""
-    from droid_jax.report.words import judged, lacks_something, percent
+    from droid_jax.report.words import DOUBT, far_off, judged, lacks_something, percent
 
     for name, gap in found.gaps.items():
         way = "one repeat: what noise alone would leave is not known"
@@ -268,5 +268,7 @@ def _summary(found: Identified, fit: Mapping[str, Any]) -> None:
     if found.refined is not None and not found.refined.converged:
         print("the refinement did not converge: take values and intervals with care")
     print(f"search stopped: {found.search.stop}; {sum(found.seconds.values()):.0f} s")
-    if lacks_something(fit):
+    if far_off(fit):
+        print(f"the fit stays far from the data: {DOUBT}")
+    elif lacks_something(fit):
         print("what is left is well above noise: `python -m droid_jax.run gap` looks for what the model lacks")

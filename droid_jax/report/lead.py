@@ -8,7 +8,7 @@ from droid_jax.report.gap_words import gap_summary, readable
 from droid_jax.report.policy_folder import Trained
 from droid_jax.report.policy_words import policy_summary
 from droid_jax.report.run_folder import Run
-from droid_jax.report.words import judged, listed, number, percent, summary
+from droid_jax.report.words import DOUBT, far_off, judged, listed, number, percent, summary
 
 WRONG = ("unexplained", "fit not converged")  # verdicts on which nothing should be trained
 ALL_THE_SAME = (
@@ -29,6 +29,8 @@ def lead(run: Run | None, gap: Gap | None, policy: Trained | None, hidden: str =
         sentences += [readable(gap.found["sentence"], gap.found), *_closed(gap)]
         sentences += [f"What the stand-in robot hid: {hidden}."] if hidden and gap.stand_in else []
         following = gap_summary(gap)[-1]
+        if run and far_off(run.fit):
+            following = following.replace("Next: ", f"Next: {DOUBT}; then ", 1)
     if policy:
         sentences += [_opened(where, found["success_rate"]) for where, found in policy.trials.items()]
         doubted = gap is not None and gap.found["verdict"] in WRONG

@@ -19,6 +19,10 @@ JUDGED = {  # by `judged` of a fit.json's gap
 }
 
 
+FAR = 3.0  # floors: a fit that leaves more, and half of the gap, has another fault than a missing effect
+DOUBT = "check joint order, signs, units and servo gains before anything else"  # of recording and scene
+
+
 def label(name: str) -> str:
     """A name as it is read: "hinge_stiffness" -> "Hinge stiffness", "panda_joint3" -> "Joint 3".
 
@@ -175,9 +179,8 @@ def unjudged(fit: Mapping[str, Any]) -> bool:
 
 def _next(run: Run, searched: bool) -> str:
     steps = []
-    gaps = list(run.fit["gap"].values())
-    if any(g["after"] > g["before"] for g in gaps):
-        steps.append("do not train on this fit; check the recording and the scene first")
+    if far_off(run.fit):
+        steps.append(f"do not train on this fit: {DOUBT}")
     if any(p["on_bound"] for p in run.fit["parameters"]):
         steps.append("ask whether the bound is real; if not, widen it and fit again")
     if unjudged(run.fit):
@@ -213,6 +216,21 @@ def lacks_something(fit: Mapping[str, Any]) -> bool:
     """
     far = any(g.get("floor") and g["after"] > 1.5 * g["floor"] for g in fit["gap"].values())
     return far or (fit.get("mean_square") or 0.0) > 2.0
+
+
+def far_off(fit: Mapping[str, Any]) -> bool:
+    """Whether a fit.json says that the fit made it worse, or stayed so far from the data that its set-up is in doubt.
+
+    Where repeats do not tell what noise leaves, two parameters at a bound have to say so.
+    """
+    bounds = sum(p["on_bound"] for p in fit["parameters"] if not p["nuisance"])
+
+    def far(gap: Mapping[str, Any]) -> bool:
+        floor = gap.get("floor")
+        most = bounds >= 2 if floor is None else gap["after"] > FAR * floor
+        return gap["after"] > gap["before"] or (most and gap["after"] > 0.5 * (gap["before"] + (floor or 0.0)))
+
+    return any(far(gap) for gap in fit["gap"].values())
 
 
 def speaker(run: Run) -> Callable[[str], str]:

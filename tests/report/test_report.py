@@ -9,12 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_up_gap import make_gap
 from made_up_run import JOINTS, ROWS, make_run, parameters
 from matplotlib.figure import Figure
 from reader import Page, read_page
 
 from droid_jax.report import page, render, search_figures, torque_figures
 from droid_jax.report.export import inline_svg
+from droid_jax.report.gap_folder import read_gap
 from droid_jax.report.lead import lead
 from droid_jax.report.run_folder import read_run
 from droid_jax.report.style import BEFORE
@@ -129,6 +131,31 @@ def test_summary_says_when_the_fit_made_it_worse(tmp_path: Path) -> None:
     assert "the fit made it worse" in text and "do not train on this fit" in text
     assert "what is left is well above noise, so the model lacks something: see below in which joint and phase" in text
     assert "these values may be bent by it: go on with the search for it, below." in summary(read_run(run), True)[-1]
+
+
+@pytest.mark.parametrize(
+    ("gap", "bounds", "doubted"),
+    [
+        ({"after": 1.05}, 1, True),  # less than half of it closed, ten times the floor left
+        ({"after": 0.5}, 5, False),  # most of it closed
+        ({"before": 0.3, "after": 0.25}, 5, False),  # it began near
+        ({"after": 1.05, "floor": None}, 1, False),
+        ({"after": 1.05, "floor": None}, 2, True),
+        ({"after": 1.3}, 0, True),
+    ],
+)
+def test_a_fit_far_from_the_data_doubts_the_set_up_first(tmp_path: Path, gap: dict, bounds: int, doubted: bool) -> None:
+    run = make_run(tmp_path / "run")
+    fit = json.loads((run / "fit.json").read_text())
+    fit["gap"]["open_close"] |= gap
+    for k, p in enumerate(fit["parameters"]):
+        p["on_bound"] = k < bounds
+    (run / "fit.json").write_text(json.dumps(fit))
+    said = "Next: do not train on this fit: check joint order, signs, units and servo gains before anything else"
+    assert summary(read_run(run))[-1].startswith(said) == doubted
+    searched = read_gap(make_gap(tmp_path / "gap"))
+    last = lead(read_run(run), searched, None)[-1]
+    assert last.startswith("Next: check joint order, signs, units and servo gains") == doubted and "look for" in last
 
 
 def test_residuals_far_above_noise_point_to_the_gap_command(tmp_path: Path) -> None:
