@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from droid_jax.model.door import door_space as door_space
     from droid_jax.model.door_scene import door_scene as door_scene
     from droid_jax.model.mjcf import fitted_mjcf as fitted_mjcf
+    from droid_jax.model.own import load_parameters as load_parameters
     from droid_jax.model.parameters import Parameter as Parameter
     from droid_jax.model.parameters import Scaling as Scaling
     from droid_jax.model.parameters import Space as Space
@@ -51,6 +52,7 @@ __all__ = [
     "Scene",
     "door_scene",
     "load_scene",
+    "load_parameters",
     "door_space",
     "door_nuisances",
     "Recording",
@@ -79,6 +81,7 @@ _HOMES = {
     "Scene": ("model.scene", "Scene"),
     "door_scene": ("model.door_scene", "door_scene"),
     "load_scene": ("model.scene", "load_scene"),
+    "load_parameters": ("model.own", "load_parameters"),
     "door_space": ("model.door", "door_space"),
     "door_nuisances": ("model.door", "door_nuisances"),
     "Recording": ("measure.recording", "Recording"),

@@ -291,12 +291,16 @@ def test_an_unknown_joint(refused, tmp_path: Path, options: list[str], expected:
 @pytest.mark.parametrize(
     ("entry", "expected"),
     [
-        ({**GOOD, "field": "dof_colour"}, "'dof_colour' is not a model field"),
+        ({**GOOD, "field": "dof_colour"}, "'dof_colour' is not a model field that a parameter can write; fields start"),
+        (
+            {**GOOD, "field": "dof_dampng"},
+            "is not a model field that a parameter can write, did you mean 'dof_damping'?",
+        ),
         ({**GOOD, "field": "opt_timestep"}, "'opt_timestep' is not a model field"),
         ({**GOOD, "element": "wrist"}, "unknown joint 'wrist'"),
         ({"field": "body_mass", "element": "hand", "std": 0.1, "high": 2.0}, "unknown body 'hand'"),
-        ({**GOOD, "colour": "red"}, "unknown colour"),
-        ({"field": "dof_damping", "element": "elbow"}, "missing std, high"),
+        ({**GOOD, "colour": "red"}, "entry 2: unknown colour; known keys"),
+        ({"field": "dof_damping", "element": "elbow"}, "missing std, high; known keys"),
         ({**GOOD, "mode": "sett"}, "mode must be one of set, negative, scale, divide, add, got 'sett'"),
         ({**GOOD, "scaling": "cubic"}, "scaling must be one of linear, log, got 'cubic'"),
         ({**GOOD, "mean": 30.0}, "outside its bounds"),

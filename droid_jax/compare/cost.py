@@ -35,7 +35,7 @@ ENGINES = ("mjx", "mujoco")
 SCATTER = 0.01  # rad or m: repeats of one motion whose start was measured begin no further apart
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Cost:
     """A cost over a space. Call it with [P, D] physical values; everything returns host arrays."""
 
@@ -49,6 +49,10 @@ class Cost:
     _failed: tuple[Callable[[Rollout], jax.Array], ...]
     _beta: tuple[Callable[[Rollout], jax.Array], ...]
     _smoothed: tuple[Callable[[Rollout], jax.Array], ...]
+
+    def __repr__(self) -> str:
+        names = ", ".join(c.name for c in self.comparisons)
+        return f"<Cost of {names} over {len(self.space)} parameters of scene {self.scene.name!r}>"
 
     def __call__(self, values: Any) -> np.ndarray:
         """[P, D] -> [P] cost, the mean over the recordings; never NaN."""
@@ -127,7 +131,7 @@ class Cost:
 def make_cost(
     scene: Scene,
     space: Space,
-    recordings: Sequence[Recording],
+    recordings: Recording | Sequence[Recording],
     *,
     engine: str = "mjx",
     config: CompareConfig | None = None,
@@ -143,6 +147,7 @@ def make_cost(
     Raises ValueError for unknown engines, joints, channels, or gains that do not match.
     """
     config = config or CompareConfig()
+    recordings = [recordings] if isinstance(recordings, Recording) else recordings
     if not recordings:
         raise ValueError("a cost needs at least one recording")
     drives = [followed(scene, r, config) for r in recordings]

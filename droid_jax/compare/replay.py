@@ -21,7 +21,7 @@ from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.model.physics import Physics
 from droid_jax.model.scene import Scene, has_servo_damping
 from droid_jax.model.seam import Effect, Rollout, State, Theta, column
-from droid_jax.model.step import servo_force
+from droid_jax.model.step import check_options, servo_force
 from droid_jax.model.step import step as simulate_step
 
 Replay = Callable[[Physics], Rollout]
@@ -61,6 +61,7 @@ def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True) -> Dri
         raise ValueError(
             f"recording {recording.name!r} holds no commands, so its servo cannot be replayed; use the inverse mode"
         )
+    _check_driven(scene, recording)
     columns = scene.command_index(recording.command_names)
     check_joints(recording, scene.command_names)
     timestep = float(scene.model.opt.timestep)
@@ -79,6 +80,18 @@ def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True) -> Dri
         torque=recording.torque,
         stiffness=None if gains is None else np.asarray(gains.stiffness, dtype=float)[columns],
     )
+
+
+def _check_driven(scene: Scene, recording: Recording) -> None:
+    """Raise ValueError where the scene has a joint that is commanded and no actuator for it."""
+    has = {scene.model.joint(i).name for i in range(scene.model.njnt)}
+    left = [j for j in recording.command_names if j in has and j not in scene.command_names]
+    if left or not scene.command_names:
+        lacks = f"actuator for {', '.join(left)}" if scene.command_names else "actuators"
+        raise ValueError(
+            f"scene {scene.name!r} has no {lacks}, and recording {recording.name!r} holds commands: give each "
+            "commanded joint a <position> servo in the MJCF"
+        )
 
 
 def check_gains(scene: Scene, drive: Drive) -> None:
@@ -113,6 +126,7 @@ def servo_replay(
     parity: step exactly as the C engine does (see `droid_jax.model.step`), for comparisons with it; then
       `late` steps late (see `_command`).
     """
+    check_options(scene.model, parity, f"a replay of scene {scene.name!r}")
     check_gains(scene, drive)
     check_stateless(scene)
     template = mjx.make_data(scene.mjx)

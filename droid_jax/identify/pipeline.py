@@ -85,7 +85,7 @@ Progress = Callable[[str, Any], None]
 def identify(
     scene: Scene,
     space: Space,
-    recordings: Sequence[Recording],
+    recordings: Recording | Sequence[Recording],
     *,
     nuisances: Space | None = None,
     config: IdentifyConfig | None = None,
@@ -103,6 +103,7 @@ def identify(
     without the refinement (the search sees the first alone), and where the initial means cannot be simulated.
     """
     config = config or IdentifyConfig()
+    recordings = [recordings] if isinstance(recordings, Recording) else recordings
     report = progress or (lambda stage, value: None)
     names = [r.name for r in recordings]
     _check_names(names, config)

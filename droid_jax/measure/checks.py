@@ -69,9 +69,11 @@ def check_joints(recording: Recording, joints: Sequence[str]) -> None:
     unknown = [j for j in have if j not in joints]
     if missing or unknown:
         what = "command" if parts else "its channels"
+        faults = [
+            f"{word}: {', '.join(names)}" for word, names in (("missing", missing), ("unknown", unknown)) if names
+        ]
         raise ValueError(
-            f"{where}, {what}: expected {len(joints)} joints, got {len(have)}; "
-            f"missing: {', '.join(missing) or 'none'}; unknown: {', '.join(unknown) or 'none'}; "
+            f"{where}, {what}: expected {len(joints)} joints, got {len(have)}; {'; '.join(faults)}; "
             f"valid names: {', '.join(joints)}"
         )
     for key, columns in known.items():

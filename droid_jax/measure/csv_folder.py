@@ -151,11 +151,9 @@ def _column_order(path: Path, header: list[str], expected: Sequence[str]) -> lis
         raise ValueError(f"{path}, line 1: expected one named column per joint beside 'time', {what}")
     wanted = list(expected) or names
     missing, unknown = [n for n in wanted if n not in names], [n for n in names if n not in wanted]
-    if missing or unknown:
-        raise ValueError(
-            f"{path}, line 1: expected {len(wanted)} joint columns, got {len(names)}; missing: "
-            f"{', '.join(missing) or 'none'}; unknown: {', '.join(unknown) or 'none'}"
-        )
+    faults = [f"{word}: {', '.join(some)}" for word, some in (("missing", missing), ("unknown", unknown)) if some]
+    if faults:
+        raise ValueError(f"{path}, line 1: expected {len(wanted)} joint columns, got {len(names)}; {'; '.join(faults)}")
     return [1 + names.index(n) for n in wanted]
 
 

@@ -147,11 +147,9 @@ def _keys(raw: Any, kind: str, where: str) -> dict[str, Any]:
         raise ValueError(f"{where}: expected an object with {', '.join(valid)}, got {raw!r}")
     unknown = sorted(set(raw) - set(valid))
     missing = [key for key in required if key not in raw]
-    if unknown or missing:
-        raise ValueError(
-            f"{where}: unknown keys: {', '.join(unknown) or 'none'}; missing keys: "
-            f"{', '.join(missing) or 'none'}; valid keys: {', '.join(valid)}"
-        )
+    faults = [f"{word} keys: {', '.join(keys)}" for word, keys in (("unknown", unknown), ("missing", missing)) if keys]
+    if faults:
+        raise ValueError(f"{where}: {'; '.join(faults)}; valid keys: {', '.join(valid)}")
     return raw
 
 

@@ -12,6 +12,7 @@ one that the scene does not have.
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Sequence
 from typing import Any
 
@@ -37,8 +38,11 @@ def element_index(scene: Scene, field: str, element: str) -> int:
     """First index into a model field, e.g. ("dof_damping", "hinge") -> the hinge's dof address."""
     kind = _KIND.get(field.split("_")[0])
     if kind is None or not hasattr(scene.model, field):
+        written = [f for f in dir(scene.model) if f.split("_")[0] in _KIND]
+        close = difflib.get_close_matches(field, written, n=1, cutoff=0.8)
+        meant = f", did you mean {close[0]!r}?" if close else ""
         raise ValueError(
-            f"{field!r} is not a model field that a parameter can write; "
+            f"{field!r} is not a model field that a parameter can write{meant}; "
             f"fields start with {', '.join(f'{k}_' for k in _KIND)} and are arrays of mujoco.MjModel"
         )
     return scene.dof(element) if field.startswith("dof_") else scene.id(kind, element)

@@ -80,11 +80,9 @@ def _parameter(scene: Scene, entry: Any, where: str) -> Parameter:
     if sum(kind in entry for kind in ("field", "sensor", "servo")) != 1:
         missing.insert(0, "one of field, sensor and servo")
     unknown = [k for k in entry if k not in _KNOWN]
-    if missing or unknown:
-        raise ValueError(
-            f"{where}: missing {', '.join(missing) or 'nothing'}; unknown {', '.join(unknown) or 'nothing'}; "
-            f"known keys: {', '.join(_KNOWN)}"
-        )
+    faults = [f"{word} {', '.join(keys)}" for word, keys in (("missing", missing), ("unknown", unknown)) if keys]
+    if faults:
+        raise ValueError(f"{where}: {'; '.join(faults)}; known keys: {', '.join(_KNOWN)}")
     try:
         options = _read(entry)
         field, sensor, servo = (options.pop(kind, None) for kind in ("field", "sensor", "servo"))

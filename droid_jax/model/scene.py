@@ -171,9 +171,9 @@ def name_to_id(model: mujoco.MjModel, kind: str, name: str) -> int:
     obj = getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
     found = mujoco.mj_name2id(model, obj, name)
     if found < 0:
-        valid = [mujoco.mj_id2name(model, obj, i) for i in range(_count(model, kind))]
-        listed = ", ".join(v for v in valid if v) or "none"
-        raise ValueError(f"unknown {kind} {name!r}; this scene has: {listed}")
+        valid = [v for v in (mujoco.mj_id2name(model, obj, i) for i in range(_count(model, kind))) if v]
+        has = f"has: {', '.join(valid)}" if valid else f"has no {kind} with a name"
+        raise ValueError(f"unknown {kind} {name!r}; this scene {has}")
     return found
 
 
@@ -343,6 +343,8 @@ def load_scene(
     Raises FileNotFoundError or ValueError (the file does not compile, unknown names, ...).
     """
     path = Path(path)
+    if path.is_dir():
+        raise FileNotFoundError(f"{path} is a folder, not an MJCF file")
     if not path.is_file():
         raise FileNotFoundError(f"no MJCF file at {path}")
     try:
@@ -354,7 +356,10 @@ def load_scene(
         if joint not in named:
             raise ValueError(f"unknown joint {joint!r}; {path} has: {', '.join(sorted(named))}")
         named[joint].frictionloss = max(named[joint].frictionloss, TINY_FRICTIONLOSS)
-    return compile_scene(spec, path.stem, joints=joints, object_joint=object_joint)
+    try:
+        return compile_scene(spec, path.stem, joints=joints, object_joint=object_joint)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
 
 
 def with_options(scene: Scene, **changes: Any) -> Scene:

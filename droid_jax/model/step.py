@@ -41,7 +41,7 @@ def step(model: Any, data: Any, *, parity: bool = False, servo_damping: bool = T
     Leaves out what no replay reads: sensors, cameras, lights.
     Raises ValueError for other integrators, and for elliptic cones unless parity.
     """
-    _check_options(model, parity)
+    check_options(model, parity)
     with exact_segments(), contextlib.nullcontext() if parity else midpoint_constraints():
         data = mjx.fwd_position(model, data)
     data = mjx.fwd_velocity(model, data)
@@ -99,11 +99,12 @@ def _is_euler(model: Any) -> bool:
     return model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
 
 
-def _check_options(model: Any, parity: bool) -> None:
+def check_options(model: Any, parity: bool, what: str = "a replay") -> None:
+    """Raise ValueError for an integrator or a friction cone that `step` has not; what: asks for it."""
     if not _is_euler(model) and model.opt.integrator != mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
-        raise ValueError("a replay integrates with Euler or implicitfast; set <option integrator=...> to one of them")
+        raise ValueError(f"{what} integrates with Euler or implicitfast; set <option integrator=...> to one of them")
     if model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC and not parity:
-        raise ValueError("a replay needs pyramidal friction cones; set <option cone='pyramidal'>")
+        raise ValueError(f"{what} needs pyramidal friction cones; set <option cone='pyramidal'>")
 
 
 def _undamped(model: Any) -> Any:

@@ -471,6 +471,29 @@ def test_missing_and_foreign_columns_are_named(scene: Scene):
         make_drive(scene, recording(qpos0={"wrist": 0.0}))
 
 
+@pytest.mark.parametrize(("left", "says"), [(0, "has no actuators"), (1, "has no actuator for shoulder")])
+def test_commanded_joints_without_an_actuator_are_the_scenes_fault(left: int, says: str):
+    xml = ARM.format(gravcomp="", friction="", sensor="")
+    start, end = xml.index("<actuator>"), xml.index("<sensor>")
+    kept = '<actuator><position name="e" joint="elbow" kp="25"/></actuator>' * left
+    bare = compile_scene(mujoco.MjSpec.from_string(xml[:start] + kept + xml[end:]), "bare")
+    with pytest.raises(ValueError, match=f"scene 'bare' {says}, and recording 'wave' holds commands"):
+        make_drive(bare, recording(gains=None))
+
+
+@pytest.mark.parametrize(("option", "says"), [('integrator="RK4"', "Euler"), ('cone="elliptic"', "pyramidal")])
+def test_an_option_that_no_replay_has_is_told_with_the_scene(option: str, says: str):
+    xml = ARM.format(gravcomp='gravcomp="1"', friction="", sensor="").replace('integrator="implicitfast"', option)
+    odd = compile_scene(mujoco.MjSpec.from_string(xml), "odd", joints=JOINTS)
+    with pytest.raises(ValueError, match=f"a replay of scene 'odd' .*{says}"):
+        servo_replay(odd, make_drive(odd, recording()))
+
+
+def test_a_cost_takes_one_recording_and_is_written_in_a_line(scene: Scene):
+    space = Space((joint_damping(scene, "elbow", std=0.1, high=50.0),))
+    assert repr(make_cost(scene, space, recording())) == "<Cost of wave over 1 parameters of scene 'arm'>"
+
+
 # ----- replays that blow up
 
 

@@ -226,7 +226,7 @@ def test_without_a_source_the_message_names_the_recording() -> None:
 def test_check_joints() -> None:
     r = make()
     check_joints(r, ["j2", "j1"])
-    with pytest.raises(ValueError, match=r"command: expected 3 joints, got 2; missing: j3; unknown: none"):
+    with pytest.raises(ValueError, match=r"command: expected 3 joints, got 2; missing: j3; valid names"):
         check_joints(r, ["j1", "j2", "j3"])
     with pytest.raises(ValueError, match=r"expected 2 joints, got 2; missing: a; unknown: j1; valid names: a, j2"):
         check_joints(r, ["a", "j2"])

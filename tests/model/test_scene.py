@@ -349,7 +349,19 @@ def test_what_mjx_has_not_is_said_in_a_sentence(option: str):
 def test_a_file_that_is_missing_or_broken_is_named(tmp_path: Path):
     with pytest.raises(FileNotFoundError, match=r"nothing.xml"):
         load_scene(tmp_path / "nothing.xml")
+    with pytest.raises(FileNotFoundError, match="is a folder, not an MJCF file"):
+        load_scene(tmp_path)
     broken = tmp_path / "broken.xml"
     broken.write_text("<mujoco><worldbody><body></worldbody></mujoco>")
     with pytest.raises(ValueError, match=r"broken.xml"):
         load_scene(broken)
+    lost = '<asset><mesh name="m" file="lost.stl"/></asset><worldbody><geom type="mesh" mesh="m"/></worldbody>'
+    broken.write_text(f"<mujoco>{lost}</mujoco>")
+    with pytest.raises(ValueError, match=r"broken.xml: .*lost.stl"):
+        load_scene(broken)
+
+
+def test_a_scene_without_such_a_thing_says_so():
+    scene = compile_scene(mujoco.MjSpec.from_string("<mujoco/>"), "empty")
+    with pytest.raises(ValueError, match="unknown pair 'grip'; this scene has no pair with a name"):
+        scene.id("pair", "grip")
