@@ -20,6 +20,7 @@ import pytest
 import droid_jax as dj
 from droid_jax import runtime
 from droid_jax.commands.identify import Identify, config_of, model_of
+from droid_jax.compare.residuals import CompareConfig
 from droid_jax.identify.pipeline import identify as identify_function
 from droid_jax.identify.refine import RefineConfig
 from droid_jax.identify.search import SearchConfig
@@ -116,6 +117,8 @@ def test_identify_is_callable_and_a_room_whatever_came_first(before: str):
 def test_identify_passes_everything_on():
     with pytest.raises(ValueError, match="different names"):
         dj.identify(None, None, [TINY, TINY])
+    with pytest.raises(ValueError, match="an identification compares torques"):  # one alone is a list of one
+        dj.identify(None, None, TINY, config=dj.IdentifyConfig(compare=CompareConfig(channels={})))
     with pytest.raises(TypeError, match="colour"):
         dj.identify(None, None, [TINY], colour="red")
 
@@ -201,7 +204,9 @@ def test_the_readme_identifies_a_robot_in_ten_lines(workplace: Path, capsys: pyt
     (code,) = blocks("README.md", "python")
     assert len(code.splitlines()) <= 11
     exec(compile(code, "README.md", "exec"), {})
-    printed = dict(line.split(": ") for line in capsys.readouterr().out.splitlines())
+    gap, *lines = capsys.readouterr().out.splitlines()
+    assert gap.startswith("share of the gap closed: {'two-link': 0.2")  # the shoulder's damping is wrong and not fitted
+    printed = dict(line.split(": ") for line in lines)
     assert list(printed) == ["elbow_damping", "forearm_mass"]
     content = json.loads((workplace / "gaussian.json").read_text())
     assert [p["name"] for p in content["space"]] == list(printed)
