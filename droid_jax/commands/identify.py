@@ -270,5 +270,5 @@ def _summary(found: Identified, fit: Mapping[str, Any]) -> None:
     print(f"search stopped: {found.search.stop}; {sum(found.seconds.values()):.0f} s")
     if far_off(fit):
         print(f"the fit stays far from the data: {DOUBT}")
-    elif lacks_something(fit):
+    if lacks_something(fit):
         print("what is left is well above noise: `python -m droid_jax.run gap` looks for what the model lacks")
