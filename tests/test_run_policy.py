@@ -246,6 +246,19 @@ def test_a_killed_training_goes_on_where_it_was(tmp_path: Path, monkeypatch: pyt
     assert main(command) == 0 and len(asked) == 2  # it is done
 
 
+@pytest.mark.parametrize("again", [(), ("--again",)])
+def test_settings_that_cannot_be_trained_with_leave_the_folder_as_it_was(tmp_path: Path, again, capsys):
+    run = tmp_path / "run"
+    command = ["train", "--method", "prior", "--steps", "0", "--out", "run", *again]
+    assert main(command) == 2 and not run.exists()
+    assert "steps and evaluations must be 1 or more, got 0" in capsys.readouterr().err
+    for name in ("training.json", "policy.npz", "checkpoints/1"):
+        (run / name).parent.mkdir(parents=True, exist_ok=True)
+        (run / name).write_text("old")
+    before = sorted(run.rglob("*"))
+    assert main(command) == 2 and sorted(run.rglob("*")) == before
+
+
 @pytest.mark.parametrize("opengl", [True, False])
 def test_films_are_of_the_trials_of_median_angle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, opengl: bool, capsys):
     success = np.array([True, True, True, False, False, False])

@@ -81,7 +81,7 @@ def run(command: Train) -> None:
         report.run(report.Report(out))
         return
     config = config_of(command)
-    env = DoorEnv(scene, effects=effects)
+    env, randomise = DoorEnv(scene, effects=effects), of_method(command.method, scene, gaussian)
     prepare_folder(out)  # only now, with all input read
     begin(out, setup, command.again, TRAINING)
     _forget(out)
@@ -97,7 +97,7 @@ def run(command: Train) -> None:
             write("train", now)
 
         found = train(
-            env, of_method(command.method, scene, gaussian), config, checkpoints=out / "checkpoints",
+            env, randomise, config, checkpoints=out / "checkpoints",
             fingerprint={"method": command.method, "gaussian": (out / GAUSSIAN).read_text()},
             progress=progress,
         )  # fmt: skip

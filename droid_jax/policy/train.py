@@ -42,6 +42,7 @@ class TrainConfig:
     that each is used.
     evaluations: times that the policy is tried (and saved) while it trains; eval_envs: episodes each time.
     seed.
+    Raises ValueError for settings that do not go together.
     """
 
     steps: int = 4_000_000
@@ -61,6 +62,15 @@ class TrainConfig:
     evaluations: int = 16
     eval_envs: int = 128
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        if min(self.steps, self.evaluations) < 1:
+            raise ValueError(f"steps and evaluations must be 1 or more, got {self.steps} and {self.evaluations}")
+        if (self.batch * self.minibatches) % self.envs:
+            raise ValueError(
+                f"batch x minibatches ({self.batch} x {self.minibatches}) must be a multiple of the {self.envs} "
+                "environments"
+            )
 
 
 PRESETS = {
@@ -118,14 +128,15 @@ def train(
 
     checkpoints: folder where the networks are kept after every evaluation, and from which an interrupted run goes on
     (with Adam's moments and starts drawn anew, and the same doors); fingerprint: what else they belong to.
-    Raises ValueError for a checkpoint of another run or network, for settings that do not go together, for more devices
-    than there are, and where no policy came of it that consists of numbers.
+    Raises ValueError for a checkpoint of another run or network, for more devices than there are, and where no policy
+    came of it that consists of numbers.
     """
     config = config or TrainConfig()
     config = replace(config, devices=_devices(config))
     scene = f"{env.scene.name}, {env.scene.sha256}, {env.start.tolist()}"
     of = {"scene": scene, "effects": ", ".join(e.name for e in env.effects), "task": repr(asdict(env.task))}
-    texts = {"config": repr(replace(config, steps=0, devices=None)), "observation": repr(LAYOUT), **of}
+    settings = {name: value for name, value in asdict(config).items() if name not in ("steps", "devices")}
+    texts = {"config": repr(settings), "observation": repr(LAYOUT), **of}
     texts |= fingerprint or {}
     run = functools.partial(_brax, env, randomise, config)
     if checkpoints is None:
@@ -137,14 +148,7 @@ def train(
 
 
 def _devices(config: TrainConfig) -> int:
-    """How many devices to use; ValueError for settings that do not go together."""
-    if min(config.steps, config.evaluations) < 1:
-        raise ValueError(f"steps and evaluations must be 1 or more, got {config.steps} and {config.evaluations}")
-    if (config.batch * config.minibatches) % config.envs:
-        raise ValueError(
-            f"batch x minibatches ({config.batch} x {config.minibatches}) must be a multiple of the {config.envs} "
-            "environments"
-        )
+    """How many devices to use; ValueError where they are not there or do not divide the environments."""
     there = jax.local_device_count()
     if config.devices is None:
         return max(d for d in range(1, there + 1) if config.envs % d == 0)
