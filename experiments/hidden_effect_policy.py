@@ -34,6 +34,7 @@ from droid_jax.commands.gap_search import searched  # noqa: E402
 from droid_jax.commands.hidden import hidden_effects, record_stand_in  # noqa: E402
 from droid_jax.gap.case import GapConfig  # noqa: E402
 from droid_jax.gap.extended import FILE, extended, load_extended, save_extended  # noqa: E402
+from droid_jax.gap.missing import case_of  # noqa: E402
 from droid_jax.gap.split import Split  # noqa: E402
 from droid_jax.gap.verdict import Kind  # noqa: E402
 from droid_jax.identify.gaussian import load as load_gaussian  # noqa: E402
@@ -106,7 +107,8 @@ def _searched(arguments: Arguments, folder: Path, code: Mapping[str, Any]) -> di
         small = RefineConfig(iterations=1, hops=0, spreads=0)
         config = GapConfig(SearchConfig(population=8, parents=None, generations=1), small, small, 1, 1, 1)
     kept = folder / "checkpoints" / str(code["commit"])
-    case, verdict, _ = searched(Split.RECORDINGS, scene, base, library(scene), roles, config, kept)
+    case = case_of(Split.RECORDINGS, scene, base, library(scene), roles, config)
+    case, verdict, _ = searched(Split.RECORDINGS, case, roles, kept)
     posterior(verdict.base.refined, case.fit.cost.comparisons).save(folder / BASE)
     save_extended(folder, extended(case, verdict.model))
     if verdict.kind is Kind.UNCONVERGED and not arguments.quick:  # no verdict: nothing is kept of it

@@ -16,6 +16,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from small_log import elbow_log, write_elbow
 
 from droid_jax import run
 from droid_jax.commands import presets
@@ -142,13 +143,20 @@ def test_a_cutoff_that_filters_nothing(refused, tmp_path: Path, command: str):
     assert "--motion-cutoff is for logs without commands, and no recording is one" in said
 
 
-def test_the_same_files_in_another_place_are_the_same_run(refused, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """What they say counts: an absolute path instead of a relative one, or a folder of another name."""
+def stopped_in_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever is given to `identify` is found good, and its search ends at once in an error."""
 
     def stopped(*_, **__) -> None:
         raise ValueError("stopped")
 
-    monkeypatch.setattr(pipeline, "identify", stopped)
+    monkeypatch.setattr(pipeline, "prepare", lambda *_, **__: None)
+    monkeypatch.setattr(pipeline, "solve", stopped)
+
+
+def test_the_same_files_in_another_place_are_the_same_run(refused, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """What they say counts: an absolute path instead of a relative one, or a folder of another name."""
+
+    stopped_in_the_search(monkeypatch)
     monkeypatch.chdir(tmp_path)
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
@@ -178,10 +186,7 @@ def test_input_that_cannot_be_read_leaves_no_folder(refused, tmp_path: Path, com
 def test_an_edited_nuisance_makes_another_run(refused, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The setup knows the whole parameter file, not only what is of interest in it."""
 
-    def stopped(*_, **__) -> None:
-        raise ValueError("stopped")
-
-    monkeypatch.setattr(pipeline, "identify", stopped)
+    stopped_in_the_search(monkeypatch)
 
     def run(std: float) -> str:
         nuisance = {**GOOD, "element": "shoulder", "nuisance": True, "std": std}
@@ -233,6 +238,21 @@ def test_starting_over_with_bad_input_keeps_the_old_run(refused, run_folder: Pat
     before = content(run_folder)
     refused("identify", "--again", "--recording", tmp_path / "nothing.npz", "--out", run_folder)
     assert content(run_folder) == before
+
+
+@pytest.mark.parametrize("command", ["identify", "gap"])
+def test_a_recording_that_the_scene_does_not_know_leaves_the_folder_as_it_was(refused, run_folder: Path, command: str):
+    """Of an earlier run with --again, and of none: the same command with a better log finds nothing in its way."""
+    recording = elbow_log(0.0, 36.0)
+    channels = {name: replace(c, columns=("elbwo",)) for name, c in recording.channels.items()}
+    save(replace(recording, channels=channels), run_folder.parent / "log.npz")
+    (run_folder / "config.json").write_text("{}")
+    before = content(run_folder)
+    given = (command, *write_elbow(run_folder.parent), "--recording", run_folder.parent / "log.npz")
+    assert "positions lack elbow" in refused(*given, "--again", "--out", run_folder)
+    assert content(run_folder) == before
+    assert "positions lack elbow" in refused(*given, "--out", run_folder.parent / "new")
+    assert content(run_folder.parent / "new") == {}
 
 
 def test_a_report_of_nothing(refused, tmp_path: Path):

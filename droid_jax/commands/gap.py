@@ -94,6 +94,7 @@ def run(command: Gap) -> None:
     runtime.start()
     warn_of_cpu(command.preset)
     from droid_jax.gap.inputs import shared_out
+    from droid_jax.gap.missing import case_of
     from droid_jax.gap.results import write_gap
     from droid_jax.gap.split import Split
     from droid_jax.identify.results import prepare_folder
@@ -119,13 +120,14 @@ def run(command: Gap) -> None:
         print("a log without repeats is fitted without a search: --fit is not needed")
     config = config_of(command)
     prepare_folder(out)  # only now, with all input read
-    begin(out, setup, command.again, "gap.json")
-    if command.again:
-        _forget(out)
     assert command.springs is not None  # settled
     roles = roles or record_stand_in(scene, hidden, out, command.springs, command.seed, command.again)
+    case = case_of(split, scene, base, effects, roles, config)
+    begin(out, setup, command.again, "gap.json")  # and only now, with all of it found good
+    if command.again:
+        _forget(out)
     board = out / FOLDER if command.tensorboard else None
-    case, verdict, seconds = searched(split, scene, base, effects, roles, config, out / "checkpoints", start, board)
+    case, verdict, seconds = searched(split, case, roles, out / "checkpoints", start, board)
     description = {
         "split": {"by": split.value, "limits": split.limits},
         "seconds": seconds,

@@ -13,13 +13,10 @@ from droid_jax.storage import write_json
 if TYPE_CHECKING:
     import numpy as np
 
-    from droid_jax.gap.case import Case, GapConfig
+    from droid_jax.gap.case import Case
     from droid_jax.gap.split import Split
     from droid_jax.gap.verdict import Verdict
     from droid_jax.measure.recording import Recording
-    from droid_jax.model.parameters import Space
-    from droid_jax.model.scene import Scene
-    from droid_jax.model.seam import Effect
 
 BARS = ("search", "refine", "floor", "screen", "look", "refit", "judge")
 IN_BLOCKS = ("refine", "screen", "look", "refit", "judge")  # of a log: no search, and no time step to refine
@@ -27,16 +24,13 @@ IN_BLOCKS = ("refine", "screen", "look", "refit", "judge")  # of a log: no searc
 
 def searched(
     split: Split,
-    scene: Scene,
-    base: Space,
-    effects: Sequence[Effect],
+    case: Case,
     roles: Mapping[str, Recording],
-    config: GapConfig,
     checkpoints: Path,
     start: np.ndarray | None = None,
     board: Path | None = None,
 ) -> tuple[Case, Verdict, dict[str, float]]:
-    """Case and verdict of recordings by role, going on from `checkpoints`; and each stage's seconds.
+    """The case and its verdict, going on from `checkpoints`; and each stage's seconds.
 
     start: [F] values of the base parameters from which their fit begins, instead of a search.
     board: folder for scalars of the base fit.
@@ -47,10 +41,10 @@ def searched(
     from droid_jax.report.scalars import scalars
 
     names = IN_BLOCKS if split is Split.BLOCKS else BARS if start is None else BARS[1:]
-    with stages(names, {"look": config.looked, "refit": config.refitted}) as show, scalars(board) as write:
+    with stages(names, {"look": case.config.looked, "refit": case.config.refitted}) as show, scalars(board) as write:
         clock = Clock(names, (show, write), checkpoints / "seconds.json")
         clock(names[0], None)
-        case, verdict = answer(split, scene, base, effects, roles, config, start, clock, checkpoints)
+        case, verdict = answer(split, case, roles, start, clock, checkpoints)
         clock("judge", None)  # its seconds count
     return case, verdict, clock.seconds
 

@@ -94,7 +94,7 @@ def run(command: Identify) -> None:
     runtime.start()
     warn_of_cpu(command.preset)
     from droid_jax.compare.start import open_loop
-    from droid_jax.identify.pipeline import cost_samples, identify
+    from droid_jax.identify.pipeline import cost_samples, prepare, solve
     from droid_jax.identify.results import prepare_folder, write_run
     from droid_jax.measure.surrogate import is_stand_in
     from droid_jax.report.progress import stages
@@ -114,7 +114,8 @@ def run(command: Identify) -> None:
     _needs_demonstrations(command, given)
     prepare_folder(out)  # only now, with all input read
     recordings, truth = _recordings(command, scene, out, given)
-    begin(out, setup, command.again)
+    problem = prepare(scene, space, recordings, nuisances=nuisances, config=config, **effects)
+    begin(out, setup, command.again)  # and only now, with all of it found good
     started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     board = out / FOLDER if command.tensorboard else None
     with stages(("search", "refine", "judge", "sample")) as show, scalars(board) as write:
@@ -123,10 +124,7 @@ def run(command: Identify) -> None:
             show(stage, value)
             write(stage, value)
 
-        found = identify(
-            scene, space, recordings, nuisances=nuisances, config=config, checkpoints=out / "checkpoints",
-            progress=progress, **effects,
-        )  # fmt: skip
+        found = solve(problem, checkpoints=out / "checkpoints", progress=progress)
         description = {
             "command": "identify",
             "preset": command.preset,

@@ -58,22 +58,20 @@ def find_missing(
     if not asked:
         raise ValueError("effects: there is none to ask about; None asks about all of the library")
     start = None if start is None else space.check(start)
-    case, verdict = answer(split, scene, space, asked, roles, config or GapConfig(), start, progress)
+    case = case_of(split, scene, space, asked, roles, config or GapConfig())
+    case, verdict = answer(split, case, roles, start, progress)
     return verdict, extended(case, verdict.model)
 
 
 def answer(
     split: Split,
-    scene: Scene,
-    base: Space,
-    effects: Sequence[Effect],
+    case: Case,
     roles: Mapping[str, Recording],
-    config: GapConfig,
     start: np.ndarray | None = None,
     progress: Progress | None = None,
     checkpoints: Path | None = None,
 ) -> tuple[Case, Verdict]:
-    """Case and verdict of recordings by role (see `shared_out`).
+    """The verdict on a case of recordings by role (see `case_of`), and the case, which now remembers its replays.
 
     start: [F] values of the base parameters from which their fit begins, instead of a search.
     checkpoints: folder of this search alone, from which it goes on after a stop; None keeps nothing.
@@ -83,7 +81,6 @@ def answer(
     def at(name: str) -> Path | None:
         return None if checkpoints is None else checkpoints / name
 
-    case = _case(split, scene, base, effects, roles, config)
     if checkpoints is not None:
         case = remembering(case, checkpoints / "replays")
     if split is Split.BLOCKS:
@@ -100,7 +97,7 @@ def answer(
     return case, verdict
 
 
-def _case(
+def case_of(
     split: Split,
     scene: Scene,
     base: Space,
@@ -108,7 +105,10 @@ def _case(
     roles: Mapping[str, Recording],
     config: GapConfig,
 ) -> Case:
-    """Of recordings with repeats, or of one or two logs without."""
+    """Of recordings by role (see `shared_out`), which are one or two logs where the split is by blocks.
+
+    Raises ValueError for what is wrong with them, or does not fit the scene.
+    """
     if split is not Split.BLOCKS:
         return make_case(scene, base, effects, **roles, config=config)
     config = replace(config, refine=replace(config.refine, hops=0, spreads=0))  # inverse dynamics is smooth

@@ -82,6 +82,28 @@ class Identified:
 Progress = Callable[[str, Any], None]
 
 
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What is to be identified, checked: costs over `full`, which is `space` with the nuisances that are fitted.
+
+    held: the repeats of each recording that the fit does not see; heldout_repeats: their numbers.  fit, heldout: costs
+    on the other repeats and on these.  seconds: that this took.
+    """
+
+    scene: Scene
+    space: Space
+    full: Space
+    config: IdentifyConfig
+    effects: tuple[Effect, ...]
+    recordings: tuple[Recording, ...]
+    held: tuple[Recording, ...]
+    heldout_repeats: tuple[tuple[int, ...], ...]
+    fit: Cost
+    heldout: Cost
+    fingerprint: str
+    seconds: float
+
+
 def identify(
     scene: Scene,
     space: Space,
@@ -102,23 +124,55 @@ def identify(
     Raises ValueError for recordings of one name, where no torque is compared, where several recordings are to be fitted
     without the refinement (the search sees the first alone), and where the initial means cannot be simulated.
     """
-    config = config or IdentifyConfig()
     recordings = [recordings] if isinstance(recordings, Recording) else recordings
-    report = progress or (lambda stage, value: None)
-    names = [r.name for r in recordings]
-    _check_names(names, config)
-    parts = [split(r, config.heldout) for r in recordings]
-    fitted, held = [p[0] for p in parts], [p[1] for p in parts]
-    full = space if nuisances is None or config.refine is None else space + nuisances
-    seconds: dict[str, float] = {}
+    problem = prepare(scene, space, recordings, nuisances=nuisances, config=config, effects=effects)
+    return solve(problem, checkpoints=checkpoints, progress=progress)
 
+
+def prepare(
+    scene: Scene,
+    space: Space,
+    recordings: Sequence[Recording],
+    *,
+    nuisances: Space | None = None,
+    config: IdentifyConfig | None = None,
+    effects: Sequence[Effect] = (),
+) -> Problem:
+    """The part of `identify` before the search: whatever is wrong with the input is told here, and nothing written."""
     began = time.monotonic()
+    config = config or IdentifyConfig()
+    _check_names([r.name for r in recordings], config)
+    fitted, held, numbers = zip(*(split(r, config.heldout) for r in recordings), strict=True)
+    full = space if nuisances is None or config.refine is None else space + nuisances
     base = make_cost(scene, full, fitted, engine=config.engine, config=config.compare, effects=effects)
     # now, since what is held out may have faults of its own, and those are to be told before anything long
     plain = replace(config.compare, whitened=False)
     commanded = all(r.command.size for r in recordings)
     heldout = base.against(held, plain) if commanded else make_cost(scene, full, held, config=plain, effects=effects)
     _check_start(base, full)
+    return Problem(
+        scene=scene,
+        space=space,
+        full=full,
+        config=config,
+        effects=tuple(effects),
+        recordings=tuple(recordings),
+        held=held,
+        heldout_repeats=numbers,
+        fit=base,
+        heldout=heldout,
+        fingerprint=_fingerprint(scene, full, fitted[0], config, effects),
+        seconds=time.monotonic() - began,
+    )
+
+
+def solve(problem: Problem, *, checkpoints: Path | None = None, progress: Progress | None = None) -> Identified:
+    """The rest of `identify`: search, refine, calibrate, judge."""
+    report = progress or (lambda stage, value: None)
+    config, space, full, base = problem.config, problem.space, problem.full, problem.fit
+    seconds: dict[str, float] = {}
+
+    began = time.monotonic() - problem.seconds
     first = base.first()
 
     def cost(rows: np.ndarray) -> np.ndarray:
@@ -132,7 +186,7 @@ def identify(
         space,
         config.search,
         checkpoint_dir=checkpoints,
-        fingerprint=_fingerprint(scene, full, fitted[0], config, effects),
+        fingerprint=problem.fingerprint,
         progress=lambda p: report("search", p),
     )
     seconds["search"] = time.monotonic() - began
@@ -147,10 +201,11 @@ def identify(
 
     began = time.monotonic()
     report("judge", None)
-    gaps = gaps_of(heldout, recordings, held, full.mean, best)
+    gaps = gaps_of(problem.heldout, problem.recordings, problem.held, full.mean, best)
     seconds["judge"] = time.monotonic() - began
+    names = [r.name for r in problem.recordings]
     return Identified(
-        scene=scene,
+        scene=problem.scene,
         space=space,
         full=full,
         best=best,
@@ -161,8 +216,8 @@ def identify(
         tells=not_judged(full_gaussian) if refined is None else identifiability(full_gaussian, refined.prior),
         gaps=dict(zip(names, gaps, strict=True)),
         fit=base,
-        heldout=heldout,
-        heldout_repeats={n: p[2] for n, p in zip(names, parts, strict=True)},
+        heldout=problem.heldout,
+        heldout_repeats=dict(zip(names, problem.heldout_repeats, strict=True)),
         seconds=seconds,
     )
 

@@ -60,10 +60,10 @@ def test_hidden_friction_is_named_and_in_the_extended_model(
 def test_unless_told_it_asks_about_all_that_could_show(monkeypatch: pytest.MonkeyPatch):
     scene, begin = elbow(), np.array([0.6, 0.1])
 
-    def answer(split, scene, base, effects, roles, config, start, progress):
+    def answer(split, case, roles, start, progress):
         assert split is Split.RECORDINGS and list(roles) == ["fit", "confirm", "sealed"]
-        assert [e.name for e in effects] == [e.name for e in possible(scene, THREE)] and len(effects) > 5
-        assert config == dj.GapConfig()
+        assert [e.name for e in case.effects] == [e.name for e in possible(scene, THREE)] and len(case.effects) > 5
+        assert case.config == dj.GapConfig()
         np.testing.assert_array_equal(start, begin)
         raise KeyboardInterrupt
 
