@@ -21,7 +21,7 @@ from small_log import elbow_log, write_elbow
 from droid_jax import run
 from droid_jax.commands import presets
 from droid_jax.commands.folder import changed, setup_of
-from droid_jax.commands.hidden import known_stand_in
+from droid_jax.commands.hidden import known_stand_in, settled
 from droid_jax.commands.identify import Identify
 from droid_jax.commands.own_effects import load_effects
 from droid_jax.identify import pipeline
@@ -383,6 +383,14 @@ def test_an_option_of_the_stand_in_beside_recordings(refused, tmp_path: Path, co
     said = refused(command, *option, "--recording", "log.npz", "--out", tmp_path / "run")
     assert f"{option[0]} is for the stand-in robot, and --recording says that there is none" in said
     assert not (tmp_path / "run").exists()
+
+
+def test_options_of_the_stand_in_are_filled_in_where_it_records():
+    """A page lists what was asked for: of a robot's own recordings it would say a number of springs that is none's."""
+    assert settled(Identify()) == Identify(springs=1, demonstrations=("A", "C"))
+    assert settled(Identify(springs=2)).springs == 2
+    own = Identify(recording=(Path("log.npz"),))
+    assert settled(own) == own
 
 
 @pytest.mark.parametrize("command", ["all", "identify", "gap", "train"])

@@ -120,8 +120,9 @@ def run(command: Gap) -> None:
         print("a log without repeats is fitted without a search: --fit is not needed")
     config = config_of(command)
     prepare_folder(out)  # only now, with all input read
-    assert command.springs is not None  # settled
-    roles = roles or record_stand_in(scene, hidden, out, command.springs, command.seed, command.again)
+    if not given:
+        assert command.springs is not None  # settled
+        roles = record_stand_in(scene, hidden, out, command.springs, command.seed, command.again)
     case = case_of(split, scene, base, effects, roles, config)
     begin(out, setup, command.again, "gap.json")  # and only now, with all of it found good
     if command.again:

@@ -23,16 +23,17 @@ T = TypeVar("T")
 
 
 def settled(command: T) -> T:
-    """A command with the options of its stand-in robot filled in.
+    """A command with the options of its stand-in robot filled in, where it records one.
 
     Raises ValueError where some were given beside recordings, which come from another robot.
     """
     usual = {name: value for name, value in OPTIONS.items() if hasattr(command, name)}
     given = [name for name in usual if getattr(command, name) is not None]
-    if given and command.recording:  # type: ignore[attr-defined]
+    if not command.recording:  # type: ignore[attr-defined]
+        return replace(command, **{k: v for k, v in usual.items() if k not in given})  # type: ignore[type-var]
+    if given:
         raise ValueError(f"--{given[0]} is for the stand-in robot, and --recording says that there is none")
-    missing = {name: value for name, value in usual.items() if name not in given}
-    return replace(command, **missing)  # type: ignore[type-var]
+    return command
 
 
 def hidden_effects(entries: Sequence[str] | None, scene: Scene) -> dict[str, float]:

@@ -353,6 +353,6 @@ def test_names_and_units_are_written_as_they_are_read(tmp_path: Path) -> None:
 def test_settings_are_those_that_a_person_reads(tmp_path: Path) -> None:
     """Fingerprints and the start of a base fit tell whether a run may go on; on the page they would be a wall."""
     asked = {"preset": "quick", "recording": ["a.npz", "b.npz"], "scene": None, "budget": 0.5}
-    setup = {**asked, "command": "gap", "recordings_sha256": ["12ab"], "start": [0.1, 0.2]}
+    setup = {**asked, "command": "gap", "recordings_sha256": ["12ab"], "start": [0.1, 0.2], "stand_in": False}
     folder = make_gap(tmp_path / "run", "named", setup=setup)
     assert gap_words.settings(read_gap(folder)) == ["preset quick", "recording a.npz, b.npz", "budget 0.5"]
