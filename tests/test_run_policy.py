@@ -274,7 +274,8 @@ def test_films_are_of_the_trials_of_median_angle(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr("droid_jax.report.film.film", film)
     monkeypatch.setattr("droid_jax.policy.transfer.filmed", lambda policy, robot, number: number)
     robot: Any = SimpleNamespace(scene=SimpleNamespace(visual_model=lambda: None), task=Task())
-    _film(tmp_path, None, robot, trials)  # type: ignore[arg-type]
+    why = _film(tmp_path, None, robot, trials)  # type: ignore[arg-type]
+    assert why is None if opengl else str(why).startswith("no OpenGL here; ")
     assert made == ({"good.webp": 2, "bad.webp": 4} if opengl else {})
     assert ("no films: no OpenGL here" in capsys.readouterr().err) is not opengl
 

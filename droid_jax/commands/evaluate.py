@@ -92,8 +92,7 @@ def run(command: Evaluate) -> None:
     inside.check()
     outside.check()
     with new_folder(folder / FILMS) as films:  # those of an earlier policy stay until these are there
-        if command.film:
-            _film(films, policy, robot, outside)
+        no_films = _film(films, policy, robot, outside) if command.film else "they were not asked for (--no-film)"
     content = {
         "simulation": inside.to_json(),
         "stand_in": outside.to_json(),
@@ -101,6 +100,7 @@ def run(command: Evaluate) -> None:
             "truth": truth,
             "hidden": [{**dataclasses.asdict(a), "unit": HIDDEN[a.name].unit} for a in robot.hidden],
         },
+        "no_films": no_films,
         "setup": setup_now,
         "versions": runtime.versions(),
         "device": runtime.device(),
@@ -164,10 +164,10 @@ def _robot(command: Evaluate, trained: Mapping[str, Any], env: DoorEnv) -> tuple
     return stand_in(scene, env.start, truth, listed(hidden_effects(own["hide"], scene)), env.task, config), truth
 
 
-def _film(folder: Path, policy: Policy, robot: TrialRobot, found: Trials) -> None:
+def _film(folder: Path, policy: Policy, robot: TrialRobot, found: Trials) -> str | None:
     """good.webp and bad.webp: of the trials that succeeded and of those that failed, the one of median angle.
 
-    Trials that blew up are no failures.
+    Trials that blew up are no failures.  Returns why nothing could be drawn, where nothing could.
     """
     import numpy as np
 
@@ -185,4 +185,5 @@ def _film(folder: Path, policy: Policy, robot: TrialRobot, found: Trials) -> Non
             film(path, robot.scene.visual_model(), [filmed(policy, robot, number)], robot.task.control)
         except NoOpenGL as error:
             print(f"no films: {error}", file=sys.stderr)
-            return
+            return f"{error}; `evaluate --again` tries once more"
+    return None if any(map(len, chosen.values())) else "every trial blew up"

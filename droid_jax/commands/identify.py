@@ -13,7 +13,7 @@ from droid_jax.commands import report
 from droid_jax.commands.folder import begin, fingerprints, finished, kept_recordings, setup_of
 from droid_jax.commands.hidden import known_stand_in, settled
 from droid_jax.commands.own_effects import load_effects
-from droid_jax.commands.pictures import draw
+from droid_jax.commands.pictures import draw, keep_replay
 from droid_jax.commands.presets import TIMESTEP, Preset, refine_config, search_config, warn_of_cpu
 from droid_jax.commands.scenes import compared, needs_log, needs_recording, needs_scene, own_scene, recording_at
 
@@ -108,6 +108,7 @@ def run(command: Identify) -> None:
     needs_log(command.motion_cutoff, given)
     setup = {**setup_of(command), **fingerprints(scene, space if nuisances is None else space + nuisances, given)}
     if finished(out, setup, command.again):
+        draw(out, scene)  # where OpenGL was missing, or drawing was stopped
         report.run(report.Report(out))
         return
     config = config_of(command)
@@ -148,11 +149,12 @@ def run(command: Identify) -> None:
             "setup": setup,
         }
         progress("sample", None)
+        keep_replay(out, found, recordings[0])
         write_run(
             out, found, description, truth=truth, samples=lambda: cost_samples(found, config.samples, config.seed),
             notes=filter(None, (open_loop(scene, recording) for recording in recordings)),
         )  # fmt: skip
-    draw(out, found, recordings[0])
+    draw(out, scene)
     report.run(report.Report(out))
     _summary(found, json.loads((out / "fit.json").read_text()))
 

@@ -12,24 +12,24 @@ from droid_jax.report.files import FILMS, REPLAY, REPLAY_FILM
 if TYPE_CHECKING:
     from droid_jax.identify.pipeline import Identified
     from droid_jax.measure.recording import Recording
+    from droid_jax.model.scene import Scene
 
 RATE = 25.0  # states per second
 AT = (0.0, 0.33, 0.6, 1.0)  # of the motion, where a frame is taken
+FRAMES = "frames"
 
 
-def draw(out: Path, found: Identified, recording: Recording) -> None:
-    """Replay a recording's commands in plain C before and after the fit: replay.npz, films/ and frames/.
+def keep_replay(out: Path, found: Identified, recording: Recording) -> None:
+    """Replay a recording's commands in plain C before and after the fit, into replay.npz.
 
-    Those of an earlier fit in this folder are removed first.  Without OpenGL only the states are written, and the
-    report says that there are no pictures.  A recording without commands has no replay to show.
+    It and the pictures of an earlier fit in this folder are removed first.  A recording without commands has no replay
+    to show.
     """
     import numpy as np
 
     from droid_jax.compare.replay import make_drive
     from droid_jax.measure.engine import poses
     from droid_jax.model.physics import make_c_model
-    from droid_jax.report.film import film
-    from droid_jax.report.render import NoOpenGL, frames, save_frames
     from droid_jax.storage import write_npz
 
     _forget(out)
@@ -43,20 +43,38 @@ def draw(out: Path, found: Identified, recording: Recording) -> None:
     )
     time = drive.timestep * every * np.arange(len(after))
     write_npz(out / REPLAY, {"time": time, "before": before, "after": after})
-    model = found.scene.visual_model()
-    camera = "front" if "front" in {model.camera(i).name for i in range(model.ncam)} else None
-    rows = [int(f * (len(after) - 1)) for f in AT]
+
+
+def draw(out: Path, scene: Scene) -> None:
+    """Draw what replay.npz holds, as film and frames, where there is one that was not drawn yet.
+
+    Where that cannot be done (no OpenGL, a replay that blew up) it is said, and the page has no pictures.
+    """
+    from droid_jax.report.film import film
+    from droid_jax.report.reading import Reader
+    from droid_jax.report.render import NoOpenGL, frames, save_frames
+    from droid_jax.storage import new_folder
+
+    if not (out / REPLAY).is_file() or (out / FRAMES).is_dir():
+        return
     try:
+        replay = Reader("identify").arrays(out / REPLAY, ("time", "before", "after"))
+        time, before, after = replay["time"], replay["before"], replay["after"]
+        model = scene.visual_model()
+        camera = "front" if "front" in {model.camera(i).name for i in range(model.ncam)} else None
+        rows = [int(f * (len(after) - 1)) for f in AT]
         images = frames(model, after, rows, camera)
-        film(out / FILMS / REPLAY_FILM, model, (before, after), drive.timestep * every, camera)
-    except NoOpenGL as error:
+        period = float(time[1]) if len(time) > 1 else 1.0 / RATE
+        film(out / FILMS / REPLAY_FILM, model, (before, after), period, camera)
+    except (NoOpenGL, ValueError) as error:
         print(f"no pictures: {error}", file=sys.stderr)
         return
-    save_frames(out / "frames", images, [float(time[r]) for r in rows], "after")
+    with new_folder(out / FRAMES) as folder:  # last: it says that all is drawn
+        save_frames(folder, images, [float(time[r]) for r in rows], "after")
 
 
 def _forget(out: Path) -> None:
     """Remove the pictures of an earlier fit."""
     for path in (out / REPLAY, out / FILMS / REPLAY_FILM):
         path.unlink(missing_ok=True)
-    shutil.rmtree(out / "frames", ignore_errors=True)
+    shutil.rmtree(out / FRAMES, ignore_errors=True)

@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 
 LOOK_GROUP = 2
+PICTURE = (480, 640)  # height, width of the largest picture that is drawn
 TINY_FRICTIONLOSS = 1e-6  # N m: enough to give a joint its friction-loss row
 ONE_DEGREE = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
@@ -145,8 +146,11 @@ class Scene:
         return np.array([geom.id for geom in spec.geoms if geom.id not in looks], dtype=int)
 
     def visual_model(self) -> mujoco.MjModel:
-        """The same scene with its looks, for rendering."""
-        return compiled(self.spec)
+        """The same scene with its looks, for rendering; pictures of the usual size fit its offscreen buffer."""
+        model = compiled(self.spec)
+        buffer = model.vis.global_  # the MJCF may ask for a small one
+        buffer.offheight, buffer.offwidth = np.maximum((buffer.offheight, buffer.offwidth), PICTURE)
+        return model
 
     def initial_qpos(self, positions: dict[str, float] | Any) -> np.ndarray:
         """[nq] the model's reference pose with named joints set; unknown names raise."""

@@ -39,7 +39,7 @@ from droid_jax.report.gap_words import (
 )
 from droid_jax.report.lead import lead
 from droid_jax.report.policy_drawings import draw_policy, film_row
-from droid_jax.report.policy_folder import NO_FILMS, Trained, has_policy, read_policy
+from droid_jax.report.policy_folder import Trained, has_policy, read_policy
 from droid_jax.report.policy_words import policy_summary
 from droid_jax.report.run_folder import Run, has_run, read_run
 from droid_jax.report.stages import left_over
@@ -195,5 +195,5 @@ def _policy(trained: Trained) -> dict[str, Any]:
         "policy_summary": policy_summary(trained),
         "policy_drawings": draw_policy(trained),
         "films": film_row(trained),
-        "no_films": NO_FILMS,
+        "no_films": trained.no_films,
     }

@@ -9,7 +9,6 @@ from typing import Any
 
 from droid_jax.report.files import FILMS, TRAINING, TRANSFER
 from droid_jax.report.reading import Reader
-from droid_jax.report.run_folder import OPENGL
 
 _READ = Reader("train")
 _NUMBER = (int, float)
@@ -27,9 +26,6 @@ _TRIALS = {
     **{"angle_deg": _SPREAD, "steps": _SPREAD, "grip": {"mean": _NUMBER}},
 }
 _TRANSFER = {"simulation": _TRIALS, "stand_in": _TRIALS, "robot": {"hidden": [{"name": str, "amplitude": _NUMBER}]}}
-
-
-NO_FILMS = f"No films: {OPENGL}"
 
 
 @dataclass(frozen=True)
@@ -50,6 +46,12 @@ class Trained:
         if self.transfer is None:
             return {}
         return {"simulation": self.transfer["simulation"], "stand-in robot": self.transfer["stand_in"]}
+
+    @property
+    def no_films(self) -> str:
+        """Why there are no films of the trials."""
+        why = (self.transfer or {}).get("no_films") or "none are there"
+        return f"No films: {why}."
 
 
 def has_policy(folder: Path) -> bool:

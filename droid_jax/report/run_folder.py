@@ -38,8 +38,10 @@ _PARAMETER_KEYS = (
 _TRACE_KEYS = ("time", "measured_mean", "measured_low", "measured_high", "before", "after", "joints")
 
 NO_REPLAY = "No pictures: a log without commands has no replay to show."
-OPENGL = "drawing needs OpenGL (Debian, Ubuntu: apt-get install libegl1 libgl1-mesa-dri)."
-NO_OPENGL = f"No pictures: {OPENGL} The replay itself is in replay.npz."
+NOT_DRAWN = (
+    "No pictures: none were drawn, most often for want of OpenGL (Debian, Ubuntu: apt-get install libegl1 "
+    "libgl1-mesa-dri). The command of this run draws them from replay.npz when it is called again, or says why not."
+)
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,7 @@ def read_run(run: Path) -> Run:
     frames = tuple(sorted((run / "frames").glob("*.png")))
     film = run / FILMS / REPLAY_FILM
     if not frames:
-        missing.append(NO_OPENGL if (run / REPLAY).is_file() else NO_REPLAY)
+        missing.append(NOT_DRAWN if (run / REPLAY).is_file() else NO_REPLAY)
     return Run(
         folder=run,
         config=config,

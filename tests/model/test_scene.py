@@ -98,6 +98,15 @@ def test_springs_stiffen_the_hinge():
     assert door_scene(springs=2).visual_model().ngeom == door_scene().visual_model().ngeom + 16
 
 
+@pytest.mark.parametrize(("size", "expected"), [((320, 240), (640, 480)), ((1920, 240), (1920, 480))])
+def test_pictures_fit_the_buffer_of_a_scene_that_asked_for_a_smaller_one(size, expected):
+    asked = f'<mujoco><visual><global offwidth="{size[0]}" offheight="{size[1]}"/></visual><worldbody>'
+    body = '<body name="arm"><joint name="elbow"/><geom size="0.1"/></body>'
+    spec = mujoco.MjSpec.from_string(f"{asked}{body}</worldbody></mujoco>")
+    buffer = compile_scene(spec, "small", joints=["elbow"]).visual_model().vis.global_
+    assert (buffer.offwidth, buffer.offheight) == expected
+
+
 def test_knob_locations_are_five_centimetres_apart():
     distance = []
     for knob in range(4):

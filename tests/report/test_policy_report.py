@@ -115,3 +115,12 @@ def test_trials_that_blew_up_are_said_and_not_counted() -> None:
     }
     said = policy_words._tried("simulation", found, {"held": 0.5, "opened": 0.52})
     assert "in 100 % of 8 trials" in said and f"2 stopped: {BLOWN_UP}" in said
+
+
+def test_the_page_says_why_there_are_no_films(tmp_path: Path):
+    made = make_policy(tmp_path / "run")
+    for picture in (made / "films").iterdir():
+        picture.unlink()
+    content = json.loads((made / "transfer.json").read_text())
+    (made / "transfer.json").write_text(json.dumps({**content, "no_films": "they were not asked for (--no-film)"}))
+    assert "No films: they were not asked for (--no-film)." in read_page(page.write_report(made)).text
