@@ -19,6 +19,8 @@ from droid_jax.commands.hidden import known_stand_in
 from droid_jax.commands.source import stand_in_of
 from droid_jax.measure.formats import load, save
 from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
+from droid_jax.measure.surrogate import SOURCE
+from droid_jax.model.door_scene import door_scene
 from droid_jax.run import main
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -36,7 +38,7 @@ def called(tuned: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list
     return commands
 
 
-def motions(*files: str, repeats: int = 8, commands: bool = True) -> tuple[str, ...]:
+def motions(*files: str, repeats: int = 8, commands: bool = True, **meta: str) -> tuple[str, ...]:
     """Recordings of the built-in arm's first joint, each of another motion; the files' names."""
     time = np.arange(400) * 0.01
     rng = np.random.default_rng(0)
@@ -57,6 +59,7 @@ def motions(*files: str, repeats: int = 8, commands: bool = True) -> tuple[str, 
             },
             torque=TorqueConvention(TorqueSide.MOTOR, False),
             qpos0={},
+            meta=meta,
         )
         save(recording, file)
     return files
@@ -238,20 +241,36 @@ def test_your_own_recordings_know_no_stand_in(called, tmp_path: Path):
 def test_a_stand_in_left_over_in_the_folder_is_not_the_robot_of_your_recordings(tmp_path: Path, monkeypatch):
     """`all` made recordings of its own before: the same names do not make them those of the fit."""
     monkeypatch.chdir(tmp_path)
-    motions("a.npz", "b.npz")
     made, stage = tmp_path / "recordings", tmp_path / "identify"
     made.mkdir()
     stage.mkdir()
     (made / "stand_in.json").write_text(json.dumps({"springs": 1, "seed": 0, "hide": []}))
-    own = [load(Path(name)).sha256 for name in ("a.npz", "b.npz")]
-    told = {"command": "identify", "recording": ["a.npz", "b.npz"], "recordings_sha256": own}
-    (stage / "setup.json").write_text(json.dumps(told))
+
+    def told(recordings: list[str]) -> None:
+        own = {"command": "identify", "recording": ["a.npz", "b.npz"], "recordings_sha256": recordings}
+        (stage / "setup.json").write_text(json.dumps(own))
+
+    for meta, known in (({}, {}), ({"source": SOURCE}, {"springs": 1, "seed": 0, "hide": []})):
+        motions("a.npz", "b.npz", **meta)
+        told([load(Path(name)).sha256 for name in ("a.npz", "b.npz")])
+        assert stand_in_of(stage) == {}
+        for name in ("a.npz", "b.npz"):
+            (tmp_path / name).rename(made / name)
+        assert stand_in_of(stage) == known  # moved with the folder; a robot's own may be copied there
+    told(["another", "two"])
     assert stand_in_of(stage) == {}
-    for name in ("a.npz", "b.npz"):
-        (tmp_path / name).rename(made / name)
-    assert stand_in_of(stage) == {"springs": 1, "seed": 0, "hide": []}  # moved with the folder
-    (stage / "setup.json").write_text(json.dumps({**told, "recordings_sha256": ["another", "two"]}))
-    assert stand_in_of(stage) == {}
+
+
+@pytest.mark.parametrize(("meta", "known"), [({"source": SOURCE}, True), ({}, False)])
+def test_a_robots_own_recording_beside_a_stand_ins_has_no_known_truth(
+    tmp_path: Path, meta: dict[str, str], known: bool
+):
+    own = tmp_path / "mine.npz"
+    motions(str(own), **meta)
+    (tmp_path / "stand_in.json").write_text(json.dumps({"springs": 1, "seed": 0, "hide": []}))
+    command = identify.Identify(recording=(own,))
+    _, truth = identify._recordings(command, door_scene(), tmp_path, [load(own)])
+    assert (truth is not None) == known
 
 
 def test_nothing_is_recorded_for_stages_that_need_no_recording(called, tmp_path: Path):

@@ -229,10 +229,11 @@ def _recordings(
 ) -> tuple[list[Recording], dict[str, float] | None]:
     """The given recordings, or the stand-in's (kept in the run's folder); with its hidden truth where that is known."""
     from droid_jax.measure.formats import load
-    from droid_jax.measure.surrogate import stand_in_truth
+    from droid_jax.measure.surrogate import is_stand_in, stand_in_truth
 
-    if given:
-        known = {} if command.scene else known_stand_in(command.recording)
+    if given:  # a robot's own may lie beside what is known of a stand-in
+        stand_in = command.scene is None and all(is_stand_in(r) for r in given)
+        known = known_stand_in(command.recording) if stand_in else {}
         return given, stand_in_truth(scene, known["springs"], known["seed"]) if known else None
     from droid_jax.measure.demonstration import demonstration_path
     from droid_jax.measure.surrogate import record

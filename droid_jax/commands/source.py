@@ -103,13 +103,15 @@ def stand_in_of(folder: Path | None) -> dict[str, Any]:
 
 
 def _hold(paths: Sequence[str | Path], hashes: Sequence[str]) -> bool:
-    """Whether these files are there and hold the recordings of these hashes: others may have their names."""
+    """Whether these files are there and hold a stand-in's recordings of these hashes: others may have their names."""
     from droid_jax.measure.formats import load
+    from droid_jax.measure.surrogate import is_stand_in
 
     try:
-        return [load(path).sha256 for path in paths] == list(hashes)
+        recordings = [load(path) for path in paths]
     except (OSError, ValueError):
         return False
+    return [r.sha256 for r in recordings] == list(hashes) and all(map(is_stand_in, recordings))
 
 
 def needs_brax() -> None:
