@@ -26,7 +26,7 @@ import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 
-from benchmarks.common import origin  # noqa: E402
+from benchmarks.common import origin, stem  # noqa: E402
 from droid_jax.measure.recording import Recording  # noqa: E402
 from droid_jax.model.scene import with_options  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
@@ -99,7 +99,7 @@ def main() -> None:
         print(f"door {number}: {found[-1].get('sentence', found[-1].get('error'))}", flush=True)
     keys = ("verdict", "sentence", "effects", "p", "gaps", "floor", "seconds", "code")
     result["cases"] = [{k: c.get(k) for k in keys} for c in found]
-    write_json(arguments.out / "cone_mismatch.json", result)
+    write_json(arguments.out / f"{stem('cone_mismatch', arguments.quick)}.json", result)
     print(json.dumps({"torque_difference": [round(d, 3) for d in difference], "said": [c["verdict"] for c in found]}))
 
 

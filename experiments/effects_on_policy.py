@@ -1,7 +1,7 @@
 """Which missing effects does a policy notice?  One policy that knows of none, on robots that hide one each.
 
     python experiments/effects_on_policy.py [--quick] [--out DIR] [--springs 0] [--trials 12]
-    python experiments/effects_on_policy.py --policy runs/train/policy.npz --hide closer=2 grip_compliance=0.01
+    python experiments/effects_on_policy.py --policy runs/train/policy.npz --hide closer=2 payload=0.5 --out runs/felt
 
 A policy is trained on draws of the prior, unless one is given.  Then the stand-in robot hides each effect of the blind
 suite in turn, at the largest amplitude that is usual and at three times that, and the policy is tried on it; and it is
@@ -46,7 +46,7 @@ from droid_jax.policy.task import Task  # noqa: E402
 from droid_jax.policy.transfer import TransferConfig, check_playable, stand_in, transfer  # noqa: E402
 from droid_jax.report.files import POLICY  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
-from experiments.policies.cases import TIMESTEP, Case, Options, finish, run_all  # noqa: E402
+from experiments.policies.cases import RESULTS, TIMESTEP, Case, Options, finish, run_all  # noqa: E402
 from experiments.policies.robots import truth_of  # noqa: E402
 from experiments.policies.settings import Setting, setting_of  # noqa: E402
 from experiments.policies.table import column  # noqa: E402
@@ -140,8 +140,15 @@ def sha256(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
+def needs_out(arguments: Arguments) -> None:
+    """Ends the program where another policy's or other effects' table would be written over the pilot's."""
+    if (arguments.policy or arguments.hide) and not arguments.quick and arguments.out == RESULTS:
+        raise SystemExit("error: --policy and --hide make another table than the one that is kept: give --out DIR")
+
+
 def main() -> None:
     arguments, code = tyro.cli(Arguments, description=__doc__), origin(0)
+    needs_out(arguments)
     setting = replace(setting_of("paper", arguments.robot), springs=arguments.springs)
     path = arguments.policy or trained(arguments, setting, code)
     policy = load(path)

@@ -29,7 +29,7 @@ import subprocess  # noqa: E402
 
 import tyro  # noqa: E402
 
-from benchmarks.common import origin  # noqa: E402
+from benchmarks.common import origin, stem  # noqa: E402
 from droid_jax.storage import write_json, write_text  # noqa: E402
 from experiments.blind.cases import FACTORS, Counts, plans  # noqa: E402
 from experiments.blind.draws import commit_of  # noqa: E402
@@ -63,7 +63,7 @@ class Limits:
     kept: Path = RUNS / "limits"
     """Folder of what is known so far of each robot: a run that was stopped goes on."""
     quick: bool = False
-    """One robot, one effect."""
+    """One robot, one effect; into a file of its own."""
 
 
 @dataclass(frozen=True)
@@ -136,14 +136,15 @@ Command = Limits | Make | Search | Oracle | Score | All
 
 def run_limits(command: Limits) -> dict[str, Any]:
     """Write every scene's limits as soon as they are known."""
+    out = command.out.with_stem(stem(command.out.stem, command.quick))
     effects = QUICK_EFFECTS if command.quick else command.effects
     for name in command.scenes:
         where = setting(name, command.kept / "door")
         found = scene_limits(where, 1 if command.quick else command.draws, command.kept, effects, _tell)
-        known = json.loads(command.out.read_text()) if command.out.is_file() else {"scenes": {}}
+        known = json.loads(out.read_text()) if out.is_file() else {"scenes": {}}
         scenes = {**known["scenes"], name: {**known["scenes"].get(name, {}), **found}}
-        write_json(command.out, {**origin(0), "scenes": scenes})
-    return {"file": command.out.name, "limits": {n: len(scenes[n]) for n in command.scenes}}
+        write_json(out, {**origin(0), "scenes": scenes})
+    return {"file": out.name, "limits": {n: len(scenes[n]) for n in command.scenes}}
 
 
 def run_make(command: Make) -> dict[str, Any]:

@@ -488,3 +488,12 @@ def test_a_search_is_given_the_cases_alone(tmp_path: Path, monkeypatch: pytest.M
     assert given == [tmp_path / "cases", tmp_path / "results"]
     with pytest.raises(SystemExit, match="no case below"):
         hidden_effects.run_search(hidden_effects.Search((tmp_path,), results=tmp_path / "results"))
+
+
+@pytest.mark.parametrize(("quick", "name"), [(True, "limits_quick.json"), (False, "limits.json")])
+def test_a_quick_limit_is_not_written_among_those_that_count(tmp_path: Path, monkeypatch, quick: bool, name: str):
+    module = hidden_effects
+    monkeypatch.setattr(module, "setting", lambda *_: None)
+    monkeypatch.setattr(module, "scene_limits", lambda *_: {"closer": 1.0})
+    module.run_limits(module.Limits(("hinge",), out=tmp_path / "limits.json", kept=tmp_path, quick=quick))
+    assert [path.name for path in tmp_path.iterdir()] == [name]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib
 import itertools
@@ -324,6 +325,22 @@ def test_an_effect_that_no_policy_can_be_tried_with_is_refused_before_the_search
     module.playable(module.Arguments())
     with pytest.raises(SystemExit, match="error: hidden effects command_delay change whole traces"):
         module.playable(module.Arguments(hide=("command_delay=0.01",)))
+
+
+@pytest.mark.parametrize(
+    ("options", "kept"),
+    [
+        ({}, True),
+        ({"hide": ("closer=2",)}, False),
+        ({"policy": Path("policy.npz")}, False),
+        ({"hide": ("closer=2",), "out": Path("mine")}, True),
+        ({"hide": ("closer=2",), "quick": True}, True),
+    ],
+)
+def test_another_table_of_felt_effects_is_not_written_over_the_pilots(options: dict[str, Any], kept: bool):
+    module = importlib.import_module("experiments.effects_on_policy")
+    with contextlib.nullcontext() if kept else pytest.raises(SystemExit, match="give --out DIR"):
+        module.needs_out(module.Arguments(**options))
 
 
 def test_a_policy_is_tried_with_every_effect_that_a_closed_loop_can_have():
