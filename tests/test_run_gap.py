@@ -421,11 +421,13 @@ def test_a_run_goes_on_after_a_stop_and_is_whole(
     (events,) = (out / "tensorboard").iterdir()
     assert b"refine/mean_square" in events.read_bytes()
 
+    setup = json.loads((out / "setup.json").read_text())
+    (out / "setup.json").write_text(json.dumps({**setup, "versions": {**setup["versions"], "jax": "0.0.1"}}))
     monkeypatch.setattr(missing, "find", find)
     monkeypatch.setattr(missing, "base_fit", lambda *a: pytest.fail("the base fit was kept"))
     assert main(command) == 0
     said = capsys.readouterr().out
-    assert "holds this run unfinished; going on" in said
+    assert "holds this run unfinished; going on with other code than it was begun with (jax 0.0.1 -> " in said
     lines = said.splitlines()[-6:]
     assert lines[0] == "The model lacks: hinge_preload at door."
     assert re.fullmatch(r"hinge_preload at door: hinge preload \S+ N m, \S+ to \S+ N m \(90 % interval\)", lines[1])

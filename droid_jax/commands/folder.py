@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 RUNS = Path("runs")  # where results go unless --out says otherwise
 BEGUN = set[Path]()  # folders of the runs that this process began
 HASHED = ("own_effects", "extended")  # options whose file is in no other hash of a setup
+CODE = "versions"  # in setup.json: of the code that began the run, which others may go on with
 PATHS = ("recording", "scene", "parameters", "fit", "run", *HASHED)  # beside each a setup holds what the file says
 
 
@@ -57,8 +58,8 @@ def fingerprints(scene: Scene, space: Space, recordings: Iterable[Recording]) ->
 
 
 def changed(before: Mapping[str, Any], setup: Mapping[str, Any]) -> list[str]:
-    """What differs between two setups; where a file lies does not count, what it says does."""
-    return sorted(k for k in {*before, *setup} - {*PATHS} if before.get(k) != setup.get(k))
+    """What differs between two setups; where a file lies does not count, what it says does; nor does the code."""
+    return sorted(k for k in {*before, *setup} - {CODE, *PATHS} if before.get(k) != setup.get(k))
 
 
 class OtherRun(ValueError):
@@ -71,6 +72,8 @@ class OtherRun(ValueError):
 
 def finished(out: Path, setup: dict[str, Any], again: bool, last: str = "config.json") -> bool:
     """True where the folder holds this very run, whole: with `last`, the file that is written last.
+
+    Says so where a run goes on with other code than it was begun with.
 
     Raises OtherRun for a folder with another run in it.
     """
@@ -85,21 +88,32 @@ def finished(out: Path, setup: dict[str, Any], again: bool, last: str = "config.
     if other:
         raise OtherRun(out, other)
     if not (out / last).is_file():
-        print(f"{out} holds this run unfinished; going on")
+        print(f"{out} holds this run unfinished; going on{_with_other_code(before)}")
         return False
     print(f"{out} holds this run already; its report is built again (start over with --again)")
     return True
 
 
+def _with_other_code(before: Mapping[str, Any]) -> str:
+    """What of the code that began a run has changed since, in words; empty where nothing has, or nobody knows."""
+    from droid_jax import runtime
+
+    old, new = before.get(CODE, {}), runtime.versions()
+    other = [f"{name} {old.get(name, 'none')} -> {new.get(name, 'none')}" for name in {**old, **new}
+             if old and old.get(name) != new.get(name)]  # fmt: skip
+    return f" with other code than it was begun with ({', '.join(other)}; --again starts over)" if other else ""
+
+
 def begin(out: Path, setup: dict[str, Any], again: bool, last: str = "config.json") -> None:
     """Only now, with all input read, forget an earlier run where that was asked for, and say what runs here."""
+    from droid_jax import runtime
     from droid_jax.storage import write_json
 
     if again:
         for name in ("checkpoints", "tensorboard"):
             shutil.rmtree(out / name, ignore_errors=True)
         (out / last).unlink(missing_ok=True)
-    write_json(out / "setup.json", setup)
+    write_json(out / "setup.json", {**setup, CODE: runtime.versions()})
     BEGUN.add(out)
 
 
