@@ -195,6 +195,20 @@ def test_another_stand_in_is_recorded_anew(called, tmp_path: Path):
         assert [file.is_file() for file in files] == [kept] * 2
 
 
+@pytest.mark.parametrize("name", ["all.json", "recordings/stand_in.json", "gap/gap.json"])
+@pytest.mark.parametrize("text", ["{", "[]"])
+def test_a_damaged_file_is_named(called, tmp_path: Path, name: str, text: str):
+    run = tmp_path / "run"
+    found(run / "gap", ["latch at door_hinge"])
+    (run / name).parent.mkdir(exist_ok=True)
+    (run / name).write_text(text)
+    with pytest.raises(ValueError, match=f"{name} "):
+        if name == "all.json":
+            whole._remember(whole.All(), run)
+        else:
+            whole.told(run)
+
+
 def test_another_runs_results_are_not_written_over(called, capsys):
     """They may have taken hours; what is left out, or tried more often, makes no other run."""
     assert main(["all", "--preset", "paper"]) == 0

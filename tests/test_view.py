@@ -61,6 +61,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
+def test_a_replay_that_was_cut_off_is_named(folder: Path, tmp_path: Path):
+    whole = (folder / REPLAY).read_bytes()
+    (tmp_path / REPLAY).write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ValueError, match=f"{REPLAY} cannot be read .*identify --again"):
+        replay_of(tmp_path)
+
+
 def test_the_two_stand_side_by_side_and_move_as_they_did(folder: Path):
     clock, states = replay_of(folder)
     (model, moved), one = side_by_side(folder / FITTED), mujoco.MjModel.from_xml_path(str(folder / FITTED))

@@ -64,11 +64,16 @@ def run(command: View) -> None:
 
 
 def replay_of(folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Times [K] s, and the states before and after the fit beside each other [K, 2 nq]."""
+    """Times [K] s, and the states before and after the fit beside each other [K, 2 nq].
+
+    Raises ValueError where the file cannot be read.
+    """
     import numpy as np
 
-    with np.load(folder / REPLAY) as file:
-        return file["time"], np.concatenate([file["before"], file["after"]], axis=1)
+    from droid_jax.report.reading import Reader
+
+    replay = Reader("identify --again").arrays(folder / REPLAY, ("time", "before", "after"))
+    return replay["time"], np.concatenate([replay["before"], replay["after"]], axis=1)
 
 
 def side_by_side(mjcf: Path) -> tuple[mujoco.MjModel, np.ndarray]:

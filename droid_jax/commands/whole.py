@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import time
 import typing
 from collections.abc import Callable, Sequence
@@ -309,4 +308,7 @@ def _stage(run_stage: Callable[[Any], None], command: Any) -> None:
 
 
 def _json(path: Path) -> dict[str, Any] | None:
-    return json.loads(path.read_text()) if path.is_file() else None
+    """What a stage left, or the run itself; None where it did not.  ValueError where it cannot be read."""
+    from droid_jax.report.reading import Reader
+
+    return Reader("all --again").json(path) if path.is_file() else None

@@ -12,7 +12,6 @@ training.json.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -41,6 +40,7 @@ from droid_jax.report.lead import lead
 from droid_jax.report.policy_drawings import draw_policy, film_row
 from droid_jax.report.policy_folder import Trained, has_policy, read_policy
 from droid_jax.report.policy_words import policy_summary
+from droid_jax.report.reading import Reader
 from droid_jax.report.run_folder import Run, has_run, read_run
 from droid_jax.report.stages import left_over
 from droid_jax.report.words import grouped, hidden_words, judged, label, like, number, percent, speaker, summary
@@ -112,8 +112,12 @@ def write_report(run: Path) -> Path:
 
 def hidden_in(folder: Path) -> list[str]:
     """What the stand-in robot hid that was recorded into a run's folder: "name=amplitude" each."""
-    path = folder / "recordings" / STAND_IN
-    return json.loads(path.read_text())["hide"] if path.is_file() else []
+    path, read = folder / "recordings" / STAND_IN, Reader("all")
+    if not path.is_file():
+        return []
+    known = read.json(path)
+    read.need(known, ("hide",), STAND_IN)
+    return known["hide"]
 
 
 def _part(places: Sequence[Path], has: Callable[[Path], bool]) -> Path | None:

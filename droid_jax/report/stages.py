@@ -14,11 +14,12 @@ from droid_jax.report.files import EXTENDED, GAUSSIAN, LAST_FILES
 
 
 def setup(folder: Path) -> dict[str, Any]:
-    """setup.json of a run's folder; empty where there is none."""
+    """setup.json of a run's folder; empty where there is none that can be read."""
     try:
-        return json.loads((folder / "setup.json").read_text())
+        told = json.loads((folder / "setup.json").read_text())
     except (OSError, ValueError):
         return {}
+    return told if isinstance(told, dict) else {}
 
 
 def unfinished(folder: Path) -> bool:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from droid_jax.report.reading import Reader
+from droid_jax.report.stages import needs_whole
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -38,6 +39,7 @@ def frames(folder: str | Path) -> Frames:
 
     folder = Path(folder)
     at = next((f for f in (folder, folder / "identify") if (f / "samples.csv").is_file()), folder)
+    needs_whole(at)
     try:
         return Frames(pd.read_csv(at / "samples.csv"), pd.read_csv(at / "history.csv", index_col="generation"))
     except (OSError, ValueError) as error:

@@ -10,7 +10,7 @@ import pytest
 
 from droid_jax.gap import extended
 from droid_jax.report.files import EXTENDED, GAUSSIAN, LAST_FILES
-from droid_jax.report.stages import extended_of, fingerprint, left_over, needs_whole, unfinished
+from droid_jax.report.stages import extended_of, fingerprint, left_over, needs_whole, setup, unfinished
 
 
 def run(whole: Path, stage: str, last: bool = True, files: dict[str, str] | None = None, **setup: Any) -> Path:
@@ -62,6 +62,12 @@ def test_a_run_is_whole_with_what_is_written_last(tmp_path: Path, stage: str):
     assert not unfinished(folder)
     (tmp_path / GAUSSIAN).write_text("given by hand")
     assert not unfinished(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "7"])
+def test_a_damaged_setup_tells_nothing(tmp_path: Path, text: str):
+    (tmp_path / "setup.json").write_text(text)
+    assert setup(tmp_path) == {} and extended_of(tmp_path) is None
 
 
 def test_the_extended_model_is_the_folders_own_or_the_one_that_was_fitted(tmp_path: Path):

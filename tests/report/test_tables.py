@@ -28,6 +28,15 @@ def test_the_tables_of_a_fit(tmp_path: Path, below: str):
     assert found.history.loc[2, "best_cost"] == 0.4 and list(found.history.columns) == HISTORY[1:]
 
 
+def test_tables_of_an_earlier_run_are_not_those_of_one_that_is_not_whole(tmp_path: Path):
+    pytest.importorskip("pandas")
+    (fit(tmp_path) / "setup.json").write_text('{"preset": "quick"}')
+    with pytest.raises(ValueError, match="holds a run that is not whole"):
+        dj.frames(tmp_path)
+    (tmp_path / "config.json").write_text("{}")
+    assert len(dj.frames(tmp_path).samples) == 3
+
+
 def test_what_is_missing_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     with pytest.raises(ValueError, match=r"holds no tables of a fit .*run `python -m droid_jax.run identify` again"):
         dj.frames(tmp_path)
