@@ -57,6 +57,8 @@ LIBRARY = {
     "torque_gain": "torque_gain",
     "torque_drift": "torque_drift",
 }
+# On a hinge these have a name of their own there.
+ON_HINGE = {"joint_stribeck": "hinge_stribeck", "joint_directional": "hinge_directional"}
 LONGEST_STEP = 0.00025  # s: the explicit torques of hidden effects want a step this short
 PAUSE = 5.0  # s between repeats, for what warms up or drifts
 

@@ -7,7 +7,8 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from droid_jax.measure.hidden import HIDDEN, LIBRARY
+from droid_jax.measure.hidden import HIDDEN, LIBRARY, ON_HINGE
+from droid_jax.model.builtin import HINGE
 from droid_jax.report.run_folder import Run
 
 # Words before "joint" of which a robot has several: the number alone does not tell its joints apart.
@@ -75,8 +76,9 @@ def hidden_words(hide: Sequence[str]) -> str:
     said = []
     for entry in hide:
         name, _, amplitude = entry.partition("=")
-        effect = HIDDEN.get(name.partition("[")[0])
-        called = LIBRARY.get(name.partition("[")[0])
+        kind, _, joint = name.rstrip("]").partition("[")
+        effect, called = HIDDEN.get(kind), LIBRARY.get(kind, "")
+        called = ON_HINGE.get(called, called) if joint == HINGE else called
         size = f"{amplitude} {effect.unit}".removesuffix(" -") if effect else amplitude
         library = f"in the library: {label(called).lower()}" if called else "the library has no form of it"
         said.append(f"{label(name).lower()} ({size}; {library})")

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.optimize
 
-from droid_jax.measure.hidden import HIDDEN, Applied
+from droid_jax.measure.hidden import HIDDEN, ON_HINGE, Applied
 from droid_jax.model.scene import Scene
 from experiments.blind.scenes import Setting
 
@@ -98,8 +98,6 @@ ANSWERS: dict[str, Answer] = {
     "torque_gain": Answer("torque_gain"),
     "torque_drift": Answer("torque_drift", ("torque_bias",), "it warms up mostly between the repeats"),
 }  # fmt: skip
-# On the hinge these have a name of their own in the library.
-ON_HINGE = {"joint_stribeck": "hinge_stribeck", "joint_directional": "hinge_directional"}
 NO_HINGE = ("cable_pull", "torque_ripple", "dry_friction", "bristle_friction", "warm_up_friction", "load_friction",
             "joint_elasticity", "backlash", "servo_gains")  # fmt: skip
 PLACES = {"command_delay": "commands", "sensor_delay": "sensors", "contact_compliance": "grip"}

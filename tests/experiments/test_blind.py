@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from droid_jax.measure.formats import load
-from droid_jax.measure.hidden import HIDDEN, LIBRARY, Applied, possible
+from droid_jax.measure.hidden import HIDDEN, LIBRARY, ON_HINGE, Applied, possible
 from droid_jax.model.effects.registry import registered
 from droid_jax.model.parameters import Parameter, Space
 from experiments import hidden_effects, null_calibration
@@ -125,6 +125,7 @@ def test_every_hidden_effect_has_an_answer():
     assert set(ANSWERS) == set(HIDDEN)
     assert {name: answer.exact for name, answer in ANSWERS.items() if answer.exact} == LIBRARY  # what users are told
     known = set(registered())
+    assert {*ON_HINGE, *ON_HINGE.values()} <= known
     for name, answer in ANSWERS.items():
         assert {n for n in (answer.exact, *answer.ties) if n} <= known, name
         assert answer.exact or (answer.why and not answer.ties), name

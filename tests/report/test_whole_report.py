@@ -13,6 +13,7 @@ from made_up_whole import make_whole
 from reader import read_page
 
 from droid_jax.report import page
+from droid_jax.report.words import hidden_words
 
 
 @pytest.fixture(scope="module")
@@ -103,3 +104,17 @@ def test_a_stage_alone_has_no_lead(tmp_path: Path):
     made = make_policy(tmp_path / "run" / "train")
     page.write_report(made.parent)
     assert 'class="summary lead"' not in (made.parent / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("hidden", "called"),
+    [
+        ("stribeck_friction[hinge]=1", "hinge stribeck"),
+        ("directional_friction[hinge]=1", "hinge directional"),
+        ("stribeck_friction[panda_joint2]=1", "joint stribeck"),
+        ("stribeck_friction=1", "joint stribeck"),
+        ("dry_friction[hinge]=1", "joint coulomb"),
+    ],
+)
+def test_what_was_hidden_is_called_as_the_library_does_there(hidden: str, called: str):
+    assert f"in the library: {called})" in hidden_words([hidden])
