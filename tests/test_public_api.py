@@ -78,7 +78,7 @@ def test_tune_can_follow_any_import_that_does_not_start_jax():
 
 
 def test_every_public_name_is_there_and_kept():
-    assert len(set(dj.__all__)) == len(dj.__all__) == 24
+    assert len(set(dj.__all__)) == len(dj.__all__) == 25
     for name in dj.__all__:
         assert getattr(dj, name) is getattr(dj, name)
         assert name in dir(dj)

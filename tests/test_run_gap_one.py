@@ -133,10 +133,10 @@ def found(run: tuple[Path, str]) -> GapFiles:
 
 
 def test_a_log_is_searched_and_its_limits_are_said(run: tuple[Path, str], found: GapFiles):
-    lines = run[1].splitlines()[-6:]
+    lines = run[1].splitlines()[-7:]
     assert lines[0] == "The model lacks: joint_coulomb at elbow."
-    assert "closed), sealed " in lines[2] and lines[3] == Split.BLOCKS.limits == found.answer["split"]["limits"]
-    assert found.answer["split"]["by"] == "blocks" and "nothing tells a place from noise" in lines[3]
+    assert "closed), sealed " in lines[3] and lines[4] == Split.BLOCKS.limits == found.answer["split"]["limits"]
+    assert found.answer["split"]["by"] == "blocks" and "nothing tells a place from noise" in lines[4]
     (amplitude,) = found.answer["amplitudes"]
     assert amplitude["low"] < COULOMB < amplitude["high"] and amplitude["value"] == pytest.approx(COULOMB, rel=0.1)
     assert found.answer["floor"] == 0.0 and set(found.answer["seconds"]) == set(IN_BLOCKS)
@@ -194,8 +194,8 @@ def test_the_second_half_of_the_repeats_confirms(
     monkeypatch.setattr(gap, "config_of", lambda command: SEARCH)
     whole = elbow_log(COULOMB, seconds=12.0, repeats=16)
     assert main(command(tmp_path, [whole], "--effects", "joint_coulomb", "cable_pull")) == 0
-    lines = capsys.readouterr().out.splitlines()[-6:]
-    assert lines[0] == "The model lacks: joint_coulomb at elbow." and lines[3] == Split.REPEATS.limits
+    lines = capsys.readouterr().out.splitlines()[-7:]
+    assert lines[0] == "The model lacks: joint_coulomb at elbow." and lines[4] == Split.REPEATS.limits
     answer = json.loads((tmp_path / "run" / "gap.json").read_text())
     assert answer["split"] == {"by": "repeats", "limits": Split.REPEATS.limits}
     names = {role: g["recording"] for role, g in answer["gaps"].items()}

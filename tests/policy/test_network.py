@@ -99,7 +99,7 @@ def rewritten(path: Path, change) -> None:
         ),
         (
             lambda path: rewritten(path, lambda found: found["mean"].fill(np.nan)),
-            "mean hold values that are no",
+            "mean hold NaN, infinite values or text",
         ),
     ],
 )
