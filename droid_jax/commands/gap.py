@@ -123,6 +123,7 @@ def run(command: Gap) -> None:
     if not given:
         assert command.springs is not None  # settled
         roles = record_stand_in(scene, hidden, out, command.springs, command.seed, command.again)
+    print("compiling the replay ...", flush=True)
     case = case_of(split, scene, base, effects, roles, config)
     begin(out, setup, command.again, "gap.json")  # and only now, with all of it found good
     if command.again:

@@ -115,6 +115,7 @@ def run(command: Identify) -> None:
     _needs_demonstrations(command, given)
     prepare_folder(out)  # only now, with all input read
     recordings, truth = _recordings(command, scene, out, given)
+    print("compiling the replay ...", flush=True)
     problem = prepare(scene, space, recordings, nuisances=nuisances, config=config, **effects)
     begin(out, setup, command.again)  # and only now, with all of it found good
     started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
