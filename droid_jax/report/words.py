@@ -18,8 +18,7 @@ JUDGED = {  # by `judged` of a fit.json's gap
     "time": "on the last part of the log, which the fit did not see",
     "same": "on its one repeat, which was fitted too",
 }
-
-
+RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")  # digits of an exponent
 FAR = 3.0  # floors: a fit that leaves more, and half of the gap, has another fault than a missing effect
 DOUBT = "check joint order, signs, units and servo gains before anything else"  # of recording and scene
 
@@ -46,7 +45,7 @@ def number(value: float | None, digits: int = 3) -> str:
     size = abs(value)
     if size and not 1e-4 <= size < 1e5:
         mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
-        return f"{mantissa}·10^{int(exponent)}".replace("-", "−")
+        return f"{mantissa}·10".replace("-", "−") + str(int(exponent)).translate(RAISED)
     decimals = max(0, digits - 1 - math.floor(math.log10(size))) if size else 0
     return f"{value:.{decimals}f}".replace("-", "−")
 

@@ -261,7 +261,7 @@ def test_a_missing_key_and_a_wrong_shape_are_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("value", "shown"),
-    [(1.0, "1.00"), (-0.05, "−0.0500"), (0.0, "0"), (12345.6, "12346"), (2e-6, "2.00·10^−6"),
+    [(1.0, "1.00"), (-0.05, "−0.0500"), (0.0, "0"), (12345.6, "12346"), (2e-6, "2.00·10⁻⁶"), (-3.5e12, "−3.50·10¹²"),
      (None, "–"), (float("nan"), "–")],
 )  # fmt: skip
 def test_numbers_are_written_with_three_digits(value: float | None, shown: str) -> None:
