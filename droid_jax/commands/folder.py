@@ -98,9 +98,14 @@ def _with_other_code(before: Mapping[str, Any]) -> str:
     """What of the code that began a run has changed since, in words; empty where nothing has, or nobody knows."""
     from droid_jax import runtime
 
-    old, new = before.get(CODE, {}), runtime.versions()
-    other = [f"{name} {old.get(name, 'none')} -> {new.get(name, 'none')}" for name in {**old, **new}
-             if old and old.get(name) != new.get(name)]  # fmt: skip
+    if not (old := before.get(CODE)):
+        return ""
+    new = runtime.versions()
+    other = [
+        f"{name} {old.get(name, 'none')} -> {new.get(name, 'none')}"
+        for name in {**old, **new}
+        if old.get(name) != new.get(name)
+    ]
     return f" with other code than it was begun with ({', '.join(other)}; --again starts over)" if other else ""
 
 

@@ -223,8 +223,7 @@ def _shut_travel(scene: Scene, recording: Recording, config: CompareConfig) -> f
     """rad (m of a slide): an object that moves less than this stayed shut; None where nothing tells what is little."""
     if scene.object_joint is None:
         return None
-    kind = scene.model.jnt_type[scene.id("joint", scene.object_joint)]
-    least = None if kind == mujoco.mjtJoint.mjJNT_SLIDE else config.shut_angle
+    least = None if scene.slides(scene.object_joint) else config.shut_angle
     if "object_angle" not in recording.channels:
         return least
     angle = recording.channels["object_angle"]

@@ -14,7 +14,7 @@ import numpy as np
 from droid_jax.compare.cost import Cost
 from droid_jax.compare.residuals import Comparison
 from droid_jax.gap.flips import gap_p_values, largest_steady_t, one_sided_p, steady
-from droid_jax.identify.refine import NotReplayed
+from droid_jax.identify.search import NotReplayed
 from droid_jax.measure.noise import coarse_clock
 
 # A parameter off its prior's mean is held back by that prior, and what is left of it all repeats share: with the

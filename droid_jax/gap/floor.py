@@ -13,7 +13,7 @@ from droid_jax.compare.replay import Drive
 from droid_jax.gap.evidence import Evidence
 from droid_jax.gap.refit import Model
 from droid_jax.gap.screen import project
-from droid_jax.identify.refine import NotReplayed
+from droid_jax.identify.search import NotReplayed
 from droid_jax.measure.recording import Recording
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import with_options

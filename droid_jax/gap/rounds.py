@@ -16,7 +16,8 @@ from droid_jax.gap.rank import Proposal, collinear, proposals
 from droid_jax.gap.refit import Model, look, refit
 from droid_jax.gap.screen import Screen
 from droid_jax.gap.select import LESS, MORE, OF_ALL, Trial, judge
-from droid_jax.identify.refine import NotReplayed, RefineConfig
+from droid_jax.identify.refine import RefineConfig
+from droid_jax.identify.search import NotReplayed
 
 T = TypeVar("T")
 Progress = Callable[[str, Any], None]

@@ -14,6 +14,11 @@ from droid_jax.gap.trend import Trend
 HALF = 0.5  # share of the gap: an effect that explains less may only imitate what is missing
 
 
+def open_share(left: float, before: float, floor: float) -> float:
+    """Share of a gap that is left open: of U before and U left, both above the floor."""
+    return (left - floor) / max(before - floor, 1e-12)
+
+
 class Kind(enum.Enum):
     """The answers there are."""
 
@@ -72,14 +77,14 @@ class Verdict:
     def closed(self, role: str) -> float:
         """1 - (U_after - U0) / (U_before - U0) on "fit", "confirm" or "sealed"."""
         before, after = self.gaps[role]
-        return 1.0 - (after - self.floor) / max(before - self.floor, 1e-12)
+        return 1.0 - open_share(after, before, self.floor)
 
     @property
     def explained(self) -> float:
         """Share of the gap on the confirming demonstration that the model, or its fit's uncertainty, explains."""
         before, after = self.gaps["confirm"]
         left = after if self.remainder is None else self.remainder
-        return 1.0 - (left - self.floor) / max(before - self.floor, 1e-12)
+        return 1.0 - open_share(left, before, self.floor)
 
     @property
     def _unsettled(self) -> str:

@@ -17,7 +17,7 @@ from droid_jax.gap.screen import Question, Screen, marks, project, questions_of,
 from droid_jax.gap.select import OF_ALL, SIGNIFICANT
 from droid_jax.gap.transfer import beyond
 from droid_jax.gap.trend import trend
-from droid_jax.gap.verdict import Kind, Verdict
+from droid_jax.gap.verdict import Kind, Verdict, open_share
 from droid_jax.identify.pipeline import grip_hypotheses, starts
 from droid_jax.identify.search import search
 
@@ -140,7 +140,7 @@ def left_over(case: Case, model: Model) -> np.ndarray:
 
 def _open(hunt: Hunt, residuals: np.ndarray) -> float:
     """Share of the gap on the confirming demonstration that these residuals still hold."""
-    return (hunt.case.confirm.gap(residuals) - hunt.floor) / max(hunt.whole_gap - hunt.floor, 1e-12)
+    return open_share(hunt.case.confirm.gap(residuals), hunt.whole_gap, hunt.floor)
 
 
 def _verdict(hunt: Hunt, base: Model, model: Model, rounds: list[Round], quiet: bool) -> Verdict:

@@ -177,9 +177,8 @@ def solve(problem: Problem, *, checkpoints: Path | None = None, progress: Progre
 
     def cost(rows: np.ndarray) -> np.ndarray:
         found = np.asarray(first(full.embed(space, rows)), np.float64)
-        return np.where(
-            found == np.float32(config.compare.non_finite_cost), np.inf, found
-        )  # no parent, whatever others cost
+        blown_up = found == np.float32(config.compare.non_finite_cost)  # no parent, whatever others cost
+        return np.where(blown_up, np.inf, found)
 
     found = search(
         cost,

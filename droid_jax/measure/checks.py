@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from droid_jax.errors import faults
 from droid_jax.measure.clocks import SLACK, check_clock
 from droid_jax.measure.recording import JOINT_CHANNELS, Channel, ObjectPose, Recording, ServoGains
 
@@ -65,15 +66,11 @@ def check_joints(recording: Recording, joints: Sequence[str]) -> None:
     else:
         parts = {}
         have = tuple(dict.fromkeys(j for columns in known.values() for j in columns))
-    missing = [j for j in joints if j not in have]
-    unknown = [j for j in have if j not in joints]
-    if missing or unknown:
+    wrong = faults({"missing:": [j for j in joints if j not in have], "unknown:": [j for j in have if j not in joints]})
+    if wrong:
         what = "command" if parts else "its channels"
-        faults = [
-            f"{word}: {', '.join(names)}" for word, names in (("missing", missing), ("unknown", unknown)) if names
-        ]
         raise ValueError(
-            f"{where}, {what}: expected {len(joints)} joints, got {len(have)}; {'; '.join(faults)}; "
+            f"{where}, {what}: expected {len(joints)} joints, got {len(have)}; {wrong}; "
             f"valid names: {', '.join(joints)}"
         )
     for key, columns in known.items():

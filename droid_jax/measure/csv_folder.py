@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from droid_jax.errors import faults
 from droid_jax.measure.clocks import SLACK, check_clock, resample
 from droid_jax.measure.metadata import Metadata, metadata_from_json, metadata_to_json, recording_of
 from droid_jax.measure.recording import JITTER, Channel, Recording
@@ -151,9 +152,8 @@ def _column_order(path: Path, header: list[str], expected: Sequence[str]) -> lis
         raise ValueError(f"{path}, line 1: expected one named column per joint beside 'time', {what}")
     wanted = list(expected) or names
     missing, unknown = [n for n in wanted if n not in names], [n for n in names if n not in wanted]
-    faults = [f"{word}: {', '.join(some)}" for word, some in (("missing", missing), ("unknown", unknown)) if some]
-    if faults:
-        raise ValueError(f"{path}, line 1: expected {len(wanted)} joint columns, got {len(names)}; {'; '.join(faults)}")
+    if wrong := faults({"missing:": missing, "unknown:": unknown}):
+        raise ValueError(f"{path}, line 1: expected {len(wanted)} joint columns, got {len(names)}; {wrong}")
     return [1 + names.index(n) for n in wanted]
 
 

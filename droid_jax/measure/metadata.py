@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from droid_jax.errors import faults
 from droid_jax.measure.recording import (
     Channel,
     ObjectPose,
@@ -147,9 +148,8 @@ def _keys(raw: Any, kind: str, where: str) -> dict[str, Any]:
         raise ValueError(f"{where}: expected an object with {', '.join(valid)}, got {raw!r}")
     unknown = sorted(set(raw) - set(valid))
     missing = [key for key in required if key not in raw]
-    faults = [f"{word} keys: {', '.join(keys)}" for word, keys in (("unknown", unknown), ("missing", missing)) if keys]
-    if faults:
-        raise ValueError(f"{where}: {'; '.join(faults)}; valid keys: {', '.join(valid)}")
+    if wrong := faults({"unknown keys:": unknown, "missing keys:": missing}):
+        raise ValueError(f"{where}: {wrong}; valid keys: {', '.join(valid)}")
     return raw
 
 

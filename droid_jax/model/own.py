@@ -28,6 +28,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from droid_jax.errors import faults
 from droid_jax.model.door import time_offset
 from droid_jax.model.fields import body_mass, model_parameter, servo_scale
 from droid_jax.model.joint_friction import sensor_parameter
@@ -80,9 +81,8 @@ def _parameter(scene: Scene, entry: Any, where: str) -> Parameter:
     if sum(kind in entry for kind in ("field", "sensor", "servo")) != 1:
         missing.insert(0, "one of field, sensor and servo")
     unknown = [k for k in entry if k not in _KNOWN]
-    faults = [f"{word} {', '.join(keys)}" for word, keys in (("missing", missing), ("unknown", unknown)) if keys]
-    if faults:
-        raise ValueError(f"{where}: {'; '.join(faults)}; known keys: {', '.join(_KNOWN)}")
+    if wrong := faults({"missing": missing, "unknown": unknown}):
+        raise ValueError(f"{where}: {wrong}; known keys: {', '.join(_KNOWN)}")
     try:
         options = _read(entry)
         field, sensor, servo = (options.pop(kind, None) for kind in ("field", "sensor", "servo"))

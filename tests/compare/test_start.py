@@ -14,7 +14,7 @@ from droid_jax.compare.cost import followed, make_cost
 from droid_jax.compare.replay import make_drive
 from droid_jax.compare.residuals import CompareConfig
 from droid_jax.compare.start import check_range, open_loop
-from droid_jax.measure.recording import Channel
+from droid_jax.measure.recording import Channel, Recording
 from droid_jax.model.fields import joint_damping
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene, compile_scene
@@ -58,36 +58,33 @@ def test_a_recording_that_begins_in_motion_is_warned_of(scene: Scene, late: floa
     assert all("'wave' begins while shoulder moves" in text for text in found)
 
 
+def in_degrees(fine: Recording, measured: bool) -> Recording:
+    """The same motion with its commands, or with measured positions, in degrees."""
+    wrong = np.rad2deg(fine.command)
+    if not measured:
+        return replace(fine, command=wrong)
+    seen = Channel("position", "rad", JOINTS, fine.time, wrong[None].repeat(2, 0), np.ones((2, *wrong.shape), bool))
+    return replace(fine, channels={**fine.channels, "position": seen})
+
+
 @pytest.mark.parametrize("measured", [False, True])
 def test_degrees_are_no_radians(measured: bool):
     xml = ARM.format(gravcomp='gravcomp="1"', friction='limited="true" range="-2 2"', sensor="")
     scene = compile_scene(mujoco.MjSpec.from_string(xml), "arm", joints=JOINTS)
     fine = recording()
     make_cost(scene, SPACE, [fine])
-    wrong = np.rad2deg(fine.command)
-    if measured:
-        seen = Channel("position", "rad", JOINTS, fine.time, wrong[None].repeat(2, 0), np.ones((2, *wrong.shape), bool))
-        wrong = replace(fine, channels={**fine.channels, "position": seen})
-    else:
-        wrong = replace(fine, command=wrong)
     said = "shoulder is measured at" if measured else "elbow is sent to"
     with pytest.raises(ValueError, match=said + r" .* far outside its range -2 \.\. 2 rad: are these degrees"):
-        make_cost(scene, SPACE, [wrong])
+        make_cost(scene, SPACE, [in_degrees(fine, measured)])
 
 
 @pytest.mark.parametrize("measured", [False, True])
 def test_degrees_are_no_radians_of_a_hinge_without_a_range_either(scene: Scene, measured: bool):
     """A wheel may turn often, so it is a warning."""
     fine = recording()
-    wrong = np.rad2deg(fine.command)
-    if measured:
-        seen = Channel("position", "rad", JOINTS, fine.time, wrong[None].repeat(2, 0), np.ones((2, *wrong.shape), bool))
-        wrong = replace(fine, channels={**fine.channels, "position": seen})
-    else:
-        wrong = replace(fine, command=wrong)
     said = "elbow is measured at" if measured else "elbow is sent to"
     with pytest.warns(UserWarning, match=rf"'wave': {said} .* turns: are these degrees\?"):
-        check_range(scene, wrong)
+        check_range(scene, in_degrees(fine, measured))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_range(scene, fine)

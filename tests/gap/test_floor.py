@@ -11,7 +11,7 @@ from small_gap import Small, small
 
 from droid_jax.gap import floor
 from droid_jax.gap.floor import numerical_floor
-from droid_jax.identify.refine import NotReplayed
+from droid_jax.identify.search import NotReplayed
 
 
 @pytest.fixture(scope="module")

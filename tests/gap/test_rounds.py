@@ -12,7 +12,7 @@ from droid_jax.gap.blocks import OUTSIDE, Blocks
 from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.evidence import Evidence
 from droid_jax.gap.rounds import Budget, Hunt, pruned, without
-from droid_jax.identify.refine import NotReplayed
+from droid_jax.identify.search import NotReplayed
 from droid_jax.model.parameters import Parameter, Space
 
 

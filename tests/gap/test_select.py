@@ -15,7 +15,7 @@ from droid_jax.gap.candidates import candidates
 from droid_jax.gap.flips import steady
 from droid_jax.gap.refit import deviations, intervals, refit, vanishing
 from droid_jax.gap.select import UNCONFIRMED, _gap_reasons, judge
-from droid_jax.identify.refine import NotReplayed
+from droid_jax.identify.search import NotReplayed
 
 
 @pytest.fixture(scope="module")
