@@ -7,6 +7,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -81,8 +82,9 @@ def test_it_sees_what_training_saw(scene, start, interface):
     for _ in range(20):
         data = state(scene, start, rng)
         seen = looked(hand_of(scene), data, np.zeros(2), np.zeros((2, 3)), 1.0, np)
-        expected = trained_on(data.qpos[scene.joint_qpos], data.qvel[scene.joint_dofs], seen)
-        np.testing.assert_allclose(control.observe(interface, reading(scene, data)), expected, rtol=1e-6, atol=1e-7)
+        with jax.enable_x64(True):  # what training computes, to as many digits as MuJoCo has
+            expected = trained_on(data.qpos[scene.joint_qpos], data.qvel[scene.joint_dofs], seen)
+        np.testing.assert_allclose(control.observe(interface, reading(scene, data)), expected, atol=1e-9)
 
 
 def test_inside_all_limits_an_action_reaches_from_where_the_joints_are(interface):
