@@ -30,10 +30,11 @@ import tyro  # noqa: E402
 
 from benchmarks.common import origin  # noqa: E402
 from droid_jax import runtime  # noqa: E402
+from droid_jax.gap.anew import base_fit  # noqa: E402
 from droid_jax.gap.candidates import candidates  # noqa: E402
 from droid_jax.gap.screen import questions_of  # noqa: E402
 from droid_jax.gap.select import SIGNIFICANT  # noqa: E402
-from droid_jax.gap.workflow import ask, base_fit, find  # noqa: E402
+from droid_jax.gap.workflow import ask, find  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 from experiments.blind.cases import Plan  # noqa: E402
 from experiments.blind.draws import commit_of, seed_of  # noqa: E402

@@ -13,10 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
+from droid_jax.gap.anew import base_fit
 from droid_jax.gap.case import Case, GapConfig, make_case
 from droid_jax.gap.refit import Model
 from droid_jax.gap.verdict import Verdict
-from droid_jax.gap.workflow import base_fit, find
+from droid_jax.gap.workflow import find
 from droid_jax.identify.refine import RefineConfig
 from droid_jax.identify.search import SearchConfig
 from droid_jax.measure.hidden import record_hidden

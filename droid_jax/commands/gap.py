@@ -199,7 +199,7 @@ def chosen_effects(command: Gap, scene: Scene, recordings: list[Recording]) -> t
 
 def config_of(command: Gap) -> GapConfig:
     """The preset with the command's own numbers."""
-    from droid_jax.gap.case import GapConfig
+    from droid_jax.gap.case import SETTLED, GapConfig
     from droid_jax.identify.refine import RefineConfig
 
     if command.budget is not None and not command.budget > 0:
@@ -207,7 +207,7 @@ def config_of(command: Gap) -> GapConfig:
     asked: dict[str, Any] = {} if command.budget is None else {"budget": command.budget}
     return GapConfig(
         search=search_config(command.preset, command.seed),
-        refine=refine_config(command.preset) or RefineConfig(),
+        refine=replace(refine_config(command.preset) or RefineConfig(), iterations=SETTLED),
         compare=compared(command.motion_cutoff),
         seed=command.seed,
         **asked,

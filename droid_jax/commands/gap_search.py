@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from droid_jax.gap.verdict import Verdict
     from droid_jax.measure.recording import Recording
 
-BARS = ("search", "refine", "floor", "screen", "look", "refit", "judge")
+BARS = ("search", "refine", "floor", "screen", "look", "refit", "anew", "judge")
 IN_BLOCKS = ("refine", "screen", "look", "refit", "judge")  # of a log: no search, and no time step to refine
 
 

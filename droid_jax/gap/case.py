@@ -18,6 +18,7 @@ from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
 
+SETTLED = 60  # iterations of the base fit at most: where something is missing it takes longer
 BEYOND = 3.0  # prior deviations of a nuisance from which on it is an effect
 
 
@@ -33,7 +34,7 @@ class GapConfig:
     """
 
     search: SearchConfig = field(default_factory=lambda: SearchConfig(parents=None, generations=20))
-    refine: RefineConfig = field(default_factory=RefineConfig)
+    refine: RefineConfig = field(default_factory=lambda: RefineConfig(iterations=SETTLED))
     refit: RefineConfig = REFIT
     looked: int = 12
     refitted: int = 6

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from droid_jax.gap.anew import base_fit
 from droid_jax.gap.candidates import possible
 from droid_jax.gap.case import Case, GapConfig, make_case
 from droid_jax.gap.extended import Extended, extended
@@ -21,7 +22,7 @@ from droid_jax.gap.resume import kept_model, kept_number, remembering
 from droid_jax.gap.single import base_model, make_log, single_case
 from droid_jax.gap.split import Split
 from droid_jax.gap.verdict import Verdict
-from droid_jax.gap.workflow import Progress, base_fit, find
+from droid_jax.gap.workflow import Progress, find
 from droid_jax.measure.recording import Recording
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence, Set
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
 
+from droid_jax.gap.anew import fitted_anew
 from droid_jax.gap.candidates import Candidate, joined
 from droid_jax.gap.case import Case
 from droid_jax.gap.choose import winning, without_idle
@@ -24,6 +26,7 @@ Progress = Callable[[str, Any], None]
 Starter = tuple[Sequence[Candidate], np.ndarray]  # effects, and values [D] to start from
 POLISH = RefineConfig(iterations=12, hops=0)
 PAIRS = 4  # pairs refitted
+ANEW = 2  # models fitted from the prior on
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +109,13 @@ class Hunt:
         self.progress("refit", joined(parts) + note)
         return refit(self.case.fit, self.case.base, parts, start[None], config)
 
+    def anew(self, model: Model) -> Model:
+        """The model gone on with, or fitted from the prior on, whichever ends lower."""
+        fits = [self.refit(model.parts, model.values, POLISH, " once more")]
+        with contextlib.suppress(NotReplayed):
+            fits.append(fitted_anew(self.case, model.parts, lambda stage, value: self.progress("anew", value)))
+        return min(fits, key=_objective)
+
     def race(self, starters: Iterable[Starter], aim: float, note: str = "") -> list[Model]:
         """Refits one after the other; one that will not reach `aim`, or the best so far, is given up early."""
         models = list[Model]()
@@ -145,6 +155,55 @@ def forward(hunt: Hunt, model: Model, found: Screen) -> Round:
     starters = (((*model.parts, *p.parts), p.start(case.whole, model.values)) for p in left)
     tried += hunt.race(starters, min(m.refined.objective for m in tried), " (looks like the best)")
     return _decided(hunt, model, found, tried)
+
+
+def anew(hunt: Hunt, model: Model, done: Round) -> Round:
+    """A round without a winner: its best models fitted from the prior on, since the basin may be at fault.
+
+    Where what is missing bent the fit into a wrong basin, the right effect explains the fitted demonstration from there
+    and not the other one.  If a model wins from the prior on, its rivals are fitted in that basin too, and so is the
+    model that stood: what that takes away by itself is no effect's.
+    """
+    least = MORE if model.parts else LESS
+    promising = [m for m in sorted(done.tried, key=lambda m: m.gap) if m.gap <= (1 - least) * model.gap][:ANEW]
+    if done.winner is not None or not promising:
+        return done
+    if hunt.budget.spent:
+        hunt.budget.skip("fits from the prior on")
+        return done
+    left = hunt.budget.within("fits from the prior on", promising)
+    fresh = {m.name: hunt.anew(m) for m in left}
+    again = _decided(hunt, model, done.screen, [fresh.get(m.name, m) for m in done.tried])
+    if again.winner is None:
+        return done
+    return _beside(hunt, model, again, set(fresh))
+
+
+def _beside(hunt: Hunt, model: Model, done: Round, fresh: Set[str]) -> Round:
+    """The round with what lost to a winner from the prior on, and what looks like it, fitted from where that ended."""
+    whole, won = hunt.case.whole, done.winner
+    assert won is not None
+    basin = won.values.copy()
+    new = [whole.index(a) for a in won.amplitudes if a not in model.amplitudes]
+    basin[new] = whole.mean[new]
+    ranked = proposals(done.screen, model.residuals, whole)
+    twins = _twins(done, ranked)
+    lost = [p for p in ranked if joined((*model.parts, *p.parts)) in {m.name for m in done.tried} - fresh]
+    left = hunt.budget.within("rivals not refitted where the best one ended", [*lost, *twins])
+    starters = (((*model.parts, *p.parts), p.start(whole, basin)) for p in left)
+    note = " (from where the best one ended)"
+    beside = hunt.race(starters, won.refined.objective, note)
+    try:
+        plain = [hunt.refit(model.parts, basin, hunt.case.config.refit, note)]
+    except NotReplayed:
+        plain = []
+    before, *_ = sorted([model, *plain], key=_objective)
+    best = {m.name: m for m in sorted([*done.tried, *beside], key=_objective, reverse=True)}
+    return _decided(hunt, before, done.screen, list(best.values()))
+
+
+def _objective(model: Model) -> float:
+    return model.refined.objective
 
 
 def _twins(done: Round, ranked: Sequence[Proposal]) -> list[Proposal]:

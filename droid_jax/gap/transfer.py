@@ -15,6 +15,7 @@ from droid_jax.gap.screen import project
 from droid_jax.identify.damped import principal_axes
 from droid_jax.identify.uncertainty import told
 
+LEAST = 0.25  # share of a step that bounds must leave for a slope
 LONGEST = 1.0  # search units: what the fit did not tell at all is no further from it than that
 
 
@@ -33,10 +34,12 @@ def beyond(fitted: Evidence, other: Evidence, model: Model) -> np.ndarray:
 def spread(fitted: Evidence, other: Evidence, model: Model) -> np.ndarray:
     """[M, D] by how much one deviation of the fit, along each of its principal axes, changes the common residual.
 
-    Zero along an axis on which a replay blows up: nothing is allowed for there.
+    Where a bound cuts a step short, what is left of it tells the slope.  Zero along an axis on which a replay blows up:
+    nothing is allowed for there.
     """
     space, whole, x = model.space, other.cost.space, model.refined.x
     steps = principal_axes(told(model.refined, fitted.cost.comparisons, misfit=False).cov, LONGEST).T
     ends = [np.clip(x + sign * steps, *map(space.to_search, (space.low, space.high))) for sign in (1.0, -1.0)]
     up, down = np.split(other.common(whole.embed(space, space.from_search(np.concatenate(ends)), model.values)), 2)
-    return np.nan_to_num(0.5 * (up - down)).T
+    left = np.sum((ends[0] - ends[1]) * steps, axis=1) / np.sum(2 * steps**2, axis=1)
+    return np.nan_to_num(0.5 * (up - down) / np.maximum(left, LEAST)[:, None]).T

@@ -11,49 +11,16 @@ import numpy as np
 from droid_jax.gap.candidates import candidates
 from droid_jax.gap.case import Case
 from droid_jax.gap.localise import localise
-from droid_jax.gap.refit import Model, refit
-from droid_jax.gap.rounds import Budget, Hunt, Round, forward, pairs, polished, pruned
+from droid_jax.gap.refit import Model
+from droid_jax.gap.rounds import Budget, Hunt, Round, anew, forward, pairs, polished, pruned
 from droid_jax.gap.screen import Question, Screen, marks, project, questions_of, screen
 from droid_jax.gap.select import OF_ALL, SIGNIFICANT
 from droid_jax.gap.transfer import beyond
 from droid_jax.gap.trend import trend
 from droid_jax.gap.verdict import Kind, Verdict, open_share
-from droid_jax.identify.pipeline import grip_hypotheses, starts
-from droid_jax.identify.search import search
 
 Progress = Callable[[str, Any], None]
 OPEN = 0.1  # share of the gap left open from which a model explains it only partly
-
-
-def base_fit(case: Case, progress: Progress, start: np.ndarray | None = None) -> Model:
-    """Everything but the effects, fitted to the first demonstration.
-
-    start: [F] values of the base parameters out of an earlier fit; without it they are searched for.
-    """
-    base = case.base
-    begin = _searched(case, progress) if start is None else np.clip(start, base.low, base.high)[None]
-    return refit(
-        case.fit,
-        base,
-        (),
-        case.whole.embed(base, begin),
-        case.config.refine,
-        hypotheses=grip_hypotheses(base),
-        progress=lambda p: progress("refine", p),
-    )
-
-
-def _searched(case: Case, progress: Progress) -> np.ndarray:
-    """[S, F] where the refinement of the base parameters begins."""
-    base = case.base
-    main = base.select([p.name for p in base.parameters if not p.nuisance])
-    found = search(
-        lambda rows: case.fit.cost(case.whole.embed(main, rows)),
-        main,
-        case.config.search,
-        progress=lambda p: progress("search", p),
-    )
-    return starts(base, main, found)
 
 
 def ask(case: Case, model: Model, asked: tuple[Question, ...]) -> Screen:
@@ -95,7 +62,7 @@ def find(case: Case, base: Model, floor: float, progress: Progress = lambda stag
         found = ask(case, model, left)
         quiet = found.p >= SIGNIFICANT or model.gap <= floor
         enough = not model.parts or hunt.gap(model) > OF_ALL * hunt.whole_gap
-        done = forward(hunt, model, found) if enough and not quiet else Round(found)
+        done = anew(hunt, model, forward(hunt, model, found)) if enough and not quiet else Round(found)
         rounds.append(done)
         if done.winner is None:
             break

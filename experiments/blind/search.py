@@ -14,12 +14,13 @@ from typing import Any
 
 from droid_jax import runtime
 from droid_jax.compare.cost import Cost
+from droid_jax.gap.anew import base_fit
 from droid_jax.gap.case import Case, GapConfig, make_case
 from droid_jax.gap.evidence import Evidence, evidence
 from droid_jax.gap.floor import finer, numerical_floor
 from droid_jax.gap.refit import Model, intervals
 from droid_jax.gap.verdict import Verdict
-from droid_jax.gap.workflow import base_fit, find
+from droid_jax.gap.workflow import find
 from droid_jax.measure.formats import load
 from droid_jax.measure.recording import Recording
 from droid_jax.storage import write_json

@@ -7,9 +7,10 @@ from dataclasses import replace
 
 from small_gap import EFFECTS, FLOOR, PRELOAD, QUICK, record, small_scene
 
+from droid_jax.gap.anew import base_fit
 from droid_jax.gap.case import make_case
 from droid_jax.gap.verdict import Kind, Verdict
-from droid_jax.gap.workflow import base_fit, find
+from droid_jax.gap.workflow import find
 from droid_jax.model.effects.registry import library
 
 FRICTION = 0.5  # N m

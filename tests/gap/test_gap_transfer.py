@@ -11,6 +11,7 @@ import pytest
 from small_gap import FLOOR, Small, record, small
 
 from droid_jax.gap import workflow
+from droid_jax.gap.anew import base_fit
 from droid_jax.gap.case import Case, make_case
 from droid_jax.gap.refit import Model, refit
 from droid_jax.gap.screen import project
@@ -29,7 +30,7 @@ def whole(found: Small) -> tuple[Case, Model]:
         found.scene, found.case.base, found.case.effects, record("fit", preload=0.0), record("confirm", preload=0.0),
         config=found.case.config,
     )  # fmt: skip
-    return case, workflow.base_fit(case, lambda stage, value: None)
+    return case, base_fit(case, lambda stage, value: None)
 
 
 def kept(case: Case, model: Model, off: np.ndarray) -> float:

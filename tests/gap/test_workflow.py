@@ -12,6 +12,7 @@ import pytest
 from small_gap import EFFECTS, FLOOR, QUICK, Small, record, small, small_scene
 
 from droid_jax.gap import workflow
+from droid_jax.gap.anew import base_fit
 from droid_jax.gap.candidates import Candidate, candidates
 from droid_jax.gap.case import make_case
 from droid_jax.gap.rank import proposals
@@ -20,7 +21,7 @@ from droid_jax.gap.rounds import Hunt
 from droid_jax.gap.screen import Screen, questions_of
 from droid_jax.gap.select import AT_BOUND, TOO_SMALL, UNCONFIRMED
 from droid_jax.gap.verdict import Kind
-from droid_jax.gap.workflow import ask, base_fit, find
+from droid_jax.gap.workflow import ask, find
 from droid_jax.model.effects.registry import library
 from droid_jax.model.parameters import Parameter
 from droid_jax.model.scene import Scene
