@@ -15,7 +15,8 @@ from droid_jax.gap.anew import base_fit
 from droid_jax.gap.case import Case, make_case
 from droid_jax.gap.refit import Model, refit
 from droid_jax.gap.screen import project
-from droid_jax.gap.transfer import beyond, spread
+from droid_jax.gap.transfer import LONGEST, beyond, spread
+from droid_jax.identify.uncertainty import told
 
 
 @pytest.fixture(scope="module")
@@ -116,3 +117,24 @@ def test_more_repeats_of_the_fit_allow_less(found: Small):
         return float(np.mean(np.sum(spread(case.fit, case.confirm, model) ** 2, axis=1)))
 
     assert size(32) < 0.6 * size(8)
+
+
+def test_a_bound_does_not_halve_a_slope(whole: tuple[Case, Model]):
+    """On a replay that is linear, one of the parameters at its bound, each parameter an axis of its own."""
+    case, model = whole
+    space, count = model.space, len(model.space)
+    x = model.refined.x.copy()
+    stuck = space.index("forearm_mass")
+    x[stuck] = space.to_search(space.high)[stuck]
+    jacobian = np.zeros_like(model.refined.jacobian)
+    jacobian[:count] = np.diag(np.linspace(20.0, 40.0, count))
+    refined = replace(model.refined, x=x, jacobian=jacobian)
+    matrix = np.random.default_rng(0).normal(size=(count, 30))
+    linear: Any = SimpleNamespace(
+        cost=case.confirm.cost, common=lambda rows: space.to_search(rows[:, case.whole.columns(space)]) @ matrix
+    )
+    slopes = spread(case.fit, linear, replace(model, refined=refined))
+    along = np.linalg.lstsq(matrix.T, slopes, rcond=None)[0]  # each column is an axis in search units
+    assert np.all(np.count_nonzero(np.abs(along) > 1e-9, axis=0) == 1)
+    deviation = np.sqrt(np.diag(told(refined, case.fit.cost.comparisons, misfit=False).cov))
+    np.testing.assert_allclose(np.abs(along).sum(axis=1), np.minimum(deviation, LONGEST), rtol=1e-6)
