@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence, Set
 from dataclasses import dataclass, field, replace
@@ -110,11 +109,12 @@ class Hunt:
         return refit(self.case.fit, self.case.base, parts, start[None], config)
 
     def anew(self, model: Model) -> Model:
-        """The model gone on with, or fitted from the prior on, whichever ends lower."""
-        fits = [self.refit(model.parts, model.values, POLISH, " once more")]
-        with contextlib.suppress(NotReplayed):
-            fits.append(fitted_anew(self.case, model.parts, lambda stage, value: self.progress("anew", value)))
-        return min(fits, key=_objective)
+        """The model as it is or fitted from the prior on, whichever ends lower."""
+        try:
+            fresh = fitted_anew(self.case, model.parts, lambda stage, value: self.progress("anew", value))
+        except NotReplayed:
+            return model
+        return min(model, fresh, key=_objective)
 
     def race(self, starters: Iterable[Starter], aim: float, note: str = "") -> list[Model]:
         """Refits one after the other; one that will not reach `aim`, or the best so far, is given up early."""

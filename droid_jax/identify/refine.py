@@ -134,12 +134,14 @@ def refine(
     state, ended[alive] = rough.descend(begun.rows(alive), config.rough)
     if hypotheses and np.mean(state.residual**2) > config.doubt:
         state, _ = rough.descend(rough.explore(state, hypotheses), config.rough)
-    problem = _Descent(residuals, space, config, progress, rough)
-    state = problem.start(state.x)
-    if not np.isfinite(state.objective[0]):
-        raise NotReplayed(
-            "the best start on the first recording could not be replayed on all; start nearer to the truth"
-        )
+    problem = rough
+    if first is not None:
+        problem = _Descent(residuals, space, config, progress, rough)
+        state = problem.start(state.x)
+        if not np.isfinite(state.objective[0]):
+            raise NotReplayed(
+                "the best start on the first recording could not be replayed on all; start nearer to the truth"
+            )
     state, _ = problem.descend(state)
     if config.hops:
         state = problem.back(state)
