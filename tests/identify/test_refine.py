@@ -502,3 +502,17 @@ def test_an_aim_that_is_out_of_reach_is_given_up_and_one_within_reach_is_pursued
     assert reachable.objective == whole.objective and reachable.evaluations == whole.evaluations
     assert hopeless.evaluations < whole.evaluations
     assert hopeless.objective > whole.objective
+
+
+def test_a_period_is_found_though_the_first_differences_span_a_whole_one():
+    """A ripple of 17.7 periods begun at 20: half a deviation's difference, 5 periods, says nothing about its slope."""
+    times = np.linspace(0.0, 1.0, 200)
+    space = Space((line("sine"), line("cosine"), line("periods", 36.0, std=17.5, low=10.0, high=80.0)))
+
+    def residuals(values):
+        sine, cosine, periods = values.T[..., None]
+        return 30.0 * (sine * np.sin(periods * times) + cosine * np.cos(periods * times) - 0.5 * np.sin(17.7 * times))
+
+    start = np.array([[0.25, -0.3, 20.0]])
+    fit = refine(residuals, space, start, RefineConfig(iterations=8, hops=0, spreads=0, aim=100.0))
+    np.testing.assert_allclose(fit.best, [0.5, 0.0, 17.7], atol=0.02)
