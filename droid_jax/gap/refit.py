@@ -18,7 +18,7 @@ from droid_jax.identify.refine import Hypotheses, RefineConfig, Refined, RefineP
 from droid_jax.identify.uncertainty import told
 from droid_jax.model.parameters import Space
 
-REFIT = RefineConfig(iterations=8, hops=0, spreads=0)
+REFIT = RefineConfig(iterations=20, hops=0, spreads=0)
 LEVEL = 0.9  # of the amplitudes' intervals
 
 

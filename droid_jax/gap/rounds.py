@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence, Set
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from droid_jax.gap.anew import fitted_anew
 from droid_jax.gap.candidates import Candidate, joined
-from droid_jax.gap.case import Case
+from droid_jax.gap.case import SETTLED, Case
 from droid_jax.gap.choose import winning, without_idle
 from droid_jax.gap.rank import Proposal, collinear, proposals
 from droid_jax.gap.refit import Model, look, refit
@@ -157,47 +157,41 @@ def forward(hunt: Hunt, model: Model, found: Screen) -> Round:
     return _decided(hunt, model, found, tried)
 
 
-def anew(hunt: Hunt, model: Model, done: Round) -> Round:
-    """A round without a winner: its best models fitted from the prior on, since the basin may be at fault.
+def anew(hunt: Hunt, base: Model, done: Round) -> Round:
+    """A first round without a winner: its best models fitted from the prior on, since the basin may be at fault.
 
-    Where what is missing bent the fit into a wrong basin, the right effect explains the fitted demonstration from there
-    and not the other one.  If a model wins from the prior on, its rivals are fitted in that basin too, and so is the
-    model that stood: what that takes away by itself is no effect's.
+    Where what is missing bent the base fit into a wrong basin, the right effect explains the fitted demonstration from
+    there and not the other one.  If a model wins from the prior on, its rivals are fitted in that basin too, and so is
+    the base model: what that takes away by itself is no effect's.
     """
-    least = MORE if model.parts else LESS
-    promising = [m for m in sorted(done.tried, key=lambda m: m.gap) if m.gap <= (1 - least) * model.gap][:ANEW]
+    promising = [m for m in sorted(done.tried, key=lambda m: m.gap) if m.gap <= (1 - LESS) * base.gap][:ANEW]
     if done.winner is not None or not promising:
         return done
     if hunt.budget.spent:
         hunt.budget.skip("fits from the prior on")
         return done
-    left = hunt.budget.within("fits from the prior on", promising)
-    fresh = {m.name: hunt.anew(m) for m in left}
-    again = _decided(hunt, model, done.screen, [fresh.get(m.name, m) for m in done.tried])
-    if again.winner is None:
-        return done
-    return _beside(hunt, model, again, set(fresh))
+    fresh = {m.name: hunt.anew(m) for m in hunt.budget.within("fits from the prior on", promising)}
+    again = _decided(hunt, base, done.screen, [fresh.get(m.name, m) for m in done.tried])
+    return done if again.winner is None else _beside(hunt, base, again, again.winner, fresh)
 
 
-def _beside(hunt: Hunt, model: Model, done: Round, fresh: Set[str]) -> Round:
+def _beside(hunt: Hunt, base: Model, done: Round, won: Model, fresh: Container[str]) -> Round:
     """The round with what lost to a winner from the prior on, and what looks like it, fitted from where that ended."""
-    whole, won = hunt.case.whole, done.winner
-    assert won is not None
+    whole = hunt.case.whole
     basin = won.values.copy()
-    new = [whole.index(a) for a in won.amplitudes if a not in model.amplitudes]
+    new = [whole.index(a) for a in won.amplitudes]
     basin[new] = whole.mean[new]
-    ranked = proposals(done.screen, model.residuals, whole)
-    twins = _twins(done, ranked)
-    lost = [p for p in ranked if joined((*model.parts, *p.parts)) in {m.name for m in done.tried} - fresh]
-    left = hunt.budget.within("rivals not refitted where the best one ended", [*lost, *twins])
-    starters = (((*model.parts, *p.parts), p.start(whole, basin)) for p in left)
+    ranked = proposals(done.screen, base.residuals, whole)
+    tried = {m.name for m in done.tried if m.name not in fresh}
+    lost = [p for p in ranked if joined(p.parts) in tried]
+    left = hunt.budget.within("rivals not refitted where the best one ended", [*lost, *_twins(done, ranked)])
     note = " (from where the best one ended)"
-    beside = hunt.race(starters, won.refined.objective, note)
+    beside = hunt.race(((p.parts, p.start(whole, basin)) for p in left), won.refined.objective, note)
     try:
-        plain = [hunt.refit(model.parts, basin, hunt.case.config.refit, note)]
+        plain = [hunt.refit((), basin, hunt.case.config.refit, note)]
     except NotReplayed:
         plain = []
-    before, *_ = sorted([model, *plain], key=_objective)
+    before = min([base, *plain], key=_objective)
     best = {m.name: m for m in sorted([*done.tried, *beside], key=_objective, reverse=True)}
     return _decided(hunt, before, done.screen, list(best.values()))
 
@@ -256,11 +250,18 @@ def without(part: Candidate, parts: Sequence[Candidate]) -> tuple[Candidate, ...
     return tuple(replace(c, shapes=part.shapes) if c is heir else c for c in rest)
 
 
+def settled(hunt: Hunt, model: Model) -> Model:
+    """The model gone on with until it stands still: what it has yet to take would be credited to the next effect."""
+    if model.refined.converged:
+        return model
+    return hunt.refit(model.parts, model.values, replace(hunt.case.config.refit, iterations=SETTLED), " gone on with")
+
+
 def polished(hunt: Hunt, model: Model) -> Model:
-    """The same model settled, with slopes over the width of its posterior: its intervals are reported."""
+    """The same model with slopes over the width of its posterior: its intervals are reported."""
     if not model.parts:
         return model
-    return hunt.refit(model.parts, model.values, POLISH, " settled")
+    return hunt.refit(model.parts, model.values, POLISH, " polished")
 
 
 def _decided(hunt: Hunt, before: Model, found: Screen, tried: Sequence[Model]) -> Round:

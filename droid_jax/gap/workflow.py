@@ -12,7 +12,7 @@ from droid_jax.gap.candidates import candidates
 from droid_jax.gap.case import Case
 from droid_jax.gap.localise import localise
 from droid_jax.gap.refit import Model
-from droid_jax.gap.rounds import Budget, Hunt, Round, anew, forward, pairs, polished, pruned
+from droid_jax.gap.rounds import Budget, Hunt, Round, anew, forward, pairs, polished, pruned, settled
 from droid_jax.gap.screen import Question, Screen, marks, project, questions_of, screen
 from droid_jax.gap.select import OF_ALL, SIGNIFICANT
 from droid_jax.gap.transfer import beyond
@@ -62,17 +62,19 @@ def find(case: Case, base: Model, floor: float, progress: Progress = lambda stag
         found = ask(case, model, left)
         quiet = found.p >= SIGNIFICANT or model.gap <= floor
         enough = not model.parts or hunt.gap(model) > OF_ALL * hunt.whole_gap
-        done = anew(hunt, model, forward(hunt, model, found)) if enough and not quiet else Round(found)
+        done = forward(hunt, model, found) if enough and not quiet else Round(found)
+        if not model.parts:
+            done = anew(hunt, base, done)
         rounds.append(done)
         if done.winner is None:
             break
-        model = done.winner
+        model = settled(hunt, done.winner)
     if not quiet and rounds[0].tried and _unsettled(hunt, model):
         if hunt.budget.spent:
             hunt.budget.skip("pairs of effects not tried")
         else:
             rounds.append(pairs(hunt, base, model, rounds[0]))
-            model = rounds[-1].winner or model
+            model = settled(hunt, rounds[-1].winner or model)
     return _verdict(hunt, base, polished(hunt, pruned(hunt, model)), rounds, quiet)
 
 
