@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Container, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
@@ -25,7 +25,6 @@ Progress = Callable[[str, Any], None]
 Starter = tuple[Sequence[Candidate], np.ndarray]  # effects, and values [D] to start from
 POLISH = RefineConfig(iterations=12, hops=0)
 PAIRS = 4  # pairs refitted
-ANEW = 2  # models fitted from the prior on
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,31 +157,31 @@ def forward(hunt: Hunt, model: Model, found: Screen) -> Round:
 
 
 def anew(hunt: Hunt, base: Model, done: Round) -> Round:
-    """A first round without a winner: its best models fitted from the prior on, since the basin may be at fault.
+    """A first round without a winner: its best model fitted from the prior on, since the basin may be at fault.
 
     Where what is missing bent the base fit into a wrong basin, the right effect explains the fitted demonstration from
-    there and not the other one.  If a model wins from the prior on, its rivals are fitted in that basin too, and so is
-    the base model: what that takes away by itself is no effect's.
+    there and not the other one.  If it wins from the prior on, its rivals are fitted in that basin too, and so is the
+    base model: what that takes away by itself is no effect's.
     """
-    promising = [m for m in sorted(done.tried, key=lambda m: m.gap) if m.gap <= (1 - LESS) * base.gap][:ANEW]
-    if done.winner is not None or not promising:
+    best = min(done.tried, key=lambda m: m.gap, default=base)
+    if done.winner is not None or best.gap > (1 - LESS) * base.gap:
         return done
     if hunt.budget.spent:
-        hunt.budget.skip("fits from the prior on")
+        hunt.budget.skip("the fit from the prior on")
         return done
-    fresh = {m.name: hunt.anew(m) for m in hunt.budget.within("fits from the prior on", promising)}
-    again = _decided(hunt, base, done.screen, [fresh.get(m.name, m) for m in done.tried])
-    return done if again.winner is None else _beside(hunt, base, again, again.winner, fresh)
+    fresh = hunt.anew(best)
+    again = _decided(hunt, base, done.screen, [fresh if m is best else m for m in done.tried])
+    return done if again.winner is None else _beside(hunt, base, again, again.winner)
 
 
-def _beside(hunt: Hunt, base: Model, done: Round, won: Model, fresh: Container[str]) -> Round:
+def _beside(hunt: Hunt, base: Model, done: Round, won: Model) -> Round:
     """The round with what lost to a winner from the prior on, and what looks like it, fitted from where that ended."""
     whole = hunt.case.whole
     basin = won.values.copy()
     new = [whole.index(a) for a in won.amplitudes]
     basin[new] = whole.mean[new]
     ranked = proposals(done.screen, base.residuals, whole)
-    tried = {m.name for m in done.tried if m.name not in fresh}
+    tried = {m.name for m in done.tried if m is not won}
     lost = [p for p in ranked if joined(p.parts) in tried]
     left = hunt.budget.within("rivals not refitted where the best one ended", [*lost, *_twins(done, ranked)])
     note = " (from where the best one ended)"

@@ -81,7 +81,7 @@ def test_a_base_fit_may_begin_at_an_earlier_one(found: Small, monkeypatch: pytes
     assert again.gap == pytest.approx(found.base.gap, rel=1e-2)
 
 
-def test_a_round_without_a_winner_has_its_best_models_fitted_from_the_prior_on(found: Small, lost: Round) -> None:
+def test_a_round_without_a_winner_has_its_best_model_fitted_from_the_prior_on(found: Small, lost: Round) -> None:
     told = list[tuple[str, Any]]()
     again = anew(hunt_of(found, told=told), found.base, lost)
     assert again.winner is not None and again.winner.name == "hinge_preload at door"
@@ -111,5 +111,5 @@ def test_no_fit_from_the_prior_on_where_there_is_a_winner_or_no_time(
     won = replace(lost, winner=lost.tried[0])
     assert anew(hunt_of(found), found.base, won) is won
     hunt = hunt_of(found, minutes=1e-9)
-    assert anew(hunt, found.base, lost) is lost and hunt.budget.cut == "fits from the prior on"
+    assert anew(hunt, found.base, lost) is lost and hunt.budget.cut == "the fit from the prior on"
     assert anew(hunt_of(found), found.base, replace(lost, tried=())).winner is None
