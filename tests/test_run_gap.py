@@ -17,7 +17,7 @@ from small_gap import EFFECTS, FLOOR, JOINTS, PRELOAD, QUICK, SCENE, record, sma
 
 from droid_jax.commands import gap, report
 from droid_jax.commands.hidden import hidden_effects, record_stand_in
-from droid_jax.gap import missing, workflow
+from droid_jax.gap import anew, missing
 from droid_jax.gap.inputs import check_recordings, lags
 from droid_jax.gap.results import load_gap
 from droid_jax.gap.verdict import Experiment
@@ -375,14 +375,14 @@ def test_the_base_fit_begins_at_an_earlier_fit(place: Path, quick: None, monkeyp
     The folder may be one of `all`.
     """
     base = small().case.base
-    monkeypatch.setattr(workflow, "search", lambda *a, **k: pytest.fail("there is nothing to search for"))
+    monkeypatch.setattr(anew, "search", lambda *a, **k: pytest.fail("there is nothing to search for"))
     begun = []
 
     def refit(evidence, space, parts, starts, *rest, **more):
         begun.append(starts)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(workflow, "refit", refit)
+    monkeypatch.setattr(anew, "refit", refit)
     known = {p.name: 0.5 * (p.mean + p.high) for p in base.parameters if not p.nuisance}
     first = next(iter(known))
     folder = fit_json(place / "all" / "identify", **{**known, first: 1e9, "of_another_model": 1.0})

@@ -161,10 +161,11 @@ def anew(hunt: Hunt, base: Model, done: Round) -> Round:
 
     Where what is missing bent the base fit into a wrong basin, the right effect explains the fitted demonstration from
     there and not the other one.  If it wins from the prior on, its rivals are fitted in that basin too, and so is the
-    base model: what that takes away by itself is no effect's.
+    base model: what that takes away by itself is no effect's.  A log of one repeat is replayed by inverse dynamics,
+    which is smooth and has one basin.
     """
     best = min(done.tried, key=lambda m: m.gap, default=base)
-    if done.winner is not None or best.gap > (1 - LESS) * base.gap:
+    if done.winner is not None or hunt.case.fit.repeats == 1 or best.gap > (1 - LESS) * base.gap:
         return done
     if hunt.budget.spent:
         hunt.budget.skip("the fit from the prior on")
