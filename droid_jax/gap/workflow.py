@@ -10,9 +10,10 @@ import numpy as np
 
 from droid_jax.gap.candidates import candidates
 from droid_jax.gap.case import Case
+from droid_jax.gap.hunt import Budget, Hunt
 from droid_jax.gap.localise import localise
 from droid_jax.gap.refit import Model
-from droid_jax.gap.rounds import Budget, Hunt, Round, anew, forward, pairs, polished, pruned, settled
+from droid_jax.gap.rounds import Round, anew, forward, pairs, polished, pruned, settled
 from droid_jax.gap.screen import Question, Screen, marks, project, questions_of, screen
 from droid_jax.gap.select import OF_ALL, SIGNIFICANT
 from droid_jax.gap.transfer import beyond

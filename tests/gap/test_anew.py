@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from small_gap import FLOOR, PRELOAD, TRUTH, Small, small
 
-from droid_jax.gap import rounds
+from droid_jax.gap import hunt as hunts
 from droid_jax.gap.anew import base_fit, fitted_anew
 from droid_jax.gap.candidates import candidates
+from droid_jax.gap.hunt import Budget, Hunt
 from droid_jax.gap.refit import Model
-from droid_jax.gap.rounds import Budget, Hunt, Round, anew, forward
+from droid_jax.gap.rounds import Round, anew, forward
 from droid_jax.gap.screen import questions_of
 from droid_jax.gap.workflow import ask
 
@@ -104,7 +105,7 @@ def test_what_the_basin_takes_by_itself_is_no_effects(
 def test_no_fit_from_the_prior_on_where_there_is_a_winner_or_no_time(
     found: Small, lost: Round, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rounds, "fitted_anew", lambda *a: pytest.fail("was not asked for"))
+    monkeypatch.setattr(hunts, "fitted_anew", lambda *a: pytest.fail("was not asked for"))
     won = replace(lost, winner=lost.tried[0])
     assert anew(hunt_of(found), found.base, won) is won
     hunt = hunt_of(found, minutes=1e-9)

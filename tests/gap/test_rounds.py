@@ -11,7 +11,8 @@ import pytest
 from droid_jax.gap.blocks import OUTSIDE, Blocks
 from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.evidence import Evidence
-from droid_jax.gap.rounds import Budget, Hunt, pruned, without
+from droid_jax.gap.hunt import Budget, Hunt
+from droid_jax.gap.rounds import pruned, without
 from droid_jax.identify.search import NotReplayed
 from droid_jax.model.parameters import Parameter, Space
 

@@ -15,9 +15,9 @@ from droid_jax.gap import workflow
 from droid_jax.gap.anew import base_fit
 from droid_jax.gap.candidates import Candidate, candidates
 from droid_jax.gap.case import make_case
+from droid_jax.gap.hunt import Hunt
 from droid_jax.gap.rank import proposals
 from droid_jax.gap.refit import Model
-from droid_jax.gap.rounds import Hunt
 from droid_jax.gap.screen import Screen, questions_of
 from droid_jax.gap.select import AT_BOUND, TOO_SMALL, UNCONFIRMED
 from droid_jax.gap.verdict import Kind
