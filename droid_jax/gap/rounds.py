@@ -84,7 +84,10 @@ def anew(hunt: Hunt, base: Model, done: Round) -> Round:
 
 
 def _beside(hunt: Hunt, base: Model, done: Round, won: Model) -> Round:
-    """The round with what lost to a winner from the prior on, and what looks like it, fitted from where that ended."""
+    """The round with what lost to a winner from the prior on, and what looks like it, fitted from where that ended.
+
+    The base model is the one that does better on the confirming demonstration, from there or as it was.
+    """
     whole = hunt.case.whole
     basin = won.values.copy()
     new = [whole.index(a) for a in won.amplitudes]
@@ -99,7 +102,7 @@ def _beside(hunt: Hunt, base: Model, done: Round, won: Model) -> Round:
         plain = [hunt.refit((), basin, hunt.case.config.refit, note)]
     except NotReplayed:
         plain = []
-    before = min([base, *plain], key=_objective)
+    before = min([base, *plain], key=hunt.gap)
     best = {m.name: m for m in sorted([*done.tried, *beside], key=_objective, reverse=True)}
     return _decided(hunt, before, done.screen, list(best.values()))
 

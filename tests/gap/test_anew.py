@@ -93,10 +93,14 @@ def test_what_the_basin_takes_by_itself_is_no_effects(
 ) -> None:
     """The base model does as well once it begins where the winner ended: it was the basin, and nothing is named."""
     best = min(lost.tried, key=lambda m: m.refined.objective)
+    worse = replace(
+        best.refined, objective=2 * found.base.refined.objective
+    )  # of the fit; on the other motion it counts
+    there = replace(best, parts=(), space=found.base.space, refined=worse)
     usual = Hunt.refit
 
     def refit(hunt: Hunt, parts: Any, start: np.ndarray, config: Any, note: str = "") -> Model:
-        return usual(hunt, parts, start, config, note) if parts else replace(best, parts=(), space=found.base.space)
+        return usual(hunt, parts, start, config, note) if parts else there
 
     monkeypatch.setattr(Hunt, "refit", refit)
     assert anew(hunt_of(found), found.base, lost).winner is None
