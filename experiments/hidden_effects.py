@@ -32,7 +32,7 @@ import tyro  # noqa: E402
 from benchmarks.common import origin, stem  # noqa: E402
 from droid_jax.storage import write_json, write_text  # noqa: E402
 from experiments.blind.cases import FACTORS, Counts, plans  # noqa: E402
-from experiments.blind.draws import commit_of  # noqa: E402
+from experiments.blind.draws import commit_of, folder_of  # noqa: E402
 from experiments.blind.limits import scene_limits  # noqa: E402
 from experiments.blind.make import make  # noqa: E402
 from experiments.blind.oracle import oracle_all  # noqa: E402
@@ -86,6 +86,8 @@ class Make:
     """Detection limits, see the command limits."""
     out: Path = RUNS
     """Folder of cases and seals."""
+    unsearched: bool = False
+    """Only cases without a file in OUT/results: a run that goes on elsewhere needs no others."""
     quick: bool = False
     """The lone hinge: nothing, and a preload."""
 
@@ -169,6 +171,9 @@ def run_make(command: Make) -> dict[str, Any]:
             if command.factors and plan.effects and plan.factor not in command.factors:
                 continue
             if effects and plan.effects and not set(effects) & set(plan.effects):
+                continue
+            if command.unsearched and (command.out / "results" / f"{folder_of(commit, plan.name)}.json").is_file():
+                outcomes[plan.name] = "there"
                 continue
             outcome = make(where, plan, commit, known.get(name, {}), command.out / "cases", command.out / "sealed")
             outcomes[plan.name] = outcome

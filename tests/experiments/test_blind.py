@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -489,6 +490,26 @@ def test_a_search_is_given_the_cases_alone(tmp_path: Path, monkeypatch: pytest.M
     assert given == [tmp_path / "cases", tmp_path / "results"]
     with pytest.raises(SystemExit, match="no case below"):
         hidden_effects.run_search(hidden_effects.Search((tmp_path,), results=tmp_path / "results"))
+
+
+def test_only_unsearched_cases_are_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    plans = [
+        SimpleNamespace(name=name, kind="none", effects=(), factor=0.0) for name in ("hinge/none/0", "hinge/none/1")
+    ]
+    asked: list[str] = []
+    monkeypatch.setattr(hidden_effects, "setting", lambda *_: None)
+    monkeypatch.setattr(hidden_effects, "commit_of", lambda name: name)
+    monkeypatch.setattr(hidden_effects, "plans", lambda *_: plans)
+    monkeypatch.setattr(hidden_effects, "make", lambda where, plan, *_: asked.append(plan.name) or "made")
+    (tmp_path / "limits.json").write_text('{"scenes": {}}')
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / f"{folder_of(COMMIT, plans[0].name)}.json").write_text("{}")
+    options = {"commit": COMMIT, "limits": tmp_path / "limits.json", "out": tmp_path, "scenes": ("hinge",)}
+    assert hidden_effects.run_make(hidden_effects.Make(**options, unsearched=True)) == {
+        "hinge": {"there": 1, "made": 1}
+    }
+    assert asked == ["hinge/none/1"]
+    assert hidden_effects.run_make(hidden_effects.Make(**options)) == {"hinge": {"made": 2}}
 
 
 @pytest.mark.parametrize(("quick", "name"), [(True, "limits_quick.json"), (False, "limits.json")])
