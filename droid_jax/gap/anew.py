@@ -7,18 +7,15 @@ motion and not the other one.  From the prior on, with the effect in the model f
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
 from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.case import Case
 from droid_jax.gap.refit import Model, refit
-from droid_jax.identify.pipeline import grip_hypotheses, starts
+from droid_jax.identify.pipeline import Progress, grip_hypotheses, starts
 from droid_jax.identify.search import search
-
-Progress = Callable[[str, Any], None]
 
 
 def base_fit(case: Case, progress: Progress, start: np.ndarray | None = None) -> Model:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -16,11 +16,11 @@ from droid_jax.gap.rank import Proposal
 from droid_jax.gap.refit import Model, look, refit
 from droid_jax.gap.screen import Screen
 from droid_jax.gap.select import LESS, MORE
+from droid_jax.identify.pipeline import Progress
 from droid_jax.identify.refine import RefineConfig
 from droid_jax.identify.search import NotReplayed
 
 T = TypeVar("T")
-Progress = Callable[[str, Any], None]
 Starter = tuple[Sequence[Candidate], np.ndarray]  # effects, and values [D] to start from
 
 

@@ -22,7 +22,8 @@ from droid_jax.gap.resume import kept_model, kept_number, remembering
 from droid_jax.gap.single import base_model, make_log, single_case
 from droid_jax.gap.split import Split
 from droid_jax.gap.verdict import Verdict
-from droid_jax.gap.workflow import Progress, find
+from droid_jax.gap.workflow import find
+from droid_jax.identify.pipeline import Progress
 from droid_jax.measure.recording import Recording
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene

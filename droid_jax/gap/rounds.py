@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from droid_jax.gap.candidates import Candidate, joined
 from droid_jax.gap.case import SETTLED
 from droid_jax.gap.choose import winning, without_idle
@@ -88,10 +90,7 @@ def _beside(hunt: Hunt, base: Model, done: Round, won: Model) -> Round:
 
     The base model is the one that does better on the confirming demonstration, from there or as it was.
     """
-    whole = hunt.case.whole
-    basin = won.values.copy()
-    new = [whole.index(a) for a in won.amplitudes]
-    basin[new] = whole.mean[new]
+    whole, basin = hunt.case.whole, _neutral(hunt, won, won.amplitudes)
     ranked = proposals(done.screen, base.residuals, whole)
     tried = {m.name for m in done.tried if m is not won}
     lost = [p for p in ranked if joined(p.parts) in tried]
@@ -103,12 +102,15 @@ def _beside(hunt: Hunt, base: Model, done: Round, won: Model) -> Round:
     except NotReplayed:
         plain = []
     before = min([base, *plain], key=hunt.gap)
-    best = {m.name: m for m in sorted([*done.tried, *beside], key=_objective, reverse=True)}
+    best = {m.name: m for m in sorted([*done.tried, *beside], key=lambda m: m.refined.objective, reverse=True)}
     return _decided(hunt, before, done.screen, list(best.values()))
 
 
-def _objective(model: Model) -> float:
-    return model.refined.objective
+def _neutral(hunt: Hunt, model: Model, amplitudes: Sequence[str]) -> np.ndarray:
+    """[D] values of a model with some amplitudes at neutral."""
+    values, at = model.values.copy(), [hunt.case.whole.index(a) for a in amplitudes]
+    values[at] = hunt.case.whole.mean[at]
+    return values
 
 
 def _twins(done: Round, ranked: Sequence[Proposal]) -> list[Proposal]:
@@ -141,9 +143,7 @@ def pairs(hunt: Hunt, base: Model, model: Model, first: Round) -> Round:
 def pruned(hunt: Hunt, model: Model) -> Model:
     """The model without what no longer pays for itself on the confirming demonstration."""
     for part in model.parts if len(model.parts) > 1 else ():
-        start = model.values.copy()
-        free = [hunt.case.whole.index(a) for a in part.amplitudes]
-        start[free] = hunt.case.whole.mean[free]
+        start = _neutral(hunt, model, part.amplitudes)
         try:
             less = hunt.refit(without(part, model.parts), start, hunt.case.config.refit, f" without {part.name}")
             pays = hunt.gap(less) - hunt.gap(model) >= OF_ALL * hunt.whole_gap

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -19,8 +19,8 @@ from droid_jax.gap.select import OF_ALL, SIGNIFICANT
 from droid_jax.gap.transfer import beyond
 from droid_jax.gap.trend import trend
 from droid_jax.gap.verdict import Kind, Verdict, open_share
+from droid_jax.identify.pipeline import Progress
 
-Progress = Callable[[str, Any], None]
 OPEN = 0.1  # share of the gap left open from which a model explains it only partly
 
 

@@ -93,9 +93,8 @@ def test_what_the_basin_takes_by_itself_is_no_effects(
 ) -> None:
     """The base model does as well once it begins where the winner ended: it was the basin, and nothing is named."""
     best = min(lost.tried, key=lambda m: m.refined.objective)
-    worse = replace(
-        best.refined, objective=2 * found.base.refined.objective
-    )  # of the fit; on the other motion it counts
+    # A worse fit all the same: it is the other motion that counts.
+    worse = replace(best.refined, objective=2 * found.base.refined.objective)
     there = replace(best, parts=(), space=found.base.space, refined=worse)
     usual = Hunt.refit
 
