@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from droid_jax.report.gap_words import unit_words
+from droid_jax.report.gap_words import quantity
 from droid_jax.report.style import AFTER, BEFORE, MEASURED, MUTED, WIDE, legend, panel_columns, styled
 from droid_jax.report.words import label, number
 
@@ -130,5 +130,4 @@ def deviations(shift: Mapping[str, Any]) -> float:
 
 
 def _shift_label(shift: Mapping[str, Any]) -> str:
-    unit = f" {unit_words(shift['unit'])}" if shift["unit"] else ""
-    return f"{label(shift['name'])}\n{number(shift['before'])} → {number(shift['after'])}{unit}"
+    return f"{label(shift['name'])}\n{number(shift['before'])} → {quantity(shift['after'], shift['unit'])}"

@@ -51,8 +51,13 @@ def readable(text: str, found: Mapping[str, Any]) -> str:
 
 
 def unit_words(unit: str) -> str:
-    """ "N m s^2/rad^2" -> "N m s²/rad²"."""
-    return unit.replace("^2", "²").replace("^3", "³")
+    """ "N m s^2/rad^2" -> "N m s²/rad²"; nothing for a number without a unit ("-")."""
+    return "" if unit == "-" else unit.replace("^2", "²").replace("^3", "³")
+
+
+def quantity(value: float | None, unit: str, digits: int = 3) -> str:
+    """(0.7213, "N m") -> "0.721 N m"."""
+    return f"{number(value, digits)} {unit_words(unit)}".rstrip()
 
 
 def gap_summary(gap: Gap) -> list[str]:
@@ -150,9 +155,14 @@ def _added(sizes: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def size_words(a: Mapping[str, Any]) -> str:
     """ "latch 0.72 N m, 0.60 to 0.84 N m": an amplitude or a shape of gap.json with its interval."""
-    unit = f" {unit_words(a['unit'])}" if a["unit"] else ""
-    name = label(a["name"]).lower()
-    return f"{name} {number(a['value'])}{unit}, {number(a['low'])} to {number(a['high'])}{unit}"
+    bound = " (at its bound)" if at_bound(a) else ""
+    value, high = (quantity(a[k], a["unit"]) for k in ("value", "high"))
+    return f"{label(a['name']).lower()} {value}{bound}, {number(a['low'])} to {high}"
+
+
+def at_bound(a: Mapping[str, Any]) -> bool:
+    """Whether a value lies outside its own interval, whose tails are equal: only one at a bound does."""
+    return a["low"] is not None and a["high"] is not None and not a["low"] <= a["value"] <= a["high"]
 
 
 def _trends(found: Mapping[str, Any]) -> list[str]:
@@ -161,7 +171,7 @@ def _trends(found: Mapping[str, Any]) -> list[str]:
 
     return [
         f"The repeats are not alike: {effect_words(t['candidate'])} changes by about "
-        f"{number(t['per_repeat'], 2)} {unit_words(t['unit'])} from one to the next (p = {number(t['p'], 2)} if their "
+        f"{quantity(t['per_repeat'], t['unit'], 2)} from one to the next (p = {number(t['p'], 2)} if their "
         "order said nothing); let the robot warm up first, or look for what works loose."
         for t in found["trends"]
         if t["p"] is not None and t["p"] < SIGNIFICANT

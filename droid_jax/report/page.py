@@ -29,6 +29,7 @@ from droid_jax.report.gap_tables import groups
 from droid_jax.report.gap_words import (
     DECISIVE,
     ROLES,
+    at_bound,
     effect_words,
     gap_summary,
     readable,
@@ -96,6 +97,7 @@ def write_report(run: Path) -> Path:
         "nested": _nested,
         "unbroken": lambda text: re.sub(r"(?<=\d) (?=N m|%)", "\u00a0", text).replace("N m", "N\u00a0m"),
     }
+    environment.tests["at_bound"] = at_bound
     parts = (_policy(policy) if policy else {}) | (_search(gap) if gap else {})
     parts |= _identification(loaded, gap is not None) if loaded else {}
     if len([part for part in (loaded, gap, policy) if part]) > 1:

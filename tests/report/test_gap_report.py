@@ -348,6 +348,15 @@ def test_names_and_units_are_written_as_they_are_read(tmp_path: Path) -> None:
     assert gap_words.readable(said, found).endswith("; joint coulomb at joint 2 does better")
     assert gap_words.readable("torque_gain[panda_joint2] ran into", found) == "torque gain, joint 2 ran into"
     assert gap_words.unit_words("N m s^2/rad^2") == "N m s²/rad²"
+    assert gap_words.quantity(0.5, "-") == "0.500"
+
+
+def test_a_value_at_its_bound_is_said_to_lie_there() -> None:
+    """Its interval's tails are equal, so it lies outside: without a word it reads like a fault."""
+    size = {"name": "latch_exponent", "unit": "-", "value": 0.5, "low": 0.503, "high": 0.606}
+    assert gap_words.size_words(size) == "latch exponent 0.500 (at its bound), 0.503 to 0.606"
+    assert gap_words.size_words({**size, "low": 0.5}) == "latch exponent 0.500, 0.500 to 0.606"
+    assert gap_words.size_words({**size, "low": None, "high": None}) == "latch exponent 0.500, – to –"
 
 
 def test_settings_are_those_that_a_person_reads(tmp_path: Path) -> None:
