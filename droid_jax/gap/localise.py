@@ -70,8 +70,8 @@ def _parts(evidence: Evidence, values: np.ndarray, residuals: np.ndarray) -> tup
     space, scene = evidence.cost.space, evidence.cost.scene
     if ALONG not in space.names or scene.object_joint in scene.joints or evidence.units != evidence.repeats:
         return ()
-    pushed = values.copy()
-    pushed[space.index(ALONG)] += 0.5 * space[ALONG].std
+    pushed, at, step = values.copy(), space.index(ALONG), 0.5 * space[ALONG].std
+    pushed[at] += step if values[at] + step <= space[ALONG].high else -step
     without, with_it = -evidence.common(np.stack([values, pushed]))
     columns = int(evidence.column.max()) + 1
     mark = (with_it - without).reshape(columns, -1)

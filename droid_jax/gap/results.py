@@ -83,8 +83,8 @@ def gap_json(case: Case, verdict: Verdict) -> dict[str, Any]:
         "cut": verdict.cut,
         "remainder": verdict.remainder,
         "explained": verdict.explained if verdict.effects else None,
-        "gaps": {role: _gap(role, e, verdict) for role, e in case.judged.items()},
-        "phases": {role: _phases(e) for role, e in case.judged.items()},
+        "gaps": {role: _gap(role, case.judged[role], verdict) for role in verdict.gaps},
+        "phases": {role: _phases(case.judged[role]) for role in verdict.gaps},
         "screens": [
             {"p": found.p, "ranking": _ranking(found), "failed": list(found.failed)} for found in verdict.screens
         ],
@@ -107,7 +107,8 @@ def gap_arrays(case: Case, verdict: Verdict) -> dict[str, np.ndarray]:
     """
     joints = _joints(case.fit)
     out = {"joints": np.array(joints)}
-    for role, evidence in case.judged.items():
+    for role in verdict.gaps:
+        evidence = case.judged[role]
         order = [_joints(evidence).index(joint) for joint in joints]
         channel = evidence.cost.comparisons[0].channel("torque")
         mine = _instants(evidence)

@@ -74,8 +74,10 @@ def anew(hunt: Hunt, base: Model, done: Round) -> Round:
     base model: what that takes away by itself is no effect's.  A log of one repeat is replayed by inverse dynamics,
     which is smooth and has one basin.
     """
-    best = min(done.tried, key=lambda m: m.gap, default=base)
-    if done.winner is not None or hunt.case.fit.repeats == 1 or best.gap > (1 - LESS) * base.gap:
+    if done.winner is not None or not done.tried or hunt.case.fit.repeats == 1:
+        return done
+    best = min(done.tried, key=lambda m: m.gap)
+    if best.gap > (1 - LESS) * base.gap:
         return done
     if hunt.budget.spent:
         hunt.budget.skip("the fit from the prior on")
@@ -98,10 +100,9 @@ def _beside(hunt: Hunt, base: Model, done: Round, won: Model) -> Round:
     note = " (from where the best one ended)"
     beside = hunt.race(((p.parts, p.start(whole, basin)) for p in left), won.refined.objective, note)
     try:
-        plain = [hunt.refit((), basin, hunt.case.config.refit, note)]
+        before = min(base, hunt.refit((), basin, hunt.case.config.refit, note), key=hunt.gap)
     except NotReplayed:
-        plain = []
-    before = min([base, *plain], key=hunt.gap)
+        before = base
     best = {m.name: m for m in sorted([*done.tried, *beside], key=lambda m: m.refined.objective, reverse=True)}
     return _decided(hunt, before, done.screen, list(best.values()))
 

@@ -50,7 +50,8 @@ class Verdict:
     base, model: before and after.  floor: U0, what the simulation's own step leaves.
     gaps: "fit", "confirm", "sealed" -> (U before, U after).  remainder: U on the confirming demonstration that neither
     `model` nor the uncertainty of its fit explains (`transfer.beyond`), None where no fit converged.  screens, trials:
-    the grounds, in the order they were made.  failed: models whose replay blew up where their refit was to begin.
+    the grounds, in the order they were made.  failed: models whose replay blew up where their refit was to begin, or
+    on the sealed recording, which then is not in gaps.
     before, after: where the gap lives on the fitted recording.  rivals: models that do as well as `model`, refitted;
     experiments: what would tell them apart, the best first.  cut: in words what the budget left out, empty for nothing.
     trend: what changes from repeat to repeat, None where nothing was asked.

@@ -20,6 +20,7 @@ from droid_jax.gap.transfer import beyond
 from droid_jax.gap.trend import trend
 from droid_jax.gap.verdict import Kind, Verdict, open_share
 from droid_jax.identify.pipeline import Progress
+from droid_jax.identify.search import NotReplayed
 
 OPEN = 0.1  # share of the gap left open from which a model explains it only partly
 
@@ -76,7 +77,7 @@ def find(case: Case, base: Model, floor: float, progress: Progress = lambda stag
         else:
             rounds.append(pairs(hunt, base, model, rounds[0]))
             model = settled(hunt, rounds[-1].winner or model)
-    return _verdict(hunt, base, polished(hunt, pruned(hunt, model)), rounds, quiet)
+    return _verdict(hunt, base, polished(hunt, settled(hunt, pruned(hunt, model))), rounds, quiet)
 
 
 def further(asked: Sequence[Question], model: Model) -> tuple[Question, ...]:
@@ -119,7 +120,7 @@ def _verdict(hunt: Hunt, base: Model, model: Model, rounds: list[Round], quiet: 
     converged = base.refined.converged and model.refined.converged
     if not converged:
         model, rounds = base, [replace(r, winner=None, chosen=None) for r in rounds]
-    gaps = {role: (e.gap_at(base.values), e.gap_at(model.values)) for role, e in case.judged.items()}
+    gaps = _gaps(hunt, base, model)
     missing = bool(rounds) and rounds[0].screen.p < SIGNIFICANT and base.gap > floor
     tied = tuple(_tied(part.name, model, rounds) for part in model.parts)
     left = left_over(case, model) if converged else None
@@ -146,6 +147,19 @@ def _verdict(hunt: Hunt, base: Model, model: Model, rounds: list[Round], quiet: 
         cut=hunt.budget.cut,
         trend=trend(rounds[0].screen, base.residuals, case.config.seed) if rounds and case.fit.repeats > 1 else None,
     )
+
+
+def _gaps(hunt: Hunt, base: Model, model: Model) -> dict[str, tuple[float, float]]:
+    """U before and after by role; without the sealed motion where one of them cannot be replayed there."""
+    gaps = {}
+    for role, judged in hunt.case.judged.items():
+        try:
+            gaps[role] = judged.gap_at(base.values), judged.gap_at(model.values)
+        except NotReplayed:
+            if role != "sealed":
+                raise
+            hunt.failed.append("the fitted model on the sealed recording")
+    return gaps
 
 
 def _remains(hunt: Hunt, residuals: np.ndarray, quiet: bool) -> bool:

@@ -70,7 +70,8 @@ class Refined:
     space; x [D] search coordinates and best [D] physical values of the best start;
     objective: |r|^2 / 2 plus the prior's part; residual [M] and jacobian [M, D] there;
     prior [D] deviations, search units; starts: objective each start ended at; evaluations: replays;
-    iterations; converged: it ended before its iterations ran out, since they no longer paid or `aim` was out of reach.
+    iterations; converged: it ended before its iterations ran out, since they no longer paid; not where it was given
+    up because `aim` was out of reach.
     """
 
     space: Space
@@ -168,7 +169,7 @@ def refine(
         starts=ended,
         evaluations=problem.evaluations,
         iterations=problem.iterations,
-        converged=settled and problem.iterations < config.iterations,
+        converged=settled and problem.iterations < config.iterations and not problem.given_up,
     )
 
 
@@ -197,6 +198,7 @@ class _Descent(Problem):
     ) -> None:
         super().__init__(residuals, space, config, before)
         self.config, self.progress = config, progress
+        self.given_up = False
 
     def excess(self, state: State) -> np.ndarray:
         """[S] by how much the objectives are above half a unit for each residual, which noise alone leaves."""
@@ -216,7 +218,8 @@ class _Descent(Problem):
             self._report(state.objective[leader], state.residual.shape[1])
             if gain[leader] <= max(self.least(state), rough * state.objective[leader]):
                 break
-            if HOPELESS * gain[leader] < state.objective[leader] - self.config.aim:
+            self.given_up = bool(HOPELESS * gain[leader] < state.objective[leader] - self.config.aim)
+            if self.given_up:
                 break
             good = state.objective <= keep[min(number, len(keep) - 1)] * state.objective[leader]
             state, alive = state.rows(good), alive[good]

@@ -65,6 +65,18 @@ def test_each_part_holds_what_was_put_there(evidence: Any, unit: np.ndarray, whe
         assert cell.gap == pytest.approx(4.0 / degrees if cell.where == name else 0.0, abs=0.25)
 
 
+def test_the_parts_are_told_where_a_preload_stands_near_its_bound(evidence: Any) -> None:
+    """Its push goes the other way there: beyond the bound nothing may be replayed."""
+
+    def common(values: np.ndarray) -> np.ndarray:
+        return evidence.common(SPACE.check(values))
+
+    checked = SimpleNamespace(**{**vars(evidence), "common": common})
+    shared = residuals(np.zeros((COLUMNS, INSTANTS)))
+    for preload in (4.9, -4.9):
+        assert len(_parts(checked, SPACE.values({"hinge_preload": preload}), shared)) == 3  # type: ignore[arg-type]
+
+
 def test_a_hinge_with_a_sensor_of_its_own_needs_no_parts(evidence: Any) -> None:
     cost = SimpleNamespace(space=SPACE, scene=SimpleNamespace(object_joint="c", joints=("a", "b", "c")))
     one = SimpleNamespace(**{**vars(evidence), "cost": cost})

@@ -15,13 +15,14 @@ from droid_jax.gap import workflow
 from droid_jax.gap.anew import base_fit
 from droid_jax.gap.candidates import Candidate, candidates
 from droid_jax.gap.case import make_case
-from droid_jax.gap.hunt import Hunt
+from droid_jax.gap.hunt import Budget, Hunt
 from droid_jax.gap.rank import proposals
 from droid_jax.gap.refit import Model
 from droid_jax.gap.screen import Screen, questions_of
 from droid_jax.gap.select import AT_BOUND, TOO_SMALL, UNCONFIRMED
 from droid_jax.gap.verdict import Kind
 from droid_jax.gap.workflow import ask, find
+from droid_jax.identify.search import NotReplayed
 from droid_jax.model.effects.registry import library
 from droid_jax.model.parameters import Parameter
 from droid_jax.model.scene import Scene
@@ -263,3 +264,15 @@ def test_what_lost_for_its_size_alone_is_said(found: Small):
     chance = replace(tiny, reasons=(f"{UNCONFIRMED} (p = 0.014)",))
     said = replace(verdict, trials=(chance, replace(chance, reasons=(*chance.reasons, "another reason")))).sentence
     assert said.endswith(f"not in the library, or {chance.name}, {UNCONFIRMED}.")
+
+
+def test_a_sealed_motion_that_blows_up_is_left_out_and_said_so(found: Small) -> None:
+    """It is opened when hours of search are over, which must not be lost."""
+
+    def gap_at(values: np.ndarray) -> float:
+        raise NotReplayed("the simulation of 'sealed' blows up")
+
+    sealed: Any = SimpleNamespace(gap_at=gap_at)
+    hunt = Hunt(replace(found.case, sealed=sealed), 1.0, FLOOR, Budget(None), lambda stage, value: None)
+    gaps = workflow._gaps(hunt, found.base, found.verdict.model)
+    assert gaps == found.verdict.gaps and hunt.failed == ["the fitted model on the sealed recording"]

@@ -502,6 +502,7 @@ def test_an_aim_that_is_out_of_reach_is_given_up_and_one_within_reach_is_pursued
     assert reachable.objective == whole.objective and reachable.evaluations == whole.evaluations
     assert hopeless.evaluations < whole.evaluations
     assert hopeless.objective > whole.objective
+    assert whole.converged and reachable.converged and not hopeless.converged
 
 
 def test_a_period_is_found_though_the_first_differences_span_a_whole_one():

@@ -138,6 +138,20 @@ def test_optima_beyond_bounds_do_not_spoil_the_search(count: int, beyond: float)
     assert set(fit.on_bound) == {f"p{i}" for i in range(count)}
 
 
+def test_a_restart_that_could_not_be_replayed_keeps_no_other_off_its_bound():
+    """Its rows all blow up; the best of the other one is asked for on its bound all the same."""
+    mass = Parameter("mass", "kg", 1.0, 0.5, 0.0, 10.0, scaling=Scaling.LOG, floor=1.0)
+    space = Space((mass, Parameter("x", "u", 0.0, 1.0, -5.0, 5.0)))
+
+    def cost(values):
+        return np.where(values[:, 1] > 2.5, np.nan, values[:, 0] ** 2 + 0.01 * values[:, 1] ** 2)
+
+    config = endless(population=16, parents=None, generations=25, restarts=2, sigma=0.02)
+    fit = search(cost, space, config, start=np.array([[1.0, 0.0], [1.0, 4.9]]))
+    assert np.isinf(fit.restarts[1].best_cost)
+    assert fit.best[0] == 0.0 and fit.on_bound == ("mass",)
+
+
 def test_resample_redraws_and_clip_clips():
     """One generation from the paper's kind of prior: damping 0.10 with deviation 0.19, never negative."""
     space = Space((Parameter("d", "N m s/rad", 0.10, 0.19, 0.0, 5.0), Parameter("e", "u", 0, 1, -9, 9)))
