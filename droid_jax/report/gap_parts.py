@@ -15,7 +15,7 @@ class Parts:
     closed: after the share of U that went away.  other: what confirms.  flipped: what the tests turn and draw again.
     lines: what is drawn over time; places: what the maps of U show.  more: what a smaller effect would need.
     repeated: whether there are repeats, which tell noise.  in_turns: whether fitted and confirming instants
-    take turns in one recording.
+    take turns in one recording.  halves: whether they are repeats of one recording.
     """
 
     gap: str
@@ -29,6 +29,7 @@ class Parts:
     more: str
     repeated: bool = True
     in_turns: bool = False
+    halves: bool = False
 
 
 _RECORDINGS = Parts(
@@ -60,7 +61,7 @@ _BLOCKS = Parts(
 )
 PARTS = {
     "recordings": _RECORDINGS,
-    "repeats": replace(_RECORDINGS, other="the other repeats"),
+    "repeats": replace(_RECORDINGS, other="the other repeats", halves=True),
     "blocks": _BLOCKS,
 }
 UNSAID = {"by": "recordings", "limits": ""}  # where gap.json does not say

@@ -114,6 +114,18 @@ def _row(found: Mapping[str, Any], name: str, entry: Any, trial: Mapping[str, An
         tied = any(ties for effect, ties in zip(effects, found["tied"], strict=False) if effect in parts)
         fate = "in the model, and others do as well" if tied else "in the model"
     else:
-        fate = "does as well: a tie" if parts <= {*effects, *rivals} else "passed, but another leaves less"
+        fate = "does as well: a tie" if parts <= {*effects, *rivals} else _passed_over(found, trial)
     ranked = entry or {"t": None, "explained": None}
     return Row(model_words(name), ranked["t"], ranked["explained"], trial, fate, kept)
+
+
+def _passed_over(found: Mapping[str, Any], trial: Mapping[str, Any]) -> str:
+    """Why a model that passed its trial is not the answer."""
+    if found["verdict"] == "fit not converged":
+        return "passed, but a fit did not converge"
+    left = [found["gaps"]["confirm"]["after"], *(t["gap_confirm"] for t in found["trials"])]
+    if trial["gap_confirm"] > min(u for u in left if u is not None):
+        return "passed, but another leaves less"
+    if BETWEEN in trial["name"]:
+        return "passed, but takes too little more away than fewer effects do"
+    return "passed, but a plainer one leaves about as much"

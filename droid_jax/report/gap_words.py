@@ -126,7 +126,9 @@ def _size(gap: Gap) -> str:
 def _allowed(gap: Gap) -> str:
     """What of the confirming motion's gap is the fit's own uncertainty, where that is worth a word."""
     left, confirm = gap.found.get("remainder"), gap.found["gaps"].get("confirm")
-    if left is None or confirm is None or not gap.extended or left > TOLD * confirm["after"]:
+    if left is None or confirm is None or not gap.extended:
+        return ""
+    if confirm["after"] <= max(gap.floor or 0.0, 0.0) or left > TOLD * confirm["after"]:
         return ""
     after, share = number(confirm["after"]), percent(1.0 - max(left, 0.0) / confirm["after"])
     return (
@@ -180,16 +182,17 @@ def _trends(found: Mapping[str, Any]) -> list[str]:
 
 def _next(gap: Gap) -> str:
     named = listed([effect_words(e) for e in gap.found["effects"]])
+    clearly = " clearly enough" if any(t["passed"] for t in gap.found["trials"]) else " its trial"
     steps = {
         "none": f"go on with the base model; a smaller effect would need {gap.parts.more}",
         "named": f"look for the {named} on the hardware, and simulate with it{_file(gap)}",
         "tie": f"take no name for the cause yet. {_separate(gap)}",
         "partly explained": _partly(gap, named),
-        "unexplained": f"look at the hardware {_where(gap)}. No effect of the library passed its trial: where one came "
+        "unexplained": f"look at the hardware {_where(gap)}. No effect of the library passed{clearly}: where one came "
         f"close it needs {gap.parts.more}, else write one of your own or correct the scene there, and run again. Do "
         "not train on this part of the motion",
         "fit not converged": f"{_longer(gap)}give the parameters tighter priors, and run again; take no number from "
-        "this page until the starts agree",
+        "this page until the fit settles",
     }
     return f"Next: {steps[gap.found['verdict']]}."
 
@@ -198,17 +201,27 @@ def _longer(gap: Gap) -> str:
     """How to search longer than `gap` itself can; nothing in blocks, whose fit needs no search."""
     if gap.parts.in_turns:
         return ""
+    recording = "the recording" if gap.parts.halves else f"“{gap.recording('fit')}”"
     return (
-        f"fit “{gap.recording('fit')}” by python -m droid_jax.run identify --preset standard --restarts 3 and hand its "
+        f"fit {recording} by python -m droid_jax.run identify --preset standard --restarts 3 and hand its "
         "folder on (gap --fit FOLDER), or "
     )
 
 
-def _partly(gap: Gap, named: str) -> str:
+def untrusted(gap: Gap) -> bool:
+    """Whether nothing should be trained on the model: no fit settled, or most of the gap has no name."""
+    return gap.found["verdict"] in ("unexplained", "fit not converged") or _mostly_open(gap)
+
+
+def _mostly_open(gap: Gap) -> bool:
     from droid_jax.gap.verdict import HALF  # only here: it imports what computes
 
     explained = gap.found.get("explained")
-    if explained is None or explained >= HALF:
+    return gap.found["verdict"] == "partly explained" and explained is not None and explained < HALF
+
+
+def _partly(gap: Gap, named: str) -> str:
+    if not _mostly_open(gap):
         return f"{_kept(gap, named)}, and look at the hardware {_where(gap)}; that part has no name yet"
     return (
         f"look at the hardware {_where(gap)}, and take no name for the cause yet: the {named} may only imitate what is "

@@ -4,13 +4,12 @@ next."""
 from __future__ import annotations
 
 from droid_jax.report.gap_folder import Gap
-from droid_jax.report.gap_words import gap_summary, readable
+from droid_jax.report.gap_words import gap_summary, readable, untrusted
 from droid_jax.report.policy_folder import Trained
 from droid_jax.report.policy_words import policy_summary
 from droid_jax.report.run_folder import Run
 from droid_jax.report.words import DOUBT, far_off, judged, listed, number, percent, summary
 
-WRONG = ("unexplained", "fit not converged")  # verdicts on which nothing should be trained
 ALL_THE_SAME = (
     "The policy was trained all the same, on a model that is known to be wrong there: do not take it to a robot."
 )
@@ -33,7 +32,7 @@ def lead(run: Run | None, gap: Gap | None, policy: Trained | None, hidden: str =
             following = following.replace("Next: ", f"Next: {DOUBT}; then ", 1)
     if policy:
         sentences += [_opened(where, found["success_rate"]) for where, found in policy.trials.items()]
-        doubted = gap is not None and gap.found["verdict"] in WRONG
+        doubted = gap is not None and untrusted(gap)
         following = f"{following} {ALL_THE_SAME}" if doubted else policy_summary(policy, gap is not None)[-1]
     return [*sentences, following]
 

@@ -153,6 +153,10 @@ def test_what_the_fit_does_not_tell_is_said_where_it_is_much(tmp_path: Path) -> 
     assert "75 % lies within the uncertainty" in said("much", remainder=0.25 * after).replace("\u00a0", " ")
     for name, remainder in (("little", 0.9 * after), ("unknown", None)):
         assert "lies within the uncertainty" not in said(name, remainder=remainder)
+    gaps = gap_json("named", ("fit", "confirm", "sealed"))["gaps"]
+    for name, u in (("nothing", 0.0), ("below", -0.006)):  # nothing is left, so that no share of it is anything
+        found = gaps | {"confirm": gaps["confirm"] | {"after": u}}
+        assert "lies within the uncertainty" not in said(name, gaps=found, remainder=-0.01)
 
 
 def test_what_leaves_most_of_the_gap_open_is_kept_by_nobody(tmp_path: Path) -> None:
@@ -238,6 +242,25 @@ def test_candidates_say_what_became_of_them(tmp_path: Path) -> None:
     assert (len(one.others), len(two.others)) == (7, 9)
     ties = groups(read_gap(make_gap(tmp_path / "tie", "tie")).found)[0].tried
     assert [r.fate for r in ties[:2]] == ["in the model, and others do as well", "does as well: a tie"]
+
+
+@pytest.mark.parametrize(
+    ("verdict", "name", "gap", "fate"),
+    [
+        ("unexplained", LATCH, 9.0, "passed, but another leaves less"),
+        ("unexplained", LATCH, 0.01, "passed, but a plainer one leaves about as much"),
+        ("unexplained", f"{LATCH} + {CLOSER}", 0.01, "passed, but takes too little more away than fewer effects do"),
+        ("fit not converged", LATCH, 0.01, "passed, but a fit did not converge"),
+    ],
+)
+def test_what_passed_and_was_not_named_says_why(tmp_path: Path, verdict: str, name: str, gap: float, fate: str) -> None:
+    found = gap_json("unexplained", ("fit", "confirm")) | {"verdict": verdict}
+    passed = {**found["trials"][0], "name": name, "gap_confirm": gap, "passed": True, "reasons": []}
+    found["trials"] = [*found["trials"][1:], {**passed, "round": name.count(" + ")}]
+    read = read_gap(make_gap(tmp_path / "run", **found))
+    assert [r.fate for g in groups(read.found) for r in g.tried if r.trial and r.trial["passed"]] == [fate]
+    said = gap_words.gap_summary(read)[-1]
+    assert ("No effect of the library passed clearly enough" in said) == (verdict == "unexplained")
 
 
 def test_pairs_tried_from_scratch_stand_beside_those_that_grew(tmp_path: Path) -> None:

@@ -65,11 +65,21 @@ def test_what_the_stand_in_robot_hid_is_said_in_the_librarys_words_too(tmp_path:
     )
 
 
-@pytest.mark.parametrize(("verdict", "warned"), [("unexplained", True), ("fit not converged", True), ("tie", False)])
+@pytest.mark.parametrize(
+    ("verdict", "explained", "warned"),
+    [
+        ("unexplained", None, True),
+        ("fit not converged", None, True),
+        ("tie", None, False),
+        ("partly explained", 0.0, True),
+        ("partly explained", 0.49, True),
+        ("partly explained", 0.51, False),
+    ],
+)
 def test_a_policy_of_a_model_that_is_known_to_be_wrong_is_not_sent_to_a_robot(
-    tmp_path: Path, verdict: str, warned: bool
+    tmp_path: Path, verdict: str, explained: float | None, warned: bool
 ):
-    make_gap(tmp_path / "gap", verdict)
+    make_gap(tmp_path / "gap", verdict, explained=explained)
     make_policy(tmp_path / "train")
     text = page.write_report(tmp_path).read_text().replace("\u00a0", " ")
     (lead,) = re.findall(r'<p class="summary lead">(.*?)</p>', text, re.S)
