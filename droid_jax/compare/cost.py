@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from droid_jax import runtime
-from droid_jax.compare.inverse import Path, path_of, path_replay
+from droid_jax.compare.inverse import Path, path_of, path_replay, prescribed
 from droid_jax.compare.population import blocks, over_block
 from droid_jax.compare.replay import Drive, Replay, check_gains, make_drive, servo_replay, torque_offset_effect
 from droid_jax.compare.residuals import CompareConfig, Comparison, make_comparison
@@ -195,7 +195,9 @@ def followed(scene: Scene, recording: Recording, config: CompareConfig) -> Drive
         warn_if_open_loop(scene, recording)
         warn_if_moving(recording)
         return make_drive(scene, recording, weigh="torque" in config.channels)
-    return measured_motion(recording, scene.joints, cutoff=config.motion_cutoff)
+    if not scene.joints:
+        raise ValueError(f"no joint of scene {scene.name!r} is driven: name the measured ones (--joints)")
+    return measured_motion(recording, prescribed(scene, recording), cutoff=config.motion_cutoff)
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +237,7 @@ def _apart(along: Along, scene: Scene, recording: Recording, config: CompareConf
     if recording.repeats == 1 or not recording.channel("position").mask.all():
         return None
     motions = [
-        measured_motion(recording.repeats_subset([n]), scene.joints, cutoff=config.motion_cutoff)
+        measured_motion(recording.repeats_subset([n]), along.motion.joints, cutoff=config.motion_cutoff)
         for n in range(recording.repeats)
     ]
     torques = np.asarray(along.torques(jax.tree.map(lambda *a: jnp.stack(a), *map(path_of, motions))), np.float64)
@@ -247,7 +249,8 @@ def _same(new: Drive | Motion, old: Drive | Motion) -> bool:
     if new.torque != old.torque:
         return False
     if isinstance(new, Motion) or isinstance(old, Motion):
-        return isinstance(new, Motion) and isinstance(old, Motion) and np.array_equal(new.time, old.time)
+        both = isinstance(new, Motion) and isinstance(old, Motion)
+        return both and new.joints == old.joints and np.array_equal(new.time, old.time)
     return np.array_equal(new.command, old.command) and np.allclose(new.qpos0, old.qpos0, rtol=0.0, atol=SCATTER)
 
 
@@ -274,7 +277,7 @@ def _engine(
             raise ValueError("mj_step replays commands; this recording has none")
         if engine != "mjx":
             raise ValueError("a recording without commands is replayed by inverse dynamics, which needs engine 'mjx'")
-        along = path_replay(scene, drive.torque, effects)
+        along = path_replay(scene, drive.torque, effects, drive.joints)
         means = jnp.asarray(space.mean, jnp.float32)
         return Along(
             over_block(lambda values, path: along(make_physics(scene, space, values), path)),

@@ -5,6 +5,7 @@ For recordings that hold no commands, such as logs of free motion.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -15,11 +16,31 @@ from mujoco import mjx
 
 from droid_jax.compare.replay import Replay, observed
 from droid_jax.measure.motion import Motion
-from droid_jax.measure.recording import TorqueConvention, TorqueSide
+from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.model.joint_friction import SMOOTHING
 from droid_jax.model.physics import Physics
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, Rollout, State, Theta, column
+
+
+def prescribed(scene: Scene, recording: Recording) -> tuple[str, ...]:
+    """The joints whose measured motion a replay follows: the scene's, then all others that the log holds throughout.
+
+    Torques are compared of the scene's joints alone, but what else moved carries them, or is carried.  All other joints
+    stand still at their initial positions; one that carries a measured joint is warned of.
+    """
+    channel = recording.channel("position")
+    whole = {j for i, j in enumerate(channel.columns) if channel.mask[:, :, i].any(axis=0).all()}
+    others = [j for j in scene.single_joints if j in whole and j not in scene.joints]
+    joints = (*scene.joints, *others)
+    still = [j for j in scene.carriers(scene.joints) if j not in joints]
+    if still:
+        warnings.warn(
+            f"recording {recording.name!r} holds no positions of {', '.join(still)}, which carry measured joints: they "
+            "are taken to stand still",
+            stacklevel=3,
+        )
+    return joints
 
 
 class Path(NamedTuple):
@@ -38,18 +59,21 @@ def path_of(motion: Motion) -> Path:
 
 def inverse_replay(scene: Scene, motion: Motion, effects: Sequence[Effect] = ()) -> Replay:
     """Torques of one prescribed motion; see `path_replay`."""
-    replay, path = path_replay(scene, motion.torque, effects), path_of(motion)
+    replay, path = path_replay(scene, motion.torque, effects, motion.joints), path_of(motion)
     return lambda physics: replay(physics, path)
 
 
 def path_replay(
-    scene: Scene, convention: TorqueConvention, effects: Sequence[Effect] = ()
+    scene: Scene, convention: TorqueConvention, effects: Sequence[Effect] = (), joints: Sequence[str] = ()
 ) -> Callable[[Physics, Path], Rollout]:
-    """Torques of prescribed motions, vectorised over time.
+    """Torques of the scene's joints along prescribed motions, vectorised over time.
 
-    tau = M(q) qdd + c(q, qd) + k (q - q_spring) [+ g(q)] and, on the motor side, + armature qdd +
-    damping qd + dry friction sgn(qd).  On the link side none of the motor's own terms appear; what
-    the joint adds there (Coulomb and viscous friction, offset) is an observation effect.
+    joints: those of the paths, the scene's first (default: these alone).
+
+    tau = M(q) qdd + c(q, qd) - passive forces [+ g(q)] and, on the motor side, + armature qdd + dry friction sgn(qd).
+    Passive are springs and dampers of joints and tendons; joints' damping on the motor side only: on the link side none
+    of the motor's own terms appear, and what the joint adds there (Coulomb and viscous friction, offset) is an
+    observation effect.  Constraints (contacts, limits, equalities) take no part.
     Whether g(q) is there is the recording's word alone, not the MJCF's gravcomp.
     Forces and friction of effects are what the torque has to overcome, on either side.
     Raises ValueError for effects of command and servo: a prescribed motion has neither.
@@ -57,38 +81,39 @@ def path_replay(
     steering = [e.name for e in effects if e.command or e.servo]
     if steering:
         raise ValueError(f"a prescribed motion has no commands that an effect could change: {', '.join(steering)}")
-    joints, positions = scene.joint_dofs, scene.joint_qpos
-    springs = np.array([scene.id("joint", j) for j in scene.joints])
+    joints = joints or scene.joints
+    dofs, positions = np.array([scene.dof(j) for j in joints]), np.array([scene.qpos(j) for j in joints])
+    compensated = 1.0 - scene.model.jnt_actgravcomp[scene.model.dof_jntid]
     base = jnp.asarray(scene.model.qpos0, jnp.float32)
     motor = convention.side is TorqueSide.MOTOR
 
     def replay(physics: Physics, path: Path) -> Rollout:
         model, theta = physics.model, physics.theta
-        link_model = model if motor else model.replace(dof_armature=jnp.zeros_like(model.dof_armature))
+        none = {name: jnp.zeros_like(getattr(model, name)) for name in ("dof_armature", "dof_damping")}
+        link_model = model if motor else model.replace(**none)
         if not convention.gravity:
             link_model = link_model.replace(opt=link_model.opt.replace(gravity=jnp.zeros(3)))
 
         def at(time, position, velocity, acceleration):
             full = jnp.zeros(scene.model.nv, jnp.float32)
-            velocity = full.at[joints].set(velocity)
+            velocity = full.at[dofs].set(velocity)
             data = mjx.make_data(link_model).replace(qpos=base.at[positions].set(position), qvel=velocity)
             data = mjx.fwd_velocity(link_model, mjx.fwd_position(link_model, data))
-            torque = mjx.full_m(link_model, data) @ full.at[joints].set(acceleration) + data.qfrc_bias
+            torque = mjx.full_m(link_model, data) @ full.at[dofs].set(acceleration) + data.qfrc_bias
+            torque = torque - (data.qfrc_passive - compensated * data.qfrc_gravcomp)
             if motor:
-                torque = torque + model.dof_damping * velocity + model.dof_frictionloss * jnp.sign(velocity)
-            stretch = position - model.qpos_spring[positions]
-            torque = torque.at[joints].add(model.jnt_stiffness[springs] * stretch)
+                torque = torque + model.dof_frictionloss * jnp.sign(velocity)
             state = State(time, data.qpos, velocity, torque)
             own = model.dof_frictionloss if motor else _behind_the_sensor(scene, theta)
-            return (torque + _resistance(theta, state, own, effects))[joints]
+            return (torque + _resistance(theta, state, own, effects))[scene.joint_dofs]
 
         torque = jax.vmap(at)(*path)
-        hinge = scene.joints.index(scene.object_joint) if scene.object_joint in scene.joints else None
+        hinge = joints.index(scene.object_joint) if scene.object_joint in joints else None
         rollout = Rollout(
             time=path.time,
             torque=torque,
-            position=path.position,
-            velocity=path.velocity,
+            position=path.position[:, : len(scene.joints)],
+            velocity=path.velocity[:, : len(scene.joints)],
             object_angle=jnp.zeros(len(path.time)) if hinge is None else path.position[:, hinge],
             contact=jnp.zeros((len(path.time), 0), bool),
             finite=jnp.array(True),

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from droid_jax.measure.recording import Channel, Recording
-from droid_jax.model.scene import ONE_DEGREE, Scene
+from droid_jax.model.scene import Scene
 
 AJAR = 0.02  # rad or m: an object seen no further than this from the scene's pose stands there, as cameras are noisy
 WEIGHT = 0.01  # N m or N: a joint that feels less uncompensated weight feels none (noise below it is never believed)
@@ -190,6 +190,4 @@ def _measured(scene: Scene, recording: Recording) -> dict[str, float]:
         seen, own = start.pop(channel.columns[0], None), scene.model.qpos0[scene.qpos(hinge)]
         if seen is not None and abs(seen - own) > AJAR:
             start[hinge] = seen
-    simple = [i for i, kind in enumerate(scene.model.jnt_type) if mujoco.mjtJoint(kind) in ONE_DEGREE]
-    known = {mujoco.mj_id2name(scene.model, mujoco.mjtObj.mjOBJ_JOINT, i) for i in simple}
-    return {joint: q for joint, q in start.items() if joint in known}
+    return {joint: q for joint, q in start.items() if joint in scene.single_joints}

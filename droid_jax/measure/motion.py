@@ -20,10 +20,11 @@ EDGE = 0.3  # s left out at both ends, where a zero-phase filter has no neighbou
 class Motion:
     """A measured motion of some joints, for the inverse mode.
 
-    time: [T] s, regular.  position, velocity, acceleration: [T, J] rad, rad/s, rad/s^2 (m for slides), in the
-    order of the scene's joints.  torque: convention of the measured torque.
+    joints: J names.  time: [T] s, regular.  position, velocity, acceleration: [T, J] rad, rad/s, rad/s^2 (m for
+    slides).  torque: convention of the measured torque.
     """
 
+    joints: tuple[str, ...]
     time: np.ndarray
     position: np.ndarray
     velocity: np.ndarray
@@ -50,7 +51,7 @@ def measured_motion(recording: Recording, joints: Sequence[str], *, cutoff: floa
     if unknown:
         raise ValueError(
             f"recording {recording.name!r} holds no commands and its positions lack {', '.join(unknown)}: "
-            "a motion is prescribed for every joint of the scene"
+            "a motion is prescribed for every measured joint (--joints)"
         )
     columns = [channel.columns.index(j) for j in joints]
     mask = channel.mask[:, :, columns]
@@ -74,7 +75,7 @@ def measured_motion(recording: Recording, joints: Sequence[str], *, cutoff: floa
     qd = np.gradient(q, 1 / rate, axis=0)
     qdd = np.gradient(qd, 1 / rate, axis=0)
     rows = (np.stack([np.interp(clock, even, c) for c in a.T], axis=1) for a in (q, qd, qdd))
-    return Motion(clock, *rows, torque=recording.torque)
+    return Motion(tuple(joints), clock, *rows, torque=recording.torque)
 
 
 def _regular(name: str, time: np.ndarray, position: np.ndarray, cutoff: float) -> np.ndarray:

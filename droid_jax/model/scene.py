@@ -105,6 +105,23 @@ class Scene:
         return np.array([self.qpos(j) for j in self.joints], dtype=int)
 
     @functools.cached_property
+    def single_joints(self) -> tuple[str, ...]:
+        """Names of all joints of one degree, driven or not, in the model's order."""
+        kinds = [mujoco.mjtJoint(k) for k in self.model.jnt_type]
+        names = (mujoco.mj_id2name(self.model, mujoco.mjtObj.mjOBJ_JOINT, i) for i in range(len(kinds)))
+        return tuple(name for name, kind in zip(names, kinds, strict=True) if kind in ONE_DEGREE and name)
+
+    def carriers(self, joints: Iterable[str]) -> tuple[str, ...]:
+        """Joints of one degree between the world and the bodies that these joints move, these included."""
+        model, above = self.model, set[int]()
+        for joint in joints:
+            body = int(model.jnt_bodyid[self.id("joint", joint)])
+            while body:
+                above.add(body)
+                body = int(model.body_parentid[body])
+        return tuple(j for j in self.single_joints if int(model.jnt_bodyid[self.id("joint", j)]) in above)
+
+    @functools.cached_property
     def finger_pairs(self) -> tuple[np.ndarray, ...]:
         """For each finger, the ids of its contact pairs."""
         fingers = self.grip.fingers if self.grip else ()

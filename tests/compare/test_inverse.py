@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -9,10 +13,10 @@ import numpy as np
 import pytest
 
 from droid_jax import runtime
-from droid_jax.compare.inverse import inverse_replay
+from droid_jax.compare.inverse import inverse_replay, prescribed
 from droid_jax.compare.replay import torque_offset_effect
 from droid_jax.measure.motion import Motion
-from droid_jax.measure.recording import TorqueConvention, TorqueSide
+from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
 from droid_jax.model.builtin import ARM
 from droid_jax.model.door import torque_offsets
 from droid_jax.model.door_scene import door_scene
@@ -28,7 +32,9 @@ PLANAR = """<mujoco><compiler angle="radian"/><worldbody>
     <geom type="capsule" size=".03" fromto="0 0 0 .3 0 0" mass="2"/>
     <body pos=".3 0 0" {gravcomp}><joint name="b" axis="0 1 0" armature="0.05" damping="1"/>
       <geom type="capsule" size=".02" fromto="0 0 0 .2 0 .1" mass="1" contype="0"/></body></body>
-</worldbody><actuator><position joint="a" kp="9"/><position joint="b" kp="9"/></actuator></mujoco>"""
+</worldbody><actuator><position joint="a" kp="9"/><position joint="b" kp="9"/></actuator>{more}</mujoco>"""
+TENDON = """<tendon><fixed stiffness="20" damping="3" springlength="0.1">
+  <joint joint="a" coef="1"/><joint joint="b" coef="-1"/></fixed></tendon>"""
 
 
 def motion(scene: Scene, side: TorqueSide, gravity: bool, count: int = 40) -> Motion:
@@ -37,6 +43,7 @@ def motion(scene: Scene, side: TorqueSide, gravity: bool, count: int = 40) -> Mo
     low, high = scene.model.jnt_range[ids].T if scene.model.jnt_range[ids].any() else (-1.0, 1.0)
     size = (count, len(scene.joints))
     return Motion(
+        joints=scene.joints,
         time=0.01 * np.arange(count),
         position=rng.uniform(low, high, size),
         velocity=rng.normal(0, 1.0, size),
@@ -103,9 +110,9 @@ def test_the_panda_against_mj_inverse(panda: tuple[Scene, Space], side: TorqueSi
     np.testing.assert_allclose(got.velocity, given.velocity, rtol=1e-6)
 
 
-def planar(*, gravcomp: bool = True, spring: str = "") -> Scene:
-    xml = PLANAR.format(gravcomp='gravcomp="1"' if gravcomp else "", spring=spring)
-    return compile_scene(mujoco.MjSpec.from_string(xml), "planar")
+def planar(*, gravcomp: bool = True, spring: str = "", more: str = "", joints: Sequence[str] | None = None) -> Scene:
+    xml = PLANAR.format(gravcomp='gravcomp="1"' if gravcomp else "", spring=spring, more=more)
+    return compile_scene(mujoco.MjSpec.from_string(xml), "planar", joints=joints)
 
 
 def check_planar(scene: Scene, side: TorqueSide, gravity: bool) -> None:
@@ -126,6 +133,43 @@ def test_gravity_is_the_recordings_choice_not_the_files(side: TorqueSide, gravit
 def test_springs_pull_on_either_side():
     for side in (MOTOR, LINK):
         check_planar(planar(spring='stiffness="5" springref="0.3"'), side, False)
+
+
+def test_tendons_pull_on_either_side():
+    for side in (MOTOR, LINK):
+        check_planar(planar(more=TENDON), side, False)
+
+
+def log(columns: Sequence[str], holes: bool = False) -> Recording:
+    """Two seconds of the planar arm without commands."""
+    time = np.arange(0.0, 2.0, 0.005)
+    values = np.stack([1.0 + 0.5 * np.sin(1.5 * time), 0.4 * np.sin(2.0 * time)], axis=1)[None, :, : len(columns)]
+    mask = np.ones(values.shape, bool)
+    mask[:, 100, 0] = not holes
+    channels = {"position": Channel("position", "rad", tuple(columns), time, values, mask)}
+    return Recording("log", np.zeros(0), np.zeros((0, 0)), (), channels, TorqueConvention(LINK, True), qpos0={})
+
+
+def test_a_joint_that_carries_a_measured_one_moves_with_the_log():
+    """Torques are asked of the second joint alone, and the first one tips and swings it all the same."""
+    whole, part = planar(), planar(joints=["b"])
+    assert prescribed(part, log(["a", "b"])) == ("b", "a")
+    given = motion(whole, LINK, True)
+    turned = {name: getattr(given, name)[:, ::-1] for name in ("position", "velocity", "acceleration")}
+    space = Space(torque_offsets(["b"]))
+    got = replayed(part, space, space.mean, replace(given, joints=("b", "a"), **turned))
+    np.testing.assert_allclose(got.torque, expected(whole.model, whole, given)[:, 1:], atol=5e-5)
+    np.testing.assert_allclose(got.position, given.position[:, 1:], rtol=1e-6)
+
+
+def test_a_carrier_without_positions_is_warned_of():
+    part = planar(joints=["b"])
+    for recording in (log(["b"]), log(["a", "b"], holes=True)):
+        with pytest.warns(UserWarning, match="holds no positions of a, which carry measured joints"):
+            assert prescribed(part, recording) == ("b",)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert prescribed(planar(joints=["a"]), log(["a"])) == ("a",)  # nothing carries it
 
 
 def test_dry_friction_opposes_the_motion_on_the_motor_side():

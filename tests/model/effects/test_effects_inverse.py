@@ -33,6 +33,7 @@ def prescribed(scene: Scene, side: TorqueSide, gravity: bool) -> Motion:
     speed = rng.normal(0, 1.0, size)
     speed[::4] *= 0.02
     return Motion(
+        joints=scene.joints,
         time=0.01 * np.arange(len(speed)),
         position=rng.uniform(-0.3, 1.0, size),
         velocity=speed,
