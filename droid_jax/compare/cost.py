@@ -23,6 +23,7 @@ from droid_jax.compare.replay import Drive, Replay, check_gains, make_drive, ser
 from droid_jax.compare.residuals import CompareConfig, Comparison, make_comparison
 from droid_jax.compare.start import check_range, warn_if_moving, warn_if_open_loop
 from droid_jax.compare.twin import twin_replay
+from droid_jax.measure.checks import validate
 from droid_jax.measure.motion import Motion, measured_motion
 from droid_jax.measure.recording import Recording
 from droid_jax.model.joint_friction import joint_friction_effect
@@ -144,7 +145,7 @@ def make_cost(
     engine: "mjx" (compiled, all devices) or "mujoco" (plain C, all cores; the parity oracle).
     effects: extra physics or observation models whose parameters are part of the space; torque
       offsets, and joint friction behind the sensor where the space holds any, are there already.
-    Raises ValueError for unknown engines, joints, channels, or gains that do not match.
+    Raises ValueError for unknown engines, joints, channels, parameters that nothing reads, or gains that do not match.
     """
     config = config or CompareConfig()
     recordings = [recordings] if isinstance(recordings, Recording) else recordings
@@ -152,6 +153,7 @@ def make_cost(
         raise ValueError("a cost needs at least one recording")
     drives = [followed(scene, r, config) for r in recordings]
     given = {e.name for e in effects}
+    check_read(scene, space, effects)
     effects = (*effects, *(e for e in _sensor_effects(scene, space) if e.name not in given))
     replays = tuple(_engine(engine, scene, space, d, effects, config.mj_step) for d in drives)
     comparisons = tuple(
@@ -159,6 +161,21 @@ def make_cost(
         for recording, drive, replay in zip(recordings, drives, replays, strict=True)
     )
     return assemble(scene, space, comparisons, replays, drives)
+
+
+def check_read(scene: Scene, space: Space, effects: Sequence[Effect]) -> None:
+    """Raise ValueError for parameters that write no model field and are read by no replay: they would change nothing.
+
+    An effect that states no parameters may read any of them.
+    """
+    sensed = [f"{what}[{joint}]" for what in ("torque_offset", "viscous", "coulomb") for joint in scene.joints]
+    read = {"time_offset", *sensed, *(p.name for e in effects for p in e.parameters)}
+    unread = [p.name for p in space.parameters if not p.writes and p.name not in read]
+    if unread and all(e.parameters for e in effects):
+        raise ValueError(
+            f"parameters {', '.join(unread)} write no field of the model, and nothing in the replay reads them; names "
+            f"that it reads: time_offset, {', '.join(sensed)}, and those of the effects that it is given"
+        )
 
 
 def assemble(
@@ -190,6 +207,7 @@ def batch_replay(scene: Scene, space: Space, replay: Replay) -> Callable[[np.nda
 
 def followed(scene: Scene, recording: Recording, config: CompareConfig) -> Drive | Motion:
     """What a replay follows: the recording's commands or, where it holds none, its measured motion."""
+    validate(recording, allow_jitter=True)  # one made in Python may not have been
     check_range(scene, recording)
     if recording.command.size:
         warn_if_open_loop(scene, recording)

@@ -115,6 +115,7 @@ def check_range(scene: Scene, recording: Recording) -> None:
     """
     sent = _sent(scene, recording) if recording.command.size else {}
     paths = [("is sent to", joint, path) for joint, path in sent.items()]
+    paths += [("starts at", joint, np.array([q])) for joint, q in recording.qpos0.items()]
     if channel := recording.channels.get("position"):
         seen = np.where(channel.mask, channel.values, np.nan).reshape(-1, len(channel.columns))
         paths += [("is measured at", joint, seen[:, i]) for i, joint in enumerate(channel.columns)]
@@ -127,8 +128,8 @@ def _check_reach(scene: Scene, joint: str, path: np.ndarray, begin: str) -> None
     """As `check_range`, of one joint's path [K], NaN where it was not seen; begin: of what is said."""
     index = scene.id("joint", joint)
     slide = scene.slides(joint)
-    if scene.model.jnt_limited[index]:
-        low, high = scene.model.jnt_range[index]
+    low, high = scene.model.jnt_range[index]
+    if low < high:  # whether the replay holds it there or not
         beyond = np.maximum(low - path, path - high)
         worst = int(np.nanargmax(beyond))
         if beyond[worst] > high - low:

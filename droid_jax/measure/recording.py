@@ -228,14 +228,14 @@ def _outside(what: str, time: np.ndarray, start: float, end: float) -> str:
 
 
 def _positions_at(recording: Recording, start: float, given: Mapping[str, float]) -> dict[str, float]:
-    """Joint positions at an instant, for the joints of qpos0 and those given."""
+    """Joint positions at an instant, for the joints of qpos0 and those given; of a log for those that were measured."""
     first = float(recording.time[0]) if len(recording.time) else recording.span[0]
     if start <= first + SLACK:
         return {**recording.qpos0, **given}
     measured = _measured_at(recording, start)
     positions = {**{j: measured[j] for j in recording.qpos0 if j in measured}, **given}
     lacking = [j for j in recording.qpos0 if j not in positions]
-    if lacking:
+    if lacking and recording.command.size:
         raise ValueError(
             f"a window from {start} s needs initial positions that were not measured: "
             f"{', '.join(lacking)}; begin it at the recording's start, or state them (window(..., qpos0=...))"

@@ -82,7 +82,7 @@ def model_parameter(
     """A parameter that is one number of a model field.
 
     field, element, column: e.g. "dof_damping", "hinge", None or "geom_size", "knob", 0.
-    mean: default is the model's own number (mode SET) or the mode's neutral value.
+    mean: default is the value that leaves the model's own number as it is.
     options: further fields of `Parameter` (nuisance, group, scaling, floor, width).
     """
     from droid_jax.model.physics import check_field  # only here: it imports jax, which may have to be tuned first
@@ -97,9 +97,9 @@ def model_parameter(
     if (field, column) in _POSITION_GAIN:
         _check_whole_servo(scene, element, first)
     if mean is None:
-        neutral = {Mode.SCALE: 1.0, Mode.DIVIDE: 1.0, Mode.ADD: 0.0}
-        nominal = np.asarray(getattr(scene.model, field))[index]
-        mean = neutral.get(mode, float(nominal))
+        nominal = float(np.asarray(getattr(scene.model, field))[index])
+        neutral = {Mode.SCALE: 1.0, Mode.DIVIDE: 1.0, Mode.ADD: 0.0, Mode.NEGATIVE: -nominal}
+        mean = neutral.get(mode, nominal)
     return Parameter(
         name or f"{element}_{field.split('_', 1)[1]}",
         unit,

@@ -1,6 +1,7 @@
 """Parameters of a user's own scene, from a JSON file.
 
-    [{"field": "dof_damping", "element": "elbow", "unit": "N m s/rad", "std": 0.5, "high": 10, "scaling": "log"},
+    [{"field": "dof_damping", "element": "elbow", "unit": "N m s/rad", "std": 0.5, "high": 10, "scaling": "log",
+      "floor": 0.05},
      {"field": "body_mass", "element": "forearm", "std": 0.2, "high": 5}]
 
 Every entry needs field, element, std and high; optional: column, name, unit, mean, low, mode
@@ -86,6 +87,8 @@ def _parameter(scene: Scene, entry: Any, where: str) -> Parameter:
     try:
         options = _read(entry)
         field, sensor, servo = (options.pop(kind, None) for kind in ("field", "sensor", "servo"))
+        if sensor is not None and "name" in options:
+            raise ValueError("what a sensor sees has the name that the replay looks it up by: leave name out")
         if servo is not None:
             return servo_scale(scene, servo, **options)
         if sensor == _TIME:

@@ -234,12 +234,16 @@ def _used(model: mujoco.MjModel, field: str) -> bool:
 
 
 def look_geoms(spec: mujoco.MjSpec) -> list[Any]:
-    """The geoms that are for the eye: of LOOK_GROUP, and nothing can touch them."""
-    paired = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
+    """The geoms for the eye: of LOOK_GROUP, nothing can touch them, and no pair, tendon or sensor names them."""
+    used = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
+    used |= {w.target.name for t in spec.tendons for w in t.path if isinstance(w.target, mujoco.MjsGeom)}
+    for s in spec.sensors:
+        ends = ((s.objtype, s.objname), (s.reftype, s.refname))
+        used |= {name for kind, name in ends if kind == mujoco.mjtObj.mjOBJ_GEOM}
     return [
         g
         for g in spec.geoms
-        if g.group == LOOK_GROUP and not g.contype and not g.conaffinity and (not g.name or g.name not in paired)
+        if g.group == LOOK_GROUP and not g.contype and not g.conaffinity and (not g.name or g.name not in used)
     ]
 
 

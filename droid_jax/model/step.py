@@ -100,11 +100,22 @@ def _is_euler(model: Any) -> bool:
 
 
 def check_options(model: Any, parity: bool, what: str = "a replay") -> None:
-    """Raise ValueError for an integrator or a friction cone that `step` has not; what: asks for it."""
+    """Raise ValueError for an integrator, a friction cone or a fluid that `step` has not; what: asks for it."""
     if not _is_euler(model) and model.opt.integrator != mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
         raise ValueError(f"{what} integrates with Euler or implicitfast; set <option integrator=...> to one of them")
     if model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC and not parity:
         raise ValueError(f"{what} needs pyramidal friction cones; set <option cone='pyramidal'>")
+    if not parity and _has_fluid(model):
+        raise ValueError(
+            f"{what} has no air or water: take density and viscosity out of <option>; the effect `drag` is for doors"
+        )
+
+
+def _has_fluid(model: Any) -> bool:
+    """Of MuJoCo's model or of MJX's, in which the numbers may be traced."""
+    if isinstance(model, mujoco.MjModel):
+        return model.opt.density > 0 or model.opt.viscosity > 0
+    return model.opt._impl.has_fluid_params
 
 
 def _undamped(model: Any) -> Any:

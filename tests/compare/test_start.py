@@ -16,8 +16,9 @@ from droid_jax.compare.residuals import CompareConfig
 from droid_jax.compare.start import check_range, open_loop
 from droid_jax.measure.recording import Channel, Recording
 from droid_jax.model.fields import joint_damping
-from droid_jax.model.parameters import Space
+from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import Scene, compile_scene
+from droid_jax.model.seam import Effect
 
 SPACE = Space((joint_damping(arm(), "elbow", name="elbow_damping", std=0.1, high=50.0),))
 
@@ -67,15 +68,38 @@ def in_degrees(fine: Recording, measured: bool) -> Recording:
     return replace(fine, channels={**fine.channels, "position": seen})
 
 
+def test_a_recording_made_in_python_is_checked_like_one_from_a_file(scene: Scene):
+    fine = recording()
+    torque = fine.channels["torque"]
+    values = torque.values.copy()
+    values[0, 3, 1] = np.nan
+    broken = replace(fine, channels={"torque": replace(torque, values=values)})
+    with pytest.raises(ValueError, match=r"channel 'torque', repeat 0, row 3, column 'elbow': expected a finite"):
+        make_cost(scene, SPACE, [broken])
+
+
+def test_a_parameter_that_nothing_reads_is_refused(scene: Scene):
+    """A slip in a name would be a parameter that no data tell, and nobody would know why."""
+    wrong = Space((*SPACE.parameters, Parameter("torque_offset[elbo]", "N m", 0.0, 0.1, -1.0, 1.0)))
+    with pytest.raises(ValueError, match=r"parameters torque_offset\[elbo\] write no field.*torque_offset\[elbow\]"):
+        make_cost(scene, wrong, [recording()])
+    effect = Effect("slip", (wrong["torque_offset[elbo]"],), observe=lambda theta, rollout: rollout)
+    make_cost(scene, wrong, [recording()], effects=[effect])
+
+
+@pytest.mark.parametrize("limited", ["true", "false"])
 @pytest.mark.parametrize("measured", [False, True])
-def test_degrees_are_no_radians(measured: bool):
-    xml = ARM.format(gravcomp='gravcomp="1"', friction='limited="true" range="-2 2"', sensor="")
+def test_degrees_are_no_radians(measured: bool, limited: str):
+    """Whether the replay holds the joint within its range or not, as the built-in scenes do not."""
+    xml = ARM.format(gravcomp='gravcomp="1"', friction=f'limited="{limited}" range="-2 2"', sensor="")
     scene = compile_scene(mujoco.MjSpec.from_string(xml), "arm", joints=JOINTS)
     fine = recording()
     make_cost(scene, SPACE, [fine])
     said = "shoulder is measured at" if measured else "elbow is sent to"
     with pytest.raises(ValueError, match=said + r" .* far outside its range -2 \.\. 2 rad: are these degrees"):
         make_cost(scene, SPACE, [in_degrees(fine, measured)])
+    with pytest.raises(ValueError, match=r"elbow starts at -17.* far outside its range"):
+        check_range(scene, replace(fine, qpos0={"elbow": -17.2}))
 
 
 @pytest.mark.parametrize("measured", [False, True])

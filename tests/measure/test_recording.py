@@ -334,3 +334,5 @@ def test_window_says_what_it_lacks() -> None:
     with pytest.raises(ValueError, match=r"not measured: j1, j2, hinge; begin it at the recording's start"):
         blind.window(0.3, 0.6)
     assert blind.window(0.3, 0.6, qpos0={"j1": 1.0, "j2": 2.0, "hinge": 0.0}).qpos0["j2"] == 2.0
+    log = replace(r, time=np.zeros(0), command=np.zeros((0, 0)), command_names=(), qpos0={**r.qpos0, "finger": 0.04})
+    assert set(log.window(0.3, 0.6).qpos0) == {"j1", "j2", "hinge"}  # a measured motion needs no other start

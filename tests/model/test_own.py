@@ -49,6 +49,14 @@ def test_an_entry_is_read_as_it_says(tmp_path: Path, scene: Scene):
     assert loaded(tmp_path, scene, height)["arm_pos"].writes[0].index == (scene.id("body", "arm"), 2)
 
 
+def test_a_negative_gain_starts_at_what_the_model_has(tmp_path: Path):
+    """A servo's damping is minus its third bias: 2, where the file says -2."""
+    servo = mujoco.MjSpec.from_string(XML.replace('kp="20"', 'kp="20" kv="2"'))
+    scene = compile_scene(servo, "arm", joints=["elbow"])
+    entry = {"field": "actuator_biasprm", "element": "elbow", "column": 2, "std": 0.5, "high": 9, "mode": "negative"}
+    assert loaded(tmp_path, scene, entry)["elbow_biasprm"].mean == 2.0
+
+
 def test_a_mass_takes_its_inertia_along_also_where_the_usual_mode_is_stated(tmp_path: Path, scene: Scene):
     entry = {"field": "body_mass", "element": "arm", "std": 0.1, "high": 3.0}
     plain, stated = loaded(tmp_path, scene, entry), loaded(tmp_path, scene, {**entry, "mode": "set"})
@@ -69,6 +77,8 @@ def test_a_servos_gain_and_the_commands_delay_have_no_element(tmp_path: Path, sc
         ({"servo": "elbow"}, "missing std"),
         ({"servo": "elbow", "sensor": "coulomb", "std": 0.05}, "missing one of field, sensor and servo"),
         ({"sensor": "time_offset", "std": 0.05}, "missing high"),
+        ({"sensor": "time_offset", "std": 0.05, "high": 1.0, "name": "lag"}, "leave name out"),
+        ({"sensor": "coulomb", "element": "elbow", "std": 0.5, "high": 5, "name": "dry"}, "leave name out"),
     ):
         with pytest.raises(ValueError, match=says):
             loaded(tmp_path, scene, entry)

@@ -332,17 +332,22 @@ def test_what_is_only_for_the_eye_weighs_and_touches_as_before():
         <geom name="bone" type="capsule" size=".02 .2"/>
         <geom name="cover" type="box" size=".1 .05 .05" pos=".1 0 0" group="2" contype="0" conaffinity="0" mass="0.7"/>
         <geom name="bumper" type="sphere" size=".03" group="2"/>
-        <geom name="paired" type="sphere" size=".02" group="2" contype="0" conaffinity="0"/></body>
+        <geom name="paired" type="sphere" size=".02" group="2" contype="0" conaffinity="0"/>
+        <geom name="drum" type="cylinder" size=".03 .05" group="2" contype="0" conaffinity="0"/><site name="end"/>
+        <geom name="seen" type="sphere" size=".02" group="2" contype="0" conaffinity="0"/></body><site name="fixed"/>
       <body name="painted"><joint name="turn"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>
         <geom type="sphere" size=".1" group="2" contype="0" conaffinity="0"/></body></worldbody>
       <contact><pair geom1="paired" geom2="floor"/></contact>
+      <sensor><framepos objtype="geom" objname="seen"/></sensor>
+      <tendon><spatial><site site="fixed"/><geom geom="drum"/><site site="end"/></spatial></tendon>
       <actuator><position name="swing" joint="swing" kp="9"/></actuator></mujoco>"""
+    kept = ["floor", "bone", "bumper", "paired", "drum", "seen"]  # the last three are named by a pair and so on
     for compiler in ("", '<compiler inertiafromgeom="true"/>'):
         whole = mujoco.MjModel.from_xml_string(xml.format(compiler=compiler))
         scene = compile_scene(mujoco.MjSpec.from_string(xml.format(compiler=compiler)), "covered")
-        assert [whole.geom(int(i)).name for i in scene.geoms_among_looks] == ["floor", "bone", "bumper", "paired"]
+        assert [whole.geom(int(i)).name for i in scene.geoms_among_looks] == kept
         for model in (scene.model, instrument(scene)):
-            assert [model.geom(i).name for i in range(model.ngeom)] == ["floor", "bone", "bumper", "paired"]
+            assert [model.geom(i).name for i in range(model.ngeom)] == kept
             for field in ("body_mass", "body_inertia", "body_ipos", "body_iquat", "dof_M0"):
                 np.testing.assert_allclose(getattr(model, field), getattr(whole, field), rtol=1e-12)
 

@@ -13,7 +13,7 @@ import pytest
 from mujoco import mjx
 
 from droid_jax.model.patches import exact_segments, midpoint_law
-from droid_jax.model.step import solve, step
+from droid_jax.model.step import check_options, solve, step
 
 # A three-link arm over a floor: contacts, limits, dry friction, a coupled and a pinned joint.
 ARM = """
@@ -336,9 +336,12 @@ def test_midpoint_law_is_its_own_derivation():
         ('integrator="RK4"', True, "integrates with Euler or implicitfast"),
         ('integrator="RK4"', False, "integrates with Euler or implicitfast"),
         ('cone="elliptic"', False, "pyramidal friction cones"),
+        ('density="1.2" viscosity="1.8e-5"', False, "no air or water"),
     ],
 )
 def test_other_options_are_refused(option: str, parity: bool, says: str):
-    model = mjx.put_model(mujoco.MjModel.from_xml_string(f"<mujoco><option {option}/></mujoco>"))
-    with pytest.raises(ValueError, match=says):
-        step(model, mjx.make_data(model), parity=parity)
+    given = mujoco.MjModel.from_xml_string(f"<mujoco><option {option}/></mujoco>")
+    model = mjx.put_model(given)
+    for refuse in (lambda: step(model, mjx.make_data(model), parity=parity), lambda: check_options(given, parity)):
+        with pytest.raises(ValueError, match=says):
+            refuse()
