@@ -306,27 +306,29 @@ def _resampling(clock: np.ndarray, time: np.ndarray) -> sparse.csr_array:
     return sparse.csr_array(entries, shape=(len(time), len(clock)))
 
 
-def _same_filter(kernel: np.ndarray, mask: np.ndarray, kept: np.ndarray, resampling: sparse.csr_array) -> np.ndarray:
+def _same_filter(
+    kernel: sparse.csr_array, mask: np.ndarray, kept: np.ndarray, resampling: sparse.csr_array
+) -> np.ndarray:
     """[C or 1, K, T] what resampling, smoothing with a mask and averaging over the repeats does to a replay's trace.
 
     kernel [K, Tc]; mask [N, Tc, C]; kept [N, K, C], the outputs that enter the mean; resampling [Tc, T].
     """
     if mask.all():
-        return (kernel @ resampling)[None]
+        return (kernel @ resampling).toarray()[None]
     columns = zip(mask.transpose(2, 0, 1), kept.transpose(2, 0, 1), strict=True)
-    return np.stack([_mean_filter(kernel, *column) @ resampling for column in columns])
+    return np.stack([(_mean_filter(kernel, *column) @ resampling).toarray() for column in columns])
 
 
-def _mean_filter(kernel: np.ndarray, mask: np.ndarray, kept: np.ndarray) -> np.ndarray:
+def _mean_filter(kernel: sparse.csr_array, mask: np.ndarray, kept: np.ndarray) -> sparse.csr_array:
     """[K, Tc] the mean of one column's filters: kernel [K, Tc], renormalised over each repeat's mask [N, Tc].
 
-    A repeat at a time: all of them at once would take N times the memory.  kept: [N, K].
+    kept: [N, K].
     """
-    total = np.zeros_like(kernel)
+    total = sparse.csr_array(kernel.shape)
     for seen, own in zip(mask, kept, strict=True):
-        share = np.where(own, 1.0 / np.where(own, kernel @ seen, 1.0), 0.0)
-        total += kernel * seen * share[:, None]
-    return total / np.maximum(kept.sum(axis=0), 1)[:, None]
+        share = np.where(own, 1.0 / np.where(own, kernel @ seen.astype(float), 1.0), 0.0)
+        total += sparse.diags_array(share) @ kernel @ sparse.diags_array(seen.astype(float))
+    return sparse.diags_array(1.0 / np.maximum(kept.sum(axis=0), 1)) @ total
 
 
 def _refuse_constant(channel: Channel) -> None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
+from scipy import sparse
 from scipy.signal.windows import parzen
 
 CUTOFF = 8.0  # Hz; real Panda residuals double between 8 and 20 Hz
@@ -27,35 +28,39 @@ def coarse_clock(start: float, end: float, rate: float = RATE) -> np.ndarray:
     return np.linspace(start, end, max(2, round((end - start) * rate) + 1))
 
 
-def lowpass(clock: np.ndarray, coarse: np.ndarray, cutoff: float = CUTOFF) -> np.ndarray:
-    """[K, T] matrix from samples at `clock` to smoothed values at `coarse`.
+def lowpass(clock: np.ndarray, coarse: np.ndarray, cutoff: float = CUTOFF) -> sparse.csr_array:
+    """[K, T] matrix from samples at a growing `clock` to smoothed values at `coarse`, sparse: a window is short.
 
     A windowed sinc (Hann, 1.5 periods of the cutoff to each side), cut and renormalised at the
     ends so that a constant stays that constant.  Source: windowed-sinc design, Oppenheim and
     Schafer, ch. 7.
     """
     half = 1.5 / cutoff
-    lag = coarse[:, None] - clock[None, :]
+    first, last = np.searchsorted(clock, coarse - half), np.searchsorted(clock, coarse + half, side="right")
+    begins = np.concatenate([[0], np.cumsum(last - first)])
+    rows = np.repeat(np.arange(len(coarse)), last - first)
+    columns = np.arange(begins[-1]) + (first - begins[:-1])[rows]
+    lag = coarse[rows] - clock[columns]
     spacing = np.gradient(clock) if len(clock) > 1 else np.ones_like(clock)
     spacing[[0, -1]] *= 0.5  # trapezoidal rule: the same result at every sampling rate
     kernel = np.sinc(2 * cutoff * lag) * (0.5 + 0.5 * np.cos(np.pi * np.clip(lag / half, -1, 1)))
-    kernel *= spacing[None, :]
-    total = kernel.sum(axis=1, keepdims=True)
+    shape = (len(coarse), len(clock))
+    weights = sparse.csr_array((kernel * spacing[columns], columns, begins), shape=shape)
+    total = weights.sum(axis=1)
     if np.any(np.abs(total) < 1e-12):
         raise ValueError(
             f"a clock with steps of {np.median(np.diff(clock)):.3g} s is too coarse to be smoothed at {cutoff} Hz"
         )
-    return kernel / total
+    return sparse.diags_array(1.0 / total) @ weights
 
 
-def smooth(values: np.ndarray, mask: np.ndarray, kernel: np.ndarray) -> np.ndarray:
-    """[N, T, C] with mask -> [N, K, C], each output renormalised over the samples that were measured.
+def smooth(values: np.ndarray, mask: np.ndarray, kernel: sparse.csr_array) -> np.ndarray:
+    """[N, T, C] with mask, through a `lowpass` [K, T] -> [N, K, C], renormalised over the samples that were measured.
 
     NaN where less than a fifth of the kernel's weight was measured.
     """
-    filled = np.where(mask, values, 0.0)
-    top = np.einsum("kt,ntc->nkc", kernel, filled)
-    weight = np.einsum("kt,ntc->nkc", kernel, mask.astype(float))
+    top = np.stack([kernel @ np.where(seen, repeat, 0.0) for repeat, seen in zip(values, mask, strict=True)])
+    weight = np.stack([kernel @ seen.astype(float) for seen in mask])
     return np.where(np.abs(weight) > 0.2, top / np.where(weight == 0, 1, weight), np.nan)
 
 

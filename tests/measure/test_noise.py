@@ -110,7 +110,7 @@ def test_unmeasured_samples_have_no_influence():
     out = smooth(np.where(mask, values, np.nan), mask, kernel)
     np.testing.assert_array_equal(out, smooth(np.where(mask, values, 1e9), mask, kernel))
     # and what is left counts as it would alone
-    expected = [(k * mask[0, :, 0] * values[0, :, 0]).sum() / (k * mask[0, :, 0]).sum() for k in kernel]
+    expected = [(k * mask[0, :, 0] * values[0, :, 0]).sum() / (k * mask[0, :, 0]).sum() for k in kernel.toarray()]
     np.testing.assert_allclose(out[0, :, 0], expected, rtol=1e-9)
 
 
