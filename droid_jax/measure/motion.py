@@ -13,6 +13,7 @@ from droid_jax.measure.recording import Recording, TorqueConvention
 CUTOFF = 20.0  # Hz, of the position before it is differentiated; above that of the torques, which are compared
 OVERSAMPLING = 6.0  # rows of a motion per period of its cutoff
 REGULAR = 0.01  # largest deviation of a clock's step from their mean, as a share, that a filter may overlook
+PASSES = 20  # see `_common`
 EDGE = 0.3  # s left out at both ends, where a zero-phase filter has no neighbours
 
 
@@ -40,6 +41,7 @@ class Motion:
 def measured_motion(recording: Recording, joints: Sequence[str], *, cutoff: float = CUTOFF) -> Motion:
     """The motion of `joints` in a recording: the mean of the repeats' positions, smoothed and differentiated.
 
+    A repeat that was not measured for a while keeps its distance from the others there (see `_common`).
     The position passes a zero-phase Butterworth filter of order 4 at `cutoff` Hz, then central
     differences at the log's own rate; measured velocities are not used.  EDGE s at both ends are left out.
     A clock that jitters is made regular first, along a cubic spline.
@@ -67,7 +69,7 @@ def measured_motion(recording: Recording, joints: Sequence[str], *, cutoff: floa
             f"recording {recording.name!r} holds positions at {rate:.4g} Hz, too slow to be smoothed at {cutoff:g} Hz; "
             f"give --motion-cutoff (CompareConfig.motion_cutoff) below {rate / 2.5:.3g} Hz"
         )
-    position = np.mean(channel.values[:, :, columns], axis=0, where=mask)
+    position = _common(channel.values[:, :, columns], mask)
     position = _regular(recording.name, channel.time, position, cutoff)
     even = np.linspace(channel.time[0], channel.time[-1], len(channel.time))
     clock = _inner_clock(recording.name, channel.time, OVERSAMPLING * cutoff)
@@ -76,6 +78,26 @@ def measured_motion(recording: Recording, joints: Sequence[str], *, cutoff: floa
     qdd = np.gradient(qd, 1 / rate, axis=0)
     rows = (np.stack([np.interp(clock, even, c) for c in a.T], axis=1) for a in (q, qd, qdd))
     return Motion(tuple(joints), clock, *rows, torque=recording.torque)
+
+
+def _common(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """[T, J] mean of repeats [N, T, J], without a step where one of them was not measured for a while.
+
+    A repeat keeps its distance from the others there, along a line between the gap's ends: m = (sum of what was
+    measured + sum of the distances of what was not) / number measured.  PASSES of it settle gaps that overlap.
+    """
+    common = np.mean(values, axis=0, where=mask)
+    rows = np.arange(values.shape[1])
+    for _ in range(0 if mask.all() else PASSES):
+        apart = values - common
+        for n, j in np.argwhere(~mask.all(axis=1)):
+            seen = mask[n, :, j]
+            if seen.any():
+                apart[n, ~seen, j] = np.interp(rows[~seen], rows[seen], apart[n, seen, j])
+            else:
+                apart[n, :, j] = 0.0
+        common = np.where(mask, values, apart).sum(axis=0) / mask.sum(axis=0)
+    return common
 
 
 def _regular(name: str, time: np.ndarray, position: np.ndarray, cutoff: float) -> np.ndarray:

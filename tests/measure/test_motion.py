@@ -46,6 +46,22 @@ def test_joints_come_in_the_order_asked_for_and_repeats_are_averaged():
     np.testing.assert_allclose(swapped.acceleration, clean.acceleration[:, ::-1], atol=1e-6)
 
 
+def test_a_repeat_that_drops_out_leaves_no_step():
+    """Repeats half a milliradian to either side; the mean of those that are left would jump, 1 rad/s^2 at once."""
+    rng = np.random.default_rng(4)
+    repeats = sines(TIME) + np.array([-1e-3, 0.0, 1e-3])[:, None, None]
+    repeats += 3e-5 * rng.normal(size=(3, 1, 1)) * TIME[None, :, None]
+    mask = np.ones(repeats.shape, bool)
+    mask[0, 2000:2200, 0] = mask[1, 2150:2400, 0] = mask[2, 3000:, 1] = False
+    whole, holed = (measured_motion(log(repeats, mask=m), JOINTS) for m in (np.ones_like(mask), mask))
+    np.testing.assert_allclose(holed.position, whole.position, atol=1e-4)
+    np.testing.assert_allclose(holed.acceleration, whole.acceleration, atol=0.02)
+    mask[0] = False
+    np.testing.assert_allclose(
+        measured_motion(log(repeats, mask=mask), JOINTS).acceleration, whole.acceleration, atol=0.02
+    )
+
+
 def test_a_lower_cutoff_lets_less_noise_through():
     noise = np.random.default_rng(1).normal(0, 1e-4, (1, len(TIME), 2))
     rough, calm = (measured_motion(log(sines(TIME)[None] + noise), JOINTS, cutoff=c) for c in (40.0, 8.0))
