@@ -10,11 +10,14 @@ import numpy as np
 import pytest
 from two_link import ARM, JOINTS, arm, measured, motion, recording
 
-from droid_jax.compare.cost import followed, make_cost
-from droid_jax.compare.replay import make_drive
+from droid_jax.compare.cost import _same, followed, make_cost
+from droid_jax.compare.replay import Drive, make_drive
 from droid_jax.compare.residuals import CompareConfig
-from droid_jax.compare.start import check_range, open_loop
+from droid_jax.compare.start import AJAR, check_range, open_loop
+from droid_jax.measure.demonstration import demonstration_path
+from droid_jax.measure.formats import load
 from droid_jax.measure.recording import Channel, Recording
+from droid_jax.model.door_scene import door_scene
 from droid_jax.model.fields import joint_damping
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import Scene, compile_scene
@@ -152,3 +155,18 @@ def test_an_object_starts_where_it_was_seen_unless_a_cameras_noise_is_all(scene:
         return float(drive.qpos0[scene.qpos("hinge")])
 
     assert start(0.005) == 0.0 and start(0.4) == pytest.approx(0.4) and start(0.4, hinge=0.1) == 0.1
+
+
+def test_repeats_serve_a_door_that_is_seen_just_ajar():
+    """About AJAR the mean of some repeats is put back to the scene's pose, and that of others is not."""
+    door, demonstration = door_scene(), load(demonstration_path("A"))
+    time = demonstration.time[::30]
+
+    def seen(angle: float) -> Drive:
+        values = np.full((2, len(time), 1), angle)
+        channel = Channel("object_angle", "rad", ("hinge",), time, values, np.ones(values.shape, bool))
+        return make_drive(door, replace(demonstration, channels={"object_angle": channel}), weigh=False)
+
+    shut, ajar, open_ = (seen(angle) for angle in (AJAR - 1e-3, AJAR + 1e-3, 2 * AJAR))
+    assert shut.qpos0[door.qpos("hinge")] == 0.0 and ajar.qpos0[door.qpos("hinge")] > AJAR
+    assert _same(door, shut, ajar) and _same(door, ajar, shut) and not _same(door, shut, open_)
