@@ -229,7 +229,9 @@ def test_what_no_policy_can_be_tried_with_is_said_at_once(called, capsys):
     assert main(["all", "--hide", "sensor_delay=0.01"]) == 2
     said = capsys.readouterr().err
     assert "hidden effects sensor_delay change whole traces" in said and "--stages identify gap train" in said
-    assert called == []
+    assert main(["all", "--seed", "-1"]) == 2
+    assert "--seed must not be negative" in capsys.readouterr().err
+    assert called == [] and not Path("runs/all/all.json").exists()  # the corrected command is no other run
     assert main(["all", "--hide", "sensor_delay=0.01", "--stages", "identify", "gap"]) == 0
 
 

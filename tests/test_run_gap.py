@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -313,6 +314,21 @@ def test_effects_of_ones_own_are_asked_about_like_the_others(place: Path, refuse
     assert "unknown effects nothing; valid:" in (said := refused(*arguments(place, *options))) and "gasket" in said
     chosen = gap.chosen_effects(gap.Gap(effects=("gasket",)), small_scene()[0], [])
     assert [e.name for e in chosen] == ["gasket"] and "door" in chosen[0].places
+
+
+def test_an_effect_that_forgot_its_places_is_not_left_out_in_silence(monkeypatch: pytest.MonkeyPatch):
+    registry.registered()
+    monkeypatch.setattr(registry, "_MAKERS", dict(registry._MAKERS))
+
+    @registry.register
+    def lost(scene: Any) -> Effect:
+        return Effect("lost", (Parameter("lost", "N m", 0.0, 1.0, 0.0, 5.0),), force=lambda theta, state: state.qvel)
+
+    scene = small_scene()[0]
+    with pytest.raises(ValueError, match="effects lost state no places"):
+        gap.chosen_effects(gap.Gap(effects=("lost", "latch")), scene, [])
+    with pytest.warns(UserWarning, match="effects lost state no places .*: they are left out"):
+        assert len(gap.chosen_effects(gap.Gap(), scene, [])) > 5
 
 
 def test_a_scene_of_ones_own_needs_recordings(tmp_path: Path, refused):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -191,7 +192,13 @@ def chosen_effects(command: Gap, scene: Scene, recordings: list[Recording]) -> t
     names = {e.name for e in here}
     impossible = [name for name in command.effects if name not in names]
     left = tuple(e for e in here if e.name in asked and e.name not in command.without)
-    if impossible or not left:
+    nowhere = [e.name for e in left if not e.places]
+    if nowhere:
+        what = f"effects {', '.join(nowhere)} state no places (Effect.places), where they could be asked about"
+        if {*nowhere} & {*command.effects}:
+            raise ValueError(what)
+        warnings.warn(f"{what}: they are left out", stacklevel=2)
+    if impossible or not any(e.places for e in left):
         what = f"cannot have {', '.join(impossible)}" if impossible else "is left without any effect"
         raise ValueError(f"scene {scene.name!r} {what} here; it can have: {', '.join(sorted(names))}")
     return left

@@ -111,7 +111,7 @@ def run(command: All) -> None:
     check_scale(command.effect_scale)
     load_effects(command.own_effects)
     roles = _roles(command)
-    _needs_hidden(command)
+    _needs_robot(command)
     out = prepare_folder(command.out)
     if {*IN_A_SCENE} & {*command.stages}:
         _remember(command, out)
@@ -181,12 +181,23 @@ def _records(command: All) -> bool:
     return not command.recording and bool({*IN_A_SCENE} & {*command.stages})
 
 
-def _needs_hidden(command: All) -> None:
-    """ValueError for what the stand-in robot cannot hide, rather now than when the folder is there."""
+def _needs_robot(command: All) -> None:
+    """ValueError for a stand-in robot that there cannot be, rather now than when the folder says it was asked for."""
+    from droid_jax.measure.hidden import listed
     from droid_jax.model.door_scene import door_scene
+    from droid_jax.policy.transfer import check_playable
 
-    if _records(command):
-        hidden_effects(command.hide, door_scene())
+    if not _records(command):
+        return
+    if command.seed < 0:
+        raise ValueError(f"--seed must not be negative, got {command.seed}")
+    scene = door_scene()
+    hidden = hidden_effects(command.hide, scene)
+    if "evaluate" in command.stages:
+        try:
+            check_playable(scene, listed(hidden))
+        except ValueError as error:
+            raise ValueError(f"{error}; or leave the trials away: --stages identify gap train") from None
 
 
 def _roles(command: All) -> tuple[str, ...]:
@@ -286,16 +297,9 @@ def _record(command: All) -> None:
 
     assert command.springs is not None  # settled
     scene = door_scene(timestep=TIMESTEP[PRESETS[command.preset].identify])
-    hidden = hidden_effects(command.hide, scene)
-    if "evaluate" in command.stages:  # rather now than when the policy is there
-        from droid_jax.measure.hidden import listed
-        from droid_jax.policy.transfer import check_playable
-
-        try:
-            check_playable(scene, listed(hidden))
-        except ValueError as error:
-            raise ValueError(f"{error}; or leave the trials away: --stages identify gap train") from None
-    record_stand_in(scene, hidden, command.out, command.springs, command.seed, command.again)
+    record_stand_in(
+        scene, hidden_effects(command.hide, scene), command.out, command.springs, command.seed, command.again
+    )
 
 
 def _stage(run_stage: Callable[[Any], None], command: Any) -> None:

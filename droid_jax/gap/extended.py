@@ -67,7 +67,7 @@ class Extended:
 
     @property
     def lacking(self) -> tuple[str, ...]:
-        """Names of the parts that an MJCF cannot hold."""
+        """Names of the parts that an MJCF cannot hold in full: of a payload it holds the mass, and not the moment."""
         effects = {e.name: e for e in self.effects}
         model = make_c_model(self.scene, self.space, self.values)
         said = {n for n, e in effects.items() if native(e, self.space, self.values, model) is not None}

@@ -43,7 +43,7 @@ from droid_jax.report.policy_folder import Trained, has_policy, read_policy
 from droid_jax.report.policy_words import policy_summary
 from droid_jax.report.reading import Reader
 from droid_jax.report.run_folder import Run, has_run, read_run
-from droid_jax.report.stages import left_over
+from droid_jax.report.stages import left_over, needs_whole
 from droid_jax.report.words import grouped, hidden_words, judged, label, like, number, percent, speaker, summary
 from droid_jax.storage import write_text
 
@@ -76,6 +76,8 @@ def write_report(run: Path) -> Path:
     gap = read_gap(at) if (at := _part(places, has_gap)) else None
     policy = read_policy(at) if (at := _part(places, has_policy)) else None
     at = _part(places, has_run)
+    if not (at or gap or policy):
+        needs_whole(folder)
     loaded = read_run(at or folder) if at or not (gap or policy) else None
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),

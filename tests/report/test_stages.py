@@ -10,6 +10,7 @@ import pytest
 
 from droid_jax.gap import extended
 from droid_jax.report.files import EXTENDED, GAUSSIAN, LAST_FILES
+from droid_jax.report.page import write_report
 from droid_jax.report.stages import extended_of, fingerprint, left_over, needs_whole, setup, unfinished
 
 
@@ -58,6 +59,8 @@ def test_a_run_is_whole_with_what_is_written_last(tmp_path: Path, stage: str):
     assert unfinished(folder)
     with pytest.raises(ValueError, match="holds a run that is not whole: run its command again"):
         needs_whole(folder)
+    with pytest.raises(ValueError, match="run its command again"):  # and not one to run another command
+        write_report(folder)
     run(tmp_path, stage)
     assert not unfinished(folder)
     (tmp_path / GAUSSIAN).write_text("given by hand")

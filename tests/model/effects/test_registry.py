@@ -126,8 +126,17 @@ def test_sizes_are_those_of_another_machine():
 
 def test_slides_are_driven_by_forces():
     scene = edited('"elbow" axis', '"elbow" type="slide" axis', joints=["elbow"], object_joint=None)
-    space = effect_space(library(scene, ["cable_pull", "joint_coulomb", "torque_drift", "torque_gain"]))
+    names = ["cable_pull", "joint_coulomb", "torque_drift", "torque_gain", "torque_ripple"]
+    space = effect_space(library(scene, [*names, "joint_stribeck", "joint_compliance", "joint_backlash"]))
     assert {p.name.split("[")[0]: p.unit for p in space.parameters} == {
+        "joint_backlash": "m",
+        "joint_compliance": "m/N",
+        "joint_stribeck": "N",
+        "joint_stribeck_exponent": "-",
+        "joint_stribeck_speed": "m/s",
+        "ripple_cosine": "N",
+        "ripple_periods": "1/(2 pi m)",
+        "ripple_sine": "N",
         "cable_stiffness": "N/m",
         "cable_pull": "N",
         "joint_coulomb": "N",
