@@ -102,6 +102,8 @@ def run(command: Train) -> None:
             progress=progress,
         )  # fmt: skip
     save_policy(out / POLICY, found.policy)
+    if (done := found.history[-1].step) < config.steps:
+        print(f"training ended after {done} of {config.steps} actions: its weights became NaN or infinite")
     content = {
         "setup": setup,
         "stand_in": setup["stand_in"],

@@ -37,6 +37,12 @@ def policy_summary(trained: Trained, searched: bool = False) -> list[str]:
             f"minutes; of the policies tried on the way the best was kept, which succeeded in "
             f"{percent(best['success'])} of its episodes in simulation."
         )
+        asked = history[-1].get("of", 0.0)
+        if history[-1]["step"] < asked:  # the one thing that ends a training early and leaves a policy
+            sentences.append(
+                f"It ended before the {asked / 1e6:.2g} million actions that were asked for, since its weights were no "
+                "finite numbers any more: another --seed may do better."
+            )
     sentences += [_tried(where, found, training["task"]) for where, found in trained.trials.items()]
     if own and trained.trials:
         sentences.append("The fit is of your own recordings: the stand-in robot is another one, and says little of it.")

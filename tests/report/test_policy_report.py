@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from made_up_gap import make_gap
-from made_up_policy import make_policy
+from made_up_policy import make_policy, training_json
 from reader import read_page
 
 from droid_jax.policy.trials import BLOWN_UP
@@ -124,3 +124,10 @@ def test_the_page_says_why_there_are_no_films(tmp_path: Path):
     content = json.loads((made / "transfer.json").read_text())
     (made / "transfer.json").write_text(json.dumps({**content, "no_films": "they were not asked for (--no-film)"}))
     assert "No films: they were not asked for (--no-film)." in read_page(page.write_report(made)).text
+
+
+def test_a_training_that_ended_in_nan_says_so(tmp_path: Path):
+    history = training_json()["history"]
+    for last, ended in ((history, False), (history[:3], True)):
+        said = " ".join(policy_summary(read_policy(make_policy(tmp_path / f"{len(last)}", None, history=last))))
+        assert ("ended before the 2 million actions" in said) is ended
