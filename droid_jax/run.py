@@ -60,6 +60,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     if not arguments or (arguments[0].startswith("-") and not arguments[0].startswith(WHOLE)):
         arguments = ["all", *arguments]
+    if _names_nothing(arguments, "--recording"):
+        print("error: --recording names no file; was it an empty shell variable?", file=sys.stderr)
+        return 2
     script = Path(sys.argv[0]).name
     prog = script if script == SCRIPT else "python -m droid_jax.run"
     try:
@@ -76,6 +79,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"interrupted{_going_on(command)}", file=sys.stderr)
         return 130
     return 0
+
+
+def _names_nothing(arguments: Sequence[str], option: str) -> bool:
+    """Whether an option stands there without values, which would be the same as leaving it away."""
+    if option not in arguments:
+        return False
+    behind = [*arguments, "-"][list(arguments).index(option) + 1]
+    return not behind or behind.startswith("-")
 
 
 def _going_on(command: Any) -> str:

@@ -20,7 +20,7 @@ from small_log import elbow_log, write_elbow
 
 from droid_jax import run
 from droid_jax.commands import presets
-from droid_jax.commands.folder import changed, setup_of
+from droid_jax.commands.folder import OtherRun, changed, finished, setup_of
 from droid_jax.commands.hidden import known_stand_in, settled
 from droid_jax.commands.identify import Identify
 from droid_jax.commands.own_effects import load_effects
@@ -65,6 +65,13 @@ def parameters(tmp_path: Path, *entries: object) -> Path:
 
 
 # ----- recordings
+
+
+@pytest.mark.parametrize("arguments", [["--recording"], ["--recording", ""], ["--recording", "--preset", "quick"]])
+@pytest.mark.parametrize("command", ["all", "identify", "gap"])
+def test_recordings_that_an_empty_variable_named(refused, command: str, arguments: list[str]):
+    """Left away, a stand-in robot would record, and its results pass for one's own."""
+    assert "--recording names no file" in refused(command, *arguments)
 
 
 def test_a_missing_recording(refused, run_folder: Path, tmp_path: Path):
@@ -223,6 +230,16 @@ def test_a_damaged_setup(refused, run_folder: Path, text: str):
     said = refused("identify", "--out", run_folder)
     assert f"{run_folder / 'setup.json'} is damaged" in said and "--again" in said
     assert content(run_folder) == before
+
+
+def test_a_run_that_was_stopped_may_get_another_budget(tmp_path: Path):
+    (tmp_path / "setup.json").write_text('{"budget": null, "seed": 1}')
+    assert not finished(tmp_path, {"budget": 5.0, "seed": 1}, False, "gap.json")
+    with pytest.raises(OtherRun, match=r"other settings \(seed\)"):
+        finished(tmp_path, {"budget": 5.0, "seed": 2}, False, "gap.json")
+    (tmp_path / "gap.json").write_text("{}")
+    with pytest.raises(OtherRun, match=r"other settings \(budget\)"):
+        finished(tmp_path, {"budget": 5.0, "seed": 1}, False, "gap.json")
 
 
 def test_a_finished_run_with_other_settings(refused, run_folder: Path):

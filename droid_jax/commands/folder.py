@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 RUNS = Path("runs")  # where results go unless --out says otherwise
 BEGUN = set[Path]()  # folders of the runs that this process began
 HASHED = ("own_effects", "extended")  # options whose file is in no other hash of a setup
+LATER = ("budget",)  # options of which nothing that an unfinished run has kept depends
 CODE = "versions"  # in setup.json: of the code that began the run, which others may go on with
 PATHS = ("recording", "scene", "parameters", "fit", "run", *HASHED)  # beside each a setup holds what the file says
 
@@ -85,9 +86,12 @@ def finished(out: Path, setup: dict[str, Any], again: bool, last: str = "config.
         other = changed(before, setup)
     except (json.JSONDecodeError, UnicodeDecodeError, AttributeError, TypeError):
         raise ValueError(f"{path} is damaged; choose another --out, or start over with --again") from None
+    whole = (out / last).is_file()
+    if not whole:
+        other = [name for name in other if name not in LATER]
     if other:
         raise OtherRun(out, other)
-    if not (out / last).is_file():
+    if not whole:
         print(f"{out} holds this run unfinished; going on{_with_other_code(before)}")
         return False
     print(f"{out} holds this run already; its report is built again (start over with --again)")
