@@ -14,7 +14,7 @@ from droid_jax.gap.hunt import Hunt
 from droid_jax.gap.rank import Proposal, collinear, proposals
 from droid_jax.gap.refit import Model
 from droid_jax.gap.screen import Screen
-from droid_jax.gap.select import LESS, MORE, OF_ALL, Trial, judge
+from droid_jax.gap.select import LESS, OF_ALL, Trial, judge, much_more
 from droid_jax.identify.refine import RefineConfig
 from droid_jax.identify.search import NotReplayed
 
@@ -134,11 +134,22 @@ def pairs(hunt: Hunt, base: Model, model: Model, first: Round) -> Round:
     left = hunt.budget.within("pairs not tried", ranked)
     starters = ((p.parts, p.start(case.whole, base.values)) for p in left)
     tried = hunt.race(starters, hunt.aim(min(first.tried, key=lambda m: m.refined.objective)))
-    alone = min(t.gap_confirm for t in first.trials)
+    alone, trial = min(zip(first.tried, first.trials, strict=True), key=lambda both: both[1].gap_confirm)
     done = _decided(hunt, base, first.screen, [*tried, model] if len(model.parts) > 1 else tried)
-    if done.chosen is not None and done.chosen.gap_confirm > (1 - MORE) * alone:
-        return replace(done, winner=None, chosen=None)
-    return done
+    won = done.winner
+    if (
+        won is None
+        or done.chosen is None
+        or much_more(
+            trial.gap_confirm,
+            done.chosen.gap_confirm,
+            lambda: hunt.beyond(alone),
+            lambda: hunt.beyond(won),
+            hunt.whole_gap,
+        )
+    ):
+        return done
+    return replace(done, winner=None, chosen=None)
 
 
 def pruned(hunt: Hunt, model: Model) -> Model:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from droid_jax.gap.evidence import Evidence
 from droid_jax.gap.refit import Model, intervals, vanishing
+from droid_jax.gap.transfer import left_over
 
 SIGNIFICANT = 0.01  # p below which something is missing
 CONFIRMED = 0.05  # and below which one effect's gain on the other demonstration is no chance, among all other gates
@@ -79,6 +81,7 @@ def judge(
     fitted = np.array([m.gap for m in models])
     same = alike(left[1:], fitted, losses, floor, confirm.tie, AS_FITTED * before.gap)
     winners = np.bincount(np.argmin(losses, axis=1), minlength=len(models)) / len(losses)
+    beside = functools.cache(lambda: confirm.gap(left_over(fit, confirm, before)))
     out = []
     for k, model in enumerate(models):
         p = confirm.gain_p_value(0.5 * (squares[0] - squares[k + 1])) if np.isfinite(left[k + 1]) else 1.0
@@ -86,7 +89,12 @@ def judge(
         spans = {a: s for a, s in intervals(fit, model).items() if a not in before.amplitudes}
         weak = [f"{UNCONFIRMED} (p = {p:.2g})"] if p >= CONFIRMED else []
         weak += _too_small(fit, model, spans, smallest)
-        reasons = _gap_reasons(left[0], left[k + 1], whole_gap, MORE if before.parts else LESS, floor)
+        if before.parts:
+            after = functools.partial(lambda m: confirm.gap(left_over(fit, confirm, m)), model)
+            taken = much_more(left[0], left[k + 1], beside, after, whole_gap)
+        else:
+            taken = left[k + 1] <= (1 - LESS) * left[0]
+        reasons = _gap_reasons(left[0], left[k + 1], whole_gap, taken, floor)
         reasons += _amplitude_reasons(fit, model, spans)
         if chosen < CHOSEN:
             leader = min(zip(left[1:], models, strict=True), key=lambda lm: lm[0])[1].name
@@ -118,7 +126,24 @@ def alike(
     return (as_good & as_good.T) | np.eye(len(left), dtype=bool)
 
 
-def _gap_reasons(before: float, after: float, whole_gap: float, least: float, floor: float) -> list[str]:
+def much_more(
+    before: float, after: float, beside: Callable[[], float], beyond: Callable[[], float], whole_gap: float
+) -> bool:
+    """Whether a further effect takes its share of what is left on the confirming demonstration.
+
+    before, after: U.  beside, beyond: the same less what the uncertainty of each fit leaves there, which no effect can
+    take; where U falls by less than the share, that may do, if it is a share of the first gap too.  (They are dear:
+    asked for where it matters.)
+    """
+    if after <= (1 - MORE) * before:
+        return True
+    if not after < before:
+        return False
+    left, rest = beside(), beyond()
+    return rest <= (1 - MORE) * left and left - rest >= OF_ALL * whole_gap
+
+
+def _gap_reasons(before: float, after: float, whole_gap: float, taken: bool, floor: float) -> list[str]:
     reasons = []
     if not np.isfinite(after):
         reasons.append("its replay of the other demonstration blew up")
@@ -126,7 +151,7 @@ def _gap_reasons(before: float, after: float, whole_gap: float, least: float, fl
         reasons.append("the other demonstration shows no gap that it could take away")
     elif after > before:
         reasons.append("makes the gap on the other demonstration larger")
-    elif after > (1 - least) * before:
+    elif not taken:
         reasons.append(f"takes only {1 - after / before:.0%} of the gap away on the other demonstration")
     elif before - after < OF_ALL * whole_gap:
         reasons.append(f"takes only {(before - after) / whole_gap:.1%} of the first gap away")

@@ -19,6 +19,13 @@ LEAST = 0.25  # share of a step that bounds must leave for a slope
 LONGEST = 1.0  # search units: what the fit did not tell at all is no further from it than that
 
 
+def left_over(fitted: Evidence, other: Evidence, model: Model) -> np.ndarray:
+    """[N, M] `beyond`; of blocks of one log, which are of one motion, what the model leaves as it is."""
+    if fitted.repeats > 1:
+        return beyond(fitted, other, model)
+    return other.residuals(other.common(model.values)[0])
+
+
 def beyond(fitted: Evidence, other: Evidence, model: Model) -> np.ndarray:
     """[N, M] residuals of a model on another recording than the fitted one, less what its uncertainty allows.
 

@@ -16,7 +16,7 @@ from droid_jax.gap.refit import Model
 from droid_jax.gap.rounds import Round, anew, forward, pairs, polished, pruned, settled
 from droid_jax.gap.screen import Question, Screen, marks, project, questions_of, screen
 from droid_jax.gap.select import OF_ALL, SIGNIFICANT
-from droid_jax.gap.transfer import beyond
+from droid_jax.gap.transfer import left_over
 from droid_jax.gap.trend import trend
 from droid_jax.gap.verdict import Kind, Verdict, open_share
 from droid_jax.identify.pipeline import Progress
@@ -98,15 +98,7 @@ def further(asked: Sequence[Question], model: Model) -> tuple[Question, ...]:
 
 def _unsettled(hunt: Hunt, model: Model) -> bool:
     """Nothing named yet, several effects, or much left over: one that mimics two may have stood in their way."""
-    return len(model.parts) != 1 or _open(hunt, left_over(hunt.case, model)) > OPEN
-
-
-def left_over(case: Case, model: Model) -> np.ndarray:
-    """[N, M] residuals of the confirming demonstration, less what the fit's own uncertainty leaves there."""
-    confirm = case.confirm
-    if case.fit.repeats > 1:
-        return beyond(case.fit, confirm, model)
-    return confirm.residuals(confirm.common(model.values)[0])  # blocks of one log are of one motion
+    return len(model.parts) != 1 or _open(hunt, left_over(hunt.case.fit, hunt.case.confirm, model)) > OPEN
 
 
 def _open(hunt: Hunt, residuals: np.ndarray) -> float:
@@ -123,7 +115,7 @@ def _verdict(hunt: Hunt, base: Model, model: Model, rounds: list[Round], quiet: 
     gaps = _gaps(hunt, base, model)
     missing = bool(rounds) and rounds[0].screen.p < SIGNIFICANT and base.gap > floor
     tied = tuple(_tied(part.name, model, rounds) for part in model.parts)
-    left = left_over(case, model) if converged else None
+    left = left_over(case.fit, case.confirm, model) if converged else None
     kind = Kind.NONE if not missing else Kind.UNEXPLAINED
     if left is None:
         kind = Kind.UNCONVERGED

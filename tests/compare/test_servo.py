@@ -191,7 +191,7 @@ def test_mj_step_needs_commands(scene: Scene):
     values = np.stack([path, path])
     position = Channel("position", "rad", JOINTS, time, values, np.ones(values.shape, bool))
     channels = {"position": position, "torque": replace(position, name="torque", unit="N m")}
-    alone = recording(time=np.zeros(0), command=np.zeros((0, 0)), command_names=(), channels=channels)
+    alone = recording(time=np.zeros(0), command=np.zeros((0, 0)), command_names=(), channels=channels, gains=None)
     with pytest.raises(ValueError, match="mj_step replays commands"):
         make_cost(scene, SPACE, [alone], config=CompareConfig(mj_step=True))
 

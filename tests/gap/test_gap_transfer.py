@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 from small_gap import FLOOR, Small, record, small
 
-from droid_jax.gap import workflow
 from droid_jax.gap.anew import base_fit
 from droid_jax.gap.case import Case, make_case
 from droid_jax.gap.refit import Model, refit
 from droid_jax.gap.screen import project
-from droid_jax.gap.transfer import LONGEST, beyond, spread
+from droid_jax.gap.transfer import LONGEST, beyond, left_over, spread
 from droid_jax.identify.uncertainty import told
 
 
@@ -75,13 +74,13 @@ def test_the_slopes_are_of_one_deviation(whole: tuple[Case, Model]):
 def test_what_is_really_missing_stays(found: Small):
     """The hidden preload acts on the other motion in a way that no uncertain parameter does."""
     case, base = found.case, found.base
-    whole_gap, left = case.confirm.gap_at(base.values), workflow.left_over(case, base)
+    whole_gap, left = case.confirm.gap_at(base.values), left_over(case.fit, case.confirm, base)
     assert whole_gap > FLOOR and case.confirm.gap(left) > 0.5 * whole_gap
 
 
 def test_the_verdict_says_what_remains(found: Small):
     case, verdict = found.case, found.verdict
-    assert verdict.remainder == pytest.approx(case.confirm.gap(workflow.left_over(case, verdict.model)))
+    assert verdict.remainder == pytest.approx(case.confirm.gap(left_over(case.fit, case.confirm, verdict.model)))
     # Where little is taken away it may lie above U by noise, of which both are free on average only.
     assert verdict.remainder is not None and verdict.remainder <= 1.1 * verdict.gaps["confirm"][1]
 

@@ -20,6 +20,7 @@ from droid_jax.gap.rank import proposals
 from droid_jax.gap.refit import Model
 from droid_jax.gap.screen import Screen, questions_of
 from droid_jax.gap.select import AT_BOUND, TOO_SMALL, UNCONFIRMED
+from droid_jax.gap.transfer import left_over
 from droid_jax.gap.verdict import Kind
 from droid_jax.gap.workflow import ask, find
 from droid_jax.identify.search import NotReplayed
@@ -163,7 +164,7 @@ def of_gap(evidence: Any, gap: float) -> Any:
 def test_what_is_left_counts_where_chance_would_not_leave_it(found: Small):
     """A remainder that no candidate looks like is one: half of what was there, or half of noise."""
     case = found.case
-    left = workflow.left_over(case, found.base)
+    left = left_over(case.fit, case.confirm, found.base)
     hunt: Any = SimpleNamespace(case=case, floor=FLOOR, whole_gap=2.0 * case.confirm.gap(left))
     assert workflow._remains(hunt, left, quiet=True)
     vast: Any = SimpleNamespace(case=case, floor=FLOOR, whole_gap=1e3)
