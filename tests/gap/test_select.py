@@ -14,7 +14,7 @@ from droid_jax.gap import select
 from droid_jax.gap.candidates import candidates
 from droid_jax.gap.flips import steady
 from droid_jax.gap.refit import deviations, intervals, refit, vanishing
-from droid_jax.gap.select import UNCONFIRMED, _gap_reasons, judge
+from droid_jax.gap.select import UNCONFIRMED, _gap_reasons, judge, much_more
 from droid_jax.identify.search import NotReplayed
 
 
@@ -120,6 +120,23 @@ def test_one_that_another_beats_in_the_resamples_is_not_named(found: Small, monk
     assert best.passed and best.chosen == 1.0
     assert worse.chosen == 0.0 and worse.reasons == (f"wins only 0% of the resamples; {right.name} does better",)
     assert not worse.weak
+
+
+@pytest.mark.parametrize(
+    ("after", "beside", "beyond", "enough"),
+    [
+        (0.55, None, None, True),  # U says enough
+        (1.1, None, None, False),
+        (0.7, 0.3, 0.05, True),  # most of what stays, stays since the fit is uncertain
+        (0.7, 0.3, 0.25, False),
+        (0.7, 0.01, -0.01, False),  # nothing was left beyond that
+    ],
+)
+def test_a_further_effect_takes_its_share(after: float, beside: float | None, beyond: float | None, enough: bool):
+    def asked(value: float | None) -> float:
+        return pytest.fail("was not to be asked") if value is None else value
+
+    assert much_more(1.0, after, lambda: asked(beside), lambda: asked(beyond), 2.0) is enough
 
 
 @pytest.mark.parametrize(
