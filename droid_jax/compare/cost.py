@@ -101,7 +101,8 @@ class Cost:
 
         A recording without commands may hold another motion: its replay is given it.
         Raises ValueError unless these are as many, with the same commands from the same start (where there are
-        none, as many instants on the same clock) and the same torque convention.
+        none, as many instants on the same clock and the same joints with positions throughout) and the same torque
+        convention.
         """
         if len(recordings) != len(self.drives):
             raise ValueError(f"expected repeats of {len(self.drives)} replayed recordings, got {len(recordings)}")
@@ -113,7 +114,8 @@ class Cost:
             if not _same(self.scene, new, drive):
                 raise ValueError(
                     f"recording {recording.name!r} holds other commands than {old.name!r} had, starts elsewhere "
-                    "(qpos0), or measured another torque (side, gravity)"
+                    "(qpos0), measured another torque (side, gravity) or, without commands, has another clock or other "
+                    "joints whose positions were measured throughout"
                 )
             drives.append(new if isinstance(new, Motion) else drive)
             replays.append(_along(replay, drives[-1]))
@@ -274,7 +276,9 @@ def _same(scene: Scene, new: Drive | Motion, old: Drive | Motion) -> bool:
         return both and new.joints == old.joints and np.array_equal(new.time, old.time)
     apart = np.full(scene.model.nq, SCATTER)
     if scene.object_joint and scene.object_joint not in scene.joints:
-        apart[scene.qpos(scene.object_joint)] += AJAR
+        hinge = scene.qpos(scene.object_joint)
+        if scene.model.qpos0[hinge] in (new.qpos0[hinge], old.qpos0[hinge]):
+            apart[hinge] += AJAR
     return np.array_equal(new.command, old.command) and bool(np.all(np.abs(new.qpos0 - old.qpos0) <= apart))
 
 

@@ -21,13 +21,14 @@ from droid_jax.model.joint_friction import SMOOTHING
 from droid_jax.model.physics import Physics
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, Rollout, State, Theta, column
+from droid_jax.model.step import NO_FLUID, has_fluid
 
 
 def prescribed(scene: Scene, recording: Recording) -> tuple[str, ...]:
     """The joints whose measured motion a replay follows: the scene's, then all others that the log holds throughout.
 
     Torques are compared of the scene's joints alone, but what else moved carries them, or is carried.  All other joints
-    stand still at their initial positions; one that carries a measured joint is warned of.
+    stand still as in the scene; one that carries a measured joint is warned of.
     """
     channel = recording.channel("position")
     whole = {j for i, j in enumerate(channel.columns) if channel.mask[:, :, i].any(axis=0).all()}
@@ -36,8 +37,8 @@ def prescribed(scene: Scene, recording: Recording) -> tuple[str, ...]:
     still = [j for j in scene.carriers(scene.joints) if j not in joints]
     if still:
         warnings.warn(
-            f"recording {recording.name!r} holds no positions of {', '.join(still)}, which carry measured joints: they "
-            "are taken to stand still",
+            f"recording {recording.name!r} does not hold the positions of {', '.join(still)} throughout, which carry "
+            "measured joints: they are taken to stand still as in the scene",
             stacklevel=3,
         )
     return joints
@@ -76,8 +77,10 @@ def path_replay(
     observation effect.  Constraints (contacts, limits, equalities) take no part.
     Whether g(q) is there is the recording's word alone, not the MJCF's gravcomp.
     Forces and friction of effects are what the torque has to overcome, on either side.
-    Raises ValueError for effects of command and servo: a prescribed motion has neither.
+    Raises ValueError for effects of command and servo, which a prescribed motion has not, and for air or water.
     """
+    if has_fluid(scene.model):
+        raise ValueError(f"a replay of scene {scene.name!r} {NO_FLUID}")
     steering = [e.name for e in effects if e.command or e.servo]
     if steering:
         raise ValueError(f"a prescribed motion has no commands that an effect could change: {', '.join(steering)}")

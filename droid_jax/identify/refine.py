@@ -209,7 +209,7 @@ class _Descent(Problem):
 
         rough: a share of the objective that is not worth an iteration either.
         """
-        ended, alive = state.objective.copy(), np.arange(len(state.x))
+        ended, alive, self.given_up = state.objective.copy(), np.arange(len(state.x)), False
         keep = self.config.keep
         for number in range(self.config.iterations - self.iterations):
             state, gain = self.step(state)

@@ -99,22 +99,23 @@ def _is_euler(model: Any) -> bool:
     return model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
 
 
+NO_FLUID = "has no air or water: take density, viscosity and wind out of <option>; the effect `drag` is for doors"
+
+
 def check_options(model: Any, parity: bool, what: str = "a replay") -> None:
     """Raise ValueError for an integrator, a friction cone or a fluid that `step` has not; what: asks for it."""
     if not _is_euler(model) and model.opt.integrator != mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
         raise ValueError(f"{what} integrates with Euler or implicitfast; set <option integrator=...> to one of them")
     if model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC and not parity:
         raise ValueError(f"{what} needs pyramidal friction cones; set <option cone='pyramidal'>")
-    if not parity and _has_fluid(model):
-        raise ValueError(
-            f"{what} has no air or water: take density and viscosity out of <option>; the effect `drag` is for doors"
-        )
+    if not parity and has_fluid(model):
+        raise ValueError(f"{what} {NO_FLUID}")
 
 
-def _has_fluid(model: Any) -> bool:
-    """Of MuJoCo's model or of MJX's, in which the numbers may be traced."""
+def has_fluid(model: Any) -> bool:
+    """Whether bodies move through air or water; of MuJoCo's model, or of MJX's, in which the numbers may be traced."""
     if isinstance(model, mujoco.MjModel):
-        return model.opt.density > 0 or model.opt.viscosity > 0
+        return bool(model.opt.density > 0 or model.opt.viscosity > 0 or np.any(model.opt.wind))
     return model.opt._impl.has_fluid_params
 
 

@@ -80,6 +80,11 @@ class Gap:
         return bool(self.found["effects"])
 
     @property
+    def lost(self) -> bool:
+        """Whether a recording was kept sealed and could not be replayed in the end."""
+        return any("sealed recording" in name for name in self.found.get("failed", ()))
+
+    @property
     def floor(self) -> float | None:
         """U0; None where it is not known and where there is none, see `timeless`."""
         return self.found["floor"] or None

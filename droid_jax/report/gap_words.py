@@ -107,9 +107,10 @@ def _significance(gap: Gap) -> str:
 
 def _size(gap: Gap) -> str:
     one = gap.found["gaps"][gap.judge]
+    without = "the sealed one could not be replayed" if gap.lost else "none was kept sealed"
     seen = {
         "sealed": "which was opened once, at the end",
-        "confirm": "which also chose the effects, since none was kept sealed",
+        "confirm": f"which also chose the effects, since {without}",
         "fit": "the only one there is",
     }
     where = f"On “{one['recording']}”" + (f", {seen[gap.judge]}," if gap.extended else "")

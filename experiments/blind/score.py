@@ -274,8 +274,9 @@ def summarise_baselines(judged: Sequence[dict[str, Any]]) -> dict[str, Any] | No
         return None
     none, known = ([c for c in done if c["class"] in kinds] for kinds in (("none",), ("single", "pair")))
     hidden = [{"closed": c["baselines"]["closed"]} for c in done if c["class"] != "none"]
+    sealed = [c["gaps"]["sealed"][0] for c in done if "sealed" in c["gaps"]]  # not of one that blew up there
     return {
-        "base_gap_sealed_median": float(np.median([c["gaps"]["sealed"][0] for c in done])),
+        "base_gap_sealed_median": float(np.median(sealed)) if sealed else None,
         "bic_names_where_nothing": rate(none, lambda c: bool(c["baselines"]["bic"])),
         "bic_names_all_hidden": rate(known, lambda c: c["baselines"]["bic_all"]),
         "bic_false_names": rate(done, lambda c: c["baselines"]["bic_false"]),

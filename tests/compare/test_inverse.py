@@ -165,7 +165,7 @@ def test_a_joint_that_carries_a_measured_one_moves_with_the_log():
 def test_a_carrier_without_positions_is_warned_of():
     part = planar(joints=["b"])
     for recording in (log(["b"]), log(["a", "b"], holes=True)):
-        with pytest.warns(UserWarning, match="holds no positions of a, which carry measured joints"):
+        with pytest.warns(UserWarning, match="does not hold the positions of a throughout, which carry"):
             assert prescribed(part, recording) == ("b",)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -197,3 +197,10 @@ def test_effects_that_a_prescribed_motion_cannot_have_are_refused(part: str):
     effect = Effect("backlash", **{part: lambda *_: None})
     with pytest.raises(ValueError, match="backlash"):
         inverse_replay(scene, motion(scene, MOTOR, False), [effect])
+
+
+def test_air_and_water_are_refused():
+    xml = PLANAR.format(gravcomp="", spring="", more='<option density="1000" integrator="Euler"/>')
+    scene = compile_scene(mujoco.MjSpec.from_string(xml), "pool")
+    with pytest.raises(ValueError, match="a replay of scene 'pool' has no air or water"):
+        inverse_replay(scene, motion(scene, MOTOR, False))

@@ -224,6 +224,13 @@ def test_an_inverse_replay_has_no_floor(tmp_path: Path, quick: None) -> None:
     assert "but it is small: U is not above zero" in text and "Numerical floor" not in text
 
 
+def test_a_sealed_recording_that_blew_up_was_kept_all_the_same(tmp_path: Path, quick: None) -> None:
+    folder = make_gap(tmp_path / "run", "named", sealed=False, failed=["the fitted model on the sealed recording"])
+    text = read_page(page.write_report(folder)).text
+    assert "since the sealed one could not be replayed" in text and "The sealed recording could not be replayed" in text
+    assert "and the fitted model on the sealed recording" in text and "kept sealed" not in text
+
+
 def test_a_stand_in_is_said(tmp_path: Path, quick: None) -> None:
     folder = make_gap(tmp_path / "run", "none", setup={"recording": []})
     assert "stand-in robot" in read_page(page.write_report(folder)).text
