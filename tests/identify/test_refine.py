@@ -503,10 +503,8 @@ def test_an_aim_that_is_out_of_reach_is_given_up_and_one_within_reach_is_pursued
     assert hopeless.evaluations < whole.evaluations
     assert hopeless.objective > whole.objective
     assert whole.converged and reachable.converged and not hopeless.converged
-    settled = refine(
-        quartic, space, [50.0], dataclasses.replace(plain, aim=-5e5)
-    )  # it stands still: nothing was given up
-    assert settled.converged
+    still = refine(quartic, space, [50.0], dataclasses.replace(plain, aim=-5e5))
+    assert still.converged
 
 
 def test_a_period_is_found_though_the_first_differences_span_a_whole_one():
