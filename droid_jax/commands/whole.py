@@ -183,9 +183,7 @@ def _records(command: All) -> bool:
 
 def _needs_robot(command: All) -> None:
     """ValueError for a stand-in robot that there cannot be, rather now than when the folder says it was asked for."""
-    from droid_jax.measure.hidden import listed
     from droid_jax.model.door_scene import door_scene
-    from droid_jax.policy.transfer import check_playable
 
     if not _records(command):
         return
@@ -194,6 +192,9 @@ def _needs_robot(command: All) -> None:
     scene = door_scene()
     hidden = hidden_effects(command.hide, scene)
     if "evaluate" in command.stages:
+        from droid_jax.measure.hidden import listed
+        from droid_jax.policy.transfer import check_playable
+
         try:
             check_playable(scene, listed(hidden))
         except ValueError as error:

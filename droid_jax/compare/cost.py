@@ -26,7 +26,7 @@ from droid_jax.compare.twin import twin_replay
 from droid_jax.measure.checks import validate
 from droid_jax.measure.motion import Motion, measured_motion
 from droid_jax.measure.recording import Recording
-from droid_jax.model.joint_friction import joint_friction_effect
+from droid_jax.model.joint_friction import TERMS, joint_friction_effect
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_physics
 from droid_jax.model.scene import Scene
@@ -170,7 +170,7 @@ def check_read(scene: Scene, space: Space, effects: Sequence[Effect]) -> None:
 
     An effect that states no parameters may read any of them.
     """
-    sensed = [f"{what}[{joint}]" for what in ("torque_offset", "viscous", "coulomb") for joint in scene.joints]
+    sensed = [f"{what}[{joint}]" for what in TERMS for joint in scene.joints]
     read = {"time_offset", *sensed, *(p.name for e in effects for p in e.parameters)}
     unread = [p.name for p in space.parameters if not p.writes and p.name not in read]
     if unread and all(e.parameters for e in effects):

@@ -21,7 +21,7 @@ from droid_jax.model.joint_friction import SMOOTHING
 from droid_jax.model.physics import Physics
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, Rollout, State, Theta, column
-from droid_jax.model.step import NO_FLUID, has_fluid
+from droid_jax.model.step import refuse_fluid
 
 
 def prescribed(scene: Scene, recording: Recording) -> tuple[str, ...]:
@@ -79,8 +79,7 @@ def path_replay(
     Forces and friction of effects are what the torque has to overcome, on either side.
     Raises ValueError for effects of command and servo, which a prescribed motion has not, and for air or water.
     """
-    if has_fluid(scene.model):
-        raise ValueError(f"a replay of scene {scene.name!r} {NO_FLUID}")
+    refuse_fluid(scene.model, f"a replay of scene {scene.name!r}")
     steering = [e.name for e in effects if e.command or e.servo]
     if steering:
         raise ValueError(f"a prescribed motion has no commands that an effect could change: {', '.join(steering)}")

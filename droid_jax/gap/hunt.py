@@ -16,7 +16,6 @@ from droid_jax.gap.rank import Proposal
 from droid_jax.gap.refit import Model, look, refit
 from droid_jax.gap.screen import Screen
 from droid_jax.gap.select import LESS, MORE
-from droid_jax.gap.transfer import left_over
 from droid_jax.identify.pipeline import Progress
 from droid_jax.identify.refine import RefineConfig
 from droid_jax.identify.search import NotReplayed
@@ -108,7 +107,3 @@ class Hunt:
     def gap(self, model: Model) -> float:
         """U on the confirming demonstration."""
         return self.case.confirm.gap_at(model.values)
-
-    def beyond(self, model: Model) -> float:
-        """U on the confirming demonstration, less what the uncertainty of the model's fit leaves there."""
-        return self.case.confirm.gap(left_over(self.case.fit, self.case.confirm, model))

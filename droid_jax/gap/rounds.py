@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -15,6 +16,7 @@ from droid_jax.gap.rank import Proposal, collinear, proposals
 from droid_jax.gap.refit import Model
 from droid_jax.gap.screen import Screen
 from droid_jax.gap.select import LESS, OF_ALL, Trial, judge, much_more
+from droid_jax.gap.transfer import remainder
 from droid_jax.identify.refine import RefineConfig
 from droid_jax.identify.search import NotReplayed
 
@@ -136,18 +138,10 @@ def pairs(hunt: Hunt, base: Model, model: Model, first: Round) -> Round:
     tried = hunt.race(starters, hunt.aim(min(first.tried, key=lambda m: m.refined.objective)))
     alone, trial = min(zip(first.tried, first.trials, strict=True), key=lambda both: both[1].gap_confirm)
     done = _decided(hunt, base, first.screen, [*tried, model] if len(model.parts) > 1 else tried)
-    won = done.winner
-    if (
-        won is None
-        or done.chosen is None
-        or much_more(
-            trial.gap_confirm,
-            done.chosen.gap_confirm,
-            lambda: hunt.beyond(alone),
-            lambda: hunt.beyond(won),
-            hunt.whole_gap,
-        )
-    ):
+    if done.winner is None or done.chosen is None:
+        return done
+    beside, beyond = (functools.partial(remainder, case.fit, case.confirm, m) for m in (alone, done.winner))
+    if much_more(trial.gap_confirm, done.chosen.gap_confirm, beside, beyond, hunt.whole_gap):
         return done
     return replace(done, winner=None, chosen=None)
 

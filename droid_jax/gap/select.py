@@ -10,7 +10,7 @@ import numpy as np
 
 from droid_jax.gap.evidence import Evidence
 from droid_jax.gap.refit import Model, intervals, vanishing
-from droid_jax.gap.transfer import left_over
+from droid_jax.gap.transfer import remainder
 
 SIGNIFICANT = 0.01  # p below which something is missing
 CONFIRMED = 0.05  # and below which one effect's gain on the other demonstration is no chance, among all other gates
@@ -81,7 +81,7 @@ def judge(
     fitted = np.array([m.gap for m in models])
     same = alike(left[1:], fitted, losses, floor, confirm.tie, AS_FITTED * before.gap)
     winners = np.bincount(np.argmin(losses, axis=1), minlength=len(models)) / len(losses)
-    beside = functools.cache(lambda: confirm.gap(left_over(fit, confirm, before)))
+    beside = functools.cache(lambda: remainder(fit, confirm, before))
     out = []
     for k, model in enumerate(models):
         p = confirm.gain_p_value(0.5 * (squares[0] - squares[k + 1])) if np.isfinite(left[k + 1]) else 1.0
@@ -90,8 +90,8 @@ def judge(
         weak = [f"{UNCONFIRMED} (p = {p:.2g})"] if p >= CONFIRMED else []
         weak += _too_small(fit, model, spans, smallest)
         if before.parts:
-            after = functools.partial(lambda m: confirm.gap(left_over(fit, confirm, m)), model)
-            taken = much_more(left[0], left[k + 1], beside, after, whole_gap)
+            beyond = functools.partial(remainder, fit, confirm, model)
+            taken = much_more(left[0], left[k + 1], beside, beyond, whole_gap)
         else:
             taken = left[k + 1] <= (1 - LESS) * left[0]
         reasons = _gap_reasons(left[0], left[k + 1], whole_gap, taken, floor)

@@ -26,6 +26,11 @@ def left_over(fitted: Evidence, other: Evidence, model: Model) -> np.ndarray:
     return other.residuals(other.common(model.values)[0])
 
 
+def remainder(fitted: Evidence, other: Evidence, model: Model) -> float:
+    """U of what a model leaves over on another recording than the fitted one."""
+    return other.gap(left_over(fitted, other, model))
+
+
 def beyond(fitted: Evidence, other: Evidence, model: Model) -> np.ndarray:
     """[N, M] residuals of a model on another recording than the fitted one, less what its uncertainty allows.
 

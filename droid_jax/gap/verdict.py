@@ -42,6 +42,9 @@ class Experiment:
     apart: float
 
 
+LOST = "the fitted model on the sealed recording"  # among what failed
+
+
 @dataclass(frozen=True, eq=False)
 class Verdict:
     """The answer and its grounds.

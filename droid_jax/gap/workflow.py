@@ -18,7 +18,7 @@ from droid_jax.gap.screen import Question, Screen, marks, project, questions_of,
 from droid_jax.gap.select import OF_ALL, SIGNIFICANT
 from droid_jax.gap.transfer import left_over
 from droid_jax.gap.trend import trend
-from droid_jax.gap.verdict import Kind, Verdict, open_share
+from droid_jax.gap.verdict import LOST, Kind, Verdict, open_share
 from droid_jax.identify.pipeline import Progress
 from droid_jax.identify.search import NotReplayed
 
@@ -150,7 +150,7 @@ def _gaps(hunt: Hunt, base: Model, model: Model) -> dict[str, tuple[float, float
         except NotReplayed:
             if role != "sealed":
                 raise
-            hunt.failed.append("the fitted model on the sealed recording")
+            hunt.failed.append(LOST)
     return gaps
 
 

@@ -244,10 +244,12 @@ def _try_bounds(run: _Run, cost: Cost, space: Space, config: SearchConfig) -> in
     Mirrored draws come near a bound and never lie on it.  A row that costs no more becomes the best.  Nothing of this
     is in a checkpoint, so that a search that is continued goes on as it would have.
     """
+    if config.bounds == "clip":
+        return 0
     known = np.isfinite(run.best_cost)  # a restart whose every row blew up has no best
     bests = np.where(known[:, None], run.best, space.mean)
     values = np.stack([_moved_onto_bounds(space, best, config.population) for best in bests])  # [R, P, D]
-    if config.bounds == "clip" or (values == bests[:, None])[known].all():
+    if (values == bests[:, None])[known].all():
         return 0
     _keep_best(run, values, _evaluate(cost, values), known, ties=True)
     return values.shape[0] * values.shape[1]

@@ -99,24 +99,30 @@ def _is_euler(model: Any) -> bool:
     return model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
 
 
-NO_FLUID = "has no air or water: take density, viscosity and wind out of <option>; the effect `drag` is for doors"
-
-
 def check_options(model: Any, parity: bool, what: str = "a replay") -> None:
     """Raise ValueError for an integrator, a friction cone or a fluid that `step` has not; what: asks for it."""
     if not _is_euler(model) and model.opt.integrator != mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
         raise ValueError(f"{what} integrates with Euler or implicitfast; set <option integrator=...> to one of them")
     if model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC and not parity:
         raise ValueError(f"{what} needs pyramidal friction cones; set <option cone='pyramidal'>")
-    if not parity and has_fluid(model):
-        raise ValueError(f"{what} {NO_FLUID}")
+    if not parity:
+        refuse_fluid(model, what)
 
 
-def has_fluid(model: Any) -> bool:
-    """Whether bodies move through air or water; of MuJoCo's model, or of MJX's, in which the numbers may be traced."""
+def refuse_fluid(model: Any, what: str) -> None:
+    """Raise ValueError where bodies move through air or water.
+
+    model: MuJoCo's, or MJX's, in which the numbers may be traced.
+    """
     if isinstance(model, mujoco.MjModel):
-        return bool(model.opt.density > 0 or model.opt.viscosity > 0 or np.any(model.opt.wind))
-    return model.opt._impl.has_fluid_params
+        fluid = model.opt.density > 0 or model.opt.viscosity > 0 or np.any(model.opt.wind)
+    else:
+        fluid = model.opt._impl.has_fluid_params
+    if fluid:
+        raise ValueError(
+            f"{what} has no air or water: take density, viscosity and wind out of <option>; the effect `drag` is for "
+            "doors"
+        )
 
 
 def _undamped(model: Any) -> Any:

@@ -82,7 +82,9 @@ class Gap:
     @property
     def lost(self) -> bool:
         """Whether a recording was kept sealed and could not be replayed in the end."""
-        return any("sealed recording" in name for name in self.found.get("failed", ()))
+        from droid_jax.gap.verdict import LOST  # only here: it imports what computes
+
+        return LOST in self.found.get("failed", ())
 
     @property
     def floor(self) -> float | None:

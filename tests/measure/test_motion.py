@@ -47,7 +47,7 @@ def test_joints_come_in_the_order_asked_for_and_repeats_are_averaged():
 
 
 def test_a_repeat_that_drops_out_leaves_no_step():
-    """Repeats half a milliradian to either side; the mean of those that are left would jump, 1 rad/s^2 at once."""
+    """Repeats a milliradian to either side; the mean of those that are left would jump, 1 rad/s^2 at once."""
     rng = np.random.default_rng(4)
     repeats = sines(TIME) + np.array([-1e-3, 0.0, 1e-3])[:, None, None]
     repeats += 3e-5 * rng.normal(size=(3, 1, 1)) * TIME[None, :, None]
