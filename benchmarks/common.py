@@ -19,14 +19,20 @@ from droid_jax import runtime
 ROOT = Path(__file__).resolve().parents[1]
 
 
+# When the program started: what it imported then makes all its results, whatever is committed meanwhile.
+CODE = runtime.versions()
+
+
 def origin(seed: int) -> dict[str, Any]:
-    """Where a result comes from: commit, versions, device, cores, seed, date.  Starts jax's backend."""
+    """Where a result comes from: commit and versions when the program started, device, cores, seed, date.
+
+    Starts jax's backend.
+    """
     import jax
 
-    versions = runtime.versions()
     return {
-        "commit": versions.pop("git", None),
-        "versions": versions,
+        "commit": CODE.get("git"),
+        "versions": {name: version for name, version in CODE.items() if name != "git"},
         "device": runtime.device(),
         "platform": jax.default_backend(),
         "jax_devices": jax.local_device_count(),

@@ -13,6 +13,7 @@ import contextlib
 import csv
 import io
 import json
+import math
 import os
 import secrets
 import shutil
@@ -45,6 +46,11 @@ def write_text(path: Path, text: str) -> None:
 def write_json(path: Path, content: Any, *, indent: int = 1) -> None:
     """A JSON file; ValueError for NaN and infinities, which JSON has no word for."""
     write_text(path, json.dumps(content, indent=indent, allow_nan=False) + "\n")
+
+
+def finite(number: float) -> float | None:
+    """The number, or None for NaN and infinities: what `write_json` takes."""
+    return float(number) if math.isfinite(number) else None
 
 
 def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:

@@ -29,7 +29,7 @@ import scipy.signal
 import scipy.stats
 from inverse_fit import rms, rounded
 
-from droid_jax import runtime
+from benchmarks.common import CODE
 from droid_jax.compare.residuals import CompareConfig
 from droid_jax.gap.blocks import OUTSIDE, Blocks
 from droid_jax.gap.case import Case, GapConfig
@@ -45,7 +45,7 @@ from droid_jax.model.effects.registry import effect_space
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, Theta
-from droid_jax.storage import write_json
+from droid_jax.storage import finite, write_json
 
 ORDER = 20  # of the noise's autoregression, at 20 Hz: one second
 BURN = 400  # samples before the noise is stationary
@@ -170,7 +170,7 @@ def false_alarms(search: Search, verdict: Verdict, count: int, seed: int, folder
     rng = np.random.default_rng(seed)
     truth, left = verdict.base.values, search.log.left(verdict.model.values)
     simulated = search.log.simulated(truth[None])[0]
-    code = str(runtime.versions().get("git"))
+    code = str(CODE.get("git"))
     missing, named = [], []
     for number in range(count):
         log = search.log.holding(simulated + coloured(left, rng))
@@ -247,7 +247,7 @@ def report(case: Case, verdict: Verdict) -> dict[str, Any]:
             for b, a in zip(verdict.before.cells, verdict.after.cells, strict=True)
         ],
         "trials": [
-            {"name": t.name, "passed": t.passed, "p": t.p, "gap_fit": t.gap_fit, "gap_confirm": t.gap_confirm,
+            {"name": t.name, "passed": t.passed, "p": t.p, "gap_fit": t.gap_fit, "gap_confirm": finite(t.gap_confirm),
              "chosen": t.chosen, "rivals": list(t.rivals), "reasons": list(t.reasons)}
             for t in verdict.trials
         ],

@@ -37,7 +37,7 @@ from experiments.blind.limits import scene_limits  # noqa: E402
 from experiments.blind.make import make  # noqa: E402
 from experiments.blind.oracle import oracle_all  # noqa: E402
 from experiments.blind.scenes import setting  # noqa: E402
-from experiments.blind.score import score_folder  # noqa: E402
+from experiments.blind.score import score_folder, smaller_than_stated  # noqa: E402
 from experiments.blind.search import Bench, search_all  # noqa: E402
 from experiments.blind.table import score_table  # noqa: E402
 
@@ -102,8 +102,8 @@ class Search:
     """Only cases of these scenes."""
     at_most: int = 1000000
     """Stop after so many."""
-    results: Path = RUNS / "results"
-    """Folder of what is found, a file a case."""
+    results: Path | None = None
+    """Folder of what is found, a file a case; default: `results` beside the folder that holds the case's folder."""
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ def run_limits(command: Limits) -> dict[str, Any]:
         found = scene_limits(where, 1 if command.quick else command.draws, command.kept, effects, _tell)
         known = json.loads(out.read_text()) if out.is_file() else {"scenes": {}}
         scenes = {**known["scenes"], name: {**known["scenes"].get(name, {}), **found}}
-        write_json(out, {**origin(0), "scenes": scenes})
+        write_json(out, {"origin": {**known.get("origin", {}), name: origin(0)}, "scenes": scenes})
     return {"file": out.name, "limits": {n: len(scenes[n]) for n in command.scenes}}
 
 
@@ -191,14 +191,21 @@ def _with(known: Mapping[str, list[str]], found: Mapping[str, str]) -> dict[str,
     return {outcome: names for outcome, names in out.items() if names}
 
 
+def case_folders(given: Path) -> list[Path]:
+    """Folders of cases at or below a path, but what a killed `make` left half written, whose name begins with a dot."""
+    found = [case.parent for case in given.rglob("case.json")]
+    return [f for f in found if not any(part.startswith(".") for part in f.relative_to(given).parts)]
+
+
 def run_search(command: Search) -> dict[str, Any]:
     """All folders, those of one scene after each other."""
-    folders = sorted(case.parent for given in command.cases for case in given.rglob("case.json"))
+    folders = sorted(folder for given in command.cases for folder in case_folders(given))
     if not folders:
         raise SystemExit(f"error: no case below {', '.join(map(str, command.cases))}; the command make records some")
     chosen = [f for f in folders if not command.scenes or f.name.split("_")[0] in command.scenes]
-    open_ones = [f for f in chosen if not (command.results / f"{f.name}.json").is_file()][: command.at_most]
-    return {"searched": search_all(open_ones, command.results, Bench(), _tell), "cases": len(chosen)}
+    wanted = [(f, command.results or f.parent.parent / "results") for f in chosen]
+    open_ones = [(f, results) for f, results in wanted if not (results / f"{f.name}.json").is_file()]
+    return {"searched": search_all(open_ones[: command.at_most], Bench(), _tell), "cases": len(chosen)}
 
 
 def run_oracle(command: Oracle) -> dict[str, Any]:
@@ -206,7 +213,7 @@ def run_oracle(command: Oracle) -> dict[str, Any]:
     folder = command.out / "cases"
     if not folder.is_dir():
         raise SystemExit(f"error: {folder} is not there; make records the cases again, the same ones for one commit")
-    names = command.cases or tuple(sorted(p.name for p in folder.iterdir()))
+    names = command.cases or tuple(sorted(p.name for p in case_folders(folder)))
     return {"oracles": oracle_all(command.out, names, Bench(), _tell)}
 
 
@@ -216,6 +223,12 @@ def run_score(command: Score) -> dict[str, Any]:
         raise SystemExit(f"error: no detection limits at {command.limits}: give the file of this run (--limits)")
     limits = json.loads(command.limits.read_text())["scenes"]
     result = score_folder(command.out / "results", command.out / "sealed", limits, command.out / "oracle")
+    strange = smaller_than_stated(result["cases"])
+    if strange:
+        raise SystemExit(
+            f"error: by {command.limits} {strange[0]} hides less than its name says: these are not the limits that "
+            "the cases were made with; give that file (--limits; git show COMMIT:benchmarks/results/...)"
+        )
     folder = command.results or command.out
     planned = (
         json.loads((command.out / "made.json").read_text())["scenes"] if (command.out / "made.json").is_file() else {}

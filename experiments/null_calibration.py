@@ -28,8 +28,7 @@ import numpy as np  # noqa: E402
 import scipy.stats  # noqa: E402
 import tyro  # noqa: E402
 
-from benchmarks.common import origin  # noqa: E402
-from droid_jax import runtime  # noqa: E402
+from benchmarks.common import CODE, origin  # noqa: E402
 from droid_jax.gap.anew import base_fit  # noqa: E402
 from droid_jax.gap.candidates import candidates  # noqa: E402
 from droid_jax.gap.screen import questions_of  # noqa: E402
@@ -79,7 +78,7 @@ def case_of(plan: Plan, commit: str, bench: Bench) -> dict[str, Any]:
         result = run_case(plan, commit, bench)
     except (ValueError, RuntimeError, FloatingPointError) as error:
         result = {"scene": plan.scene, "verdict": "error", "error": str(error), "seed": seed_of(commit, plan.name)}
-    return {**result, "code": runtime.versions().get("git")}
+    return {**result, "code": CODE.get("git")}
 
 
 def run_case(plan: Plan, commit: str, bench: Bench) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from droid_jax.gap.select import Trial
 from droid_jax.gap.split import ROLES
 from droid_jax.gap.verdict import Verdict
 from droid_jax.identify.uncertainty import told
-from droid_jax.storage import write_json, write_npz
+from droid_jax.storage import finite, write_json, write_npz
 
 TRACES = ("time", "measured", "scatter", "before", "after")
 _KEYS = ("verdict", "sentence", "effects", "p", "floor", "gaps", "screens", "trials", "cells", "amplitudes", "shifts")
@@ -176,7 +176,7 @@ def _trial(trial: Trial) -> dict[str, Any]:
         "round": trial.name.count(" + "),
         "name": trial.name,
         "gap_fit": trial.gap_fit,
-        "gap_confirm": trial.gap_confirm if np.isfinite(trial.gap_confirm) else None,
+        "gap_confirm": finite(trial.gap_confirm),
         "p": trial.p,
         "chosen": trial.chosen,
         "passed": trial.passed,

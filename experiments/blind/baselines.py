@@ -69,7 +69,10 @@ def stepwise_bic(screen: Screen, common: np.ndarray) -> list[str]:
 
 
 def black_box(case: Case, model: Model, recordings: Mapping[str, Recording]) -> dict[str, list[float]]:
-    """Role -> U before and after a network, trained on the fitted recording, has added its torque."""
+    """Role -> U before and after a network, trained on the fitted recording, has added its torque.
+
+    A recording on which the base model blows up is left out.
+    """
     inputs = {role: features(e, recordings[role]) for role, e in case.judged.items()}
     left = _shaped(case.fit, torques(case.fit, case.fit.common(model.values)))
     centre, scale = inputs["fit"].mean(axis=0), inputs["fit"].std(axis=0) + 1e-9
@@ -84,7 +87,9 @@ def black_box(case: Case, model: Model, recordings: Mapping[str, Recording]) -> 
         added = whitened(e, torque.T.reshape(1, -1))[0]
         if e.own_columns is not None:  # the recording's own offsets are fitted again
             added = project(added[None], e.own_columns, np.full(len(e.own), np.sqrt(e.repeats)))[0]
-        out[role] = [e.gap(e.residuals(common)), e.gap(e.residuals(common - added))]
+        gaps = [e.gap(e.residuals(common)), e.gap(e.residuals(common - added))]
+        if np.all(np.isfinite(gaps)):
+            out[role] = gaps
     return out
 
 

@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.measure.hidden import HIDDEN, Applied
-from droid_jax.model.scene import Scene
-from experiments.blind.answers import ANSWERS, inside, right, targets
+from droid_jax.measure.hidden import HIDDEN, ON_HINGE, Applied
+from experiments.blind.answers import ANSWERS, inside, targets
 from experiments.blind.draws import seed_of
 from experiments.blind.scenes import Setting
 
@@ -64,7 +63,7 @@ def plans(
     def rng(kind: str) -> np.random.Generator:  # one for each class: how many pairs are asked for decides nothing else
         return np.random.default_rng(seed_of(commit, f"{setting.name}/plans/{kind}"))
 
-    pairs = [(*a, *b) for a, b in itertools.combinations(named, 2) if _apart(setting.scene, *a, *b)]
+    pairs = [(*a, *b) for a, b in itertools.combinations(named, 2) if _apart(*a, *b)]
     wanted = [("none", (), 0.0, k) for k in range(counts.none)]
     wanted += [("single", *one, k) for one in itertools.product(named, factors) for k in range(counts.single)]
     wanted += [("pair", *one) for one in _some(rng("pair"), setting, [(p, 3.0) for p in pairs], limits, counts.pair)]
@@ -79,9 +78,9 @@ def _plan(scene: str, kind: str, effects: tuple[str, ...], factor: float, number
     return Plan(f"{scene}/{kind}/{'+'.join(effects) or 'nothing'}/{factor:g}x/{number}", scene, kind, effects, factor)
 
 
-def _apart(scene: Scene, first: str, second: str) -> bool:
-    """Whether no name is right for both: the answers to such a pair could not be told apart."""
-    names = [{n.split(" at ")[0] for n in right(scene, Applied(e, 1.0))} for e in (first, second)]
+def _apart(first: str, second: str) -> bool:
+    """Whether no name is right for both, wherever they are: the answers to such a pair could not be told apart."""
+    names = [{ON_HINGE.get(n, n) for n in (ANSWERS[e].exact, *ANSWERS[e].ties)} for e in (first, second)]
     return not names[0] & names[1]
 
 

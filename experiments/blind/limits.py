@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.common import CODE
 from droid_jax.gap.candidates import candidates
 from droid_jax.gap.flips import largest_steady_t
 from droid_jax.gap.screen import questions_of
@@ -118,7 +119,7 @@ def _draw_limits(
     setting: Setting, number: int, folder: Path, asked: list[Applied], tell: Callable[[str], None]
 ) -> dict[str, dict[str, Any]]:
     """key -> entry, of one robot."""
-    path = folder / f"{setting.name}_{number}.json"
+    path = folder / f"{setting.name}_{number}_{CODE.get('git', 'unknown')}.json"  # of no other code's
     known = json.loads(path.read_text()) if path.is_file() else {}
     left = [e for e in asked if key(e.name, e.joint) not in known]
     if not left:

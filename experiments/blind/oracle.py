@@ -8,6 +8,7 @@ search never sees it.
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -33,7 +34,7 @@ SIZES = np.geomspace(3e-3, 0.8, 12)  # of the way from neutral to a bound
 KINDS = ("single", "pair")  # whose effects the library has forms of
 
 
-def oracle(folder: Path, truth: dict[str, Any], result: dict[str, Any] | None, bench: Bench) -> dict[str, Any]:
+def oracle(folder: Path, truth: dict[str, Any], result: dict[str, Any], bench: Bench) -> dict[str, Any]:
     """U on every recording with the right forms in the model, parameters fitted to the first alone.
 
     result: what the search found, whose amplitudes are then told without noise as well (`quiet.py`).
@@ -47,7 +48,7 @@ def oracle(folder: Path, truth: dict[str, Any], result: dict[str, Any] | None, b
         "gaps": {role: of.gap_at(model.values) for role, of in case.judged.items()},
         "amplitudes": {name: float(model.values[case.whole.index(name)]) for name in model.amplitudes},
         "converged": model.refined.converged,
-        "settled": settled(recordings, truth, result, bench) if result else None,
+        "settled": settled(recordings, truth, result, bench),
     }
 
 
@@ -83,17 +84,26 @@ def best_start(case: Case, start: np.ndarray, asked: Iterable[Candidate]) -> tup
 
 
 def oracle_all(runs: Path, chosen: Iterable[str], bench: Bench, tell: Callable[[str], None] = print) -> int:
-    """The oracle of every chosen case that has forms in the library and none yet in the folder `oracle` of a run."""
+    """The oracle of every chosen case that is searched, has forms in the library and no oracle yet of that result.
+
+    They go to the folder `oracle` of a run; a case that cannot be fitted from its truth leaves the error there.
+    """
     count = 0
     for name in chosen:
         path, sealed, known = (runs / folder / f"{name}.json" for folder in ("oracle", "sealed", "results"))
         truth = json.loads(sealed.read_text())
+        if truth["kind"] not in KINDS or not known.is_file():
+            continue
+        of = hashlib.sha256(known.read_bytes()).hexdigest()
         with claimed(path, wait=False) as mine:
-            if not mine or path.is_file() or truth["kind"] not in KINDS:
+            if not mine or (path.is_file() and json.loads(path.read_text()).get("of") == of):
                 continue
-            result = json.loads(known.read_text()) if known.is_file() else None
-            found = oracle(runs / "cases" / name, truth, result, bench)
-            write_json(path, found)
+            try:
+                found = oracle(runs / "cases" / name, truth, json.loads(known.read_text()), bench)
+            except ValueError as error:
+                found = {"error": str(error)}
+            write_json(path, {"of": of, **found})
         count += 1
-        tell(f"{name}: {found['model']}, U {', '.join(f'{role} {u:.3g}' for role, u in found['gaps'].items())}")
+        left = ", ".join(f"U {role} {u:.3g}" for role, u in found.get("gaps", {}).items())
+        tell(f"{name}: {found.get('error', found.get('model'))} {left}")
     return count

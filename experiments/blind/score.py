@@ -62,14 +62,18 @@ def score_folder(results: Path, sealed: Path, limits: Mapping[str, Any], oracles
         "by_group": {name: summarise(cases) for name, cases in grouped(judged).items()},
         "confusion": {scene: confusion(cases) for scene, cases in by_scene.items()},
         "commits": sorted({c["truth"]["commit"] for c in found}),
-        "searched_by_other_code": sorted(c["truth"]["name"] for c in found if not by_frozen_code(c)),
+        **{
+            f"searched_by_{whose}_code": sorted(c["truth"]["name"] for c in found if code_of(c) == whose)
+            for whose in ("other", "unknown")
+        },
         "cases": judged,
     }
 
 
-def by_frozen_code(case: Case) -> bool:
-    """Whether the commit that searched is the one that the case's seed is of; results before 0e96fcd do not tell."""
-    return case["result"].get("code") in (None, case["truth"]["commit"])
+def code_of(case: Case) -> str:
+    """Whether the commit that searched is the "frozen" one that the case's seed is of, an "other" one or "unknown"."""
+    code = case["result"].get("code")
+    return "unknown" if code is None else "frozen" if code == case["truth"]["commit"] else "other"
 
 
 def judge(case: Case, limits: Mapping[str, Any]) -> dict[str, Any]:
@@ -102,6 +106,7 @@ def judge(case: Case, limits: Mapping[str, Any]) -> dict[str, Any]:
         "p": result.get("p"),
         "false_names": false,
         "wrong_confident": bool(false) and verdict in CLEAN,
+        "said": [saying(slot, allowed, names) for slot in slots],
         "met": met,
         "named": bool(met) and all(met) and not false and verdict in NAMING,
         "alone": alone and verdict in NAMING,
@@ -109,7 +114,7 @@ def judge(case: Case, limits: Mapping[str, Any]) -> dict[str, Any]:
         "open": verdict in OPEN,
         "reachable": reachable(case),
         "gaps": result.get("gaps", {}),
-        "closed": {role: closed(result, role) for role in result.get("gaps", {}) if result["effects"]},
+        "closed": _shares(result) if names else {},
         "within_floor": within_floor(result),
         "coverage": coverage(case),
         "counterpart_coverage": counterpart_coverage(case, limits),
@@ -132,6 +137,25 @@ def slots_of(result: Mapping[str, Any], right_names: Sequence[Sequence[str]]) ->
     return out
 
 
+def saying(slot: set[str], allowed: Sequence[Sequence[str]], leaders: Sequence[str]) -> str:
+    """A part of an answer in a word: the right name in it, without its place, else the one that leads.
+
+    "(elsewhere)": the right effect, in the wrong place.
+    """
+    right_ones = [name for names in allowed for name in names]
+    hits = [name for name in right_ones if name in slot]
+    if hits:
+        return _plain(hits[0])
+    elsewhere = [name for name in sorted(slot) if _plain(name) in map(_plain, right_ones)]
+    if elsewhere:
+        return f"{_plain(elsewhere[0])} (elsewhere)"
+    return _plain(next((name for name in leaders if name in slot), min(slot)))
+
+
+def _plain(name: str) -> str:
+    return name.split(" at ")[0]
+
+
 def times_limit(truth: Mapping[str, Any], limits: Mapping[str, Any]) -> dict[str, float]:
     """How many times its detection limit each hidden effect is: more than the factor where its worth sets its size."""
     known = limits.get(truth["scene"], {})
@@ -139,10 +163,23 @@ def times_limit(truth: Mapping[str, Any], limits: Mapping[str, Any]) -> dict[str
     return {n: size / known[n]["limit"] for n, size in names.items() if known.get(n, {}).get("limit")}
 
 
-def closed(result: Mapping[str, Any], role: str) -> float:
-    """1 - (U after - U0) / (U before - U0)."""
+def smaller_than_stated(judged: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Names of cases that hide less than their factor times the limit, which no case of these limits can."""
+    return [c["name"] for c in judged if any(t < c["factor"] * (1.0 - 1e-6) for t in c["times_limit"].values())]
+
+
+def closed(result: Mapping[str, Any], role: str) -> float | None:
+    """1 - (U after - U0) / (U before - U0); None where there was hardly a gap to close."""
     before, after = result["gaps"][role]
-    return 1.0 - (after - result["floor"]) / max(before - result["floor"], 1e-12)
+    if before - result["floor"] < SEEN:
+        return None
+    return 1.0 - (after - result["floor"]) / (before - result["floor"])
+
+
+def _shares(result: Mapping[str, Any]) -> dict[str, float]:
+    """Role -> share of its gap that was closed, of the recordings that show one."""
+    shares = {role: closed(result, role) for role in result.get("gaps", {})}
+    return {role: share for role, share in shares.items() if share is not None}
 
 
 def reachable(case: Case) -> float | None:
@@ -151,7 +188,7 @@ def reachable(case: Case) -> float | None:
     0 where the base model leaves hardly a gap: nothing can be named there.
     """
     known, gaps = case["oracle"], case["result"].get("gaps", {})
-    if not known or "confirm" not in gaps:
+    if not known or "gaps" not in known or "confirm" not in gaps:
         return None
     floor, before = case["result"]["floor"], gaps["confirm"][0]
     if before - floor < SEEN:
@@ -194,17 +231,18 @@ def counterpart_coverage(case: Case, limits: Mapping[str, Any]) -> list[bool]:
 
 
 def against_baselines(case: Case) -> dict[str, Any] | None:
-    """What BIC named and what the black box closed, on this case."""
+    """What BIC named, and what search and black box closed of the same gaps, on this case."""
     found = case["result"].get("baselines")
     if not found:
         return None
     left_out = case["truth"]["kind"] == "left_out"
     names = [[] for _ in case["right"]] if left_out else case["right"]
-    boxes = {"gaps": found["black_box"], "floor": case["result"]["floor"]}
+    box = _shares({"gaps": found["black_box"], "floor": case["result"]["floor"]})
+    search = _shares(case["result"])  # 0 where nothing was named
     return {
         "bic": found["bic"],
         **{f"bic_{k}": v for k, v in bic_outcome(found["bic"], names, [] if left_out else case["parts"]).items()},
-        "closed": {role: closed(boxes, role) for role in ("confirm", "sealed")},
+        "closed": {"search": search, "black_box": {role: share for role, share in box.items() if role in search}},
     }
 
 
@@ -224,7 +262,8 @@ def _label(case: Mapping[str, Any]) -> str:
 def summarise(judged: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """All rates of some cases, those that do not apply left away.
 
-    What is named is counted of effects at three times their limit or more; at the limit half shall be detected at all.
+    What is named is counted of effects at three times their limit or more (at the limit half shall be detected at all),
+    what is named falsely of everything hidden.
     """
     none = [c for c in judged if c["class"] == "none" and c["verdict"] in ANSWERED]
     known = [c for c in judged if c["class"] in ("single", "pair") and c["factor"] >= ABOVE]
@@ -232,12 +271,13 @@ def summarise(judged: Sequence[dict[str, Any]]) -> dict[str, Any]:
     nameable = [c for c in known if (c["reachable"] or 0.0) >= NAMEABLE]
     alone, both = [c for c in nameable if c["class"] == "single"], [c for c in nameable if c["class"] == "pair"]
     strange = [c for c in judged if c["class"] in ("outside", "left_out")]
+    hidden = [c for c in judged if c["class"] != "none"]
     named = [c for c in known if c["named"]]
     rates = {
         "false_alarm_rate": rate(none, lambda c: c["verdict"] != "none"),
         "false_names_where_nothing": rate(none, lambda c: bool(c["effects"])),
-        "wrong_name_rate": rate([*single, *pair, *strange], lambda c: c["wrong_confident"]),
-        "false_names": rate([*single, *pair, *strange], lambda c: bool(c["false_names"])),
+        "wrong_name_rate": rate(hidden, lambda c: c["wrong_confident"]),
+        "false_names": rate(hidden, lambda c: bool(c["false_names"])),
         "detected": rate(known, lambda c: c["verdict"] in (*NAMING, "unexplained")),
         "named_up_to_tie": rate(single, lambda c: c["named"]),
         "named_alone": rate(single, lambda c: c["alone"]),
@@ -268,20 +308,26 @@ def summarise(judged: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def summarise_baselines(judged: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
-    """The same cases by simpler means: BIC's names, the black box's gap, and the gap that the base model leaves."""
+    """The same cases by simpler means: BIC's names, the gap that the base model leaves, and the black box.
+
+    Its share of the gap is beside the search's, of everything hidden and whatever the search named.
+    """
     done = [c for c in judged if c["baselines"]]
     if not done:
         return None
     none, known = ([c for c in done if c["class"] in kinds] for kinds in (("none",), ("single", "pair")))
-    hidden = [{"closed": c["baselines"]["closed"]} for c in done if c["class"] != "none"]
+    shares = [c["baselines"]["closed"] for c in done if c["class"] != "none"]
     sealed = [c["gaps"]["sealed"][0] for c in done if "sealed" in c["gaps"]]  # not of one that blew up there
     return {
         "base_gap_sealed_median": float(np.median(sealed)) if sealed else None,
         "bic_names_where_nothing": rate(none, lambda c: bool(c["baselines"]["bic"])),
         "bic_names_all_hidden": rate(known, lambda c: c["baselines"]["bic_all"]),
         "bic_false_names": rate(done, lambda c: c["baselines"]["bic_false"]),
-        "black_box_closed_confirm": closing(hidden, "confirm"),
-        "black_box_closed_sealed": closing(hidden, "sealed"),
+        **{
+            f"{who}_closed_{role}": closing([{"closed": s[who]} for s in shares], role)
+            for who in ("search", "black_box")
+            for role in ("confirm", "sealed")
+        },
     }
 
 
@@ -295,7 +341,10 @@ def rate(cases: Sequence[Any], hit: Callable[[Any], bool]) -> dict[str, Any] | N
 
 
 def closing(cases: Sequence[dict[str, Any]], role: str) -> dict[str, Any] | None:
-    """Median of the gap closed with a bootstrap over cases, and the share of cases that close `CLOSED` of it."""
+    """Median of the gap closed with a bootstrap over cases, and the share of cases that close `CLOSED` of it.
+
+    Of cases that show a gap there.
+    """
     values = np.array([c["closed"][role] for c in cases if role in c["closed"]])
     if not len(values):
         return None
@@ -308,11 +357,11 @@ def closing(cases: Sequence[dict[str, Any]], role: str) -> dict[str, Any] | None
 
 
 def confusion(judged: Sequence[dict[str, Any]]) -> dict[str, dict[str, int]]:
-    """What was hidden -> what the verdict names, without places, or its kind where it names nothing."""
+    """What was hidden -> what the verdict says (`saying`), or its kind where it names nothing."""
     table: dict[str, Counter[str]] = {}
     for case in judged:
         hidden = "+".join(sorted(h.split("[")[0] for h in case["hidden"])) or "nothing"
-        said = " + ".join(sorted(e.split(" at ")[0] for e in case["effects"])) or f"({case['verdict']})"
+        said = " + ".join(sorted(case["said"])) or f"({case['verdict']})"
         table.setdefault(f"{hidden}{' left out' if case['class'] == 'left_out' else ''}", Counter())[said] += 1
     return {hidden: dict(said.most_common()) for hidden, said in sorted(table.items())}
 
@@ -328,5 +377,5 @@ def _seconds(judged: Sequence[dict[str, Any]]) -> dict[str, float] | None:
     taken = [c["seconds"] for c in judged if c["seconds"]]
     if not taken:
         return None
-    stages = {stage: float(np.median([t.get(stage, 0.0) for t in taken])) for stage in taken[-1]}
+    stages = {s: float(np.median([t.get(s, 0.0) for t in taken])) for s in dict.fromkeys(s for t in taken for s in t)}
     return {**stages, "whole": float(np.median([sum(t.values()) for t in taken]))}

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from droid_jax import runtime
+from benchmarks.common import CODE
 from droid_jax.compare.cost import Cost
 from droid_jax.gap.anew import base_fit
 from droid_jax.gap.case import Case, GapConfig, make_case
@@ -23,7 +23,7 @@ from droid_jax.gap.verdict import Verdict
 from droid_jax.gap.workflow import find
 from droid_jax.measure.formats import load
 from droid_jax.measure.recording import Recording
-from droid_jax.storage import write_json
+from droid_jax.storage import finite, write_json
 from experiments.blind.baselines import baselines
 from experiments.blind.scenes import ROLES, Setting, setting
 from experiments.sharing import claimed
@@ -91,8 +91,7 @@ def search_case(folder: Path, bench: Bench) -> dict[str, Any]:
     told = json.loads((folder / "case.json").read_text())
     recordings = {role: load(folder / "recordings" / f"{role}.npz") for role in ROLES}
     watch = Stopwatch()
-    code = runtime.versions().get("git")
-    result: dict[str, Any] = {"scene": told["scene"], "without": told["without"], "code": code}
+    result: dict[str, Any] = {"scene": told["scene"], "without": told["without"], "code": CODE.get("git")}
     try:
         case = watch("prepare", lambda: bench.case(told["scene"], recordings, told["without"]))
         model = watch("base", lambda: base_fit(case, silent))
@@ -131,20 +130,20 @@ def describe(case: Case, verdict: Verdict) -> dict[str, Any]:
             name: float(verdict.model.values[space.index(name)]) for part in verdict.model.parts for name in part.shapes
         },
         "trials": [
-            {"name": t.name, "gap_fit": t.gap_fit, "gap_confirm": t.gap_confirm, "p": t.p, "chosen": t.chosen}
+            {"name": t.name, "gap_fit": t.gap_fit, "gap_confirm": finite(t.gap_confirm), "p": t.p, "chosen": t.chosen}
             | {"rivals": list(t.rivals), "reasons": list(t.reasons)}
             for t in verdict.trials
         ],
     }
 
 
-def search_all(folders: Iterable[Path], results: Path, bench: Bench, tell: Callable[[str], None] = print) -> int:
-    """Search every folder that has no result yet in the folder `results`; how many there were.
+def search_all(wanted: Iterable[tuple[Path, Path]], bench: Bench, tell: Callable[[str], None] = print) -> int:
+    """Search every (case folder, folder of results) that has no result yet; how many there were.
 
     Processes that run the same command share them.
     """
     count = 0
-    for folder in folders:
+    for folder, results in wanted:
         path = results / f"{folder.name}.json"
         with claimed(path, wait=False) as mine:
             if not mine or path.is_file():

@@ -16,7 +16,7 @@ from droid_jax.measure.hidden import HIDDEN, LIBRARY, ON_HINGE, Applied, possibl
 from droid_jax.model.effects.registry import registered
 from droid_jax.model.parameters import Parameter, Space
 from experiments import hidden_effects, null_calibration
-from experiments.blind import limits, score
+from experiments.blind import limits, oracle, score
 from experiments.blind.answers import ANSWERS, inside, parts, right, targets, without
 from experiments.blind.baselines import bic_outcome
 from experiments.blind.cases import Counts, amplitude, key, keys, plans
@@ -25,6 +25,7 @@ from experiments.blind.make import Drawn, make, record
 from experiments.blind.marks import Ground, ground
 from experiments.blind.quiet import QUIET, around
 from experiments.blind.scenes import ROLES, Setting, setting
+from experiments.blind.search import Bench
 from experiments.blind.table import score_table
 
 CHEAP = ("hinge", "bench", "arm")
@@ -165,6 +166,15 @@ def test_plans_are_of_all_classes_and_drawn_by_the_commit():
     assert [p.effects for p in made if p.kind == "pair"] != [p.effects for p in other if p.kind == "pair"]
     few = {"closer": entry(), "air_drag": entry(), "detent": entry()}
     assert {p.effects for p in plans(bench, counts, COMMIT, few) if p.kind == "pair"} == {("closer", "air_drag")}
+
+
+@pytest.mark.parametrize("name", ["hinge", "bench", "door"])
+def test_no_pair_shares_a_right_name(name: str):
+    where = setting(name)
+    wanted = plans(where, Counts(none=0, single=0, pair=1000, outside=0, left_out=0), COMMIT, limits_of(where))
+    names = {e: {n for joint in targets(where, e) for n in right(where.scene, Applied(e, 1.0, joint))} for e in ANSWERS}
+    pairs = {plan.effects for plan in wanted}
+    assert len(pairs) > 20 and [pair for pair in pairs if names[pair[0]] & names[pair[1]]] == []
 
 
 def test_amplitudes_are_multiples_of_what_can_be_told_and_is_worth_it():
@@ -362,6 +372,31 @@ def test_intervals_are_compared_with_what_the_library_form_should_take():
     assert "amplitude_counterpart_coverage" not in rates(measured(2.9, 3.1), known=far)
 
 
+def test_where_there_is_no_gap_no_share_of_it_is_closed():
+    gaps = {"confirm": [11.0, 2.0], "sealed": [1.01, 0.99]}
+    judged = score.judge(case("single", "named", ["latch at door"], [["latch at door"]], gaps=gaps), {})
+    assert judged["closed"] == {"confirm": pytest.approx(0.9)}
+
+
+def test_search_and_black_box_are_compared_on_the_same_gaps():
+    box = {"bic": [], "black_box": {"confirm": [11.0, 6.0], "sealed": [11.0, 1.0]}}
+    named = case("single", "named", ["latch at door"], [["latch at door"]], baselines=box)
+    gaps = {"confirm": [11.0, 11.0], "sealed": [1.0, 1.0]}  # the sealed motion shows none
+    silent = case("single", "unexplained", [], [["latch at door"]], baselines=box, gaps=gaps)
+    found = rates(named, silent)["baselines"]
+    assert found["search_closed_confirm"]["median"] == pytest.approx(0.45)  # 0.9 and 0
+    assert found["black_box_closed_confirm"]["median"] == pytest.approx(0.5)
+    assert found["search_closed_sealed"]["at_least"]["of"] == found["black_box_closed_sealed"]["at_least"]["of"] == 1
+
+
+def test_confusion_tells_ties_from_swaps_and_right_effects_in_wrong_places():
+    right_names = [["latch at door", "preload at door"]]
+    answers = (["preload at door"], ["latch at elbow"], ["closer at door"])
+    judged = [score.judge(case("single", "named", names, right_names), {}) for names in answers]
+    judged.append(score.judge(case("single", "tie", ["closer at door"], right_names, tied=[["latch at door"]]), {}))
+    assert score.confusion(judged) == {"h0": {"preload": 1, "latch (elsewhere)": 1, "closer": 1, "latch": 1}}
+
+
 def test_confusion_and_errors():
     judged = [
         score.judge(c, {})
@@ -445,8 +480,17 @@ def test_a_case_tells_its_multiple_of_the_limit_and_whose_code_searched():
     given = case("single", "named", ["latch at door"], [["latch at door"]])
     judged = score.judge(given, known)
     assert judged["times_limit"] == {"h0": abs(given["truth"]["hidden"][0]["amplitude"]) / 0.5}
-    other = {**given, "result": {**given["result"], "code": "f" * 40}}
-    assert score.by_frozen_code(given) and not score.by_frozen_code(other)
+    codes = (COMMIT, "f" * 40, None)  # None: the folder was no checkout any more
+    searched = [{**given, "result": {**given["result"], "code": code}} for code in codes]
+    assert [score.code_of(c) for c in searched] == ["frozen", "other", "unknown"]
+
+
+def test_limits_of_another_run_are_noticed():
+    """A case of three times its limit of 0.5 hides 1.5 or more, however large a size worth naming is."""
+    given = case("single", "named", ["latch at door"], [["latch at door"]])  # hides 2.0
+    for limit, strange in ((0.5, []), (1.0, [given["truth"]["name"]])):
+        judged = [score.judge(given, {"s": {"h0": {"limit": limit}}})]
+        assert score.smaller_than_stated(judged) == strange
 
 
 def test_a_null_that_was_made_in_pieces_is_summed_up_whole(
@@ -490,6 +534,37 @@ def test_a_search_is_given_the_cases_alone(tmp_path: Path, monkeypatch: pytest.M
     assert given == [tmp_path / "cases", tmp_path / "results"]
     with pytest.raises(SystemExit, match="no case below"):
         hidden_effects.run_search(hidden_effects.Search((tmp_path,), results=tmp_path / "results"))
+
+
+def test_what_a_killed_make_left_half_written_is_no_case(tmp_path: Path):
+    for name in ("hinge_1", ".hinge_0.3fa9/new"):
+        (tmp_path / ".runs" / "cases" / name).mkdir(parents=True)
+        (tmp_path / ".runs" / "cases" / name / "case.json").write_text("{}")
+    assert hidden_effects.case_folders(tmp_path / ".runs" / "cases") == [tmp_path / ".runs" / "cases" / "hinge_1"]
+
+
+def test_an_oracle_is_of_the_result_that_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """None without a result, none twice of the same, one more of another; a case that fails leaves its error."""
+    asked: list[Any] = []
+
+    def one(folder: Path, truth: Any, result: dict[str, Any], bench: Any) -> dict[str, Any]:
+        asked.append(result["n"])
+        if result["n"] == 3:
+            raise ValueError("no replay")
+        return {"model": "latch", "gaps": {"fit": 1.0}}
+
+    monkeypatch.setattr(oracle, "oracle", one)
+    for folder in ("sealed", "results"):
+        (tmp_path / folder).mkdir()
+    for name in ("a", "b"):
+        (tmp_path / "sealed" / f"{name}.json").write_text('{"kind": "single"}')
+    for number in (1, 1, 2, 3):
+        (tmp_path / "results" / "a.json").write_text(json.dumps({"n": number}))
+        oracle.oracle_all(tmp_path, ("a", "b"), Bench(), lambda line: None)
+    assert asked == [1, 2, 3]
+    assert json.loads((tmp_path / "oracle" / "a.json").read_text())["error"] == "no replay"
+    given = {**case("single", "named", ["latch at door"], [["latch at door"]]), "oracle": {"error": "no replay"}}
+    assert score.judge(given, {})["reachable"] is None
 
 
 def test_only_unsearched_cases_are_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
