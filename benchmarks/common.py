@@ -53,8 +53,12 @@ def stem(name: str, quick: bool) -> str:
 
 
 def empty_cache(folder: str) -> dict[str, str]:
-    """An environment, for a process of its own, in which nothing has been compiled yet."""
-    return {**os.environ, runtime.CACHE_VARIABLE: f"{folder}/cache", "PYTHONPATH": str(ROOT)}
+    """An environment, for a process of its own, in which nothing has been compiled yet.
+
+    Without the log level that an imported jax leaves behind, under which XLA says more than in a fresh terminal.
+    """
+    given = {name: value for name, value in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}
+    return {**given, runtime.CACHE_VARIABLE: f"{folder}/cache", "PYTHONPATH": str(ROOT)}
 
 
 def interleave(

@@ -128,6 +128,8 @@ def main() -> None:
                 break
     found = {"help_s": help_seconds(), **figures(lines)}
     result = found if arguments.quick else {**found, **results(arguments.out / name)}
+    import tuned  # noqa: F401  (before jax starts: the run had all cores)
+
     printed = [[round(line.seconds, 1), line.text] for line in lines]
     write_json(arguments.out / f"{name}.json", {**result, "printed": printed, **origin(0)})
     print(json.dumps({k: result[k] for k in result if k not in ("torque_gap", "sentence")}))

@@ -6,8 +6,9 @@
 Needs the package installed (`pip install -e .`), or the checkout on PYTHONPATH.
 
 A step is 2 ms of one sample.  Every engine replays demonstration A (a whole opening, with grasp
-contact) for the same random samples with the same cone, time step and solver options; MJX and C
-take turns.  Writes OUT/throughput.json, prints a table and, as the last line, one line of JSON.
+contact) for the same random samples with the same cone and time step.  C and `mjx.step` have the model's own solver
+options and integrator, the replay its own step and solver (`solver_options` in the result); replay and C take turns.
+Writes OUT/throughput.json, prints a table and, as the last line, one line of JSON.
 """
 
 from __future__ import annotations
@@ -235,11 +236,14 @@ def headline(rows: Sequence[Row], untuned: dict[str, Any] | None, memory: dict[s
 
 
 def table_of(rows: Sequence[Row]) -> Table:
-    """All rows; the last column compares with the C engine at the same number of samples."""
+    """All rows; the last column compares with the C engine at the same number of samples, when it took turns."""
     table = Table(title="Physics steps per second")
     for name in ("engine", "samples", "steps", "compile s", "run s", "steps/s", "of C"):
         table.add_column(name, justify="left" if name == "engine" else "right")
-    c = {row.population: row.rate for row in rows if row.engine == C}
+    c = dict[int, float]()
+    for row in rows:
+        if row.engine == C:
+            c.setdefault(row.population, row.rate)
     for row in rows:
         compiling = "" if row.compile_s is None else f"{row.compile_s:.1f}"
         share = f"{row.rate / c[row.population]:.2g}" if row.population in c else ""

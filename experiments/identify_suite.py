@@ -75,13 +75,20 @@ def recordings(scene: Scene, truth: dict[str, float], names: str, seed: int) -> 
 
 
 def describe(found: Identified, truth: dict[str, float]) -> dict[str, Any]:
-    """A case's figures: gap closed, every parameter with truth, interval and verdict."""
+    """A case's figures: gap closed, every parameter with truth, interval and verdict.
+
+    search: mean and deviation in the coordinate in which the parameter was fitted, where it is normal.
+    """
     low, high = found.full_gaussian.interval(LEVEL)
+    told = found.full_gaussian
+    assert told.coordinates == "search"
+    deviation = np.sqrt(np.diag(told.cov))
     parameters = {
         p.name: {
             "truth": truth[p.name],
             "best": float(found.best[i]),
             "interval": [float(low[i]), float(high[i])],
+            "search": [float(told.mean[i]), float(deviation[i])],
             "inside": bool(low[i] <= truth[p.name] <= high[i]),
             "identifiable": found.tells[i].identifiable,
             "shrinkage": found.tells[i].shrinkage,
@@ -265,23 +272,20 @@ def _coverage(cases: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def agreement(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
-    """Do the two poses agree on what both tell?  Their difference, in units of its own deviation, is normal if so."""
+    """Do the two poses agree on what both tell?
+
+    Their difference in the coordinate of the search, in units of its own deviation, is normal if so.
+    """
     names = [
         n for n, p in a["parameters"].items()
         if not p["nuisance"] and p["identifiable"] and b["parameters"][n]["identifiable"]
     ]  # fmt: skip
     apart = {}
     for name in names:
-        (mean_a, std_a), (mean_b, std_b) = (gaussian(case["parameters"][name]) for case in (a, b))
+        (mean_a, std_a), (mean_b, std_b) = (case["parameters"][name]["search"] for case in (a, b))
         apart[name] = (mean_a - mean_b) / np.hypot(std_a, std_b)
     within = np.abs(list(apart.values())) <= scipy.stats.norm.ppf(0.95)
     return {"difference_in_deviations": apart, "within_90": float(np.mean(within)) if names else None}
-
-
-def gaussian(parameter: dict[str, Any]) -> tuple[float, float]:
-    """Centre and deviation of the Gaussian whose interval a case's parameter states, in its own unit."""
-    low, high = parameter["interval"]
-    return 0.5 * (low + high), (high - low) / (2 * scipy.stats.norm.ppf(0.5 + LEVEL / 2))
 
 
 def main() -> None:

@@ -18,7 +18,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
 
 import numpy as np  # noqa: E402
 import tyro  # noqa: E402
-from identify_suite import agreement, gaussian, kept_cases  # noqa: E402
+from identify_suite import agreement, kept_cases  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 from scipy import stats  # noqa: E402
 
@@ -48,9 +48,9 @@ def both_tell(a: dict[str, Any], b: dict[str, Any]) -> list[str]:
 
 @styled
 def densities(a: dict[str, Any], b: dict[str, Any], width: float = WIDE) -> Figure:
-    """One panel for each parameter that both poses tell: the two Gaussians and the truth."""
+    """One panel for each parameter that both poses tell: the two densities and the truth."""
     names = both_tell(a, b)
-    units = {p.name: p.unit for p in door_space(door_scene()).parameters}
+    known = {p.name: p for p in door_space(door_scene()).parameters}
     columns = 4
     rows = max(1, -(-len(names) // columns))
     figure = Figure(figsize=(width, 0.6 + 1.5 * rows), layout="constrained")
@@ -60,17 +60,23 @@ def densities(a: dict[str, Any], b: dict[str, Any], width: float = WIDE) -> Figu
     for axes, name in zip(panels, names, strict=False):
         low = min(a[name]["interval"][0], b[name]["interval"][0])
         high = max(a[name]["interval"][1], b[name]["interval"][1])
-        x = np.linspace(low - 0.4 * (high - low), high + 0.4 * (high - low), 300)
+        p = known[name]
+        x = np.linspace(max(low - 0.4 * (high - low), p.low), min(high + 0.4 * (high - low), p.high), 300)
+        stretch = np.gradient(p.to_search(x), x)  # of the coordinate in which the density is normal
         for pose, colour, case in (("A", AFTER, a), ("B", BEFORE, b)):
-            density = stats.norm(*gaussian(case[name])).pdf(x)
+            density = stats.norm(*case[name]["search"]).pdf(p.to_search(x)) * stretch
             axes.fill_between(x, density, color=colour, alpha=0.35, linewidth=0, label=f"pose {pose}")
             axes.plot(x, density, color=colour, linewidth=1.2)
         axes.axvline(a[name]["truth"], color=TRUTH, linewidth=1.4, linestyle=(0, (4, 1.5)), label="truth")
-        axes.set(title=label(name), xlabel=f"[{units[name]}]", yticks=[], xlim=(x[0], x[-1]))
+        axes.set(title=label(name), xlabel=f"[{p.unit}]", yticks=[], xlim=(x[0], x[-1]))
         axes.locator_params(axis="x", nbins=3)
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper left", ncols=3, frameon=False)
     return figure
+
+
+def _drawn(parameter: dict[str, Any]) -> dict[str, Any]:
+    return {key: parameter[key] for key in ("best", "interval", "search")}
 
 
 def main() -> None:
@@ -79,7 +85,14 @@ def main() -> None:
     a, b = (case["parameters"] for case in cases)
     name = stem("pose_agreement", arguments.quick)
     save(densities(a, b), arguments.out, name)
-    drawn = {n: {"truth": a[n]["truth"], "A": gaussian(a[n]), "B": gaussian(b[n])} for n in both_tell(a, b)}
+    kept = ("best", "interval", "search")
+    drawn = {
+        n: {
+            "truth": a[n]["truth"],
+            **{pose: {key: case[n][key] for key in kept} for pose, case in (("A", a), ("B", b))},
+        }
+        for n in both_tell(a, b)
+    }
     origins = {pose: case["origin"] for pose, case in zip("AB", cases, strict=True)}
     result = {"parameters": drawn, **agreement(*cases), "origin": origins}
     write_json(arguments.out / f"{name}.json", result, indent=2)

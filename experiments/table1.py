@@ -5,7 +5,8 @@
 Reads the cases door_0, door_1 and door_2 of `identify_suite.py` in DIR/identify_cases (that script makes them);
 writes DIR/table1.md and DIR/table1.json.  The paper's fitted means are the hidden truth of the stand-in robot (its
 recordings are not public), all but the joints' damping, which here is the servo's (docs/paper.md).  So the
-program's mean is to be near the paper's mean; the deviations are each one's own.
+program's best fit is to be near the paper's mean; widths are each one's own: the paper's deviation, and here the ends
+of the 90 % interval, which of a value that is fitted in its logarithm do not lie alike on both sides.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
 
 import tyro  # noqa: E402
-from identify_suite import gaussian, kept_cases  # noqa: E402
+from identify_suite import kept_cases  # noqa: E402
 
 from benchmarks.common import stem  # noqa: E402
 from droid_jax.report.words import label, like, number  # noqa: E402
@@ -59,7 +60,8 @@ class Arguments:
 
 
 def table(cases: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:
-    """Parameter -> the paper's (mean, deviation) and, by door, truth, mean, deviation and whether the motion tells it.
+    """Parameter -> the paper's (mean, deviation) and, by door, truth, best fit, 90 % interval, whether that holds the
+    truth and whether the motion tells the parameter.
 
     cases: by number of springs, "parameters" of the suite's cases.
     """
@@ -67,29 +69,29 @@ def table(cases: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:
     for name, paper in PAPER.items():
         doors = {}
         for springs, parameters in cases.items():
-            mean, std = gaussian(parameters[name])
-            doors[str(springs)] = {
-                "paper": list(paper[springs + 1]),
-                "truth": parameters[name]["truth"],
-                "mean": mean,
-                "std": std,
-                "identifiable": parameters[name]["identifiable"],
-            }
+            kept = ("truth", "best", "interval", "inside", "identifiable")
+            doors[str(springs)] = {"paper": list(paper[springs + 1]), **{key: parameters[name][key] for key in kept}}
         rows[name] = {"initial": list(paper[0]), "doors": doors}
     return rows
 
 
 def as_markdown(rows: Mapping[str, Any]) -> str:
-    """The table as text; a mean in brackets is one that the motion does not tell."""
+    """The table as text; what stands in italics is not told by the motion."""
     doors = list(next(iter(rows.values()))["doors"])
     springs = {"0": "no spring", "1": "one spring", "2": "two springs"}
-    head = ["", "initial, paper", *(c for d in doors for c in (f"{springs[d]}, paper", "truth here", "found here"))]
+    head = [
+        "",
+        "initial, paper",
+        *(c for d in doors for c in (f"{springs[d]}, paper", "truth here", "best here, 90 %")),
+    ]
     lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
     for name, row in rows.items():
         cells = [label(name), _pair(*row["initial"])]
         for door in row["doors"].values():
-            found = f"{like(door['mean'], door['std'])} ± {number(door['std'], 2)}"
-            cells += [_pair(*door["paper"]), number(door["truth"]), found if door["identifiable"] else f"({found})"]
+            low, high = door["interval"]
+            best, *ends = (like(value, 0.5 * (high - low)) for value in (door["best"], low, high))
+            found = f"{best} ({' to '.join(ends)})"
+            cells += [_pair(*door["paper"]), number(door["truth"]), found if door["identifiable"] else f"*{found}*"]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
@@ -109,7 +111,7 @@ def main() -> None:
     origins = {str(k): case["origin"] for k, case in cases.items()}
     write_json(arguments.out / f"{name}.json", {"parameters": rows, "origin": origins}, indent=2)
     told = [d for r in rows.values() for d in r["doors"].values() if d["identifiable"]]
-    inside = sum(bool(abs(d["mean"] - d["truth"]) <= 1.645 * d["std"]) for d in told)
+    inside = sum(bool(d["inside"]) for d in told)
     print(json.dumps({"identifiable": len(told), "inside_90": inside, "table": str(arguments.out / f"{name}.md")}))
 
 

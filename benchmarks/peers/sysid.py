@@ -65,11 +65,18 @@ def minimise(parameters: Any, residual: Any, **options: Any) -> PeerFit:
 
 
 def fit(
-    scene: Scene, space: Space, recordings: Sequence[Recording], *, off_bounds: bool = False, **options: Any
+    scene: Scene,
+    space: Space,
+    recordings: Sequence[Recording],
+    *,
+    off_bounds: bool = False,
+    priors: bool = False,
+    **options: Any,
 ) -> PeerFit:
     """Fit all of `space`, from its means and within its bounds, to the mean torques of recordings with commands.
 
     off_bounds: move what starts near a bound inwards, as its own warning advises.
+    priors: of the nuisances, as rows of the residual (`with_priors`).
     options: of its optimiser (max_iters, x_scale, optimizer, ...).
     """
     sysid = library()
@@ -91,6 +98,8 @@ def fit(
         modify_residual=_difference(plain, space),
         resample_true=False,
     )
+    if priors:
+        residual = with_priors(residual, space, float(np.mean([_noise(r) for r in recordings])))
     parameters = parameters_of(space)
     return minimise(parameters.move_off_bounds() if off_bounds else parameters, residual, **options)
 
@@ -103,6 +112,30 @@ def parameters_of(space: Space, modifier: Callable[[Parameter], Callable[..., No
         how = None if modifier is None else modifier(p)
         parameters.add(sysid.Parameter(p.name, nominal=p.mean, min_value=p.low, max_value=p.high, modifier=how))
     return parameters
+
+
+def with_priors(residual: Callable[..., Any], space: Space, noise: float) -> Callable[..., Any]:
+    """Its residual function with one more row for each nuisance: how many prior deviations it is off its mean.
+
+    noise: size of a row of the measurement's where nothing but noise is left, so that both weigh alike.
+    """
+    rows = [i for i, p in enumerate(space.parameters) if p.nuisance]
+    mean, std = space.mean[rows], space.std[rows]
+
+    def whole(x: np.ndarray, parameters: Any, **more: Any) -> Any:  # x: [D], or [D, n] of finite differences
+        parts, *rest = residual(x, parameters, **more)
+        return [*parts, noise * ((x[rows].T - mean) / std).T], *rest
+
+    return whole
+
+
+def _noise(recording: Recording) -> float:
+    """RMS of what the mean torque's noise is in rows of `normalize_residual`."""
+    channel = recording.channel("torque")
+    values = np.where(channel.mask, channel.values, np.nan)
+    mean = np.nanmean(values, axis=0)
+    scatter = np.nanstd(values, axis=0, ddof=1) / np.sqrt(recording.repeats)
+    return float(np.sqrt(np.nanmean((scatter / (np.linalg.norm(mean, axis=0) / np.sqrt(2))) ** 2)))
 
 
 def _measured(recording: Recording) -> Any:
