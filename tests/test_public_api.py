@@ -223,7 +223,7 @@ def test_the_code_of_own_robot_runs(workplace: Path, capsys: pytest.CaptureFixtu
     assert np.shape(names["samples"]) == (1000, 4)
     fitted = dj.load_scene("fitted.xml").model.body("forearm").mass[0]
     assert fitted == pytest.approx(names["found"].best[0], rel=1e-4) != 0.8  # type: ignore[attr-defined]
-    assert names["space"].names[-1] == "elbow_rotor"  # type: ignore[attr-defined]
+    assert names["space"].names[-1] == "elbow_rotor_scale"  # type: ignore[attr-defined]
 
 
 def test_the_json_of_own_robot_is_a_space(workplace: Path):

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+if TYPE_CHECKING:
+    from droid_jax.measure.recording import Phase
+
 OF_BAGS = (
     "joints", "slides", "torque", "gravity", "state_topic", "command_topic", "stiffness", "damping", "command_joints",
-    "command_tolerance", "rate", "stamps",
+    "command_tolerance", "rate", "stamps", "phases",
 )  # fmt: skip
 
 
@@ -52,6 +55,9 @@ class Convert:
     """Bags: rate of the common clock, Hz; default: the usual rate of the first bag's joint states."""
     stamps: Literal["auto", "header", "bag"] = "auto"
     """Bags: stamps that count: header, of the recorder (bag), or header where all messages have one (auto)."""
+    phases: tuple[str, ...] = ()
+    """Bags: parts of the motion as NAME=START:END, in s from where the bags begin, e.g. approach=0:1.5 grasp=1.5:2.
+    Pages tell the gap by them; with a phase grasp, one whose grip is lost in the replay counts as failed."""
     allow_jitter: bool = False
     """Accept clocks of an irregular rate."""
     resample: bool = False
@@ -124,9 +130,22 @@ def _bag_options(command: Convert) -> dict[str, Any]:
         "command_joints": command.command_joints or None,
         "command_tolerance": command.command_tolerance,
         "rate": command.rate,
+        "phases": [_phase(words) for words in command.phases],
     }
     if command.stamps != "auto":
         from droid_jax.measure.formats import rosbag_reader
 
         options["stamps"] = rosbag_reader().Stamps(command.stamps)
     return options
+
+
+def _phase(words: str) -> Phase:
+    """ "grasp=1.5:2" as a phase; ValueError for other words."""
+    from droid_jax.measure.recording import Phase
+
+    name, _, span = words.partition("=")
+    start, _, end = span.partition(":")
+    try:
+        return Phase(name, float(start), float(end))
+    except ValueError:
+        raise ValueError(f"--phases takes NAME=START:END in seconds, e.g. grasp=1.5:2, got {words!r}") from None

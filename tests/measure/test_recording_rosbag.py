@@ -210,6 +210,16 @@ def test_units_follow_the_slides(tmp_path: Path, slides: tuple[str, ...], units:
     assert tuple(load(out).channel(name).unit for name in ("torque", "position", "velocity")) == units
 
 
+def test_phases_are_stated_in_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "axis.npz"
+    said = ["--joints", *JOINTS, "--torque", "motor", "--command-topic", "/command", "--out", out]
+    bag = pulled(tmp_path, "sqlite3")
+    assert convert(bag, *said, "--phases", "approach=0:0.5", "grasp=0.5:1") == 0
+    assert [(p.name, p.start, p.end) for p in load(out).phases] == [("approach", 0.0, 0.5), ("grasp", 0.5, 1.0)]
+    assert convert(bag, *said, "--phases", "grasp=0.5") == 2
+    assert "--phases takes NAME=START:END in seconds, e.g. grasp=1.5:2, got 'grasp=0.5'" in capsys.readouterr().err
+
+
 def test_slides_are_joints(tmp_path: Path) -> None:
     fails([pulled(tmp_path, "sqlite3")], "slides must be among the joints j1, j2, got j3", slides=["j3"])
 
