@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
-from droid_jax.compare.start import check_weight, start_pose, weight_share
+from droid_jax.compare.start import check_weight, holding, start_pose, weight_share
 from droid_jax.measure.checks import check_joints
 from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.model.physics import Physics
@@ -63,14 +63,20 @@ def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True) -> Dri
         )
     _check_driven(scene, recording)
     columns = scene.command_index(recording.command_names)
-    check_joints(recording, scene.command_names)
+    check_joints(recording, scene.needs_command, also=scene.command_names)
     timestep = float(scene.model.opt.timestep)
     start, end = float(recording.time[0]), float(recording.time[-1])
     steps = int(np.floor((end - start) / timestep + 1e-6)) + 1
     clock = start + np.arange(steps) * timestep
-    command = np.stack([np.interp(clock, recording.time, recording.command[:, c]) for c in columns], axis=1)
     gains = recording.gains
     qpos0 = start_pose(scene, recording)
+    command = np.tile(holding(scene, qpos0), (steps, 1))
+    sent = np.flatnonzero(columns >= 0)
+    for actuator in sent:
+        command[:, actuator] = np.interp(clock, recording.time, recording.command[:, columns[actuator]])
+    stiffness = scene.model.actuator_gainprm[:, 0].copy()
+    if gains is not None:
+        stiffness[sent] = np.asarray(gains.stiffness, dtype=float)[columns[sent]]
     if weigh:
         check_weight(scene, recording, qpos0)
     return Drive(
@@ -78,7 +84,7 @@ def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True) -> Dri
         qpos0=qpos0,
         timestep=timestep,
         torque=recording.torque,
-        stiffness=None if gains is None else np.asarray(gains.stiffness, dtype=float)[columns],
+        stiffness=None if gains is None else stiffness,
     )
 
 

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from droid_jax.measure.recording import Channel, Recording
-from droid_jax.model.scene import Scene
+from droid_jax.model.scene import Scene, drives_joint
 
 AJAR = 0.02  # rad or m: an object seen no further than this from the scene's pose stands there, as cameras are noisy
 WEIGHT = 0.01  # N m or N: a joint that feels less uncompensated weight feels none (noise below it is never believed)
@@ -23,12 +23,12 @@ TURNS = 4  # from its zero, that a hinge without a range is believed to make; de
 def start_pose(scene: Scene, recording: Recording) -> np.ndarray:
     """[nq] where the motion starts: as stated (qpos0), else as measured, else where its servos were sent first.
 
-    Joints that no actuator drives and nobody measured stand as in the scene.
-    Raises ValueError for a driven joint of which nothing says where it starts.
+    Joints that nobody commanded or measured stand as in the scene.
+    Raises ValueError for a joint that needs a command and of which nothing says where it starts.
     """
     sent = {joint: path[0] for joint, path in _sent(scene, recording).items()}
     told = {**sent, **_measured(scene, recording), **recording.qpos0}
-    guessed = [j for j in scene.command_names if j not in told]
+    guessed = [j for j in scene.driven_joints if j in scene.needs_command and j not in told]
     if guessed:
         raise ValueError(
             f"recording {recording.name!r} does not tell where {', '.join(guessed)} starts: state it in qpos0 "
@@ -78,7 +78,8 @@ def open_loop(scene: Scene, recording: Recording) -> str:
     """What is to be known where the recording's commands drive actuators without position feedback; else empty."""
     model = scene.model
     feedback = (model.actuator_biastype != mujoco.mjtBias.mjBIAS_NONE) & (model.actuator_biasprm[:, 1] != 0)
-    joints = [joint for joint, held in zip(scene.command_names, feedback, strict=True) if not held]
+    open_ones = np.flatnonzero(~feedback & drives_joint(model))
+    joints = [scene.command_names[u] for u in open_ones if scene.command_names[u] in recording.command_names]
     if not joints or not recording.command.size:
         return ""
     return (
@@ -91,6 +92,36 @@ def open_loop(scene: Scene, recording: Recording) -> str:
 def warn_if_open_loop(scene: Scene, recording: Recording) -> None:
     """Warn where commands are no positions: a <motor> in place of a <position> takes radians for torques."""
     if text := open_loop(scene, recording):
+        warnings.warn(text, stacklevel=2)
+
+
+def holding(scene: Scene, qpos0: np.ndarray) -> np.ndarray:
+    """[U] the controls at which the actuators hold the pose [nq] by themselves; 0 without position feedback.
+
+    Of an actuator whose force is gain * control + b0 + b1 * length + b2 * velocity, as a position servo's is: that of
+    no force at rest, within its range.
+    """
+    model, data = scene.model, mujoco.MjData(scene.model)
+    data.qpos[:] = qpos0
+    mujoco.mj_fwdPosition(model, data)
+    gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm
+    held = (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE) & (bias[:, 1] != 0) & (gain != 0)
+    control = np.where(held, -(bias[:, 0] + bias[:, 1] * data.actuator_length) / np.where(held, gain, 1.0), 0.0)
+    low, high = model.actuator_ctrlrange.T
+    return np.where(model.actuator_ctrllimited, np.clip(control, low, high), control)
+
+
+def left_alone(scene: Scene, recording: Recording) -> str:
+    """What is to be known where the recording has commands, but none for some actuators; else empty."""
+    names = [n for n in scene.command_names if n not in recording.command_names]
+    if not names or not recording.command.size:
+        return ""
+    return f"recording {recording.name!r} has no command for {', '.join(names)}: held where the motion starts"
+
+
+def warn_if_left_alone(scene: Scene, recording: Recording) -> None:
+    """Warn where actuators are held for want of a command."""
+    if text := left_alone(scene, recording):
         warnings.warn(text, stacklevel=2)
 
 
@@ -180,7 +211,8 @@ def _sent(scene: Scene, recording: Recording) -> dict[str, np.ndarray]:
     kp, position_gain, gear = model.actuator_gainprm[:, 0], model.actuator_biasprm[:, 1], model.actuator_gear[:, 0]
     servos = np.flatnonzero((kp != 0) & (position_gain == -kp))
     columns = scene.command_index(recording.command_names)
-    return {scene.command_names[u]: recording.command[:, columns[u]] / gear[u] for u in servos}
+    sent = [u for u in servos if drives_joint(model)[u] and columns[u] >= 0]
+    return {scene.command_names[u]: recording.command[:, columns[u]] / gear[u] for u in sent}
 
 
 def _measured(scene: Scene, recording: Recording) -> dict[str, float]:

@@ -51,8 +51,8 @@ def validate(recording: Recording, *, source: str = "", allow_jitter: bool = Fal
     return recording
 
 
-def check_joints(recording: Recording, joints: Sequence[str]) -> None:
-    """ValueError unless the recording speaks of exactly these robot joints, in any order.
+def check_joints(recording: Recording, joints: Sequence[str], also: Sequence[str] = ()) -> None:
+    """ValueError unless the recording speaks of exactly these robot joints, in any order; those of `also` may be there.
 
     The command must have a column for each of them; in a log without commands the torque,
     position and velocity channels together must.  No such column may bear another name; other
@@ -66,18 +66,18 @@ def check_joints(recording: Recording, joints: Sequence[str]) -> None:
     else:
         parts = {}
         have = tuple(dict.fromkeys(j for columns in known.values() for j in columns))
-    wrong = faults({"missing:": [j for j in joints if j not in have], "unknown:": [j for j in have if j not in joints]})
+    valid = tuple(dict.fromkeys((*joints, *also)))
+    wrong = faults({"missing:": [j for j in joints if j not in have], "unknown:": [j for j in have if j not in valid]})
     if wrong:
         what = "command" if parts else "its channels"
         raise ValueError(
-            f"{where}, {what}: expected {len(joints)} joints, got {len(have)}; {wrong}; "
-            f"valid names: {', '.join(joints)}"
+            f"{where}, {what}: expected {len(joints)} joints, got {len(have)}; {wrong}; valid names: {', '.join(valid)}"
         )
     for key, columns in known.items():
-        unknown = [j for j in columns if j not in joints]
+        unknown = [j for j in columns if j not in valid]
         if unknown:
             raise ValueError(
-                f"{where}, channel {key!r}: unknown joints {', '.join(unknown)}; valid names: {', '.join(joints)}"
+                f"{where}, channel {key!r}: unknown joints {', '.join(unknown)}; valid names: {', '.join(valid)}"
             )
 
 

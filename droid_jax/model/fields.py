@@ -216,8 +216,8 @@ def body_mass_scale(scene: Scene, body: str, *, std: float = 0.03, **options: An
 
 def servo_scale(scene: Scene, joint: str, *, std: float = 0.03, **options: Any) -> Parameter:
     """Factor on the position gain of a joint's servo, 1 at nominal."""
-    if joint not in scene.command_names:
-        raise ValueError(f"no actuator drives {joint!r}; driven joints: {', '.join(scene.command_names)}")
+    if joint not in scene.driven_joints:
+        raise ValueError(f"no actuator drives {joint!r}; driven joints: {', '.join(scene.driven_joints)}")
     actuator = scene.command_names.index(joint)
     writes = (
         write(scene, "actuator_gainprm", (actuator, 0), Mode.SCALE),

@@ -60,7 +60,7 @@ class Scene:
     spec:   the MjSpec, looks included; never changed after construction.
     model:  compiled without looks; what is replayed.
     joints: servo-driven joints whose torque and position are measured, in channel order [J].
-    command_names: joints of the actuators, in actuator order [U].
+    command_names: joints of the actuators, in actuator order [U]; of one that drives a tendon its own name.
     object_joint: joint of the thing that is moved (the door's hinge), or None.
     grip:   how a lost grasp is seen, or None where there is nothing to grip.
     """
@@ -127,10 +127,15 @@ class Scene:
         fingers = self.grip.fingers if self.grip else ()
         return tuple(np.array([self.id("pair", p) for p in pairs], dtype=int) for pairs in fingers)
 
+    @functools.cached_property
+    def driven_joints(self) -> tuple[str, ...]:
+        """Joints that an actuator of their own drives, in actuator order."""
+        return tuple(n for n, j in zip(self.command_names, drives_joint(self.model), strict=True) if j)
+
     @property
     def finger_joints(self) -> tuple[str, ...]:
-        """The gripper's joints: commanded, but not measured."""
-        return tuple(name for name in self.command_names if name not in self.joints)
+        """The gripper's joints: driven, but not measured."""
+        return tuple(name for name in self.driven_joints if name not in self.joints)
 
     @functools.cached_property
     def mjx(self) -> Any:
@@ -176,15 +181,26 @@ class Scene:
             qpos[self.qpos(joint)] = value
         return qpos
 
+    @property
+    def needs_command(self) -> tuple[str, ...]:
+        """Those of `command_names` that a recording must command: measured joints, and where something is gripped all.
+
+        The others stay where the motion starts if it does not.
+        """
+        return tuple(n for n in self.command_names if n in self.joints or self.grip is not None)
+
     def command_index(self, names: Sequence[str]) -> np.ndarray:
-        """[U] columns of `names` that feed this scene's actuators, in actuator order."""
-        missing = [n for n in self.command_names if n not in names]
+        """[U] columns of `names` that feed this scene's actuators, in actuator order; -1 for one that has none there.
+
+        ValueError where one is missing that is needed.
+        """
+        missing = [n for n in self.needs_command if n not in names]
         if missing:
             raise ValueError(
-                f"scene {self.name!r} needs a command for {', '.join(self.command_names)}; "
+                f"scene {self.name!r} needs a command for {', '.join(self.needs_command)}; "
                 f"missing: {', '.join(missing)}; given: {', '.join(names) or 'none'}"
             )
-        return np.array([list(names).index(n) for n in self.command_names], dtype=int)
+        return np.array([list(names).index(n) if n in names else -1 for n in self.command_names], dtype=int)
 
 
 def name_to_id(model: mujoco.MjModel, kind: str, name: str) -> int:
@@ -324,12 +340,14 @@ def compile_scene(
             joint.frictionloss = TINY_FRICTIONLOSS
     model = bare.compile()
     refuse_ignored(model, name)
-    command_names = _actuated_joints(model)
+    command_names = _command_names(model)
     scene = Scene(
         name=name,
         spec=spec,
         model=model,
-        joints=tuple(joints) if joints is not None else tuple(dict.fromkeys(command_names)),
+        joints=tuple(
+            dict.fromkeys(np.array(command_names)[drives_joint(model)].tolist() if joints is None else joints)
+        ),
         command_names=command_names,
         object_joint=object_joint,
         grip=grip,
@@ -342,16 +360,22 @@ def compile_scene(
     return scene
 
 
-def _actuated_joints(model: mujoco.MjModel) -> tuple[str, ...]:
-    """[U] the joint each actuator drives, in actuator order."""
+def drives_joint(model: mujoco.MjModel) -> np.ndarray:
+    """[U] bool, actuators that drive a joint, and not a tendon, a site or a body."""
+    return np.asarray(model.actuator_trntype) == mujoco.mjtTrn.mjTRN_JOINT
+
+
+def _command_names(model: mujoco.MjModel) -> tuple[str, ...]:
+    """[U] the joint that each actuator drives, or its own name where it drives none."""
     names = []
-    for i in range(model.nu):
-        if model.actuator_trntype[i] != mujoco.mjtTrn.mjTRN_JOINT:
-            raise ValueError(
-                f"actuator {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i)!r} does not drive a joint; "
-                "a replay needs joint actuators"
-            )
-        names.append(mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, int(model.actuator_trnid[i, 0])))
+    for i, of_joint in enumerate(drives_joint(model)):
+        own = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i)
+        if of_joint:
+            names.append(mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, int(model.actuator_trnid[i, 0])))
+        elif not own or mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, own) >= 0:
+            raise ValueError(f"actuator {own or i!r} drives no joint: give it a name that no joint has")
+        else:
+            names.append(own)
     return tuple(names)
 
 

@@ -23,6 +23,7 @@ import numpy as np
 from mujoco import mjx
 
 from droid_jax.model.patches import exact_segments, midpoint_constraints
+from droid_jax.model.scene import drives_joint
 
 ITERATIONS = 8  # at most; two or three are usual from a warm start
 LINE_SEARCH = 6  # corners of the piecewise linear slope followed in one step
@@ -85,9 +86,10 @@ def _held(model: Any, data: Any, parity: bool) -> jax.Array:
     held = model.actuator_forcelimited & _outside(data.actuator_force, model.actuator_forcerange)
     if parity:
         return held
-    joint = model.actuator_trnid[:, 0]
+    of_joint = drives_joint(model)
+    joint = np.where(of_joint, model.actuator_trnid[:, 0], 0)  # a tendon's number is no joint's
     torque = data.qfrc_actuator[model.jnt_dofadr[joint]]
-    return held | (model.jnt_actfrclimited[joint] & _outside(torque, model.jnt_actfrcrange[joint]))
+    return held | (of_joint & model.jnt_actfrclimited[joint] & _outside(torque, model.jnt_actfrcrange[joint]))
 
 
 def _outside(values: jax.Array, bounds: jax.Array) -> jax.Array:

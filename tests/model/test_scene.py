@@ -304,11 +304,16 @@ def test_joints_of_several_degrees_are_refused():
             compile_scene(mechanism(), "rod", **wrong)
 
 
-def test_actuators_that_drive_no_joint_are_refused():
+def test_actuators_that_drive_no_joint_go_by_their_own_name():
     spec = mechanism()
-    spec.add_actuator(name="pull", target="t", trntype=mujoco.mjtTrn.mjTRN_TENDON)
-    with pytest.raises(ValueError, match="actuator 'pull' does not drive a joint"):
-        compile_scene(spec, "rod")
+    pull = spec.add_actuator(name="pull", target="t", trntype=mujoco.mjtTrn.mjTRN_TENDON)
+    scene = compile_scene(spec, "rod")
+    assert scene.command_names[-1] == "pull" and "pull" not in (*scene.joints, *scene.driven_joints)
+    assert "pull" not in scene.needs_command
+    for name, said in (("", "actuator"), ("j", "actuator 'j'")):
+        pull.name = name
+        with pytest.raises(ValueError, match=rf"{said}.* drives no joint: give it a name that no joint has"):
+            compile_scene(spec, "rod")
 
 
 def test_friction_loss_rows_exist_only_where_asked(tmp_path: Path):
