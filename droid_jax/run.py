@@ -6,10 +6,12 @@ and so that --help is quick.
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import os
 import sys
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -71,7 +73,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is flushed at the end
         return 0
     try:
-        _ACTIONS[type(command)](command)
+        with _plain_warnings():
+            _ACTIONS[type(command)](command)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -79,6 +82,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"interrupted{_going_on(command)}", file=sys.stderr)
         return 130
     return 0
+
+
+@contextlib.contextmanager
+def _plain_warnings() -> Iterator[None]:
+    """Warnings for people (UserWarning) in one line without the place in the code that gave them."""
+    usual = warnings.formatwarning
+
+    def plain(message: Any, category: type[Warning], *place: Any, **more: Any) -> str:
+        return f"warning: {message}\n" if category is UserWarning else usual(message, category, *place, **more)
+
+    warnings.formatwarning = plain
+    try:
+        yield
+    finally:
+        warnings.formatwarning = usual
 
 
 def _names_nothing(arguments: Sequence[str], option: str) -> bool:

@@ -9,6 +9,7 @@ import os
 import re
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +20,7 @@ import pytest
 from small_log import elbow_log, write_elbow
 
 from droid_jax import run
-from droid_jax.commands import presets
+from droid_jax.commands import convert, presets
 from droid_jax.commands.folder import OtherRun, changed, finished, setup_of
 from droid_jax.commands.hidden import known_stand_in, settled
 from droid_jax.commands.identify import Identify
@@ -562,6 +563,24 @@ def test_the_page_of_the_command_line_is_current():
     spec.loader.exec_module(module)
     assert module.PAGE.read_text(encoding="utf-8") == module.page()
     assert re.findall(r"^## (\w+)$", module.page(), re.MULTILINE) == [c.__name__.lower() for c in run._ACTIONS]
+
+
+def test_a_warning_is_one_line_without_a_place_in_the_code(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    def warn(command: object) -> None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("always")
+            warnings.showwarning = told  # what pytest puts in its place never asks for words
+            warnings.warn("the log is old", stacklevel=1)
+            warnings.warn("not for people", DeprecationWarning, stacklevel=1)
+
+    def told(message, category, filename, lineno, file=None, line=None):
+        said.append(warnings.formatwarning(message, category, filename, lineno, line))
+
+    said: list[str] = []
+    usual = warnings.formatwarning
+    monkeypatch.setitem(run._ACTIONS, convert.Convert, warn)
+    assert main(["convert", "x"]) == 0 and warnings.formatwarning is usual
+    assert said[0] == "warning: the log is old\n" and "DeprecationWarning: not for people" in said[1]
 
 
 def test_it_says_its_version(capsys: pytest.CaptureFixture[str]):
