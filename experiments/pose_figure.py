@@ -85,14 +85,7 @@ def main() -> None:
     a, b = (case["parameters"] for case in cases)
     name = stem("pose_agreement", arguments.quick)
     save(densities(a, b), arguments.out, name)
-    kept = ("best", "interval", "search")
-    drawn = {
-        n: {
-            "truth": a[n]["truth"],
-            **{pose: {key: case[n][key] for key in kept} for pose, case in (("A", a), ("B", b))},
-        }
-        for n in both_tell(a, b)
-    }
+    drawn = {n: {"truth": a[n]["truth"], "A": _drawn(a[n]), "B": _drawn(b[n])} for n in both_tell(a, b)}
     origins = {pose: case["origin"] for pose, case in zip("AB", cases, strict=True)}
     result = {"parameters": drawn, **agreement(*cases), "origin": origins}
     write_json(arguments.out / f"{name}.json", result, indent=2)

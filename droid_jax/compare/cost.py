@@ -280,7 +280,12 @@ def _same(scene: Scene, new: Drive | Motion, old: Drive | Motion) -> bool:
         hinge = scene.qpos(scene.object_joint)
         if scene.model.qpos0[hinge] in (new.qpos0[hinge], old.qpos0[hinge]):
             apart[hinge] += AJAR
-    return np.array_equal(new.command, old.command) and bool(np.all(np.abs(new.qpos0 - old.qpos0) <= apart))
+    sent, before = (np.ones(d.command.shape[1], bool) if d.sent is None else d.sent for d in (new, old))
+    return (
+        np.array_equal(sent, before)
+        and np.array_equal(new.command[:, sent], old.command[:, sent])  # what is held follows from the start
+        and bool(np.all(np.abs(new.qpos0 - old.qpos0) <= apart))
+    )
 
 
 def _clock(recording: Recording, follows: Drive | Motion) -> np.ndarray:

@@ -36,6 +36,7 @@ class Drive:
     timestep: s.
     torque:  convention of the measured torque.
     stiffness: [U] servo gains stated by the recording, or None: the scene's own.
+    sent: [U] bool, actuators that the recording commands, the others hold their start; None: all.
     """
 
     command: np.ndarray
@@ -43,6 +44,7 @@ class Drive:
     timestep: float
     torque: TorqueConvention
     stiffness: np.ndarray | None = None
+    sent: np.ndarray | None = None
 
     @property
     def time(self) -> np.ndarray:
@@ -63,7 +65,7 @@ def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True) -> Dri
         )
     _check_driven(scene, recording)
     columns = scene.command_index(recording.command_names)
-    check_joints(recording, scene.needs_command, also=scene.command_names)
+    check_joints(recording, scene.needs_command, also=(*scene.command_names, *scene.single_joints))
     timestep = float(scene.model.opt.timestep)
     start, end = float(recording.time[0]), float(recording.time[-1])
     steps = int(np.floor((end - start) / timestep + 1e-6)) + 1
@@ -85,6 +87,7 @@ def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True) -> Dri
         timestep=timestep,
         torque=recording.torque,
         stiffness=None if gains is None else stiffness,
+        sent=columns >= 0,
     )
 
 

@@ -24,11 +24,12 @@ def start_pose(scene: Scene, recording: Recording) -> np.ndarray:
     """[nq] where the motion starts: as stated (qpos0), else as measured, else where its servos were sent first.
 
     Joints that nobody commanded or measured stand as in the scene.
-    Raises ValueError for a joint that needs a command and of which nothing says where it starts.
+    Raises ValueError for a joint that has or needs a command and of which nothing says where it starts.
     """
     sent = {joint: path[0] for joint, path in _sent(scene, recording).items()}
     told = {**sent, **_measured(scene, recording), **recording.qpos0}
-    guessed = [j for j in scene.driven_joints if j in scene.needs_command and j not in told]
+    asked = {*scene.needs_command, *recording.command_names}
+    guessed = [j for j in scene.driven_joints if j in asked and j not in told]
     if guessed:
         raise ValueError(
             f"recording {recording.name!r} does not tell where {', '.join(guessed)} starts: state it in qpos0 "
@@ -76,9 +77,7 @@ def warn_if_moving(recording: Recording) -> None:
 
 def open_loop(scene: Scene, recording: Recording) -> str:
     """What is to be known where the recording's commands drive actuators without position feedback; else empty."""
-    model = scene.model
-    feedback = (model.actuator_biastype != mujoco.mjtBias.mjBIAS_NONE) & (model.actuator_biasprm[:, 1] != 0)
-    open_ones = np.flatnonzero(~feedback & drives_joint(model))
+    open_ones = np.flatnonzero(~_feedback(scene.model) & drives_joint(scene.model))
     joints = [scene.command_names[u] for u in open_ones if scene.command_names[u] in recording.command_names]
     if not joints or not recording.command.size:
         return ""
@@ -105,7 +104,7 @@ def holding(scene: Scene, qpos0: np.ndarray) -> np.ndarray:
     data.qpos[:] = qpos0
     mujoco.mj_fwdPosition(model, data)
     gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm
-    held = (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE) & (bias[:, 1] != 0) & (gain != 0)
+    held = _feedback(model) & (gain != 0)
     control = np.where(held, -(bias[:, 0] + bias[:, 1] * data.actuator_length) / np.where(held, gain, 1.0), 0.0)
     low, high = model.actuator_ctrlrange.T
     return np.where(model.actuator_ctrllimited, np.clip(control, low, high), control)
@@ -113,10 +112,24 @@ def holding(scene: Scene, qpos0: np.ndarray) -> np.ndarray:
 
 def left_alone(scene: Scene, recording: Recording) -> str:
     """What is to be known where the recording has commands, but none for some actuators; else empty."""
-    names = [n for n in scene.command_names if n not in recording.command_names]
-    if not names or not recording.command.size:
+    if not recording.command.size:
         return ""
-    return f"recording {recording.name!r} has no command for {', '.join(names)}: held where the motion starts"
+    left = [
+        (n, f)
+        for n, f in zip(scene.command_names, _feedback(scene.model), strict=True)
+        if n not in recording.command_names
+    ]
+    said = {
+        "held where the motion starts": [n for n, feedback in left if feedback],
+        "given 0 (no position feedback)": [n for n, feedback in left if not feedback],
+    }
+    told = "; ".join(f"{', '.join(names)} {what}" for what, names in said.items() if names)
+    return f"recording {recording.name!r} has not all commands: {told}" if told else ""
+
+
+def _feedback(model: mujoco.MjModel) -> np.ndarray:
+    """[U] bool, actuators whose force follows their own position, as a position servo's does."""
+    return (model.actuator_biastype != mujoco.mjtBias.mjBIAS_NONE) & (model.actuator_biasprm[:, 1] != 0)
 
 
 def warn_if_left_alone(scene: Scene, recording: Recording) -> None:

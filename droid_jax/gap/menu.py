@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -49,7 +50,9 @@ def separating(case: Case, models: Sequence[Model], recording: Recording) -> tup
     config = known.comparisons[0].config
     found = []
     for motion in (*(warped(recording, entry) for entry in MENU), *_further(known, recording, values[:1])):
-        cost = make_cost(known.scene, case.whole, [motion], config=config, effects=case.effects)
+        with warnings.catch_warnings():  # what there is to warn of was said of the recording itself
+            warnings.simplefilter("ignore", UserWarning)
+            cost = make_cost(known.scene, case.whole, [motion], config=config, effects=case.effects)
         found += _experiment(motion.name, cost, values)
     seen = {name: weight for name, weight in config.channels.items() if name != "object_angle"}
     if known.scene.grip is not None and seen:

@@ -235,6 +235,8 @@ def _own_value(scene: Scene, parameter) -> float:
 def _control(hidden: Scene, demonstration: Recording, timestep: float, delay: float) -> tuple[np.ndarray, np.ndarray]:
     """Clock [T] and commands [T, U] of the stand-in's own time step."""
     columns = hidden.command_index(demonstration.command_names)
+    if without := [n for n, c in zip(hidden.command_names, columns, strict=True) if c < 0]:
+        raise ValueError(f"the stand-in robot needs a command for {', '.join(without)} too; the demonstration has none")
     start, end = demonstration.time[0], demonstration.time[-1]
     clock = start + np.arange(int((end - start) / timestep + 1e-6) + 1) * timestep
     command = [np.interp(clock - delay, demonstration.time, demonstration.command[:, c]) for c in columns]

@@ -362,7 +362,8 @@ def compile_scene(
 
 def drives_joint(model: mujoco.MjModel) -> np.ndarray:
     """[U] bool, actuators that drive a joint, and not a tendon, a site or a body."""
-    return np.asarray(model.actuator_trntype) == mujoco.mjtTrn.mjTRN_JOINT
+    kinds = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+    return np.isin(model.actuator_trntype, kinds)
 
 
 def _command_names(model: mujoco.MjModel) -> tuple[str, ...]:

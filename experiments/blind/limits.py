@@ -119,8 +119,9 @@ def _draw_limits(
     setting: Setting, number: int, folder: Path, asked: list[Applied], tell: Callable[[str], None]
 ) -> dict[str, dict[str, Any]]:
     """key -> entry, of one robot."""
-    path = folder / f"{setting.name}_{number}_{CODE.get('git', 'unknown')}.json"  # of no other code's
-    known = json.loads(path.read_text()) if path.is_file() else {}
+    # Of no other code: one with uncommitted changes could not be known again.
+    path = folder / f"{setting.name}_{number}_{CODE.get('git', 'dirty')}.json"
+    known = json.loads(path.read_text()) if path.is_file() and "dirty" not in path.name else {}
     left = [e for e in asked if key(e.name, e.joint) not in known]
     if not left:
         return known

@@ -8,7 +8,6 @@ search never sees it.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -26,6 +25,7 @@ from droid_jax.storage import write_json
 from experiments.blind.answers import right
 from experiments.blind.quiet import settled
 from experiments.blind.scenes import ROLES
+from experiments.blind.score import digest
 from experiments.blind.search import Bench
 from experiments.sharing import claimed
 
@@ -94,9 +94,9 @@ def oracle_all(runs: Path, chosen: Iterable[str], bench: Bench, tell: Callable[[
         truth = json.loads(sealed.read_text())
         if truth["kind"] not in KINDS or not known.is_file():
             continue
-        of = hashlib.sha256(known.read_bytes()).hexdigest()
+        of = digest(known)
         with claimed(path, wait=False) as mine:
-            if not mine or (path.is_file() and json.loads(path.read_text()).get("of") == of):
+            if not mine or (path.is_file() and json.loads(path.read_text()).get("of", of) == of):
                 continue
             try:
                 found = oracle(runs / "cases" / name, truth, json.loads(known.read_text()), bench)

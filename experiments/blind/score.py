@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import scipy.stats
 from droid_jax.measure.hidden import Applied
 from experiments.blind.answers import beside, matched, parts, right
 from experiments.blind.baselines import bic_outcome
-from experiments.blind.cases import key
+from experiments.blind.cases import amplitude, key
 from experiments.blind.scenes import setting
 
 NAMING = ("named", "tie", "partly explained")  # verdicts that give a name
@@ -42,16 +43,19 @@ def score_folder(results: Path, sealed: Path, limits: Mapping[str, Any], oracles
             continue
         scene = scenes.setdefault(truth["scene"], setting(truth["scene"]).scene)
         names = [list(right(scene, Applied(**h))) for h in truth["hidden"]]
-        known = oracles / path.name if oracles else None
+        known = json.loads(found_by.read_text()) if oracles and (found_by := oracles / path.name).is_file() else None
+        if known and known.get("of", digest(result)) != digest(result):
+            known = None  # of another result
         found.append(
             {
                 "truth": truth,
                 "result": json.loads(result.read_text()),
                 "right": names,
                 "parts": [list(parts(scene, Applied(**h))) for h in truth["hidden"]],
-                "oracle": json.loads(known.read_text()) if known and known.is_file() else None,
+                "oracle": known,
             }
         )
+    refuse_other_limits((case["truth"] for case in found), limits)
     judged = [judge(case, limits) for case in found]
     by_scene = {s: [c for c in judged if c["scene"] == s] for s in sorted(scenes)}
     hidden = [c for c in judged if c["class"] != "none"]
@@ -106,7 +110,7 @@ def judge(case: Case, limits: Mapping[str, Any]) -> dict[str, Any]:
         "p": result.get("p"),
         "false_names": false,
         "wrong_confident": bool(false) and verdict in CLEAN,
-        "said": [saying(slot, allowed, names) for slot in slots],
+        "said": [saying(*part, right_names, allowed) for part in zip(names, result.get("tied", ()), strict=True)],
         "met": met,
         "named": bool(met) and all(met) and not false and verdict in NAMING,
         "alone": alone and verdict in NAMING,
@@ -137,19 +141,20 @@ def slots_of(result: Mapping[str, Any], right_names: Sequence[Sequence[str]]) ->
     return out
 
 
-def saying(slot: set[str], allowed: Sequence[Sequence[str]], leaders: Sequence[str]) -> str:
-    """A part of an answer in a word: the right name in it, without its place, else the one that leads.
+def saying(
+    effect: str, ties: Sequence[str], right_names: Sequence[Sequence[str]], allowed: Sequence[Sequence[str]]
+) -> str:
+    """An effect of an answer, without its place: by the exact name of what it or a tie of it names rightly, or its own.
 
-    "(elsewhere)": the right effect, in the wrong place.
+    "(elsewhere)": a right effect, or a part of one, in the wrong place.  Ties of several at once are not looked at.
     """
-    right_ones = [name for names in allowed for name in names]
-    hits = [name for name in right_ones if name in slot]
+    said = [effect, *(tie for tie in ties if " + " not in tie)]
+    hits = [names[0] for name in said for names in right_names if name in names]
     if hits:
         return _plain(hits[0])
-    elsewhere = [name for name in sorted(slot) if _plain(name) in map(_plain, right_ones)]
-    if elsewhere:
-        return f"{_plain(elsewhere[0])} (elsewhere)"
-    return _plain(next((name for name in leaders if name in slot), min(slot)))
+    right_ones = [name for names in allowed for name in names]
+    elsewhere = [name for name in said if name not in right_ones and _plain(name) in map(_plain, right_ones)]
+    return f"{_plain(elsewhere[0])} (elsewhere)" if elsewhere else _plain(effect)
 
 
 def _plain(name: str) -> str:
@@ -163,9 +168,22 @@ def times_limit(truth: Mapping[str, Any], limits: Mapping[str, Any]) -> dict[str
     return {n: size / known[n]["limit"] for n, size in names.items() if known.get(n, {}).get("limit")}
 
 
-def smaller_than_stated(judged: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Names of cases that hide less than their factor times the limit, which no case of these limits can."""
-    return [c["name"] for c in judged if any(t < c["factor"] * (1.0 - 1e-6) for t in c["times_limit"].values())]
+def refuse_other_limits(truths: Iterable[Mapping[str, Any]], limits: Mapping[str, Any]) -> None:
+    """ValueError where a case does not hide what its factor and these limits say."""
+    for truth in truths:
+        known = limits.get(truth["scene"], {})
+        for h in truth["hidden"]:
+            size = amplitude(h["name"], h["joint"], truth["factor"], known)
+            if size is None or not np.isclose(abs(h["amplitude"]), size):
+                raise ValueError(
+                    f"{truth['name']} hides {abs(h['amplitude']):.4g} of {h['name']}, by these limits it would be "
+                    f"{size}: give those that the cases were made with (--limits)"
+                )
+
+
+def digest(result: Path) -> str:
+    """Which result an oracle is of."""
+    return hashlib.sha256(result.read_bytes()).hexdigest()
 
 
 def closed(result: Mapping[str, Any], role: str) -> float | None:

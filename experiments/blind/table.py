@@ -92,7 +92,7 @@ def _rows() -> Iterator[tuple[str, str, Chosen, Chosen]]:
     yield "anything hidden: stepwise BIC holds a false name", "", _judged_by_bic, lambda c: c["baselines"]["bic_false"]
     yield "any: error, or fit not converged", "", lambda c: True, lambda c: c["verdict"] not in ANSWERED
     closed = f"rightly named: at least {CLOSED:.0%} of the sealed gap closed"
-    yield closed, "", _named, lambda c: c["closed"].get("sealed", 0.0) >= CLOSED
+    yield closed, "", lambda c: _named(c) and "sealed" in c["closed"], lambda c: c["closed"]["sealed"] >= CLOSED
     yield "rightly named: sealed gap within two floors of the floor", "all", _named, lambda c: bool(c["within_floor"])
     near = "nothing hidden: sealed gap within two floors of the floor"  # what the base model itself leaves
     yield near, "", _kind("none"), lambda c: bool(c["within_floor"])

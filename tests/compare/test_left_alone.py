@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
 
 from droid_jax.compare.cost import make_cost
 from droid_jax.compare.replay import make_drive
-from droid_jax.compare.start import holding
+from droid_jax.compare.start import holding, left_alone
 from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
+from droid_jax.measure.surrogate import _control
 from droid_jax.model.fields import joint_damping
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene, compile_scene
@@ -82,6 +85,22 @@ def recording(**more: np.ndarray) -> Recording:
     )  # fmt: skip
 
 
+def with_positions(given: Recording, names: tuple[str, ...], scatter: float = 0.0) -> Recording:
+    """The recording with measured positions of joints that stand still where they start, in four repeats."""
+    torque = given.channels["torque"]
+    values = np.repeat(torque.values, 4, axis=0)
+    still = np.tile([START[n] for n in names], (4, len(TIME), 1)) + scatter * np.arange(4)[:, None, None]
+    channels = {
+        "torque": replace(torque, values=values, mask=np.ones(values.shape, bool)),
+        "position": Channel("position", "rad", names, TIME, still, np.ones(still.shape, bool)),
+    }
+    return replace(given, channels=channels, qpos0={"shoulder": START["shoulder"]})
+
+
+def space(arm: Scene) -> Space:
+    return Space((joint_damping(arm, "shoulder", std=0.5, high=9.0),))
+
+
 def test_holding_controls_pull_nowhere():
     arm = scene()
     model, data = arm.model, mujoco.MjData(arm.model)
@@ -96,8 +115,8 @@ def test_holding_controls_pull_nowhere():
 
 def test_what_has_no_command_is_held_and_said():
     arm = scene()
-    with pytest.warns(UserWarning, match="recording 'wave' has no command for grip, thumb: held where the motion sta"):
-        cost = make_cost(arm, Space((joint_damping(arm, "shoulder", std=0.5, high=9.0),)), [recording()])
+    with pytest.warns(UserWarning, match="'wave' has not all commands: grip, thumb held where the motion starts"):
+        cost = make_cost(arm, space(arm), [recording()])
     torque = cost.rollouts(np.array([[1.0]]))[0].torque[0, :, 0]
     assert np.max(np.abs(torque - by_hand())) < 0.02 * np.max(np.abs(by_hand()))
     given = make_drive(arm, recording(grip=np.full(len(TIME), 30.0)))
@@ -109,3 +128,33 @@ def test_a_measured_joint_needs_its_command():
     assert whole.joints == ("shoulder", "thumb")
     with pytest.raises(ValueError, match="needs a command for shoulder, thumb; missing: thumb; given: shoulder"):
         make_drive(whole, recording())
+
+
+def test_a_motor_without_a_command_is_given_nothing_and_that_is_said():
+    spec = mujoco.MjSpec.from_string(ARM.replace('<position joint="thumb" kp="20" kv="1"/>', '<motor joint="thumb"/>'))
+    arm = compile_scene(spec, "arm", joints=["shoulder"])
+    assert left_alone(arm, recording()) == (
+        "recording 'wave' has not all commands: grip held where the motion starts; thumb given 0 (no position feedback)"
+    )
+    with pytest.raises(ValueError, match="does not tell where thumb starts"):  # commanded, and a torque tells no place
+        make_drive(arm, replace(recording(thumb=np.zeros(len(TIME))), qpos0={"shoulder": 0.2}))
+
+
+@pytest.mark.filterwarnings("ignore:recording 'wave' has not all commands")
+def test_what_is_held_starts_where_it_was_measured_in_each_part_of_the_repeats():
+    arm, whole = scene(), with_positions(recording(), ("shoulder", "thumb", "a", "b"), scatter=1e-5)
+    first, last = whole.repeats_subset([0, 1]), whole.repeats_subset([2, 3])
+    drive = make_drive(arm, first)
+    assert drive.qpos0 == pytest.approx(arm.initial_qpos(START), abs=1e-4)
+    assert drive.command[0] == pytest.approx([0.2, GRIP, 0.3], rel=1e-3)
+    cost = make_cost(arm, space(arm), [first], engine="mujoco")
+    row = np.array([[1.0]])
+    assert cost.against([last])(row) == pytest.approx(cost(row), rel=1e-3)
+    with pytest.raises(ValueError, match="holds other commands"):
+        cost.against([replace(last, command=last.command + 0.01)])
+
+
+def test_the_stand_in_robot_needs_all_commands():
+    arm = scene()
+    with pytest.raises(ValueError, match="the stand-in robot needs a command for grip, thumb too"):
+        _control(arm, recording(), 0.001, 0.0)

@@ -394,7 +394,10 @@ def test_confusion_tells_ties_from_swaps_and_right_effects_in_wrong_places():
     answers = (["preload at door"], ["latch at elbow"], ["closer at door"])
     judged = [score.judge(case("single", "named", names, right_names), {}) for names in answers]
     judged.append(score.judge(case("single", "tie", ["closer at door"], right_names, tied=[["latch at door"]]), {}))
-    assert score.confusion(judged) == {"h0": {"preload": 1, "latch (elsewhere)": 1, "closer": 1, "latch": 1}}
+    assert score.confusion(judged) == {"h0": {"latch": 2, "latch (elsewhere)": 1, "closer": 1}}
+    pair, ties = [["tilt at door"], ["delay at door"]], [["delay at door + tilt at door"], ["tilt at door"]]
+    both = score.judge(case("pair", "tie", ["drag at door", "delay at door"], pair, tied=ties), {})
+    assert both["said"] == ["drag", "delay"]
 
 
 def test_confusion_and_errors():
@@ -485,12 +488,16 @@ def test_a_case_tells_its_multiple_of_the_limit_and_whose_code_searched():
     assert [score.code_of(c) for c in searched] == ["frozen", "other", "unknown"]
 
 
-def test_limits_of_another_run_are_noticed():
-    """A case of three times its limit of 0.5 hides 1.5 or more, however large a size worth naming is."""
-    given = case("single", "named", ["latch at door"], [["latch at door"]])  # hides 2.0
-    for limit, strange in ((0.5, []), (1.0, [given["truth"]["name"]])):
-        judged = [score.judge(given, {"s": {"h0": {"limit": limit}}})]
-        assert score.smaller_than_stated(judged) == strange
+def test_limits_of_another_run_are_refused():
+    hidden = {"name": "closer", "joint": "", "amplitude": -0.3}
+    truth = {"name": "s/single/closer/3x/0", "scene": "s", "factor": 3.0, "hidden": [hidden]}
+    score.refuse_other_limits([truth], {"s": {"closer": entry(limit=0.1)}})
+    score.refuse_other_limits([truth], {"s": {"closer": entry(limit=0.01, worth=0.1)}})
+    for limit in (0.05, 0.2, None):
+        with pytest.raises(
+            ValueError, match=r"closer/3x/0 hides 0.3 of closer, by these limits it would be .*--limits"
+        ):
+            score.refuse_other_limits([truth], {"s": {"closer": entry(limit=limit)}})
 
 
 def test_a_null_that_was_made_in_pieces_is_summed_up_whole(
