@@ -79,8 +79,8 @@ def describe(found: Identified, truth: dict[str, float]) -> dict[str, Any]:
 
     search: mean and deviation in the coordinate in which the parameter was fitted, where it is normal.
     """
-    low, high = found.full_gaussian.interval(LEVEL)
     told = found.full_gaussian
+    low, high = told.interval(LEVEL)
     assert told.coordinates == "search"
     deviation = np.sqrt(np.diag(told.cov))
     parameters = {
@@ -271,15 +271,17 @@ def _coverage(cases: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
+def both_tell(a: dict[str, Any], b: dict[str, Any]) -> list[str]:
+    """Names of the parameters that both poses tell."""
+    return [n for n, p in a.items() if not p["nuisance"] and p["identifiable"] and b[n]["identifiable"]]
+
+
 def agreement(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
     """Do the two poses agree on what both tell?
 
     Their difference in the coordinate of the search, in units of its own deviation, is normal if so.
     """
-    names = [
-        n for n, p in a["parameters"].items()
-        if not p["nuisance"] and p["identifiable"] and b["parameters"][n]["identifiable"]
-    ]  # fmt: skip
+    names = both_tell(a["parameters"], b["parameters"])
     apart = {}
     for name in names:
         (mean_a, std_a), (mean_b, std_b) = (case["parameters"][name]["search"] for case in (a, b))

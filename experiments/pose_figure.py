@@ -18,7 +18,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
 
 import numpy as np  # noqa: E402
 import tyro  # noqa: E402
-from identify_suite import agreement, kept_cases  # noqa: E402
+from identify_suite import agreement, both_tell, kept_cases  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 from scipy import stats  # noqa: E402
 
@@ -39,11 +39,6 @@ class Arguments:
     """Folder with identify_cases."""
     quick: bool = False
     """Read the cases of a quick suite."""
-
-
-def both_tell(a: dict[str, Any], b: dict[str, Any]) -> list[str]:
-    """Names of the parameters that both poses tell."""
-    return [n for n, p in a.items() if not p["nuisance"] and p["identifiable"] and b[n]["identifiable"]]
 
 
 @styled

@@ -79,11 +79,8 @@ def as_markdown(rows: Mapping[str, Any]) -> str:
     """The table as text; what stands in italics is not told by the motion."""
     doors = list(next(iter(rows.values()))["doors"])
     springs = {"0": "no spring", "1": "one spring", "2": "two springs"}
-    head = [
-        "",
-        "initial, paper",
-        *(c for d in doors for c in (f"{springs[d]}, paper", "truth here", "best here, 90 %")),
-    ]
+    columns = ("{}, paper", "truth here", "best here (90 %)")
+    head = ["", "initial, paper", *(column.format(springs[d]) for d in doors for column in columns)]
     lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
     for name, row in rows.items():
         cells = [label(name), _pair(*row["initial"])]

@@ -129,10 +129,15 @@ def with_priors(residual: Callable[..., Any], space: Space, noise: float) -> Cal
     return whole
 
 
+def _torques(recording: Recording) -> np.ndarray:
+    """[N, T, J] N m, NaN where none was measured."""
+    channel = recording.channel("torque")
+    return np.where(channel.mask, channel.values, np.nan)
+
+
 def _noise(recording: Recording) -> float:
     """RMS of what the mean torque's noise is in rows of `normalize_residual`."""
-    channel = recording.channel("torque")
-    values = np.where(channel.mask, channel.values, np.nan)
+    values = _torques(recording)
     mean = np.nanmean(values, axis=0)
     scatter = np.nanstd(values, axis=0, ddof=1) / np.sqrt(recording.repeats)
     return float(np.sqrt(np.nanmean((scatter / (np.linalg.norm(mean, axis=0) / np.sqrt(2))) ** 2)))
@@ -142,7 +147,7 @@ def _measured(recording: Recording) -> Any:
     """Its time series of the repeats' mean torque."""
     sysid = library()
     channel = recording.channel("torque")
-    mean = np.nanmean(np.where(channel.mask, channel.values, np.nan), axis=0)
+    mean = np.nanmean(_torques(recording), axis=0)
     names = {name: (sysid.SignalType.CustomObs, np.array([i])) for i, name in enumerate(channel.columns)}
     return sysid.TimeSeries(channel.time - recording.time[0], mean, signal_mapping=names)
 

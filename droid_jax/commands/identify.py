@@ -93,7 +93,7 @@ def run(command: Identify) -> None:
     needs_writer(command.tensorboard)
     runtime.start()
     warn_of_cpu(command.preset)
-    from droid_jax.compare.start import left_alone, open_loop
+    from droid_jax.compare.start import command_notes
     from droid_jax.identify.pipeline import cost_samples, prepare, solve
     from droid_jax.identify.results import prepare_folder, write_run
     from droid_jax.measure.surrogate import is_stand_in
@@ -153,7 +153,7 @@ def run(command: Identify) -> None:
         keep_replay(out, found, recordings[0])
         write_run(
             out, found, description, truth=truth, samples=lambda: cost_samples(found, config.samples, config.seed),
-            notes=filter(None, (note(scene, r) for r in recordings for note in (open_loop, left_alone))),
+            notes=[text for recording in recordings for text in command_notes(scene, recording)],
         )  # fmt: skip
     draw(out, scene)
     report.run(report.Report(out))

@@ -21,7 +21,7 @@ from droid_jax.compare.inverse import Path, path_of, path_replay, prescribed
 from droid_jax.compare.population import blocks, over_block
 from droid_jax.compare.replay import Drive, Replay, check_gains, make_drive, servo_replay, torque_offset_effect
 from droid_jax.compare.residuals import CompareConfig, Comparison, make_comparison
-from droid_jax.compare.start import AJAR, check_range, warn_if_left_alone, warn_if_moving, warn_if_open_loop
+from droid_jax.compare.start import AJAR, check_range, warn_if_moving, warn_of_commands
 from droid_jax.compare.twin import twin_replay
 from droid_jax.measure.checks import validate
 from droid_jax.measure.motion import Motion, measured_motion
@@ -212,8 +212,7 @@ def followed(scene: Scene, recording: Recording, config: CompareConfig) -> Drive
     validate(recording, allow_jitter=True)  # one made in Python may not have been
     check_range(scene, recording)
     if recording.command.size:
-        warn_if_open_loop(scene, recording)
-        warn_if_left_alone(scene, recording)
+        warn_of_commands(scene, recording)
         warn_if_moving(recording)
         return make_drive(scene, recording, weigh="torque" in config.channels)
     if not scene.joints:

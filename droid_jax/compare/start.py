@@ -75,6 +75,17 @@ def warn_if_moving(recording: Recording) -> None:
         )
 
 
+def command_notes(scene: Scene, recording: Recording) -> list[str]:
+    """What is to be known of the commands: a <motor> that takes radians for torques, actuators that got none."""
+    return [text for text in (open_loop(scene, recording), left_alone(scene, recording)) if text]
+
+
+def warn_of_commands(scene: Scene, recording: Recording) -> None:
+    """Warn of what is to be known of the commands."""
+    for text in command_notes(scene, recording):
+        warnings.warn(text, stacklevel=2)
+
+
 def open_loop(scene: Scene, recording: Recording) -> str:
     """What is to be known where the recording's commands drive actuators without position feedback; else empty."""
     open_ones = np.flatnonzero(~_feedback(scene.model) & drives_joint(scene.model))
@@ -86,12 +97,6 @@ def open_loop(scene: Scene, recording: Recording) -> str:
         f"{recording.name!r} are taken as their torques (or forces, or speeds); for position commands use "
         "<position> servos"
     )
-
-
-def warn_if_open_loop(scene: Scene, recording: Recording) -> None:
-    """Warn where commands are no positions: a <motor> in place of a <position> takes radians for torques."""
-    if text := open_loop(scene, recording):
-        warnings.warn(text, stacklevel=2)
 
 
 def holding(scene: Scene, qpos0: np.ndarray) -> np.ndarray:
@@ -130,12 +135,6 @@ def left_alone(scene: Scene, recording: Recording) -> str:
 def _feedback(model: mujoco.MjModel) -> np.ndarray:
     """[U] bool, actuators whose force follows their own position, as a position servo's does."""
     return (model.actuator_biastype != mujoco.mjtBias.mjBIAS_NONE) & (model.actuator_biasprm[:, 1] != 0)
-
-
-def warn_if_left_alone(scene: Scene, recording: Recording) -> None:
-    """Warn where actuators are held for want of a command."""
-    if text := left_alone(scene, recording):
-        warnings.warn(text, stacklevel=2)
 
 
 def _moves(begin: float, channel: Channel, column: int) -> bool:

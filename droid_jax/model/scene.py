@@ -130,7 +130,7 @@ class Scene:
     @functools.cached_property
     def driven_joints(self) -> tuple[str, ...]:
         """Joints that an actuator of their own drives, in actuator order."""
-        return tuple(n for n, j in zip(self.command_names, drives_joint(self.model), strict=True) if j)
+        return _driven(self.model, self.command_names)
 
     @property
     def finger_joints(self) -> tuple[str, ...]:
@@ -345,9 +345,7 @@ def compile_scene(
         name=name,
         spec=spec,
         model=model,
-        joints=tuple(
-            dict.fromkeys(np.array(command_names)[drives_joint(model)].tolist() if joints is None else joints)
-        ),
+        joints=tuple(joints) if joints is not None else tuple(dict.fromkeys(_driven(model, command_names))),
         command_names=command_names,
         object_joint=object_joint,
         grip=grip,
@@ -364,6 +362,11 @@ def drives_joint(model: mujoco.MjModel) -> np.ndarray:
     """[U] bool, actuators that drive a joint, and not a tendon, a site or a body."""
     kinds = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
     return np.isin(model.actuator_trntype, kinds)
+
+
+def _driven(model: mujoco.MjModel, command_names: Sequence[str]) -> tuple[str, ...]:
+    """Those of `command_names` that are joints."""
+    return tuple(name for name, of_joint in zip(command_names, drives_joint(model), strict=True) if of_joint)
 
 
 def _command_names(model: mujoco.MjModel) -> tuple[str, ...]:

@@ -25,7 +25,7 @@ from droid_jax.storage import write_json
 from experiments.blind.answers import right
 from experiments.blind.quiet import settled
 from experiments.blind.scenes import ROLES
-from experiments.blind.score import digest
+from experiments.blind.score import digest, oracle_of
 from experiments.blind.search import Bench
 from experiments.sharing import claimed
 
@@ -94,15 +94,14 @@ def oracle_all(runs: Path, chosen: Iterable[str], bench: Bench, tell: Callable[[
         truth = json.loads(sealed.read_text())
         if truth["kind"] not in KINDS or not known.is_file():
             continue
-        of = digest(known)
         with claimed(path, wait=False) as mine:
-            if not mine or (path.is_file() and json.loads(path.read_text()).get("of", of) == of):
+            if not mine or oracle_of(known, path):
                 continue
             try:
                 found = oracle(runs / "cases" / name, truth, json.loads(known.read_text()), bench)
             except ValueError as error:
                 found = {"error": str(error)}
-            write_json(path, {"of": of, **found})
+            write_json(path, {"of": digest(known), **found})
         count += 1
         left = ", ".join(f"U {role} {u:.3g}" for role, u in found.get("gaps", {}).items())
         tell(f"{name}: {found.get('error', found.get('model'))} {left}")

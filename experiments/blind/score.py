@@ -43,16 +43,13 @@ def score_folder(results: Path, sealed: Path, limits: Mapping[str, Any], oracles
             continue
         scene = scenes.setdefault(truth["scene"], setting(truth["scene"]).scene)
         names = [list(right(scene, Applied(**h))) for h in truth["hidden"]]
-        known = json.loads(found_by.read_text()) if oracles and (found_by := oracles / path.name).is_file() else None
-        if known and known.get("of", digest(result)) != digest(result):
-            known = None  # of another result
         found.append(
             {
                 "truth": truth,
                 "result": json.loads(result.read_text()),
                 "right": names,
                 "parts": [list(parts(scene, Applied(**h))) for h in truth["hidden"]],
-                "oracle": known,
+                "oracle": oracle_of(result, oracles / path.name) if oracles else None,
             }
         )
     refuse_other_limits((case["truth"] for case in found), limits)
@@ -179,6 +176,15 @@ def refuse_other_limits(truths: Iterable[Mapping[str, Any]], limits: Mapping[str
                     f"{truth['name']} hides {abs(h['amplitude']):.4g} of {h['name']}, by these limits it would be "
                     f"{size}: give those that the cases were made with (--limits)"
                 )
+
+
+def oracle_of(result: Path, oracle: Path) -> dict[str, Any] | None:
+    """What the right names could reach on the case of a result; None where that is not known, or of another result.
+
+    Oracles before 2be0ce3 do not tell whose they are.
+    """
+    known = json.loads(oracle.read_text()) if oracle.is_file() else None
+    return known if known and known.get("of", digest(result)) == digest(result) else None
 
 
 def digest(result: Path) -> str:
