@@ -13,9 +13,9 @@ import pytest
 
 from droid_jax.commands import report
 from droid_jax.commands.evaluate import Evaluate, _film, _robot, _task
-from droid_jax.commands.folder import setup_of, stage_folder
+from droid_jax.commands.folder import begin, setup_of, stage_folder
 from droid_jax.commands.source import source, stand_in_of
-from droid_jax.commands.train import Train, _fit_folder, _forget
+from droid_jax.commands.train import Train, _fit_folder
 from droid_jax.identify.gaussian import prior
 from droid_jax.model.door import door_nuisances, door_space
 from droid_jax.model.door_scene import door_scene
@@ -101,11 +101,14 @@ def test_the_setup_of_every_command_can_be_written():
 
 
 def test_a_new_training_forgets_the_old_policy(tmp_path: Path):
-    for name in ("policy.npz", "transfer.json", "extended.json", "films/good.webp", "export/policy.onnx", "setup.json"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
+    old = ("policy.npz", "transfer.json", "extended.json", "films/good.webp", "export/policy.onnx", "training.json")
+    for name in (*old, "checkpoints/0/x", "mine.txt"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("old")
-    _forget(tmp_path)
-    assert [p.name for p in tmp_path.iterdir()] == ["setup.json"]
+    begin(tmp_path, {"seed": 1}, again=False, stage="train")
+    assert {p.name for p in tmp_path.iterdir()} == {"setup.json", "checkpoints", "mine.txt"}
+    begin(tmp_path, {"seed": 1}, again=True, stage="train")
+    assert {p.name for p in tmp_path.iterdir()} == {"setup.json", "mine.txt"}
 
 
 def test_without_a_fit_there_is_the_prior(scene):

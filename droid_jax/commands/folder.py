@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from droid_jax.report.files import LAST_FILES, RESULTS
+
 if TYPE_CHECKING:
     from droid_jax.measure.recording import Recording
     from droid_jax.model.parameters import Space
@@ -21,6 +23,7 @@ HASHED = ("own_effects", "extended")  # options whose file is in no other hash o
 LATER = ("budget",)  # options of which nothing that an unfinished run has kept depends
 CODE = "versions"  # in setup.json: of the code that began the run, which others may go on with
 PATHS = ("recording", "scene", "parameters", "fit", "run", *HASHED)  # beside each a setup holds what the file says
+INPUTS = ("start", "stand_in")  # in a setup: of what a run was given by another, as are all that end in _sha256
 
 
 def setup_of(command: Any) -> dict[str, Any]:
@@ -64,9 +67,14 @@ def changed(before: Mapping[str, Any], setup: Mapping[str, Any]) -> list[str]:
 
 
 class OtherRun(ValueError):
-    """The folder holds a run with other settings or inputs; `what` says which."""
+    """The folder holds a run with other settings or inputs; `what` says which.
+
+    inputs: whether only what it was given differs, and nothing that was asked for.
+    """
 
     def __init__(self, out: Path, changed: Iterable[str]) -> None:
+        changed = tuple(changed)
+        self.inputs = all(name in INPUTS or name.endswith("_sha256") for name in changed)
         self.what = f"{out} holds a run with other settings ({', '.join(changed)})"
         super().__init__(f"{self.what}; choose another --out, or --again")
 
@@ -113,34 +121,42 @@ def _with_other_code(before: Mapping[str, Any]) -> str:
     return f" with other code than it was begun with ({', '.join(other)}; --again starts over)" if other else ""
 
 
-def begin(out: Path, setup: dict[str, Any], again: bool, last: str = "config.json") -> None:
-    """Only now, with all input read, forget an earlier run where that was asked for, and say what runs here."""
+def begin(out: Path, setup: dict[str, Any], again: bool, stage: str) -> None:
+    """Only now, with all input read, forget an earlier run's results, and say what runs here.
+
+    again: its checkpoints too.
+    """
     from droid_jax import runtime
     from droid_jax.storage import write_json
 
-    if again:
-        for name in ("checkpoints", "tensorboard"):
-            shutil.rmtree(out / name, ignore_errors=True)
-        (out / last).unlink(missing_ok=True)
+    forget(out, stage, results_alone=not again)
     write_json(out / "setup.json", {**setup, CODE: runtime.versions()})
     BEGUN.add(out)
 
 
-def kept_recordings(
-    paths: Mapping[str, Path], again: bool, record: Callable[[int, str], Recording]
-) -> dict[str, Recording]:
+def forget(out: Path, stage: str, results_alone: bool = False) -> None:
+    """Remove what a run of this stage left; its checkpoints too, from which it would go on, unless told otherwise."""
+    begun = () if results_alone else ("checkpoints", "tensorboard", "setup.json")
+    for name in (LAST_FILES[stage], *RESULTS[stage], *begun):
+        if (path := out / name).is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def kept_recordings(paths: Mapping[str, Path], again: bool, record: Callable[[str], Recording]) -> dict[str, Recording]:
     """What the stand-in robot recorded earlier into this run's folder, by name; recorded now where it did not.
 
-    paths: by name.  record: of a recording's place among them and its name.
+    paths: by name.  record: of a recording's name.
     """
     from droid_jax.measure.formats import load, save
     from droid_jax.report.progress import counting
 
-    absent = [(i, name) for i, (name, path) in enumerate(paths.items()) if again or not path.is_file()]
+    absent = [name for name, path in paths.items() if again or not path.is_file()]
     if absent:
         with counting("recording the stand-in robot", len(absent)) as count:
-            for done, (i, name) in enumerate(absent, 1):
+            for done, name in enumerate(absent, 1):
                 paths[name].parent.mkdir(parents=True, exist_ok=True)
-                save(record(i, name), paths[name])
+                save(record(name), paths[name])
                 count(done)
     return {name: load(path, name=name) for name, path in paths.items()}

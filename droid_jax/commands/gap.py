@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from droid_jax.commands import report
 from droid_jax.commands.folder import begin, fingerprints, finished, setup_of, stage_folder
 from droid_jax.commands.gap_search import searched
-from droid_jax.commands.hidden import hidden_effects, record_stand_in, settled
+from droid_jax.commands.hidden import hidden_effects, kept_at, known_stand_in, record_stand_in, settled
 from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.presets import TIMESTEP, refine_config, search_config, warn_of_cpu
 from droid_jax.commands.scenes import compared, needs_log, needs_recording, needs_scene, own_scene, recording_at
@@ -126,29 +126,21 @@ def run(command: Gap) -> None:
         roles = record_stand_in(scene, hidden, out, command.springs, command.seed, command.again)
     print("compiling the replay ...", flush=True)
     case = case_of(split, scene, base, effects, roles, config)
-    begin(out, setup, command.again, "gap.json")  # and only now, with all of it found good
-    if command.again:
-        _forget(out)
+    begin(out, setup, command.again, "gap")  # and only now, with all of it found good
     board = out / FOLDER if command.tensorboard else None
     case, verdict, seconds = searched(split, case, roles, out / "checkpoints", start, board)
+    stand_in = all(is_stand_in(r) for r in roles.values())
+    known = known_stand_in(command.recording or kept_at(out))
     description = {
         "split": {"by": split.value, "limits": split.limits},
         "seconds": seconds,
         "versions": runtime.versions(),
         "device": runtime.device(),
-        "setup": {**setup, "stand_in": all(is_stand_in(r) for r in roles.values())},
+        "setup": {**setup, "stand_in": stand_in, "robot": known if stand_in else {}},
     }
     write_gap(out, case, verdict, description)
     shutil.rmtree(out / "checkpoints" / "replays", ignore_errors=True)
     _done(out)
-
-
-def _forget(out: Path) -> None:
-    """Remove what belongs to a search that was made here before."""
-    from droid_jax.gap.extended import FILE, MJCF
-
-    for name in ("gap.npz", FILE, MJCF):
-        (out / name).unlink(missing_ok=True)
 
 
 def model_of(command: Gap) -> tuple[Scene, Space]:

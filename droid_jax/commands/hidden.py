@@ -28,6 +28,8 @@ def settled(command: T) -> T:
     Raises ValueError where some were given beside recordings, which come from another robot.
     """
     usual = {name: value for name, value in OPTIONS.items() if hasattr(command, name)}
+    if "demonstrations" in usual and command.preset == "paper":  # type: ignore[attr-defined]
+        usual["demonstrations"] = ("A",)  # one is fitted there
     given = [name for name in usual if getattr(command, name) is not None]
     if not command.recording:  # type: ignore[attr-defined]
         return replace(command, **{k: v for k, v in usual.items() if k not in given})  # type: ignore[type-var]
@@ -78,18 +80,25 @@ def record_stand_in(
 
     truth = stand_in_truth(scene, springs, seed)
 
-    def recorded(index: int, name: str) -> Recording:
-        demonstration = load(demonstration_path(name))
-        return record_hidden(scene, demonstration, truth, hidden, seed=1000 * seed + index, name=name)
+    names = list(DEMONSTRATIONS.values())
 
-    paths = {name: out / "recordings" / f"{name}.npz" for name in DEMONSTRATIONS.values()}
+    def recorded(name: str) -> Recording:
+        demonstration = load(demonstration_path(name))
+        return record_hidden(scene, demonstration, truth, hidden, seed=1000 * seed + names.index(name), name=name)
+
+    paths = dict(zip(names, kept_at(out), strict=True))
     this = stand_in_json(hidden, springs, seed)
-    if again or known_stand_in(list(paths.values())) != this:
+    if again or known_stand_in(kept_at(out)) != this:
         for path in paths.values():
             path.unlink(missing_ok=True)
     write_json(out / "recordings" / STAND_IN, this)  # before the first: a stop leaves no recordings of an unknown robot
     found = kept_recordings(paths, False, recorded)
     return {role: found[name] for role, name in DEMONSTRATIONS.items()}
+
+
+def kept_at(out: Path) -> tuple[Path, ...]:
+    """Files of the stand-in robot's motions in a run's folder: fit, confirm, sealed."""
+    return tuple(out / "recordings" / f"{name}.npz" for name in DEMONSTRATIONS.values())
 
 
 def stand_in_json(hidden: Mapping[str, float], springs: int, seed: int) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.pictures import draw, keep_replay
 from droid_jax.commands.presets import TIMESTEP, Preset, refine_config, search_config, warn_of_cpu
 from droid_jax.commands.scenes import compared, needs_log, needs_recording, needs_scene, own_scene, recording_at
+from droid_jax.report.files import EXTENDED
 
 if TYPE_CHECKING:
     from droid_jax.identify.pipeline import Identified, IdentifyConfig
@@ -99,6 +100,7 @@ def run(command: Identify) -> None:
     from droid_jax.measure.surrogate import is_stand_in
     from droid_jax.report.progress import stages
     from droid_jax.report.scalars import FOLDER, scalars
+    from droid_jax.storage import write_bytes
 
     load_effects(command.own_effects, None if command.extended is None else command.extended.parent)
     out = command.out
@@ -117,7 +119,9 @@ def run(command: Identify) -> None:
     recordings, truth = _recordings(command, scene, out, given)
     print("compiling the replay ...", flush=True)
     problem = prepare(scene, space, recordings, nuisances=nuisances, config=config, **effects)
-    begin(out, setup, command.again)  # and only now, with all of it found good
+    begin(out, setup, command.again, "identify")  # and only now, with all of it found good
+    if command.extended is not None:  # the Gaussian's own, whatever becomes of the search that made it
+        write_bytes(out / EXTENDED, command.extended.read_bytes())
     started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     board = out / FOLDER if command.tensorboard else None
     with stages(("search", "refine", "judge", "sample")) as show, scalars(board) as write:
@@ -236,20 +240,19 @@ def _recordings(
         stand_in = command.scene is None and all(is_stand_in(r) for r in given)
         known = known_stand_in(command.recording) if stand_in else {}
         return given, stand_in_truth(scene, known["springs"], known["seed"]) if known else None
-    from droid_jax.measure.demonstration import demonstration_path
+    from droid_jax.measure.demonstration import PLANS, demonstration_path
     from droid_jax.measure.surrogate import record
 
     assert command.springs is not None and command.demonstrations is not None  # settled
     gains = "paper" if command.preset == "paper" else "impedance"
-    names = command.demonstrations[:1] if command.preset == "paper" else command.demonstrations
     truth = stand_in_truth(scene, command.springs, command.seed, nuisances=command.preset != "paper")
 
-    def recorded(index: int, name: str) -> Recording:
+    def recorded(name: str) -> Recording:  # as `record` does, whatever stands beside it
         demonstration = load(demonstration_path(name, gains=gains))
-        return record(scene, demonstration, truth, seed=1000 * command.seed + index)
+        return record(scene, demonstration, truth, seed=1000 * command.seed + sorted(PLANS).index(name))
 
     tag = f"springs{command.springs}_seed{command.seed}" + ("_paper" if gains == "paper" else "")
-    paths = {name: out / "recordings" / f"{name}_{tag}.npz" for name in names}
+    paths = {name: out / "recordings" / f"{name}_{tag}.npz" for name in command.demonstrations}
     return list(kept_recordings(paths, command.again, recorded).values()), truth
 
 

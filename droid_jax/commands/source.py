@@ -49,8 +49,10 @@ def source(folder: Path | None, knob: int) -> tuple[Scene, Gaussian, tuple[Effec
         return scene, own, ()
     extended = load_extended(model, scene)
     own = load(at) if at.is_file() else extended.gaussian
-    effects = {name for part in extended.parts for name in part.free}
-    return extended.scene, own if effects <= set(own.space.names) else extended.gaussian, extended.effects
+    lacking = {name for part in extended.parts for name in part.free} - set(own.space.names)
+    if lacking:
+        raise ValueError(f"{at} lacks {', '.join(sorted(lacking))} of {model}, which is of another search by now")
+    return extended.scene, own, extended.effects
 
 
 def _check_door(path: Path, gaussian: Gaussian, scene: Scene) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -13,7 +12,7 @@ from droid_jax.commands.folder import RUNS, begin, finished, setup_of
 from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.presets import warn_of_cpu
 from droid_jax.commands.source import has_model, model_folder, needs_brax, source, stand_in_of
-from droid_jax.report.files import FILMS, GAUSSIAN, POLICY, TRAINING, TRANSFER
+from droid_jax.report.files import GAUSSIAN, POLICY, TRAINING
 from droid_jax.report.stages import extended_of, fingerprint
 
 if TYPE_CHECKING:
@@ -83,8 +82,7 @@ def run(command: Train) -> None:
     config = config_of(command)
     env, randomise = DoorEnv(scene, effects=effects), of_method(command.method, scene, gaussian)
     prepare_folder(out)  # only now, with all input read
-    begin(out, setup, command.again, TRAINING)
-    _forget(out)
+    begin(out, setup, command.again, "train")
     gaussian.save(out / GAUSSIAN)
     model = None if fit is None else extended_of(fit)
     if model is not None:
@@ -117,16 +115,6 @@ def run(command: Train) -> None:
     }
     write_json(out / TRAINING, content)  # last: its presence says that the run is whole
     report.run(report.Report(out))
-
-
-def _forget(out: Path) -> None:
-    """Remove what belongs to a policy that was trained here before."""
-    from droid_jax.gap.extended import FILE
-
-    for name in (POLICY, TRANSFER, FILE):
-        (out / name).unlink(missing_ok=True)
-    for name in (FILMS, "export"):
-        shutil.rmtree(out / name, ignore_errors=True)
 
 
 def config_of(command: Train) -> TrainConfig:

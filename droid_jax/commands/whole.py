@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from droid_jax.commands import evaluate, gap, identify, report, train
-from droid_jax.commands.folder import OtherRun, changed, setup_of
-from droid_jax.commands.hidden import DEMONSTRATIONS, hidden_effects, record_stand_in, settled
+from droid_jax.commands.folder import OtherRun, changed, forget, setup_of
+from droid_jax.commands.hidden import DEMONSTRATIONS, hidden_effects, kept_at, record_stand_in, settled
 from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.scenes import needs_log, needs_recording, needs_scene
 from droid_jax.commands.source import model_folder, needs_brax
-from droid_jax.report.files import TRANSFER
-from droid_jax.report.stages import left_over
+from droid_jax.report.files import LAST_FILES, TRANSFER
+from droid_jax.report.stages import left_over, setup, unfinished
 from droid_jax.storage import write_json
 
 Stage = Literal["identify", "gap", "train", "evaluate"]
@@ -115,6 +115,9 @@ def run(command: All) -> None:
     out = prepare_folder(command.out)
     if {*IN_A_SCENE} & {*command.stages}:
         _remember(command, out)
+    if command.again:  # now: one that a stop leaves unreached is not to pass for this run's; the first does so itself
+        for stage in [stage for stage in command.stages if stage in LAST_FILES][1:]:
+            forget(out / stage, stage)
     _run_stages(command, out, roles)
     page = report.write(out)
     print(f"\n{command.out}: {(time.monotonic() - started) / 60:.0f} minutes")
@@ -153,7 +156,7 @@ def _run_stages(command: All, out: Path, roles: tuple[str, ...]) -> None:
 
     Where one fails, the page of those before it is written.
     """
-    plan = _plan(command, out, command.recording or _recordings(out), roles)
+    plan = _plan(command, out, command.recording or kept_at(out), roles)
     if _records(command):
         plan = {"record": lambda: _record(command), **plan}
     for number, (stage, run_stage) in enumerate(plan.items(), 1):
@@ -243,8 +246,7 @@ def _plan(
 
     def search() -> None:
         # A log in blocks of time has no confirming recording, and its base fit needs no start.
-        known = "confirm" in roles and (out / "identify" / "fit.json").is_file()
-        fit = out / "identify" if known else None
+        fit = out / "identify" if "confirm" in roles and _fitted(out / "identify", command, recordings) else None
         scale = command.effect_scale
         _stage(gap.run, gap.Gap(recordings, fit, presets.identify, effect_scale=scale, out=out / "gap", **board, **own))
 
@@ -258,10 +260,23 @@ def _plan(
     return {stage: plan[stage] for stage in command.stages}
 
 
+def _fitted(folder: Path, command: All, recordings: Sequence[Path]) -> bool:
+    """Whether a folder of `identify` holds the fit of these recordings: made just now, or earlier of the same."""
+    from droid_jax.commands.scenes import recording_at
+
+    if not (folder / "fit.json").is_file() or unfinished(folder):
+        return False
+    if "identify" in command.stages:
+        return True
+    made = setup(folder)
+    hashes = made.get("recordings_sha256", [])
+    same_scene = made.get("scene") == (None if command.scene is None else str(command.scene))
+    return bool(hashes) and same_scene and [recording_at(p).sha256 for p in recordings[: len(hashes)]] == hashes
+
+
 def told(out: Path) -> list[str]:
     """One line for each stage that has a result."""
     from droid_jax.report.gap_words import readable
-    from droid_jax.report.page import hidden_in
     from droid_jax.report.words import hidden_words, judged, percent
 
     lines, old = [], left_over(out)
@@ -273,10 +288,10 @@ def told(out: Path) -> list[str]:
         lines.append(f"identify: torque distance {', '.join(gaps)}")
     if found := None if "gap" in old else _json(out / "gap" / "gap.json"):
         role, size = list(found["gaps"].items())[-1]
-        closed = size["closed"]
+        closed = size["closed"] if found["effects"] else None
         share = "" if closed is None else f"; {percent(closed)} of the gap U closed on the {role} motion"
         lines.append(f"gap: {readable(found['sentence'], found).rstrip('.')}{share}")
-        if found["setup"].get("stand_in") and (hidden := hidden_words(hidden_in(out))):
+        if found["setup"].get("stand_in") and (hidden := hidden_words(found["setup"].get("robot", {}).get("hide", ()))):
             lines.append(f"hidden in the stand-in robot: {hidden}")
     for name, of in {} if "train" in old else (_json(out / "train" / TRANSFER) or {}).items():
         if name in ("simulation", "stand_in"):
@@ -284,11 +299,6 @@ def told(out: Path) -> list[str]:
             where = {"simulation": "in simulation", "stand_in": "on the stand-in robot"}[name]
             lines.append(f"policy: {percent(of['success_rate'])} success {where} ({percent(low)} to {percent(high)})")
     return lines
-
-
-def _recordings(out: Path) -> tuple[Path, ...]:
-    """Files of the stand-in robot's motions: fit, confirm, sealed."""
-    return tuple(out / "recordings" / f"{name}.npz" for name in DEMONSTRATIONS.values())
 
 
 def _record(command: All) -> None:
@@ -304,10 +314,15 @@ def _record(command: All) -> None:
 
 
 def _stage(run_stage: Callable[[Any], None], command: Any) -> None:
-    """Run a stage, anew where its folder holds a run with other inputs."""
+    """Run a stage, anew where its folder holds a run with other inputs.
+
+    Raises OtherRun where it was asked for something else: that may have taken hours.
+    """
     try:
         run_stage(command)
     except OtherRun as other:
+        if not other.inputs:
+            raise
         print(f"{other.what}: it is run again")
         run_stage(replace(command, again=True))
 

@@ -123,6 +123,11 @@ class Gap:
         """Whether the run says that its torques come from a stand-in robot: no recording was given to it."""
         return self.found["setup"].get("stand_in", self.found["setup"].get("recording") == [])
 
+    @property
+    def hidden(self) -> list[str]:
+        """What the stand-in robot hid that was searched: "name=amplitude" each; empty where nothing is known of it."""
+        return self.found["setup"].get("robot", {}).get("hide", []) if self.stand_in else []
+
     def recording(self, role: str) -> str:
         """Name of the recording in a role."""
         return self.found["gaps"][role]["recording"]

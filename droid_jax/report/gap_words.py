@@ -69,7 +69,7 @@ def gap_summary(gap: Gap) -> list[str]:
 
 def settings(gap: Gap) -> list[str]:
     """What was asked for, one text per setting; what only tells a run that goes on from another stays in its file."""
-    out, untold = [], ("command", "start", "stand_in")
+    out, untold = [], ("command", "start", "stand_in", "robot")
     for name, value in gap.found["setup"].items():
         if value not in (None, [], "") and name not in untold and not name.endswith("_sha256"):
             words = ", ".join(map(str, value)) if isinstance(value, list) else str(value)

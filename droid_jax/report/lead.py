@@ -26,7 +26,7 @@ def lead(run: Run | None, gap: Gap | None, policy: Trained | None, hidden: str =
         following = summary(run, gap is not None)[-1]
     if gap:
         sentences += [readable(gap.found["sentence"], gap.found), *_closed(gap)]
-        sentences += [f"What the stand-in robot hid: {hidden}."] if hidden and gap.stand_in else []
+        sentences += [f"What the stand-in robot hid: {hidden}."] if hidden else []
         following = gap_summary(gap)[-1]
         if run and far_off(run.fit):
             following = following.replace("Next: ", f"Next: {DOUBT}; then ", 1)

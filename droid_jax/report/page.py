@@ -22,7 +22,7 @@ from markupsafe import Markup
 
 from droid_jax.report.drawings import draw, frame_rows
 from droid_jax.report.export import data_uri
-from droid_jax.report.files import FITTED, LAST_FILES, POLICY, STAND_IN, TRAINING, TRANSFER
+from droid_jax.report.files import FITTED, LAST_FILES, POLICY, TRAINING, TRANSFER
 from droid_jax.report.gap_drawings import draw_gap
 from droid_jax.report.gap_folder import Gap, has_gap, read_gap
 from droid_jax.report.gap_tables import groups
@@ -41,7 +41,6 @@ from droid_jax.report.lead import lead
 from droid_jax.report.policy_drawings import draw_policy, film_row
 from droid_jax.report.policy_folder import Trained, has_policy, read_policy
 from droid_jax.report.policy_words import policy_summary
-from droid_jax.report.reading import Reader
 from droid_jax.report.run_folder import Run, has_run, read_run
 from droid_jax.report.stages import left_over, needs_whole
 from droid_jax.report.words import grouped, hidden_words, judged, label, like, number, percent, speaker, summary
@@ -114,16 +113,6 @@ def write_report(run: Path) -> Path:
     return path
 
 
-def hidden_in(folder: Path) -> list[str]:
-    """What the stand-in robot hid that was recorded into a run's folder: "name=amplitude" each."""
-    path, read = folder / "recordings" / STAND_IN, Reader("all")
-    if not path.is_file():
-        return []
-    known = read.json(path)
-    read.need(known, ("hide",), STAND_IN)
-    return known["hide"]
-
-
 def _part(places: Sequence[Path], has: Callable[[Path], bool]) -> Path | None:
     """Where a part of the page is: in the run's folder, or in that of one of its stages."""
     return next((at for at in places if has(at)), None)
@@ -149,7 +138,7 @@ def _together(folder: Path, run: Run | None, gap: Gap | None, policy: Trained | 
     return {
         "title": f"Report: {name}",
         "heading": f"Report: {scene or name}",
-        "lead": lead(run, gap, policy, hidden_words(hidden_in(folder))),
+        "lead": lead(run, gap, policy, hidden_words(gap.hidden if gap else ())),
     }
 
 

@@ -28,15 +28,18 @@ def learning(history: Sequence[Mapping[str, Any]], width: float = WIDE) -> Figur
 
 @styled
 def angles(trials: Mapping[str, Mapping[str, Any]], opened: float, width: float = WIDE) -> Figure:
-    """Histogram of the largest angle of each trial, by where it took place; opened: degrees that success asks for."""
+    """Histogram of the largest angle of each trial that counts, by where it took place.
+
+    opened: degrees that success asks for.
+    """
     figure = Figure(figsize=(width, 2.7), layout="constrained")
     axes = figure.add_subplot()
-    widest = max(max(found["angle_deg"]["all"]) for found in trials.values())
+    widest = max(max(found["angles"], default=0.0) for found in trials.values())
     bins = np.arange(0.0, max(widest, opened) + 4.0, 2.0).tolist()
     axes.hist(  # beside each other: over each other they would make a third colour
-        [found["angle_deg"]["all"] for found in trials.values()],
+        [found["angles"] for found in trials.values()],
         bins,
-        weights=[np.full(found["trials"], 100.0 / found["trials"]) for found in trials.values()],
+        weights=[np.full(len(found["angles"]), 100.0 / max(len(found["angles"]), 1)) for found in trials.values()],
         color=[COLOURS[where] for where in trials],
         label=list(trials),
     )

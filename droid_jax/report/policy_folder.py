@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from droid_jax.policy.trials import BLOWN_UP
 from droid_jax.report.files import FILMS, TRAINING, TRANSFER
 from droid_jax.report.reading import Reader
 
@@ -42,16 +43,23 @@ class Trained:
 
     @property
     def trials(self) -> dict[str, Mapping[str, Any]]:
-        """Where the policy was tried -> what came of it."""
+        """Where the policy was tried -> what came of it; `counted` and `angles` without trials that blew up."""
         if self.transfer is None:
             return {}
-        return {"simulation": self.transfer["simulation"], "stand-in robot": self.transfer["stand_in"]}
+        places = {"simulation": "simulation", "stand-in robot": "stand_in"}
+        return {where: _without_blown_up(self.transfer[name]) for where, name in places.items()}
 
     @property
     def no_films(self) -> str:
         """Why there are no films of the trials."""
         why = (self.transfer or {}).get("no_films") or "none are there"
         return f"No films: {why}."
+
+
+def _without_blown_up(found: Mapping[str, Any]) -> dict[str, Any]:
+    each = found.get("stopped_each", [""] * found["trials"])
+    angles = [a for a, why in zip(found["angle_deg"]["all"], each, strict=True) if why != BLOWN_UP]
+    return {**found, "counted": found["trials"] - found["stopped"].get(BLOWN_UP, 0), "angles": angles}
 
 
 def has_policy(folder: Path) -> bool:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.policy.trials import BLOWN_UP, LEARNED
+from droid_jax.policy.trials import LEARNED
 from droid_jax.report.policy_folder import Trained
 from droid_jax.report.words import label, listed, number, percent
 
@@ -57,11 +57,10 @@ def _with(effects: list[str]) -> str:
 def _tried(where: str, found: Mapping[str, Any], task: Mapping[str, Any]) -> str:
     low, high = found["interval_95"]
     place = {"simulation": "In the simulation", "stand-in robot": "On the stand-in robot"}[where]
-    counted = found["trials"] - found["stopped"].get(BLOWN_UP, 0)
     stopped = "; ".join(f"{count} stopped: {why}" for why, count in found["stopped"].items())
     return (
         f"{place} it held the door open for {number(task['held'], 2)} s at {np.rad2deg(task['opened']):.0f} degrees "
-        f"or more, knob in hand, in {percent(found['success_rate'])} of {counted} trials (95 % interval "
+        f"or more, knob in hand, in {percent(found['success_rate'])} of {found['counted']} trials (95 % interval "
         f"{percent(low)} to {percent(high)}); it opened to {found['angle_deg']['mean']:.1f} ± "
         f"{found['angle_deg']['std']:.1f} degrees{'; ' + stopped if stopped else ''}."
     )

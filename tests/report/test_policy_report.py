@@ -108,6 +108,7 @@ def test_trials_that_blew_up_are_said_and_not_counted() -> None:
     angle = {"mean": 40.0, "std": 1.0}
     found = {
         "trials": 10,
+        "counted": 8,
         "stopped": {BLOWN_UP: 2},
         "interval_95": [0.68, 1.0],
         "success_rate": 1.0,
@@ -115,6 +116,19 @@ def test_trials_that_blew_up_are_said_and_not_counted() -> None:
     }
     said = policy_words._tried("simulation", found, {"held": 0.5, "opened": 0.52})
     assert "in 100 % of 8 trials" in said and f"2 stopped: {BLOWN_UP}" in said
+
+
+def test_trials_that_blew_up_are_in_no_figure_of_the_page(tmp_path: Path) -> None:
+    made = make_policy(tmp_path / "run")
+    transfer = json.loads((made / "transfer.json").read_text())
+    robot = transfer["stand_in"]
+    each = [BLOWN_UP, BLOWN_UP, *[""] * (robot["trials"] - 2)]
+    robot |= {"stopped": {BLOWN_UP: 2}, "stopped_each": each}
+    (made / "transfer.json").write_text(json.dumps(transfer))
+    found = read_policy(made).trials["stand-in robot"]
+    assert found["counted"] == robot["trials"] - 2 and found["angles"] == robot["angle_deg"]["all"][2:]
+    html = page.write_report(made).read_text()
+    assert f'<td data-label="Trials">{robot["trials"] - 2}</td>' in html
 
 
 def test_the_page_says_why_there_are_no_films(tmp_path: Path):

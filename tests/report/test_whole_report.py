@@ -53,11 +53,11 @@ def test_what_the_stand_in_robot_hid_is_said_in_the_librarys_words_too(tmp_path:
 
     assert "hid" not in lead()
     (tmp_path / "recordings").mkdir()
-    (tmp_path / "recordings" / "stand_in.json").write_text('{"hide": ["magnetic_catch=1.5", "detent=0.5"]}')
+    (tmp_path / "recordings" / "stand_in.json").write_text('{"hide": ["closer=2"]}')
     assert "hid" not in lead()  # a robot's own recordings were searched, and the stand-in's lie beside them
     path = tmp_path / "gap" / "gap.json"
     searched = json.loads(path.read_text())
-    searched["setup"]["stand_in"] = True
+    searched["setup"] |= {"stand_in": True, "robot": {"hide": ["magnetic_catch=1.5", "detent=0.5"]}}
     path.write_text(json.dumps(searched))
     assert (
         "What the stand-in robot hid: magnetic catch (1.5 N m; in the library: latch) and detent (0.5 N m; the library "
