@@ -228,11 +228,12 @@ class Along:
     """
 
     compiled: Callable[..., Rollout]
+    scene: Scene
     motion: Motion
     torques: Callable[[Path], jax.Array]
 
     def __call__(self, values: np.ndarray) -> Rollout:
-        return self.compiled(values, path_of(self.motion))
+        return self.compiled(values, path_of(self.scene, self.motion))
 
 
 def _along(replay: Callable[[np.ndarray], Rollout], follows: Drive | Motion) -> Callable[[np.ndarray], Rollout]:
@@ -260,7 +261,8 @@ def _apart(along: Along, scene: Scene, recording: Recording, config: CompareConf
         measured_motion(recording.repeats_subset([n]), along.motion.joints, cutoff=config.motion_cutoff)
         for n in range(recording.repeats)
     ]
-    torques = np.asarray(along.torques(jax.tree.map(lambda *a: jnp.stack(a), *map(path_of, motions))), np.float64)
+    paths = [path_of(scene, motion) for motion in motions]
+    torques = np.asarray(along.torques(jax.tree.map(lambda *a: jnp.stack(a), *paths)), np.float64)
     return torques - torques.mean(axis=0)
 
 
@@ -314,6 +316,7 @@ def _engine(
         means = jnp.asarray(space.mean, jnp.float32)
         return Along(
             over_block(lambda values, path: along(make_physics(scene, space, values), path)),
+            scene,
             drive,
             _compiled(lambda path: along(make_physics(scene, space, means), path).torque),
         )

@@ -28,39 +28,53 @@ def prescribed(scene: Scene, recording: Recording) -> tuple[str, ...]:
     """The joints whose measured motion a replay follows: the scene's, then all others that the log holds throughout.
 
     Torques are compared of the scene's joints alone, but what else moved carries them, or is carried.  All other joints
-    stand still as in the scene; one that carries a measured joint is warned of.
+    stand still, where the recording states it (qpos0) or else as in the scene; one that carries a measured joint and is
+    not stated is warned of.
+    Raises ValueError where a joint of several degrees carries a measured one: a log does not tell how it moves.
     """
+    floating = scene.floating(scene.joints)
+    if floating:
+        raise ValueError(
+            f"recording {recording.name!r} holds no commands, and {', '.join(floating)} of scene {scene.name!r}, of "
+            "several degrees, carries measured joints: how it moves is not in the log, nor what holds it; take it out "
+            "of the MJCF where the robot is bolted down"
+        )
     channel = recording.channel("position")
     whole = {j for i, j in enumerate(channel.columns) if channel.mask[:, :, i].any(axis=0).all()}
     others = [j for j in scene.single_joints if j in whole and j not in scene.joints]
     joints = (*scene.joints, *others)
-    still = [j for j in scene.carriers(scene.joints) if j not in joints]
+    still = [j for j in scene.carriers(scene.joints) if j not in joints and j not in recording.qpos0]
     if still:
         warnings.warn(
             f"recording {recording.name!r} does not hold the positions of {', '.join(still)} throughout, which carry "
-            "measured joints: they are taken to stand still as in the scene",
+            "measured joints: they are taken to stand still as in the scene (state where in qpos0)",
             stacklevel=3,
         )
     return joints
 
 
 class Path(NamedTuple):
-    """The arrays of a motion, single precision: [T] s, and [T, J] rad, rad/s, rad/s^2 (m for slides)."""
+    """The arrays of a motion, single precision: [T] s, [T, J] rad, rad/s, rad/s^2 (m for slides).
+
+    rest: [nq] where all joints that do not move stand.
+    """
 
     time: jax.Array
     position: jax.Array
     velocity: jax.Array
     acceleration: jax.Array
+    rest: jax.Array
 
 
-def path_of(motion: Motion) -> Path:
-    """What a compiled replay is given of a motion."""
-    return Path(*(jnp.asarray(getattr(motion, name), jnp.float32) for name in Path._fields))
+def path_of(scene: Scene, motion: Motion) -> Path:
+    """What a compiled replay is given of a motion; ValueError where it states a joint that the scene has not."""
+    arrays = (motion.time, motion.position, motion.velocity, motion.acceleration, scene.initial_qpos(motion.others))
+    return Path(*(jnp.asarray(a, jnp.float32) for a in arrays))
 
 
 def inverse_replay(scene: Scene, motion: Motion, effects: Sequence[Effect] = ()) -> Replay:
     """Torques of one prescribed motion; see `path_replay`."""
-    replay, path = path_replay(scene, motion.torque, effects, motion.joints), path_of(motion)
+    replay, path = path_replay(scene, motion.torque, effects, motion.joints), path_of(scene, motion)
     return lambda physics: replay(physics, path)
 
 
@@ -86,7 +100,6 @@ def path_replay(
     joints = joints or scene.joints
     dofs, positions = np.array([scene.dof(j) for j in joints]), np.array([scene.qpos(j) for j in joints])
     compensated = 1.0 - scene.model.jnt_actgravcomp[scene.model.dof_jntid]
-    base = jnp.asarray(scene.model.qpos0, jnp.float32)
     motor = convention.side is TorqueSide.MOTOR
 
     def replay(physics: Physics, path: Path) -> Rollout:
@@ -99,7 +112,7 @@ def path_replay(
         def at(time, position, velocity, acceleration):
             full = jnp.zeros(scene.model.nv, jnp.float32)
             velocity = full.at[dofs].set(velocity)
-            data = mjx.make_data(link_model).replace(qpos=base.at[positions].set(position), qvel=velocity)
+            data = mjx.make_data(link_model).replace(qpos=path.rest.at[positions].set(position), qvel=velocity)
             data = mjx.fwd_velocity(link_model, mjx.fwd_position(link_model, data))
             torque = mjx.full_m(link_model, data) @ full.at[dofs].set(acceleration) + data.qfrc_bias
             torque = torque - (data.qfrc_passive - compensated * data.qfrc_gravcomp)
@@ -109,7 +122,7 @@ def path_replay(
             own = model.dof_frictionloss if motor else _behind_the_sensor(scene, theta)
             return (torque + _resistance(theta, state, own, effects))[scene.joint_dofs]
 
-        torque = jax.vmap(at)(*path)
+        torque = jax.vmap(at)(*path[:-1])
         hinge = joints.index(scene.object_joint) if scene.object_joint in joints else None
         rollout = Rollout(
             time=path.time,

@@ -76,7 +76,7 @@ def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True) -> Dri
     sent = np.flatnonzero(columns >= 0)
     for actuator in sent:
         command[:, actuator] = np.interp(clock, recording.time, recording.command[:, columns[actuator]])
-    stiffness = scene.model.actuator_gainprm[:, 0].copy()
+    stiffness = scene.model.actuator_gainprm[:, 0] * scene.model.actuator_gear[:, 0] ** 2
     if gains is not None:
         stiffness[sent] = np.asarray(gains.stiffness, dtype=float)[columns[sent]]
     if weigh:
@@ -107,7 +107,7 @@ def check_gains(scene: Scene, drive: Drive) -> None:
     """Raise ValueError where the recording states servo gains that the scene does not have."""
     if drive.stiffness is None:
         return
-    own = scene.model.actuator_gainprm[:, 0]
+    own = scene.model.actuator_gainprm[:, 0] * scene.model.actuator_gear[:, 0] ** 2  # at the joint
     for name, stated, has in zip(scene.command_names, drive.stiffness, own, strict=True):
         if not np.isclose(stated, has, rtol=1e-3):
             raise ValueError(

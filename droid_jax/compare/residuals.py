@@ -7,6 +7,7 @@ residuals, in units of the noise of the repeats' mean.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -17,7 +18,7 @@ import numpy as np
 from scipy import sparse
 
 from droid_jax.measure.motion import CUTOFF
-from droid_jax.measure.noise import Noise, coarse_clock, discrepancy, estimate_noise, lowpass, smooth
+from droid_jax.measure.noise import RATE, Noise, coarse_clock, discrepancy, estimate_noise, lowpass, smooth
 from droid_jax.measure.recording import Channel, Phase, Recording
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Rollout
@@ -275,6 +276,7 @@ def _measure(scene: Scene, channel: Channel, clock: np.ndarray, weight: float, a
         )
     time, values, mask = channel.time[inside], channel.values[:, inside], channel.mask[:, inside]
     coarse = coarse_clock(float(time[0]), float(time[-1]))
+    _needs_memory(channel, len(clock), len(coarse))
     kernel = lowpass(time, coarse)
     resampling = _resampling(clock, time)
     off = 0.0 if apart is None else np.stack([resampling @ a[:, columns] for a in apart])
@@ -297,6 +299,21 @@ def _measure(scene: Scene, channel: Channel, clock: np.ndarray, weight: float, a
     )
 
 
+def _needs_memory(channel: Channel, steps: int, instants: int) -> None:
+    """Raise ValueError where filter and covariance, which grow with the square of the duration, fill the memory."""
+    filters = 1 if channel.mask.all() or np.all(channel.mask == channel.mask[..., :1]) else len(channel.columns)
+    needed = 8.0 * instants * (filters * steps + len(channel.columns) * instants)
+    if not hasattr(os, "sysconf"):  # elsewhere than on Linux and macOS
+        return
+    there = float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
+    if 2.0 * needed > there:  # what computes with them needs as much again
+        raise ValueError(
+            f"channel {channel.name!r} of {instants / RATE:.0f} s needs {needed / 1e9:.1f} GB for its filter and the "
+            f"covariance of its noise, and half of this machine's memory is {there / 2e9:.1f} GB: cut the recording "
+            "(`python -m droid_jax.run convert --start S --end S`), or fit its parts as several"
+        )
+
+
 def _resampling(clock: np.ndarray, time: np.ndarray) -> sparse.csr_array:
     """[Tc, T] linear interpolation from the replay's clock to a channel's."""
     at = np.clip((time - clock[0]) / (clock[1] - clock[0]), 0, len(clock) - 1)
@@ -315,7 +332,9 @@ def _same_filter(
     """
     if mask.all():
         return (kernel @ resampling).toarray()[None]
-    columns = zip(mask.transpose(2, 0, 1), kept.transpose(2, 0, 1), strict=True)
+    columns = list(zip(mask.transpose(2, 0, 1), kept.transpose(2, 0, 1), strict=True))
+    if all(np.array_equal(m, columns[0][0]) and np.array_equal(k, columns[0][1]) for m, k in columns):
+        columns = columns[:1]  # a log that was silent for a while was so in all of them
     return np.stack([(_mean_filter(kernel, *column) @ resampling).toarray() for column in columns])
 
 

@@ -4,13 +4,14 @@ that its torque holds."""
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from typing import Any
 
 import mujoco
 import numpy as np
 
 from droid_jax.measure.recording import Channel, Recording
-from droid_jax.model.scene import Scene, drives_joint
+from droid_jax.model.scene import Scene, has_feedback
 
 AJAR = 0.02  # rad or m: an object seen no further than this from the scene's pose stands there, as cameras are noisy
 WEIGHT = 0.01  # N m or N: a joint that feels less uncompensated weight feels none (noise below it is never believed)
@@ -23,7 +24,8 @@ TURNS = 4  # from its zero, that a hinge without a range is believed to make; de
 def start_pose(scene: Scene, recording: Recording) -> np.ndarray:
     """[nq] where the motion starts: as stated (qpos0), else as measured, else where its servos were sent first.
 
-    Joints that nobody commanded or measured stand as in the scene.
+    Of joints that nobody commanded or measured one that an equality couples to another starts where that has it, all
+    others stand as in the scene.
     Raises ValueError for a joint that has or needs a command and of which nothing says where it starts.
     """
     sent = {joint: path[0] for joint, path in _sent(scene, recording).items()}
@@ -35,7 +37,28 @@ def start_pose(scene: Scene, recording: Recording) -> np.ndarray:
             f"recording {recording.name!r} does not tell where {', '.join(guessed)} starts: state it in qpos0 "
             "or measure its position"
         )
-    return scene.initial_qpos(told)
+    return _coupled(scene, told)
+
+
+def _coupled(scene: Scene, told: Mapping[str, float]) -> np.ndarray:
+    """[nq] the scene's pose with these joints in it, and those that equalities couple to them where these have them.
+
+    q1 - q1_0 = polynomial of q2 - q2_0 (MuJoCo's <equality><joint>); from q1 to q2 where the polynomial is a line.
+    """
+    model, known = scene.model, {scene.qpos(joint): q for joint, q in told.items()}
+    qpos = scene.initial_qpos(told)
+    couplings = np.flatnonzero((model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & model.eq_active0 & (model.eq_obj2id >= 0))
+    for _ in couplings:  # in a chain each needs the one before
+        for e in couplings:
+            first, second = (int(model.jnt_qposadr[i[e]]) for i in (model.eq_obj1id, model.eq_obj2id))
+            c = model.eq_data[e, :5]
+            if second in known and first not in known:
+                known[first] = model.qpos0[first] + float(np.polyval(c[::-1], known[second] - model.qpos0[second]))
+            elif first in known and second not in known and c[1] != 0 and not c[2:].any():
+                known[second] = model.qpos0[second] + (known[first] - model.qpos0[first] - c[0]) / c[1]
+    for address, q in known.items():
+        qpos[address] = q
+    return qpos
 
 
 def check_weight(scene: Scene, recording: Recording, qpos0: np.ndarray) -> None:
@@ -76,8 +99,10 @@ def warn_if_moving(recording: Recording) -> None:
 
 
 def command_notes(scene: Scene, recording: Recording) -> list[str]:
-    """What is to be known of the commands: a <motor> that takes radians for torques, actuators that got none."""
-    return [text for text in (open_loop(scene, recording), left_alone(scene, recording)) if text]
+    """What is to be known of the commands: a <motor> that takes radians for torques, geared servos, actuators that got
+    none."""
+    said = (open_loop(scene, recording), geared(scene, recording), left_alone(scene, recording))
+    return [text for text in said if text]
 
 
 def warn_of_commands(scene: Scene, recording: Recording) -> None:
@@ -88,7 +113,7 @@ def warn_of_commands(scene: Scene, recording: Recording) -> None:
 
 def open_loop(scene: Scene, recording: Recording) -> str:
     """What is to be known where the recording's commands drive actuators without position feedback; else empty."""
-    open_ones = np.flatnonzero(~_feedback(scene.model) & drives_joint(scene.model))
+    open_ones = np.flatnonzero(~has_feedback(scene.model) & scene.of_joint)
     joints = [scene.command_names[u] for u in open_ones if scene.command_names[u] in recording.command_names]
     if not joints or not recording.command.size:
         return ""
@@ -96,6 +121,19 @@ def open_loop(scene: Scene, recording: Recording) -> str:
         f"the actuators of {', '.join(joints)} have no position feedback: the commands of recording "
         f"{recording.name!r} are taken as their torques (or forces, or speeds); for position commands use "
         "<position> servos"
+    )
+
+
+def geared(scene: Scene, recording: Recording) -> str:
+    """What is to be known where the recording's commands go to position servos with a gear; else empty."""
+    gear = scene.model.actuator_gear[:, 0]
+    servos = np.flatnonzero(has_feedback(scene.model) & scene.of_joint & (gear != 1.0))
+    joints = [scene.command_names[u] for u in servos if scene.command_names[u] in recording.command_names]
+    if not joints or not recording.command.size:
+        return ""
+    return (
+        f"the servos of {', '.join(joints)} have a gear: the commands of recording {recording.name!r} are taken as "
+        "MuJoCo's controls, which are the joint's position times the gear"
     )
 
 
@@ -109,7 +147,7 @@ def holding(scene: Scene, qpos0: np.ndarray) -> np.ndarray:
     data.qpos[:] = qpos0
     mujoco.mj_fwdPosition(model, data)
     gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm
-    held = _feedback(model) & (gain != 0)
+    held = has_feedback(model) & (gain != 0)
     control = np.where(held, -(bias[:, 0] + bias[:, 1] * data.actuator_length) / np.where(held, gain, 1.0), 0.0)
     low, high = model.actuator_ctrlrange.T
     return np.where(model.actuator_ctrllimited, np.clip(control, low, high), control)
@@ -121,7 +159,7 @@ def left_alone(scene: Scene, recording: Recording) -> str:
         return ""
     left = [
         (n, f)
-        for n, f in zip(scene.command_names, _feedback(scene.model), strict=True)
+        for n, f in zip(scene.command_names, has_feedback(scene.model), strict=True)
         if n not in recording.command_names
     ]
     said = {
@@ -130,11 +168,6 @@ def left_alone(scene: Scene, recording: Recording) -> str:
     }
     told = "; ".join(f"{', '.join(names)} {what}" for what, names in said.items() if names)
     return f"recording {recording.name!r} has not all commands: {told}" if told else ""
-
-
-def _feedback(model: mujoco.MjModel) -> np.ndarray:
-    """[U] bool, actuators whose force follows their own position, as a position servo's does."""
-    return (model.actuator_biastype != mujoco.mjtBias.mjBIAS_NONE) & (model.actuator_biasprm[:, 1] != 0)
 
 
 def _moves(begin: float, channel: Channel, column: int) -> bool:
@@ -223,7 +256,7 @@ def _sent(scene: Scene, recording: Recording) -> dict[str, np.ndarray]:
     kp, position_gain, gear = model.actuator_gainprm[:, 0], model.actuator_biasprm[:, 1], model.actuator_gear[:, 0]
     servos = np.flatnonzero((kp != 0) & (position_gain == -kp))
     columns = scene.command_index(recording.command_names)
-    sent = [u for u in servos if drives_joint(model)[u] and columns[u] >= 0]
+    sent = [u for u in servos if scene.of_joint[u] and columns[u] >= 0]
     return {scene.command_names[u]: recording.command[:, columns[u]] / gear[u] for u in sent}
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy import interpolate, signal
@@ -22,7 +22,7 @@ class Motion:
     """A measured motion of some joints, for the inverse mode.
 
     joints: J names.  time: [T] s, regular.  position, velocity, acceleration: [T, J] rad, rad/s, rad/s^2 (m for
-    slides).  torque: convention of the measured torque.
+    slides).  torque: convention of the measured torque.  others: joints that stand still -> where, as far as stated.
     """
 
     joints: tuple[str, ...]
@@ -31,6 +31,7 @@ class Motion:
     velocity: np.ndarray
     acceleration: np.ndarray
     torque: TorqueConvention
+    others: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def timestep(self) -> float:
@@ -42,8 +43,8 @@ def measured_motion(recording: Recording, joints: Sequence[str], *, cutoff: floa
     """The motion of `joints` in a recording: the mean of the repeats' positions, smoothed and differentiated.
 
     A repeat that was not measured for a while keeps its distance from the others there (see `_common`).
-    The position passes a zero-phase Butterworth filter of order 4 at `cutoff` Hz, then central
-    differences at the log's own rate; measured velocities are not used.  EDGE s at both ends are left out.
+    The position passes a zero-phase Butterworth filter of order 4 at `cutoff` Hz; velocity and acceleration are those
+    of the quintic spline through it; measured velocities are not used.  EDGE s at both ends are left out.
     A clock that jitters is made regular first, along a cubic spline.
     Raises ValueError where a joint's position was not measured throughout, the log is too slow for
     the cutoff (in one long step too), or too short.
@@ -74,10 +75,10 @@ def measured_motion(recording: Recording, joints: Sequence[str], *, cutoff: floa
     even = np.linspace(channel.time[0], channel.time[-1], len(channel.time))
     clock = _inner_clock(recording.name, channel.time, OVERSAMPLING * cutoff)
     q = signal.sosfiltfilt(signal.butter(4, cutoff, fs=rate, output="sos"), position, axis=0)
-    qd = np.gradient(q, 1 / rate, axis=0)
-    qdd = np.gradient(qd, 1 / rate, axis=0)
-    rows = (np.stack([np.interp(clock, even, c) for c in a.T], axis=1) for a in (q, qd, qdd))
-    return Motion(tuple(joints), clock, *rows, torque=recording.torque)
+    path = interpolate.make_interp_spline(even, q, k=5)  # differences lose 3 to 15 % of a fast motion in a slow log
+    rows = (path(clock), path.derivative(1)(clock), path.derivative(2)(clock))
+    others = {joint: q for joint, q in recording.qpos0.items() if joint not in joints}
+    return Motion(tuple(joints), clock, *rows, torque=recording.torque, others=others)
 
 
 def _common(values: np.ndarray, mask: np.ndarray) -> np.ndarray:

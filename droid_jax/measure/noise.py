@@ -19,6 +19,8 @@ RATE = 20.0  # Hz of the coarse clock
 # weights then depend on the mean that they weigh, and p-values of nothing are too small (tests/gap/test_null.py).
 LONGEST = 1.0  # s
 SHRINK = 0.1
+LEAST = 0.2  # of a window that must be measured: what is left is renormalised, and noise with it
+COARSEST = 0.9  # periods of the cutoff from one sample to the next; beyond, a window holds two of opposite signs
 # Repeats from which on what grows or fades steadily from one to the next (a sensor that warms up) is no noise.
 STEADY = 5
 
@@ -32,8 +34,9 @@ def lowpass(clock: np.ndarray, coarse: np.ndarray, cutoff: float = CUTOFF) -> sp
     """[K, T] matrix from samples at a growing `clock` to smoothed values at `coarse`, sparse: a window is short.
 
     A windowed sinc (Hann, 1.5 periods of the cutoff to each side), cut and renormalised at the
-    ends so that a constant stays that constant.  Source: windowed-sinc design, Oppenheim and
-    Schafer, ch. 7.
+    ends so that a constant stays that constant.  Where the clock is silent for so long that less than a fifth of the
+    window is left, the row is zero.  Source: windowed-sinc design, Oppenheim and Schafer, ch. 7.
+    Raises ValueError for a clock that is too coarse for the cutoff throughout.
     """
     half = 1.5 / cutoff
     first, last = np.searchsorted(clock, coarse - half), np.searchsorted(clock, coarse + half, side="right")
@@ -47,11 +50,11 @@ def lowpass(clock: np.ndarray, coarse: np.ndarray, cutoff: float = CUTOFF) -> sp
     shape = (len(coarse), len(clock))
     weights = sparse.csr_array((kernel * spacing[columns], columns, begins), shape=shape)
     total = weights.sum(axis=1)
-    if np.any(np.abs(total) < 1e-12):
-        raise ValueError(
-            f"a clock with steps of {np.median(np.diff(clock)):.3g} s is too coarse to be smoothed at {cutoff} Hz"
-        )
-    return sparse.diags_array(1.0 / total) @ weights
+    enough = total > LEAST / (2.0 * cutoff)  # of the whole window's area
+    usual = np.median(np.diff(clock)) if len(clock) > 1 else np.inf
+    if not enough.all() and usual > COARSEST / cutoff:
+        raise ValueError(f"a clock with steps of {usual:.3g} s is too coarse to be smoothed at {cutoff} Hz")
+    return sparse.diags_array(np.where(enough, 1.0 / np.where(enough, total, 1.0), 0.0)) @ weights
 
 
 def smooth(values: np.ndarray, mask: np.ndarray, kernel: sparse.csr_array) -> np.ndarray:
@@ -61,7 +64,7 @@ def smooth(values: np.ndarray, mask: np.ndarray, kernel: sparse.csr_array) -> np
     """
     top = np.stack([kernel @ np.where(seen, repeat, 0.0) for repeat, seen in zip(values, mask, strict=True)])
     weight = np.stack([kernel @ seen.astype(float) for seen in mask])
-    return np.where(np.abs(weight) > 0.2, top / np.where(weight == 0, 1, weight), np.nan)
+    return np.where(np.abs(weight) > LEAST, top / np.where(weight == 0, 1, weight), np.nan)
 
 
 @dataclass(frozen=True, eq=False)

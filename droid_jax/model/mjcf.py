@@ -36,6 +36,11 @@ _FOLLOWING = {"geom_rbound", "geom_aabb"}  # the compiler works them out
 WORDS = frozenset({*_ATTRIBUTES, *_WEIGHT, *_FOLLOWING})  # model fields that MJCF can say
 _ANGLES = {"jnt_range", "qpos_spring"}  # written in the compiler's unit
 _PLACE = {"body_pos", "body_quat"}  # written together
+# Compared with the model once more, a compiler may know more ways to work numbers out.
+_SURE = (
+    *("body_mass", "body_inertia", "jnt_stiffness", "dof_damping", "dof_frictionloss", "dof_armature"),
+    *("actuator_gainprm", "actuator_biasprm"),
+)
 _SHAPE = {"geom_pos", "geom_quat", "geom_size"}
 
 
@@ -57,13 +62,30 @@ def fitted_mjcf(scene: Scene, space: Space, values: np.ndarray, effects: Sequenc
     for kind, elements in _elements(spec, model).items():
         for row, element in elements.items():
             _write_changed(kind, element, row, scene.model, model)
+    _settle(spec, model)
     keep_inertia(spec, model)
     _locate_assets(spec)
     try:
-        compiled(spec)
+        written = compiled(spec)
     except ValueError as error:
         raise ValueError(f"the fitted values make no MJCF: {' '.join(str(error).split())}") from None
+    other = [f for f in _SURE if not np.allclose(getattr(written, f), getattr(model, f), rtol=1e-3, atol=1e-5)]
+    if other:
+        raise ValueError(f"the fitted values make no MJCF: MuJoCo works out another {', '.join(other)} from it")
     return _unwrapped(spec.to_xml())
+
+
+def _settle(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
+    """Say in numbers, as the model has them, what the compiler would work out anew from fitted masses."""
+    spec.compiler.boundmass, spec.compiler.boundinertia, spec.compiler.settotalmass = 0.0, 0.0, -1.0
+    for joint in spec.joints:
+        if np.all(np.asarray(joint.springdamper) > 0):
+            joint.springdamper = [0.0, 0.0]
+            _set(joint, "stiffness", model.jnt_stiffness[joint.id : joint.id + 1])
+            _set(joint, "damping", model.dof_damping[model.jnt_dofadr[joint.id] :][:1])
+    for actuator in spec.actuators:
+        if actuator.biastype == mujoco.mjtBias.mjBIAS_AFFINE and actuator.biasprm[2] > 0:  # a servo's dampratio
+            _set(actuator, "biasprm", model.actuator_biasprm[actuator.id])
 
 
 def native(

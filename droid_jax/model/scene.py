@@ -60,7 +60,8 @@ class Scene:
     spec:   the MjSpec, looks included; never changed after construction.
     model:  compiled without looks; what is replayed.
     joints: servo-driven joints whose torque and position are measured, in channel order [J].
-    command_names: joints of the actuators, in actuator order [U]; of one that drives a tendon its own name.
+    command_names: joints of the actuators, in actuator order [U]; of one that drives a tendon, or drives a joint beside
+      the joint's position servo, its own name.
     object_joint: joint of the thing that is moved (the door's hinge), or None.
     grip:   how a lost grasp is seen, or None where there is nothing to grip.
     """
@@ -112,14 +113,31 @@ class Scene:
         return tuple(name for name, kind in zip(names, kinds, strict=True) if kind in ONE_DEGREE and name)
 
     def carriers(self, joints: Iterable[str]) -> tuple[str, ...]:
-        """Joints of one degree between the world and the bodies that these joints move, these included."""
+        """Joints of one degree between the world and the bodies that these joints move, these included.
+
+        One without a name goes by its body's.
+        """
+        return tuple(self._called(j) for j in self._above(joints) if self._is_single(j))
+
+    def floating(self, joints: Iterable[str]) -> tuple[str, ...]:
+        """Joints of several degrees (free ones, balls) between the world and the bodies that these joints move."""
+        return tuple(self._called(j) for j in self._above(joints) if not self._is_single(j))
+
+    def _above(self, joints: Iterable[str]) -> list[int]:
         model, above = self.model, set[int]()
         for joint in joints:
             body = int(model.jnt_bodyid[self.id("joint", joint)])
             while body:
                 above.add(body)
                 body = int(model.body_parentid[body])
-        return tuple(j for j in self.single_joints if int(model.jnt_bodyid[self.id("joint", j)]) in above)
+        return [j for j in range(model.njnt) if int(model.jnt_bodyid[j]) in above]
+
+    def _is_single(self, joint: int) -> bool:
+        return mujoco.mjtJoint(self.model.jnt_type[joint]) in ONE_DEGREE
+
+    def _called(self, joint: int) -> str:
+        name = mujoco.mj_id2name(self.model, mujoco.mjtObj.mjOBJ_JOINT, joint)
+        return name or f"the joint of body {self.model.body(self.model.jnt_bodyid[joint]).name!r}"
 
     @functools.cached_property
     def finger_pairs(self) -> tuple[np.ndarray, ...]:
@@ -128,9 +146,14 @@ class Scene:
         return tuple(np.array([self.id("pair", p) for p in pairs], dtype=int) for pairs in fingers)
 
     @functools.cached_property
+    def of_joint(self) -> np.ndarray:
+        """[U] bool, whose entry of `command_names` is a joint."""
+        return _of_joint(self.model, self.command_names)
+
+    @functools.cached_property
     def driven_joints(self) -> tuple[str, ...]:
         """Joints that an actuator of their own drives, in actuator order."""
-        return _driven(self.model, self.command_names)
+        return tuple(name for name, of in zip(self.command_names, self.of_joint, strict=True) if of)
 
     @property
     def finger_joints(self) -> tuple[str, ...]:
@@ -341,11 +364,12 @@ def compile_scene(
     model = bare.compile()
     refuse_ignored(model, name)
     command_names = _command_names(model)
+    driven = tuple(n for n, of in zip(command_names, _of_joint(model, command_names), strict=True) if of)
     scene = Scene(
         name=name,
         spec=spec,
         model=model,
-        joints=tuple(joints) if joints is not None else tuple(dict.fromkeys(_driven(model, command_names))),
+        joints=tuple(joints) if joints is not None else driven,
         command_names=command_names,
         object_joint=object_joint,
         grip=grip,
@@ -364,20 +388,40 @@ def drives_joint(model: mujoco.MjModel) -> np.ndarray:
     return np.isin(model.actuator_trntype, kinds)
 
 
-def _driven(model: mujoco.MjModel, command_names: Sequence[str]) -> tuple[str, ...]:
-    """Those of `command_names` that are joints."""
-    return tuple(name for name, of_joint in zip(command_names, drives_joint(model), strict=True) if of_joint)
+def has_feedback(model: mujoco.MjModel) -> np.ndarray:
+    """[U] bool, actuators whose force follows their own position, as a position servo's does."""
+    return (model.actuator_biastype != mujoco.mjtBias.mjBIAS_NONE) & (model.actuator_biasprm[:, 1] != 0)
+
+
+def _of_joint(model: mujoco.MjModel, command_names: Sequence[str]) -> np.ndarray:
+    """[U] bool, those of `command_names` that are joints."""
+    joints = {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, i) for i in range(model.njnt)}
+    return np.array([name in joints for name in command_names], dtype=bool)
 
 
 def _command_names(model: mujoco.MjModel) -> tuple[str, ...]:
-    """[U] the joint that each actuator drives, or its own name where it drives none."""
-    names = []
-    for i, of_joint in enumerate(drives_joint(model)):
+    """[U] the joint that each actuator drives, or its own name where it drives none.
+
+    Of several that drive one joint (a position servo with its damping in a <velocity> of its own) the servo goes by the
+    joint's name, the others by their own.
+    """
+    joints = [int(j) if of else -1 for j, of in zip(model.actuator_trnid[:, 0], drives_joint(model), strict=True)]
+    feedback, names = has_feedback(model), list[str]()
+    for i, joint in enumerate(joints):
         own = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i)
-        if of_joint:
-            names.append(mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, int(model.actuator_trnid[i, 0])))
+        rivals = [k for k, other in enumerate(joints) if other == joint >= 0]
+        servos = [k for k in rivals if feedback[k]]
+        if joint >= 0 and (rivals == [i] or servos == [i]):
+            names.append(mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint))
+        elif len(rivals) > 1 and len(servos) != 1:
+            raise ValueError(
+                f"joint {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint)!r} has {len(rivals)} actuators, "
+                f"{len(servos)} of them with position feedback: it needs one <position> servo (kp and kv) that takes "
+                "its command"
+            )
         elif not own or mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, own) >= 0:
-            raise ValueError(f"actuator {own or i!r} drives no joint: give it a name that no joint has")
+            what = "has another one beside it" if joint >= 0 else "drives no joint"
+            raise ValueError(f"actuator {own or i!r} {what}: give it a name that no joint has")
         else:
             names.append(own)
     return tuple(names)

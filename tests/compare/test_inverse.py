@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from droid_jax import runtime
+from droid_jax.compare.cost import make_cost
 from droid_jax.compare.inverse import inverse_replay, prescribed
 from droid_jax.compare.replay import torque_offset_effect
 from droid_jax.measure.motion import Motion
@@ -204,3 +205,49 @@ def test_air_and_water_are_refused():
     scene = compile_scene(mujoco.MjSpec.from_string(xml), "pool")
     with pytest.raises(ValueError, match="a replay of scene 'pool' has no air or water"):
         inverse_replay(scene, motion(scene, MOTOR, False))
+
+
+LOCKED = """<mujoco><compiler angle="radian"/><worldbody>
+  <body><joint name="torso" axis="0 1 0"/><geom size=".1" pos="0 0 .3" mass="3"/>
+    <body pos="0 0 .4"><joint name="arm" axis="0 1 0"/>
+      <geom size=".05" pos="0 0 .3" mass="1"/></body></body></worldbody>
+  <actuator><position joint="arm" kp="9"/></actuator></mujoco>"""
+
+
+def standing(qpos0: dict[str, float]) -> Recording:
+    time = np.arange(0.0, 3.0, 0.005)
+    path = (0.3 * np.sin(2 * time))[None, :, None]
+    channels = {
+        name: Channel(name, unit, ("arm",), time, path, np.ones(path.shape, bool))
+        for name, unit in (("position", "rad"), ("torque", "N m"))
+    }
+    return Recording("log", np.zeros(0), np.zeros((0, 0)), (), channels, TorqueConvention(MOTOR, True), qpos0=qpos0)
+
+
+def test_a_joint_that_is_not_in_the_log_stands_where_it_is_stated():
+    """Else the weight is taken at another angle."""
+    scene = compile_scene(mujoco.MjSpec.from_string(LOCKED), "locked")
+    space = Space((joint_damping(scene, "arm", name="damping", std=0.1, high=5.0),))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        cost = make_cost(scene, space, [standing({"torso": 0.7})])
+    rollout = cost.rollouts(np.zeros((1, 1)))[0]
+    weight = -1.0 * 9.81 * 0.3 * np.sin(0.7 + np.asarray(rollout.position)[0, :, 0])
+    inertia = (0.3**2 + 0.4 * 0.05**2) * np.gradient(
+        np.gradient(np.asarray(rollout.position)[0, :, 0], rollout.time[0]), rollout.time[0]
+    )
+    np.testing.assert_allclose(np.asarray(rollout.torque)[0, 5:-5, 0], (weight + inertia)[5:-5], atol=0.01)
+    with pytest.warns(UserWarning, match="stand still as in the scene"):
+        make_cost(scene, space, [standing({})])
+    with pytest.raises(ValueError, match="unknown joint 'waist'"):
+        make_cost(scene, space, [standing({"torso": 0.7, "waist": 1.0})]).rollouts(np.zeros((1, 1)))
+
+
+def test_a_log_of_a_robot_that_floats_is_refused():
+    scene = compile_scene(
+        mujoco.MjSpec.from_string(LOCKED.replace('<joint name="torso" axis="0 1 0"/>', "<freejoint/>")), "walks"
+    )
+    with pytest.raises(
+        ValueError, match=r"the joint of body .* of scene 'walks', of several degrees, carries measured"
+    ):
+        prescribed(scene, standing({}))

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from droid_jax.compare import residuals
 from droid_jax.compare.residuals import CompareConfig, Comparison, make_comparison
 from droid_jax.measure.recording import Channel, Phase, Recording, TorqueConvention, TorqueSide
 from droid_jax.model.door_scene import door_scene
@@ -435,3 +436,26 @@ def test_an_angle_without_an_object_is_refused(scene: Scene):
     values = np.random.default_rng(0).normal(size=(2, STEPS, 1))
     with pytest.raises(ValueError, match="object_angle"):
         compare(scene, recording(channel("object_angle", CLOCK, values, ["hinge"])), channels={"object_angle": 1.0})
+
+
+def test_columns_that_were_silent_together_share_a_filter(scene: Scene):
+    values = np.stack([smooth_traces(3, 1)] * 3) + np.random.default_rng(0).normal(0, 0.05, (3, STEPS, 3))
+    mask = np.ones(values.shape, bool)
+    mask[1, 300:420] = False
+    together = make_comparison(
+        scene, recording(channel("torque", CLOCK, values, mask=mask)), CLOCK, CompareConfig()
+    ).channel("torque")
+    mask[1, 420, 0] = False  # and apart
+    apart = make_comparison(
+        scene, recording(channel("torque", CLOCK, values, mask=mask)), CLOCK, CompareConfig()
+    ).channel("torque")
+    assert len(together.kernel) == 1 and len(apart.kernel) == 3
+    np.testing.assert_allclose(apart.kernel[1], together.kernel[0], atol=1e-12)
+
+
+def test_a_recording_that_does_not_fit_into_memory_is_refused(scene: Scene, monkeypatch: pytest.MonkeyPatch):
+    given = recording(channel("torque", CLOCK, np.stack([smooth_traces(3, 1)] * 2)))
+    sizes = {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 100}
+    monkeypatch.setattr(residuals.os, "sysconf", sizes.__getitem__)
+    with pytest.raises(ValueError, match=r"'torque' of 2 s needs 0\.0 GB.*convert --start S --end S"):
+        make_comparison(scene, given, CLOCK, CompareConfig())

@@ -11,12 +11,12 @@ import pytest
 from two_link import ARM, JOINTS, arm, measured, motion, recording
 
 from droid_jax.compare.cost import _same, followed, make_cost
-from droid_jax.compare.replay import Drive, make_drive
+from droid_jax.compare.replay import Drive, check_gains, make_drive
 from droid_jax.compare.residuals import CompareConfig
-from droid_jax.compare.start import AJAR, check_range, open_loop
+from droid_jax.compare.start import AJAR, check_range, geared, open_loop
 from droid_jax.measure.demonstration import demonstration_path
 from droid_jax.measure.formats import load
-from droid_jax.measure.recording import Channel, Recording
+from droid_jax.measure.recording import Channel, Recording, ServoGains
 from droid_jax.model.door_scene import door_scene
 from droid_jax.model.fields import joint_damping
 from droid_jax.model.parameters import Parameter, Space
@@ -171,3 +171,44 @@ def test_repeats_serve_a_door_that_is_seen_just_ajar():
     assert shut.qpos0[door.qpos("hinge")] == 0.0 and ajar.qpos0[door.qpos("hinge")] > AJAR
     assert _same(door, shut, ajar) and _same(door, ajar, shut) and not _same(door, shut, open_)
     assert not _same(door, open_, seen(2 * AJAR + 0.015))  # neither is put back: these are two motions
+
+
+COUPLED = """<mujoco><worldbody><body><joint name="shoulder" axis="0 1 0"/><geom size=".1" pos="0 0 .2"/>
+  <body pos="0 0 .4"><joint name="elbow" axis="0 1 0"/><geom size=".1" pos="0 0 .2"/>
+    <body pos="0 0 .2"><joint name="mimic" axis="0 1 0" ref="0.1"/><geom size=".05" pos="0 0 .1"/></body>
+    <body pos="0 0 .3"><joint name="last" axis="0 1 0"/><geom size=".05" pos="0 0 .1"/></body></body></body></worldbody>
+  <equality><joint joint1="last" joint2="mimic" polycoef="0 2 1 0 0"/>
+    <joint joint1="{first}" joint2="{second}" polycoef="0.05 -2 0 0 0"/></equality>
+  <actuator><position joint="shoulder" kp="80" kv="5"/><position joint="elbow" kp="80" kv="5"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("driver", ["elbow", "mimic"])
+def test_a_joint_that_follows_another_starts_where_that_has_it(driver: str):
+    """Else the replay begins with a constraint that is broken, and yanks the joints together."""
+    first, second = ("mimic", "elbow") if driver == "elbow" else ("elbow", "mimic")
+    scene = compile_scene(
+        mujoco.MjSpec.from_string(COUPLED.format(first=first, second=second)), "coupled", joints=("shoulder", "elbow")
+    )
+    heavy = {"torque": replace(recording().torque, gravity=True), "gains": None}
+    model, data = scene.model, mujoco.MjData(scene.model)
+    data.qpos[:] = make_drive(scene, recording(qpos0={"shoulder": 0.2, "elbow": 0.4}, **heavy)).qpos0
+    mujoco.mj_fwdPosition(model, data)
+    rows = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+    assert rows.sum() == 2 and np.abs(data.efc_pos[rows]).max() < 1e-9
+    assert data.qpos[scene.qpos("elbow")] == 0.4 and abs(data.qpos[scene.qpos("mimic")]) > 0.1
+    stated = make_drive(scene, recording(qpos0={"shoulder": 0.2, "elbow": 0.4, "mimic": 0.3}, **heavy)).qpos0
+    assert stated[scene.qpos("mimic")] == 0.3  # what a recording says is not touched
+
+
+def test_a_servo_with_a_gear_is_sent_its_control_and_that_is_said():
+    spec = arm().spec.copy()
+    for actuator in spec.actuators:
+        actuator.gear[0] = 50.0
+    scene = compile_scene(spec, "geared", joints=JOINTS)
+    assert "the servos of elbow, shoulder have a gear" in geared(scene, recording())
+    assert not geared(arm(), recording())
+    kp = np.array([60.0, 25.0])
+    given = recording(gains=ServoGains(kp * 50.0**2, np.zeros(2)))  # N m/rad at the joint
+    check_gains(scene, make_drive(scene, given))
+    with pytest.raises(ValueError, match="the recording states a servo gain of"):
+        check_gains(scene, make_drive(scene, recording(gains=ServoGains(kp, np.zeros(2)))))

@@ -271,3 +271,26 @@ def test_what_warms_up_from_repeat_to_repeat_is_no_noise(repeats: int, forgiven:
     warming = calm + 0.5 * (np.arange(repeats) - (repeats - 1) / 2)[:, None, None]
     still, moving = (estimate_noise(r, minimum=1e-3).whitener[0] @ np.ones(200) for r in (calm, warming))
     assert bool(np.linalg.norm(moving) > 0.95 * np.linalg.norm(still)) is forgiven
+
+
+@pytest.mark.parametrize("gap", [0.05, 0.08, 0.12, 0.14, 0.16, 0.18, 0.5])
+def test_where_a_clock_is_silent_nothing_is_made_up(gap: float):
+    """A sinc's positive and negative parts nearly cancel over a gap: divided by what is left, noise becomes a spike."""
+    clock = CLOCK[(CLOCK < 3.0) | (3.0 + gap < CLOCK)]
+    rng = np.random.default_rng(3)
+    values = 10.0 + 0.05 * rng.normal(size=(200, len(clock), 1))
+    smoothed = smooth(values, np.ones(values.shape, bool), lowpass(clock, COARSE))
+    seen = ~np.isnan(smoothed)
+    assert np.abs(smoothed[seen] - 10.0).max() < 0.25
+    assert seen.all() == (gap < 0.1)
+
+
+def test_a_channel_of_a_slow_camera_is_refused_where_windows_cancel():
+    for rate, coarse in ((7.5, True), (8.0, True), (9.0, False), (15.0, False)):
+        clock = np.arange(0, 6.0, 1 / rate)
+        if coarse:
+            with pytest.raises(ValueError, match="too coarse to be smoothed"):
+                lowpass(clock, coarse_clock(0.0, clock[-1]))
+        else:
+            kernel = lowpass(clock, coarse_clock(0.0, clock[-1])).toarray()
+            assert np.abs(kernel).sum(axis=1).max() < 2.0

@@ -10,7 +10,7 @@ import pytest
 
 import droid_jax as dj
 from droid_jax.model.door import door_nuisances
-from droid_jax.model.fields import body_mass
+from droid_jax.model.fields import body_mass, joint_damping
 from droid_jax.model.mjcf import fitted_mjcf, unwritten
 from droid_jax.model.parameters import Parameter, Space, Write
 from droid_jax.model.physics import make_c_model
@@ -182,3 +182,36 @@ def test_meshes_are_found_from_any_folder(tmp_path: Path):
     written = mujoco.MjModel.from_xml_path(str(tmp_path / "run" / "fitted.xml"))
     assert written.nmeshvert == 8 and written.dof_damping[0] == 2.0
     assert unwritten(scene, one(scene, "geom_size", (0, 0), 0.2)) == ("geom_size",)
+
+
+WORKED_OUT = """<mujoco>{compiler}<worldbody><body name="arm"><joint name="swing" axis="0 1 0" {joint}/>
+    <geom size=".05" pos="0 0 .3" mass="1"/>
+    <body name="tip" pos="0 0 .6"><joint name="turn" axis="1 0 0"/>
+      <geom size=".05" pos="0 0 .1" mass="1"/></body></body>
+  </worldbody><actuator><position joint="swing" kp="100" {servo}/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("changes", "values"),
+    [
+        ({"servo": 'dampratio="1"'}, {"arm_mass": 3.0}),
+        ({"joint": 'springdamper="0.5 1"'}, {"arm_mass": 3.0}),
+        ({"joint": 'springdamper="0.5 1"'}, {"arm_mass": 3.0, "damping": 3.0}),
+        ({"compiler": '<compiler boundmass="0.5"/>'}, {"arm_mass": 0.2}),
+        ({"compiler": '<compiler settotalmass="4"/>'}, {"arm_mass": 3.0}),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass'")
+def test_what_a_compiler_works_out_from_masses_stays_as_it_was_replayed(changes: dict, values: dict):
+    """A damping ratio, a spring's period, a bound on masses: they would be asked of the fitted masses again."""
+    text = WORKED_OUT.format(**{"compiler": "", "joint": "", "servo": "", **changes})
+    scene = compile_scene(mujoco.MjSpec.from_string(text), "worked out")
+    space = Space(
+        (body_mass(scene, "arm", name="arm_mass", std=0.2, high=50.0),)
+        + ((joint_damping(scene, "swing", name="damping", std=1.0, high=50.0),) if "damping" in values else ())
+    )
+    expected = make_c_model(scene, space, space.values(values))
+    written = mujoco.MjModel.from_xml_string(fitted_mjcf(scene, space, space.values(values)))
+    assert expected.body_mass[1] == values["arm_mass"]
+    for field in (*FIELDS, "actuator_gainprm", "actuator_biasprm"):
+        np.testing.assert_allclose(getattr(written, field), getattr(expected, field), rtol=1e-3, atol=1e-6)

@@ -384,3 +384,45 @@ def test_a_scene_without_such_a_thing_says_so():
     scene = compile_scene(mujoco.MjSpec.from_string("<mujoco/>"), "empty")
     with pytest.raises(ValueError, match="unknown pair 'grip'; this scene has no pair with a name"):
         scene.id("pair", "grip")
+
+
+SERVO_AND_DAMPER = """<mujoco><worldbody><body><joint name="j" axis="0 1 0"/><geom size=".1" pos="0 0 .2"/>
+  <body name="b" pos="0 0 .3"><joint name="k" axis="0 1 0"/><geom size=".1" pos="0 0 .2"/></body></body></worldbody>
+  <actuator>{}<position joint="k" kp="9"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_of_several_actuators_of_a_joint_the_position_servo_takes_its_command(turned: bool):
+    pair = ['<position name="p" joint="j" kp="100"/>', '<velocity name="damper" joint="j" kv="5"/>']
+    text = SERVO_AND_DAMPER.format("".join(reversed(pair) if turned else pair))
+    scene = compile_scene(mujoco.MjSpec.from_string(text), "two")
+    servo, damper = (1, 0) if turned else (0, 1)
+    assert scene.command_names[servo] == "j" and scene.command_names[damper] == "damper"
+    assert scene.joints == scene.driven_joints == scene.needs_command == ("j", "k")
+    assert scene.command_index(("k", "j"))[[servo, damper]].tolist() == [1, -1]
+
+
+@pytest.mark.parametrize(
+    ("actuators", "said"),
+    [
+        ('<motor name="a" joint="j"/><velocity name="b" joint="j" kv="1"/>', "'j' has 2 actuators, 0 of them with"),
+        ('<position name="a" joint="j"/><position name="b" joint="j"/>', "'j' has 2 actuators, 2 of them with"),
+        ('<position joint="j"/><velocity joint="j" kv="1"/>', "actuator 1 has another one beside it: give it a name"),
+        ('<position joint="j"/><velocity name="k" joint="j"/>', "'k' has another one beside it: give it a name that"),
+    ],
+)
+def test_actuators_of_which_none_is_the_joints_own_are_refused(actuators: str, said: str):
+    with pytest.raises(ValueError, match=said):
+        compile_scene(mujoco.MjSpec.from_string(SERVO_AND_DAMPER.format(actuators)), "two")
+
+
+def test_joints_between_the_world_and_what_is_measured():
+    spec = mujoco.MjSpec.from_string("""<mujoco><worldbody>
+      <body name="base"><freejoint name="root"/><geom size=".1"/>
+        <body name="hip"><joint axis="0 1 0"/><geom size=".1"/>
+          <body name="leg"><joint name="knee" axis="0 1 0"/><geom size=".1"/></body></body></body>
+      <body name="ball"><freejoint name="free"/><geom size=".1"/></body></worldbody>
+      <actuator><position joint="knee"/></actuator></mujoco>""")
+    scene = compile_scene(spec, "legs")
+    assert scene.carriers(scene.joints) == ("the joint of body 'hip'", "knee")
+    assert scene.floating(scene.joints) == ("root",)
