@@ -22,7 +22,7 @@ from droid_jax.model.effects.registry import effect_space, library, ready
 from droid_jax.model.mjcf import fitted_mjcf
 from droid_jax.model.parameters import Parameter, Space, Write
 from droid_jax.model.physics import make_c_model
-from droid_jax.model.scene import Scene, load_scene
+from droid_jax.model.scene import Scene, compile_scene, load_scene
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -170,7 +170,10 @@ def test_laws_that_mujoco_has_numbers_for_are_in_the_mjcf(degrees: bool):
 def test_a_preload_without_a_spring_has_no_place_in_the_mjcf():
     scene, base = small_scene()
     stiff = base.select([n for n in base.names if n != "door_stiffness"])
-    scene.model.jnt_stiffness[:] = 0.0
+    spec = scene.spec.copy()
+    for joint in spec.joints:
+        joint.stiffness = np.zeros_like(joint.stiffness)
+    scene = compile_scene(spec, "slack", joints=scene.joints, object_joint="door")
     model = with_effects(scene, stiff, hinge_preload=0.5)
     assert model.lacking == ("hinge_preload at door",)
     fitted_mjcf(model.scene, model.space, model.values, model.effects)
