@@ -16,6 +16,7 @@ from droid_jax.model.scene import Scene
 FALSE_DISCOVERIES = 0.1
 BINS = 6
 STILL = 0.01  # rad/s or m/s
+LEAST = 1e-3  # of its size, by which a variable must change to be divided
 ALONG = "hinge_preload"  # the amplitude whose mark says how a torque of the hinge shows in the measured joints
 POSITION, LOAD = "position of ", "load of "  # a joint
 HELD = 0.2  # of that mark's size where it is large: with less the door is not held
@@ -134,9 +135,9 @@ def _length(scene: Scene, joint: str) -> str:
 
 
 def _bins(variable: str, x: np.ndarray, unit: str, mine: Any = True) -> list[tuple[tuple[str, str], np.ndarray]]:
-    """Equal bins of x [M] over its range in the cell `mine`; none where it has no range."""
+    """Equal bins of x [M] over its range in the cell `mine`; none where it hardly changes (a rounded constant)."""
     least, most = np.min(x, where=mine, initial=np.inf), np.max(x, where=mine, initial=-np.inf)
-    if not most > least:
+    if not most - least > LEAST * max(abs(least), abs(most)):
         return []
     digits = max(2, math.ceil(1 - math.log10((most - least) / BINS)))
     return [

@@ -112,5 +112,6 @@ def test_bins_cover_a_cell_and_nothing_else():
     assert np.array_equal(np.sum(masks, axis=0), mine)
     assert names[0] == ("load of a", "0.00 to 0.50 N m") and names[-1] == ("load of a", "2.50 to 3.00 N m")
     assert _bins("load of a", x, "N m", np.array([True, False, False, False, False])) == []
+    assert _bins("object speed", 0.1 + 1e-6 * x, "rad/s") == []  # constant, but for rounding
     fine = _bins("position of a", 1e-3 * x, "rad")
     assert [where for (_, where), _ in fine][:2] == ["0.0000 to 0.0015 rad", "0.0015 to 0.0030 rad"]
