@@ -223,7 +223,6 @@ def share(hits: int, count: int) -> dict[str, Any]:
 def report(case: Case, verdict: Verdict) -> dict[str, Any]:
     """A verdict with its grounds as JSON values."""
     spans, widths = intervals(case.fit, verdict.model), deviations(case.fit, verdict.model)
-    after = {(cell.variable, cell.where): cell.gap for cell in verdict.after.cells}
     return {
         "verdict": verdict.kind.value,
         "sentence": verdict.sentence,
@@ -244,9 +243,8 @@ def report(case: Case, verdict: Verdict) -> dict[str, Any]:
         "noise_stated": rounded(1 / np.einsum("ckk->kc", _torque(case).noise.whitener).max(axis=0)),
         "blocks": {"each": case.fit.units, "seconds": round(_block_seconds(case), 3)},
         "where": [
-            {"variable": b.variable, "where": b.where, "before": b.gap, "after": after[b.variable, b.where]}
-            for b in verdict.before.cells
-            if (b.variable, b.where) in after  # a model's own load has a range of its own
+            {"variable": b.variable, "where": b.where, "before": b.gap, "after": a.gap}
+            for b, a in zip(verdict.before.cells, verdict.after.cells, strict=True)
         ],
         "trials": [
             {"name": t.name, "passed": t.passed, "p": t.p, "gap_fit": t.gap_fit, "gap_confirm": finite(t.gap_confirm),

@@ -459,6 +459,8 @@ def test_a_run_goes_on_after_a_stop_and_is_whole(
     assert answer["amplitudes"][0]["value"] == pytest.approx(PRELOAD, rel=0.05)
     assert {"search", "refine", "floor", "screen", "refit"} <= set(answer["seconds"])
     assert answer["setup"]["stand_in"] is True and answer["setup"]["command"] == "gap"
+    places = {when: [(c["variable"], c["where"]) for c in answer["cells"][when]] for when in ("before", "after")}
+    assert places["before"] == places["after"]
     assert answer["versions"]["jax"] and answer["device"]
 
     monkeypatch.setattr(missing, "find", lambda *a: pytest.fail("this run is whole"))

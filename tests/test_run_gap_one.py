@@ -142,6 +142,8 @@ def test_a_log_is_searched_and_its_limits_are_said(run: tuple[Path, str], found:
     assert found.answer["floor"] == 0.0 and set(found.answer["seconds"]) == set(IN_BLOCKS)
     assert found.answer["trends"] == [] and found.answer["experiments"] == []
     assert not any(cell["found"] for cell in found.answer["cells"]["before"])
+    places = {when: [(c["variable"], c["where"]) for c in found.answer["cells"][when]] for when in ("before", "after")}
+    assert places["before"] == places["after"]  # also loads, of which each model has its own
 
 
 def test_each_role_has_its_own_instants(found: GapFiles):

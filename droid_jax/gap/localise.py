@@ -43,14 +43,15 @@ class Localisation:
     cells: tuple[Cell, ...]
 
 
-def localise(evidence: Evidence, values: np.ndarray, residuals: np.ndarray) -> Localisation:
+def localise(evidence: Evidence, values: np.ndarray, residuals: np.ndarray, motion: np.ndarray) -> Localisation:
     """Cells by joint and phase, door angle, sign and size of the door's speed, each joint's direction, angle and load.
 
     What the repeats' order changes is no cell: U is what the repeats share (`trend`).
 
-    values: [D] of the model; residuals: [N, M] of its repeats or blocks.
+    values: [D] of the model; residuals: [N, M] of its repeats or blocks.  motion: [D] of the model whose angles, speeds
+    and loads divide them: one for all models that are compared, each has loads of its own.
     """
-    names, masks = zip(*_cells(evidence, values), strict=True)
+    names, masks = zip(*_cells(evidence, motion), strict=True)
     cells = np.stack(masks)
     kept = cells.sum(axis=1) >= 5
     p = np.ones(len(cells))
