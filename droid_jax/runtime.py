@@ -116,7 +116,7 @@ def versions() -> dict[str, str]:
     """Versions of Python, this package and what computes for it, and the git commit of a checkout.
 
     A package that is not installed has no entry.  A commit with uncommitted changes to tracked
-    files ends in "-dirty".
+    files, results of experiments and benchmarks excepted, ends in "-dirty".
     """
     found = {"python": platform.python_version()}
     for name in ("droid_jax", *PACKAGES):
@@ -322,7 +322,9 @@ def _git_commit(checkout: Path) -> str | None:
         return None
     try:
         commit = _git(checkout, "rev-parse", "HEAD")
-        changed = _git(checkout, "status", "--porcelain", "--untracked-files=no")
+        # not of the results: one experiment after the other writes them
+        elsewhere = (":(exclude)benchmarks/results", ":(exclude)experiments/results")
+        changed = _git(checkout, "status", "--porcelain", "--untracked-files=no", "--", ".", *elsewhere)
     except (OSError, subprocess.SubprocessError):
         return None
     return f"{commit}-dirty" if changed else commit

@@ -16,6 +16,7 @@ from small_log import elbow_log, write_elbow
 from droid_jax.commands import evaluate, gap, hidden, identify, report, train, whole
 from droid_jax.commands.folder import OtherRun
 from droid_jax.commands.hidden import known_stand_in
+from droid_jax.commands.presets import TIMESTEP
 from droid_jax.commands.source import stand_in_of
 from droid_jax.measure.formats import load, save
 from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
@@ -217,11 +218,12 @@ def test_a_search_begins_at_a_fit_of_its_own_recordings_alone(called, tmp_path: 
     for name in ("fit.json", "config.json"):
         (fit / name).write_text("{}")
     hashes = [load(Path(f"{name}.npz")).sha256 for name in "abc"]
-    for made in (hashes[:2], hashes[1:], []):
-        (fit / "setup.json").write_text(json.dumps({"recordings_sha256": made, "scene": None}))
+    scene = door_scene(timestep=TIMESTEP["quick"]).sha256
+    for made, of in ((hashes[:2], scene), (hashes[1:], scene), ([], scene), (hashes[:2], "another")):
+        (fit / "setup.json").write_text(json.dumps({"recordings_sha256": made, "scene_sha256": of}))
         given = ("--recording", "a.npz", "b.npz", "c.npz", "--stages", "gap", "--out", "run")
         assert main(["all", *given]) == 0
-    assert [command.fit for command in called] == [Path("run/identify"), None, None]
+    assert [command.fit for command in called] == [Path("run/identify"), None, None, None]
 
 
 def test_nothing_is_said_to_be_closed_where_nothing_is_named(called, tmp_path: Path, capsys):

@@ -214,11 +214,16 @@ def test_git_commit_of_a_checkout(tmp_path):
     except FileNotFoundError:
         pytest.skip("git is not installed")
     assert runtime._git_commit(tmp_path) is None  # no commit yet
-    (tmp_path / "file").write_text("1")
-    git("add", "file")
+    result = tmp_path / "experiments" / "results" / "found.json"
+    result.parent.mkdir(parents=True)
+    for path in (tmp_path / "file", result):
+        path.write_text("1")
+    git("add", ".")
     git("commit", "--quiet", "--no-verify", "-m", "one")
     commit = runtime._git_commit(tmp_path)
     assert commit == git("rev-parse", "HEAD") and re.fullmatch(r"[0-9a-f]{40,64}", commit)
+    result.write_text("2")
+    assert runtime._git_commit(tmp_path) == commit
     (tmp_path / "file").write_text("2")
     assert runtime._git_commit(tmp_path) == f"{commit}-dirty"
 

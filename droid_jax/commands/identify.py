@@ -119,9 +119,11 @@ def run(command: Identify) -> None:
     recordings, truth = _recordings(command, scene, out, given)
     print("compiling the replay ...", flush=True)
     problem = prepare(scene, space, recordings, nuisances=nuisances, config=config, **effects)
+    # The Gaussian's own, whatever becomes of the search that made it; it may lie in this very folder.
+    extended = None if command.extended is None else command.extended.read_bytes()
     begin(out, setup, command.again, "identify")  # and only now, with all of it found good
-    if command.extended is not None:  # the Gaussian's own, whatever becomes of the search that made it
-        write_bytes(out / EXTENDED, command.extended.read_bytes())
+    if extended is not None:
+        write_bytes(out / EXTENDED, extended)
     started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     board = out / FOLDER if command.tensorboard else None
     with stages(("search", "refine", "judge", "sample")) as show, scalars(board) as write:

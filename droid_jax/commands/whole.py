@@ -270,7 +270,8 @@ def _fitted(folder: Path, command: All, recordings: Sequence[Path]) -> bool:
         return True
     made = setup(folder)
     hashes = made.get("recordings_sha256", [])
-    same_scene = made.get("scene") == (None if command.scene is None else str(command.scene))
+    scene, _ = gap.model_of(gap.Gap(command.recording, preset=PRESETS[command.preset].identify, **_own(command)))
+    same_scene = made.get("scene_sha256") == scene.sha256
     return bool(hashes) and same_scene and [recording_at(p).sha256 for p in recordings[: len(hashes)]] == hashes
 
 

@@ -21,7 +21,7 @@ from droid_jax.compare.inverse import Path, path_of, path_replay, prescribed
 from droid_jax.compare.population import blocks, over_block
 from droid_jax.compare.replay import Drive, Replay, check_gains, make_drive, servo_replay, torque_offset_effect
 from droid_jax.compare.residuals import CompareConfig, Comparison, make_comparison
-from droid_jax.compare.start import AJAR, check_range, warn_if_moving, warn_of_commands
+from droid_jax.compare.start import AJAR, check_range, following, warn_if_moving, warn_of_commands
 from droid_jax.compare.twin import twin_replay
 from droid_jax.measure.checks import validate
 from droid_jax.measure.motion import Motion, measured_motion
@@ -281,6 +281,7 @@ def _same(scene: Scene, new: Drive | Motion, old: Drive | Motion) -> bool:
         hinge = scene.qpos(scene.object_joint)
         if scene.model.qpos0[hinge] in (new.qpos0[hinge], old.qpos0[hinge]):
             apart[hinge] += AJAR
+    apart[list(following(scene, new.qpos0) & following(scene, old.qpos0))] = np.inf  # by as much as what has them there
     sent, before = (np.ones(d.command.shape[1], bool) if d.sent is None else d.sent for d in (new, old))
     return (
         np.array_equal(sent, before)

@@ -43,7 +43,8 @@ def prescribed(scene: Scene, recording: Recording) -> tuple[str, ...]:
     whole = {j for i, j in enumerate(channel.columns) if channel.mask[:, :, i].any(axis=0).all()}
     others = [j for j in scene.single_joints if j in whole and j not in scene.joints]
     joints = (*scene.joints, *others)
-    still = [j for j in scene.carriers(scene.joints) if j not in joints and j not in recording.qpos0]
+    stated = {j for j in recording.qpos0 if j not in channel.columns}  # of a measured one it is where it began
+    still = [j for j in scene.carriers(scene.joints) if j not in joints and j not in stated]
     if still:
         warnings.warn(
             f"recording {recording.name!r} does not hold the positions of {', '.join(still)} throughout, which carry "

@@ -47,7 +47,7 @@ def _coupled(scene: Scene, told: Mapping[str, float]) -> np.ndarray:
     """
     model, known = scene.model, {scene.qpos(joint): q for joint, q in told.items()}
     qpos = scene.initial_qpos(told)
-    couplings = np.flatnonzero((model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & model.eq_active0 & (model.eq_obj2id >= 0))
+    couplings = _couplings(model)
     for _ in couplings:  # in a chain each needs the one before
         for e in couplings:
             first, second = (int(model.jnt_qposadr[i[e]]) for i in (model.eq_obj1id, model.eq_obj2id))
@@ -59,6 +59,24 @@ def _coupled(scene: Scene, told: Mapping[str, float]) -> np.ndarray:
     for address, q in known.items():
         qpos[address] = q
     return qpos
+
+
+def following(scene: Scene, qpos: np.ndarray) -> set[int]:
+    """Position addresses of joints that stand, in a pose [nq], where an equality has them; of measured ones none."""
+    model = scene.model
+    own = {scene.qpos(j) for j in (*scene.joints, *([scene.object_joint] if scene.object_joint else []))}
+    found = set[int]()
+    for e in _couplings(model):
+        first, second = (int(model.jnt_qposadr[i[e]]) for i in (model.eq_obj1id, model.eq_obj2id))
+        there = np.polyval(model.eq_data[e, 4::-1], qpos[second] - model.qpos0[second])
+        if np.isclose(qpos[first] - model.qpos0[first], there, atol=1e-9):
+            found |= {first if first not in own else second} - own
+    return found
+
+
+def _couplings(model: mujoco.MjModel) -> np.ndarray:
+    """Rows of the equalities that couple one joint to another and are active."""
+    return np.flatnonzero((model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & model.eq_active0 & (model.eq_obj2id >= 0))
 
 
 def check_weight(scene: Scene, recording: Recording, qpos0: np.ndarray) -> None:

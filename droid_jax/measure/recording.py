@@ -228,12 +228,19 @@ def _outside(what: str, time: np.ndarray, start: float, end: float) -> str:
 
 
 def _positions_at(recording: Recording, start: float, given: Mapping[str, float]) -> dict[str, float]:
-    """Joint positions at an instant, for the joints of qpos0 and those given; of a log for those that were measured."""
+    """Joint positions at an instant, for the joints of qpos0 and those given.
+
+    Of a log joints of which nothing was measured are taken to stand still, and those of which something was, but not
+    there, are left out.
+    """
     first = float(recording.time[0]) if len(recording.time) else recording.span[0]
     if start <= first + SLACK:
         return {**recording.qpos0, **given}
     measured = _measured_at(recording, start)
     positions = {**{j: measured[j] for j in recording.qpos0 if j in measured}, **given}
+    if not recording.command.size:
+        seen = {j for k in POSITION_CHANNELS if k in recording.channels for j in recording.channels[k].columns}
+        positions = {**{j: q for j, q in recording.qpos0.items() if j not in seen}, **positions}
     lacking = [j for j in recording.qpos0 if j not in positions]
     if lacking and recording.command.size:
         raise ValueError(

@@ -12,7 +12,7 @@ import numpy as np
 
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model
-from droid_jax.model.scene import Scene, compiled, keep_inertia, look_geoms
+from droid_jax.model.scene import Scene, compiled, keep_inertia, look_geoms, weigh
 from droid_jax.model.seam import Effect
 
 # Model field -> attribute of the element that holds a row of it, or its first numbers.
@@ -77,6 +77,10 @@ def fitted_mjcf(scene: Scene, space: Space, values: np.ndarray, effects: Sequenc
 
 def _settle(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
     """Say in numbers, as the model has them, what the compiler would work out anew from fitted masses."""
+    if max(spec.compiler.boundmass, spec.compiler.boundinertia, spec.compiler.settotalmass) > 0:
+        for body in spec.bodies[1:]:
+            if model.body_mass[body.id] > 0:
+                weigh(body, model, body.id)
     spec.compiler.boundmass, spec.compiler.boundinertia, spec.compiler.settotalmass = 0.0, 0.0, -1.0
     for joint in spec.joints:
         if np.all(np.asarray(joint.springdamper) > 0):

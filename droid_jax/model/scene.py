@@ -208,9 +208,12 @@ class Scene:
     def needs_command(self) -> tuple[str, ...]:
         """Those of `command_names` that a recording must command: measured joints, and where something is gripped all.
 
-        The others stay where the motion starts if it does not.
+        The others stay where the motion starts if it does not; so do those that drive a joint beside its servo.
         """
-        return tuple(n for n in self.command_names if n in self.joints or self.grip is not None)
+        beside = drives_joint(self.model) & ~self.of_joint
+        gripped = self.grip is not None
+        names = zip(self.command_names, beside, strict=True)
+        return tuple(name for name, other in names if name in self.joints or (gripped and not other))
 
     def command_index(self, names: Sequence[str]) -> np.ndarray:
         """[U] columns of `names` that feed this scene's actuators, in actuator order; -1 for one that has none there.
@@ -309,7 +312,7 @@ def keep_inertia(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
     always = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     for body in spec.bodies[1:]:
         if other[body.id] or (always and model.body_mass[body.id] > 0):
-            _weigh(body, model, body.id)
+            weigh(body, model, body.id)
     if always:  # every body now says what it weighs, so none is left to its geoms
         spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
 
@@ -320,7 +323,7 @@ def _rows_close(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.all(np.reshape(close, (len(a), -1)), axis=1)
 
 
-def _weigh(body: Any, model: mujoco.MjModel, index: int) -> None:
+def weigh(body: Any, model: mujoco.MjModel, index: int) -> None:
     """Mass, centre and inertia of a body, its own and not its geoms'."""
     body.explicitinertial = True
     body.mass = float(model.body_mass[index])
@@ -403,22 +406,15 @@ def _command_names(model: mujoco.MjModel) -> tuple[str, ...]:
     """[U] the joint that each actuator drives, or its own name where it drives none.
 
     Of several that drive one joint (a position servo with its damping in a <velocity> of its own) the servo goes by the
-    joint's name, the others by their own.
+    joint's name, the others by their own; where there is no servo, or more than one, all go by their own.
     """
     joints = [int(j) if of else -1 for j, of in zip(model.actuator_trnid[:, 0], drives_joint(model), strict=True)]
     feedback, names = has_feedback(model), list[str]()
     for i, joint in enumerate(joints):
         own = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i)
         rivals = [k for k, other in enumerate(joints) if other == joint >= 0]
-        servos = [k for k in rivals if feedback[k]]
-        if joint >= 0 and (rivals == [i] or servos == [i]):
+        if joint >= 0 and (rivals == [i] or [k for k in rivals if feedback[k]] == [i]):
             names.append(mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint))
-        elif len(rivals) > 1 and len(servos) != 1:
-            raise ValueError(
-                f"joint {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint)!r} has {len(rivals)} actuators, "
-                f"{len(servos)} of them with position feedback: it needs one <position> servo (kp and kv) that takes "
-                "its command"
-            )
         elif not own or mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, own) >= 0:
             what = "has another one beside it" if joint >= 0 else "drives no joint"
             raise ValueError(f"actuator {own or i!r} {what}: give it a name that no joint has")

@@ -16,6 +16,7 @@ from droid_jax import runtime
 from droid_jax.compare.cost import make_cost
 from droid_jax.compare.inverse import inverse_replay, prescribed
 from droid_jax.compare.replay import torque_offset_effect
+from droid_jax.identify.judge import split
 from droid_jax.measure.motion import Motion
 from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
 from droid_jax.model.builtin import ARM
@@ -251,3 +252,25 @@ def test_a_log_of_a_robot_that_floats_is_refused():
         ValueError, match=r"the joint of body .* of scene 'walks', of several degrees, carries measured"
     ):
         prescribed(scene, standing({}))
+
+
+def test_a_part_of_a_log_keeps_what_stands_still():
+    """Its end is held out; a joint that was measured, but not there, is not taken to stand where it began."""
+    whole = standing({"torso": 0.7, "arm": 0.0})
+    part = whole.window(2.0, 3.0)
+    assert part.qpos0["torso"] == 0.7 and part.qpos0["arm"] == pytest.approx(0.3 * np.sin(4.0), abs=1e-3)
+    fitted, held, _ = split(whole, 0.3)
+    assert fitted.qpos0["torso"] == held.qpos0["torso"] == 0.7
+
+
+def test_a_carrier_with_a_hole_in_its_positions_is_warned_of_though_its_start_is_known():
+    """As a bag's log has it: qpos0 holds every measured joint's start."""
+    scene = compile_scene(mujoco.MjSpec.from_string(LOCKED), "locked")
+    log = standing({"torso": 0.0, "arm": 0.0})
+    path = log.channels["position"]
+    values = np.concatenate([path.values, path.values], axis=2)
+    mask = np.ones(values.shape, bool)
+    mask[:, 100, 1] = False
+    holed = replace(path, columns=("arm", "torso"), values=values, mask=mask)
+    with pytest.warns(UserWarning, match="the positions of torso throughout"):
+        assert prescribed(scene, replace(log, channels={**log.channels, "position": holed})) == ("arm",)

@@ -212,3 +212,17 @@ def test_a_servo_with_a_gear_is_sent_its_control_and_that_is_said():
     check_gains(scene, make_drive(scene, given))
     with pytest.raises(ValueError, match="the recording states a servo gain of"):
         check_gains(scene, make_drive(scene, recording(gains=ServoGains(kp, np.zeros(2)))))
+
+
+def test_coupled_joints_follow_the_scatter_of_what_has_them():
+    """Starts that differ by a milliradian differ by fifty in a rotor behind a gear: the same replay serves both."""
+    text = (
+        COUPLED.format(first="mimic", second="elbow").replace("0.05 -2 0 0 0", "0 50 0 0 0").replace("0 2 1 0 0", "0 1")
+    )
+    scene = compile_scene(mujoco.MjSpec.from_string(text), "geared", joints=("shoulder", "elbow"))
+    heavy = {"torque": replace(recording().torque, gravity=True), "gains": None}
+    one, other = (make_drive(scene, recording(qpos0={"shoulder": 0.2, "elbow": q}, **heavy)) for q in (0.4, 0.401))
+    assert np.abs(one.qpos0 - other.qpos0).max() == pytest.approx(0.05)
+    assert _same(scene, one, other)
+    stated = {"shoulder": 0.2, "elbow": 0.401, "mimic": 0.0}
+    assert not _same(scene, one, make_drive(scene, recording(qpos0=stated, **heavy)))

@@ -335,4 +335,7 @@ def test_window_says_what_it_lacks() -> None:
         blind.window(0.3, 0.6)
     assert blind.window(0.3, 0.6, qpos0={"j1": 1.0, "j2": 2.0, "hinge": 0.0}).qpos0["j2"] == 2.0
     log = replace(r, time=np.zeros(0), command=np.zeros((0, 0)), command_names=(), qpos0={**r.qpos0, "finger": 0.04})
-    assert set(log.window(0.3, 0.6).qpos0) == {"j1", "j2", "hinge"}  # a measured motion needs no other start
+    assert log.window(0.3, 0.6).qpos0["finger"] == 0.04  # what a log does not measure stands still
+    unseen = np.zeros_like(log.channels["object_angle"].mask)
+    gone = {**log.channels, "object_angle": replace(log.channels["object_angle"], mask=unseen)}
+    assert set(replace(log, channels=gone).window(0.3, 0.6).qpos0) == {"j1", "j2", "finger"}  # and nothing else does

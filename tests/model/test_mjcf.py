@@ -184,10 +184,11 @@ def test_meshes_are_found_from_any_folder(tmp_path: Path):
     assert unwritten(scene, one(scene, "geom_size", (0, 0), 0.2)) == ("geom_size",)
 
 
+DUMMY = '<body name="tool"><joint name="tool" axis="0 0 1"/></body>'  # as of a URDF: it weighs what boundmass says
 WORKED_OUT = """<mujoco>{compiler}<worldbody><body name="arm"><joint name="swing" axis="0 1 0" {joint}/>
     <geom size=".05" pos="0 0 .3" mass="1"/>
     <body name="tip" pos="0 0 .6"><joint name="turn" axis="1 0 0"/>
-      <geom size=".05" pos="0 0 .1" mass="1"/></body></body>
+      <geom size=".05" pos="0 0 .1" mass="1"/>{dummy}</body></body>
   </worldbody><actuator><position joint="swing" kp="100" {servo}/></actuator></mujoco>"""
 
 
@@ -199,12 +200,13 @@ WORKED_OUT = """<mujoco>{compiler}<worldbody><body name="arm"><joint name="swing
         ({"joint": 'springdamper="0.5 1"'}, {"arm_mass": 3.0, "damping": 3.0}),
         ({"compiler": '<compiler boundmass="0.5"/>'}, {"arm_mass": 0.2}),
         ({"compiler": '<compiler settotalmass="4"/>'}, {"arm_mass": 3.0}),
+        ({"compiler": '<compiler boundmass=".01" boundinertia=".001"/>', "dummy": DUMMY}, {"arm_mass": 3.0}),
     ],
 )
 @pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass'")
 def test_what_a_compiler_works_out_from_masses_stays_as_it_was_replayed(changes: dict, values: dict):
     """A damping ratio, a spring's period, a bound on masses: they would be asked of the fitted masses again."""
-    text = WORKED_OUT.format(**{"compiler": "", "joint": "", "servo": "", **changes})
+    text = WORKED_OUT.format(**{"compiler": "", "joint": "", "servo": "", "dummy": "", **changes})
     scene = compile_scene(mujoco.MjSpec.from_string(text), "worked out")
     space = Space(
         (body_mass(scene, "arm", name="arm_mass", std=0.2, high=50.0),)

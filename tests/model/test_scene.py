@@ -13,7 +13,7 @@ from droid_jax.model.builtin import ARM, FINGERS
 from droid_jax.model.door import door_space, truth
 from droid_jax.model.door_scene import LEVERS, door_scene
 from droid_jax.model.fields import body_mass, joint_damping, joint_frictionloss, model_parameter, servo_scale
-from droid_jax.model.scene import LOOK_GROUP, TINY_FRICTIONLOSS, Scene, compile_scene, load_scene, with_options
+from droid_jax.model.scene import LOOK_GROUP, TINY_FRICTIONLOSS, Grip, Scene, compile_scene, load_scene, with_options
 
 # Franka's documentation, "Denavit-Hartenberg parameters" (Craig's convention): a, d [m], alpha [rad].
 DH = (
@@ -403,17 +403,33 @@ def test_of_several_actuators_of_a_joint_the_position_servo_takes_its_command(tu
 
 
 @pytest.mark.parametrize(
+    "actuators",
+    [
+        '<motor name="a" joint="j"/><velocity name="b" joint="j" kv="1"/>',
+        '<position name="a" joint="j"/><position name="b" joint="j"/>',
+    ],
+)
+def test_actuators_of_which_none_is_the_joints_own_go_by_their_own_names(actuators: str):
+    scene = compile_scene(mujoco.MjSpec.from_string(SERVO_AND_DAMPER.format(actuators)), "two")
+    assert scene.command_names == ("a", "b", "k") and scene.joints == scene.needs_command == ("k",)
+
+
+@pytest.mark.parametrize(
     ("actuators", "said"),
     [
-        ('<motor name="a" joint="j"/><velocity name="b" joint="j" kv="1"/>', "'j' has 2 actuators, 0 of them with"),
-        ('<position name="a" joint="j"/><position name="b" joint="j"/>', "'j' has 2 actuators, 2 of them with"),
         ('<position joint="j"/><velocity joint="j" kv="1"/>', "actuator 1 has another one beside it: give it a name"),
         ('<position joint="j"/><velocity name="k" joint="j"/>', "'k' has another one beside it: give it a name that"),
     ],
 )
-def test_actuators_of_which_none_is_the_joints_own_are_refused(actuators: str, said: str):
+def test_actuators_beside_a_servo_need_names(actuators: str, said: str):
     with pytest.raises(ValueError, match=said):
         compile_scene(mujoco.MjSpec.from_string(SERVO_AND_DAMPER.format(actuators)), "two")
+
+
+def test_a_damper_beside_a_servo_needs_no_command_where_something_is_gripped():
+    pair = '<position name="p" joint="j" kp="100"/><velocity name="damper" joint="j" kv="5"/>'
+    scene = compile_scene(mujoco.MjSpec.from_string(SERVO_AND_DAMPER.format(pair)), "two", grip=Grip(()))
+    assert scene.needs_command == ("j", "k")
 
 
 def test_joints_between_the_world_and_what_is_measured():
