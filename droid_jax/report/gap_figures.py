@@ -96,7 +96,7 @@ def base_shifts(shifts: Sequence[Mapping[str, Any]], width: float = WIDE) -> Fig
     shifts: name, unit, before, after, deviation_before; the MOST_SHIFTS largest are drawn.
     """
     drawn = largest_shifts(shifts)
-    figure = Figure(figsize=(width, 0.8 + 0.38 * len(drawn)), layout="constrained")
+    figure = Figure(figsize=(width, max(1.6, 0.8 + 0.38 * len(drawn))), layout="constrained")
     axes = figure.add_subplot()
     axes.axvspan(-1.645, 1.645, color=BEFORE, alpha=0.13, linewidth=0, label="90 % interval of the base model")
     axes.axvline(0, color=BEFORE, linewidth=1, linestyle=(0, (4, 1.5)), label="base model")

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
+
 import numpy as np
 import pytest
 from made_up_gap import make_gap
 
-from droid_jax.report import gap_figures, gap_maps, gap_torques
+from droid_jax.report import gap_figures, gap_maps, gap_torques, style
 from droid_jax.report.gap_folder import Gap, read_gap
 from droid_jax.report.words import number
 
@@ -71,3 +73,14 @@ def test_position_and_load_are_shown_of_the_joint_with_the_most(named: Gap) -> N
     some = [c for c in cells["before"] if c["variable"] in (gap_maps.TIME, f"load of {joint}")]
     curve = gap_torques.remainder(named.traces["fit"], some, "N m").axes[-1]
     assert (curve.get_title("left"), curve.get_xlabel()) == ("That joint alone", "Load of joint 1 [N m]")
+
+
+@pytest.mark.parametrize("width", [style.WIDE, style.NARROW])
+@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.filterwarnings("error")
+def test_one_parameter_has_room_for_its_axes(width: float, count: int):
+    """A scene of one parameter: a row of its own height alone left none for the axes."""
+    shifts = [
+        {"name": f"p{k}", "unit": "kg", "before": 1.0, "after": 2.0, "deviation_before": 0.4} for k in range(count)
+    ]
+    gap_figures.base_shifts(shifts, width=width).savefig(io.BytesIO(), format="png")
