@@ -29,6 +29,7 @@ import tyro  # noqa: E402
 
 from benchmarks.common import empty_cache, origin, stem  # noqa: E402
 from droid_jax.report.files import TRANSFER  # noqa: E402
+from droid_jax.report.gap_folder import hidden_in  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 
 STAGE = re.compile(r"\[\d+/\d+\] (?P<stage>\w+): (?P<minutes>[\d.]+) minutes")  # as the command says that one ended
@@ -106,7 +107,7 @@ def results(out: Path) -> dict[str, Any]:
         json.loads((out / name).read_text()) for name in ("identify/fit.json", "gap/gap.json", f"train/{TRANSFER}")
     )
     return {
-        "hidden": gap["setup"].get("robot", {}).get("hide", []),
+        "hidden": hidden_in(gap),
         "torque_gap": fit["gap"],
         "verdict": gap["verdict"],
         "effects": gap["effects"],

@@ -130,13 +130,13 @@ def run(command: Gap) -> None:
     board = out / FOLDER if command.tensorboard else None
     case, verdict, seconds = searched(split, case, roles, out / "checkpoints", start, board)
     stand_in = all(is_stand_in(r) for r in roles.values())
-    known = known_stand_in(command.recording or kept_at(out))
+    known = known_stand_in(command.recording or kept_at(out)) if stand_in else {}
     description = {
         "split": {"by": split.value, "limits": split.limits},
         "seconds": seconds,
         "versions": runtime.versions(),
         "device": runtime.device(),
-        "setup": {**setup, "stand_in": stand_in, "robot": known if stand_in else {}},
+        "setup": {**setup, "stand_in": stand_in, "robot": known},
     }
     write_gap(out, case, verdict, description)
     shutil.rmtree(out / "checkpoints" / "replays", ignore_errors=True)

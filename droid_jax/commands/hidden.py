@@ -86,9 +86,10 @@ def record_stand_in(
         demonstration = load(demonstration_path(name))
         return record_hidden(scene, demonstration, truth, hidden, seed=1000 * seed + names.index(name), name=name)
 
-    paths = dict(zip(names, kept_at(out), strict=True))
+    files = kept_at(out)
+    paths = dict(zip(names, files, strict=True))
     this = stand_in_json(hidden, springs, seed)
-    if again or known_stand_in(kept_at(out)) != this:
+    if again or known_stand_in(files) != this:
         for path in paths.values():
             path.unlink(missing_ok=True)
     write_json(out / "recordings" / STAND_IN, this)  # before the first: a stop leaves no recordings of an unknown robot

@@ -277,6 +277,7 @@ def _fitted(folder: Path, command: All, recordings: Sequence[Path]) -> bool:
 
 def told(out: Path) -> list[str]:
     """One line for each stage that has a result."""
+    from droid_jax.report.gap_folder import hidden_in
     from droid_jax.report.gap_words import readable
     from droid_jax.report.words import hidden_words, judged, percent
 
@@ -292,7 +293,7 @@ def told(out: Path) -> list[str]:
         closed = size["closed"] if found["effects"] else None
         share = "" if closed is None else f"; {percent(closed)} of the gap U closed on the {role} motion"
         lines.append(f"gap: {readable(found['sentence'], found).rstrip('.')}{share}")
-        if found["setup"].get("stand_in") and (hidden := hidden_words(found["setup"].get("robot", {}).get("hide", ()))):
+        if hidden := hidden_words(hidden_in(found)):
             lines.append(f"hidden in the stand-in robot: {hidden}")
     for name, of in {} if "train" in old else (_json(out / "train" / TRANSFER) or {}).items():
         if name in ("simulation", "stand_in"):

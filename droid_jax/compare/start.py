@@ -49,9 +49,7 @@ def _coupled(scene: Scene, told: Mapping[str, float]) -> np.ndarray:
     qpos = scene.initial_qpos(told)
     couplings = _couplings(model)
     for _ in couplings:  # in a chain each needs the one before
-        for e in couplings:
-            first, second = (int(model.jnt_qposadr[i[e]]) for i in (model.eq_obj1id, model.eq_obj2id))
-            c = model.eq_data[e, :5]
+        for first, second, c in couplings:
             if second in known and first not in known:
                 known[first] = model.qpos0[first] + float(np.polyval(c[::-1], known[second] - model.qpos0[second]))
             elif first in known and second not in known and c[1] != 0 and not c[2:].any():
@@ -66,17 +64,18 @@ def following(scene: Scene, qpos: np.ndarray) -> set[int]:
     model = scene.model
     own = {scene.qpos(j) for j in (*scene.joints, *([scene.object_joint] if scene.object_joint else []))}
     found = set[int]()
-    for e in _couplings(model):
-        first, second = (int(model.jnt_qposadr[i[e]]) for i in (model.eq_obj1id, model.eq_obj2id))
-        there = np.polyval(model.eq_data[e, 4::-1], qpos[second] - model.qpos0[second])
+    for first, second, c in _couplings(model):
+        there = np.polyval(c[::-1], qpos[second] - model.qpos0[second])
         if np.isclose(qpos[first] - model.qpos0[first], there, atol=1e-9):
             found |= {first if first not in own else second} - own
     return found
 
 
-def _couplings(model: mujoco.MjModel) -> np.ndarray:
-    """Rows of the equalities that couple one joint to another and are active."""
-    return np.flatnonzero((model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & model.eq_active0 & (model.eq_obj2id >= 0))
+def _couplings(model: mujoco.MjModel) -> list[tuple[int, int, np.ndarray]]:
+    """Of each active equality that couples one joint to another: both position addresses, and its polynomial [5]."""
+    rows = np.flatnonzero((model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & model.eq_active0 & (model.eq_obj2id >= 0))
+    ends = (model.jnt_qposadr[of[rows]].tolist() for of in (model.eq_obj1id, model.eq_obj2id))
+    return list(zip(*ends, model.eq_data[rows, :5], strict=True))
 
 
 def check_weight(scene: Scene, recording: Recording, qpos0: np.ndarray) -> None:

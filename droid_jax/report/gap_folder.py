@@ -125,12 +125,18 @@ class Gap:
 
     @property
     def hidden(self) -> list[str]:
-        """What the stand-in robot hid that was searched: "name=amplitude" each; empty where nothing is known of it."""
-        return self.found["setup"].get("robot", {}).get("hide", []) if self.stand_in else []
+        """See `hidden_in`."""
+        return hidden_in(self.found)
 
     def recording(self, role: str) -> str:
         """Name of the recording in a role."""
         return self.found["gaps"][role]["recording"]
+
+
+def hidden_in(found: Mapping[str, Any]) -> list[str]:
+    """What the stand-in robot hid that was searched, of gap.json: "name=amplitude" each; empty where none is known."""
+    setup = found["setup"]
+    return setup.get("robot", {}).get("hide", []) if setup.get("stand_in") else []
 
 
 def has_gap(folder: Path) -> bool:
