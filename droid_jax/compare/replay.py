@@ -18,8 +18,9 @@ from mujoco import mjx
 from droid_jax.compare.start import check_weight, holding, start_pose, weight_share
 from droid_jax.measure.checks import check_joints
 from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
+from droid_jax.model.actuators import has_servo_damping
 from droid_jax.model.physics import Physics
-from droid_jax.model.scene import Scene, has_servo_damping
+from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, Rollout, State, Theta, column
 from droid_jax.model.step import check_options, servo_force
 from droid_jax.model.step import step as simulate_step

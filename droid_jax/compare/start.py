@@ -11,7 +11,8 @@ import mujoco
 import numpy as np
 
 from droid_jax.measure.recording import Channel, Recording
-from droid_jax.model.scene import Scene, has_feedback
+from droid_jax.model.actuators import has_feedback
+from droid_jax.model.scene import Scene
 
 AJAR = 0.02  # rad or m: an object seen no further than this from the scene's pose stands there, as cameras are noisy
 WEIGHT = 0.01  # N m or N: a joint that feels less uncompensated weight feels none (noise below it is never believed)

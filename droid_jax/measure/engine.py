@@ -10,7 +10,8 @@ import numpy as np
 from mujoco import rollout
 
 from droid_jax import runtime
-from droid_jax.model.scene import Scene, without_looks
+from droid_jax.model.looks import without_looks
+from droid_jax.model.scene import Scene
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,8 @@ from pathlib import Path
 import mujoco
 
 from droid_jax.model.builtin import ARM, HINGE, mjcf_dir
-from droid_jax.model.scene import LOOK_GROUP, Grip, Scene, compile_scene
+from droid_jax.model.looks import LOOK_GROUP
+from droid_jax.model.scene import Grip, Scene, compile_scene
 
 LEVERS = (0.30, 0.25, 0.20, 0.15)  # m, knob to hinge axis: four locations 5 cm apart (paper, IV-E)
 

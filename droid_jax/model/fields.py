@@ -19,8 +19,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from droid_jax.model.actuators import has_servo_damping
 from droid_jax.model.parameters import Mode, Parameter, Scaling, Write
-from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene, has_servo_damping
+from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
 
 _KIND = {
     "dof": "joint",

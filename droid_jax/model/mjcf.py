@@ -10,9 +10,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from droid_jax.model.looks import compiled, keep_inertia, look_geoms, weigh
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model
-from droid_jax.model.scene import Scene, compiled, keep_inertia, look_geoms, weigh
+from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
 
 # Model field -> attribute of the element that holds a row of it, or its first numbers.

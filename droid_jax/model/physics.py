@@ -19,8 +19,9 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
+from droid_jax.model.ignored import IGNORED
 from droid_jax.model.parameters import Space, Write
-from droid_jax.model.scene import IGNORED, Scene
+from droid_jax.model.scene import Scene
 
 # Writing one of these changes what the compiler derives.
 _SOURCES = {"body_mass", "body_inertia", "body_pos", "body_quat", "body_ipos", "body_iquat", "dof_armature",

@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
-import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,28 +17,13 @@ from typing import Any
 import mujoco
 import numpy as np
 
-LOOK_GROUP = 2
+from droid_jax.model.actuators import actuator_names, drives_joint, of_joint
+from droid_jax.model.ignored import refuse_ignored
+from droid_jax.model.looks import compiled, look_geoms, without_looks
+
 PICTURE = (480, 640)  # height, width of the largest picture that is drawn
 TINY_FRICTIONLOSS = 1e-6  # N m: enough to give a joint its friction-loss row
 ONE_DEGREE = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-
-# C MuJoCo's model arrays that MJX accepts in a file and then leaves out (mujoco-mjx 3.17.0):
-# field, and what it is.
-IGNORED = (
-    ("jnt_stiffnesspoly", "polynomial joint stiffness"),
-    ("dof_dampingpoly", "polynomial joint damping"),
-    ("tendon_stiffnesspoly", "polynomial tendon stiffness"),
-    ("tendon_dampingpoly", "polynomial tendon damping"),
-    ("actuator_delay", "actuator delay"),
-    ("actuator_damping", "actuator damping"),
-    ("actuator_dampingpoly", "polynomial actuator damping"),
-    ("actuator_armature", "actuator armature"),
-    ("sensor_delay", "sensor delay"),
-    ("actuator_actearly", "early activation of actuators"),
-    ("geom_adhesion", "adhesion of geoms"),
-    ("pair_adhesion", "adhesion of contact pairs"),
-    ("geom_surfacevel", "surface velocity"),
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +132,7 @@ class Scene:
     @functools.cached_property
     def of_joint(self) -> np.ndarray:
         """[U] bool, whose entry of `command_names` is a joint."""
-        return _of_joint(self.model, self.command_names)
+        return of_joint(self.model, self.command_names)
 
     @functools.cached_property
     def driven_joints(self) -> tuple[str, ...]:
@@ -251,94 +235,6 @@ def _count(model: mujoco.MjModel, kind: str) -> int:
     }[kind]
 
 
-def has_servo_damping(model: mujoco.MjModel) -> bool:
-    """Whether any actuator has a velocity gain: its force then follows the joint's velocity."""
-    return bool(np.any(model.actuator_biasprm[:, 2]) or np.any(model.actuator_gainprm[:, 2]))
-
-
-def refuse_ignored(model: mujoco.MjModel, name: str) -> None:
-    """Raise ValueError listing every feature of the model that MJX would silently leave out."""
-    found = [what for field, what in IGNORED if _used(model, field)]
-    if np.any(model.opt.disableactuator != 0):
-        found.append("disabled actuator groups")
-    if model.opt.noslip_iterations > 0:
-        found.append("the noslip solver")
-    if found:
-        raise ValueError(
-            f"scene {name!r} uses features that MJX accepts and then ignores: {', '.join(found)}; "
-            "remove them from the MJCF or add the effect through the program's own library"
-        )
-
-
-def _used(model: mujoco.MjModel, field: str) -> bool:
-    array = getattr(model, field, None)
-    return array is not None and np.size(array) > 0 and bool(np.any(np.asarray(array) != 0))
-
-
-def look_geoms(spec: mujoco.MjSpec) -> list[Any]:
-    """The geoms for the eye: of LOOK_GROUP, nothing can touch them, and no pair, tendon or sensor names them."""
-    used = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
-    used |= {w.target.name for t in spec.tendons for w in t.path if isinstance(w.target, mujoco.MjsGeom)}
-    for s in spec.sensors:
-        ends = ((s.objtype, s.objname), (s.reftype, s.refname))
-        used |= {name for kind, name in ends if kind == mujoco.mjtObj.mjOBJ_GEOM}
-    return [
-        g
-        for g in spec.geoms
-        if g.group == LOOK_GROUP and not g.contype and not g.conaffinity and (not g.name or g.name not in used)
-    ]
-
-
-def without_looks(spec: mujoco.MjSpec) -> mujoco.MjSpec:
-    """A copy without `look_geoms`, whose bodies weigh what they weighed with them."""
-    bare = spec.copy()
-    looks = look_geoms(bare)
-    if looks:
-        whole = compiled(spec.copy())
-        for geom in looks:
-            bare.delete(geom)
-        keep_inertia(bare, whole)
-    return bare
-
-
-def keep_inertia(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
-    """Have every body of a spec weigh what it weighs in `model` (of the same bodies), whatever its geoms would give."""
-    now = compiled(spec)  # numbers the bodies, of which not all need a name
-    fields = ("body_mass", "body_inertia", "body_ipos", "body_iquat")
-    same = np.all([_rows_close(getattr(now, f), getattr(model, f)) for f in fields], axis=0)
-    other = ~same & (model.body_mass > 0)
-    if not other.any():
-        return
-    always = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
-    for body in spec.bodies[1:]:
-        if other[body.id] or (always and model.body_mass[body.id] > 0):
-            weigh(body, model, body.id)
-    if always:  # every body now says what it weighs, so none is left to its geoms
-        spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
-
-
-def _rows_close(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """[n] bool, rows equal to rounding."""
-    close = np.isclose(a, b, rtol=1e-9, atol=1e-14)
-    return np.all(np.reshape(close, (len(a), -1)), axis=1)
-
-
-def weigh(body: Any, model: mujoco.MjModel, index: int) -> None:
-    """Mass, centre and inertia of a body, its own and not its geoms'."""
-    body.explicitinertial = True
-    body.mass = float(model.body_mass[index])
-    body.ipos, body.iquat = model.body_ipos[index].tolist(), model.body_iquat[index].tolist()
-    body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT  # of several ways to say how the inertia is turned
-    body.inertia, body.fullinertia = model.body_inertia[index].tolist(), [np.nan] * 6
-
-
-def compiled(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """The model of a spec, without MuJoCo's warning of attached files that share a default (see door_scene._attach)."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        return spec.compile()
-
-
 def compile_scene(
     spec: mujoco.MjSpec,
     name: str,
@@ -366,8 +262,8 @@ def compile_scene(
             joint.frictionloss = TINY_FRICTIONLOSS
     model = bare.compile()
     refuse_ignored(model, name)
-    command_names = _command_names(model)
-    driven = tuple(n for n, of in zip(command_names, _of_joint(model, command_names), strict=True) if of)
+    command_names = actuator_names(model)
+    driven = tuple(n for n, of in zip(command_names, of_joint(model, command_names), strict=True) if of)
     scene = Scene(
         name=name,
         spec=spec,
@@ -383,44 +279,6 @@ def compile_scene(
             raise ValueError(f"joint {joint!r} of scene {name!r} must be a hinge or a slide")
     _ = scene.finger_pairs  # unknown pair names fail here, not in the first replay
     return scene
-
-
-def drives_joint(model: mujoco.MjModel) -> np.ndarray:
-    """[U] bool, actuators that drive a joint, and not a tendon, a site or a body."""
-    kinds = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
-    return np.isin(model.actuator_trntype, kinds)
-
-
-def has_feedback(model: mujoco.MjModel) -> np.ndarray:
-    """[U] bool, actuators whose force follows their own position, as a position servo's does."""
-    return (model.actuator_biastype != mujoco.mjtBias.mjBIAS_NONE) & (model.actuator_biasprm[:, 1] != 0)
-
-
-def _of_joint(model: mujoco.MjModel, command_names: Sequence[str]) -> np.ndarray:
-    """[U] bool, those of `command_names` that are joints."""
-    joints = {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, i) for i in range(model.njnt)}
-    return np.array([name in joints for name in command_names], dtype=bool)
-
-
-def _command_names(model: mujoco.MjModel) -> tuple[str, ...]:
-    """[U] the joint that each actuator drives, or its own name where it drives none.
-
-    Of several that drive one joint (a position servo with its damping in a <velocity> of its own) the servo goes by the
-    joint's name, the others by their own; where there is no servo, or more than one, all go by their own.
-    """
-    joints = [int(j) if of else -1 for j, of in zip(model.actuator_trnid[:, 0], drives_joint(model), strict=True)]
-    feedback, names = has_feedback(model), list[str]()
-    for i, joint in enumerate(joints):
-        own = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i)
-        rivals = [k for k, other in enumerate(joints) if other == joint >= 0]
-        if joint >= 0 and (rivals == [i] or [k for k in rivals if feedback[k]] == [i]):
-            names.append(mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint))
-        elif not own or mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, own) >= 0:
-            what = "has another one beside it" if joint >= 0 else "drives no joint"
-            raise ValueError(f"actuator {own or i!r} {what}: give it a name that no joint has")
-        else:
-            names.append(own)
-    return tuple(names)
 
 
 def load_scene(

@@ -22,8 +22,8 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
+from droid_jax.model.actuators import drives_joint
 from droid_jax.model.patches import exact_segments, midpoint_constraints
-from droid_jax.model.scene import drives_joint
 
 ITERATIONS = 8  # at most; two or three are usual from a warm start
 LINE_SEARCH = 6  # corners of the piecewise linear slope followed in one step

@@ -14,9 +14,10 @@ from mujoco import mjx
 
 from droid_jax.compare.replay import check_stateless, pushed, rubbing, servo_given, through
 from droid_jax.measure.demonstration import OPEN, PLANS, Plan, grasp_pose, solve_pose
+from droid_jax.model.actuators import has_servo_damping
 from droid_jax.model.effects.registry import ready
 from droid_jax.model.physics import Physics
-from droid_jax.model.scene import Scene, has_servo_damping
+from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, State, Theta
 from droid_jax.model.step import step as simulate_step
 from droid_jax.policy.control import ACTIONS, OBSERVED, Safety, limited

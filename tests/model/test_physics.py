@@ -17,9 +17,10 @@ from droid_jax.model.builtin import ARM
 from droid_jax.model.door import door_nuisances, door_space
 from droid_jax.model.door_scene import door_scene
 from droid_jax.model.fields import body_mass, model_parameter, servo_scale
+from droid_jax.model.looks import LOOK_GROUP
 from droid_jax.model.parameters import Mode, Parameter, Space, Write
 from droid_jax.model.physics import derive, make_c_model, make_physics, theta_of, written_fields
-from droid_jax.model.scene import LOOK_GROUP, Scene, compile_scene
+from droid_jax.model.scene import Scene, compile_scene
 
 # The compiler's bounding-volume tree: explicit contact pairs never look at it.
 NOT_DERIVED = {"bvh_aabb", "oct_aabb"}

@@ -13,7 +13,8 @@ from droid_jax.model.builtin import ARM, FINGERS
 from droid_jax.model.door import door_space, truth
 from droid_jax.model.door_scene import LEVERS, door_scene
 from droid_jax.model.fields import body_mass, joint_damping, joint_frictionloss, model_parameter, servo_scale
-from droid_jax.model.scene import LOOK_GROUP, TINY_FRICTIONLOSS, Grip, Scene, compile_scene, load_scene, with_options
+from droid_jax.model.looks import LOOK_GROUP
+from droid_jax.model.scene import TINY_FRICTIONLOSS, Grip, Scene, compile_scene, load_scene, with_options
 
 # Franka's documentation, "Denavit-Hartenberg parameters" (Craig's convention): a, d [m], alpha [rad].
 DH = (
