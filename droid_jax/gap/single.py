@@ -25,7 +25,7 @@ import jax
 import numpy as np
 
 from droid_jax.compare.cost import Cost, make_cost
-from droid_jax.compare.residuals import MINIMUM_NOISE
+from droid_jax.compare.measured import MINIMUM_NOISE
 from droid_jax.gap.blocks import OUTSIDE, Blocks, block_length, blocks, interleaved
 from droid_jax.gap.candidates import candidates
 from droid_jax.gap.case import Case, GapConfig, restrained

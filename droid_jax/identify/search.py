@@ -15,7 +15,7 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -24,16 +24,15 @@ import numpy as np
 from droid_jax.identify.cma import Strategy, recombination
 from droid_jax.identify.fit import Fit, History, Progress, Restart, on_bound
 from droid_jax.identify.gaussian import space_to_json
+from droid_jax.identify.state import REASONS, Run
 from droid_jax.model.parameters import Space
 
 if TYPE_CHECKING:
-    from droid_jax.identify.checkpoints import Checkpoints, Tree
+    from droid_jax.identify.checkpoints import Checkpoints
 
 Cost = Callable[[np.ndarray], Any]  # [rows, D] float64 physical values -> [rows]; +inf is a failed row
 
 _NEAR = 1.0  # search coordinates, one prior deviation: so near to a bound the best is tried on it
-
-_REASONS = ("", "tol_cost", "tol_sigma")  # why a restart stopped, by the code kept in checkpoints
 
 
 class NotReplayed(ValueError):
@@ -133,7 +132,7 @@ def search(
     strategy = _strategy(space, config)
     centre = _start(space, config, start)
     with _checkpoints(checkpoint_dir, space, config, centre, fingerprint) as checkpoints:
-        run = _restored(checkpoints, strategy, centre) or _Run.fresh(strategy.init(centre), config, len(space))
+        run = _restored(checkpoints, strategy, centre) or Run.fresh(strategy.init(centre), config.restarts, len(space))
         while _unfinished(run, config):
             _generation(run, cost, strategy, config)
             if checkpoints and (run.generation % config.checkpoint_every == 0 or not _unfinished(run, config)):
@@ -152,58 +151,7 @@ def _strategy(space: Space, config: SearchConfig) -> Strategy:
     return Strategy(space, weights, sigma=config.sigma, seeds=seeds, redraw=config.bounds == "resample")
 
 
-@dataclass(eq=False)
-class _Run:
-    """Everything that changes while a search runs; what a checkpoint holds."""
-
-    state: Any  # evosax's, leading axis [R]
-    generation: int
-    best: np.ndarray  # [R, D] physical
-    best_cost: np.ndarray  # [R]
-    stopped: np.ndarray  # [R] index into _REASONS
-    ended: np.ndarray  # [R] generations the restart ran
-    failed: int
-    records: dict[str, list[np.ndarray]] = field(default_factory=dict)  # per generation [R, ...]
-
-    @staticmethod
-    def fresh(state: Any, config: SearchConfig, dims: int) -> _Run:
-        r = config.restarts
-        none = np.zeros(r, np.int64)
-        return _Run(state, 0, np.full((r, dims), np.nan), np.full(r, np.inf), none, none.copy(), 0)
-
-    @property
-    def cov(self) -> np.ndarray:
-        """[R, D, D] sigma^2 C, search coordinates."""
-        c = np.asarray(self.state.C, np.float64)
-        sigma = np.asarray(self.state.std, np.float64)
-        return sigma[:, None, None] ** 2 * (c + c.swapaxes(1, 2)) / 2
-
-    @property
-    def seconds(self) -> float:
-        """Wall time of all generations so far."""
-        return float(sum(float(s[0]) for s in self.records.get("seconds", [])))
-
-    def tree(self) -> Tree:
-        """As nested dictionaries of arrays."""
-        return {
-            "state": {name: np.asarray(getattr(self.state, name)) for name in self.state.__dataclass_fields__},
-            "records": {name: np.stack(rows) for name, rows in self.records.items()},
-            "best": self.best,
-            "best_cost": self.best_cost,
-            "stopped": self.stopped,
-            "ended": self.ended,
-            "failed": np.array(self.failed),
-        }
-
-    @staticmethod
-    def of_tree(generation: int, tree: Tree, state: Any) -> _Run:
-        """Inverse of tree(), with the state already on its device."""
-        records = {name: list(rows) for name, rows in tree["records"].items()}
-        best, best_cost, stopped, ended = (np.array(tree[k]) for k in ("best", "best_cost", "stopped", "ended"))
-        return _Run(state, generation, best, best_cost, stopped, ended, int(tree["failed"]), records)
-
-
-def _generation(run: _Run, cost: Cost, strategy: Strategy, config: SearchConfig) -> None:
+def _generation(run: Run, cost: Cost, strategy: Strategy, config: SearchConfig) -> None:
     """One generation of every restart: draw, evaluate, update, record, judge."""
     started = time.perf_counter()
     space = strategy.space
@@ -220,10 +168,10 @@ def _generation(run: _Run, cost: Cost, strategy: Strategy, config: SearchConfig)
         )
     run.failed += int((~np.isfinite(costs)).sum())
     run.state = strategy.tell(state, x, costs, running)
-    _keep_best(run, values, costs, running)
+    run.keep_best(values, costs, running)
     run.generation += 1
     run.ended[running] = run.generation
-    _record(run, costs, space.from_search(np.asarray(run.state.mean, np.float64)))
+    run.record(costs, space.from_search(np.asarray(run.state.mean, np.float64)))
     run.records["seconds"].append(np.full(config.restarts, time.perf_counter() - started))
     _judge(run, config)
 
@@ -238,7 +186,7 @@ def mirrored(space: Space, x: np.ndarray) -> np.ndarray:
     return np.clip(np.where(x < low, 2 * low - x, np.where(x > high, 2 * high - x, x)), low, high)
 
 
-def _try_bounds(run: _Run, cost: Cost, space: Space, config: SearchConfig) -> int:
+def _try_bounds(run: Run, cost: Cost, space: Space, config: SearchConfig) -> int:
     """Ask once more for every restart's best, moved onto bounds it lies near; how many rows were asked.
 
     Mirrored draws come near a bound and never lie on it.  A row that costs no more becomes the best.  Nothing of this
@@ -251,7 +199,7 @@ def _try_bounds(run: _Run, cost: Cost, space: Space, config: SearchConfig) -> in
     values = np.stack([_moved_onto_bounds(space, best, config.population) for best in bests])  # [R, P, D]
     if (values == bests[:, None])[known].all():
         return 0
-    _keep_best(run, values, _evaluate(cost, values), known, ties=True)
+    run.keep_best(values, _evaluate(cost, values), known, ties=True)
     return values.shape[0] * values.shape[1]
 
 
@@ -275,32 +223,7 @@ def _evaluate(cost: Cost, values: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(costs), costs, np.inf).reshape(values.shape[:2])
 
 
-def _keep_best(run: _Run, values: np.ndarray, costs: np.ndarray, running: np.ndarray, *, ties: bool = False) -> None:
-    """Bring every running restart's best row up to date, with `ties` also by a row that costs the same."""
-    for r in np.flatnonzero(running):
-        i = int(np.argmin(costs[r]))
-        if costs[r, i] < run.best_cost[r] or (ties and costs[r, i] == run.best_cost[r]):
-            run.best[r], run.best_cost[r] = values[r, i], costs[r, i]
-
-
-def _record(run: _Run, costs: np.ndarray, mean: np.ndarray) -> None:
-    """Append this generation to the records; costs [R, P], mean [R, D] physical."""
-    finite = [row[np.isfinite(row)] for row in costs]
-    entries = {
-        "mean": mean,
-        "std": np.sqrt(np.diagonal(run.cov, axis1=1, axis2=2)),
-        "sigma": np.asarray(run.state.std, np.float64),
-        "best_cost": run.best_cost.copy(),
-        "mean_cost": np.array([f.mean() if f.size else np.inf for f in finite]),
-        "median_cost": np.array([np.median(f) if f.size else np.inf for f in finite]),
-        "costs": costs,
-    }
-    for name, entry in entries.items():
-        run.records.setdefault(name, []).append(entry)
-    run.records.setdefault("seconds", [])
-
-
-def _judge(run: _Run, config: SearchConfig) -> None:
+def _judge(run: Run, config: SearchConfig) -> None:
     """Mark the restarts that have converged; a marked one stays as it is from then on."""
     widest = np.sqrt(np.linalg.eigvalsh(run.cov)[:, -1])  # [R]
     narrow = widest < config.tol_sigma
@@ -310,17 +233,17 @@ def _judge(run: _Run, config: SearchConfig) -> None:
         with np.errstate(invalid="ignore"):  # inf - inf while a restart has not found a finite row
             stalled = before - run.best_cost < config.tol_cost * np.abs(before)
     running = run.stopped == 0
-    run.stopped[running & stalled] = _REASONS.index("tol_cost")
-    run.stopped[running & narrow] = _REASONS.index("tol_sigma")
+    run.stopped[running & stalled] = REASONS.index("tol_cost")
+    run.stopped[running & narrow] = REASONS.index("tol_sigma")
 
 
-def _unfinished(run: _Run, config: SearchConfig) -> bool:
+def _unfinished(run: Run, config: SearchConfig) -> bool:
     """Whether another generation is due."""
     in_time = config.max_seconds is None or run.seconds < config.max_seconds
     return bool((run.stopped == 0).any()) and run.generation < config.generations and in_time
 
 
-def _progress(run: _Run, config: SearchConfig) -> Progress:
+def _progress(run: Run, config: SearchConfig) -> Progress:
     """Numbers for a display; the pace is the median of ten generations, so that compilation drops out."""
     pace = float(np.median([s[0] for s in run.records["seconds"][-10:]]))
     left = pace * (config.generations - run.generation) if _unfinished(run, config) else 0.0
@@ -332,7 +255,7 @@ def _progress(run: _Run, config: SearchConfig) -> Progress:
     return Progress(run.generation, config.generations, float(run.best_cost[leader]), median, sigma, run.seconds, left)
 
 
-def _fit(run: _Run, space: Space, config: SearchConfig, asked: int) -> Fit:
+def _fit(run: Run, space: Space, config: SearchConfig, asked: int) -> Fit:
     """The result, led by the restart with the lowest cost; `asked` rows came after the generations."""
     overall = "max_seconds" if run.generation < config.generations else "generations"
     covs, means = run.cov, run.records["mean"][-1]
@@ -343,7 +266,7 @@ def _fit(run: _Run, space: Space, config: SearchConfig, asked: int) -> Fit:
             best_cost=float(run.best_cost[r]),
             mean=means[r],
             cov=covs[r],
-            stop=_REASONS[run.stopped[r]] or overall,
+            stop=REASONS[run.stopped[r]] or overall,
             history=History(**{k: np.stack([e[r] for e in v[: run.ended[r]]]) for k, v in run.records.items()}),
         )
         for r in range(config.restarts)
@@ -391,11 +314,11 @@ def _checkpoints(folder: Path | None, space: Space, config: SearchConfig, centre
     return Checkpoints(folder, fingerprint=texts)
 
 
-def _restored(checkpoints: Checkpoints | None, strategy: Strategy, centre: np.ndarray) -> _Run | None:
+def _restored(checkpoints: Checkpoints | None, strategy: Strategy, centre: np.ndarray) -> Run | None:
     """The search as its newest whole checkpoint left it, or None."""
     found = checkpoints.restore() if checkpoints else None
     if found is None:
         return None
     generation, tree = found
     state = strategy.put_state(strategy.init(centre), tree["state"])
-    return _Run.of_tree(generation, tree, state)
+    return Run.of_tree(generation, tree, state)

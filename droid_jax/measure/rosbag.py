@@ -13,24 +13,15 @@ import enum
 import itertools
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from rosbags.highlevel import AnyReader
-from rosbags.typesys import Stores, get_typestore
 
+from droid_jax.measure.bag_topics import FIELDS, Track, read_bag
 from droid_jax.measure.checks import validate
 from droid_jax.measure.clocks import check_clock
 from droid_jax.measure.recording import Channel, Phase, Recording, ServoGains, TorqueConvention
 
-# channel -> field of sensor_msgs/JointState, and its unit at hinges and at slides
-_FIELDS = {
-    "torque": ("effort", "N m", "N"),
-    "position": ("position", "rad", "m"),
-    "velocity": ("velocity", "rad/s", "m/s"),
-}
 _GAP = 5.0  # usual steps; a longer silence of a topic counts as unmeasured
 
 
@@ -40,19 +31,6 @@ class Stamps(enum.Enum):
     AUTO = "auto"  # header stamps where all messages used have one, else BAG
     HEADER = "header"  # when the message was made
     BAG = "bag"  # when the recorder received it
-
-
-@dataclass(frozen=True, eq=False)
-class _Track:
-    """One topic of one bag: bag and header stamps [M] ns, and values [M, J] by field.
-
-    A field that the messages leave empty is absent.  Header stamps are None without headers.
-    Stamps stay integers: nanoseconds since 1970 do not fit a float64.
-    """
-
-    received: np.ndarray
-    stamped: np.ndarray | None
-    fields: dict[str, np.ndarray]
 
 
 _Timed = tuple[np.ndarray, dict[str, np.ndarray]]  # stamps [M] s, and values [M, J] by field
@@ -112,7 +90,7 @@ def read_bags(
     topics = {state_topic: (tuple(joints), "effort")}
     if command_topic is not None:
         topics[command_topic] = (command_joints, "position")
-    tracks = [_read_bag(bag, topics) for bag in bags]
+    tracks = [read_bag(bag, topics) for bag in bags]
     order = _as_recorded([track[state_topic].received for track in tracks])
     bags, tracks = [bags[i] for i in order], [tracks[i] for i in order]
     use_header = _use_header(tracks, stamps, bags)
@@ -149,119 +127,6 @@ def read_bags(
     return validate(recording, source=", ".join(str(bag) for bag in bags))
 
 
-def _read_bag(bag: Path, topics: Mapping[str, tuple[tuple[str, ...], str]]) -> dict[str, _Track]:
-    """topic -> track of one bag.  topics: of each its joints, and the field whose numbers must all be finite."""
-    if not bag.exists():
-        raise FileNotFoundError(f"no ROS bag at {bag}: there is no such file or folder")
-    try:
-        # Bags of ROS 2 before Iron in sqlite3 hold no message definitions of their own.
-        with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            return {topic: _read_topic(reader, bag, topic, *wanted) for topic, wanted in topics.items()}
-    except Exception as error:  # damaged bags fail in many ways: AssertionError, OverflowError, UnicodeDecodeError, ...
-        if isinstance(error, ValueError) and str(error).startswith(str(bag)):
-            raise
-        what = f"{type(error).__name__}: {error}"
-        raise ValueError(f"{bag}: not a readable ROS bag, or one that was cut off ({what})") from error
-
-
-def _read_topic(reader: AnyReader, bag: Path, topic: str, joints: tuple[str, ...], needed: str) -> _Track:
-    connections = [c for c in reader.connections if c.topic == topic]
-    if not connections:
-        have = ", ".join(sorted({c.topic for c in reader.connections})) or "none"
-        raise ValueError(f"{bag}: no topic {topic!r}; the bag has: {have}")
-    for kind in {c.msgtype for c in connections} - set(reader.typestore.fielddefs):
-        raise ValueError(
-            f"{bag}, topic {topic!r}: the bag does not define {kind}, as bags in sqlite3 of ROS 2 before Iron do not; "
-            "`ros2 bag convert` makes an mcap of it that does"
-        )
-    received, stamped, rows = [], [], []
-    seen: set[str] = set()
-    for number, (connection, nanoseconds, data) in enumerate(reader.messages(connections)):
-        message = reader.deserialize(data, connection.msgtype)
-        where = f"{bag}, topic {topic!r}, message {number}"
-        for offset, names, fields in _samples(message, joints, connection.msgtype, where):
-            seen.update(names)
-            picked = _pick(fields, names, joints, needed, where)
-            if picked is None:
-                continue
-            rows.append(picked)
-            received.append(nanoseconds + offset)
-            stamped.append(_header_stamp(message, offset))
-    if not rows and seen:
-        raise ValueError(f"{bag}, topic {topic!r}: no joint of {', '.join(joints)}; it has: {', '.join(sorted(seen))}")
-    if not rows:
-        raise ValueError(f"{bag}, topic {topic!r}: no messages")
-    fields = {key: np.array([row[key] for row in rows]) for key in rows[0] if all(key in row for row in rows)}
-    header = None if None in stamped else np.array(stamped, dtype=np.int64)
-    return _Track(np.array(received, dtype=np.int64), header, fields)
-
-
-def _header_stamp(message: Any, offset: int) -> int | None:
-    """Nanoseconds of the header's stamp plus offset; None when there is none or it is zero."""
-    stamp = getattr(getattr(message, "header", None), "stamp", None)
-    if stamp is None or not (stamp.sec or stamp.nanosec):
-        return None
-    return stamp.sec * 10**9 + stamp.nanosec + offset
-
-
-def _samples(
-    message: Any, joints: tuple[str, ...], kind: str, where: str
-) -> list[tuple[int, tuple[str, ...], dict[str, np.ndarray]]]:
-    """The (offset in ns, joint names, field -> numbers) that one message holds."""
-    if hasattr(message, "name") and hasattr(message, "position"):  # JointState
-        fields = {field: np.asarray(getattr(message, field), dtype=np.float64) for field, *_ in _FIELDS.values()}
-        return [(0, tuple(message.name), fields)]
-    if hasattr(message, "joint_names") and hasattr(message, "points"):  # JointTrajectory
-        names = tuple(message.joint_names)
-        return [(_nanoseconds(p.time_from_start), names, {"position": np.asarray(p.positions)}) for p in message.points]
-    if hasattr(message, "joint_names") and (hasattr(message, "reference") or hasattr(message, "desired")):
-        # JointTrajectoryControllerState, in older versions with the second name
-        point = message.reference if hasattr(message, "reference") else message.desired
-        return [(0, tuple(message.joint_names), {"position": np.asarray(point.positions)})]
-    if hasattr(message, "positions"):  # JointTrajectoryPoint
-        numbers = np.asarray(message.positions, dtype=np.float64)
-    elif hasattr(message, "data") and np.ndim(message.data) == 1:  # Float64MultiArray
-        numbers = np.asarray(message.data, dtype=np.float64)
-    else:
-        raise ValueError(
-            f"{where}: cannot read {kind}; expected JointState, JointTrajectory, JointTrajectoryPoint, "
-            "Float64MultiArray or JointTrajectoryControllerState"
-        )
-    if len(numbers) != len(joints):
-        raise ValueError(f"{where}: expected {len(joints)} numbers ({', '.join(joints)}), got {len(numbers)}")
-    return [(0, joints, {"position": numbers})]
-
-
-def _nanoseconds(duration: Any) -> int:
-    return duration.sec * 10**9 + duration.nanosec
-
-
-def _pick(
-    fields: Mapping[str, np.ndarray], names: tuple[str, ...], joints: tuple[str, ...], needed: str, where: str
-) -> dict[str, np.ndarray] | None:
-    """field -> [J] numbers of the joints wanted, without empty fields; finite in the field `needed`.
-
-    None when the message has none of them: arm and gripper often share a topic.
-    """
-    missing = [j for j in joints if j not in names]
-    if len(missing) == len(joints):
-        return None
-    if missing:
-        raise ValueError(f"{where}: no joint {', '.join(missing)}; the message has: {', '.join(names)}")
-    order = [names.index(j) for j in joints]
-    picked = {}
-    for field, numbers in fields.items():
-        if not len(numbers):
-            continue
-        if len(numbers) != len(names):
-            raise ValueError(f"{where}: expected {len(names)} numbers in {field!r}, got {len(numbers)}")
-        bad = [j for j, i in zip(joints, order, strict=True) if not np.isfinite(numbers[i])]
-        if bad and field == needed:
-            raise ValueError(f"{where}: {field} of joint {bad[0]!r} is {numbers[names.index(bad[0])]}, not finite")
-        picked[field] = numbers[order]
-    return picked
-
-
 def _as_recorded(received: Sequence[np.ndarray]) -> list[int]:
     """The bags with these recorder's stamps [M] ns in order of time, or as they are.
 
@@ -272,7 +137,7 @@ def _as_recorded(received: Sequence[np.ndarray]) -> list[int]:
     return order if apart else list(range(len(received)))
 
 
-def _use_header(tracks: Sequence[Mapping[str, _Track]], stamps: Stamps, bags: Sequence[Path]) -> bool:
+def _use_header(tracks: Sequence[Mapping[str, Track]], stamps: Stamps, bags: Sequence[Path]) -> bool:
     """Whether header stamps count: one choice for all, two clocks would shift the topics."""
     bare = [(bag, topic) for bag, t in zip(bags, tracks, strict=True) for topic in t if t[topic].stamped is None]
     if stamps is Stamps.HEADER and bare:
@@ -283,7 +148,7 @@ def _use_header(tracks: Sequence[Mapping[str, _Track]], stamps: Stamps, bags: Se
 
 
 def _timed(
-    tracks: Mapping[str, _Track],
+    tracks: Mapping[str, Track],
     use_header: bool,
     bag: Path,
     first_topic: str,
@@ -292,7 +157,7 @@ def _timed(
 ) -> dict[str, _Timed]:
     """topic -> checked stamps [M] s since the first message of first_topic, and the fields."""
 
-    def stamps(track: _Track) -> np.ndarray:
+    def stamps(track: Track) -> np.ndarray:
         return track.stamped if use_header and track.stamped is not None else track.received
 
     start = stamps(tracks[first_topic])[0]
@@ -343,7 +208,7 @@ def _channels(
     if lacking:
         raise ValueError(f"{lacking[0]}: the joint states hold no effort, so there is no torque to compare")
     channels = {}
-    for name, (field, hinge, slide) in _FIELDS.items():
+    for name, (field, hinge, slide) in FIELDS.items():
         if not all(field in fields for _, fields in states):
             continue
         values = np.stack([_interpolate(clock, t, fields[field]) for t, fields in states])

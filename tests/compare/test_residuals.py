@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from droid_jax.compare import residuals
+from droid_jax.compare import measured
 from droid_jax.compare.residuals import CompareConfig, Comparison, make_comparison
 from droid_jax.measure.recording import Channel, Phase, Recording, TorqueConvention, TorqueSide
 from droid_jax.model.door_scene import door_scene
@@ -456,6 +456,6 @@ def test_columns_that_were_silent_together_share_a_filter(scene: Scene):
 def test_a_recording_that_does_not_fit_into_memory_is_refused(scene: Scene, monkeypatch: pytest.MonkeyPatch):
     given = recording(channel("torque", CLOCK, np.stack([smooth_traces(3, 1)] * 2)))
     sizes = {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 100}
-    monkeypatch.setattr(residuals.os, "sysconf", sizes.__getitem__)
+    monkeypatch.setattr(measured.os, "sysconf", sizes.__getitem__)
     with pytest.raises(ValueError, match=r"'torque' of 2 s needs 0\.0 GB.*convert --start S --end S"):
         make_comparison(scene, given, CLOCK, CompareConfig())

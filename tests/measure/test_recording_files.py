@@ -189,7 +189,8 @@ def test_paths_that_are_no_recording(tmp_path: Path) -> None:
 
 
 def test_bags_without_the_package_say_what_to_install(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.delitem(sys.modules, "droid_jax.measure.rosbag", raising=False)
+    for name in ("rosbag", "bag_topics"):
+        monkeypatch.delitem(sys.modules, f"droid_jax.measure.{name}", raising=False)
     for name in ("rosbags", "rosbags.highlevel"):
         monkeypatch.setitem(sys.modules, name, None)
     (tmp_path / "a.bag").write_text("x")
