@@ -28,6 +28,7 @@ import tyro  # noqa: E402
 
 from benchmarks.common import commits, origin, stem  # noqa: E402
 from benchmarks.peers import doors, springs, sysid  # noqa: E402
+from benchmarks.sharing import kept  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 
 Case = Callable[[], dict[str, Any]]
@@ -69,10 +70,8 @@ def main() -> None:
         raise SystemExit(f"unknown cases {', '.join(unknown)}; there are: {', '.join(known)}")
     folder = arguments.out / stem("peer_sysid_cases", arguments.quick)
     for name in arguments.cases or known:
-        path = folder / f"{name}.json"
-        if not path.is_file():
-            print(f"{name} ...", flush=True)
-            write_json(path, {**known[name](), "origin": origin(0)}, indent=2)
+        print(f"{name} ...", flush=True)
+        kept(folder / f"{name}.json", lambda name=name: {**known[name](), "origin": origin(0)})
     done = {n: json.loads((folder / f"{n}.json").read_text()) for n in known if (folder / f"{n}.json").is_file()}
     figures = {n: {k: v for k, v in case.items() if k != "origin"} for n, case in done.items()}
     name = stem("peer_sysid", arguments.quick)

@@ -4,8 +4,8 @@
 
 One policy on doors drawn from the prior, on all devices, from an empty compilation cache; then it is tried in the
 simulation and on the stand-in robot (Table I's door without a spring).  Writes DIR/training.json, by preset and device:
-what the file holds of others stays.  The policy and the Gaussian of its doors are left in DIR/training_policy/PRESET,
-where experiments/policy_parity.py can take them.
+what the file holds of others stays.  The policy and the Gaussian of its doors are left in DIR/training_policy/PRESET
+(PRESET_gpu of a GPU), where experiments/policy_parity.py can take them.
 """
 
 from __future__ import annotations
@@ -82,7 +82,9 @@ def measured(arguments: Arguments) -> dict[str, Any]:
     doors = randomised(scene, gaussian)
     found = train(env, doors, config, progress=_tell)
     seconds = time.perf_counter() - began
-    left = arguments.out / stem("training_policy", arguments.quick) / arguments.preset
+    platform = jax.default_backend()
+    place = arguments.preset if platform == "cpu" else f"{arguments.preset}_{platform}"  # as its figures: apart
+    left = arguments.out / stem("training_policy", arguments.quick) / place
     save_policy(left / "policy.npz", found.policy)
     gaussian.save(left / "gaussian.json")
     physics = round(env.task.control / TIMESTEP)  # steps of the simulation in an action

@@ -21,7 +21,6 @@ import tuned  # noqa: F401  before anything that imports jax
 
 # isort: split
 import hashlib
-import json
 
 import numpy as np
 import scipy.linalg
@@ -30,6 +29,7 @@ import scipy.stats
 from inverse_fit import rms, rounded
 
 from benchmarks.common import CODE
+from benchmarks.sharing import code_name, kept
 from droid_jax.compare.residuals import CompareConfig
 from droid_jax.gap.blocks import OUTSIDE, Blocks
 from droid_jax.gap.case import Case, GapConfig
@@ -45,7 +45,7 @@ from droid_jax.model.effects.registry import effect_space
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, Theta
-from droid_jax.storage import finite, write_json
+from droid_jax.storage import finite
 
 ORDER = 20  # of the noise's autoregression, at 20 Hz: one second
 BURN = 400  # samples before the noise is stationary
@@ -170,14 +170,12 @@ def false_alarms(search: Search, verdict: Verdict, count: int, seed: int, folder
     rng = np.random.default_rng(seed)
     truth, left = verdict.base.values, search.log.left(verdict.model.values)
     simulated = search.log.simulated(truth[None])[0]
-    code = str(CODE.get("git"))
+    code = code_name(CODE.get("git"))
     missing, named = [], []
     for number in range(count):
         log = search.log.holding(simulated + coloured(left, rng))
         path = folder / f"{number:04d}_{_key(log, code)}.json"
-        if not path.is_file():
-            write_json(path, _said_of(search, log, truth))
-        said = json.loads(path.read_text())
+        said = kept(path, lambda log=log: _said_of(search, log, truth))
         print(f"  {number + 1:4d}: {said}", flush=True)
         if "refused" in said:
             continue

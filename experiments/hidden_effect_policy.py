@@ -30,6 +30,7 @@ import json  # noqa: E402
 import tyro  # noqa: E402
 
 from benchmarks.common import origin  # noqa: E402
+from benchmarks.sharing import claimed, code_name  # noqa: E402
 from droid_jax.commands.gap_search import searched  # noqa: E402
 from droid_jax.commands.hidden import hidden_effects, record_stand_in  # noqa: E402
 from droid_jax.gap.case import GapConfig  # noqa: E402
@@ -54,7 +55,6 @@ from droid_jax.storage import write_json  # noqa: E402
 from experiments.policies.cases import TIMESTEP, Case, Options, finish, found_of, made_by, run_all, tried  # noqa: E402
 from experiments.policies.store import Doors  # noqa: E402
 from experiments.policies.table import PLACES, apart, column, rates  # noqa: E402
-from experiments.sharing import claimed  # noqa: E402
 
 MODELS = ("prior", "base", "extended")
 BASE, SETUP = "base.json", "setup.json"
@@ -106,9 +106,9 @@ def _searched(arguments: Arguments, folder: Path, code: Mapping[str, Any]) -> di
     if arguments.quick:
         small = RefineConfig(iterations=1, hops=0, spreads=0)
         config = GapConfig(SearchConfig(population=8, parents=None, generations=1), small, small, 1, 1, 1)
-    kept = folder / "checkpoints" / str(code["commit"])
+    checkpoints = folder / "checkpoints" / code_name(code["commit"])
     case = case_of(Split.RECORDINGS, scene, base, library(scene), roles, config)
-    case, verdict, _ = searched(Split.RECORDINGS, case, roles, kept)
+    case, verdict, _ = searched(Split.RECORDINGS, case, roles, checkpoints)
     posterior(verdict.base.refined, case.fit.cost.comparisons).save(folder / BASE)
     save_extended(folder, extended(case, verdict.model))
     if verdict.kind is Kind.UNCONVERGED and not arguments.quick:  # no verdict: nothing is kept of it

@@ -29,7 +29,7 @@ import subprocess  # noqa: E402
 
 import tyro  # noqa: E402
 
-from benchmarks.common import origin, stem  # noqa: E402
+from benchmarks.common import CODE, origin, stem  # noqa: E402
 from droid_jax.storage import write_json, write_text  # noqa: E402
 from experiments.blind.cases import FACTORS, Counts, plans  # noqa: E402
 from experiments.blind.draws import commit_of, folder_of  # noqa: E402
@@ -144,7 +144,8 @@ def run_limits(command: Limits) -> dict[str, Any]:
         where = setting(name, command.kept / "door")
         found = scene_limits(where, 1 if command.quick else command.draws, command.kept, effects, _tell)
         known = json.loads(out.read_text()) if out.is_file() else {"scenes": {}}
-        scenes = {**known["scenes"], name: {**known["scenes"].get(name, {}), **found}}
+        of = {effect: {**entry, "commit": CODE.get("git")} for effect, entry in found.items()}
+        scenes = {**known["scenes"], name: {**known["scenes"].get(name, {}), **of}}
         write_json(out, {"origin": {**known.get("origin", {}), name: origin(0)}, "scenes": scenes})
     return {"file": out.name, "limits": {n: len(scenes[n]) for n in command.scenes}}
 
@@ -163,6 +164,7 @@ def run_make(command: Make) -> dict[str, Any]:
         if known_cases["commit"] != commit:
             raise SystemExit(f"error: {command.out} holds cases of {known_cases['commit']}; choose another --out")
         made = known_cases["scenes"]
+    write_json(path, {"commit": commit, "scenes": made})  # before the first case: no other commit's come beside it
     for name in ("hinge",) if command.quick else command.scenes:
         where, outcomes = setting(name, command.out / "door"), dict[str, str]()
         for plan in plans(where, counts, commit, known.get(name, {}), command.factors or FACTORS):

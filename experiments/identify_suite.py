@@ -28,6 +28,7 @@ import scipy.stats  # noqa: E402
 import tyro  # noqa: E402
 
 from benchmarks.common import commits, origin, stem  # noqa: E402
+from benchmarks.sharing import kept  # noqa: E402
 from droid_jax.compare.cost import make_cost  # noqa: E402
 from droid_jax.identify.gaussian import prior  # noqa: E402
 from droid_jax.identify.pipeline import Identified, IdentifyConfig, cost_samples, identify  # noqa: E402
@@ -163,12 +164,12 @@ def pose_case(demonstration: str, quick: bool) -> dict[str, Any]:
     return result
 
 
-def parity_case(_: int, quick: bool) -> dict[str, Any]:
+def parity_case(seed: int, quick: bool) -> dict[str, Any]:
     """MJX against the C engine over the whole opening: traces, and the rank correlation of the cost."""
     scene = door_scene(timestep=0.002)
     space = door_space(scene)
     truth = stand_in_truth(scene, 1, 1)
-    data = recordings(scene, truth, "A", 1)
+    data = recordings(scene, truth, "A", seed)
     values = prior(space).sample(0, 8 if quick else 200)
     costs, torques = {}, {}
     for engine in ("mjx", "mujoco"):
@@ -191,24 +192,22 @@ def parity_case(_: int, quick: bool) -> dict[str, Any]:
 def run_cases(arguments: Arguments) -> dict[str, dict[str, Any]]:
     """Run what is missing of the chosen parts; returns all cases that there are, by name."""
     quick = arguments.quick
-    cases: dict[str, Callable[[], dict[str, Any]]] = {}
+    cases: dict[str, tuple[int, Callable[[], dict[str, Any]]]] = {}  # name -> seed, and what makes it
     if "doors" in arguments.parts:
         for k in (1,) if quick else (0, 1, 2):
-            cases[f"door_{k}"] = lambda k=k: door_case(k, quick)
+            cases[f"door_{k}"] = k, lambda k=k: door_case(k, quick)
     if "parity" in arguments.parts:
-        cases["parity"] = lambda: parity_case(0, quick)
+        cases["parity"] = 1, lambda: parity_case(1, quick)
     if "pose" in arguments.parts:
         for name in "AB":
-            cases[f"pose_{name}"] = lambda name=name: pose_case(name, quick)
+            cases[f"pose_{name}"] = 900 + ord(name), lambda name=name: pose_case(name, quick)
     if "calibration" in arguments.parts:
         for k in range(1 if quick else arguments.calibration):
-            cases[f"calibration_{k:02d}"] = lambda k=k: calibration_case(k, quick)
+            cases[f"calibration_{k:02d}"] = 500 + k, lambda k=k: calibration_case(k, quick)
     folder = arguments.out / stem("identify_cases", quick)
-    for number, (name, run) in enumerate(cases.items(), 1):
-        path = folder / f"{name}.json"
-        if not path.is_file():
-            print(f"[{number}/{len(cases)}] {name} ...", flush=True)
-            write_json(path, {**run(), "origin": origin(0)}, indent=2)
+    for number, (name, (seed, run)) in enumerate(cases.items(), 1):
+        print(f"[{number}/{len(cases)}] {name} ...", flush=True)
+        kept(folder / f"{name}.json", lambda run=run, seed=seed: {**run(), "origin": origin(seed)})
     return {path.stem: json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))}
 
 

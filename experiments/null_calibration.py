@@ -12,6 +12,7 @@ seeds come as in the blind suite.
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,8 @@ import numpy as np  # noqa: E402
 import scipy.stats  # noqa: E402
 import tyro  # noqa: E402
 
-from benchmarks.common import CODE, origin  # noqa: E402
+from benchmarks.common import CODE, origin, stem  # noqa: E402
+from benchmarks.sharing import claimed  # noqa: E402
 from droid_jax.gap.anew import base_fit  # noqa: E402
 from droid_jax.gap.candidates import candidates  # noqa: E402
 from droid_jax.gap.screen import questions_of  # noqa: E402
@@ -41,8 +43,8 @@ from experiments.blind.make import recorded  # noqa: E402
 from experiments.blind.scenes import setting  # noqa: E402
 from experiments.blind.score import rate  # noqa: E402
 from experiments.blind.search import Bench, Stopwatch, silent  # noqa: E402
-from experiments.sharing import claimed  # noqa: E402
 
+FAILED = (ValueError, RuntimeError, FloatingPointError)
 LEVELS = (0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9)
 
 
@@ -73,17 +75,20 @@ class Arguments:
 
 
 def case_of(plan: Plan, commit: str, bench: Bench) -> dict[str, Any]:
-    """One case; what fails is a result too, and counts as a case without an answer."""
+    """One case; what fails is a result too, and keeps the p-value of a screening that was done."""
+    watch = Stopwatch()
+    told = {"scene": plan.scene, "seed": seed_of(commit, plan.name), "code": CODE.get("git"), "seconds": watch.seconds}
     try:
-        result = run_case(plan, commit, bench)
-    except (ValueError, RuntimeError, FloatingPointError) as error:
-        result = {"scene": plan.scene, "verdict": "error", "error": str(error), "seed": seed_of(commit, plan.name)}
-    return {**result, "code": CODE.get("git")}
+        for known in run_case(plan, commit, bench, watch):
+            told |= known
+    except FAILED as error:
+        told |= {"verdict": "error", "error": str(error)}
+    return told
 
 
-def run_case(plan: Plan, commit: str, bench: Bench) -> dict[str, Any]:
-    """Screen one case; search it to the end where the screening rejects."""
-    scene, where, watch = plan.scene, bench.setting(plan.scene), Stopwatch()
+def run_case(plan: Plan, commit: str, bench: Bench, watch: Stopwatch) -> Iterator[dict[str, Any]]:
+    """Screen one case; search it to the end where the screening rejects.  Each part of the result when it is known."""
+    scene, where = plan.scene, bench.setting(plan.scene)
     found = watch("record", lambda: recorded(where, plan, {}, seed_of(commit, plan.name)))
     if isinstance(found, str):
         raise ValueError(f"case {plan.name}: {found}")
@@ -92,21 +97,21 @@ def run_case(plan: Plan, commit: str, bench: Bench) -> dict[str, Any]:
     model = watch("base", lambda: base_fit(case, silent))
     screen = watch("screen", lambda: ask(case, model, questions_of(candidates(case.effects))))
     best = screen.questions[int(np.argmax(np.abs(screen.t)))].candidate.name
-    result = {"scene": scene, "p": screen.p, "gap": model.gap, "converged": bool(model.refined.converged), "best": best}
+    yield {"p": screen.p, "gap": model.gap, "converged": bool(model.refined.converged), "best": best}
     if screen.p < SIGNIFICANT:
         floor = watch("floor", lambda: bench.floor(scene, case, model, recordings["fit"]))
         whole = watch("prepare", lambda: bench.case(scene, recordings))
         verdict = watch("find", lambda: find(whole, model, floor))
-        result |= {"floor": floor, "verdict": verdict.kind.value, "effects": list(verdict.effects)}
-    return {**result, "seed": seed_of(commit, plan.name), "seconds": watch.seconds}
+        yield {"floor": floor, "verdict": verdict.kind.value, "effects": list(verdict.effects)}
 
 
 def summarise(cases: list[dict[str, Any]]) -> dict[str, Any]:
     """False alarms with Wilson's intervals, and the p-values' distribution.
 
-    Shares are of the cases that were answered; those that failed are counted beside them.
+    Shares are of the cases that were screened; those that failed, before or after, are counted beside them.  Whether
+    one that failed after its screening rejected would have ended in an alarm is not known: it counts as one.
     """
-    failed, cases = sum("p" not in c for c in cases), [c for c in cases if "p" in c]
+    failed, cases = sum("error" in c for c in cases), [c for c in cases if "p" in c]
     if not cases:
         return {"cases": 0, "errors": failed}
     p = np.array([c["p"] for c in cases])
@@ -148,14 +153,17 @@ def cases_of(folder: Path, commit: str) -> dict[str, list[dict[str, Any]]]:
 
 def told(case: dict[str, Any]) -> str:
     """One line."""
-    return f"p = {case['p']:.3f}" if "p" in case else f"error: {case['error']}"
+    p, error = (f"p = {case['p']:.3f}" if "p" in case else ""), (f"error: {case['error']}" if "error" in case else "")
+    return ", ".join(filter(None, (p, error)))
 
 
 def main() -> None:
     arguments = tyro.cli(Arguments, description=__doc__)
     commit = commit_of(arguments.commit)
     wanted = {"hinge": 2} if arguments.quick else asdict(arguments.counts)
-    folder = arguments.out / "null_cases"
+    folder, summary = arguments.out / "null_cases", arguments.out / f"{stem('null_calibration', arguments.quick)}.json"
+    if summary.is_file() and (other := json.loads(summary.read_text())["seeds_from"]) != commit:
+        raise SystemExit(f"error: {summary} sums up cases of {other}, not of {commit}: choose another --out")
     for scene, count in wanted.items() if not arguments.sum_only else ():
         bench = Bench({scene: setting(scene, arguments.out / "door")})
         for number in range(count):
@@ -172,7 +180,7 @@ def main() -> None:
     whole = summarise([c for cases in found.values() for c in cases])
     other = sum(c.get("code") != commit for cases in found.values() for c in cases)
     result = {**origin(0), "seeds_from": commit, "by_other_code": other, "all": whole, "scenes": scenes}
-    write_json(arguments.out / "null_calibration.json", result)
+    write_json(summary, result)
     print(json.dumps(whole))
 
 

@@ -27,6 +27,7 @@ import tyro  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 
 from benchmarks.common import commits, origin, stem  # noqa: E402
+from benchmarks.sharing import kept  # noqa: E402
 from droid_jax.compare.cost import Cost, make_cost  # noqa: E402
 from droid_jax.identify.judge import split  # noqa: E402
 from droid_jax.identify.search import SearchConfig, search  # noqa: E402
@@ -134,9 +135,9 @@ def main() -> None:
     for seed in range(1 if arguments.quick else arguments.seeds):
         for population in populations:
             path = folder / f"{population}_samples_{seconds:g}_s_{seed}.json"
-            if not path.is_file():
-                write_json(path, {**curve(cost, held, population, seconds, seed), "origin": origin(seed)})
-            runs.append(json.loads(path.read_text()))
+            runs.append(
+                kept(path, lambda p=population, s=seed: {**curve(cost, held, p, seconds, s), "origin": origin(s)})
+            )
             print(f"{population} samples, seed {seed}: held-out {runs[-1]['held_out'][-1]:.4f} N m", flush=True)
     shares = (0.25, 0.5, 1.0)
     table = {

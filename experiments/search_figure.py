@@ -28,6 +28,7 @@ import tyro  # noqa: E402
 from table1 import PAPER  # noqa: E402
 
 from benchmarks.common import origin, stem  # noqa: E402
+from benchmarks.sharing import kept  # noqa: E402
 from droid_jax.commands.identify import Identify, run  # noqa: E402
 from droid_jax.report import search_figures, torque_figures  # noqa: E402
 from droid_jax.report.export import save  # noqa: E402
@@ -70,6 +71,7 @@ def main() -> None:
             out=folder,
         )
     )
+    of = kept(folder / "origin.json", lambda: origin(0))  # a run that is drawn again stays of the code that made it
     found = read_run(folder)
     for name, figure in figures(found).items():
         save(figure, arguments.out, stem(name, arguments.quick))
@@ -85,7 +87,11 @@ def main() -> None:
         "seconds": found.fit["seconds"],
         "parameters": shown,
     }
-    write_json(arguments.out / f"{stem('search_figure', arguments.quick)}.json", {**origin(0), **result}, indent=2)
+    write_json(
+        arguments.out / f"{stem('search_figure', arguments.quick)}.json",
+        {**of, **result},
+        indent=2,
+    )
     print(json.dumps(result))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import time
@@ -10,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks.common import ROOT
 from droid_jax.measure.formats import save
 from droid_jax.measure.recording import Recording
 
@@ -25,7 +27,8 @@ def run_gap(recordings: Sequence[Recording], folder: Path, arguments: Sequence[s
     out = folder / "run"
     command = [sys.executable, "-m", "droid_jax.run", "gap", *arguments, "--recording", *paths, "--out", str(out)]
     began = time.perf_counter()
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}  # this checkout, and not what may be installed
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     seconds = time.perf_counter() - began
     if done.returncode:
         raise RuntimeError(f"gap ended with {done.returncode}: {' '.join(done.stderr.strip().splitlines()[-1:])}")

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.common import CODE
+from benchmarks.sharing import code_name
 from droid_jax.gap.candidates import candidates
 from droid_jax.gap.flips import largest_steady_t
 from droid_jax.gap.screen import questions_of
@@ -119,9 +120,8 @@ def _draw_limits(
     setting: Setting, number: int, folder: Path, asked: list[Applied], tell: Callable[[str], None]
 ) -> dict[str, dict[str, Any]]:
     """key -> entry, of one robot."""
-    # Of no other code: one with uncommitted changes could not be known again.
-    path = folder / f"{setting.name}_{number}_{CODE.get('git', 'dirty')}.json"
-    known = json.loads(path.read_text()) if path.is_file() and "dirty" not in path.name else {}
+    path = folder / f"{setting.name}_{number}_{code_name(CODE.get('git'))}.json"
+    known = json.loads(path.read_text()) if path.is_file() else {}
     left = [e for e in asked if key(e.name, e.joint) not in known]
     if not left:
         return known

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.sharing import claimed
 from droid_jax.gap.candidates import Candidate, candidates
 from droid_jax.gap.case import Case
 from droid_jax.gap.refit import Model, refit
@@ -27,7 +28,6 @@ from experiments.blind.quiet import settled
 from experiments.blind.scenes import ROLES
 from experiments.blind.score import digest, oracle_of
 from experiments.blind.search import Bench
-from experiments.sharing import claimed
 
 FROM_TRUTH = RefineConfig(iterations=12, hops=0, spreads=0)
 SIZES = np.geomspace(3e-3, 0.8, 12)  # of the way from neutral to a bound

@@ -24,6 +24,7 @@ OPEN = ("unexplained", "partly explained")
 CLOSED = 0.8  # share of a gap that a named effect has to close
 NAMEABLE = 0.5  # share of the gap that the right names have to close from the truth: less explains nothing
 ANSWERED = ("none", *NAMING, "unexplained")  # verdicts that say something; an error or an unconverged fit does not
+ROUNDED = 1.05  # beyond this times the stated multiple of its limit an effect is larger than that says
 ABOVE = 3.0  # multiple of its detection limit from which an effect counts in the rates of what is named
 SEEN = 0.02  # U above the floor below which a recording shows no gap
 COMPARABLE = 0.5  # of an effect's own size, left over by its library form, up to which amplitudes are compared
@@ -78,20 +79,10 @@ def code_of(case: Case) -> str:
 
 
 def judge(case: Case, limits: Mapping[str, Any]) -> dict[str, Any]:
-    """One case: what is right and wrong about its verdict."""
-    truth, result, right_names = case["truth"], case["result"], case["right"]
-    verdict = result["verdict"]
-    left_out = truth["kind"] == "left_out"
-    if left_out:
-        right_names = [[] for _ in right_names]
-    slots = slots_of(result, right_names)
-    met = matched(slots, right_names)
-    allowed = [*right_names, *beside([] if left_out else case["parts"], met)]
-    false = [sorted(slot) for slot in slots if not any(slot & set(names) for names in allowed)]
-    exact = [any(e == names[0] for e in result.get("effects", ())) for names in right_names if names]
-    names = result.get("effects", ())
-    alone = bool(exact) and all(exact) and len(names) == len(exact) and not any(result.get("tied", ()))
-    seconds = result.get("seconds", {})
+    """One case: what was hidden, what is right and wrong about the verdict, and what it closed."""
+    truth, result = case["truth"], case["result"]
+    times = times_limit(truth, limits)
+    answer = answered(case)
     return {
         "name": truth["name"],
         "seed": truth.get("seed"),
@@ -99,28 +90,45 @@ def judge(case: Case, limits: Mapping[str, Any]) -> dict[str, Any]:
         "class": truth["kind"],
         "factor": truth["factor"],
         "hidden": {key(h["name"], h["joint"]): h["amplitude"] for h in truth["hidden"]},
-        "times_limit": times_limit(truth, limits),
+        "times_limit": times,
+        "larger": any(t > ROUNDED * truth["factor"] for t in times.values()),
         "code": result.get("code"),
-        "verdict": verdict,
-        "effects": list(result.get("effects", ())),
-        "tied": [list(t) for t in result.get("tied", ())],
         "p": result.get("p"),
+        **answer,
+        "reachable": reachable(case, answer["named"]),
+        "gaps": result.get("gaps", {}),
+        "closed": _shares(result) if result.get("effects") else {},
+        "within_floor": within_floor(result),
+        "coverage": coverage(case),
+        "counterpart_coverage": counterpart_coverage(case, limits),
+        "baselines": against_baselines(case),
+        "seconds": result.get("seconds", {}),
+    }
+
+
+def answered(case: Case) -> dict[str, Any]:
+    """What the verdict says, and what of its names is right: where a form was taken away, none can be."""
+    result, left_out = case["result"], case["truth"]["kind"] == "left_out"
+    verdict, effects, ties = result["verdict"], result.get("effects", ()), result.get("tied", ())
+    right_names = [[] for _ in case["right"]] if left_out else case["right"]
+    slots = slots_of(result, right_names)
+    met = matched(slots, right_names)
+    allowed = [*right_names, *beside([] if left_out else case["parts"], met)]
+    false = [sorted(slot) for slot in slots if not any(slot & set(names) for names in allowed)]
+    exact = [any(e == names[0] for e in effects) for names in right_names if names]
+    alone = bool(exact) and all(exact) and len(effects) == len(exact) and not any(ties)
+    return {
+        "verdict": verdict,
+        "effects": list(effects),
+        "tied": [list(t) for t in ties],
         "false_names": false,
         "wrong_confident": bool(false) and verdict in CLEAN,
-        "said": [saying(*part, right_names, allowed) for part in zip(names, result.get("tied", ()), strict=True)],
+        "said": [saying(*part, right_names, allowed) for part in zip(effects, ties, strict=True)],
         "met": met,
         "named": bool(met) and all(met) and not false and verdict in NAMING,
         "alone": alone and verdict in NAMING,
         "exact": alone and verdict == "named",
         "open": verdict in OPEN,
-        "reachable": reachable(case),
-        "gaps": result.get("gaps", {}),
-        "closed": _shares(result) if names else {},
-        "within_floor": within_floor(result),
-        "coverage": coverage(case),
-        "counterpart_coverage": counterpart_coverage(case, limits),
-        "baselines": against_baselines(case),
-        "seconds": seconds,
     }
 
 
@@ -206,18 +214,23 @@ def _shares(result: Mapping[str, Any]) -> dict[str, float]:
     return {role: share for role, share in shares.items() if share is not None}
 
 
-def reachable(case: Case) -> float | None:
-    """Share of the confirming recording's gap that the right names close from the truth; None where that is not known.
+def reachable(case: Case, named: bool) -> float | None:
+    """Share of the confirming recording's gap that right names are known to close: the oracle's, or more of the search.
 
-    0 where the base model leaves hardly a gap: nothing can be named there.
+    None where that is not known: an oracle that has not settled, and a search that named rightly, tell only that so
+    much can be closed, which says something where it is `NAMEABLE`.  0 where the base model leaves hardly a gap:
+    nothing can be named there.
     """
-    known, gaps = case["oracle"], case["result"].get("gaps", {})
-    if not known or "gaps" not in known or "confirm" not in gaps:
+    oracle, result = case["oracle"] or {}, case["result"]
+    if "confirm" not in result.get("gaps", {}):
         return None
-    floor, before = case["result"]["floor"], gaps["confirm"][0]
+    (before, after), floor = result["gaps"]["confirm"], result["floor"]
     if before - floor < SEEN:
         return 0.0
-    return 1.0 - (known["gaps"]["confirm"] - floor) / (before - floor)
+    left = [after] if named else []
+    left += [oracle["gaps"]["confirm"]] if "gaps" in oracle else []
+    share = max(((before - u) / (before - floor) for u in left), default=0.0)
+    return share if share >= NAMEABLE or oracle.get("converged") else None
 
 
 def within_floor(result: Mapping[str, Any]) -> bool | None:
@@ -306,7 +319,13 @@ def summarise(judged: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "named_up_to_tie": rate(single, lambda c: c["named"]),
         "named_alone": rate(single, lambda c: c["alone"]),
         "named_exactly": rate(single, lambda c: c["exact"]),
+        **{
+            f"{name}_{size}": rate([c for c in single if c["larger"] == larger], lambda c, key=key: c[key])
+            for size, larger in (("at_the_multiple", False), ("larger", True))
+            for name, key in (("named_up_to_tie", "named"), ("named_alone", "alone"))
+        },
         "nameable": rate([c for c in known if c["reachable"] is not None], lambda c: c["reachable"] >= NAMEABLE),
+        "nameable_unknown": rate(known, lambda c: c["reachable"] is None),
         "nameable_named_up_to_tie": rate(alone, lambda c: c["named"]),
         "nameable_named_exactly": rate(alone, lambda c: c["exact"]),
         "nameable_pair_one_named_none_false": rate(both, lambda c: any(c["met"]) and not c["false_names"]),

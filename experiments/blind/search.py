@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.common import CODE
+from benchmarks.sharing import claimed
 from droid_jax.compare.cost import Cost
 from droid_jax.gap.anew import base_fit
 from droid_jax.gap.case import Case, GapConfig, make_case
@@ -26,7 +27,6 @@ from droid_jax.measure.recording import Recording
 from droid_jax.storage import finite, write_json
 from experiments.blind.baselines import baselines
 from experiments.blind.scenes import ROLES, Setting, setting
-from experiments.sharing import claimed
 
 
 @dataclass

@@ -81,7 +81,18 @@ def _rows() -> Iterator[tuple[str, str, Chosen, Chosen]]:
     yield "one at its limit: detected", "50 %", at_limit, lambda c: c["verdict"] in (*NAMING, "unexplained")
     yield "one at 3 or 10 times: named alone, a remainder or not", "", above, lambda c: c["alone"]
     yield "one at 3 or 10 times: named alone, nothing left open", "80 %", above, lambda c: c["exact"]
-    yield "one whose right name closes half of the gap: named, alone or in a tie", "", _reachable, _named
+    yield "of these at that multiple: named, alone or in a tie", "", lambda c: above(c) and not c["larger"], _named
+    yield "of these at that multiple: named alone", "", lambda c: above(c) and not c["larger"], lambda c: c["alone"]
+    yield (
+        "of these larger, to be worth a name: named, alone or in a tie",
+        "",
+        lambda c: above(c) and c["larger"],
+        _named,
+    )
+    yield "of these larger: named alone", "", lambda c: above(c) and c["larger"], lambda c: c["alone"]
+    yield "one whose right name is known to close half of the gap: named, alone or in a tie", "", _reachable, _named
+    unknown = "one at 3 or 10 times: what its right name closes is not known"
+    yield unknown, "", above, lambda c: c["reachable"] is None
     yield "two: one named, nothing false", "90 %", _kind("pair"), lambda c: any(c["met"]) and not _false(c)
     yield "two: both named, nothing false", "70 %", _kind("pair"), _named
     yield "no form in the library: called open", "80 %", _kind("outside"), lambda c: c["open"]

@@ -14,6 +14,7 @@ import jax
 from matplotlib.figure import Figure
 
 from benchmarks.common import commits, stem
+from benchmarks.sharing import claimed
 from droid_jax.commands.source import TIMESTEP as TIMESTEP
 from droid_jax.policy.control import load
 from droid_jax.policy.door_env import DoorEnv
@@ -28,7 +29,6 @@ from droid_jax.report.files import POLICY
 from droid_jax.storage import write_json
 from experiments.policies.store import Doors, sha256, trained
 from experiments.policies.table import PLACES
-from experiments.sharing import claimed
 
 QUICK_STEPS = 20  # actions of an episode where nothing shall be learned
 RESULTS = Path(__file__).resolve().parents[1] / "results"

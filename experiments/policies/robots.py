@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
+from benchmarks.sharing import claimed
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.gaussian import load as load_gaussian
 from droid_jax.identify.pipeline import identify
@@ -21,7 +22,6 @@ from experiments.identify_suite import describe, recordings, settings
 from experiments.policies.cases import TIMESTEP, Options
 from experiments.policies.settings import Setting
 from experiments.policies.table import SLIPPERY
-from experiments.sharing import claimed
 
 FIT = "fit.json"
 SLIDING = 0.05  # friction of slippery pads

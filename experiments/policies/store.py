@@ -16,6 +16,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from benchmarks.sharing import claimed, code_name
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.model.scene import Scene
 from droid_jax.policy.door_env import DoorEnv
@@ -24,7 +25,6 @@ from droid_jax.policy.randomise import of_method
 from droid_jax.policy.train import TrainConfig, train
 from droid_jax.report.files import GAUSSIAN, POLICY, TRAINING
 from droid_jax.storage import write_json
-from experiments.sharing import claimed
 
 OF = "of.json"
 SAME = 1e-9  # numbers nearer than that, in shares of themselves, are the same
@@ -52,8 +52,9 @@ def trained(
     with claimed(place, wait=True):
         if not (place / TRAINING).is_file():
             drawn = of_method(doors.method, env.scene, doors.gaussian)
-            kept = place / "checkpoints" / str(code["commit"])  # what other code left half-done is not gone on with
-            found = train(env, drawn, config, checkpoints=kept, fingerprint={"key": place.name})
+            # What other code left half done is not gone on with.
+            checkpoints = place / "checkpoints" / code_name(code["commit"])
+            found = train(env, drawn, config, checkpoints=checkpoints, fingerprint={"key": place.name})
             place.mkdir(exist_ok=True)
             write_json(place / OF, of)
             save_policy(place / POLICY, found.policy)

@@ -19,7 +19,7 @@ from experiments import hidden_effects, null_calibration
 from experiments.blind import limits, oracle, score
 from experiments.blind.answers import ANSWERS, inside, parts, right, targets, without
 from experiments.blind.baselines import bic_outcome
-from experiments.blind.cases import Counts, amplitude, key, keys, plans
+from experiments.blind.cases import Counts, Plan, amplitude, key, keys, plans
 from experiments.blind.draws import commit_of, draw_truths, folder_of, seed_of
 from experiments.blind.make import Drawn, make, record
 from experiments.blind.marks import Ground, ground
@@ -266,9 +266,9 @@ def case(
     return {"truth": truth, "result": result, "right": right_names, "parts": [], "oracle": None}
 
 
-def reached(confirm: float) -> Any:
+def reached(confirm: float, converged: bool = True) -> Any:
     """An oracle."""
-    return {"gaps": {"confirm": confirm}, "settled": None}
+    return {"gaps": {"confirm": confirm}, "settled": None, "converged": converged}
 
 
 def rates(*cases: Any, known: Any = None) -> dict[str, Any]:
@@ -307,22 +307,42 @@ def test_rates_of_what_is_named():
     assert found["within_floor"]["rate"] == 1.0 and found["seconds"]["whole"] == 5.0
 
 
-def test_cases_are_nameable_where_the_right_names_close_half_of_the_gap():
+def test_cases_are_nameable_where_right_names_are_known_to_close_half_of_the_gap():
     latch = "latch at door"
     good, poor = ({"oracle": reached(u)} for u in (5.0, 7.0))  # of 10 above the floor they close 6 and 4
+    shut = case("single", "none", [], [[latch]], gaps={"confirm": [1.01, 1.01], "sealed": [1.0, 1.0]})
     found = rates(
         {**case("single", "named", [latch], [[latch]]), **good},
+        {**case("single", "named", [latch], [[latch]]), **poor},  # it closed 9 itself: the oracle is no upper bound
+        case("single", "named", [latch], [[latch]]),  # without an oracle, what it closed itself counts
         {**case("single", "unexplained", [], [[latch]]), **good},
         {**case("single", "unexplained", [], [[latch]]), **poor},
+        {**case("single", "unexplained", [], [[latch]]), "oracle": reached(7.0, converged=False)},  # not known
+        {**case("single", "unexplained", [], [[latch]]), "oracle": reached(5.0, converged=False)},  # known to be enough
+        case("single", "unexplained", [], [[latch]]),  # not known either
+        {**shut, **good},
         {**case("pair", "named", [latch, "drag at door"], [[latch], ["drag at door"]]), **good},
     )
     hits = {name: (found[name]["hits"], found[name]["of"]) for name in found if name.startswith("nameable")}
     assert hits == {
-        "nameable": (3, 4), "nameable_named_up_to_tie": (1, 2), "nameable_named_exactly": (1, 2),
+        "nameable": (6, 8), "nameable_unknown": (2, 10),
+        "nameable_named_up_to_tie": (3, 5), "nameable_named_exactly": (3, 5),
         "nameable_pair_one_named_none_false": (1, 1), "nameable_pair_both_named": (1, 1),
     }  # fmt: skip
-    shut = {**case("single", "none", [], [[latch]], gaps={"confirm": [1.01, 1.01], "sealed": [1.0, 1.0]}), **good}
-    assert score.reachable(shut) == 0.0  # no gap to speak of
+    assert score.judge({**shut, **good}, {})["reachable"] == 0.0  # no gap to speak of
+
+
+def test_effects_larger_than_their_factor_says_are_counted_apart():
+    latch = "latch at door"
+    limits = [{"s": {"h0": {"limit": limit}}} for limit in (2.0 / 3.0, 0.1)]  # 2.0 hidden: 3 and 20 times
+    given = (case("single", "named", [latch], [[latch]]), case("single", "unexplained", [], [[latch]]))
+    judged = [
+        score.judge(c, known) for c, known in zip((given[0], given[1], given[0]), (*limits, limits[1]), strict=True)
+    ]
+    found = score.summarise(judged)
+    assert [j["larger"] for j in judged] == [False, True, True]
+    assert (found["named_alone_at_the_multiple"]["hits"], found["named_alone_at_the_multiple"]["of"]) == (1, 1)
+    assert (found["named_up_to_tie_larger"]["hits"], found["named_up_to_tie_larger"]["of"]) == (1, 2)
 
 
 def test_a_part_of_what_was_hidden_is_no_false_name_beside_it_but_alone():
@@ -503,7 +523,7 @@ def test_limits_of_another_run_are_refused():
 def test_a_null_that_was_made_in_pieces_is_summed_up_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    """Scene by scene, in any order; cases of another commit lie beside them and do not count."""
+    """Scene by scene, in any order; another commit's are refused, and --quick has a summary of its own."""
     made = list[str]()
 
     def case_of(plan: Any, commit: str, bench: Any) -> dict[str, Any]:
@@ -521,12 +541,44 @@ def test_a_null_that_was_made_in_pieces_is_summed_up_whole(
 
     monkeypatch.setattr(null_calibration, "case_of", case_of)
     monkeypatch.setattr(null_calibration, "commit_of", lambda name: name)
-    run("--commit", "b" * 40, *counts(2, 0))
     run("--commit", COMMIT, *counts(3, 0))
+    with pytest.raises(SystemExit, match=f"of {COMMIT}, not of {'b' * 40}"):
+        run("--commit", "b" * 40, *counts(0, 2))
+    run("--commit", "b" * 40, "--quick")
     found = run("--commit", COMMIT, *counts(0, 2))
     assert {scene: of["cases"] for scene, of in found["scenes"].items()} == {"hinge": 3, "bench": 2}
     assert found["all"]["cases"] == 5 and found["by_other_code"] == 0 and len(made) == 7
     assert run("--commit", COMMIT, "--sum-only")["all"] == found["all"] and len(made) == 7
+
+
+def test_a_null_that_fails_after_its_screening_keeps_its_p(monkeypatch: pytest.MonkeyPatch):
+    """Else those that reject, the only ones that go on, would leave the count where they fail."""
+
+    def run_case(plan: Any, commit: str, bench: Any, watch: Any) -> Any:
+        watch.seconds["base"] = 1.0
+        yield {"p": 0.001, "gap": 0.1, "converged": True}
+        raise RuntimeError("out of memory")
+
+    monkeypatch.setattr(null_calibration, "run_case", run_case)
+    case = null_calibration.case_of(Plan("hinge/null/0", "hinge", "none"), COMMIT, Bench())
+    other = {"p": 0.5, "gap": 0.0, "converged": True, "seconds": {"base": 1.0}}
+    found = null_calibration.summarise([case, other])
+    assert case["p"] == 0.001 and case["error"] == "out of memory" and case["verdict"] == "error"
+    assert (found["screening_rejects"]["hits"], found["screening_rejects"]["of"]) == (1, 2)
+    assert found["alarms"]["hits"] == 1 and found["errors"] == 1
+
+
+def test_cases_of_two_commits_do_not_mix_where_make_was_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def stopped(*given: Any) -> str:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(hidden_effects, "make", stopped)
+    monkeypatch.setattr(hidden_effects, "commit_of", lambda name: name)
+    command = hidden_effects.Make(quick=True, out=tmp_path, limits=LIMITS)
+    with pytest.raises(KeyboardInterrupt):
+        hidden_effects.run_make(replace(command, commit=COMMIT))
+    with pytest.raises(SystemExit, match=f"holds cases of {COMMIT}"):
+        hidden_effects.run_make(replace(command, commit="b" * 40))
 
 
 def test_a_search_is_given_the_cases_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -570,7 +622,7 @@ def test_an_oracle_is_of_the_result_that_is_there(tmp_path: Path, monkeypatch: p
         oracle.oracle_all(tmp_path, ("a", "b"), Bench(), lambda line: None)
     assert asked == [1, 2, 3]
     assert json.loads((tmp_path / "oracle" / "a.json").read_text())["error"] == "no replay"
-    given = {**case("single", "named", ["latch at door"], [["latch at door"]]), "oracle": {"error": "no replay"}}
+    given = {**case("single", "unexplained", [], [["latch at door"]]), "oracle": {"error": "no replay"}}
     assert score.judge(given, {})["reachable"] is None
 
 
@@ -598,6 +650,8 @@ def test_only_unsearched_cases_are_made_again(tmp_path: Path, monkeypatch: pytes
 def test_a_quick_limit_is_not_written_among_those_that_count(tmp_path: Path, monkeypatch, quick: bool, name: str):
     module = hidden_effects
     monkeypatch.setattr(module, "setting", lambda *_: None)
-    monkeypatch.setattr(module, "scene_limits", lambda *_: {"closer": 1.0})
+    monkeypatch.setattr(module, "scene_limits", lambda *_: {"closer": {"limit": 1.0}})
     module.run_limits(module.Limits(("hinge",), out=tmp_path / "limits.json", kept=tmp_path, quick=quick))
     assert [path.name for path in tmp_path.iterdir()] == [name]
+    entry = json.loads((tmp_path / name).read_text())["scenes"]["hinge"]["closer"]
+    assert entry == {"limit": 1.0, "commit": hidden_effects.CODE.get("git")}  # others of the file may be older

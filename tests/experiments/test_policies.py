@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
+from benchmarks.sharing import claimed
 from droid_jax.identify.gaussian import load as load_gaussian
 from droid_jax.identify.gaussian import prior
 from droid_jax.measure.hidden import Applied, possible
@@ -48,7 +49,6 @@ from experiments.policies.robots import fitted, robots_of
 from experiments.policies.settings import SETTINGS, Setting, setting_of
 from experiments.policies.store import Doors, decided_by, place_of, trained
 from experiments.policies.table import PLACES, apart, column, rate_interval, resampled, spread, summed_up
-from experiments.sharing import claimed
 
 ROOT = Path(__file__).resolve().parents[2]
 CODE = {"commit": "one"}
@@ -485,7 +485,7 @@ def test_what_another_process_makes_is_left_to_it(tmp_path: Path):
         Case(tmp_path / f"{n}.json", lambda n=n: made.append(n) or case("mean", 0, 0.5), {}, "fit") for n in "abc"
     ]
     holds = (
-        "import sys, time; from pathlib import Path; from experiments.sharing import claimed\n"
+        "import sys, time; from pathlib import Path; from benchmarks.sharing import claimed\n"
         f"with claimed(Path({str(tmp_path / 'a.json')!r}), wait=False) as mine: print(mine, flush=True); time.sleep(60)"
     )
     other = subprocess.Popen([sys.executable, "-c", holds], cwd=ROOT, stdout=subprocess.PIPE, text=True)
