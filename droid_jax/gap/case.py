@@ -20,6 +20,7 @@ from droid_jax.model.seam import Effect
 
 SETTLED = 60  # iterations of the base fit at most: where something is missing it takes longer
 BEYOND = 3.0  # prior deviations of a nuisance from which on it is an effect
+FAR = 1e4  # prior deviations that no sensor is off
 
 
 @dataclass(frozen=True)
@@ -114,15 +115,32 @@ def make_case(
     scene = ready(scene)
     base = restrained(base)
     whole = base + effect_space(effects)
-    costs = [make_cost(scene, whole, [r], config=config.compare, effects=effects) for r in recordings]
+    spaces = [whole, *[_unbounded(whole, _own(base))] * (len(recordings) - 1)]
+    made = zip(recordings, spaces, strict=True)
+    costs = [make_cost(scene, space, [r], config=config.compare, effects=effects) for r, space in made]
     return _case(costs, base, tuple(effects), config)
 
 
 def _case(costs: Sequence[Cost], base: Space, effects: tuple[Effect, ...], config: GapConfig) -> Case:
-    own = [p.name for p in base.parameters if p.nuisance and p.name.startswith("torque_offset[")]
     fit, *others = (evidence(c) for c in costs)
-    confirm, *sealed = (e.with_own(own) for e in others)
+    confirm, *sealed = (e.with_own(_own(base)) for e in others)
     return Case(fit, confirm, sealed[0] if sealed else None, base, effects, config)
+
+
+def _own(base: Space) -> list[str]:
+    """Nuisances that every recording has for itself: what a sensor shows at rest changes from day to day."""
+    return [p.name for p in base.parameters if p.nuisance and p.name.startswith("torque_offset[")]
+
+
+def _unbounded(whole: Space, names: Sequence[str]) -> Space:
+    """The space of a recording whose own nuisances `names` are solved for, however far off they are."""
+    far = {n: FAR * whole[n].std for n in names}
+    return Space(
+        tuple(
+            replace(p, low=p.mean - far[p.name], high=p.mean + far[p.name]) if p.name in far else p
+            for p in whole.parameters
+        )
+    )
 
 
 def restrained(base: Space) -> Space:

@@ -13,7 +13,7 @@ import numpy as np
 
 from droid_jax.compare.cost import Cost
 from droid_jax.compare.residuals import Comparison
-from droid_jax.gap.flips import gap_p_values, largest_steady_t, one_sided_p, steady
+from droid_jax.gap.flips import largest_steady_t, one_sided_p, steady, steady_gap_p_values
 from droid_jax.identify.search import NotReplayed
 from droid_jax.measure.noise import coarse_clock
 
@@ -133,7 +133,7 @@ class Evidence:
 
     def cell_p_values(self, residuals: np.ndarray, cells: np.ndarray) -> np.ndarray:
         """[K] p-value of each cell's U being above zero."""
-        return gap_p_values(steady(residuals), cells)
+        return steady_gap_p_values(residuals, cells)
 
     def gain_p_value(self, gains: np.ndarray) -> float:
         """p-value of gains [N], one of each repeat, being above zero; what grows or fades steadily is no noise."""

@@ -11,11 +11,11 @@ import scipy.stats
 from droid_jax.gap.evidence import gap, gaps
 from droid_jax.gap.flips import (
     benjamini_hochberg,
-    gap_p_values,
     largest_steady_t,
     largest_t,
     sign_flips,
     steady,
+    steady_gap_p_values,
     t_values,
 )
 
@@ -25,6 +25,7 @@ def test_all_flips_up_to_twelve_repeats():
     assert flips.shape == (16, 5) and np.all(flips[0] == 1)
     both = {tuple(row) for row in np.concatenate([flips, -flips])}
     assert both == set(itertools.product((-1.0, 1.0), repeat=5))
+    assert {tuple(row) for row in sign_flips(5, one_sided=True)} == both
     drawn = sign_flips(20, seed=3)
     assert np.all(drawn[0] == 1) and set(np.unique(drawn)) == {-1.0, 1.0}
     np.testing.assert_array_equal(drawn, sign_flips(20, seed=3))
@@ -85,10 +86,22 @@ def test_the_gap_lies_where_it_was_put():
     cells = np.zeros((6, 300), bool)
     for k in range(6):
         cells[k, 50 * k : 50 * (k + 1)] = True
-    p = gap_p_values(residuals, cells)
+    p = steady_gap_p_values(residuals, cells)
     assert p[2] == pytest.approx(1 / 512)
     assert np.argmax(gaps(residuals, cells)) == 2
     np.testing.assert_array_equal(benjamini_hochberg(p, 0.02), np.arange(6) == 2)
+
+
+def test_a_small_gap_everywhere_is_found_and_nothing_keeps_its_level():
+    """400 times: what was taken out of the trend must not hide U = 0.02, nor make p of noise anything but uniform."""
+    rng, cell = np.random.default_rng(6), np.ones((1, 1400), bool)
+    drift = 3.0 * (np.arange(8) - 3.5)[:, None]
+    none, there = (
+        np.array([steady_gap_p_values(rng.normal(np.sqrt(u), 1.0, (8, 1400)) + drift, cell)[0] for _ in range(400)])
+        for u in (0.0, 0.02)
+    )
+    assert np.mean(none < 0.05) < 0.075 and 0.4 < np.mean(none) < 0.6
+    assert np.mean(there < 0.01) > 0.5
 
 
 def test_benjamini_hochberg_steps_up():

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from droid_jax.gap.evidence import gap
-from droid_jax.gap.flips import gap_p_values
+from droid_jax.gap.flips import steady_gap_p_values
 from droid_jax.gap.localise import _bins, _cells, _parts
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import compile_scene
@@ -38,7 +38,7 @@ def evidence(unit: np.ndarray) -> Any:
     return SimpleNamespace(
         cost=SimpleNamespace(space=SPACE, scene=SimpleNamespace(object_joint="hinge", joints=("a", "b", "c"))),
         units=REPEATS, repeats=REPEATS, column=np.repeat(np.arange(COLUMNS), INSTANTS), common=common, gap=gap,
-        cell_p_values=gap_p_values,
+        cell_p_values=steady_gap_p_values,
     )  # fmt: skip
 
 

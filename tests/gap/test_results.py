@@ -78,11 +78,12 @@ def replace_own(evidence):
     return dataclasses.replace(evidence, own=(), own_columns=None)
 
 
-def test_a_recordings_own_offset_is_no_gap_of_the_traces(found: Small):
-    """A sensor that was 0.15 N m off on the second day: U fits that, and so do the traces beside it."""
+@pytest.mark.parametrize("off", [0.15, 0.8])
+def test_a_recordings_own_offset_is_no_gap_of_the_traces(found: Small, off: float):
+    """A sensor that was off on the second day, in units of its prior by 1.5 and by 8: U fits that, and so do traces."""
     recording = found.recordings["confirm"]
     torque = recording.channel("torque")
-    shifted = dataclasses.replace(torque, values=torque.values + np.float32([0.0, 0.15, 0.0]))
+    shifted = dataclasses.replace(torque, values=torque.values + np.float32([0.0, off, 0.0]))
     confirm = dataclasses.replace(recording, channels={**recording.channels, "torque": shifted})
     case = found.case.against({"fit": found.recordings["fit"], "confirm": confirm})
     arrays = gap_arrays(case, found.verdict)

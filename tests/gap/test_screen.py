@@ -102,7 +102,9 @@ def test_shapes_are_not_rivals_of_each_other():
 
 
 def test_one_sided_p():
-    assert one_sided_p(np.full(10, 2.0) + np.linspace(-0.1, 0.1, 10)) == pytest.approx(1 / 512)
+    assert one_sided_p(np.full(10, 2.0) + np.linspace(-0.1, 0.1, 10)) == pytest.approx(1 / 1024)
+    unlike = np.array([1.0, 1.1, 0.9, 1.0, 1.2, 0.8, 1.0, -10.0])
+    assert one_sided_p(unlike) == one_sided_p(unlike[::-1]) > 0.4  # whichever repeat it is
     assert one_sided_p(-np.arange(1.0, 11.0)) > 0.9
     assert one_sided_p(np.full(10, 1.0)) < 0.01 < 0.3 < one_sided_p(np.array([1.0, -1.0] * 5))
 
