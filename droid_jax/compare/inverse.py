@@ -20,7 +20,7 @@ from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.model.joint_friction import SMOOTHING
 from droid_jax.model.physics import Physics
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect, Rollout, State, Theta, column
+from droid_jax.model.seam import Effect, Rollout, State, Theta, column, complete
 from droid_jax.model.step import refuse_fluid
 
 
@@ -104,7 +104,7 @@ def path_replay(
     motor = convention.side is TorqueSide.MOTOR
 
     def replay(physics: Physics, path: Path) -> Rollout:
-        model, theta = physics.model, physics.theta
+        model, theta = physics.model, complete(physics.theta, effects)
         none = {name: jnp.zeros_like(getattr(model, name)) for name in ("dof_armature", "dof_damping")}
         link_model = model if motor else model.replace(**none)
         if not convention.gravity:

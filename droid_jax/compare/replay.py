@@ -21,7 +21,7 @@ from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.model.actuators import has_servo_damping
 from droid_jax.model.physics import Physics
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect, Rollout, State, Theta, column
+from droid_jax.model.seam import Effect, Rollout, State, Theta, column, complete
 from droid_jax.model.step import check_options, servo_force
 from droid_jax.model.step import step as simulate_step
 
@@ -150,7 +150,7 @@ def servo_replay(
     damping = has_servo_damping(scene.model)
 
     def replay(physics: Physics) -> Rollout:
-        model, theta = physics.model, physics.theta
+        model, theta = physics.model, complete(physics.theta, effects)
 
         def step(carry, k):
             qpos, qvel, warm, load = carry

@@ -107,3 +107,8 @@ class Hunt:
     def gap(self, model: Model) -> float:
         """U on the confirming demonstration."""
         return self.case.confirm.gap_at(model.values)
+
+    def gone_on_with(self, model: Model, config: RefineConfig, note: str) -> Model:
+        """`model` gone on with from where it is; as it is where that cannot be replayed on the confirming motion."""
+        found = self.refit(model.parts, model.values, config, note)
+        return found if np.isfinite(self.case.confirm.common(found.values)).all() else model

@@ -48,11 +48,14 @@ def separating(case: Case, models: Sequence[Model], recording: Recording) -> tup
     values = np.stack([m.values for m in models])
     known = case.fit.cost
     config = known.comparisons[0].config
-    found = []
+    found = list[Experiment]()
     for motion in (*(warped(recording, entry) for entry in MENU), *_further(known, recording, values[:1])):
         with warnings.catch_warnings():  # what there is to warn of was said of the recording itself
             warnings.simplefilter("ignore", UserWarning)
-            cost = make_cost(known.scene, case.whole, [motion], config=config, effects=case.effects)
+            try:
+                cost = make_cost(known.scene, case.whole, [motion], config=config, effects=case.effects)
+            except ValueError:  # too long for the memory, say: the search is done, and other entries are left
+                continue
         found += _experiment(motion.name, cost, values)
     seen = {name: weight for name, weight in config.channels.items() if name != "object_angle"}
     if known.scene.grip is not None and seen:

@@ -25,6 +25,7 @@ from droid_jax.gap.verdict import Verdict
 from droid_jax.gap.workflow import find
 from droid_jax.identify.pipeline import Progress
 from droid_jax.measure.recording import Recording
+from droid_jax.model.effects.registry import checked
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
@@ -56,9 +57,11 @@ def find_missing(
     recording without commands cannot have.
     """
     split, roles = shared_out(scene, recordings)
-    asked = possible(scene, recordings) if effects is None else tuple(effects)
+    asked = possible(scene, recordings) if effects is None else tuple(map(checked, effects))
     if not asked:
         raise ValueError("effects: there is none to ask about; None asks about all of the library")
+    if not any(effect.places for effect in asked):  # said before the base fit, and not after it
+        raise ValueError("effects: none of them says its places (`Effect.places`), where it could be asked about")
     start = None if start is None else space.check(start)
     case = case_of(split, scene, space, asked, roles, config or GapConfig())
     case, verdict = answer(split, case, roles, start, progress)

@@ -171,14 +171,14 @@ def settled(hunt: Hunt, model: Model) -> Model:
     """The model gone on with until it stands still: what it has yet to take would be credited to the next effect."""
     if model.refined.converged:
         return model
-    return hunt.refit(model.parts, model.values, replace(hunt.case.config.refit, iterations=SETTLED), " gone on with")
+    return hunt.gone_on_with(model, replace(hunt.case.config.refit, iterations=SETTLED), " gone on with")
 
 
 def polished(hunt: Hunt, model: Model) -> Model:
     """The same model with slopes over the width of its posterior: its intervals are reported."""
     if not model.parts:
         return model
-    return hunt.refit(model.parts, model.values, POLISH, " polished")
+    return hunt.gone_on_with(model, POLISH, " polished")
 
 
 def _decided(hunt: Hunt, before: Model, found: Screen, tried: Sequence[Model]) -> Round:

@@ -71,7 +71,7 @@ def find(case: Case, base: Model, floor: float, progress: Progress = lambda stag
         if done.winner is None:
             break
         model = settled(hunt, done.winner)
-    if not quiet and rounds[0].tried and _unsettled(hunt, model):
+    if case.config.most > 1 and not quiet and rounds[0].tried and _unsettled(hunt, model):
         if hunt.budget.spent:
             hunt.budget.skip("pairs of effects not tried")
         else:
@@ -130,7 +130,7 @@ def _verdict(hunt: Hunt, base: Model, model: Model, rounds: list[Round], quiet: 
         floor=floor,
         gaps=gaps,
         remainder=None if left is None else case.confirm.gap(left),
-        screens=tuple(r.screen for r in rounds),
+        screens=tuple(dict.fromkeys(r.screen for r in rounds)),  # pairs are proposed from the first one
         trials=tuple(t for r in rounds for t in r.trials),
         before=localise(case.fit, base.values, base.residuals, model.values),
         after=localise(case.fit, model.values, model.residuals, model.values),

@@ -166,6 +166,21 @@ def prepare(
     )
 
 
+def to_search(
+    cost: Callable[[np.ndarray], Any], config: CompareConfig, full: Space, space: Space, at: np.ndarray | None = None
+) -> Callable[[np.ndarray], np.ndarray]:
+    """[P, d] rows over `space` -> [P] costs of them in the full one: a replay that blew up is no parent.
+
+    at: [D] where the other parameters stand; default: their means.
+    """
+
+    def searched(rows: np.ndarray) -> np.ndarray:
+        found = np.asarray(cost(full.embed(space, rows, at)), np.float64)
+        return np.where(found == np.float32(config.non_finite_cost), np.inf, found)
+
+    return searched
+
+
 def solve(problem: Problem, *, checkpoints: Path | None = None, progress: Progress | None = None) -> Identified:
     """The rest of `identify`: search, refine, calibrate, judge."""
     report = progress or (lambda stage, value: None)
@@ -175,13 +190,8 @@ def solve(problem: Problem, *, checkpoints: Path | None = None, progress: Progre
     began = time.monotonic() - problem.seconds
     first = base.first()
 
-    def cost(rows: np.ndarray) -> np.ndarray:
-        found = np.asarray(first(full.embed(space, rows)), np.float64)
-        blown_up = found == np.float32(config.compare.non_finite_cost)  # no parent, whatever others cost
-        return np.where(blown_up, np.inf, found)
-
     found = search(
-        cost,
+        to_search(first, config.compare, full, space),
         space,
         config.search,
         checkpoint_dir=checkpoints,

@@ -60,7 +60,7 @@ class Rollout:
 class Effect:
     """One physical effect outside the MuJoCo model, or a change of it, that vanishes at neutral.
 
-    name:         "hinge preload".
+    name:         "hinge_preload", that of the function that makes it.
     parameters:   what it reads from theta or writes into the model; their means are its neutral values,
                   at which a replay is as without it.
     command:      (theta, time [], look) -> [U]; look(t) gives the command at time t [s].
@@ -97,6 +97,15 @@ class Effect:
     places: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     shapes: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     smallest: float = 0.0
+
+
+def complete(theta: Theta, effects: Sequence[Effect]) -> Theta:
+    """theta with the neutral values of what the effects read and it does not hold.
+
+    A model in which an effect was named at one joint has no parameters of the others.
+    """
+    neutral = {p.name: jnp.float32(p.mean) for e in effects for p in e.parameters if not p.writes}
+    return {**neutral, **theta}
 
 
 def column(theta: Theta, name: str, joints: Sequence[str]) -> jax.Array:

@@ -18,7 +18,7 @@ from droid_jax.model.actuators import has_servo_damping
 from droid_jax.model.effects.registry import ready
 from droid_jax.model.physics import Physics
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect, State, Theta
+from droid_jax.model.seam import Effect, State, Theta, complete
 from droid_jax.model.step import step as simulate_step
 from droid_jax.policy.control import ACTIONS, OBSERVED, Safety, limited
 from droid_jax.policy.hand import finger_forces, hand_of, looked
@@ -143,7 +143,7 @@ class DoorEnv(Env):
 
     def _advance(self, physics: Physics, world: World) -> tuple[World, jax.Array]:
         """`Task.control` seconds later; and the force on each finger [2] N in the last of its steps."""
-        model, theta = physics.model, physics.theta
+        model, theta = physics.model, complete(physics.theta, self.effects)
 
         def substep(carry, number):
             qpos, qvel, warm, load, _ = carry

@@ -48,8 +48,6 @@ class Group:
 def groups(found: Mapping[str, Any]) -> list[Group]:
     """One for each number of effects that was screened or tried."""
     screens = found["screens"]
-    if len(screens) > 1 and screens[-1] == screens[0]:
-        screens = screens[:-1]  # pairs are proposed from the first screening, which is listed again for them
     count = max([len(screens), *(t["round"] + 1 for t in found["trials"])])
     return [_group(found, k, screens[k] if k < len(screens) else None) for k in range(count)]
 

@@ -66,6 +66,21 @@ def test_a_drag_is_told_from_a_preload_by_another_speed(demonstration, monkeypat
     assert slower < weighed < faster
 
 
+def test_an_entry_that_this_machine_cannot_replay_is_left_out(demonstration, monkeypatch):
+    """The search is done by then: a motion too long for the memory ends nothing."""
+    make = menu.make_cost
+
+    def short_of_memory(scene, space, recordings, **options):
+        if recordings[0].time[-1] > demonstration.time[-1] + 0.1:
+            raise ValueError("needs 9.0 GB")
+        return make(scene, space, recordings, **options)
+
+    monkeypatch.setattr(menu, "MENU", MENU[:2])
+    monkeypatch.setattr(menu, "make_cost", short_of_memory)
+    found = {e.what for e in separating(small().case, (model("drag", 0.0), model("drag", 0.8)), demonstration)}
+    assert MENU[0].what not in found and MENU[1].what in found
+
+
 def test_a_known_weight_tells_only_what_acts_through_it(demonstration, monkeypatch):
     """Two payloads differ by as much with a weight beside them as without; two preloads likewise."""
     monkeypatch.setattr(menu, "MENU", ())

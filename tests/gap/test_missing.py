@@ -24,7 +24,8 @@ from droid_jax.model.seam import Effect
 
 SEARCH = replace(CONFIG, search=SearchConfig(population=8, parents=None, generations=2), most=1)
 
-LATE = Effect("late", (Parameter("late", "s", 0.0, 0.01, -0.1, 0.1),), command=lambda theta, time, look: look(time))
+LATE = Effect("late", (Parameter("late", "s", 0.0, 0.01, -0.1, 0.1),), command=lambda theta, time, look: look(time),
+              places={"elbow": ("late",)})  # fmt: skip
 THREE = [replace(elbow_log(COULOMB, seconds, 8), name=f"{seconds:g} s") for seconds in (7.0, 6.0, 5.0)]
 
 
@@ -92,6 +93,7 @@ def test_settings_that_no_search_could_use_are_refused(changes: dict[str, Any], 
         ({"recordings": [elbow_log(0.0, 2.0, 15)]}, "is the only one and has 15 repeats"),
         ({"recordings": [elbow_log(0.0, 2.0, 8)] * 2}, "the fit and the confirm recording are the same"),
         ({"effects": ()}, "effects: there is none to ask about"),
+        ({"effects": [Effect("late")]}, "none of them says its places"),
         ({"effects": [LATE]}, "no commands that an effect could change: late"),
         ({"start": np.zeros(3)}, "expected parameter vectors [..., 2]"),
     ],

@@ -107,6 +107,26 @@ def test_a_search_ends_where_all_that_was_asked_about_is_in_the_model():
     assert verdict.effects == ("hinge_preload at door",) and len(verdict.screens) == 1
 
 
+def test_no_more_effects_are_tried_together_than_are_asked_for(found: Small):
+    """`most` of the small search is one: no trial has two effects, and the screening is told once."""
+    assert found.case.config.most == 1
+    assert not any(" + " in trial.name for trial in found.verdict.trials) and len(found.verdict.screens) == 1
+
+
+def test_what_blows_up_on_the_other_motion_while_it_settles_stays_as_it_was(monkeypatch: pytest.MonkeyPatch):
+    class Judge:
+        def common(self, values):
+            return values[None] * np.where(values[0] > 1.0, np.nan, 1.0)
+
+    hunt: Any = Hunt(SimpleNamespace(confirm=Judge()), 1.0, 0.0, Budget(None), lambda stage, value: None)  # type: ignore
+    model: Any = SimpleNamespace(parts=(), values=np.array([0.5]))
+    ends: Any = [SimpleNamespace(parts=(), values=np.array([x])) for x in (0.7, 1.5)]
+    monkeypatch.setattr(Hunt, "refit", lambda self, parts, start, config, note: ends[0])
+    assert hunt.gone_on_with(model, None, "") is ends[0]
+    monkeypatch.setattr(Hunt, "refit", lambda self, parts, start, config, note: ends[1])
+    assert hunt.gone_on_with(model, None, "") is model
+
+
 def test_effects_without_places_cannot_be_asked_about(found: Small):
     placeless = tuple(replace(e, places={}) for e in found.case.effects)
     with pytest.raises(ValueError, match="none of the effects says its places"):

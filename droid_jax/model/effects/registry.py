@@ -69,19 +69,33 @@ def _made(maker: Maker, scene: Scene, scale: float) -> Effect | None:
     made = maker(scene)
     if made is None:
         return None
-    effect = _checked(made)
+    effect = checked(made)
+    if effect.name != maker.__name__:  # by which it is asked for, left out and loaded again
+        raise ValueError(
+            f"the effect that {maker.__name__!r} makes is called {effect.name!r}: give it the function's name"
+        )
     built_in = str(maker.__module__).startswith(f"{__package__}.")  # None for code that was run as text
     return sized(effect, scene, scale) if built_in else effect
 
 
-def _checked(effect: Effect) -> Effect:
-    """The effect; ValueError for parameters that it does not have, and amplitudes that cannot be neutral or linear."""
+def checked(effect: Effect) -> Effect:
+    """The effect; ValueError where it is not well made.
+
+    It must have the parameters that it speaks of, amplitudes that are neutral at 0 and linear, and shapes whose values
+    to try lie within their bounds.
+    """
     own = {p.name: p for p in effect.parameters}
     amplitudes = [name for place in effect.places.values() for name in place]
     for name in (*amplitudes, *effect.shapes):
         if name not in own:
             raise ValueError(
                 f"effect {effect.name!r} speaks of a parameter {name!r} that it does not have; it has: {', '.join(own)}"
+            )
+    for p, values in ((own[name], values) for name, values in effect.shapes.items()):
+        if strange := [v for v in values if not p.low <= v <= p.high]:
+            raise ValueError(
+                f"effect {effect.name!r}: values to try of its shape {p.name!r} lie outside its bounds "
+                f"[{p.low:g}, {p.high:g}]: {', '.join(f'{v:g}' for v in strange)}"
             )
     for p in (own[name] for name in amplitudes):
         if p.mean != 0.0:  # `Parameter` itself sees that the mean lies within the bounds

@@ -8,11 +8,14 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from effect_bench import ARM, JOINTS, MECHANISM, Bench, make_bench, mechanism
+from effect_bench import ARM, JOINTS, MECHANISM, MOTOR, Bench, make_bench, mechanism
 
+from droid_jax.compare.replay import Drive, servo_replay
 from droid_jax.model.effects import amplitudes as a
 from droid_jax.model.effects import registry
 from droid_jax.model.effects.registry import effect_space, library, ready, register, registered
+from droid_jax.model.parameters import Parameter
+from droid_jax.model.physics import make_physics
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene, compile_scene
 from droid_jax.model.seam import Effect
 
@@ -39,6 +42,53 @@ def edited(old: str, new: str, **options) -> Scene:
     assert old in MECHANISM
     options = {"joints": JOINTS, "object_joint": "door", **options}
     return compile_scene(mujoco.MjSpec.from_string(MECHANISM.replace(old, new)), "edited", **options)
+
+
+# ----- effects of one's own
+
+
+def grease_at(*joints: str, name: str = "grease", high: float = 9.0) -> Effect:
+    """A push at each of these joints, as a user would write it: theta is taken to hold every amplitude."""
+
+    def force(theta, state):
+        return sum((jnp.zeros_like(state.qvel).at[k].set(theta[f"grease[{j}]"]) for k, j in enumerate(joints)))
+
+    amplitudes = tuple(Parameter(f"grease[{j}]", "N m", 0.0, 1.0, -5.0, 5.0) for j in joints)
+    shape = Parameter("thickness", "mm", 1.0, 1.0, 0.1, 5.0)
+    places = {j: (p.name,) for j, p in zip(joints, amplitudes, strict=True)}
+    return Effect(name, (*amplitudes, shape), force=force, places=places, shapes={"thickness": (1.0, high)})
+
+
+def test_a_model_that_names_one_place_leaves_the_others_at_neutral():
+    """An extended model has the parameters of what was named, and the effect reads all of its own."""
+    scene = mechanism()
+    grease = grease_at(*JOINTS, high=2.0)
+    drive = Drive(np.zeros((40, 3)), scene.initial_qpos({}), 0.005, MOTOR)
+    replay = servo_replay(scene, drive, [grease])
+    whole = effect_space([grease])
+    named = whole.select([f"grease[{JOINTS[1]}]"])
+    torques = [
+        replay(make_physics(scene, space, space.values({named.names[0]: 0.4}))).torque for space in (whole, named)
+    ]
+    np.testing.assert_array_equal(*torques)
+    assert np.ptp(torques[0]) > 0.1
+
+
+@pytest.mark.parametrize(
+    ("effect", "said"),
+    [
+        (grease_at("door", name="thick grease", high=2.0), "'grease' makes is called 'thick grease'"),
+        (grease_at("door"), r"its shape 'thickness' lie outside its bounds \[0.1, 5\]: 9"),
+    ],
+)
+@pytest.mark.usefixtures("own_list")
+def test_an_effect_that_would_fail_later_is_refused(effect: Effect, said: str):
+    @register
+    def grease(scene):
+        return effect
+
+    with pytest.raises(ValueError, match=said):
+        library(mechanism(), ["grease"])
 
 
 # ----- what a scene can have
