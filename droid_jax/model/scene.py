@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -287,9 +287,11 @@ def load_scene(
     joints: Sequence[str] | None = None,
     object_joint: str | None = None,
     friction_joints: Sequence[str] = (),
+    assets: Mapping[str, bytes] | None = None,
 ) -> Scene:
     """A user's own MJCF as a Scene.
 
+    assets: contents of files that it names, by name, where they lie elsewhere: `env.model_assets` of mujoco_playground.
     friction_joints: joints whose friction loss will be a parameter though the file gives none.
     Raises FileNotFoundError or ValueError (the file does not compile, unknown names, ...).
     """
@@ -299,7 +301,7 @@ def load_scene(
     if not path.is_file():
         raise FileNotFoundError(f"no MJCF file at {path}")
     try:
-        spec = mujoco.MjSpec.from_file(str(path))
+        spec = mujoco.MjSpec.from_file(str(path)) if assets is None else _with_assets(path, assets)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     named = {j.name: j for j in spec.joints}
@@ -311,6 +313,13 @@ def load_scene(
         return compile_scene(spec, path.stem, joints=joints, object_joint=object_joint)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
+
+
+def _with_assets(path: Path, assets: Mapping[str, bytes]) -> mujoco.MjSpec:
+    """The spec of an MJCF whose included files, meshes and textures are given."""
+    included = {name: content for name, content in assets.items() if name.endswith(".xml")}
+    others = {name: content for name, content in assets.items() if name not in included}
+    return mujoco.MjSpec.from_string(path.read_text(encoding="utf-8"), include=included, assets=others)
 
 
 def with_options(scene: Scene, **changes: Any) -> Scene:

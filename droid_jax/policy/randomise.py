@@ -8,7 +8,7 @@ follows from them, are batched.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jax
@@ -19,7 +19,7 @@ from droid_jax.identify.gaussian import Gaussian
 from droid_jax.model.fields import element_name
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import Physics, make_physics, model_writes, written_fields
-from droid_jax.model.scene import Scene
+from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
 
 Randomise = Callable[[Any, jax.Array], tuple[Any, Any]]
 
@@ -46,10 +46,11 @@ def of_method(method: str, scene: Scene, gaussian: Gaussian) -> Randomise:
 def randomised_model(scene: Scene, gaussian: Gaussian) -> Randomise:
     """The same for environments that know an mjx.Model only (mujoco_playground's): the model fields alone.
 
-    scene: of the same MJCF, whose geoms that are for the eye alone the environment may have.  Fields that no parameter
-    writes stay the environment's own.
+    scene: of the same MJCF, whose geoms that are for the eye alone the environment may have.  Numbers that no parameter
+    writes stay the environment's own, those apart that follow from masses and places: they are the scene's.
     Warns of parameters that live outside the model: they have no place there and stay at neutral.
-    Raises ValueError for a Gaussian of another scene, and when called with a model of another scene.
+    Raises ValueError for a Gaussian of another scene, and when called with a model of another scene or with one in
+    which a friction loss that varies has no row.
     """
     both, fields = randomised(scene, gaussian), _batched(scene, gaussian.space)
     outside = [p.name for p in gaussian.space.parameters if not p.writes]
@@ -58,27 +59,52 @@ def randomised_model(scene: Scene, gaussian: Gaussian) -> Randomise:
             f"an environment that knows an mjx.Model only cannot vary {', '.join(outside)}: they are no fields of it",
             stacklevel=2,
         )
+    written = dict[str, list[tuple[int, ...]]]()
+    for _, write in model_writes(gaussian.space):
+        written.setdefault(write.field, []).append(write.index)
 
     def randomise(model: Any, rng: jax.Array) -> tuple[Any, Any]:
-        looks = model.ngeom != scene.model.ngeom and len(scene.spec.geoms) == model.ngeom
-        rows = {field: scene.geoms_among_looks for field in fields if looks and field.startswith("geom_")}
-        for field in fields:
-            own, given = (jax.tree.map(jnp.shape, getattr(m, field)) for m in (scene.mjx, model))
-            if field in rows and own[1:] == given[1:]:
-                continue
-            if own != given:
-                raise ValueError(
-                    f"the environment's model has {field} of shape {given}, the scene {scene.name!r} of {own}: the "
-                    "scene must be of the environment's MJCF"
-                )
-        physics, _ = both(Physics(scene.mjx, {}), rng)
-        values = {field: getattr(physics.model, field) for field in fields}
-        for field, kept in rows.items():
-            every = jnp.repeat(getattr(model, field)[None], _count(rng), axis=0)
-            values[field] = every.at[:, kept].set(values[field])
+        geoms = _geoms_among(scene, model, fields)
+        _check_friction_rows(scene, model, written.get("dof_frictionloss", ()))
+        drawn, _ = both(Physics(scene.mjx, {}), rng)
+        values = {field: getattr(drawn.model, field) for field in fields}
+        for field in (f for f in fields if f in written or f in geoms):
+            own, ids = jnp.repeat(getattr(model, field)[None], _count(rng), axis=0), geoms.get(field, slice(None))
+            for index in written.get(field, [()]):  # of a derived field everything
+                at = (np.arange(own.shape[1])[ids][index[0]], *index[1:]) if index else (ids,)
+                own = own.at[(slice(None), *at)].set(values[field][(slice(None), *index)])
+            values[field] = own
         return model.replace(**values), _zeros(model, fields)
 
     return randomise
+
+
+def _geoms_among(scene: Scene, model: Any, fields: Sequence[str]) -> dict[str, np.ndarray]:
+    """geom_ field -> ids of the scene's geoms in a model that has the looks too; empty where it has none.
+
+    ValueError where a field's shape is of another scene.
+    """
+    looks = model.ngeom != scene.model.ngeom and len(scene.spec.geoms) == model.ngeom
+    rows = {field: scene.geoms_among_looks for field in fields if looks and field.startswith("geom_")}
+    for field in fields:
+        own, given = (jax.tree.map(jnp.shape, getattr(m, field)) for m in (scene.mjx, model))
+        if own != given and not (field in rows and own[1:] == given[1:]):
+            raise ValueError(
+                f"the environment's model has {field} of shape {given}, the scene {scene.name!r} of {own}: the "
+                "scene must be of the environment's MJCF"
+            )
+    return rows
+
+
+def _check_friction_rows(scene: Scene, model: Any, written: Iterable[tuple[int, ...]]) -> None:
+    """ValueError for a friction loss that was zero when the model was compiled: MJX laid out no row for it."""
+    without = [i for (i, *_) in written if float(model.dof_frictionloss[i]) == 0.0]
+    if without:
+        names = ", ".join(element_name(scene.model, "dof_frictionloss", (i,)) or f"dof {i}" for i in without)
+        raise ValueError(
+            f"the environment's MJCF has no friction loss at {names}, and MJX no row for it: what is drawn would have "
+            f"no effect; give it {TINY_FRICTIONLOSS:g} or more there"
+        )
 
 
 def fixed(scene: Scene, space: Space, values: np.ndarray) -> Randomise:

@@ -50,6 +50,21 @@ def flange_pose(q: np.ndarray) -> np.ndarray:
     return pose @ craig(0.0, FLANGE, 0.0, 0.0)
 
 
+def test_an_mjcf_whose_files_are_given(tmp_path: Path):
+    """As environments ship them: includes and meshes by name, in no folder of their own."""
+    mesh = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    arm = (
+        "<mujoco><asset><mesh name='box' file='box.obj'/></asset><worldbody><body><joint name='elbow'/>"
+        "<geom type='mesh' mesh='box' mass='1'/></body></worldbody></mujoco>"
+    )
+    path = tmp_path / "scene.xml"
+    path.write_text("<mujoco><include file='arm.xml'/><actuator><position joint='elbow' kp='9'/></actuator></mujoco>")
+    assets = {"arm.xml": arm.encode(), "box.obj": mesh.encode()}
+    assert load_scene(path, assets=assets).joints == ("elbow",)
+    with pytest.raises(ValueError, match=r"scene.xml: .*arm.xml"):
+        load_scene(path)
+
+
 def test_flange_follows_the_dh_table(door: Scene):
     rng = np.random.default_rng(0)
     data = mujoco.MjData(door.model)

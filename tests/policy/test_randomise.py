@@ -19,7 +19,7 @@ from droid_jax.identify.gaussian import Gaussian, load, prior
 from droid_jax.model.door import door_space
 from droid_jax.model.door_scene import door_scene
 from droid_jax.model.effects.registry import effect_space, library
-from droid_jax.model.fields import body_mass, joint_damping, model_parameter
+from droid_jax.model.fields import body_mass, joint_damping, joint_frictionloss, model_parameter
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import Physics, make_physics, written_fields
 from droid_jax.model.scene import compile_scene, load_scene
@@ -126,6 +126,31 @@ def test_an_environments_own_model_is_kept_but_for_what_varies(scene, gaussian, 
     assert batched.qpos0 is None and model.body_mass.shape == (ENVS, scene.model.nbody)
     with pytest.raises(ValueError, match=r"has dof_damping of shape \(3,\).*must be of the environment's MJCF"):
         randomised_model(scene, gaussian)(own.replace(dof_damping=own.dof_damping[:3]), keys)
+
+
+def test_what_an_environment_changed_beside_a_parameter_stays(keys):
+    xml = """<mujoco><worldbody><body><joint name="a" damping="1"/><geom size=".1"/>
+      <body pos="0 0 1"><joint name="b" damping="2"/><geom size=".1"/></body></body></worldbody></mujoco>"""
+    scene = compile_scene(mujoco.MjSpec.from_string(xml), "two", joints=("a", "b"))
+    own = mjx.put_model(mujoco.MjModel.from_xml_string(xml))
+    own = own.replace(dof_damping=own.dof_damping.at[1].set(7.0))  # as environments do after loading
+    model, _ = randomised_model(scene, prior(Space((joint_damping(scene, "a", std=0.1, high=5.0),))))(own, keys)
+    assert len(np.unique(model.dof_damping[:, 0])) == ENVS
+    np.testing.assert_array_equal(model.dof_damping[:, 1], 7.0)
+
+
+def test_a_friction_loss_without_a_row_is_refused(keys, tmp_path: Path):
+    """What is drawn would have no effect, and nothing would say so."""
+    path = tmp_path / "dry.xml"
+    path.write_text(
+        "<mujoco><worldbody><body><joint name='j'/><geom size='.1'/></body></worldbody>"
+        "<actuator><position joint='j' kp='9'/></actuator></mujoco>"
+    )
+    scene = load_scene(path, friction_joints=["j"])
+    randomise = randomised_model(scene, prior(Space((joint_frictionloss(scene, "j", std=0.1, high=2.0),))))
+    with pytest.raises(ValueError, match="no friction loss at j"):
+        randomise(mjx.put_model(mujoco.MjModel.from_xml_path(str(path))), keys)
+    randomise(scene.mjx, keys)
 
 
 def test_an_environment_with_geoms_for_the_eye_takes_it(keys):
