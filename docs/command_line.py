@@ -30,9 +30,9 @@ python -m droid_jax.run [COMMAND] [OPTIONS]
 ```
 
 Without a command: [`all`](#all). `droid-jax` is the same program. `--version` says which version it is, `--help` what \
-there is, `--tyro-print-completion bash` (`zsh`, `tcsh`) completes it in a shell. An option with dots takes several \
-values; a switch `--film` is turned off by `--no-film`. Bad input ends with one sentence on stderr \
-(an option that does not exist, with those that do) and exit code 2, Ctrl-C with exit code 130.
+there is, `--tyro-print-completion bash` (`zsh`, `tcsh`) completes it in a shell. An option shown with `...` takes \
+several values; a switch `--film` is turned off by `--no-film`. Bad input ends with exit code 2 and, on stderr, one \
+sentence (of an option that does not exist, a box with those that resemble it); Ctrl-C ends with exit code 130.
 """
 
 
