@@ -119,7 +119,7 @@ def path_replay(
             torque = torque - (data.qfrc_passive - compensated * data.qfrc_gravcomp)
             if motor:
                 torque = torque + model.dof_frictionloss * jnp.sign(velocity)
-            state = State(time, data.qpos, velocity, torque)
+            state = State(time, data.qpos, velocity, torque, model)
             own = model.dof_frictionloss if motor else _behind_the_sensor(scene, theta)
             return (torque + _resistance(theta, state, own, effects))[scene.joint_dofs]
 

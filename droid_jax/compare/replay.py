@@ -154,7 +154,7 @@ def servo_replay(
 
         def step(carry, k):
             qpos, qvel, warm, load = carry
-            state = State(k * drive.timestep, qpos, qvel, load)
+            state = State(k * drive.timestep, qpos, qvel, load, model)
             ctrl = servo_given(_command(table, drive.timestep, k, shift, theta, effects), theta, state, effects)
             before = template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm, ctrl=ctrl)
             after = simulate_step(

@@ -25,12 +25,14 @@ class State:
     """What a force may depend on, before a step.
 
     time: s.  qpos: [nq].  qvel: [nv].  load: [nv] N m, the previous step's actuator torque.
+    model: the sample's mjx.Model, with the values of its parameters (fitted servo gains, say).
     """
 
     time: jax.Array
     qpos: jax.Array
     qvel: jax.Array
     load: jax.Array
+    model: Any = None
 
 
 @jax.tree_util.register_dataclass

@@ -147,7 +147,7 @@ class DoorEnv(Env):
 
         def substep(carry, number):
             qpos, qvel, warm, load, _ = carry
-            now = State(world.time + number * self._timestep, qpos, qvel, load)
+            now = State(world.time + number * self._timestep, qpos, qvel, load, model)
             ctrl = self._servo(theta, now, world)
             data = self._template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm, ctrl=ctrl)
             after = simulate_step(

@@ -4,8 +4,8 @@ The servo measures the motor, the dynamics move the link.  Under a torque tau th
 elastic joint; in one with backlash it turns freely within half of it to either side of the link.  Both are
 quasi-static: ringing is not simulated.
 
-The torque is solved for with the servo's own law.  Feeding back the torque of the step before would be simpler, but
-a stiff servo makes that a loop with a gain above one, which chatters.
+The torque is solved for with the servo's own law, whose gains and damping may be fitted.  Feeding back the torque of
+the step before would be simpler, but a stiff servo makes that a loop with a gain above one, which chatters.
 """
 
 from __future__ import annotations
@@ -29,27 +29,36 @@ COMPLIANCE, BACKLASH = "joint_compliance", "joint_backlash"
 class _Servos:
     """The arm's joints with a position servo: names, actuators, positions and degrees of freedom, all [J].
 
-    gain, bias: [J], [J,3] of the actuators, as the MJCF has them.  gear: [J].  stiffness: [J] N m/rad, at the joint.
+    gear: [J].  stiffness: [J] N m/rad at the joint, as the MJCF has it.
     """
 
     joints: tuple[str, ...]
     actuators: np.ndarray
     positions: np.ndarray
     dofs: np.ndarray
-    gain: np.ndarray
-    bias: np.ndarray
     gear: np.ndarray
     stiffness: np.ndarray
 
     def rigid_torque(self, state: State, ctrl: jax.Array) -> jax.Array:
         """[J] N m with the motor where its link is."""
+        gain, bias = self._law(state)
         length, speed = self.gear * state.qpos[self.positions], self.gear * state.qvel[self.dofs]
-        feedback = self.bias[:, 0] + self.bias[:, 1] * length + self.bias[:, 2] * speed
-        return jnp.asarray(self.gear) * (self.gain * ctrl[self.actuators] + feedback)
+        feedback = bias[:, 0] + bias[:, 1] * length + bias[:, 2] * speed
+        return jnp.asarray(self.gear) * (gain * ctrl[self.actuators] + feedback)
 
-    def with_lead(self, ctrl: jax.Array, lead: jax.Array) -> jax.Array:
+    def stiffness_in(self, state: State) -> jax.Array:
+        """[J] N m/rad at the joint, of the sample."""
+        return -self._law(state)[1][:, 1] * self.gear**2
+
+    def with_lead(self, state: State, ctrl: jax.Array, lead: jax.Array) -> jax.Array:
         """[U] the command that has the same effect as motors ahead of their links by lead [J] rad."""
-        return ctrl.at[self.actuators].add(-self.stiffness * lead / (self.gear * self.gain))
+        gain, _ = self._law(state)
+        return ctrl.at[self.actuators].add(-self.stiffness_in(state) * lead / (self.gear * gain))
+
+    def _law(self, state: State) -> tuple[jax.Array, jax.Array]:
+        """Gain [J] and bias [J, 3] of the actuators."""
+        gain, bias = state.model.actuator_gainprm, state.model.actuator_biasprm
+        return gain[self.actuators, 0], bias[self.actuators, :3]
 
 
 def _servos(scene: Scene) -> _Servos | None:
@@ -70,8 +79,6 @@ def _servos(scene: Scene) -> _Servos | None:
         actuators=actuators,
         positions=np.array([scene.qpos(j) for j in joints], dtype=int),
         dofs=np.array([scene.dof(j) for j in joints], dtype=int),
-        gain=model.actuator_gainprm[actuators, 0],
-        bias=model.actuator_biasprm[actuators, :3],
         gear=gear[actuators],
         stiffness=stiffness[actuators],
     )
@@ -86,8 +93,8 @@ def joint_compliance(scene: Scene) -> Effect | None:
 
     def servo(theta, state, ctrl):
         compliance = column(theta, COMPLIANCE, servos.joints)
-        torque = servos.rigid_torque(state, ctrl) / (1.0 + servos.stiffness * compliance)
-        return servos.with_lead(ctrl, compliance * torque)
+        torque = servos.rigid_torque(state, ctrl) / (1.0 + servos.stiffness_in(state) * compliance)
+        return servos.with_lead(state, ctrl, compliance * torque)
 
     def parameter(joint: str, stiffness: float):
         # Below zero only so that a rigid joint is no edge; never so far that 1 + k c comes near zero.
@@ -116,9 +123,9 @@ def joint_backlash(scene: Scene) -> Effect | None:
 
     def servo(theta, state, ctrl):
         half = 0.5 * column(theta, BACKLASH, servos.joints)
-        error = servos.rigid_torque(state, ctrl) / servos.stiffness
+        error = servos.rigid_torque(state, ctrl) / servos.stiffness_in(state)
         lead = jnp.sign(half) * jnp.clip(error, -jnp.abs(half), jnp.abs(half))
-        return servos.with_lead(ctrl, lead)
+        return servos.with_lead(state, ctrl, lead)
 
     return Effect(
         BACKLASH,

@@ -115,7 +115,7 @@ def moments(scene: Scene) -> list[State]:
         return jnp.asarray(scale * rng.normal(size=size), jnp.float32)
 
     return [
-        State(jnp.float32(time), draw(model.nq, 1.0), draw(model.nv, speed), draw(model.nv, 5.0))
+        State(jnp.float32(time), draw(model.nq, 1.0), draw(model.nv, speed), draw(model.nv, 5.0), scene.mjx)
         for time, speed in ((0.0, 1.0), (0.3, 0.01), (0.6, 0.0))
     ]
 
