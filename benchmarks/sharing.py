@@ -18,10 +18,11 @@ UNCOMMITTED = "-dirty"  # what `runtime.versions` puts behind a commit that is n
 
 def kept(path: Path, make: Callable[[], Mapping[str, Any]]) -> dict[str, Any]:
     """The JSON that lies at `path`, made first where there is none; another process that is making it is waited for."""
-    with claimed(path, wait=True):
-        if not path.is_file():
-            write_json(path, make(), indent=2)
-        return json.loads(path.read_text())
+    if not path.is_file():
+        with claimed(path, wait=True):
+            if not path.is_file():  # which another process may have made meanwhile
+                write_json(path, make(), indent=2)
+    return json.loads(path.read_text())
 
 
 def code_name(commit: str | None) -> str:

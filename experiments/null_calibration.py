@@ -77,13 +77,18 @@ class Arguments:
 def case_of(plan: Plan, commit: str, bench: Bench) -> dict[str, Any]:
     """One case; what fails is a result too, and keeps the p-value of a screening that was done."""
     watch = Stopwatch()
-    told = {"scene": plan.scene, "seed": seed_of(commit, plan.name), "code": CODE.get("git"), "seconds": watch.seconds}
+    result = {
+        "scene": plan.scene,
+        "seed": seed_of(commit, plan.name),
+        "code": CODE.get("git"),
+        "seconds": watch.seconds,
+    }
     try:
         for known in run_case(plan, commit, bench, watch):
-            told |= known
+            result |= known
     except FAILED as error:
-        told |= {"verdict": "error", "error": str(error)}
-    return told
+        result |= {"verdict": "error", "error": str(error)}
+    return result
 
 
 def run_case(plan: Plan, commit: str, bench: Bench, watch: Stopwatch) -> Iterator[dict[str, Any]]:
@@ -109,7 +114,7 @@ def summarise(cases: list[dict[str, Any]]) -> dict[str, Any]:
     """False alarms with Wilson's intervals, and the p-values' distribution.
 
     Shares are of the cases that were screened; those that failed, before or after, are counted beside them.  Whether
-    one that failed after its screening rejected would have ended in an alarm is not known: it counts as one.
+    one that failed after its screening rejected would have ended in an alarm is not known (`rejected_then_failed`).
     """
     failed, cases = sum("error" in c for c in cases), [c for c in cases if "p" in c]
     if not cases:
@@ -120,7 +125,8 @@ def summarise(cases: list[dict[str, Any]]) -> dict[str, Any]:
         "errors": failed,
         "codes": sorted({str(c.get("code")) for c in cases}),
         "screening_rejects": rate(cases, lambda c: c["p"] < SIGNIFICANT),
-        "alarms": rate(cases, lambda c: c.get("verdict", "none") not in ("none", "fit not converged")),
+        "alarms": rate(cases, lambda c: c.get("verdict", "none") not in ("none", "fit not converged", "error")),
+        "rejected_then_failed": sum("error" in c for c in cases),
         "names": rate(cases, lambda c: bool(c.get("effects"))),
         "unconverged": rate(cases, lambda c: not c["converged"]),
         "p_below": {f"{level:g}": float(np.mean(p < level)) for level in LEVELS},

@@ -27,8 +27,7 @@ import json  # noqa: E402
 import tyro  # noqa: E402
 from table1 import PAPER  # noqa: E402
 
-from benchmarks.common import origin, stem  # noqa: E402
-from benchmarks.sharing import kept  # noqa: E402
+from benchmarks.common import stem  # noqa: E402
 from droid_jax.commands.identify import Identify, run  # noqa: E402
 from droid_jax.report import search_figures, torque_figures  # noqa: E402
 from droid_jax.report.export import save  # noqa: E402
@@ -60,6 +59,14 @@ def figures(found: Run) -> dict[str, Any]:
     }
 
 
+def made_by(found: Run) -> dict[str, Any]:
+    """Where the run comes from, in the words of `origin`: one that is drawn again stays of the code that made it."""
+    told = found.config
+    versions = {name: version for name, version in told["versions"].items() if name != "git"}
+    of = {"commit": told["versions"].get("git"), "versions": versions, "device": told["device"], "seed": told["seed"]}
+    return {**of, "date": told["started"]}
+
+
 def main() -> None:
     arguments = tyro.cli(Arguments, description=__doc__)
     folder = arguments.out / stem("search_run", arguments.quick)
@@ -71,7 +78,6 @@ def main() -> None:
             out=folder,
         )
     )
-    of = kept(folder / "origin.json", lambda: origin(0))  # a run that is drawn again stays of the code that made it
     found = read_run(folder)
     for name, figure in figures(found).items():
         save(figure, arguments.out, stem(name, arguments.quick))
@@ -87,11 +93,7 @@ def main() -> None:
         "seconds": found.fit["seconds"],
         "parameters": shown,
     }
-    write_json(
-        arguments.out / f"{stem('search_figure', arguments.quick)}.json",
-        {**of, **result},
-        indent=2,
-    )
+    write_json(arguments.out / f"{stem('search_figure', arguments.quick)}.json", {**made_by(found), **result}, indent=2)
     print(json.dumps(result))
 
 

@@ -22,6 +22,10 @@ ENOUGH = 0.1  # share of the time that two repeats must have measured
 MINIMUM_NOISE = {"torque": 0.01, "position": 2e-5, "velocity": 5e-4, "object_angle": 2e-4}
 
 
+class TooLong(ValueError):
+    """A recording whose filter and covariance would fill the memory."""
+
+
 @dataclass(frozen=True, eq=False)
 class Measured:
     """One channel ready to be compared.
@@ -113,14 +117,14 @@ def _of_joints(scene: Scene, channel: Channel) -> Channel:
 
 
 def _needs_memory(channel: Channel, steps: int, instants: int) -> None:
-    """Raise ValueError where filter and covariance, which grow with the square of the duration, fill the memory."""
+    """Raise TooLong where filter and covariance, which grow with the square of the duration, fill the memory."""
     filters = 1 if channel.mask.all() or np.all(channel.mask == channel.mask[..., :1]) else len(channel.columns)
     needed = 8.0 * instants * (filters * steps + len(channel.columns) * instants)
     if not hasattr(os, "sysconf"):  # elsewhere than on Linux and macOS
         return
     there = float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
     if 2.0 * needed > there:  # what computes with them needs as much again
-        raise ValueError(
+        raise TooLong(
             f"channel {channel.name!r} of {instants / RATE:.0f} s needs {needed / 1e9:.1f} GB for its filter and the "
             f"covariance of its noise, and half of this machine's memory is {there / 2e9:.1f} GB: cut the recording "
             "(`python -m droid_jax.run convert --start S --end S`), or fit its parts as several"

@@ -111,4 +111,7 @@ class Hunt:
     def gone_on_with(self, model: Model, config: RefineConfig, note: str) -> Model:
         """`model` gone on with from where it is; as it is where that cannot be replayed on the confirming motion."""
         found = self.refit(model.parts, model.values, config, note)
-        return found if np.isfinite(self.case.confirm.common(found.values)).all() else model
+        if np.isfinite(self.case.confirm.common(found.values)).all():
+            return found
+        self.failed.append(joined(model.parts) + note)
+        return model

@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 
 from droid_jax.compare.cost import Cost, make_cost
+from droid_jax.compare.measured import TooLong
 from droid_jax.gap.case import Case
 from droid_jax.gap.reach import opened_further
 from droid_jax.gap.refit import Model
@@ -41,7 +42,8 @@ def separating(case: Case, models: Sequence[Model], recording: Recording) -> tup
     """Experiments by how far apart they put the two models that they tell apart least, the best first.
 
     models: tied ones, each refitted.  recording: what the case was fitted to.  Empty for a log without
-    commands, whose motion cannot be asked for again.  Entries that a model cannot be replayed on are left out.
+    commands, whose motion cannot be asked for again.  Entries that a model cannot be replayed on, and
+    those too long for the memory, are left out.
     """
     if len(models) < 2 or not recording.command.size:
         return ()
@@ -54,7 +56,7 @@ def separating(case: Case, models: Sequence[Model], recording: Recording) -> tup
             warnings.simplefilter("ignore", UserWarning)
             try:
                 cost = make_cost(known.scene, case.whole, [motion], config=config, effects=case.effects)
-            except ValueError:  # too long for the memory, say: the search is done, and other entries are left
+            except TooLong:  # the search is done, and other entries are left
                 continue
         found += _experiment(motion.name, cost, values)
     seen = {name: weight for name, weight in config.channels.items() if name != "object_angle"}

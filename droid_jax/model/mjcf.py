@@ -99,7 +99,8 @@ def native(
     """What an effect adds to the numbers (field, row) of a model; None where it acts in the replay alone."""
     if effect.native is None:
         return None
-    return effect.native(dict(zip(space.names, np.asarray(values).tolist(), strict=True)), model)
+    neutral = {p.name: p.mean for p in effect.parameters}  # of what the space does not hold
+    return effect.native(neutral | dict(zip(space.names, np.asarray(values).tolist(), strict=True)), model)
 
 
 def unwritten(scene: Scene, space: Space) -> tuple[str, ...]:

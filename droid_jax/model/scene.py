@@ -291,7 +291,8 @@ def load_scene(
 ) -> Scene:
     """A user's own MJCF as a Scene.
 
-    assets: contents of files that it names, by name, where they lie elsewhere: `env.model_assets` of mujoco_playground.
+    assets: contents of files that it names, by name, where they do not lie beside it: `env.model_assets` of
+      mujoco_playground.  An MJCF that is written of the scene later names them as this one does.
     friction_joints: joints whose friction loss will be a parameter though the file gives none.
     Raises FileNotFoundError or ValueError (the file does not compile, unknown names, ...).
     """
@@ -301,7 +302,7 @@ def load_scene(
     if not path.is_file():
         raise FileNotFoundError(f"no MJCF file at {path}")
     try:
-        spec = mujoco.MjSpec.from_file(str(path)) if assets is None else _with_assets(path, assets)
+        spec = _read(path, assets or {})
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     named = {j.name: j for j in spec.joints}
@@ -315,11 +316,11 @@ def load_scene(
         raise ValueError(f"{path}: {error}") from None
 
 
-def _with_assets(path: Path, assets: Mapping[str, bytes]) -> mujoco.MjSpec:
-    """The spec of an MJCF whose included files, meshes and textures are given."""
+def _read(path: Path, assets: Mapping[str, bytes]) -> mujoco.MjSpec:
+    """The spec of an MJCF, of whose included files, meshes and textures some are given."""
     included = {name: content for name, content in assets.items() if name.endswith(".xml")}
     others = {name: content for name, content in assets.items() if name not in included}
-    return mujoco.MjSpec.from_string(path.read_text(encoding="utf-8"), include=included, assets=others)
+    return mujoco.MjSpec.from_file(str(path), include=included, assets=others)
 
 
 def with_options(scene: Scene, **changes: Any) -> Scene:

@@ -38,7 +38,7 @@ def step(model: Any, data: Any, *, parity: bool = False, servo_damping: bool = T
       velocities to half a step before (leapfrog); joint damping and constraint damping use the mean
       velocity of the step, and constraints are solved with the inertia that follows, M + h/2 D.
     parity=True: what C MuJoCo's implicitfast and Euler do, first order, for comparisons step by step.
-    servo_damping: False spares what only actuators with a velocity gain need (see `scene.has_servo_damping`).
+    servo_damping: False spares what only actuators with a velocity gain need (see `actuators.has_servo_damping`).
     Leaves out what no replay reads: sensors, cameras, lights.
     Raises ValueError for other integrators, and for elliptic cones unless parity.
     """

@@ -98,7 +98,8 @@ def _geoms_among(scene: Scene, model: Any, fields: Sequence[str]) -> dict[str, n
 
 def _check_friction_rows(scene: Scene, model: Any, written: Iterable[tuple[int, ...]]) -> None:
     """ValueError for a friction loss that was zero when the model was compiled: MJX laid out no row for it."""
-    without = [i for (i, *_) in written if float(model.dof_frictionloss[i]) == 0.0]
+    rows = getattr(model._impl, "dof_hasfrictionloss", None)  # of the implementation in JAX; others lay out all rows
+    without = [i for (i, *_) in written if rows is not None and not rows[i]]
     if without:
         names = ", ".join(element_name(scene.model, "dof_frictionloss", (i,)) or f"dof {i}" for i in without)
         raise ValueError(

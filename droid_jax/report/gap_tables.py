@@ -48,6 +48,8 @@ class Group:
 def groups(found: Mapping[str, Any]) -> list[Group]:
     """One for each number of effects that was screened or tried."""
     screens = found["screens"]
+    if len(screens) > 1 and screens[-1] == screens[0]:
+        screens = screens[:-1]  # files of version 0.1 before December 2026 list the first one again for pairs
     count = max([len(screens), *(t["round"] + 1 for t in found["trials"])])
     return [_group(found, k, screens[k] if k < len(screens) else None) for k in range(count)]
 

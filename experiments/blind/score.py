@@ -82,7 +82,6 @@ def judge(case: Case, limits: Mapping[str, Any]) -> dict[str, Any]:
     """One case: what was hidden, what is right and wrong about the verdict, and what it closed."""
     truth, result = case["truth"], case["result"]
     times = times_limit(truth, limits)
-    answer = answered(case)
     return {
         "name": truth["name"],
         "seed": truth.get("seed"),
@@ -94,8 +93,8 @@ def judge(case: Case, limits: Mapping[str, Any]) -> dict[str, Any]:
         "larger": any(t > ROUNDED * truth["factor"] for t in times.values()),
         "code": result.get("code"),
         "p": result.get("p"),
-        **answer,
-        "reachable": reachable(case, answer["named"]),
+        **answered(case),
+        "reachable": reachable(case),
         "gaps": result.get("gaps", {}),
         "closed": _shares(result) if result.get("effects") else {},
         "within_floor": within_floor(result),
@@ -214,22 +213,21 @@ def _shares(result: Mapping[str, Any]) -> dict[str, float]:
     return {role: share for role, share in shares.items() if share is not None}
 
 
-def reachable(case: Case, named: bool) -> float | None:
-    """Share of the confirming recording's gap that right names are known to close: the oracle's, or more of the search.
+def reachable(case: Case) -> float | None:
+    """Share of the confirming recording's gap that the oracle's names close from the truth; None where not known.
 
-    None where that is not known: an oracle that has not settled, and a search that named rightly, tell only that so
-    much can be closed, which says something where it is `NAMEABLE`.  0 where the base model leaves hardly a gap:
-    nothing can be named there.
+    Of the oracle alone, whatever was named, so that what is missed and what is named are asked alike.  It is no upper
+    bound: a search that begins elsewhere may close more.  One that has not settled tells only that so much can be
+    closed, which says something where it is `NAMEABLE`.  0 where the base model leaves hardly a gap: nothing can be
+    named there.
     """
     oracle, result = case["oracle"] or {}, case["result"]
-    if "confirm" not in result.get("gaps", {}):
+    if "gaps" not in oracle or "confirm" not in result.get("gaps", {}):
         return None
-    (before, after), floor = result["gaps"]["confirm"], result["floor"]
+    before, floor = result["gaps"]["confirm"][0], result["floor"]
     if before - floor < SEEN:
         return 0.0
-    left = [after] if named else []
-    left += [oracle["gaps"]["confirm"]] if "gaps" in oracle else []
-    share = max(((before - u) / (before - floor) for u in left), default=0.0)
+    share = (before - oracle["gaps"]["confirm"]) / (before - floor)
     return share if share >= NAMEABLE or oracle.get("converged") else None
 
 

@@ -90,8 +90,8 @@ def _rows() -> Iterator[tuple[str, str, Chosen, Chosen]]:
         _named,
     )
     yield "of these larger: named alone", "", lambda c: above(c) and c["larger"], lambda c: c["alone"]
-    yield "one whose right name is known to close half of the gap: named, alone or in a tie", "", _reachable, _named
-    unknown = "one at 3 or 10 times: what its right name closes is not known"
+    yield "one whose right name closes half of the gap from the truth: named, alone or in a tie", "", _reachable, _named
+    unknown = "one at 3 or 10 times: what its right name closes from the truth is not known"
     yield unknown, "", above, lambda c: c["reachable"] is None
     yield "two: one named, nothing false", "90 %", _kind("pair"), lambda c: any(c["met"]) and not _false(c)
     yield "two: both named, nothing false", "70 %", _kind("pair"), _named

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from small_gap import record, small
 
+from droid_jax.compare.measured import TooLong
 from droid_jax.gap import menu
 from droid_jax.gap.case import Case
 from droid_jax.gap.menu import CARRIED, IN_THE_AIR, WEIGHT, separating, untouched
@@ -72,7 +73,7 @@ def test_an_entry_that_this_machine_cannot_replay_is_left_out(demonstration, mon
 
     def short_of_memory(scene, space, recordings, **options):
         if recordings[0].time[-1] > demonstration.time[-1] + 0.1:
-            raise ValueError("needs 9.0 GB")
+            raise TooLong("needs 9.0 GB")
         return make(scene, space, recordings, **options)
 
     monkeypatch.setattr(menu, "MENU", MENU[:2])

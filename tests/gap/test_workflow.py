@@ -18,6 +18,7 @@ from droid_jax.gap.case import make_case
 from droid_jax.gap.hunt import Budget, Hunt
 from droid_jax.gap.rank import proposals
 from droid_jax.gap.refit import Model
+from droid_jax.gap.rounds import Round, forward
 from droid_jax.gap.screen import Screen, questions_of
 from droid_jax.gap.select import AT_BOUND, TOO_SMALL, UNCONFIRMED
 from droid_jax.gap.transfer import left_over
@@ -107,10 +108,25 @@ def test_a_search_ends_where_all_that_was_asked_about_is_in_the_model():
     assert verdict.effects == ("hinge_preload at door",) and len(verdict.screens) == 1
 
 
-def test_no_more_effects_are_tried_together_than_are_asked_for(found: Small):
-    """`most` of the small search is one: no trial has two effects, and the screening is told once."""
+def test_no_more_effects_are_tried_together_than_are_asked_for(found: Small, monkeypatch: pytest.MonkeyPatch):
+    """Where two might explain more, pairs are tried, and the screening that they come from is told once."""
+    tried = list[str]()
+
+    def pairs(hunt, base, model, first):
+        tried.append(model.name)
+        return Round(first.screen)
+
+    monkeypatch.setattr(workflow, "pairs", pairs)
+    monkeypatch.setattr(workflow, "_unsettled", lambda hunt, model: True)
+    monkeypatch.setattr(workflow, "further", lambda asked, model: () if model.parts else asked)
     assert found.case.config.most == 1
-    assert not any(" + " in trial.name for trial in found.verdict.trials) and len(found.verdict.screens) == 1
+    assert len(find(found.case, found.base, FLOOR).screens) == 1 and not tried
+    monkeypatch.setattr(
+        workflow, "forward", lambda hunt, model, screen: replace(forward(hunt, model, screen), winner=None)
+    )
+    monkeypatch.setattr(workflow, "anew", lambda hunt, base, done: done)
+    two = replace(found.case, config=replace(found.case.config, most=2))
+    assert len(find(two, found.base, FLOOR).screens) == 1 and tried == [found.base.name]
 
 
 def test_what_blows_up_on_the_other_motion_while_it_settles_stays_as_it_was(monkeypatch: pytest.MonkeyPatch):

@@ -22,6 +22,7 @@ from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, State, column
 
+LEAST = 0.2  # of 1 + k c: a fitted servo may be stiffer than the one of which the bounds below zero are
 COMPLIANCE, BACKLASH = "joint_compliance", "joint_backlash"
 
 
@@ -93,7 +94,8 @@ def joint_compliance(scene: Scene) -> Effect | None:
 
     def servo(theta, state, ctrl):
         compliance = column(theta, COMPLIANCE, servos.joints)
-        torque = servos.rigid_torque(state, ctrl) / (1.0 + servos.stiffness_in(state) * compliance)
+        yielding = jnp.maximum(1.0 + servos.stiffness_in(state) * compliance, LEAST)
+        torque = servos.rigid_torque(state, ctrl) / yielding
         return servos.with_lead(state, ctrl, compliance * torque)
 
     def parameter(joint: str, stiffness: float):

@@ -14,6 +14,7 @@ from droid_jax.compare.replay import Drive, servo_replay
 from droid_jax.model.effects import amplitudes as a
 from droid_jax.model.effects import registry
 from droid_jax.model.effects.registry import effect_space, library, ready, register, registered
+from droid_jax.model.mjcf import native
 from droid_jax.model.parameters import Parameter
 from droid_jax.model.physics import make_physics
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene, compile_scene
@@ -56,7 +57,13 @@ def grease_at(*joints: str, name: str = "grease", high: float = 9.0) -> Effect:
     amplitudes = tuple(Parameter(f"grease[{j}]", "N m", 0.0, 1.0, -5.0, 5.0) for j in joints)
     shape = Parameter("thickness", "mm", 1.0, 1.0, 0.1, 5.0)
     places = {j: (p.name,) for j, p in zip(joints, amplitudes, strict=True)}
-    return Effect(name, (*amplitudes, shape), force=force, places=places, shapes={"thickness": (1.0, high)})
+
+    def native(values, model):
+        return {("qpos_spring", k): 0.1 * values[f"grease[{j}]"] for k, j in enumerate(joints)}
+
+    return Effect(
+        name, (*amplitudes, shape), force=force, native=native, places=places, shapes={"thickness": (1.0, high)}
+    )
 
 
 def test_a_model_that_names_one_place_leaves_the_others_at_neutral():
@@ -72,6 +79,8 @@ def test_a_model_that_names_one_place_leaves_the_others_at_neutral():
     ]
     np.testing.assert_array_equal(*torques)
     assert np.ptp(torques[0]) > 0.1
+    added = [native(grease, space, space.values({named.names[0]: 0.4}), scene.model) for space in (whole, named)]
+    assert added[0] == added[1] == {("qpos_spring", k): 0.1 * push for k, push in enumerate((0.0, 0.4, 0.0))}
 
 
 @pytest.mark.parametrize(
