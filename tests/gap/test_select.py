@@ -181,7 +181,7 @@ def test_a_gain_that_fades_steadily_is_significant_and_chance_is_not(found: Smal
     rng = np.random.default_rng(0)
     fading = np.linspace(9.0, -1.0, 10) + 0.1 * rng.normal(size=10)
     p_value = found.case.confirm.gain_p_value
-    assert p_value(fading) == 1 / 512
+    assert p_value(fading) == 1 / 1024
     assert steady(fading).mean() == pytest.approx(fading.mean())
     assert np.std(steady(fading)) < 0.5
     chance = np.array([p_value(rng.normal(size=10)) for _ in range(2000)])
