@@ -14,7 +14,7 @@ import numpy as np
 from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.case import Case
 from droid_jax.gap.refit import Model, refit
-from droid_jax.identify.pipeline import Progress, grip_hypotheses, starts, to_search
+from droid_jax.identify.pipeline import Progress, grip_hypotheses, search_cost, starts
 from droid_jax.identify.search import search
 
 
@@ -40,7 +40,7 @@ def fitted_anew(case: Case, parts: Sequence[Candidate], progress: Progress) -> M
     amplitudes = [a for part in parts for a in part.amplitudes]
     main = whole.select([*(p.name for p in base.parameters if not p.nuisance), *amplitudes])
     found = search(
-        to_search(case.fit.cost, case.config.compare, whole, main, at),
+        search_cost(case.fit.cost, case.config.compare, whole, main, at),
         main,
         case.config.search,
         progress=lambda p: progress("search", p),

@@ -166,7 +166,7 @@ def prepare(
     )
 
 
-def to_search(
+def search_cost(
     cost: Callable[[np.ndarray], Any], config: CompareConfig, full: Space, space: Space, at: np.ndarray | None = None
 ) -> Callable[[np.ndarray], np.ndarray]:
     """[P, d] rows over `space` -> [P] costs of them in the full one: a replay that blew up is no parent.
@@ -191,7 +191,7 @@ def solve(problem: Problem, *, checkpoints: Path | None = None, progress: Progre
     first = base.first()
 
     found = search(
-        to_search(first, config.compare, full, space),
+        search_cost(first, config.compare, full, space),
         space,
         config.search,
         checkpoint_dir=checkpoints,
