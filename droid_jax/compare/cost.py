@@ -8,6 +8,7 @@ cost.rollouts(values)   # [P, D] -> one Rollout per recording
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -156,6 +157,8 @@ def make_cost(
     drives = [followed(scene, r, config) for r in recordings]
     given = {e.name for e in effects}
     check_read(scene, space, effects)
+    if not any(isinstance(drive, Drive) for drive in drives):
+        _warn_of_commanded(space)
     effects = (*effects, *(e for e in _sensor_effects(scene, space) if e.name not in given))
     replays = tuple(_engine(engine, scene, space, d, effects, config.mj_step) for d in drives)
     comparisons = tuple(
@@ -177,6 +180,20 @@ def check_read(scene: Scene, space: Space, effects: Sequence[Effect]) -> None:
         raise ValueError(
             f"parameters {', '.join(unread)} write no field of the model, and nothing in the replay reads them; names "
             f"that it reads: time_offset, {', '.join(sensed)}, and those of the effects that it is given"
+        )
+
+
+def _warn_of_commanded(space: Space) -> None:
+    """Warn of parameters that act through commands, where no recording has any: they change nothing."""
+    idle = [
+        p.name
+        for p in space.parameters
+        if p.name == "time_offset" or (p.writes and all(w.field.startswith("actuator_") for w in p.writes))
+    ]
+    if idle:
+        warnings.warn(
+            f"parameters {', '.join(idle)} change nothing where no recording holds commands: its motion is prescribed",
+            stacklevel=3,
         )
 
 

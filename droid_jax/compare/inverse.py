@@ -39,6 +39,11 @@ def prescribed(scene: Scene, recording: Recording) -> tuple[str, ...]:
             "several degrees, carries measured joints: how it moves is not in the log, nor what holds it; take it out "
             "of the MJCF where the robot is bolted down"
         )
+    if "position" not in recording.channels:
+        raise ValueError(
+            f"recording {recording.name!r} holds no commands and no measured positions: there is no motion to replay; "
+            "read the log with its commands (--command-topic of `convert`) or with positions"
+        )
     channel = recording.channel("position")
     whole = {j for i, j in enumerate(channel.columns) if channel.mask[:, :, i].any(axis=0).all()}
     others = [j for j in scene.single_joints if j in whole and j not in scene.joints]

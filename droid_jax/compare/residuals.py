@@ -151,7 +151,7 @@ def _smooth(channel: Measured, trace: jax.Array) -> jax.Array:
 
 
 def _distance(channel: Measured, trace: jax.Array) -> jax.Array:
-    """[] mean over repeats and time of the Euclidean norm over columns, masked samples left out."""
+    """[] mean over repeats and time of the Euclidean norm over columns; what was not measured is left out."""
     last = trace.shape[0] - 1
     low = np.clip(np.floor(channel.at).astype(int), 0, last)
     part = jnp.asarray((channel.at - low)[:, None], jnp.float32)
@@ -160,7 +160,8 @@ def _distance(channel: Measured, trace: jax.Array) -> jax.Array:
     error = jnp.where(mask, simulated[None] - jnp.asarray(np.where(channel.mask, channel.values, 0), jnp.float32), 0)
     norm = jnp.sqrt(jnp.sum(error**2, axis=-1) + 1e-20)  # [N, Tc]
     measured = jnp.any(mask, axis=-1)
-    return jnp.mean(jnp.sum(norm * measured, axis=1) / jnp.maximum(jnp.sum(measured, axis=1), 1))
+    samples = jnp.sum(measured, axis=1)  # [N], none where a repeat was not measured during the replay
+    return jnp.sum(jnp.sum(norm * measured, axis=1) / jnp.maximum(samples, 1)) / jnp.maximum(jnp.sum(samples > 0), 1)
 
 
 def make_comparison(
@@ -178,7 +179,7 @@ def make_comparison(
         for name, weight in config.channels.items()
     )
     acts = scene.grip is not None and recording.command.size > 0  # along a prescribed motion nothing is gripped
-    grip = _grip_window(recording) if acts else None
+    grip = recording.grip_window if acts else None
     shut = _shut_travel(scene, recording, config) if acts else None
     rows = None
     if grip is not None:
@@ -197,12 +198,3 @@ def _shut_travel(scene: Scene, recording: Recording, config: CompareConfig) -> f
         return least
     angle = recording.channels["object_angle"]
     return max(least or 0.0, 0.5 * float(np.ptp(angle.values[angle.mask])))
-
-
-def _grip_window(recording: Recording) -> tuple[float, float] | None:
-    """From the end of the grasp to the beginning of the release, s; None where no phases are stated."""
-    named = {p.name: p for p in recording.phases}
-    if "grasp" not in named:
-        return None
-    end = named["release"].start if "release" in named else recording.time[-1]
-    return named["grasp"].end, float(end)

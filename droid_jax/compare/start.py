@@ -19,6 +19,7 @@ WEIGHT = 0.01  # N m or N: a joint that feels less uncompensated weight feels no
 POSES = 50  # of a motion, at which the weight is looked at
 BEGINNING = 0.02  # s (six rows at least), in which the speed at the start is looked at
 MOVING = 0.25  # of the motion's largest speed: a joint that is faster at the start does not begin at rest
+BEYOND = 0.05  # of its range, by which a joint may be outside of it unremarked
 TURNS = 4  # from its zero, that a hinge without a range is believed to make; degrees look like that from 25 on
 
 
@@ -205,7 +206,8 @@ def _moves(begin: float, channel: Channel, column: int) -> bool:
 def check_range(scene: Scene, recording: Recording) -> None:
     """Raise ValueError where a measured joint goes, or is sent, so far outside its range that the unit is wrong.
 
-    A hinge without a range, which may be a wheel, is warned of where it goes more than TURNS from its zero.
+    One that is outside by more than BEYOND of its range is warned of, and a hinge without a range, which may be a
+    wheel, where it goes more than TURNS from its zero.
     """
     sent = _sent(scene, recording) if recording.command.size else {}
     paths = [("is sent to", joint, path) for joint, path in sent.items()]
@@ -226,11 +228,11 @@ def _check_reach(scene: Scene, joint: str, path: np.ndarray, begin: str) -> None
     if low < high:  # whether the replay holds it there or not
         beyond = np.maximum(low - path, path - high)
         worst = int(np.nanargmax(beyond))
+        unit = "m: are these millimetres?" if slide else "rad: are these degrees?"
         if beyond[worst] > high - low:
-            raise ValueError(
-                f"{begin} {path[worst]:.4g}, far outside its range {low:.4g} .. {high:.4g} "
-                f"{'m: are these millimetres' if slide else 'rad: are these degrees'}?"
-            )
+            raise ValueError(f"{begin} {path[worst]:.4g}, far outside its range {low:.4g} .. {high:.4g} {unit}")
+        if beyond[worst] > BEYOND * (high - low):
+            warnings.warn(f"{begin} {path[worst]:.4g}, outside its range {low:.4g} .. {high:.4g} {unit}", stacklevel=3)
     elif not slide:
         turns = np.abs(path) / (2 * np.pi)
         worst = int(np.nanargmax(turns))

@@ -132,7 +132,7 @@ def _cells(evidence: Evidence, values: np.ndarray) -> list[tuple[tuple[str, str]
 
 def _length(scene: Scene, joint: str) -> str:
     """Unit of a joint's position."""
-    return "m" if scene.slides(joint) else "rad"
+    return scene.position_unit([joint])
 
 
 def _bins(variable: str, x: np.ndarray, unit: str, mine: Any = True) -> list[tuple[tuple[str, str], np.ndarray]]:

@@ -272,8 +272,10 @@ def _refined(
     if all(c.repeats > 1 for c in base.comparisons):
         return base, run(base, begin)
     base = base.restated(begin[0])
-    base = base.restated(run(base, begin).best)
-    return base, run(base, begin)
+    first = run(base, begin)
+    base = base.restated(first.best)
+    last = run(base, begin)
+    return base, replace(last, evaluations=first.evaluations + last.evaluations)
 
 
 def starts(full: Space, space: Space, found: Fit) -> np.ndarray:
@@ -305,10 +307,11 @@ def _fingerprint(
     made_from = {
         "recording": recording.sha256,
         "scene": scene.sha256,
+        "measured": [scene.joints, scene.command_names, scene.object_joint, scene.grip and scene.grip.fingers],
         "space": space_to_json(full),
         "engine": config.engine,
         "compare": asdict(config.compare),
-        "effects": [effect.name for effect in effects],
+        "effects": [[e.name, *([p.name, p.mean, p.low, p.high] for p in e.parameters)] for e in effects],
     }
     return json.dumps(made_from, sort_keys=True)
 

@@ -5,7 +5,7 @@ Joint states, trajectories, arrays of numbers and states of a controller become 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
+
+_DAY = 86400 * 10**9  # ns
 
 # channel -> field of sensor_msgs/JointState, and its unit at hinges and at slides
 FIELDS = {
@@ -28,11 +30,13 @@ class Track:
 
     A field that the messages leave empty is absent.  Header stamps are None without headers.
     Stamps stay integers: nanoseconds since 1970 do not fit a float64.
+    numbers: [M] which message of the topic each row is of; a trajectory has several.
     """
 
     received: np.ndarray
     stamped: np.ndarray | None
     fields: dict[str, np.ndarray]
+    numbers: tuple[int, ...]
 
 
 def read_bag(bag: Path, topics: Mapping[str, tuple[tuple[str, ...], str]]) -> dict[str, Track]:
@@ -60,7 +64,7 @@ def _read_topic(reader: AnyReader, bag: Path, topic: str, joints: tuple[str, ...
             f"{bag}, topic {topic!r}: the bag does not define {kind}, as bags in sqlite3 of ROS 2 before Iron do not; "
             "`ros2 bag convert` makes an mcap of it that does"
         )
-    received, stamped, rows = [], [], []
+    received, stamped, rows, numbers = [], [], [], []
     seen: set[str] = set()
     for number, (connection, nanoseconds, data) in enumerate(reader.messages(connections)):
         message = reader.deserialize(data, connection.msgtype)
@@ -71,23 +75,48 @@ def _read_topic(reader: AnyReader, bag: Path, topic: str, joints: tuple[str, ...
             if picked is None:
                 continue
             rows.append(picked)
+            numbers.append(number)
             received.append(nanoseconds + offset)
             stamped.append(_header_stamp(message, offset))
     if not rows and seen:
         raise ValueError(f"{bag}, topic {topic!r}: no joint of {', '.join(joints)}; it has: {', '.join(sorted(seen))}")
     if not rows:
         raise ValueError(f"{bag}, topic {topic!r}: no messages")
-    fields = {key: np.array([row[key] for row in rows]) for key in rows[0] if all(key in row for row in rows)}
-    header = None if None in stamped else np.array(stamped, dtype=np.int64)
-    return Track(np.array(received, dtype=np.int64), header, fields)
+    without = [number for number, row in zip(numbers, rows, strict=True) if needed not in row]
+    if without and len(without) < len(rows):
+        raise ValueError(f"{bag}, topic {topic!r}, message {without[0]}: holds no {needed}, as others of the topic do")
+    bare = np.full(len(joints), np.nan)  # a field that only some messages leave empty was not measured there
+    fields = {key: np.array([row.get(key, bare) for row in rows]) for key in {k: None for row in rows for k in row}}
+    _check_trajectories(received, numbers, f"{bag}, topic {topic!r}")
+    return Track(np.array(received, dtype=np.int64), _header_stamps(stamped), fields, tuple(numbers))
+
+
+def _check_trajectories(received: Sequence[int], numbers: Sequence[int], where: str) -> None:
+    """ValueError where a message of several points, times received [M] ns, was still running when the next one came."""
+    for row in range(2, len(numbers)):
+        several = numbers[row - 1] == numbers[row - 2]
+        if several and numbers[row] != numbers[row - 1] and received[row] <= received[row - 1]:
+            raise ValueError(
+                f"{where}, message {numbers[row]}: begins before the trajectory of message {numbers[row - 1]} has "
+                "ended, and what the controller made of both is not in this topic: read its state, "
+                "--command-topic .../controller_state (JointTrajectoryControllerState)"
+            )
 
 
 def _header_stamp(message: Any, offset: int) -> int | None:
-    """Nanoseconds of the header's stamp plus offset; None when there is none or it is zero."""
+    """Nanoseconds of the header's stamp plus offset; None when there is none, or a trajectory's is zero ("now")."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
-    if stamp is None or not (stamp.sec or stamp.nanosec):
+    if stamp is None or (hasattr(message, "points") and not _nanoseconds(stamp)):
         return None
-    return stamp.sec * 10**9 + stamp.nanosec + offset
+    return _nanoseconds(stamp) + offset
+
+
+def _header_stamps(stamped: Sequence[int | None]) -> np.ndarray | None:
+    """[M] ns, or None where a message has none: a zero is a time only of a simulation's first message."""
+    first, others = stamped[0], stamped[1:]
+    if None in stamped or 0 in others or (first == 0 and not any(n and n < _DAY for n in others[:1])):
+        return None
+    return np.array(stamped, dtype=np.int64)
 
 
 def _samples(

@@ -8,6 +8,7 @@ import numpy as np
 
 SLACK = 1e-6  # s, two instants closer than this are the same
 _DAY = 86400.0  # s
+_GAP = 5.0  # usual steps; a longer silence counts as unmeasured
 _JITTER = 0.5  # largest deviation of a clock's step from its median, as a fraction
 
 
@@ -68,18 +69,31 @@ def _check_seconds(time: np.ndarray, steps: np.ndarray, where: str) -> None:
         )
 
 
+def in_gap(clock: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """[T] bool of clock [T] s, True strictly between two stamps of time [M] s further apart than _GAP usual steps."""
+    if len(time) < 2:
+        return np.zeros(len(clock), bool)
+    steps = np.diff(time)
+    i = np.clip(np.searchsorted(time, clock, side="right") - 1, 0, len(steps) - 1)
+    inside = (clock > time[i] + 1e-9) & (clock < time[i + 1] - 1e-9)
+    return inside & (steps[i] > _GAP * np.median(steps))
+
+
 def resample(times: Sequence[np.ndarray], values: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Repeats with clocks of their own -> one clock [Tc] s and values [N, Tc, C].
 
     times:  N arrays [T_r] s;  values: N arrays [T_r, C], NaN where nothing was measured.
 
     The clock is the first repeat's, cut to the part that all repeats cover; in between, values are interpolated
-    linearly and are NaN where either neighbour is.  Raises ValueError when no part is common.
+    linearly, and are NaN where either neighbour is and in gaps (`in_gap`).  Raises ValueError when no part is common.
     """
     first, last = max(float(t[0]) for t in times), min(float(t[-1]) for t in times)
     clock = times[0][(times[0] >= first - SLACK) & (times[0] <= last + SLACK)]
     if not len(clock):
         spans = ", ".join(f"{t[0]:g} .. {t[-1]:g} s" for t in times)
         raise ValueError(f"the repeats cover no common part of the clock: {spans}")
-    columns = [[np.interp(clock, t, v[:, c]) for c in range(v.shape[1])] for t, v in zip(times, values, strict=True)]
-    return clock, np.stack([np.stack(repeat, axis=-1) for repeat in columns])
+    repeats = []
+    for time, value in zip(times, values, strict=True):
+        repeat = np.stack([np.interp(clock, time, column) for column in value.T], axis=-1)
+        repeats.append(np.where(in_gap(clock, time)[:, None], np.nan, repeat))
+    return clock, np.stack(repeats)

@@ -105,8 +105,12 @@ def _text(path: Path) -> str:
 
 def _read_repeats(path: Path, key: str, columns: tuple[str, ...], allow_jitter: bool) -> list[_Table]:
     """The tables of key_00.csv, key_01.csv, ... without a gap, all with the same columns."""
-    matches = (re.fullmatch(rf"{re.escape(key)}_(\d+)\.csv", p.name) for p in path.iterdir())
-    files = {int(m[1]): path / m[0] for m in matches if m}
+    matches = (re.fullmatch(rf"{re.escape(key)}_(\d+)\.csv", p.name) for p in sorted(path.iterdir()))
+    files: dict[int, Path] = {}
+    for match in filter(None, matches):
+        if other := files.get(int(match[1])):
+            raise ValueError(f"{path}: {other.name} and {match[0]} are both repeat {int(match[1])} of channel {key!r}")
+        files[int(match[1])] = path / match[0]
     missing = [i for i in range(max(files, default=0) + 1) if i not in files]
     if missing:
         raise ValueError(f"{path}: missing {key}_{missing[0]:02d}.csv, repeat {missing[0]} of channel {key!r}")

@@ -13,6 +13,8 @@ from droid_jax.measure.recording import Recording, TorqueConvention
 CUTOFF = 20.0  # Hz, of the position before it is differentiated; above that of the torques, which are compared
 OVERSAMPLING = 6.0  # rows of a motion per period of its cutoff
 REGULAR = 0.01  # largest deviation of a clock's step from their mean, as a share, that a filter may overlook
+ALIKE = 0.05  # RMS distance of a repeat from their mean, as a share of the joint's travel, beyond which it is another
+STILL = 0.02  # rad or m, the least such distance
 PASSES = 20  # see `_common`
 EDGE = 0.3  # s left out at both ends, where a zero-phase filter has no neighbours
 
@@ -71,6 +73,7 @@ def measured_motion(recording: Recording, joints: Sequence[str], *, cutoff: floa
             f"give --motion-cutoff (CompareConfig.motion_cutoff) below {rate / 2.5:.3g} Hz"
         )
     position = _common(channel.values[:, :, columns], mask)
+    _check_alike(recording.name, joints, np.ma.masked_array(channel.values[:, :, columns], ~mask), position)
     position = _regular(recording.name, channel.time, position, cutoff)
     even = np.linspace(channel.time[0], channel.time[-1], len(channel.time))
     clock = _inner_clock(recording.name, channel.time, OVERSAMPLING * cutoff)
@@ -101,6 +104,20 @@ def _common(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return common
 
 
+def _check_alike(name: str, joints: Sequence[str], values: np.ma.MaskedArray, common: np.ndarray) -> None:
+    """ValueError where a repeat [N, T, J], masked where not measured, is another motion than the others."""
+    apart = np.sqrt(((values - common) ** 2).mean(axis=1).filled(0.0))  # [N, J]
+    travel = np.ptp(values, axis=1).max(axis=0).filled(0.0)  # [J]
+    excess = apart - np.maximum(ALIKE * travel, STILL)
+    repeat, joint = np.unravel_index(int(np.argmax(excess)), excess.shape)
+    if excess[repeat, joint] > 0:
+        raise ValueError(
+            f"recording {name!r} holds no commands, and repeat {repeat} is another motion than their mean: "
+            f"{joints[joint]} is {apart[repeat, joint]:.3g} from it (RMS), where it travels {travel[joint]:.3g}; cut "
+            "the logs alike, so that each begins where the motion does, or give them as recordings of their own"
+        )
+
+
 def _regular(name: str, time: np.ndarray, position: np.ndarray, cutoff: float) -> np.ndarray:
     """Positions [T, J] of a clock [T] s at as many even instants of its span; as they are where it is even already."""
     steps = np.diff(time)
@@ -120,5 +137,8 @@ def _inner_clock(name: str, time: np.ndarray, rate: float) -> np.ndarray:
     """[T] s at `rate`, EDGE inside the measured time."""
     first, last = float(time[0]) + EDGE, float(time[-1]) - EDGE
     if last - first < 1.0:
-        raise ValueError(f"recording {name!r} is {time[-1] - time[0]:.3g} s long; a motion needs {1 + 2 * EDGE:g} s")
+        raise ValueError(
+            f"recording {name!r} is {time[-1] - time[0]:.3g} s long; a motion needs {1 + 2 * EDGE:g} s "
+            "(also what is held out of a lone log without commands, its last third)"
+        )
     return first + np.arange(int(np.floor((last - first) * rate + 1e-6)) + 1) / rate

@@ -40,6 +40,8 @@ def load_npz(path: Path) -> Recording:
     meta = metadata_from_json(str(take("metadata")), f"{path}, metadata")
     channels = {}
     for key, unit in meta.units.items():
+        if not meta.columns[key]:
+            raise ValueError(f"{path}, metadata, channel {key!r}: 'columns' is missing, the names of its columns")
         values = take(f"{key}.values")
         mask = arrays.get(f"{key}.mask", np.ones(values.shape, dtype=bool))
         channels[key] = Channel(key, unit, meta.columns[key], take(f"{key}.time"), values, mask)

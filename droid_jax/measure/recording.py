@@ -167,6 +167,15 @@ class Recording:
             have = ", ".join(sorted(self.channels))
             raise ValueError(f"unknown channel {name!r}; recording {self.name!r} has: {have}") from None
 
+    @property
+    def grip_window(self) -> tuple[float, float] | None:
+        """s, from the end of phase "grasp" to the beginning of "release", or the last command; None without a grasp."""
+        named = {p.name: p for p in self.phases}
+        if "grasp" not in named:
+            return None
+        end = named["release"].start if "release" in named else self.time[-1]
+        return named["grasp"].end, float(end)
+
     def measured_start(self) -> dict[str, float]:
         """Joint -> measured position at the beginning of the motion, rad or m, mean over the repeats."""
         first = float(self.time[0]) if len(self.time) else self.span[0]

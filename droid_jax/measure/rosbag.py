@@ -19,10 +19,8 @@ import numpy as np
 
 from droid_jax.measure.bag_topics import FIELDS, Track, read_bag
 from droid_jax.measure.checks import validate
-from droid_jax.measure.clocks import check_clock
+from droid_jax.measure.clocks import check_clock, in_gap
 from droid_jax.measure.recording import Channel, Phase, Recording, ServoGains, TorqueConvention
-
-_GAP = 5.0  # usual steps; a longer silence of a topic counts as unmeasured
 
 
 class Stamps(enum.Enum):
@@ -82,6 +80,8 @@ def read_bags(
     bags = [Path(p) for p in paths]
     if not bags:
         raise ValueError("expected one ROS bag per repeat, got none")
+    if twice := [bag for i, bag in enumerate(bags) if bag.resolve() in [other.resolve() for other in bags[:i]]]:
+        raise ValueError(f"{twice[0]}: given twice; every bag is one repeat of its own")
     if command_topic == state_topic:
         raise ValueError(f"command and joint states need topics of their own, got {state_topic!r} for both")
     if strange := [slide for slide in slides if slide not in joints]:
@@ -168,16 +168,19 @@ def _timed(
         # Commands may pause while the robot holds still, or be waypoints seconds apart: their rate is not checked.
         state = topic == state_topic
         jitter = allow_jitter or not state
-        check_clock(time, where, allow_jitter=jitter, seconds=state, label=lambda i: f"message {i}")
+        check_clock(time, where, allow_jitter=jitter, seconds=state, label=lambda i, n=track.numbers: f"message {n[i]}")
         timed[topic] = (time, track.fields)
     return timed
 
 
 def _clock(states: Sequence[_Timed], rate: float | None, bags: Sequence[Path]) -> np.ndarray:
     """[T] s, uniform, a multiple of its step, over the part that all repeats cover from 0 on."""
-    short = [bag for bag, (t, _) in zip(bags, states, strict=True) if len(t) < 2 or t[-1] <= 0]
-    if short:
-        raise ValueError(f"{short[0]}: needs two joint states or more after the first command")
+    for bag, (time, _) in zip(bags, states, strict=True):
+        if len(time) < 2 or time[-1] <= 0:
+            raise ValueError(
+                f"{bag}: needs two joint states or more after the first command; there are {len(time)}, from "
+                f"{time[0]:.3f} to {time[-1]:.3f} s of it (are the header stamps of two clocks? then --stamps bag)"
+            )
     if rate is not None and not rate > 0:
         raise ValueError(f"rate must be positive, got {rate} Hz")
     step = 1.0 / rate if rate else float(np.median(np.diff(states[0][0])))
@@ -203,7 +206,7 @@ def _channels(
     slides: Sequence[str],
     bags: Sequence[Path],
 ) -> dict[str, Channel]:
-    """torque, position and velocity on the common clock, those of them that all bags hold."""
+    """torque, position and velocity on the common clock, those of them that all bags hold and measured."""
     lacking = [bag for bag, (_, fields) in zip(bags, states, strict=True) if "effort" not in fields]
     if lacking:
         raise ValueError(f"{lacking[0]}: the joint states hold no effort, so there is no torque to compare")
@@ -212,9 +215,9 @@ def _channels(
         if not all(field in fields for _, fields in states):
             continue
         values = np.stack([_interpolate(clock, t, fields[field]) for t, fields in states])
-        seen = np.stack([~_in_gap(clock, t) for t, _ in states])
+        seen = np.stack([~in_gap(clock, t) for t, _ in states])
         mask = seen[:, :, None] & np.isfinite(values)
-        if not mask.any():  # a driver that does not measure it says NaN
+        if not mask.any(axis=(1, 2)).all():  # a driver that does not measure it says NaN
             continue
         unit = " or ".join(dict.fromkeys(slide if joint in slides else hinge for joint in joints))
         channels[name] = Channel(name, unit, joints, clock, values, mask)
@@ -224,14 +227,6 @@ def _channels(
 def _interpolate(clock: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:
     """values [M, J] at time [M] -> [T, J] at clock [T]; beyond the ends the last value holds."""
     return np.stack([np.interp(clock, time, column) for column in values.T], axis=-1)
-
-
-def _in_gap(clock: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """[T] bool, True strictly between two stamps that lie further apart than _GAP usual steps."""
-    steps = np.diff(time)
-    i = np.clip(np.searchsorted(time, clock, side="right") - 1, 0, len(steps) - 1)
-    inside = (clock > time[i] + 1e-9) & (clock < time[i + 1] - 1e-9)
-    return inside & (steps[i] > _GAP * np.median(steps))
 
 
 def _command(

@@ -9,7 +9,7 @@ torque is the motor's, as the simulated servo's damping (Table I) cannot be seen
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -22,9 +22,9 @@ from droid_jax.measure.recording import Channel, Recording, TorqueConvention, To
 from droid_jax.model.builtin import HINGE
 from droid_jax.model.door import JOINT_DAMPING, door_nuisances, door_space, time_offset, torque_offsets
 from droid_jax.model.door import truth as table_i
-from droid_jax.model.parameters import Space
+from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model
-from droid_jax.model.scene import Scene
+from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
 
 
 @dataclass(frozen=True)
@@ -126,10 +126,17 @@ def set_up(
     """Models, start poses and commands of every repeat; `space` is what truth may speak of (default: the door's)."""
     if config.repeats < 1:
         raise ValueError(f"the stand-in robot needs at least one repeat, got {config.repeats}")
+    if not 0 < config.rate * config.timestep <= 1:
+        raise ValueError(
+            f"the stand-in robot measures at most once per time step, at {1 / config.timestep:g} Hz, got a rate of "
+            f"{config.rate:g} Hz"
+        )
     rng = np.random.default_rng([seed, 2])
     hidden = _hidden_scene(scene, config)
     nominal = hidden.initial_qpos(dict(demonstration.qpos0))
     models, qpos0 = _repeats(hidden, truth, nominal, config, rng, space)
+    if config.side is TorqueSide.LINK:
+        _check_link_side(hidden, models)
     clock, control = _control(hidden, demonstration, config.timestep, truth.get("time_offset", 0.0))
     return StandIn(demonstration, truth, config, seed, hidden, models, qpos0, clock, control, rng)
 
@@ -145,10 +152,16 @@ def as_recording(
     time = clock[::every]
     torque = torque[:, ::every] + _offset(scene, stand_in.truth)
     channels = {
-        "torque": _channel("torque", "N m", scene.joints, time, torque + _torque_noise(torque.shape, config, rng)),
+        "torque": _channel(
+            "torque",
+            scene.torque_unit(scene.joints),
+            scene.joints,
+            time,
+            torque + _torque_noise(torque.shape, config, rng),
+        ),
         "position": _channel(
             "position",
-            "rad",
+            scene.position_unit(scene.joints),
             scene.joints,
             time,
             position[:, ::every] + rng.normal(0, config.position_noise, torque.shape),
@@ -227,9 +240,10 @@ def _space(hidden: Scene, truth: Mapping[str, float], space: Space | None) -> Sp
     return space.with_prior(**own)
 
 
-def _own_value(scene: Scene, parameter) -> float:
+def _own_value(scene: Scene, parameter: Parameter) -> float:
+    """The parameter's value in the scene as it is."""
     first = parameter.writes[0]
-    return float(getattr(scene.model, first.field)[first.index])
+    return float(first.neutral(getattr(scene.model, first.field)[first.index]))
 
 
 def _control(hidden: Scene, demonstration: Recording, timestep: float, delay: float) -> tuple[np.ndarray, np.ndarray]:
@@ -246,13 +260,23 @@ def _control(hidden: Scene, demonstration: Recording, timestep: float, delay: fl
 def _check_opened(demonstration: Recording, clock: np.ndarray, trace: Trace) -> None:
     if not np.isfinite(trace.torque).all():
         raise ValueError("the stand-in robot's simulation became unstable with these values")
-    grasp = [p for p in demonstration.phases if p.name == "grasp"]
-    if not grasp or trace.contact.shape[-1] == 0:
+    window = demonstration.grip_window
+    if window is None or trace.contact.shape[-1] == 0:
         return
-    held = trace.contact[:, clock >= grasp[0].end].all(axis=-1)
+    held = trace.contact[:, (clock >= window[0]) & (clock <= window[1])].all(axis=-1)
     lost = np.flatnonzero(held.mean(axis=1) < 0.99)
     if lost.size:
         raise ValueError(f"the stand-in robot lost its grasp in repeat {lost[0]} (too little friction for this door?)")
+
+
+def _check_link_side(scene: Scene, models: Sequence[mujoco.MjModel]) -> None:
+    """ValueError where the model's own dry friction stands between motor and link: no sensor of C MuJoCo tells it."""
+    friction = np.max([m.dof_frictionloss[scene.joint_dofs] for m in models], axis=0)
+    if rubs := [joint for joint, loss in zip(scene.joints, friction, strict=True) if loss > 1.001 * TINY_FRICTIONLOSS]:
+        raise ValueError(
+            f"the stand-in robot cannot tell the torque on the link side of joints with a frictionloss of their own "
+            f"({', '.join(rubs)}): take it out of the scene and hide joint_stribeck instead, or measure at the motor"
+        )
 
 
 def sensor_torque(stand_in: StandIn, trace: Trace) -> np.ndarray:
@@ -286,13 +310,14 @@ def _torque_noise(shape: tuple[int, ...], config: SurrogateConfig, rng: np.rando
 def _camera(
     scene: Scene, clock: np.ndarray, angle: np.ndarray, config: SurrogateConfig, rng: np.random.Generator
 ) -> Channel:
-    """The door's angle on the camera's own clock, [N, Tc, 1] rad."""
+    """The door's angle on the camera's own clock, [N, Tc, 1] rad (m of a slide)."""
+    joint = str(scene.object_joint)
     time = np.arange(clock[0], clock[-1], 1.0 / config.angle_rate)
     values = np.stack([np.interp(time, clock, row) for row in angle])[..., None]
     return _channel(
         "object_angle",
-        "rad",
-        (str(scene.object_joint),),
+        scene.position_unit([joint]),
+        (joint,),
         time,
         values + rng.normal(0, config.angle_noise, values.shape),
     )

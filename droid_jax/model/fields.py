@@ -97,10 +97,9 @@ def model_parameter(
         _check_servo_damping(scene, element)
     if (field, column) in _POSITION_GAIN:
         _check_whole_servo(scene, element, first)
+    own = write(scene, field, index, mode)
     if mean is None:
-        nominal = float(np.asarray(getattr(scene.model, field))[index])
-        neutral = {Mode.SCALE: 1.0, Mode.DIVIDE: 1.0, Mode.ADD: 0.0, Mode.NEGATIVE: -nominal}
-        mean = neutral.get(mode, nominal)
+        mean = own.neutral(np.asarray(getattr(scene.model, field))[index])
     return Parameter(
         name or f"{element}_{field.split('_', 1)[1]}",
         unit,
@@ -108,7 +107,7 @@ def model_parameter(
         std,
         low,
         high,
-        writes=(write(scene, field, index, mode),),
+        writes=(own,),
         **options,
     )
 

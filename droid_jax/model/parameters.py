@@ -70,6 +70,11 @@ class Write:
             return nominal / value
         return nominal + value
 
+    def neutral(self, nominal: Any) -> Any:
+        """The value that leaves the field as it is: the inverse of `new`."""
+        same = {Mode.SET: nominal, Mode.NEGATIVE: -nominal, Mode.ADD: 0.0}.get(self.mode, 1.0)
+        return (same - self.offset) / self.gain
+
 
 class Scaling(enum.Enum):
     """Search coordinate of a parameter, see the module's text."""

@@ -76,8 +76,15 @@ class Scene:
 
     def torque_unit(self, joints: Iterable[str]) -> str:
         """Of what joints are driven with: N m for hinges, N for slides, "N m or N" for both."""
+        return self._unit(joints, "N m", "N")
+
+    def position_unit(self, joints: Iterable[str]) -> str:
+        """Of where joints are: rad for hinges, m for slides, "rad or m" for both."""
+        return self._unit(joints, "rad", "m")
+
+    def _unit(self, joints: Iterable[str], hinge: str, slide: str) -> str:
         kinds = {self.slides(joint) for joint in joints}
-        return " or ".join(unit for unit, slides in (("N m", False), ("N", True)) if slides in kinds)
+        return " or ".join(unit for unit, slides in ((hinge, False), (slide, True)) if slides in kinds)
 
     @functools.cached_property
     def joint_dofs(self) -> np.ndarray:

@@ -153,6 +153,15 @@ def test_samples_beyond_the_replay_are_left_out(scene: Scene):
     assert float(got) == pytest.approx(expected, rel=1e-5)
 
 
+def test_a_repeat_that_was_not_measured_counts_in_no_mean(scene: Scene):
+    simulated = rollout()
+    values = np.stack([np.asarray(simulated.torque) + np.array([1.0, 0.0, 0.0])] * 4)
+    mask = np.ones(values.shape, bool)
+    mask[3] = False
+    measured = recording(channel("torque", CLOCK, values, mask=mask))
+    assert float(compare(scene, measured).distance(simulated)) == pytest.approx(1.0, rel=1e-5)
+
+
 # ----- beta
 
 

@@ -105,6 +105,19 @@ def test_degrees_are_no_radians(measured: bool, limited: str):
         check_range(scene, replace(fine, qpos0={"elbow": -17.2}))
 
 
+def test_a_little_outside_of_a_range_may_be_degrees_too(scene: Scene):
+    """Eight degrees are twice as far as an arm can reach that turns by four radians; a servo overshoots by less."""
+    xml = ARM.format(gravcomp='gravcomp="1"', friction='range="-2 2"', sensor="")
+    limited = compile_scene(mujoco.MjSpec.from_string(xml), "arm", joints=JOINTS)
+    fine = recording()
+    for q in (2.3, 5.0, -5.9):
+        with pytest.warns(UserWarning, match=rf"elbow starts at {q:g}, outside its range -2 \.\. 2 rad: are these deg"):
+            check_range(limited, replace(fine, qpos0={"elbow": q}))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_range(limited, replace(fine, qpos0={"elbow": 2.1}))
+
+
 @pytest.mark.parametrize("measured", [False, True])
 def test_degrees_are_no_radians_of_a_hinge_without_a_range_either(scene: Scene, measured: bool):
     """A wheel may turn often, so it is a warning."""

@@ -20,6 +20,7 @@ from droid_jax.identify.fit import on_bound
 from droid_jax.identify.gaussian import prior
 from droid_jax.identify.judge import WORTH, _closed, _floor, _scatter, judged_on, split
 from droid_jax.identify.pipeline import Identified, IdentifyConfig, cost_samples, grip_hypotheses, identify, starts
+from droid_jax.identify.refine import RefineConfig, refine
 from droid_jax.identify.results import traces, write_run
 from droid_jax.identify.search import SearchConfig
 from droid_jax.measure.recording import Channel
@@ -184,7 +185,7 @@ def test_a_floor_in_newton_metres_stands_beside_no_cost_in_noise_units(found: Id
 
 
 def test_a_search_of_another_cost_is_not_gone_on_with(scene: Scene, tmp_path: Path):
-    """Another scene, comparison or prior of a nuisance is another cost."""
+    """Another scene, what is measured of it, comparison or prior of a nuisance is another cost."""
     recording, space = elbow_log(COULOMB, 10.0, 2), elbow_space(scene)
     main, offset = space.select(["elbow_damping"]), space.select(["torque_offset[elbow]"])
 
@@ -199,6 +200,7 @@ def test_a_search_of_another_cost_is_not_gone_on_with(scene: Scene, tmp_path: Pa
     for changes in (
         {"config": dataclasses.replace(QUICK, compare=CompareConfig(whitened=True))},
         {"scene": heavier},
+        {"scene": dataclasses.replace(elbow(), object_joint="elbow")},
         {"config": refined, "nuisances": offset},
     ):
         with pytest.raises(ValueError, match="belongs to another run: it differs in fingerprint"):
@@ -263,6 +265,24 @@ def test_without_the_refinement_one_recording_is_fitted(scene: Scene):
     both = [elbow_log(0.0, 10.0, 2), dataclasses.replace(elbow_log(0.0, 12.0, 2), name="other")]
     with pytest.raises(ValueError, match="one recording is fitted, got 2: elbow, other"):
         identify(scene, elbow_space(scene), both, config=dataclasses.replace(QUICK, refine=None))
+
+
+@pytest.mark.parametrize(("repeats", "runs"), [(1, 2), (3, 1)])
+def test_every_replay_of_the_refinement_is_counted(
+    scene: Scene, repeats: int, runs: int, monkeypatch: pytest.MonkeyPatch
+):
+    """The noise of a single repeat is stated twice, with a refinement in between."""
+    counted = []
+
+    def counting(*args, **options):
+        counted.append(refine(*args, **options))
+        return counted[-1]
+
+    monkeypatch.setattr(pipeline, "refine", counting)
+    config = dataclasses.replace(QUICK, refine=RefineConfig(iterations=3, hops=0))
+    found = identify(scene, elbow_space(scene), [elbow_log(COULOMB, 10.0, repeats)], config=config)
+    assert len(counted) == runs and found.refined is not None
+    assert found.refined.evaluations == sum(one.evaluations for one in counted)
 
 
 @pytest.mark.parametrize(("repeats", "judged"), [(1, "time"), (3, "repeats")])

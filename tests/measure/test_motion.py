@@ -119,3 +119,15 @@ def test_a_slow_log_loses_nothing_of_a_fast_motion(rate: float, cutoff: float):
     for order, values in ((1, found.velocity), (2, found.acceleration)):
         amplitude = np.sqrt(np.mean(np.sum(values[inner] ** 2, axis=1)))
         assert amplitude == pytest.approx(0.2 * (2 * np.pi * 3.0) ** order * size, rel=1e-3)
+
+
+def test_repeats_of_another_motion_are_not_averaged():
+    """A log that was cut a second later is the same motion, but not at the same time."""
+    later = log(np.stack([sines(TIME), sines(TIME + 1.0)]))
+    with pytest.raises(ValueError, match=r"'log' holds no commands, and repeat [01] is another motion.*cut the logs"):
+        measured_motion(later, JOINTS)
+    scattered = sines(TIME) + np.random.default_rng(2).normal(0, 1e-3, (4, 1, 2))
+    measured_motion(log(scattered), JOINTS)
+    mask = np.ones((2, len(TIME), 2), bool)
+    mask[1, :, 0] = False
+    measured_motion(log(np.stack([sines(TIME)] * 2), mask=mask), JOINTS)

@@ -434,6 +434,22 @@ def test_resample_is_linear_over_the_common_part() -> None:
         resample([times[0], times[0] + 5], values)
 
 
+def test_resampling_invents_nothing_in_a_gap() -> None:
+    """A second of silence is not a line through what was before and after it."""
+    whole = np.arange(0, 3.0, 0.01)
+    holed = whole[(whole < 1.0) | (whole > 1.995)] + 0.003
+    clock, out = resample([whole, holed], [np.sin(5 * t)[:, None] for t in (whole, holed)])
+    silent = (clock > 0.993 + 1e-6) & (clock < 2.003 - 1e-6)
+    np.testing.assert_array_equal(np.isnan(out[1, :, 0]), silent)
+    np.testing.assert_allclose(out[1, ~silent, 0], np.sin(5 * clock[~silent]), atol=5e-4)
+    assert np.isfinite(out[0]).all()
+
+
+def test_a_number_is_one_repeat(folder: Path) -> None:
+    (folder / "torque_1.csv").write_text((folder / "torque_01.csv").read_text())
+    fails(folder, "torque_01.csv and torque_1.csv are both repeat 1 of channel 'torque'")
+
+
 def test_load_resamples_only_when_asked(folder: Path) -> None:
     recording = make()
     t = recording.time

@@ -43,22 +43,27 @@ class Bag:
     """Collects messages and writes them as one bag of any kind.
 
     delay: ns between a header's stamp and the recorder's; header 0 where there is no stamp.
+    slow: the recorder's seconds per second of a simulation, whose header stamps begin at 0; 0 where there is none.
     """
 
-    def __init__(self, folder: Path, kind: str, stem: str = "run", delay: int = 0, headers: bool = True) -> None:
-        self.kind, self.delay, self.headers = kind, delay, headers
+    def __init__(
+        self, folder: Path, kind: str, stem: str = "run", delay: int = 0, headers: bool = True, slow: float = 0.0
+    ) -> None:
+        self.kind, self.delay, self.headers, self.slow = kind, delay, headers, slow
         self.path = folder / (f"{stem}.bag" if kind == "ros1" else stem)
         self.store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
         self.messages: list[tuple[str, str, int, object]] = []
 
     def add(self, topic: str, kind: str, t: float, **fields) -> None:
         types = self.store.types
-        nanoseconds = EPOCH + round(t * 1e9)
+        nanoseconds = round(t * 1e9) if self.slow else EPOCH + round(t * 1e9)
         if kind in ("sensor_msgs/msg/JointState", "trajectory_msgs/msg/JointTrajectory", CONTROLLER):
             sec, nano = divmod(nanoseconds, 10**9) if self.headers else (0, 0)
             stamp = types["builtin_interfaces/msg/Time"](sec=sec, nanosec=nano)
             seq = {"seq": 0} if self.kind == "ros1" else {}
             fields["header"] = types["std_msgs/msg/Header"](stamp=stamp, frame_id="", **seq)
+        if self.slow:
+            nanoseconds = EPOCH + round(self.slow * t * 1e9)
         self.messages.append((topic, kind, nanoseconds + self.delay, types[kind](**fields)))
 
     def state(self, t: float, topic: str = "/joint_states", names: tuple[str, ...] = JOINTS, **changes) -> None:
@@ -237,6 +242,19 @@ def test_a_whole_trajectory_in_one_message(tmp_path: Path) -> None:
     np.testing.assert_allclose(recording.command, np.stack([held, -held], axis=-1), atol=1e-7)
 
 
+def test_a_trajectory_that_replaces_one_is_not_the_command(tmp_path: Path) -> None:
+    """What the controller followed in between is its own affair."""
+    bag = Bag(tmp_path, "sqlite3")
+    for t in grid(0.0, 2.5):
+        bag.state(t)
+    make = bag.store.types["trajectory_msgs/msg/JointTrajectoryPoint"]
+    for start in (0.5, 1.0):
+        points = [make(**point_fields(bag, np.array([t, -t]), t)) for t in (0.0, 0.5, 1.0)]
+        bag.add("/plan", "trajectory_msgs/msg/JointTrajectory", start, joint_names=list(JOINTS), points=points)
+    said = "message 1: begins before the trajectory of message 0 has ended"
+    fails([bag.write()], said, "controller_state", command_topic="/plan")
+
+
 def test_waypoints_may_be_seconds_apart(tmp_path: Path) -> None:
     bag = Bag(tmp_path, "sqlite3")
     for t in grid(0.0, 6.0):
@@ -311,6 +329,61 @@ def test_zero_header_stamps_are_not_used(tmp_path: Path) -> None:
     recording = read_bags([bag.write()], joints=JOINTS, torque=TORQUE)
     assert recording.meta["stamps"] == "bag"
     assert recording.duration == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("stamps", [Stamps.AUTO, Stamps.HEADER])
+def test_a_simulation_begins_at_zero(tmp_path: Path, stamps: Stamps) -> None:
+    """At half its speed, so that the recorder's clock would double every time."""
+    bag = Bag(tmp_path, "mcap", slow=2.0)
+    for t in grid(0.0, 1.0):
+        bag.state(t)
+    recording = read_bags([bag.write()], joints=JOINTS, torque=TORQUE, stamps=stamps)
+    assert recording.meta["stamps"] == "header"
+    assert recording.duration == pytest.approx(1.0)
+
+
+def test_a_first_message_without_a_stamp_is_no_simulation(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "mcap", headers=False)
+    bag.state(0.0)
+    bag.headers = True
+    for t in grid(0.01, 1.0):
+        bag.state(t)
+    assert read_bags([bag.write()], joints=JOINTS, torque=TORQUE).meta["stamps"] == "bag"
+
+
+def test_one_bag_is_one_repeat(tmp_path: Path) -> None:
+    """A copy among the repeats would make the noise of their mean too small."""
+    path = pulled(tmp_path, "mcap", "run0")
+    fails([path, tmp_path / "." / path.name], "run0: given twice")
+
+
+def test_a_velocity_that_one_bag_did_not_measure_is_left_away(tmp_path: Path) -> None:
+    paths = []
+    for stem, velocity in (("run0", 0.2), ("run1", np.nan)):
+        bag = Bag(tmp_path, "mcap", stem)
+        for t in grid(0.0, 1.0):
+            bag.state(t, velocity=np.full(2, velocity))
+        paths.append(bag.write())
+    assert set(read_bags(paths, joints=JOINTS, torque=TORQUE).channels) == {"torque", "position"}
+
+
+def test_what_one_message_leaves_empty_was_not_measured_there(tmp_path: Path) -> None:
+    """An effort must be in every message, as it must be finite."""
+    bag, effortless = Bag(tmp_path, "mcap", "position"), Bag(tmp_path, "mcap", "effort")
+    for i, t in enumerate(grid(0.0, 1.0)):
+        bag.state(t, **({"position": np.zeros(0)} if i == 50 else {}))
+        effortless.state(t, **({"effort": np.zeros(0)} if i == 50 else {}))
+    seen = read_bags([bag.write()], joints=JOINTS, torque=TORQUE).channel("position").mask
+    assert {50} <= set(np.flatnonzero(~seen[0].all(axis=1)).tolist()) <= {49, 50, 51}
+    fails([effortless.write()], "message 50: holds no effort")
+
+
+def test_clocks_of_two_machines_are_told(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "mcap")
+    for t in grid(0.0, 1.0):
+        bag.state(t)
+        joint_state(bag, t + 100.0, np.array([t, t]))
+    fails([bag.write()], "from -100.000 to -99.000 s of it", "--stamps bag", command_topic="/command")
 
 
 def test_messages_of_another_publisher_are_passed_over(tmp_path: Path) -> None:

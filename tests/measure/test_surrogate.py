@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -12,9 +13,11 @@ from droid_jax.compare.cost import make_cost
 from droid_jax.measure.demonstration import demonstration_path
 from droid_jax.measure.formats import load
 from droid_jax.measure.hidden import record_hidden
+from droid_jax.measure.recording import TorqueSide
 from droid_jax.measure.surrogate import DRIFT_TIME, SurrogateConfig, _torque_noise, set_up
 from droid_jax.model.door import door_nuisances, time_offset
 from droid_jax.model.door_scene import door_scene
+from droid_jax.model.fields import body_mass_scale, body_position, joint_damping, servo_scale
 from droid_jax.model.parameters import Space
 
 QUIET = SurrogateConfig(
@@ -67,3 +70,36 @@ def test_the_door_stands_a_little_otherwise_in_every_repeat():
         (write,) = nuisances[axis].writes
         at = [getattr(m, write.field)[write.index] for m in robot.models]
         assert np.std(at) == pytest.approx(2e-3, rel=0.35)
+
+
+def test_without_a_truth_the_stand_in_is_the_scene():
+    """Whether a parameter sets a number of the model, scales it or adds to it."""
+    scene, _ = small_scene()
+    forearm, elbow = "forearm", "elbow"
+    space = Space(
+        (
+            joint_damping(scene, elbow, std=1.0, high=20.0),
+            body_mass_scale(scene, forearm, std=0.1),
+            body_position(scene, forearm, 0, std=0.01, limit=0.5),
+            servo_scale(scene, elbow, std=0.1),
+        )
+    )
+    robot = set_up(scene, demonstration("fit"), {}, seed=3, config=QUIET, space=space)
+    for field in ("dof_damping", "body_mass", "body_inertia", "body_pos", "actuator_gainprm", "actuator_biasprm"):
+        for model in robot.models:
+            np.testing.assert_allclose(getattr(model, field), getattr(robot.scene.model, field), rtol=1e-12)
+
+
+def test_the_link_side_of_dry_friction_in_the_model_is_not_known():
+    scene, space = small_scene()
+    rubs = copy.copy(scene.model)
+    rubs.dof_frictionloss[scene.dof("elbow")] = 0.5
+    with pytest.raises(ValueError, match=r"link side of joints with a frictionloss of their own \(elbow"):
+        config = replace(QUIET, side=TorqueSide.LINK)
+        set_up(replace(scene, model=rubs), demonstration("fit"), TRUTH, seed=3, config=config, space=space)
+
+
+def test_a_rate_above_the_time_steps_is_refused():
+    scene, space = small_scene()
+    with pytest.raises(ValueError, match="at most once per time step, at 4000 Hz, got a rate of 9000 Hz"):
+        set_up(scene, demonstration("fit"), {}, seed=3, config=replace(QUIET, rate=9000.0), space=space)
