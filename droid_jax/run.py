@@ -74,6 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     try:
         with _plain_warnings():
+            _check_seeds(command)
             _ACTIONS[type(command)](command)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
@@ -82,6 +83,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"interrupted{_going_on(command)}", file=sys.stderr)
         return 130
     return 0
+
+
+def _check_seeds(command: Any) -> None:
+    """ValueError for a negative seed, of which numpy's generators say less."""
+    for name in ("seed", "robot"):  # of what is drawn, and of the stand-in robot
+        if (value := getattr(command, name, None)) is not None and value < 0:
+            raise ValueError(f"--{name} must not be negative, got {value}")
 
 
 @contextlib.contextmanager

@@ -631,3 +631,8 @@ def test_it_completes_in_a_shell(monkeypatch: pytest.MonkeyPatch, capsys: pytest
         main()
     out = capsys.readouterr().out
     assert not ended.value.code and "droid-jax" in out and "identify" in out and "--recording" in out
+
+
+@pytest.mark.parametrize("command", [["record", "--seed"], ["train", "--seed"], ["evaluate", "--robot"]])
+def test_a_negative_seed_is_refused(refused, command: list[str]):
+    assert f"{command[1]} must not be negative, got -1" in refused(*command, "-1")

@@ -331,6 +331,33 @@ def test_a_stand_in_left_over_in_the_folder_is_not_the_robot_of_your_recordings(
     assert stand_in_of(stage) == {}
 
 
+def test_a_fit_keeps_which_stand_in_it_is_of(tmp_path: Path, monkeypatch):
+    """Wherever the recordings are by now, and wherever the next command runs."""
+    robot = {"springs": 2, "seed": 5, "hide": []}
+    (tmp_path / "setup.json").write_text(json.dumps({"recording": ["recs/A.npz"], "recordings_sha256": ["a"]}))
+    assert stand_in_of(tmp_path) == {}
+    (tmp_path / "config.json").write_text(json.dumps({"stand_in": True, "robot": robot}))
+    assert stand_in_of(tmp_path) == robot
+    (tmp_path / "config.json").unlink()
+    (tmp_path / "gap.json").write_text(json.dumps({"setup": {"stand_in": True, "robot": robot}}))
+    assert stand_in_of(tmp_path) == robot
+
+
+def test_options_of_stages_that_are_left_out_are_refused(called, refused):
+    for option in (("--hide", "not_an_effect=9"), ("--springs", "2")):
+        said = refused("all", "--stages", "train", "evaluate", *option)
+        assert f"{option[0]} is for the stages identify and gap" in said and "evaluate RUN" in said
+    assert "is for the stages gap, and" in refused("all", "--stages", "identify", "--effect-scale", "3")
+    assert called == []
+
+
+def test_a_folder_of_identify_is_no_folder_of_all(called, refused, tmp_path: Path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "setup.json").write_text('{"preset": "quick"}')
+    assert "holds a run of `identify` itself" in refused("all", "--out", "mine")
+    assert called == []
+
+
 @pytest.mark.parametrize(("meta", "known"), [({"source": SOURCE}, True), ({}, False)])
 def test_a_robots_own_recording_beside_a_stand_ins_has_no_known_truth(
     tmp_path: Path, meta: dict[str, str], known: bool
@@ -339,7 +366,7 @@ def test_a_robots_own_recording_beside_a_stand_ins_has_no_known_truth(
     motions(str(own), **meta)
     (tmp_path / "stand_in.json").write_text(json.dumps({"springs": 1, "seed": 0, "hide": []}))
     command = identify.Identify(recording=(own,))
-    _, truth = identify._recordings(command, door_scene(), tmp_path, [load(own)])
+    _, truth, _ = identify._recordings(command, door_scene(), tmp_path, [load(own)])
     assert (truth is not None) == known
 
 

@@ -102,6 +102,10 @@ def _needs_effect(command: Convert, bags: bool) -> None:
     """ValueError for options that would change nothing; a path that does not exist is told as such."""
     if bags and command.resample:
         raise ValueError("--resample is for CSV folders; the repeats of ROS bags have one clock already (--rate)")
+    if command.resample and command.source[0].is_file():
+        raise ValueError(
+            f"--resample is for CSV folders, and the repeats of {command.source[0]} have one clock already"
+        )
     given = [f.name for f in fields(Convert) if f.name in OF_BAGS and getattr(command, f.name) != f.default]
     if given and not bags and command.source[0].exists():
         raise ValueError(f"--{given[0].replace('_', '-')} is for ROS bags, and {command.source[0]} is none")

@@ -116,7 +116,7 @@ def run(command: Identify) -> None:
     config = config_of(command)
     _needs_demonstrations(command, given)
     prepare_folder(out)  # only now, with all input read
-    recordings, truth = _recordings(command, scene, out, given)
+    recordings, truth, known = _recordings(command, scene, out, given)
     print("compiling the replay ...", flush=True)
     problem = prepare(scene, space, recordings, nuisances=nuisances, config=config, **effects)
     # The Gaussian's own, whatever becomes of the search that made it; it may lie in this very folder.
@@ -153,6 +153,7 @@ def run(command: Identify) -> None:
             "device": runtime.device(),
             "started": started,
             "stand_in": all(is_stand_in(r) for r in recordings),
+            "robot": known,
             "setup": setup,
         }
         progress("sample", None)
@@ -173,6 +174,8 @@ def model_of(command: Identify) -> tuple[Scene, Space, Space | None]:
 
     if command.scene is not None:
         scene, listed = own_scene(command)
+        if all(p.nuisance for p in listed.parameters):
+            raise ValueError(f"{command.parameters}: every entry is a nuisance; identify fits at least one that is not")
         main = listed.select(p.name for p in listed.parameters if not p.nuisance)
         extra = [p.name for p in listed.parameters if p.nuisance]
         return scene, main, listed.select(extra) if command.nuisances and extra else None
@@ -233,15 +236,16 @@ def _needs_demonstrations(command: Identify, given: list[Recording]) -> None:
 
 def _recordings(
     command: Identify, scene: Scene, out: Path, given: list[Recording]
-) -> tuple[list[Recording], dict[str, float] | None]:
-    """The given recordings, or the stand-in's (kept in the run's folder); with its hidden truth where that is known."""
+) -> tuple[list[Recording], dict[str, float] | None, dict[str, Any]]:
+    """The given recordings, or the stand-in's (kept in the run's folder); with its hidden truth and, of given ones,
+    springs, seed and hidden effects where these are known."""
     from droid_jax.measure.formats import load
     from droid_jax.measure.surrogate import is_stand_in, stand_in_truth
 
     if given:  # a robot's own may lie beside what is known of a stand-in
         stand_in = command.scene is None and all(is_stand_in(r) for r in given)
         known = known_stand_in(command.recording) if stand_in else {}
-        return given, stand_in_truth(scene, known["springs"], known["seed"]) if known else None
+        return given, stand_in_truth(scene, known["springs"], known["seed"]) if known else None, known
     from droid_jax.measure.demonstration import PLANS, demonstration_path
     from droid_jax.measure.surrogate import record
 
@@ -255,12 +259,12 @@ def _recordings(
 
     tag = f"springs{command.springs}_seed{command.seed}" + ("_paper" if gains == "paper" else "")
     paths = {name: out / "recordings" / f"{name}_{tag}.npz" for name in command.demonstrations}
-    return list(kept_recordings(paths, command.again, recorded).values()), truth
+    return list(kept_recordings(paths, command.again, recorded).values()), truth, {}
 
 
 def _summary(found: Identified, fit: Mapping[str, Any]) -> None:
     """A few lines that say how it went; fit: of fit.json."""
-    from droid_jax.report.words import DOUBT, far_off, judged, lacks_something, percent
+    from droid_jax.report.words import DOUBT, asked_of, far_off, judged, lacks_something, needed, noiseless, percent
 
     for name, gap in found.gaps.items():
         way = "one repeat: what noise alone would leave is not known"
@@ -278,4 +282,7 @@ def _summary(found: Identified, fit: Mapping[str, Any]) -> None:
     if far_off(fit):
         print(f"the fit stays far from the data: {DOUBT}")
     if lacks_something(fit):
-        print("what is left is well above noise: `python -m droid_jax.run gap` looks for what the model lacks")
+        takes = needed([recording.repeats for recording in found.recordings])
+        print(f"what is left is well above noise: `python -m droid_jax.run gap` looks for what the model lacks{takes}")
+    elif noiseless(fit):
+        print(f"one repeat does not tell noise from what the model lacks: {asked_of(fit)}")

@@ -97,11 +97,27 @@ def stand_in_of(folder: Path | None) -> dict[str, Any]:
     known = {} if folder is None else setup(folder)
     if known.get("command") == "train":
         return known.get("stand_in", {})
-    if known.get("recording"):  # as named where the command ran; those of `all` lie beside its stages
+    if kept := _robot(folder):
+        return kept
+    if known.get("recording"):  # not kept by this run: as named where it ran; those of `all` lie beside its stages
         beside = [folder.parent / "recordings" / Path(name).name for name in known["recording"]] if folder else []
         hashes = known.get("recordings_sha256", [])
         return next((known_stand_in(at) for at in (known["recording"], beside) if _hold(at, hashes)), {})
     return {k: known[k] for k in ("springs", "seed", "hide") if k in known}
+
+
+def _robot(folder: Path | None) -> dict[str, Any]:
+    """The same as a finished run of `identify` or `gap` keeps it; empty where it does not."""
+    for name, within in (("config.json", ()), ("gap.json", ("setup",))):
+        try:
+            told = json.loads((folder / name).read_text()) if folder else {}
+            for key in within:
+                told = told[key]
+            if told.get("stand_in") and told.get("robot"):
+                return told["robot"]
+        except (OSError, ValueError, KeyError, AttributeError):
+            continue
+    return {}
 
 
 def _hold(paths: Sequence[str | Path], hashes: Sequence[str]) -> bool:

@@ -95,6 +95,7 @@ def run(command: All) -> None:
     from droid_jax import runtime
     from droid_jax.report.scalars import needs_writer
 
+    _needs_stages(command)
     command = settled(command)
     needs_scene(command)
     needs_recording(command)
@@ -126,6 +127,17 @@ def run(command: All) -> None:
     print(f"report: {page}")
 
 
+def _needs_stages(command: All) -> None:
+    """ValueError for options of stages that were not asked for, which would change nothing."""
+    of = {"hide": IN_A_SCENE, "springs": IN_A_SCENE, "effect_scale": ("gap",)}
+    given = [name for name in of if getattr(command, name) != All.__dataclass_fields__[name].default]
+    for name in given:
+        if not {*of[name]} & {*command.stages}:
+            option, stages = f"--{name.replace('_', '-')}", " and ".join(of[name])
+            robot = "" if name == "effect_scale" else "; `evaluate RUN --springs ... --hide ...` tries another robot"
+            raise ValueError(f"{option} is for the stages {stages}, and --stages leaves them out{robot}")
+
+
 def _remember(command: All, out: Path) -> None:
     """Keep what was asked for; OtherRun where the folder holds what other options made, which may have taken hours.
 
@@ -134,6 +146,11 @@ def _remember(command: All, out: Path) -> None:
     asked = {k: v for k, v in setup_of(command).items() if k not in ("stages", "trials")}
     files = [*command.recording, *filter(None, (command.scene, command.parameters))]
     asked["files"] = [str(path.resolve()) for path in files]
+    if own := setup(out):
+        raise ValueError(
+            f"{out} holds a run of `{own.get('command', 'identify')}` itself, and the page would be of both: "
+            "give another folder (--out)"
+        )
     path = out / ASKED
     before = _json(path) if not command.again else None
     if before is not None and (other := changed(before, asked)):
@@ -190,8 +207,6 @@ def _needs_robot(command: All) -> None:
 
     if not _records(command):
         return
-    if command.seed < 0:
-        raise ValueError(f"--seed must not be negative, got {command.seed}")
     scene = door_scene()
     hidden = hidden_effects(command.hide, scene)
     if "evaluate" in command.stages:

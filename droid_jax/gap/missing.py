@@ -89,7 +89,8 @@ def answer(
     if checkpoints is not None:
         case = remembering(case, checkpoints / "replays")
     if split is Split.BLOCKS:
-        model, floor = kept_model(at("base"), case.base, lambda: base_model(case)), 0.0
+        floor = 0.0
+        model = kept_model(at("base"), case.base, lambda: base_model(case, progress=lambda now: tell("refine", now)))
     else:
         model = kept_model(at("base"), case.base, lambda: base_fit(case, tell, start))
         tell("floor", None)

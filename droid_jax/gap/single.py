@@ -17,7 +17,7 @@ absolute size, but ratios of gaps are free of the unit.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -36,6 +36,7 @@ from droid_jax.gap.refit import Model, refit
 from droid_jax.gap.screen import Screen, questions_of
 from droid_jax.gap.select import LESS
 from droid_jax.gap.workflow import ask
+from droid_jax.identify.refine import RefineProgress
 from droid_jax.measure.motion import Motion
 from droid_jax.measure.noise import discrepancy
 from droid_jax.measure.recording import Recording
@@ -173,13 +174,15 @@ def single_case(
     return Case(fit, confirm, judged, restrained(base), tuple(effects), config)
 
 
-def base_model(case: Case, start: np.ndarray | None = None) -> Model:
+def base_model(
+    case: Case, start: np.ndarray | None = None, progress: Callable[[RefineProgress], None] | None = None
+) -> Model:
     """The base parameters fitted, from the prior's mean unless a start [D] is given.
 
     Inverse dynamics is smooth in them, so one start and no search will do.
     """
     start = case.whole.mean if start is None else start
-    return refit(case.fit, case.base, (), start[None], case.config.refine)
+    return refit(case.fit, case.base, (), start[None], case.config.refine, progress=progress)
 
 
 def noise_of(

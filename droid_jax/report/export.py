@@ -8,11 +8,16 @@ from __future__ import annotations
 
 import base64
 import io
+import itertools
 import re
 from pathlib import Path
+from typing import cast
 
 import matplotlib
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.text import Text
+from matplotlib.ticker import ScalarFormatter
 
 from droid_jax.report.style import CSS, STYLE
 from droid_jax.storage import write_bytes
@@ -21,11 +26,39 @@ SVG_LIMIT = 300_000  # bytes; a larger drawing goes into the page as PNG
 
 
 def settled(figure: Figure) -> Figure:
-    """The figure with its panels arranged for good: saving it several times need not arrange them again."""
+    """The figure with its panels arranged for good: saving it several times need not arrange them again.
+
+    A name's dollar signs are no mathematics, and names below an axis that would overlap are turned.
+    """
     with matplotlib.rc_context(STYLE):
+        _read_as_written(figure)
         figure.draw_without_rendering()
+        if crowded := [axes for axes in figure.axes if _overlap(axes)]:
+            for axes in crowded:
+                for text in axes.get_xticklabels():
+                    text.set(rotation=60, ha="right", rotation_mode="anchor")
+            figure.draw_without_rendering()
     figure.set_layout_engine("none")
     return figure
+
+
+def _read_as_written(figure: Figure) -> None:
+    """No text but the numbers of logarithmic axes is mathematics."""
+    logarithmic = [axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis) if axis.get_scale() != "linear"]
+    powers = {id(text) for axis in logarithmic for text in axis.findobj(Text)}
+    for text in figure.findobj(Text):
+        if id(text) not in powers:
+            cast(Text, text).set_parse_math(False)
+
+
+def _overlap(axes: Axes) -> bool:
+    """Whether two neighbours of the names below an axis touch."""
+    if not axes.get_visible() or isinstance(axes.xaxis.get_major_formatter(), ScalarFormatter):
+        return False
+    shown = [text for text in axes.get_xticklabels() if text.get_visible() and text.get_text()]
+    upright = [text for text in shown if text.get_rotation() == 0]
+    boxes = [text.get_window_extent() for text in upright]
+    return any(left.x1 > right.x0 for left, right in itertools.pairwise(sorted(boxes, key=lambda box: box.x0)))
 
 
 def inline_svg(figure: Figure, prefix: str) -> str:

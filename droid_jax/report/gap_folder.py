@@ -87,6 +87,17 @@ class Gap:
         return LOST in self.found.get("failed", ())
 
     @property
+    def blown_up(self) -> list[str]:
+        """Candidates and models that were left out since their replay blew up, each once."""
+        from droid_jax.gap.verdict import LOST  # as above
+
+        names = [
+            *(name for screen in self.found["screens"] for name in screen["failed"]),
+            *self.found.get("failed", ()),
+        ]
+        return [name for name in dict.fromkeys(names) if name != LOST]
+
+    @property
     def floor(self) -> float | None:
         """U0; None where it is not known and where there is none, see `timeless`."""
         return self.found["floor"] or None

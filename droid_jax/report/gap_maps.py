@@ -138,7 +138,7 @@ def _bins(name: str, cells: Sequence[Cell]) -> Bins:
     spans = [re.fullmatch(r"(\S+) to (\S+)(?: (.+))?", span_words(c["where"])) for c in cells]
     labels = [f"{s[1]} to\n{s[2]}" if s else c["where"] for s, c in zip(spans, cells, strict=True)]
     unit = next((f" [{s[3]}]" for s in spans if s and s[3]), "")
-    return Bins(variable_words(name) + unit, tuple(labels), gaps, found)
+    return Bins(variable_words(name, cells[0]["where"]) + unit, tuple(labels), gaps, found)
 
 
 @styled

@@ -15,7 +15,7 @@ from droid_jax.report.gap_figures import as_floats
 from droid_jax.report.gap_maps import TIME, Cell
 from droid_jax.report.gap_words import OF, joint_phase, variable_words
 from droid_jax.report.style import AFTER, BEFORE, LINE, MEASURED, WIDE, label_bottom, legend, panel_columns, styled
-from droid_jax.report.torque_figures import band, shade, thin
+from droid_jax.report.torque_figures import fill, shade, thin
 from droid_jax.report.words import label
 
 POINTS = 60  # buckets of a line: fourteen panels must fit into the page as SVG
@@ -59,8 +59,9 @@ def _models(extended: bool) -> list[tuple[str, str, dict[str, Any]]]:
 
 def _overlay(axes: Axes, traces: Mapping[str, Any], j: int, extended: bool) -> None:
     time, measured, scatter = traces["time"], traces["measured"][:, j], SCATTERS * traces["scatter"][:, j]
-    _fill(axes, time, measured - scatter, measured + scatter, "measured, ±2 deviations of the repeats")
-    name = "measured, mean" if scatter.any() else "measured"
+    what = "measured, ±2 deviations of the repeats"
+    repeated = fill(axes, time, measured - scatter, measured + scatter, what, POINTS)
+    name = "measured, mean" if repeated else "measured"
     axes.plot(*thin(time, measured, POINTS), color=MEASURED, linewidth=2.2, label=name)
     for key, name, look in _models(extended):
         axes.plot(*thin(time, traces[key][:, j], POINTS), label=name, **look)
@@ -69,16 +70,10 @@ def _overlay(axes: Axes, traces: Mapping[str, Any], j: int, extended: bool) -> N
 
 def _residual(axes: Axes, traces: Mapping[str, Any], j: int, extended: bool) -> None:
     time, scatter = traces["time"], SCATTERS * traces["scatter"][:, j]
-    _fill(axes, time, -scatter, scatter)
+    fill(axes, time, -scatter, scatter, buckets=POINTS)
     axes.axhline(0.0, color=LINE, linewidth=0.8)
     for key, _, look in _models(extended):
         axes.plot(*thin(time, traces["measured"][:, j] - traces[key][:, j], POINTS), **look)
-
-
-def _fill(axes: Axes, time: np.ndarray, low: np.ndarray, high: np.ndarray, name: str = "") -> None:
-    """A band of the repeats; none where there is one repeat, whose scatter is zero."""
-    if np.any(high > low):
-        axes.fill_between(*band(time, low, high, POINTS), color=MEASURED, alpha=0.16, linewidth=0, label=name or None)
 
 
 @styled
@@ -95,7 +90,7 @@ def remainder(traces: Mapping[str, Any], cells: Sequence[Cell], unit: str, width
     time, j = traces["time"], traces["joints"].index(joint)
     scatter = SCATTERS * traces["scatter"][:, j]
     shade(left, traces["phases"], named=True)
-    _fill(left, time, -scatter, scatter, "±2 deviations of the repeats")
+    fill(left, time, -scatter, scatter, "±2 deviations of the repeats", POINTS)
     left.axhline(0.0, color=LINE, linewidth=0.8)
     left.plot(*thin(time, traces["measured"][:, j] - traces["after"][:, j]), color=AFTER, label="measured − simulated")
     left.set(title=label(joint), xlabel="Time [s]", ylabel=f"Residual [{unit}]", xlim=(time[0], time[-1]))

@@ -8,7 +8,7 @@ from typing import Any
 
 from droid_jax.report.gap_folder import Gap
 from droid_jax.report.gap_parts import parts_of
-from droid_jax.report.words import label, listed, number, percent
+from droid_jax.report.words import counted, label, listed, number, percent, was
 
 DECISIVE = 6.0  # standardised difference from which ten repeats decide between rivals
 TOLD = 0.8  # share of what is left on the confirming motion: where more is left beyond the fit's uncertainty, no word
@@ -24,8 +24,13 @@ def effect_words(name: str) -> str:
     return label(effect).lower() + at + (label(place).lower() if at else "")
 
 
-def variable_words(name: str) -> str:
-    """ "object angle" -> "Object angle", "position of panda_joint2" -> "Position of joint 2"."""
+def variable_words(name: str, where: str = "") -> str:
+    """ "object angle" -> "Object angle", "position of panda_joint2" -> "Position of joint 2".
+
+    where: one of its bins, which tells by its unit that an object slides and has no angle.
+    """
+    if name == "object angle" and where.endswith(" m"):
+        return "Object position"
     what, of, joint = name.partition(OF)
     return label(what) + of + (label(joint).lower() if of else "")
 
@@ -83,13 +88,15 @@ def _fitted(gap: Gap) -> str:
     if not found["screens"]:
         return text + "; no candidate was asked about."
     asked = len({r["candidate"] for s in found["screens"] for r in s["ranking"]})
-    text += f", {asked} candidate effects were screened against what it leaves"
+    text += f", {counted(asked, 'candidate effect')} {was(asked)} screened against what it leaves"
     tried = len({t["name"] for t in found["trials"]})
     if tried:
-        text += f", and {tried} extended models were refitted and judged on “{gap.recording('confirm')}”"
-    failed = dict.fromkeys([*(name for s in found["screens"] for name in s["failed"]), *found.get("failed", ())])
-    left_out = f" Left out, because the simulation blew up with it: {listed([model_words(f) for f in failed])}."
-    return f"{text}.{left_out if failed else ''}"
+        text += (
+            f", and {counted(tried, 'extended model')} {was(tried)} refitted and judged on “{gap.recording('confirm')}”"
+        )
+    blown = [model_words(name) for name in gap.blown_up]
+    left_out = f" Left out, because the simulation blew up with it: {listed(blown)}."
+    return f"{text}.{left_out if blown else ''}"
 
 
 def _significance(gap: Gap) -> str:
@@ -183,10 +190,11 @@ def _trends(found: Mapping[str, Any]) -> list[str]:
 
 def _next(gap: Gap) -> str:
     named = listed([effect_words(e) for e in gap.found["effects"]])
+    it = "it" if len(gap.found["effects"]) == 1 else "them"
     clearly = " clearly enough" if any(t["passed"] for t in gap.found["trials"]) else " its trial"
     steps = {
         "none": f"go on with the base model; a smaller effect would need {gap.parts.more}",
-        "named": f"look for the {named} on the hardware, and simulate with it{_file(gap)}",
+        "named": f"look for the {named} on the hardware, and simulate with {it}{_file(gap)}",
         "tie": f"take no name for the cause yet. {_separate(gap)}",
         "partly explained": _partly(gap, named),
         "unexplained": f"look at the hardware {_where(gap)}. No effect of the library passed{clearly}: where one came "
@@ -265,12 +273,13 @@ def _where(gap: Gap) -> str:
     """The largest cell that the test found in what is left; of all, where there are no repeats to test."""
     cells = [c for c in gap.found["cells"]["after"] if c["gap"] is not None]
     found = [c for c in cells if c["found"] or not gap.parts.repeated]
-    over_time = [c for c in found if c["variable"] == "joint x phase"]
     if not found:
         return "(no single place stands out)"
+    over_time = [c for c in found if c["variable"] == "joint x phase"]
+    kinds = [kind for kind in (over_time, _others(found)) if kind] or [found]
     noise = "" if gap.parts.repeated else ", noise included"
     return f"where the most is left{noise}: " + listed(
-        [place_words(max(cells, key=lambda c: c["gap"])) for cells in (over_time, _others(found)) if cells]
+        [place_words(max(kind, key=lambda c: c["gap"])) for kind in kinds]
     )
 
 
@@ -281,7 +290,8 @@ def _others(found: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
 def place_words(cell: Mapping[str, Any]) -> str:
     """ "joint 2 in opening, from 2.0 s on", "object angle 0.10 to 0.20 rad"."""
     if cell["variable"] != "joint x phase":
-        return f"{cell['variable']} {span_words(cell['where'])}"
+        words = variable_words(cell["variable"], cell["where"])
+        return f"{words[:1].lower()}{words[1:]} {span_words(cell['where'])}"
     joint, phase, start = joint_phase(cell["where"])
     return label(joint).lower() + (f" in {phase}, from {start} s on" if phase not in ("", "all") else "")
 

@@ -8,11 +8,20 @@ from droid_jax.report.gap_words import gap_summary, readable, untrusted
 from droid_jax.report.policy_folder import Trained
 from droid_jax.report.policy_words import policy_summary
 from droid_jax.report.run_folder import Run
-from droid_jax.report.words import DOUBT, far_off, judged, listed, number, percent, summary
+from droid_jax.report.words import DOUBT, counted, far_off, judged, listed, number, percent, summary, was
 
-ALL_THE_SAME = (
-    "The policy was trained all the same, on a model that is known to be wrong there: do not take it to a robot."
-)
+
+def doubt(run: Run | None, gap: Gap | None) -> str:
+    """Why a policy that was trained on these should not be taken to a robot; empty where nothing speaks against it."""
+    if run and far_off(run.fit):
+        why = "a fit that is far from the data"
+    elif gap and gap.found["verdict"] == "fit not converged":
+        why = "a model of which no search could say whether it is right"
+    elif gap and untrusted(gap):
+        why = "a model that is known to be wrong somewhere"
+    else:
+        return ""
+    return f"The policy was trained all the same, on {why}: do not take it to a robot."
 
 
 def lead(run: Run | None, gap: Gap | None, policy: Trained | None, hidden: str = "") -> list[str]:
@@ -32,8 +41,8 @@ def lead(run: Run | None, gap: Gap | None, policy: Trained | None, hidden: str =
             following = following.replace("Next: ", f"Next: {DOUBT}; then ", 1)
     if policy:
         sentences += [_opened(where, found["success_rate"]) for where, found in policy.trials.items()]
-        doubted = gap is not None and untrusted(gap)
-        following = f"{following} {ALL_THE_SAME}" if doubted else policy_summary(policy, gap is not None)[-1]
+        last = policy_summary(policy, gap, doubt(run, gap))[-1]
+        following = f"{following} {last}" if doubt(run, gap) else last
     return [*sentences, following]
 
 
@@ -44,9 +53,10 @@ def _fitted(run: Run) -> str:
         for name, g in gaps.items()
     ]
     went = "fell" if all(g["after"] < g["before"] for g in gaps.values()) else "went"
+    count = len(run.parameters)
     return (
-        f"{len(run.parameters)} parameters were fitted to what the {run.robot} measured: the distance between measured "
-        f"and simulated torques {went} {listed(sizes)}."
+        f"{counted(count, 'parameter')} {was(count)} fitted to what the {run.robot} measured: the distance between "
+        f"measured and simulated torques {went} {listed(sizes)}."
     )
 
 

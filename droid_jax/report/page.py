@@ -13,6 +13,7 @@ training.json.
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -37,13 +38,24 @@ from droid_jax.report.gap_words import (
     settings,
     unit_words,
 )
-from droid_jax.report.lead import lead
+from droid_jax.report.lead import doubt, lead
 from droid_jax.report.policy_drawings import draw_policy, film_row
 from droid_jax.report.policy_folder import Trained, has_policy, read_policy
 from droid_jax.report.policy_words import policy_summary
 from droid_jax.report.run_folder import Run, has_run, read_run
 from droid_jax.report.stages import left_over, needs_whole
-from droid_jax.report.words import grouped, hidden_words, judged, label, like, number, percent, speaker, summary
+from droid_jax.report.words import (
+    counted,
+    grouped,
+    hidden_words,
+    judged,
+    label,
+    like,
+    number,
+    percent,
+    speaker,
+    summary,
+)
 from droid_jax.storage import write_text
 
 _DOWNLOADS = (
@@ -90,6 +102,8 @@ def write_report(run: Path) -> Path:
         "like": like,
         "percent": percent,
         "label": label,
+        "counted": counted,
+        "quote": lambda path: shlex.quote(str(path)),
         "judged": judged,
         "effect": effect_words,
         "unit": unit_words,
@@ -99,7 +113,7 @@ def write_report(run: Path) -> Path:
         "unbroken": lambda text: re.sub(r"(?<=\d) (?=N m|%)", "\u00a0", text).replace("N m", "N\u00a0m"),
     }
     environment.tests["at_bound"] = at_bound
-    parts = (_policy(policy) if policy else {}) | (_search(gap) if gap else {})
+    parts = (_policy(policy, gap, doubt(loaded, gap)) if policy else {}) | (_search(gap) if gap else {})
     parts |= _identification(loaded, gap is not None) if loaded else {}
     if len([part for part in (loaded, gap, policy) if part]) > 1:
         parts |= _together(folder, loaded, gap, policy)
@@ -181,15 +195,15 @@ def _search(gap: Gap) -> dict[str, Any]:
     }
 
 
-def _policy(trained: Trained) -> dict[str, Any]:
-    """What the page says of a trained policy."""
+def _policy(trained: Trained, gap: Gap | None, doubt: str) -> dict[str, Any]:
+    """What the page says of a trained policy; gap and doubt as in `policy_summary`."""
     setup, name = trained.training["setup"], trained.folder.resolve().name
     return {
         "title": f"Policy: {name}",
         "heading": f"Policy for {trained.training['scene']}",
         "meta": [f"Method {setup['method']}", f"preset {setup['preset']}", f"seed {setup['seed']}", name],
         "stand_in": bool(trained.trials),
-        "policy_summary": policy_summary(trained),
+        "policy_summary": policy_summary(trained, gap, doubt),
         "policy_drawings": draw_policy(trained),
         "films": film_row(trained),
         "no_films": trained.no_films,

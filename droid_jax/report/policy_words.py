@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from droid_jax.policy.trials import LEARNED
+from droid_jax.report.gap_folder import Gap
 from droid_jax.report.policy_folder import Trained
 from droid_jax.report.words import label, listed, number, percent
 
@@ -19,10 +21,10 @@ METHODS = {
 ENOUGH = 0.8  # success on the stand-in from which the next step is the robot
 
 
-def policy_summary(trained: Trained, searched: bool = False) -> list[str]:
+def policy_summary(trained: Trained, gap: Gap | None = None, doubt: str = "") -> list[str]:
     """The sentences at the top, from the numbers alone; the last says what to do next.
 
-    searched: the page holds a search of the gap too.
+    gap: the search that the page holds too.  doubt: why it should not be taken to a robot.
     """
     training = trained.training
     history = training["history"]
@@ -46,7 +48,7 @@ def policy_summary(trained: Trained, searched: bool = False) -> list[str]:
     sentences += [_tried(where, found, training["task"]) for where, found in trained.trials.items()]
     if own and trained.trials:
         sentences.append("The fit is of your own recordings: the stand-in robot is another one, and says little of it.")
-    return [*sentences, _next(trained, own, searched or bool(training["effects"]))]
+    return [*sentences, doubt or _next(trained, own, gap)]
 
 
 def _with(effects: list[str]) -> str:
@@ -66,18 +68,23 @@ def _tried(where: str, found: Mapping[str, Any], task: Mapping[str, Any]) -> str
     )
 
 
-def _next(trained: Trained, own: bool, searched: bool) -> str:
+def _next(trained: Trained, own: bool, gap: Gap | None) -> str:
+    folder = shlex.quote(str(trained.folder))
     longer = "It has not learned the task in simulation yet: train longer (--steps), or with another --seed."
     if trained.transfer is None:
         learned = any(now["success"] >= LEARNED for now in trained.training["history"])
-        return f"Next: python -m droid_jax.run evaluate {trained.folder}" if learned else longer
+        return f"Next: python -m droid_jax.run evaluate {folder}" if learned else longer
     if trained.transfer["stand_in"]["success_rate"] >= ENOUGH:
-        return f"Next: python -m droid_jax.run export {trained.folder}, and docs/policy-on-a-robot.md."
+        return f"Next: python -m droid_jax.run export {folder}, and docs/policy-on-a-robot.md."
     if trained.transfer["simulation"]["success_rate"] < ENOUGH:
         return longer
     if own:
         return "It works in simulation and not on a robot that it was not fitted to, which was to be expected."
     where = "It works in simulation and not on the stand-in robot"
-    if searched:
+    held = trained.training["effects"]
+    if gap is not None and gap.extended and not held:
+        train = f"python -m droid_jax.run train --fit {shlex.quote(str(gap.folder))}"
+        return f"{where}: train on the model that the search extended ({train})."
+    if gap is not None or held:
         return f"{where}, although what the model lacks was searched for: look at the film of a bad trial."
     return f"{where}: search the gap (python -m droid_jax.run gap)."

@@ -24,6 +24,7 @@ from droid_jax.report.style import (
 )
 from droid_jax.report.words import label
 
+BUCKETS = 220  # points of a drawn band
 _TRACES = ("measured_mean", "measured_low", "measured_high", "before", "after")
 
 
@@ -41,14 +42,9 @@ def torque_traces(
     for j, (axes, joint) in enumerate(zip(panels, joints, strict=True)):
         line = {k: np.asarray(traces[k])[:, j] for k in _TRACES}
         shade(axes, phases, named=j < panel_columns(width))
-        axes.fill_between(
-            *band(time, line["measured_low"], line["measured_high"]),
-            color=MEASURED,
-            alpha=0.16,
-            linewidth=0,
-            label="measured, 5 to 95 % of repeats",
-        )
-        axes.plot(*thin(time, line["measured_mean"]), color=MEASURED, linewidth=2.4, label="measured, mean")
+        repeated = fill(axes, time, line["measured_low"], line["measured_high"], "measured, 5 to 95 % of repeats")
+        mean = "measured, mean" if repeated else "measured"
+        axes.plot(*thin(time, line["measured_mean"]), color=MEASURED, linewidth=2.4, label=mean)
         axes.plot(*thin(time, line["before"]), color=BEFORE, linestyle=(0, (4, 1.5)), label="before the fit")
         axes.plot(*thin(time, line["after"]), color=AFTER, linewidth=1.0, label="after the fit")
         axes.set(title=label(joint), xlim=(time[0], time[-1]), ylim=_torque_limits(line))
@@ -91,6 +87,16 @@ def gap_per_joint(
     return figure
 
 
+def fill(
+    axes: Axes, time: np.ndarray, low: np.ndarray, high: np.ndarray, name: str = "", buckets: int = BUCKETS
+) -> bool:
+    """A band of the repeats, of so many `buckets`; none, and False, for one repeat, whose scatter is zero."""
+    if not np.any(high > low):
+        return False
+    axes.fill_between(*band(time, low, high, buckets), color=MEASURED, alpha=0.16, linewidth=0, label=name or None)
+    return True
+
+
 def shade(axes: Axes, phases: Sequence[Mapping[str, Any]], named: bool) -> None:
     """Every other phase of the motion shaded; names at the top where asked for."""
     for i, phase in enumerate(phases):
@@ -124,7 +130,7 @@ def thin(time: np.ndarray, value: np.ndarray, buckets: int = 220) -> tuple[np.nd
 
 
 def band(
-    time: np.ndarray, low: np.ndarray, high: np.ndarray, buckets: int = 220
+    time: np.ndarray, low: np.ndarray, high: np.ndarray, buckets: int = BUCKETS
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The band's outline, one point per bucket and one at the end, never inside the band itself."""
     if len(time) <= buckets:

@@ -11,8 +11,8 @@ from droid_jax.measure.hidden import HIDDEN, LIBRARY, ON_HINGE
 from droid_jax.model.builtin import HINGE
 from droid_jax.report.run_folder import Run
 
-# Words before "joint" of which a robot has several: the number alone does not tell its joints apart.
-SEVERAL = re.compile(r"left|right|[lr]|\w*finger\w*|(arm|robot|leg)\d+")
+# Words before "joint" that name the arm as a whole: its number alone tells a joint.
+ARM = re.compile(r"panda|fr3|fer|(lbr_)?iiwa\d*|lbr|gen3|kinova|xarm\d*|ur\d+e?")
 JUDGED = {  # by `judged` of a fit.json's gap
     "repeats": "on repeats that the fit did not see",
     "time": "on the last part of the log, which the fit did not see",
@@ -26,16 +26,26 @@ DOUBT = "check joint order, signs, units and servo gains before anything else"  
 def label(name: str) -> str:
     """A name as it is read: "hinge_stiffness" -> "Hinge stiffness", "panda_joint3" -> "Joint 3".
 
-    "torque_offset[panda_joint3]" -> "Torque offset, joint 3"; "left_joint3" stays "Left joint3".
+    "torque_offset[panda_joint3]" -> "Torque offset, joint 3"; "thumb_joint3" stays "Thumb joint3".
     """
     indexed = re.fullmatch(r"(.+)\[(.+)\]", name)
     if indexed:
         return f"{label(indexed[1])}, {label(indexed[2]).lower()}"
     joint = re.fullmatch(r"(?:(\w+)_)?joint_?(\d+)", name)
-    if joint and not any(SEVERAL.fullmatch(word) for word in (joint[1] or "").split("_")):
+    if joint and (joint[1] is None or ARM.fullmatch(joint[1])):
         return f"Joint {joint[2]}"
     words = name.replace("_", " ").strip()
     return words[:1].upper() + words[1:]
+
+
+def counted(count: int, thing: str) -> str:
+    """ "1 repeat", "2 repeats"."""
+    return f"{count} {thing}{'' if count == 1 else 's'}"
+
+
+def was(count: int) -> str:
+    """The verb of `counted`."""
+    return "was" if count == 1 else "were"
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -108,10 +118,11 @@ def _what(run: Run) -> str:
     robot = run.robot
     parts = listed([f"{n} of the {robot if g == 'Robot' else g.lower()}" for g, n in groups.items()])
     nuisances = len(run.fit["parameters"]) - len(run.parameters)
-    beside = f", and {nuisances} nuisances beside them," if nuisances else ""
+    beside = f", and {counted(nuisances, 'nuisance')} beside them," if nuisances else ""
+    were = was(len(run.parameters) + nuisances)
     recordings = [r["name"] for r in run.config["recordings"]]
     return (
-        f"{len(run.parameters)} parameters ({parts}){beside} were fitted so that the simulation "
+        f"{counted(len(run.parameters), 'parameter')} ({parts}){beside} {were} fitted so that the simulation "
         f"reproduces the joint torques which the {robot} measured in "
         f"the demonstration{'s' if len(recordings) > 1 else ''} {listed([f'“{r}”' for r in recordings])}."
     )
@@ -156,10 +167,8 @@ def _truth(run: Run) -> list[str]:
     if not known:
         return []
     inside = sum(p["interval"][0] <= p["truth"] <= p["interval"][1] for p in known)
-    return [
-        f"The true value is known for {len(known)} of the parameters that it does tell, and lies inside "
-        f"the 90 % interval for {inside} of them."
-    ]
+    told = f"the true value is known of {counted(len(known), 'parameter')}"
+    return [f"Of what it does tell {told}; {inside} of {len(known)} lie{'s' * (len(known) == 1)} in the 90 % interval."]
 
 
 def _bound(p: Mapping[str, Any]) -> str:
@@ -194,20 +203,43 @@ def _next(run: Run, searched: bool) -> str:
             f"{lacks}, and these values may be bent by it: go on with the search for it, below"
             if searched
             else f"{lacks}: see below in which joint and phase, and let python -m droid_jax.run gap look for the "
-            f"missing effect{_needed(run)}"
+            f"missing effect{needed([r['repeats'] for r in run.config['recordings']])}"
+        )
+    elif noiseless(run.fit):
+        steps.append(
+            "whether the model lacks something is asked by the search below"
+            if searched
+            else "one repeat does not tell noise from what the model lacks, and these values may be bent by it: "
+            + asked_of(run.fit)
         )
     elif not steps:
         steps.append("draw the simulations you train on from gaussian.json")
     return "Next: " + "; ".join(steps) + "."
 
 
-def _needed(run: Run) -> str:
-    """What gap needs beside what was fitted here."""
-    from droid_jax.gap.split import HALVES  # only here: it imports distributions of scipy
+def needed(repeats: Sequence[int]) -> str:
+    """What the search of the gap takes beside recordings of so many repeats, in brackets; empty where they will do."""
+    from droid_jax.gap.flips import FEWEST  # only here: these import distributions of scipy
+    from droid_jax.gap.split import HALVES
 
-    recordings = run.config["recordings"]
-    few = len(recordings) == 1 and 1 < recordings[0]["repeats"] < HALVES
-    return f" (it takes a second motion, or {HALVES} repeats of this one)" if few else ""
+    alone = len(repeats) == 1
+    if (alone and repeats[0] in (1, *range(HALVES, repeats[0] + 1))) or (not alone and min(repeats) >= FEWEST):
+        return ""
+    if alone and repeats[0] >= FEWEST:
+        return f" (it takes a second motion, or {HALVES} repeats of this one)"
+    return f" (it takes {FEWEST} repeats of each of two motions, or {HALVES} of one)"
+
+
+def noiseless(fit: Mapping[str, Any]) -> bool:
+    """Whether a fit.json is of single repeats, which do not tell noise from what the model lacks."""
+    return any(gap.get("floor") is None for gap in fit["gap"].values())
+
+
+def asked_of(fit: Mapping[str, Any]) -> str:
+    """What tells whether the model of a `noiseless` fit lacks something."""
+    if all(gap.get("judged") == "time" for gap in fit["gap"].values()):
+        return "let python -m droid_jax.run gap ask what it lacks"
+    return "record repeats of the motion"
 
 
 def lacks_something(fit: Mapping[str, Any]) -> bool:

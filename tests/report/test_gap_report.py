@@ -225,10 +225,31 @@ def test_an_inverse_replay_has_no_floor(tmp_path: Path, quick: None) -> None:
 
 
 def test_a_sealed_recording_that_blew_up_was_kept_all_the_same(tmp_path: Path, quick: None) -> None:
-    folder = make_gap(tmp_path / "run", "named", sealed=False, failed=["the fitted model on the sealed recording"])
+    folder = make_gap(
+        tmp_path / "run", "named", sealed=False, failed=["drag", "the fitted model on the sealed recording"]
+    )
     text = read_page(page.write_report(folder)).text
     assert "since the sealed one could not be replayed" in text and "The sealed recording could not be replayed" in text
-    assert "and the fitted model on the sealed recording" in text and "kept sealed" not in text
+    assert "blew up with it: " in text and "the fitted model on the sealed recording" not in text
+    assert "kept sealed" not in text
+
+
+def test_what_is_left_at_some_position_alone_is_a_place_too(tmp_path: Path) -> None:
+    """Of all cells the test finds that of a joint's position."""
+    found = read_gap(make_gap(tmp_path / "made", "unexplained")).found["cells"]
+    (cell,) = [c for c in found["after"] if c["variable"] == "position of panda_joint2"][:1] or [
+        {**found["after"][-1], "variable": "position of panda_joint2", "where": "0.10 to 0.20 rad"}
+    ]
+    cells = [{**c, "found": False} for c in found["after"]] + [{**cell, "gap": 3.0, "found": True}]
+    folder = make_gap(tmp_path / "run", "unexplained", cells={**found, "after": cells})
+    text = gap_words.gap_summary(read_gap(folder))[-1]
+    assert f"where the most is left: position of joint 2 {gap_words.span_words(cell['where'])}." in text
+
+
+def test_an_object_on_a_slide_has_a_position_and_no_angle() -> None:
+    slide, hinge = ({"variable": "object angle", "where": f"0.00 to 0.14 {unit}"} for unit in ("m", "rad"))
+    assert gap_words.place_words(slide) == "object position 0.00 to 0.14 m"
+    assert gap_words.place_words(hinge) == "object angle 0.00 to 0.14 rad"
 
 
 def test_a_stand_in_is_said(tmp_path: Path, quick: None) -> None:

@@ -12,6 +12,7 @@ from reader import read_page
 
 from droid_jax.policy.trials import BLOWN_UP
 from droid_jax.report import page, policy_words
+from droid_jax.report.gap_folder import read_gap
 from droid_jax.report.policy_folder import read_policy
 from droid_jax.report.policy_words import policy_summary
 
@@ -54,7 +55,10 @@ def test_it_says_what_to_do_next(tmp_path: Path, successes: int | None, simulate
         (made / "transfer.json").write_text(json.dumps(content))
     assert next_step in policy_summary(read_policy(made))[-1]
     if next_step == "search the gap":
-        assert next_step not in policy_summary(read_policy(made), searched=True)[-1]
+        searched = read_gap(make_gap(tmp_path / "gap", "named"))
+        said = policy_summary(read_policy(made), searched)[-1]
+        assert next_step not in said and f"train --fit {tmp_path / 'gap'}" in said
+        assert "look at the film" in policy_summary(read_policy(made), read_gap(make_gap(tmp_path / "no", "none")))[-1]
 
 
 def test_a_training_that_reached_95_percent_in_no_evaluation_is_not_tried_but_made_longer(tmp_path: Path):

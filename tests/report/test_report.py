@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import itertools
 import json
 import re
 import xml.etree.ElementTree as ElementTree
@@ -15,12 +17,12 @@ from matplotlib.figure import Figure
 from reader import Page, read_page
 
 from droid_jax.report import page, render, search_figures, torque_figures
-from droid_jax.report.export import inline_svg
+from droid_jax.report.export import inline_svg, settled
 from droid_jax.report.gap_folder import read_gap
 from droid_jax.report.lead import lead
 from droid_jax.report.run_folder import read_run
-from droid_jax.report.style import BEFORE
-from droid_jax.report.words import JUDGED, label, like, number, percent, summary
+from droid_jax.report.style import BEFORE, NARROW, WIDE
+from droid_jax.report.words import JUDGED, label, like, needed, number, percent, summary
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +71,7 @@ def test_summary_is_made_from_the_numbers(run: Path) -> None:
     assert "2 nuisances" in text and "1.22 N m before the fit" in text and "0.119 N m after it" in text
     assert "98 % of what can be closed" in text
     assert "does not tell door mass;" in text
-    assert "known for 7 of the parameters" in text and "for 6 of them" in text
+    assert "true value is known of 7 parameters; 6 of 7 lie in the 90 % interval" in text
     assert "hinge friction loss (lower bound 0 N m)" in text
     assert "Next:" in text and "droid_jax.run gap" not in text
 
@@ -115,11 +117,86 @@ def test_what_gap_needs_is_said_and_not_where_it_ran(tmp_path: Path) -> None:
     [
         ("panda_joint3", "Joint 3"), ("joint_3", "Joint 3"), ("panda_finger_joint1", "Panda finger joint1"),
         ("arm2_joint2", "Arm2 joint2"), ("fr3_joint2", "Joint 2"), ("left_joint3", "Left joint3"),
+        ("thumb_joint1", "Thumb joint1"), ("torso_joint_1", "Torso joint 1"), ("lbr_iiwa_joint_1", "Joint 1"),
         ("torque_offset[panda_joint3]", "Torque offset, joint 3"),
     ],
 )  # fmt: skip
 def test_joints_of_different_names_have_different_labels(name: str, words: str) -> None:
     assert label(name) == words
+
+
+@pytest.mark.parametrize(
+    ("repeats", "said"),
+    [
+        ([3], "8 repeats of each of two motions, or 16 of one"),
+        ([8], "a second motion, or 16 repeats of this one"),
+        ([5, 9], "8 repeats of each of two motions, or 16 of one"),
+        ([16], ""),
+        ([1], ""),  # a log of which parts take the place of repeats
+        ([8, 8], ""),
+    ],
+)
+def test_what_the_search_takes_is_what_it_asks_for(repeats: list[int], said: str) -> None:
+    assert needed(repeats) == (f" (it takes {said})" if said else "")
+
+
+@pytest.mark.parametrize(("judged", "next_step"), [("time", "droid_jax.run gap ask"), ("same", "record repeats")])
+def test_a_single_repeat_does_not_say_that_the_model_is_whole(tmp_path: Path, judged: str, next_step: str) -> None:
+    """Its noise is what the fit left, so nothing is ever above it."""
+    run = make_run(tmp_path / "run")
+    fit = json.loads((run / "fit.json").read_text())
+    fit["gap"]["open_close"] |= {"floor": None, "closed": None, "judged": judged}
+    (run / "fit.json").write_text(json.dumps(fit))
+    last = summary(read_run(run))[-1]
+    assert next_step in last and "draw the simulations" not in last
+    assert "asked by the search below" in summary(read_run(run), searched=True)[-1]
+
+
+def test_one_of_a_thing_is_not_several(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run")
+    fit, config = (json.loads((run / f"{name}.json").read_text()) for name in ("fit", "config"))
+    fit["parameters"] = [p for p in fit["parameters"] if not p["nuisance"]][:1]
+    config["recordings"][0]["repeats"] = 1
+    (run / "fit.json").write_text(json.dumps(fit))
+    assert summary(read_run(run))[0].startswith("1 parameter (1 of the door) was fitted so that")
+    assert lead(read_run(run), None, None)[0].startswith("1 parameter was fitted to")
+
+
+def test_names_with_dollars_are_written_as_they_are() -> None:
+    """MuJoCo allows them; as mathematics the first ends the drawing, and the second loses its dollars."""
+    gaps = np.ones(2)
+    for names in (["x$\\foo$", "y"], ["a$b$c", "k_$x_{1$"]):
+        figure = settled(torque_figures.gap_per_joint(names, gaps, gaps, None))
+        assert [t.get_text() for t in figure.axes[0].get_xticklabels()] == [label(name) for name in names]
+        figure.savefig(io.BytesIO())
+
+
+@pytest.mark.parametrize("width", [WIDE, NARROW])
+@pytest.mark.parametrize(
+    "names",
+    [
+        [f"{a}_joint" for a in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")],
+        [f"joint_{i}" for i in range(30)],
+    ],
+)
+def test_names_below_an_axis_do_not_overlap(names: list[str], width: float) -> None:
+    gaps = np.ones(len(names))
+    figure = settled(torque_figures.gap_per_joint(names, gaps, gaps, None, width=width))
+    texts = figure.axes[0].get_xticklabels()
+    if texts[0].get_rotation():  # turned, they lie side by side where their lines do not touch
+        starts = np.diff([text.get_window_extent().x1 for text in texts])
+        height = texts[0].get_fontsize() * figure.dpi / 72
+        assert starts.min() > 0.8 * height
+    else:
+        boxes = [text.get_window_extent() for text in texts]
+        assert all(left.x1 <= right.x0 for left, right in itertools.pairwise(boxes))
+
+
+def test_a_lone_log_has_no_band_of_repeats() -> None:
+    time = np.linspace(0.0, 1.0, 50)
+    lines = {name: np.sin(time)[:, None] for name in torque_figures._TRACES}
+    figure = torque_figures.torque_traces({"time": time, "joints": ["a"], **lines})
+    assert figure.axes[0].get_legend_handles_labels()[1] == ["measured", "before the fit", "after the fit"]
 
 
 def test_summary_says_when_the_fit_made_it_worse(tmp_path: Path) -> None:

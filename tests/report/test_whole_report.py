@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from made_up_gap import make_gap
 from made_up_policy import make_policy
+from made_up_run import make_run
 from made_up_whole import make_whole
 from reader import read_page
 
@@ -88,6 +89,29 @@ def test_a_policy_of_a_model_that_is_known_to_be_wrong_is_not_sent_to_a_robot(
     if warned:
         (own,) = re.findall(r'<p class="answer.*?<span class="next">(.*?)</span>', text, re.S)
         assert own in lead
+
+
+def test_a_policy_of_a_fit_that_is_far_off_is_not_sent_to_a_robot(tmp_path: Path):
+    """Whatever the search found; and the policy's own part says the same as the lead."""
+    for folder, gap in ((tmp_path / "with", True), (tmp_path / "without", False)):
+        run = make_run(folder / "identify")
+        fit = json.loads((run / "fit.json").read_text())
+        fit["gap"]["open_close"] |= {"before": 1.22, "after": 1.1, "closed": 0.1}
+        (run / "fit.json").write_text(json.dumps(fit | {"mean_square": 80.0}))
+        make_policy(folder / "train")
+        if gap:
+            make_gap(folder / "gap", "named")
+        text = page.write_report(folder).read_text().replace("\u00a0", " ")
+        assert "Next: python -m droid_jax.run export" not in text
+        assert text.count("on a fit that is far from the data: do not take it to a robot") == 2
+
+
+def test_a_search_that_did_not_settle_says_nothing_of_the_model(tmp_path: Path):
+    make_gap(tmp_path / "gap", "fit not converged")
+    make_policy(tmp_path / "train")
+    text = page.write_report(tmp_path).read_text().replace("\u00a0", " ")
+    assert text.count("of which no search could say whether it is right: do not take it to a robot") == 2
+    assert "known to be wrong" not in text
 
 
 def test_every_link_leads_to_a_file_of_a_stage(folder: Path):
