@@ -28,7 +28,7 @@ from droid_jax.compare.cost import Cost, make_cost  # noqa: E402
 from droid_jax.gap.candidates import candidates  # noqa: E402
 from droid_jax.gap.case import GapConfig  # noqa: E402
 from droid_jax.gap.screen import questions_of  # noqa: E402
-from droid_jax.identify.damped import TRIALS  # noqa: E402
+from droid_jax.identify.damped import CHORDS, TRIALS  # noqa: E402
 from droid_jax.measure.demonstration import demonstration_path  # noqa: E402
 from droid_jax.measure.formats import load  # noqa: E402
 from droid_jax.measure.recording import Recording  # noqa: E402
@@ -81,7 +81,9 @@ def main() -> None:
     asked, config = candidates(effects), GapConfig()
     questions = questions_of(asked)
     row = usual["full"] / arguments.rows
-    refit_rows = 2 * (len(base) + 2) + TRIALS
+    steps = CHORDS * TRIALS  # of an iteration: batches of steps along one Jacobian, where every one pays
+    look_rows = 2 * (1 + steps)  # from two starts, whose Jacobian is known
+    refit_rows = 2 * (len(base) + 2) + steps
     result = {
         **origin(0),
         "quick": arguments.quick,
@@ -98,10 +100,10 @@ def main() -> None:
         "questions": len(questions),
         "screening_s": (len(questions) + 1) * row,
         "candidate_screened_s": (len(questions) + 1) * row / len(asked),
-        "look_rows_at_most": 3 * TRIALS,
-        "look_s_at_most": 3 * TRIALS * row,
+        "look_rows_at_most": look_rows,
+        "look_s_at_most": look_rows * row,
         "refit_iteration_rows": refit_rows,
-        "refit_s_at_most": config.refit.iterations * refit_rows * row,
+        "refit_s_at_most": (1 + config.refit.iterations * refit_rows) * row,
     }
     write_json(arguments.out / f"{stem('candidates', arguments.quick)}.json", result)
     print(json.dumps(result))

@@ -19,6 +19,7 @@ from droid_jax import runtime
 from droid_jax.compare.cost import batch_replay
 from droid_jax.compare.population import over_block, over_population
 from droid_jax.compare.replay import Drive, make_drive, servo_replay
+from droid_jax.compare.twin import control_of
 from droid_jax.measure.demonstration import demonstration_path
 from droid_jax.measure.engine import instrument, simulate
 from droid_jax.measure.formats import load
@@ -87,8 +88,7 @@ def c_engine(case: Case, population: int) -> Callable[[], np.ndarray]:
     """
     plain = replace(case.scene, model=instrument(case.scene))
     models = [make_c_model(plain, case.space, row) for row in case.values(population)]
-    late = case.drive.time - 0.5 * case.drive.timestep  # as the MJX replay applies its command
-    control = np.stack([np.interp(late, case.drive.time, c) for c in case.drive.command.T], axis=1)
+    control = control_of(case.drive)
 
     def run() -> np.ndarray:
         chunks = [models[i : i + C_CHUNK] for i in range(0, population, C_CHUNK)]

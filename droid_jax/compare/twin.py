@@ -49,7 +49,7 @@ def twin_replay(
     def piece(values: np.ndarray) -> Rollout:
         models = [make_c_model(plain, space, row) for row in values]
         thetas = [theta_of(space, row) for row in values]
-        control = np.stack([_control(drive, t.get("time_offset", 0.0), late) for t in thetas])
+        control = np.stack([control_of(drive, t.get("time_offset", 0.0), late) for t in thetas])
         trace = simulate(plain, models, drive.qpos0[None], control)
         traces = (trace.torque, trace.position, trace.velocity, trace.object_angle[..., None])
         ahead = late * drive.timestep
@@ -79,7 +79,7 @@ def _later(velocity: np.ndarray, late: float) -> np.ndarray:
     return velocity + late * (after - velocity)
 
 
-def _control(drive: Drive, time_offset: float, late: float) -> np.ndarray:
+def control_of(drive: Drive, time_offset: float = 0.0, late: float = 0.5) -> np.ndarray:
     """[T, U] the command so many steps (and the time offset) late."""
     at = drive.time - late * drive.timestep - time_offset
     return np.stack([np.interp(at, drive.time, c) for c in drive.command.T], axis=1)

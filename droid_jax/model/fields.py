@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import mujoco
@@ -30,6 +31,13 @@ _KIND = {
     "geom": "geom",
     "pair": "pair",
     "actuator": "actuator",
+}
+# field -> whether an element's limit of it acts at all, which is fixed when the model is compiled
+_LIMITED = {
+    "actuator_forcerange": "actuator_forcelimited",
+    "actuator_ctrlrange": "actuator_ctrllimited",
+    "jnt_range": "jnt_limited",
+    "jnt_actfrcrange": "jnt_actfrclimited",
 }
 _POSITION_GAIN = (("actuator_gainprm", 0), ("actuator_biasprm", 1))  # both of them, with opposite signs
 _SERVO, _VELOCITY_GAIN = ("actuator_gainprm", "actuator_biasprm"), 2  # fields, and their column of the velocity gain
@@ -61,7 +69,13 @@ def element_name(model: mujoco.MjModel, field: str, index: Sequence[int]) -> str
 def write(
     scene: Scene, field: str, index: tuple[int, ...], mode: Mode = Mode.SET, *, gain: float = 1.0, offset: float = 0.0
 ) -> Write:
-    """A `Write` that knows the name of its element."""
+    """A `Write` that knows the name of its element.
+
+    Raises ValueError for the place of a mocap body, which is no part of the model in a replay.
+    """
+    if field in ("body_pos", "body_quat") and scene.model.body_mocapid[index[0]] >= 0:
+        name = element_name(scene.model, field, index)
+        raise ValueError(f"body {name!r} is a mocap body, whose place no parameter can be: take mocap out of the MJCF")
     return Write(field, index, mode, gain, offset, element_name(scene.model, field, index))
 
 
@@ -92,7 +106,9 @@ def model_parameter(
         _check_frictionloss(scene, element)
     first = element_index(scene, field, element)
     check_field(scene, field)
-    index = (first, *_column(scene, field, column))
+    columns = _column(scene, field, column)
+    index = (first, *columns)
+    _check_limited(scene, field, element, first)
     if field in _SERVO and column == _VELOCITY_GAIN:
         _check_servo_damping(scene, element)
     if (field, column) in _POSITION_GAIN:
@@ -107,7 +123,7 @@ def model_parameter(
         std,
         low,
         high,
-        writes=(own,),
+        writes=(own, *(replace(own, index=(row, *columns)) for row in _further_dofs(scene, field, first))),
         **options,
     )
 
@@ -126,6 +142,23 @@ def _column(scene: Scene, field: str, column: int | None) -> tuple[int, ...]:
             f'give "column", 0 to {width[0] - 1}{got}'
         )
     return (int(column),)
+
+
+def _further_dofs(scene: Scene, field: str, first: int) -> range:
+    """The other rows of a ball's or free joint's number, which an MJCF states once for all its degrees of freedom."""
+    if not field.startswith("dof_"):
+        return range(0)
+    return range(first + 1, first + int(np.sum(scene.model.dof_jntid == scene.model.dof_jntid[first])))
+
+
+def _check_limited(scene: Scene, field: str, element: str, index: int) -> None:
+    """ValueError for a limit that the model was compiled without: it would never act."""
+    flag = _LIMITED.get(field)
+    if flag and not getattr(scene.model, flag)[index]:
+        raise ValueError(
+            f"{element!r} was compiled without the limit that {field} is of, which a replay can never switch on; "
+            "give it one in the MJCF"
+        )
 
 
 def _check_servo_damping(scene: Scene, actuator: str) -> None:

@@ -31,6 +31,9 @@ def refuse_ignored(model: mujoco.MjModel, name: str) -> None:
         found.append("disabled actuator groups")
     if model.opt.noslip_iterations > 0:
         found.append("the noslip solver")
+    passive = (mujoco.mjtDisableBit.mjDSBL_SPRING, mujoco.mjtDisableBit.mjDSBL_DAMPER)
+    if sum(bool(model.opt.disableflags & bit) for bit in passive) == 1:
+        found.append("springs without dampers, or the other way round (a flag: MJX then drops both, and gravcomp)")
     if found:
         raise ValueError(
             f"scene {name!r} uses features that MJX accepts and then ignores: {', '.join(found)}; "

@@ -43,6 +43,7 @@ _SURE = (
     *("actuator_gainprm", "actuator_biasprm"),
 )
 _SHAPE = {"geom_pos", "geom_quat", "geom_size"}
+_OF_FILES = (int(mujoco.mjtGeom.mjGEOM_MESH), int(mujoco.mjtGeom.mjGEOM_HFIELD))  # geoms whose shape is not the MJCF's
 
 
 def fitted_mjcf(scene: Scene, space: Space, values: np.ndarray, effects: Sequence[Effect] = ()) -> str:
@@ -88,6 +89,9 @@ def _settle(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
             joint.springdamper = [0.0, 0.0]
             _set(joint, "stiffness", model.jnt_stiffness[joint.id : joint.id + 1])
             _set(joint, "damping", model.dof_damping[model.jnt_dofadr[joint.id] :][:1])
+    for tendon in spec.tendons:
+        if model.tendon_stiffness[tendon.id] > 0:  # else its length at qpos0, which a moved body changes
+            tendon.springlength = model.tendon_lengthspring[tendon.id].tolist()
     for actuator in spec.actuators:
         if actuator.biastype == mujoco.mjtBias.mjBIAS_AFFINE and actuator.biasprm[2] > 0:  # a servo's dampratio
             _set(actuator, "biasprm", model.actuator_biasprm[actuator.id])
@@ -110,8 +114,7 @@ def unwritten(scene: Scene, space: Space) -> tuple[str, ...]:
 
 
 def _has_words(scene: Scene, parameter: Parameter) -> bool:
-    files = [int(mujoco.mjtGeom.mjGEOM_MESH), int(mujoco.mjtGeom.mjGEOM_HFIELD)]
-    shaped = any(w.field in _SHAPE and scene.model.geom_type[w.index[0]] in files for w in parameter.writes)
+    shaped = any(w.field in _SHAPE and scene.model.geom_type[w.index[0]] in _OF_FILES for w in parameter.writes)
     return all(w.field in WORDS for w in parameter.writes) and not shaped
 
 
@@ -134,6 +137,8 @@ def _write_changed(kind: str, element: Any, row: int, before: mujoco.MjModel, af
     """Write into an element what differs between its rows in two models."""
     fields = [f for f in _ATTRIBUTES if f.startswith(f"{kind}_")]
     changed = {f for f in fields if np.any(getattr(before, f)[row] != getattr(after, f)[row])}
+    if kind == "geom" and before.geom_type[row] in _OF_FILES:  # compiled numbers hold the file's own frame
+        changed -= _SHAPE
     for together in (_PLACE, _SHAPE):
         if changed & together:
             changed |= together

@@ -45,6 +45,11 @@ _KNOWN = (
     *_NEEDED, "field", "sensor", "servo", "column", "name", "unit", "mean", "low", "mode", "scaling", "floor", "width",
     "nuisance", "group",
 )  # fmt: skip
+# Of these, what an entry of a kind has no use for.
+_USELESS = {
+    "servo": ("element", "column", "mode"), "sensor": ("column", "mode", "name"), _TIME: ("element",),
+    "body_mass": ("column",),
+}  # fmt: skip
 
 
 def load_parameters(path: str | Path, scene: Scene) -> Space:
@@ -84,11 +89,11 @@ def _parameter(scene: Scene, entry: Any, where: str) -> Parameter:
     unknown = [k for k in entry if k not in _KNOWN]
     if wrong := faults({"missing": missing, "unknown": unknown}):
         raise ValueError(f"{where}: {wrong}; known keys: {', '.join(_KNOWN)}")
+    if extra := [k for k in _useless(entry) if k in entry]:
+        raise ValueError(f"{where}: leave {', '.join(extra)} out, which an entry of its kind has no use for")
     try:
         options = _read(entry)
         field, sensor, servo = (options.pop(kind, None) for kind in ("field", "sensor", "servo"))
-        if sensor is not None and "name" in options:
-            raise ValueError("what a sensor sees has the name that the replay looks it up by: leave name out")
         if servo is not None:
             return servo_scale(scene, servo, **options)
         if sensor == _TIME:
@@ -102,6 +107,15 @@ def _parameter(scene: Scene, entry: Any, where: str) -> Parameter:
         return model_parameter(scene, field, element, options.pop("column", None), **{"unit": "", **options})
     except (ValueError, TypeError) as error:
         raise ValueError(f"{where}: {error}") from None
+
+
+def _useless(entry: Mapping[str, Any]) -> tuple[str, ...]:
+    """Keys that an entry of this kind does not have: a sensor's name is the one that the replay looks it up by."""
+    if "servo" in entry:
+        return _USELESS["servo"]
+    if "sensor" in entry:
+        return _USELESS["sensor"] + (_USELESS[_TIME] if entry["sensor"] == _TIME else ())
+    return _USELESS["body_mass"] if entry["field"] == "body_mass" else ()
 
 
 def _read(entry: Mapping[str, Any]) -> dict[str, Any]:

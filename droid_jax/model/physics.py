@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +19,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from mujoco import mjx
+from mujoco.mjx._src import math as mjx_math
 
 from droid_jax.model.ignored import IGNORED
 from droid_jax.model.parameters import Space, Write
@@ -26,6 +28,7 @@ from droid_jax.model.scene import Scene
 # Writing one of these changes what the compiler derives.
 _SOURCES = {"body_mass", "body_inertia", "body_pos", "body_quat", "body_ipos", "body_iquat", "dof_armature",
             "jnt_pos", "jnt_axis"}  # fmt: skip
+_PLACES = {"geom_pos", "geom_quat"}  # of which C keeps whether they are the body's own
 DERIVED = (
     "body_subtreemass",
     "body_invweight0",
@@ -33,10 +36,12 @@ DERIVED = (
     "dof_M0",
     "tendon_length0",
     "tendon_invweight0",
+    "eq_data",
     "stat",
 )
 # Writes set one component of these at a time; a compiler, and engines in their own ways, make them unit vectors.
-_UNIT = ("body_quat", "body_iquat", "geom_quat", "site_quat", "jnt_axis")
+UNIT = ("body_quat", "body_iquat", "geom_quat", "site_quat", "jnt_axis")
+_AUTOMATIC = 11  # column of MjModel.eq_data that is 1 where the compiler worked a weld's pose out
 _SLIDES_ONLY = 2  # MjModel.body_simple of a body whose inertia is its mass alone
 
 
@@ -102,7 +107,7 @@ def make_physics(scene: Scene, space: Space, values: jax.Array) -> Physics:
             new[w.index] = w.new(new.get(w.index, nominal[w.index]), values[column])
         index = tuple(np.array(axis) for axis in zip(*new, strict=True))
         changed[field] = nominal.at[index].set(jnp.stack(list(new.values())).astype(nominal.dtype))
-    for field in set(_UNIT) & set(changed):
+    for field in set(UNIT) & set(changed):
         changed[field] /= jnp.linalg.norm(changed[field], axis=1, keepdims=True)
     model = model.replace(**changed)
     if _SOURCES & set(by_field):
@@ -115,18 +120,22 @@ def derive(model: Any) -> Any:
     """Recompute what mj_setConst derives from masses, inertias and geometry at the pose qpos0.
 
     body_subtreemass, body_invweight0 [nbody,2], dof_invweight0 [nv], dof_M0 [nv], tendon_length0 and
-    tendon_invweight0 [ntendon], stat.meaninertia and stat.meanmass.  As in C, free and ball joints
-    average over their degrees of freedom, and a lone body on slides counts with its mass alone.
+    tendon_invweight0 [ntendon], eq_data of connected and welded bodies, stat.meaninertia and stat.meanmass.
+    As in C, free and ball joints average over their degrees of freedom, a lone body on slides counts with its
+    mass alone, and dof_M0 alone knows no armature of tendons.
     """
     data = mjx.make_data(model).replace(qpos=model.qpos0)
     data = mjx.kinematics(model, data)
     data = mjx.com_pos(model, data)
     data = mjx.crb(model, data)
-    inertia = mjx.full_m(model, data)
+    inertia = bare = mjx.full_m(model, data)
+    if model.ntendon:
+        data = mjx.tendon_armature(model, mjx.tendon(model, data))
+        inertia = mjx.full_m(model, data)
     inverse = jnp.linalg.inv(inertia)
-    diagonal = jnp.diagonal(inertia)
     subtree = _subtree_mass(model)
-    stat = model.stat.replace(meaninertia=jnp.mean(diagonal), meanmass=subtree[0] / (model.nbody - 1))
+    meaninertia = jnp.mean(jnp.diagonal(inertia))
+    stat = model.stat.replace(meaninertia=meaninertia, meanmass=subtree[0] / (model.nbody - 1))
     slides = model.body_simple == _SLIDES_ONLY
     of_mass = 1.0 / jnp.where(slides, jnp.asarray(model.body_mass), 1.0)
     of_body = jnp.stack([of_mass, jnp.zeros_like(of_mass)], axis=-1)
@@ -136,14 +145,42 @@ def derive(model: Any) -> Any:
         body_subtreemass=subtree,
         body_invweight0=bodies,
         dof_invweight0=jnp.where(slides[model.dof_bodyid], of_mass[model.dof_bodyid], dofs),
-        dof_M0=diagonal,
+        dof_M0=jnp.diagonal(bare),
+        eq_data=_equality_data(model, data),
         stat=stat,
     )
     if model.ntendon:
-        data = mjx.tendon(model, data)
         pull = data._impl.ten_J
         derived.update(tendon_length0=data.ten_length, tendon_invweight0=jnp.einsum("ti,ij,tj->t", pull, inverse, pull))
     return model.replace(**derived)
+
+
+def _equality_data(model: Any, data: Any) -> jax.Array:
+    """eq_data of two bodies as they stand at qpos0: where a connect's anchor is in the second one, and a weld's pose.
+
+    As mj_setConst works it out: a pose that the MJCF states stays.
+    """
+    numbers = jnp.asarray(model.eq_data)
+    between = np.asarray(model.eq_objtype) == mujoco.mjtObj.mjOBJ_BODY
+    kinds = np.asarray(model.eq_type)
+    for kind in (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD):
+        rows = np.flatnonzero(between & (kinds == kind))
+        if not rows.size:
+            continue
+        one, two = np.asarray(model.eq_obj1id)[rows], np.asarray(model.eq_obj2id)[rows]
+        at, turned = data.xpos, data.xmat
+        anchor = numbers[rows, :3]  # in the first body of a connect, in the second of a weld
+        if kind == mujoco.mjtEq.mjEQ_CONNECT:
+            world = at[one] + jnp.einsum("eij,ej->ei", turned[one], anchor)
+            numbers = numbers.at[rows, 3:6].set(jnp.einsum("eji,ej->ei", turned[two], world - at[two]))
+            continue
+        world = at[two] + jnp.einsum("eij,ej->ei", turned[two], anchor)
+        place = jnp.einsum("eji,ej->ei", turned[one], world - at[one])
+        back = data.xquat[one] * jnp.array([1.0, -1.0, -1.0, -1.0])
+        pose = jnp.concatenate([place, jax.vmap(mjx_math.quat_mul)(back, data.xquat[two])], axis=1)
+        own = numbers[rows, _AUTOMATIC, None] > 0
+        numbers = numbers.at[rows, 3:10].set(jnp.where(own, pose, numbers[rows, 3:10]))
+    return numbers
 
 
 def _ancestors(model: Any) -> np.ndarray:
@@ -194,14 +231,42 @@ def make_c_model(scene: Scene, space: Space, values: np.ndarray) -> mujoco.MjMod
         array = getattr(model, write.field)
         array[write.index] = write.new(array[write.index], float(values[column]))
     written = {w.field for _, w in model_writes(space)}
-    for array in (getattr(model, field) for field in written.intersection(_UNIT)):
+    for array in (getattr(model, field) for field in written.intersection(UNIT)):
         array /= np.linalg.norm(array, axis=1, keepdims=True)
-    if _SOURCES & written:
-        mujoco.mj_setConst(model, mujoco.MjData(model))
+    if (_SOURCES | _PLACES) & written:
+        data = mujoco.MjData(model)
+        mujoco.mj_setConst(model, data)
         # mj_setConst leaves the statistics alone; the solver scales its tolerance with them.
-        model.stat.meaninertia = model.dof_M0.mean()
+        model.stat.meaninertia = _inertia_of(model, data).mean()
         model.stat.meanmass = model.body_subtreemass[0] / (model.nbody - 1)
+    if (_PLACES | {"geom_size"}) & written:  # boxes around several geoms of a body stay as they were compiled
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
+        _bound(model, {w.index[0] for _, w in model_writes(space) if w.field == "geom_size"})
     return model
+
+
+def _inertia_of(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    """[nv] diagonal of the inertia matrix at qpos0, where mj_setConst left `data`, with armature of tendons."""
+    if not model.tendon_armature.any():
+        return model.dof_M0
+    full = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, full)
+    return np.diagonal(full)
+
+
+def _bound(model: mujoco.MjModel, geoms: Iterable[int]) -> None:
+    """Write the radius and box around geoms of a primitive shape, as the compiler does; a mesh has no own size."""
+    for geom in geoms:
+        x, y, z = model.geom_size[geom]
+        around = {
+            mujoco.mjtGeom.mjGEOM_SPHERE: ((x, x, x), x),
+            mujoco.mjtGeom.mjGEOM_CAPSULE: ((x, x, x + y), x + y),
+            mujoco.mjtGeom.mjGEOM_CYLINDER: ((x, x, y), np.hypot(x, y)),
+            mujoco.mjtGeom.mjGEOM_ELLIPSOID: ((x, y, z), max(x, y, z)),
+            mujoco.mjtGeom.mjGEOM_BOX: ((x, y, z), np.sqrt(x**2 + y**2 + z**2)),
+        }.get(mujoco.mjtGeom(int(model.geom_type[geom])))
+        if around is not None:
+            model.geom_aabb[geom, 3:], model.geom_rbound[geom] = around
 
 
 def theta_of(space: Space, values: np.ndarray) -> dict[str, float]:

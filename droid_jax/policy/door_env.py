@@ -29,6 +29,7 @@ from droid_jax.policy.task import (
     holding,
     observation,
     reward,
+    substeps_of,
     succeeded,
     terms,
 )
@@ -56,15 +57,21 @@ class World(NamedTuple):
 
 
 class DoorEnv(Env):
-    """Opening the built-in door, or another scene with a gripper and a knob.
+    """Opening the built-in door.
 
-    scene: with joint limits enforced.  effects: of the extended model; their parameters are in `sys.theta`, and
-    what they do to torque sensors is not seen by a policy.  sys: `Physics`, the scene's own unless randomised.
+    scene: the built-in one, with joint limits enforced.  effects: of the extended model; their parameters are in
+    `sys.theta`, and what they do to torque sensors is not seen by a policy.  sys: `Physics`, the scene's own unless
+    randomised.
     The hand starts in front of the knob, open, in the arm pose of `plan`.
     """
 
     def __init__(self, scene: Scene, task: Task | None = None, effects: Sequence[Effect] = (), plan: Plan = PLANS["A"]):
         check_stateless(scene)
+        if scene.command_names != (*scene.joints, *scene.finger_joints):
+            raise ValueError(
+                f"commands of a policy are of the arm and then of the fingers, and the actuators of scene "
+                f"{scene.name!r} are {', '.join(scene.command_names)}"
+            )
         self.scene, self.task, self.effects = ready(scene) if effects else scene, task or Task(), tuple(effects)
         self.sys = Physics(self.scene.mjx, {})
         self.start = start_pose(self.scene, self.task, plan)
@@ -72,12 +79,7 @@ class DoorEnv(Env):
         self._hand, self._template = hand_of(self.scene), mjx.make_data(self.scene.mjx)
         self._timestep = float(self.scene.model.opt.timestep)
         self._servo_damping = has_servo_damping(self.scene.model)
-        self._substeps = round(self.task.control / self._timestep)
-        if abs(self._substeps * self._timestep - self.task.control) > 1e-9:
-            raise ValueError(
-                f"the time between actions, {self.task.control:g} s, is no multiple of the scene's time step, "
-                f"{self._timestep:g} s"
-            )
+        self._substeps = substeps_of(self.task.control, self._timestep, "the scene's")
 
     @property
     def observation_size(self) -> int:

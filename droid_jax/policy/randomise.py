@@ -18,7 +18,7 @@ import numpy as np
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.model.fields import element_name
 from droid_jax.model.parameters import Space
-from droid_jax.model.physics import Physics, make_physics, model_writes, written_fields
+from droid_jax.model.physics import UNIT, Physics, make_physics, model_writes, written_fields
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
 
 Randomise = Callable[[Any, jax.Array], tuple[Any, Any]]
@@ -60,8 +60,8 @@ def randomised_model(scene: Scene, gaussian: Gaussian) -> Randomise:
             stacklevel=2,
         )
     written = dict[str, list[tuple[int, ...]]]()
-    for _, write in model_writes(gaussian.space):
-        written.setdefault(write.field, []).append(write.index)
+    for _, write in model_writes(gaussian.space):  # of a unit vector all that was scaled with what is written
+        written.setdefault(write.field, []).append(write.index[: 1 if write.field in UNIT else None])
 
     def randomise(model: Any, rng: jax.Array) -> tuple[Any, Any]:
         geoms = _geoms_among(scene, model, fields)

@@ -50,6 +50,16 @@ class Task:
     standoff: float = 0.05
 
 
+def substeps_of(control: float, timestep: float, whose: str) -> int:
+    """Time steps [s] between two actions [s]; ValueError where that is no whole number."""
+    steps = round(control / timestep)
+    if steps < 1 or abs(steps * timestep - control) > 1e-9:
+        raise ValueError(
+            f"the time between actions, {control:g} s, is no multiple of {whose} time step, {timestep:g} s"
+        )
+    return steps
+
+
 class Seen(NamedTuple):
     """Hand and knob at one instant.
 

@@ -23,7 +23,7 @@ from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene
 from droid_jax.policy.control import Controller, Policy, Reading
 from droid_jax.policy.hand import finger_forces_c, hand_of, looked
-from droid_jax.policy.task import Task, gripped, holding, succeeded
+from droid_jax.policy.task import Task, gripped, holding, substeps_of, succeeded
 from droid_jax.policy.trials import BLOWN_UP, Trials
 
 TRIAL = 4  # a stream of its own: those of the hidden errors are [seed, 1] to [seed, 3]
@@ -80,6 +80,7 @@ def stand_in(
     check_playable(scene, hidden)
     if hidden:
         config = replace(config, timestep=min(config.timestep, LONGEST_STEP))
+    substeps_of(task.control, config.timestep, "the stand-in robot's")
     space = door_space(scene) + door_nuisances(scene)
     model = make_c_model(scene, space, space.values(dict(truth)))
     own = replace(scene, model=own_engine(model, config.timestep))
@@ -142,7 +143,7 @@ def _trial(
     data.qpos[:] = robot.start
     data.qpos[scene.joint_qpos] += rng.normal(0.0, task.spread, len(scene.joints))
     mujoco.mj_forward(model, data)
-    advance = _advancer(model, data, influences, round(task.control / config.timestep))
+    advance = _advancer(model, data, influences, substeps_of(task.control, config.timestep, "the stand-in robot's"))
     sense = _senses(scene, data, config, rng)
     seen = looked(hand, data, finger_forces_c(hand, model, data), np.zeros((2, 3)), task.control, np)
     loop = Controller(policy)

@@ -162,14 +162,15 @@ def test_an_inertia_that_no_body_can_have_is_said():
         fitted_mjcf(scene, space, space.mean)
 
 
+# of a box whose corners go through z first, then y, then x
+FACES = "f 1 2 4\nf 1 4 3\nf 5 8 6\nf 5 7 8\nf 1 6 2\nf 1 5 6\nf 3 4 8\nf 3 8 7\nf 1 3 7\nf 1 7 5\nf 2 6 8\nf 2 8 4\n"
+
+
 def test_meshes_are_found_from_any_folder(tmp_path: Path):
     """meshdir is relative to the file that was read; what is written lies elsewhere."""
     (tmp_path / "robot" / "parts").mkdir(parents=True)
     corners = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1))
-    faces = (
-        "f 1 2 4\nf 1 4 3\nf 5 8 6\nf 5 7 8\nf 1 6 2\nf 1 5 6\nf 3 4 8\nf 3 8 7\nf 1 3 7\nf 1 7 5\nf 2 6 8\nf 2 8 4\n"
-    )
-    (tmp_path / "robot" / "parts" / "cube.obj").write_text(corners + faces)
+    (tmp_path / "robot" / "parts" / "cube.obj").write_text(corners + FACES)
     (tmp_path / "robot" / "robot.xml").write_text(
         """<mujoco><compiler meshdir="parts"/><asset><mesh name="cube" file="cube.obj" scale=".1 .1 .1"/></asset>
         <worldbody><body name="arm"><joint name="swing" axis="0 1 0" damping="1"/><geom type="mesh" mesh="cube"/></body>
@@ -217,3 +218,36 @@ def test_what_a_compiler_works_out_from_masses_stays_as_it_was_replayed(changes:
     assert expected.body_mass[1] == values["arm_mass"]
     for field in (*FIELDS, "actuator_gainprm", "actuator_biasprm"):
         np.testing.assert_allclose(getattr(written, field), getattr(expected, field), rtol=1e-3, atol=1e-6)
+
+
+def test_the_shape_of_a_mesh_stays_as_the_file_has_it(tmp_path: Path):
+    """Its compiled place holds the mesh's own frame: written, it would be applied twice."""
+    corners = [(x, y, z) for x in (0, 2) for y in (0, 1) for z in (0, 3)]
+    (tmp_path / "brick.obj").write_text("".join(f"v {x} {y} {z}\n" for x, y, z in corners) + FACES)
+    (tmp_path / "arm.xml").write_text(
+        """<mujoco><asset><mesh name="brick" file="brick.obj" scale=".1 .1 .1"/></asset>
+        <worldbody><body name="arm"><joint name="swing" axis="0 1 0"/>
+        <geom name="bone" type="mesh" mesh="brick" euler="10 0 0"/></body></worldbody>
+        <actuator><motor joint="swing"/></actuator></mujoco>"""
+    )
+    scene = load_scene(tmp_path / "arm.xml")
+    space = one(scene, "geom_pos", (scene.id("geom", "bone"), 2), 0.2)
+    assert unwritten(scene, space) == ("geom_pos",)
+    written = mujoco.MjModel.from_xml_string(fitted_mjcf(scene, space, space.mean))
+    np.testing.assert_allclose(written.geom_pos, scene.model.geom_pos, atol=1e-6)
+    np.testing.assert_allclose(written.geom_quat, scene.model.geom_quat, atol=1e-6)
+
+
+def test_a_tendon_rests_at_the_length_that_it_was_replayed_with():
+    """Without a stated length it is the one at qpos0, which a moved body changes."""
+    xml = """<mujoco><worldbody><site name="wall" pos="0 0 1"/>
+      <body name="arm" pos="0 0 .2"><joint name="swing" axis="0 1 0"/><geom size=".05" pos="0 0 .3" mass="1"/>
+      <site name="tip" pos=".1 0 .2"/></body></worldbody>
+      <tendon><spatial stiffness="9"><site site="wall"/><site site="tip"/></spatial></tendon>
+      <actuator><motor joint="swing"/></actuator></mujoco>"""
+    scene = compile_scene(mujoco.MjSpec.from_string(xml), "strung")
+    space = one(scene, "body_pos", (1, 2), 0.3)
+    expected = make_c_model(scene, space, space.mean)
+    written = mujoco.MjModel.from_xml_string(fitted_mjcf(scene, space, space.mean))
+    assert abs(written.tendon_length0[0] - expected.tendon_lengthspring[0, 0]) > 0.05
+    np.testing.assert_allclose(written.tendon_lengthspring, expected.tendon_lengthspring, rtol=1e-4)

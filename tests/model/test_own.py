@@ -79,6 +79,10 @@ def test_a_servos_gain_and_the_commands_delay_have_no_element(tmp_path: Path, sc
         ({"sensor": "time_offset", "std": 0.05}, "missing high"),
         ({"sensor": "time_offset", "std": 0.05, "high": 1.0, "name": "lag"}, "leave name out"),
         ({"sensor": "coulomb", "element": "elbow", "std": 0.5, "high": 5, "name": "dry"}, "leave name out"),
+        ({"servo": "elbow", "std": 0.05, "column": 0}, "leave column out"),
+        ({"servo": "elbow", "std": 0.05, "element": "elbow", "mode": "set"}, "leave element, mode out"),
+        ({"sensor": "coulomb", "element": "elbow", "std": 0.5, "high": 5, "mode": "scale"}, "leave mode out"),
+        ({"field": "body_mass", "element": "arm", "std": 0.5, "high": 5, "column": 0}, "leave column out"),
     ):
         with pytest.raises(ValueError, match=says):
             loaded(tmp_path, scene, entry)

@@ -129,7 +129,7 @@ def test_the_oracle_really_changes_the_model(scene: Scene, space: Space, vectors
     """The comparison above would pass on two unchanged models: every declared field differs here."""
     nominal, compiled = float_fields(scene.model), float_fields(edited(scene, space, vectors[0]))
     for name in written_fields(space):
-        if name in ("stat", "tendon_length0", "tendon_invweight0"):
+        if name in ("stat", "tendon_length0", "tendon_invweight0", "eq_data"):
             continue
         assert np.abs(compiled[name] - nominal[name]).max() > 0, name
     assert compiled["stat.meaninertia"] != nominal["stat.meaninertia"]
@@ -249,10 +249,21 @@ MECHANISMS = {
       <geom size=".1 .2 .3" type="box" pos=".3 .1 0" mass="2"/><site name="sa" pos=".2 0 .1"/>
       <body name="b" pos=".3 0 0"><joint axis="0 1 1" name="b"/><geom size=".05 .2" type="capsule" mass="1"/>
       <site name="sb" pos=".2 0 .1"/></body></body></worldbody>
-      <tendon><fixed><joint joint="a" coef=".7"/><joint joint="b" coef="-1.2"/></fixed>
+      <tendon><fixed armature="3"><joint joint="a" coef=".7"/><joint joint="b" coef="-1.2"/></fixed>
       <spatial><site site="sa"/><site site="sb"/></spatial></tendon><worldbody>""",
+    "connected and welded": """<body name="a" pos="0 0 1" euler="0 10 0"><joint axis="0 1 0"/>
+      <geom size=".1 .2 .3" type="box" pos=".3 .1 0" mass="2"/>
+      <body name="b" pos=".3 0 .2" euler="20 0 30"><joint type="ball"/>
+      <geom size=".05 .2" type="capsule" mass="1"/></body></body>
+      <body name="c" pos=".1 .2 .3"><freejoint/><geom size=".1" mass="1"/></body></worldbody>
+      <equality><connect body1="a" body2="b" anchor=".1 .02 .03"/><weld body1="b" body2="c"/><connect body1="b"
+      anchor=".1 0 0"/><weld body1="a" body2="b" anchor=".1 .02 .03"/>
+      <weld body1="a" body2="c" relpose=".4 .1 .1 1 0 0 0"/></equality><worldbody>""",
 }
-DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "tendon_length0", "tendon_invweight0")
+DERIVED = (
+    *("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0"),
+    *("tendon_length0", "tendon_invweight0", "eq_data"),
+)
 
 
 def compiled(name: str, *, scale: float = 1.0, move: float = 0.0) -> mujoco.MjModel:
@@ -272,12 +283,59 @@ def test_derived_quantities_equal_the_compiler(name: str):
     changed.body_mass[:] *= 2.5
     changed.body_inertia[:] *= 2.5
     changed.body_pos[1:, 1] += 0.07
+    free = changed.jnt_type == mujoco.mjtJoint.mjJNT_FREE
+    changed.qpos0[changed.jnt_qposadr[free] + 1] += 0.07  # where the compiler lets such a body begin
     model = derive(mjx.put_model(changed))
     for field in DERIVED:
         # float32 inverse of an inertia matrix of a few rows
         np.testing.assert_allclose(getattr(model, field), getattr(target, field), rtol=2e-4, atol=1e-5, err_msg=field)
     assert float(model.stat.meaninertia) == pytest.approx(target.stat.meaninertia, rel=1e-5)
     assert float(model.stat.meanmass) == pytest.approx(target.stat.meanmass, rel=1e-5)
+
+
+def heavier(name: str) -> tuple[Scene, Space]:
+    """A mechanism and the mass of its first body."""
+    spec = mujoco.MjSpec.from_string(f"<mujoco><worldbody>{MECHANISMS[name]}</worldbody></mujoco>")
+    spec.add_actuator(name="drive", trntype=mujoco.mjtTrn.mjTRN_JOINT, target="a")
+    scene = compile_scene(spec, "mechanism", joints=["a"])
+    return scene, Space((body_mass(scene, "a", std=1.0, high=9.0),))
+
+
+def test_the_c_twin_knows_the_armature_of_tendons():
+    """A mass at its nominal value changes nothing."""
+    scene, space = heavier("tendons")
+    assert scene.model.stat.meaninertia > 1.5  # mostly the tendon's
+    same = make_c_model(scene, space, space.mean)
+    assert same.stat.meaninertia == pytest.approx(scene.model.stat.meaninertia, rel=1e-9)
+
+
+def rests(xml: str, field: str, column: int, value: float) -> tuple[float, float, float]:
+    """m, height at which a body stays: in the C twin, in MJX and as the compiled model with that number has it."""
+    scene = compile_scene(mujoco.MjSpec.from_string(xml), "fall", joints=["z"])
+    space = Space((model_parameter(scene, field, "ball", column, unit="m", std=0.1, low=-1.0, high=1.0),))
+    spec = mujoco.MjSpec.from_string(xml)
+    attribute = list(getattr(spec.geom("ball"), field.removeprefix("geom_")))
+    attribute[column] = value
+    setattr(spec.geom("ball"), field.removeprefix("geom_"), attribute)
+    heights = []
+    for model in (make_c_model(scene, space, np.array([value])), spec.compile()):
+        data = mujoco.MjData(model)
+        while data.time < 1.5:
+            mujoco.mj_step(model, data)
+        heights.append(float(data.qpos[0]))
+    model = make_physics(scene, space, jnp.asarray([value], jnp.float32)).model
+    data = jax.jit(lambda d: jax.lax.fori_loop(0, 750, lambda _, d: mjx.step(model, d), d))(mjx.make_data(model))
+    return heights[0], float(data.qpos[0]), heights[1]
+
+
+@pytest.mark.parametrize(("field", "column", "value"), [("geom_pos", 2, -0.1), ("geom_size", 0, 0.15)])
+def test_a_geom_that_was_moved_or_grew_touches_in_both_engines(field: str, column: int, value: float):
+    xml = """<mujoco><worldbody><geom type="plane" size="5 5 1"/><body pos="0 0 .3"><joint name="z" type="slide"
+      damping="30" axis="0 0 1"/><geom name="ball" size=".05" mass="1"/></body></worldbody>
+      <actuator><motor joint="z"/></actuator></mujoco>"""
+    twin, mjx_, compiled_ = rests(xml, field, column, value)
+    assert compiled_ > -0.2  # 0.05 would lie at -0.25
+    np.testing.assert_allclose([twin, mjx_], compiled_, atol=1e-3)
 
 
 def test_a_moved_joint_axis_is_derived_too():
@@ -330,6 +388,16 @@ def test_parameters_of_one_entry_act_one_after_the_other():
     np.testing.assert_allclose(in_mjx.actuator_gainprm[2, 0], expected, rtol=1e-6)
     np.testing.assert_allclose(in_c.actuator_gainprm[2, 0], expected, rtol=1e-12)
     np.testing.assert_allclose(in_c.actuator_biasprm[2, 1], -expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("flag", ["spring", "damper"])
+def test_a_flag_that_mjx_takes_for_both_is_refused(flag: str):
+    xml = f"""<mujoco><option><flag {flag}="disable"/></option><worldbody><body><joint name="j" damping="1"/>
+      <geom size=".1"/></body></worldbody><actuator><motor joint="j"/></actuator></mujoco>"""
+    with pytest.raises(ValueError, match="springs without dampers, or the other way round"):
+        compile_scene(mujoco.MjSpec.from_string(xml), "flagged")
+    both = xml.replace(f'{flag}="disable"', 'spring="disable" damper="disable"')
+    compile_scene(mujoco.MjSpec.from_string(both), "flagged")
 
 
 def test_what_mjx_would_leave_out_is_refused(scene: Scene):

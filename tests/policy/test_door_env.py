@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import mujoco
 import numpy as np
@@ -152,3 +154,11 @@ def test_effects_of_an_extended_model_act_here_too(env: DoorEnv):
 def test_a_time_step_that_does_not_fit_is_refused():
     with pytest.raises(ValueError, match=r"0\.02 s, is no multiple of the scene's time step, 0\.003 s"):
         DoorEnv(door_scene(timestep=0.003, limits=True), TASK)
+
+
+def test_other_actuators_than_the_policys_are_refused():
+    """Fingers before the arm: joint angles would become the fingers' commands."""
+    scene = door_scene(limits=True)
+    turned = dataclasses.replace(scene, command_names=(*scene.finger_joints, *scene.joints))
+    with pytest.raises(ValueError, match=r"of the arm and then of the fingers, and the actuators .* are panda_finger"):
+        DoorEnv(turned, TASK)

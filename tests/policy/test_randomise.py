@@ -19,7 +19,7 @@ from droid_jax.identify.gaussian import Gaussian, load, prior
 from droid_jax.model.door import door_space
 from droid_jax.model.door_scene import door_scene
 from droid_jax.model.effects.registry import effect_space, library
-from droid_jax.model.fields import body_mass, joint_damping, joint_frictionloss, model_parameter
+from droid_jax.model.fields import body_mass, body_yaw, joint_damping, joint_frictionloss, model_parameter
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import Physics, make_physics, written_fields
 from droid_jax.model.scene import compile_scene, load_scene
@@ -237,3 +237,17 @@ def test_a_gaussian_of_a_scene_of_the_same_shapes_is_refused_by_its_names(tmp_pa
     randomised(scenes["elbow"], kept)
     with pytest.raises(ValueError, match=r"of 'elbow', but in 'wrist' that entry is of 'wrist'.*another scene"):
         randomised(scenes["wrist"], kept)
+
+
+def test_unit_vectors_stay_whole_in_an_environments_model(keys):
+    """What was scaled beside the number that is written belongs to it."""
+    xml = """<mujoco><worldbody><body name="arm" pos="0 0 1"><joint name="a" axis="0 1 0"/><geom size=".1"/>
+      </body></worldbody></mujoco>"""
+    scene = compile_scene(mujoco.MjSpec.from_string(xml), "one", joints=("a",))
+    axis = model_parameter(scene, "jnt_axis", "a", 0, unit="-", std=0.3, low=-1.0, high=1.0)
+    gaussian = prior(Space((body_yaw(scene, "arm", std=0.3, limit=1.0), axis)))
+    model, _ = randomised_model(scene, gaussian)(mjx.put_model(mujoco.MjModel.from_xml_string(xml)), keys)
+    drawn, _ = randomised(scene, gaussian)(Physics(scene.mjx, {}), keys)
+    for field in ("body_quat", "jnt_axis"):
+        np.testing.assert_allclose(np.linalg.norm(getattr(model, field)[:, -1], axis=-1), 1.0, rtol=1e-6)
+        np.testing.assert_array_equal(getattr(model, field), getattr(drawn.model, field))

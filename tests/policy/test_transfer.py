@@ -198,3 +198,10 @@ def test_the_sensors_are_as_noisy_as_they_say(scene):
         np.testing.assert_array_equal(knobs, knobs[:1].repeat(3, axis=0))
         seen.append(knobs[0] - data.site("knob").xpos)
     assert np.std(seen) == pytest.approx(3e-3, rel=0.25) and abs(np.mean(seen)) < 1e-3
+
+
+def test_a_time_step_that_divides_no_action_is_refused():
+    scene = door_scene(limits=True)
+    for timestep in (0.0003, 0.05):
+        with pytest.raises(ValueError, match=f"is no multiple of the stand-in robot's time step, {timestep:g} s"):
+            stand_in(scene, np.zeros(scene.model.nq), {}, config=TransferConfig(trials=1, timestep=timestep))
