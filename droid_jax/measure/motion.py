@@ -109,7 +109,7 @@ def _check_alike(name: str, joints: Sequence[str], values: np.ma.MaskedArray, co
     apart = np.sqrt(((values - common) ** 2).mean(axis=1).filled(0.0))  # [N, J]
     travel = np.ptp(values, axis=1).max(axis=0).filled(0.0)  # [J]
     excess = apart - np.maximum(ALIKE * travel, STILL)
-    repeat, joint = np.unravel_index(int(np.argmax(excess)), excess.shape)
+    repeat, joint = (int(i) for i in np.unravel_index(int(np.argmax(excess)), excess.shape))
     if excess[repeat, joint] > 0:
         raise ValueError(
             f"recording {name!r} holds no commands, and repeat {repeat} is another motion than their mean: "

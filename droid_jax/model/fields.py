@@ -115,7 +115,7 @@ def model_parameter(
         _check_whole_servo(scene, element, first)
     own = write(scene, field, index, mode)
     if mean is None:
-        mean = own.neutral(np.asarray(getattr(scene.model, field))[index])
+        mean = float(own.neutral(np.asarray(getattr(scene.model, field))[index]))
     return Parameter(
         name or f"{element}_{field.split('_', 1)[1]}",
         unit,
