@@ -10,6 +10,7 @@ import base64
 import io
 import itertools
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import cast
 
@@ -34,9 +35,7 @@ def settled(figure: Figure) -> Figure:
         _read_as_written(figure)
         figure.draw_without_rendering()
         if crowded := [axes for axes in figure.axes if _overlap(axes)]:
-            for axes in crowded:
-                for text in axes.get_xticklabels():
-                    text.set(rotation=60, ha="right", rotation_mode="anchor")
+            _turn_names(figure, crowded)
             figure.draw_without_rendering()
     figure.set_layout_engine("none")
     return figure
@@ -49,6 +48,21 @@ def _read_as_written(figure: Figure) -> None:
     for text in figure.findobj(Text):
         if id(text) not in powers:
             cast(Text, text).set_parse_math(False)
+
+
+def _turn_names(figure: Figure, crowded: Sequence[Axes]) -> None:
+    """Turn the names below these panels; the figure grows by what they then need below each row of panels."""
+    needed: dict[int, float] = {}
+    for axes in crowded:
+        texts = axes.get_xticklabels()
+        flat = max(text.get_window_extent().height for text in texts)
+        for text in texts:
+            text.set(rotation=60, ha="right", rotation_mode="anchor")
+        place = axes.get_subplotspec()
+        row = place.rowspan.start if place else 0
+        more = max(text.get_window_extent().height for text in texts) - flat
+        needed[row] = max(needed.get(row, 0.0), more / figure.dpi)
+    figure.set_figheight(figure.get_figheight() + sum(needed.values()))
 
 
 def _overlap(axes: Axes) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any
@@ -79,8 +80,9 @@ def gap_per_joint(
     elif floor is not None:
         axes.axhline(floor, color=MEASURED, linestyle=(0, (3, 2)), linewidth=1.1, label="floor (repeats), all joints")
     names = [label(j) for j in joints]
-    axes.set_xticks(x, names if width > 6 else [n.removeprefix("Joint ") for n in names])
-    axes.set_xlabel("" if width > 6 else "Joint")
+    numbered = width <= 6 and all(re.fullmatch(r"Joint \d+", name) for name in names)
+    axes.set_xticks(x, [name.removeprefix("Joint ") for name in names] if numbered else names)
+    axes.set_xlabel("Joint" if numbered else "")
     axes.set_ylabel(f"RMS torque difference [{unit}]" if width > 6 else f"RMS difference [{unit}]")
     axes.grid(axis="x", visible=False)
     legend(figure, axes, width, columns=3)

@@ -182,6 +182,9 @@ def test_names_with_dollars_are_written_as_they_are() -> None:
 def test_names_below_an_axis_do_not_overlap(names: list[str], width: float) -> None:
     gaps = np.ones(len(names))
     figure = settled(torque_figures.gap_per_joint(names, gaps, gaps, None, width=width))
+    short = settled(torque_figures.gap_per_joint(["a"], [1.0], [1.0], None, width=width))
+    heights = [f.axes[0].get_window_extent().height for f in (figure, short)]
+    assert heights[0] > 0.9 * heights[1]  # the names take nothing from the panel
     texts = figure.axes[0].get_xticklabels()
     if texts[0].get_rotation():  # turned, they lie side by side where their lines do not touch
         starts = np.diff([text.get_window_extent().x1 for text in texts])
