@@ -347,7 +347,6 @@ def test_options_of_stages_that_are_left_out_are_refused(called, refused):
     for option in (("--hide", "not_an_effect=9"), ("--springs", "2")):
         said = refused("all", "--stages", "train", "evaluate", *option)
         assert f"{option[0]} is for the stages identify and gap" in said and "evaluate RUN" in said
-    assert "is for the stages gap, and" in refused("all", "--stages", "identify", "--effect-scale", "3")
     assert called == []
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -164,7 +164,7 @@ def run(command: Identify) -> None:
         )  # fmt: skip
     draw(out, scene)
     report.run(report.Report(out))
-    _summary(found, json.loads((out / "fit.json").read_text()))
+    _summary(found, json.loads((out / "fit.json").read_text()), [r.repeats for r in recordings])
 
 
 def model_of(command: Identify) -> tuple[Scene, Space, Space | None]:
@@ -262,8 +262,8 @@ def _recordings(
     return list(kept_recordings(paths, command.again, recorded).values()), truth, {}
 
 
-def _summary(found: Identified, fit: Mapping[str, Any]) -> None:
-    """A few lines that say how it went; fit: of fit.json."""
+def _summary(found: Identified, fit: Mapping[str, Any], repeats: Sequence[int]) -> None:
+    """A few lines that say how it went; fit: of fit.json; repeats: of each recording."""
     from droid_jax.report.words import DOUBT, asked_of, far_off, judged, lacks_something, needed, noiseless, percent
 
     for name, gap in found.gaps.items():
@@ -282,7 +282,9 @@ def _summary(found: Identified, fit: Mapping[str, Any]) -> None:
     if far_off(fit):
         print(f"the fit stays far from the data: {DOUBT}")
     if lacks_something(fit):
-        takes = needed([recording.repeats for recording in found.recordings])
-        print(f"what is left is well above noise: `python -m droid_jax.run gap` looks for what the model lacks{takes}")
+        print(
+            "what is left is well above noise: `python -m droid_jax.run gap` looks for what the model lacks"
+            + needed(repeats)
+        )
     elif noiseless(fit):
         print(f"one repeat does not tell noise from what the model lacks: {asked_of(fit)}")

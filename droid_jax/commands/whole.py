@@ -128,14 +128,13 @@ def run(command: All) -> None:
 
 
 def _needs_stages(command: All) -> None:
-    """ValueError for options of stages that were not asked for, which would change nothing."""
-    of = {"hide": IN_A_SCENE, "springs": IN_A_SCENE, "effect_scale": ("gap",)}
-    given = [name for name in of if getattr(command, name) != All.__dataclass_fields__[name].default]
-    for name in given:
-        if not {*of[name]} & {*command.stages}:
-            option, stages = f"--{name.replace('_', '-')}", " and ".join(of[name])
-            robot = "" if name == "effect_scale" else "; `evaluate RUN --springs ... --hide ...` tries another robot"
-            raise ValueError(f"{option} is for the stages {stages}, and --stages leaves them out{robot}")
+    """ValueError for options of the stand-in robot where no stage records one: they would change nothing."""
+    given = [name for name in ("hide", "springs") if getattr(command, name) is not None]
+    if given and not {*IN_A_SCENE} & {*command.stages}:
+        raise ValueError(
+            f"--{given[0]} is for the stages identify and gap, and --stages leaves them out; "
+            "`evaluate RUN --springs ... --hide ...` tries another robot"
+        )
 
 
 def _remember(command: All, out: Path) -> None:

@@ -234,7 +234,8 @@ def followed(scene: Scene, recording: Recording, config: CompareConfig) -> Drive
         return make_drive(scene, recording, weigh="torque" in config.channels)
     if not scene.joints:
         raise ValueError(f"no joint of scene {scene.name!r} is driven: name the measured ones (--joints)")
-    return measured_motion(recording, prescribed(scene, recording), cutoff=config.motion_cutoff)
+    felt = (*scene.joints, *scene.carriers(scene.joints))  # by the torques that are compared
+    return measured_motion(recording, prescribed(scene, recording), cutoff=config.motion_cutoff, alike=felt)
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,9 +291,10 @@ def _same(scene: Scene, new: Drive | Motion, old: Drive | Motion) -> bool:
     """
     if new.torque != old.torque:
         return False
+    if isinstance(new, Motion) and isinstance(old, Motion):
+        return new.joints == old.joints and np.array_equal(new.time, old.time)
     if isinstance(new, Motion) or isinstance(old, Motion):
-        both = isinstance(new, Motion) and isinstance(old, Motion)
-        return both and new.joints == old.joints and np.array_equal(new.time, old.time)
+        return False
     apart = np.full(scene.model.nq, SCATTER)
     if scene.object_joint and scene.object_joint not in scene.joints:
         hinge = scene.qpos(scene.object_joint)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, replace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -148,11 +149,16 @@ def _same_filter(
     kernel [K, Tc]; mask [N, Tc, C]; kept [N, K, C], the outputs that enter the mean; resampling [Tc, T].
     """
     if mask.all():
-        return (kernel @ resampling).toarray()[None]
+        return _dense(kernel @ resampling)[None]
     columns = list(zip(mask.transpose(2, 0, 1), kept.transpose(2, 0, 1), strict=True))
     if all(np.array_equal(m, columns[0][0]) and np.array_equal(k, columns[0][1]) for m, k in columns):
         columns = columns[:1]  # a log that was silent for a while was so in all of them
-    return np.stack([(_mean_filter(kernel, *column) @ resampling).toarray() for column in columns])
+    return np.stack([_dense(_mean_filter(kernel, *column) @ resampling) for column in columns])
+
+
+def _dense(matrix: Any) -> np.ndarray:
+    """A sparse array written out; scipy's types say that a product of two may be dense."""
+    return matrix.toarray()
 
 
 def _mean_filter(kernel: sparse.csr_array, mask: np.ndarray, kept: np.ndarray) -> sparse.csr_array:

@@ -28,7 +28,8 @@ FIELDS = {
 class Track:
     """One topic of one bag: bag and header stamps [M] ns, and values [M, J] by field.
 
-    A field that the messages leave empty is absent.  Header stamps are None without headers.
+    A field that all messages leave empty is absent; where some do, their rows are NaN.  Header stamps are None without
+    headers.
     Stamps stay integers: nanoseconds since 1970 do not fit a float64.
     numbers: [M] which message of the topic each row is of; a trajectory has several.
     """
@@ -87,20 +88,7 @@ def _read_topic(reader: AnyReader, bag: Path, topic: str, joints: tuple[str, ...
         raise ValueError(f"{bag}, topic {topic!r}, message {without[0]}: holds no {needed}, as others of the topic do")
     bare = np.full(len(joints), np.nan)  # a field that only some messages leave empty was not measured there
     fields = {key: np.array([row.get(key, bare) for row in rows]) for key in {k: None for row in rows for k in row}}
-    _check_trajectories(received, numbers, f"{bag}, topic {topic!r}")
     return Track(np.array(received, dtype=np.int64), _header_stamps(stamped), fields, tuple(numbers))
-
-
-def _check_trajectories(received: Sequence[int], numbers: Sequence[int], where: str) -> None:
-    """ValueError where a message of several points, times received [M] ns, was still running when the next one came."""
-    for row in range(2, len(numbers)):
-        several = numbers[row - 1] == numbers[row - 2]
-        if several and numbers[row] != numbers[row - 1] and received[row] <= received[row - 1]:
-            raise ValueError(
-                f"{where}, message {numbers[row]}: begins before the trajectory of message {numbers[row - 1]} has "
-                "ended, and what the controller made of both is not in this topic: read its state, "
-                "--command-topic .../controller_state (JointTrajectoryControllerState)"
-            )
 
 
 def _header_stamp(message: Any, offset: int) -> int | None:

@@ -41,13 +41,16 @@ class Motion:
         return float(self.time[-1] - self.time[0]) / (len(self.time) - 1)
 
 
-def measured_motion(recording: Recording, joints: Sequence[str], *, cutoff: float = CUTOFF) -> Motion:
+def measured_motion(
+    recording: Recording, joints: Sequence[str], *, cutoff: float = CUTOFF, alike: Sequence[str] | None = None
+) -> Motion:
     """The motion of `joints` in a recording: the mean of the repeats' positions, smoothed and differentiated.
 
     A repeat that was not measured for a while keeps its distance from the others there (see `_common`).
     The position passes a zero-phase Butterworth filter of order 4 at `cutoff` Hz; velocity and acceleration are those
     of the quintic spline through it; measured velocities are not used.  EDGE s at both ends are left out.
     A clock that jitters is made regular first, along a cubic spline.
+    alike: joints of which all repeats must be one motion; None: all.
     Raises ValueError where a joint's position was not measured throughout, the log is too slow for
     the cutoff (in one long step too), or too short.
     """
@@ -73,7 +76,9 @@ def measured_motion(recording: Recording, joints: Sequence[str], *, cutoff: floa
             f"give --motion-cutoff (CompareConfig.motion_cutoff) below {rate / 2.5:.3g} Hz"
         )
     position = _common(channel.values[:, :, columns], mask)
-    _check_alike(recording.name, joints, np.ma.masked_array(channel.values[:, :, columns], ~mask), position)
+    judged = [i for i, joint in enumerate(joints) if alike is None or joint in alike]
+    measured = np.ma.masked_array(channel.values[:, :, columns], ~mask)[:, :, judged]
+    _check_alike(recording.name, [joints[i] for i in judged], measured, position[:, judged])
     position = _regular(recording.name, channel.time, position, cutoff)
     even = np.linspace(channel.time[0], channel.time[-1], len(channel.time))
     clock = _inner_clock(recording.name, channel.time, OVERSAMPLING * cutoff)

@@ -165,12 +165,25 @@ def _timed(
     for topic, track in tracks.items():
         time = 1e-9 * (stamps(track) - start)
         where = f"{bag}, topic {topic!r} ({'header' if use_header else 'bag'} stamps)"
+        _check_trajectories(time, track.numbers, where)
         # Commands may pause while the robot holds still, or be waypoints seconds apart: their rate is not checked.
         state = topic == state_topic
         jitter = allow_jitter or not state
         check_clock(time, where, allow_jitter=jitter, seconds=state, label=lambda i, n=track.numbers: f"message {n[i]}")
         timed[topic] = (time, track.fields)
     return timed
+
+
+def _check_trajectories(time: np.ndarray, numbers: Sequence[int], where: str) -> None:
+    """ValueError where a message of several points, at times [M] s, was still running when the next one began."""
+    for row in range(2, len(numbers)):
+        several = numbers[row - 1] == numbers[row - 2]
+        if several and numbers[row] != numbers[row - 1] and time[row] <= time[row - 1]:
+            raise ValueError(
+                f"{where}, message {numbers[row]}: begins before the trajectory of message {numbers[row - 1]} has "
+                "ended, and what the controller made of both is not in this topic: read its state, "
+                "--command-topic .../controller_state (JointTrajectoryControllerState)"
+            )
 
 
 def _clock(states: Sequence[_Timed], rate: float | None, bags: Sequence[Path]) -> np.ndarray:

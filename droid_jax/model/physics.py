@@ -161,12 +161,7 @@ def _equality_data(model: Any, data: Any) -> jax.Array:
     As mj_setConst works it out: a pose that the MJCF states stays.
     """
     numbers = jnp.asarray(model.eq_data)
-    between = np.asarray(model.eq_objtype) == mujoco.mjtObj.mjOBJ_BODY
-    kinds = np.asarray(model.eq_type)
-    for kind in (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD):
-        rows = np.flatnonzero(between & (kinds == kind))
-        if not rows.size:
-            continue
+    for kind, rows in joined_bodies(model).items():
         one, two = np.asarray(model.eq_obj1id)[rows], np.asarray(model.eq_obj2id)[rows]
         at, turned = data.xpos, data.xmat
         anchor = numbers[rows, :3]  # in the first body of a connect, in the second of a weld
@@ -179,8 +174,19 @@ def _equality_data(model: Any, data: Any) -> jax.Array:
         back = data.xquat[one] * jnp.array([1.0, -1.0, -1.0, -1.0])
         pose = jnp.concatenate([place, jax.vmap(mjx_math.quat_mul)(back, data.xquat[two])], axis=1)
         own = numbers[rows, _AUTOMATIC, None] > 0
-        numbers = numbers.at[rows, 3:10].set(jnp.where(own, pose, numbers[rows, 3:10]))
+        numbers = numbers.at[rows, POSE].set(jnp.where(own, pose, numbers[rows, POSE]))
     return numbers
+
+
+POSE = slice(3, 10)  # columns of eq_data that follow from where two joined bodies stand
+
+
+def joined_bodies(model: Any) -> dict[mujoco.mjtEq, np.ndarray]:
+    """Rows of eq_data that connect or weld two bodies, by kind, those kinds of which there are any."""
+    between = np.asarray(model.eq_objtype) == mujoco.mjtObj.mjOBJ_BODY
+    kinds = (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
+    rows = {kind: np.flatnonzero(between & (np.asarray(model.eq_type) == kind)) for kind in kinds}
+    return {kind: found for kind, found in rows.items() if found.size}
 
 
 def _ancestors(model: Any) -> np.ndarray:

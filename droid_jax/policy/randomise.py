@@ -18,7 +18,7 @@ import numpy as np
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.model.fields import element_name
 from droid_jax.model.parameters import Space
-from droid_jax.model.physics import UNIT, Physics, make_physics, model_writes, written_fields
+from droid_jax.model.physics import POSE, UNIT, Physics, joined_bodies, make_physics, model_writes, written_fields
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
 
 Randomise = Callable[[Any, jax.Array], tuple[Any, Any]]
@@ -74,6 +74,11 @@ def randomised_model(scene: Scene, gaussian: Gaussian) -> Randomise:
                 at = (np.arange(own.shape[1])[ids][index[0]], *index[1:]) if index else (ids,)
                 own = own.at[(slice(None), *at)].set(values[field][(slice(None), *index)])
             values[field] = own
+        if "eq_data" in values:
+            own = jnp.repeat(model.eq_data[None], _count(rng), axis=0)
+            for rows in joined_bodies(scene.mjx).values():
+                own = own.at[:, rows, POSE].set(values["eq_data"][:, rows, POSE])
+            values["eq_data"] = own
         return model.replace(**values), _zeros(model, fields)
 
     return randomise

@@ -11,9 +11,10 @@ from droid_jax.report.run_folder import Run
 from droid_jax.report.words import DOUBT, counted, far_off, judged, listed, number, percent, summary, was
 
 
-def doubt(run: Run | None, gap: Gap | None) -> str:
+def doubt(run: Run | None, gap: Gap | None, policy: Trained) -> str:
     """Why a policy that was trained on these should not be taken to a robot; empty where nothing speaks against it."""
-    if run and far_off(run.fit):
+    on_the_fit = policy.training["setup"]["fit"] is not None and not policy.training["effects"]
+    if run and far_off(run.fit) and on_the_fit:
         why = "a fit that is far from the data"
     elif gap and gap.found["verdict"] == "fit not converged":
         why = "a model of which no search could say whether it is right"
@@ -41,8 +42,9 @@ def lead(run: Run | None, gap: Gap | None, policy: Trained | None, hidden: str =
             following = following.replace("Next: ", f"Next: {DOUBT}; then ", 1)
     if policy:
         sentences += [_opened(where, found["success_rate"]) for where, found in policy.trials.items()]
-        last = policy_summary(policy, gap, doubt(run, gap))[-1]
-        following = f"{following} {last}" if doubt(run, gap) else last
+        why_not = doubt(run, gap, policy)
+        last = policy_summary(policy, gap, why_not)[-1]
+        following = f"{following} {last}" if why_not else last
     return [*sentences, following]
 
 

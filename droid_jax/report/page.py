@@ -113,7 +113,7 @@ def write_report(run: Path) -> Path:
         "unbroken": lambda text: re.sub(r"(?<=\d) (?=N m|%)", "\u00a0", text).replace("N m", "N\u00a0m"),
     }
     environment.tests["at_bound"] = at_bound
-    parts = (_policy(policy, gap, doubt(loaded, gap)) if policy else {}) | (_search(gap) if gap else {})
+    parts = (_policy(policy, gap, doubt(loaded, gap, policy)) if policy else {}) | (_search(gap) if gap else {})
     parts |= _identification(loaded, gap is not None) if loaded else {}
     if len([part for part in (loaded, gap, policy) if part]) > 1:
         parts |= _together(folder, loaded, gap, policy)

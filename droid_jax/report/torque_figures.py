@@ -25,7 +25,7 @@ from droid_jax.report.style import (
 )
 from droid_jax.report.words import label
 
-BUCKETS = 220  # points of a drawn band
+BUCKETS = 220  # pieces of a drawn line, and points of a band
 _TRACES = ("measured_mean", "measured_low", "measured_high", "before", "after")
 
 
@@ -118,7 +118,7 @@ def shade(axes: Axes, phases: Sequence[Mapping[str, Any]], named: bool) -> None:
             )
 
 
-def thin(time: np.ndarray, value: np.ndarray, buckets: int = 220) -> tuple[np.ndarray, np.ndarray]:
+def thin(time: np.ndarray, value: np.ndarray, buckets: int = BUCKETS) -> tuple[np.ndarray, np.ndarray]:
     """The smallest and largest sample of each bucket, in order of time: short, and no spike is lost."""
     if len(time) <= 2 * buckets:
         return time, value

@@ -167,8 +167,10 @@ def _truth(run: Run) -> list[str]:
     if not known:
         return []
     inside = sum(p["interval"][0] <= p["truth"] <= p["interval"][1] for p in known)
-    told = f"the true value is known of {counted(len(known), 'parameter')}"
-    return [f"Of what it does tell {told}; {inside} of {len(known)} lie{'s' * (len(known) == 1)} in the 90 % interval."]
+    return [
+        f"Of the parameters that the demonstration tells, the true value is known for {len(known)}; for {inside} of "
+        "them it lies in the 90 % interval."
+    ]
 
 
 def _bound(p: Mapping[str, Any]) -> str:
@@ -223,7 +225,7 @@ def needed(repeats: Sequence[int]) -> str:
     from droid_jax.gap.split import HALVES
 
     alone = len(repeats) == 1
-    if (alone and repeats[0] in (1, *range(HALVES, repeats[0] + 1))) or (not alone and min(repeats) >= FEWEST):
+    if (alone and (repeats[0] == 1 or repeats[0] >= HALVES)) or (not alone and min(repeats) >= FEWEST):
         return ""
     if alone and repeats[0] >= FEWEST:
         return f" (it takes a second motion, or {HALVES} repeats of this one)"
@@ -237,7 +239,7 @@ def noiseless(fit: Mapping[str, Any]) -> bool:
 
 def asked_of(fit: Mapping[str, Any]) -> str:
     """What tells whether the model of a `noiseless` fit lacks something."""
-    if all(gap.get("judged") == "time" for gap in fit["gap"].values()):
+    if len(fit["gap"]) <= 2 and all(gap.get("judged") == "time" for gap in fit["gap"].values()):
         return "let python -m droid_jax.run gap ask what it lacks"
     return "record repeats of the motion"
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from small_log import COULOMB, elbow, elbow_log, elbow_space
 
+from droid_jax.commands.identify import _summary
 from droid_jax.compare.residuals import CompareConfig, make_comparison
 from droid_jax.identify import pipeline, results
 from droid_jax.identify.fit import on_bound
@@ -113,6 +114,23 @@ def test_traces_and_joints_are_of_the_held_out_repeat(found: Identified):
     everything = make_comparison(elbow(), elbow_log(COULOMB, 10.0, 2), held.clock, CompareConfig(whitened=True))
     apart = np.diff(everything.channel("torque").noise.repeats[..., 0], axis=0)  # of two, one of which is held out
     assert gap.per_joint_floor == pytest.approx([np.sqrt(np.mean(apart**2) / 2)], rel=0.02)
+
+
+def test_the_command_says_how_it_went_and_what_to_do(found: Identified, tmp_path: Path, capsys):
+    write_run(tmp_path, found, {"recordings": []})
+    fit = json.loads((tmp_path / "fit.json").read_text())
+    (name,) = fit["gap"]
+    fit["gap"][name]["after"] = fit["gap"][name]["floor"]
+    alone = {name: {**fit["gap"][name], "floor": None, "judged": "time"}}
+    for changes, repeats, said in (
+        ({"mean_square": 90.0}, [8], "gap` looks for what the model lacks (it takes a second motion, or 16 repeats"),
+        ({"mean_square": 90.0}, [16], "gap` looks for what the model lacks\n"),
+        ({"mean_square": 1.0, "gap": alone}, [1], "one repeat does not tell noise from what the model lacks: let"),
+    ):
+        _summary(found, {**fit, **changes}, repeats)
+        assert said in capsys.readouterr().out
+        _summary(found, {**fit, "mean_square": 1.0}, repeats)
+        assert said not in capsys.readouterr().out
 
 
 def test_samples_are_of_both_gaussians_with_the_cost_of_each(found: Identified):

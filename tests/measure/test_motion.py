@@ -131,3 +131,12 @@ def test_repeats_of_another_motion_are_not_averaged():
     mask = np.ones((2, len(TIME), 2), bool)
     mask[1, :, 0] = False
     measured_motion(log(np.stack([sines(TIME)] * 2), mask=mask), JOINTS)
+
+
+def test_what_no_torque_feels_may_stand_elsewhere_in_every_repeat():
+    """A wheel below, or a second arm beside."""
+    parked = np.stack([sines(TIME)] * 2)
+    parked[:, :, 1] = [[13.2], [15.9]]
+    with pytest.raises(ValueError, match=r"b is 1\.35 from it"):
+        measured_motion(log(parked), JOINTS)
+    measured_motion(log(parked), JOINTS, alike=("a",))

@@ -255,6 +255,21 @@ def test_a_trajectory_that_replaces_one_is_not_the_command(tmp_path: Path) -> No
     fails([bag.write()], said, "controller_state", command_topic="/plan")
 
 
+def test_trajectories_may_be_sent_ahead(tmp_path: Path) -> None:
+    """What counts is when they begin by their headers, and not when they came."""
+    bag = Bag(tmp_path, "mcap")
+    for t in grid(0.0, 4.0):
+        bag.state(t)
+    make = bag.store.types["trajectory_msgs/msg/JointTrajectoryPoint"]
+    for start, ahead in ((1.0, 800_000_000), (2.5, 1_800_000_000)):
+        points = [make(**point_fields(bag, np.array([start + t, -t]), t)) for t in (0.0, 0.5, 1.0)]
+        bag.delay = -ahead
+        bag.add("/plan", "trajectory_msgs/msg/JointTrajectory", start, joint_names=list(JOINTS), points=points)
+    recording = read_bags([bag.write()], joints=JOINTS, torque=TORQUE, command_topic="/plan")
+    assert recording.meta["stamps"] == "header"
+    np.testing.assert_allclose(recording.command[[0, 50, 100], 0], [1.0, 1.5, 2.0], atol=1e-7)
+
+
 def test_waypoints_may_be_seconds_apart(tmp_path: Path) -> None:
     bag = Bag(tmp_path, "sqlite3")
     for t in grid(0.0, 6.0):

@@ -19,7 +19,14 @@ from droid_jax.identify.gaussian import Gaussian, load, prior
 from droid_jax.model.door import door_space
 from droid_jax.model.door_scene import door_scene
 from droid_jax.model.effects.registry import effect_space, library
-from droid_jax.model.fields import body_mass, body_yaw, joint_damping, joint_frictionloss, model_parameter
+from droid_jax.model.fields import (
+    body_mass,
+    body_position,
+    body_yaw,
+    joint_damping,
+    joint_frictionloss,
+    model_parameter,
+)
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import Physics, make_physics, written_fields
 from droid_jax.model.scene import compile_scene, load_scene
@@ -251,3 +258,22 @@ def test_unit_vectors_stay_whole_in_an_environments_model(keys):
     for field in ("body_quat", "jnt_axis"):
         np.testing.assert_allclose(np.linalg.norm(getattr(model, field)[:, -1], axis=-1), 1.0, rtol=1e-6)
         np.testing.assert_array_equal(getattr(model, field), getattr(drawn.model, field))
+
+
+def test_an_environments_own_constraints_stay_and_anchors_follow(keys):
+    """Of a coupling of joints nothing follows from masses and places, of a weld its torque does not."""
+    xml = """<mujoco><worldbody><body name="a"><joint name="a"/><geom size=".1" mass="1"/>
+      <body name="b" pos="0 0 1"><joint name="b"/><geom size=".1" mass="1"/></body></body></worldbody><equality>
+      <joint joint1="a" joint2="b"/><weld body1="a" body2="b"/><connect body1="a" body2="b" anchor="0 0 .5"/>
+      </equality></mujoco>"""
+    scene = compile_scene(mujoco.MjSpec.from_string(xml), "joined", joints=("a", "b"))
+    own = mjx.put_model(mujoco.MjModel.from_xml_string(xml))
+    own = own.replace(eq_data=own.eq_data.at[0, 1].set(0.5).at[1, 10].set(7.0))
+    space = Space((body_position(scene, "b", 2, std=0.1, limit=0.5),))
+    model, _ = randomised_model(scene, prior(space))(own, keys)
+    moved = np.asarray(model.body_pos[:, -1, 2]) - 1.0
+    assert np.all(np.abs(moved) > 0)
+    np.testing.assert_array_equal(model.eq_data[:, 0, 1], 0.5)
+    np.testing.assert_array_equal(model.eq_data[:, 1, 10], 7.0)
+    np.testing.assert_allclose(model.eq_data[:, 1, 5], 1.0 + moved, rtol=1e-6)
+    np.testing.assert_allclose(model.eq_data[:, 2, 5], -0.5 - moved, rtol=1e-5)

@@ -71,7 +71,7 @@ def test_summary_is_made_from_the_numbers(run: Path) -> None:
     assert "2 nuisances" in text and "1.22 N m before the fit" in text and "0.119 N m after it" in text
     assert "98 % of what can be closed" in text
     assert "does not tell door mass;" in text
-    assert "true value is known of 7 parameters; 6 of 7 lie in the 90 % interval" in text
+    assert "the true value is known for 7; for 6 of them it lies in the 90 % interval" in text
     assert "hinge friction loss (lower bound 0 N m)" in text
     assert "Next:" in text and "droid_jax.run gap" not in text
 
@@ -158,8 +158,10 @@ def test_one_of_a_thing_is_not_several(tmp_path: Path) -> None:
     fit["parameters"] = [p for p in fit["parameters"] if not p["nuisance"]][:1]
     config["recordings"][0]["repeats"] = 1
     (run / "fit.json").write_text(json.dumps(fit))
+    (run / "config.json").write_text(json.dumps(config))
     assert summary(read_run(run))[0].startswith("1 parameter (1 of the door) was fitted so that")
     assert lead(read_run(run), None, None)[0].startswith("1 parameter was fitted to")
+    assert "1 repeat of 7.68 s" in read_page(page.write_report(run)).text
 
 
 def test_names_with_dollars_are_written_as_they_are() -> None:

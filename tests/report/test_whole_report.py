@@ -106,6 +106,20 @@ def test_a_policy_of_a_fit_that_is_far_off_is_not_sent_to_a_robot(tmp_path: Path
         assert text.count("on a fit that is far from the data: do not take it to a robot") == 2
 
 
+def test_a_policy_of_the_extended_model_is_not_of_the_fit_that_is_far_off(tmp_path: Path):
+    """A large missing effect leaves the base fit far off, and is in what the policy was trained on."""
+    run = make_run(tmp_path / "identify")
+    fit = json.loads((run / "fit.json").read_text())
+    fit["gap"]["open_close"] |= {"before": 1.22, "after": 1.1, "closed": 0.1}
+    (run / "fit.json").write_text(json.dumps(fit | {"mean_square": 80.0}))
+    make_gap(tmp_path / "gap", "named")
+    make_policy(tmp_path / "train")
+    training = json.loads((tmp_path / "train" / "training.json").read_text())
+    (tmp_path / "train" / "training.json").write_text(json.dumps(training | {"effects": ["latch at hinge"]}))
+    text = page.write_report(tmp_path).read_text()
+    assert "do not take it to a robot" not in text and "Next: python -m droid_jax.run export" in text
+
+
 def test_a_search_that_did_not_settle_says_nothing_of_the_model(tmp_path: Path):
     make_gap(tmp_path / "gap", "fit not converged")
     make_policy(tmp_path / "train")
