@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from droid_jax.commands.hidden import known_stand_in
 from droid_jax.report.files import GAUSSIAN
-from droid_jax.report.stages import extended_of, left_over, needs_whole, setup, unfinished
+from droid_jax.report.stages import extended_of, left_over, needs_whole, setup, told_in, unfinished
 
 if TYPE_CHECKING:
     from droid_jax.identify.gaussian import Gaussian
@@ -108,16 +108,10 @@ def stand_in_of(folder: Path | None) -> dict[str, Any]:
 
 def _robot(folder: Path | None) -> dict[str, Any]:
     """The same as a finished run of `identify` or `gap` keeps it; empty where it does not."""
-    for name, within in (("config.json", ()), ("gap.json", ("setup",))):
-        try:
-            told = json.loads((folder / name).read_text()) if folder else {}
-            for key in within:
-                told = told[key]
-            if told.get("stand_in") and told.get("robot"):
-                return told["robot"]
-        except (OSError, ValueError, KeyError, AttributeError):
-            continue
-    return {}
+    if folder is None:
+        return {}
+    told = (told_in(folder / "config.json"), told_in(folder / "gap.json").get("setup", {}))
+    return next((of["robot"] for of in told if of.get("stand_in") and of.get("robot")), {})
 
 
 def _hold(paths: Sequence[str | Path], hashes: Sequence[str]) -> bool:

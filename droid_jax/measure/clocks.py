@@ -69,6 +69,11 @@ def _check_seconds(time: np.ndarray, steps: np.ndarray, where: str) -> None:
         )
 
 
+def interpolate(clock: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """values [M, J] at time [M] -> [T, J] at clock [T]; beyond the ends the last value holds."""
+    return np.stack([np.interp(clock, time, column) for column in values.T], axis=-1)
+
+
 def in_gap(clock: np.ndarray, time: np.ndarray) -> np.ndarray:
     """[T] bool of clock [T] s, True strictly between two stamps of time [M] s further apart than _GAP usual steps."""
     if len(time) < 2:
@@ -92,8 +97,5 @@ def resample(times: Sequence[np.ndarray], values: Sequence[np.ndarray]) -> tuple
     if not len(clock):
         spans = ", ".join(f"{t[0]:g} .. {t[-1]:g} s" for t in times)
         raise ValueError(f"the repeats cover no common part of the clock: {spans}")
-    repeats = []
-    for time, value in zip(times, values, strict=True):
-        repeat = np.stack([np.interp(clock, time, column) for column in value.T], axis=-1)
-        repeats.append(np.where(in_gap(clock, time)[:, None], np.nan, repeat))
-    return clock, np.stack(repeats)
+    pairs = zip(times, values, strict=True)
+    return clock, np.stack([np.where(in_gap(clock, t)[:, None], np.nan, interpolate(clock, t, v)) for t, v in pairs])

@@ -19,7 +19,7 @@ import numpy as np
 
 from droid_jax.measure.bag_topics import FIELDS, Track, read_bag
 from droid_jax.measure.checks import validate
-from droid_jax.measure.clocks import check_clock, in_gap
+from droid_jax.measure.clocks import check_clock, in_gap, interpolate
 from droid_jax.measure.recording import Channel, Phase, Recording, ServoGains, TorqueConvention
 
 
@@ -227,7 +227,7 @@ def _channels(
     for name, (field, hinge, slide) in FIELDS.items():
         if not all(field in fields for _, fields in states):
             continue
-        values = np.stack([_interpolate(clock, t, fields[field]) for t, fields in states])
+        values = np.stack([interpolate(clock, t, fields[field]) for t, fields in states])
         seen = np.stack([~in_gap(clock, t) for t, _ in states])
         mask = seen[:, :, None] & np.isfinite(values)
         if not mask.any(axis=(1, 2)).all():  # a driver that does not measure it says NaN
@@ -235,11 +235,6 @@ def _channels(
         unit = " or ".join(dict.fromkeys(slide if joint in slides else hinge for joint in joints))
         channels[name] = Channel(name, unit, joints, clock, values, mask)
     return channels
-
-
-def _interpolate(clock: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """values [M, J] at time [M] -> [T, J] at clock [T]; beyond the ends the last value holds."""
-    return np.stack([np.interp(clock, time, column) for column in values.T], axis=-1)
 
 
 def _command(
@@ -253,7 +248,7 @@ def _command(
     for bag, (_, fields) in zip(bags, commands, strict=True):
         if "position" not in fields:
             raise ValueError(f"{bag}: the command messages hold no positions")
-    every = [_interpolate(clock, t, fields["position"]) for t, fields in commands]
+    every = [interpolate(clock, t, fields["position"]) for t, fields in commands]
     for bag, command in zip(bags[1:], every[1:], strict=True):
         gap = np.abs(command - every[0])
         i, j = np.unravel_index(int(np.argmax(gap)), gap.shape)

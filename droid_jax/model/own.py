@@ -45,11 +45,6 @@ _KNOWN = (
     *_NEEDED, "field", "sensor", "servo", "column", "name", "unit", "mean", "low", "mode", "scaling", "floor", "width",
     "nuisance", "group",
 )  # fmt: skip
-# Of these, what an entry of a kind has no use for.
-_USELESS = {
-    "servo": ("element", "column", "mode"), "sensor": ("column", "mode", "name"), _TIME: ("element",),
-    "body_mass": ("column",),
-}  # fmt: skip
 
 
 def load_parameters(path: str | Path, scene: Scene) -> Space:
@@ -112,10 +107,10 @@ def _parameter(scene: Scene, entry: Any, where: str) -> Parameter:
 def _useless(entry: Mapping[str, Any]) -> tuple[str, ...]:
     """Keys that an entry of this kind does not have: a sensor's name is the one that the replay looks it up by."""
     if "servo" in entry:
-        return _USELESS["servo"]
+        return ("element", "column", "mode")
     if "sensor" in entry:
-        return _USELESS["sensor"] + (_USELESS[_TIME] if entry["sensor"] == _TIME else ())
-    return _USELESS["body_mass"] if entry["field"] == "body_mass" else ()
+        return ("column", "mode", "name", *(["element"] if entry["sensor"] == _TIME else []))
+    return ("column",) if entry["field"] == "body_mass" else ()
 
 
 def _read(entry: Mapping[str, Any]) -> dict[str, Any]:

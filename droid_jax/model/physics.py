@@ -41,6 +41,7 @@ DERIVED = (
 )
 # Writes set one component of these at a time; a compiler, and engines in their own ways, make them unit vectors.
 UNIT = ("body_quat", "body_iquat", "geom_quat", "site_quat", "jnt_axis")
+POSE = slice(3, 10)  # columns of MjModel.eq_data that follow from where two joined bodies stand
 _AUTOMATIC = 11  # column of MjModel.eq_data that is 1 where the compiler worked a weld's pose out
 _SLIDES_ONLY = 2  # MjModel.body_simple of a body whose inertia is its mass alone
 
@@ -176,9 +177,6 @@ def _equality_data(model: Any, data: Any) -> jax.Array:
         own = numbers[rows, _AUTOMATIC, None] > 0
         numbers = numbers.at[rows, POSE].set(jnp.where(own, pose, numbers[rows, POSE]))
     return numbers
-
-
-POSE = slice(3, 10)  # columns of eq_data that follow from where two joined bodies stand
 
 
 def joined_bodies(model: Any) -> dict[mujoco.mjtEq, np.ndarray]:

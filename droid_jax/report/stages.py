@@ -15,8 +15,13 @@ from droid_jax.report.files import EXTENDED, GAUSSIAN, LAST_FILES
 
 def setup(folder: Path) -> dict[str, Any]:
     """setup.json of a run's folder; empty where there is none that can be read."""
+    return told_in(folder / "setup.json")
+
+
+def told_in(path: Path) -> dict[str, Any]:
+    """What a JSON file of a run says; empty where there is none that can be read."""
     try:
-        told = json.loads((folder / "setup.json").read_text())
+        told = json.loads(path.read_text())
     except (OSError, ValueError):
         return {}
     return told if isinstance(told, dict) else {}
