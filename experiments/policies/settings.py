@@ -1,4 +1,7 @@
-"""The doors on which methods are compared.  docs/pilots.md gives their reasons; nothing here changes after a run."""
+"""The doors on which methods are compared; nothing here changes after a run.
+
+Their reasons: experiments/results/pilots/README.md.
+"""
 
 from __future__ import annotations
 
