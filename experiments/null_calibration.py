@@ -40,8 +40,8 @@ from droid_jax.storage import write_json  # noqa: E402
 from experiments.blind.cases import Plan  # noqa: E402
 from experiments.blind.draws import commit_of, seed_of  # noqa: E402
 from experiments.blind.make import recorded  # noqa: E402
+from experiments.blind.rates import rate  # noqa: E402
 from experiments.blind.scenes import setting  # noqa: E402
-from experiments.blind.score import rate  # noqa: E402
 from experiments.blind.search import Bench, Stopwatch, silent  # noqa: E402
 
 FAILED = (ValueError, RuntimeError, FloatingPointError)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.blind.score import ANSWERED, CLOSED, NAMEABLE, NAMING, closing, rate
+from experiments.blind.rates import ANSWERED, CLOSED, NAMEABLE, NAMING, closing, rate
 
 Case = Mapping[str, Any]
 Chosen = Callable[[Case], bool]
@@ -74,9 +74,13 @@ def _false(case: Case) -> bool:
 def _rows() -> Iterator[tuple[str, str, Chosen, Chosen]]:
     """What is counted, what was asked for, of which cases, and which of them count."""
     at_limit, above = _kind("single", factors=(1.0,)), _kind("single", factors=(3.0, 10.0))
+    ten, three = _kind("single", factors=(10.0,)), _kind("single", factors=(3.0,))
+    own = "by its own name, not by a declared equivalent's alone"
     yield "nothing hidden: an alarm", "under 1 %", _answered, lambda c: c["verdict"] != "none"
-    yield "one at 10 times its limit: named, alone or in a tie", "95 %", _kind("single", factors=(10.0,)), _named
-    yield "one at 3 times: named, alone or in a tie", "90 %", _kind("single", factors=(3.0,)), _named
+    yield "one at 10 times its limit: named, alone or in a tie", "95 %", ten, _named
+    yield f"one at 10 times: the same, {own}", "", ten, lambda c: c["own"]
+    yield "one at 3 times: named, alone or in a tie", "90 %", three, _named
+    yield f"one at 3 times: the same, {own}", "", three, lambda c: c["own"]
     yield "one at its limit: named, alone or in a tie", "", at_limit, _named
     yield "one at its limit: detected", "50 %", at_limit, lambda c: c["verdict"] in (*NAMING, "unexplained")
     yield "one at 3 or 10 times: named alone, a remainder or not", "", above, lambda c: c["alone"]

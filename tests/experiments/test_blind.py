@@ -17,6 +17,7 @@ from droid_jax.model.effects.registry import registered
 from droid_jax.model.parameters import Parameter, Space
 from experiments import hidden_effects, null_calibration
 from experiments.blind import limits, oracle, score
+from experiments.blind import rates as summing
 from experiments.blind.answers import ANSWERS, inside, parts, right, targets, without
 from experiments.blind.baselines import bic_outcome
 from experiments.blind.cases import Counts, Plan, amplitude, key, keys, plans
@@ -272,7 +273,7 @@ def reached(confirm: float, converged: bool = True) -> Any:
 
 
 def rates(*cases: Any, known: Any = None) -> dict[str, Any]:
-    return score.summarise([score.judge(c, known or {}) for c in cases])
+    return summing.summarise([score.judge(c, known or {}) for c in cases])
 
 
 def test_rates_of_what_is_named():
@@ -338,7 +339,7 @@ def test_effects_larger_than_their_factor_says_are_counted_apart():
     judged = [
         score.judge(c, known) for c, known in zip((given[0], given[1], given[0]), (*limits, limits[1]), strict=True)
     ]
-    found = score.summarise(judged)
+    found = summing.summarise(judged)
     assert [j["larger"] for j in judged] == [False, True, True]
     assert (found["named_alone_at_the_multiple"]["hits"], found["named_alone_at_the_multiple"]["of"]) == (1, 1)
     assert (found["named_up_to_tie_larger"]["hits"], found["named_up_to_tie_larger"]["of"]) == (1, 2)
@@ -413,7 +414,7 @@ def test_confusion_tells_ties_from_swaps_and_right_effects_in_wrong_places():
     answers = (["preload at door"], ["latch at elbow"], ["closer at door"])
     judged = [score.judge(case("single", "named", names, right_names), {}) for names in answers]
     judged.append(score.judge(case("single", "tie", ["closer at door"], right_names, tied=[["latch at door"]]), {}))
-    assert score.confusion(judged) == {"h0": {"latch": 2, "latch (elsewhere)": 1, "closer": 1}}
+    assert summing.confusion(judged) == {"h0": {"latch": 2, "latch (elsewhere)": 1, "closer": 1}}
     pair, ties = [["tilt at door"], ["delay at door"]], [["delay at door + tilt at door"], ["tilt at door"]]
     both = score.judge(case("pair", "tie", ["drag at door", "delay at door"], pair, tied=ties), {})
     assert both["said"] == ["drag", "delay"]
@@ -428,8 +429,8 @@ def test_confusion_and_errors():
             {**case("single", "error", [], [["latch at door"]]), "result": {"verdict": "error", "error": "no replay"}},
         )
     ]
-    assert score.confusion(judged) == {"h0": {"latch": 1, "(unexplained)": 1, "(error)": 1}}
-    assert score.summarise(judged)["unconverged_or_error"]["hits"] == 1
+    assert summing.confusion(judged) == {"h0": {"latch": 1, "(unexplained)": 1, "(error)": 1}}
+    assert summing.summarise(judged)["unconverged_or_error"]["hits"] == 1
 
 
 def test_bic_is_judged_by_the_same_answers():
@@ -466,6 +467,32 @@ def test_two_names_for_one_effect_are_not_named_alone():
     given = {**case("single", "named", ["bias", "drift"], [["bias"]]), "parts": [["drift"]]}
     judged = score.judge(given, {})
     assert judged["named"] and not judged["alone"] and not judged["exact"]
+
+
+def test_an_effects_own_name_is_told_from_an_equivalents():
+    """As an effect or in a tie of it, also one of several at once; of a pair both must be there."""
+    names = [["latch", "preload"]]
+    one = [
+        case("single", "named", ["latch"], names),
+        case("single", "tie", ["drag"], names, tied=[["latch"]]),
+        case("single", "named", ["preload"], names),
+        case("single", "named", ["latch", "drag"], names),  # with a false name it is not named
+        case("left_out", "named", ["latch"], names),
+    ]
+    judged = [score.judge(c, {}) for c in one]
+    assert [j["named"] for j in judged] == [True, True, True, False, False]
+    assert [j["own"] for j in judged] == [True, True, False, False, False]
+    found = summing.summarise(judged)["named_by_its_own_name"]
+    assert (found["hits"], found["of"]) == (2, 4)
+    assert "| one at 3 times: the same, by its own name" in score_table(judged, {})
+    pair = [["latch", "preload"], ["tilt", "spring"]]
+    two = [
+        case("pair", "named", ["tilt", "preload"], pair),
+        case("pair", "named", ["tilt", "latch"], pair),
+        case("pair", "tie", ["drag"], pair, tied=[["preload + tilt", "latch + tilt"]]),
+    ]
+    judged = [score.judge(c, {}) for c in two]
+    assert [(j["named"], j["own"]) for j in judged] == [(True, False), (True, True), (True, True)]
 
 
 def test_no_answer_is_no_alarm_and_the_limit_is_counted_apart():
