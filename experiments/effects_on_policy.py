@@ -33,6 +33,7 @@ from rich.console import Console  # noqa: E402
 from rich.progress import track  # noqa: E402
 
 from benchmarks.common import origin  # noqa: E402
+from benchmarks.sharing import claimed  # noqa: E402
 from droid_jax.commands.hidden import hidden_effects  # noqa: E402
 from droid_jax.measure.demonstration import demonstration_path  # noqa: E402
 from droid_jax.measure.formats import load as load_recording  # noqa: E402
@@ -132,6 +133,10 @@ def trained(arguments: Arguments, setting: Setting, code: Mapping[str, Any]) -> 
     make = functools.partial(policy_case, "prior", seed, setting, arguments, code)
     path = folder / f"prior_{seed}.json"
     finish(run_all([Case(path, make, of, "prior")], 1, code))
+    with claimed(path, wait=True):  # another process may be training it
+        pass
+    if not path.is_file():
+        raise SystemExit(f"error: another process failed to make {path}; start again")
     return arguments.trained / json.loads(path.read_text())["trained"] / POLICY
 
 
@@ -157,10 +162,8 @@ def main() -> None:
         "policy": arguments.policy.parent.name if arguments.policy else "prior",
         "policy_sha256": sha256(path),
     }
-    table = list[dict[str, Any]]()
-    for row in rows(policy, setting, arguments.budget.task(Task()), arguments):
-        table.append(row)
-        write_json(arguments.summary("effects_on_policy"), {**of, "rows": table, **code})
+    table = list(rows(policy, setting, arguments.budget.task(Task()), arguments))
+    write_json(arguments.summary("effects_on_policy"), {**of, "rows": table, **code})
     known, usual = [r for r in table if r["success_rate"] is not None], table[0]["success_rate"] or 0.0
     felt = [r for r in known if r["success_rate"] < usual - 0.2]
     names = [f"{r['hidden']}{'[' + r['joint'] + ']' if r['joint'] else ''}={r['amplitude']:g}" for r in felt]

@@ -42,9 +42,8 @@ from experiments.blind.draws import commit_of, seed_of  # noqa: E402
 from experiments.blind.make import recorded  # noqa: E402
 from experiments.blind.rates import rate  # noqa: E402
 from experiments.blind.scenes import setting  # noqa: E402
-from experiments.blind.search import Bench, Stopwatch, silent  # noqa: E402
+from experiments.blind.search import FAILED, Bench, Stopwatch, silent  # noqa: E402
 
-FAILED = (ValueError, RuntimeError, FloatingPointError)
 LEVELS = (0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9)
 
 

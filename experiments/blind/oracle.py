@@ -27,7 +27,7 @@ from experiments.blind.answers import right
 from experiments.blind.quiet import settled
 from experiments.blind.scenes import ROLES
 from experiments.blind.score import digest, oracle_of
-from experiments.blind.search import Bench
+from experiments.blind.search import FAILED, Bench
 
 FROM_TRUTH = RefineConfig(iterations=12, hops=0, spreads=0)
 SIZES = np.geomspace(3e-3, 0.8, 12)  # of the way from neutral to a bound
@@ -99,7 +99,7 @@ def oracle_all(runs: Path, chosen: Iterable[str], bench: Bench, tell: Callable[[
                 continue
             try:
                 found = oracle(runs / "cases" / name, truth, json.loads(known.read_text()), bench)
-            except ValueError as error:
+            except FAILED as error:
                 found = {"error": str(error)}
             write_json(path, {"of": digest(known), **found})
         count += 1

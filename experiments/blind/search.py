@@ -28,6 +28,9 @@ from droid_jax.storage import finite, write_json
 from experiments.blind.baselines import baselines
 from experiments.blind.scenes import ROLES, Setting, setting
 
+# What is kept as the result of a case that fails; running out of memory is none, and a later start tries it again.
+FAILED = (ValueError, ArithmeticError)
+
 
 @dataclass
 class Bench:
@@ -97,13 +100,13 @@ def search_case(folder: Path, bench: Bench) -> dict[str, Any]:
         model = watch("base", lambda: base_fit(case, silent))
         floor = watch("floor", lambda: bench.floor(told["scene"], case, model, recordings["fit"]))
         verdict = watch("find", lambda: find(case, model, floor))
-    except (ValueError, ArithmeticError) as error:
+    except FAILED as error:
         return {**result, "verdict": "error", "error": str(error), "seconds": watch.seconds}
     result |= describe(case, verdict)
     first = verdict.screens[0] if verdict.screens else None
     try:
         result["baselines"] = watch("baselines", lambda: baselines(case, model, first, recordings))
-    except (ValueError, ArithmeticError) as error:  # what they are compared with stands
+    except FAILED as error:  # what they are compared with stands
         result["baselines_failed"] = str(error)
     return {**result, "seconds": watch.seconds}
 

@@ -16,7 +16,7 @@ from droid_jax.measure.hidden import HIDDEN, LIBRARY, ON_HINGE, Applied, possibl
 from droid_jax.model.effects.registry import registered
 from droid_jax.model.parameters import Parameter, Space
 from experiments import hidden_effects, null_calibration
-from experiments.blind import limits, oracle, score
+from experiments.blind import limits, marks, oracle, score
 from experiments.blind import rates as summing
 from experiments.blind.answers import ANSWERS, inside, parts, right, targets, without
 from experiments.blind.baselines import bic_outcome
@@ -217,6 +217,35 @@ def test_limits_scale_with_the_effect():
     twice = power.limit(2 * added, 10.0)
     assert twice == pytest.approx(found / 2, rel=0.05)
     assert power.limit(added * (np.arange(40) < 10), 10.0) is None  # nothing of it is left
+
+
+def test_a_form_that_blows_up_hides_no_limit(monkeypatch: pytest.MonkeyPatch):
+    """Its mark is NaN, with which every p would be zero and every limit the smallest."""
+    monkeypatch.setattr(marks, "marks", lambda *_: np.array([[1.0, 2.0], [np.nan, np.nan]]))
+    seen: Any = SimpleNamespace(evidence=None, model=SimpleNamespace(values=None))
+    np.testing.assert_array_equal(Ground.added(seen, ()), [[1.0, 2.0], [0.0, 0.0]])
+    stage: Any = Stage()
+    raw = np.stack([np.random.default_rng(1).normal(size=40), np.zeros(40)])
+    power = limits.Power(stage, raw, np.tile(np.arange(10), (5, 1)), {})
+    assert power.limit(np.tile(raw[0], (limits.REPEATS, 1)), 10.0) == pytest.approx(
+        limits.Power(stage, raw[:1], power.chosen, {}).limit(np.tile(raw[0], (limits.REPEATS, 1)), 10.0)
+    )
+
+
+def test_a_limit_says_at_which_size_its_effect_was_recorded():
+    """Also where the last recording was not near enough yet."""
+    recorded = list[float]()
+
+    def hidden(effect: Applied) -> np.ndarray:
+        recorded.append(effect.amplitude)
+        return np.zeros((limits.REPEATS, 1))
+
+    where: Any = SimpleNamespace(hidden=hidden, left=lambda column: (column, np.ones(1, bool)))
+    power: Any = SimpleNamespace(limit=lambda added, largest: 0.1 * recorded[-1])  # smaller with every recording
+    forms: Any = SimpleNamespace(of=lambda *_: {})
+    found = limits.limit_of(where, power, forms, Applied("closer", 1.0))
+    assert len(recorded) == limits.RECORDED and len(set(recorded)) == limits.RECORDED
+    assert found["recorded_at"] == recorded[-1]
 
 
 def test_bounds_hold_what_the_base_model_absorbs():
@@ -583,15 +612,34 @@ def test_a_null_that_fails_after_its_screening_keeps_its_p(monkeypatch: pytest.M
     def run_case(plan: Any, commit: str, bench: Any, watch: Any) -> Any:
         watch.seconds["base"] = 1.0
         yield {"p": 0.001, "gap": 0.1, "converged": True}
-        raise RuntimeError("out of memory")
+        raise ValueError("no replay")
 
     monkeypatch.setattr(null_calibration, "run_case", run_case)
     case = null_calibration.case_of(Plan("hinge/null/0", "hinge", "none"), COMMIT, Bench())
     other = {"p": 0.5, "gap": 0.0, "converged": True, "seconds": {"base": 1.0}}
     found = null_calibration.summarise([case, other])
-    assert case["p"] == 0.001 and case["error"] == "out of memory" and case["verdict"] == "error"
+    assert case["p"] == 0.001 and case["error"] == "no replay" and case["verdict"] == "error"
     assert (found["screening_rejects"]["hits"], found["screening_rejects"]["of"]) == (1, 2)
     assert (found["alarms"]["hits"], found["rejected_then_failed"], found["errors"]) == (0, 1, 1)
+
+
+def test_a_case_that_runs_out_of_memory_is_no_result(monkeypatch: pytest.MonkeyPatch):
+    """It would never be tried again."""
+
+    def run_case(*given: Any) -> Any:
+        raise RuntimeError("out of memory")
+
+    monkeypatch.setattr(null_calibration, "run_case", run_case)
+    with pytest.raises(RuntimeError, match="out of memory"):
+        null_calibration.case_of(Plan("hinge/null/0", "hinge", "none"), COMMIT, Bench())
+
+
+def test_a_quick_suite_has_a_folder_of_its_own(tmp_path: Path):
+    placed, runs = hidden_effects.placed, hidden_effects.RUNS
+    assert placed(hidden_effects.All(quick=True)).out == placed(hidden_effects.Make(quick=True)).out
+    assert placed(hidden_effects.All(quick=True)).out == runs.with_name("hidden_effects_quick")
+    assert placed(hidden_effects.All()).out == placed(hidden_effects.Score()).out == runs
+    assert placed(hidden_effects.All(quick=True, out=tmp_path)).out == tmp_path
 
 
 def test_cases_of_two_commits_do_not_mix_where_make_was_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -635,7 +683,7 @@ def test_an_oracle_is_of_the_result_that_is_there(tmp_path: Path, monkeypatch: p
     def one(folder: Path, truth: Any, result: dict[str, Any], bench: Any) -> dict[str, Any]:
         asked.append(result["n"])
         if result["n"] == 3:
-            raise ValueError("no replay")
+            raise FloatingPointError("no replay")
         return {"model": "latch", "gaps": {"fit": 1.0}}
 
     monkeypatch.setattr(oracle, "oracle", one)
