@@ -10,6 +10,7 @@ judged on repeats that the search did not see.  The compilation is done before t
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -106,6 +107,14 @@ def at(run: dict[str, Any], seconds: float) -> float | None:
     return done[-1] if done else None
 
 
+def one_device(runs: Sequence[Mapping[str, Any]]) -> str:
+    """The device on which all ran.  Ends the program where they differ: their wall times are of one figure."""
+    found = sorted({run["origin"]["device"] for run in runs})
+    if len(found) > 1:
+        raise SystemExit(f"error: searches of several devices: {'; '.join(found)}: choose another --out")
+    return found[0]
+
+
 def figure(runs: list[dict[str, Any]]) -> Figure:
     """Held-out cost over wall time: one line per seed, one colour per population."""
     drawn = Figure(figsize=(7.0, 4.0), layout="constrained")
@@ -131,20 +140,22 @@ def main() -> None:
     for compiled in (cost, held):
         compiled(np.tile(cost.space.mean, (max(populations), 1)))
     folder = arguments.out / stem("population_curve_runs", arguments.quick)
-    runs = []
+    runs, searched_on = [], ""
     for seed in range(1 if arguments.quick else arguments.seeds):
         for population in populations:
             path = folder / f"{population}_samples_{seconds:g}_s_{seed}.json"
             runs.append(
                 kept(path, lambda p=population, s=seed: {**curve(cost, held, p, seconds, s), "origin": origin(s)})
             )
+            searched_on = one_device(runs)
             print(f"{population} samples, seed {seed}: held-out {runs[-1]['held_out'][-1]:.4f} N m", flush=True)
     shares = (0.25, 0.5, 1.0)
     table = {
         str(p): {f"{s * seconds:g} s": [at(r, s * seconds) for r in runs if r["population"] == p] for s in shares}
         for p in populations
     }
-    summary = {"seconds": seconds, "searches_from_commits": commits(runs), "held_out_by_population_and_time": table}
+    summary = {"seconds": seconds, "searched_on": searched_on, "searches_from_commits": commits(runs)}
+    summary |= {"held_out_by_population_and_time": table}
     name = stem("population_curve", arguments.quick)
     write_json(arguments.out / f"{name}.json", {**origin(0), **summary, "runs": runs})
     write_bytes(arguments.out / f"{name}.png", png_bytes(figure(runs)))
