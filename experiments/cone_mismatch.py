@@ -26,7 +26,7 @@ import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 
-from benchmarks.common import origin, stem  # noqa: E402
+from benchmarks.common import publish  # noqa: E402
 from droid_jax.measure.recording import Recording  # noqa: E402
 from droid_jax.model.scene import with_options  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
@@ -101,15 +101,15 @@ def main() -> None:
     arguments = tyro.cli(Arguments, description=__doc__)
     commit, where = commit_of(arguments.commit), setting("door", arguments.out / "door")
     difference = between_cones(where, seed_of(commit, plan_of(0).name))
-    result: dict[str, Any] = {**origin(0), "seeds_from": commit, "torque_difference": difference}
+    result: dict[str, Any] = {"seeds_from": commit, "torque_difference": difference}
     bench, found = Bench({"door": where}), list[dict[str, Any]]()
     for number in range(0 if arguments.quick else arguments.cases):
         found.append(case(where, number, commit, arguments.out, bench))
         print(f"door {number}: {found[-1].get('sentence', found[-1].get('error'))}", flush=True)
     keys = ("verdict", "sentence", "effects", "p", "gaps", "floor", "seconds", "code")
     result["cases"] = [{k: c.get(k) for k in keys} for c in found]
-    write_json(arguments.out / f"{stem('cone_mismatch', arguments.quick)}.json", result)
-    print(json.dumps({"torque_difference": [round(d, 3) for d in difference], "said": [c["verdict"] for c in found]}))
+    line = {"torque_difference": [round(d, 3) for d in difference], "said": [c["verdict"] for c in found]}
+    publish(arguments.out, "cone_mismatch", arguments.quick, 0, result, line)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,6 @@ import tuned  # noqa: E402, F401  (before jax starts)
 
 # isort: split
 import functools  # noqa: E402
-import hashlib  # noqa: E402
 import json  # noqa: E402
 
 import tyro  # noqa: E402
@@ -46,7 +45,7 @@ from droid_jax.policy.door_env import DoorEnv  # noqa: E402
 from droid_jax.policy.task import Task  # noqa: E402
 from droid_jax.policy.transfer import TransferConfig, check_playable, stand_in, transfer  # noqa: E402
 from droid_jax.report.files import POLICY  # noqa: E402
-from droid_jax.storage import write_json  # noqa: E402
+from droid_jax.storage import file_sha256, write_json  # noqa: E402
 from experiments.policies.cases import RESULTS, TIMESTEP, Case, Options, finish, run_all  # noqa: E402
 from experiments.policies.robots import truth_of  # noqa: E402
 from experiments.policies.settings import Setting, setting_of  # noqa: E402
@@ -140,11 +139,6 @@ def trained(arguments: Arguments, setting: Setting, code: Mapping[str, Any]) -> 
     return arguments.trained / json.loads(path.read_text())["trained"] / POLICY
 
 
-def sha256(path: Path) -> str:
-    """Of a file's bytes."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
 def needs_out(arguments: Arguments) -> None:
     """Ends the program where another policy's or other effects' table would be written over the pilot's."""
     if (arguments.policy or arguments.hide) and not arguments.quick and arguments.out == RESULTS:
@@ -160,7 +154,7 @@ def main() -> None:
     of = {
         "springs": arguments.springs,
         "policy": arguments.policy.parent.name if arguments.policy else "prior",
-        "policy_sha256": sha256(path),
+        "policy_sha256": file_sha256(path),
     }
     table = list(rows(policy, setting, arguments.budget.task(Task()), arguments))
     write_json(arguments.summary("effects_on_policy"), {**of, "rows": table, **code})

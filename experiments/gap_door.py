@@ -25,7 +25,6 @@ fitted to the hook's path.  They are not part of this repository.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,8 +48,9 @@ from gap_single import (
 # isort: split
 import numpy as np
 import tyro
-from inverse_fit import RESULTS, make_recording, origin, read_npz, rms, run, stem
+from inverse_fit import RESULTS, make_recording, read_npz, rms, run
 
+from benchmarks.common import publish, stem
 from droid_jax.gap.verdict import Verdict
 from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.model.effects.registry import library
@@ -58,7 +58,6 @@ from droid_jax.model.fields import joint_frictionloss
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene, load_scene
 from droid_jax.model.seam import Effect
-from droid_jax.storage import write_json
 
 HINGE = "hinge"
 FIT, JUDGE = "ikea_cabinet_2", "ikea_cabinet_log"
@@ -164,7 +163,6 @@ def main(config: GapDoor) -> None:
     alarms = false_alarms(search, verdict, 5 if config.quick else config.cases, config.seed, logs)
     print(f"  false alarms: {alarms['said_to_be_missing']}, named {alarms['named']}")
     result = {
-        **origin(config.seed),
         "experiment": "gap_door",
         "quick": config.quick,
         "source": SOURCE,
@@ -184,8 +182,7 @@ def main(config: GapDoor) -> None:
             "added_found": {effect: names_one_of(a, [effect]) for effect, a in added.items()},
         },
     }
-    write_json(config.out / f"{stem('gap_door', config.quick)}.json", result, indent=2)
-    print(json.dumps(result))
+    publish(config.out, "gap_door", config.quick, config.seed, result)
 
 
 if __name__ == "__main__":

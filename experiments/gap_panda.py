@@ -17,7 +17,6 @@ Data and filter: see real_panda.py.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -40,9 +39,10 @@ from gap_single import (
 # isort: split
 import numpy as np
 import tyro
-from inverse_fit import RESULTS, origin, rounded, run, stem
+from inverse_fit import RESULTS, rounded, run
 from real_panda import MOTION_CUTOFF, SOURCE, link_nuisances, load_panda, load_published
 
+from benchmarks.common import publish, stem
 from droid_jax.model.arm import panda_arm_scene
 from droid_jax.model.builtin import ARM
 from droid_jax.model.effects.registry import library
@@ -50,7 +50,6 @@ from droid_jax.model.joint_friction import joint_friction_space
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
-from droid_jax.storage import write_json
 
 NOT_ASKED = ("torque_bias", "payload")  # the base has offsets and the last link's mass
 NINETY = 1.645  # deviations from which on zero is outside of a 90 % interval
@@ -154,7 +153,6 @@ def main(config: GapPanda) -> None:
     sealed = found["rigid"]["rms"]["sealed"]
     most_left = max(of_joints(found["rigid"]), key=lambda cell: cell["after"])["where"].split(",")[0]
     result = {
-        **origin(config.seed),
         "experiment": "gap_panda",
         "quick": config.quick,
         "source": SOURCE,
@@ -176,8 +174,7 @@ def main(config: GapPanda) -> None:
             "added_found": {effect: names_one_of(a, [effect]) for effect, a in added.items()},
         },
     }
-    write_json(config.out / f"{stem('gap_panda', config.quick)}.json", result, indent=2)
-    print(json.dumps(result))
+    publish(config.out, "gap_panda", config.quick, config.seed, result)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ import numpy as np  # noqa: E402
 import scipy.stats  # noqa: E402
 import tyro  # noqa: E402
 
-from benchmarks.common import commits, origin, stem  # noqa: E402
+from benchmarks.common import commits, origin, publish, stem  # noqa: E402
 from benchmarks.sharing import kept  # noqa: E402
 from droid_jax.compare.cost import make_cost  # noqa: E402
 from droid_jax.identify.gaussian import prior  # noqa: E402
@@ -42,7 +42,6 @@ from droid_jax.model.door import JOINT_DAMPING, door_nuisances, door_space  # no
 from droid_jax.model.door import truth as table_i  # noqa: E402
 from droid_jax.model.door_scene import door_scene  # noqa: E402
 from droid_jax.model.scene import Scene  # noqa: E402
-from droid_jax.storage import write_json  # noqa: E402
 
 Part = Literal["doors", "calibration", "pose", "parity"]
 MUST_BE_KNOWN = ("hinge_stiffness", "hinge_frictionloss", "hinge_damping", *JOINT_DAMPING)
@@ -294,9 +293,7 @@ def agreement(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
 def main() -> None:
     arguments = tyro.cli(Arguments, description=__doc__)
     summary = summarise(run_cases(arguments))
-    result = {**origin(0), **summary}
-    write_json(arguments.out / f"{stem('identify', arguments.quick)}.json", result, indent=2)
-    print(json.dumps(summary))
+    publish(arguments.out, "identify", arguments.quick, 0, summary, summary)
 
 
 if __name__ == "__main__":

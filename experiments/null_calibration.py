@@ -176,8 +176,9 @@ def main() -> None:
             with claimed(path, wait=False) as mine:
                 if not mine or path.is_file():
                     continue
-                write_json(path, case_of(Plan(name_of(scene, number), scene, "none"), commit, bench))
-                print(f"{scene} {number}: {told(json.loads(path.read_text()))}", flush=True)
+                case = case_of(Plan(name_of(scene, number), scene, "none"), commit, bench)
+                write_json(path, case)
+                print(f"{scene} {number}: {told(case)}", flush=True)
     found = cases_of(folder, commit)
     if not found:
         raise SystemExit(f"error: {folder} holds no case of commit {commit}")

@@ -24,7 +24,6 @@ sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
 import tuned  # noqa: E402, F401  (before jax starts)
 
 # isort: split
-import hashlib  # noqa: E402
 import json  # noqa: E402
 
 import numpy as np  # noqa: E402
@@ -46,7 +45,7 @@ from droid_jax.policy.transfer import TransferConfig, stand_in, transfer  # noqa
 from droid_jax.policy.trials import Trials  # noqa: E402
 from droid_jax.report.export import png_bytes  # noqa: E402
 from droid_jax.report.style import AFTER, INK, styled  # noqa: E402
-from droid_jax.storage import write_bytes, write_json  # noqa: E402
+from droid_jax.storage import file_sha256, write_bytes, write_json  # noqa: E402
 from experiments.policies.cases import QUICK_STEPS, RESULTS, TIMESTEP, Options  # noqa: E402
 
 WITHIN = 3.0  # degrees
@@ -90,7 +89,7 @@ def named(path: Path) -> dict[str, str]:
     """A file by its place in the project (elsewhere its name alone) and its hash."""
     own = path.resolve()
     where = own.relative_to(ROOT).as_posix() if own.is_relative_to(ROOT) else own.name
-    return {"file": where, "sha256": hashlib.sha256(own.read_bytes()).hexdigest()}
+    return {"file": where, "sha256": file_sha256(own)}
 
 
 def in_mjx(policy: Policy, env: DoorEnv, gaussian: Gaussian, values: np.ndarray) -> Trials:

@@ -21,13 +21,12 @@ sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
 import tuned  # noqa: E402, F401  (before jax starts)
 
 # isort: split
-import json  # noqa: E402
 
 import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 
-from benchmarks.common import commits, origin, stem  # noqa: E402
+from benchmarks.common import commits, origin, publish, stem  # noqa: E402
 from benchmarks.sharing import kept  # noqa: E402
 from droid_jax.compare.cost import Cost, make_cost  # noqa: E402
 from droid_jax.identify.judge import split  # noqa: E402
@@ -37,7 +36,7 @@ from droid_jax.measure.formats import load  # noqa: E402
 from droid_jax.measure.surrogate import record, stand_in_truth  # noqa: E402
 from droid_jax.model.door import door_space  # noqa: E402
 from droid_jax.model.door_scene import door_scene  # noqa: E402
-from droid_jax.storage import write_bytes, write_json  # noqa: E402
+from droid_jax.storage import write_bytes  # noqa: E402
 
 COLOURS = ("#2b6cb0", "#c05621", "#2f855a", "#6b46c1")
 
@@ -80,6 +79,7 @@ def curve(cost: Cost, held: Cost, population: int, seconds: float, seed: int) ->
     search(cost, cost.space, replace(config, generations=1))
     found = search(cost, cost.space, config)
     history = found.history
+    rows = _rows(len(history.mean))
     return {
         "population": population,
         "seed": seed,
@@ -87,18 +87,14 @@ def curve(cost: Cost, held: Cost, population: int, seconds: float, seed: int) ->
         "generations": len(history.sigma),
         "evaluations": found.evaluations,
         "seconds": np.round(np.cumsum(history.seconds), 2).tolist(),
-        "held_out": np.round(held(_thinned(history.mean)), 4).tolist(),
-        "rows": _rows(len(history.mean)).tolist(),
+        "held_out": np.round(held(history.mean[rows]), 4).tolist(),
+        "rows": rows.tolist(),
     }
 
 
 def _rows(generations: int, most: int = 64) -> np.ndarray:
     """Generations at which a curve is judged: all, or about `most` of them."""
     return np.unique(np.linspace(0, generations - 1, min(generations, most)).astype(int))
-
-
-def _thinned(means: np.ndarray) -> np.ndarray:
-    return means[_rows(len(means))]
 
 
 def at(run: dict[str, Any], seconds: float) -> float | None:
@@ -156,10 +152,8 @@ def main() -> None:
     }
     summary = {"seconds": seconds, "searched_on": searched_on, "searches_from_commits": commits(runs)}
     summary |= {"held_out_by_population_and_time": table}
-    name = stem("population_curve", arguments.quick)
-    write_json(arguments.out / f"{name}.json", {**origin(0), **summary, "runs": runs})
-    write_bytes(arguments.out / f"{name}.png", png_bytes(figure(runs)))
-    print(json.dumps(summary))
+    write_bytes(arguments.out / f"{stem('population_curve', arguments.quick)}.png", png_bytes(figure(runs)))
+    publish(arguments.out, "population_curve", arguments.quick, 0, {**summary, "runs": runs}, summary)
 
 
 if __name__ == "__main__":

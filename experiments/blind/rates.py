@@ -7,7 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import scipy.stats
+
+from droid_jax.policy.trials import wilson
 
 NAMING = ("named", "tie", "partly explained")  # verdicts that give a name
 ANSWERED = ("none", *NAMING, "unexplained")  # verdicts that say something; an error or an unconverged fit does not
@@ -75,7 +76,7 @@ def summarise(judged: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "gap_closed_whatever_was_named": closing([c for c in judged if c["effects"]], "sealed"),
         "within_floor": rate(named, lambda c: bool(c["within_floor"])),
         **{
-            f"amplitude_{key}": rate([{"inside": i} for c in named for i in c[key]], lambda c: c["inside"])
+            f"amplitude_{key}": rate([inside for c in named for inside in c[key]], bool)
             for key in ("coverage", "counterpart_coverage")
         },
         "baselines": summarise_baselines(judged),
@@ -109,12 +110,12 @@ def summarise_baselines(judged: Sequence[dict[str, Any]]) -> dict[str, Any] | No
 
 
 def rate(cases: Sequence[Any], hit: Callable[[Any], bool]) -> dict[str, Any] | None:
-    """Share of cases with its 95 % interval (Wilson 1927)."""
+    """Share of cases with its 95 % interval; None of no case."""
     if not cases:
         return None
     hits = sum(bool(hit(c)) for c in cases)
-    span = scipy.stats.binomtest(hits, len(cases)).proportion_ci(0.95, method="wilson")
-    return {"hits": hits, "of": len(cases), "rate": hits / len(cases), "interval_95": [span.low, span.high]}
+    interval = list(wilson(hits, len(cases)))
+    return {"hits": hits, "of": len(cases), "rate": hits / len(cases), "interval_95": interval}
 
 
 def closing(cases: Sequence[dict[str, Any]], role: str) -> dict[str, Any] | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from droid_jax.measure.hidden import Applied
+from droid_jax.storage import file_sha256
 from experiments.blind.answers import beside, matched, parts, right
 from experiments.blind.baselines import bic_outcome
 from experiments.blind.cases import amplitude, key
@@ -191,12 +191,8 @@ def oracle_of(result: Path, oracle: Path) -> dict[str, Any] | None:
     Oracles before 2be0ce3 do not tell whose they are.
     """
     known = json.loads(oracle.read_text()) if oracle.is_file() else None
-    return known if known and known.get("of", digest(result)) == digest(result) else None
-
-
-def digest(result: Path) -> str:
-    """Which result an oracle is of."""
-    return hashlib.sha256(result.read_bytes()).hexdigest()
+    whose = file_sha256(result)
+    return known if known and known.get("of", whose) == whose else None
 
 
 def closed(result: Mapping[str, Any], role: str) -> float | None:

@@ -117,7 +117,7 @@ def _judged_by_bic(case: Case) -> bool:
     return _hidden(case) and bool(case["baselines"])
 
 
-def _share(cases: Sequence[Case], hit: Chosen) -> str:
+def _share(cases: Sequence[Any], hit: Callable[[Any], bool]) -> str:
     """ "22 of 25 (70 to 96 %)"; empty where there is no case."""
     found = rate(cases, hit)
     if found is None:
@@ -142,5 +142,4 @@ def _minutes(judged: Sequence[Mapping[str, Any]], scene: str) -> str:
 
 
 def _amplitudes(judged: Sequence[Mapping[str, Any]], scene: str) -> str:
-    inside = [i for c in judged if c["scene"] == scene and _named(c) for i in c["coverage"]]
-    return _share([{"inside": i} for i in inside], lambda c: c["inside"]) or "-"
+    return _share([i for c in judged if c["scene"] == scene and _named(c) for i in c["coverage"]], bool) or "-"
