@@ -89,7 +89,7 @@ class Make:
     unsearched: bool = False
     """Only cases without a file in OUT/results: a run that goes on elsewhere needs no others."""
     quick: bool = False
-    """The lone hinge: nothing, and a preload."""
+    """The lone hinge: nothing, and a preload.  Without --out in a folder beside the full run's, *_quick."""
 
 
 @dataclass(frozen=True)

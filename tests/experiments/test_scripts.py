@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import importlib
 import json
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+
+from benchmarks.common import publish
 
 
 def test_searches_of_several_machines_are_not_drawn_over_one_wall_time():
@@ -17,6 +20,15 @@ def test_searches_of_several_machines_are_not_drawn_over_one_wall_time():
     assert module.one_device([one, one]) == "a CPU, 1 core"
     with pytest.raises(SystemExit, match="error: searches of several devices: a CPU, 1 core; a CPU, 2 cores"):
         module.one_device([one, other])
+
+
+def test_a_script_ends_in_its_file_and_one_line_of_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    publish(tmp_path, "figures", False, 7, {"figure": 1.0, "more": [2]}, {"figure": 1.0})
+    assert capsys.readouterr().out == '{"figure": 1.0}\n'
+    publish(tmp_path, "figures", True, 8, {"figure": 3.0})
+    kept, quick = (json.loads((tmp_path / f"{name}.json").read_text()) for name in ("figures", "figures_quick"))
+    assert (kept["seed"], kept["figure"], kept["more"], quick["seed"], quick["figure"]) == (7, 1.0, [2], 8, 3.0)
+    assert {"commit", "versions", "device"} <= set(kept) and json.loads(capsys.readouterr().out) == quick
 
 
 def door(*inside: bool) -> dict[str, Any]:
