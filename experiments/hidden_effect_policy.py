@@ -54,7 +54,7 @@ from droid_jax.policy.transfer import TransferConfig, check_playable, stand_in  
 from droid_jax.storage import write_json  # noqa: E402
 from experiments.policies.cases import TIMESTEP, Case, Options, finish, found_of, made_by, run_all, tried  # noqa: E402
 from experiments.policies.store import Doors  # noqa: E402
-from experiments.policies.table import PLACES, apart, column, rates  # noqa: E402
+from experiments.policies.table import better_than, columns, line_of  # noqa: E402
 
 MODELS = ("prior", "base", "extended")
 BASE, SETUP = "base.json", "setup.json"
@@ -182,12 +182,10 @@ def main() -> None:
         failed, planned = [], []
     found = found_of(planned)
     of = {model: [c for c in found if c["model"] == model] for model in MODELS}
-    table = {model: {place: column(own, place) for place in PLACES} for model, own in of.items() if own}
-    others = [m for m in ("base", "prior") if of[m] and of["extended"]]
-    better = {m: {what: apart(of["extended"], of[m], what) for what in ("success", "angle")} for m in others}
+    table, better = columns(of), better_than("extended", ("base", "prior"), of)
     summary = {**verdict, "models": table, "extended_better_than": better, **made_by(found), **code}
     write_json(arguments.summary("hidden_effect_policy"), summary)
-    print(json.dumps({m: rates(columns) for m, columns in table.items()}))
+    print(json.dumps(line_of(table)))
     finish(failed)
 
 

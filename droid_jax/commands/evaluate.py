@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -67,14 +66,13 @@ def run(command: Evaluate) -> None:
     from droid_jax.policy.transfer import transfer
     from droid_jax.report.policy_folder import read_training
     from droid_jax.report.progress import counting
-    from droid_jax.storage import new_folder, write_json
+    from droid_jax.storage import file_sha256, new_folder, write_json
 
     folder = stage_folder(command.run, "train", TRAINING)
     load_effects(command.own_effects, folder)
     trained = read_training(folder)
     setup, policy = trained["setup"], load(folder / POLICY)
-    policy_sha256 = hashlib.sha256((folder / POLICY).read_bytes()).hexdigest()
-    setup_now = {**setup_of(command), "run": str(folder), "policy_sha256": policy_sha256}
+    setup_now = {**setup_of(command), "run": str(folder), "policy_sha256": file_sha256(folder / POLICY)}
     if not command.again and (done := _done(folder, setup_now)):
         print(f"{folder} holds these trials already (start over with --again)")
         _tell(done)

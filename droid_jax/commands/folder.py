@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from droid_jax.report.files import LAST_FILES, RESULTS
+from droid_jax.storage import file_sha256
 
 if TYPE_CHECKING:
     from droid_jax.measure.recording import Recording
@@ -33,7 +34,7 @@ def setup_of(command: Any) -> dict[str, Any]:
         fields.pop(name, None)
     for name in HASHED:  # a changed file makes another run
         if path := fields.get(name):
-            fields[f"{name}_sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
+            fields[f"{name}_sha256"] = file_sha256(path)
     return {k: [str(v) for v in value] if isinstance(value, tuple) else _plain(value) for k, value in fields.items()}
 
 

@@ -147,6 +147,12 @@ def test_repeated_rows_are_left_out(experiment: Callable[[str], ModuleType]) -> 
     np.testing.assert_allclose(fit.resampled(time, held, time), time[:, None])
 
 
+def test_where_no_spring_was_named_none_is_asked_for_again(experiment: Callable[[str], ModuleType]) -> None:
+    """It would count as not named again, of a search that was the first one once more."""
+    door = experiment("gap_door")
+    assert door.with_known([], lambda known: pytest.fail("searched")) is None
+
+
 def test_carriage_comes_back(experiment: Callable[[str], ModuleType], tmp_path: Path) -> None:
     emps = experiment("real_emps")
     write_emps(tmp_path, 88.0, 150.0, 25.0, 4.0)
