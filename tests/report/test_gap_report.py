@@ -16,7 +16,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from reader import read_page
 
-from droid_jax.report import drawings, gap_drawings, gap_maps, gap_words, page, style
+from droid_jax.report import drawings, gap_drawings, gap_words, page, style
 from droid_jax.report.drawings import Drawing
 from droid_jax.report.gap_folder import VERDICTS, read_gap
 from droid_jax.report.gap_parts import PARTS
@@ -206,7 +206,7 @@ def test_a_log_is_drawn_in_order_of_time(tmp_path: Path) -> None:
     for key, values in whole.items():
         np.testing.assert_array_equal(drawn[key], values)
     gap = read_gap(folder)
-    empty = {"variable": gap_maps.TIME, "where": "elbow, later 9.0 s", "gap": 0.0, "p": 1.0, "found": False}
+    empty = {"variable": gap_words.TIME, "where": "elbow, later 9.0 s", "gap": 0.0, "p": 1.0, "found": False}
     assert gap_drawings._shown(gap, [empty, {**empty, "gap": 2.0}]) == [{**empty, "gap": 2.0, "found": True}]
 
 
@@ -351,11 +351,13 @@ def test_a_damaged_file_is_named(tmp_path: Path, break_it: Callable[[dict[str, A
 @pytest.mark.parametrize("name", ["gap.json", "gap.npz"])
 @pytest.mark.parametrize("content", [None, b"", b"{broken", b"[]"])
 def test_a_missing_or_broken_file_is_named(tmp_path: Path, name: str, content: bytes | None) -> None:
+    """Only a search without its gap.json goes on by itself: one that has it passes for whole."""
     folder = make_gap(tmp_path / "run")
     (folder / name).unlink()
     if content is not None:
         (folder / name).write_bytes(content)
-    with pytest.raises(ValueError, match=rf"{re.escape(name)}.*droid_jax\.run gap"):
+    how = "gap` again" if (name, content) == ("gap.json", None) else "gap --again`"
+    with pytest.raises(ValueError, match=rf"{re.escape(name)}.*droid_jax\.run {how}"):
         page.write_report(folder)
 
 
@@ -390,7 +392,7 @@ def test_places_are_read(where: str, parts: tuple[str, str, str]) -> None:
     assert gap_words.joint_phase(where) == parts
     bins = {"variable": "object angle", "where": "-0.00 to 0.15 rad"}
     assert gap_words.place_words(bins) == "object angle 0.00 to 0.15 rad"
-    assert gap_words.place_words({"variable": gap_maps.TIME, "where": "elbow, all 0.0 s"}) == "elbow"
+    assert gap_words.place_words({"variable": gap_words.TIME, "where": "elbow, all 0.0 s"}) == "elbow"
 
 
 def test_names_and_units_are_written_as_they_are_read(tmp_path: Path) -> None:
