@@ -12,7 +12,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from droid_jax.gap.blocks import OUTSIDE, Blocks
 from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.case import Case
 from droid_jax.gap.evidence import Evidence
@@ -60,7 +59,7 @@ def gap_json(case: Case, verdict: Verdict) -> dict[str, Any]:
         "amplitudes": _sizes(case, verdict, "amplitudes"),
         "shapes": _sizes(case, verdict, "shapes"),
         "shifts": _shifts(case, verdict),
-        "experiments": [{"what": e.what, "apart": e.apart} for e in verdict.experiments],
+        "experiments": [asdict(experiment) for experiment in verdict.experiments],
         "trends": [{**asdict(t), "unit": case.whole[t.amplitude].unit} for t in (verdict.trend,) if t is not None],
         "units": case.fit.cost.scene.torque_unit(_joints(case.fit)),
     }
@@ -77,7 +76,7 @@ def gap_arrays(case: Case, verdict: Verdict) -> dict[str, np.ndarray]:
         evidence = case.judged[role]
         order = [_joints(evidence).index(joint) for joint in joints]
         channel = evidence.cost.comparisons[0].channel("torque")
-        mine = _instants(evidence)
+        mine = evidence.instants
         (simulated,) = evidence.cost.smoothed(_before_after(evidence, verdict))
         before, after = simulated[:, mine][:, :, order]
         repeats = channel.noise.repeats[:, mine][:, :, order]
@@ -89,13 +88,6 @@ def gap_arrays(case: Case, verdict: Verdict) -> dict[str, np.ndarray]:
             f"{role}.after": after,
         }
     return out
-
-
-def _instants(evidence: Evidence) -> np.ndarray:
-    """[K] bool of the coarse clock: all, or those of a role's blocks."""
-    if isinstance(evidence, Blocks):
-        return evidence.block[evidence.column == 0] != OUTSIDE
-    return np.ones(int(np.sum(evidence.column == 0)), bool)
 
 
 def _before_after(evidence: Evidence, verdict: Verdict) -> np.ndarray:
@@ -124,7 +116,7 @@ def _gap(role: str, evidence: Evidence, verdict: Verdict) -> dict[str, Any]:
 
 
 def _phases(evidence: Evidence) -> list[dict[str, Any]]:
-    return [{"name": p.name, "start": p.start, "end": p.end} for p in evidence.cost.comparisons[0].phases]
+    return [asdict(phase) for phase in evidence.cost.comparisons[0].phases]
 
 
 def _ranking(found: Screen) -> list[dict[str, Any]]:
@@ -152,7 +144,7 @@ def _trial(trial: Trial) -> dict[str, Any]:
 
 
 def _cells(found: Localisation) -> list[dict[str, Any]]:
-    return [{"variable": c.variable, "where": c.where, "gap": c.gap, "p": c.p, "found": c.found} for c in found.cells]
+    return [asdict(cell) for cell in found.cells]
 
 
 def _sizes(case: Case, verdict: Verdict, kind: Literal["amplitudes", "shapes"]) -> list[dict[str, Any]]:
