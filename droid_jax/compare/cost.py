@@ -19,10 +19,11 @@ import numpy as np
 
 from droid_jax import runtime
 from droid_jax.compare.inverse import Path, path_of, path_replay, prescribed
+from droid_jax.compare.notes import check_range, warn_if_moving, warn_of_commands
 from droid_jax.compare.population import in_blocks, over_block
 from droid_jax.compare.replay import Drive, Replay, check_gains, make_drive, servo_replay, torque_offset_effect
 from droid_jax.compare.residuals import CompareConfig, Comparison, make_comparison
-from droid_jax.compare.start import AJAR, check_range, following, warn_if_moving, warn_of_commands
+from droid_jax.compare.start import AJAR, following
 from droid_jax.compare.twin import twin_replay
 from droid_jax.measure.checks import validate
 from droid_jax.measure.motion import Motion, measured_motion
