@@ -42,6 +42,7 @@ def gap_json(case: Case, verdict: Verdict) -> dict[str, Any]:
         "sentence": verdict.sentence,
         "effects": list(verdict.effects),
         "tied": [list(rivals) for rivals in verdict.tied],
+        "about": _about(case, verdict),
         "p": verdict.screens[0].p if verdict.screens else None,
         "floor": verdict.floor,
         "converged": verdict.base.refined.converged,
@@ -145,6 +146,17 @@ def _trial(trial: Trial) -> dict[str, Any]:
 
 def _cells(found: Localisation) -> list[dict[str, Any]]:
     return [asdict(cell) for cell in found.cells]
+
+
+def _about(case: Case, verdict: Verdict) -> dict[str, dict[str, Any]]:
+    """Of each effect of the answer, tied ones too: what it is, where its mark should appear, what looks like it."""
+    answers = [*verdict.effects, *(rival for rivals in verdict.tied for rival in rivals)]
+    named = {candidate.partition(" at ")[0] for answer in answers for candidate in answer.split(" + ")}
+    return {
+        e.name: {"what": e.what, "mark": e.mark, "confused_with": list(e.confused_with)}
+        for e in case.effects
+        if e.name in named
+    }
 
 
 def _sizes(case: Case, verdict: Verdict, kind: Literal["amplitudes", "shapes"]) -> list[dict[str, Any]]:

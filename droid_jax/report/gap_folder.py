@@ -43,6 +43,7 @@ _SCHEMA = {
     "trends": [_TREND],
     **{"units": str, "versions": dict, "device": str, "setup": dict},
 }
+_ABOUT = {"what": str, "mark": str, "confused_with": [str]}
 _SPLIT = {"by": str, "limits": str}
 _LINES = ("measured", "scatter", "before", "after")
 
@@ -113,6 +114,11 @@ class Gap:
         return [*self.found["amplitudes"], *self.found.get("shapes", [])]
 
     @property
+    def about(self) -> Mapping[str, Mapping[str, Any]]:
+        """What the library says of the effects of the answer, by their names there; an older search does not tell."""
+        return self.found.get("about", {})
+
+    @property
     def parts(self) -> Parts:
         """What is said of how the recordings were divided."""
         return parts_of(self.found)
@@ -163,6 +169,7 @@ def read_gap(folder: str | Path) -> Gap:
     _READ.check(found, _SCHEMA, "gap.json")
     _READ.check(said_split(found), _SPLIT, "gap.json, 'split'")
     _READ.check(found.get("shapes", []), [_SIZE], "gap.json, 'shapes'")
+    _READ.check(found.get("about", {}), {str: _ABOUT}, "gap.json, 'about'")
     for fault in _faults(found):
         raise _READ.fault(f"gap.json, {fault}")
     roles = [r for r in ROLES if r in found["gaps"]]

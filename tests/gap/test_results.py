@@ -31,7 +31,7 @@ def folder(found: Small, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_what_was_hidden_is_in_the_file(folder: Path):
+def test_what_was_hidden_is_in_the_file(found: Small, folder: Path):
     answer = read_gap(folder).found
     assert answer["verdict"] == "named" and answer["effects"] == ["hinge_preload at door"] and answer["tied"] == [[]]
     (amplitude,) = answer["amplitudes"]
@@ -39,6 +39,9 @@ def test_what_was_hidden_is_in_the_file(folder: Path):
     assert amplitude["value"] == pytest.approx(PRELOAD, rel=0.05)
     assert (amplitude["unit"], amplitude["effect"]) == ("N m", "hinge_preload at door")
     assert "constant torque" in amplitude["what"]
+    (preload,) = (e for e in found.case.effects if e.name == "hinge_preload")
+    told = {"what": preload.what, "mark": preload.mark, "confused_with": list(preload.confused_with)}
+    assert answer["about"] == {"hinge_preload": told} and told["mark"] and told["confused_with"]
     assert answer["p"] == pytest.approx(1 / 128)  # the smallest that eight repeats allow
     assert answer["converged"] is True and answer["floor"] == FLOOR and answer["units"] == "N m"
 
@@ -162,11 +165,12 @@ def test_the_report_reads_it(folder: Path):
 
 def test_ties_experiments_and_cuts_come_along(found: Small):
     verdict = dataclasses.replace(
-        found.verdict, kind=Kind.TIE, tied=(("tilted_frame at door",),), experiments=(Experiment("open further", 7.5),),
+        found.verdict, kind=Kind.TIE, tied=(("drag at door",),), experiments=(Experiment("open further", 7.5),),
         cut="two candidates were not tried",
     )  # fmt: skip
     answer = gap_json(found.case, verdict)
-    assert answer["tied"] == [["tilted_frame at door"]] and answer["cut"] == "two candidates were not tried"
+    assert set(answer["about"]) == {"hinge_preload", "drag"}
+    assert answer["tied"] == [["drag at door"]] and answer["cut"] == "two candidates were not tried"
     assert answer["experiments"] == [{"what": "open further", "apart": 7.5}]
 
 
@@ -190,7 +194,11 @@ def test_where_nothing_was_asked_or_found_there_are_no_numbers(found: Small):
         gaps={role: (e.gap_at(found.base.values),) * 2 for role, e in found.case.judged.items()},
     )  # fmt: skip
     answer = json.loads(json.dumps(gap_json(found.case, nothing), allow_nan=False))
-    assert answer["p"] is None and answer["screens"] == answer["trials"] == answer["amplitudes"] == []
+    assert (
+        answer["about"] == {}
+        and answer["p"] is None
+        and answer["screens"] == answer["trials"] == answer["amplitudes"] == []
+    )
     assert all(gap["closed"] is None for gap in answer["gaps"].values())
     assert all(s["before"] == s["after"] for s in answer["shifts"])
 

@@ -76,6 +76,33 @@ def test_every_verdict_has_its_words(tmp_path: Path, quick: None, verdict: str) 
     assert f"Torque over time, {gap.recording(gap.judge)} ({'sealed' if sealed else 'confirming'})" in text
 
 
+def test_the_page_says_what_to_look_for(tmp_path: Path, quick: None) -> None:
+    """Beside every effect of the answer its mark and what looks like it; of what does as well also what it is."""
+    folder = make_gap(tmp_path / "run", "tie")
+    told = [
+        "Latch at door hinge Its mark: the first degrees of opening, and the last of closing. Can look like: hinge "
+        "stribeck, over centre spring.",
+        "Hinge stribeck at door hinge does as well Dry friction of the hinge that falls with speed. Its mark: "
+        "breakaway and reversals of the door. Can look like: latch, joint stribeck.",
+    ]
+    text = " ".join(read_page(page.write_report(folder)).text.split())
+    assert [line for line in told if line not in text] == []
+    found = json.loads((folder / "gap.json").read_text())
+    del found["about"]  # as searches before did not tell it
+    (folder / "gap.json").write_text(json.dumps(found))
+    text = read_page(page.write_report(folder)).text
+    assert "Its mark" not in text and "latch at door hinge" in text
+
+
+def test_a_mark_at_several_places_is_told_once_and_none_where_nothing_is_known(tmp_path: Path) -> None:
+    coulomb, own = ["joint_coulomb at panda_joint2", "joint_coulomb at panda_joint3"], "squeak at door_hinge"
+    step = {"what": "dry friction", "mark": "a step at every reversal.", "confused_with": []}
+    about = {"joint_coulomb": step, "squeak": {"what": "", "mark": "", "confused_with": []}}
+    gap = read_gap(make_gap(tmp_path, effects=[*coulomb, own], tied=[["drag at door_hinge"], [], []], about=about))
+    told = "Joint coulomb at joint 2 and joint coulomb at joint 3"
+    assert gap_words.marks(gap) == [(told, False, "Its mark: a step at every reversal.")]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("verdict", ["partly explained", "none"])
 def test_the_page_loads_nothing_and_every_link_is_there(tmp_path: Path, verdict: str) -> None:
@@ -334,6 +361,7 @@ def test_one_page_for_a_folder_with_both(tmp_path: Path) -> None:
         (lambda f: f.update(verdict="maybe"), r"'verdict' must be one of none, named.*got 'maybe'"),
         (lambda f: f.update(remainder="much"), r"'remainder' must be a number or null, got 'much'"),
         (lambda f: f.update(split={"by": "halves", "limits": ""}), r"'by' must be one of recordings.*got 'halves'"),
+        (lambda f: f["about"]["latch"].pop("mark"), r"'about', 'latch' lacks 'mark'"),
         (lambda f: f.update(split={"by": "blocks"}), r"'split' lacks 'limits'"),
         (lambda f: f.update(tied=[[], []]), r"'tied' has 2 lists for 1 effects"),
     ],
