@@ -179,35 +179,6 @@ def _added(sizes: Sequence[Mapping[str, Any]]) -> list[str]:
     return out
 
 
-def marks(gap: Gap) -> list[tuple[str, bool, str]]:
-    """What to look for: effects of the answer by name, whether these do only as well as others, and their mark.
-
-    What lies at several places is told of once.
-    """
-    named = gap.found["effects"]
-    tied = [part for rivals in gap.found["tied"] for model in rivals for part in model.split(BETWEEN)]
-    alike: dict[tuple[bool, str], list[str]] = {}
-    for name in dict.fromkeys([*named, *tied]):
-        if text := _mark(gap, name, name not in named):
-            alike.setdefault((name not in named, text), []).append(effect_words(name))
-    return [(listed(names).capitalize(), rival, text) for (rival, text), names in alike.items()]
-
-
-def _mark(gap: Gap, name: str, rival: bool) -> str:
-    """ "Its mark: the first degrees of opening. Can look like: drag.", and before it of a rival what it is."""
-    effect = name.partition(" at ")[0]
-    if effect not in gap.about:
-        return ""
-    one = gap.about[effect]
-    others = ", ".join(effect_words(other) for other in one["confused_with"])
-    said = (
-        one["what"][:1].upper() + one["what"][1:] if rival else "",
-        f"Its mark: {one['mark']}" if one["mark"] else "",
-        f"Can look like: {others}" if others else "",
-    )
-    return readable(" ".join(f"{text.rstrip('.')}." for text in said if text), gap.found)
-
-
 def size_words(a: Mapping[str, Any]) -> str:
     """ "latch 0.72 N m, 0.60 to 0.84 N m": an amplitude or a shape of gap.json with its interval."""
     bound = " (at its bound)" if at_bound(a) else ""

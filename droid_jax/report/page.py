@@ -26,6 +26,7 @@ from droid_jax.report.export import data_uri
 from droid_jax.report.files import FITTED, LAST_FILES, POLICY, TRAINING, TRANSFER
 from droid_jax.report.gap_drawings import draw_gap
 from droid_jax.report.gap_folder import Gap, has_gap, read_gap
+from droid_jax.report.gap_marks import marks
 from droid_jax.report.gap_tables import groups
 from droid_jax.report.gap_words import (
     DECISIVE,
@@ -33,7 +34,6 @@ from droid_jax.report.gap_words import (
     at_bound,
     effect_words,
     gap_summary,
-    marks,
     readable,
     role_words,
     settings,

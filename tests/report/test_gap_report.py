@@ -16,7 +16,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from reader import read_page
 
-from droid_jax.report import drawings, gap_drawings, gap_words, page, style
+from droid_jax.report import drawings, gap_drawings, gap_marks, gap_words, page, style
 from droid_jax.report.drawings import Drawing
 from droid_jax.report.gap_folder import VERDICTS, read_gap
 from droid_jax.report.gap_parts import PARTS
@@ -100,7 +100,7 @@ def test_a_mark_at_several_places_is_told_once_and_none_where_nothing_is_known(t
     about = {"joint_coulomb": step, "squeak": {"what": "", "mark": "", "confused_with": []}}
     gap = read_gap(make_gap(tmp_path, effects=[*coulomb, own], tied=[["drag at door_hinge"], [], []], about=about))
     told = "Joint coulomb at joint 2 and joint coulomb at joint 3"
-    assert gap_words.marks(gap) == [(told, False, "Its mark: a step at every reversal.")]
+    assert gap_marks.marks(gap) == [(told, False, "Its mark: a step at every reversal.")]
 
 
 @pytest.mark.slow
