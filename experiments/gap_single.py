@@ -30,7 +30,7 @@ from inverse_fit import rms, rounded
 from benchmarks.common import CODE
 from benchmarks.sharing import code_name, kept
 from droid_jax.compare.residuals import CompareConfig
-from droid_jax.gap.blocks import OUTSIDE, Blocks
+from droid_jax.gap.blocks import Blocks
 from droid_jax.gap.case import Case, GapConfig
 from droid_jax.gap.evidence import Evidence, only_comparison
 from droid_jax.gap.refit import deviations, intervals
@@ -263,7 +263,7 @@ def _block(evidence: Evidence) -> np.ndarray:
 def _rms_of(case: Case, verdict: Verdict, role: str) -> dict[str, list[float]]:
     """RMS of each column before and after, in its unit, over the instants of a role."""
     evidence = case.judged[role]
-    inside, log = _block(evidence) != OUTSIDE, evidence.cost
+    inside, log = evidence.instants, evidence.cost
     assert isinstance(log, Log)
     return {
         when: rounded(rms(log.left(model.values)[inside]))

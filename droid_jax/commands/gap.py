@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from droid_jax.model.parameters import Space
     from droid_jax.model.scene import Scene
     from droid_jax.model.seam import Effect
+    from droid_jax.report.gap_folder import Gap as Found
 
 
 @dataclass(frozen=True)
@@ -226,29 +227,38 @@ def given_to(command: Gap) -> list[Recording]:
 
 def _done(out: Path) -> None:
     """Build the page, and say in a few lines what was found."""
-    from droid_jax.gap.results import load_gap, most_shifted
+    from droid_jax.report.gap_folder import read_gap
     from droid_jax.report.gap_words import size_words
     from droid_jax.report.words import percent
 
-    found = load_gap(out).answer
+    gap = read_gap(out)
+    found = gap.found
     page = report.write(out)
     print(found["sentence"])
-    for size in (*found["amplitudes"], *found.get("shapes", ())):
+    for size in gap.sizes:
         print(f"{size['effect']}: {size_words(size)} (90 % interval)")
     p = "nothing was asked" if found["p"] is None else f"p = {found['p']:.2g} if nothing were missing"
     print(f"{p}; base fit converged: {'yes' if found['converged'] else 'no'}")
     gaps = []
-    for role, gap in found["gaps"].items():
-        closed = "" if gap["closed"] is None else f" ({percent(gap['closed'])} closed)"
-        gaps.append(f"{role} {gap['before']:.3g} -> {gap['after']:.3g}{closed}")
+    for role, one in found["gaps"].items():
+        closed = "" if one["closed"] is None else f" ({percent(one['closed'])} closed)"
+        gaps.append(f"{role} {one['before']:.3g} -> {one['after']:.3g}{closed}")
     print(f"gap, noise units squared: {', '.join(gaps)}")
     if found["cut"]:
         print(f"left out for lack of time (--budget): {found['cut']}")
-    if limits := found.get("split", {}).get("limits"):
-        print(limits)
-    shift, deviations = most_shifted(found["shifts"])
-    moved = (
-        f"{shift['name']} {shift['before']:.3g} -> {shift['after']:.3g} {shift['unit']} ({deviations:.1f} deviations)"
-    )
-    print(f"shifted most: {moved if found['effects'] else 'nothing, no effect came in'}")
+    if gap.limits:
+        print(gap.limits)
+    print(f"shifted most: {_shifted_most(gap)}")
     print(f"report: {page}")
+
+
+def _shifted_most(gap: Found) -> str:
+    """Which base parameter the effects moved most, by how many of its deviations."""
+    from droid_jax.report.gap_words import deviations, largest_shifts
+
+    if not gap.extended:
+        return "nothing, no effect came in"
+    for most in largest_shifts(gap.found["shifts"])[:1]:
+        by = abs(deviations(most))
+        return f"{most['name']} {most['before']:.3g} -> {most['after']:.3g} {most['unit']} ({by:.1f} deviations)"
+    return "nothing whose deviation is known"

@@ -94,7 +94,7 @@ def run(command: Identify) -> None:
     needs_writer(command.tensorboard)
     runtime.start()
     warn_of_cpu(command.preset)
-    from droid_jax.compare.start import command_notes
+    from droid_jax.compare.notes import command_notes
     from droid_jax.identify.pipeline import cost_samples, prepare, solve
     from droid_jax.identify.results import prepare_folder, write_run
     from droid_jax.measure.surrogate import is_stand_in

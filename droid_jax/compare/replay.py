@@ -17,6 +17,7 @@ from mujoco import mjx
 
 from droid_jax.compare.start import check_weight, holding, start_pose, weight_share
 from droid_jax.measure.checks import check_joints
+from droid_jax.measure.clocks import interpolate
 from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.model.actuators import has_servo_damping
 from droid_jax.model.physics import Physics
@@ -75,8 +76,8 @@ def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True) -> Dri
     qpos0 = start_pose(scene, recording)
     command = np.tile(holding(scene, qpos0), (steps, 1))
     sent = np.flatnonzero(columns >= 0)
-    for actuator in sent:
-        command[:, actuator] = np.interp(clock, recording.time, recording.command[:, columns[actuator]])
+    if sent.size:
+        command[:, sent] = interpolate(clock, recording.time, recording.command[:, columns[sent]])
     stiffness = scene.model.actuator_gainprm[:, 0] * scene.model.actuator_gear[:, 0] ** 2
     if gains is not None:
         stiffness[sent] = np.asarray(gains.stiffness, dtype=float)[columns[sent]]

@@ -68,10 +68,15 @@ def steers(effect: Effect) -> bool:
 
 
 def candidates(effects: Iterable[Effect]) -> tuple[Candidate, ...]:
-    """Every effect at every place with every combination of its shapes' values."""
+    """Every effect at every place with every combination of its shapes' values.
+
+    Raises ValueError where that is none at all.
+    """
     out = []
     for effect in effects:
         grid = [dict(zip(effect.shapes, values, strict=True)) for values in itertools.product(*effect.shapes.values())]
         for (place, amplitudes), shapes in itertools.product(effect.places.items(), grid):
             out.append(Candidate(effect.name, place, amplitudes, shapes))
+    if not out:
+        raise ValueError("there is nothing to ask about: none of the effects says its places (`Effect.places`)")
     return tuple(out)

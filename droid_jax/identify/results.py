@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -104,19 +105,6 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
             }
         )
     costs = found.fit(np.stack([found.start, found.best]))
-    gaps = {
-        name: {
-            "before": g.before,
-            "after": g.after,
-            "floor": g.floor,
-            "closed": g.closed,
-            "per_joint_before": list(g.per_joint_before),
-            "per_joint_after": list(g.per_joint_after),
-            "per_joint_floor": None if g.per_joint_floor is None else list(g.per_joint_floor),
-            "judged": g.judged,
-        }
-        for name, g in found.gaps.items()
-    }
     floors: list[Any] = [g.floor for g in found.gaps.values()]
     comparison = found.fit.comparisons[0]
     whitened = comparison.config.whitened  # the gaps' floors are in the unit of the torque
@@ -130,7 +118,7 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
             "floor": None if whitened or None in floors else float(np.mean(floors)),
             "unit": "noise units" if whitened else unit,
         },
-        "gap": gaps,
+        "gap": {name: asdict(gap) for name, gap in found.gaps.items()},
         "torque_unit": unit,
         "stop": found.search.stop,
         "converged": None if found.refined is None else found.refined.converged,
@@ -182,6 +170,5 @@ def traces(found: Identified) -> dict[str, np.ndarray]:
         out[f"{name}/measured_high"] = np.quantile(repeats, 0.95, axis=0)
         out[f"{name}/before"], out[f"{name}/after"] = both[i]
         out[f"{name}/joints"] = np.array([found.scene.joints[c] for c in channel.columns])
-        phases = [{"name": p.name, "start": p.start, "end": p.end} for p in comparison.phases]
-        out[f"{name}/phases"] = np.array(json.dumps(phases))
+        out[f"{name}/phases"] = np.array(json.dumps([asdict(phase) for phase in comparison.phases]))
     return out

@@ -17,6 +17,7 @@ import numpy as np
 import scipy.signal
 
 from droid_jax.measure.checks import validate
+from droid_jax.measure.clocks import interpolate
 from droid_jax.measure.engine import Trace, instrument, simulate
 from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
 from droid_jax.model.builtin import HINGE
@@ -253,8 +254,7 @@ def _control(hidden: Scene, demonstration: Recording, timestep: float, delay: fl
         raise ValueError(f"the stand-in robot needs a command for {', '.join(without)} too; the demonstration has none")
     start, end = demonstration.time[0], demonstration.time[-1]
     clock = start + np.arange(int((end - start) / timestep + 1e-6) + 1) * timestep
-    command = [np.interp(clock - delay, demonstration.time, demonstration.command[:, c]) for c in columns]
-    return clock, np.stack(command, axis=1)
+    return clock, interpolate(clock - delay, demonstration.time, demonstration.command[:, columns])
 
 
 def _check_opened(demonstration: Recording, clock: np.ndarray, trace: Trace) -> None:

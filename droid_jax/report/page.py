@@ -26,6 +26,7 @@ from droid_jax.report.export import data_uri
 from droid_jax.report.files import FITTED, LAST_FILES, POLICY, TRAINING, TRANSFER
 from droid_jax.report.gap_drawings import draw_gap
 from droid_jax.report.gap_folder import Gap, has_gap, read_gap
+from droid_jax.report.gap_marks import marks
 from droid_jax.report.gap_tables import groups
 from droid_jax.report.gap_words import (
     DECISIVE,
@@ -188,6 +189,7 @@ def _search(gap: Gap) -> dict[str, Any]:
         "answer": readable(gap.found["sentence"], gap.found),
         "gap_summary": gap_summary(gap),
         "gap_drawings": draw_gap(gap),
+        "marks": marks(gap),
         "settings": settings(gap),
         "candidates": groups(gap.found),
         "roles": ROLES,
