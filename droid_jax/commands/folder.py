@@ -84,7 +84,7 @@ def finished(out: Path, setup: dict[str, Any], again: bool, last: str = "config.
 
     Says so where a run goes on with other code than it was begun with.
 
-    Raises OtherRun for a folder with another run in it.
+    Raises OtherRun for a folder with another run in it, ValueError where its setup.json is damaged.
     """
     path = out / "setup.json"
     if again or not path.is_file():

@@ -33,7 +33,7 @@ RATE = 500.0  # Hz, command clock
 
 @dataclass(frozen=True)
 class Segment:
-    """One stretch of a demonstration: the door's angle [rad] and the stand-off [m] at its end."""
+    """One stretch of a demonstration: the door's angle [rad], stand-off [m] and finger command [m] at its end."""
 
     phase: str
     seconds: float

@@ -41,7 +41,7 @@ _TABLE_I: dict[int, dict[str, Any]] = {
 
 
 def truth(springs: int) -> dict[str, float]:
-    """The nine door and finger values of a fitted column of Table I (0, 1 or 2 springs)."""
+    """The nine door and finger values of a fitted column of Table I (0, 1 or 2 springs; ValueError for others)."""
     if springs not in _TABLE_I:
         raise ValueError(f"Table I has doors with {sorted(_TABLE_I)} springs, got {springs}")
     row = dict(_TABLE_I[springs])
@@ -60,6 +60,7 @@ def door_space(scene: Scene, *, preset: str = "impedance") -> Space:
     preset "impedance": the same door and gripper; joint damping around the scene's own servo
       damping with a deviation of 10 %; log coordinates, wide enough that a sprung door, 200 of
       Table I's deviations away, is still found.
+    Raises ValueError for other presets and for a scene without a grip.
     """
     if preset not in ("impedance", "paper"):
         raise ValueError(f"preset must be 'impedance' or 'paper', got {preset!r}")

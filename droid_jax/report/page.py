@@ -77,7 +77,7 @@ _DOWNLOADS = (
 
 
 def write_report(run: Path) -> Path:
-    """Write RUN/report.html and RUN/figures/ from the files in RUN; returns the page's path.
+    """Write RUN/report.html, and figures/ of the folder of each part, from the files in RUN; returns the page's path.
 
     Raises ValueError that names the file when a required one is missing or broken.
     """
