@@ -17,7 +17,7 @@ from droid_jax.commands.folder import changed, setup_of, stage_folder
 from droid_jax.commands.hidden import hidden_effects
 from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.source import needs_brax, source
-from droid_jax.report.files import FILMS, POLICY, TRAINING, TRANSFER
+from droid_jax.files import FILMS, POLICY, TRAINING, TRANSFER
 
 if TYPE_CHECKING:
     from droid_jax.policy.control import Policy

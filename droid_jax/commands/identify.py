@@ -16,7 +16,7 @@ from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.pictures import draw, keep_replay
 from droid_jax.commands.presets import TIMESTEP, Preset, refine_config, search_config, warn_of_cpu
 from droid_jax.commands.scenes import compared, needs_log, needs_recording, needs_scene, own_scene, recording_at
-from droid_jax.report.files import EXTENDED
+from droid_jax.files import EXTENDED, FIT
 
 if TYPE_CHECKING:
     from droid_jax.identify.pipeline import Identified, IdentifyConfig
@@ -164,7 +164,7 @@ def run(command: Identify) -> None:
         )  # fmt: skip
     draw(out, scene)
     report.run(report.Report(out))
-    _summary(found, json.loads((out / "fit.json").read_text()), [r.repeats for r in recordings])
+    _summary(found, json.loads((out / FIT).read_text()), [r.repeats for r in recordings])
 
 
 def model_of(command: Identify) -> tuple[Scene, Space, Space | None]:

@@ -12,7 +12,7 @@ from droid_jax.commands.folder import RUNS, begin, finished, setup_of
 from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.presets import warn_of_cpu
 from droid_jax.commands.source import has_model, model_folder, needs_brax, source, stand_in_of
-from droid_jax.report.files import GAUSSIAN, POLICY, TRAINING
+from droid_jax.files import EXTENDED, GAUSSIAN, POLICY, TRAINING
 from droid_jax.report.stages import extended_of, fingerprint
 
 if TYPE_CHECKING:
@@ -61,7 +61,6 @@ def run(command: Train) -> None:
     needs_writer(command.tensorboard)
     runtime.start()
     warn_of_cpu(command.preset)
-    from droid_jax.gap.extended import FILE
     from droid_jax.identify.results import prepare_folder
     from droid_jax.policy.door_env import DoorEnv
     from droid_jax.policy.network import save_policy
@@ -86,7 +85,7 @@ def run(command: Train) -> None:
     gaussian.save(out / GAUSSIAN)
     model = None if fit is None else extended_of(fit)
     if model is not None:
-        write_bytes(out / FILE, model.read_bytes())
+        write_bytes(out / EXTENDED, model.read_bytes())
     board = out / FOLDER if command.tensorboard else None
     with training(config.steps) as show, scalars(board) as write:
 

@@ -16,7 +16,7 @@ from droid_jax.commands.hidden import DEMONSTRATIONS, hidden_effects, kept_at, r
 from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.scenes import needs_log, needs_recording, needs_scene
 from droid_jax.commands.source import model_folder, needs_brax
-from droid_jax.report.files import LAST_FILES, TRANSFER
+from droid_jax.files import FIT, GAP, LAST_FILES, TRANSFER
 from droid_jax.report.stages import left_over, setup, unfinished
 from droid_jax.storage import write_json
 
@@ -278,7 +278,7 @@ def _fitted(folder: Path, command: All, recordings: Sequence[Path]) -> bool:
     """Whether a folder of `identify` holds the fit of these recordings: made just now, or earlier of the same."""
     from droid_jax.commands.scenes import recording_at
 
-    if not (folder / "fit.json").is_file() or unfinished(folder):
+    if not (folder / FIT).is_file() or unfinished(folder):
         return False
     if "identify" in command.stages:
         return True
@@ -298,11 +298,11 @@ def told(out: Path) -> list[str]:
     lines, old = [], left_over(out)
     if old:
         lines.append(f"not on the page: {' and '.join(sorted(old))}, of an earlier run in this folder")
-    if fit := _json(out / "identify" / "fit.json"):
+    if fit := _json(out / "identify" / FIT):
         unit = fit.get("torque_unit", "N m")
         gaps = [f"{name} {g['before']:.3f} -> {g['after']:.3f} {unit} {judged(g)}" for name, g in fit["gap"].items()]
         lines.append(f"identify: torque distance {', '.join(gaps)}")
-    if found := None if "gap" in old else _json(out / "gap" / "gap.json"):
+    if found := None if "gap" in old else _json(out / "gap" / GAP):
         role, size = list(found["gaps"].items())[-1]
         closed = size["closed"] if found["effects"] else None
         share = "" if closed is None else f"; {percent(closed)} of the gap U closed on the {role} motion"

@@ -15,6 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from droid_jax.files import GAP, GAP_TRACES
 from droid_jax.gap.blocks import OUTSIDE, Blocks
 from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.case import Case
@@ -52,15 +53,15 @@ def write_gap(folder: Path, case: Case, verdict: Verdict, description: Mapping[s
 
     description: what else gap.json shall hold: "seconds", "versions", "device", "setup", ...
     """
-    write_npz(folder / "gap.npz", gap_arrays(case, verdict))
+    write_npz(folder / GAP_TRACES, gap_arrays(case, verdict))
     save_extended(folder, extended(case, verdict.model))
-    write_json(folder / "gap.json", {**gap_json(case, verdict), **description})
+    write_json(folder / GAP, {**gap_json(case, verdict), **description})
 
 
 def load_gap(folder: str | Path) -> GapFiles:
     """The answer and the traces of a finished search; ValueError names the file that is missing or broken."""
     folder = Path(folder)
-    answer, arrays = _read_json(folder / "gap.json"), _read_npz(folder / "gap.npz")
+    answer, arrays = _read_json(folder / GAP), _read_npz(folder / GAP_TRACES)
     absent = [key for key in _KEYS if key not in answer]
     roles = [role for role in ROLES if role in answer.get("gaps", {})]
     absent += [key for key in ("joints", *(f"{r}.{t}" for r in roles for t in TRACES)) if key not in arrays]

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from droid_jax.files import POLICY
 from droid_jax.policy import control
 from droid_jax.policy.control import ACTIONS, ARM, LAYOUT, OBSERVED, Policy
 from droid_jax.policy.network import save_policy
@@ -39,7 +40,7 @@ def export(folder: Path, policy: Policy) -> float:
     if not apart <= CLOSE:
         raise ValueError(f"the ONNX policy differs from the JAX policy by {apart:.2g} in an action: it is not written")
     folder.mkdir(parents=True, exist_ok=True)
-    save_policy(folder / "policy.npz", policy)
+    save_policy(folder / POLICY, policy)
     write_bytes(folder / "policy.onnx", model)
     write_bytes(folder / "control.py", Path(control.__file__).read_bytes())
     return apart

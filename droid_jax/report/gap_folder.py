@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from droid_jax.files import GAP, GAP_TRACES
 from droid_jax.report.gap_parts import PARTS, Parts, parts_of, split_of
 from droid_jax.report.reading import Reader
 
@@ -152,19 +153,19 @@ def hidden_in(found: Mapping[str, Any]) -> list[str]:
 
 def has_gap(folder: Path) -> bool:
     """Whether a folder holds, or should hold, a search for a missing effect."""
-    return any((folder / name).exists() for name in ("gap.json", "gap.npz"))
+    return any((folder / name).exists() for name in (GAP, GAP_TRACES))
 
 
 def read_gap(folder: Path) -> Gap:
     """Load and check; ValueError names what is missing or broken."""
-    found = _READ.json(folder / "gap.json")
-    _READ.check(found, _SCHEMA, "gap.json")
+    found = _READ.json(folder / GAP)
+    _READ.check(found, _SCHEMA, GAP)
     _READ.check(split_of(found), _SPLIT, "gap.json, 'split'")
     _READ.check(found.get("shapes", []), [_SIZE], "gap.json, 'shapes'")
     for fault in _faults(found):
         raise _READ.fault(f"gap.json, {fault}")
     roles = [r for r in ROLES if r in found["gaps"]]
-    return Gap(folder, found, _traces(folder / "gap.npz", roles, found["phases"]))
+    return Gap(folder, found, _traces(folder / GAP_TRACES, roles, found["phases"]))
 
 
 def _faults(found: Mapping[str, Any]) -> Iterator[str]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from droid_jax.files import HISTORY_TABLE, SAMPLES
 from droid_jax.report.reading import Reader
 from droid_jax.report.stages import needs_whole
 
@@ -38,9 +39,9 @@ def frames(folder: str | Path) -> Frames:
     import pandas as pd
 
     folder = Path(folder)
-    at = next((f for f in (folder, folder / "identify") if (f / "samples.csv").is_file()), folder)
+    at = next((f for f in (folder, folder / "identify") if (f / SAMPLES).is_file()), folder)
     needs_whole(at)
     try:
-        return Frames(pd.read_csv(at / "samples.csv"), pd.read_csv(at / "history.csv", index_col="generation"))
+        return Frames(pd.read_csv(at / SAMPLES), pd.read_csv(at / HISTORY_TABLE, index_col="generation"))
     except (OSError, ValueError) as error:
         raise Reader("identify").fault(f"{at} holds no tables of a fit ({error})") from None
