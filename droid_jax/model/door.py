@@ -23,7 +23,7 @@ from droid_jax.model.fields import (
     pair_friction,
     servo_scale,
 )
-from droid_jax.model.parameters import Parameter, Scaling, Space
+from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
 
 PAPER_DAMPING_STD = (2.0, 2.0, 2.0, 2.0, 2.0, 1.0, 0.2)  # Table I, N m s/rad
@@ -127,6 +127,6 @@ def torque_offsets(joints: tuple[str, ...], std: float = 0.1) -> tuple[Parameter
     """Constant error of each joint's torque sensor, N m."""
     return tuple(
         Parameter(f"torque_offset[{j}]", "N m", 0.0, std if i < 4 else 0.3 * std, -2.0, 2.0, nuisance=True,
-                  group="Nuisance", scaling=Scaling.LINEAR)
+                  group="Nuisance")
         for i, j in enumerate(joints)
     )  # fmt: skip
