@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from droid_jax.commands.hidden import known_stand_in
+from droid_jax.errors import needs
 from droid_jax.files import CONFIG, GAP, GAUSSIAN
 from droid_jax.report.stages import extended_of, left_over, needs_whole, setup, told_in, unfinished
 
@@ -128,5 +128,4 @@ def _hold(paths: Sequence[str | Path], hashes: Sequence[str]) -> bool:
 
 def needs_brax() -> None:
     """ValueError that says what to install where brax is not."""
-    if importlib.util.find_spec("brax") is None:
-        raise ValueError("policies need brax: in the checkout, pip install -c constraints.txt -e '.[train]'")
+    needs("policies need", "train", "brax")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from droid_jax.errors import needs
 from droid_jax.files import POLICY
 from droid_jax.policy import control
 from droid_jax.policy.control import ACTIONS, ARM, LAYOUT, OBSERVED, Policy
@@ -30,11 +30,7 @@ def export(folder: Path, policy: Policy) -> float:
 
     Raises ValueError where onnx or onnxruntime is not installed, or the two differ by more than `CLOSE`.
     """
-    missing = [name for name in ("onnx", "onnxruntime") if importlib.util.find_spec(name) is None]
-    if missing:
-        raise ValueError(
-            f"export needs {' and '.join(missing)}: in the checkout, pip install -c constraints.txt -e '.[export]'"
-        )
+    needs("export needs", "export", "onnx", "onnxruntime")
     model = to_onnx(policy)
     apart = difference(policy, model)
     if not apart <= CLOSE:
