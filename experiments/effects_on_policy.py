@@ -33,7 +33,7 @@ from rich.console import Console  # noqa: E402
 from rich.progress import track  # noqa: E402
 
 from benchmarks.common import origin  # noqa: E402
-from droid_jax.commands.hidden import hidden_effects  # noqa: E402
+from droid_jax.commands.stand_in import hidden_effects  # noqa: E402
 from droid_jax.files import POLICY  # noqa: E402
 from droid_jax.measure.demonstration import demonstration_path  # noqa: E402
 from droid_jax.measure.formats import load as load_recording  # noqa: E402

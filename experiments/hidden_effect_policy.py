@@ -32,7 +32,7 @@ import tyro  # noqa: E402
 from benchmarks.common import origin  # noqa: E402
 from benchmarks.sharing import claimed, code_name  # noqa: E402
 from droid_jax.commands.gap_search import searched  # noqa: E402
-from droid_jax.commands.hidden import hidden_effects, record_stand_in  # noqa: E402
+from droid_jax.commands.stand_in import hidden_effects, record_stand_in  # noqa: E402
 from droid_jax.files import EXTENDED  # noqa: E402
 from droid_jax.gap.case import GapConfig  # noqa: E402
 from droid_jax.gap.extended import extended, load_extended, save_extended  # noqa: E402

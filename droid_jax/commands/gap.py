@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, Literal
 from droid_jax.commands import report
 from droid_jax.commands.folder import begin, fingerprints, finished, setup_of, stage_folder
 from droid_jax.commands.gap_search import searched
-from droid_jax.commands.hidden import hidden_effects, kept_at, known_stand_in, record_stand_in, settled
 from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.presets import TIMESTEP, refine_config, search_config, warn_of_cpu
 from droid_jax.commands.scenes import compared, needs_log, needs_recording, needs_scene, own_scene, recording_at
+from droid_jax.commands.stand_in import hidden_effects, kept_at, known_stand_in, record_stand_in, settled
 from droid_jax.files import FIT, GAP
 from droid_jax.report.stages import needs_whole
 

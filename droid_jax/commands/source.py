@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from droid_jax.commands.hidden import known_stand_in
+from droid_jax.commands.stand_in import known_stand_in
 from droid_jax.errors import needs
 from droid_jax.files import CONFIG, GAP, GAUSSIAN
 from droid_jax.report.stages import extended_of, left_over, needs_whole, setup, told_in, unfinished

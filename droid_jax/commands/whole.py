@@ -12,10 +12,10 @@ from typing import Any, Literal, NamedTuple
 
 from droid_jax.commands import evaluate, gap, identify, report, train
 from droid_jax.commands.folder import OtherRun, changed, forget, setup_of
-from droid_jax.commands.hidden import DEMONSTRATIONS, hidden_effects, kept_at, record_stand_in, settled
 from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.scenes import needs_log, needs_recording, needs_scene
 from droid_jax.commands.source import model_folder, needs_brax
+from droid_jax.commands.stand_in import DEMONSTRATIONS, hidden_effects, kept_at, record_stand_in, settled
 from droid_jax.files import FIT, GAP, LAST_FILES, TRANSFER
 from droid_jax.report.stages import left_over, setup, unfinished
 from droid_jax.storage import write_json
@@ -293,6 +293,8 @@ def told(out: Path) -> list[str]:
     """One line for each stage that has a result."""
     from droid_jax.report.gap_folder import hidden_in
     from droid_jax.report.gap_words import readable
+    from droid_jax.report.policy_folder import read_training
+    from droid_jax.report.policy_words import another_robot
     from droid_jax.report.words import hidden_words, judged, percent
 
     lines, old = [], left_over(out)
@@ -309,11 +311,12 @@ def told(out: Path) -> list[str]:
         lines.append(f"gap: {readable(found['sentence'], found).rstrip('.')}{share}")
         if hidden := hidden_words(hidden_in(found)):
             lines.append(f"hidden in the stand-in robot: {hidden}")
-    for name, of in {} if "train" in old else (_json(out / "train" / TRANSFER) or {}).items():
-        if name in ("simulation", "stand_in"):
-            low, high = of["interval_95"]
-            where = {"simulation": "in simulation", "stand_in": "on the stand-in robot"}[name]
-            lines.append(f"policy: {percent(of['success_rate'])} success {where} ({percent(low)} to {percent(high)})")
+    if tried := None if "train" in old else _json(out / "train" / TRANSFER):
+        for name, where in (("simulation", "in simulation"), ("stand_in", "on the stand-in robot")):
+            rate, (low, high) = tried[name]["success_rate"], tried[name]["interval_95"]
+            lines.append(f"policy: {percent(rate)} success {where} ({percent(low)} to {percent(high)})")
+        if other := another_robot(read_training(out / "train")):
+            lines.append(other)
     return lines
 
 
