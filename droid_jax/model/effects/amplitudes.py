@@ -1,4 +1,4 @@
-"""What the effects share: parameters for a hinge or for every joint, and smooth signs."""
+"""What the effects share: parameters for a hinge or for every joint, and what holds a friction above zero."""
 
 from __future__ import annotations
 
