@@ -32,9 +32,10 @@ import tyro  # noqa: E402
 from benchmarks.common import origin  # noqa: E402
 from benchmarks.sharing import claimed, code_name  # noqa: E402
 from droid_jax.commands.gap_search import searched  # noqa: E402
-from droid_jax.commands.hidden import hidden_effects, record_stand_in  # noqa: E402
+from droid_jax.commands.stand_in import hidden_effects, record_stand_in  # noqa: E402
+from droid_jax.files import EXTENDED  # noqa: E402
 from droid_jax.gap.case import GapConfig  # noqa: E402
-from droid_jax.gap.extended import FILE, extended, load_extended, save_extended  # noqa: E402
+from droid_jax.gap.extended import extended, load_extended, save_extended  # noqa: E402
 from droid_jax.gap.missing import case_of  # noqa: E402
 from droid_jax.gap.split import Split  # noqa: E402
 from droid_jax.gap.verdict import Kind  # noqa: E402
@@ -145,7 +146,7 @@ def case(model: str, seed: int, folder: Path, arguments: Arguments, code: Mappin
         space = door_space(env.scene) + door_nuisances(env.scene)
         gaussian = load_gaussian(folder / BASE) if model == "base" else prior(space)
     else:
-        known = load_extended(folder / FILE, scene)
+        known = load_extended(folder / EXTENDED, scene)
         env, gaussian = DoorEnv(known.scene, task, known.effects), known.gaussian
     hidden, config = listed(hidden_effects(arguments.hide, scene)), TransferConfig(trials=budget.trials, seed=robot)
     truth = stand_in_truth(door_scene(), SPRINGS, robot)

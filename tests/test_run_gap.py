@@ -17,7 +17,7 @@ import pytest
 from small_gap import EFFECTS, FLOOR, JOINTS, PRELOAD, QUICK, SCENE, record, small, small_scene, write_parameters
 
 from droid_jax.commands import gap, report
-from droid_jax.commands.hidden import hidden_effects, record_stand_in
+from droid_jax.commands.stand_in import hidden_effects, record_stand_in
 from droid_jax.gap import anew, missing
 from droid_jax.gap.inputs import check_recordings, lags
 from droid_jax.gap.verdict import Experiment

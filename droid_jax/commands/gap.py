@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any, Literal
 from droid_jax.commands import report
 from droid_jax.commands.folder import begin, fingerprints, finished, setup_of, stage_folder
 from droid_jax.commands.gap_search import searched
-from droid_jax.commands.hidden import hidden_effects, kept_at, known_stand_in, record_stand_in, settled
 from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.presets import TIMESTEP, refine_config, search_config, warn_of_cpu
 from droid_jax.commands.scenes import compared, needs_log, needs_recording, needs_scene, own_scene, recording_at
+from droid_jax.commands.stand_in import hidden_effects, kept_at, known_stand_in, record_stand_in, settled
+from droid_jax.files import FIT, GAP
 from droid_jax.report.stages import needs_whole
 
 if TYPE_CHECKING:
@@ -103,7 +104,7 @@ def run(command: Gap) -> None:
     from droid_jax.measure.surrogate import is_stand_in
 
     out = command.out
-    fit = None if command.fit is None else stage_folder(command.fit, "identify", "fit.json")
+    fit = None if command.fit is None else stage_folder(command.fit, "identify", FIT)
     load_effects(command.own_effects, fit)
     scene, base = model_of(command)
     given = given_to(command)
@@ -114,7 +115,7 @@ def run(command: Gap) -> None:
     setup = {**setup_of(command), "command": "gap", **fingerprints(scene, base, given)}
     if start is not None:
         setup["start"] = start.tolist()
-    if finished(out, setup, command.again, "gap.json"):
+    if finished(out, setup, command.again, GAP):
         _done(out)
         return
     split, roles = shared_out(scene, given) if given else (Split.RECORDINGS, {})
@@ -162,7 +163,7 @@ def values_of(folder: Path, base: Space) -> np.ndarray:
     """
     needs_whole(folder)
     try:
-        known = {p["name"]: float(p["best"]) for p in json.loads((folder / "fit.json").read_text())["parameters"]}
+        known = {p["name"]: float(p["best"]) for p in json.loads((folder / FIT).read_text())["parameters"]}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"--fit {folder} is no folder of a finished `identify`: {error}") from None
     lacking = [p.name for p in base.parameters if not p.nuisance and p.name not in known]

@@ -17,7 +17,7 @@ from mujoco import mjx
 from droid_jax.compare.replay import observed
 from droid_jax.measure.motion import Motion
 from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
-from droid_jax.model.joint_friction import SMOOTHING
+from droid_jax.model.joint_friction import direction
 from droid_jax.model.physics import Physics
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, Rollout, State, Theta, column, complete
@@ -146,7 +146,7 @@ def _resistance(theta: Theta, state: State, own: jax.Array, effects: Sequence[Ef
             loss = effect.frictionloss(theta, state, loss)
         if effect.force is not None:
             resistance = resistance - effect.force(theta, state)
-    return resistance + (loss - own) * jnp.tanh(state.qvel / SMOOTHING)
+    return resistance + (loss - own) * direction(state.qvel)
 
 
 def _behind_the_sensor(scene: Scene, theta: Theta) -> jax.Array:

@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from droid_jax.files import GAP, GAP_TRACES
 from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.case import Case
 from droid_jax.gap.evidence import Evidence
@@ -30,9 +31,9 @@ def write_gap(folder: Path, case: Case, verdict: Verdict, description: Mapping[s
 
     description: what else gap.json shall hold: "seconds", "versions", "device", "setup", ...
     """
-    write_npz(folder / "gap.npz", gap_arrays(case, verdict))
+    write_npz(folder / GAP_TRACES, gap_arrays(case, verdict))
     save_extended(folder, extended(case, verdict.model))
-    write_json(folder / "gap.json", {**gap_json(case, verdict), **description})
+    write_json(folder / GAP, {**gap_json(case, verdict), **description})
 
 
 def gap_json(case: Case, verdict: Verdict) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from droid_jax.files import GAP, GAP_TRACES
 from droid_jax.report.gap_parts import PARTS, Parts, parts_of, said_split
 from droid_jax.report.reading import Reader
 
@@ -158,22 +159,22 @@ def hidden_in(found: Mapping[str, Any]) -> list[str]:
 
 def has_gap(folder: Path) -> bool:
     """Whether a folder holds, or should hold, a search for a missing effect."""
-    return any((folder / name).exists() for name in ("gap.json", "gap.npz"))
+    return any((folder / name).exists() for name in (GAP, GAP_TRACES))
 
 
 def read_gap(folder: str | Path) -> Gap:
     """Load and check; ValueError names what is missing or broken."""
     folder = Path(folder)
-    path = folder / "gap.json"
+    path = folder / GAP
     found = (_READ if path.exists() else Reader("gap")).json(path)
-    _READ.check(found, _SCHEMA, "gap.json")
+    _READ.check(found, _SCHEMA, GAP)
     _READ.check(said_split(found), _SPLIT, "gap.json, 'split'")
     _READ.check(found.get("shapes", []), [_SIZE], "gap.json, 'shapes'")
     _READ.check(found.get("about", {}), {str: _ABOUT}, "gap.json, 'about'")
     for fault in _faults(found):
         raise _READ.fault(f"gap.json, {fault}")
     roles = [r for r in ROLES if r in found["gaps"]]
-    return Gap(folder, found, _traces(folder / "gap.npz", roles, found["phases"]))
+    return Gap(folder, found, _traces(folder / GAP_TRACES, roles, found["phases"]))
 
 
 def _faults(found: Mapping[str, Any]) -> Iterator[str]:

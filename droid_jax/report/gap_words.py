@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from droid_jax.files import EXTENDED
 from droid_jax.report.gap_folder import Gap
 from droid_jax.report.gap_parts import parts_of
 from droid_jax.report.words import counted, label, listed, number, percent, was
@@ -262,7 +263,7 @@ def _kept(gap: Gap, named: str) -> str:
 
 
 def _file(gap: Gap) -> str:
-    return " (extended.json)" if (gap.folder / "extended.json").is_file() else ""
+    return f" ({EXTENDED})" if (gap.folder / EXTENDED).is_file() else ""
 
 
 def _separate(gap: Gap) -> str:

@@ -22,6 +22,7 @@ import pytest
 import scipy.stats
 
 from benchmarks.sharing import claimed
+from droid_jax.files import GAUSSIAN, POLICY
 from droid_jax.identify.gaussian import load as load_gaussian
 from droid_jax.identify.gaussian import prior
 from droid_jax.measure.hidden import Applied, possible
@@ -33,7 +34,6 @@ from droid_jax.policy.task import Task
 from droid_jax.policy.train import TrainConfig
 from droid_jax.policy.transfer import transfer
 from droid_jax.policy.trials import Trials
-from droid_jax.report.files import GAUSSIAN, POLICY
 from experiments.policies import store
 from experiments.policies.cases import (
     RESULTS,
