@@ -18,12 +18,11 @@ sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
 import tuned  # noqa: E402, F401  (before jax starts)
 
 # isort: split
-import json  # noqa: E402
 
 import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 
-from benchmarks.common import interleave, origin, stem  # noqa: E402
+from benchmarks.common import interleave, publish  # noqa: E402
 from droid_jax.compare.cost import Cost, make_cost  # noqa: E402
 from droid_jax.gap.candidates import candidates  # noqa: E402
 from droid_jax.gap.case import GapConfig  # noqa: E402
@@ -36,7 +35,6 @@ from droid_jax.measure.surrogate import SurrogateConfig, record, stand_in_truth 
 from droid_jax.model.door import door_nuisances, door_space  # noqa: E402
 from droid_jax.model.door_scene import door_scene  # noqa: E402
 from droid_jax.model.effects.registry import effect_space, library, ready  # noqa: E402
-from droid_jax.storage import write_json  # noqa: E402
 
 TIMESTEP = 0.004  # s
 SHORT = 1.0  # s of the demonstration with --quick
@@ -85,7 +83,6 @@ def main() -> None:
     look_rows = 2 * (1 + steps)  # from two starts, whose Jacobian is known
     refit_rows = 2 * (len(base) + 2) + steps
     result = {
-        **origin(0),
         "quick": arguments.quick,
         "timestep": TIMESTEP,
         "seconds_of_motion": measured.duration,
@@ -105,8 +102,7 @@ def main() -> None:
         "refit_iteration_rows": refit_rows,
         "refit_s_at_most": (1 + config.refit.iterations * refit_rows) * row,
     }
-    write_json(arguments.out / f"{stem('candidates', arguments.quick)}.json", result)
-    print(json.dumps(result))
+    publish(arguments.out, "candidates", arguments.quick, 0, result)
 
 
 if __name__ == "__main__":

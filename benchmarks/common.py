@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from droid_jax import runtime
+from droid_jax.storage import write_json
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -50,6 +51,18 @@ def commits(cases: Iterable[Mapping[str, Any]]) -> list[str]:
 def stem(name: str, quick: bool) -> str:
     """Name of a result: what --quick writes stands beside the figures that are kept, never over them."""
     return f"{name}_quick" if quick else name
+
+
+def publish(
+    folder: Path, name: str, quick: bool, seed: int, result: Mapping[str, Any], line: Mapping[str, Any] | None = None
+) -> None:
+    """The end of a script: writes FOLDER/NAME.json, where it comes from first, and prints one last line of JSON.
+
+    line: what is printed; default: all that is written.  Starts jax's backend, as `origin` does.
+    """
+    whole = {**origin(seed), **result}
+    write_json(folder / f"{stem(name, quick)}.json", whole, indent=2)
+    print(json.dumps(whole if line is None else line))
 
 
 def empty_cache(folder: str) -> dict[str, str]:

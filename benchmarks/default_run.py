@@ -28,7 +28,7 @@ import tempfile  # noqa: E402
 import tyro  # noqa: E402
 
 from benchmarks.common import empty_cache, origin, stem  # noqa: E402
-from droid_jax.report.files import TRANSFER  # noqa: E402
+from droid_jax.files import TRANSFER  # noqa: E402
 from droid_jax.report.gap_folder import hidden_in  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 

@@ -26,10 +26,9 @@ import json  # noqa: E402
 
 import tyro  # noqa: E402
 
-from benchmarks.common import commits, origin, stem  # noqa: E402
+from benchmarks.common import commits, origin, publish, stem  # noqa: E402
 from benchmarks.peers import doors, springs, sysid  # noqa: E402
 from benchmarks.sharing import kept  # noqa: E402
-from droid_jax.storage import write_json  # noqa: E402
 
 Case = Callable[[], dict[str, Any]]
 
@@ -74,13 +73,8 @@ def main() -> None:
         kept(folder / f"{name}.json", lambda name=name: {**known[name](), "origin": origin(0)})
     done = {n: json.loads((folder / f"{n}.json").read_text()) for n in known if (folder / f"{n}.json").is_file()}
     figures = {n: {k: v for k, v in case.items() if k != "origin"} for n, case in done.items()}
-    name = stem("peer_sysid", arguments.quick)
-    write_json(
-        arguments.out / f"{name}.json",
-        {**origin(0), "cases_from_commits": commits(done.values()), "cases": figures},
-        indent=2,
-    )
-    print(json.dumps({"cases": figures}))
+    whole = {"cases_from_commits": commits(done.values()), "cases": figures}
+    publish(arguments.out, "peer_sysid", arguments.quick, 0, whole, {"cases": figures})
 
 
 if __name__ == "__main__":

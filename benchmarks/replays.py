@@ -115,16 +115,9 @@ def _mjx_step(case: Case) -> Callable[[jax.Array], jax.Array]:
     return replay
 
 
-def mjx_as_it_comes(case: Case, population: int) -> Run:
-    """mjx.step, vmapped and jitted without any option, on one device."""
-    batch = jax.jit(jax.vmap(_mjx_step(case)))
-    values = np.float32(case.values(population))
-    return lambda: jax.block_until_ready(batch(values))
-
-
-def mjx_with_option(case: Case, population: int) -> Run:
-    """mjx.step with this program's compiler option, on one device."""
-    batch = jax.jit(jax.vmap(_mjx_step(case)), compiler_options=runtime.compiler_options())
+def mjx_on_one_device(case: Case, population: int, options: dict[str, Any] | None = None) -> Run:
+    """mjx.step, vmapped and jitted as it comes or with compiler options, on one device."""
+    batch = jax.jit(jax.vmap(_mjx_step(case)), compiler_options=options)
     values = np.float32(case.values(population))
     return lambda: jax.block_until_ready(batch(values))
 

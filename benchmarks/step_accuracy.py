@@ -18,13 +18,12 @@ sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
 import tuned  # noqa: E402, F401  (before jax starts)
 
 # isort: split
-import json  # noqa: E402
 
 import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 
-from benchmarks.common import origin, stem  # noqa: E402
+from benchmarks.common import publish  # noqa: E402
 from droid_jax.compare.population import over_population  # noqa: E402
 from droid_jax.compare.replay import make_drive, servo_replay  # noqa: E402
 from droid_jax.compare.twin import twin_replay  # noqa: E402
@@ -35,7 +34,6 @@ from droid_jax.model.door import door_space, truth  # noqa: E402
 from droid_jax.model.door_scene import door_scene  # noqa: E402
 from droid_jax.model.physics import make_c_model, make_physics  # noqa: E402
 from droid_jax.model.scene import with_options  # noqa: E402
-from droid_jax.storage import write_json  # noqa: E402
 
 FINE = 1e-4  # s
 DEMONSTRATION = load(demonstration_path("A"))
@@ -96,9 +94,7 @@ def main() -> None:
         "parity_2ms_against_c_2ms": worst(coarse(values, 0.002, "parity"), in_c),
         "unit": "N m",
     }
-    name = stem("step_accuracy", arguments.quick)
-    write_json(arguments.out / f"{name}.json", {**origin(0), **result})
-    print(json.dumps(result))
+    publish(arguments.out, "step_accuracy", arguments.quick, 0, result, result)
 
 
 if __name__ == "__main__":

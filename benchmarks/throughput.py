@@ -118,7 +118,7 @@ def untuned_part(config: Throughput) -> dict[str, Any]:
         import replays
 
     case = replays.make_case(config.seed, UNTUNED_STEPS)
-    runs = {UNTUNED: replays.mjx_as_it_comes(case, BARE_POPULATION)}
+    runs = {UNTUNED: replays.mjx_on_one_device(case, BARE_POPULATION)}
     (row,) = time_rows(runs, BARE_POPULATION, case.steps, config.repeats, lambda: None)
     return asdict(row)
 
@@ -175,7 +175,7 @@ def alternate(case: Any, populations: Sequence[int], repeats: int, progress: Pro
         )
     take(
         {
-            OPTION: replays.mjx_with_option(case, BARE_POPULATION),
+            OPTION: replays.mjx_on_one_device(case, BARE_POPULATION, runtime.compiler_options()),
             SHARDED: replays.mjx_on_all_devices(case, BARE_POPULATION),
             C: replays.c_engine(case, BARE_POPULATION),
         },

@@ -23,8 +23,7 @@ import json  # noqa: E402
 
 import tyro  # noqa: E402
 
-from benchmarks.common import empty_cache, origin, stem  # noqa: E402
-from droid_jax.storage import write_json  # noqa: E402
+from benchmarks.common import empty_cache, publish  # noqa: E402
 
 POPULATION, GENERATIONS, TIMESTEP = 30, 100, 0.002
 
@@ -94,9 +93,7 @@ def main() -> None:
         result["identify_quick"] = identify_command()
     import tuned  # noqa: F401  (before jax starts: the fits had all cores)
 
-    name = stem("time_to_fit", arguments.quick)
-    write_json(arguments.out / f"{name}.json", {**origin(0), **result})
-    print(json.dumps(result))
+    publish(arguments.out, "time_to_fit", arguments.quick, 0, result, result)
 
 
 if __name__ == "__main__":

@@ -2,9 +2,26 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Collection, Mapping
 
 
 def faults(found: Mapping[str, Collection[str]]) -> str:
     """ "missing: a, b; unknown: c": what is wrong and the names it is wrong with; empty where no names are."""
     return "; ".join(f"{what} {', '.join(names)}" for what, names in found.items() if names)
+
+
+def lacking(what: str, extra: str, *packages: str) -> str:
+    """ "export needs onnx and what to type" where one of the packages is not installed; empty where all are.
+
+    what: with its verb, "export needs".  extra: of this project, which brings the packages.
+    """
+    missing = [name for name in packages if importlib.util.find_spec(name) is None]
+    how = f"in the checkout, pip install -c constraints.txt -e '.[{extra}]'"
+    return f"{what} {' and '.join(missing)}: {how}" if missing else ""
+
+
+def needs(what: str, extra: str, *packages: str) -> None:
+    """ValueError that says so where something is `lacking`."""
+    if told := lacking(what, extra, *packages):
+        raise ValueError(told)

@@ -1,4 +1,4 @@
-"""Writing files and folders whole or not at all.
+"""Writing files and folders whole or not at all; reading text.
 
 What is written stands beside its final name first and is then moved there: a reader sees the old
 content or the new one, and a run that is killed or finds the disk full leaves the old one behind.
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import hashlib
 import io
 import json
 import math
@@ -43,9 +44,22 @@ def write_text(path: Path, text: str) -> None:
     write_bytes(path, text.encode("utf-8"))
 
 
+def read_text(path: Path) -> str:
+    """A text file in UTF-8, with or without a byte order mark; ValueError names the one that is not."""
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: not a text file in UTF-8, byte {error.start} cannot be read") from None
+
+
 def write_json(path: Path, content: Any, *, indent: int = 1) -> None:
     """A JSON file; ValueError for NaN and infinities, which JSON has no word for."""
     write_text(path, json.dumps(content, indent=indent, allow_nan=False) + "\n")
+
+
+def file_sha256(path: Path) -> str:
+    """SHA-256 of a file's bytes, 64 hexadecimal digits."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def finite(number: float) -> float | None:

@@ -26,13 +26,13 @@ import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 
-from benchmarks.common import origin, stem  # noqa: E402
+from benchmarks.common import publish  # noqa: E402
 from droid_jax.measure.recording import Recording  # noqa: E402
 from droid_jax.model.scene import with_options  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 from experiments.blind.cases import Plan  # noqa: E402
 from experiments.blind.draws import commit_of, folder_of, seed_of  # noqa: E402
-from experiments.blind.make import draw, record, recorded, write_case  # noqa: E402
+from experiments.blind.make import Drawn, record, recorded, write_case  # noqa: E402
 from experiments.blind.scenes import Setting, setting  # noqa: E402
 from experiments.blind.search import Bench, search_case  # noqa: E402
 
@@ -63,11 +63,21 @@ def plan_of(number: int) -> Plan:
     return Plan(f"door/cone/{number}", "door", "none")
 
 
+def robot(where: Setting, number: int, seed: int) -> tuple[int, Drawn, dict[str, Recording]]:
+    """A robot with elliptic contacts, as the suite draws and records them (`recorded`)."""
+    found = recorded(elliptic(where), plan_of(number), {}, seed)
+    if isinstance(found, str):
+        raise SystemExit(f"error: case {plan_of(number).name}: {found}")
+    return found
+
+
 def between_cones(where: Setting, seed: int) -> list[float]:
-    """Joint by joint the root mean square [N m] of what the cone alone changes: one robot, the same noise."""
-    drawn = draw(where, plan_of(0), {}, np.random.default_rng([seed, 0]))
-    assert drawn is not None  # nothing is hidden that might not be possible
-    torque = [_mean_torque(record(w, drawn, ("fit",))["fit"]) for w in (where, elliptic(where))]
+    """Joint by joint the root mean square [N m] of what the cone alone changes: one robot, the same noise.
+
+    The first robot that is searched, which keeps hold of its door with elliptic contacts.
+    """
+    _, drawn, recordings = robot(where, 0, seed)
+    torque = [_mean_torque(r["fit"]) for r in (record(where, drawn, ("fit",)), recordings)]
     return np.sqrt(np.mean((torque[1] - torque[0]) ** 2, axis=0)).tolist()
 
 
@@ -77,13 +87,12 @@ def _mean_torque(recording: Recording) -> np.ndarray:
 
 def case(where: Setting, number: int, commit: str, out: Path, bench: Bench) -> dict[str, Any]:
     """One robot: recorded once, searched once."""
-    plan, folder = plan_of(number), out / "cone_cases" / folder_of(commit, plan_of(number).name)
+    name = plan_of(number).name
+    folder = out / "cone_cases" / folder_of(commit, name)
     if not (folder / "result.json").is_file():
         if not folder.is_dir():
-            found = recorded(elliptic(where), plan, {}, seed_of(commit, plan.name))
-            if isinstance(found, str):
-                raise SystemExit(f"error: case {plan.name}: {found}")
-            write_case(folder, "door", (), found[2])
+            _, _, recordings = robot(where, number, seed_of(commit, name))
+            write_case(folder, "door", (), recordings)
         write_json(folder / "result.json", search_case(folder, bench))
     return json.loads((folder / "result.json").read_text())
 
@@ -92,15 +101,15 @@ def main() -> None:
     arguments = tyro.cli(Arguments, description=__doc__)
     commit, where = commit_of(arguments.commit), setting("door", arguments.out / "door")
     difference = between_cones(where, seed_of(commit, plan_of(0).name))
-    result: dict[str, Any] = {**origin(0), "seeds_from": commit, "torque_difference": difference}
+    result: dict[str, Any] = {"seeds_from": commit, "torque_difference": difference}
     bench, found = Bench({"door": where}), list[dict[str, Any]]()
     for number in range(0 if arguments.quick else arguments.cases):
         found.append(case(where, number, commit, arguments.out, bench))
         print(f"door {number}: {found[-1].get('sentence', found[-1].get('error'))}", flush=True)
     keys = ("verdict", "sentence", "effects", "p", "gaps", "floor", "seconds", "code")
     result["cases"] = [{k: c.get(k) for k in keys} for c in found]
-    write_json(arguments.out / f"{stem('cone_mismatch', arguments.quick)}.json", result)
-    print(json.dumps({"torque_difference": [round(d, 3) for d in difference], "said": [c["verdict"] for c in found]}))
+    line = {"torque_difference": [round(d, 3) for d in difference], "said": [c["verdict"] for c in found]}
+    publish(arguments.out, "cone_mismatch", arguments.quick, 0, result, line)
 
 
 if __name__ == "__main__":

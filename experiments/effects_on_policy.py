@@ -25,7 +25,6 @@ import tuned  # noqa: E402, F401  (before jax starts)
 
 # isort: split
 import functools  # noqa: E402
-import hashlib  # noqa: E402
 import json  # noqa: E402
 
 import tyro  # noqa: E402
@@ -33,7 +32,9 @@ from rich.console import Console  # noqa: E402
 from rich.progress import track  # noqa: E402
 
 from benchmarks.common import origin  # noqa: E402
-from droid_jax.commands.hidden import hidden_effects  # noqa: E402
+from benchmarks.sharing import claimed  # noqa: E402
+from droid_jax.commands.stand_in import hidden_effects  # noqa: E402
+from droid_jax.files import POLICY  # noqa: E402
 from droid_jax.measure.demonstration import demonstration_path  # noqa: E402
 from droid_jax.measure.formats import load as load_recording  # noqa: E402
 from droid_jax.measure.hidden import HIDDEN, LONGEST_STEP, Applied, listed, possible, record_hidden  # noqa: E402
@@ -44,8 +45,7 @@ from droid_jax.policy.control import Policy, load  # noqa: E402
 from droid_jax.policy.door_env import DoorEnv  # noqa: E402
 from droid_jax.policy.task import Task  # noqa: E402
 from droid_jax.policy.transfer import TransferConfig, check_playable, stand_in, transfer  # noqa: E402
-from droid_jax.report.files import POLICY  # noqa: E402
-from droid_jax.storage import write_json  # noqa: E402
+from droid_jax.storage import file_sha256, write_json  # noqa: E402
 from experiments.policies.cases import RESULTS, TIMESTEP, Case, Options, finish, run_all  # noqa: E402
 from experiments.policies.robots import truth_of  # noqa: E402
 from experiments.policies.settings import Setting, setting_of  # noqa: E402
@@ -132,12 +132,11 @@ def trained(arguments: Arguments, setting: Setting, code: Mapping[str, Any]) -> 
     make = functools.partial(policy_case, "prior", seed, setting, arguments, code)
     path = folder / f"prior_{seed}.json"
     finish(run_all([Case(path, make, of, "prior")], 1, code))
+    with claimed(path, wait=True):  # another process may be training it
+        pass
+    if not path.is_file():
+        raise SystemExit(f"error: another process failed to make {path}; start again")
     return arguments.trained / json.loads(path.read_text())["trained"] / POLICY
-
-
-def sha256(path: Path) -> str:
-    """Of a file's bytes."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def needs_out(arguments: Arguments) -> None:
@@ -155,12 +154,10 @@ def main() -> None:
     of = {
         "springs": arguments.springs,
         "policy": arguments.policy.parent.name if arguments.policy else "prior",
-        "policy_sha256": sha256(path),
+        "policy_sha256": file_sha256(path),
     }
-    table = list[dict[str, Any]]()
-    for row in rows(policy, setting, arguments.budget.task(Task()), arguments):
-        table.append(row)
-        write_json(arguments.summary("effects_on_policy"), {**of, "rows": table, **code})
+    table = list(rows(policy, setting, arguments.budget.task(Task()), arguments))
+    write_json(arguments.summary("effects_on_policy"), {**of, "rows": table, **code})
     known, usual = [r for r in table if r["success_rate"] is not None], table[0]["success_rate"] or 0.0
     felt = [r for r in known if r["success_rate"] < usual - 0.2]
     names = [f"{r['hidden']}{'[' + r['joint'] + ']' if r['joint'] else ''}={r['amplitude']:g}" for r in felt]

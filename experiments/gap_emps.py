@@ -15,7 +15,6 @@ of a user's own; it is asked about in a search of its own, and was written knowi
 from __future__ import annotations
 
 import copy
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -38,16 +37,16 @@ from gap_single import (
 # isort: split
 import jax.numpy as jnp
 import tyro
-from inverse_fit import RESULTS, origin, rms, rounded, run, stem
+from inverse_fit import RESULTS, rms, rounded, run
 from real_emps import FIT, JUDGE, MOTION_CUTOFF, SLIDE, SOURCE, emps_space, load_emps
 
+from benchmarks.common import publish, stem
 from droid_jax.gap.single import make_log
 from droid_jax.gap.verdict import Verdict
 from droid_jax.model.effects.registry import library
 from droid_jax.model.parameters import Parameter
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene, load_scene
 from droid_jax.model.seam import Effect
-from droid_jax.storage import write_json
 
 NEWTONS = 30.0  # N of the carriage for each N m of a robot's joint: priors, bounds and sizes worth naming
 NOT_ASKED = ("torque_bias", "payload", "torque_ripple")  # the base has offset and mass; and a slide makes no turns
@@ -145,7 +144,6 @@ def main(config: GapEmps) -> None:
     print(f"  false alarms: {alarms['said_to_be_missing']}, named {alarms['named']}")
     before, after = found["viscous"][JUDGE]["rms_N"]
     result = {
-        **origin(config.seed),
         "experiment": "gap_emps",
         "quick": config.quick,
         "source": SOURCE,
@@ -163,8 +161,7 @@ def main(config: GapEmps) -> None:
             "added_found": {effect: names_one_of(a, [effect]) for effect, a in added.items()},
         },
     }
-    write_json(config.out / f"{stem('gap_emps', config.quick)}.json", result, indent=2)
-    print(json.dumps(result))
+    publish(config.out, "gap_emps", config.quick, config.seed, result)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,6 @@ Data and filter: see real_panda.py.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -40,17 +39,18 @@ from gap_single import (
 # isort: split
 import numpy as np
 import tyro
-from inverse_fit import RESULTS, origin, rounded, run, stem
+from inverse_fit import RESULTS, rounded, run
 from real_panda import MOTION_CUTOFF, SOURCE, link_nuisances, load_panda, load_published
 
+from benchmarks.common import publish, stem
+from droid_jax.gap.candidates import possible
+from droid_jax.measure.recording import Recording
 from droid_jax.model.arm import panda_arm_scene
 from droid_jax.model.builtin import ARM
-from droid_jax.model.effects.registry import library
 from droid_jax.model.joint_friction import joint_friction_space
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
-from droid_jax.storage import write_json
 
 NOT_ASKED = ("torque_bias", "payload")  # the base has offsets and the last link's mass
 NINETY = 1.645  # deviations from which on zero is outside of a 90 % interval
@@ -86,10 +86,9 @@ def base_space(scene: Scene) -> Space:
     return friction.select([n for n in friction.names if not n.startswith("coulomb")]) + link_nuisances(scene)
 
 
-def asked_about(scene: Scene) -> list[Effect]:
-    """What a prescribed motion can show of the library, joint by joint and in all joints at once."""
-    effects = [e for e in library(scene) if not (e.command or e.servo) and e.name not in NOT_ASKED]
-    return [_everywhere(e) for e in effects if not e.name.startswith(("servo", "command"))]
+def asked_about(scene: Scene, recording: Recording) -> list[Effect]:
+    """What the log can show of the library, joint by joint and in all joints at once."""
+    return [_everywhere(e) for e in possible(scene, [recording]) if e.name not in NOT_ASKED]
 
 
 def _everywhere(effect: Effect) -> Effect:
@@ -129,7 +128,7 @@ def main(config: GapPanda) -> None:
     """Four questions about one log; see gap_single.py."""
     scene, recording = panda_arm_scene(), load_panda(config.data)
     published, gap = load_published(config.data), settings(MOTION_CUTOFF, config.seed)
-    effects = asked_about(scene)
+    effects = asked_about(scene, recording)
     known = [as_known(e) for e in effects if e.name == FOUND]
     searches = {
         "rigid": make_search(scene, base_space(scene), effects, [recording], gap),
@@ -154,7 +153,6 @@ def main(config: GapPanda) -> None:
     sealed = found["rigid"]["rms"]["sealed"]
     most_left = max(of_joints(found["rigid"]), key=lambda cell: cell["after"])["where"].split(",")[0]
     result = {
-        **origin(config.seed),
         "experiment": "gap_panda",
         "quick": config.quick,
         "source": SOURCE,
@@ -176,8 +174,7 @@ def main(config: GapPanda) -> None:
             "added_found": {effect: names_one_of(a, [effect]) for effect, a in added.items()},
         },
     }
-    write_json(config.out / f"{stem('gap_panda', config.quick)}.json", result, indent=2)
-    print(json.dumps(result))
+    publish(config.out, "gap_panda", config.quick, config.seed, result)
 
 
 if __name__ == "__main__":

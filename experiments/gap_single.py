@@ -25,15 +25,14 @@ import hashlib
 import numpy as np
 import scipy.linalg
 import scipy.signal
-import scipy.stats
 from inverse_fit import rms, rounded
 
 from benchmarks.common import CODE
 from benchmarks.sharing import code_name, kept
 from droid_jax.compare.residuals import CompareConfig
-from droid_jax.gap.blocks import OUTSIDE, Blocks
+from droid_jax.gap.blocks import Blocks
 from droid_jax.gap.case import Case, GapConfig
-from droid_jax.gap.evidence import Evidence
+from droid_jax.gap.evidence import Evidence, only_comparison
 from droid_jax.gap.refit import deviations, intervals
 from droid_jax.gap.select import SIGNIFICANT
 from droid_jax.gap.single import Log, base_model, make_log, single_case
@@ -45,7 +44,8 @@ from droid_jax.model.effects.registry import effect_space
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, Theta
-from droid_jax.storage import finite
+from droid_jax.policy.trials import wilson
+from experiments.trials import trial_json
 
 ORDER = 20  # of the noise's autoregression, at 20 Hz: one second
 BURN = 400  # samples before the noise is stationary
@@ -105,10 +105,10 @@ def run_search(search: Search, log: Log | None = None, start: np.ndarray | None 
     return case, find(case, base_model(case, start), 0.0)
 
 
-def answer(search: Search, log: Log | None = None, start: np.ndarray | None = None) -> dict[str, Any]:
+def answer(search: Search, log: Log | None = None) -> dict[str, Any]:
     """The report of a search, or why none was possible: nothing is said then."""
     try:
-        return report(*run_search(search, log, start))
+        return report(*run_search(search, log))
     except ValueError as error:
         silent = {"effects": [], "tied": [], "p": [], "rms": {}}
         return {"verdict": "refused", "sentence": str(error), **silent}
@@ -208,11 +208,10 @@ def _key(log: Log, code: str) -> str:
 
 
 def share(hits: int, count: int) -> dict[str, Any]:
-    """Hits, their share and its 95 % interval (Wilson 1927); of nothing, all is possible."""
+    """Hits, their share and its 95 % interval; of nothing, all is possible."""
     if count == 0:
         return {"hits": 0, "share": None, "interval": [0.0, 1.0]}
-    span = scipy.stats.binomtest(hits, count).proportion_ci(0.95, method="wilson")
-    return {"hits": hits, "share": round(hits / count, 4), "interval": rounded([span.low, span.high])}
+    return {"hits": hits, "share": round(hits / count, 4), "interval": rounded(wilson(hits, count))}
 
 
 # Report ------------------------------------------------------------------------------------
@@ -221,6 +220,7 @@ def share(hits: int, count: int) -> dict[str, Any]:
 def report(case: Case, verdict: Verdict) -> dict[str, Any]:
     """A verdict with its grounds as JSON values."""
     spans, widths = intervals(case.fit, verdict.model), deviations(case.fit, verdict.model)
+    torque = only_comparison(case.fit.cost).channel("torque")
     return {
         "verdict": verdict.kind.value,
         "sentence": verdict.sentence,
@@ -238,22 +238,14 @@ def report(case: Case, verdict: Verdict) -> dict[str, Any]:
         "p": [s.p for s in verdict.screens],
         "gaps": {role: {"before": b, "after": a, "closed": 1 - a / b} for role, (b, a) in verdict.gaps.items()},
         "rms": {role: _rms_of(case, verdict, role) for role in ("fit", "confirm", "sealed")},
-        "noise_stated": rounded(1 / np.einsum("ckk->kc", _torque(case).noise.whitener).max(axis=0)),
+        "noise_stated": rounded(1 / np.einsum("ckk->kc", torque.noise.whitener).max(axis=0)),
         "blocks": {"each": case.fit.units, "seconds": round(_block_seconds(case), 3)},
         "where": [
             {"variable": b.variable, "where": b.where, "before": b.gap, "after": a.gap}
             for b, a in zip(verdict.before.cells, verdict.after.cells, strict=True)
         ],
-        "trials": [
-            {"name": t.name, "passed": t.passed, "p": t.p, "gap_fit": t.gap_fit, "gap_confirm": finite(t.gap_confirm),
-             "chosen": t.chosen, "rivals": list(t.rivals), "reasons": list(t.reasons)}
-            for t in verdict.trials
-        ],
-    }  # fmt: skip
-
-
-def _torque(case: Case) -> Any:
-    return case.fit.cost.comparisons[0].channel("torque")
+        "trials": [trial_json(trial) for trial in verdict.trials],
+    }
 
 
 def _block_seconds(case: Case) -> float:
@@ -271,7 +263,7 @@ def _block(evidence: Evidence) -> np.ndarray:
 def _rms_of(case: Case, verdict: Verdict, role: str) -> dict[str, list[float]]:
     """RMS of each column before and after, in its unit, over the instants of a role."""
     evidence = case.judged[role]
-    inside, log = _block(evidence) != OUTSIDE, evidence.cost
+    inside, log = evidence.instants, evidence.cost
     assert isinstance(log, Log)
     return {
         when: rounded(rms(log.left(model.values)[inside]))

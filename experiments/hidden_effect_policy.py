@@ -32,9 +32,10 @@ import tyro  # noqa: E402
 from benchmarks.common import origin  # noqa: E402
 from benchmarks.sharing import claimed, code_name  # noqa: E402
 from droid_jax.commands.gap_search import searched  # noqa: E402
-from droid_jax.commands.hidden import hidden_effects, record_stand_in  # noqa: E402
+from droid_jax.commands.stand_in import hidden_effects, record_stand_in  # noqa: E402
+from droid_jax.files import EXTENDED  # noqa: E402
 from droid_jax.gap.case import GapConfig  # noqa: E402
-from droid_jax.gap.extended import FILE, extended, load_extended, save_extended  # noqa: E402
+from droid_jax.gap.extended import extended, load_extended, save_extended  # noqa: E402
 from droid_jax.gap.missing import case_of  # noqa: E402
 from droid_jax.gap.split import Split  # noqa: E402
 from droid_jax.gap.verdict import Kind  # noqa: E402
@@ -54,7 +55,7 @@ from droid_jax.policy.transfer import TransferConfig, check_playable, stand_in  
 from droid_jax.storage import write_json  # noqa: E402
 from experiments.policies.cases import TIMESTEP, Case, Options, finish, found_of, made_by, run_all, tried  # noqa: E402
 from experiments.policies.store import Doors  # noqa: E402
-from experiments.policies.table import PLACES, apart, column, rates  # noqa: E402
+from experiments.policies.table import better_than, columns, line_of  # noqa: E402
 
 MODELS = ("prior", "base", "extended")
 BASE, SETUP = "base.json", "setup.json"
@@ -145,7 +146,7 @@ def case(model: str, seed: int, folder: Path, arguments: Arguments, code: Mappin
         space = door_space(env.scene) + door_nuisances(env.scene)
         gaussian = load_gaussian(folder / BASE) if model == "base" else prior(space)
     else:
-        known = load_extended(folder / FILE, scene)
+        known = load_extended(folder / EXTENDED, scene)
         env, gaussian = DoorEnv(known.scene, task, known.effects), known.gaussian
     hidden, config = listed(hidden_effects(arguments.hide, scene)), TransferConfig(trials=budget.trials, seed=robot)
     truth = stand_in_truth(door_scene(), SPRINGS, robot)
@@ -182,12 +183,10 @@ def main() -> None:
         failed, planned = [], []
     found = found_of(planned)
     of = {model: [c for c in found if c["model"] == model] for model in MODELS}
-    table = {model: {place: column(own, place) for place in PLACES} for model, own in of.items() if own}
-    others = [m for m in ("base", "prior") if of[m] and of["extended"]]
-    better = {m: {what: apart(of["extended"], of[m], what) for what in ("success", "angle")} for m in others}
+    table, better = columns(of), better_than("extended", ("base", "prior"), of)
     summary = {**verdict, "models": table, "extended_better_than": better, **made_by(found), **code}
     write_json(arguments.summary("hidden_effect_policy"), summary)
-    print(json.dumps({m: rates(columns) for m, columns in table.items()}))
+    print(json.dumps(line_of(table)))
     finish(failed)
 
 

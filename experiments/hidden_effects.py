@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -89,7 +89,7 @@ class Make:
     unsearched: bool = False
     """Only cases without a file in OUT/results: a run that goes on elsewhere needs no others."""
     quick: bool = False
-    """The lone hinge: nothing, and a preload."""
+    """The lone hinge: nothing, and a preload.  Without --out in a folder beside the full run's, *_quick."""
 
 
 @dataclass(frozen=True)
@@ -248,12 +248,19 @@ def run_all(command: All) -> dict[str, Any]:
     return {"made": made, **run_score(Score(out=command.out, limits=command.limits))}
 
 
+def placed(command: Any) -> Any:
+    """A command whose --quick, where no folder is named, has one of its own: never that of the full run."""
+    if isinstance(command, Make) and command.quick and command.out == RUNS:
+        return replace(command, out=RUNS.with_name(stem(RUNS.name, True)))
+    return command
+
+
 def _tell(line: str) -> None:
     print(line, flush=True)
 
 
 def main() -> None:
-    command = tyro.cli(Command, description=__doc__)  # pyright: ignore[reportArgumentType]
+    command = placed(tyro.cli(Command, description=__doc__))  # pyright: ignore[reportArgumentType]
     run = {
         Limits: run_limits, Make: run_make, Search: run_search, Oracle: run_oracle, Score: run_score, All: run_all,
     }[type(command)]  # fmt: skip

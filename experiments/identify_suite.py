@@ -27,7 +27,7 @@ import numpy as np  # noqa: E402
 import scipy.stats  # noqa: E402
 import tyro  # noqa: E402
 
-from benchmarks.common import commits, origin, stem  # noqa: E402
+from benchmarks.common import commits, origin, publish, stem  # noqa: E402
 from benchmarks.sharing import kept  # noqa: E402
 from droid_jax.compare.cost import make_cost  # noqa: E402
 from droid_jax.identify.gaussian import prior  # noqa: E402
@@ -42,7 +42,6 @@ from droid_jax.model.door import JOINT_DAMPING, door_nuisances, door_space  # no
 from droid_jax.model.door import truth as table_i  # noqa: E402
 from droid_jax.model.door_scene import door_scene  # noqa: E402
 from droid_jax.model.scene import Scene  # noqa: E402
-from droid_jax.storage import write_json  # noqa: E402
 
 Part = Literal["doors", "calibration", "pose", "parity"]
 MUST_BE_KNOWN = ("hinge_stiffness", "hinge_frictionloss", "hinge_damping", *JOINT_DAMPING)
@@ -171,21 +170,22 @@ def parity_case(seed: int, quick: bool) -> dict[str, Any]:
     truth = stand_in_truth(scene, 1, 1)
     data = recordings(scene, truth, "A", seed)
     values = prior(space).sample(0, 8 if quick else 200)
-    costs, torques = {}, {}
+    tables = np.stack([space.values(table_i(k)) for k in (0, 1, 2)])
+    costs, torques, of_tables = {}, {}, {}
     for engine in ("mjx", "mujoco"):
         cost = make_cost(scene, space, data, engine=engine)
         costs[engine] = cost(values)
         torques[engine] = cost.rollouts(values[:8])[0].torque
+        of_tables[engine] = cost(tables).tolist()
     error = torques["mjx"] - torques["mujoco"]
     grasp = next(p for p in data[0].phases if p.name == "grasp")
     contact = int(grasp.start / 0.002)
-    tables = np.stack([space.values(table_i(k)) for k in (0, 1, 2)])
     return {
         "rank_correlation": float(scipy.stats.spearmanr(costs["mjx"], costs["mujoco"]).statistic),
         "samples": len(values),
         "rms_before_contact": np.sqrt(np.mean(error[:, :contact] ** 2, axis=(0, 1))).tolist(),
         "rms_whole": np.sqrt(np.mean(error**2, axis=(0, 1))).tolist(),
-        "table_i_costs": {e: make_cost(scene, space, data, engine=e)(tables).tolist() for e in ("mjx", "mujoco")},
+        "table_i_costs": of_tables,
     }
 
 
@@ -256,15 +256,16 @@ def _door_summary(case: dict[str, Any]) -> dict[str, Any]:
 
 def _coverage(cases: list[dict[str, Any]]) -> dict[str, Any]:
     """Share of identifiable parameters whose 90 % interval holds the truth, with a bootstrap over doors."""
+    counts = {"doors": len(cases), "converged": sum(bool(c["converged"]) for c in cases)}
     known = [[p["inside"] for p in c["parameters"].values() if p["identifiable"] and not p["nuisance"]] for c in cases]
+    counts["parameters"] = sum(map(len, known))
+    if not counts["parameters"]:
+        return {**counts, "coverage": None, "coverage_interval_95": None}
     rng = np.random.default_rng(0)
-    draws = [
-        np.mean(np.concatenate([known[i] for i in rng.integers(len(known), size=len(known))])) for _ in range(2000)
-    ]
+    drawn = ([known[i] for i in rng.integers(len(known), size=len(known))] for _ in range(2000))
+    draws = [np.mean(np.concatenate(doors)) for doors in drawn if any(doors)]  # doors that tell nothing have no share
     return {
-        "doors": len(cases),
-        "converged": sum(bool(c["converged"]) for c in cases),
-        "parameters": int(sum(len(k) for k in known)),
+        **counts,
         "coverage": float(np.mean(np.concatenate(known))),
         "coverage_interval_95": np.quantile(draws, [0.025, 0.975]).tolist(),
     }
@@ -291,10 +292,8 @@ def agreement(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
 
 def main() -> None:
     arguments = tyro.cli(Arguments, description=__doc__)
-    cases = run_cases(arguments)
-    result = {**origin(0), **summarise(cases)}
-    write_json(arguments.out / f"{stem('identify', arguments.quick)}.json", result, indent=2)
-    print(json.dumps(summarise(cases)))
+    summary = summarise(run_cases(arguments))
+    publish(arguments.out, "identify", arguments.quick, 0, summary, summary)
 
 
 if __name__ == "__main__":

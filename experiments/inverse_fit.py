@@ -11,7 +11,6 @@ that this takes is compared with the measured one.  One filter chain, fixed befo
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ import tuned  # noqa: F401  before anything that imports jax
 import numpy as np
 from matplotlib.figure import Figure
 
+from benchmarks import common
 from droid_jax.compare.cost import Cost, make_cost
 from droid_jax.compare.residuals import CompareConfig
 from droid_jax.identify.fit import Fit
@@ -39,10 +39,7 @@ from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
 from droid_jax.report import style
 from droid_jax.report.export import png_bytes
-from droid_jax.storage import write_bytes, write_json
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-from common import origin, stem  # noqa: F401  # pyright: ignore[reportMissingImports]
+from droid_jax.storage import write_bytes
 
 RESULTS = Path(__file__).parent / "results"
 LEVEL = 0.9  # of all intervals
@@ -195,6 +192,7 @@ def rounded(values: Any, digits: int = 4) -> list[float]:
     return [round(float(v), digits) for v in np.atleast_1d(values)]
 
 
+@style.styled
 def draw_fit(
     time: np.ndarray,
     titles: Sequence[str],
@@ -203,34 +201,24 @@ def draw_fit(
     ylabel: str,
 ) -> Figure:
     """One panel per column: measured [T, C] in black and every line [T, C] in its colour over time [T] s."""
-    columns = 2 if len(titles) > 1 else 1
-    rows = -(-len(titles) // columns)
-    figure = Figure(figsize=(style.WIDE, 0.7 + (1.8 if columns > 1 else 2.8) * rows), layout="constrained")
-    panels = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
-    for unused in panels[len(titles) :]:
-        unused.set_visible(False)
-    for c, (axes, title) in enumerate(zip(panels, titles, strict=False)):
+    width, height = (style.WIDE, 1.8) if len(titles) > 1 else (6.0, 2.8)  # 6: the widest with one column
+    figure, panels = style.panel_grid(len(titles), width, height)
+    for c, (axes, title) in enumerate(zip(panels, titles, strict=True)):
         axes.plot(time, measured[:, c], color=style.MEASURED, linewidth=1.8, label="measured")
         for name, (line, colour) in lines.items():
             axes.plot(time, line[:, c], color=colour, linewidth=1.1, label=name)
-        axes.set(title=title, xlim=(time[0], time[-1]))
-        axes.set_ylabel(ylabel if c % columns == 0 else "")
-        axes.grid(color=style.LINE, linewidth=0.6)
-        if c >= len(titles) - columns:
-            axes.set_xlabel("Time [s]")
-            axes.tick_params(labelbottom=True)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper left", ncols=len(labels), frameon=False)
+        axes.set(title=title, xlim=(time[0], time[-1]), ylabel="" if c % style.panel_columns(width) else ylabel)
+    style.label_bottom(panels, width, "Time [s]")
+    style.legend(figure, panels[0], width, 1 + len(lines))
     return figure
 
 
-def publish(folder: Path, name: str, seed: int, result: Mapping[str, Any], figure: Figure) -> None:
-    """Write folder/name.json, with its origin, and folder/name.png; print the JSON as one last line."""
-    whole = {**origin(seed), **result}
-    write_json(folder / f"{name}.json", whole, indent=2)
-    write_bytes(folder / f"{name}.png", png_bytes(figure))
-    print(f"  wrote {folder / name}.json and .png")
-    print(json.dumps(whole))
+def publish(folder: Path, name: str, quick: bool, seed: int, result: Mapping[str, Any], figure: Figure) -> None:
+    """Write folder/name.png and folder/name.json, with its origin; print the JSON as one last line."""
+    path = folder / f"{common.stem(name, quick)}.png"
+    write_bytes(path, png_bytes(figure))
+    print(f"  writes {path} and .json")
+    common.publish(folder, name, quick, seed, result)
 
 
 def run(experiment: Callable[[], None]) -> None:

@@ -40,7 +40,7 @@ from experiments.policies.figure import knob_histograms, knobs_as_text  # noqa: 
 from experiments.policies.robots import fitted, truth_of  # noqa: E402
 from experiments.policies.settings import Setting, setting_of  # noqa: E402
 from experiments.policies.store import Doors  # noqa: E402
-from experiments.policies.table import PLACES, column, rates  # noqa: E402
+from experiments.policies.table import columns, line_of  # noqa: E402
 
 
 @dataclass(frozen=True)
@@ -84,13 +84,12 @@ def main() -> None:
     failed = run_all([c for c in planned if c.of["knob"] in knobs], arguments.at_most, code)
     found = found_of(planned)
     of = {f"{LEVERS[k]:.2f} m": [c for c in found if c["knob"] == k] for k in sorted({c["knob"] for c in found})}
-    table = {lever: {place: column(own, place) for place in PLACES} for lever, own in of.items()}
-    line = {lever: rates(columns) for lever, columns in table.items()}
+    table = columns(of)
     summary = {"levers": table, **made_by(found), **code}
     write_json(arguments.summary("knob_locations"), summary)
     write_text(arguments.summary("knob_locations", ".md"), knobs_as_text(table))
     arguments.draw("knob_locations", knob_histograms(of))
-    print(json.dumps(line))
+    print(json.dumps(line_of(table)))
     finish(failed)
 
 

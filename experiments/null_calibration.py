@@ -40,11 +40,10 @@ from droid_jax.storage import write_json  # noqa: E402
 from experiments.blind.cases import Plan  # noqa: E402
 from experiments.blind.draws import commit_of, seed_of  # noqa: E402
 from experiments.blind.make import recorded  # noqa: E402
+from experiments.blind.rates import rate  # noqa: E402
 from experiments.blind.scenes import setting  # noqa: E402
-from experiments.blind.score import rate  # noqa: E402
-from experiments.blind.search import Bench, Stopwatch, silent  # noqa: E402
+from experiments.blind.search import FAILED, Bench, Stopwatch, silent  # noqa: E402
 
-FAILED = (ValueError, RuntimeError, FloatingPointError)
 LEVELS = (0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9)
 
 
@@ -177,8 +176,9 @@ def main() -> None:
             with claimed(path, wait=False) as mine:
                 if not mine or path.is_file():
                     continue
-                write_json(path, case_of(Plan(name_of(scene, number), scene, "none"), commit, bench))
-                print(f"{scene} {number}: {told(json.loads(path.read_text()))}", flush=True)
+                case = case_of(Plan(name_of(scene, number), scene, "none"), commit, bench)
+                write_json(path, case)
+                print(f"{scene} {number}: {told(case)}", flush=True)
     found = cases_of(folder, commit)
     if not found:
         raise SystemExit(f"error: {folder} holds no case of commit {commit}")

@@ -17,8 +17,8 @@ grip_way_share, of the door's way to open, that it goes with the grip on, and wo
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -38,15 +38,15 @@ from rich.console import Console  # noqa: E402
 from rich.progress import track  # noqa: E402
 
 from benchmarks.common import origin, stem  # noqa: E402
+from droid_jax.files import POLICY  # noqa: E402
 from droid_jax.model.door_scene import door_scene  # noqa: E402
 from droid_jax.policy.control import Policy, load  # noqa: E402
 from droid_jax.policy.door_env import DoorEnv  # noqa: E402
 from droid_jax.policy.hand import finger_forces_c, hand_of, looked  # noqa: E402
 from droid_jax.policy.task import Task, gripped  # noqa: E402
 from droid_jax.policy.transfer import TransferConfig, TrialRobot, stand_in, transfer, watched  # noqa: E402
-from droid_jax.report.files import POLICY  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
-from experiments.policies.cases import QUICK_STEPS, RESULTS, TIMESTEP  # noqa: E402
+from experiments.policies.cases import QUICK_STEPS, RESULTS, TIMESTEP, made_by  # noqa: E402
 from experiments.policies.robots import pads_of, truth_of  # noqa: E402
 from experiments.policies.settings import SETTINGS, Setting  # noqa: E402
 from experiments.policies.table import METHODS  # noqa: E402
@@ -155,20 +155,24 @@ def openings(policy: Policy, robot: TrialRobot, trials: int) -> dict[str, Any]:
 
 
 def made(arguments: Arguments) -> list[dict[str, Any]]:
-    """The cases of Table II that are there, method by method."""
+    """The cases of Table II that are there, method by method.  Ends the program where they are of another robot."""
     folder = arguments.policies / "table2_cases" / arguments.setting
     found = [json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))]
     if not found:
         raise SystemExit(f"error: no policies in {folder}; run experiments/table2.py first")
+    wanted = json.loads(json.dumps(asdict(SETTINGS[arguments.setting])))
+    other = [f"{case['method']} {case['seed']}" for case in found if case["setting"] != wanted]
+    if other:
+        raise SystemExit(f"error: in {folder} are policies of another setting than {wanted}: {', '.join(other)}")
     by_method = sorted(found, key=lambda case: (METHODS.index(case["method"]), case["seed"]))
     first = {case["method"]: case for case in reversed(by_method)}
     return list(first.values()) if arguments.quick else by_method
 
 
-def rows(arguments: Arguments) -> Iterator[dict[str, Any]]:
+def rows(cases: Sequence[dict[str, Any]], arguments: Arguments) -> Iterator[dict[str, Any]]:
     """Each policy, by pads."""
     by_pads, few = robots(SETTINGS[arguments.setting], arguments), 1 if arguments.quick else WATCHED
-    for case in track(made(arguments), "policies", console=Console(stderr=True)):
+    for case in track(cases, "policies", console=Console(stderr=True)):
         policy = load(arguments.policies / "trained_cases" / case["trained"] / POLICY)
         row = {"policy": f"{case['method']} {case['seed']}", "trained": case["trained"], "pads": {}}
         for name, robot in by_pads.items():
@@ -182,17 +186,23 @@ def rows(arguments: Arguments) -> Iterator[dict[str, Any]]:
         yield row
 
 
+def needless(tried: Mapping[str, Any]) -> bool:
+    """Whether a policy that was tried with such pads does without a grip; one whose trials all blew up does not."""
+    return (tried["success_rate"] or 0.0) >= NEEDED
+
+
 def main() -> None:
     arguments, code = tyro.cli(Arguments, description=__doc__), origin(0)
     if arguments.setting not in SETTINGS:
         raise SystemExit(f"error: unknown setting {arguments.setting!r}; valid: {', '.join(SETTINGS)}")
-    found = list(rows(arguments))
+    cases = made(arguments)
+    found = list(rows(cases, arguments))
     by_friction = (f"{mu:g}" for mu in arguments.frictions)
-    free = {mu: [row["policy"] for row in found if row["pads"][mu]["success_rate"] >= NEEDED] for mu in by_friction}
+    free = {mu: [row["policy"] for row in found if needless(row["pads"][mu])] for mu in by_friction}
     summary = {"setting": arguments.setting, "policies": len(found), "do_not_need_their_grip": free}
     counts = {"trials": 1 if arguments.quick else arguments.trials, "watched": 1 if arguments.quick else WATCHED}
     path = arguments.out / f"{stem('pad_friction', arguments.quick)}_{arguments.setting}.json"
-    write_json(path, {**summary, **counts, "rows": found, **code})
+    write_json(path, {**summary, **counts, "rows": found, **made_by(cases), **code})
     print(json.dumps(summary))
 
 

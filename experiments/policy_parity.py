@@ -2,8 +2,9 @@
 
     python experiments/policy_parity.py [--policies runs/train/policy.npz ...] [--quick] [--out DIR]
 
-Each policy without any noise on doors drawn from the distribution that it was trained on (without effects, the
-gaussian.json beside it): each door once in MJX with the training's time step, and once in C at 1 ms with a solver that
+Each policy without any noise on doors of its own, drawn from the Gaussian beside it (gaussian.json, without effects:
+what it was trained on, or what lies around the mean that a policy of the method "mean" is trained on): each door once
+in MJX with the training's time step, and once in C at 1 ms with a solver that
 has converged.  Start pose and physics are the same, so what differs is the simulation.  Writes DIR/policy_parity.json
 and .png, with the hashes of policy and distribution; the target is a largest opening angle within 3 degrees on every
 door.
@@ -23,7 +24,6 @@ sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
 import tuned  # noqa: E402, F401  (before jax starts)
 
 # isort: split
-import hashlib  # noqa: E402
 import json  # noqa: E402
 
 import numpy as np  # noqa: E402
@@ -45,7 +45,7 @@ from droid_jax.policy.transfer import TransferConfig, stand_in, transfer  # noqa
 from droid_jax.policy.trials import Trials  # noqa: E402
 from droid_jax.report.export import png_bytes  # noqa: E402
 from droid_jax.report.style import AFTER, INK, styled  # noqa: E402
-from droid_jax.storage import write_bytes, write_json  # noqa: E402
+from droid_jax.storage import file_sha256, write_bytes, write_json  # noqa: E402
 from experiments.policies.cases import QUICK_STEPS, RESULTS, TIMESTEP, Options  # noqa: E402
 
 WITHIN = 3.0  # degrees
@@ -65,7 +65,7 @@ class Arguments:
     doors: int = 50
     """Doors of each policy, one episode each."""
     seed: int = 0
-    """Of the doors."""
+    """Of the first policy's doors; each further policy's is one more, so that no door is counted twice."""
 
 
 def trained(policy: Path, gaussian: Path) -> tuple[Policy, DoorEnv, Gaussian]:
@@ -89,7 +89,7 @@ def named(path: Path) -> dict[str, str]:
     """A file by its place in the project (elsewhere its name alone) and its hash."""
     own = path.resolve()
     where = own.relative_to(ROOT).as_posix() if own.is_relative_to(ROOT) else own.name
-    return {"file": where, "sha256": hashlib.sha256(own.read_bytes()).hexdigest()}
+    return {"file": where, "sha256": file_sha256(own)}
 
 
 def in_mjx(policy: Policy, env: DoorEnv, gaussian: Gaussian, values: np.ndarray) -> Trials:
@@ -131,6 +131,7 @@ def compared(policy: Policy, env: DoorEnv, gaussian: Gaussian, doors: int, seed:
     whole = (both["mjx"].stopped == "") & (both["c"].stopped == "")
     return {
         "doors": doors,
+        "seed": seed,
         "difference_deg": {
             "median": float(np.median(apart)),
             "quantile_90": float(np.quantile(apart, 0.9)),
@@ -151,10 +152,10 @@ def main() -> None:
     results: list[dict[str, Any]] = []
     if arguments.quick:
         results.append({"policy": "untrained", "gaussian": "prior", **compared(*untrained(), 2, arguments.seed)})
-    for policy in () if arguments.quick else arguments.policies:
+    for number, policy in enumerate(() if arguments.quick else arguments.policies):
         beside = policy.with_name("gaussian.json")
         of = {"policy": named(policy), "gaussian": named(beside)}
-        results.append({**of, **compared(*trained(policy, beside), arguments.doors, arguments.seed)})
+        results.append({**of, **compared(*trained(policy, beside), arguments.doors, arguments.seed + number)})
     name = stem("policy_parity", arguments.quick)
     every = [r["difference_deg"] for r in results]
     worst = {"largest_deg": max(d["largest"] for d in every), "within_target": min(d["within_target"] for d in every)}

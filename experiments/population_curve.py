@@ -10,6 +10,7 @@ judged on repeats that the search did not see.  The compilation is done before t
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,13 +21,12 @@ sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
 import tuned  # noqa: E402, F401  (before jax starts)
 
 # isort: split
-import json  # noqa: E402
 
 import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 
-from benchmarks.common import commits, origin, stem  # noqa: E402
+from benchmarks.common import commits, origin, publish, stem  # noqa: E402
 from benchmarks.sharing import kept  # noqa: E402
 from droid_jax.compare.cost import Cost, make_cost  # noqa: E402
 from droid_jax.identify.judge import split  # noqa: E402
@@ -36,7 +36,7 @@ from droid_jax.measure.formats import load  # noqa: E402
 from droid_jax.measure.surrogate import record, stand_in_truth  # noqa: E402
 from droid_jax.model.door import door_space  # noqa: E402
 from droid_jax.model.door_scene import door_scene  # noqa: E402
-from droid_jax.storage import write_bytes, write_json  # noqa: E402
+from droid_jax.storage import write_bytes  # noqa: E402
 
 COLOURS = ("#2b6cb0", "#c05621", "#2f855a", "#6b46c1")
 
@@ -79,6 +79,7 @@ def curve(cost: Cost, held: Cost, population: int, seconds: float, seed: int) ->
     search(cost, cost.space, replace(config, generations=1))
     found = search(cost, cost.space, config)
     history = found.history
+    rows = _rows(len(history.mean))
     return {
         "population": population,
         "seed": seed,
@@ -86,8 +87,8 @@ def curve(cost: Cost, held: Cost, population: int, seconds: float, seed: int) ->
         "generations": len(history.sigma),
         "evaluations": found.evaluations,
         "seconds": np.round(np.cumsum(history.seconds), 2).tolist(),
-        "held_out": np.round(held(_thinned(history.mean)), 4).tolist(),
-        "rows": _rows(len(history.mean)).tolist(),
+        "held_out": np.round(held(history.mean[rows]), 4).tolist(),
+        "rows": rows.tolist(),
     }
 
 
@@ -96,14 +97,18 @@ def _rows(generations: int, most: int = 64) -> np.ndarray:
     return np.unique(np.linspace(0, generations - 1, min(generations, most)).astype(int))
 
 
-def _thinned(means: np.ndarray) -> np.ndarray:
-    return means[_rows(len(means))]
-
-
 def at(run: dict[str, Any], seconds: float) -> float | None:
     """Held-out cost of the latest judged generation finished by then; None before the first."""
     done = [c for row, c in zip(run["rows"], run["held_out"], strict=True) if run["seconds"][row] <= seconds]
     return done[-1] if done else None
+
+
+def one_device(runs: Sequence[Mapping[str, Any]]) -> str:
+    """The device on which all ran.  Ends the program where they differ: their wall times are of one figure."""
+    found = sorted({run["origin"]["device"] for run in runs})
+    if len(found) > 1:
+        raise SystemExit(f"error: searches of several devices: {'; '.join(found)}: choose another --out")
+    return found[0]
 
 
 def figure(runs: list[dict[str, Any]]) -> Figure:
@@ -131,24 +136,24 @@ def main() -> None:
     for compiled in (cost, held):
         compiled(np.tile(cost.space.mean, (max(populations), 1)))
     folder = arguments.out / stem("population_curve_runs", arguments.quick)
-    runs = []
+    runs, searched_on = [], ""
     for seed in range(1 if arguments.quick else arguments.seeds):
         for population in populations:
             path = folder / f"{population}_samples_{seconds:g}_s_{seed}.json"
             runs.append(
                 kept(path, lambda p=population, s=seed: {**curve(cost, held, p, seconds, s), "origin": origin(s)})
             )
+            searched_on = one_device(runs)
             print(f"{population} samples, seed {seed}: held-out {runs[-1]['held_out'][-1]:.4f} N m", flush=True)
     shares = (0.25, 0.5, 1.0)
     table = {
         str(p): {f"{s * seconds:g} s": [at(r, s * seconds) for r in runs if r["population"] == p] for s in shares}
         for p in populations
     }
-    summary = {"seconds": seconds, "searches_from_commits": commits(runs), "held_out_by_population_and_time": table}
-    name = stem("population_curve", arguments.quick)
-    write_json(arguments.out / f"{name}.json", {**origin(0), **summary, "runs": runs})
-    write_bytes(arguments.out / f"{name}.png", png_bytes(figure(runs)))
-    print(json.dumps(summary))
+    summary = {"seconds": seconds, "searched_on": searched_on, "searches_from_commits": commits(runs)}
+    summary |= {"held_out_by_population_and_time": table}
+    write_bytes(arguments.out / f"{stem('population_curve', arguments.quick)}.png", png_bytes(figure(runs)))
+    publish(arguments.out, "population_curve", arguments.quick, 0, {**summary, "runs": runs}, summary)
 
 
 if __name__ == "__main__":

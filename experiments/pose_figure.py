@@ -42,13 +42,13 @@ class Arguments:
 
 
 @styled
-def densities(a: dict[str, Any], b: dict[str, Any], width: float = WIDE) -> Figure:
+def densities(a: dict[str, Any], b: dict[str, Any]) -> Figure:
     """One panel for each parameter that both poses tell: the two densities and the truth."""
     names = both_tell(a, b)
     known = {p.name: p for p in door_space(door_scene()).parameters}
     columns = 4
     rows = max(1, -(-len(names) // columns))
-    figure = Figure(figsize=(width, 0.6 + 1.5 * rows), layout="constrained")
+    figure = Figure(figsize=(WIDE, 0.6 + 1.5 * rows), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for unused in panels[len(names) :]:
         unused.set_visible(False)

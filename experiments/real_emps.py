@@ -42,7 +42,6 @@ from inverse_fit import (
     rms,
     rounded,
     run,
-    stem,
     table,
 )
 
@@ -186,9 +185,7 @@ def main(config: RealEmps) -> None:
         },
     }
     print(f"  {JUDGE}: {result['before'][JUDGE]} before, {result['after'][JUDGE]} after")
-    publish(
-        config.out, stem("real_emps", config.quick), config.seed, result, trace_figure(judge, space.mean, found.best)
-    )
+    publish(config.out, "real_emps", config.quick, config.seed, result, trace_figure(judge, space.mean, found.best))
 
 
 if __name__ == "__main__":

@@ -60,7 +60,6 @@ from inverse_fit import (
     rms,
     rounded,
     run,
-    stem,
     table,
 )
 
@@ -344,7 +343,7 @@ def main(config: RealPanda) -> None:
             "coulomb_within_40_percent_but_joint_2": lead["coulomb_close_but_joint_2"],
         },
     }
-    publish(config.out, stem("real_panda", config.quick), config.seed, result, residual_figure(clock, fits, leading))
+    publish(config.out, "real_panda", config.quick, config.seed, result, residual_figure(clock, fits, leading))
 
 
 if __name__ == "__main__":

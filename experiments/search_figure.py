@@ -45,8 +45,6 @@ class Arguments:
     """Three generations: shows that it runs."""
     out: Path = ROOT / "experiments" / "results"
     """Folder for the figures."""
-    springs: int = 0
-    """Of the door."""
 
 
 def figures(found: Run) -> dict[str, Any]:
@@ -70,20 +68,13 @@ def made_by(found: Run) -> dict[str, Any]:
 def main() -> None:
     arguments = tyro.cli(Arguments, description=__doc__)
     folder = arguments.out / stem("search_run", arguments.quick)
-    run(
-        Identify(
-            preset="paper",
-            springs=arguments.springs,
-            generations=3 if arguments.quick else None,
-            out=folder,
-        )
-    )
+    run(Identify(preset="paper", springs=0, generations=3 if arguments.quick else None, out=folder))
     found = read_run(folder)
     for name, figure in figures(found).items():
         save(figure, arguments.out, stem(name, arguments.quick))
     shown = {
         p["name"]: {k: p[k] for k in ("truth", "initial_mean", "mean", "std")}
-        | {"paper": PAPER[p["name"]][arguments.springs + 1]}  # mean and deviation
+        | {"paper": PAPER[p["name"]][1]}  # mean and deviation, of the door without a spring
         for p in found.parameters
     }
     result = {

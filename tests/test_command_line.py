@@ -22,9 +22,9 @@ from small_log import elbow_log, write_elbow
 from droid_jax import run
 from droid_jax.commands import convert, presets
 from droid_jax.commands.folder import OtherRun, changed, finished, setup_of
-from droid_jax.commands.hidden import known_stand_in, settled
 from droid_jax.commands.identify import Identify
 from droid_jax.commands.own_effects import load_effects
+from droid_jax.commands.stand_in import known_stand_in, settled
 from droid_jax.identify import pipeline
 from droid_jax.measure.demonstration import demonstration_path
 from droid_jax.measure.formats import load, save

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from small_log import elbow_log, write_elbow
 
-from droid_jax.commands import evaluate, gap, hidden, identify, report, train, whole
+from droid_jax.commands import evaluate, gap, identify, report, stand_in, train, whole
 from droid_jax.commands.folder import OtherRun
-from droid_jax.commands.hidden import known_stand_in
 from droid_jax.commands.presets import TIMESTEP
 from droid_jax.commands.source import stand_in_of
+from droid_jax.commands.stand_in import known_stand_in
 from droid_jax.measure.formats import load, save
 from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
 from droid_jax.measure.surrogate import SOURCE
@@ -34,7 +34,7 @@ def called(tuned: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list
     monkeypatch.chdir(tmp_path)
     for module in (identify, gap, train, evaluate):
         monkeypatch.setattr(module, "run", commands.append)
-    monkeypatch.setattr(hidden, "kept_recordings", lambda paths, again, record: dict.fromkeys(paths))
+    monkeypatch.setattr(stand_in, "kept_recordings", lambda paths, again, record: dict.fromkeys(paths))
     monkeypatch.setattr(report, "write", lambda folder: folder / "report.html")
     return commands
 
@@ -160,6 +160,24 @@ def test_the_last_lines_say_what_was_hidden_in_what_was_searched(called, tmp_pat
     assert main([]) == 0
     said = capsys.readouterr().out
     assert ("hidden in the stand-in robot: magnetic catch (1.5 N m; in the library: latch)" in said) == stand_in
+
+
+@pytest.mark.parametrize("robot", [{}, {"springs": 1, "seed": 0}])
+def test_a_success_on_another_robot_than_the_fitted_one_is_no_promise(called, tmp_path: Path, capsys, robot: dict):
+    """The policy of a fit of one's own recordings is tried on the stand-in robot all the same."""
+    folder = tmp_path / "runs" / "all" / "train"
+    folder.mkdir(parents=True)
+    trials = {"success_rate": 1.0, "interval_95": [0.9, 1.0]}
+    (folder / "transfer.json").write_text(json.dumps({"simulation": trials, "stand_in": trials}))
+    setup = {"method": "fitted", "preset": "quick", "knob": 0, "seed": 0, "fit": "runs/all/identify"}
+    task = {"opened": 0.7, "held": 1.0, "control": 0.02, "steps": 512}
+    training = {"setup": setup, "stand_in": robot, "task": task, "scene": "door", "effects": [], "versions": {},
+                "device": "cpu", "history": []}  # fmt: skip
+    (folder / "training.json").write_text(json.dumps(training))
+    assert main(["all", "--stages", "identify"]) == 0
+    said = capsys.readouterr().out
+    assert "policy: 100 % success on the stand-in robot" in said
+    assert ("The fit is of your own recordings: the stand-in robot is another one" in said) == (not robot)
 
 
 def test_without_a_named_effect_it_is_trained_on_the_fit(called, tmp_path: Path):
@@ -441,8 +459,8 @@ def test_presets_reach_the_stages(called, capsys):
 def test_jax_is_tuned_before_the_stand_in_is_recorded(tmp_path: Path):
     """In a process of its own, where nothing has started jax: it could not be tuned afterwards."""
     code = (
-        "from droid_jax.commands import hidden, identify, report, whole\n"
-        "hidden.kept_recordings = lambda paths, again, record: dict.fromkeys(paths)\n"
+        "from droid_jax.commands import identify, report, stand_in, whole\n"
+        "stand_in.kept_recordings = lambda paths, again, record: dict.fromkeys(paths)\n"
         "def fit(command):\n"
         "    from droid_jax import runtime\n"
         "    runtime.tune()\n"

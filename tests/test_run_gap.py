@@ -17,10 +17,9 @@ import pytest
 from small_gap import EFFECTS, FLOOR, JOINTS, PRELOAD, QUICK, SCENE, record, small, small_scene, write_parameters
 
 from droid_jax.commands import gap, report
-from droid_jax.commands.hidden import hidden_effects, record_stand_in
+from droid_jax.commands.stand_in import hidden_effects, record_stand_in
 from droid_jax.gap import anew, missing
 from droid_jax.gap.inputs import check_recordings, lags
-from droid_jax.gap.results import load_gap
 from droid_jax.gap.verdict import Experiment
 from droid_jax.measure.formats import save
 from droid_jax.measure.recording import Channel, Recording
@@ -28,6 +27,7 @@ from droid_jax.model.door_scene import door_scene
 from droid_jax.model.effects import registry
 from droid_jax.model.parameters import Parameter, Scaling
 from droid_jax.model.seam import Effect
+from droid_jax.report.gap_folder import read_gap
 from droid_jax.run import main
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -455,7 +455,7 @@ def test_a_run_goes_on_after_a_stop_and_is_whole(
     written = {"gap.json", "gap.npz", "extended.json", "extended.xml"}
     assert files == {"checkpoints", "setup.json", "tensorboard", *written}
     assert not (out / "checkpoints" / "replays").exists()
-    answer = load_gap(out).answer
+    answer = read_gap(out).found
     assert answer["amplitudes"][0]["value"] == pytest.approx(PRELOAD, rel=0.05)
     assert {"search", "refine", "floor", "screen", "refit"} <= set(answer["seconds"])
     assert answer["setup"]["stand_in"] is True and answer["setup"]["command"] == "gap"
@@ -488,7 +488,7 @@ def test_ties_come_with_an_experiment(place: Path, quick: None, monkeypatch: pyt
     monkeypatch.setattr(missing, "separating", apart)
     assert main(arguments(place, "--effects", *EFFECTS)) == 0
     assert asked == [(["hinge_preload at door", "base"], "fit")]
-    assert load_gap(place / "run").answer["experiments"] == [{"what": "the same motion twice as fast", "apart": 8.5}]
+    assert read_gap(place / "run").found["experiments"] == [{"what": "the same motion twice as fast", "apart": 8.5}]
 
 
 @pytest.mark.slow

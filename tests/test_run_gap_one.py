@@ -18,13 +18,12 @@ from droid_jax.commands import gap
 from droid_jax.commands.gap_search import IN_BLOCKS
 from droid_jax.gap import missing
 from droid_jax.gap.extended import load_extended
-from droid_jax.gap.results import GapFiles, load_gap
 from droid_jax.gap.single import Log
 from droid_jax.gap.split import Split, roles_of, split_of
 from droid_jax.identify.search import SearchConfig
 from droid_jax.measure.formats import save
 from droid_jax.measure.recording import Recording
-from droid_jax.report.gap_folder import read_gap
+from droid_jax.report.gap_folder import Gap, read_gap
 from droid_jax.run import main
 
 SEARCH = replace(CONFIG, search=SearchConfig(population=8, parents=None, generations=2), most=1)
@@ -128,33 +127,33 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
 
 @pytest.fixture(scope="module")
-def found(run: tuple[Path, str]) -> GapFiles:
-    return load_gap(run[0])
+def found(run: tuple[Path, str]) -> Gap:
+    return read_gap(run[0])
 
 
-def test_a_log_is_searched_and_its_limits_are_said(run: tuple[Path, str], found: GapFiles):
+def test_a_log_is_searched_and_its_limits_are_said(run: tuple[Path, str], found: Gap):
     lines = run[1].splitlines()[-7:]
     assert lines[0] == "The model lacks: joint_coulomb at elbow."
-    assert "closed), sealed " in lines[3] and lines[4] == Split.BLOCKS.limits == found.answer["split"]["limits"]
-    assert found.answer["split"]["by"] == "blocks" and "nothing tells a place from noise" in lines[4]
-    (amplitude,) = found.answer["amplitudes"]
+    assert "closed), sealed " in lines[3] and lines[4] == Split.BLOCKS.limits == found.found["split"]["limits"]
+    assert found.found["split"]["by"] == "blocks" and "nothing tells a place from noise" in lines[4]
+    (amplitude,) = found.found["amplitudes"]
     assert amplitude["low"] < COULOMB < amplitude["high"] and amplitude["value"] == pytest.approx(COULOMB, rel=0.1)
-    assert found.answer["floor"] == 0.0 and set(found.answer["seconds"]) == set(IN_BLOCKS)
-    assert found.answer["trends"] == [] and found.answer["experiments"] == []
-    assert not any(cell["found"] for cell in found.answer["cells"]["before"])
-    places = {when: [(c["variable"], c["where"]) for c in found.answer["cells"][when]] for when in ("before", "after")}
+    assert found.found["floor"] == 0.0 and set(found.found["seconds"]) == set(IN_BLOCKS)
+    assert found.found["trends"] == [] and found.found["experiments"] == []
+    assert not any(cell["found"] for cell in found.found["cells"]["before"])
+    places = {when: [(c["variable"], c["where"]) for c in found.found["cells"][when]] for when in ("before", "after")}
     assert places["before"] == places["after"]  # also loads, of which each model has its own
 
 
-def test_each_role_has_its_own_instants(found: GapFiles):
+def test_each_role_has_its_own_instants(found: Gap):
     clocks = [found.traces[role]["time"] for role in ("fit", "confirm", "sealed")]
     together = np.sort(np.concatenate(clocks))
     assert len(np.unique(together)) == len(together)
     assert np.ptp(np.diff(together)) < 1e-6  # nothing is left out
     assert clocks[2].min() > max(clocks[0].max(), clocks[1].max())
-    names = [g["recording"] for g in found.answer["gaps"].values()]
+    names = [g["recording"] for g in found.found["gaps"].values()]
     assert names == ["elbow, every other block", "elbow, the blocks between", "elbow, last third"]
-    for role, gap_of_role in found.answer["gaps"].items():
+    for role, gap_of_role in found.found["gaps"].items():
         traces = found.traces[role]
         np.testing.assert_array_equal(traces["scatter"], 0.0)
         for when in ("before", "after"):  # equation 1 holds the noise that the filter takes out of the traces
@@ -182,7 +181,7 @@ def test_the_page_of_a_log_claims_no_repeats(run: tuple[Path, str]):
 def test_another_log_is_sealed(tmp_path: Path):
     other = replace(elbow_log(COULOMB, seconds=12.0), name="other")
     assert main(command(tmp_path, [LOG.window(0.0, 24.0), other], "--effects", "joint_coulomb", "cable_pull")) == 0
-    gaps = load_gap(tmp_path / "run").answer["gaps"]
+    gaps = read_gap(tmp_path / "run").found["gaps"]
     assert [g["recording"] for g in gaps.values()] == ["elbow, every other block", "elbow, the blocks between", "other"]
     assert gaps["sealed"]["after"] < 0.1 * gaps["sealed"]["before"]
 

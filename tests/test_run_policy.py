@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from droid_jax.commands import report
-from droid_jax.commands.evaluate import Evaluate, _film, _robot, _task
+from droid_jax.commands.evaluate import Evaluate, _film, _robot, _task, _tell
 from droid_jax.commands.folder import begin, setup_of, stage_folder
 from droid_jax.commands.source import source, stand_in_of
 from droid_jax.commands.train import Train, _fit_folder
@@ -281,6 +281,18 @@ def test_films_are_of_the_trials_of_median_angle(tmp_path: Path, monkeypatch: py
     assert why is None if opengl else str(why).startswith("no OpenGL here; ")
     assert made == ({"good.webp": 2, "bad.webp": 4} if opengl else {})
     assert ("no films: no OpenGL here" in capsys.readouterr().err) is not opengl
+
+
+@pytest.mark.parametrize(
+    ("fit", "robot", "another"), [("fit", {}, True), ("fit", {"springs": 1, "seed": 0}, False), (None, {}, False)]
+)
+def test_trials_on_another_robot_than_the_fitted_one_say_so(fit: str | None, robot: dict, another: bool, capsys):
+    """With recordings of one's own the stand-in is another robot; without a fit there is none that it could be."""
+    trials = {"success_rate": 1.0, "interval_95": [0.9, 1.0], "angle_deg": {"mean": 40.0, "std": 1.0}}
+    _tell({"simulation": trials, "stand_in": trials}, {"setup": {"fit": fit}, "stand_in": robot})
+    said = capsys.readouterr().out
+    assert "stand-in robot: 100 % success" in said
+    assert ("The fit is of your own recordings: the stand-in robot is another one" in said) == another
 
 
 @pytest.mark.slow

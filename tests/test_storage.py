@@ -121,3 +121,10 @@ def test_a_failed_folder_leaves_the_old_one(failing: int, tmp_path: Path, monkey
             raise OSError("disk full")
     assert [p.name for p in target.iterdir()] == ["old"]
     assert list(tmp_path.iterdir()) == [target]
+
+
+def test_a_files_hash_is_of_its_bytes(tmp_path: Path):
+    """The standard's own example: FIPS 180-4, "abc"."""
+    (tmp_path / "file").write_bytes(b"abc")
+    expected = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    assert storage.file_sha256(tmp_path / "file") == expected

@@ -30,6 +30,7 @@ from droid_jax.measure.surrogate import stand_in_truth
 from droid_jax.model.door import JOINT_DAMPING, door_nuisances, door_space
 from droid_jax.model.door_scene import door_scene
 from droid_jax.model.parameters import Space
+from droid_jax.storage import finite
 
 OURS, THEIRS, JUDGE = 0.004, 0.002, 0.0005  # s, time steps; ours is of second order
 WAYS: dict[str, dict[str, bool]] = {
@@ -95,7 +96,7 @@ def _figures(
         "largest_joint_damping_error": max(abs(error[n] / truth[space.index(n)]) for n in JOINT_DAMPING),
         "inside_95": {"of_table_i": [int(inside[main].sum()), int(main.sum())],
                       "of_identifiable": [int(inside[told].sum()), int(told.sum())]},
-        "half_width_95": {n: float(h) if np.isfinite(h) else None for n, h in zip(space.names, half, strict=True)},
+        "half_width_95": {n: finite(h) for n, h in zip(space.names, half, strict=True)},
         "values": dict(zip(space.names, best.tolist(), strict=True)),
         "seconds": seconds,
     }  # fmt: skip

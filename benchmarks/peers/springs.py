@@ -26,6 +26,7 @@ from droid_jax.model.fields import model_parameter
 from droid_jax.model.own import load_parameters
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import Scene, load_scene
+from droid_jax.storage import finite
 
 FORCE_NOISE, POSITION_NOISE = 0.02, 1e-5  # N and m, white, of the measured log
 RATE = 500.0  # Hz of that log
@@ -235,14 +236,20 @@ def hidden_friction(seconds: float, seed: int) -> dict[str, Any]:
         "truth": TRUTH,
         "sysid": {
             "values": dict(zip(TRUTH, theirs.values.tolist(), strict=True)),
-            "half_width_95": dict(zip(TRUTH, theirs.half_width.tolist(), strict=True)),
-            "error_in_half_widths": {
-                n: float(e / h) for (n, e), h in zip(errors.items(), theirs.half_width, strict=True)
-            },
+            **half_widths(errors, theirs.half_width),
             "says": list(theirs.says),
             "seconds": theirs.seconds,
         },
         "ours": ours,
+    }
+
+
+def half_widths(errors: Mapping[str, float], half_width: np.ndarray) -> dict[str, Any]:
+    """Half widths [D] of 95 % intervals, and errors in units of them; None where a fit tells nothing of a value."""
+    each = {n: finite(h) for n, h in zip(errors, half_width.tolist(), strict=True)}
+    return {
+        "half_width_95": each,
+        "error_in_half_widths": {n: finite(errors[n] / h) if h else None for n, h in each.items()},
     }
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,10 +13,10 @@ import tyro
 
 from droid_jax.commands import report
 from droid_jax.commands.folder import changed, setup_of, stage_folder
-from droid_jax.commands.hidden import hidden_effects
 from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.source import needs_brax, source
-from droid_jax.report.files import FILMS, POLICY, TRAINING, TRANSFER
+from droid_jax.commands.stand_in import hidden_effects
+from droid_jax.files import FILMS, POLICY, TRAINING, TRANSFER
 
 if TYPE_CHECKING:
     from droid_jax.policy.control import Policy
@@ -67,17 +66,16 @@ def run(command: Evaluate) -> None:
     from droid_jax.policy.transfer import transfer
     from droid_jax.report.policy_folder import read_training
     from droid_jax.report.progress import counting
-    from droid_jax.storage import new_folder, write_json
+    from droid_jax.storage import file_sha256, new_folder, write_json
 
     folder = stage_folder(command.run, "train", TRAINING)
     load_effects(command.own_effects, folder)
     trained = read_training(folder)
     setup, policy = trained["setup"], load(folder / POLICY)
-    policy_sha256 = hashlib.sha256((folder / POLICY).read_bytes()).hexdigest()
-    setup_now = {**setup_of(command), "run": str(folder), "policy_sha256": policy_sha256}
+    setup_now = {**setup_of(command), "run": str(folder), "policy_sha256": file_sha256(folder / POLICY)}
     if not command.again and (done := _done(folder, setup_now)):
         print(f"{folder} holds these trials already (start over with --again)")
-        _tell(done)
+        _tell(done, trained)
         report.run(report.Report(folder))
         return
     scene, gaussian, effects = source(folder, setup["knob"])
@@ -106,7 +104,7 @@ def run(command: Evaluate) -> None:
         "device": runtime.device(),
     }
     write_json(folder / TRANSFER, content)  # last: its presence says that the trials are whole
-    _tell(content)
+    _tell(content, trained)
     report.run(report.Report(folder))
 
 
@@ -137,8 +135,9 @@ def _task(folder: Path, known: Mapping[str, Any]) -> Task:
     return Task(**known)
 
 
-def _tell(found: Mapping[str, Any]) -> None:
-    """Two lines of transfer.json."""
+def _tell(found: Mapping[str, Any], trained: Mapping[str, Any]) -> None:
+    """Two lines of transfer.json, and what they do not tell of a policy whose training.json is `trained`."""
+    from droid_jax.report.policy_words import another_robot
     from droid_jax.report.words import percent
 
     for name, where in (("simulation", "simulation"), ("stand_in", "stand-in robot")):
@@ -146,6 +145,8 @@ def _tell(found: Mapping[str, Any]) -> None:
         low, high = of["interval_95"]
         angle = f"opened to {of['angle_deg']['mean']:.1f} ± {of['angle_deg']['std']:.1f} degrees"
         print(f"{where}: {percent(of['success_rate'])} success ({percent(low)} to {percent(high)}), {angle}")
+    if other := another_robot(trained):
+        print(other)
 
 
 def _robot(command: Evaluate, trained: Mapping[str, Any], env: DoorEnv) -> tuple[TrialRobot, dict[str, float]]:

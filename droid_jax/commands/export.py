@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from droid_jax.commands.folder import stage_folder
-from droid_jax.report.files import POLICY
+from droid_jax.files import POLICY
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from droid_jax.report.files import LAST_FILES, RESULTS
+from droid_jax.files import CONFIG, LAST_FILES, RESULTS, SETUP
+from droid_jax.storage import file_sha256
 
 if TYPE_CHECKING:
     from droid_jax.measure.recording import Recording
@@ -33,7 +34,7 @@ def setup_of(command: Any) -> dict[str, Any]:
         fields.pop(name, None)
     for name in HASHED:  # a changed file makes another run
         if path := fields.get(name):
-            fields[f"{name}_sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
+            fields[f"{name}_sha256"] = file_sha256(path)
     return {k: [str(v) for v in value] if isinstance(value, tuple) else _plain(value) for k, value in fields.items()}
 
 
@@ -79,14 +80,14 @@ class OtherRun(ValueError):
         super().__init__(f"{self.what}; choose another --out, or --again")
 
 
-def finished(out: Path, setup: dict[str, Any], again: bool, last: str = "config.json") -> bool:
+def finished(out: Path, setup: dict[str, Any], again: bool, last: str = CONFIG) -> bool:
     """True where the folder holds this very run, whole: with `last`, the file that is written last.
 
     Says so where a run goes on with other code than it was begun with.
 
-    Raises OtherRun for a folder with another run in it.
+    Raises OtherRun for a folder with another run in it, ValueError where its setup.json is damaged.
     """
-    path = out / "setup.json"
+    path = out / SETUP
     if again or not path.is_file():
         return False
     try:
@@ -130,13 +131,13 @@ def begin(out: Path, setup: dict[str, Any], again: bool, stage: str) -> None:
     from droid_jax.storage import write_json
 
     forget(out, stage, results_alone=not again)
-    write_json(out / "setup.json", {**setup, CODE: runtime.versions()})
+    write_json(out / SETUP, {**setup, CODE: runtime.versions()})
     BEGUN.add(out)
 
 
 def forget(out: Path, stage: str, results_alone: bool = False) -> None:
     """Remove what a run of this stage left; its checkpoints too, from which it would go on, unless told otherwise."""
-    begun = () if results_alone else ("checkpoints", "tensorboard", "setup.json")
+    begun = () if results_alone else ("checkpoints", "tensorboard", SETUP)
     for name in (LAST_FILES[stage], *RESULTS[stage], *begun):
         if (path := out / name).is_dir():
             shutil.rmtree(path, ignore_errors=True)

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any, Literal
 from droid_jax.commands import report
 from droid_jax.commands.folder import begin, fingerprints, finished, setup_of, stage_folder
 from droid_jax.commands.gap_search import searched
-from droid_jax.commands.hidden import hidden_effects, kept_at, known_stand_in, record_stand_in, settled
 from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.presets import TIMESTEP, refine_config, search_config, warn_of_cpu
 from droid_jax.commands.scenes import compared, needs_log, needs_recording, needs_scene, own_scene, recording_at
+from droid_jax.commands.stand_in import hidden_effects, kept_at, known_stand_in, record_stand_in, settled
+from droid_jax.files import FIT, GAP
 from droid_jax.report.stages import needs_whole
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from droid_jax.model.parameters import Space
     from droid_jax.model.scene import Scene
     from droid_jax.model.seam import Effect
+    from droid_jax.report.gap_folder import Gap as Found
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,7 @@ def run(command: Gap) -> None:
     from droid_jax.measure.surrogate import is_stand_in
 
     out = command.out
-    fit = None if command.fit is None else stage_folder(command.fit, "identify", "fit.json")
+    fit = None if command.fit is None else stage_folder(command.fit, "identify", FIT)
     load_effects(command.own_effects, fit)
     scene, base = model_of(command)
     given = given_to(command)
@@ -113,7 +115,7 @@ def run(command: Gap) -> None:
     setup = {**setup_of(command), "command": "gap", **fingerprints(scene, base, given)}
     if start is not None:
         setup["start"] = start.tolist()
-    if finished(out, setup, command.again, "gap.json"):
+    if finished(out, setup, command.again, GAP):
         _done(out)
         return
     split, roles = shared_out(scene, given) if given else (Split.RECORDINGS, {})
@@ -161,7 +163,7 @@ def values_of(folder: Path, base: Space) -> np.ndarray:
     """
     needs_whole(folder)
     try:
-        known = {p["name"]: float(p["best"]) for p in json.loads((folder / "fit.json").read_text())["parameters"]}
+        known = {p["name"]: float(p["best"]) for p in json.loads((folder / FIT).read_text())["parameters"]}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"--fit {folder} is no folder of a finished `identify`: {error}") from None
     lacking = [p.name for p in base.parameters if not p.nuisance and p.name not in known]
@@ -226,29 +228,38 @@ def given_to(command: Gap) -> list[Recording]:
 
 def _done(out: Path) -> None:
     """Build the page, and say in a few lines what was found."""
-    from droid_jax.gap.results import load_gap, most_shifted
+    from droid_jax.report.gap_folder import read_gap
     from droid_jax.report.gap_words import size_words
     from droid_jax.report.words import percent
 
-    found = load_gap(out).answer
+    gap = read_gap(out)
+    found = gap.found
     page = report.write(out)
     print(found["sentence"])
-    for size in (*found["amplitudes"], *found.get("shapes", ())):
+    for size in gap.sizes:
         print(f"{size['effect']}: {size_words(size)} (90 % interval)")
     p = "nothing was asked" if found["p"] is None else f"p = {found['p']:.2g} if nothing were missing"
     print(f"{p}; base fit converged: {'yes' if found['converged'] else 'no'}")
     gaps = []
-    for role, gap in found["gaps"].items():
-        closed = "" if gap["closed"] is None else f" ({percent(gap['closed'])} closed)"
-        gaps.append(f"{role} {gap['before']:.3g} -> {gap['after']:.3g}{closed}")
+    for role, one in found["gaps"].items():
+        closed = "" if one["closed"] is None else f" ({percent(one['closed'])} closed)"
+        gaps.append(f"{role} {one['before']:.3g} -> {one['after']:.3g}{closed}")
     print(f"gap, noise units squared: {', '.join(gaps)}")
     if found["cut"]:
         print(f"left out for lack of time (--budget): {found['cut']}")
-    if limits := found.get("split", {}).get("limits"):
-        print(limits)
-    shift, deviations = most_shifted(found["shifts"])
-    moved = (
-        f"{shift['name']} {shift['before']:.3g} -> {shift['after']:.3g} {shift['unit']} ({deviations:.1f} deviations)"
-    )
-    print(f"shifted most: {moved if found['effects'] else 'nothing, no effect came in'}")
+    if gap.limits:
+        print(gap.limits)
+    print(f"shifted most: {_shifted_most(gap)}")
     print(f"report: {page}")
+
+
+def _shifted_most(gap: Found) -> str:
+    """Which base parameter the effects moved most, by how many of its deviations."""
+    from droid_jax.report.gap_words import deviations, largest_shifts
+
+    if not gap.extended:
+        return "nothing, no effect came in"
+    for most in largest_shifts(gap.found["shifts"])[:1]:
+        by = abs(deviations(most))
+        return f"{most['name']} {most['before']:.3g} -> {most['after']:.3g} {most['unit']} ({by:.1f} deviations)"
+    return "nothing whose deviation is known"

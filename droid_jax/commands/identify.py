@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from droid_jax.commands import report
 from droid_jax.commands.folder import begin, fingerprints, finished, kept_recordings, setup_of
-from droid_jax.commands.hidden import known_stand_in, settled
 from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.pictures import draw, keep_replay
 from droid_jax.commands.presets import TIMESTEP, Preset, refine_config, search_config, warn_of_cpu
 from droid_jax.commands.scenes import compared, needs_log, needs_recording, needs_scene, own_scene, recording_at
-from droid_jax.report.files import EXTENDED
+from droid_jax.commands.stand_in import known_stand_in, settled
+from droid_jax.files import EXTENDED, FIT
 
 if TYPE_CHECKING:
     from droid_jax.identify.pipeline import Identified, IdentifyConfig
@@ -94,10 +94,9 @@ def run(command: Identify) -> None:
     needs_writer(command.tensorboard)
     runtime.start()
     warn_of_cpu(command.preset)
-    from droid_jax.compare.start import command_notes
+    from droid_jax.compare.notes import command_notes
     from droid_jax.identify.pipeline import cost_samples, prepare, solve
     from droid_jax.identify.results import prepare_folder, write_run
-    from droid_jax.measure.surrogate import is_stand_in
     from droid_jax.report.progress import stages
     from droid_jax.report.scalars import FOLDER, scalars
     from droid_jax.storage import write_bytes
@@ -134,25 +133,8 @@ def run(command: Identify) -> None:
 
         found = solve(problem, checkpoints=out / "checkpoints", progress=progress)
         description = {
-            "command": "identify",
-            "preset": command.preset,
-            "scene": scene.name,
-            "engine": config.engine,
-            "recordings": [
-                {
-                    "name": r.name,
-                    "sha256": r.sha256,
-                    "repeats": r.repeats,
-                    "heldout": list(found.heldout_repeats[r.name]),
-                    "duration": r.duration,
-                }
-                for r in recordings
-            ],
-            "seed": command.seed,
-            "versions": runtime.versions(),
-            "device": runtime.device(),
+            **_description(command, found, recordings),
             "started": started,
-            "stand_in": all(is_stand_in(r) for r in recordings),
             "robot": known,
             "setup": setup,
         }
@@ -164,7 +146,34 @@ def run(command: Identify) -> None:
         )  # fmt: skip
     draw(out, scene)
     report.run(report.Report(out))
-    _summary(found, json.loads((out / "fit.json").read_text()), [r.repeats for r in recordings])
+    _summary(found, json.loads((out / FIT).read_text()), [r.repeats for r in recordings])
+
+
+def _description(command: Identify, found: Identified, recordings: Sequence[Recording]) -> dict[str, Any]:
+    """What config.json says of a fit, its setup apart."""
+    from droid_jax import runtime
+    from droid_jax.measure.surrogate import is_stand_in
+
+    return {
+        "command": "identify",
+        "preset": command.preset,
+        "scene": found.scene.name,
+        "engine": command.engine,
+        "recordings": [
+            {
+                "name": r.name,
+                "sha256": r.sha256,
+                "repeats": r.repeats,
+                "heldout": list(found.heldout_repeats[r.name]),
+                "duration": r.duration,
+            }
+            for r in recordings
+        ],
+        "seed": command.seed,
+        "versions": runtime.versions(),
+        "device": runtime.device(),
+        "stand_in": all(is_stand_in(r) for r in recordings),
+    }
 
 
 def model_of(command: Identify) -> tuple[Scene, Space, Space | None]:

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from droid_jax.report.files import FILMS, REPLAY, REPLAY_FILM
+from droid_jax.files import FILMS, REPLAY, REPLAY_FILM
 
 if TYPE_CHECKING:
     from droid_jax.identify.pipeline import Identified

@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from droid_jax.commands.folder import RUNS
-from droid_jax.report.files import LAST_FILES
+from droid_jax.files import LAST_FILES
 
 
 @dataclass(frozen=True)

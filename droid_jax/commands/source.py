@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from droid_jax.commands.hidden import known_stand_in
-from droid_jax.report.files import GAUSSIAN
+from droid_jax.commands.stand_in import known_stand_in
+from droid_jax.errors import needs
+from droid_jax.files import CONFIG, GAP, GAUSSIAN
 from droid_jax.report.stages import extended_of, left_over, needs_whole, setup, told_in, unfinished
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ def model_folder(whole: Path) -> Path:
     A search in other recordings than the fit's, left over from an earlier run, does not count.
     Raises ValueError for a verdict that cannot be read.
     """
-    path = whole / "gap" / "gap.json"
+    path = whole / "gap" / GAP
     try:
         named = path.is_file() and bool(json.loads(path.read_text())["effects"])
     except (ValueError, KeyError, TypeError) as error:
@@ -110,7 +110,7 @@ def _robot(folder: Path | None) -> dict[str, Any]:
     """The same as a finished run of `identify` or `gap` keeps it; empty where it does not."""
     if folder is None:
         return {}
-    told = (told_in(folder / "config.json"), told_in(folder / "gap.json").get("setup", {}))
+    told = (told_in(folder / CONFIG), told_in(folder / GAP).get("setup", {}))
     return next((of["robot"] for of in told if of.get("stand_in") and of.get("robot")), {})
 
 
@@ -128,5 +128,4 @@ def _hold(paths: Sequence[str | Path], hashes: Sequence[str]) -> bool:
 
 def needs_brax() -> None:
     """ValueError that says what to install where brax is not."""
-    if importlib.util.find_spec("brax") is None:
-        raise ValueError("policies need brax: in the checkout, pip install -c constraints.txt -e '.[train]'")
+    needs("policies need", "train", "brax")

@@ -5,19 +5,20 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from droid_jax.commands import report
 from droid_jax.commands.folder import RUNS, begin, finished, setup_of
 from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.presets import warn_of_cpu
 from droid_jax.commands.source import has_model, model_folder, needs_brax, source, stand_in_of
-from droid_jax.report.files import GAUSSIAN, POLICY, TRAINING
+from droid_jax.files import EXTENDED, GAUSSIAN, POLICY, TRAINING
 from droid_jax.report.stages import extended_of, fingerprint
 
 if TYPE_CHECKING:
     from droid_jax.identify.gaussian import Gaussian
-    from droid_jax.policy.train import TrainConfig, TrainProgress
+    from droid_jax.policy.door_env import DoorEnv
+    from droid_jax.policy.train import TrainConfig, Trained, TrainProgress
 
 Method = Literal["fitted", "mean", "prior"]
 
@@ -61,7 +62,6 @@ def run(command: Train) -> None:
     needs_writer(command.tensorboard)
     runtime.start()
     warn_of_cpu(command.preset)
-    from droid_jax.gap.extended import FILE
     from droid_jax.identify.results import prepare_folder
     from droid_jax.policy.door_env import DoorEnv
     from droid_jax.policy.network import save_policy
@@ -86,7 +86,7 @@ def run(command: Train) -> None:
     gaussian.save(out / GAUSSIAN)
     model = None if fit is None else extended_of(fit)
     if model is not None:
-        write_bytes(out / FILE, model.read_bytes())
+        write_bytes(out / EXTENDED, model.read_bytes())
     board = out / FOLDER if command.tensorboard else None
     with training(config.steps) as show, scalars(board) as write:
 
@@ -102,19 +102,25 @@ def run(command: Train) -> None:
     save_policy(out / POLICY, found.policy)
     if (done := found.history[-1].step) < config.steps:
         print(f"training ended after {done} of {config.steps} actions: its weights became NaN or infinite")
-    content = {
+    write_json(out / TRAINING, _description(setup, config, env, found))  # last: its presence says that the run is whole
+    report.run(report.Report(out))
+
+
+def _description(setup: dict[str, Any], config: TrainConfig, env: DoorEnv, found: Trained) -> dict[str, Any]:
+    """What training.json says."""
+    from droid_jax import runtime
+
+    return {
         "setup": setup,
         "stand_in": setup["stand_in"],
         "config": dataclasses.asdict(config),
         "task": dataclasses.asdict(env.task),
-        "scene": scene.name,
-        "effects": [e.name for e in effects],
+        "scene": env.scene.name,
+        "effects": [e.name for e in env.effects],
         "history": [dataclasses.asdict(now) for now in found.history],
         "versions": runtime.versions(),
         "device": runtime.device(),
     }
-    write_json(out / TRAINING, content)  # last: its presence says that the run is whole
-    report.run(report.Report(out))
 
 
 def config_of(command: Train) -> TrainConfig:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from droid_jax.commands.folder import stage_folder
-from droid_jax.report.files import FITTED, REPLAY
+from droid_jax.files import FITTED, REPLAY
 
 if TYPE_CHECKING:
     import mujoco

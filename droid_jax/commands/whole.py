@@ -12,11 +12,11 @@ from typing import Any, Literal, NamedTuple
 
 from droid_jax.commands import evaluate, gap, identify, report, train
 from droid_jax.commands.folder import OtherRun, changed, forget, setup_of
-from droid_jax.commands.hidden import DEMONSTRATIONS, hidden_effects, kept_at, record_stand_in, settled
 from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.scenes import needs_log, needs_recording, needs_scene
 from droid_jax.commands.source import model_folder, needs_brax
-from droid_jax.report.files import LAST_FILES, TRANSFER
+from droid_jax.commands.stand_in import DEMONSTRATIONS, hidden_effects, kept_at, record_stand_in, settled
+from droid_jax.files import FIT, GAP, LAST_FILES, TRANSFER
 from droid_jax.report.stages import left_over, setup, unfinished
 from droid_jax.storage import write_json
 
@@ -278,7 +278,7 @@ def _fitted(folder: Path, command: All, recordings: Sequence[Path]) -> bool:
     """Whether a folder of `identify` holds the fit of these recordings: made just now, or earlier of the same."""
     from droid_jax.commands.scenes import recording_at
 
-    if not (folder / "fit.json").is_file() or unfinished(folder):
+    if not (folder / FIT).is_file() or unfinished(folder):
         return False
     if "identify" in command.stages:
         return True
@@ -293,27 +293,30 @@ def told(out: Path) -> list[str]:
     """One line for each stage that has a result."""
     from droid_jax.report.gap_folder import hidden_in
     from droid_jax.report.gap_words import readable
+    from droid_jax.report.policy_folder import read_training
+    from droid_jax.report.policy_words import another_robot
     from droid_jax.report.words import hidden_words, judged, percent
 
     lines, old = [], left_over(out)
     if old:
         lines.append(f"not on the page: {' and '.join(sorted(old))}, of an earlier run in this folder")
-    if fit := _json(out / "identify" / "fit.json"):
+    if fit := _json(out / "identify" / FIT):
         unit = fit.get("torque_unit", "N m")
         gaps = [f"{name} {g['before']:.3f} -> {g['after']:.3f} {unit} {judged(g)}" for name, g in fit["gap"].items()]
         lines.append(f"identify: torque distance {', '.join(gaps)}")
-    if found := None if "gap" in old else _json(out / "gap" / "gap.json"):
+    if found := None if "gap" in old else _json(out / "gap" / GAP):
         role, size = list(found["gaps"].items())[-1]
         closed = size["closed"] if found["effects"] else None
         share = "" if closed is None else f"; {percent(closed)} of the gap U closed on the {role} motion"
         lines.append(f"gap: {readable(found['sentence'], found).rstrip('.')}{share}")
         if hidden := hidden_words(hidden_in(found)):
             lines.append(f"hidden in the stand-in robot: {hidden}")
-    for name, of in {} if "train" in old else (_json(out / "train" / TRANSFER) or {}).items():
-        if name in ("simulation", "stand_in"):
-            low, high = of["interval_95"]
-            where = {"simulation": "in simulation", "stand_in": "on the stand-in robot"}[name]
-            lines.append(f"policy: {percent(of['success_rate'])} success {where} ({percent(low)} to {percent(high)})")
+    if tried := None if "train" in old else _json(out / "train" / TRANSFER):
+        for name, where in (("simulation", "in simulation"), ("stand_in", "on the stand-in robot")):
+            rate, (low, high) = tried[name]["success_rate"], tried[name]["interval_95"]
+            lines.append(f"policy: {percent(rate)} success {where} ({percent(low)} to {percent(high)})")
+        if other := another_robot(read_training(out / "train")):
+            lines.append(other)
     return lines
 
 

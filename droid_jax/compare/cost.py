@@ -19,10 +19,11 @@ import numpy as np
 
 from droid_jax import runtime
 from droid_jax.compare.inverse import Path, path_of, path_replay, prescribed
-from droid_jax.compare.population import blocks, over_block
+from droid_jax.compare.notes import check_range, warn_if_moving, warn_of_commands
+from droid_jax.compare.population import in_blocks, over_block
 from droid_jax.compare.replay import Drive, Replay, check_gains, make_drive, servo_replay, torque_offset_effect
 from droid_jax.compare.residuals import CompareConfig, Comparison, make_comparison
-from droid_jax.compare.start import AJAR, check_range, following, warn_if_moving, warn_of_commands
+from droid_jax.compare.start import AJAR, following
 from droid_jax.compare.twin import twin_replay
 from droid_jax.measure.checks import validate
 from droid_jax.measure.motion import Motion, measured_motion
@@ -124,12 +125,10 @@ class Cost:
         return assemble(self.scene, self.space, made, replays, drives)
 
     def _blockwise(self, values: Any, functions: Sequence[Callable], join: Callable) -> Any:
-        pieces = []
-        for block, count in blocks(self.space.check(values)):
-            parts = [f(replay(block)) for f, replay in zip(functions, self._replays, strict=True)]
-            parts = jax.tree.map(lambda a, n=count: np.asarray(a)[:n], parts)
-            pieces.append(join(parts))
-        return jax.tree.map(lambda *p: np.concatenate(p), *pieces)
+        def block(rows: np.ndarray) -> Any:
+            return join([f(replay(rows)) for f, replay in zip(functions, self._replays, strict=True)])
+
+        return in_blocks(block, self.space.check(values))
 
 
 def make_cost(
@@ -202,7 +201,7 @@ def assemble(
     space: Space,
     comparisons: Sequence[Comparison],
     replays: Sequence[Callable[[np.ndarray], Rollout]],
-    drives: Sequence[Drive | Motion] = (),
+    drives: Sequence[Drive | Motion],
 ) -> Cost:
     """A Cost from batch replays ([B, D] -> Rollout), what each is compared with, and what each follows."""
     return Cost(

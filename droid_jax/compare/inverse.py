@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
-from droid_jax.compare.replay import Replay, observed
+from droid_jax.compare.replay import observed
 from droid_jax.measure.motion import Motion
 from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
-from droid_jax.model.joint_friction import SMOOTHING
+from droid_jax.model.joint_friction import direction
 from droid_jax.model.physics import Physics
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, Rollout, State, Theta, column, complete
@@ -76,12 +76,6 @@ def path_of(scene: Scene, motion: Motion) -> Path:
     """What a compiled replay is given of a motion; ValueError where it states a joint that the scene has not."""
     arrays = (motion.time, motion.position, motion.velocity, motion.acceleration, scene.initial_qpos(motion.others))
     return Path(*(jnp.asarray(a, jnp.float32) for a in arrays))
-
-
-def inverse_replay(scene: Scene, motion: Motion, effects: Sequence[Effect] = ()) -> Replay:
-    """Torques of one prescribed motion; see `path_replay`."""
-    replay, path = path_replay(scene, motion.torque, effects, motion.joints), path_of(scene, motion)
-    return lambda physics: replay(physics, path)
 
 
 def path_replay(
@@ -152,7 +146,7 @@ def _resistance(theta: Theta, state: State, own: jax.Array, effects: Sequence[Ef
             loss = effect.frictionloss(theta, state, loss)
         if effect.force is not None:
             resistance = resistance - effect.force(theta, state)
-    return resistance + (loss - own) * jnp.tanh(state.qvel / SMOOTHING)
+    return resistance + (loss - own) * direction(state.qvel)
 
 
 def _behind_the_sensor(scene: Scene, theta: Theta) -> jax.Array:

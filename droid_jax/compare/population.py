@@ -68,11 +68,12 @@ def over_block(function: Callable[..., Any]) -> Callable[..., Any]:
 def over_population(function: Callable[[jax.Array], Any]) -> Callable[[Any], Any]:
     """Compile `function` ([D] -> pytree) for any number of rows: [P, D] -> the same on the host, [P, ...]."""
     compiled = over_block(function)
+    return lambda values: in_blocks(compiled, values)
 
-    def batch(values: Any) -> Any:
-        pieces = [
-            jax.tree.map(lambda a, n=count: np.asarray(a)[:n], compiled(block)) for block, count in blocks(values)
-        ]
-        return jax.tree.map(lambda *parts: np.concatenate(parts), *pieces)
 
-    return batch
+def in_blocks(function: Callable[[np.ndarray], Any], values: Any) -> Any:
+    """`function` ([B, D] -> pytree with a leading [B]) of any number of rows [P, D], block by block: [P, ...], on the
+    host.
+    """
+    pieces = [jax.tree.map(lambda a, n=count: np.asarray(a)[:n], function(block)) for block, count in blocks(values)]
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *pieces)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,7 @@ from mujoco import mjx
 
 from droid_jax.compare.start import check_weight, holding, start_pose, weight_share
 from droid_jax.measure.checks import check_joints
+from droid_jax.measure.clocks import interpolate
 from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.model.actuators import has_servo_damping
 from droid_jax.model.physics import Physics
@@ -75,8 +77,8 @@ def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True) -> Dri
     qpos0 = start_pose(scene, recording)
     command = np.tile(holding(scene, qpos0), (steps, 1))
     sent = np.flatnonzero(columns >= 0)
-    for actuator in sent:
-        command[:, actuator] = np.interp(clock, recording.time, recording.command[:, columns[actuator]])
+    if sent.size:
+        command[:, sent] = interpolate(clock, recording.time, recording.command[:, columns[sent]])
     stiffness = scene.model.actuator_gainprm[:, 0] * scene.model.actuator_gear[:, 0] ** 2
     if gains is not None:
         stiffness[sent] = np.asarray(gains.stiffness, dtype=float)[columns[sent]]
@@ -140,7 +142,7 @@ def servo_replay(
     check_gains(scene, drive)
     check_stateless(scene)
     template = mjx.make_data(scene.mjx)
-    fingers = _finger_geoms(scene)
+    fingers = finger_geoms(scene)
     table = jnp.asarray(drive.command, jnp.float32)
     start = jnp.asarray(drive.qpos0, jnp.float32)
     joints, positions = scene.joint_dofs, scene.joint_qpos
@@ -281,18 +283,21 @@ def _joint_torque(model, before, after, servo: jax.Array, joints: np.ndarray, dr
     return torque + share * after.qfrc_gravcomp[joints] if share.any() else torque
 
 
-def _finger_geoms(scene: Scene) -> list[np.ndarray]:
+def finger_geoms(scene: Scene) -> tuple[np.ndarray, ...]:
     """For each finger, [pairs, 2] the sorted geom ids of its contact pairs."""
-    model = scene.model
-    both = np.sort(np.stack([model.pair_geom1, model.pair_geom2], axis=1), axis=1) if model.npair else None
-    return [both[pairs] for pairs in scene.finger_pairs] if both is not None else []
+    both = np.sort(np.stack([scene.model.pair_geom1, scene.model.pair_geom2], axis=1), axis=1)
+    return tuple(both[pairs] for pairs in scene.finger_pairs)
 
 
-def _touching(data, fingers: list[np.ndarray]) -> jax.Array:
+def of_fingers(contact: Any, fingers: Sequence[np.ndarray]) -> list[jax.Array]:
+    """For each finger, [contacts] bool: which of MJX's contacts are of its pairs, as `finger_geoms` has them."""
+    geoms = jnp.sort(contact.geom, axis=1)  # [contacts, 2]
+    return [jnp.any(jnp.all(geoms[:, None] == pairs[None], axis=-1), axis=1) for pairs in fingers]
+
+
+def _touching(data, fingers: Sequence[np.ndarray]) -> jax.Array:
     """[F] bool: does any contact of a finger's pairs penetrate?"""
     if not fingers:
         return jnp.zeros((0,), bool)
     contact = data._impl.contact
-    geoms = jnp.sort(contact.geom, axis=1)  # [contacts, 2]
-    of_finger = [jnp.any(jnp.all(geoms[:, None] == pairs[None], axis=-1), axis=1) for pairs in fingers]
-    return jnp.stack([jnp.any(mine & (contact.dist < 0)) for mine in of_finger])
+    return jnp.stack([jnp.any(mine & (contact.dist < 0)) for mine in of_fingers(contact, fingers)])

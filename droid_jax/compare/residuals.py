@@ -122,9 +122,9 @@ class Comparison:
 
         return replace(self, channels=tuple(stated(c) for c in self.channels))
 
-    def smoothed(self, rollout: Rollout, channel: str = "torque") -> jax.Array:
-        """[K, C] a channel of the rollout through the filter the data went through."""
-        c = self.channel(channel)
+    def smoothed(self, rollout: Rollout) -> jax.Array:
+        """[K, C] the rollout's torque through the filter the data went through."""
+        c = self.channel("torque")
         return _smooth(c, _trace(rollout, c))
 
     def channel(self, name: str) -> Measured:

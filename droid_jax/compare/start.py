@@ -1,26 +1,20 @@
-"""Where a recorded motion starts in the scene, whether its joints can make it, and whether the scene carries the weight
-that its torque holds."""
+"""Where a recorded motion starts in the scene, and whether the scene carries the weight that its torque holds."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from droid_jax.measure.recording import Channel, Recording
+from droid_jax.measure.recording import Recording
 from droid_jax.model.actuators import has_feedback
 from droid_jax.model.scene import Scene
 
 AJAR = 0.02  # rad or m: an object seen no further than this from the scene's pose stands there, as cameras are noisy
 WEIGHT = 0.01  # N m or N: a joint that feels less uncompensated weight feels none (noise below it is never believed)
 POSES = 50  # of a motion, at which the weight is looked at
-BEGINNING = 0.02  # s (six rows at least), in which the speed at the start is looked at
-MOVING = 0.25  # of the motion's largest speed: a joint that is faster at the start does not begin at rest
-BEYOND = 0.05  # of its range, by which a joint may be outside of it unremarked
-TURNS = 4  # from its zero, that a hinge without a range is believed to make; degrees look like that from 25 on
 
 
 def start_pose(scene: Scene, recording: Recording) -> np.ndarray:
@@ -30,7 +24,7 @@ def start_pose(scene: Scene, recording: Recording) -> np.ndarray:
     others stand as in the scene.
     Raises ValueError for a joint that has or needs a command and of which nothing says where it starts.
     """
-    sent = {joint: path[0] for joint, path in _sent(scene, recording).items()}
+    sent = {joint: path[0] for joint, path in sent_to(scene, recording).items()}
     told = {**sent, **_measured(scene, recording), **recording.qpos0}
     asked = {*scene.needs_command, *recording.command_names}
     guessed = [j for j in scene.driven_joints if j in asked and j not in told]
@@ -99,63 +93,6 @@ def check_weight(scene: Scene, recording: Recording, qpos0: np.ndarray) -> None:
         )
 
 
-def warn_if_moving(recording: Recording) -> None:
-    """Warn where joints were measured to move already when a recording with commands begins: its replay is at rest.
-
-    The speed at the start is that of a line through the mean of the repeats over so short a time that a servo that sets
-    off from rest is not fast yet; it must be five times its own error.
-    """
-    channel = recording.channels.get("position")
-    if channel is None:
-        return
-    moving = [j for i, j in enumerate(channel.columns) if _moves(recording.time[0], channel, i)]
-    if moving:
-        warnings.warn(
-            f"recording {recording.name!r} begins while {', '.join(moving)} moves, and a replay begins at rest: let "
-            "the recording begin where the robot stands still",
-            stacklevel=2,
-        )
-
-
-def command_notes(scene: Scene, recording: Recording) -> list[str]:
-    """What is to be known of the commands: a <motor> that takes radians for torques, geared servos, actuators that got
-    none."""
-    said = (open_loop(scene, recording), geared(scene, recording), left_alone(scene, recording))
-    return [text for text in said if text]
-
-
-def warn_of_commands(scene: Scene, recording: Recording) -> None:
-    """Warn of what is to be known of the commands."""
-    for text in command_notes(scene, recording):
-        warnings.warn(text, stacklevel=2)
-
-
-def open_loop(scene: Scene, recording: Recording) -> str:
-    """What is to be known where the recording's commands drive actuators without position feedback; else empty."""
-    open_ones = np.flatnonzero(~has_feedback(scene.model) & scene.of_joint)
-    joints = [scene.command_names[u] for u in open_ones if scene.command_names[u] in recording.command_names]
-    if not joints or not recording.command.size:
-        return ""
-    return (
-        f"the actuators of {', '.join(joints)} have no position feedback: the commands of recording "
-        f"{recording.name!r} are taken as their torques (or forces, or speeds); for position commands use "
-        "<position> servos"
-    )
-
-
-def geared(scene: Scene, recording: Recording) -> str:
-    """What is to be known where the recording's commands go to position servos with a gear; else empty."""
-    gear = scene.model.actuator_gear[:, 0]
-    servos = np.flatnonzero(has_feedback(scene.model) & scene.of_joint & (gear != 1.0))
-    joints = [scene.command_names[u] for u in servos if scene.command_names[u] in recording.command_names]
-    if not joints or not recording.command.size:
-        return ""
-    return (
-        f"the servos of {', '.join(joints)} have a gear: the commands of recording {recording.name!r} are taken as "
-        "MuJoCo's controls, which are the joint's position times the gear"
-    )
-
-
 def holding(scene: Scene, qpos0: np.ndarray) -> np.ndarray:
     """[U] the controls at which the actuators hold the pose [nq] by themselves; 0 without position feedback.
 
@@ -170,74 +107,6 @@ def holding(scene: Scene, qpos0: np.ndarray) -> np.ndarray:
     control = np.where(held, -(bias[:, 0] + bias[:, 1] * data.actuator_length) / np.where(held, gain, 1.0), 0.0)
     low, high = model.actuator_ctrlrange.T
     return np.where(model.actuator_ctrllimited, np.clip(control, low, high), control)
-
-
-def left_alone(scene: Scene, recording: Recording) -> str:
-    """What is to be known where the recording has commands, but none for some actuators; else empty."""
-    if not recording.command.size:
-        return ""
-    left = [
-        (n, f)
-        for n, f in zip(scene.command_names, has_feedback(scene.model), strict=True)
-        if n not in recording.command_names
-    ]
-    said = {
-        "held where the motion starts": [n for n, feedback in left if feedback],
-        "given 0 (no position feedback)": [n for n, feedback in left if not feedback],
-    }
-    told = "; ".join(f"{', '.join(names)} {what}" for what, names in said.items() if names)
-    return f"recording {recording.name!r} has not all commands: {told}" if told else ""
-
-
-def _moves(begin: float, channel: Channel, column: int) -> bool:
-    """Whether a position's path has a speed of its own where the motion begins."""
-    time, seen = channel.time - begin, channel.mask[..., column].all(axis=0)
-    path = channel.values[..., column].mean(axis=0)
-    rows = np.flatnonzero(seen & (time >= 0.0))
-    first = rows[: max(6, int(np.sum(time[rows] <= BEGINNING)))]
-    if len(first) < 6:  # a line through two points has no error to be judged by
-        return False
-    (speed, _), covariance = np.polyfit(time[first], path[first], 1, cov=True)
-    steps = rows[:: len(first)]  # as far apart as the beginning is long
-    fastest = np.abs(np.diff(path[steps]) / np.diff(time[steps])).max(initial=0.0)
-    return bool(abs(speed) > max(MOVING * fastest, 5.0 * np.sqrt(covariance[0, 0])))
-
-
-def check_range(scene: Scene, recording: Recording) -> None:
-    """Raise ValueError where a measured joint goes, or is sent, so far outside its range that the unit is wrong.
-
-    One that is outside by more than BEYOND of its range is warned of, and a hinge without a range, which may be a
-    wheel, where it goes more than TURNS from its zero.
-    """
-    sent = _sent(scene, recording) if recording.command.size else {}
-    paths = [("is sent to", joint, path) for joint, path in sent.items()]
-    paths += [("starts at", joint, np.array([q])) for joint, q in recording.qpos0.items()]
-    if channel := recording.channels.get("position"):
-        seen = np.where(channel.mask, channel.values, np.nan).reshape(-1, len(channel.columns))
-        paths += [("is measured at", joint, seen[:, i]) for i, joint in enumerate(channel.columns)]
-    for what, joint, path in paths:
-        if joint in scene.joints and not np.isnan(path).all():
-            _check_reach(scene, joint, path, f"recording {recording.name!r}: {joint} {what}")
-
-
-def _check_reach(scene: Scene, joint: str, path: np.ndarray, begin: str) -> None:
-    """As `check_range`, of one joint's path [K], NaN where it was not seen; begin: of what is said."""
-    index = scene.id("joint", joint)
-    slide = scene.slides(joint)
-    low, high = scene.model.jnt_range[index]
-    if low < high:  # whether the replay holds it there or not
-        beyond = np.maximum(low - path, path - high)
-        worst = int(np.nanargmax(beyond))
-        unit = "m: are these millimetres?" if slide else "rad: are these degrees?"
-        if beyond[worst] > high - low:
-            raise ValueError(f"{begin} {path[worst]:.4g}, far outside its range {low:.4g} .. {high:.4g} {unit}")
-        if beyond[worst] > BEYOND * (high - low):
-            warnings.warn(f"{begin} {path[worst]:.4g}, outside its range {low:.4g} .. {high:.4g} {unit}", stacklevel=3)
-    elif not slide:
-        turns = np.abs(path) / (2 * np.pi)
-        worst = int(np.nanargmax(turns))
-        if turns[worst] > TURNS:
-            warnings.warn(f"{begin} {path[worst]:.4g} rad, {turns[worst]:.3g} turns: are these degrees?", stacklevel=3)
 
 
 def weight_share(model: Any, joints: np.ndarray, gravity: bool) -> np.ndarray:
@@ -265,12 +134,12 @@ def _poses(scene: Scene, recording: Recording, qpos0: np.ndarray) -> np.ndarray:
     """[POSES, nq] along the motion, as commanded; joints without position servos stay at the start."""
     poses = np.tile(qpos0, (POSES, 1))
     rows = np.linspace(0, len(recording.time) - 1, POSES).round().astype(int)
-    for joint, path in _sent(scene, recording).items():
+    for joint, path in sent_to(scene, recording).items():
         poses[:, scene.qpos(joint)] = path[rows]
     return poses
 
 
-def _sent(scene: Scene, recording: Recording) -> dict[str, np.ndarray]:
+def sent_to(scene: Scene, recording: Recording) -> dict[str, np.ndarray]:
     """Joint -> the positions [T] its servo is sent to, rad or m; what drives no position (a motor) is left out."""
     model = scene.model
     kp, position_gain, gear = model.actuator_gainprm[:, 0], model.actuator_biasprm[:, 1], model.actuator_gear[:, 0]

@@ -7,11 +7,13 @@ that write model fields, and the torque offsets; everything else needs MJX.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from droid_jax.compare.replay import Drive, check_gains, check_stateless
 from droid_jax.compare.start import weight_share
+from droid_jax.measure.clocks import interpolate
 from droid_jax.measure.engine import instrument, simulate
 from droid_jax.measure.recording import TorqueSide
 from droid_jax.model.parameters import Space
@@ -19,9 +21,11 @@ from droid_jax.model.physics import make_c_model, theta_of
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, Rollout
 
+CHUNK = 64  # samples whose traces of the whole state are held at once
+
 
 def twin_replay(
-    scene: Scene, space: Space, drive: Drive, effects: Sequence[Effect] = (), *, late: float = 0.5, chunk: int = 64
+    scene: Scene, space: Space, drive: Drive, effects: Sequence[Effect] = (), *, late: float = 0.5
 ) -> Callable[[np.ndarray], Rollout]:
     """values [P, D] -> Rollout with a leading [P], float64, on all cores.
 
@@ -43,8 +47,7 @@ def twin_replay(
             "the C engine replays the actuators' torque alone: motor-side, and without gravity where the scene "
             "compensates it; use MJX for this recording"
         )
-    base = instrument(scene)
-    plain = Scene(scene.name, scene.spec, base, scene.joints, scene.command_names, scene.object_joint, scene.grip)
+    plain = replace(scene, model=instrument(scene))
 
     def piece(values: np.ndarray) -> Rollout:
         models = [make_c_model(plain, space, row) for row in values]
@@ -53,7 +56,7 @@ def twin_replay(
         trace = simulate(plain, models, drive.qpos0[None], control)
         traces = (trace.torque, trace.position, trace.velocity, trace.object_angle[..., None])
         ahead = late * drive.timestep
-        rollout = Rollout(
+        return Rollout(
             time=np.broadcast_to(drive.time, trace.object_angle.shape),
             torque=trace.torque + _offsets(scene, thetas)[:, None],
             position=trace.position + ahead * trace.velocity,
@@ -62,11 +65,10 @@ def twin_replay(
             contact=trace.contact,
             finite=np.all([np.isfinite(t).all(axis=(1, 2)) for t in traces], axis=0),
         )
-        return rollout
 
     def replay(values: np.ndarray) -> Rollout:
         values = np.atleast_2d(np.asarray(values, dtype=np.float64))
-        pieces = [piece(values[i : i + chunk]) for i in range(0, len(values), chunk)]
+        pieces = [piece(values[i : i + CHUNK]) for i in range(0, len(values), CHUNK)]
         fields = Rollout.__dataclass_fields__
         return Rollout(**{f: np.concatenate([getattr(p, f) for p in pieces]) for f in fields})
 
@@ -82,7 +84,7 @@ def _later(velocity: np.ndarray, late: float) -> np.ndarray:
 def control_of(drive: Drive, time_offset: float = 0.0, late: float = 0.5) -> np.ndarray:
     """[T, U] the command so many steps (and the time offset) late."""
     at = drive.time - late * drive.timestep - time_offset
-    return np.stack([np.interp(at, drive.time, c) for c in drive.command.T], axis=1)
+    return interpolate(at, drive.time, drive.command)
 
 
 def _offsets(scene: Scene, thetas: Sequence[dict[str, float]]) -> np.ndarray:

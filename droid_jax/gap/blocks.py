@@ -50,6 +50,16 @@ class Blocks(Evidence):
         return int(self.block.max()) + 1
 
     @property
+    def repeated(self) -> bool:
+        """They are not."""
+        return False
+
+    @property
+    def instants(self) -> np.ndarray:
+        """Those of the blocks."""
+        return self.block[self.column == 0] != OUTSIDE
+
+    @property
     def size(self) -> int:
         """Those of the blocks."""
         return int((self.block != OUTSIDE).sum())

@@ -47,19 +47,36 @@ def joined(parts: Iterable[Candidate]) -> str:
 
 
 def possible(scene: Scene, recordings: Iterable[Recording], scale: float = 1.0) -> tuple[Effect, ...]:
-    """The library's effects that could show: a motion without commands has no servo that an effect could change.
+    """The library's effects that could show in these recordings: in one without commands all but `steers`.
 
     scale: of their forces and torques, see `library`.
     """
     commanded = all(r.command.size for r in recordings)
-    return tuple(e for e in library(scene, scale=scale) if commanded or not (e.command or e.servo))
+    return tuple(e for e in library(scene, scale=scale) if commanded or not steers(e))
+
+
+def steers(effect: Effect) -> bool:
+    """Whether an effect is one of commands, servos or actuators alone, which a motion without commands does not have.
+
+    Also one without laws of its own whose parameters write nothing but fields of actuators (`servo_gain`).
+    """
+    if effect.command or effect.servo:
+        return True
+    fields = [w.field for p in effect.parameters for w in p.writes]
+    acts = effect.force or effect.frictionloss or effect.observe or not all(p.writes for p in effect.parameters)
+    return bool(fields) and not acts and all(field.startswith("actuator_") for field in fields)
 
 
 def candidates(effects: Iterable[Effect]) -> tuple[Candidate, ...]:
-    """Every effect at every place with every combination of its shapes' values."""
+    """Every effect at every place with every combination of its shapes' values.
+
+    Raises ValueError where that is none at all.
+    """
     out = []
     for effect in effects:
         grid = [dict(zip(effect.shapes, values, strict=True)) for values in itertools.product(*effect.shapes.values())]
         for (place, amplitudes), shapes in itertools.product(effect.places.items(), grid):
             out.append(Candidate(effect.name, place, amplitudes, shapes))
+    if not out:
+        raise ValueError("there is nothing to ask about: none of the effects says its places (`Effect.places`)")
     return tuple(out)

@@ -15,7 +15,6 @@ from droid_jax.compare.cost import Cost
 from droid_jax.compare.residuals import Comparison
 from droid_jax.gap.flips import largest_steady_t, one_sided_p, steady, steady_gap_p_values
 from droid_jax.identify.search import NotReplayed
-from droid_jax.measure.noise import coarse_clock
 
 # A parameter off its prior's mean is held back by that prior, and what is left of it all repeats share: with the
 # priors as they are, 6 of 200 recordings of a lone hinge with nothing missing fell below p = 0.01.  Within three
@@ -50,6 +49,16 @@ class Evidence:
     def units(self) -> int:
         """How many rows the residuals have: what is flipped and resampled."""
         return self.repeats
+
+    @property
+    def repeated(self) -> bool:
+        """Whether rows are repeats, which tell noise from what they share; blocks of one motion do not."""
+        return True
+
+    @property
+    def instants(self) -> np.ndarray:
+        """[K] bool of the coarse clock, those that count."""
+        return np.ones(int(np.sum(self.column == 0)), bool)
 
     @property
     def size(self) -> int:
@@ -182,7 +191,7 @@ def places(comparison: Comparison) -> tuple[np.ndarray, np.ndarray]:
     """Column and instant [s] of each residual, both [M]."""
     columns, times, start = [], [], 0
     for channel in comparison.channels:
-        clock = coarse_clock(*channel.span)
+        clock = channel.clock
         columns.append(np.repeat(start + np.arange(len(channel.columns)), len(clock)))
         times.append(np.tile(clock, len(channel.columns)))
         start += len(channel.columns)

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from droid_jax.files import EXTENDED, EXTENDED_MJCF
 from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.case import Case
 from droid_jax.gap.refit import Model
@@ -30,7 +31,6 @@ from droid_jax.model.seam import Effect
 from droid_jax.storage import write_json, write_text
 
 FORMAT, VERSION = "droid_jax extended model", 1
-FILE, MJCF = "extended.json", "extended.xml"
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,13 +86,13 @@ def extended(case: Case, model: Model) -> Extended:
 
 def save_extended(folder: Path, model: Extended) -> None:
     """Write extended.json and extended.xml into `folder`; extended.json says why where there is no MJCF."""
-    mjcf: dict[str, Any] = {"file": MJCF, "lacks": list(model.lacking)}
+    mjcf: dict[str, Any] = {"file": EXTENDED_MJCF, "lacks": list(model.lacking)}
     try:
-        write_text(folder / MJCF, fitted_mjcf(model.scene, model.space, model.values, model.effects))
+        write_text(folder / EXTENDED_MJCF, fitted_mjcf(model.scene, model.space, model.values, model.effects))
     except ValueError as error:
         mjcf |= {"file": None, "error": str(error)}
-        (folder / MJCF).unlink(missing_ok=True)  # of another run, started over in this folder
-    write_json(folder / FILE, _to_json(model) | {"mjcf": mjcf})
+        (folder / EXTENDED_MJCF).unlink(missing_ok=True)  # of another run, started over in this folder
+    write_json(folder / EXTENDED, _to_json(model) | {"mjcf": mjcf})
 
 
 def load_extended(path: str | Path, scene: Scene) -> Extended:

@@ -57,14 +57,10 @@ def one_sided_p(gains: np.ndarray) -> float:
     return float(np.mean(t >= t[0] - 1e-12))
 
 
-def largest_t(scores: np.ndarray, seed: int = 0) -> tuple[np.ndarray, float]:
-    """[K] t of each of K questions with scores [K, N], and the p-value of the largest |t| among them."""
-    t = t_values(scores, sign_flips(scores.shape[1], seed))
-    return t[0], _p_value(t, np.max(np.abs(t[0])))
-
-
 def largest_steady_t(scores: np.ndarray, seed: int = 0) -> tuple[np.ndarray, float]:
-    """`largest_t` of scores [K, N] without what grows or fades steadily over the repeats (`steady`).
+    """[K] t of each of K questions with scores [K, N], and the p-value of the largest |t| among them.
+
+    Without what grows or fades steadily over the repeats (`steady`).
 
     A line taken out costs a degree of freedom, but not where rows were flipped after it: the unflipped t is compared as
     the quantile of theirs that it is of its own.  Without that 1.6 % of noise alone fell below p = 0.01 (ten repeats,
@@ -73,15 +69,11 @@ def largest_steady_t(scores: np.ndarray, seed: int = 0) -> tuple[np.ndarray, flo
     count = scores.shape[1]
     t = t_values(steady(scores.T).T, sign_flips(count, seed))
     own, flipped = scipy.stats.t(max(count - 2, 1)), scipy.stats.t(count - 1)
-    return t[0], _p_value(t, flipped.isf(own.sf(np.max(np.abs(t[0])))))
+    found = flipped.isf(own.sf(np.max(np.abs(t[0]))))
+    return t[0], float(np.mean(np.max(np.abs(t), axis=1) >= found * (1 - 1e-12)))
 
 
-def _p_value(t: np.ndarray, found: float) -> float:
-    """Share of flips in which the largest |t| [F, K] is as large as what was found."""
-    return float(np.mean(np.max(np.abs(t), axis=1) >= found * (1 - 1e-12)))
-
-
-def steady_gap_p_values(residuals: np.ndarray, cells: np.ndarray, seed: int = 0) -> np.ndarray:
+def steady_gap_p_values(residuals: np.ndarray, cells: np.ndarray) -> np.ndarray:
     """[K] p-value of each cell's U being above zero, without what grows or fades steadily over the repeats (`steady`).
 
     residuals [N, M], cells [K, M] bool.  Where a line was taken out, the products of different repeats have a part of
@@ -89,7 +81,7 @@ def steady_gap_p_values(residuals: np.ndarray, cells: np.ndarray, seed: int = 0)
     back.  Without that hardly anything is found below U = M^-1/2 (U = 0.02 of 1400 residuals, eight repeats, p < 0.01:
     1 in 50, and now 2 in 3; `tests/gap/test_flips.py`).
     """
-    flips, rows, out = sign_flips(len(residuals), seed), steady(residuals), []
+    flips, rows, out = sign_flips(len(residuals)), steady(residuals), []
     for cell in cells:
         gram = rows[:, cell] @ rows[:, cell].T
         gram -= _taken_out(gram)

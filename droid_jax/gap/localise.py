@@ -70,7 +70,7 @@ def _parts(evidence: Evidence, values: np.ndarray, residuals: np.ndarray) -> tup
     Empty where nothing tells the first: no hinge, a sensor on the hinge itself, or blocks instead of repeats.
     """
     space, scene = evidence.cost.space, evidence.cost.scene
-    if ALONG not in space.names or scene.object_joint in scene.joints or evidence.units != evidence.repeats:
+    if ALONG not in space.names or scene.object_joint in scene.joints or not evidence.repeated:
         return ()
     pushed, at, step = values.copy(), space.index(ALONG), 0.5 * space[ALONG].std
     pushed[at] += step if values[at] + step <= space[ALONG].high else -step

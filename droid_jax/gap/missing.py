@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from droid_jax.gap.anew import base_fit
-from droid_jax.gap.candidates import possible
+from droid_jax.gap.candidates import candidates, possible
 from droid_jax.gap.case import Case, GapConfig, make_case
 from droid_jax.gap.extended import Extended, extended
 from droid_jax.gap.floor import numerical_floor
@@ -60,8 +60,7 @@ def find_missing(
     asked = possible(scene, recordings) if effects is None else tuple(map(checked, effects))
     if not asked:
         raise ValueError("effects: there is none to ask about; None asks about all of the library")
-    if not any(effect.places for effect in asked):  # said before the base fit, and not after it
-        raise ValueError("effects: none of them says its places (`Effect.places`), where it could be asked about")
+    candidates(asked)  # refused before the base fit, and not after it
     start = None if start is None else space.check(start)
     case = case_of(split, scene, space, asked, roles, config or GapConfig())
     case, verdict = answer(split, case, roles, start, progress)

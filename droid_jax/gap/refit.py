@@ -28,7 +28,7 @@ class Model:
 
     parts: candidates, none for the base model.  values: [D] over the whole space, absent effects at
     neutral.  space: what was free.  refined: how the fit ended, over `space`.  residuals: [N, M] of
-    the fitted recording's repeats.  gap: their U.
+    the fitted recording's repeats, or blocks.  gap: their U.
     """
 
     parts: tuple[Candidate, ...]

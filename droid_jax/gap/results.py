@@ -1,21 +1,18 @@
 """What a search for a missing effect leaves in its folder: gap.json and gap.npz, the extended model beside them.
 
-docs/gap-command.md lists every entry; `report` turns them into a page.  No pickle.
+docs/gap-command.md lists every entry; `report.gap_folder` reads them, for a page and for a user.  No pickle.
 """
 
 from __future__ import annotations
 
-import json
-import zipfile
-import zlib
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from droid_jax.gap.blocks import OUTSIDE, Blocks
+from droid_jax.files import GAP, GAP_TRACES
 from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.case import Case
 from droid_jax.gap.evidence import Evidence
@@ -24,27 +21,9 @@ from droid_jax.gap.localise import Localisation
 from droid_jax.gap.refit import intervals
 from droid_jax.gap.screen import Screen
 from droid_jax.gap.select import Trial
-from droid_jax.gap.split import ROLES
 from droid_jax.gap.verdict import Verdict
 from droid_jax.identify.uncertainty import told
 from droid_jax.storage import finite, write_json, write_npz
-
-TRACES = ("time", "measured", "scatter", "before", "after")
-_KEYS = ("verdict", "sentence", "effects", "p", "floor", "gaps", "screens", "trials", "cells", "amplitudes", "shifts")
-
-
-@dataclass(frozen=True, eq=False)
-class GapFiles:
-    """A search's folder, read.
-
-    answer: gap.json.  joints: J names.  traces: role ("fit", "confirm" and perhaps "sealed") -> "time" [K] s and,
-    all [K, J] N m (N for slides), "measured" (mean of the repeats), "scatter" (their deviation, zero of one repeat),
-    "before" and "after" (simulated, through the measurement's filter).  Of a log in blocks: at its role's instants.
-    """
-
-    answer: Mapping[str, Any]
-    joints: tuple[str, ...]
-    traces: Mapping[str, Mapping[str, np.ndarray]]
 
 
 def write_gap(folder: Path, case: Case, verdict: Verdict, description: Mapping[str, Any]) -> None:
@@ -52,22 +31,9 @@ def write_gap(folder: Path, case: Case, verdict: Verdict, description: Mapping[s
 
     description: what else gap.json shall hold: "seconds", "versions", "device", "setup", ...
     """
-    write_npz(folder / "gap.npz", gap_arrays(case, verdict))
+    write_npz(folder / GAP_TRACES, gap_arrays(case, verdict))
     save_extended(folder, extended(case, verdict.model))
-    write_json(folder / "gap.json", {**gap_json(case, verdict), **description})
-
-
-def load_gap(folder: str | Path) -> GapFiles:
-    """The answer and the traces of a finished search; ValueError names the file that is missing or broken."""
-    folder = Path(folder)
-    answer, arrays = _read_json(folder / "gap.json"), _read_npz(folder / "gap.npz")
-    absent = [key for key in _KEYS if key not in answer]
-    roles = [role for role in ROLES if role in answer.get("gaps", {})]
-    absent += [key for key in ("joints", *(f"{r}.{t}" for r in roles for t in TRACES)) if key not in arrays]
-    if absent:
-        raise ValueError(f"{folder}: gap.json and gap.npz lack {', '.join(absent)}; run the same command with --again")
-    traces = {role: {name: arrays[f"{role}.{name}"] for name in TRACES} for role in roles}
-    return GapFiles(answer, tuple(arrays["joints"].tolist()), traces)
+    write_json(folder / GAP, {**gap_json(case, verdict), **description})
 
 
 def gap_json(case: Case, verdict: Verdict) -> dict[str, Any]:
@@ -77,6 +43,7 @@ def gap_json(case: Case, verdict: Verdict) -> dict[str, Any]:
         "sentence": verdict.sentence,
         "effects": list(verdict.effects),
         "tied": [list(rivals) for rivals in verdict.tied],
+        "about": _about(case, verdict),
         "p": verdict.screens[0].p if verdict.screens else None,
         "floor": verdict.floor,
         "converged": verdict.base.refined.converged,
@@ -94,7 +61,7 @@ def gap_json(case: Case, verdict: Verdict) -> dict[str, Any]:
         "amplitudes": _sizes(case, verdict, "amplitudes"),
         "shapes": _sizes(case, verdict, "shapes"),
         "shifts": _shifts(case, verdict),
-        "experiments": [{"what": e.what, "apart": e.apart} for e in verdict.experiments],
+        "experiments": [asdict(experiment) for experiment in verdict.experiments],
         "trends": [{**asdict(t), "unit": case.whole[t.amplitude].unit} for t in (verdict.trend,) if t is not None],
         "units": case.fit.cost.scene.torque_unit(_joints(case.fit)),
     }
@@ -111,7 +78,7 @@ def gap_arrays(case: Case, verdict: Verdict) -> dict[str, np.ndarray]:
         evidence = case.judged[role]
         order = [_joints(evidence).index(joint) for joint in joints]
         channel = evidence.cost.comparisons[0].channel("torque")
-        mine = _instants(evidence)
+        mine = evidence.instants
         (simulated,) = evidence.cost.smoothed(_before_after(evidence, verdict))
         before, after = simulated[:, mine][:, :, order]
         repeats = channel.noise.repeats[:, mine][:, :, order]
@@ -123,13 +90,6 @@ def gap_arrays(case: Case, verdict: Verdict) -> dict[str, np.ndarray]:
             f"{role}.after": after,
         }
     return out
-
-
-def _instants(evidence: Evidence) -> np.ndarray:
-    """[K] bool of the coarse clock: all, or those of a role's blocks."""
-    if isinstance(evidence, Blocks):
-        return evidence.block[evidence.column == 0] != OUTSIDE
-    return np.ones(int(np.sum(evidence.column == 0)), bool)
 
 
 def _before_after(evidence: Evidence, verdict: Verdict) -> np.ndarray:
@@ -158,7 +118,7 @@ def _gap(role: str, evidence: Evidence, verdict: Verdict) -> dict[str, Any]:
 
 
 def _phases(evidence: Evidence) -> list[dict[str, Any]]:
-    return [{"name": p.name, "start": p.start, "end": p.end} for p in evidence.cost.comparisons[0].phases]
+    return [asdict(phase) for phase in evidence.cost.comparisons[0].phases]
 
 
 def _ranking(found: Screen) -> list[dict[str, Any]]:
@@ -186,7 +146,18 @@ def _trial(trial: Trial) -> dict[str, Any]:
 
 
 def _cells(found: Localisation) -> list[dict[str, Any]]:
-    return [{"variable": c.variable, "where": c.where, "gap": c.gap, "p": c.p, "found": c.found} for c in found.cells]
+    return [asdict(cell) for cell in found.cells]
+
+
+def _about(case: Case, verdict: Verdict) -> dict[str, dict[str, Any]]:
+    """Of each effect of the answer, tied ones too: what it is, where its mark should appear, what looks like it."""
+    answers = [*verdict.effects, *(rival for rivals in verdict.tied for rival in rivals)]
+    named = {candidate.partition(" at ")[0] for answer in answers for candidate in answer.split(" + ")}
+    return {
+        e.name: {"what": e.what, "mark": e.mark, "confused_with": list(e.confused_with)}
+        for e in case.effects
+        if e.name in named
+    }
 
 
 def _sizes(case: Case, verdict: Verdict, kind: Literal["amplitudes", "shapes"]) -> list[dict[str, Any]]:
@@ -220,32 +191,3 @@ def _shifts(case: Case, verdict: Verdict) -> list[dict[str, Any]]:
         {"name": p.name, "unit": p.unit, "before": b, "after": a, "deviation_before": s}
         for p, b, a, s in zip(case.base.parameters, before.tolist(), after.tolist(), deviation.tolist(), strict=True)
     ]
-
-
-def most_shifted(shifts: Sequence[Mapping[str, Any]]) -> tuple[Mapping[str, Any], float]:
-    """The entry of "shifts" that moved most, and by how many of its deviations."""
-    moved = [abs(s["after"] - s["before"]) / max(s["deviation_before"], 1e-12) for s in shifts]
-    most = int(np.argmax(moved))
-    return shifts[most], moved[most]
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ValueError(f"{path} is missing; `python -m droid_jax.run gap` writes it when it is done") from None
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path} cannot be read: {error}") from None
-    if not isinstance(content, dict):
-        raise ValueError(f"{path} must hold a JSON object, got {type(content).__name__}")
-    return content
-
-
-def _read_npz(path: Path) -> dict[str, np.ndarray]:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return {key: file[key] for key in file.files}
-    except FileNotFoundError:
-        raise ValueError(f"{path} is missing; run the same command with --again") from None
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(f"{path} cannot be read: {error}") from None

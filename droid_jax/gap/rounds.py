@@ -28,12 +28,13 @@ PAIRS = 4  # pairs refitted
 class Round:
     """What was asked, what was tried, and what won.
 
-    screen: of the model that stood; stood: names of its effects.  tried, trials: the refitted models;
-    winner, chosen: the one that does best and its trial, or None.
+    screen: of the model that stood; stood: names of its effects.  ranked: what could be added, the best first.
+    tried, trials: the refitted models; winner, chosen: the one that does best and its trial, or None.
     """
 
     screen: Screen
     stood: tuple[str, ...] = ()
+    ranked: tuple[Proposal, ...] = ()
     tried: tuple[Model, ...] = ()
     trials: tuple[Trial, ...] = ()
     winner: Model | None = None
@@ -52,20 +53,21 @@ def forward(hunt: Hunt, model: Model, found: Screen) -> Round:
     """Add the effect that does best on the confirming demonstration, if one passes its trial."""
     case, config = hunt.case, hunt.case.config
     ranked = proposals(found, model.residuals, case.whole)
+    begun = Round(found, tuple(c.name for c in model.parts), tuple(ranked))
     looks = [
         (hunt.look(model, p, found), p) for p in hunt.budget.within("candidates not looked at", ranked[: config.looked])
     ]
     best = sorted(looks, key=lambda look: look[0][1])[: config.refitted]
     left = hunt.budget.within("candidates not refitted", best)
     tried = hunt.race((((*model.parts, *p.parts), values) for (values, _), p in left), hunt.aim(model))
-    done = _decided(hunt, model, found, tried)
-    twins = _twins(done, ranked)
+    done = _decided(hunt, model, begun, tried)
+    twins = _twins(done)
     if not twins:
         return done
     left = hunt.budget.within("candidates that look like the best not refitted", twins)
     starters = (((*model.parts, *p.parts), p.start(case.whole, model.values)) for p in left)
     tried += hunt.race(starters, min(m.refined.objective for m in tried), " (looks like the best)")
-    return _decided(hunt, model, found, tried)
+    return _decided(hunt, model, begun, tried)
 
 
 def anew(hunt: Hunt, base: Model, done: Round) -> Round:
@@ -76,7 +78,7 @@ def anew(hunt: Hunt, base: Model, done: Round) -> Round:
     base model: what that takes away by itself is no effect's.  A log of one repeat is replayed by inverse dynamics,
     which is smooth and has one basin.
     """
-    if done.winner is not None or not done.tried or hunt.case.fit.repeats == 1:
+    if done.winner is not None or not done.tried or not hunt.case.fit.repeated:
         return done
     best = min(done.tried, key=lambda m: m.gap)
     if best.gap > (1 - LESS) * base.gap:
@@ -85,7 +87,7 @@ def anew(hunt: Hunt, base: Model, done: Round) -> Round:
         hunt.budget.skip("the fit from the prior on")
         return done
     fresh = hunt.anew(best)
-    again = _decided(hunt, base, done.screen, [fresh if m is best else m for m in done.tried])
+    again = _decided(hunt, base, done, [fresh if m is best else m for m in done.tried])
     return done if again.winner is None else _beside(hunt, base, again, again.winner)
 
 
@@ -95,10 +97,9 @@ def _beside(hunt: Hunt, base: Model, done: Round, won: Model) -> Round:
     The base model is the one that does better on the confirming demonstration, from there or as it was.
     """
     whole, basin = hunt.case.whole, _neutral(hunt, won, won.amplitudes)
-    ranked = proposals(done.screen, base.residuals, whole)
     tried = {m.name for m in done.tried if m is not won}
-    lost = [p for p in ranked if joined(p.parts) in tried]
-    left = hunt.budget.within("rivals not refitted where the best one ended", [*lost, *_twins(done, ranked)])
+    lost = [p for p in done.ranked if joined(p.parts) in tried]
+    left = hunt.budget.within("rivals not refitted where the best one ended", [*lost, *_twins(done)])
     note = " (from where the best one ended)"
     beside = hunt.race(((p.parts, p.start(whole, basin)) for p in left), won.refined.objective, note)
     try:
@@ -106,7 +107,7 @@ def _beside(hunt: Hunt, base: Model, done: Round, won: Model) -> Round:
     except NotReplayed:
         before = base
     best = {m.name: m for m in sorted([*done.tried, *beside], key=lambda m: m.refined.objective, reverse=True)}
-    return _decided(hunt, before, done.screen, list(best.values()))
+    return _decided(hunt, before, done, list(best.values()))
 
 
 def _neutral(hunt: Hunt, model: Model, amplitudes: Sequence[str]) -> np.ndarray:
@@ -116,14 +117,14 @@ def _neutral(hunt: Hunt, model: Model, amplitudes: Sequence[str]) -> np.ndarray:
     return values
 
 
-def _twins(done: Round, ranked: Sequence[Proposal]) -> list[Proposal]:
+def _twins(done: Round) -> list[Proposal]:
     """Candidates that were not refitted though their marks are nearly the winner's: they may do as well."""
     if done.winner is None:
         return []
     new = [c.name for c in done.winner.parts if c.name not in done.stood]
     tried = {c.name for m in done.tried for c in m.parts}
     near = collinear(done.screen, set(new))
-    return [p for p in ranked if p.names[0] in near - tried]
+    return [p for p in done.ranked if p.names[0] in near - tried]
 
 
 def pairs(hunt: Hunt, base: Model, model: Model, first: Round) -> Round:
@@ -137,7 +138,7 @@ def pairs(hunt: Hunt, base: Model, model: Model, first: Round) -> Round:
     starters = ((p.parts, p.start(case.whole, base.values)) for p in left)
     tried = hunt.race(starters, hunt.aim(min(first.tried, key=lambda m: m.refined.objective)))
     alone, trial = min(zip(first.tried, first.trials, strict=True), key=lambda both: both[1].gap_confirm)
-    done = _decided(hunt, base, first.screen, [*tried, model] if len(model.parts) > 1 else tried)
+    done = _decided(hunt, base, first, [*tried, model] if len(model.parts) > 1 else tried)
     if done.winner is None or done.chosen is None:
         return done
     beside, beyond = (functools.partial(remainder, case.fit, case.confirm, m) for m in (alone, done.winner))
@@ -181,16 +182,18 @@ def polished(hunt: Hunt, model: Model) -> Model:
     return hunt.gone_on_with(model, POLISH, " polished")
 
 
-def _decided(hunt: Hunt, before: Model, found: Screen, tried: Sequence[Model]) -> Round:
-    case, stood = hunt.case, tuple(c.name for c in before.parts)
+def _decided(hunt: Hunt, before: Model, begun: Round, tried: Sequence[Model]) -> Round:
+    """A round with these models on trial, and none before; before: the model that stood."""
+    case, done = hunt.case, replace(begun, tried=tuple(tried), trials=(), winner=None, chosen=None)
     if not tried:
-        return Round(found, stood)
+        return done
     trials = judge(
         case.fit, case.confirm, before, tried, case.smallest, hunt.whole_gap, floor=hunt.floor, seed=case.config.seed
     )
     judged = list(zip(tried, trials, strict=True))
     won = winning(judged, hunt.floor, hunt.whole_gap)
     if won is None:
-        return Round(found, stood, tuple(tried), tuple(trials))
+        return replace(done, trials=tuple(trials))
     trials = without_idle(judged, won, case.effects, hunt.floor)
-    return Round(found, stood, tuple(tried), tuple(trials), *won)
+    winner, chosen = won
+    return replace(done, trials=tuple(trials), winner=winner, chosen=chosen)

@@ -16,7 +16,6 @@ import numpy as np
 
 from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.evidence import Evidence
-from droid_jax.gap.flips import largest_t
 
 Test = Callable[[np.ndarray], tuple[np.ndarray, float]]
 SMALL = 0.3  # prior deviations of an amplitude: large against solver noise, small enough to be linear
@@ -92,7 +91,7 @@ def screen(
     questions: Sequence[Question],
     raw: np.ndarray,
     projected: np.ndarray,
-    test: Test = largest_t,
+    test: Test,
 ) -> Screen:
     """Score projected marks [K, M] against residuals [N, M] of the base fit.
 

@@ -21,7 +21,7 @@ LONGEST = 1.0  # search units: what the fit did not tell at all is no further fr
 
 def left_over(fitted: Evidence, other: Evidence, model: Model) -> np.ndarray:
     """[N, M] `beyond`; of blocks of one log, which are of one motion, what the model leaves as it is."""
-    if fitted.repeats > 1:
+    if fitted.repeated:
         return beyond(fitted, other, model)
     return other.residuals(other.common(model.values)[0])
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from droid_jax.measure.clocks import interpolate
 from droid_jax.measure.recording import Channel, Recording
 
 STOP = 2.0  # s
@@ -53,6 +54,6 @@ def warped(recording: Recording, entry: Entry) -> Recording:
         return replace(c, time=new, values=values, mask=c.mask[:, near])
 
     time, old = instants(recording.time)
-    command = np.stack([np.interp(old, recording.time, column) for column in recording.command.T], axis=1)
+    command = interpolate(old, recording.time, recording.command)
     channels = {name: channel(c) for name, c in recording.channels.items()}
     return replace(recording, name=entry.what, time=time, command=command, channels=channels, phases=())

@@ -52,8 +52,6 @@ def find(case: Case, base: Model, floor: float, progress: Progress = lambda stag
     if not base.refined.converged:
         return _verdict(hunt, base, base, [], quiet=False)
     asked = questions_of(candidates(case.effects))
-    if not asked:
-        raise ValueError("there is nothing to ask about: none of the effects says its places (`Effect.places`)")
     model, rounds, quiet = base, list[Round](), False
     while len(model.parts) < case.config.most:
         left = further(asked, model)
@@ -137,7 +135,7 @@ def _verdict(hunt: Hunt, base: Model, model: Model, rounds: list[Round], quiet: 
         failed=tuple(hunt.failed),
         rivals=next((r.rivals for r in reversed(rounds) if r.winner is not None), ()),
         cut=hunt.budget.cut,
-        trend=trend(rounds[0].screen, base.residuals, case.config.seed) if rounds and case.fit.repeats > 1 else None,
+        trend=trend(rounds[0].screen, base.residuals, case.config.seed) if rounds and case.fit.repeated else None,
     )
 
 

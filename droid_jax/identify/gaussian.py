@@ -113,6 +113,7 @@ class Gaussian:
 
         A marginal is truncated (or clipped) at its own bounds only: exact unless the bounds of
         another, strongly correlated parameter cut rows away too.
+        Raises ValueError for other levels.
         """
         q = np.asarray(q, dtype=np.float64)
         if q.ndim != 1 or not np.all((q >= 0) & (q <= 1)):
@@ -125,7 +126,10 @@ class Gaussian:
         return self._to_physical(np.stack(columns, axis=-1))
 
     def interval(self, level: float = 0.9) -> tuple[np.ndarray, np.ndarray]:
-        """Equal-tailed marginal interval that holds `level` of the mass: (low [D], high [D])."""
+        """Equal-tailed marginal interval that holds `level` of the mass: (low [D], high [D]).
+
+        Raises ValueError unless 0 < level < 1.
+        """
         if not 0 < level < 1:
             raise ValueError(f"level must lie between 0 and 1, got {level}")
         low, high = self.quantiles([(1 - level) / 2, (1 + level) / 2])

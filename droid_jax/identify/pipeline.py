@@ -319,7 +319,8 @@ def _fingerprint(
 def cost_samples(found: Identified, count: int, seed: int) -> dict[str, np.ndarray]:
     """Costs on held-out repeats of samples from the initial and from the fitted Gaussian.
 
-    initial, fitted: [n, D] values; initial_cost, fitted_cost: [n] N m, failed replays carry their penalty.
+    initial, fitted: [n, D] values; initial_cost, fitted_cost: [n] N m, failed replays carry their penalty;
+    names: [D] of the parameters.
     """
     first = prior(found.space).sample(seed, count)
     last = found.full_gaussian.sample(seed, count)

@@ -146,18 +146,7 @@ def refine(
     state, _ = problem.descend(state)
     if config.hops:
         state = problem.back(state)
-    settled, slopes = config.hops == 0, None
-    for number in range(config.hops):
-        slopes = problem.jacobian(state)[0]
-        hopped = problem.hop(state, slopes, number)
-        least = max(HOP_TOLERANCE, HOP_FAR * problem.excess(state)[0])
-        settled = bool(state.objective[0] - hopped.objective[0] <= least)
-        if hopped.objective[0] < state.objective[0]:
-            state, slopes = hopped, None
-        if settled:
-            break
-        state, _ = problem.descend(state)
-        slopes = None
+    state, slopes, settled = problem.hopped(state)
     return Refined(
         space=space,
         x=state.x[0],
@@ -253,6 +242,25 @@ class _Descent(Problem):
         deviation = np.sqrt(np.diag(np.linalg.inv(curvature(slopes, self.prior))))
         which = ~self.space.nuisance & (np.abs(state.x[0]) > STRAYED) & (deviation > UNTOLD)
         return [self.space.names[k] for k in np.flatnonzero(which)]
+
+    def hopped(self, state: State) -> tuple[State, np.ndarray | None, bool]:
+        """Leave small basins, as often as that pays and no more than `hops` times; one start.
+
+        Returns where that ended, its slopes [M, D] where they are known, and whether a hop found nothing more.
+        """
+        settled, slopes = self.config.hops == 0, None
+        for number in range(self.config.hops):
+            slopes = self.jacobian(state)[0]
+            hopped = self.hop(state, slopes, number)
+            least = max(HOP_TOLERANCE, HOP_FAR * self.excess(state)[0])
+            settled = bool(state.objective[0] - hopped.objective[0] <= least)
+            if hopped.objective[0] < state.objective[0]:
+                state, slopes = hopped, None
+            if settled:
+                break
+            state, _ = self.descend(state)
+            slopes = None
+        return state, slopes, settled
 
     def hop(self, state: State, jacobian: np.ndarray, seed: int) -> State:
         """Leave a small basin: CMA-ES in the metric of the posterior, from a start that stands still.

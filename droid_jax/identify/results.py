@@ -9,11 +9,24 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from droid_jax.files import (
+    CONFIG,
+    CORRELATION,
+    DISTRIBUTION,
+    FIT,
+    FITTED,
+    GAUSSIAN,
+    HISTORY,
+    HISTORY_TABLE,
+    SAMPLES,
+    TRACES,
+)
 from droid_jax.identify.fit import on_bound
 from droid_jax.identify.gaussian import prior
 from droid_jax.identify.pipeline import Identified
@@ -52,24 +65,24 @@ def write_run(
         mjcf = fitted_mjcf(found.scene, found.full, found.best)
     except ValueError as error:  # the fit itself is whole
         notes.append(f"fitted.xml is not written: {error}")
-    write_json(folder / "fit.json", fit_json(found, truth or {}, notes))
-    found.gaussian.save(folder / "gaussian.json")
+    write_json(folder / FIT, fit_json(found, truth or {}, notes))
+    found.gaussian.save(folder / GAUSSIAN)
     found.full_gaussian.save(folder / "gaussian_full.json")
     _write_history(folder, found)
-    write_npz(folder / "traces.npz", traces(found))
+    write_npz(folder / TRACES, traces(found))
     correlation = found.full_gaussian.cov / np.sqrt(
         np.outer(np.diag(found.full_gaussian.cov), np.diag(found.full_gaussian.cov))
     )
-    write_npz(folder / "correlation.npz", {"names": np.array(found.full.names), "correlation": correlation})
+    write_npz(folder / CORRELATION, {"names": np.array(found.full.names), "correlation": correlation})
     if mjcf is not None:
-        write_text(folder / "fitted.xml", mjcf)
+        write_text(folder / FITTED, mjcf)
     else:
-        (folder / "fitted.xml").unlink(missing_ok=True)  # of a fit before
+        (folder / FITTED).unlink(missing_ok=True)  # of a fit before
     if samples is not None:
         drawn = samples()
-        write_npz(folder / "distribution.npz", drawn)
-        write_csv(folder / "samples.csv", found.space.names, drawn["fitted"].tolist())
-    write_json(folder / "config.json", dict(config))  # last: its presence says that the run is whole
+        write_npz(folder / DISTRIBUTION, drawn)
+        write_csv(folder / SAMPLES, found.space.names, drawn["fitted"].tolist())
+    write_json(folder / CONFIG, dict(config))  # last: its presence says that the run is whole
 
 
 def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) -> dict[str, Any]:
@@ -104,19 +117,6 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
             }
         )
     costs = found.fit(np.stack([found.start, found.best]))
-    gaps = {
-        name: {
-            "before": g.before,
-            "after": g.after,
-            "floor": g.floor,
-            "closed": g.closed,
-            "per_joint_before": list(g.per_joint_before),
-            "per_joint_after": list(g.per_joint_after),
-            "per_joint_floor": None if g.per_joint_floor is None else list(g.per_joint_floor),
-            "judged": g.judged,
-        }
-        for name, g in found.gaps.items()
-    }
     floors: list[Any] = [g.floor for g in found.gaps.values()]
     comparison = found.fit.comparisons[0]
     whitened = comparison.config.whitened  # the gaps' floors are in the unit of the torque
@@ -130,7 +130,7 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
             "floor": None if whitened or None in floors else float(np.mean(floors)),
             "unit": "noise units" if whitened else unit,
         },
-        "gap": gaps,
+        "gap": {name: asdict(gap) for name, gap in found.gaps.items()},
         "torque_unit": unit,
         "stop": found.search.stop,
         "converged": None if found.refined is None else found.refined.converged,
@@ -156,10 +156,10 @@ def _write_history(folder: Path, found: Identified) -> None:
         "median_cost": history.median_cost,
         "sigma": history.sigma,
     }
-    write_npz(folder / "history.npz", arrays)
+    write_npz(folder / HISTORY, arrays)
     table = np.column_stack([arrays[k] for k in ("generation", "best_cost", "median_cost", "sigma", "mean", "std")])
     header = ["generation", "best_cost", "median_cost", "sigma", *(f"mean_{n}" for n in names)]
-    write_csv(folder / "history.csv", [*header, *(f"std_{n}" for n in names)], table.tolist())
+    write_csv(folder / HISTORY_TABLE, [*header, *(f"std_{n}" for n in names)], table.tolist())
 
 
 def _physical_deviation(space: Space, mean: np.ndarray, std: np.ndarray) -> np.ndarray:
@@ -182,6 +182,5 @@ def traces(found: Identified) -> dict[str, np.ndarray]:
         out[f"{name}/measured_high"] = np.quantile(repeats, 0.95, axis=0)
         out[f"{name}/before"], out[f"{name}/after"] = both[i]
         out[f"{name}/joints"] = np.array([found.scene.joints[c] for c in channel.columns])
-        phases = [{"name": p.name, "start": p.start, "end": p.end} for p in comparison.phases]
-        out[f"{name}/phases"] = np.array(json.dumps(phases))
+        out[f"{name}/phases"] = np.array(json.dumps([asdict(phase) for phase in comparison.phases]))
     return out

@@ -16,12 +16,8 @@ from rosbags.typesys import Stores, get_typestore
 
 _DAY = 86400 * 10**9  # ns
 
-# channel -> field of sensor_msgs/JointState, and its unit at hinges and at slides
-FIELDS = {
-    "torque": ("effort", "N m", "N"),
-    "position": ("position", "rad", "m"),
-    "velocity": ("velocity", "rad/s", "m/s"),
-}
+# channel -> field of sensor_msgs/JointState
+FIELDS = {"torque": "effort", "position": "position", "velocity": "velocity"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +108,7 @@ def _samples(
 ) -> list[tuple[int, tuple[str, ...], dict[str, np.ndarray]]]:
     """The (offset in ns, joint names, field -> numbers) that one message holds."""
     if hasattr(message, "name") and hasattr(message, "position"):  # JointState
-        fields = {field: np.asarray(getattr(message, field), dtype=np.float64) for field, *_ in FIELDS.values()}
+        fields = {field: np.asarray(getattr(message, field), dtype=np.float64) for field in FIELDS.values()}
         return [(0, tuple(message.name), fields)]
     if hasattr(message, "joint_names") and hasattr(message, "points"):  # JointTrajectory
         names = tuple(message.joint_names)

@@ -14,7 +14,7 @@ from droid_jax.errors import faults
 from droid_jax.measure.clocks import SLACK, check_clock, resample
 from droid_jax.measure.metadata import Metadata, metadata_from_json, metadata_to_json, recording_of
 from droid_jax.measure.recording import JITTER, Channel, Recording
-from droid_jax.storage import new_folder, write_csv, write_text
+from droid_jax.storage import new_folder, read_text, write_csv, write_text
 
 
 def save_csv(recording: Recording, path: Path) -> None:
@@ -94,10 +94,7 @@ def load_csv(path: Path, interpolate: bool, allow_jitter: bool) -> Recording:
 
 
 def _text(path: Path) -> str:
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: not a text file in UTF-8, byte {error.start} cannot be read") from None
+    text = read_text(path)
     if not text.strip():
         raise ValueError(f"{path}: the file is empty")
     return text

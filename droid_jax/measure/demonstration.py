@@ -33,12 +33,11 @@ RATE = 500.0  # Hz, command clock
 
 @dataclass(frozen=True)
 class Segment:
-    """One stretch of a demonstration: the door's angle [rad] and the stand-off [m] at its end."""
+    """One stretch of a demonstration: the door's angle [rad] and the finger command [m] at its end."""
 
     phase: str
     seconds: float
     angle: float
-    standoff: float
     finger: float
 
 
@@ -52,12 +51,12 @@ class Plan:
     segments: tuple[Segment, ...]
 
 
-def _opening(angle: float, seconds: float) -> tuple[Segment, ...]:
+def _opening(angle: float) -> tuple[Segment, ...]:
     return (
-        Segment("approach", 1.6, 0.0, 0.0, OPEN),
-        Segment("grasp", 0.8, 0.0, 0.0, CLOSED),
-        Segment("opening", seconds, angle, 0.0, CLOSED),
-        Segment("hold", 0.5, angle, 0.0, CLOSED),
+        Segment("approach", 1.6, 0.0, OPEN),
+        Segment("grasp", 0.8, 0.0, CLOSED),
+        Segment("opening", 4.8, angle, CLOSED),
+        Segment("hold", 0.5, angle, CLOSED),
     )
 
 
@@ -66,21 +65,21 @@ POSE_B = (1.39, -1.06, -0.96, -2.17, -2.19, 2.49, 2.12)
 _DEG = np.pi / 180
 
 PLANS = {
-    "A": Plan("A", POSE_A, -1, _opening(50 * _DEG, 4.8)),
-    "B": Plan("B", POSE_B, 1, _opening(50 * _DEG, 4.8)),
+    "A": Plan("A", POSE_A, -1, _opening(50 * _DEG)),
+    "B": Plan("B", POSE_B, 1, _opening(50 * _DEG)),
     "C": Plan(
         "C",
         POSE_A,
         -1,
         (
-            Segment("approach", 1.2, 0.0, 0.0, OPEN),
-            Segment("grasp", 0.8, 0.0, 0.0, CLOSED),
-            Segment("opening", 2.4, 15 * _DEG, 0.0, CLOSED),
-            Segment("opening", 3.6, 50 * _DEG, 0.0, CLOSED),
-            Segment("hold", 0.4, 50 * _DEG, 0.0, CLOSED),
-            Segment("closing", 3.2, 15 * _DEG, 0.0, CLOSED),
-            Segment("closing", 1.6, 6 * _DEG, 0.0, CLOSED),
-            Segment("rest", 0.4, 6 * _DEG, 0.0, CLOSED),
+            Segment("approach", 1.2, 0.0, OPEN),
+            Segment("grasp", 0.8, 0.0, CLOSED),
+            Segment("opening", 2.4, 15 * _DEG, CLOSED),
+            Segment("opening", 3.6, 50 * _DEG, CLOSED),
+            Segment("hold", 0.4, 50 * _DEG, CLOSED),
+            Segment("closing", 3.2, 15 * _DEG, CLOSED),
+            Segment("closing", 1.6, 6 * _DEG, CLOSED),
+            Segment("rest", 0.4, 6 * _DEG, CLOSED),
         ),
     ),
 }
@@ -92,10 +91,10 @@ PAPER_PLANS = {
         POSE_A,
         -1,
         (
-            Segment("approach", 4.0, 0.0, 0.0, OPEN),
-            Segment("grasp", 0.8, 0.0, 0.0, CLOSED),
-            Segment("opening", 14.0, 30 * _DEG, 0.0, CLOSED),
-            Segment("hold", 0.5, 30 * _DEG, 0.0, CLOSED),
+            Segment("approach", 4.0, 0.0, OPEN),
+            Segment("grasp", 0.8, 0.0, CLOSED),
+            Segment("opening", 14.0, 30 * _DEG, CLOSED),
+            Segment("hold", 0.5, 30 * _DEG, CLOSED),
         ),
     )
 }
@@ -199,11 +198,15 @@ def demonstrate(scene: Scene, plan: Plan) -> Recording:
 
 
 def _timing(plan: Plan) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, tuple[Phase, ...]]:
-    """Clock [T] and, on it, door angle, stand-off, finger command; phases of the same name that touch merge."""
+    """Clock [T] and, on it, door angle, stand-off, finger command; phases of the same name that touch merge.
+
+    The hand reaches the knob in the first segment and stays there.
+    """
     ends = np.cumsum([s.seconds for s in plan.segments])
     clock = np.arange(round(ends[-1] * RATE) + 1) / RATE
-    now = Segment("start", 0.0, 0.0, START_STANDOFF, OPEN)
-    tracks = {k: np.full(len(clock), getattr(now, k), dtype=float) for k in ("angle", "standoff", "finger")}
+    standoff = START_STANDOFF - START_STANDOFF * minimum_jerk(clock / plan.segments[0].seconds)
+    now = Segment("start", 0.0, 0.0, OPEN)
+    tracks = {k: np.full(len(clock), getattr(now, k), dtype=float) for k in ("angle", "finger")}
     phases: list[Phase] = []
     for segment, end in zip(plan.segments, ends, strict=True):
         begin = end - segment.seconds
@@ -215,7 +218,7 @@ def _timing(plan: Plan) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray,
         else:
             phases.append(Phase(segment.phase, float(begin), float(end)))
         now = segment
-    return clock, tracks["angle"], tracks["standoff"], tracks["finger"], tuple(phases)
+    return clock, tracks["angle"], standoff, tracks["finger"], tuple(phases)
 
 
 def _check_path(scene: Scene, plan: Plan, path: np.ndarray, velocity: np.ndarray, damping: np.ndarray) -> None:

@@ -17,6 +17,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from droid_jax.errors import needs
 from droid_jax.measure.checks import validate
 from droid_jax.measure.csv_folder import load_csv, save_csv
 from droid_jax.measure.npz_file import load_npz, save_npz
@@ -119,12 +120,8 @@ def bags_at(path: Path) -> list[Path]:
 
 def rosbag_reader() -> ModuleType:
     """`droid_jax.measure.rosbag`, imported where bags are read; ValueError where what it needs is not installed."""
-    try:
-        return importlib.import_module("droid_jax.measure.rosbag")
-    except ModuleNotFoundError as error:
-        if (error.name or "").split(".")[0] != "rosbags":
-            raise
-        raise ValueError("ROS bags need rosbags: in the checkout, pip install -c constraints.txt -e '.[ros]'") from None
+    needs("ROS bags need", "ros", "rosbags")
+    return importlib.import_module("droid_jax.measure.rosbag")
 
 
 def _load_bags(bags: list[Path], name: str | None, allow_jitter: bool, options: Mapping[str, Any]) -> Recording:

@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 import scipy.signal
 
+from droid_jax.measure.clocks import interpolate
 from droid_jax.model.scene import Scene
 
 
@@ -242,7 +243,7 @@ def lagged(values: np.ndarray, clock: np.ndarray, delay: float, lag: float) -> n
     The lag y' = (x - y) / lag is stepped exactly for an input held over each step.
     """
     if delay > 0:
-        values = np.stack([np.interp(clock - delay, clock, column) for column in values.T], axis=1)
+        values = interpolate(clock - delay, clock, values)
     if lag > 0 and len(clock) > 1:
         keep = np.exp(-(clock[1] - clock[0]) / lag)
         start = keep * values[:1]

@@ -25,12 +25,12 @@ COARSEST = 0.9  # periods of the cutoff from one sample to the next; beyond, a w
 STEADY = 5
 
 
-def coarse_clock(start: float, end: float, rate: float = RATE) -> np.ndarray:
-    """[K] s from start to end at about `rate`."""
-    return np.linspace(start, end, max(2, round((end - start) * rate) + 1))
+def coarse_clock(start: float, end: float) -> np.ndarray:
+    """[K] s from start to end at about RATE."""
+    return np.linspace(start, end, max(2, round((end - start) * RATE) + 1))
 
 
-def lowpass(clock: np.ndarray, coarse: np.ndarray, cutoff: float = CUTOFF) -> sparse.csr_array:
+def lowpass(clock: np.ndarray, coarse: np.ndarray) -> sparse.csr_array:
     """[K, T] matrix from samples at a growing `clock` to smoothed values at `coarse`, sparse: a window is short.
 
     A windowed sinc (Hann, 1.5 periods of the cutoff to each side), cut and renormalised at the
@@ -38,7 +38,7 @@ def lowpass(clock: np.ndarray, coarse: np.ndarray, cutoff: float = CUTOFF) -> sp
     window is left, the row is zero.  Source: windowed-sinc design, Oppenheim and Schafer, ch. 7.
     Raises ValueError for a clock that is too coarse for the cutoff throughout.
     """
-    half = 1.5 / cutoff
+    half = 1.5 / CUTOFF
     first, last = np.searchsorted(clock, coarse - half), np.searchsorted(clock, coarse + half, side="right")
     begins = np.concatenate([[0], np.cumsum(last - first)])
     rows = np.repeat(np.arange(len(coarse)), last - first)
@@ -46,14 +46,14 @@ def lowpass(clock: np.ndarray, coarse: np.ndarray, cutoff: float = CUTOFF) -> sp
     lag = coarse[rows] - clock[columns]
     spacing = np.gradient(clock) if len(clock) > 1 else np.ones_like(clock)
     spacing[[0, -1]] *= 0.5  # trapezoidal rule: the same result at every sampling rate
-    kernel = np.sinc(2 * cutoff * lag) * (0.5 + 0.5 * np.cos(np.pi * np.clip(lag / half, -1, 1)))
+    kernel = np.sinc(2 * CUTOFF * lag) * (0.5 + 0.5 * np.cos(np.pi * np.clip(lag / half, -1, 1)))
     shape = (len(coarse), len(clock))
     weights = sparse.csr_array((kernel * spacing[columns], columns, begins), shape=shape)
     total = weights.sum(axis=1)
-    enough = total > LEAST / (2.0 * cutoff)  # of the whole window's area
+    enough = total > LEAST / (2.0 * CUTOFF)  # of the whole window's area
     usual = np.median(np.diff(clock)) if len(clock) > 1 else np.inf
-    if not enough.all() and usual > COARSEST / cutoff:
-        raise ValueError(f"a clock with steps of {usual:.3g} s is too coarse to be smoothed at {cutoff} Hz")
+    if not enough.all() and usual > COARSEST / CUTOFF:
+        raise ValueError(f"a clock with steps of {usual:.3g} s is too coarse to be smoothed at {CUTOFF} Hz")
     return sparse.diags_array(np.where(enough, 1.0 / np.where(enough, total, 1.0), 0.0)) @ weights
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from droid_jax.measure.bag_topics import FIELDS, Track, read_bag
-from droid_jax.measure.checks import validate
+from droid_jax.measure.checks import UNITS, validate
 from droid_jax.measure.clocks import check_clock, in_gap, interpolate
 from droid_jax.measure.recording import Channel, Phase, Recording, ServoGains, TorqueConvention
 
@@ -77,19 +77,9 @@ def read_bags(
     topic or joint, a topic without messages, efforts that are not finite, stamps that do not
     increase, commands that differ between repeats, or bags without a common part.
     """
-    bags = [Path(p) for p in paths]
-    if not bags:
-        raise ValueError("expected one ROS bag per repeat, got none")
-    if twice := [bag for i, bag in enumerate(bags) if bag.resolve() in [other.resolve() for other in bags[:i]]]:
-        raise ValueError(f"{twice[0]}: given twice; every bag is one repeat of its own")
-    if command_topic == state_topic:
-        raise ValueError(f"command and joint states need topics of their own, got {state_topic!r} for both")
-    if strange := [slide for slide in slides if slide not in joints]:
-        raise ValueError(f"slides must be among the joints {', '.join(joints)}, got {', '.join(strange)}")
+    bags = _bags(paths)
     command_joints = tuple(joints if command_joints is None else command_joints)
-    topics = {state_topic: (tuple(joints), "effort")}
-    if command_topic is not None:
-        topics[command_topic] = (command_joints, "position")
+    topics = _topics(joints, slides, state_topic, command_topic, command_joints)
     tracks = [read_bag(bag, topics) for bag in bags]
     order = _as_recorded([track[state_topic].received for track in tracks])
     bags, tracks = [bags[i] for i in order], [tracks[i] for i in order]
@@ -125,6 +115,35 @@ def read_bags(
         },
     )
     return validate(recording, source=", ".join(str(bag) for bag in bags))
+
+
+def _bags(paths: Sequence[str | os.PathLike[str]]) -> list[Path]:
+    """The bags, or ValueError where there is none or one is there twice."""
+    bags = [Path(p) for p in paths]
+    if not bags:
+        raise ValueError("expected one ROS bag per repeat, got none")
+    if twice := [bag for i, bag in enumerate(bags) if bag.resolve() in [other.resolve() for other in bags[:i]]]:
+        raise ValueError(f"{twice[0]}: given twice; every bag is one repeat of its own")
+    return bags
+
+
+def _topics(
+    joints: Sequence[str],
+    slides: Sequence[str],
+    state_topic: str,
+    command_topic: str | None,
+    command_joints: tuple[str, ...],
+) -> dict[str, tuple[tuple[str, ...], str]]:
+    """What `read_bag` is asked for: topic -> its joints, and the field that must be finite.
+
+    ValueError where the two topics are one, or slides are no joints.
+    """
+    if command_topic == state_topic:
+        raise ValueError(f"command and joint states need topics of their own, got {state_topic!r} for both")
+    if strange := [slide for slide in slides if slide not in joints]:
+        raise ValueError(f"slides must be among the joints {', '.join(joints)}, got {', '.join(strange)}")
+    topics = {state_topic: (tuple(joints), "effort")}
+    return topics if command_topic is None else {**topics, command_topic: (command_joints, "position")}
 
 
 def _as_recorded(received: Sequence[np.ndarray]) -> list[int]:
@@ -224,7 +243,7 @@ def _channels(
     if lacking:
         raise ValueError(f"{lacking[0]}: the joint states hold no effort, so there is no torque to compare")
     channels = {}
-    for name, (field, hinge, slide) in FIELDS.items():
+    for name, field in FIELDS.items():
         if not all(field in fields for _, fields in states):
             continue
         values = np.stack([interpolate(clock, t, fields[field]) for t, fields in states])
@@ -232,6 +251,7 @@ def _channels(
         mask = seen[:, :, None] & np.isfinite(values)
         if not mask.any(axis=(1, 2)).all():  # a driver that does not measure it says NaN
             continue
+        hinge, slide = UNITS[name]
         unit = " or ".join(dict.fromkeys(slide if joint in slides else hinge for joint in joints))
         channels[name] = Channel(name, unit, joints, clock, values, mask)
     return channels

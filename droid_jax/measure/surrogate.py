@@ -17,6 +17,7 @@ import numpy as np
 import scipy.signal
 
 from droid_jax.measure.checks import validate
+from droid_jax.measure.clocks import interpolate
 from droid_jax.measure.engine import Trace, instrument, simulate
 from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
 from droid_jax.model.builtin import HINGE
@@ -33,7 +34,7 @@ class SurrogateConfig:
 
     repeats: N.
     timestep: s; C MuJoCo's semi-implicit Euler, first order, so fine enough to stand for continuous time
-      (the analysis takes steps forty times as long, second order).
+      (the analysis takes steps twenty or forty times as long, second order).
     rate: Hz of torque and position samples.
     torque_noise: N m, white, joints 1-4 and 5-7 (a real Panda: 0.03 to 0.08 at 1 kHz).
     torque_drift: N m, first-order noise with a correlation time of 0.15 s, joints 1-4 and 5-7.
@@ -253,8 +254,7 @@ def _control(hidden: Scene, demonstration: Recording, timestep: float, delay: fl
         raise ValueError(f"the stand-in robot needs a command for {', '.join(without)} too; the demonstration has none")
     start, end = demonstration.time[0], demonstration.time[-1]
     clock = start + np.arange(int((end - start) / timestep + 1e-6) + 1) * timestep
-    command = [np.interp(clock - delay, demonstration.time, demonstration.command[:, c]) for c in columns]
-    return clock, np.stack(command, axis=1)
+    return clock, interpolate(clock - delay, demonstration.time, demonstration.command[:, columns])
 
 
 def _check_opened(demonstration: Recording, clock: np.ndarray, trace: Trace) -> None:

@@ -10,16 +10,14 @@ from droid_jax.model.scene import Scene, compile_scene
 HAND = "hand"
 
 
-def panda_arm_scene(*, timestep: float = 0.002, limits: bool = False) -> Scene:
+def panda_arm_scene() -> Scene:
     """The seven-joint Panda of `mjcf/panda.xml` with nothing mounted on its flange.
 
-    timestep: s.
-    limits: enforce the joint ranges (a replay of a measured motion keeps inside them).
+    Joint ranges are not enforced: a replay of a measured motion keeps inside them.
     """
     spec = mujoco.MjSpec.from_file(str(mjcf_dir() / "panda.xml"))
     for finger in FINGERS:  # its actuator would drive a joint that is gone
         spec.delete(spec.actuator(finger))
     spec.delete(spec.body(HAND))
     spec.modelname = "panda_arm"
-    spec.option.timestep = timestep
-    return compile_scene(spec, "Panda arm", joints=ARM, unlimited=() if limits else ARM)
+    return compile_scene(spec, "Panda arm", joints=ARM, unlimited=ARM)

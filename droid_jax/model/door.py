@@ -23,7 +23,7 @@ from droid_jax.model.fields import (
     pair_friction,
     servo_scale,
 )
-from droid_jax.model.parameters import Parameter, Scaling, Space
+from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
 
 PAPER_DAMPING_STD = (2.0, 2.0, 2.0, 2.0, 2.0, 1.0, 0.2)  # Table I, N m s/rad
@@ -41,7 +41,7 @@ _TABLE_I: dict[int, dict[str, Any]] = {
 
 
 def truth(springs: int) -> dict[str, float]:
-    """The nine door and finger values of a fitted column of Table I (0, 1 or 2 springs)."""
+    """The nine door and finger values of a fitted column of Table I (0, 1 or 2 springs; ValueError for others)."""
     if springs not in _TABLE_I:
         raise ValueError(f"Table I has doors with {sorted(_TABLE_I)} springs, got {springs}")
     row = dict(_TABLE_I[springs])
@@ -60,6 +60,7 @@ def door_space(scene: Scene, *, preset: str = "impedance") -> Space:
     preset "impedance": the same door and gripper; joint damping around the scene's own servo
       damping with a deviation of 10 %; log coordinates, wide enough that a sprung door, 200 of
       Table I's deviations away, is still found.
+    Raises ValueError for other presets and for a scene without a grip.
     """
     if preset not in ("impedance", "paper"):
         raise ValueError(f"preset must be 'impedance' or 'paper', got {preset!r}")
@@ -126,6 +127,6 @@ def torque_offsets(joints: tuple[str, ...], std: float = 0.1) -> tuple[Parameter
     """Constant error of each joint's torque sensor, N m."""
     return tuple(
         Parameter(f"torque_offset[{j}]", "N m", 0.0, std if i < 4 else 0.3 * std, -2.0, 2.0, nuisance=True,
-                  group="Nuisance", scaling=Scaling.LINEAR)
+                  group="Nuisance")
         for i, j in enumerate(joints)
     )  # fmt: skip

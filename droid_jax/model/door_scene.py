@@ -39,6 +39,7 @@ def door_scene(
     gains:   "impedance": what a Panda's joint impedance runs at; "paper": Table I's stiff servo.
     timestep: s.
     limits:  enforce the arm's joint ranges (needed when a policy drives the arm; a replay keeps inside).
+    Raises ValueError for other springs, knobs or gains.
     """
     if springs not in SPRINGS:
         raise ValueError(f"springs must be one of {sorted(SPRINGS)}, got {springs}")

@@ -1,8 +1,8 @@
 """Make any quantity of an MJCF a parameter, in a line.
 
     space = Space((
-        joint_damping(scene, "elbow", mean=1.0, std=0.5),
-        body_mass(scene, "forearm", std=0.3),
+        joint_damping(scene, "elbow", mean=1.0, std=0.5, high=20.0),
+        body_mass(scene, "forearm", std=0.3, high=3.0),
         model_parameter(scene, "pair_friction", "left_near", 0, name="grip", unit="-", std=0.2, high=4),
     ))
 

@@ -1,11 +1,11 @@
 """Friction of a joint as the link-side torque sensor sees it: viscous, Coulomb and a constant.
 
-    tau += viscous * qd + coulomb * tanh(qd / v0) + torque_offset        [N m]
+    tau += viscous * qd + coulomb * tanh(qd / SMOOTHING) + torque_offset        [N m]
 
 These are observation parameters: they change what is read, not how the arm moves.  The model's own
 `joint_damping` and `joint_frictionloss` lie on the motor side, where a link-side sensor cannot see
 them; what it does see is friction of the bearings behind it.  Model: the linear friction of Gaz et al.,
-RA-L 2019, with the sign smoothed over v0.
+RA-L 2019, with a smooth sign (`direction`).
 """
 
 from __future__ import annotations
@@ -14,50 +14,50 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.seam import Effect, Rollout, Theta, column
 
-SMOOTHING = 0.01  # rad/s: tanh(qd / v0) reaches 0.96 at twice this speed
+SMOOTHING = 0.01  # rad/s: `direction` reaches 0.96 at twice this speed
 TERMS = ("viscous", "coulomb", "torque_offset")
 _UNITS = {"viscous": "N m s/rad", "coulomb": "N m", "torque_offset": "N m"}
+_DEVIATIONS = {"viscous": 0.3, "coulomb": 0.5, "torque_offset": 0.3}  # of the prior
 
 
-def joint_friction_effect(joints: Sequence[str], *, v0: float = SMOOTHING) -> Effect:
+def direction(velocity: jax.Array) -> jax.Array:
+    """Smooth sign of a speed, rad/s; speeds well below SMOOTHING have no direction yet."""
+    return jnp.tanh(velocity / SMOOTHING)
+
+
+def joint_friction_effect(joints: Sequence[str]) -> Effect:
     """Adds viscous and Coulomb friction to the torque of `joints`, the channel order of the scene.
 
     Reads `viscous[joint]` and `coulomb[joint]` from theta; absent means zero.  The offset is left to
     `droid_jax.compare.replay.torque_offset_effect`, which reads `torque_offset[joint]`.
-    v0: rad/s, where the sign is smoothed.  Raises ValueError unless v0 > 0.
     """
-    if not v0 > 0:
-        raise ValueError(f"v0: expected a speed above 0 rad/s, got {v0}")
     joints = tuple(joints)
 
     def observe(theta: Theta, rollout: Rollout) -> Rollout:
         speed = rollout.velocity  # [T, J]
-        friction = column(theta, "viscous", joints) * speed + column(theta, "coulomb", joints) * jnp.tanh(speed / v0)
+        friction = column(theta, "viscous", joints) * speed + column(theta, "coulomb", joints) * direction(speed)
         return replace(rollout, torque=rollout.torque + friction)
 
     parameters = tuple(p for p in joint_friction_space(joints).parameters if not p.name.startswith("torque_offset"))
     return Effect("joint friction", parameters=parameters, observe=observe)
 
 
-def joint_friction_space(
-    joints: Sequence[str], *, viscous: float = 0.3, coulomb: float = 0.5, offset: float = 0.3
-) -> Space:
+def joint_friction_space(joints: Sequence[str]) -> Space:
     """Three parameters a joint, `viscous[joint]`, `coulomb[joint]` and `torque_offset[joint]`, all zero at first.
 
-    viscous, coulomb, offset: prior deviations in N m s/rad, N m and N m.  Bounds are ten deviations to
-    either side: zero, no friction, is then no edge, and a fit that comes out negative shows that
-    something other than friction was fitted.
+    Bounds are ten deviations to either side: zero, no friction, is then no edge, and a fit that comes out
+    negative shows that something other than friction was fitted.
     """
-    deviations = dict(zip(TERMS, (viscous, coulomb, offset), strict=True))
     return Space(
         tuple(
             Parameter(f"{term}[{joint}]", _UNITS[term], 0.0, std, -10 * std, 10 * std, group="Joint friction")
-            for term, std in deviations.items()
+            for term, std in _DEVIATIONS.items()
             for joint in joints
         )
     )

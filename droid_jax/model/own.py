@@ -35,16 +35,14 @@ from droid_jax.model.fields import body_mass, model_parameter, servo_scale
 from droid_jax.model.joint_friction import sensor_parameter
 from droid_jax.model.parameters import Mode, Parameter, Scaling, Space
 from droid_jax.model.scene import Scene
+from droid_jax.storage import read_text
 
 _NEEDED = ("element", "std", "high")
 _TIME = "time_offset"
 _TEXTS = ("field", "sensor", "servo", "element", "name", "unit", "group")
 _NUMBERS = ("std", "high", "low", "mean", "floor", "width")
 _CHOICES = {"mode": Mode, "scaling": Scaling}
-_KNOWN = (
-    *_NEEDED, "field", "sensor", "servo", "column", "name", "unit", "mean", "low", "mode", "scaling", "floor", "width",
-    "nuisance", "group",
-)  # fmt: skip
+_KNOWN = (*_TEXTS, *_NUMBERS, *_CHOICES, "column", "nuisance")
 
 
 def load_parameters(path: str | Path, scene: Scene) -> Space:
@@ -63,9 +61,7 @@ def _entries(path: Path) -> list[Any]:
     if not path.is_file():
         raise FileNotFoundError(f"no parameter file at {path}")
     try:
-        entries = json.loads(path.read_text(encoding="utf-8-sig"))
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: not a text file in UTF-8, byte {error.start} cannot be read") from None
+        entries = json.loads(read_text(path))
     except json.JSONDecodeError as error:
         raise ValueError(f"{path}: not JSON ({error})") from None
     if not isinstance(entries, list) or not entries:

@@ -333,7 +333,7 @@ def _read(path: Path, assets: Mapping[str, bytes]) -> mujoco.MjSpec:
 def with_options(scene: Scene, **changes: Any) -> Scene:
     """The same scene compiled with other options: timestep, integrator, cone, iterations, ls_iterations...
 
-    Names are those of mujoco.MjOption; the spec is not touched.
+    Names are those of mujoco.MjOption, ValueError for others; the spec is not touched.
     """
     model = scene.model.__copy__()
     for name, value in changes.items():

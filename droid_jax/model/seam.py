@@ -24,7 +24,10 @@ Theta = Mapping[str, jax.Array]
 class State:
     """What a force may depend on, before a step.
 
-    time: s.  qpos: [nq].  qvel: [nv].  load: [nv] N m, the previous step's actuator torque.
+    time: s, 0 at the first step of a servo replay; along a prescribed motion the recording's own clock.
+    qpos: [nq].  qvel: [nv].
+    load: [nv] N m, in a servo replay the actuators' torque in the step before, along a prescribed motion the torque
+    of the same instant, without effects.
     model: the sample's mjx.Model, with the values of its parameters (fitted servo gains, say).
     """
 
@@ -44,7 +47,7 @@ class Rollout:
     torque:   [T, J] N m (N for slides), in the recording's convention.
     position: [T, J] rad or m.
     velocity: [T, J] rad/s or m/s.
-    object_angle: [T] rad, zeros where the scene has no object.
+    object_angle: [T] rad or m, zeros where the scene has no object.
     contact:  [T, F] bool, True where finger f touches.
     finite:   [] bool, False where a number of the above became NaN or infinite.
     """

@@ -40,7 +40,7 @@ def step(model: Any, data: Any, *, parity: bool = False, servo_damping: bool = T
     parity=True: what C MuJoCo's implicitfast and Euler do, first order, for comparisons step by step.
     servo_damping: False spares what only actuators with a velocity gain need (see `actuators.has_servo_damping`).
     Leaves out what no replay reads: sensors, cameras, lights.
-    Raises ValueError for other integrators, and for elliptic cones unless parity.
+    Raises ValueError for other integrators, and for elliptic cones, air and water unless parity.
     """
     check_options(model, parity)
     with exact_segments(), contextlib.nullcontext() if parity else midpoint_constraints():

@@ -13,7 +13,7 @@ from brax.envs.base import State as EnvState
 from mujoco import mjx
 
 from droid_jax.compare.replay import check_stateless, pushed, rubbing, servo_given, through
-from droid_jax.measure.demonstration import OPEN, PLANS, Plan, grasp_pose, solve_pose
+from droid_jax.measure.demonstration import OPEN, grasp_pose, solve_pose
 from droid_jax.model.actuators import has_servo_damping
 from droid_jax.model.effects.registry import ready
 from droid_jax.model.physics import Physics
@@ -22,7 +22,7 @@ from droid_jax.model.seam import Effect, State, Theta, complete
 from droid_jax.model.step import step as simulate_step
 from droid_jax.policy.control import ACTIONS, OBSERVED, Safety, limited
 from droid_jax.policy.hand import finger_forces, hand_of, looked
-from droid_jax.policy.interface import interface_of
+from droid_jax.policy.interface import PLAN, interface_of
 from droid_jax.policy.task import (
     Task,
     gripped,
@@ -62,10 +62,10 @@ class DoorEnv(Env):
     scene: the built-in one, with joint limits enforced.  effects: of the extended model; their parameters are in
     `sys.theta`, and what they do to torque sensors is not seen by a policy.  sys: `Physics`, the scene's own unless
     randomised.
-    The hand starts in front of the knob, open, in the arm pose of `plan`.
+    The hand starts in front of the knob, open, in the arm pose of demonstration A.
     """
 
-    def __init__(self, scene: Scene, task: Task | None = None, effects: Sequence[Effect] = (), plan: Plan = PLANS["A"]):
+    def __init__(self, scene: Scene, task: Task | None = None, effects: Sequence[Effect] = ()):
         check_stateless(scene)
         if scene.command_names != (*scene.joints, *scene.finger_joints):
             raise ValueError(
@@ -74,8 +74,8 @@ class DoorEnv(Env):
             )
         self.scene, self.task, self.effects = ready(scene) if effects else scene, task or Task(), tuple(effects)
         self.sys = Physics(self.scene.mjx, {})
-        self.start = start_pose(self.scene, self.task, plan)
-        self.interface = interface_of(self.scene, self.task, self.start, plan)
+        self.start = start_pose(self.scene, self.task)
+        self.interface = interface_of(self.scene, self.task, self.start)
         self._hand, self._template = hand_of(self.scene), mjx.make_data(self.scene.mjx)
         self._timestep = float(self.scene.model.opt.timestep)
         self._servo_damping = has_servo_damping(self.scene.model)
@@ -184,10 +184,10 @@ class DoorEnv(Env):
         return observation(world.qpos[self.scene.joint_qpos], world.qvel[self.scene.joint_dofs], seen)
 
 
-def start_pose(scene: Scene, task: Task, plan: Plan = PLANS["A"]) -> np.ndarray:
+def start_pose(scene: Scene, task: Task) -> np.ndarray:
     """[nq] the arm in front of the closed door's knob, fingers open.  ValueError where the knob is out of reach."""
-    q = solve_pose(scene, np.array(plan.pose), *grasp_pose(scene, 0.0, 0.0, plan.roll))
+    q = solve_pose(scene, np.array(PLAN.pose), *grasp_pose(scene, 0.0, 0.0, PLAN.roll))
     for standoff in np.linspace(0.0, task.standoff, 10):
-        q = solve_pose(scene, q, *grasp_pose(scene, 0.0, standoff, plan.roll))
+        q = solve_pose(scene, q, *grasp_pose(scene, 0.0, standoff, PLAN.roll))
     arm = dict(zip(scene.joints, q.tolist(), strict=True))
     return scene.initial_qpos({**arm, **dict.fromkeys(scene.finger_joints, OPEN)})

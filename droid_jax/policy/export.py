@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from droid_jax.errors import needs
+from droid_jax.files import POLICY
 from droid_jax.policy import control
 from droid_jax.policy.control import ACTIONS, ARM, LAYOUT, OBSERVED, Policy
 from droid_jax.policy.network import save_policy
@@ -29,17 +30,13 @@ def export(folder: Path, policy: Policy) -> float:
 
     Raises ValueError where onnx or onnxruntime is not installed, or the two differ by more than `CLOSE`.
     """
-    missing = [name for name in ("onnx", "onnxruntime") if importlib.util.find_spec(name) is None]
-    if missing:
-        raise ValueError(
-            f"export needs {' and '.join(missing)}: in the checkout, pip install -c constraints.txt -e '.[export]'"
-        )
+    needs("export needs", "export", "onnx", "onnxruntime")
     model = to_onnx(policy)
     apart = difference(policy, model)
     if not apart <= CLOSE:
         raise ValueError(f"the ONNX policy differs from the JAX policy by {apart:.2g} in an action: it is not written")
     folder.mkdir(parents=True, exist_ok=True)
-    save_policy(folder / "policy.npz", policy)
+    save_policy(folder / POLICY, policy)
     write_bytes(folder / "policy.onnx", model)
     write_bytes(folder / "control.py", Path(control.__file__).read_bytes())
     return apart

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from droid_jax.compare.replay import finger_geoms, of_fingers
 from droid_jax.model.scene import Scene
 from droid_jax.policy.task import Seen
 
@@ -36,11 +37,9 @@ def hand_of(scene: Scene) -> Hand:
     """Of a scene with a gripper of two fingers and a knob; ValueError names what it lacks."""
     if scene.object_joint is None or scene.grip is None or len(scene.finger_pairs) != 2:
         raise ValueError(f"scene {scene.name!r} lacks a door or a gripper of two fingers: there is no such task in it")
-    model = scene.model
-    both = np.sort(np.stack([model.pair_geom1, model.pair_geom2], axis=1), axis=1)
     fingers = np.array([scene.id("body", f"{side}_finger") for side in ("left", "right")])
-    pairs = tuple(both[mine] for mine in scene.finger_pairs)
-    return Hand(scene.id("site", "pinch"), scene.id("site", "knob"), fingers, scene.qpos(scene.object_joint), pairs)
+    sites = scene.id("site", "pinch"), scene.id("site", "knob")
+    return Hand(*sites, fingers, scene.qpos(scene.object_joint), finger_geoms(scene))
 
 
 def pads_at(hand: Hand, data: Any, origin: Any, axes: Any, numbers: Any = np) -> Any:
@@ -72,12 +71,10 @@ def looked(hand: Hand, data: Any, force: Any, last: Any, seconds: float, numbers
 def finger_forces(hand: Hand, data: Any) -> jax.Array:
     """[2] N, normal force on each finger, from mjx.Data after a step."""
     contact, rows = data._impl.contact, data._impl
-    geoms = jnp.sort(contact.geom, axis=1)
     force: Any = rows.efc_force
     edges: Any = force[contact.efc_address[:, None] + np.arange(EDGES)]
     normal = jnp.sum(edges, axis=1) * (contact.dist < 0)
-    mine = [jnp.any(jnp.all(geoms[:, None] == pairs[None], axis=-1), axis=1) for pairs in hand.pairs]
-    return jnp.stack([jnp.sum(normal * m) for m in mine])
+    return jnp.stack([jnp.sum(normal * mine) for mine in of_fingers(contact, hand.pairs)])
 
 
 def finger_forces_c(hand: Hand, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:

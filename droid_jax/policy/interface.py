@@ -7,18 +7,19 @@ import itertools
 import mujoco
 import numpy as np
 
-from droid_jax.measure.demonstration import PLANS, Plan, joint_path
+from droid_jax.measure.demonstration import PLANS, joint_path
 from droid_jax.model.scene import Scene
 from droid_jax.policy.control import Interface
 from droid_jax.policy.hand import Hand, hand_of, pads_at
 from droid_jax.policy.task import Task
 
+PLAN = PLANS["A"]  # whose arm pose and hand roll a policy has
 SPEED = (2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61)  # rad/s, Panda: Franka's data sheet
 ROOM = 0.12  # m that the hand may be away from where an opening by the book has it
 WIDEST = 1.2  # rad, of that opening
 
 
-def interface_of(scene: Scene, task: Task, start: np.ndarray, plan: Plan = PLANS["A"]) -> Interface:
+def interface_of(scene: Scene, task: Task, start: np.ndarray) -> Interface:
     """Of the built-in scene.  start: [nq], `DoorEnv.start`.  The base frame is the scene's world."""
     model, hand, arm = scene.model, hand_of(scene), list(scene.joint_dofs)
     fingers = [scene.qpos(name) for name in scene.finger_joints]
@@ -42,7 +43,7 @@ def interface_of(scene: Scene, task: Task, start: np.ndarray, plan: Plan = PLANS
         effort=model.jnt_actfrcrange[model.dof_jntid[arm], 1].copy(),
         stiffness=model.actuator_gainprm[motors, 0].copy(),
         damping=model.dof_damping[arm].copy(),
-        workspace=_workspace(scene, hand, start, plan),
+        workspace=_workspace(scene, hand, start),
         chain=np.array([np.linalg.inv(a) @ b for a, b in itertools.pairwise(links)]),
         pads=shut,
         slides=slides,
@@ -51,9 +52,9 @@ def interface_of(scene: Scene, task: Task, start: np.ndarray, plan: Plan = PLANS
     )
 
 
-def _workspace(scene: Scene, hand: Hand, start: np.ndarray, plan: Plan) -> np.ndarray:
+def _workspace(scene: Scene, hand: Hand, start: np.ndarray) -> np.ndarray:
     """[2, 3] m, lowest and highest corner around the pinch point of an opening by the book, and its start."""
-    path = joint_path(scene, plan, np.linspace(0.0, WIDEST, 25), np.zeros(25))
+    path = joint_path(scene, PLAN, np.linspace(0.0, WIDEST, 25), np.zeros(25))
     points = []
     for arm in [start[scene.joint_qpos], *path]:
         qpos = start.copy()

@@ -202,35 +202,6 @@ def _brax(
         nonlocal latest
         latest = params
 
-    def run(steps: int, restore: Any = None, **hooks: Any) -> Any:
-        return ppo.train(
-            environment=env,
-            num_timesteps=steps,
-            num_envs=config.envs,
-            episode_length=env.task.steps,
-            learning_rate=config.learning_rate,
-            entropy_cost=config.entropy,
-            discounting=config.discount,
-            unroll_length=config.unroll,
-            batch_size=config.batch,
-            num_minibatches=config.minibatches,
-            num_updates_per_batch=config.epochs,
-            normalize_observations=True,
-            reward_scaling=config.reward_scaling,
-            clipping_epsilon=config.clip,
-            gae_lambda=config.gae,
-            network_factory=_networks(config),
-            seed=config.seed + done,
-            num_evals=evaluations_left(config, steps),
-            num_eval_envs=config.eval_envs,
-            deterministic_eval=True,
-            randomization_fn=randomise,
-            wrap_env_fn=wrapped(randomise, config.devices or 1, config.seed),
-            max_devices_per_host=config.devices,
-            restore_params=restore,
-            **hooks,
-        )
-
     with replicated():
         params: Any = None
         if tree is not None:
@@ -238,7 +209,7 @@ def _brax(
             params, best = (from_tree(blank, tree[name]) for name in ("latest", "best"))
         if done < config.steps:
             with contextlib.suppress(_Diverged):  # NaN does not go away again: the best so far stays
-                run(config.steps - done, params, progress_fn=tell, policy_params_fn=keep)
+                _ppo(env, randomise, config, done, params, progress_fn=tell, policy_params_fn=keep)
     if best is None:
         raise ValueError(
             "training ended in NaN or infinite weights: try another --seed "
@@ -246,6 +217,38 @@ def _brax(
         )
     normaliser, actor, _ = best
     return Trained(policy_of(normaliser, actor, layer_sizes(config.hidden), env.interface), tuple(history))
+
+
+def _ppo(env: DoorEnv, randomise: Randomise | None, config: TrainConfig, done: int, restore: Any, **hooks: Any) -> Any:
+    """brax's own function with the settings of `config`, for what is left of its actions after `done`."""
+    steps = config.steps - done
+    return ppo.train(
+        environment=env,
+        num_timesteps=steps,
+        num_envs=config.envs,
+        episode_length=env.task.steps,
+        learning_rate=config.learning_rate,
+        entropy_cost=config.entropy,
+        discounting=config.discount,
+        unroll_length=config.unroll,
+        batch_size=config.batch,
+        num_minibatches=config.minibatches,
+        num_updates_per_batch=config.epochs,
+        normalize_observations=True,
+        reward_scaling=config.reward_scaling,
+        clipping_epsilon=config.clip,
+        gae_lambda=config.gae,
+        network_factory=_networks(config),
+        seed=config.seed + done,
+        num_evals=evaluations_left(config, steps),
+        num_eval_envs=config.eval_envs,
+        deterministic_eval=True,
+        randomization_fn=randomise,
+        wrap_env_fn=wrapped(randomise, config.devices or 1, config.seed),
+        max_devices_per_host=config.devices,
+        restore_params=restore,
+        **hooks,
+    )
 
 
 class _Diverged(Exception):

@@ -14,6 +14,12 @@ LEARNED = 0.95
 BLOWN_UP = "the simulation blew up"  # in `Trials.stopped`: says nothing of the policy
 
 
+def wilson(hits: int, count: int, level: float = 0.95) -> tuple[float, float]:
+    """Interval of a share, `hits` of `count`.  Wilson, JASA 1927.  ValueError for a count of 0."""
+    span = scipy.stats.binomtest(hits, count).proportion_ci(level, method="wilson")
+    return float(span.low), float(span.high)
+
+
 @dataclass(frozen=True, eq=False)
 class Trials:
     """One entry for each trial, N of them.
@@ -47,11 +53,10 @@ class Trials:
         return float(np.mean(self.success[self.counted]))
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
-        """Of the success rate.  Wilson, JASA 1927.  ValueError where all trials blew up."""
+        """Of the success rate (`wilson`).  ValueError where all trials blew up."""
         self.check()
         success = self.success[self.counted]
-        span = scipy.stats.binomtest(int(np.sum(success)), len(success)).proportion_ci(level, method="wilson")
-        return float(span.low), float(span.high)
+        return wilson(int(np.sum(success)), len(success), level)
 
     def to_json(self) -> dict[str, Any]:
         """As plain data, angles in degrees; trial by trial and in sum.

@@ -11,7 +11,7 @@ from droid_jax.report import gap_figures, gap_maps, gap_torques
 from droid_jax.report.drawings import Drawing, drawing
 from droid_jax.report.gap_folder import Gap
 from droid_jax.report.gap_maps import Cell
-from droid_jax.report.gap_words import ROLES, role_words
+from droid_jax.report.gap_words import ROLES, largest_shifts, role_words
 
 CURVE = ("unexplained", "partly explained")  # verdicts that leave something to look at
 
@@ -47,7 +47,7 @@ def draw_gap(gap: Gap) -> dict[str, list[Drawing]]:
         add("place", "cells", "By joint and phase", fitted, gap_maps.cell_maps, *cells)
     if gap_maps.state_bins(cells[0]):
         add("place", "state", "Over the state of the motion", fitted, gap_maps.state_bars, *cells)
-    if extended and gap_figures.largest_shifts(found["shifts"]):
+    if extended and largest_shifts(found["shifts"]):
         add(
             "shifts", "shifts", "What the missing effect had bent",
             "Base parameters, fitted again together with what was missing: how far they moved, in units of the "

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from droid_jax.report.gap_words import quantity
+from droid_jax.report.gap_words import deviations, largest_shifts, quantity
 from droid_jax.report.style import AFTER, BEFORE, MEASURED, MUTED, WIDE, legend, panel_columns, styled
 from droid_jax.report.words import label, number
 
@@ -95,7 +95,7 @@ def base_shifts(shifts: Sequence[Mapping[str, Any]], width: float = WIDE) -> Fig
 
     shifts: name, unit, before, after, deviation_before; the MOST_SHIFTS largest are drawn.
     """
-    drawn = largest_shifts(shifts)
+    drawn = largest_shifts(shifts)[:MOST_SHIFTS]
     figure = Figure(figsize=(width, max(1.6, 0.8 + 0.38 * len(drawn))), layout="constrained")
     axes = figure.add_subplot()
     axes.axvspan(-1.645, 1.645, color=BEFORE, alpha=0.13, linewidth=0, label="90 % interval of the base model")
@@ -115,18 +115,6 @@ def base_shifts(shifts: Sequence[Mapping[str, Any]], width: float = WIDE) -> Fig
     axes.grid(axis="y", visible=False)
     legend(figure, axes, width, columns=3)
     return figure
-
-
-def largest_shifts(shifts: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Those with a known shift, the largest first, MOST_SHIFTS at most."""
-    known = [s for s in shifts if np.isfinite(deviations(s))]
-    return sorted(known, key=lambda s: -abs(deviations(s)))[:MOST_SHIFTS]
-
-
-def deviations(shift: Mapping[str, Any]) -> float:
-    """A shift in deviations; NaN where one of its numbers is not known."""
-    before, after, deviation = as_floats([shift[k] for k in ("before", "after", "deviation_before")])
-    return float((after - before) / deviation) if deviation > 0 else float("nan")
 
 
 def _shift_label(shift: Mapping[str, Any]) -> str:

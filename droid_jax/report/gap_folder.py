@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.report.gap_parts import PARTS, Parts, parts_of, split_of
+from droid_jax.files import GAP, GAP_TRACES
+from droid_jax.report.gap_parts import PARTS, Parts, parts_of, said_split
 from droid_jax.report.reading import Reader
 
 VERDICTS = ("none", "named", "tie", "partly explained", "unexplained", "fit not converged")
 ROLES = ("fit", "confirm", "sealed")
-_READ = Reader("gap")
+_READ = Reader("gap --again")  # gap.json comes last: once it is there, the command takes the run for whole
 _NUMBER = (int, float)
 _MAYBE = (int, float, type(None))
 _CELL = {"variable": str, "where": str, "gap": _MAYBE, "p": _MAYBE, "found": bool}
@@ -43,6 +44,7 @@ _SCHEMA = {
     "trends": [_TREND],
     **{"units": str, "versions": dict, "device": str, "setup": dict},
 }
+_ABOUT = {"what": str, "mark": str, "confused_with": [str]}
 _SPLIT = {"by": str, "limits": str}
 _LINES = ("measured", "scatter", "before", "after")
 
@@ -113,6 +115,11 @@ class Gap:
         return [*self.found["amplitudes"], *self.found.get("shapes", [])]
 
     @property
+    def about(self) -> Mapping[str, Mapping[str, Any]]:
+        """What the library says of the effects of the answer, by their names there; an older search does not tell."""
+        return self.found.get("about", {})
+
+    @property
     def parts(self) -> Parts:
         """What is said of how the recordings were divided."""
         return parts_of(self.found)
@@ -120,7 +127,7 @@ class Gap:
     @property
     def limits(self) -> str:
         """What cannot be concluded, in words; empty where nothing is to be said."""
-        return split_of(self.found)["limits"]
+        return said_split(self.found)["limits"]
 
     @property
     def sheets(self) -> list[tuple[tuple[str, ...], Mapping[str, Any]]]:
@@ -152,26 +159,29 @@ def hidden_in(found: Mapping[str, Any]) -> list[str]:
 
 def has_gap(folder: Path) -> bool:
     """Whether a folder holds, or should hold, a search for a missing effect."""
-    return any((folder / name).exists() for name in ("gap.json", "gap.npz"))
+    return any((folder / name).exists() for name in (GAP, GAP_TRACES))
 
 
-def read_gap(folder: Path) -> Gap:
+def read_gap(folder: str | Path) -> Gap:
     """Load and check; ValueError names what is missing or broken."""
-    found = _READ.json(folder / "gap.json")
-    _READ.check(found, _SCHEMA, "gap.json")
-    _READ.check(split_of(found), _SPLIT, "gap.json, 'split'")
+    folder = Path(folder)
+    path = folder / GAP
+    found = (_READ if path.exists() else Reader("gap")).json(path)
+    _READ.check(found, _SCHEMA, GAP)
+    _READ.check(said_split(found), _SPLIT, "gap.json, 'split'")
     _READ.check(found.get("shapes", []), [_SIZE], "gap.json, 'shapes'")
+    _READ.check(found.get("about", {}), {str: _ABOUT}, "gap.json, 'about'")
     for fault in _faults(found):
         raise _READ.fault(f"gap.json, {fault}")
     roles = [r for r in ROLES if r in found["gaps"]]
-    return Gap(folder, found, _traces(folder / "gap.npz", roles, found["phases"]))
+    return Gap(folder, found, _traces(folder / GAP_TRACES, roles, found["phases"]))
 
 
 def _faults(found: Mapping[str, Any]) -> Iterator[str]:
     """What the schema cannot say."""
     if found["verdict"] not in VERDICTS:
         yield f"'verdict' must be one of {', '.join(VERDICTS)}, got {found['verdict']!r}"
-    by = split_of(found)["by"]
+    by = said_split(found)["by"]
     if by not in PARTS:
         yield f"'split', 'by' must be one of {', '.join(PARTS)}, got {by!r}"
     for name in ("remainder", "explained"):  # older files have none

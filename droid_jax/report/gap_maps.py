@@ -16,12 +16,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
 from droid_jax.report.gap_figures import LOGARITHMIC, U_LABEL, as_floats, scale
-from droid_jax.report.gap_words import joint_phase, span_words, variable_words
+from droid_jax.report.gap_words import TIME, joint_phase, span_words, variable_words
 from droid_jax.report.style import AFTER, BEFORE, LINE, MUTED, WIDE, panel_columns, panel_grid, styled
 from droid_jax.report.words import label, number
 
 Cell = Mapping[str, Any]
-TIME = "joint x phase"
 DIRECTION, POSITION, LOAD = "direction of ", "position of ", "load of "  # a joint
 _BLANK: dict[str, Any] = {"facecolor": "none", "edgecolor": LINE, "hatch": "////", "linewidth": 0}
 

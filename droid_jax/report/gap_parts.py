@@ -67,11 +67,11 @@ PARTS = {
 UNSAID = {"by": "recordings", "limits": ""}  # where gap.json does not say
 
 
-def split_of(found: Mapping[str, Any]) -> Mapping[str, Any]:
+def said_split(found: Mapping[str, Any]) -> Mapping[str, Any]:
     """ "split" of gap.json."""
     return found.get("split", UNSAID)
 
 
 def parts_of(found: Mapping[str, Any]) -> Parts:
     """The words for a gap.json."""
-    return PARTS[split_of(found)["by"]]
+    return PARTS[said_split(found)["by"]]

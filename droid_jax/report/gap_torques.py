@@ -12,8 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from droid_jax.report.gap_figures import as_floats
-from droid_jax.report.gap_maps import TIME, Cell
-from droid_jax.report.gap_words import OF, joint_phase, variable_words
+from droid_jax.report.gap_maps import Cell
+from droid_jax.report.gap_words import OF, TIME, joint_phase, variable_words
 from droid_jax.report.style import AFTER, BEFORE, LINE, MEASURED, WIDE, label_bottom, legend, panel_columns, styled
 from droid_jax.report.torque_figures import fill, shade, thin
 from droid_jax.report.words import label

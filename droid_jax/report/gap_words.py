@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from droid_jax.files import EXTENDED
 from droid_jax.report.gap_folder import Gap
 from droid_jax.report.gap_parts import parts_of
 from droid_jax.report.words import counted, label, listed, number, percent, was
@@ -14,6 +16,7 @@ DECISIVE = 6.0  # standardised difference from which ten repeats decide between 
 TOLD = 0.8  # share of what is left on the confirming motion: where more is left beyond the fit's uncertainty, no word
 OTHER = "the other demonstration"  # as the search calls what confirms, whatever it is
 OF = " of "  # between what is said of a joint and its name
+TIME = "joint x phase"  # the variable of the cells that have a joint and a phase of the motion
 BETWEEN = " + "  # between the effects in a model's name
 ROLES = {"fit": "fitted", "confirm": "confirming", "sealed": "sealed"}
 
@@ -70,6 +73,20 @@ def gap_summary(gap: Gap) -> list[str]:
     sentences = [_fitted(gap), _significance(gap), _size(gap), _allowed(gap), *_added(gap.sizes)]
     said = [*sentences, *_trends(gap.found), gap.limits]
     return [*(s for s in said if s), _next(gap)]
+
+
+def largest_shifts(shifts: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Entries of "shifts" with a known shift, the largest first."""
+    known = [s for s in shifts if math.isfinite(deviations(s))]
+    return sorted(known, key=lambda s: -abs(deviations(s)))
+
+
+def deviations(shift: Mapping[str, Any]) -> float:
+    """A shift in deviations; NaN where one of its numbers is not known."""
+    before, after, deviation = (shift[k] for k in ("before", "after", "deviation_before"))
+    if None in (before, after, deviation) or not deviation > 0:
+        return math.nan
+    return (after - before) / deviation
 
 
 def settings(gap: Gap) -> list[str]:
@@ -246,7 +263,7 @@ def _kept(gap: Gap, named: str) -> str:
 
 
 def _file(gap: Gap) -> str:
-    return " (extended.json)" if (gap.folder / "extended.json").is_file() else ""
+    return f" ({EXTENDED})" if (gap.folder / EXTENDED).is_file() else ""
 
 
 def _separate(gap: Gap) -> str:
@@ -275,7 +292,7 @@ def _where(gap: Gap) -> str:
     found = [c for c in cells if c["found"] or not gap.parts.repeated]
     if not found:
         return "(no single place stands out)"
-    over_time = [c for c in found if c["variable"] == "joint x phase"]
+    over_time = [c for c in found if c["variable"] == TIME]
     kinds = [kind for kind in (over_time, _others(found)) if kind] or [found]
     noise = "" if gap.parts.repeated else ", noise included"
     return f"where the most is left{noise}: " + listed(
@@ -289,7 +306,7 @@ def _others(found: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
 
 def place_words(cell: Mapping[str, Any]) -> str:
     """ "joint 2 in opening, from 2.0 s on", "object angle 0.10 to 0.20 rad"."""
-    if cell["variable"] != "joint x phase":
+    if cell["variable"] != TIME:
         words = variable_words(cell["variable"], cell["where"])
         return f"{words[:1].lower()}{words[1:]} {span_words(cell['where'])}"
     joint, phase, start = joint_phase(cell["where"])

@@ -21,11 +21,28 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
+from droid_jax.files import (
+    CONFIG,
+    EXTENDED,
+    EXTENDED_MJCF,
+    FIT,
+    FITTED,
+    GAP,
+    GAP_TRACES,
+    GAUSSIAN,
+    HISTORY_TABLE,
+    LAST_FILES,
+    POLICY,
+    SAMPLES,
+    TRACES,
+    TRAINING,
+    TRANSFER,
+)
 from droid_jax.report.drawings import draw, frame_rows
 from droid_jax.report.export import data_uri
-from droid_jax.report.files import FITTED, LAST_FILES, POLICY, TRAINING, TRANSFER
 from droid_jax.report.gap_drawings import draw_gap
 from droid_jax.report.gap_folder import Gap, has_gap, read_gap
+from droid_jax.report.gap_marks import marks
 from droid_jax.report.gap_tables import groups
 from droid_jax.report.gap_words import (
     DECISIVE,
@@ -59,25 +76,25 @@ from droid_jax.report.words import (
 from droid_jax.storage import write_text
 
 _DOWNLOADS = (
-    ("gaussian.json", "the Gaussian of the model's parameters, for training"),
-    ("extended.json", "the extended model: effects, values and Gaussian, for fits and training"),
-    ("extended.xml", "the extended model as MJCF, as far as MJCF has words for it"),
+    (GAUSSIAN, "the Gaussian of the model's parameters, for training"),
+    (EXTENDED, "the extended model: effects, values and Gaussian, for fits and training"),
+    (EXTENDED_MJCF, "the extended model as MJCF, as far as MJCF has words for it"),
     (FITTED, "the scene with the fitted values"),
-    ("fit.json", "every number of this page"),
-    ("samples.csv", "parameter sets drawn from the fitted Gaussian"),
-    ("history.csv", "the search, generation by generation"),
-    ("traces.npz", "torques over time"),
-    ("config.json", "how the run was set up"),
+    (FIT, "every number of this page"),
+    (SAMPLES, "parameter sets drawn from the fitted Gaussian"),
+    (HISTORY_TABLE, "the search, generation by generation"),
+    (TRACES, "torques over time"),
+    (CONFIG, "how the run was set up"),
     (POLICY, "the policy: python -m droid_jax.run export makes it ready for a robot"),
     (TRAINING, "how the policy was trained"),
     (TRANSFER, "every trial of the policy"),
-    ("gap.json", "the search for a missing effect: every number"),
-    ("gap.npz", "the search for a missing effect: torques over time"),
+    (GAP, "the search for a missing effect: every number"),
+    (GAP_TRACES, "the search for a missing effect: torques over time"),
 )
 
 
 def write_report(run: Path) -> Path:
-    """Write RUN/report.html and RUN/figures/ from the files in RUN; returns the page's path.
+    """Write RUN/report.html, and figures/ of the folder of each part, from the files in RUN; returns the page's path.
 
     Raises ValueError that names the file when a required one is missing or broken.
     """
@@ -188,6 +205,7 @@ def _search(gap: Gap) -> dict[str, Any]:
         "answer": readable(gap.found["sentence"], gap.found),
         "gap_summary": gap_summary(gap),
         "gap_drawings": draw_gap(gap),
+        "marks": marks(gap),
         "settings": settings(gap),
         "candidates": groups(gap.found),
         "roles": ROLES,

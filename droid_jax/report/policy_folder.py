@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from droid_jax.files import FILMS, TRAINING, TRANSFER
 from droid_jax.policy.trials import BLOWN_UP
-from droid_jax.report.files import FILMS, TRAINING, TRANSFER
 from droid_jax.report.reading import Reader
 
 _READ = Reader("train")

@@ -29,7 +29,6 @@ def policy_summary(trained: Trained, gap: Gap | None = None, doubt: str = "") ->
     training = trained.training
     history = training["history"]
     known = training["setup"]["fit"] is not None
-    own = known and not training["stand_in"]
     method = METHODS[training["setup"]["method"] if known else "prior"]
     sentences = [f"A policy was trained on {method}{_with(training['effects'])}."]
     if history:
@@ -46,9 +45,16 @@ def policy_summary(trained: Trained, gap: Gap | None = None, doubt: str = "") ->
                 "finite numbers any more: another --seed may do better."
             )
     sentences += [_tried(where, found, training["task"]) for where, found in trained.trials.items()]
-    if own and trained.trials:
-        sentences.append("The fit is of your own recordings: the stand-in robot is another one, and says little of it.")
-    return [*sentences, doubt or _next(trained, own, gap)]
+    if trained.trials and (other := another_robot(training)):
+        sentences.append(other)
+    return [*sentences, doubt or _next(trained, gap)]
+
+
+def another_robot(training: Mapping[str, Any]) -> str:
+    """What trials on the stand-in robot do not tell where another one was fitted, of training.json; empty elsewhere."""
+    if training["setup"]["fit"] is None or training["stand_in"]:
+        return ""
+    return "The fit is of your own recordings: the stand-in robot is another one, and says little of it."
 
 
 def _with(effects: list[str]) -> str:
@@ -68,7 +74,7 @@ def _tried(where: str, found: Mapping[str, Any], task: Mapping[str, Any]) -> str
     )
 
 
-def _next(trained: Trained, own: bool, gap: Gap | None) -> str:
+def _next(trained: Trained, gap: Gap | None) -> str:
     folder = shlex.quote(str(trained.folder))
     longer = "It has not learned the task in simulation yet: train longer (--steps), or with another --seed."
     if trained.transfer is None:
@@ -78,7 +84,7 @@ def _next(trained: Trained, own: bool, gap: Gap | None) -> str:
         return f"Next: python -m droid_jax.run export {folder}, and docs/policy-on-a-robot.md."
     if trained.transfer["simulation"]["success_rate"] < ENOUGH:
         return longer
-    if own:
+    if another_robot(trained.training):
         return "It works in simulation and not on a robot that it was not fitted to, which was to be expected."
     where = "It works in simulation and not on the stand-in robot"
     held = trained.training["effects"]

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.report.files import FILMS, REPLAY, REPLAY_FILM
+from droid_jax.files import CONFIG, CORRELATION, DISTRIBUTION, FILMS, FIT, HISTORY, REPLAY, REPLAY_FILM, TRACES
 from droid_jax.report.reading import Reader
 
 _READ = Reader("identify")
@@ -83,7 +83,7 @@ class Run:
 
 def has_run(folder: Path) -> bool:
     """Whether a folder holds, or should hold, an identification beside something else."""
-    return (folder / "fit.json").exists()
+    return (folder / FIT).exists()
 
 
 def read_run(run: Path) -> Run:
@@ -91,21 +91,21 @@ def read_run(run: Path) -> Run:
     run = Path(run)
     if not run.is_dir():
         raise _READ.fault(f"there is no folder {run}")
-    config, fit = _READ.json(run / "config.json"), _READ.json(run / "fit.json")
-    _READ.need(config, ("preset", "scene", "engine", "recordings", "seed", "stand_in"), "config.json")
-    _READ.need(fit, ("parameters", "cost", "gap", "stop", "rule"), "fit.json")
+    config, fit = _READ.json(run / CONFIG), _READ.json(run / FIT)
+    _READ.need(config, ("preset", "scene", "engine", "recordings", "seed", "stand_in"), CONFIG)
+    _READ.need(fit, ("parameters", "cost", "gap", "stop", "rule"), FIT)
     for i, p in enumerate(fit["parameters"]):
         _READ.need(p, _PARAMETER_KEYS, f"fit.json, parameter {p.get('name', i)!r}")
     for name, gap in fit["gap"].items():
         _READ.need(gap, ("before", "after", "per_joint_before", "per_joint_after"), f"fit.json, gap {name!r}")
     missing = []
     distribution = None
-    if not (run / "distribution.npz").is_file():
+    if not (run / DISTRIBUTION).is_file():
         missing.append(
             "distribution.npz is not there: the initial and the fitted Gaussian are not compared by samples."
         )
     else:
-        distribution = _READ.arrays(run / "distribution.npz", _ARRAYS["distribution"])
+        distribution = _READ.arrays(run / DISTRIBUTION, _ARRAYS["distribution"])
     frames = tuple(sorted((run / "frames").glob("*.png")))
     film = run / FILMS / REPLAY_FILM
     if not frames:
@@ -114,9 +114,9 @@ def read_run(run: Path) -> Run:
         folder=run,
         config=config,
         fit=fit,
-        traces=_traces(run / "traces.npz", list(fit["gap"])),
-        history=_READ.arrays(run / "history.npz", _ARRAYS["history"]),
-        correlation=_READ.arrays(run / "correlation.npz", _ARRAYS["correlation"]),
+        traces=_traces(run / TRACES, list(fit["gap"])),
+        history=_READ.arrays(run / HISTORY, _ARRAYS["history"]),
+        correlation=_READ.arrays(run / CORRELATION, _ARRAYS["correlation"]),
         distribution=distribution,
         frames=frames,
         film=film if film.is_file() else None,

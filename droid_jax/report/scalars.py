@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import importlib.util
 from collections.abc import Callable, Iterator
 from numbers import Real
 from pathlib import Path
 from typing import Any
+
+from droid_jax.errors import needs
 
 FOLDER = "tensorboard"
 _COUNTS = ("generation", "iteration", "step")  # what a progress value counts with
@@ -16,10 +17,8 @@ _COUNTS = ("generation", "iteration", "step")  # what a progress value counts wi
 
 def needs_writer(wanted: bool) -> None:
     """ValueError that says what to install where scalars are wanted and nothing can write them."""
-    if wanted and importlib.util.find_spec("tensorboardX") is None:
-        raise ValueError(
-            "--tensorboard needs tensorboardX: in the checkout, pip install -c constraints.txt -e '.[tensorboard]'"
-        )
+    if wanted:
+        needs("--tensorboard needs", "tensorboard", "tensorboardX")
 
 
 @contextlib.contextmanager

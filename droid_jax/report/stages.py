@@ -10,12 +10,12 @@ import json
 from pathlib import Path
 from typing import Any
 
-from droid_jax.report.files import EXTENDED, GAUSSIAN, LAST_FILES
+from droid_jax.files import EXTENDED, GAUSSIAN, LAST_FILES, SETUP
 
 
 def setup(folder: Path) -> dict[str, Any]:
     """setup.json of a run's folder; empty where there is none that can be read."""
-    return told_in(folder / "setup.json")
+    return told_in(folder / SETUP)
 
 
 def told_in(path: Path) -> dict[str, Any]:

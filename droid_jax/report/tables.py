@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from droid_jax.errors import lacking
+from droid_jax.files import HISTORY_TABLE, SAMPLES
 from droid_jax.report.reading import Reader
 from droid_jax.report.stages import needs_whole
 
@@ -31,16 +32,14 @@ def frames(folder: str | Path) -> Frames:
 
     Raises ImportError where pandas is not installed, ValueError where the folder holds no whole fit.
     """
-    if importlib.util.find_spec("pandas") is None:
-        raise ImportError(
-            "droid_jax.frames needs pandas: in the checkout, pip install -c constraints.txt -e '.[frames]'"
-        )
+    if told := lacking("droid_jax.frames needs", "frames", "pandas"):
+        raise ImportError(told)
     import pandas as pd
 
     folder = Path(folder)
-    at = next((f for f in (folder, folder / "identify") if (f / "samples.csv").is_file()), folder)
+    at = next((f for f in (folder, folder / "identify") if (f / SAMPLES).is_file()), folder)
     needs_whole(at)
     try:
-        return Frames(pd.read_csv(at / "samples.csv"), pd.read_csv(at / "history.csv", index_col="generation"))
+        return Frames(pd.read_csv(at / SAMPLES), pd.read_csv(at / HISTORY_TABLE, index_col="generation"))
     except (OSError, ValueError) as error:
         raise Reader("identify").fault(f"{at} holds no tables of a fit ({error})") from None

@@ -49,7 +49,7 @@ def was(count: int) -> str:
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """A number with three significant digits, a real minus sign, and a dash where there is none."""
+    """A number with `digits` significant digits, a real minus sign, and a dash where there is none."""
     if value is None or not math.isfinite(value):
         return "–"
     size = abs(value)

@@ -31,6 +31,6 @@ scenes, door_motion   where
 draws, cases, make    what is hidden, and how it is recorded
 answers               which names are right, and which ties are declared
 search, baselines     the part that knows nothing, and simpler methods on the same base fit
-score                 rates and their intervals
+score, rates, table   what is right of each answer, the rates and their intervals, and these as a table
 units, marks, forms, limits   what a hidden effect leaves in the torques, whose it could be, and whether it is seen
 """

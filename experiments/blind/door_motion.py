@@ -21,8 +21,8 @@ POSE_BETWEEN = (1.24, -0.87, -0.94, -2.14, -2.17, 2.65, -0.87)  # rad, the arm n
 
 def _plan(name: str, pose: tuple[float, ...], roll: int, moves: tuple[tuple[str, float, float], ...]) -> Plan:
     """Approach, grasp, then (phase, seconds, degrees of the door at its end)."""
-    reach = (Segment("approach", 0.8, 0.0, 0.0, OPEN), Segment("grasp", 0.5, 0.0, 0.0, CLOSED))
-    return Plan(name, pose, roll, (*reach, *(Segment(p, s, a * _DEG, 0.0, CLOSED) for p, s, a in moves)))
+    reach = (Segment("approach", 0.8, 0.0, OPEN), Segment("grasp", 0.5, 0.0, CLOSED))
+    return Plan(name, pose, roll, (*reach, *(Segment(p, s, a * _DEG, CLOSED) for p, s, a in moves)))
 
 
 PLANS = (

@@ -91,9 +91,10 @@ def limit_of(where: Ground, power: Power, forms: Forms, effect: Applied) -> dict
     """One effect's entry: limit, unit, size worth naming, and how far it is from its library form."""
     hidden = HIDDEN[effect.name]
     largest, size = SAFE * hidden.typical[1], hidden.typical[0]
-    limit, added = None, np.zeros(0)
+    limit, added, recorded = None, np.zeros(0), size
     for _ in range(RECORDED):
-        added = where.hidden(replace(effect, amplitude=size))
+        recorded = size
+        added = where.hidden(replace(effect, amplitude=recorded))
         limit = power.limit(added, largest)
         wanted = largest if limit is None else min(TYPICAL * limit, largest)
         if max(wanted / size, size / wanted) <= NEAR:
@@ -101,7 +102,7 @@ def limit_of(where: Ground, power: Power, forms: Forms, effect: Applied) -> dict
         size = wanted
     common = added.mean(axis=0)
     _, free = where.left(TYPICAL * (limit or largest) * common)
-    return {"limit": limit, "unit": hidden.unit, "recorded_at": size, **forms.of(effect, common, free)}
+    return {"limit": limit, "unit": hidden.unit, "recorded_at": recorded, **forms.of(effect, common, free)}
 
 
 def scene_limits(

@@ -88,8 +88,8 @@ class Ground:
         return column - self.slopes @ step, (step > low + 1e-6) & (step < high - 1e-6)
 
     def added(self, questions: tuple[Question, ...]) -> np.ndarray:
-        """[K, M] what the library's amplitudes add, per unit of each."""
-        return marks(self.evidence, self.model.values, questions)
+        """[K, M] what the library's amplitudes add, per unit of each; 0 where a replay blows up, as in the search."""
+        return np.nan_to_num(marks(self.evidence, self.model.values, questions))
 
     def record(self, hidden: tuple[Applied, ...], repeats: int) -> Recording:
         """The same robot and the same noise, with something hidden."""

@@ -22,12 +22,12 @@ from droid_jax.gap.refit import Model, refit
 from droid_jax.identify.refine import RefineConfig
 from droid_jax.measure.formats import load
 from droid_jax.measure.hidden import Applied
-from droid_jax.storage import write_json
+from droid_jax.storage import file_sha256, write_json
 from experiments.blind.answers import right
 from experiments.blind.quiet import settled
 from experiments.blind.scenes import ROLES
-from experiments.blind.score import digest, oracle_of
-from experiments.blind.search import Bench
+from experiments.blind.score import oracle_of
+from experiments.blind.search import FAILED, Bench
 
 FROM_TRUTH = RefineConfig(iterations=12, hops=0, spreads=0)
 SIZES = np.geomspace(3e-3, 0.8, 12)  # of the way from neutral to a bound
@@ -99,9 +99,9 @@ def oracle_all(runs: Path, chosen: Iterable[str], bench: Bench, tell: Callable[[
                 continue
             try:
                 found = oracle(runs / "cases" / name, truth, json.loads(known.read_text()), bench)
-            except ValueError as error:
+            except FAILED as error:
                 found = {"error": str(error)}
-            write_json(path, {"of": digest(known), **found})
+            write_json(path, {"of": file_sha256(known), **found})
         count += 1
         left = ", ".join(f"U {role} {u:.3g}" for role, u in found.get("gaps", {}).items())
         tell(f"{name}: {found.get('error', found.get('model'))} {left}")

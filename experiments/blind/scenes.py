@@ -19,6 +19,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from droid_jax.gap.candidates import steers
 from droid_jax.measure.demonstration import minimum_jerk
 from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.model.arm import panda_arm_scene
@@ -85,9 +86,8 @@ class Setting:
 
     def effects(self, without: Iterable[str] = ()) -> tuple[Effect, ...]:
         """The library's effects for this scene, less those named; a prescribed motion has no servo to be wrong."""
-        left_out = {*without, *(("servo_gain",) if self.prescribed else ())}
-        found = (e for e in library(self.scene) if e.name not in left_out)
-        return tuple(e for e in found if not (self.prescribed and (e.command or e.servo)))
+        found = (e for e in library(self.scene) if e.name not in {*without})
+        return tuple(e for e in found if not (self.prescribed and steers(e)))
 
 
 def setting(name: str, cache: Path | None = None) -> Setting:

@@ -16,7 +16,7 @@ from benchmarks.common import CODE
 from benchmarks.sharing import claimed
 from droid_jax.compare.cost import Cost
 from droid_jax.gap.anew import base_fit
-from droid_jax.gap.case import Case, GapConfig, make_case
+from droid_jax.gap.case import Case, make_case
 from droid_jax.gap.evidence import Evidence, evidence
 from droid_jax.gap.floor import finer, numerical_floor
 from droid_jax.gap.refit import Model, intervals
@@ -24,9 +24,13 @@ from droid_jax.gap.verdict import Verdict
 from droid_jax.gap.workflow import find
 from droid_jax.measure.formats import load
 from droid_jax.measure.recording import Recording
-from droid_jax.storage import finite, write_json
+from droid_jax.storage import write_json
 from experiments.blind.baselines import baselines
 from experiments.blind.scenes import ROLES, Setting, setting
+from experiments.trials import trial_json
+
+# What is kept as the result of a case that fails; running out of memory is none, and a later start tries it again.
+FAILED = (ValueError, ArithmeticError)
 
 
 @dataclass
@@ -34,7 +38,6 @@ class Bench:
     """Settings and compiled replays that later cases use again."""
 
     settings: dict[str, Setting] = field(default_factory=dict)
-    config: GapConfig | None = None
     compiled: dict[str, Case] = field(default_factory=dict)
     fine: dict[str, Cost | None] = field(default_factory=dict)
 
@@ -53,7 +56,7 @@ class Bench:
         given = {role: recordings.get(role, recordings["fit"]) for role in ROLES}
         key = ", ".join((scene, *sorted(recordings)))
         if key not in self.compiled:
-            self.compiled[key] = make_case(where.scene, where.base, where.effects(), **given, config=self.config)
+            self.compiled[key] = make_case(where.scene, where.base, where.effects(), **given)
         known = self.compiled[key]
         of = {role: _again(known.judged[role], recording) for role, recording in recordings.items()}
         kept = {e.name for e in where.effects(without)}
@@ -97,13 +100,13 @@ def search_case(folder: Path, bench: Bench) -> dict[str, Any]:
         model = watch("base", lambda: base_fit(case, silent))
         floor = watch("floor", lambda: bench.floor(told["scene"], case, model, recordings["fit"]))
         verdict = watch("find", lambda: find(case, model, floor))
-    except (ValueError, ArithmeticError) as error:
+    except FAILED as error:
         return {**result, "verdict": "error", "error": str(error), "seconds": watch.seconds}
     result |= describe(case, verdict)
     first = verdict.screens[0] if verdict.screens else None
     try:
         result["baselines"] = watch("baselines", lambda: baselines(case, model, first, recordings))
-    except (ValueError, ArithmeticError) as error:  # what they are compared with stands
+    except FAILED as error:  # what they are compared with stands
         result["baselines_failed"] = str(error)
     return {**result, "seconds": watch.seconds}
 
@@ -129,11 +132,7 @@ def describe(case: Case, verdict: Verdict) -> dict[str, Any]:
         "shapes": {
             name: float(verdict.model.values[space.index(name)]) for part in verdict.model.parts for name in part.shapes
         },
-        "trials": [
-            {"name": t.name, "gap_fit": t.gap_fit, "gap_confirm": finite(t.gap_confirm), "p": t.p, "chosen": t.chosen}
-            | {"rivals": list(t.rivals), "reasons": list(t.reasons)}
-            for t in verdict.trials
-        ],
+        "trials": [trial_json(trial) for trial in verdict.trials],
     }
 
 

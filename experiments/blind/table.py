@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.blind.score import ANSWERED, CLOSED, NAMEABLE, NAMING, closing, rate
+from experiments.blind.rates import ANSWERED, CLOSED, NAMEABLE, NAMING, closing, rate
 
 Case = Mapping[str, Any]
 Chosen = Callable[[Case], bool]
@@ -74,9 +74,13 @@ def _false(case: Case) -> bool:
 def _rows() -> Iterator[tuple[str, str, Chosen, Chosen]]:
     """What is counted, what was asked for, of which cases, and which of them count."""
     at_limit, above = _kind("single", factors=(1.0,)), _kind("single", factors=(3.0, 10.0))
+    ten, three = _kind("single", factors=(10.0,)), _kind("single", factors=(3.0,))
+    own = "by its own name, not by a declared equivalent's alone"
     yield "nothing hidden: an alarm", "under 1 %", _answered, lambda c: c["verdict"] != "none"
-    yield "one at 10 times its limit: named, alone or in a tie", "95 %", _kind("single", factors=(10.0,)), _named
-    yield "one at 3 times: named, alone or in a tie", "90 %", _kind("single", factors=(3.0,)), _named
+    yield "one at 10 times its limit: named, alone or in a tie", "95 %", ten, _named
+    yield f"one at 10 times: the same, {own}", "", ten, lambda c: c["own"]
+    yield "one at 3 times: named, alone or in a tie", "90 %", three, _named
+    yield f"one at 3 times: the same, {own}", "", three, lambda c: c["own"]
     yield "one at its limit: named, alone or in a tie", "", at_limit, _named
     yield "one at its limit: detected", "50 %", at_limit, lambda c: c["verdict"] in (*NAMING, "unexplained")
     yield "one at 3 or 10 times: named alone, a remainder or not", "", above, lambda c: c["alone"]
@@ -113,7 +117,7 @@ def _judged_by_bic(case: Case) -> bool:
     return _hidden(case) and bool(case["baselines"])
 
 
-def _share(cases: Sequence[Case], hit: Chosen) -> str:
+def _share(cases: Sequence[Any], hit: Callable[[Any], bool]) -> str:
     """ "22 of 25 (70 to 96 %)"; empty where there is no case."""
     found = rate(cases, hit)
     if found is None:
@@ -138,5 +142,4 @@ def _minutes(judged: Sequence[Mapping[str, Any]], scene: str) -> str:
 
 
 def _amplitudes(judged: Sequence[Mapping[str, Any]], scene: str) -> str:
-    inside = [i for c in judged if c["scene"] == scene and _named(c) for i in c["coverage"]]
-    return _share([{"inside": i} for i in inside], lambda c: c["inside"]) or "-"
+    return _share([i for c in judged if c["scene"] == scene and _named(c) for i in c["coverage"]], bool) or "-"

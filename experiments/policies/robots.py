@@ -8,6 +8,7 @@ from dataclasses import asdict
 from typing import Any
 
 from benchmarks.sharing import claimed
+from droid_jax.files import GAUSSIAN
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.gaussian import load as load_gaussian
 from droid_jax.identify.pipeline import identify
@@ -16,7 +17,6 @@ from droid_jax.model.door import door_nuisances, door_space
 from droid_jax.model.door_scene import door_scene
 from droid_jax.policy.door_env import DoorEnv
 from droid_jax.policy.transfer import TransferConfig, TrialRobot, stand_in
-from droid_jax.report.files import GAUSSIAN
 from droid_jax.storage import write_json
 from experiments.identify_suite import describe, recordings, settings
 from experiments.policies.cases import TIMESTEP, Options

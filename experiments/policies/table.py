@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import scipy.stats
 
-from droid_jax.policy.trials import BLOWN_UP
+from droid_jax.policy.trials import BLOWN_UP, wilson
 
 METHODS = ("prior", "mean", "fitted")
 PLACES = ("simulation", "stand_in")
@@ -29,18 +29,27 @@ def summed_up(cases: Sequence[Mapping[str, Any]], settings: Sequence[str]) -> di
     table: dict[str, Any] = {}
     for name in settings:
         of = {m: [c for c in cases if c["setting"]["name"] == name and c["method"] == m] for m in METHODS}
-        columns = {m: {place: column(own, place) for place in (*PLACES, SLIPPERY)} for m, own in of.items() if own}
-        others = [m for m in ("prior", "mean") if of[m] and of["fitted"]]
-        better = {m: {what: apart(of["fitted"], of[m], what) for what in ("success", "angle")} for m in others}
-        table[name] = {"methods": columns, "fitted_better_than": better}
-    line = {name: {m: rates(columns) for m, columns in found["methods"].items()} for name, found in table.items()}
+        better = better_than("fitted", ("prior", "mean"), of)
+        table[name] = {"methods": columns(of, (*PLACES, SLIPPERY)), "fitted_better_than": better}
+    line = {name: line_of(found["methods"]) for name, found in table.items()}
     return {"table": table, "paper": PAPER, "line": line}
 
 
-def rates(columns: Mapping[str, Any]) -> dict[str, float | None]:
-    """Success of a method's policies by place, for one line."""
-    of = {place: columns[place]["success_rate"] for place in PLACES}
-    return {place: None if rate is None else round(rate, 3) for place, rate in of.items()}
+def columns(of: Mapping[str, Sequence[Mapping[str, Any]]], places: Sequence[str] = PLACES) -> dict[str, Any]:
+    """For each kind of policies that there are, the column of every place.  of: kind -> its cases."""
+    return {kind: {place: column(own, place) for place in places} for kind, own in of.items() if own}
+
+
+def better_than(best: str, others: Sequence[str], of: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
+    """How much better one kind of policies is than each of the others, of those that there are (`apart`)."""
+    known = [kind for kind in others if of[kind] and of[best]]
+    return {kind: {what: apart(of[best], of[kind], what) for what in ("success", "angle")} for kind in known}
+
+
+def line_of(found: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, float | None]]:
+    """Success of each kind of policies (`columns`) by place, for one line."""
+    rates = {kind: {place: by[place]["success_rate"] for place in PLACES} for kind, by in found.items()}
+    return {k: {p: None if r is None else round(r, 3) for p, r in by.items()} for k, by in rates.items()}
 
 
 def column(cases: Sequence[Mapping[str, Any]], place: str) -> dict[str, Any]:
@@ -123,8 +132,7 @@ def rate_interval(each: Sequence[np.ndarray]) -> list[float]:
 
 
 def _wilson(success: np.ndarray) -> tuple[float, float]:
-    found = scipy.stats.binomtest(int(success.sum()), len(success)).proportion_ci(LEVEL, method="wilson")
-    return float(found.low), float(found.high)
+    return wilson(int(success.sum()), len(success), LEVEL)
 
 
 def _newcombe(a: np.ndarray, b: np.ndarray) -> list[float]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
-from benchmarks.peers import sysid
+from benchmarks.peers import springs, sysid
 from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
 from droid_jax.model.parameters import Parameter, Space
 
@@ -46,3 +48,10 @@ def test_the_noise_is_of_the_repeats_mean_in_rows_of_the_residual():
     size = np.linalg.norm(clean, axis=0) / np.sqrt(2)  # as the library normalises
     expected = np.sqrt(np.mean((0.1 / np.sqrt(10) / size) ** 2))
     assert sysid._noise(recording) == pytest.approx(expected, rel=0.05)
+
+
+def test_an_interval_without_end_is_written_as_none():
+    found = springs.half_widths({"mass": 0.1, "stiffness": 2.0, "damping": 1.0}, np.array([0.2, np.inf, 0.0]))
+    assert found["half_width_95"] == {"mass": 0.2, "stiffness": None, "damping": 0.0}
+    assert found["error_in_half_widths"] == {"mass": 0.5, "stiffness": None, "damping": None}
+    json.dumps(found, allow_nan=False)

@@ -14,8 +14,8 @@ import pytest
 
 from droid_jax import runtime
 from droid_jax.compare.cost import make_cost
-from droid_jax.compare.inverse import inverse_replay, prescribed
-from droid_jax.compare.replay import torque_offset_effect
+from droid_jax.compare.inverse import path_of, path_replay, prescribed
+from droid_jax.compare.replay import Replay, torque_offset_effect
 from droid_jax.identify.judge import split
 from droid_jax.measure.motion import Motion
 from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
@@ -52,6 +52,12 @@ def motion(scene: Scene, side: TorqueSide, gravity: bool, count: int = 40) -> Mo
         acceleration=rng.normal(0, 3.0, size),
         torque=TorqueConvention(side, gravity),
     )
+
+
+def inverse_replay(scene: Scene, motion: Motion, effects: Sequence[Effect] = ()) -> Replay:
+    """Torques of one prescribed motion."""
+    replay, path = path_replay(scene, motion.torque, effects, motion.joints), path_of(scene, motion)
+    return lambda physics: replay(physics, path)
 
 
 def replayed(scene: Scene, space: Space, values: np.ndarray, given: Motion, *effects: Effect) -> Rollout:

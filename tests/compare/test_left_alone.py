@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from droid_jax.compare.cost import make_cost
+from droid_jax.compare.notes import left_alone
 from droid_jax.compare.replay import make_drive
-from droid_jax.compare.start import holding, left_alone
+from droid_jax.compare.start import holding
 from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
 from droid_jax.measure.surrogate import _control
 from droid_jax.model.fields import joint_damping

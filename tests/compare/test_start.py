@@ -11,9 +11,10 @@ import pytest
 from two_link import ARM, JOINTS, arm, measured, motion, recording
 
 from droid_jax.compare.cost import _same, followed, make_cost
+from droid_jax.compare.notes import check_range, geared, open_loop
 from droid_jax.compare.replay import Drive, check_gains, make_drive
 from droid_jax.compare.residuals import CompareConfig
-from droid_jax.compare.start import AJAR, check_range, geared, open_loop
+from droid_jax.compare.start import AJAR
 from droid_jax.measure.demonstration import demonstration_path
 from droid_jax.measure.formats import load
 from droid_jax.measure.recording import Channel, Recording, ServoGains

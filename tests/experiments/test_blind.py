@@ -16,7 +16,8 @@ from droid_jax.measure.hidden import HIDDEN, LIBRARY, ON_HINGE, Applied, possibl
 from droid_jax.model.effects.registry import registered
 from droid_jax.model.parameters import Parameter, Space
 from experiments import hidden_effects, null_calibration
-from experiments.blind import limits, oracle, score
+from experiments.blind import limits, marks, oracle, score
+from experiments.blind import rates as summing
 from experiments.blind.answers import ANSWERS, inside, parts, right, targets, without
 from experiments.blind.baselines import bic_outcome
 from experiments.blind.cases import Counts, Plan, amplitude, key, keys, plans
@@ -218,6 +219,35 @@ def test_limits_scale_with_the_effect():
     assert power.limit(added * (np.arange(40) < 10), 10.0) is None  # nothing of it is left
 
 
+def test_a_form_that_blows_up_hides_no_limit(monkeypatch: pytest.MonkeyPatch):
+    """Its mark is NaN, with which every p would be zero and every limit the smallest."""
+    monkeypatch.setattr(marks, "marks", lambda *_: np.array([[1.0, 2.0], [np.nan, np.nan]]))
+    seen: Any = SimpleNamespace(evidence=None, model=SimpleNamespace(values=None))
+    np.testing.assert_array_equal(Ground.added(seen, ()), [[1.0, 2.0], [0.0, 0.0]])
+    stage: Any = Stage()
+    raw = np.stack([np.random.default_rng(1).normal(size=40), np.zeros(40)])
+    power = limits.Power(stage, raw, np.tile(np.arange(10), (5, 1)), {})
+    assert power.limit(np.tile(raw[0], (limits.REPEATS, 1)), 10.0) == pytest.approx(
+        limits.Power(stage, raw[:1], power.chosen, {}).limit(np.tile(raw[0], (limits.REPEATS, 1)), 10.0)
+    )
+
+
+def test_a_limit_says_at_which_size_its_effect_was_recorded():
+    """Also where the last recording was not near enough yet."""
+    recorded = list[float]()
+
+    def hidden(effect: Applied) -> np.ndarray:
+        recorded.append(effect.amplitude)
+        return np.zeros((limits.REPEATS, 1))
+
+    where: Any = SimpleNamespace(hidden=hidden, left=lambda column: (column, np.ones(1, bool)))
+    power: Any = SimpleNamespace(limit=lambda added, largest: 0.1 * recorded[-1])  # smaller with every recording
+    forms: Any = SimpleNamespace(of=lambda *_: {})
+    found = limits.limit_of(where, power, forms, Applied("closer", 1.0))
+    assert len(recorded) == limits.RECORDED and len(set(recorded)) == limits.RECORDED
+    assert found["recorded_at"] == recorded[-1]
+
+
 def test_bounds_hold_what_the_base_model_absorbs():
     """A column twice as long as a parameter may go leaves the rest, and that parameter counts as stuck."""
     space = Space((Parameter("a", "-", 0.0, 1.0, -1.0, 1.0), Parameter("b", "-", 0.0, 1.0, -9.0, 9.0)))
@@ -272,7 +302,7 @@ def reached(confirm: float, converged: bool = True) -> Any:
 
 
 def rates(*cases: Any, known: Any = None) -> dict[str, Any]:
-    return score.summarise([score.judge(c, known or {}) for c in cases])
+    return summing.summarise([score.judge(c, known or {}) for c in cases])
 
 
 def test_rates_of_what_is_named():
@@ -338,7 +368,7 @@ def test_effects_larger_than_their_factor_says_are_counted_apart():
     judged = [
         score.judge(c, known) for c, known in zip((given[0], given[1], given[0]), (*limits, limits[1]), strict=True)
     ]
-    found = score.summarise(judged)
+    found = summing.summarise(judged)
     assert [j["larger"] for j in judged] == [False, True, True]
     assert (found["named_alone_at_the_multiple"]["hits"], found["named_alone_at_the_multiple"]["of"]) == (1, 1)
     assert (found["named_up_to_tie_larger"]["hits"], found["named_up_to_tie_larger"]["of"]) == (1, 2)
@@ -413,7 +443,7 @@ def test_confusion_tells_ties_from_swaps_and_right_effects_in_wrong_places():
     answers = (["preload at door"], ["latch at elbow"], ["closer at door"])
     judged = [score.judge(case("single", "named", names, right_names), {}) for names in answers]
     judged.append(score.judge(case("single", "tie", ["closer at door"], right_names, tied=[["latch at door"]]), {}))
-    assert score.confusion(judged) == {"h0": {"latch": 2, "latch (elsewhere)": 1, "closer": 1}}
+    assert summing.confusion(judged) == {"h0": {"latch": 2, "latch (elsewhere)": 1, "closer": 1}}
     pair, ties = [["tilt at door"], ["delay at door"]], [["delay at door + tilt at door"], ["tilt at door"]]
     both = score.judge(case("pair", "tie", ["drag at door", "delay at door"], pair, tied=ties), {})
     assert both["said"] == ["drag", "delay"]
@@ -428,8 +458,8 @@ def test_confusion_and_errors():
             {**case("single", "error", [], [["latch at door"]]), "result": {"verdict": "error", "error": "no replay"}},
         )
     ]
-    assert score.confusion(judged) == {"h0": {"latch": 1, "(unexplained)": 1, "(error)": 1}}
-    assert score.summarise(judged)["unconverged_or_error"]["hits"] == 1
+    assert summing.confusion(judged) == {"h0": {"latch": 1, "(unexplained)": 1, "(error)": 1}}
+    assert summing.summarise(judged)["unconverged_or_error"]["hits"] == 1
 
 
 def test_bic_is_judged_by_the_same_answers():
@@ -466,6 +496,32 @@ def test_two_names_for_one_effect_are_not_named_alone():
     given = {**case("single", "named", ["bias", "drift"], [["bias"]]), "parts": [["drift"]]}
     judged = score.judge(given, {})
     assert judged["named"] and not judged["alone"] and not judged["exact"]
+
+
+def test_an_effects_own_name_is_told_from_an_equivalents():
+    """As an effect or in a tie of it, also one of several at once; of a pair both must be there."""
+    names = [["latch", "preload"]]
+    one = [
+        case("single", "named", ["latch"], names),
+        case("single", "tie", ["drag"], names, tied=[["latch"]]),
+        case("single", "named", ["preload"], names),
+        case("single", "named", ["latch", "drag"], names),  # with a false name it is not named
+        case("left_out", "named", ["latch"], names),
+    ]
+    judged = [score.judge(c, {}) for c in one]
+    assert [j["named"] for j in judged] == [True, True, True, False, False]
+    assert [j["own"] for j in judged] == [True, True, False, False, False]
+    found = summing.summarise(judged)["named_by_its_own_name"]
+    assert (found["hits"], found["of"]) == (2, 4)
+    assert "| one at 3 times: the same, by its own name" in score_table(judged, {})
+    pair = [["latch", "preload"], ["tilt", "spring"]]
+    two = [
+        case("pair", "named", ["tilt", "preload"], pair),
+        case("pair", "named", ["tilt", "latch"], pair),
+        case("pair", "tie", ["drag"], pair, tied=[["preload + tilt", "latch + tilt"]]),
+    ]
+    judged = [score.judge(c, {}) for c in two]
+    assert [(j["named"], j["own"]) for j in judged] == [(True, False), (True, True), (True, True)]
 
 
 def test_no_answer_is_no_alarm_and_the_limit_is_counted_apart():
@@ -556,15 +612,34 @@ def test_a_null_that_fails_after_its_screening_keeps_its_p(monkeypatch: pytest.M
     def run_case(plan: Any, commit: str, bench: Any, watch: Any) -> Any:
         watch.seconds["base"] = 1.0
         yield {"p": 0.001, "gap": 0.1, "converged": True}
-        raise RuntimeError("out of memory")
+        raise ValueError("no replay")
 
     monkeypatch.setattr(null_calibration, "run_case", run_case)
     case = null_calibration.case_of(Plan("hinge/null/0", "hinge", "none"), COMMIT, Bench())
     other = {"p": 0.5, "gap": 0.0, "converged": True, "seconds": {"base": 1.0}}
     found = null_calibration.summarise([case, other])
-    assert case["p"] == 0.001 and case["error"] == "out of memory" and case["verdict"] == "error"
+    assert case["p"] == 0.001 and case["error"] == "no replay" and case["verdict"] == "error"
     assert (found["screening_rejects"]["hits"], found["screening_rejects"]["of"]) == (1, 2)
     assert (found["alarms"]["hits"], found["rejected_then_failed"], found["errors"]) == (0, 1, 1)
+
+
+def test_a_case_that_runs_out_of_memory_is_no_result(monkeypatch: pytest.MonkeyPatch):
+    """It would never be tried again."""
+
+    def run_case(*given: Any) -> Any:
+        raise RuntimeError("out of memory")
+
+    monkeypatch.setattr(null_calibration, "run_case", run_case)
+    with pytest.raises(RuntimeError, match="out of memory"):
+        null_calibration.case_of(Plan("hinge/null/0", "hinge", "none"), COMMIT, Bench())
+
+
+def test_a_quick_suite_has_a_folder_of_its_own(tmp_path: Path):
+    placed, runs = hidden_effects.placed, hidden_effects.RUNS
+    assert placed(hidden_effects.All(quick=True)).out == placed(hidden_effects.Make(quick=True)).out
+    assert placed(hidden_effects.All(quick=True)).out == runs.with_name("hidden_effects_quick")
+    assert placed(hidden_effects.All()).out == placed(hidden_effects.Score()).out == runs
+    assert placed(hidden_effects.All(quick=True, out=tmp_path)).out == tmp_path
 
 
 def test_cases_of_two_commits_do_not_mix_where_make_was_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -608,7 +683,7 @@ def test_an_oracle_is_of_the_result_that_is_there(tmp_path: Path, monkeypatch: p
     def one(folder: Path, truth: Any, result: dict[str, Any], bench: Any) -> dict[str, Any]:
         asked.append(result["n"])
         if result["n"] == 3:
-            raise ValueError("no replay")
+            raise FloatingPointError("no replay")
         return {"model": "latch", "gaps": {"fit": 1.0}}
 
     monkeypatch.setattr(oracle, "oracle", one)

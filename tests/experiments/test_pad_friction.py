@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import asdict
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
@@ -11,8 +15,9 @@ from droid_jax.measure.surrogate import stand_in_truth
 from droid_jax.model.door_scene import door_scene
 from droid_jax.policy.task import Task
 from droid_jax.policy.transfer import TransferConfig, TrialRobot, stand_in
-from experiments.pad_friction import PARTS, Opening, hinge_torques
+from experiments.pad_friction import NEEDED, PARTS, Arguments, Opening, hinge_torques, made, needless
 from experiments.policies.robots import pads_of
+from experiments.policies.settings import SETTINGS, setting_of
 
 EXACT = 1e-9  # N m and J, of sums of a few N m
 CONTACT = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_PYRAMIDAL)
@@ -116,3 +121,20 @@ def test_a_copy_that_leaves_the_trial_is_no_measurement():
     data.qpos[0] += 0.01
     with pytest.raises(RuntimeError, match="the copy has left the trial"):
         opening(data)
+
+
+def test_policies_of_another_robot_are_no_cases_of_the_setting(tmp_path: Path):
+    folder = tmp_path / "table2_cases" / "paper"
+    folder.mkdir(parents=True)
+    for seed, robot in enumerate((None, 100)):
+        case = {"method": "mean", "seed": seed, "setting": asdict(setting_of("paper", robot))}
+        (folder / f"mean_{seed}.json").write_text(json.dumps(case))
+    with pytest.raises(SystemExit, match=r"error: .* another setting than .*: mean 1$"):
+        made(Arguments(policies=tmp_path))
+    (folder / "mean_1.json").unlink()
+    assert [case["seed"] for case in made(Arguments(policies=tmp_path))] == [0]
+    assert made(Arguments())[0]["setting"]["robot"] == SETTINGS["paper"].robot  # those that are kept
+
+
+def test_where_all_trials_blew_up_a_grip_is_needed():
+    assert [needless({"success_rate": rate}) for rate in (None, 0.0, NEEDED)] == [False, False, True]

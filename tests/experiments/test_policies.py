@@ -9,6 +9,8 @@ import itertools
 import json
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -20,6 +22,7 @@ import pytest
 import scipy.stats
 
 from benchmarks.sharing import claimed
+from droid_jax.files import GAUSSIAN, POLICY
 from droid_jax.identify.gaussian import load as load_gaussian
 from droid_jax.identify.gaussian import prior
 from droid_jax.measure.hidden import Applied, possible
@@ -31,7 +34,6 @@ from droid_jax.policy.task import Task
 from droid_jax.policy.train import TrainConfig
 from droid_jax.policy.transfer import transfer
 from droid_jax.policy.trials import Trials
-from droid_jax.report.files import GAUSSIAN, POLICY
 from experiments.policies import store
 from experiments.policies.cases import (
     RESULTS,
@@ -341,6 +343,39 @@ def test_another_table_of_felt_effects_is_not_written_over_the_pilots(options: d
     module = importlib.import_module("experiments.effects_on_policy")
     with contextlib.nullcontext() if kept else pytest.raises(SystemExit, match="give --out DIR"):
         module.needs_out(module.Arguments(**options))
+
+
+def test_a_policy_that_another_process_trains_is_waited_for(tmp_path: Path):
+    module = importlib.import_module("experiments.effects_on_policy")
+    arguments, setting = module.Arguments(out=tmp_path), setting_of("paper", module.PILOT)
+    path = arguments.cases("effects_on_policy") / f"prior_{module.PILOT}.json"
+    taken, seen = threading.Event(), list[Path]()
+
+    def other() -> None:
+        with claimed(path, wait=False):
+            taken.set()
+            time.sleep(0.3)
+            path.write_text('{"trained": "there"}')
+
+    thread = threading.Thread(target=other)
+    thread.start()
+    taken.wait()
+    seen.append(module.trained(arguments, setting, CODE))
+    thread.join()
+    assert seen == [arguments.trained / "there" / POLICY]
+
+
+def test_each_policys_doors_are_its_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """Two policies of one Gaussian would else be compared on the same doors, which then count twice."""
+    module, seeds = importlib.import_module("experiments.policy_parity"), list[int]()
+    found = {"difference_deg": {"largest": 1.0, "within_target": 1.0}, "angles_deg": {"mjx": [1.0], "c": [1.0]}}
+    monkeypatch.setattr(module, "trained", lambda *_: (None, None, None))
+    monkeypatch.setattr(module, "named", lambda path: {"file": path.name})
+    monkeypatch.setattr(module, "compared", lambda *given: seeds.append(given[-1]) or found)
+    words = ["--policies", "a/policy.npz", "b/policy.npz", "--seed", "7", "--out", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", ["policy_parity.py", *words])
+    module.main()
+    assert seeds == [7, 8]
 
 
 def test_a_policy_is_tried_with_every_effect_that_a_closed_loop_can_have():

@@ -134,5 +134,5 @@ def test_no_fit_from_the_prior_on_where_there_is_a_winner_or_no_time(
         assert anew(hunt_of(found), replace(found.base, gap=gap), quiet) is quiet
     little = replace(lost, tried=tuple(replace(m, gap=0.9 * found.base.gap) for m in lost.tried))
     assert anew(hunt_of(found), found.base, little) is little
-    log: Any = SimpleNamespace(case=SimpleNamespace(fit=SimpleNamespace(repeats=1)))
+    log: Any = SimpleNamespace(case=SimpleNamespace(fit=SimpleNamespace(repeated=False)))
     assert anew(log, found.base, lost) is lost

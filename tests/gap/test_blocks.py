@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from plain_flips import largest_t
 from small_log import ASKED, CONFIG, COULOMB, elbow, elbow_log, elbow_space
 
 from droid_jax.compare.cost import make_cost
 from droid_jax.gap import single
 from droid_jax.gap.blocks import OUTSIDE, Blocks, block_length, blocks, interleaved
 from droid_jax.gap.case import make_case
-from droid_jax.gap.flips import largest_t
 from droid_jax.gap.screen import project
 from droid_jax.gap.select import resamples
 from droid_jax.gap.single import Log, base_model, make_log, single_case

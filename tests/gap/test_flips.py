@@ -7,12 +7,12 @@ import itertools
 import numpy as np
 import pytest
 import scipy.stats
+from plain_flips import largest_t
 
 from droid_jax.gap.evidence import gap, gaps
 from droid_jax.gap.flips import (
     benjamini_hochberg,
     largest_steady_t,
-    largest_t,
     sign_flips,
     steady,
     steady_gap_p_values,

@@ -37,7 +37,7 @@ def evidence(unit: np.ndarray) -> Any:
 
     return SimpleNamespace(
         cost=SimpleNamespace(space=SPACE, scene=SimpleNamespace(object_joint="hinge", joints=("a", "b", "c"))),
-        units=REPEATS, repeats=REPEATS, column=np.repeat(np.arange(COLUMNS), INSTANTS), common=common, gap=gap,
+        repeated=True, column=np.repeat(np.arange(COLUMNS), INSTANTS), common=common, gap=gap,
         cell_p_values=steady_gap_p_values,
     )  # fmt: skip
 

@@ -6,20 +6,22 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
-from small_log import CONFIG, COULOMB, elbow, elbow_log, elbow_space
+from small_log import CONFIG, COULOMB, MJCF, elbow, elbow_log, elbow_space
 
 import droid_jax as dj
 from droid_jax.compare.residuals import CompareConfig
 from droid_jax.gap import missing
-from droid_jax.gap.candidates import possible
+from droid_jax.gap.candidates import possible, steers
 from droid_jax.gap.split import Split
 from droid_jax.gap.verdict import Kind
 from droid_jax.identify.search import SearchConfig
 from droid_jax.measure.recording import Recording
 from droid_jax.model.effects.registry import library
 from droid_jax.model.parameters import Parameter
+from droid_jax.model.scene import compile_scene
 from droid_jax.model.seam import Effect
 
 SEARCH = replace(CONFIG, search=SearchConfig(population=8, parents=None, generations=2), most=1)
@@ -58,6 +60,19 @@ def test_hidden_friction_is_named_and_in_the_extended_model(
     assert ("search" in stages) is searched and {"screen", "refit", "judge"} <= set(stages)
 
 
+def test_a_log_without_commands_has_no_servo_to_ask_about():
+    """Nor gains of one, which are numbers of the model and change nothing there; laws that read them are kept."""
+    servo = '</worldbody><actuator><position name="servo" joint="elbow" kp="10"/></actuator>'
+    scene = compile_scene(mujoco.MjSpec.from_string(MJCF.replace("</worldbody>", servo)), "elbow", joints=["elbow"])
+    log = elbow_log(COULOMB)
+    commanded = {e.name for e in possible(scene, [replace(log, command=np.zeros((2, 1)))])}
+    assert commanded - {e.name for e in possible(scene, [log])} >= {"servo_gain", "command_delay"}
+    assert {"payload", "joint_coulomb", "sensor_delay", "torque_gain"} <= {e.name for e in possible(scene, [log])}
+    (gain,) = library(scene, ["servo_gain"])
+    assert steers(gain) and not steers(replace(gain, force=lambda theta, state: state.qvel))
+    assert not steers(replace(gain, parameters=(*gain.parameters, *library(scene, ["payload"])[0].parameters)))
+
+
 def test_unless_told_it_asks_about_all_that_could_show(monkeypatch: pytest.MonkeyPatch):
     scene, begin = elbow(), np.array([0.6, 0.1])
 
@@ -93,7 +108,7 @@ def test_settings_that_no_search_could_use_are_refused(changes: dict[str, Any], 
         ({"recordings": [elbow_log(0.0, 2.0, 15)]}, "is the only one and has 15 repeats"),
         ({"recordings": [elbow_log(0.0, 2.0, 8)] * 2}, "the fit and the confirm recording are the same"),
         ({"effects": ()}, "effects: there is none to ask about"),
-        ({"effects": [Effect("late")]}, "none of them says its places"),
+        ({"effects": [Effect("late")]}, "none of the effects says its places"),
         ({"effects": [LATE]}, "no commands that an effect could change: late"),
         ({"start": np.zeros(3)}, "expected parameter vectors [..., 2]"),
     ],

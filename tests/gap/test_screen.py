@@ -6,6 +6,7 @@ from typing import cast
 
 import numpy as np
 import pytest
+from plain_flips import largest_t
 
 from droid_jax.compare.cost import Cost
 from droid_jax.gap.candidates import Candidate, candidates
@@ -51,20 +52,20 @@ def test_a_tight_prior_lets_a_base_column_explain_little():
 
 
 def test_the_missing_effect_is_found_with_its_size():
-    found = screen(repeats(1, a3=0.7), QUESTIONS, MARKS, project(MARKS, BASE, LOOSE))
+    found = screen(repeats(1, a3=0.7), QUESTIONS, MARKS, project(MARKS, BASE, LOOSE), largest_t)
     assert found.best()[0] == 3 and found.p == pytest.approx(1 / 512)
     assert found.size[3] == pytest.approx(0.7, abs=0.05)
     assert found.explained[3] > 0.5 > 10 * np.delete(found.explained, 3).max()
 
 
 def test_nothing_missing_names_nothing():
-    p = [screen(repeats(seed), QUESTIONS, MARKS, project(MARKS, BASE, LOOSE)).p for seed in range(300)]
+    p = [screen(repeats(seed), QUESTIONS, MARKS, project(MARKS, BASE, LOOSE), largest_t).p for seed in range(300)]
     assert 0.02 < np.mean(np.array(p) < 0.05) < 0.09
 
 
 def test_what_the_base_can_absorb_is_no_effect():
     marks = np.concatenate([MARKS[:4], (BASE @ np.arange(6.0))[None]])
-    found = screen(repeats(2, a1=0.5), QUESTIONS, marks, project(marks, BASE, LOOSE))
+    found = screen(repeats(2, a1=0.5), QUESTIONS, marks, project(marks, BASE, LOOSE), largest_t)
     assert found.best()[0] == 1
     assert abs(found.explained[4]) < 1e-2
 
@@ -74,7 +75,7 @@ def test_the_ranking_takes_amplitudes_together_and_inside_their_bounds():
     both = Candidate("both", "hinge", ("a3", "a4"))
     questions = (*QUESTIONS[:3], Question(both, "a3"), Question(both, "a4"))
     data = repeats(3, a1=-0.8, a3=0.5, a4=-0.6)
-    found = screen(data, questions, MARKS, project(MARKS, BASE, LOOSE))
+    found = screen(data, questions, MARKS, project(MARKS, BASE, LOOSE), largest_t)
     first, *rest = proposals(found, data, space)
     assert first.names == ("both at hinge",)
     assert first.sizes["a3"] == pytest.approx(0.5, abs=0.08) and first.sizes["a4"] == pytest.approx(-0.6, abs=0.08)
@@ -86,7 +87,7 @@ def test_the_ranking_takes_amplitudes_together_and_inside_their_bounds():
 def test_pairs_are_ranked_together():
     space = Space(tuple(Parameter(f"a{k}", "N m", 0.0, 1.0, -5.0, 5.0) for k in range(5)))
     data = repeats(4, a0=0.5, a2=0.5)
-    found = screen(data, QUESTIONS, MARKS, project(MARKS, BASE, LOOSE))
+    found = screen(data, QUESTIONS, MARKS, project(MARKS, BASE, LOOSE), largest_t)
     best = proposals(found, data, space, number=2)
     assert len(best) == 10 and set(best[0].names) == {"effect0 at hinge", "effect2 at hinge"}
     few = proposals(found, data, space, number=2, among={"effect1 at hinge", "effect2 at hinge", "effect3 at hinge"})
@@ -97,7 +98,7 @@ def test_shapes_are_not_rivals_of_each_other():
     space = Space((Parameter("a", "N m", 0.0, 1.0, -5.0, 5.0), Parameter("w", "rad", 0.1, 0.1, 0.0, 1.0)))
     shaped = tuple(Question(Candidate("latch", "hinge", ("a",), {"w": w}), "a") for w in (0.1, 0.2, 0.3))
     data = repeats(5, a1=0.7)
-    (only,) = proposals(screen(data, shaped, MARKS[:3], project(MARKS[:3], BASE, LOOSE)), data, space)
+    (only,) = proposals(screen(data, shaped, MARKS[:3], project(MARKS[:3], BASE, LOOSE), largest_t), data, space)
     assert only.parts[0].shapes == {"w": 0.2}
 
 

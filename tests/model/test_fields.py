@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import textwrap
+
 import mujoco
 import numpy as np
 import pytest
 
+from droid_jax.model import fields
 from droid_jax.model.fields import body_position, joint_damping, joint_frictionloss, model_parameter
 from droid_jax.model.mjcf import fitted_mjcf, unwritten
 from droid_jax.model.parameters import Space
@@ -22,6 +25,18 @@ XML = """<mujoco><worldbody>
 
 def scene(limits: str = "", servo: str = "") -> Scene:
     return compile_scene(mujoco.MjSpec.from_string(XML.format(limits=limits, servo=servo)), "arm", joints=["swing"])
+
+
+def test_the_example_of_the_modules_docstring_runs():
+    """As a reader would type it, in a scene that has what it names."""
+    spec = mujoco.MjSpec.from_string(
+        """<mujoco><worldbody><geom name="knob" size=".1" pos="1 0 0"/>
+        <body name="forearm"><joint name="elbow" axis="0 1 0"/><geom name="pad" size=".05" pos="0 0 .3" mass="1"/>
+        </body></worldbody><contact><pair name="left_near" geom1="knob" geom2="pad"/></contact></mujoco>"""
+    )
+    names = {"scene": compile_scene(spec, "arm", joints=["elbow"]), "Space": Space, **vars(fields)}
+    exec(textwrap.dedent(str(fields.__doc__).split("\n\n")[1]), names)
+    assert names["space"].names == ("elbow_damping", "forearm_mass", "grip")
 
 
 def test_a_balls_number_is_one_for_all_its_degrees_of_freedom():

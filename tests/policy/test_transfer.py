@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scripted import Script, opening
 
-from droid_jax.measure.demonstration import PLANS
 from droid_jax.measure.hidden import Applied
 from droid_jax.measure.surrogate import stand_in_truth
 from droid_jax.model.door_scene import door_scene
@@ -32,7 +31,7 @@ def scene():
 
 @pytest.fixture(scope="module")
 def start(scene) -> np.ndarray:
-    return start_pose(scene, TASK, PLANS["A"])
+    return start_pose(scene, TASK)
 
 
 @pytest.fixture(scope="module")

@@ -57,7 +57,7 @@ def gap_json(verdict: str, roles: tuple[str, ...]) -> dict[str, Any]:
     }
     return {
         "verdict": verdict, "sentence": words[verdict], "effects": effects,
-        "tied": [[STRIBECK] if verdict == "tie" else []][: len(effects)],
+        "tied": [[STRIBECK] if verdict == "tie" else []][: len(effects)], "about": _about(verdict) if effects else {},
         "p": None if not asked else 0.412 if verdict == "none" else 0.00195, "floor": 0.0123, "converged": asked,
         "cut": "", "seconds": {"compile": 41.2, "base_fit": 312.0, "screen": 18.5, "refit": 640.1},
         "gaps": {r: _gap(name, k, first, left) for k, (r, name) in enumerate(zip(roles, "ABC", strict=False))},
@@ -142,6 +142,20 @@ def _cells(size: float) -> list[dict[str, Any]]:
 def _size(*size: Any) -> dict[str, Any]:
     what = "a magnetic catch or latch that holds the door in its first degrees"
     return dict(zip(("name", "unit", "value", "low", "high"), size, strict=True)) | {"effect": LATCH, "what": what}
+
+
+def _about(verdict: str) -> dict[str, Any]:
+    latch = {
+        "what": "a magnetic catch or latch that holds the door in its first degrees",
+        "mark": "the first degrees of opening, and the last of closing",
+        "confused_with": ["hinge_stribeck", "over_centre_spring"],
+    }
+    stribeck = {
+        "what": "dry friction of the hinge that falls with speed",
+        "mark": "breakaway and reversals of the door",
+        "confused_with": ["latch", "joint_stribeck"],
+    }
+    return {"latch": latch} | ({"hinge_stribeck": stribeck} if verdict == "tie" else {})
 
 
 def _trends(verdict: str) -> list[dict[str, Any]]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from made_up_gap import make_gap
 
-from droid_jax.report import gap_figures, gap_maps, gap_torques, style
+from droid_jax.report import gap_figures, gap_maps, gap_torques, gap_words, style
 from droid_jax.report.gap_folder import Gap, read_gap
 from droid_jax.report.words import number
 
@@ -35,9 +35,9 @@ def test_the_maps_share_one_scale_and_leave_out_what_is_not_found(named: Gap) ->
     first, second, *_ = gap_maps.cell_maps(cells["before"], cells["after"]).axes
     before, after = first.collections[0], second.collections[0]
     assert before.get_clim() == after.get_clim()
-    found = [c["found"] for c in cells["after"] if c["variable"] == gap_maps.TIME]
+    found = [c["found"] for c in cells["after"] if c["variable"] == gap_words.TIME]
     np.testing.assert_array_equal(~np.ma.getmaskarray(np.ma.asarray(after.get_array())).ravel(), found)
-    largest = max(c["gap"] for c in cells["before"] if c["variable"] == gap_maps.TIME)
+    largest = max(c["gap"] for c in cells["before"] if c["variable"] == gap_words.TIME)
     assert np.max(np.asarray(before.get_array())) == largest
     assert number(largest, 2) in {t.get_text() for t in first.texts}
 
@@ -57,9 +57,9 @@ def test_figures_survive_odd_numbers(named: Gap) -> None:
 
 def test_shifts_are_counted_in_deviations() -> None:
     shift = {"name": "knob_mass", "unit": "kg", "before": 2.6, "after": 0.2, "deviation_before": 0.4}
-    assert gap_figures.deviations(shift) == pytest.approx(-6.0)
+    assert gap_words.deviations(shift) == pytest.approx(-6.0)
     unknown = [{**shift, "deviation_before": d} for d in (None, 0.0)]
-    assert gap_figures.largest_shifts([*unknown, shift]) == [shift]
+    assert gap_words.largest_shifts([*unknown, shift]) == [shift]
 
 
 def test_position_and_load_are_shown_of_the_joint_with_the_most(named: Gap) -> None:
@@ -70,7 +70,7 @@ def test_position_and_load_are_shown_of_the_joint_with_the_most(named: Gap) -> N
     assert loudest["variable"] == f"position of {joint}"
     shown = [a.get_xlabel() for a in gap_maps.state_bars(cells["before"], cells["after"]).axes if a.get_visible()]
     assert [name for name in shown if " of " in name] == ["Position of joint 1 [rad]", "Load of joint 1 [N m]"]
-    some = [c for c in cells["before"] if c["variable"] in (gap_maps.TIME, f"load of {joint}")]
+    some = [c for c in cells["before"] if c["variable"] in (gap_words.TIME, f"load of {joint}")]
     curve = gap_torques.remainder(named.traces["fit"], some, "N m").axes[-1]
     assert (curve.get_title("left"), curve.get_xlabel()) == ("That joint alone", "Load of joint 1 [N m]")
 

@@ -16,7 +16,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from reader import read_page
 
-from droid_jax.report import drawings, gap_drawings, gap_maps, gap_words, page, style
+from droid_jax.report import drawings, gap_drawings, gap_marks, gap_words, page, style
 from droid_jax.report.drawings import Drawing
 from droid_jax.report.gap_folder import VERDICTS, read_gap
 from droid_jax.report.gap_parts import PARTS
@@ -74,6 +74,33 @@ def test_every_verdict_has_its_words(tmp_path: Path, quick: None, verdict: str) 
     assert ("Descriptive only" in text) == (verdict in ("unexplained", "partly explained"))
     assert ("No recording was kept sealed" in text) == (not sealed)
     assert f"Torque over time, {gap.recording(gap.judge)} ({'sealed' if sealed else 'confirming'})" in text
+
+
+def test_the_page_says_what_to_look_for(tmp_path: Path, quick: None) -> None:
+    """Beside every effect of the answer its mark and what looks like it; of what does as well also what it is."""
+    folder = make_gap(tmp_path / "run", "tie")
+    told = [
+        "Latch at door hinge Its mark: the first degrees of opening, and the last of closing. Can look like: hinge "
+        "stribeck, over centre spring.",
+        "Hinge stribeck at door hinge does as well Dry friction of the hinge that falls with speed. Its mark: "
+        "breakaway and reversals of the door. Can look like: latch, joint stribeck.",
+    ]
+    text = " ".join(read_page(page.write_report(folder)).text.split())
+    assert [line for line in told if line not in text] == []
+    found = json.loads((folder / "gap.json").read_text())
+    del found["about"]  # as searches before did not tell it
+    (folder / "gap.json").write_text(json.dumps(found))
+    text = read_page(page.write_report(folder)).text
+    assert "Its mark" not in text and "latch at door hinge" in text
+
+
+def test_a_mark_at_several_places_is_told_once_and_none_where_nothing_is_known(tmp_path: Path) -> None:
+    coulomb, own = ["joint_coulomb at panda_joint2", "joint_coulomb at panda_joint3"], "squeak at door_hinge"
+    step = {"what": "dry friction", "mark": "a step at every reversal.", "confused_with": []}
+    about = {"joint_coulomb": step, "squeak": {"what": "", "mark": "", "confused_with": []}}
+    gap = read_gap(make_gap(tmp_path, effects=[*coulomb, own], tied=[["drag at door_hinge"], [], []], about=about))
+    told = "Joint coulomb at joint 2 and joint coulomb at joint 3"
+    assert gap_marks.marks(gap) == [(told, False, "Its mark: a step at every reversal.")]
 
 
 @pytest.mark.slow
@@ -206,7 +233,7 @@ def test_a_log_is_drawn_in_order_of_time(tmp_path: Path) -> None:
     for key, values in whole.items():
         np.testing.assert_array_equal(drawn[key], values)
     gap = read_gap(folder)
-    empty = {"variable": gap_maps.TIME, "where": "elbow, later 9.0 s", "gap": 0.0, "p": 1.0, "found": False}
+    empty = {"variable": gap_words.TIME, "where": "elbow, later 9.0 s", "gap": 0.0, "p": 1.0, "found": False}
     assert gap_drawings._shown(gap, [empty, {**empty, "gap": 2.0}]) == [{**empty, "gap": 2.0, "found": True}]
 
 
@@ -334,6 +361,7 @@ def test_one_page_for_a_folder_with_both(tmp_path: Path) -> None:
         (lambda f: f.update(verdict="maybe"), r"'verdict' must be one of none, named.*got 'maybe'"),
         (lambda f: f.update(remainder="much"), r"'remainder' must be a number or null, got 'much'"),
         (lambda f: f.update(split={"by": "halves", "limits": ""}), r"'by' must be one of recordings.*got 'halves'"),
+        (lambda f: f["about"]["latch"].pop("mark"), r"'about', 'latch' lacks 'mark'"),
         (lambda f: f.update(split={"by": "blocks"}), r"'split' lacks 'limits'"),
         (lambda f: f.update(tied=[[], []]), r"'tied' has 2 lists for 1 effects"),
     ],
@@ -351,11 +379,13 @@ def test_a_damaged_file_is_named(tmp_path: Path, break_it: Callable[[dict[str, A
 @pytest.mark.parametrize("name", ["gap.json", "gap.npz"])
 @pytest.mark.parametrize("content", [None, b"", b"{broken", b"[]"])
 def test_a_missing_or_broken_file_is_named(tmp_path: Path, name: str, content: bytes | None) -> None:
+    """Only a search without its gap.json goes on by itself: one that has it passes for whole."""
     folder = make_gap(tmp_path / "run")
     (folder / name).unlink()
     if content is not None:
         (folder / name).write_bytes(content)
-    with pytest.raises(ValueError, match=rf"{re.escape(name)}.*droid_jax\.run gap"):
+    how = "gap` again" if (name, content) == ("gap.json", None) else "gap --again`"
+    with pytest.raises(ValueError, match=rf"{re.escape(name)}.*droid_jax\.run {how}"):
         page.write_report(folder)
 
 
@@ -390,7 +420,7 @@ def test_places_are_read(where: str, parts: tuple[str, str, str]) -> None:
     assert gap_words.joint_phase(where) == parts
     bins = {"variable": "object angle", "where": "-0.00 to 0.15 rad"}
     assert gap_words.place_words(bins) == "object angle 0.00 to 0.15 rad"
-    assert gap_words.place_words({"variable": gap_maps.TIME, "where": "elbow, all 0.0 s"}) == "elbow"
+    assert gap_words.place_words({"variable": gap_words.TIME, "where": "elbow, all 0.0 s"}) == "elbow"
 
 
 def test_names_and_units_are_written_as_they_are_read(tmp_path: Path) -> None:

@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 
-from droid_jax.gap import extended
-from droid_jax.report.files import EXTENDED, GAUSSIAN, LAST_FILES
+from droid_jax.files import EXTENDED, GAUSSIAN, LAST_FILES
 from droid_jax.report.page import write_report
 from droid_jax.report.stages import extended_of, fingerprint, left_over, needs_whole, setup, unfinished
 
@@ -74,7 +73,6 @@ def test_a_damaged_setup_tells_nothing(tmp_path: Path, text: str):
 
 
 def test_the_extended_model_is_the_folders_own_or_the_one_that_was_fitted(tmp_path: Path):
-    assert extended.FILE == EXTENDED
     told = run(tmp_path, "identify", extended="elsewhere/extended.json")
     assert extended_of(told) == Path("elsewhere/extended.json") and extended_of(tmp_path) is None
     assert extended_of(run(tmp_path, "gap", files={EXTENDED: "{}"})) == tmp_path / "gap" / EXTENDED

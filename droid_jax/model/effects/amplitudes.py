@@ -1,4 +1,4 @@
-"""What the effects share: parameters for a hinge or for every joint, and smooth signs."""
+"""What the effects share: parameters for a hinge or for every joint, and what holds a friction above zero."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from droid_jax.model.joint_friction import SMOOTHING
 from droid_jax.model.parameters import Parameter
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import State, Theta
@@ -98,8 +97,3 @@ def damping(speed: jax.Array, exponent: jax.Array) -> jax.Array:
     0.3 rad/s a valve opens, which also keeps a force that is taken at the old speed from ringing.
     """
     return USUAL_SPEED * jnp.minimum(jnp.abs(speed) / USUAL_SPEED, RELIEF) ** exponent
-
-
-def direction(velocity: jax.Array) -> jax.Array:
-    """Smooth sign of a speed, rad/s; speeds well below SMOOTHING have no direction yet."""
-    return jnp.tanh(velocity / SMOOTHING)

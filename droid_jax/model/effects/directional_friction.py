@@ -2,6 +2,7 @@
 
 from droid_jax.model.effects import amplitudes as a
 from droid_jax.model.effects.registry import register
+from droid_jax.model.joint_friction import direction
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, column
 
@@ -16,7 +17,7 @@ def joint_directional(scene: Scene) -> Effect | None:
         return None
 
     def frictionloss(theta, state, base):
-        extra = column(theta, JOINT, joints) * a.direction(state.qvel[dofs])
+        extra = column(theta, JOINT, joints) * direction(state.qvel[dofs])
         return base.at[dofs].set(a.never_negative(base[dofs], extra))
 
     return Effect(
@@ -40,7 +41,7 @@ def hinge_directional(scene: Scene) -> Effect | None:
     dof = scene.dof(joint)
 
     def frictionloss(theta, state, base):
-        extra = a.value(theta, HINGE) * a.direction(state.qvel[dof])
+        extra = a.value(theta, HINGE) * direction(state.qvel[dof])
         return base.at[dof].set(a.never_negative(base[dof], extra))
 
     return Effect(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
@@ -10,8 +10,9 @@ import pytest
 from effect_bench import JOINTS, MECHANISM, mechanism
 from effect_oracles import ORACLES, SLOW, Now
 
-from droid_jax.compare.inverse import inverse_replay
+from droid_jax.compare.inverse import path_of, path_replay
 from droid_jax.compare.population import over_population
+from droid_jax.compare.replay import Replay
 from droid_jax.measure.motion import Motion
 from droid_jax.measure.recording import TorqueConvention, TorqueSide
 from droid_jax.model.effects.registry import effect_space, library
@@ -19,6 +20,7 @@ from droid_jax.model.joint_friction import joint_friction_effect, joint_friction
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_physics
 from droid_jax.model.scene import Scene
+from droid_jax.model.seam import Effect
 
 MOTOR, LINK = TorqueSide.MOTOR, TorqueSide.LINK
 STEERING = ("command_delay", "joint_backlash", "joint_compliance")
@@ -45,6 +47,12 @@ def prescribed(scene: Scene, side: TorqueSide, gravity: bool) -> Motion:
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     return mechanism()
+
+
+def inverse_replay(scene: Scene, motion: Motion, effects: Sequence[Effect] = ()) -> Replay:
+    """Torques of one prescribed motion."""
+    replay, path = path_replay(scene, motion.torque, effects, motion.joints), path_of(scene, motion)
+    return lambda physics: replay(physics, path)
 
 
 class Inverse:

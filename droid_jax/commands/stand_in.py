@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from droid_jax.commands.folder import kept_recordings
-from droid_jax.report.files import STAND_IN
+from droid_jax.files import STAND_IN
 
 if TYPE_CHECKING:
     from droid_jax.measure.recording import Recording

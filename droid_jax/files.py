@@ -1,0 +1,19 @@
+"""Names of files in a run's folder that one room writes and another reads; light, for the command line."""
+
+SETUP, CONFIG, FIT = "setup.json", "config.json", "fit.json"
+GAUSSIAN, SAMPLES = "gaussian.json", "samples.csv"
+TRACES, CORRELATION, DISTRIBUTION = "traces.npz", "correlation.npz", "distribution.npz"
+HISTORY, HISTORY_TABLE = "history.npz", "history.csv"
+FITTED, REPLAY, REPLAY_FILM = "fitted.xml", "replay.npz", "replay.webp"
+GAP, GAP_TRACES = "gap.json", "gap.npz"
+EXTENDED, EXTENDED_MJCF = "extended.json", "extended.xml"
+POLICY, TRAINING, TRANSFER, FILMS = "policy.npz", "training.json", "transfer.json", "films"
+STAND_IN = "stand_in.json"  # beside the stand-in's recordings: its springs, seed and hidden effects
+# Folders in one of `all`, and what is written last in each: its presence says that the run is whole.
+LAST_FILES = {"identify": CONFIG, "gap": GAP, "train": TRAINING}
+# What else is in them that would be taken for the next run's.
+RESULTS = {
+    "identify": (FIT, GAUSSIAN, EXTENDED),
+    "gap": (GAP_TRACES, EXTENDED, EXTENDED_MJCF),
+    "train": (POLICY, TRANSFER, EXTENDED, FILMS, "export"),
+}

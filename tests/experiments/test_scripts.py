@@ -1,0 +1,68 @@
+"""What single scripts make of their cases: nothing undefined is written, and what does not go together is refused."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.common import publish
+
+
+def test_searches_of_several_machines_are_not_drawn_over_one_wall_time():
+    module = importlib.import_module("experiments.population_curve")
+    one, other = ({"origin": {"device": device}} for device in ("a CPU, 1 core", "a CPU, 2 cores"))
+    assert module.one_device([one, one]) == "a CPU, 1 core"
+    with pytest.raises(SystemExit, match="error: searches of several devices: a CPU, 1 core; a CPU, 2 cores"):
+        module.one_device([one, other])
+
+
+def test_a_script_ends_in_its_file_and_one_line_of_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    publish(tmp_path, "figures", False, 7, {"figure": 1.0, "more": [2]}, {"figure": 1.0})
+    assert capsys.readouterr().out == '{"figure": 1.0}\n'
+    publish(tmp_path, "figures", True, 8, {"figure": 3.0})
+    kept, quick = (json.loads((tmp_path / f"{name}.json").read_text()) for name in ("figures", "figures_quick"))
+    assert (kept["seed"], kept["figure"], kept["more"], quick["seed"], quick["figure"]) == (7, 1.0, [2], 8, 3.0)
+    assert {"commit", "versions", "device"} <= set(kept) and json.loads(capsys.readouterr().out) == quick
+
+
+def door(*inside: bool) -> dict[str, Any]:
+    """A case of identification with so many identifiable parameters, and another that is not."""
+    told = [{"inside": i, "identifiable": True, "nuisance": False} for i in inside]
+    rest = {"inside": False, "identifiable": False, "nuisance": False}
+    return {
+        "parameters": {str(k): p for k, p in enumerate([*told, rest])},
+        "converged": True,
+        "origin": {"commit": "a"},
+    }
+
+
+def test_doors_that_tell_nothing_have_no_coverage():
+    module = importlib.import_module("experiments.identify_suite")
+    none = module.summarise({"calibration_00": door()})["calibration"]
+    assert none == {"doors": 1, "converged": 1, "parameters": 0, "coverage": None, "coverage_interval_95": None}
+    some = module.summarise({"calibration_00": door(), "calibration_01": door(True, False)})["calibration"]
+    assert some["parameters"] == 2 and some["coverage"] == 0.5
+    json.dumps(some, allow_nan=False)
+
+
+def test_the_cones_are_compared_on_the_robot_that_is_searched(monkeypatch: pytest.MonkeyPatch):
+    """Not on the first one drawn, which may lose its door."""
+    module, seen = importlib.import_module("experiments.cone_mismatch"), list[Any]()
+
+    def of(value: float) -> dict[str, Any]:
+        return {"fit": SimpleNamespace(channels={"torque": SimpleNamespace(values=np.full((2, 4, 1), value))})}
+
+    monkeypatch.setattr(module, "elliptic", lambda where: f"{where}, elliptic")
+    monkeypatch.setattr(module, "recorded", lambda where, *_: seen.append(where) or (3, "the fourth", of(1.5)))
+    monkeypatch.setattr(module, "record", lambda where, drawn, roles: seen.append((where, drawn)) or of(1.0))
+    assert module.between_cones("door", 0) == [0.5]
+    assert seen == ["door, elliptic", ("door", "the fourth")]
+    monkeypatch.setattr(module, "recorded", lambda *_: "never held its door")
+    with pytest.raises(SystemExit, match="error: case door/cone/0: never held its door"):
+        module.between_cones("door", 0)
