@@ -77,7 +77,11 @@ def between_cones(where: Setting, seed: int) -> list[float]:
     The first robot that is searched, which keeps hold of its door with elliptic contacts.
     """
     _, drawn, recordings = robot(where, 0, seed)
-    torque = [_mean_torque(r["fit"]) for r in (record(where, drawn, ("fit",)), recordings)]
+    try:
+        pyramidal = record(where, drawn, ("fit",))
+    except ValueError as error:
+        raise SystemExit(f"error: {plan_of(0).name} with pyramidal contacts: {error}") from None
+    torque = [_mean_torque(r["fit"]) for r in (pyramidal, recordings)]
     return np.sqrt(np.mean((torque[1] - torque[0]) ** 2, axis=0)).tolist()
 
 

@@ -182,6 +182,7 @@ def run_make(command: Make) -> dict[str, Any]:
             _tell(f"{plan.name}: {outcome}")
         made[name] = _with(made.get(name, {}), outcomes)
         write_json(path, {"commit": commit, "scenes": made})
+    _tell(f"cases in {command.out / 'cases'}")
     return {scene: {outcome: len(names) for outcome, names in found.items()} for scene, found in made.items()}
 
 

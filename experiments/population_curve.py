@@ -9,6 +9,7 @@ judged on repeats that the search did not see.  The compilation is done before t
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -136,15 +137,17 @@ def main() -> None:
     for compiled in (cost, held):
         compiled(np.tile(cost.space.mean, (max(populations), 1)))
     folder = arguments.out / stem("population_curve_runs", arguments.quick)
-    runs, searched_on = [], ""
-    for seed in range(1 if arguments.quick else arguments.seeds):
-        for population in populations:
-            path = folder / f"{population}_samples_{seconds:g}_s_{seed}.json"
-            runs.append(
-                kept(path, lambda p=population, s=seed: {**curve(cost, held, p, seconds, s), "origin": origin(s)})
-            )
-            searched_on = one_device(runs)
-            print(f"{population} samples, seed {seed}: held-out {runs[-1]['held_out'][-1]:.4f} N m", flush=True)
+    planned = {
+        (seed, population): folder / f"{population}_samples_{seconds:g}_s_{seed}.json"
+        for seed in range(1 if arguments.quick else arguments.seeds)
+        for population in populations
+    }
+    there = [json.loads(path.read_text()) for path in planned.values() if path.is_file()]
+    here = [{"origin": origin(0)}] if len(there) < len(planned) else []
+    runs, searched_on = [], one_device([*there, *here])  # refused before a search is made
+    for (seed, population), path in planned.items():
+        runs.append(kept(path, lambda p=population, s=seed: {**curve(cost, held, p, seconds, s), "origin": origin(s)}))
+        print(f"{population} samples, seed {seed}: held-out {runs[-1]['held_out'][-1]:.4f} N m", flush=True)
     shares = (0.25, 0.5, 1.0)
     table = {
         str(p): {f"{s * seconds:g} s": [at(r, s * seconds) for r in runs if r["population"] == p] for s in shares}

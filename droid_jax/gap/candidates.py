@@ -78,5 +78,7 @@ def candidates(effects: Iterable[Effect]) -> tuple[Candidate, ...]:
         for (place, amplitudes), shapes in itertools.product(effect.places.items(), grid):
             out.append(Candidate(effect.name, place, amplitudes, shapes))
     if not out:
-        raise ValueError("there is nothing to ask about: none of the effects says its places (`Effect.places`)")
+        raise ValueError(
+            "effects: there is nothing to ask about, none of the effects says its places (`Effect.places`)"
+        )
     return tuple(out)

@@ -89,9 +89,11 @@ def answer(
         case = remembering(case, checkpoints / "replays")
     if split is Split.BLOCKS:
         floor = 0.0
-        model = kept_model(at("base"), case.base, lambda: base_model(case, progress=lambda now: tell("refine", now)))
+        model = kept_model(
+            at("base"), case.base, case.whole, lambda: base_model(case, progress=lambda now: tell("refine", now))
+        )
     else:
-        model = kept_model(at("base"), case.base, lambda: base_fit(case, tell, start))
+        model = kept_model(at("base"), case.base, case.whole, lambda: base_fit(case, tell, start))
         tell("floor", None)
         floor = kept_number(at("floor"), lambda: numerical_floor(case.fit, model, roles["fit"]))
     verdict = find(case, model, floor, tell)

@@ -73,12 +73,17 @@ class Remembered(Cost):
         return out
 
 
-def kept_model(folder: Path | None, base: Space, fit: Callable[[], Model]) -> Model:
+def kept_model(folder: Path | None, base: Space, whole: Space, fit: Callable[[], Model]) -> Model:
     """The base model over the space `base`, from its folder or, where that holds none that is whole, fitted now.
 
-    None: nothing is kept.
+    None: nothing is kept.  One that is not over the space `whole`, as where other code asked about other effects, is
+    warned of and fitted anew.
     """
-    return _model(base, _kept(folder, lambda: _tree(fit())))
+
+    def over(tree: Tree) -> bool:
+        return np.shape(tree["values"]) == (len(whole),)
+
+    return _model(base, _kept(folder, lambda: _tree(fit()), over))
 
 
 def kept_number(folder: Path | None, compute: Callable[[], float]) -> float:
@@ -86,16 +91,18 @@ def kept_number(folder: Path | None, compute: Callable[[], float]) -> float:
     return float(_kept(folder, lambda: {"value": np.array(compute())})["value"])
 
 
-def _kept(folder: Path | None, make: Callable[[], Tree]) -> Tree:
-    """Damage is reported as a warning that names the checkpoint."""
+def _kept(folder: Path | None, make: Callable[[], Tree], fits: Callable[[Tree], bool] = lambda tree: True) -> Tree:
+    """Damage, and what does not fit, is reported as a warning that names the checkpoint."""
     if folder is None:
         return make()
     with Checkpoints(folder, keep=1) as checkpoints:
         found = checkpoints.restore()
-        if found is None:
-            checkpoints.save(0, tree := make())
-            return tree
-        return found[1]
+        if found is not None and fits(found[1]):
+            return found[1]
+        if found is not None:
+            warnings.warn(f"checkpoint {folder} is of other effects and is computed again", stacklevel=3)
+        checkpoints.save(0, tree := make())
+        return tree
 
 
 # what a base model holds beside its space, which the caller knows: numbers and arrays, and those of its refinement

@@ -17,15 +17,19 @@ import numpy as np
 class Reader:
     """Reads what one command wrote; every fault is a ValueError that names the file.
 
-    command: "identify", "gap", "train" or "evaluate", to run again where something is missing or broken.
+    command: "identify", "gap", "train" or "evaluate", to run again where something is missing or broken; with an option
+      that it then needs ("gap --again").
     """
 
     command: str
 
     def fault(self, what: str) -> ValueError:
         """The error for a fault, with what to do about it."""
-        again = f"run `python -m droid_jax.run {self.command}` again, or pass the folder that it wrote"
-        return ValueError(f"{what}; {again}")
+        command, _, option = self.command.partition(" ")
+        how = f" with the same options and {option}" if option else ""
+        return ValueError(
+            f"{what}; run `python -m droid_jax.run {command}` again{how}, or pass the folder that it wrote"
+        )
 
     def json(self, path: Path) -> dict[str, Any]:
         """A JSON object."""

@@ -83,9 +83,19 @@ def test_a_search_that_is_run_again_replays_nothing_and_ends_alike(found: Small,
     assert sum(counts) <= 4 * 32
 
 
+def test_a_base_model_over_other_effects_is_fitted_again(found: Small, tmp_path: Path):
+    """What a search that was stopped finds where other code asks about one effect less."""
+    case, fewer = found.case, dataclasses.replace(found.base, values=found.base.values[:-1])
+    kept_model(tmp_path / "base", case.base, case.whole, lambda: fewer)
+    with pytest.warns(UserWarning, match="of other effects"):
+        back = kept_model(tmp_path / "base", case.base, case.whole, lambda: found.base)
+    np.testing.assert_array_equal(back.values, found.base.values)
+    np.testing.assert_array_equal(kept_model(tmp_path / "base", case.base, case.whole, never).values, back.values)
+
+
 def test_a_base_model_comes_back_as_it_was(found: Small, tmp_path: Path):
-    kept_model(tmp_path / "base", found.case.base, lambda: found.base)
-    back = kept_model(tmp_path / "base", found.case.base, never)
+    kept_model(tmp_path / "base", found.case.base, found.case.whole, lambda: found.base)
+    back = kept_model(tmp_path / "base", found.case.base, found.case.whole, never)
     assert (back.parts, back.gap, back.name) == ((), found.base.gap, "base")
     assert back.space is found.case.base
     np.testing.assert_array_equal(back.values, found.base.values)

@@ -384,7 +384,11 @@ def test_a_missing_or_broken_file_is_named(tmp_path: Path, name: str, content: b
     (folder / name).unlink()
     if content is not None:
         (folder / name).write_bytes(content)
-    how = "gap` again" if (name, content) == ("gap.json", None) else "gap --again`"
+    how = (
+        "gap` again, or"
+        if (name, content) == ("gap.json", None)
+        else "gap` again with the same options and --again, or"
+    )
     with pytest.raises(ValueError, match=rf"{re.escape(name)}.*droid_jax\.run {how}"):
         page.write_report(folder)
 
