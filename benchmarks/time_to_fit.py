@@ -24,6 +24,7 @@ import json  # noqa: E402
 import tyro  # noqa: E402
 
 from benchmarks.common import empty_cache, publish  # noqa: E402
+from droid_jax.files import FIT  # noqa: E402
 
 POPULATION, GENERATIONS, TIMESTEP = 30, 100, 0.002
 
@@ -76,7 +77,7 @@ def identify_command() -> dict[str, Any]:
         command = [sys.executable, "-m", "droid_jax.run", "identify", "--out", f"{folder}/run"]
         subprocess.run(command, check=True, cwd=ROOT, env=empty_cache(folder), stdout=subprocess.DEVNULL)
         seconds = time.perf_counter() - began
-        stages = json.loads((Path(folder) / "run" / "fit.json").read_text())["seconds"]
+        stages = json.loads((Path(folder) / "run" / FIT).read_text())["seconds"]
     return {"seconds": seconds, "stages": stages}
 
 

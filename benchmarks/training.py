@@ -36,6 +36,7 @@ import jax  # noqa: E402
 import tyro  # noqa: E402
 
 from benchmarks.common import origin, stem  # noqa: E402
+from droid_jax.files import GAUSSIAN, POLICY  # noqa: E402
 from droid_jax.identify.gaussian import prior  # noqa: E402
 from droid_jax.measure.surrogate import stand_in_truth  # noqa: E402
 from droid_jax.model.door import door_nuisances, door_space  # noqa: E402
@@ -85,8 +86,8 @@ def measured(arguments: Arguments) -> dict[str, Any]:
     platform = jax.default_backend()
     place = arguments.preset if platform == "cpu" else f"{arguments.preset}_{platform}"  # as its figures: apart
     left = arguments.out / stem("training_policy", arguments.quick) / place
-    save_policy(left / "policy.npz", found.policy)
-    gaussian.save(left / "gaussian.json")
+    save_policy(left / POLICY, found.policy)
+    gaussian.save(left / GAUSSIAN)
     physics = round(env.task.control / TIMESTEP)  # steps of the simulation in an action
     rates = [now.rate for now in found.history[2:]] or [found.history[-1].rate]  # the first part compiles
     reached = [now for now in found.history if now.success >= ENOUGH]

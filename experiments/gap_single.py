@@ -32,7 +32,7 @@ from benchmarks.sharing import code_name, kept
 from droid_jax.compare.residuals import CompareConfig
 from droid_jax.gap.blocks import Blocks
 from droid_jax.gap.case import Case, GapConfig
-from droid_jax.gap.evidence import Evidence, only_comparison
+from droid_jax.gap.evidence import only_comparison
 from droid_jax.gap.refit import deviations, intervals
 from droid_jax.gap.select import SIGNIFICANT
 from droid_jax.gap.single import Log, base_model, make_log, single_case
@@ -250,14 +250,9 @@ def report(case: Case, verdict: Verdict) -> dict[str, Any]:
 
 def _block_seconds(case: Case) -> float:
     """Shortest of the blocks."""
-    block, time = _block(case.fit), case.fit.time
+    assert isinstance(case.fit, Blocks)
+    block, time = case.fit.block[case.fit.column == 0], case.fit.time
     return min(float(np.sum(block == b)) for b in range(case.fit.units)) * float(time[1] - time[0])
-
-
-def _block(evidence: Evidence) -> np.ndarray:
-    """[K] block of each instant."""
-    assert isinstance(evidence, Blocks)
-    return evidence.block[evidence.column == 0]
 
 
 def _rms_of(case: Case, verdict: Verdict, role: str) -> dict[str, list[float]]:

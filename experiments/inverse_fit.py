@@ -33,6 +33,7 @@ from droid_jax.identify.search import SearchConfig, search
 from droid_jax.identify.uncertainty import calibrated, identifiability, time_blocks
 from droid_jax.measure import noise
 from droid_jax.measure.checks import validate
+from droid_jax.measure.clocks import interpolate
 from droid_jax.measure.recording import Channel, Recording, TorqueConvention
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
@@ -73,7 +74,7 @@ def resampled(time: np.ndarray, values: np.ndarray, clock: np.ndarray) -> np.nda
     A repeated row is a packet that did not arrive, not a robot that stood still for a millisecond.
     """
     fresh = np.r_[True, np.any(np.diff(values, axis=0) != 0, axis=1)]
-    return np.stack([np.interp(clock, time[fresh], values[fresh, c]) for c in range(values.shape[1])], axis=1)
+    return interpolate(clock, time[fresh], values[fresh])
 
 
 def make_recording(

@@ -31,6 +31,7 @@ import tyro  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 
 from benchmarks.common import origin, stem  # noqa: E402
+from droid_jax.files import GAUSSIAN  # noqa: E402
 from droid_jax.identify.gaussian import Gaussian, prior  # noqa: E402
 from droid_jax.identify.gaussian import load as load_gaussian  # noqa: E402
 from droid_jax.model.door import door_nuisances, door_space  # noqa: E402
@@ -153,7 +154,7 @@ def main() -> None:
     if arguments.quick:
         results.append({"policy": "untrained", "gaussian": "prior", **compared(*untrained(), 2, arguments.seed)})
     for number, policy in enumerate(() if arguments.quick else arguments.policies):
-        beside = policy.with_name("gaussian.json")
+        beside = policy.with_name(GAUSSIAN)
         of = {"policy": named(policy), "gaussian": named(beside)}
         results.append({**of, **compared(*trained(policy, beside), arguments.doors, arguments.seed + number)})
     name = stem("policy_parity", arguments.quick)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.common import ROOT
+from droid_jax.files import GAP
 from droid_jax.measure.formats import save
 from droid_jax.measure.recording import Recording
 
@@ -32,7 +33,7 @@ def run_gap(recordings: Sequence[Recording], folder: Path, arguments: Sequence[s
     seconds = time.perf_counter() - began
     if done.returncode:
         raise RuntimeError(f"gap ended with {done.returncode}: {' '.join(done.stderr.strip().splitlines()[-1:])}")
-    found = json.loads((out / "gap.json").read_text())
+    found = json.loads((out / GAP).read_text())
     return {
         **{k: found[k] for k in ("verdict", "sentence", "effects", "tied", "p", "gaps", "shifts")},
         "seconds": seconds,

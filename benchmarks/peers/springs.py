@@ -19,6 +19,7 @@ from benchmarks.peers import sysid as peer
 from benchmarks.peers.gap import run_gap
 from droid_jax.compare.cost import ENGINES, make_cost
 from droid_jax.compare.residuals import CompareConfig
+from droid_jax.files import EXTENDED
 from droid_jax.gap.extended import load_extended
 from droid_jax.identify.refine import RefineConfig, refine
 from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
@@ -287,6 +288,6 @@ def _gap(folder: Path, xml: str, recordings: Sequence[Recording]) -> tuple[Space
     parameters.write_text(json.dumps(PARAMETERS))
     found = run_gap(recordings, folder, ["--scene", str(scene), "--parameters", str(parameters)])
     loaded = load_scene(scene)
-    model = load_extended(folder / "run" / "extended.json", loaded)
+    model = load_extended(folder / "run" / EXTENDED, loaded)
     values = dict(zip(model.space.names, model.values.tolist(), strict=True))
     return load_parameters(parameters, loaded), {**found, "values": values}

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from droid_jax.compare.replay import make_drive
+from droid_jax.measure.clocks import interpolate
 from droid_jax.measure.engine import instrument
 from droid_jax.measure.recording import Recording
 from droid_jax.model.parameters import Parameter, Space
@@ -166,7 +167,7 @@ def _difference(scene: Scene, space: Space) -> Any:
         x = parameters.as_vector()
         at = measured.times - (0.0 if late is None else x[late])
         clock = predicted.times - model.opt.timestep
-        values = np.stack([np.interp(at, clock, column) for column in predicted.data[:, :joints].T], axis=1)
+        values = interpolate(at, clock, predicted.data[:, :joints])
         values += [0.0 if i is None else x[i] for i in offsets]
         trace = sysid.TimeSeries(measured.times, values, measured.signal_mapping)
         error = sysid.weighted_diff(predicted_data=values, measured_data=measured.data, model=model)

@@ -97,9 +97,9 @@ def _kept(folder: Path | None, make: Callable[[], Tree], fits: Callable[[Tree], 
         return make()
     with Checkpoints(folder, keep=1) as checkpoints:
         found = checkpoints.restore()
-        if found is not None and fits(found[1]):
-            return found[1]
         if found is not None:
+            if fits(found[1]):
+                return found[1]
             warnings.warn(f"checkpoint {folder} is of other effects and is computed again", stacklevel=3)
         checkpoints.save(0, tree := make())
         return tree
