@@ -64,7 +64,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_replay_that_was_cut_off_is_named(folder: Path, tmp_path: Path):
     whole = (folder / REPLAY).read_bytes()
     (tmp_path / REPLAY).write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(ValueError, match=f"{REPLAY} cannot be read .*identify --again"):
+    with pytest.raises(ValueError, match=f"{REPLAY} cannot be read .*identify` again .* and --again"):
         replay_of(tmp_path)
 
 
