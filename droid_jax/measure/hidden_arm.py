@@ -176,7 +176,7 @@ def grip_compliance(place: Place, a: float) -> Influence:
 
 ARM_EFFECTS = (
     Hidden("payload", "kg", (0.05, 0.6), "hand", payload, "a tool on the hand that the robot does not know"),
-    Hidden("cable_pull", "N m", (0.5, 5.0), "arm", cable_pull, "a cable that pulls the joint back"),
+    Hidden("cable_pull", "N m", (0.1, 1.0), "arm", cable_pull, "a cable that pulls the joint back"),
     Hidden("torque_ripple", "N m", (0.1, 1.0), "arm", torque_ripple, "two harmonics of a gear"),
     Hidden("joint_elasticity", "rad/(N m)", (5e-5, 1e-3), "arm", joint_elasticity, "gears that twist"),
     Hidden("backlash", "rad", (0.0005, 0.005), "arm", backlash, "a gap in the gears"),
