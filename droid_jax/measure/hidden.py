@@ -89,7 +89,7 @@ def record_hidden(
     """Like `surrogate.record`, with effects that no parameter of the model stands for.
 
     effects: amplitudes by name, or by "name[joint]"; or `Applied`.
-    config: the default records with time steps of 0.25 ms; longer ones are refused.
+    config: time steps of more than LONGEST_STEP are refused.
     space: what truth may speak of; the default is a held door's parameters, else offsets and timing.
     Without effects the recording equals `record`'s with the same config bit for bit: the same steps
     of the same model, taken one by one.
@@ -97,7 +97,7 @@ def record_hidden(
     measured joints, ripple.
     Raises ValueError for unknown names, joints or amplitudes, and like `record`.
     """
-    config = config or SurrogateConfig(timestep=LONGEST_STEP)
+    config = config or SurrogateConfig()
     if config.timestep > LONGEST_STEP * (1 + 1e-9):
         raise ValueError(f"hidden effects need time steps of at most {LONGEST_STEP} s, got {config.timestep}")
     applied = listed(effects)

@@ -17,7 +17,7 @@ from droid_jax.gap.candidates import Candidate, candidates
 from droid_jax.gap.case import Case
 from droid_jax.gap.refit import refit
 from droid_jax.identify.refine import RefineConfig
-from droid_jax.measure.hidden import LONGEST_STEP, Applied
+from droid_jax.measure.hidden import Applied
 from droid_jax.measure.recording import Recording
 from droid_jax.measure.surrogate import SurrogateConfig
 from experiments.blind.make import Drawn, record
@@ -25,7 +25,7 @@ from experiments.blind.search import Bench
 
 SETTLE = RefineConfig(iterations=20, hops=0, spreads=0)
 QUIET = SurrogateConfig(
-    timestep=LONGEST_STEP, torque_noise=(0.0, 0.0), torque_drift=(0.0, 0.0), position_noise=0.0, angle_noise=0.0,
+    torque_noise=(0.0, 0.0), torque_drift=(0.0, 0.0), position_noise=0.0, angle_noise=0.0,
     start_noise=0.0, pose_noise=0.0,
 )  # fmt: skip
 
