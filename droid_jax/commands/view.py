@@ -72,7 +72,7 @@ def replay_of(folder: Path) -> tuple[np.ndarray, np.ndarray]:
 
     from droid_jax.report.reading import Reader
 
-    replay = Reader("identify --again").arrays(folder / REPLAY, ("time", "before", "after"))
+    replay = Reader("identify", "--again").arrays(folder / REPLAY, ("time", "before", "after"))
     return replay["time"], np.concatenate([replay["before"], replay["after"]], axis=1)
 
 

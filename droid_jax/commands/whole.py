@@ -350,4 +350,4 @@ def _json(path: Path) -> dict[str, Any] | None:
     """What a stage left, or the run itself; None where it did not.  ValueError where it cannot be read."""
     from droid_jax.report.reading import Reader
 
-    return Reader("all --again").json(path) if path.is_file() else None
+    return Reader("all", "--again").json(path) if path.is_file() else None

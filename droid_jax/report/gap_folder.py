@@ -15,7 +15,7 @@ from droid_jax.report.reading import Reader
 
 VERDICTS = ("none", "named", "tie", "partly explained", "unexplained", "fit not converged")
 ROLES = ("fit", "confirm", "sealed")
-_READ = Reader("gap --again")  # gap.json comes last: once it is there, the command takes the run for whole
+_READ = Reader("gap", "--again")  # gap.json comes last: once it is there, the command takes the run for whole
 _NUMBER = (int, float)
 _MAYBE = (int, float, type(None))
 _CELL = {"variable": str, "where": str, "gap": _MAYBE, "p": _MAYBE, "found": bool}

@@ -17,18 +17,18 @@ import numpy as np
 class Reader:
     """Reads what one command wrote; every fault is a ValueError that names the file.
 
-    command: "identify", "gap", "train" or "evaluate", to run again where something is missing or broken; with an option
-      that it then needs ("gap --again").
+    command: "identify", "gap", "train" or "evaluate", to run again where something is missing or broken.
+    option: what it then needs beside the same options ("--again").
     """
 
     command: str
+    option: str = ""
 
     def fault(self, what: str) -> ValueError:
         """The error for a fault, with what to do about it."""
-        command, _, option = self.command.partition(" ")
-        how = f" with the same options and {option}" if option else ""
+        how = f" with the same options and {self.option}" if self.option else ""
         return ValueError(
-            f"{what}; run `python -m droid_jax.run {command}` again{how}, or pass the folder that it wrote"
+            f"{what}; run `python -m droid_jax.run {self.command}` again{how}, or pass the folder that it wrote"
         )
 
     def json(self, path: Path) -> dict[str, Any]:

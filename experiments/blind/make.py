@@ -24,9 +24,6 @@ from experiments.blind.cases import Limits, Plan, applied
 from experiments.blind.draws import Truth, draw_truths, folder_of, seed_of
 from experiments.blind.scenes import ROLES, Setting
 
-# Ten repeats with a real robot's noise.  Its time step is the stand-in's own: at 0.25 ms the stand-in's integration
-# alone left U = 0.001 that no parameter takes away, and p-values of doors with nothing missing came out too small.
-USUAL = SurrogateConfig()
 ATTEMPTS = 8  # draws of a robot that keeps hold of its door with this effect
 
 
@@ -82,7 +79,7 @@ def draw(setting: Setting, plan: Plan, limits: Limits, rng: np.random.Generator)
 
 
 def record(
-    setting: Setting, drawn: Drawn, roles: tuple[str, ...] = ROLES, config: SurrogateConfig = USUAL
+    setting: Setting, drawn: Drawn, roles: tuple[str, ...] = ROLES, config: SurrogateConfig | None = None
 ) -> dict[str, Recording]:
     """Role -> recording.  Raises ValueError where the stand-in loses the door."""
     out = {}

@@ -22,10 +22,11 @@ from droid_jax.identify.refine import RefineConfig
 from droid_jax.measure.hidden import Applied
 from droid_jax.measure.noise import lowpass, smooth
 from droid_jax.measure.recording import Recording
+from droid_jax.measure.surrogate import SurrogateConfig
 from droid_jax.model.effects.registry import effect_space
 from droid_jax.model.seam import Effect
 from experiments.blind.draws import Truth
-from experiments.blind.make import USUAL, Drawn, record
+from experiments.blind.make import Drawn, record
 from experiments.blind.scenes import Setting
 from experiments.blind.units import torques, whitened
 
@@ -132,7 +133,7 @@ def ground(setting: Setting, truth: Truth, seed: int) -> Ground:
 
 def _recorded(setting: Setting, hidden: tuple[Applied, ...], truth: Truth, seed: int, repeats: int) -> Recording:
     drawn = Drawn(hidden, {"fit": truth}, {"fit": seed})
-    return record(setting, drawn, ("fit",), replace(USUAL, repeats=repeats))["fit"]
+    return record(setting, drawn, ("fit",), SurrogateConfig(repeats=repeats))["fit"]
 
 
 def dense(effects: tuple[Effect, ...]) -> tuple[Candidate, ...]:
