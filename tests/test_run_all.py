@@ -88,7 +88,7 @@ def test_without_arguments_every_stage_runs_on_one_recording(called, tmp_path: P
     assert main([]) == 0
     fit, search, policy, trials = called
     files = tuple(Path("runs/all/recordings") / f"{name}.npz" for name in "CBA")
-    assert fit.recording == files[:1] and search.recording == files
+    assert fit.recording == files[:2] and search.recording == files
     assert policy.fit == fit.out and policy.out == trials.run == Path("runs/all/train")
     assert known_stand_in(files) == {"springs": 1, "seed": 0, "hide": ["magnetic_catch=1.5"]}
     lines = capsys.readouterr().out.splitlines()
@@ -321,7 +321,7 @@ def test_a_search_in_other_recordings_is_not_trained_on(called, tmp_path: Path):
 def test_your_own_recordings_know_no_stand_in(called, tmp_path: Path):
     motions("a.npz", "b.npz")
     assert main(["all", "--recording", "a.npz", "b.npz", "--stages", "identify", "gap"]) == 0
-    assert called[0].recording == (Path("a.npz"),) and called[1].recording == (Path("a.npz"), Path("b.npz"))
+    assert called[0].recording == called[1].recording == (Path("a.npz"), Path("b.npz"))
     (tmp_path / "setup.json").write_text(json.dumps({"command": "identify", "recording": ["a.npz", "b.npz"]}))
     assert stand_in_of(tmp_path) == {}
 
@@ -399,7 +399,7 @@ def test_nothing_is_recorded_for_stages_that_need_no_recording(called, tmp_path:
 @pytest.mark.parametrize(
     ("repeats", "count", "commands", "fitted", "begins_at_fit"),
     [
-        (8, 3, True, 1, True),
+        (8, 3, True, 2, True),
         (16, 1, True, 1, True),
         (1, 2, False, 1, False),  # the second log is sealed; one in blocks is fitted without a start
         (1, 1, False, 1, False),
@@ -416,12 +416,6 @@ def test_a_sealed_recording_is_not_fitted(
     fit, search = called
     assert [str(path) for path in fit.recording] == names[:fitted]
     assert len(search.recording) == count and search.fit == (Path("run/identify") if begins_at_fit else None)
-
-
-def test_without_a_search_all_but_the_sealed_one_are_fitted(called):
-    names = motions("a.npz", "b.npz", "c.npz")
-    assert main(["all", "--recording", *names, "--stages", "identify"]) == 0
-    assert [str(path) for path in called[0].recording] == [*names[:2]]
 
 
 def test_recordings_are_checked_before_any_stage(called, capsys):

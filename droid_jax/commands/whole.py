@@ -56,8 +56,7 @@ class All:
     standard (100 generations; not identify's paper, whose servo no policy can be trained on), train with paper; hours.
     gpu: all with gpu."""
     recording: tuple[Path, ...] = ()
-    """FIT CONFIRM [SEALED], ONE or LOG [SEALED], as in gap: identify fits the first, without the stage gap all but the
-    sealed one.  With fewer repeats: --stages identify."""
+    """FIT CONFIRM [SEALED], ONE or LOG [SEALED], as in gap; with fewer repeats: --stages identify."""
     scene: Path | None = None
     """Your own MJCF instead of the built-in door: identify and gap, policies are trained at the built-in one."""
     parameters: Path | None = None
@@ -253,9 +252,8 @@ def _plan(
     presets = PRESETS[command.preset]
     common: dict[str, Any] = {"seed": command.seed, "again": command.again, "own_effects": command.own_effects}
     own, board = _own(command) | common, {"tensorboard": command.tensorboard}
-    # The search fits the first alone, and begins where this fit ends; the sealed one stays sealed until it opens it.
-    spared = ("confirm", "sealed") if "gap" in command.stages else ("sealed",)
-    seen = tuple(path for path, role in zip(recordings, roles, strict=False) if role not in spared)
+    # A sealed one stays sealed until the search opens it.
+    seen = tuple(path for path, role in zip(recordings, roles, strict=False) if role != "sealed")
 
     def fit() -> None:
         _stage(identify.run, identify.Identify(presets.identify, seen, out=out / "identify", **board, **own))
