@@ -39,7 +39,7 @@ PRESETS = {
     "gpu": _Presets("gpu", "gpu"),
 }
 
-MINUTES = {"record": 0.6, "identify": 7.8, "gap": 11.2, "train": 9.5, "evaluate": 2.1}
+MINUTES = {"record": 0.3, "identify": 3.9, "gap": 6.2, "train": 6.1, "evaluate": 1.2}
 """Of each stage in the preset "quick", on two cores with nothing compiled before (benchmarks/default_run.py)."""
 
 
