@@ -109,9 +109,9 @@ def _searched(arguments: Arguments, folder: Path, code: Mapping[str, Any]) -> di
         config = GapConfig(SearchConfig(population=8, parents=None, generations=1), small, small, 1, 1, 1)
     checkpoints = folder / "checkpoints" / code_name(code["commit"])
     case = case_of(Split.RECORDINGS, scene, base, library(scene), roles, config)
-    case, verdict, _ = searched(Split.RECORDINGS, case, roles, checkpoints)
+    case, verdict, handed, _ = searched(Split.RECORDINGS, case, roles, checkpoints)
     posterior(verdict.base.refined, case.fit.cost.comparisons).save(folder / BASE)
-    save_extended(folder, extended(case, verdict.model))
+    save_extended(folder, extended(case, handed))
     if verdict.kind is Kind.UNCONVERGED and not arguments.quick:  # no verdict: nothing is kept of it
         raise SystemExit(f"error: {verdict.sentence}")
     found = {

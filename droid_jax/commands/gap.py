@@ -130,7 +130,7 @@ def run(command: Gap) -> None:
     case = case_of(split, scene, base, effects, roles, config)
     begin(out, setup, command.again, "gap")  # and only now, with all of it found good
     board = out / FOLDER if command.tensorboard else None
-    case, verdict, seconds = searched(split, case, roles, out / "checkpoints", start, board)
+    case, verdict, handed, seconds = searched(split, case, roles, out / "checkpoints", start, board)
     stand_in = all(is_stand_in(r) for r in roles.values())
     known = known_stand_in(command.recording or kept_at(out)) if stand_in else {}
     description = {
@@ -140,7 +140,7 @@ def run(command: Gap) -> None:
         "device": runtime.device(),
         "setup": {**setup, "stand_in": stand_in, "robot": known},
     }
-    write_gap(out, case, verdict, description)
+    write_gap(out, case, verdict, handed, description)
     shutil.rmtree(out / "checkpoints" / "replays", ignore_errors=True)
     _done(out)
 

@@ -14,11 +14,12 @@ if TYPE_CHECKING:
     import numpy as np
 
     from droid_jax.gap.case import Case
+    from droid_jax.gap.handover import HandedOn
     from droid_jax.gap.split import Split
     from droid_jax.gap.verdict import Verdict
     from droid_jax.measure.recording import Recording
 
-BARS = ("search", "refine", "floor", "screen", "look", "refit", "anew", "judge")
+BARS = ("search", "refine", "floor", "screen", "look", "refit", "anew", "judge", "both")
 IN_BLOCKS = ("refine", "screen", "look", "refit", "judge")  # of a log: no search, and no time step to refine
 
 
@@ -29,12 +30,13 @@ def searched(
     checkpoints: Path,
     start: np.ndarray | None = None,
     board: Path | None = None,
-) -> tuple[Case, Verdict, dict[str, float]]:
-    """The case and its verdict, going on from `checkpoints`; and each stage's seconds.
+) -> tuple[Case, Verdict, HandedOn, dict[str, float]]:
+    """The case, its verdict and the model to hand on, going on from `checkpoints`; and each stage's seconds.
 
     start: [F] values of the base parameters from which their fit begins, instead of a search.
     board: folder for scalars of the base fit.
     """
+    from droid_jax.gap.handover import handed_on
     from droid_jax.gap.missing import answer
     from droid_jax.gap.split import Split
     from droid_jax.report.progress import stages
@@ -45,8 +47,9 @@ def searched(
         clock = Clock(names, (show, write), checkpoints / "seconds.json")
         clock(names[0], None)
         case, verdict = answer(split, case, roles, start, clock, checkpoints)
-        clock("judge", None)  # its seconds count
-    return case, verdict, clock.seconds
+        handed = handed_on(case, verdict.model, clock)
+        clock.stop()
+    return case, verdict, handed, clock.seconds
 
 
 class Clock:
@@ -57,12 +60,17 @@ class Clock:
         self.seconds: dict[str, float] = _seconds(kept)
         self._stage, self._since = stages[0], time.monotonic()
 
-    def __call__(self, stage: str, value: Any) -> None:
+    def stop(self) -> None:
+        """Count the seconds of the stage that is on."""
         now = time.monotonic()
         self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._since
+        self._since = now
+
+    def __call__(self, stage: str, value: Any) -> None:
+        self.stop()
         if stage != self._stage:
             write_json(self.kept, self.seconds)
-        self._stage, self._since = stage, now
+        self._stage = stage
         if stage in self.stages:
             for tell in self.tell:
                 tell(stage, value)

@@ -19,7 +19,7 @@ import numpy as np
 from droid_jax.files import EXTENDED, EXTENDED_MJCF
 from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.case import Case
-from droid_jax.gap.refit import Model
+from droid_jax.gap.handover import HandedOn
 from droid_jax.identify.gaussian import Gaussian, space_from_json, space_to_json
 from droid_jax.identify.uncertainty import posterior
 from droid_jax.model.effects.registry import effect_space, library, ready
@@ -75,10 +75,11 @@ class Extended:
         return tuple(p.name for p in parts if not _in_mjcf(effects[p.effect], self.space.select(p.free)))
 
 
-def extended(case: Case, model: Model) -> Extended:
-    """The extended model that a search ended with, as something to save."""
+def extended(case: Case, handed: HandedOn) -> Extended:
+    """The extended model that a search hands on, as something to save."""
+    model = handed.model
     values = model.values[case.whole.columns(model.space)]
-    gaussian = posterior(model.refined, case.fit.cost.comparisons)
+    gaussian = posterior(model.refined, [c for evidence in handed.of for c in evidence.cost.comparisons])
     named = {part.effect for part in model.parts}
     effects = tuple(e for e in case.effects if e.name in named)
     return Extended(case.fit.cost.scene, model.parts, effects, values, gaussian)

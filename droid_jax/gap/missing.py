@@ -16,6 +16,7 @@ from droid_jax.gap.candidates import candidates, possible
 from droid_jax.gap.case import Case, GapConfig, make_case
 from droid_jax.gap.extended import Extended, extended
 from droid_jax.gap.floor import numerical_floor
+from droid_jax.gap.handover import handed_on
 from droid_jax.gap.inputs import shared_out
 from droid_jax.gap.menu import separating
 from droid_jax.gap.resume import kept_model, kept_number, remembering
@@ -64,7 +65,7 @@ def find_missing(
     start = None if start is None else space.check(start)
     case = case_of(split, scene, space, asked, roles, config or GapConfig())
     case, verdict = answer(split, case, roles, start, progress)
-    return verdict, extended(case, verdict.model)
+    return verdict, extended(case, handed_on(case, verdict.model, progress or (lambda stage, value: None)))
 
 
 def answer(

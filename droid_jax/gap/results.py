@@ -17,6 +17,7 @@ from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.case import Case
 from droid_jax.gap.evidence import Evidence
 from droid_jax.gap.extended import extended, save_extended
+from droid_jax.gap.handover import HandedOn
 from droid_jax.gap.localise import Localisation
 from droid_jax.gap.refit import intervals
 from droid_jax.gap.screen import Screen
@@ -26,14 +27,15 @@ from droid_jax.identify.uncertainty import told
 from droid_jax.storage import finite, write_json, write_npz
 
 
-def write_gap(folder: Path, case: Case, verdict: Verdict, description: Mapping[str, Any]) -> None:
+def write_gap(folder: Path, case: Case, verdict: Verdict, handed: HandedOn, description: Mapping[str, Any]) -> None:
     """Write all files of a search; gap.json last, its presence says that the run is whole.
 
+    handed: the model to hand on.
     description: what else gap.json shall hold: "seconds", "versions", "device", "setup", ...
     """
     write_npz(folder / GAP_TRACES, gap_arrays(case, verdict))
-    save_extended(folder, extended(case, verdict.model))
-    write_json(folder / GAP, {**gap_json(case, verdict), **description})
+    save_extended(folder, extended(case, handed))
+    write_json(folder / GAP, {**gap_json(case, verdict), "handed_on": _handed_on(case, verdict, handed), **description})
 
 
 def gap_json(case: Case, verdict: Verdict) -> dict[str, Any]:
@@ -100,6 +102,15 @@ def _before_after(evidence: Evidence, verdict: Verdict) -> np.ndarray:
 def _joints(evidence: Evidence) -> list[str]:
     """Measured joints, in the order of the torque channel's columns."""
     return [evidence.cost.scene.joints[c] for c in evidence.cost.comparisons[0].channel("torque").columns]
+
+
+def _handed_on(case: Case, verdict: Verdict, handed: HandedOn) -> dict[str, Any]:
+    """Which recordings the model that is handed on is fitted to, and U of each role with it; null where it blows up."""
+    commons = {role: case.judged[role].common(handed.model.values)[0] for role in verdict.gaps}
+    return {
+        "fitted_to": [evidence.cost.comparisons[0].name for evidence in handed.of],
+        "gaps": {role: finite(case.judged[role].gap(case.judged[role].residuals(c))) for role, c in commons.items()},
+    }
 
 
 def _gap(role: str, evidence: Evidence, verdict: Verdict) -> dict[str, Any]:

@@ -44,6 +44,7 @@ _SCHEMA = {
     "trends": [_TREND],
     **{"units": str, "versions": dict, "device": str, "setup": dict},
 }
+_HANDED_ON = {"fitted_to": [str], "gaps": {str: _MAYBE}}
 _ABOUT = {"what": str, "mark": str, "confused_with": [str]}
 _SPLIT = {"by": str, "limits": str}
 _LINES = ("measured", "scatter", "before", "after")
@@ -120,6 +121,11 @@ class Gap:
         return self.found.get("about", {})
 
     @property
+    def fitted_to(self) -> list[str]:
+        """Recordings that the model that was handed on is fitted to; an older search fitted it to the first."""
+        return self.found.get("handed_on", {}).get("fitted_to", [self.recording("fit")])
+
+    @property
     def parts(self) -> Parts:
         """What is said of how the recordings were divided."""
         return parts_of(self.found)
@@ -171,6 +177,8 @@ def read_gap(folder: str | Path) -> Gap:
     _READ.check(said_split(found), _SPLIT, "gap.json, 'split'")
     _READ.check(found.get("shapes", []), [_SIZE], "gap.json, 'shapes'")
     _READ.check(found.get("about", {}), {str: _ABOUT}, "gap.json, 'about'")
+    if "handed_on" in found:
+        _READ.check(found["handed_on"], _HANDED_ON, "gap.json, 'handed_on'")
     for fault in _faults(found):
         raise _READ.fault(f"gap.json, {fault}")
     roles = [r for r in ROLES if r in found["gaps"]]

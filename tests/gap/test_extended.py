@@ -17,6 +17,7 @@ import droid_jax as dj
 from droid_jax.compare.cost import make_cost
 from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.extended import Extended, extended, load_extended, save_extended
+from droid_jax.gap.handover import HandedOn
 from droid_jax.identify.gaussian import prior
 from droid_jax.model.effects.registry import effect_space, library, ready
 from droid_jax.model.mjcf import fitted_mjcf
@@ -35,7 +36,7 @@ def found() -> Small:
 @pytest.fixture(scope="module")
 def saved(found: Small, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("extended")
-    save_extended(folder, extended(found.case, found.verdict.model))
+    save_extended(folder, extended(found.case, HandedOn(found.verdict.model, (found.case.fit,))))
     return folder / "extended.json"
 
 
@@ -110,7 +111,7 @@ def test_effects_join_a_space_from_where_they_were_found(saved: Path):
 
 
 def test_a_model_without_effects_is_the_base_model(found: Small, tmp_path: Path):
-    save_extended(tmp_path, extended(found.case, found.base))
+    save_extended(tmp_path, extended(found.case, HandedOn(found.base, (found.case.fit,))))
     scene, base = small_scene()
     model = load_extended(tmp_path / "extended.json", scene)
     assert (model.parts, model.effects, model.lacking) == ((), (), ())
