@@ -54,6 +54,7 @@ def find_missing(
 
     The verdict's gaps are in squared noise units of one repeat.  Only another motion tells effects apart that act
     alike in this one (`Split.limits`).
+    The model is handed on as `handed_on` says: with effects in it, it is fitted to both motions.
     Raises ValueError for recordings in which a search could not end well, and for effects that are none or that a
     recording without commands cannot have.
     """
