@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -73,12 +75,15 @@ def test_without_an_effect_in_blocks_or_unsettled_it_is_the_searchs_own(found: S
 
 def test_file_and_page_say_what_it_is_fitted_to(found: Small, both: HandedOn, tmp_path):
     write_gap(tmp_path, found.case, found.verdict, both, MORE)
-    told = read_gap(tmp_path)
+    told: Any = read_gap(tmp_path)
     assert told.fitted_to == ["fit", "confirm"]
     for role, evidence in (("fit", found.case.fit), ("confirm", found.case.confirm)):
         assert told.found["handed_on"]["gaps"][role] == pytest.approx(evidence.gap_at(both.model.values))
     page = write_report(tmp_path).read_text()
-    assert "was fitted to “fit” and “confirm” together" in page
+    assert re.search("was fitted to “fit” and “confirm” together; on “confirm” it leaves U = [0-9.e-]+", page)
+    told.found["handed_on"]["gaps"]["confirm"] = None  # its replay blew up
+    (tmp_path / "gap.json").write_text(json.dumps(told.found))
+    assert "was fitted to “fit” and “confirm” together.</p>" in write_report(tmp_path).read_text()
     alone = HandedOn(found.verdict.model, (found.case.fit,))
     write_gap(tmp_path, found.case, found.verdict, alone, MORE)
     assert "handed-on" not in write_report(tmp_path).read_text()
