@@ -15,6 +15,7 @@ import numpy as np
 
 from droid_jax.gap.anew import base_fit
 from droid_jax.gap.case import Case, GapConfig, make_case
+from droid_jax.gap.handover import HandedOn
 from droid_jax.gap.refit import Model
 from droid_jax.gap.verdict import Verdict
 from droid_jax.gap.workflow import find
@@ -94,6 +95,11 @@ class Small:
     case: Case
     base: Model
     verdict: Verdict
+
+    @property
+    def own(self) -> HandedOn:
+        """The search's own model, of the first motion alone."""
+        return HandedOn(self.verdict.model, (self.case.fit,))
 
 
 @functools.cache

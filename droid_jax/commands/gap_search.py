@@ -34,7 +34,7 @@ def searched(
     """The case, its verdict and the model to hand on, going on from `checkpoints`; and each stage's seconds.
 
     start: [F] values of the base parameters from which their fit begins, instead of a search.
-    board: folder for scalars of the base fit.
+    board: folder for scalars of the base fit, and of the others that report iterations.
     """
     from droid_jax.gap.handover import handed_on
     from droid_jax.gap.missing import answer

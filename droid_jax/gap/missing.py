@@ -65,8 +65,9 @@ def find_missing(
     candidates(asked)  # refused before the base fit, and not after it
     start = None if start is None else space.check(start)
     case = case_of(split, scene, space, asked, roles, config or GapConfig())
-    case, verdict = answer(split, case, roles, start, progress)
-    return verdict, extended(case, handed_on(case, verdict.model, progress or (lambda stage, value: None)))
+    tell = progress or (lambda stage, value: None)
+    case, verdict = answer(split, case, roles, start, tell)
+    return verdict, extended(case, handed_on(case, verdict.model, tell))
 
 
 def answer(

@@ -36,7 +36,7 @@ def found() -> Small:
 @pytest.fixture(scope="module")
 def saved(found: Small, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("extended")
-    save_extended(folder, extended(found.case, HandedOn(found.verdict.model, (found.case.fit,))))
+    save_extended(folder, extended(found.case, found.own))
     return folder / "extended.json"
 
 

@@ -84,6 +84,5 @@ def test_file_and_page_say_what_it_is_fitted_to(found: Small, both: HandedOn, tm
     told.found["handed_on"]["gaps"]["confirm"] = None  # its replay blew up
     (tmp_path / "gap.json").write_text(json.dumps(told.found))
     assert "was fitted to “fit” and “confirm” together.</p>" in write_report(tmp_path).read_text()
-    alone = HandedOn(found.verdict.model, (found.case.fit,))
-    write_gap(tmp_path, found.case, found.verdict, alone, MORE)
+    write_gap(tmp_path, found.case, found.verdict, found.own, MORE)
     assert "handed-on" not in write_report(tmp_path).read_text()

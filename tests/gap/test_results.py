@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from small_gap import FLOOR, JOINTS, PRELOAD, Small, small
 
-from droid_jax.gap.handover import HandedOn
 from droid_jax.gap.results import gap_arrays, gap_json, write_gap
 from droid_jax.gap.split import ROLES
 from droid_jax.gap.verdict import Experiment, Kind
@@ -28,7 +27,7 @@ def found() -> Small:
 @pytest.fixture(scope="module")
 def folder(found: Small, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("gap")
-    write_gap(path, found.case, found.verdict, HandedOn(found.verdict.model, (found.case.fit,)), MORE)
+    write_gap(path, found.case, found.verdict, found.own, MORE)
     return path
 
 
@@ -216,6 +215,5 @@ def test_the_sealed_recording_is_a_role_like_the_others(found: Small):
 def test_it_is_written_whole_or_not_at_all(found: Small, tmp_path: Path):
     """gap.json comes last: where writing fails before it, no run looks finished."""
     with pytest.raises(ValueError, match="not JSON compliant"):
-        alone = HandedOn(found.verdict.model, (found.case.fit,))
-        write_gap(tmp_path, found.case, found.verdict, alone, {"seconds": float("nan")})
+        write_gap(tmp_path, found.case, found.verdict, found.own, {"seconds": float("nan")})
     assert sorted(p.name for p in tmp_path.iterdir()) == ["extended.json", "extended.xml", "gap.npz"]
