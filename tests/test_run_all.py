@@ -195,7 +195,7 @@ def test_a_stage_with_other_inputs_is_run_again(called, monkeypatch: pytest.Monk
     monkeypatch.setattr(identify, "run", changed)
     assert main(["all", "--stages", "identify"]) == 0
     assert [command.again for command in called] == [False, True]
-    assert "other settings (recordings_sha256): it is run again" in capsys.readouterr().out
+    assert "other settings (recordings): it is run again" in capsys.readouterr().out
 
 
 def test_a_policy_that_was_made_with_other_options_is_kept(called, monkeypatch: pytest.MonkeyPatch, capsys):
@@ -208,7 +208,7 @@ def test_a_policy_that_was_made_with_other_options_is_kept(called, monkeypatch: 
     monkeypatch.setattr(train, "run", other)
     assert main(["all", "--stages", "train", "evaluate"]) == 2
     assert [command.again for command in called] == [False]
-    assert "runs/all/train holds a run with other settings (fit_sha256, preset)" in capsys.readouterr().err
+    assert "runs/all/train holds a run with other settings (fit, preset)" in capsys.readouterr().err
 
 
 def test_what_a_stop_leaves_unreached_is_not_taken_for_this_runs_later(called, monkeypatch, tmp_path: Path):
@@ -242,6 +242,19 @@ def test_a_search_begins_at_a_fit_of_its_own_recordings_alone(called, tmp_path: 
         given = ("--recording", "a.npz", "b.npz", "c.npz", "--stages", "gap", "--out", "run")
         assert main(["all", *given]) == 0
     assert [command.fit for command in called] == [Path("run/identify"), None, None, None]
+
+
+def test_a_parameter_with_an_effects_name_is_told_before_the_fit(called, tmp_path: Path, capsys):
+    """Of this scene the library has joint_coulomb[elbow]."""
+    own = write_elbow(tmp_path)
+    file = tmp_path / "parameters.json"
+    entries = json.loads(file.read_text())
+    file.write_text(json.dumps([{**entries[0], "name": "joint_coulomb[elbow]"}, *entries[1:]]))
+    save(elbow_log(0.0, 2.0, 16), "log.npz")
+    assert main(["all", "--stages", "identify", "gap", "--recording", "log.npz", *own]) == 2
+    assert "'joint_coulomb[elbow]' (of the effect joint_coulomb); give yours others" in capsys.readouterr().err
+    assert called == []
+    assert main(["all", "--stages", "identify", "--recording", "log.npz", *own]) == 0
 
 
 def test_nothing_is_said_to_be_closed_where_nothing_is_named(called, tmp_path: Path, capsys):

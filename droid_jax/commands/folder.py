@@ -76,7 +76,7 @@ class OtherRun(ValueError):
     def __init__(self, out: Path, changed: Iterable[str]) -> None:
         changed = tuple(changed)
         self.inputs = all(name in INPUTS or name.endswith("_sha256") for name in changed)
-        self.what = f"{out} holds a run with other settings ({', '.join(changed)})"
+        self.what = f"{out} holds a run with other settings ({', '.join(c.removesuffix('_sha256') for c in changed)})"
         super().__init__(f"{self.what}; choose another --out, or --again")
 
 

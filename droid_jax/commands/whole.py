@@ -228,10 +228,15 @@ def _roles(command: All) -> tuple[str, ...]:
         needs_log(command.motion_cutoff, ())
         return tuple(DEMONSTRATIONS)
     from droid_jax.gap.inputs import shared_out
+    from droid_jax.model.effects.registry import joined
 
     own = gap.Gap(command.recording, preset=PRESETS[command.preset].identify, **_own(command))
+    scene, base = gap.model_of(own)
+    given = gap.given_to(own)
     try:
-        _, roles = shared_out(gap.model_of(own)[0], gap.given_to(own))
+        _, roles = shared_out(scene, given)
+        if "gap" in command.stages:  # names that are taken are told now, and not after the fit
+            joined(base, gap.chosen_effects(own, scene, given))
     except ValueError:
         if "gap" in command.stages:
             raise

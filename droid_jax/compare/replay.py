@@ -113,10 +113,10 @@ def check_gains(scene: Scene, drive: Drive) -> None:
     own = scene.model.actuator_gainprm[:, 0] * scene.model.actuator_gear[:, 0] ** 2  # at the joint
     for name, stated, has in zip(scene.command_names, drive.stiffness, own, strict=True):
         if not np.isclose(stated, has, rtol=1e-3):
-            raise ValueError(
-                f"the recording states a servo gain of {stated:g} for {name}, the scene has {has:g}; "
-                "build the scene with the recording's gains"
-            )
+            servo = scene.model.actuator_biasprm[scene.command_names.index(name), 1] != 0
+            do = "build the scene with the recording's gains" if servo else "make it a <position> servo in the MJCF"
+            has_it = f"the scene has {has:g}" + ("" if servo else " and its actuator is no position servo")
+            raise ValueError(f"the recording states a servo gain of {stated:g} for {name}, {has_it}; {do}")
 
 
 def check_stateless(scene: Scene) -> None:

@@ -22,8 +22,14 @@ def start_pose(scene: Scene, recording: Recording) -> np.ndarray:
 
     Of joints that nobody commanded or measured one that an equality couples to another starts where that has it, all
     others stand as in the scene.
-    Raises ValueError for a joint that has or needs a command and of which nothing says where it starts.
+    Raises ValueError for a joint that has or needs a command and of which nothing says where it starts, and for one
+    that the scene does not have.
     """
+    for joint in recording.qpos0:
+        try:
+            scene.qpos(joint)
+        except ValueError as error:
+            raise ValueError(f"recording {recording.name!r}, qpos0: {error}") from None
     sent = {joint: path[0] for joint, path in sent_to(scene, recording).items()}
     told = {**sent, **_measured(scene, recording), **recording.qpos0}
     asked = {*scene.needs_command, *recording.command_names}

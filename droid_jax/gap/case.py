@@ -13,7 +13,7 @@ from droid_jax.gap.refit import REFIT
 from droid_jax.identify.refine import RefineConfig
 from droid_jax.identify.search import SearchConfig
 from droid_jax.measure.recording import Recording
-from droid_jax.model.effects.registry import effect_space, ready
+from droid_jax.model.effects.registry import joined, ready
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
@@ -114,7 +114,7 @@ def make_case(
         )
     scene = ready(scene)
     base = restrained(base)
-    whole = base + effect_space(effects)
+    whole = joined(base, effects)
     spaces = [whole, *[_unbounded(whole, _own(base))] * (len(recordings) - 1)]
     made = zip(recordings, spaces, strict=True)
     costs = [make_cost(scene, space, [r], config=config.compare, effects=effects) for r, space in made]

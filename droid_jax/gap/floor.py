@@ -19,6 +19,16 @@ from droid_jax.model.parameters import Space
 from droid_jax.model.scene import with_options
 
 FINER = 4
+WORST = (FINER / (FINER - 1)) ** 2  # the step's whole U over U0, of an error that falls no faster than the step
+
+
+def above(gap: float, floor: float) -> bool:
+    """Whether U is more than the time step could leave.
+
+    U0 is what a quarter of the step changes.  Of an error of second order that is nearly all of it; where joints stick,
+    or where a motion begins with a jolt, the error falls with the step itself, and a quarter of it stays.
+    """
+    return gap > WORST * floor
 
 
 def finer(evidence: Evidence, base: Space, recording: Recording) -> Cost | None:

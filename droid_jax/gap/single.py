@@ -40,7 +40,7 @@ from droid_jax.identify.refine import RefineProgress
 from droid_jax.measure.motion import Motion
 from droid_jax.measure.noise import discrepancy
 from droid_jax.measure.recording import Recording
-from droid_jax.model.effects.registry import effect_space, ready
+from droid_jax.model.effects.registry import joined, ready
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
@@ -136,7 +136,7 @@ def make_log(
     """
     if recording.repeats > 1:
         raise ValueError(f"recording {recording.name!r} has {recording.repeats} repeats: use make_case")
-    whole, config = restrained(base) + effect_space(effects), config or GapConfig()
+    whole, config = joined(restrained(base), effects), config or GapConfig()
     cost = make_cost(ready(scene), whole, [recording], config=config.compare, effects=[*known, *effects])
     if not isinstance(cost.drives[0], Motion):
         raise ValueError(f"recording {recording.name!r} holds commands; blocks are for logs in inverse mode")

@@ -10,6 +10,7 @@ import numpy as np
 
 from droid_jax.gap.candidates import candidates
 from droid_jax.gap.case import Case
+from droid_jax.gap.floor import above
 from droid_jax.gap.hunt import Budget, Hunt
 from droid_jax.gap.localise import localise
 from droid_jax.gap.refit import Model
@@ -60,7 +61,7 @@ def find(case: Case, base: Model, floor: float, progress: Progress = lambda stag
             break
         progress("screen", model.name)
         found = ask(case, model, left)
-        quiet = found.p >= SIGNIFICANT or model.gap <= floor
+        quiet = found.p >= SIGNIFICANT or not above(model.gap, floor)
         enough = not model.parts or hunt.gap(model) > OF_ALL * hunt.whole_gap
         done = forward(hunt, model, found) if enough and not quiet else Round(found)
         if not model.parts:
@@ -111,7 +112,7 @@ def _verdict(hunt: Hunt, base: Model, model: Model, rounds: list[Round], quiet: 
     if not converged:
         model, rounds = base, [replace(r, winner=None, chosen=None) for r in rounds]
     gaps = _gaps(hunt, base, model)
-    missing = bool(rounds) and rounds[0].screen.p < SIGNIFICANT and base.gap > floor
+    missing = bool(rounds) and rounds[0].screen.p < SIGNIFICANT and above(base.gap, floor)
     tied = tuple(_tied(part.name, model, rounds) for part in model.parts)
     left = left_over(case.fit, case.confirm, model) if converged else None
     kind = Kind.NONE if not missing else Kind.UNEXPLAINED

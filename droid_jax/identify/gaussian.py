@@ -219,6 +219,8 @@ def prior(space: Space) -> Gaussian:
 def load(path: str | Path) -> Gaussian:
     """Read a file written by `Gaussian.save`; ValueError names the file and what is wrong in it."""
     path = Path(path)
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder; a run keeps its Gaussian in gaussian.json there")
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(content, dict) or content.get("format") != FORMAT:

@@ -129,6 +129,15 @@ def identify(
     return solve(problem, checkpoints=checkpoints, progress=progress)
 
 
+def _check_recordings(recordings: Sequence[Recording]) -> None:
+    """ValueError where there is none, or where a file's name was given for what is in it."""
+    if not recordings:
+        raise ValueError("no recording to fit: give one, or several")
+    other = [r for r in recordings if not isinstance(r, Recording)]
+    if other:
+        raise ValueError(f"expected a Recording, got {other[0]!r}; load_recording reads one from a file or folder")
+
+
 def prepare(
     scene: Scene,
     space: Space,
@@ -141,6 +150,7 @@ def prepare(
     """The part of `identify` before the search: whatever is wrong with the input is told here, and nothing written."""
     began = time.monotonic()
     config = config or IdentifyConfig()
+    _check_recordings(recordings)
     _check_names([r.name for r in recordings], config)
     fitted, held, numbers = zip(*(split(r, config.heldout) for r in recordings), strict=True)
     full = space if nuisances is None or config.refine is None else space + nuisances

@@ -7,14 +7,14 @@ simulated robot); everything behind it may rely on what it checks.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from droid_jax.errors import faults
 from droid_jax.measure.clocks import SLACK, check_clock
-from droid_jax.measure.recording import JOINT_CHANNELS, Channel, ObjectPose, Recording, ServoGains
+from droid_jax.measure.recording import JOINT_CHANNELS, Channel, ObjectPose, Recording, ServoGains, TorqueConvention
 
 # Of the channels that a replay has, at hinges and at slides; a channel of both says "N m or N".
 UNITS = {
@@ -33,6 +33,10 @@ def validate(recording: Recording, *, source: str = "", allow_jitter: bool = Fal
     Rows and repeats in messages count from 0, as numpy does.
     """
     where = source or f"recording {recording.name!r}"
+    if not isinstance(recording.torque, TorqueConvention):
+        raise ValueError(f"{where}: torque must be a TorqueConvention, which says the side, got {recording.torque!r}")
+    if not isinstance(recording.qpos0, Mapping):
+        raise ValueError(f"{where}: qpos0 must map joint names to positions, got {recording.qpos0!r}")
     _check_command(recording, where, allow_jitter)
     if not recording.channels:
         raise ValueError(f"{where}: empty, expected at least one measured channel")

@@ -108,7 +108,7 @@ class Recording:
     command_names: U joint names.
     channels:      name -> Channel; all share N.
     torque:        what the torque channel holds.
-    qpos0:         joint name -> position at the start, rad or m.
+    qpos0:         joint name -> position at the start, rad or m; joints not named start where the scene has them.
     gains:         servo gains, when known.
     phases:        named parts of the motion.
     object_pose:   pose of the manipulated object, when known.
@@ -121,7 +121,7 @@ class Recording:
     command_names: tuple[str, ...]
     channels: Mapping[str, Channel]
     torque: TorqueConvention
-    qpos0: Mapping[str, float]
+    qpos0: Mapping[str, float] = field(default_factory=dict)
     gains: ServoGains | None = None
     phases: tuple[Phase, ...] = ()
     object_pose: ObjectPose | None = None

@@ -30,11 +30,29 @@ def without_looks(spec: mujoco.MjSpec) -> mujoco.MjSpec:
     bare = spec.copy()
     looks = look_geoms(bare)
     if looks:
-        whole = compiled(spec.copy())
+        whole = compiled(bare)
+        _weigh_emptied(bare, whole, {geom.id for geom in looks})
         for geom in looks:
             bare.delete(geom)
         keep_inertia(bare, whole)
     return bare
+
+
+def _weigh_emptied(spec: mujoco.MjSpec, model: mujoco.MjModel, looks: set[int]) -> None:
+    """Weigh the bodies that have their mass of looks alone: without them the spec would not compile."""
+    emptied = {b.id for b in spec.bodies[1:] if b.geoms and all(g.id in looks for g in b.geoms)}
+    emptied &= set(np.flatnonzero(model.body_mass > 0).tolist())
+    if emptied and _from_geoms_alone(spec):
+        emptied = set(np.flatnonzero(model.body_mass > 0).tolist())
+        spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+    for body in spec.bodies[1:]:
+        if body.id in emptied:
+            weigh(body, model, body.id)
+
+
+def _from_geoms_alone(spec: mujoco.MjSpec) -> bool:
+    """Whether the MJCF has its bodies' own masses count for nothing."""
+    return spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
 
 
 def keep_inertia(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
@@ -45,7 +63,7 @@ def keep_inertia(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
     other = ~same & (model.body_mass > 0)
     if not other.any():
         return
-    always = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    always = _from_geoms_alone(spec)
     for body in spec.bodies[1:]:
         if other[body.id] or (always and model.body_mass[body.id] > 0):
             weigh(body, model, body.id)

@@ -315,7 +315,8 @@ def load_scene(
     named = {j.name: j for j in spec.joints}
     for joint in friction_joints:
         if joint not in named:
-            raise ValueError(f"unknown joint {joint!r}; {path} has: {', '.join(sorted(named))}")
+            has = f"has: {', '.join(sorted(named))}" if named else "has no joints at all"
+            raise ValueError(f"unknown joint {joint!r}; {path} {has}")
         named[joint].frictionloss = max(named[joint].frictionloss, TINY_FRICTIONLOSS)
     try:
         return compile_scene(spec, path.stem, joints=joints, object_joint=object_joint)

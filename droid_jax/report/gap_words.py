@@ -13,6 +13,7 @@ from droid_jax.report.gap_parts import parts_of
 from droid_jax.report.words import counted, label, listed, number, percent, was
 
 DECISIVE = 6.0  # standardised difference from which ten repeats decide between rivals
+COARSE = 0.1  # share of U that is the numerical floor, from which that is worth a word
 TOLD = 0.8  # share of what is left on the confirming motion: where more is left beyond the fit's uncertainty, no word
 OTHER = "the other demonstration"  # as the search calls what confirms, whatever it is
 OF = " of "  # between what is said of a joint and its name
@@ -165,7 +166,15 @@ def _allowed(gap: Gap) -> str:
 def _floor(gap: Gap) -> str:
     if gap.timeless:
         return "there is no numerical floor, since a measured motion is replayed without a time step"
-    return "the numerical floor is not known" if gap.floor is None else f"the numerical floor is {number(gap.floor)}"
+    if gap.floor is None:
+        return "the numerical floor is not known"
+    fit = gap.found["gaps"]["fit"]["before"]
+    coarse = (
+        f", {percent(gap.floor / fit)} of U before: a finer timestep would tell more"
+        if gap.floor > COARSE * fit > 0
+        else ""
+    )
+    return f"the numerical floor is {number(gap.floor)}{coarse}"
 
 
 def _added(sizes: Sequence[Mapping[str, Any]]) -> list[str]:

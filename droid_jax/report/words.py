@@ -200,7 +200,7 @@ def _next(run: Run, searched: bool) -> str:
     elif any(not p["identifiable"] for p in run.parameters):
         steps.append("record a motion that moves what is not told, or leave it at its initial spread")
     if lacks_something(run.fit):
-        lacks = "what is left is well above noise, so the model lacks something"
+        lacks = "what is left is well above noise, so the model lacks something, or its timestep is too coarse"
         steps.append(
             f"{lacks}, and these values may be bent by it: go on with the search for it, below"
             if searched

@@ -472,6 +472,15 @@ def test_a_recording_without_commands_is_refused(scene: Scene):
         make_drive(scene, log)
 
 
+def test_gains_of_what_is_no_servo_are_told_to_need_one():
+    spec = arm().spec.copy()
+    spec.actuators[1].set_to_motor()
+    scene = compile_scene(spec, "driven", joints=JOINTS)
+    stated = make_drive(arm(), recording(gains=ServoGains(np.array([60.0, 25.0]), np.array([3.0, 1.0]))))
+    with pytest.raises(ValueError, match="no position servo; make it a <position> servo in the MJCF"):
+        check_gains(scene, stated)
+
+
 def test_missing_and_foreign_columns_are_named(scene: Scene):
     _, command = motion()
     with pytest.raises(ValueError, match="missing: elbow; given: shoulder"):
@@ -479,7 +488,7 @@ def test_missing_and_foreign_columns_are_named(scene: Scene):
     with pytest.raises(ValueError, match="unknown: wrist"):
         more = np.concatenate([command, command[:, :1]], axis=1)
         make_drive(scene, recording(command=more, command_names=(*JOINTS, "wrist"), gains=None))
-    with pytest.raises(ValueError, match=r"unknown joint 'wrist'.*shoulder, elbow"):
+    with pytest.raises(ValueError, match=r"recording 'wave', qpos0: unknown joint 'wrist'.*shoulder, elbow"):
         make_drive(scene, recording(qpos0={"wrist": 0.0}))
 
 

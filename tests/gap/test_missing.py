@@ -19,8 +19,8 @@ from droid_jax.gap.split import Split
 from droid_jax.gap.verdict import Kind
 from droid_jax.identify.search import SearchConfig
 from droid_jax.measure.recording import Recording
-from droid_jax.model.effects.registry import library
-from droid_jax.model.parameters import Parameter
+from droid_jax.model.effects.registry import joined, library
+from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import compile_scene
 from droid_jax.model.seam import Effect
 
@@ -98,6 +98,17 @@ def test_unless_told_it_asks_about_all_that_could_show(monkeypatch: pytest.Monke
 def test_settings_that_no_search_could_use_are_refused(changes: dict[str, Any], said: str):
     with pytest.raises(ValueError, match=said):
         dj.GapConfig(**changes)
+
+
+def test_a_name_that_an_effect_has_is_refused_with_what_to_do():
+    """A body called payload has a payload_mass; so has the library."""
+    scene = elbow()
+    space = elbow_space(scene)
+    taken = Space((*space.parameters[1:], replace(space.parameters[0], name="payload_mass[elbow]")))
+    twin = Effect("twin", (replace(space.parameters[0], name="payload_mass[elbow]", writes=()),), places={"elbow": ()})
+    with pytest.raises(ValueError, match=r"'payload_mass\[elbow\]' \(of the effect twin\); give yours others"):
+        joined(taken, (twin,))
+    assert joined(space, (twin,)).names == (*space.names, "payload_mass[elbow]")
 
 
 @pytest.mark.parametrize(

@@ -288,6 +288,12 @@ def test_a_gap_below_the_floor_is_none(found: Small):
     assert not verdict.effects and np.isfinite(verdict.closed("confirm"))
 
 
+def test_a_gap_that_an_error_of_first_order_could_leave_is_none(found: Small):
+    """A quarter of the step leaves a quarter of such an error: U0 shows nine sixteenths of its U."""
+    assert find(found.case, found.base, 0.6 * found.base.gap).kind is Kind.NONE
+    assert find(found.case, found.base, 0.5 * found.base.gap).kind is not Kind.NONE
+
+
 def test_what_lost_for_its_size_alone_is_said(found: Small):
     verdict = replace(found.verdict, kind=Kind.UNEXPLAINED, effects=(), tied=())
     assert verdict.sentence == "The model lacks something that is not in the library."

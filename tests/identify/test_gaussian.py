@@ -274,3 +274,5 @@ def test_missing_and_truncated_files_are_named(saved):
         load(path)
     with pytest.raises(ValueError, match=r"nowhere\.json: there is no such file"):
         load(path.parent / "nowhere.json")
+    with pytest.raises(ValueError, match=r"is a folder; a run keeps its Gaussian in gaussian\.json there"):
+        load(path.parent)

@@ -38,6 +38,14 @@ def repeats(count: int, seed: int = 0, noise: float = 0.3) -> np.ndarray:
     return wave + np.random.default_rng(seed).normal(0, noise, (count, 4000, 2))
 
 
+def test_what_is_no_recording_is_refused():
+    scene = elbow()
+    with pytest.raises(ValueError, match="no recording to fit"):
+        identify(scene, elbow_space(scene), [])
+    with pytest.raises(ValueError, match=r"expected a Recording, got 'log\.npz'; load_recording reads one"):
+        identify(scene, elbow_space(scene), ["log.npz"])  # pyright: ignore[reportArgumentType]
+
+
 NORM = 0.3 * np.sqrt(np.pi / 2)  # mean norm of two normal numbers of deviation 0.3
 
 

@@ -96,6 +96,11 @@ def test_a_log_without_commands_passes() -> None:
     assert validate(recording).duration == pytest.approx(1.0)
 
 
+def test_what_is_no_torque_convention_and_no_mapping_is_said() -> None:
+    refuses(replace(make(), torque="motor"), "torque must be a TorqueConvention", "'motor'")  # pyright: ignore[reportArgumentType]
+    refuses(replace(make(), qpos0=[0.0, 1.0]), "qpos0 must map joint names")  # pyright: ignore[reportArgumentType]
+
+
 def test_empty() -> None:
     refuses(replace(make(), channels={}), "empty", "at least one measured channel")
     r = make()

@@ -344,6 +344,10 @@ def test_friction_loss_rows_exist_only_where_asked(tmp_path: Path):
     joint_frictionloss(scene, "j", std=1.0, mean=0.1, high=2.0)
     with pytest.raises(ValueError, match=r"unknown joint 'k'.*has: free, j"):
         load_scene(file, friction_joints=["k"])
+    urdf = tmp_path / "rod.urdf"
+    urdf.write_text('<robot name="rod"><link name="rod"/></robot>')
+    with pytest.raises(ValueError, match=r"rod\.urdf has no joints at all"):
+        load_scene(urdf, friction_joints=["k"])
 
 
 def test_what_is_only_for_the_eye_weighs_and_touches_as_before():
@@ -371,6 +375,19 @@ def test_what_is_only_for_the_eye_weighs_and_touches_as_before():
             assert [model.geom(i).name for i in range(model.ngeom)] == kept
             for field in ("body_mass", "body_inertia", "body_ipos", "body_iquat", "dof_M0"):
                 np.testing.assert_allclose(getattr(model, field), getattr(whole, field), rtol=1e-12)
+
+
+@pytest.mark.parametrize("compiler", ["", '<compiler inertiafromgeom="true"/>'])
+def test_a_body_may_weigh_by_its_looks_alone(compiler: str):
+    xml = f"""<mujoco>{compiler}<worldbody><body name="a"><joint name="j"/>
+      <geom type="capsule" size=".02" fromto="0 0 0 .3 0 0" mass="1" group="2" contype="0" conaffinity="0"/>
+      <body name="b" pos=".3 0 0"><joint name="k"/><geom size=".1" density="500"/></body></body></worldbody>
+      <actuator><position name="j" joint="j" kp="9"/></actuator></mujoco>"""
+    whole, scene = (f(xml) for f in (mujoco.MjModel.from_xml_string, mujoco.MjSpec.from_string))
+    model = compile_scene(scene, "looks").model
+    assert model.ngeom == 1
+    for field in ("body_mass", "body_inertia", "body_ipos", "body_iquat"):
+        np.testing.assert_allclose(getattr(model, field), getattr(whole, field), rtol=1e-12)
 
 
 @pytest.mark.parametrize("option", ['integrator="implicit"', 'solver="PGS"'])

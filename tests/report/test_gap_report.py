@@ -152,6 +152,17 @@ def test_the_summary_says_how_large_and_how_sure(named: Path) -> None:
     assert "Settings preset quick; fit a.npz; confirm b.npz; recording a.npz" in re.sub(r"\s+", " ", text)
 
 
+def test_a_floor_that_is_much_of_the_gap_is_said(tmp_path: Path, quick: None) -> None:
+    """A tenth is worth a word, a hundredth is not."""
+    for share, said in ((0.3, True), (0.01, False)):
+        folder = make_gap(tmp_path / str(said), floor=0.0)
+        content = json.loads((folder / "gap.json").read_text())
+        content["floor"] = share * content["gaps"]["fit"]["before"]
+        (folder / "gap.json").write_text(json.dumps(content))
+        text = read_page(page.write_report(folder)).text.replace("\u00a0", " ")
+        assert ("30 % of U before: a finer timestep would tell more" in text) is said
+
+
 def test_what_was_cut_and_an_unknown_floor_are_said(tmp_path: Path, quick: None) -> None:
     folder = make_gap(tmp_path / "run", cut="pairs were not tried", floor=None)
     text = read_page(page.write_report(folder)).text

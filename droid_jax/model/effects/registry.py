@@ -119,6 +119,22 @@ def ready(scene: Scene) -> Scene:
     return replace(scene, model=model)
 
 
+def joined(base: Space, effects: Iterable[Effect]) -> Space:
+    """A base model's parameters, and then all of some effects'.
+
+    Raises ValueError, with what to do, where one of the base has the name of an effect's.
+    """
+    effects = tuple(effects)
+    whose = {p.name: effect.name for effect in effects for p in effect.parameters}
+    taken = [f"{name!r} (of the effect {whose[name]})" for name in base.names if name in whose]
+    if taken:
+        raise ValueError(
+            f"parameters have names that belong to effects of the library: {', '.join(taken)}; give yours others, in a "
+            'file of parameters with "name", or leave these effects away (gap --without)'
+        )
+    return base + effect_space(effects)
+
+
 def effect_space(effects: Iterable[Effect]) -> Space:
     """All parameters of some effects; its mean is neutral."""
     return Space(tuple(p for effect in effects for p in effect.parameters))
