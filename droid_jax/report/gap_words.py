@@ -124,7 +124,9 @@ def _significance(gap: Gap) -> str:
     if p is None:
         return ""
     if gap.found["verdict"] == "none" and p < SIGNIFICANT:
-        small = "U is not above zero" if gap.timeless else "no larger than what the simulation's own time step leaves"
+        small = (
+            "U is not above zero" if gap.timeless else "no larger than what the simulation's own time step may leave"
+        )
         return f"What it leaves is no chance (p = {number(p, 2)}), but it is small: {small}."
     chance = f"If nothing were missing, noise would look this much like one of them with p = {number(p, 2)}"
     return f"{chance}; below {bar} something is missing." if p < SIGNIFICANT else f"{chance}, not below {bar}."
@@ -168,13 +170,11 @@ def _floor(gap: Gap) -> str:
         return "there is no numerical floor, since a measured motion is replayed without a time step"
     if gap.floor is None:
         return "the numerical floor is not known"
-    fit = gap.found["gaps"]["fit"]["before"]
-    coarse = (
-        f", {percent(gap.floor / fit)} of U before: a finer timestep would tell more"
-        if gap.floor > COARSE * fit > 0
-        else ""
-    )
-    return f"the numerical floor is {number(gap.floor)}{coarse}"
+    floor, fit = f"the numerical floor is {number(gap.floor)}", gap.found["gaps"]["fit"]
+    if not gap.floor > COARSE * fit["before"] > 0:
+        return floor
+    share, base = percent(gap.floor / fit["before"]), " of the base model" if gap.extended else ""
+    return f"{floor}, {share} of U{base} on “{fit['recording']}”: a finer timestep would tell more"
 
 
 def _added(sizes: Sequence[Mapping[str, Any]]) -> list[str]:

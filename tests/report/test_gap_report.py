@@ -160,7 +160,7 @@ def test_a_floor_that_is_much_of_the_gap_is_said(tmp_path: Path, quick: None) ->
         content["floor"] = share * content["gaps"]["fit"]["before"]
         (folder / "gap.json").write_text(json.dumps(content))
         text = read_page(page.write_report(folder)).text.replace("\u00a0", " ")
-        assert ("30 % of U before: a finer timestep would tell more" in text) is said
+        assert ("30 % of U of the base model on “A”: a finer timestep would tell more" in text) is said
 
 
 def test_what_was_cut_and_an_unknown_floor_are_said(tmp_path: Path, quick: None) -> None:
@@ -179,7 +179,7 @@ def test_a_tie_that_nothing_on_the_menu_separates(tmp_path: Path) -> None:
 
 def test_significant_but_below_the_floor_is_said(tmp_path: Path) -> None:
     gap = read_gap(make_gap(tmp_path / "run", "none", p=0.002))
-    assert "no larger than what the simulation's own time step leaves" in " ".join(gap_words.gap_summary(gap))
+    assert "no larger than what the simulation's own time step may leave" in " ".join(gap_words.gap_summary(gap))
 
 
 def test_what_the_fit_does_not_tell_is_said_where_it_is_much(tmp_path: Path) -> None:
