@@ -53,9 +53,11 @@ def fitted_mjcf(scene: Scene, space: Space, values: np.ndarray, effects: Sequenc
 
     Files of meshes and textures are named by their absolute paths, wherever the text is saved.
 
-    Raises ValueError where MuJoCo compiles no model of these values: a replay takes an inertia that no body can
-    have (fitted about one axis alone, say), the compiler does not.
+    Raises ValueError for values of another shape, and where MuJoCo compiles no model of them: a replay takes an inertia
+    that no body can have (fitted about one axis alone, say), the compiler does not.
     """
+    if np.shape(values) != (len(space),):
+        raise ValueError(f"expected values [{len(space)}], one for each of {space.names}, got {list(np.shape(values))}")
     spec, model = scene.spec.copy(), make_c_model(scene, space, values)
     for effect in effects:
         for (field, row), more in (native(effect, space, values, model) or {}).items():

@@ -47,8 +47,13 @@ _KNOWN = (*_TEXTS, *_NUMBERS, *_CHOICES, "column", "nuisance")
 
 def load_parameters(path: str | Path, scene: Scene) -> Space:
     """The space described in a JSON file; ValueError names the file, the entry and what is wrong with it."""
-    entries = _entries(Path(path))
-    return Space(tuple(_parameter(scene, entry, f"{path}, entry {i + 1}") for i, entry in enumerate(entries)))
+    entries, first = _entries(Path(path)), dict[str, int]()
+    parameters = [_parameter(scene, entry, f"{path}, entry {i}") for i, entry in enumerate(entries, 1)]
+    for i, p in enumerate(parameters, 1):
+        if first.setdefault(p.name, i) != i:
+            before = first[p.name]
+            raise ValueError(f'{path}, entry {i}: {p.name!r} is entry {before} already; a "name" tells two apart')
+    return Space(tuple(parameters))
 
 
 def friction_joints(path: str | Path) -> tuple[str, ...]:

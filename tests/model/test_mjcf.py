@@ -162,6 +162,13 @@ def test_an_inertia_that_no_body_can_have_is_said():
         fitted_mjcf(scene, space, space.mean)
 
 
+def test_values_of_another_shape_are_refused():
+    scene = compile_scene(mujoco.MjSpec.from_string(TURNED), "turned")
+    space = one(scene, "dof_damping", (0,), 2.0)
+    with pytest.raises(ValueError, match=r"expected values \[1\], one for each of \('dof_damping',\), got \[3\]"):
+        fitted_mjcf(scene, space, np.ones(3))
+
+
 # of a box whose corners go through z first, then y, then x
 FACES = "f 1 2 4\nf 1 4 3\nf 5 8 6\nf 5 7 8\nf 1 6 2\nf 1 5 6\nf 3 4 8\nf 3 8 7\nf 1 3 7\nf 1 7 5\nf 2 6 8\nf 2 8 4\n"
 

@@ -121,6 +121,13 @@ def test_a_mistake_is_named(tmp_path: Path, scene: Scene, changes: dict[str, Any
     assert says in str(caught.value) and "parameters.json, entry 1: " in str(caught.value)
 
 
+def test_a_name_that_is_there_twice_is_told_where(tmp_path: Path, scene: Scene):
+    path = tmp_path / "parameters.json"
+    path.write_text(json.dumps([GOOD, {**GOOD, "name": "oil"}, GOOD]))
+    with pytest.raises(ValueError, match=r"parameters\.json, entry 3: 'elbow_damping' is entry 1 already"):
+        load_parameters(path, scene)
+
+
 def test_the_gravity_compensation_of_a_compensated_scene_is_a_parameter(tmp_path: Path):
     spec = mujoco.MjSpec.from_string(XML.replace('<body name="arm">', '<body name="arm" gravcomp="1">'))
     space = loaded(tmp_path, compile_scene(spec, "arm"), {**GOOD, "field": "body_gravcomp", "element": "arm"})
