@@ -39,7 +39,7 @@ PRESETS = {
     "gpu": _Presets("gpu", "gpu"),
 }
 
-MINUTES = {"record": 0.3, "identify": 3.9, "gap": 6.2, "train": 6.1, "evaluate": 1.2}
+MINUTES = {"record": 0.3, "identify": 4.0, "gap": 7.5, "train": 6.0, "evaluate": 1.1}
 """Of each stage in the preset "quick", on two cores with nothing compiled before (benchmarks/default_run.py)."""
 
 
