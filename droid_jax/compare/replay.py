@@ -111,9 +111,9 @@ def check_gains(scene: Scene, drive: Drive) -> None:
     if drive.stiffness is None:
         return
     own = scene.model.actuator_gainprm[:, 0] * scene.model.actuator_gear[:, 0] ** 2  # at the joint
-    for name, stated, has in zip(scene.command_names, drive.stiffness, own, strict=True):
+    servos = scene.model.actuator_biasprm[:, 1] != 0
+    for name, stated, has, servo in zip(scene.command_names, drive.stiffness, own, servos, strict=True):
         if not np.isclose(stated, has, rtol=1e-3):
-            servo = scene.model.actuator_biasprm[scene.command_names.index(name), 1] != 0
             do = "build the scene with the recording's gains" if servo else "make it a <position> servo in the MJCF"
             has_it = f"the scene has {has:g}" + ("" if servo else " and its actuator is no position servo")
             raise ValueError(f"the recording states a servo gain of {stated:g} for {name}, {has_it}; {do}")

@@ -40,19 +40,22 @@ def without_looks(spec: mujoco.MjSpec) -> mujoco.MjSpec:
 
 def _weigh_emptied(spec: mujoco.MjSpec, model: mujoco.MjModel, looks: set[int]) -> None:
     """Weigh the bodies that have their mass of looks alone: without them the spec would not compile."""
-    emptied = {b.id for b in spec.bodies[1:] if b.geoms and all(g.id in looks for g in b.geoms)}
-    emptied &= set(np.flatnonzero(model.body_mass > 0).tolist())
-    if emptied and _from_geoms_alone(spec):
-        emptied = set(np.flatnonzero(model.body_mass > 0).tolist())
+    emptied = [b.id for b in spec.bodies[1:] if b.geoms and all(g.id in looks for g in b.geoms)]
+    chosen = np.zeros(model.nbody, dtype=bool)
+    chosen[emptied] = model.body_mass[emptied] > 0
+    _weigh_chosen(spec, model, chosen)
+
+
+def _weigh_chosen(spec: mujoco.MjSpec, model: mujoco.MjModel, chosen: np.ndarray) -> None:
+    """Weigh the chosen bodies [nbody]; where what a body says of itself counts for nothing, all, so that it counts."""
+    if not chosen.any():
+        return
+    if spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE:
+        chosen = model.body_mass > 0
         spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
     for body in spec.bodies[1:]:
-        if body.id in emptied:
+        if chosen[body.id]:
             weigh(body, model, body.id)
-
-
-def _from_geoms_alone(spec: mujoco.MjSpec) -> bool:
-    """Whether the MJCF has its bodies' own masses count for nothing."""
-    return spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
 
 
 def keep_inertia(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
@@ -60,15 +63,7 @@ def keep_inertia(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
     now = compiled(spec)  # numbers the bodies, of which not all need a name
     fields = ("body_mass", "body_inertia", "body_ipos", "body_iquat")
     same = np.all([_rows_close(getattr(now, f), getattr(model, f)) for f in fields], axis=0)
-    other = ~same & (model.body_mass > 0)
-    if not other.any():
-        return
-    always = _from_geoms_alone(spec)
-    for body in spec.bodies[1:]:
-        if other[body.id] or (always and model.body_mass[body.id] > 0):
-            weigh(body, model, body.id)
-    if always:  # every body now says what it weighs, so none is left to its geoms
-        spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+    _weigh_chosen(spec, model, ~same & (model.body_mass > 0))
 
 
 def _rows_close(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -212,9 +212,9 @@ def test_summary_says_when_the_fit_made_it_worse(tmp_path: Path) -> None:
     text = " ".join(summary(read_run(run)))
     assert "the fit made it worse" in text and "do not train on this fit" in text
     assert (
-        "what is left is well above noise, so the model lacks something, or its timestep is too coarse: see below"
-        in text
-    )
+        "what is left is well above noise, so the model lacks something, or its timestep is too coarse: "
+        "see below in which joint and phase"
+    ) in text
     assert "these values may be bent by it: go on with the search for it, below." in summary(read_run(run), True)[-1]
 
 
