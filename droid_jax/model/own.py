@@ -51,8 +51,7 @@ def load_parameters(path: str | Path, scene: Scene) -> Space:
     parameters = [_parameter(scene, entry, f"{path}, entry {i}") for i, entry in enumerate(entries, 1)]
     for i, p in enumerate(parameters, 1):
         if first.setdefault(p.name, i) != i:
-            before = first[p.name]
-            raise ValueError(f'{path}, entry {i}: {p.name!r} is entry {before} already; a "name" tells two apart')
+            raise ValueError(f'{path}, entry {i}: {p.name!r} is entry {first[p.name]} already; give it a unique "name"')
     return Space(tuple(parameters))
 
 

@@ -55,6 +55,8 @@ def correlation_map(names: Sequence[str], correlation: np.ndarray, width: float 
     roomy = width > 6
     side = min(width, 2.4 + 0.36 * n) if roomy else width
     figure = Figure(figsize=(side + (0.6 if roomy else 0), side), layout="constrained")
+    # A vector file's text is some points wider than the layout's measure: without more room labels are cut.
+    figure.get_layout_engine().set(w_pad=0.1, h_pad=0.1)  # type: ignore[union-attr]  # named one line above
     axes = figure.add_subplot()
     values = np.ma.masked_invalid(np.asarray(correlation, dtype=float))
     mesh = axes.pcolormesh(values, cmap="PuOr_r", vmin=-1, vmax=1, edgecolors="white", linewidth=0.5, antialiased=True)
