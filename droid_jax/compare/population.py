@@ -18,7 +18,7 @@ from jax.sharding import PartitionSpec
 from droid_jax import runtime
 
 AXIS = "population"
-CPU_BLOCK = 32  # rows; on a CPU blocks of 64 to 512 run 14 to 26 % faster, and every smaller stage would pay for them
+CPU_BLOCK = 32  # rows; on a CPU blocks of 64 to 512 run 12 to 25 % faster, and every smaller stage would pay for them
 GPU_BLOCK = 4096  # rows at most in one piece on an accelerator
 
 
