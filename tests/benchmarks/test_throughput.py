@@ -150,7 +150,7 @@ def test_a_quick_run_ends_in_one_line_of_json(tmp_path):
     assert json.loads((tmp_path / "results" / "throughput_quick.json").read_text()) == result
 
     assert (result["population"], result["steps"], result["seed"], result["quick"]) == (64, 200, 5, True)
-    assert (result["timestep"], result["cone"], result["iterations"]) == (0.002, "pyramidal", 4)
+    assert (result["timestep"], result["cone"], result["iterations"]) == (0.002, "pyramidal", 100)
     assert result["versions"]["mujoco"] == importlib.metadata.version("mujoco")
     git = subprocess.run(["git", "-C", str(ROOT), "rev-parse", "HEAD"], capture_output=True, text=True)
     if git.returncode == 0:

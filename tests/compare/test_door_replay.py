@@ -164,7 +164,12 @@ def test_both_engines_rank_samples_alike(scene: Scene, demonstration: Recording,
     truth_row = space.values(truth(1))[None]
     assert costs["mjx"](truth_row)[0] < 0.9 * by_mjx.min()
     np.testing.assert_array_equal(costs["mjx"].failed(draws), costs["mujoco"].failed(draws))
-    np.testing.assert_allclose(costs["mjx"](draws[10:11]), by_mjx[10:11], rtol=1e-6)
+    # A sample's neighbours change nothing of it, its place no more than rounding: in a batch's last rows the sums of a
+    # matrix product run in another order (5e-6 of the cost when this was written).
+    neighbours = np.concatenate([draws[:32][::-1], draws[32:]])
+    neighbours[10] = draws[10]
+    assert costs["mjx"](neighbours)[10] == by_mjx[10]
+    np.testing.assert_allclose(costs["mjx"](draws[10:11]), by_mjx[10:11], rtol=2e-5)
 
 
 def test_the_replay_moves_smoothly_with_the_grip(space: Space, demonstration: Recording):
