@@ -517,7 +517,8 @@ def test_the_command_as_a_user_runs_it(place: Path):
     found = {p["name"]: p for p in fitted["parameters"]}
     low, high = found["hinge_preload"]["interval"]
     assert low < PRELOAD < high and not found["hinge_preload"]["nuisance"]
-    assert found["door_stiffness"]["best"] == pytest.approx(0.7, rel=0.15)
+    wound = PRELOAD / 5  # N m/rad: the hidden coil, wound up by 5 rad, is wound further as the door opens
+    assert found["door_stiffness"]["best"] == pytest.approx(0.7 + wound, rel=0.03)
 
 
 def test_help_is_quick():
