@@ -127,8 +127,8 @@ def door(gains: str = "impedance") -> Scene:
     return ready(door_scene(springs=1, timestep=0.004, gains=gains))
 
 
-def door_bench(gains: str = "impedance", names: Sequence[str] | None = None) -> Bench:
-    """The built-in scene, its first demonstration, and its library or some of it; for slow tests."""
+def door_bench(gains: str = "impedance", names: Sequence[str] | None = None, motion: str = "A") -> Bench:
+    """The built-in scene, one of its demonstrations, and its library or some of it; for slow tests."""
     scene = door(gains)
-    drive = make_drive(scene, load(demonstration_path("A", gains=gains)))
+    drive = make_drive(scene, load(demonstration_path(motion, gains=gains)))
     return make_bench(scene, drive, library(scene, names))

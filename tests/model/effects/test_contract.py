@@ -22,8 +22,7 @@ from droid_jax.model.seam import Effect, Rollout, State
 
 EFFECTS = registered()
 NEUTRAL = 1e-3  # N m: what a program compiled with the effects may differ by from one without
-# N m, worst moment: above what two programs differ by, and less than any effect does even where a recording hardly
-# shows it (a closer in a door that only opens).
+# N m, worst moment: above what two programs differ by, and less than any effect does.
 SEEN = 2e-3
 # N m: a torque that goes up and down again from step to step.  The bare scenes stay below 0.02.
 CHATTER = 0.1
@@ -254,8 +253,8 @@ def check_shapes(bench: Bench, effect: Effect) -> None:
     for name, values in effect.shapes.items():
         shape = bench.space[name]
         tried = [{name: v} for v in sorted({*values, shape.low, shape.high})]
-        quiet = bench.torque({}, *tried)
-        np.testing.assert_array_equal(quiet, np.broadcast_to(quiet[:1], quiet.shape))
+        # Row by row: a batch's last rows may be rounded another way than its first.
+        np.testing.assert_array_equal(bench.torque(*tried), bench.torque(*({} for _ in tried)))
         loud = bench.torque(*({**everywhere(effect), **row} for row in tried))
         assert np.isfinite(loud).all()
         apart = np.abs(loud[:, None] - loud[None]).max(axis=(2, 3))
@@ -302,10 +301,12 @@ def test_neutral_is_the_door_without_effects(real: Bench):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EFFECTS)
 def test_on_the_door(real: Bench, name: str):
-    effect = real.effect(name)
-    check_amplitudes(real, effect)
-    check_shapes(real, effect)
-    check_calm(real, effect)
+    # A only opens the door, which says nothing of a closer; C closes it again.
+    bench = door_bench(names=[name], motion="C") if name == "door_closer" else real
+    effect = bench.effect(name)
+    check_amplitudes(bench, effect)
+    check_shapes(bench, effect)
+    check_calm(bench, effect)
 
 
 @pytest.mark.slow
