@@ -164,8 +164,8 @@ def test_both_engines_rank_samples_alike(scene: Scene, demonstration: Recording,
     truth_row = space.values(truth(1))[None]
     assert costs["mjx"](truth_row)[0] < 0.9 * by_mjx.min()
     np.testing.assert_array_equal(costs["mjx"].failed(draws), costs["mujoco"].failed(draws))
-    # A sample's neighbours change nothing of it, its place no more than rounding: in a batch's last rows the sums of a
-    # matrix product run in another order (5e-6 of the cost when this was written).
+    # A sample's neighbours change nothing of it, its place no more than rounding: the last eight rows of a device's
+    # share are rounded another way than those before (5e-6 of the cost when this was written).
     neighbours = np.concatenate([draws[:32][::-1], draws[32:]])
     neighbours[10] = draws[10]
     assert costs["mjx"](neighbours)[10] == by_mjx[10]
