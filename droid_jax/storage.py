@@ -44,8 +44,22 @@ def write_text(path: Path, text: str) -> None:
     write_bytes(path, text.encode("utf-8"))
 
 
-def read_text(path: Path) -> str:
-    """A text file in UTF-8, with or without a byte order mark; ValueError names the one that is not."""
+def check_size(path: Path, most: int) -> int:
+    """Bytes of a regular file; ValueError for a folder, a device or a pipe, and for more than `most`."""
+    found = path.stat()
+    if not stat.S_ISREG(found.st_mode):
+        raise ValueError(f"{path}: is no regular file")
+    if found.st_size > most:
+        raise ValueError(f"{path}: has {found.st_size / 2**20:.0f} MiB, at most {most / 2**20:.0f} are read")
+    return found.st_size
+
+
+def read_text(path: Path, most: int = 64 * 2**20) -> str:
+    """A text file in UTF-8, with or without a byte order mark.
+
+    ValueError names the one that is not, is no regular file, or has more bytes than `most`.
+    """
+    check_size(path, most)
     try:
         return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:

@@ -12,9 +12,18 @@ from typing import Any
 
 import numpy as np
 
+from droid_jax.arguments import instance, instances, name, note, number, shown
 from droid_jax.errors import faults
 from droid_jax.measure.clocks import SLACK, check_clock
-from droid_jax.measure.recording import JOINT_CHANNELS, Channel, ObjectPose, Recording, ServoGains, TorqueConvention
+from droid_jax.measure.recording import (
+    JOINT_CHANNELS,
+    Channel,
+    ObjectPose,
+    Phase,
+    Recording,
+    ServoGains,
+    TorqueConvention,
+)
 
 # Of the channels that a replay has, at hinges and at slides; a channel of both says "N m or N".
 UNITS = {
@@ -32,11 +41,11 @@ def validate(recording: Recording, *, source: str = "", allow_jitter: bool = Fal
     allow_jitter: accept clocks whose steps differ from their median by more than half of it.
     Rows and repeats in messages count from 0, as numpy does.
     """
-    where = source or f"recording {recording.name!r}"
-    if not isinstance(recording.torque, TorqueConvention):
-        raise ValueError(f"{where}: torque must be a TorqueConvention, which says the side, got {recording.torque!r}")
-    if not isinstance(recording.qpos0, Mapping):
-        raise ValueError(f"{where}: qpos0 must map joint names to positions, got {recording.qpos0!r}")
+    instance(recording, Recording, "a recording")
+    where = source or f"recording {shown(recording.name)}"
+    name(recording.name, f"{where}: its name", file=True)
+    _check_types(recording, where)
+    _check_texts(recording, where)
     _check_command(recording, where, allow_jitter)
     if not recording.channels:
         raise ValueError(f"{where}: empty, expected at least one measured channel")
@@ -45,14 +54,48 @@ def validate(recording: Recording, *, source: str = "", allow_jitter: bool = Fal
     _check_repeats(recording, where)
     _check_clocks_meet(recording, where)
     for joint, q in recording.qpos0.items():
-        if not np.isfinite(q):
-            raise ValueError(f"{where}: qpos0 of joint {joint!r} must be a finite number, got {q}")
+        number(q, f"{where}: qpos0 of joint {joint!r}")
     _check_phases(recording, where)
     if recording.gains is not None:
         _check_gains(recording.gains, recording.command_names, where)
     if recording.object_pose is not None:
         _check_pose(recording.object_pose, where)
     return recording
+
+
+def _check_types(recording: Recording, where: str) -> None:
+    """ValueError for a part of another class than it must be of."""
+    if not isinstance(recording.torque, TorqueConvention):
+        raise ValueError(
+            f"{where}: torque must be a TorqueConvention, which says the side, got {shown(recording.torque)}"
+        )
+    for what, mapping, mapped in (
+        ("channels", recording.channels, "names to channels"),
+        ("qpos0", recording.qpos0, "joint names to positions"),
+        ("meta", recording.meta, "texts to texts"),
+    ):
+        if not isinstance(mapping, Mapping):
+            raise ValueError(f"{where}: {what} must map {mapped}, got {shown(mapping)}")
+    for key, channel in recording.channels.items():
+        instance(channel, Channel, f"{where}: channel {shown(key)}")
+    instances(recording.phases, Phase, f"{where}: phases")
+    if recording.gains is not None:
+        instance(recording.gains, ServoGains, f"{where}: gains")
+    if recording.object_pose is not None:
+        instance(recording.object_pose, ObjectPose, f"{where}: object_pose")
+
+
+def _check_texts(recording: Recording, where: str) -> None:
+    """ValueError for a text that cannot be printed or is too long: page and tables hold all of them."""
+    for joint in recording.qpos0:
+        name(joint, f"{where}: a joint of qpos0")
+    for key, channel in recording.channels.items():
+        name(key, f"{where}: a channel's name")
+        name(channel.unit, f"{where}, channel {key!r}: unit", empty=True)
+    for phase in recording.phases:
+        name(phase.name, f"{where}: a phase's name")
+    for key, text in recording.meta.items():
+        note(text, f"{where}: meta {name(key, f'{where}: a key of meta')!r}")
 
 
 def check_joints(recording: Recording, joints: Sequence[str], also: Sequence[str] = ()) -> None:
@@ -99,11 +142,13 @@ def _check_array(array: Any, shape: tuple[int | None, ...], kind: str, where: st
 
 def _check_names(names: Sequence[str], where: str, what: str) -> None:
     """ValueError unless all names are non-empty strings and none is given twice."""
-    twice = sorted({str(n) for n in names if list(names).count(n) > 1})
+    if isinstance(names, str) or not all(isinstance(n, str) and n for n in names):
+        raise ValueError(f"{where}: {what} must be non-empty names, got {shown(names)}")
+    for one in names:
+        name(one, f"{where}: one of the {what}")
+    twice = sorted({n for n in names if list(names).count(n) > 1})
     if twice:
         raise ValueError(f"{where}: {what} must be unique, repeated: {', '.join(twice)}")
-    if not all(isinstance(n, str) and n for n in names):
-        raise ValueError(f"{where}: {what} must be non-empty names, got {list(names)}")
 
 
 def _check_command(recording: Recording, where: str, allow_jitter: bool) -> None:
@@ -191,6 +236,8 @@ def _check_phases(recording: Recording, where: str) -> None:
     first, last = recording.span
     _check_names([p.name for p in recording.phases], where, "phase names")
     for p in recording.phases:
+        for what, instant in (("start", p.start), ("end", p.end)):
+            number(instant, f"{where}: {what} of phase {p.name!r}")
         if not p.start < p.end:
             raise ValueError(f"{where}: phase {p.name!r} must start before it ends, got {p.start} .. {p.end} s")
         if p.start < first - SLACK or p.end > last + SLACK:

@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import re
-from collections.abc import Sequence
+from array import array
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 
+from droid_jax.arguments import LONGEST_NAME, printable, shown
 from droid_jax.errors import faults
 from droid_jax.measure.clocks import SLACK, check_clock, resample
 from droid_jax.measure.metadata import Metadata, metadata_from_json, metadata_to_json, recording_of
 from droid_jax.measure.recording import JITTER, Channel, Recording
-from droid_jax.storage import new_folder, read_text, write_csv, write_text
+from droid_jax.read_json import MOST_BYTES
+from droid_jax.storage import check_size, new_folder, read_text, write_csv, write_text
+
+MOST_TABLE = 256 * 2**20  # bytes of one CSV file: ten minutes of seven joints at 1 kHz have 80 MB
+MOST_LINE = 2**16  # characters of one of its lines
+MOST_COLUMNS = 1000
 
 
 def save_csv(recording: Recording, path: Path) -> None:
@@ -45,7 +54,11 @@ def _only_a_recording(path: Path) -> None:
 
 def _metadata(path: Path) -> Metadata:
     """What the recording.json of a folder says; ValueError names what is wrong with it."""
-    return metadata_from_json(_text(path / "recording.json"), str(path / "recording.json"))
+    file = path / "recording.json"
+    text = read_text(file, most=MOST_BYTES)
+    if not text.strip():
+        raise ValueError(f"{file}: the file is empty")
+    return metadata_from_json(text, str(file))
 
 
 def _write_table(path: Path, columns: Sequence[str], time: np.ndarray, values: np.ndarray) -> None:
@@ -93,24 +106,18 @@ def load_csv(path: Path, interpolate: bool, allow_jitter: bool) -> Recording:
     return recording_of(meta, path, time, command, names, channels)
 
 
-def _text(path: Path) -> str:
-    text = read_text(path)
-    if not text.strip():
-        raise ValueError(f"{path}: the file is empty")
-    return text
-
-
 def _read_repeats(path: Path, key: str, columns: tuple[str, ...], allow_jitter: bool) -> list[_Table]:
     """The tables of key_00.csv, key_01.csv, ... without a gap, all with the same columns."""
-    matches = (re.fullmatch(rf"{re.escape(key)}_(\d+)\.csv", p.name) for p in sorted(path.iterdir()))
+    matches = (re.fullmatch(rf"{re.escape(key)}_([0-9]+)\.csv", p.name) for p in sorted(path.iterdir()))
     files: dict[int, Path] = {}
     for match in filter(None, matches):
         if other := files.get(int(match[1])):
             raise ValueError(f"{path}: {other.name} and {match[0]} are both repeat {int(match[1])} of channel {key!r}")
         files[int(match[1])] = path / match[0]
-    missing = [i for i in range(max(files, default=0) + 1) if i not in files]
-    if missing:
-        raise ValueError(f"{path}: missing {key}_{missing[0]:02d}.csv, repeat {missing[0]} of channel {key!r}")
+    absent = next((i for i in range(len(files) or 1) if i not in files), None)
+    if absent is not None:
+        beyond = f"; {files[max(files)].name} is there" if files else ""
+        raise ValueError(f"{path}: missing {key}_{absent:02d}.csv, repeat {absent} of channel {key!r}{beyond}")
     tables = []
     for i in range(len(files)):
         table = _read_table(files[i], columns, False, allow_jitter)
@@ -125,32 +132,57 @@ def _read_table(path: Path, expected: Sequence[str], full: bool, allow_jitter: b
     expected: column names that must be there, in the order wanted; empty takes the file's own.
     full:     an empty cell is an error (commands) rather than a missing measurement.
     """
-    reader = csv.reader(_text(path).splitlines(keepends=True))
-    try:
-        header = [cell.strip() for cell in next(reader)]
-        rows = [(reader.line_num, row) for row in reader if row]
-    except csv.Error as error:
-        raise ValueError(f"{path}, line {reader.line_num}: {error}") from None
-    order = _column_order(path, header, expected)
-    if not rows:
+    if check_size(path, MOST_TABLE) == 0:
+        raise ValueError(f"{path}: the file is empty")
+    numbers, lines = array("d"), array("q")
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        reader = csv.reader(_lines(path, file))
+        try:
+            header = [cell.strip() for cell in next(reader, [])]
+            order = _column_order(path, header, expected)
+            for row in reader:
+                if row:
+                    numbers.extend(_numbers(path, reader.line_num, row, header, full))
+                    lines.append(reader.line_num)
+        except UnicodeDecodeError:
+            raise ValueError(f"{path}: not a text file in UTF-8 near line {reader.line_num + 1}") from None
+        except csv.Error as error:
+            raise ValueError(f"{path}, line {reader.line_num}: {error}") from None
+    if not lines:
         raise ValueError(f"{path}: empty, there is no row below the header")
-    data = np.array([_numbers(path, line, row, header, full) for line, row in rows])
-    lines = [line for line, _ in rows]
+    data = np.frombuffer(numbers, np.float64).reshape(len(lines), len(header))
     check_clock(data[:, 0], str(path), allow_jitter=allow_jitter, label=lambda i: f"line {lines[i]}")
     columns = tuple(header[i] for i in order)
-    return _Table(path, columns, data[:, 0], np.ascontiguousarray(data[:, order]))
+    return _Table(path, columns, data[:, 0].copy(), np.ascontiguousarray(data[:, order]))
+
+
+def _lines(path: Path, file: TextIO) -> Iterator[str]:
+    """The lines of a table, none of them read beyond MOST_LINE characters."""
+    for number in itertools.count(1):
+        line = file.readline(MOST_LINE + 1)
+        if len(line) > MOST_LINE:
+            raise ValueError(f"{path}, line {number}: is longer than {MOST_LINE} characters")
+        if "\0" in line:
+            raise ValueError(f"{path}, line {number}: holds a zero byte, which no table has")
+        if not line:
+            return
+        yield line
 
 
 def _column_order(path: Path, header: list[str], expected: Sequence[str]) -> list[int]:
     """Where the wanted columns stand in the file."""
     first = header[0] if header else "an empty line"
     if first != "time":
-        raise ValueError(f"{path}, line 1: the first column must be 'time' (comma separated), got {first!r}")
+        raise ValueError(f"{path}, line 1: the first column must be 'time' (comma separated), got {shown(first)}")
     names = header[1:]
+    if len(names) > MOST_COLUMNS:
+        raise ValueError(f"{path}, line 1: has {len(names)} columns beside 'time', at most {MOST_COLUMNS} are read")
+    for column in names:
+        printable(column, f"{path}, line 1: the column name")
     twice = sorted({n for n in names if names.count(n) > 1})
     if twice or not names or "" in names:
         what = f"repeated: {', '.join(twice)}" if twice else f"got {names}"
-        raise ValueError(f"{path}, line 1: expected one named column per joint beside 'time', {what}")
+        raise ValueError(f"{path}, line 1: expected one named column per joint beside 'time', {what[:LONGEST_NAME]}")
     wanted = list(expected) or names
     missing, unknown = [n for n in wanted if n not in names], [n for n in names if n not in wanted]
     if wrong := faults({"missing:": missing, "unknown:": unknown}):
@@ -168,12 +200,14 @@ def _numbers(path: Path, line: int, row: list[str], header: list[str], full: boo
         try:
             number = float("nan") if blank else float(cell)
         except ValueError:
-            raise ValueError(f"{path}, line {line}, column {column!r}: {cell!r} is not a number") from None
+            number = None
+        if number is None or "_" in cell:  # Python reads 1_000 as a thousand, a table does not
+            raise ValueError(f"{path}, line {line}, column {column!r}: {shown(cell)} is not a number")
         if blank and (full or column == "time"):
             raise ValueError(f"{path}, line {line}, column {column!r}: expected a number, the cell is empty")
         if not blank and not np.isfinite(number):
             raise ValueError(
-                f"{path}, line {line}, column {column!r}: {cell!r} is not a finite number"
+                f"{path}, line {line}, column {column!r}: {shown(cell)} is not a finite number"
                 + ("" if full else "; leave the cell empty where nothing was measured")
             )
         numbers.append(number)

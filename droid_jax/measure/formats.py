@@ -17,6 +17,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from droid_jax.arguments import shown
 from droid_jax.errors import needs
 from droid_jax.measure.checks import validate
 from droid_jax.measure.csv_folder import load_csv, save_csv
@@ -41,7 +42,8 @@ def load(
     """Reads a recording from an npz file, a CSV folder or ROS bags, and validates it.
 
     name:         replaces the stored name.
-    resample:     CSV only: repeats with clocks of their own are interpolated onto the first's.
+    resample:     repeats with clocks of their own are interpolated onto the first's; those of bags always are, those
+                  of an npz file share one.
     allow_jitter: accept irregular clocks, see `validate`; a recording that was accepted says so in its `meta`, and is
                   read without being asked again once it is saved.
     bag_options:  passed to `rosbag.read_bags`; `joints` and `torque` are required for bags.
@@ -49,7 +51,7 @@ def load(
     Raises FileNotFoundError when there is no such path, ValueError for everything in the
     file that is not as it should be.
     """
-    path = Path(path)
+    path = _path(path)
     if not path.exists():
         raise FileNotFoundError(f"no recording at {path}: there is no such file or folder")
     bags = bags_at(path)
@@ -57,6 +59,8 @@ def load(
         return _load_bags(bags, name, allow_jitter, bag_options)
     if bag_options:
         raise ValueError(f"{path}: not a ROS bag, it takes no option {', '.join(sorted(bag_options))}")
+    if resample and path.suffix == ".npz" and not path.is_dir():
+        raise ValueError(f"{path}: resample is for CSV folders; the repeats of an npz file share one clock already")
     if path.is_dir():
         if not (path / "recording.json").exists():
             raise ValueError(f"{path}: not a recording, the folder has no recording.json; {_supported()}")
@@ -81,7 +85,7 @@ def save(recording: Recording, path: str | os.PathLike[str]) -> Path:
     An existing recording of that name is replaced.  Raises ValueError when the recording is
     not valid, the suffix is another one, or the folder holds something else.
     """
-    path = Path(path)
+    path = _path(path)
     if path.suffix not in ("", ".npz"):
         raise ValueError(f"{path}: expected the suffix .npz or none (a CSV folder), got {path.suffix!r}")
     # Irregular clocks were a question when the data came in; here they are only kept.
@@ -91,6 +95,13 @@ def save(recording: Recording, path: str | os.PathLike[str]) -> Path:
     else:
         save_csv(recording, path)
     return path
+
+
+def _path(path: Any) -> Path:
+    """A path, or ValueError for what is none."""
+    if not isinstance(path, (str, os.PathLike)) or "\0" in os.fspath(path):
+        raise ValueError(f"a recording's path must be text or a Path, got {shown(path)}")
+    return Path(path)
 
 
 def _supported() -> str:

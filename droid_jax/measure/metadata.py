@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
-from droid_jax.errors import faults
+from droid_jax.arguments import shown
 from droid_jax.measure.recording import (
     Channel,
     ObjectPose,
@@ -20,6 +20,7 @@ from droid_jax.measure.recording import (
     TorqueConvention,
     TorqueSide,
 )
+from droid_jax.read_json import parse_json, typed
 
 FORMAT = "droid_jax recording 1"
 
@@ -41,20 +42,47 @@ class Metadata:
     meta: dict[str, str]
 
 
-_VALID = {  # kind of JSON object -> keys it may have; those it must have
-    "recording": (
-        (
-            *("format", "name", "commands", "command_names", "channels", "torque"),
-            *("qpos0", "gains", "phases", "object_pose", "meta"),
-        ),
-        ("channels", "torque"),
-    ),
-    "torque": (("side", "gravity"),) * 2,
-    "gains": (("stiffness", "damping"),) * 2,
-    "object_pose": (("position", "quaternion", "covariance"),) * 2,
-    "phase": (("name", "start", "end"),) * 2,
-    "channel": (("unit", "columns"), ("unit",)),
-}
+class _Torque(msgspec.Struct, forbid_unknown_fields=True):
+    side: TorqueSide
+    gravity: bool
+
+
+class _Gains(msgspec.Struct, forbid_unknown_fields=True):
+    stiffness: list[float]
+    damping: list[float]
+
+
+class _Pose(msgspec.Struct, forbid_unknown_fields=True):
+    position: list[float]
+    quaternion: list[float]
+    covariance: list[list[float]]
+
+
+class _Phase(msgspec.Struct, forbid_unknown_fields=True):
+    name: str
+    start: float
+    end: float
+
+
+class _Channel(msgspec.Struct, forbid_unknown_fields=True):
+    unit: str
+    columns: list[str] = []
+
+
+class _File(msgspec.Struct, forbid_unknown_fields=True):
+    """The content of a recording.json."""
+
+    channels: dict[str, _Channel]
+    torque: _Torque
+    format: str = FORMAT
+    name: str = ""
+    commands: bool = True
+    command_names: list[str] = []
+    qpos0: dict[str, float] = {}
+    gains: _Gains | None = None
+    phases: list[_Phase] = []
+    object_pose: _Pose | None = None
+    meta: dict[str, str | float | bool | None] = {}
 
 
 def metadata_to_json(recording: Recording) -> str:
@@ -91,30 +119,33 @@ def metadata_from_json(text: str, where: str) -> Metadata:
 
     where: what the text belongs to.  ValueError names the key that is unknown, missing or of the wrong kind.
     """
-    try:
-        raw = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{where}: not valid JSON, line {error.lineno}: {error.msg}") from None
-    raw = _keys(raw, "recording", where)
-    if raw.get("format", FORMAT) != FORMAT:
-        raise ValueError(f"{where}: expected format {FORMAT!r}, got {raw['format']!r}")
-    commands = raw.get("commands", True)
-    if not isinstance(commands, bool):
-        raise ValueError(f"{where}: 'commands' must be true or false, got {commands!r}")
-    channels = {k: _keys(c, "channel", f"{where}, channel {k!r}") for k, c in _object(raw, "channels", where)}
+    raw = parse_json(text, where)
+    if isinstance(raw, dict) and raw.get("format", FORMAT) != FORMAT:
+        raise ValueError(f"{where}: expected format {FORMAT!r}, got {shown(raw['format'])}")
+    file = typed(raw, _File, where)
     return Metadata(
-        name=str(raw.get("name", "")),
-        commands=commands,
-        command_names=_names(raw.get("command_names", []), f"{where}, command_names"),
-        units={k: str(c["unit"]) for k, c in channels.items()},
-        columns={k: _names(c.get("columns", []), f"{where}, channel {k!r}") for k, c in channels.items()},
-        torque=_torque(_keys(raw["torque"], "torque", f"{where}, torque"), where),
-        qpos0={joint: _float(q, f"{where}, qpos0, joint {joint!r}") for joint, q in _object(raw, "qpos0", where)},
-        gains=_arrays(raw, "gains", ServoGains, where),
-        phases=_phases(raw.get("phases", []), f"{where}, phases"),
-        object_pose=_arrays(raw, "object_pose", ObjectPose, where),
-        meta={k: str(v) for k, v in _object(raw, "meta", where)},
+        name=file.name,
+        commands=file.commands,
+        command_names=tuple(file.command_names),
+        units={key: c.unit for key, c in file.channels.items()},
+        columns={key: tuple(c.columns) for key, c in file.channels.items()},
+        torque=TorqueConvention(file.torque.side, file.torque.gravity),
+        qpos0=file.qpos0,
+        gains=None if file.gains is None else ServoGains(_array(file.gains.stiffness), _array(file.gains.damping)),
+        phases=tuple(Phase(p.name, p.start, p.end) for p in file.phases),
+        object_pose=None if file.object_pose is None else _pose(file.object_pose, where),
+        meta={key: str(value) for key, value in file.meta.items()},
     )
+
+
+def _array(numbers: Any) -> np.ndarray:
+    return np.array(numbers, dtype=np.float64)
+
+
+def _pose(pose: _Pose, where: str) -> ObjectPose:
+    if len({len(row) for row in pose.covariance}) > 1:
+        raise ValueError(f"{where}, 'object_pose', 'covariance' must have rows of one length")
+    return ObjectPose(_array(pose.position), _array(pose.quaternion), _array(pose.covariance))
 
 
 def recording_of(
@@ -139,61 +170,3 @@ def recording_of(
         object_pose=meta.object_pose,
         meta=meta.meta,
     )
-
-
-def _keys(raw: Any, kind: str, where: str) -> dict[str, Any]:
-    """A JSON object with the keys of its kind, none unknown and none of the required missing."""
-    valid, required = _VALID[kind]
-    if not isinstance(raw, dict):
-        raise ValueError(f"{where}: expected an object with {', '.join(valid)}, got {raw!r}")
-    unknown = sorted(set(raw) - set(valid))
-    missing = [key for key in required if key not in raw]
-    if wrong := faults({"unknown keys:": unknown, "missing keys:": missing}):
-        raise ValueError(f"{where}: {wrong}; valid keys: {', '.join(valid)}")
-    return raw
-
-
-def _object(raw: Mapping[str, Any], key: str, where: str) -> list[tuple[str, Any]]:
-    value = raw.get(key, {})
-    if not isinstance(value, dict):
-        raise ValueError(f"{where}: {key!r} must be an object, got {value!r}")
-    return list(value.items())
-
-
-def _names(raw: Any, where: str) -> tuple[str, ...]:
-    if not isinstance(raw, list) or not all(isinstance(n, str) for n in raw):
-        raise ValueError(f"{where}: expected a list of joint names, got {raw!r}")
-    return tuple(raw)
-
-
-def _float(raw: Any, where: str) -> float:
-    if isinstance(raw, bool) or not isinstance(raw, (int, float)):
-        raise ValueError(f"{where}: expected a number, got {raw!r}")
-    return float(raw)
-
-
-def _phases(raw: Any, where: str) -> tuple[Phase, ...]:
-    if not isinstance(raw, list):
-        raise ValueError(f"{where}: expected a list of objects with name, start and end, got {raw!r}")
-    phases = [_keys(p, "phase", where) for p in raw]
-    return tuple(Phase(str(p["name"]), _float(p["start"], where), _float(p["end"], where)) for p in phases)
-
-
-def _torque(raw: Mapping[str, Any], where: str) -> TorqueConvention:
-    sides = [side.value for side in TorqueSide]
-    if raw["side"] not in sides:
-        raise ValueError(f"{where}: torque side must be one of {', '.join(sides)}, got {raw['side']!r}")
-    if not isinstance(raw["gravity"], bool):
-        raise ValueError(f"{where}: torque gravity must be true or false, got {raw['gravity']!r}")
-    return TorqueConvention(TorqueSide(raw["side"]), raw["gravity"])
-
-
-def _arrays(raw: Mapping[str, Any], key: str, make: Any, where: str) -> Any:
-    """ServoGains or ObjectPose from lists of numbers, or None where the key is not given."""
-    if raw.get(key) is None:
-        return None
-    lists = _keys(raw[key], key, f"{where}, {key}")
-    try:
-        return make(**{k: np.array(v, dtype=np.float64) for k, v in lists.items()})
-    except (TypeError, ValueError):
-        raise ValueError(f"{where}, {key}: expected lists of numbers, got {lists}") from None

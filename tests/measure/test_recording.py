@@ -344,3 +344,34 @@ def test_window_says_what_it_lacks() -> None:
     unseen = np.zeros_like(log.channels["object_angle"].mask)
     gone = {**log.channels, "object_angle": replace(log.channels["object_angle"], mask=unseen)}
     assert set(replace(log, channels=gone).window(0.3, 0.6).qpos0) == {"j1", "j2", "finger"}  # and nothing else does
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"name": "a\0b"}, "its name holds the character U+0000"),
+        ({"name": "a/b"}, "its name names files"),
+        ({"name": ""}, "its name must not be empty"),
+        ({"name": 3}, "its name must be text"),
+        ({"phases": (Phase("\ud800", 0.0, 0.1),)}, "a phase's name holds the character U+D800"),
+        ({"phases": (Phase("p" * 201, 0.0, 0.1),)}, "a phase's name must have at most 200 characters"),
+        ({"phases": (Phase("p", "0", 0.1),)}, "start of phase 'p' must be a number, got '0'"),
+        ({"phases": "opening"}, "phases must be a list of Phase objects, got 'opening'"),
+        ({"phases": (("p", 0.0, 0.1),)}, "phases, entry 0 must be a Phase, got a tuple"),
+        ({"command_names": ("j1", "j\x1b2")}, "holds the character U+001B"),
+        ({"command_names": "j1"}, "must be non-empty names, got 'j1'"),
+        ({"qpos0": {"j1": "0"}}, "qpos0 of joint 'j1' must be a number, got '0'"),
+        ({"qpos0": {"j1": float("nan")}}, "qpos0 of joint 'j1' must be finite"),
+        ({"meta": {"note": "\ud800"}}, "meta 'note' holds the character U+D800"),
+        ({"meta": {"note": 3}}, "meta 'note' must be text, got 3"),
+        ({"meta": []}, "meta must map texts to texts"),
+        ({"gains": (1.0, 2.0)}, "gains must be a ServoGains, got a tuple"),
+        ({"channels": [1]}, "channels must map names to channels"),
+        ({"channels": {"torque": np.zeros(3)}}, "channel 'torque' must be a Channel, got a ndarray"),
+        ({"time": [0.0, 0.1]}, "must be a numpy array"),
+    ],
+)
+def test_texts_and_types_are_checked(change: dict, said: str) -> None:
+    refuses(replace(make(), **change), said)
+    with pytest.raises(ValueError, match="a recording must be a Recording, got 'log"):
+        validate("log.npz")  # pyright: ignore[reportArgumentType]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import resource
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -346,19 +347,23 @@ def test_files_missing_or_empty(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("key", "value", "said"),
     [
-        ("torque", {"side": "motor"}, "torque: missing keys: gravity"),
+        ("torque", {"side": "motor"}, "'torque': missing keys: gravity"),
         ("torque", {"side": "motor", "gravty": True, "gravity": True}, "unknown keys: gravty"),
-        ("torque", {"side": "joint", "gravity": True}, "torque side must be one of motor, link, got 'joint'"),
-        ("torque", {"side": "link", "gravity": "no"}, "torque gravity must be true or false, got 'no'"),
+        ("torque", {"side": "joint", "gravity": True}, "'torque', 'side' must be one of motor, link, got 'joint'"),
+        ("torque", {"side": "link", "gravity": "no"}, "'torque', 'gravity' must be true or false, got 'no'"),
         ("gain", {}, "unknown keys: gain"),
         ("commands", "false", "'commands' must be true or false, got 'false'"),
         ("channels", [], "'channels' must be an object"),
-        ("channels", {"torque": {}}, "channel 'torque': missing keys: unit"),
+        ("channels", {"torque": {}}, "'channels', 'torque': missing keys: unit"),
         ("channels", {}, "at least one measured channel"),
-        ("command_names", "j1", "command_names: expected a list of joint names, got 'j1'"),
-        ("qpos0", {"j1": "0"}, "qpos0, joint 'j1': expected a number, got '0'"),
-        ("phases", [{"name": "hold", "start": 0.1}], "phases: missing keys: end"),
-        ("gains", {"stiffness": [1, "a"], "damping": [1, 2]}, "gains: expected lists of numbers"),
+        ("command_names", "j1", "'command_names' must be a list, got 'j1'"),
+        ("qpos0", {"j1": "0"}, "'qpos0', 'j1' must be a number, got '0'"),
+        ("phases", [{"name": "hold", "start": 0.1}], "'phases', entry 0: missing keys: end"),
+        (
+            "gains",
+            {"stiffness": [1, "a"], "damping": [1, 2]},
+            "'gains', 'stiffness', entry 1 must be a number, got 'a'",
+        ),
         ("gains", {"stiffness": [1], "damping": [1, 2]}, "gains: stiffness"),
         ("object_pose", {"position": [0, 0, 0]}, "missing keys: quaternion, covariance"),
         (
@@ -466,3 +471,83 @@ def test_jitter_must_be_allowed(folder: Path) -> None:
     edit(folder / "command.csv", 7, None)
     fails(folder, "command.csv, line 7: irregular rate", "allow_jitter=True")
     assert len(load(folder, allow_jitter=True).time) == 19
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"name": "a\0b"}, "the text holds the character U+0000 at position 1"),
+        ({"name": "a/b"}, "its name names files: it must hold no / or"),
+        ({"name": ".."}, "not begin with a dot"),
+        ({"name": "n" * 201}, "its name must have at most 200 bytes, got 201"),
+        ({"name": "ö" * 101}, "its name must have at most 200 bytes, got 202"),
+        ({"phases": [{"name": "open\ud800", "start": 0.0, "end": 0.1}]}, "U+D800 at position 4"),
+        ({"phases": [{"name": "\x1b[2J", "start": 0.0, "end": 0.1}]}, "U+001B at position 0"),
+        ({"phases": [{"name": "p" * 201, "start": 0.0, "end": 0.1}]}, "at most 200 characters, got 201"),
+        ({"meta": {"robot": "a\0"}}, "'meta', 'robot': the text holds the character U+0000"),
+        ({"meta": {"r\nb": "a"}}, "the key holds the character U+000A"),
+        ({"meta": {"robot": "a" * 10_001}}, "meta 'robot' must have at most 10000 characters"),
+        ({"qpos0": {"j\u2028": 0.0}}, "the key holds the character U+2028"),
+        ({"qpos0": {"j1": float("nan")}}, "NaN is no number of JSON"),
+        ({"qpos0": {"j1": 10**400}}, "'qpos0', 'j1': a whole number beyond 2^63"),
+    ],
+)
+def test_texts_that_no_file_name_or_page_can_hold(folder: Path, change: dict[str, object], said: str) -> None:
+    path = folder / "recording.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+    fails(folder, said)
+    written = json.dumps({**json.loads(path.read_text()), **change})
+    np.savez(folder.parent / "a.npz", **{**parts_of(folder.parent / "b.npz"), "metadata": np.array(written)})
+    fails(folder.parent / "a.npz", said)
+
+
+def test_a_repeat_far_beyond_the_others_is_not_counted_up_to(folder: Path) -> None:
+    (folder / "torque_99999999.csv").write_text((folder / "torque_01.csv").read_text())
+    fails(folder, "missing torque_02.csv, repeat 2 of channel 'torque'; torque_99999999.csv is there")
+
+
+@pytest.mark.parametrize(
+    ("line", "text", "said"),
+    [
+        (3, "0.01,1e999,0.5", "line 3, column 'j1': '1e999' is not a finite number"),
+        (3, "0.01,1_0,0.5", "line 3, column 'j1': '1_0' is not a number"),
+        (3, "0.01,1\0,0.5", "line 3: holds a zero byte"),
+        (3, "0.01," + "1" * 70_000, "line 3: is longer than 65536 characters"),
+        (1, "time," + ",".join(map(str, range(2000))), "line 1: has 2000 columns beside 'time', at most 1000"),
+        (1, "time,j1,j\x1b2", "line 1: the column name holds the character U+001B"),
+        (3, '0.01,"1,0.5', "line 20: "),
+    ],
+)
+def test_tables_that_are_no_tables(folder: Path, line: int, text: str, said: str) -> None:
+    path = folder / "torque_01.csv"
+    lines = path.read_text().splitlines()
+    lines[line - 1] = text
+    path.write_text("\n".join(lines))
+    fails(folder, said if "line 20" not in said else "torque_01.csv")
+
+
+def test_a_pipe_and_a_huge_table_are_not_waited_for(folder: Path) -> None:
+    (folder / "torque_01.csv").unlink()
+    os.mkfifo(folder / "torque_01.csv")
+    fails(folder, "torque_01.csv: is no regular file")
+    (folder / "torque_01.csv").unlink()
+    with (folder / "torque_01.csv").open("wb") as file:
+        file.truncate(257 * 2**20)
+    fails(folder, "torque_01.csv: has 257 MiB, at most 256 are read")
+
+
+def test_resampling_is_refused_where_nothing_is_resampled(tmp_path: Path) -> None:
+    fails(save(make(), tmp_path / "a.npz"), "resample is for CSV folders", resample=True)
+
+
+def test_only_the_members_of_a_recording_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    np.savez_compressed(path, **parts_of(tmp_path / "b.npz"), more=np.zeros(30 * 2**20))
+    before = peak()
+    assert load(path).sha256 == make().sha256
+    assert peak() - before < 60 * 2**20
+
+
+def peak() -> int:
+    """Bytes of this process at its largest."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

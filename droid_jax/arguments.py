@@ -1,0 +1,195 @@
+"""Checks of numbers, names and texts, the same for a file's content and for a Python argument.
+
+Every function returns what it was given, in the type that it promises, or raises a ValueError of one sentence that
+begins with `what`: the argument, or the file and the place in it.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+import numbers
+import re
+from collections.abc import Collection, Iterable
+from typing import Any, TypeVar
+
+LONGEST_NAME = 200  # characters of a name; of a name that becomes a file's, bytes in UTF-8 (file systems allow 255)
+LONGEST_NOTE = 10_000  # characters of a free text
+# Control characters, half surrogate pairs and line separators: no file name, figure or page can hold all of them.
+_UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff\u2028\u2029]")
+_UNPRINTABLE_NOTE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff]")  # tabs and line ends are fine
+
+Chosen = TypeVar("Chosen", bound=enum.Enum)
+Kind = TypeVar("Kind")
+
+
+def shown(value: Any, longest: int = 80) -> str:
+    """The repr of a value in one line of ASCII-safe text, cut where it is long: for messages."""
+    try:
+        text = ascii(value) if isinstance(value, str) else repr(value)
+    except Exception:  # a repr of a user's class may raise anything
+        text = f"a {type(value).__name__}"
+    text = _UNPRINTABLE.sub("?", " ".join(text.split()))
+    return text if len(text) <= longest else f"{text[: longest - 3]}..."
+
+
+def name(value: Any, what: str, *, file: bool = False, empty: bool = False) -> str:
+    """A name: text without control characters, of at most LONGEST_NAME characters.
+
+    Args:
+        value: what should be one.
+        what: begins the message, e.g. "recording 'a', phase 2, name".
+        file: whether it becomes the name of a file: no path separator, no dot in front.
+        empty: whether "" is a name.
+    """
+    if not isinstance(value, str):
+        raise ValueError(f"{what} must be text, got {shown(value)}")
+    if not value and not empty:
+        raise ValueError(f"{what} must not be empty")
+    printable(value, what)
+    length = len(value.encode()) if file else len(value)
+    if length > LONGEST_NAME:
+        unit = "bytes" if file else "characters"
+        raise ValueError(f"{what} must have at most {LONGEST_NAME} {unit}, got {length}: {shown(value, 40)}")
+    if file and ("/" in value or "\\" in value or value.startswith(".")):
+        raise ValueError(f"{what} names files: it must hold no / or \\ and not begin with a dot, got {shown(value)}")
+    return str(value)
+
+
+def names(value: Any, what: str, *, empty: bool = True) -> tuple[str, ...]:
+    """Several names, none of them twice; one text is no list of its letters."""
+    if isinstance(value, (str, bytes)) or not isinstance(value, Iterable):
+        raise ValueError(f"{what} must be a list of names, got {shown(value)}")
+    out = tuple(name(one, f"{what}, entry {i}") for i, one in enumerate(value, 1))
+    if not out and not empty:
+        raise ValueError(f"{what} must not be empty")
+    if twice := sorted({one for one in out if out.count(one) > 1}):
+        raise ValueError(f"{what} must be unique, repeated: {', '.join(twice)}")
+    return out
+
+
+def note(value: Any, what: str) -> str:
+    """A free text: no control characters but tabs and line ends, at most LONGEST_NOTE characters."""
+    if not isinstance(value, str):
+        raise ValueError(f"{what} must be text, got {shown(value)}")
+    printable(value, what, lines=True)
+    if len(value) > LONGEST_NOTE:
+        raise ValueError(f"{what} must have at most {LONGEST_NOTE} characters, got {len(value)}")
+    return str(value)
+
+
+def printable(text: str, what: str, *, lines: bool = False) -> None:
+    """ValueError for text with control characters or halves of surrogate pairs; lines: tabs and line ends may be."""
+    if found := (_UNPRINTABLE_NOTE if lines else _UNPRINTABLE).search(text):
+        raise ValueError(
+            f"{what} holds the character U+{ord(found[0]):04X} at position {found.start()}, which cannot be printed: "
+            f"{shown(text)}"
+        )
+
+
+def number(
+    value: Any,
+    what: str,
+    *,
+    above: float | None = None,
+    least: float | None = None,
+    below: float | None = None,
+    most: float | None = None,
+) -> float:
+    """A finite number; true and false are none, nor is text that looks like one.
+
+    Args:
+        value: a Python or numpy number.
+        what: begins the message.
+        above: it must be larger.  least: it must not be smaller.  below: it must be smaller.
+        most: it must not be larger.
+    """
+    if isinstance(value, bool) or not isinstance(value, numbers.Real):
+        raise ValueError(f"{what} must be a number, got {shown(value)}")
+    try:
+        out = float(value)
+    except (OverflowError, ValueError):
+        raise ValueError(f"{what} must be a number, got {shown(value)}") from None
+    if not math.isfinite(out):
+        raise ValueError(f"{what} must be finite, got {shown(value)}")
+    _check_range(out, what, above, least, below, most)
+    return out
+
+
+def whole(value: Any, what: str, *, least: int | None = None, most: int | None = None) -> int:
+    """A whole number as an int; 2.0 is none."""
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral):
+        raise ValueError(f"{what} must be a whole number, got {shown(value)}")
+    out = int(value)
+    _check_range(out, what, None, least, None, most)
+    return out
+
+
+def _check_range(
+    value: float, what: str, above: float | None, least: float | None, below: float | None, most: float | None
+) -> None:
+    wanted = [
+        f"{word} {limit:g}"
+        for word, limit, holds in (
+            ("above", above, above is None or value > above),
+            ("at least", least, least is None or value >= least),
+            ("below", below, below is None or value < below),
+            ("at most", most, most is None or value <= most),
+        )
+        if not holds
+    ]
+    if wanted:
+        raise ValueError(f"{what} must be {' and '.join(wanted)}, got {shown(value)}")
+
+
+def flag(value: Any, what: str) -> bool:
+    """True or False, of Python or numpy; other values are no answers to a question."""
+    if isinstance(value, bool):
+        return value
+    if type(value).__name__ in ("bool", "bool_") and type(value).__module__ == "numpy":
+        return bool(value)
+    raise ValueError(f"{what} must be True or False, got {shown(value)}")
+
+
+def choice(value: Any, kind: type[Chosen], what: str) -> Chosen:
+    """A member of an enum; its value, as files state it, is converted."""
+    if isinstance(value, kind):
+        return value
+    for member in kind:
+        if isinstance(value, str) and value == member.value:
+            return member
+    raise ValueError(f"{what} must be one of {', '.join(str(m.value) for m in kind)}, got {shown(value)}")
+
+
+def one_of(value: Any, valid: Collection[str], what: str) -> str:
+    """One of these texts."""
+    if not isinstance(value, str) or value not in valid:
+        raise ValueError(f"{what} must be one of {', '.join(valid)}, got {shown(value)}")
+    return value
+
+
+def instance(value: Any, kind: type[Kind], what: str) -> Kind:
+    """An object of a class."""
+    if not isinstance(value, kind):
+        raise ValueError(f"{what} must be {_article(kind.__name__)}, got {_got(value)}")
+    return value
+
+
+def instances(value: Any, kind: type[Kind], what: str, *, empty: bool = True) -> tuple[Kind, ...]:
+    """A list of objects of a class."""
+    if isinstance(value, (str, bytes, dict)) or not isinstance(value, Iterable):
+        raise ValueError(f"{what} must be a list of {kind.__name__} objects, got {_got(value)}")
+    out = tuple(instance(one, kind, f"{what}, entry {i}") for i, one in enumerate(value))
+    if not out and not empty:
+        raise ValueError(f"{what} must not be empty")
+    return out
+
+
+def _article(word: str) -> str:
+    return f"{'an' if word[0] in 'AEIOUaeiou' else 'a'} {word}"
+
+
+def _got(value: Any) -> str:
+    """What a value is: its text where it is short data, else its type."""
+    plain = value is None or isinstance(value, (str, bytes, int, float))
+    return shown(value) if plain else _article(type(value).__name__)
