@@ -25,3 +25,15 @@ def needs(what: str, extra: str, *packages: str) -> None:
     """ValueError that says so where something is `lacking`."""
     if told := lacking(what, extra, *packages):
         raise ValueError(told)
+
+
+def reason(error: BaseException) -> str:
+    """Why something was not made, in one line: an error's message; with its type where that says no more than a name.
+
+    Of ours (ValueError, OSError) the message is a sentence; of others the type says what it is about.
+    """
+    lines = str(error).strip().splitlines()
+    said = lines[0].strip() if lines else ""
+    if isinstance(error, ValueError | OSError) and said:
+        return said
+    return f"{type(error).__name__}: {said}" if said else type(error).__name__

@@ -6,6 +6,8 @@ TRACES, CORRELATION, DISTRIBUTION = "traces.npz", "correlation.npz", "distributi
 HISTORY, HISTORY_TABLE = "history.npz", "history.csv"
 FITTED, REPLAY, REPLAY_FILM = "fitted.xml", "replay.npz", "replay.webp"
 GAP, GAP_TRACES = "gap.json", "gap.npz"
+# States in "amendments" of gap.json: the run was stopped before; "not made: " and the reason.
+TO_BE_MADE, NOT_MADE = "to be made", "not made"
 EXTENDED, EXTENDED_MJCF = "extended.json", "extended.xml"
 POLICY, TRAINING, TRANSFER, FILMS = "policy.npz", "training.json", "transfer.json", "films"
 STAND_IN = "stand_in.json"  # beside the stand-in's recordings: its springs, seed and hidden effects

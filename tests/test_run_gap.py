@@ -18,7 +18,7 @@ from small_gap import EFFECTS, FLOOR, JOINTS, PRELOAD, QUICK, SCENE, record, sma
 
 from droid_jax.commands import gap, report
 from droid_jax.commands.stand_in import hidden_effects, record_stand_in
-from droid_jax.gap import anew, missing
+from droid_jax.gap import amend, anew, missing
 from droid_jax.gap.inputs import check_recordings, lags
 from droid_jax.gap.verdict import Experiment
 from droid_jax.measure.formats import save
@@ -475,20 +475,67 @@ def test_a_run_goes_on_after_a_stop_and_is_whole(
     assert (out / "gap.json").read_bytes() == before
 
 
+def tied(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A search that ends with a tie at once."""
+    done = small()
+    monkeypatch.setattr(missing, "base_fit", lambda *a: done.base)
+    monkeypatch.setattr(missing, "find", lambda *a: replace(done.verdict, rivals=(done.base,)))
+
+
 def test_ties_come_with_an_experiment(place: Path, quick: None, monkeypatch: pytest.MonkeyPatch):
     """The command asks what would tell the rivals apart, on the fitted recording."""
-    done, asked = small(), []
+    asked = []
 
     def apart(case, models, recording):
         asked.append(([m.name for m in models], recording.name))
-        return (Experiment("the same motion twice as fast", 8.5),)
+        return (Experiment("the same motion twice as fast", 8.5), Experiment("slower", None, "too long"))
 
-    monkeypatch.setattr(missing, "base_fit", lambda *a: done.base)
-    monkeypatch.setattr(missing, "find", lambda *a: replace(done.verdict, rivals=(done.base,)))
-    monkeypatch.setattr(missing, "separating", apart)
+    tied(monkeypatch)
+    monkeypatch.setattr(amend, "separating", apart)
     assert main(arguments(place, "--effects", *EFFECTS)) == 0
     assert asked == [(["hinge_preload at door", "base"], "fit")]
-    assert read_gap(place / "run").found["experiments"] == [{"what": "the same motion twice as fast", "apart": 8.5}]
+    found = read_gap(place / "run").found
+    assert found["experiments"] == [
+        {"what": "the same motion twice as fast", "apart": 8.5, "not_made": ""},
+        {"what": "slower", "apart": None, "not_made": "too long"},
+    ]
+    assert found["amendments"] == {"experiments": "made", "final_refit": "made"}
+
+
+def test_the_verdict_is_there_whatever_becomes_of_what_is_added_to_it(
+    place: Path, quick: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """Stopped while candidate experiments are made; gone on with, where these fail and the final refit is made."""
+    command, out = arguments(place, "--effects", *EFFECTS), place / "run"
+    tied(monkeypatch)
+
+    def stopped(*arguments: Any) -> Any:
+        raise KeyboardInterrupt
+
+    def failing(*arguments: Any) -> Any:
+        assert read_gap(out).found["verdict"] == "named"  # it stayed there while the run went on
+        raise ValueError("no motion can be asked for")
+
+    monkeypatch.setattr(amend, "separating", stopped)
+    assert main(command) == 130
+    said = capsys.readouterr()
+    assert f"the verdict is in {out / 'gap.json'}: The model lacks: hinge_preload at door." in said.out
+    first = read_gap(out)
+    assert first.amendments == {"experiments": "to be made", "final_refit": "to be made"}
+    assert first.found["verdict"] == "named" and first.fitted_to == ["fit"]
+    assert {"gap.npz", "extended.json", "checkpoints"} <= {p.name for p in out.iterdir()}
+
+    monkeypatch.setattr(amend, "separating", failing)
+    assert main(command) == 0
+    said = capsys.readouterr().out
+    assert "holds this run unfinished; going on" in said
+    assert "would tell the tied effects apart were not made: no motion can be asked for; the tie stands" in said
+    last = read_gap(out)
+    assert last.amendments == {"experiments": "not made: no motion can be asked for", "final_refit": "made"}
+    assert last.fitted_to == ["fit", "confirm"] and last.found["effects"] == first.found["effects"]
+
+    monkeypatch.setattr(missing, "find", lambda *a: pytest.fail("this run is whole"))
+    assert main(command) == 0
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from droid_jax.files import CONFIG, LAST_FILES, RESULTS, SETUP
+from droid_jax.report.stages import to_be_amended
 from droid_jax.storage import file_sha256
 
 if TYPE_CHECKING:
@@ -95,7 +96,7 @@ def finished(out: Path, setup: dict[str, Any], again: bool, last: str = CONFIG) 
         other = changed(before, setup)
     except (json.JSONDecodeError, UnicodeDecodeError, AttributeError, TypeError):
         raise ValueError(f"{path} is damaged; choose another --out, or start over with --again") from None
-    whole = (out / last).is_file()
+    whole = (out / last).is_file() and not to_be_amended(out)
     if not whole:
         other = [name for name in other if name not in LATER]
     if other:
@@ -122,15 +123,16 @@ def _with_other_code(before: Mapping[str, Any]) -> str:
     return f" with other code than it was begun with ({', '.join(other)}; --again starts over)" if other else ""
 
 
-def begin(out: Path, setup: dict[str, Any], again: bool, stage: str) -> None:
+def begin(out: Path, setup: dict[str, Any], again: bool, stage: str, keep: bool = False) -> None:
     """Only now, with all input read, forget an earlier run's results, and say what runs here.
 
-    again: its checkpoints too.
+    again: its checkpoints too.  keep: nothing; the results are this run's own, and it adds to them.
     """
     from droid_jax import runtime
     from droid_jax.storage import write_json
 
-    forget(out, stage, results_alone=not again)
+    if not keep:
+        forget(out, stage, results_alone=not again)
     write_json(out / SETUP, {**setup, CODE: runtime.versions()})
     BEGUN.add(out)
 

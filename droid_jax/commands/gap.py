@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -17,12 +18,13 @@ from droid_jax.commands.presets import TIMESTEP, refine_config, search_config, w
 from droid_jax.commands.scenes import compared, needs_log, needs_recording, needs_scene, own_scene, recording_at
 from droid_jax.commands.stand_in import hidden_effects, kept_at, known_stand_in, record_stand_in, settled
 from droid_jax.files import FIT, GAP
-from droid_jax.report.stages import needs_whole
+from droid_jax.report.stages import needs_whole, to_be_amended
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from droid_jax.gap.case import GapConfig
+    from droid_jax.gap.amend import Amended
+    from droid_jax.gap.case import Case, GapConfig
     from droid_jax.measure.recording import Recording
     from droid_jax.model.parameters import Space
     from droid_jax.model.scene import Scene
@@ -98,7 +100,7 @@ def run(command: Gap) -> None:
     warn_of_cpu(command.preset)
     from droid_jax.gap.inputs import shared_out
     from droid_jax.gap.missing import case_of
-    from droid_jax.gap.results import write_gap
+    from droid_jax.gap.results import write_amended, write_gap
     from droid_jax.gap.split import Split
     from droid_jax.identify.results import prepare_folder
     from droid_jax.measure.surrogate import is_stand_in
@@ -118,6 +120,7 @@ def run(command: Gap) -> None:
     if finished(out, setup, command.again, GAP):
         _done(out)
         return
+    known = not command.again and to_be_amended(out)  # its verdict is there and stays there
     split, roles = shared_out(scene, given) if given else (Split.RECORDINGS, {})
     if split is Split.BLOCKS and start is not None:
         print("a log without repeats is fitted without a search: --fit is not needed")
@@ -128,19 +131,30 @@ def run(command: Gap) -> None:
         roles = record_stand_in(scene, hidden, out, command.springs, command.seed, command.again)
     print("compiling the replay ...", flush=True)
     case = case_of(split, scene, base, effects, roles, config)
-    begin(out, setup, command.again, "gap")  # and only now, with all of it found good
+    begin(out, setup, command.again, "gap", keep=known)  # and only now, with all of it found good
     board = out / FOLDER if command.tensorboard else None
-    case, verdict, handed, seconds = searched(split, case, roles, out / "checkpoints", start, board)
     stand_in = all(is_stand_in(r) for r in roles.values())
-    known = known_stand_in(command.recording or kept_at(out)) if stand_in else {}
+    robot = known_stand_in(command.recording or kept_at(out)) if stand_in else {}
     description = {
         "split": {"by": split.value, "limits": split.limits},
-        "seconds": seconds,
         "versions": runtime.versions(),
         "device": runtime.device(),
-        "setup": {**setup, "stand_in": stand_in, "robot": known},
+        "setup": {**setup, "stand_in": stand_in, "robot": robot},
     }
-    write_gap(out, case, verdict, handed, description)
+    written = list[str]()
+
+    def keep(case: Case, now: Amended, seconds: Mapping[str, float]) -> None:
+        """First the verdict, then each amendment to it: a stop or an error between them loses neither."""
+        write = write_amended if written else write_gap
+        write(out, case, now.verdict, now.handed, {**description, "seconds": dict(seconds)}, now.states)
+        written.append(now.verdict.sentence)
+
+    try:
+        searched(split, case, roles, out / "checkpoints", start, board, keep)
+    except KeyboardInterrupt:
+        if written:
+            print(f"the verdict is in {out / GAP}: {written[0]} What is to be added to it is made by the same command")
+        raise
     shutil.rmtree(out / "checkpoints" / "replays", ignore_errors=True)
     _done(out)
 
@@ -229,7 +243,7 @@ def given_to(command: Gap) -> list[Recording]:
 def _done(out: Path) -> None:
     """Build the page, and say in a few lines what was found."""
     from droid_jax.report.gap_folder import read_gap
-    from droid_jax.report.gap_words import size_words
+    from droid_jax.report.gap_words import amendment_words, size_words
     from droid_jax.report.words import percent
 
     gap = read_gap(out)
@@ -247,6 +261,8 @@ def _done(out: Path) -> None:
     print(f"gap, noise units squared: {', '.join(gaps)}")
     if found["cut"]:
         print(f"left out for lack of time (--budget): {found['cut']}")
+    for line in amendment_words(gap):
+        print(line)
     if gap.limits:
         print(gap.limits)
     print(f"shifted most: {_shifted_most(gap)}")

@@ -13,6 +13,7 @@ from droid_jax.storage import write_json
 if TYPE_CHECKING:
     import numpy as np
 
+    from droid_jax.gap.amend import Amended
     from droid_jax.gap.case import Case
     from droid_jax.gap.handover import HandedOn
     from droid_jax.gap.split import Split
@@ -30,13 +31,15 @@ def searched(
     checkpoints: Path,
     start: np.ndarray | None = None,
     board: Path | None = None,
+    keep: Callable[[Case, Amended, Mapping[str, float]], None] = lambda case, now, seconds: None,
 ) -> tuple[Case, Verdict, HandedOn, dict[str, float]]:
     """The case, its verdict and the model to hand on, going on from `checkpoints`; and each stage's seconds.
 
     start: [F] values of the base parameters from which their fit begins, instead of a search.
     board: folder for scalars of the base fit, and of the others that report iterations.
+    keep: called with what there is and the seconds so far once the verdict is known, and after each amendment to it.
     """
-    from droid_jax.gap.handover import handed_on
+    from droid_jax.gap.amend import amended
     from droid_jax.gap.missing import answer
     from droid_jax.gap.split import Split
     from droid_jax.report.progress import stages
@@ -47,8 +50,10 @@ def searched(
         clock = Clock(names, (show, write), checkpoints / "seconds.json")
         clock(names[0], None)
         case, verdict = answer(split, case, roles, start, clock, checkpoints)
-        handed = handed_on(case, verdict.model, clock)
-        clock.stop()
+        for now in amended(case, verdict, roles["fit"], clock):
+            clock.stop()
+            keep(case, now, clock.seconds)
+            verdict, handed = now.verdict, now.handed
     return case, verdict, handed, clock.seconds
 
 

@@ -21,10 +21,19 @@ from droid_jax.identify.refine import refine
 
 @dataclass(frozen=True, eq=False)
 class HandedOn:
-    """A model, and the evidence that it is fitted to."""
+    """A model, and the evidence that it is fitted to.
+
+    not_made: why it is the search's own although a fit to both motions was due, empty where none was or it was made.
+    """
 
     model: Model
     of: tuple[Evidence, ...]
+    not_made: str = ""
+
+
+def due(case: Case, model: Model) -> bool:
+    """Whether a model is to be fitted to both motions once it is chosen."""
+    return bool(model.parts) and case.fit.repeated
 
 
 def handed_on(case: Case, model: Model, progress: Progress = lambda stage, value: None) -> HandedOn:
@@ -33,9 +42,8 @@ def handed_on(case: Case, model: Model, progress: Progress = lambda stage, value
     Without an effect it stays as it is, since `identify` fits a base model to any number of recordings.  So does that
     of a log in blocks, whose blocks are of one motion, and one whose fit to both does not converge.
     """
-    alone = HandedOn(model, (case.fit,))
-    if not model.parts or not case.fit.repeated:
-        return alone
+    if not due(case, model):
+        return HandedOn(model, (case.fit,))
     fit, confirm, whole, space = case.fit, case.confirm, case.whole, model.space
 
     def residuals(rows: np.ndarray) -> np.ndarray:
@@ -47,7 +55,7 @@ def handed_on(case: Case, model: Model, progress: Progress = lambda stage, value
     progress("both", None)
     refined = refine(residuals, space, begin, case.config.refine, progress=lambda now: progress("both", now))
     if not refined.converged:
-        return alone
+        return HandedOn(model, (case.fit,), "the fit to both motions did not converge")
     values = whole.embed(space, refined.best[None], model.values)[0]
     left = fit.residuals(fit.common(values)[0])
     return HandedOn(Model(model.parts, values, space, refined, left, fit.gap(left)), (fit, confirm))

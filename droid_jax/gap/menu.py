@@ -8,9 +8,10 @@ away from what the hand held.
 from __future__ import annotations
 
 import copy
+import functools
 import itertools
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import jax
@@ -18,9 +19,9 @@ import mujoco
 import numpy as np
 
 from droid_jax.compare.cost import Cost, make_cost
-from droid_jax.compare.measured import TooLong
+from droid_jax.errors import reason
 from droid_jax.gap.case import Case
-from droid_jax.gap.reach import opened_further
+from droid_jax.gap.reach import FURTHER, opened_further
 from droid_jax.gap.refit import Model
 from droid_jax.gap.verdict import Experiment
 from droid_jax.gap.warp import MENU, warped
@@ -42,49 +43,67 @@ def separating(case: Case, models: Sequence[Model], recording: Recording) -> tup
     """Experiments by how far apart they put the two models that they tell apart least, the best first.
 
     models: tied ones, each refitted.  recording: what the case was fitted to.  Empty for a log without
-    commands, whose motion cannot be asked for again.  Entries that a model cannot be replayed on, and
-    those too long for the memory, are left out.
+    commands, whose motion cannot be asked for again.  Experiments that cannot be made come last, and say why.
     """
     if len(models) < 2 or not recording.command.size:
         return ()
     values = np.stack([m.values for m in models])
+    found = [_made(what, make) for what, make in _menu(case, values, recording)]
+    return tuple(sorted(found, key=lambda e: -np.inf if e.apart is None else e.apart, reverse=True))
+
+
+def _menu(case: Case, values: np.ndarray, recording: Recording) -> Iterator[tuple[str, Callable[[], Experiment]]]:
+    """What there is to try in this scene, in words, and how each is made for models [K, D]."""
     known = case.fit.cost
     config = known.comparisons[0].config
-    found = list[Experiment]()
-    for motion in (*(warped(recording, entry) for entry in MENU), *_further(known, recording, values[:1])):
-        with warnings.catch_warnings():  # what there is to warn of was said of the recording itself
-            warnings.simplefilter("ignore", UserWarning)
-            try:
-                cost = make_cost(known.scene, case.whole, [motion], config=config, effects=case.effects)
-            except TooLong:  # the search is done, and other entries are left
-                continue
-        found += _experiment(motion.name, cost, values)
+
+    def moved(what: str, motion: Callable[[], Recording]) -> Experiment:
+        cost = make_cost(known.scene, case.whole, [motion()], config=config, effects=case.effects)
+        return _experiment(what, cost, values)
+
+    for entry in MENU:
+        yield entry.what, functools.partial(moved, entry.what, functools.partial(warped, recording, entry))
+    if known.scene.grip is not None:
+        yield FURTHER, functools.partial(moved, FURTHER, lambda: _further(known, recording, values[:1]))
     seen = {name: weight for name, weight in config.channels.items() if name != "object_angle"}
     if known.scene.grip is not None and seen:
-        alone = replace(config, channels=seen)
-        cost = make_cost(untouched(known.scene), case.whole, [recording], config=alone, effects=case.effects)
-        found += _experiment(IN_THE_AIR, cost, values)
+
+        def in_the_air() -> Experiment:
+            alone = replace(config, channels=seen)
+            cost = make_cost(untouched(known.scene), case.whole, [recording], config=alone, effects=case.effects)
+            return _experiment(IN_THE_AIR, cost, values)
+
+        yield IN_THE_AIR, in_the_air
     if CARRIED in case.whole.names:
         what = f"the same motion with {WEIGHT:g} kg more, weighed, at the hand"
-        found += _experiment(what, known, _carrying(case, values))
-    return tuple(sorted(found, key=lambda e: -e.apart))
+        yield what, lambda: _experiment(what, known, _carrying(case, values))
 
 
-def _further(known: Cost, recording: Recording, values: np.ndarray) -> list[Recording]:
-    """The motion opened further, as a model [1, D] made it; none where nothing grips or the hand does not get there."""
-    if known.scene.grip is None:
-        return []
+def _made(what: str, make: Callable[[], Experiment]) -> Experiment:
+    """An experiment, or why it cannot be made: the search is done, and one candidate must not end it."""
+    with warnings.catch_warnings():  # what there is to warn of was said of the recording itself
+        warnings.simplefilter("ignore", UserWarning)
+        try:
+            return make()
+        except Exception as error:
+            return Experiment(what, None, reason(error))
+
+
+def _further(known: Cost, recording: Recording, values: np.ndarray) -> Recording:
+    """The motion opened further, as a model [1, D] made it; ValueError where the hand does not get there."""
     longer = opened_further(known.scene, recording, jax.tree.map(lambda a: a[0], known.rollouts(values)[0]))
-    return [] if longer is None else [longer]
+    if longer is None:
+        raise ValueError("the hand does not hold the object where it is open most, or does not reach further")
+    return longer
 
 
-def _experiment(what: str, cost: Cost, values: np.ndarray) -> list[Experiment]:
-    """How far apart models [K, D] are that one experiment tells apart least; none where one cannot be replayed."""
+def _experiment(what: str, cost: Cost, values: np.ndarray) -> Experiment:
+    """How far apart models [K, D] are that one experiment tells apart least; ValueError where a replay fails."""
     if cost.failed(values).any():
-        return []
+        raise ValueError("the simulation of one of the rivals fails on this motion")
     simulated = cost.whitened(values).astype(np.float64)
     apart = min(float(np.linalg.norm(a - b)) for a, b in itertools.combinations(simulated, 2))
-    return [Experiment(what, apart)]
+    return Experiment(what, apart)
 
 
 def _carrying(case: Case, values: np.ndarray) -> np.ndarray:

@@ -11,14 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
+from droid_jax.gap.amend import amended
 from droid_jax.gap.anew import base_fit
 from droid_jax.gap.candidates import candidates, possible
 from droid_jax.gap.case import Case, GapConfig, make_case
 from droid_jax.gap.extended import Extended, extended
 from droid_jax.gap.floor import numerical_floor
-from droid_jax.gap.handover import handed_on
 from droid_jax.gap.inputs import shared_out
-from droid_jax.gap.menu import separating
 from droid_jax.gap.resume import kept_model, kept_number, remembering
 from droid_jax.gap.single import base_model, make_log, single_case
 from droid_jax.gap.split import Split
@@ -54,7 +53,8 @@ def find_missing(
 
     The verdict's gaps are in squared noise units of one repeat.  Only another motion tells effects apart that act
     alike in this one (`Split.limits`).
-    The model is handed on as `handed_on` says: with effects in it, it is fitted to both motions.
+    The model is handed on as `handed_on` says: with effects in it, it is fitted to both motions; where that fails it is
+    the search's own, of the first motion.
     Raises ValueError for recordings in which a search could not end well, and for effects that are none or that a
     recording without commands cannot have.
     """
@@ -67,7 +67,8 @@ def find_missing(
     case = case_of(split, scene, space, asked, roles, config or GapConfig())
     tell = progress or (lambda stage, value: None)
     case, verdict = answer(split, case, roles, start, tell)
-    return verdict, extended(case, handed_on(case, verdict.model, tell))
+    *_, whole = amended(case, verdict, roles["fit"], tell)
+    return whole.verdict, extended(case, whole.handed)
 
 
 def answer(
@@ -80,6 +81,7 @@ def answer(
 ) -> tuple[Case, Verdict]:
     """The verdict on a case of recordings by role (see `case_of`), and the case, which now remembers its replays.
 
+    Without experiments for a tie: `amend.amended` adds them.
     start: [F] values of the base parameters from which their fit begins, instead of a search.
     checkpoints: folder of this search alone, from which it goes on after a stop; None keeps nothing.
     """
@@ -101,9 +103,6 @@ def answer(
         floor = kept_number(at("floor"), lambda: numerical_floor(case.fit, model, roles["fit"]))
     verdict = find(case, model, floor, tell)
     tell("judge", None)
-    if verdict.rivals:
-        tied = (verdict.model, *verdict.rivals)
-        verdict = replace(verdict, experiments=separating(case, tied, roles["fit"]))
     return case, verdict
 
 

@@ -1,5 +1,7 @@
 """What a search for a missing effect leaves in its folder: gap.json and gap.npz, the extended model beside them.
 
+The verdict is written when it is known; what is added to it later (`droid_jax.gap.amend`) is written again.
+
 docs/gap-command.md lists every entry; `report.gap_folder` reads them, for a page and for a user.  No pickle.
 """
 
@@ -27,15 +29,36 @@ from droid_jax.identify.uncertainty import told
 from droid_jax.storage import finite, write_json, write_npz
 
 
-def write_gap(folder: Path, case: Case, verdict: Verdict, handed: HandedOn, description: Mapping[str, Any]) -> None:
-    """Write all files of a search; gap.json last, its presence says that the run is whole.
+def write_gap(
+    folder: Path,
+    case: Case,
+    verdict: Verdict,
+    handed: HandedOn,
+    description: Mapping[str, Any],
+    amendments: Mapping[str, str] | None = None,
+) -> None:
+    """Write all files of a search as soon as its verdict is known; gap.json last.
 
-    handed: the model to hand on.
+    handed: the model to hand on, the search's own while the final refit is to be made.
     description: what else gap.json shall hold: "seconds", "versions", "device", "setup", ...
+    amendments: their states (`amend.Amended.states`); None where all that is due has been made.
     """
     write_npz(folder / GAP_TRACES, gap_arrays(case, verdict))
+    write_amended(folder, case, verdict, handed, description, amendments)
+
+
+def write_amended(
+    folder: Path,
+    case: Case,
+    verdict: Verdict,
+    handed: HandedOn,
+    description: Mapping[str, Any],
+    amendments: Mapping[str, str] | None = None,
+) -> None:
+    """Write what an amendment changes of `write_gap`'s files: the extended model, then gap.json."""
     save_extended(folder, extended(case, handed))
-    write_json(folder / GAP, {**gap_json(case, verdict), "handed_on": _handed_on(case, verdict, handed), **description})
+    more = {"handed_on": _handed_on(case, verdict, handed), "amendments": dict(amendments or {})}
+    write_json(folder / GAP, {**gap_json(case, verdict), **more, **description})
 
 
 def gap_json(case: Case, verdict: Verdict) -> dict[str, Any]:

@@ -35,11 +35,13 @@ class Experiment:
     """Something to record that would tell tied effects apart.
 
     what: in words.  apart: standardised difference of the rivals' simulated torques there, after each was
-    refitted to what is recorded already; above about 6 ten repeats decide.
+    refitted to what is recorded already; above about 6 ten repeats decide.  None where it could not be made:
+    not_made says why.
     """
 
     what: str
-    apart: float
+    apart: float | None
+    not_made: str = ""
 
 
 LOST = "the fitted model on the sealed recording"  # among what failed

@@ -126,6 +126,11 @@ class Gap:
         return self.found.get("handed_on", {}).get("fitted_to", [self.recording("fit")])
 
     @property
+    def amendments(self) -> Mapping[str, str]:
+        """What was added to the verdict after it was written, and whether: name -> state; an older search added all."""
+        return self.found.get("amendments", {})
+
+    @property
     def parts(self) -> Parts:
         """What is said of how the recordings were divided."""
         return parts_of(self.found)
@@ -177,6 +182,9 @@ def read_gap(folder: str | Path) -> Gap:
     _READ.check(said_split(found), _SPLIT, "gap.json, 'split'")
     _READ.check(found.get("shapes", []), [_SIZE], "gap.json, 'shapes'")
     _READ.check(found.get("about", {}), {str: _ABOUT}, "gap.json, 'about'")
+    _READ.check(found.get("amendments", {}), {str: str}, "gap.json, 'amendments'")
+    for entry in found["experiments"]:
+        _READ.check(entry.get("not_made", ""), str, "gap.json, 'experiments', 'not_made'")
     if "handed_on" in found:
         _READ.check(found["handed_on"], _HANDED_ON, "gap.json, 'handed_on'")
     for fault in _faults(found):

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from droid_jax.files import EXTENDED
+from droid_jax.files import EXTENDED, NOT_MADE, TO_BE_MADE
 from droid_jax.report.gap_folder import Gap
 from droid_jax.report.gap_parts import parts_of
 from droid_jax.report.words import counted, label, listed, number, percent, was
@@ -72,8 +72,26 @@ def quantity(value: float | None, unit: str, digits: int = 3) -> str:
 def gap_summary(gap: Gap) -> list[str]:
     """The sentences under the answer, from the numbers alone; the last says what to do."""
     sentences = [_fitted(gap), _significance(gap), _size(gap), _allowed(gap), *_added(gap.sizes)]
-    said = [*sentences, *_trends(gap.found), gap.limits]
+    said = [*sentences, *_trends(gap.found), gap.limits, *amendment_words(gap)]
     return [*(s for s in said if s), _next(gap)]
+
+
+AMENDMENTS = {  # of gap.json: what it is called, and what there is without it
+    "experiments": ("The candidate experiments that would tell the tied effects apart", "the tie stands without them"),
+    "final_refit": ("The final refit to both motions", f"{EXTENDED} holds the model of the first motion"),
+}
+
+
+def amendment_words(gap: Gap) -> list[str]:
+    """One sentence for each addition to the verdict that is not there, with the reason and what that means."""
+    out = []
+    for name, (what, without) in AMENDMENTS.items():
+        state, verb = gap.amendments.get(name, ""), "were" if name == "experiments" else "was"
+        if state == TO_BE_MADE:
+            out.append(f"{what} {verb} not made yet, since the run was stopped: the same command makes it; {without}.")
+        elif state.startswith(NOT_MADE):
+            out.append(f"{what} {verb} {state.rstrip('.')}; {without}.")
+    return out
 
 
 def largest_shifts(shifts: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:

@@ -10,7 +10,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from droid_jax.files import EXTENDED, GAUSSIAN, LAST_FILES, SETUP
+from droid_jax.files import EXTENDED, GAP, GAUSSIAN, LAST_FILES, SETUP, TO_BE_MADE
 
 
 def setup(folder: Path) -> dict[str, Any]:
@@ -30,6 +30,12 @@ def told_in(path: Path) -> dict[str, Any]:
 def unfinished(folder: Path) -> bool:
     """Whether a run began in a folder and is not whole: what lies there may be an earlier run's."""
     return bool(setup(folder)) and not any((folder / last).is_file() for last in LAST_FILES.values())
+
+
+def to_be_amended(folder: Path) -> bool:
+    """Whether a search was stopped after its verdict was written: the same command makes what is to be added to it."""
+    states = told_in(folder / GAP).get("amendments")
+    return isinstance(states, dict) and TO_BE_MADE in states.values()
 
 
 def needs_whole(folder: Path) -> None:

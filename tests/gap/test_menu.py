@@ -17,6 +17,7 @@ from droid_jax.gap.reach import FURTHER
 from droid_jax.gap.refit import Model
 from droid_jax.gap.warp import MENU, STOP, warped
 from droid_jax.measure.demonstration import PLANS, grasp_pose, solve_pose
+from droid_jax.measure.recording import Recording
 from droid_jax.model.door_scene import door_scene
 from droid_jax.model.scene import Grip
 
@@ -60,26 +61,47 @@ def test_a_drag_is_told_from_a_preload_by_another_speed(demonstration, monkeypat
     """Rivals that differ in a speed-dependent torque: three times slower they come closer, twice as fast they part."""
     monkeypatch.setattr(menu, "MENU", MENU[:2])
     rivals = (model("drag", 0.0), model("drag", 0.8))
-    found = {e.what: e.apart for e in separating(small().case, rivals, demonstration)}
+    found = {e.what: e.apart or 0.0 for e in separating(small().case, rivals, demonstration)}
     slower, faster = (found[entry.what] for entry in MENU[:2])
     assert faster > 3.0 * slower > 0.0
     weighed = next(apart for what, apart in found.items() if "weighed" in what)
     assert slower < weighed < faster
 
 
-def test_an_entry_that_this_machine_cannot_replay_is_left_out(demonstration, monkeypatch):
-    """The search is done by then: a motion too long for the memory ends nothing."""
-    make = menu.make_cost
+def test_an_experiment_that_cannot_be_made_says_why_and_ends_nothing(demonstration, monkeypatch):
+    """The search is done by then.  Those that can be made come first."""
+    make, raised = menu.make_cost, [TooLong("needs 9.0 GB"), RuntimeError("RESOURCE_EXHAUSTED\nout of memory")]
 
     def short_of_memory(scene, space, recordings, **options):
         if recordings[0].time[-1] > demonstration.time[-1] + 0.1:
-            raise TooLong("needs 9.0 GB")
+            raise raised.pop(0)
         return make(scene, space, recordings, **options)
 
-    monkeypatch.setattr(menu, "MENU", MENU[:2])
+    monkeypatch.setattr(menu, "MENU", MENU[:3])
     monkeypatch.setattr(menu, "make_cost", short_of_memory)
-    found = {e.what for e in separating(small().case, (model("drag", 0.0), model("drag", 0.8)), demonstration)}
-    assert MENU[0].what not in found and MENU[1].what in found
+    found = separating(small().case, (model("drag", 0.0), model("drag", 0.8)), demonstration)
+    said = {e.what: (e.apart is None, e.not_made) for e in found}
+    assert said[MENU[0].what] == (True, "needs 9.0 GB")
+    assert said[MENU[1].what] == (False, "")
+    assert said[MENU[2].what] == (True, "RuntimeError: RESOURCE_EXHAUSTED")
+    assert [e.apart is None for e in found] == sorted(e.apart is None for e in found)
+
+
+def dropped(recording: Recording, seconds: float) -> Recording:
+    """A recording whose torque sensor gave nothing for a while, in all repeats."""
+    channel = recording.channels["torque"]
+    mask = channel.mask.copy()
+    mask[:, (channel.time > 1.0) & (channel.time < 1.0 + seconds)] = False
+    return replace(recording, channels={**recording.channels, "torque": replace(channel, mask=mask)})
+
+
+def test_a_dropout_that_a_slower_motion_makes_too_long_is_said(demonstration):
+    """60 ms without torques are filled in; three times slower they are too long."""
+    rivals = (model("drag", 0.0), model("drag", 0.8))
+    found = {e.what: e for e in separating(small().case, rivals, dropped(demonstration, 0.06))}
+    slower, faster = (found[entry.what] for entry in MENU[:2])
+    assert slower.apart is None and "a stretch that no repeat measured" in slower.not_made
+    assert faster.apart is not None and faster.apart > 0.0
 
 
 def test_a_known_weight_tells_only_what_acts_through_it(demonstration, monkeypatch):
@@ -104,10 +126,19 @@ def test_in_the_air_only_the_robot_is_seen(demonstration, monkeypatch):
     monkeypatch.setattr(menu, "MENU", ())
     case = small().case
     rivals = (model(CARRIED, 0.0), model(CARRIED, 0.2))
-    found = {e.what: e.apart for e in separating(gripping(case), rivals, demonstration)}
+    found = {e.what: e.apart or 0.0 for e in separating(gripping(case), rivals, demonstration)}
     plain = case.fit.cost.whitened(np.stack([m.values for m in rivals])).astype(float)
     assert found[IN_THE_AIR] == pytest.approx(np.linalg.norm(plain[0] - plain[1]), rel=0.2)
     assert IN_THE_AIR not in {e.what for e in separating(case, rivals, demonstration)}
+
+
+def test_a_hand_that_gets_no_further_is_said(demonstration, monkeypatch):
+    monkeypatch.setattr(menu, "MENU", ())
+    monkeypatch.setattr(menu, "opened_further", lambda *arguments: None)
+    found = {
+        e.what: e for e in separating(gripping(small().case), (model("drag", 0.0), model("drag", 0.8)), demonstration)
+    }
+    assert found[FURTHER].apart is None and "does not reach further" in found[FURTHER].not_made
 
 
 def test_a_motion_within_reach_is_on_the_menu(demonstration, monkeypatch):
@@ -116,7 +147,7 @@ def test_a_motion_within_reach_is_on_the_menu(demonstration, monkeypatch):
     monkeypatch.setattr(menu, "opened_further", lambda scene, recording, replayed: replace(recording, name=FURTHER))
     case = small().case
     rivals = (model("drag", 0.0), model("drag", 0.8))
-    found = {e.what: e.apart for e in separating(gripping(case), rivals, demonstration)}
+    found = {e.what: e.apart or 0.0 for e in separating(gripping(case), rivals, demonstration)}
     assert FURTHER not in {e.what for e in separating(case, rivals, demonstration)}
     plain = case.fit.cost.whitened(np.stack([m.values for m in rivals])).astype(float)
     assert found[FURTHER] == pytest.approx(np.linalg.norm(plain[0] - plain[1]), rel=1e-3)
@@ -147,15 +178,16 @@ def test_an_experiment_is_as_good_as_what_it_tells_apart_least():
             return np.array([[at[abs(v)], 0.0] for v in values[:, 0]])
 
     rivals = np.array([[0.0], [1.0], [2.0]])
-    (found,) = menu._experiment("so", Cost(), rivals)  # type: ignore[arg-type]
+    found = menu._experiment("so", Cost(), rivals)  # type: ignore[arg-type]
     assert (found.what, found.apart) == ("so", 1.0)
-    assert menu._experiment("so", Cost(), -rivals) == []  # type: ignore[arg-type]  # one cannot be replayed
+    lost = menu._made("so", lambda: menu._experiment("so", Cost(), -rivals))  # type: ignore[arg-type]
+    assert (lost.what, lost.apart) == ("so", None) and "fails on this motion" in lost.not_made
 
 
 def test_the_best_experiment_comes_first(demonstration, monkeypatch):
     monkeypatch.setattr(menu, "MENU", MENU[:2])
     found = separating(small().case, (model("drag", 0.0), model("drag", 0.8)), demonstration)
-    apart = [e.apart for e in found]
+    apart = [e.apart or 0.0 for e in found]
     assert apart == sorted(apart, reverse=True) and apart[0] > apart[-1]
 
 
