@@ -103,13 +103,13 @@ class Opening:
     """Watches a trial until the door is open, step by step on a copy that takes the same actions.
 
     opened: whether it is.  way: rad that the door has come from where it was shut, and of these held: with the grip
-    on.  work: [4] J by PARTS.
+    on.  work: [4] J by PARTS.  servo: J that the arm's actuators give meanwhile, summed over the joints.
     """
 
     def __init__(self, robot: TrialRobot):
         self.robot, self.hand = robot, hand_of(robot.scene)
         self.knob, self.hinge = robot.scene.id("geom", "knob"), robot.scene.id("joint", str(robot.scene.object_joint))
-        self.opened, self.way, self.held, self.work = False, 0.0, 0.0, np.zeros(4)
+        self.opened, self.way, self.held, self.work, self.servo = False, 0.0, 0.0, np.zeros(4), 0.0
         self.copy: mujoco.MjData | None = None
 
     def __call__(self, data: mujoco.MjData) -> None:
@@ -124,12 +124,13 @@ class Opening:
 
     def _step(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         """One action; the copy needs no more than the opening's part of the last one."""
-        task, before = self.robot.task, self.way
+        task, before, scene = self.robot.task, self.way, self.robot.scene
         for _ in range(round(task.control / self.robot.config.timestep)):
-            angle = data.qpos[self.hand.hinge]
+            angle, arm = data.qpos[self.hand.hinge], data.qpos[scene.joint_qpos]
             mujoco.mj_step(model, data)
             moved = data.qpos[self.hand.hinge] - angle
             self.work += moved * hinge_torques(model, data, self.knob, self.hinge)
+            self.servo += float(data.qfrc_actuator[scene.joint_dofs] @ (data.qpos[scene.joint_qpos] - arm))
             self.way = max(self.way, angle + moved)
             self.opened = angle + moved >= task.opened
             if self.opened:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,9 @@ sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
 import tyro  # noqa: E402
 from identify_suite import kept_cases  # noqa: E402
 
-from benchmarks.common import stem  # noqa: E402
+from benchmarks.common import commits, stem  # noqa: E402
+from droid_jax.model.door import door_space  # noqa: E402
+from droid_jax.model.door_scene import door_scene  # noqa: E402
 from droid_jax.report.words import label, like, number  # noqa: E402
 from droid_jax.storage import write_json, write_text  # noqa: E402
 
@@ -75,15 +77,33 @@ def table(cases: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:
     return rows
 
 
-def as_markdown(rows: Mapping[str, Any]) -> str:
-    """The table as text; what stands in italics is not told by the motion."""
+CAPTION = """# Table I: initial and fitted distributions of the three doors
+
+- **Paper**: its mean ± its `diag(Sigma)`, read as a deviation. The paper gives no unit but kg; the others are a
+  reading ([paper.md](../../docs/paper.md)).
+- **Truth here**: the hidden value of the stand-in robot. For door and fingers it is the paper's fitted mean; joint
+  damping is that of the servo used here, not the paper's.
+- **Best here**: the fit to demonstrations A and C with its 90 % interval. *Italics*: the motion does not constrain the
+  parameter; take no number from it.
+- Fits of commit {commits}; all numbers in [table1.json](table1.json). Sliding friction has no unit.
+"""
+
+
+def as_markdown(rows: Mapping[str, Any], units: Mapping[str, str], commits: Sequence[str]) -> str:
+    """The table as text, with its caption; italics mark what the motion does not constrain.
+
+    rows: of `table`.  units: by parameter, "-" for none.  commits: that made the fits.
+    """
     doors = list(next(iter(rows.values()))["doors"])
     springs = {"0": "no spring", "1": "one spring", "2": "two springs"}
     columns = ("{}, paper", "truth here", "best here (90 %)")
     head = ["", "initial, paper", *(column.format(springs[d]) for d in doors for column in columns)]
-    lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    told = ", ".join(f"`{commit[:7]}`" for commit in commits)
+    lines = [CAPTION.format(commits=told)]
+    lines += ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
     for name, row in rows.items():
-        cells = [label(name), _pair(*row["initial"])]
+        unit = "" if units[name] == "-" else f" [{units[name]}]"
+        cells = [label(name) + unit, _pair(*row["initial"])]
         for door in row["doors"].values():
             low, high = door["interval"]
             best, *ends = (like(value, 0.5 * (high - low)) for value in (door["best"], low, high))
@@ -91,6 +111,11 @@ def as_markdown(rows: Mapping[str, Any]) -> str:
             cells += [_pair(*door["paper"]), number(door["truth"]), found if door["identifiable"] else f"*{found}*"]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
+
+
+def units_of() -> dict[str, str]:
+    """Unit of each parameter of Table I, as the door's space has it."""
+    return {p.name: p.unit for p in door_space(door_scene()).parameters}
 
 
 def _pair(mean: float, deviation: float) -> str:
@@ -104,8 +129,8 @@ def main() -> None:
     cases = dict(zip(doors, found, strict=True))
     rows = table({k: case["parameters"] for k, case in cases.items()})
     name = stem("table1", arguments.quick)
-    write_text(arguments.out / f"{name}.md", as_markdown(rows))
     origins = {str(k): case["origin"] for k, case in cases.items()}
+    write_text(arguments.out / f"{name}.md", as_markdown(rows, units_of(), commits(found)))
     write_json(arguments.out / f"{name}.json", {"parameters": rows, "origin": origins}, indent=2)
     told = [d for r in rows.values() for d in r["doors"].values() if d["identifiable"]]
     inside = sum(bool(d["inside"]) for d in told)

@@ -53,7 +53,8 @@ def draw(run: Run) -> dict[str, list[Drawing]]:
         add(
             "torque", f"torque_{i}", f"Torque over time{of}",
             f"Thick line and band: what the {robot} measured ({judged(gap)}). Dashed: the simulation with the initial "
-            "means. Thin blue line: with the fitted values. Shaded: every other phase of the motion.",
+            "means. Thin blue line: with the fitted values. Below each joint, on a scale of its own: measurement minus "
+            "simulation. Shaded: every other phase of the motion.",
             torque_figures.torque_traces, traces, traces["phases"], run.torque_unit,
         )  # fmt: skip
     add(

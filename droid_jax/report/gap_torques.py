@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -15,7 +14,7 @@ from droid_jax.report.gap_figures import as_floats
 from droid_jax.report.gap_maps import Cell
 from droid_jax.report.gap_words import OF, TIME, joint_phase, variable_words
 from droid_jax.report.style import AFTER, BEFORE, LINE, MEASURED, WIDE, label_bottom, legend, panel_columns, styled
-from droid_jax.report.torque_figures import fill, shade, thin
+from droid_jax.report.torque_figures import fill, shade, thin, torque_grid
 from droid_jax.report.words import label
 
 POINTS = 60  # buckets of a line: fourteen panels must fit into the page as SVG
@@ -30,12 +29,7 @@ def torque_overlays(traces: Mapping[str, Any], unit: str, extended: bool = True,
     extended: False where no effect entered the model: no "after".
     """
     joints, columns = traces["joints"], panel_columns(width)
-    rows = math.ceil(len(joints) / columns)
-    figure = Figure(figsize=(width, 0.6 + 2.5 * rows), layout="constrained")
-    axes = figure.subplots(2 * rows, columns, sharex=True, squeeze=False, height_ratios=[1.9, 1.0] * rows)
-    upper, lower = axes[0::2].ravel(), axes[1::2].ravel()
-    for spare in (*upper[len(joints) :], *lower[len(joints) :]):
-        spare.set_visible(False)
+    figure, upper, lower = torque_grid(len(joints), width)
     for j, joint in enumerate(joints):
         _overlay(upper[j], traces, j, extended)
         _residual(lower[j], traces, j, extended)
@@ -45,8 +39,8 @@ def torque_overlays(traces: Mapping[str, Any], unit: str, extended: bool = True,
         upper[j].set_ylabel(f"Torque [{unit}]" if j % columns == 0 else "")
         lower[j].set_ylabel(f"Residual [{unit}]" if j % columns == 0 else "")
     upper[0].set_xlim(traces["time"][0], traces["time"][-1])
-    label_bottom(list(lower[: len(joints)]), width, "Time [s]")
-    figure.align_ylabels(axes[:, 0])
+    label_bottom(lower, width, "Time [s]")
+    figure.align_ylabels([axes for j in range(0, len(joints), columns) for axes in (upper[j], lower[j])])
     legend(figure, upper[0], width, columns=4)
     return figure
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
@@ -14,45 +15,82 @@ from matplotlib.figure import Figure
 from droid_jax.report.style import (
     AFTER,
     BEFORE,
+    LINE,
     MEASURED,
     MUTED,
     WIDE,
     label_bottom,
     legend,
     panel_columns,
-    panel_grid,
     styled,
 )
 from droid_jax.report.words import label
 
-BUCKETS = 220  # pieces of a drawn line, and points of a band
+BUCKETS = 140  # pieces of a drawn line, and points of a band
+RESIDUAL_BUCKETS = 60  # of a line of residuals: the figure must fit into the page as SVG
 _TRACES = ("measured_mean", "measured_low", "measured_high", "before", "after")
+_FITS: dict[str, dict[str, Any]] = {
+    "before": {"color": BEFORE, "linestyle": (0, (4, 1.5))},
+    "after": {"color": AFTER, "linewidth": 1.0},
+}
 
 
 @styled
 def torque_traces(
     traces: Mapping[str, Any], phases: Sequence[Mapping[str, Any]] = (), unit: str = "N m", width: float = WIDE
 ) -> Figure:
-    """Torque of every joint over time: the repeats' mean and 5 to 95 % band, before and after the fit.
+    """Every joint's torque over time with, below it, measurement minus simulation.
 
-    traces: time [T] s; measured_mean, measured_low, measured_high, before, after [T, J] N m;
-    joints [J] names.  phases: parts of the motion, each with name, start and end in s.
+    Over a motion that the fit follows well the three lines of a torque are one; the lower panel shows what is left.
+
+    traces: time [T] s; measured_mean, measured_low (5 % of the repeats), measured_high (95 %), before, after (the
+    fit) [T, J] in `unit`; joints [J] names.  phases: parts of the motion, each with name, start and end in s.
     """
     time, joints = np.asarray(traces["time"]), [str(j) for j in traces["joints"]]
-    figure, panels = panel_grid(len(joints), width, height=1.75)
-    for j, (axes, joint) in enumerate(zip(panels, joints, strict=True)):
+    columns = panel_columns(width)
+    figure, upper, lower = torque_grid(len(joints), width)
+    for j, joint in enumerate(joints):
         line = {k: np.asarray(traces[k])[:, j] for k in _TRACES}
-        shade(axes, phases, named=j < panel_columns(width))
-        repeated = fill(axes, time, line["measured_low"], line["measured_high"], "measured, 5 to 95 % of repeats")
-        mean = "measured, mean" if repeated else "measured"
-        axes.plot(*thin(time, line["measured_mean"]), color=MEASURED, linewidth=2.4, label=mean)
-        axes.plot(*thin(time, line["before"]), color=BEFORE, linestyle=(0, (4, 1.5)), label="before the fit")
-        axes.plot(*thin(time, line["after"]), color=AFTER, linewidth=1.0, label="after the fit")
-        axes.set(title=label(joint), xlim=(time[0], time[-1]), ylim=_torque_limits(line))
-        axes.set_ylabel(f"Torque [{unit}]" if j % panel_columns(width) == 0 else "")
-    label_bottom(panels, width, "Time [s]")
-    legend(figure, panels[0], width, columns=4)
+        _torques(upper[j], time, line)
+        _residuals(lower[j], time, line)
+        for axes in (upper[j], lower[j]):
+            shade(axes, phases, named=j < columns and axes is upper[j])
+        upper[j].set(title=label(joint), xlim=(time[0], time[-1]))
+        upper[j].set_ylabel(f"Torque [{unit}]" if j % columns == 0 else "")
+        lower[j].set_ylabel(f"Residual [{unit}]" if j % columns == 0 else "")
+    label_bottom(lower, width, "Time [s]")
+    figure.align_ylabels([axes for j in range(0, len(joints), columns) for axes in (upper[j], lower[j])])
+    legend(figure, upper[0], width, columns=4)
     return figure
+
+
+def torque_grid(joints: int, width: float) -> tuple[Figure, list[Axes], list[Axes]]:
+    """A figure with two panels a joint, in the joints' order: the upper for its torque, the lower for what is left."""
+    columns = panel_columns(width)
+    rows = math.ceil(joints / columns)
+    figure = Figure(figsize=(width, 0.6 + 2.5 * rows), layout="constrained")
+    axes = figure.subplots(2 * rows, columns, sharex=True, squeeze=False, height_ratios=[1.9, 1.0] * rows)
+    upper, lower = axes[0::2].ravel(), axes[1::2].ravel()
+    for spare in (*upper[joints:], *lower[joints:]):
+        spare.set_visible(False)
+    return figure, list(upper[:joints]), list(lower[:joints])
+
+
+def _torques(axes: Axes, time: np.ndarray, line: Mapping[str, np.ndarray]) -> None:
+    repeated = fill(axes, time, line["measured_low"], line["measured_high"], "measured, 5 to 95 % of repeats")
+    mean = "measured, mean" if repeated else "measured"
+    axes.plot(*thin(time, line["measured_mean"]), color=MEASURED, linewidth=2.4, label=mean)
+    for name, look in _FITS.items():
+        axes.plot(*thin(time, line[name]), label=f"{name} the fit", **look)
+    axes.set_ylim(_torque_limits(line))
+
+
+def _residuals(axes: Axes, time: np.ndarray, line: Mapping[str, np.ndarray]) -> None:
+    mean = line["measured_mean"]
+    fill(axes, time, line["measured_low"] - mean, line["measured_high"] - mean, buckets=RESIDUAL_BUCKETS)
+    axes.axhline(0.0, color=LINE, linewidth=0.8)
+    for name, look in _FITS.items():
+        axes.plot(*thin(time, mean - line[name], RESIDUAL_BUCKETS), label=f"{name} the fit", **look)
 
 
 @styled

@@ -46,7 +46,7 @@ from experiments.policies.cases import (
     made_by,
     run_all,
 )
-from experiments.policies.figure import as_text, histograms, knob_histograms, knobs_as_text
+from experiments.policies.figure import OPENED_WORDS, as_text, histograms, knob_histograms, knobs_as_text
 from experiments.policies.robots import fitted, robots_of
 from experiments.policies.settings import SETTINGS, Setting, setting_of
 from experiments.policies.store import Doors, decided_by, place_of, trained
@@ -71,6 +71,11 @@ def case(
         "trained_by": {"commit": "an older one"},
         **{place: found.to_json() for place in ("simulation", "stand_in", "slippery")},
     }
+
+
+def percent_in(panels: Sequence[Any]) -> list[float]:
+    """The bars of each panel of a histogram, added up."""
+    return [sum(bar.get_height() for bar in panel.patches) for panel in panels]
 
 
 def test_a_column_is_the_mean_over_all_trials():
@@ -172,7 +177,10 @@ def test_the_table_holds_what_was_run_and_the_papers_own():
     assert "Fitted against prior, stand-in robot: +0 points of success (-2" in text
     assert "## Setting `paper`" in text and "`dry`" not in text  # which is still to be run
     panels = histograms(cases, ["paper", "dry"]).axes
-    assert [sum(p.get_height() for p in panel.patches) for panel in panels] == [50, 0, 50]
+    assert percent_in(panels) == pytest.approx([100, 0, 100])  # of each panel's trials
+    assert panels[0].get_ylabel() == "trials [%]"
+    lines = [line for line in panels[0].lines if line.get_label() == OPENED_WORDS]
+    assert [line.get_xdata()[0] for line in lines] == [30.0] and "30°" in [t.get_text() for t in panels[0].texts]
 
 
 def test_the_table_shows_stops_slippery_pads_and_what_blew_up():
@@ -208,7 +216,7 @@ def test_every_knob_place_has_a_column_and_a_panel():
     assert "| | 0.30 m | 0.25 m |" in text and "| of each policy | 100 | 50, 50 |" in text
     panels = knob_histograms(of).axes
     assert [panel.get_title("left") for panel in panels] == [f"{lever} from the hinge" for lever in of]
-    assert [sum(p.get_height() for p in panel.patches) for panel in panels] == [50, 100]
+    assert percent_in(panels) == pytest.approx([100, 100])
 
 
 def test_a_summarys_figure_lies_beside_it_in_both_forms(tmp_path: Path):
@@ -221,7 +229,7 @@ def test_a_summarys_figure_lies_beside_it_in_both_forms(tmp_path: Path):
 def test_a_door_that_opens_to_its_stop_is_in_the_histogram():
     wide = case("prior", 0, 0.5)
     wide["stand_in"]["angle_deg"]["all"] = [100.3] * 50
-    assert sum(p.get_height() for p in histograms([wide], ["paper"]).axes[0].patches) == 50
+    assert percent_in(histograms([wide], ["paper"]).axes[:1]) == pytest.approx([100])
 
 
 def test_slippery_pads_are_all_that_differs_from_the_settings_robot():

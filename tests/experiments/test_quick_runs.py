@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.common import commits
+
 ROOT = Path(__file__).resolve().parents[2]
 DATA = {  # folders of real logs
     "experiments/gap_door.py": "door_pr2_ikea",
@@ -29,6 +31,7 @@ SCRIPTS: dict[str, tuple[str, ...]] = {
     "experiments/search_figure.py": (),
     "experiments/effects_on_policy.py": (),
     "experiments/hidden_effect_policy.py": (),
+    "experiments/door_work.py": (),
     "experiments/pad_friction.py": (),
     "experiments/policy_parity.py": (),
     **dict.fromkeys(DATA, ()),
@@ -69,6 +72,18 @@ def test_the_poses_panels_say_their_units(monkeypatch: pytest.MonkeyPatch) -> No
     panels = [axes for axes in figure.densities(*(case["parameters"] for case in cases)).axes if axes.get_visible()]
     said = {axes.get_title("left"): axes.get_xlabel() for axes in panels}
     assert said["Hinge stiffness"] == "[N m/rad]" and all(said.values())
+
+
+def test_table_one_says_its_units_and_is_that_of_its_json(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "experiments"))
+    script, folder = importlib.import_module("table1"), ROOT / "benchmarks/results"
+    kept = json.loads((folder / "table1.json").read_text())
+    text = script.as_markdown(
+        kept["parameters"], script.units_of(), commits({"origin": o} for o in kept["origin"].values())
+    )
+    assert text == (folder / "table1.md").read_text()
+    assert "| Hinge stiffness [N m/rad] | 0.01 ± 0.005 |" in text and "| Sliding friction left | 0.5 ± 0.25 |" in text
+    assert "90 % interval" in text.split("| Door mass")[0]  # said before the numbers
 
 
 def test_every_script_is_run_by_some_test() -> None:

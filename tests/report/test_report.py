@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from reader import Page, read_page
 
 from droid_jax.report import page, render, search_figures, torque_figures
-from droid_jax.report.export import inline_svg, settled
+from droid_jax.report.export import SVG_LIMIT, inline_svg, settled
 from droid_jax.report.gap_folder import read_gap
 from droid_jax.report.lead import lead
 from droid_jax.report.run_folder import read_run
@@ -375,13 +375,25 @@ def test_torque_figure_draws_the_given_traces(run: Path) -> None:
     traces = read_run(run).traces["open_close"]
     figure = torque_figures.torque_traces(traces, traces["phases"])
     panels = [a for a in figure.axes if a.get_visible()]
-    assert [a.get_title("left") for a in panels] == [f"Joint {i}" for i in range(1, 8)]
-    for j, axes in enumerate(panels):
-        drawn = {line.get_label(): line for line in axes.lines}
+    upper = [a for a in panels if a.get_title("left")]
+    lower = [a for a in panels if not a.get_title("left")]
+    assert [a.get_title("left") for a in upper] == [f"Joint {i}" for i in range(1, 8)] and len(lower) == 7
+    time, measured = traces["time"], np.asarray(traces["measured_mean"])
+    for j, (axes, below) in enumerate(zip(upper, lower, strict=True)):
+        own, residual = (panel.lines for panel in (axes, below))
         for name, key in (("before the fit", "before"), ("after the fit", "after")):
-            line = drawn[name]
-            rows = np.searchsorted(traces["time"], line.get_xdata())
+            line, left = ({one.get_label(): one for one in lines}[name] for lines in (own, residual))
+            rows = np.searchsorted(time, line.get_xdata())
             np.testing.assert_array_equal(line.get_ydata(), traces[key][rows, j])
+            rows = np.searchsorted(time, left.get_xdata())
+            np.testing.assert_array_equal(left.get_ydata(), (measured[:, j] - traces[key][:, j])[rows])
+
+
+def test_a_long_torque_figure_stays_a_drawing_on_the_page(run: Path) -> None:
+    traces = read_run(run).traces["open_close"]
+    for width in (WIDE, NARROW):
+        figure = settled(torque_figures.torque_traces(traces, traces["phases"], width=width))
+        assert len(inline_svg(figure, "torque")) < SVG_LIMIT  # beyond, the page shows pixels
 
 
 def test_figures_survive_failed_replays() -> None:
