@@ -11,7 +11,10 @@ import math
 import numbers
 import re
 from collections.abc import Collection, Iterable
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
+
+if TYPE_CHECKING:
+    import numpy as np
 
 LONGEST_NAME = 200  # characters of a name; of a name that becomes a file's, bytes in UTF-8 (file systems allow 255)
 LONGEST_NOTE = 10_000  # characters of a free text
@@ -116,6 +119,19 @@ def number(
     return out
 
 
+def numeric(value: Any, what: str) -> np.ndarray:
+    """Numbers as a float64 array, NaN and infinities among them; text is none, lists of unequal length are none."""
+    import numpy as np
+
+    try:
+        if np.asarray(value).dtype.kind not in "biuf":
+            raise ValueError(f"{what} must be numbers, got {_got(value)}")
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        said = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ValueError(said if said.startswith(what) else f"{what} must be numbers: {said}") from None
+
+
 def whole(value: Any, what: str, *, least: int | None = None, most: int | None = None) -> int:
     """A whole number as an int; 2.0 is none."""
     if isinstance(value, bool) or not isinstance(value, numbers.Integral):
@@ -183,6 +199,11 @@ def instances(value: Any, kind: type[Kind], what: str, *, empty: bool = True) ->
     if not out and not empty:
         raise ValueError(f"{what} must not be empty")
     return out
+
+
+def set_field(of: Any, field: str, value: Any) -> None:
+    """Put what a check made of an argument into a frozen dataclass, in its __post_init__."""
+    object.__setattr__(of, field, value)
 
 
 def _article(word: str) -> str:

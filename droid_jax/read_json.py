@@ -126,12 +126,13 @@ def _text_fault(text: str, what: str, is_key: bool) -> str:
 
 
 def _said(place: tuple[Any, ...]) -> str:
-    """A place in a message: ", 'phases', entry 0, 'name'"."""
-    return "".join(f", entry {key}" if isinstance(key, int) else f", {shown(key)}" for key in place)
+    """A place in a message: ": 'phases', entry 0, 'name'"."""
+    said = ", ".join(f"entry {key}" if isinstance(key, int) else shown(key) for key in place)
+    return f": {said}" if said else ""
 
 
 _WORDS = {
-    **{"float": "a number", "int": "a whole number", "str": "a text", "bool": "true or false"},
+    **{"float": "a number", "int": "a whole number", "str": "text", "bool": "true or false"},
     **{"null": "null", "array": "a list", "object": "an object"},
 }
 
@@ -148,12 +149,11 @@ def _sentence(value: Any, kind: Any, said: str) -> str:
     options = node.types if isinstance(node, inspect.UnionType) else (node,)
     if said.startswith("Object"):
         return f"{_said(place)}: {_keys(found, options)}"
-    if said.startswith("Invalid enum value"):
-        valid = [v for o in options for v in _values(o)]
-        return f"{_said(place)} must be one of {', '.join(map(str, valid))}, got {shown(found)}"
+    if valid := [v for o in options for v in _values(o)]:
+        return f"{_said(place) or ': the content'} must be one of {', '.join(map(str, valid))}, got {shown(found)}"
     wanted = re.sub(r"`([^`]*)`", lambda m: " or ".join(_WORDS.get(w, w) for w in m[1].split(" | ")), said)
     wanted = wanted.removeprefix("Expected ").partition(", got ")[0]
-    return f"{_said(place)} must be {wanted}, got {shown(found)}"
+    return f"{_said(place) or ': the content'} must be {wanted}, got {shown(found)}"
 
 
 def _keys(found: dict[str, Any], options: tuple[Any, ...]) -> str:

@@ -358,7 +358,7 @@ def test_a_bad_parameter(refused, run_folder: Path, tmp_path: Path, entry: objec
 
 @pytest.mark.parametrize(
     ("text", "expected"),
-    [("[", "not JSON"), ("{}", "expected a list"), ("[]", "expected a list"), (None, "no parameter")],
+    [("[", "not valid JSON"), ("{}", "expected a list"), ("[]", "expected a list"), (None, "no parameter")],
 )
 def test_a_bad_parameter_file(refused, tmp_path: Path, text: str | None, expected: str):
     path = tmp_path / "parameters.json"

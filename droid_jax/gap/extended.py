@@ -9,18 +9,19 @@ that MJCF has no words for are missing in it, and extended.json says which.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
+from droid_jax.arguments import instance
 from droid_jax.files import EXTENDED, EXTENDED_MJCF
 from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.case import Case
 from droid_jax.gap.handover import HandedOn
-from droid_jax.identify.gaussian import Gaussian, space_from_json, space_to_json
+from droid_jax.identify.gaussian import Coordinates, Gaussian, ParameterEntry, matrix, space_of, space_to_json
 from droid_jax.identify.uncertainty import posterior
 from droid_jax.model.effects.registry import effect_space, library, ready
 from droid_jax.model.mjcf import WORDS, fitted_mjcf, native
@@ -28,6 +29,7 @@ from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
+from droid_jax.read_json import read_json, typed
 from droid_jax.storage import write_json, write_text
 
 FORMAT, VERSION = "droid_jax extended model", 1
@@ -101,14 +103,18 @@ def load_extended(path: str | Path, scene: Scene) -> Extended:
 
     Raises ValueError that names the file where it is missing or damaged, or belongs to another scene.
     """
-    path = Path(path)
+    path, scene = Path(path), instance(scene, Scene, "scene")
     try:
-        return _of_json(json.loads(path.read_text(encoding="utf-8")), scene)
+        content = read_json(path)
     except FileNotFoundError:
         raise ValueError(f"{path}: there is no such file; `python -m droid_jax.run gap` writes one") from None
-    except (ValueError, KeyError, TypeError, OSError) as error:
-        what = f"there is no entry {error}" if isinstance(error, KeyError) else error
-        raise ValueError(f"{path}: {what}") from error
+    if not isinstance(content, dict) or (content.get("format"), content.get("version")) != (FORMAT, VERSION):
+        raise ValueError(f"{path}: expected a JSON object with format {FORMAT!r}, version {VERSION}")
+    file = typed(content, _File, str(path))
+    try:
+        return _of_file(file, scene)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
 
 
 def _in_mjcf(effect: Effect, free: Space) -> bool:
@@ -116,6 +122,34 @@ def _in_mjcf(effect: Effect, free: Space) -> bool:
     laws = (effect.command, effect.servo, effect.force, effect.frictionloss, effect.observe)
     fields = [{w.field for w in p.writes} for p in free.parameters]
     return not any(laws) and all(written and written <= WORDS for written in fields)
+
+
+class _Effect(msgspec.Struct, forbid_unknown_fields=True):
+    effect: str
+    place: str
+    what: str
+    amplitudes: list[str]
+    shapes: list[str]
+
+
+class _Normal(msgspec.Struct, forbid_unknown_fields=True):
+    coordinates: Coordinates
+    rule: str
+    mean: list[float]
+    cov: list[list[float]]
+
+
+class _File(msgspec.Struct, forbid_unknown_fields=True):
+    """The content of an extended.json."""
+
+    format: str
+    version: int
+    scene: dict[str, str | int | list[str] | None]
+    effects: list[_Effect]
+    values: dict[str, float]
+    gaussian: _Normal
+    space: list[ParameterEntry]
+    mjcf: dict[str, str | list[str] | None] = {}
 
 
 def _to_json(model: Extended) -> dict[str, Any]:
@@ -146,23 +180,25 @@ def _to_json(model: Extended) -> dict[str, Any]:
     }
 
 
-def _of_json(content: Any, scene: Scene) -> Extended:
-    if not isinstance(content, dict) or (content.get("format"), content.get("version")) != (FORMAT, VERSION):
-        raise ValueError(f"expected a JSON object with format {FORMAT!r}, version {VERSION}")
-    if (own := _scene_to_json(scene)) | {"name": ""} != content["scene"] | {"name": ""}:
-        raise ValueError(f"it was fitted with another scene, {content['scene']}; this one is {own}")
-    space = space_from_json(content["space"])
-    values = np.array([content["values"][name] for name in space.names], dtype=np.float64)
-    at = dict(zip(space.names, values.tolist(), strict=True))
+def _of_file(file: _File, scene: Scene) -> Extended:
+    if (own := _scene_to_json(scene)) | {"name": ""} != file.scene | {"name": ""}:
+        raise ValueError(f"it was fitted with another scene, {file.scene}; this one is {own}")
+    space = space_of(file.space)
+    free = [name for effect in file.effects for name in (*effect.amplitudes, *effect.shapes)]
+    if absent := [name for name in free if name not in space.names]:
+        raise ValueError(f"the effects have parameters that the space lacks: {', '.join(absent)}")
+    if absent := [name for name in space.names if name not in file.values]:
+        raise ValueError(f"'values': missing keys: {', '.join(absent)}")
     parts = tuple(
-        Candidate(e["effect"], e["place"], tuple(e["amplitudes"]), {name: at[name] for name in e["shapes"]})
-        for e in content["effects"]
+        Candidate(e.effect, e.place, tuple(e.amplitudes), {name: file.values[name] for name in e.shapes})
+        for e in file.effects
     )
     effects = library(scene, dict.fromkeys(p.effect for p in parts))
     _check_known(parts, effects, space)
-    g = content["gaussian"]
-    gaussian = Gaussian(space, g["mean"], g["cov"], g["rule"], g["coordinates"])
-    return Extended(ready(scene), parts, effects, space.check(values), gaussian)
+    g = file.gaussian
+    gaussian = Gaussian(space, matrix("mean", g.mean), matrix("cov", g.cov), g.rule, g.coordinates)
+    values = space.check(np.array([file.values[name] for name in space.names]))
+    return Extended(ready(scene), parts, effects, values, gaussian)
 
 
 def _check_known(parts: tuple[Candidate, ...], effects: tuple[Effect, ...], space: Space) -> None:

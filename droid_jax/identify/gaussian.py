@@ -22,7 +22,6 @@ File format (JSON, version 1)::
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
@@ -30,10 +29,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+import msgspec
 import numpy as np
 
+from droid_jax.arguments import instance, note, number, numeric, one_of, shown, whole
 from droid_jax.identify.truncated import gibbs, quantiles
 from droid_jax.model.parameters import Mode, Parameter, Scaling, Space, Write
+from droid_jax.read_json import read_json, typed
 from droid_jax.storage import write_json
 
 Coordinates = Literal["search", "physical"]
@@ -64,8 +66,9 @@ class Gaussian:
     coordinates: Coordinates = "search"
 
     def __post_init__(self) -> None:
-        if self.coordinates not in get_args(Coordinates):
-            raise ValueError(f"coordinates must be 'search' or 'physical', got {self.coordinates!r}")
+        instance(self.space, Space, "space")
+        note(self.rule, "rule")
+        one_of(self.coordinates, get_args(Coordinates), "coordinates")
         d = len(self.space)
         mean, cov = _numbers("mean", self.mean, (d,)), _numbers("cov", self.cov, (d, d))
         _check_covariance(cov)
@@ -75,7 +78,8 @@ class Gaussian:
 
     def sample(self, seed: int | np.random.Generator, n: int) -> np.ndarray:
         """[n, D] physical values, all inside the bounds; the same seed gives the same rows."""
-        rng = np.random.default_rng(seed)
+        n = whole(n, "n, the number of draws", least=0)
+        rng = seed if isinstance(seed, np.random.Generator) else np.random.default_rng(whole(seed, "seed", least=0))
         low, high = self._box()
         out, filled, drawn = np.empty((n, len(self.space))), 0, 0
         while filled < n:
@@ -94,7 +98,7 @@ class Gaussian:
         -inf outside the bounds.  It is the density of the normal itself: not renormalised for what
         the bounds cut off.  Raises ValueError when cov is singular.
         """
-        values = np.asarray(values, dtype=np.float64)
+        values = numeric(values, "values")
         if values.shape[-1:] != (len(self.space),):
             raise ValueError(f"values must have shape [..., {len(self.space)}], got {values.shape}")
         try:
@@ -115,7 +119,7 @@ class Gaussian:
         another, strongly correlated parameter cut rows away too.
         Raises ValueError for other levels.
         """
-        q = np.asarray(q, dtype=np.float64)
+        q = numeric(q, "q")
         if q.ndim != 1 or not np.all((q >= 0) & (q <= 1)):
             raise ValueError(f"q must be a list of levels between 0 and 1, got {q}")
         low, high = self._box()
@@ -130,8 +134,7 @@ class Gaussian:
 
         Raises ValueError unless 0 < level < 1.
         """
-        if not 0 < level < 1:
-            raise ValueError(f"level must lie between 0 and 1, got {level}")
+        level = number(level, "level", above=0, below=1)
         low, high = self.quantiles([(1 - level) / 2, (1 + level) / 2])
         return low, high
 
@@ -222,20 +225,19 @@ def load(path: str | Path) -> Gaussian:
     if path.is_dir():
         raise ValueError(f"{path} is a folder; a run keeps its Gaussian in gaussian.json there")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        if not isinstance(content, dict) or content.get("format") != FORMAT:
-            raise ValueError(f"expected a JSON object with format {FORMAT!r}")
-        if content.get("version") != VERSION:
-            raise ValueError(f"expected version {VERSION}, got {content.get('version')!r}")
-        space = space_from_json(_entry(content, "space", "the file"))
-        mean, cov, rule, coordinates = (
-            _entry(content, key, "the file") for key in ("mean", "cov", "rule", "coordinates")
-        )
-        return Gaussian(space, mean, cov, rule, coordinates)
+        content = read_json(path)
     except FileNotFoundError:
         raise ValueError(f"{path}: there is no such file") from None
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise ValueError(f"{path}: expected a JSON object with format {FORMAT!r}")
+    if content.get("version") != VERSION:
+        raise ValueError(f"{path}: expected version {VERSION}, got {shown(content.get('version'))}")
+    file = typed(content, _File, str(path))
+    try:
+        space = space_of(file.space)
+        return Gaussian(space, matrix("mean", file.mean), matrix("cov", file.cov), file.rule, file.coordinates)
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+        raise ValueError(f"{path}: {error}") from None
 
 
 def space_to_json(space: Space) -> list[dict[str, Any]]:
@@ -248,11 +250,70 @@ def space_to_json(space: Space) -> list[dict[str, Any]]:
     return out
 
 
+class WriteEntry(msgspec.Struct, forbid_unknown_fields=True):
+    """A write of a parameter in a file; older files state no offset and no element."""
+
+    field: str
+    index: list[int]
+    mode: Mode
+    gain: float
+    offset: float = 0.0
+    element: str = ""
+
+
+class ParameterEntry(msgspec.Struct, forbid_unknown_fields=True):
+    """A parameter in a file."""
+
+    name: str
+    unit: str
+    mean: float
+    std: float
+    low: float
+    high: float
+    writes: list[WriteEntry]
+    nuisance: bool
+    group: str
+    scaling: Scaling
+    floor: float
+    width: float | None
+
+
+class _File(msgspec.Struct, forbid_unknown_fields=True):
+    """The content of a file of `Gaussian.save`."""
+
+    format: str
+    version: int
+    coordinates: Coordinates
+    rule: str
+    mean: list[float]
+    cov: list[list[float]]
+    space: list[ParameterEntry]
+
+
 def space_from_json(entries: Any) -> Space:
     """The space that `space_to_json` described; ValueError names the parameter and entry that is wrong."""
-    if not isinstance(entries, list):
-        raise ValueError(f"space must be a list of parameters, got {type(entries).__name__}")
-    return Space(tuple(_parameter_from_json(i, e) for i, e in enumerate(entries)))
+    return space_of(typed(entries, list[ParameterEntry], "space"))
+
+
+def space_of(entries: Iterable[ParameterEntry]) -> Space:
+    """The space of a file's entries."""
+    return Space(tuple(_parameter(entry) for entry in entries))
+
+
+def _parameter(entry: ParameterEntry) -> Parameter:
+    fields = msgspec.structs.asdict(entry)
+    try:
+        fields["writes"] = tuple(Write(**{**msgspec.structs.asdict(w), "index": tuple(w.index)}) for w in entry.writes)
+    except ValueError as error:
+        raise ValueError(f"parameter {shown(entry.name)}: {error}") from None
+    return Parameter(**fields)
+
+
+def matrix(name: str, rows: list[Any]) -> np.ndarray:
+    """Rows of a file as an array, where they are of one length."""
+    if len({len(row) for row in rows if isinstance(row, list)}) > 1:
+        raise ValueError(f"{name} must have rows of one length")
+    return np.array(rows, dtype=np.float64)
 
 
 def redraw_box(space: Space) -> tuple[np.ndarray, np.ndarray]:
@@ -265,43 +326,9 @@ def redraw_box(space: Space) -> tuple[np.ndarray, np.ndarray]:
     return np.where(linear, low, -np.inf), np.where(linear, high, np.inf)
 
 
-def _parameter_from_json(position: int, entry: Any) -> Parameter:
-    """One parameter of `space_from_json`."""
-    if not isinstance(entry, dict):
-        raise ValueError(f"parameter {position} must be an object, got {type(entry).__name__}")
-    where = f"parameter {entry.get('name', position)!r}"
-    get: dict[str, Any] = {key: _entry(entry, key, where) for key in Parameter.__dataclass_fields__}
-    try:
-        get["writes"] = tuple(_write_from_json(w) for w in get["writes"])
-        get["scaling"] = Scaling(get["scaling"])
-        get["width"] = None if get["width"] is None else float(get["width"])
-        for key in ("mean", "std", "low", "high", "floor"):
-            get[key] = float(get[key])
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{where}: an entry has the wrong form ({error!r})") from error
-    return Parameter(**get)
-
-
-def _write_from_json(entry: dict[str, Any]) -> Write:
-    """One write of a parameter."""
-    index = tuple(int(i) for i in entry["index"])
-    numbers = float(entry["gain"]), float(entry.get("offset", 0.0))
-    return Write(str(entry["field"]), index, Mode(entry["mode"]), *numbers, str(entry.get("element", "")))
-
-
-def _entry(content: dict[str, Any], key: str, where: str) -> Any:
-    """content[key], or a ValueError that says where it is missing."""
-    if key not in content:
-        raise ValueError(f"{where} has no entry {key!r}")
-    return content[key]
-
-
 def _numbers(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
     """A float64 copy of an array of this shape, or ValueError."""
-    try:
-        array = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be an array of numbers of shape {shape} ({error})") from error
+    array = numeric(values, f"{name} [{', '.join(map(str, shape))}]").copy()
     if array.shape != shape:
         raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
     if not np.isfinite(array).all():

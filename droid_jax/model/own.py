@@ -21,13 +21,12 @@ servo have no element.
 
 from __future__ import annotations
 
-import enum
-import json
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from droid_jax.errors import faults
 from droid_jax.model.door import time_offset
@@ -35,14 +34,35 @@ from droid_jax.model.fields import body_mass, model_parameter, servo_scale
 from droid_jax.model.joint_friction import sensor_parameter
 from droid_jax.model.parameters import Mode, Parameter, Scaling, Space
 from droid_jax.model.scene import Scene
-from droid_jax.storage import read_text
+from droid_jax.read_json import read_json, typed
 
 _NEEDED = ("element", "std", "high")
 _TIME = "time_offset"
-_TEXTS = ("field", "sensor", "servo", "element", "name", "unit", "group")
-_NUMBERS = ("std", "high", "low", "mean", "floor", "width")
-_CHOICES = {"mode": Mode, "scaling": Scaling}
-_KNOWN = (*_TEXTS, *_NUMBERS, *_CHOICES, "column", "nuisance")
+
+
+class _Entry(msgspec.Struct, forbid_unknown_fields=True):
+    """An entry of the file, whatever its kind."""
+
+    field: str | msgspec.UnsetType = msgspec.UNSET
+    sensor: str | msgspec.UnsetType = msgspec.UNSET
+    servo: str | msgspec.UnsetType = msgspec.UNSET
+    element: str | msgspec.UnsetType = msgspec.UNSET
+    name: str | msgspec.UnsetType = msgspec.UNSET
+    unit: str | msgspec.UnsetType = msgspec.UNSET
+    group: str | msgspec.UnsetType = msgspec.UNSET
+    std: float | msgspec.UnsetType = msgspec.UNSET
+    high: float | msgspec.UnsetType = msgspec.UNSET
+    low: float | msgspec.UnsetType = msgspec.UNSET
+    mean: float | msgspec.UnsetType = msgspec.UNSET
+    floor: float | msgspec.UnsetType = msgspec.UNSET
+    width: float | msgspec.UnsetType = msgspec.UNSET
+    mode: Mode | msgspec.UnsetType = msgspec.UNSET
+    scaling: Scaling | msgspec.UnsetType = msgspec.UNSET
+    column: int | msgspec.UnsetType = msgspec.UNSET
+    nuisance: bool | msgspec.UnsetType = msgspec.UNSET
+
+
+_KNOWN = _Entry.__struct_fields__
 
 
 def load_parameters(path: str | Path, scene: Scene) -> Space:
@@ -64,10 +84,7 @@ def friction_joints(path: str | Path) -> tuple[str, ...]:
 def _entries(path: Path) -> list[Any]:
     if not path.is_file():
         raise FileNotFoundError(f"no parameter file at {path}")
-    try:
-        entries = json.loads(read_text(path))
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{path}: not JSON ({error})") from None
+    entries = read_json(path)
     if not isinstance(entries, list) or not entries:
         got = "an empty one" if entries == [] else type(entries).__name__
         raise ValueError(f"{path}: expected a list of parameters, got {got}")
@@ -86,8 +103,9 @@ def _parameter(scene: Scene, entry: Any, where: str) -> Parameter:
         raise ValueError(f"{where}: {wrong}; known keys: {', '.join(_KNOWN)}")
     if extra := [k for k in _useless(entry) if k in entry]:
         raise ValueError(f"{where}: leave {', '.join(extra)} out, which an entry of its kind has no use for")
+    read = msgspec.structs.asdict(typed(entry, _Entry, where))
+    options = {key: value for key, value in read.items() if value is not msgspec.UNSET}
     try:
-        options = _read(entry)
         field, sensor, servo = (options.pop(kind, None) for kind in ("field", "sensor", "servo"))
         if servo is not None:
             return servo_scale(scene, servo, **options)
@@ -111,29 +129,3 @@ def _useless(entry: Mapping[str, Any]) -> tuple[str, ...]:
     if "sensor" in entry:
         return ("column", "mode", "name", *(["element"] if entry["sensor"] == _TIME else []))
     return ("column",) if entry["field"] == "body_mass" else ()
-
-
-def _read(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """An entry with its choices looked up, or ValueError for a value of the wrong kind."""
-    out = dict(entry)
-    for key, value in entry.items():
-        if key in _TEXTS and not isinstance(value, str):
-            raise ValueError(f"{key} must be text, got {value!r}")
-        if key in _NUMBERS and not _is_number(value):
-            raise ValueError(f"{key} must be a number, got {value!r}")
-        if key == "nuisance" and not isinstance(value, bool):
-            raise ValueError(f"nuisance must be true or false, got {value!r}")
-        if key in _CHOICES:
-            out[key] = _chosen(key, value, _CHOICES[key])
-    return out
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _chosen(key: str, value: Any, choices: type[enum.Enum]) -> enum.Enum:
-    valid = [choice.value for choice in choices]
-    if value not in valid:
-        raise ValueError(f"{key} must be one of {', '.join(valid)}, got {value!r}")
-    return choices(value)

@@ -24,6 +24,9 @@ from typing import Any
 
 import numpy as np
 
+from droid_jax.arguments import choice, flag, instances, name, number, numeric, set_field, shown, whole
+
+MOST_ROWS = 10**9  # of a model's field
 ROUNDING = 1e-6  # share of a parameter's range by which a value may miss a bound
 
 
@@ -56,6 +59,17 @@ class Write:
     gain: float = 1.0
     offset: float = 0.0
     element: str = dataclasses.field(default="", compare=False)
+
+    def __post_init__(self) -> None:
+        where = f"a write of {shown(self.field)}"
+        set_field(self, "field", name(self.field, f"{where}: field"))
+        if not isinstance(self.index, (tuple, list)) or not self.index:
+            raise ValueError(f"{where}: index must be a tuple of whole numbers, got {shown(self.index)}")
+        set_field(self, "index", tuple(whole(i, f"{where}: index", least=0, most=MOST_ROWS) for i in self.index))
+        set_field(self, "mode", choice(self.mode, Mode, f"{where}: mode"))
+        set_field(self, "gain", number(self.gain, f"{where}: gain"))
+        set_field(self, "offset", number(self.offset, f"{where}: offset"))
+        name(self.element, f"{where}: element", empty=True)
 
     def new(self, nominal: Any, value: Any) -> Any:
         """The field's new number(s) for a value; works on numpy and jax arrays alike."""
@@ -113,9 +127,17 @@ class Parameter:
     width: float | None = None
 
     def __post_init__(self) -> None:
-        numbers = (self.mean, self.std, self.low, self.high)
-        if not all(math.isfinite(n) for n in numbers):
-            raise ValueError(f"parameter {self.name!r}: mean, std and bounds must be finite, got {numbers}")
+        where = f"parameter {shown(self.name)}"
+        name(self.name, f"{where}: its name")
+        name(self.unit, f"{where}: unit", empty=True)
+        name(self.group, f"{where}: group", empty=True)
+        for key in ("mean", "std", "low", "high", "floor"):
+            set_field(self, key, number(getattr(self, key), f"{where}: {key}"))
+        set_field(self, "writes", instances(self.writes, Write, f"{where}: writes"))
+        set_field(self, "nuisance", flag(self.nuisance, f"{where}: nuisance"))
+        set_field(self, "scaling", choice(self.scaling, Scaling, f"{where}: scaling"))
+        if self.width is not None:
+            set_field(self, "width", number(self.width, f"{where}: width", above=0))
         if not self.low < self.high:
             raise ValueError(f"parameter {self.name!r}: low {self.low} must be below high {self.high}")
         if not self.low <= self.mean <= self.high:
@@ -127,8 +149,15 @@ class Parameter:
             raise ValueError(f"parameter {self.name!r}: std must be positive, got {self.std}")
         if self.scaling is Scaling.LOG and self.low + self.floor <= 0:
             raise ValueError(f"parameter {self.name!r}: log scaling needs low + floor > 0")
-        if self.width is not None and not self.width > 0:
-            raise ValueError(f"parameter {self.name!r}: width must be positive, got {self.width}")
+        if not (math.isfinite(self.high - self.low) and (self.scaling is Scaling.LINEAR or self._mapped())):
+            raise ValueError(f"parameter {self.name!r}: its numbers are too large or too small to search among")
+
+    def _mapped(self) -> bool:
+        """Whether the logarithmic map is finite and of positive width at the bounds."""
+        if not (self.high + self.floor < math.inf and self.log_width > 0):
+            return False
+        ends = (math.log((end + self.floor) / (self.mean + self.floor)) for end in (self.low, self.high))
+        return all(math.isfinite(end / self.log_width) for end in ends)
 
     @property
     def log_width(self) -> float:
@@ -165,6 +194,7 @@ class Space:
     _index: dict[str, int] = field(init=False, repr=False, compare=False, hash=False, default_factory=dict)
 
     def __post_init__(self) -> None:
+        set_field(self, "parameters", instances(self.parameters, Parameter, "the parameters of a space"))
         names = [p.name for p in self.parameters]
         if not names:
             raise ValueError("a space needs at least one parameter")
@@ -190,8 +220,8 @@ class Space:
         """Position of a parameter; an unknown name raises and lists the valid ones."""
         try:
             return self._index[name]
-        except KeyError:
-            raise ValueError(f"unknown parameter {name!r}; this space has: {', '.join(self.names)}") from None
+        except (KeyError, TypeError):
+            raise ValueError(f"unknown parameter {shown(name)}; this space has: {', '.join(self.names)}") from None
 
     def _array(self, attribute: str) -> np.ndarray:
         return np.array([getattr(p, attribute) for p in self.parameters], dtype=np.float64)
@@ -228,9 +258,11 @@ class Space:
     def with_prior(self, **prior: tuple[float, float]) -> Space:
         """A copy in which some parameters start from another (mean, std)."""
         changed = list(self.parameters)
-        for name, (mean, std) in prior.items():
-            i = self.index(name)
-            changed[i] = replace(changed[i], mean=mean, std=std)
+        for of, pair in prior.items():
+            i = self.index(of)
+            if not isinstance(pair, (tuple, list)) or len(pair) != 2:
+                raise ValueError(f"the prior of {of!r} must be its mean and deviation, got {shown(pair)}")
+            changed[i] = replace(changed[i], mean=pair[0], std=pair[1])
         return Space(tuple(changed))
 
     def linear(self) -> Space:
@@ -240,8 +272,8 @@ class Space:
     def values(self, values: dict[str, float] | None = None) -> np.ndarray:
         """[D] the means, with some entries replaced by name."""
         out = self.mean
-        for name, value in (values or {}).items():
-            out[self.index(name)] = value
+        for of, value in (values or {}).items():
+            out[self.index(of)] = number(value, f"the value of {of!r}")
         return out
 
     def columns(self, part: Space) -> list[int]:
@@ -259,7 +291,7 @@ class Space:
 
         What single precision made of a bound counts as on it, and is returned as the bound itself.
         """
-        values = np.asarray(values, dtype=np.float64)
+        values = numeric(values, "parameter vectors")
         if values.shape[-1:] != (len(self),):
             raise ValueError(
                 f"expected parameter vectors [..., {len(self)}] ({', '.join(self.names)}), got shape {values.shape}"

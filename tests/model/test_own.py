@@ -95,17 +95,16 @@ def test_a_servos_gain_and_the_commands_delay_have_no_element(tmp_path: Path, sc
         ({"field": "body_pos", "element": "arm"}, 'body_pos has 3 numbers for each body: give "column", 0 to 2'),
         ({"field": "body_pos", "element": "arm", "column": 7}, 'give "column", 0 to 2, got 7'),
         ({"field": "body_inertia", "element": "arm", "column": -1}, 'give "column", 0 to 2, got -1'),
-        ({"field": "geom_size", "element": "bone", "column": "1"}, "give \"column\", 0 to 2, got '1'"),
-        ({"std": "a"}, "std must be a number, got 'a'"),
-        ({"std": True}, "std must be a number, got True"),
-        ({"width": "x", "scaling": "log", "floor": 0.1}, "width must be a number, got 'x'"),
-        ({"width": 0, "scaling": "log", "floor": 0.1}, "width must be positive, got 0"),
-        ({"floor": float("nan")}, "floor must be a number, got nan"),
-        ({"nuisance": "false"}, "nuisance must be true or false, got 'false'"),
-        ({"name": 5}, "name must be text, got 5"),
-        ({"element": 3}, "element must be text, got 3"),
-        ({"mode": "sett"}, "mode must be one of set, negative, scale, divide, add, got 'sett'"),
-        ({"scaling": 1}, "scaling must be one of linear, log, got 1"),
+        ({"field": "geom_size", "element": "bone", "column": "1"}, "'column' must be a whole number, got '1'"),
+        ({"std": "a"}, "'std' must be a number, got 'a'"),
+        ({"std": True}, "'std' must be a number, got True"),
+        ({"width": "x", "scaling": "log", "floor": 0.1}, "'width' must be a number, got 'x'"),
+        ({"width": 0, "scaling": "log", "floor": 0.1}, "width must be above 0, got 0"),
+        ({"nuisance": "false"}, "'nuisance' must be true or false, got 'false'"),
+        ({"name": 5}, "'name' must be text, got 5"),
+        ({"element": 3}, "'element' must be text, got 3"),
+        ({"mode": "sett"}, "'mode' must be one of set, negative, scale, divide, add, got 'sett'"),
+        ({"scaling": 1}, "'scaling' must be one of linear, log, got 1"),
         ({"field": "actuator_damping", "element": "elbow"}, "'actuator_damping' cannot be a parameter: MJX"),
         ({"field": "jnt_stiffnesspoly", "column": 0}, "'jnt_stiffnesspoly' cannot be a parameter: MJX"),
         ({"field": "geom_contype", "element": "bone"}, "'geom_contype' cannot be a parameter: MJX"),
@@ -119,6 +118,13 @@ def test_a_mistake_is_named(tmp_path: Path, scene: Scene, changes: dict[str, Any
     with pytest.raises(ValueError) as caught:
         loaded(tmp_path, scene, {**GOOD, **changes})
     assert says in str(caught.value) and "parameters.json, entry 1: " in str(caught.value)
+
+
+def test_numbers_that_are_none_are_refused_with_the_file(tmp_path: Path, scene: Scene):
+    with pytest.raises(ValueError, match=r"parameters\.json: NaN is no number of JSON"):
+        loaded(tmp_path, scene, {**GOOD, "floor": float("nan")})
+    with pytest.raises(ValueError, match=r"parameters\.json: entry 0, 'std': a whole number beyond 2\^63"):
+        loaded(tmp_path, scene, {**GOOD, "std": 10**400})
 
 
 def test_a_name_that_is_there_twice_is_told_where(tmp_path: Path, scene: Scene):

@@ -80,7 +80,7 @@ def test_numpy_and_jax_agree_and_keep_their_kind():
         (dict(low=3.0), "must be below high"),
         (dict(std=0.0), "std must be positive"),
         (dict(std=-1.0), "std must be positive"),
-        (dict(width=0.0), "width must be positive"),
+        (dict(width=0.0), "width must be above 0"),
         (dict(mean=math.nan), "must be finite"),
         (dict(high=math.inf), "must be finite"),
     ],
