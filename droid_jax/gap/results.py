@@ -68,6 +68,8 @@ def gap_json(case: Case, verdict: Verdict) -> dict[str, Any]:
         "sentence": verdict.sentence,
         "effects": list(verdict.effects),
         "tied": [list(rivals) for rivals in verdict.tied],
+        "hints": [asdict(hint) for hint in verdict.hints],
+        "thresholds": {"least_closed": case.config.least_closed},
         "about": _about(case, verdict),
         "p": verdict.screens[0].p if verdict.screens else None,
         "floor": verdict.floor,
@@ -184,8 +186,9 @@ def _cells(found: Localisation) -> list[dict[str, Any]]:
 
 
 def _about(case: Case, verdict: Verdict) -> dict[str, dict[str, Any]]:
-    """Of each effect of the answer, tied ones too: what it is, where its mark should appear, what looks like it."""
-    answers = [*verdict.effects, *(rival for rivals in verdict.tied for rival in rivals)]
+    """Of each effect of the answer, ties and hints with it: what it is, where its mark should appear, and its likes."""
+    groups = [(verdict.effects, verdict.tied), *((hint.effects, hint.tied) for hint in verdict.hints)]
+    answers = [a for effects, tied in groups for a in (*effects, *(rival for rivals in tied for rival in rivals))]
     named = {candidate.partition(" at ")[0] for answer in answers for candidate in answer.split(" + ")}
     return {
         e.name: {"what": e.what, "mark": e.mark, "confused_with": list(e.confused_with)}

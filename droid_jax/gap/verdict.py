@@ -5,6 +5,7 @@ from __future__ import annotations
 import enum
 from dataclasses import dataclass
 
+from droid_jax.gap.floor import above
 from droid_jax.gap.localise import Localisation
 from droid_jax.gap.refit import Model
 from droid_jax.gap.screen import Screen
@@ -44,6 +45,24 @@ class Experiment:
     not_made: str = ""
 
 
+@dataclass(frozen=True)
+class Hint:
+    """Effects that passed their trials and close too little to be named: they may only imitate what is missing.
+
+    effects, tied: as of a verdict.  closed: share of U beyond the floor by held-out role, "confirm" and "sealed".
+    """
+
+    effects: tuple[str, ...]
+    tied: tuple[tuple[str, ...], ...]
+    closed: dict[str, float]
+
+    @property
+    def words(self) -> str:
+        """ "a (closes 31 %)", "a or b (closes 31 %)": the least that it closes on a held-out recording."""
+        each = [" or ".join((e, *ties)) for e, ties in zip(self.effects, self.tied, strict=True)]
+        return f"{' and '.join(each)} (closes {max(min(self.closed.values()), 0.0):.0%})"
+
+
 LOST = "the fitted model on the sealed recording"  # among what failed
 
 
@@ -60,6 +79,7 @@ class Verdict:
     before, after: where the gap lives on the fitted recording.  rivals: models that do as well as `model`, refitted;
     experiments: what would tell them apart, the best first.  cut: in words what the budget left out, empty for nothing.
     trend: what changes from repeat to repeat, None where nothing was asked.
+    hints: effects that close too little to be named, see `unnamed`; the model is without them.
     """
 
     kind: Kind
@@ -79,11 +99,17 @@ class Verdict:
     experiments: tuple[Experiment, ...] = ()
     cut: str = ""
     trend: Trend | None = None
+    hints: tuple[Hint, ...] = ()
 
     def closed(self, role: str) -> float:
         """1 - (U_after - U0) / (U_before - U0) on "fit", "confirm" or "sealed"."""
         before, after = self.gaps[role]
         return 1.0 - open_share(after, before, self.floor)
+
+    def closed_held_out(self) -> dict[str, float]:
+        """`closed` of the held-out roles that show a discrepancy at all."""
+        held_out = {role: before for role, (before, _) in self.gaps.items() if role != "fit"}
+        return {role: self.closed(role) for role, before in held_out.items() if above(before, self.floor)}
 
     @property
     def explained(self) -> float:
@@ -127,6 +153,12 @@ class Verdict:
         )
 
     @property
+    def _hinted(self) -> str:
+        if not self.hints:
+            return ""
+        return f" Hints, not names, since they may only imitate it: {'; '.join(h.words for h in self.hints)}."
+
+    @property
     def sentence(self) -> str:
         """The answer in words."""
         return {
@@ -134,6 +166,6 @@ class Verdict:
             Kind.NAMED: f"The model lacks: {self._lacking}.",
             Kind.TIE: f"The model lacks {self._lacking}.",
             Kind.PARTLY: self._partly,
-            Kind.UNEXPLAINED: f"The model lacks something that is not in the library{self._or_lost}.",
+            Kind.UNEXPLAINED: f"The model lacks something that is not in the library{self._or_lost}.{self._hinted}",
             Kind.UNCONVERGED: f"The fit of {self._unsettled} did not converge; nothing can be concluded.",
         }[self.kind]

@@ -19,7 +19,7 @@ from droid_jax.gap.screen import Question, Screen, marks, project, questions_of,
 from droid_jax.gap.select import OF_ALL, SIGNIFICANT
 from droid_jax.gap.transfer import left_over
 from droid_jax.gap.trend import trend
-from droid_jax.gap.verdict import LOST, Kind, Verdict, open_share
+from droid_jax.gap.verdict import LOST, Hint, Kind, Verdict, open_share
 from droid_jax.identify.pipeline import Progress
 from droid_jax.identify.search import NotReplayed
 
@@ -120,7 +120,7 @@ def _verdict(hunt: Hunt, base: Model, model: Model, rounds: list[Round], quiet: 
         kind = Kind.UNCONVERGED
     elif model.parts:
         kind = Kind.PARTLY if _remains(hunt, left, quiet) else Kind.TIE if any(tied) else Kind.NAMED
-    return Verdict(
+    verdict = Verdict(
         kind=kind,
         effects=tuple(c.name for c in model.parts),
         tied=tied,
@@ -137,6 +137,35 @@ def _verdict(hunt: Hunt, base: Model, model: Model, rounds: list[Round], quiet: 
         rivals=next((r.rivals for r in reversed(rounds) if r.winner is not None), ()),
         cut=hunt.budget.cut,
         trend=trend(rounds[0].screen, base.residuals, case.config.seed) if rounds and case.fit.repeated else None,
+    )
+    return unnamed(case, verdict) if too_little(verdict, case.config.least_closed) else verdict
+
+
+def too_little(verdict: Verdict, least: float) -> bool:
+    """Whether effects beside a remainder close less than a share `least` on a held-out recording.
+
+    What closes a third of a discrepancy and leaves the rest may only imitate what is missing.
+    """
+    closed = verdict.closed_held_out() if verdict.kind is Kind.PARTLY else {}
+    return bool(closed) and min(closed.values()) < least
+
+
+def unnamed(case: Case, verdict: Verdict) -> Verdict:
+    """The verdict with its effects as hints, and the base model as the one that stands."""
+    base = verdict.base
+    where = localise(case.fit, base.values, base.residuals, base.values)
+    return replace(
+        verdict,
+        kind=Kind.UNEXPLAINED,
+        effects=(),
+        tied=(),
+        model=base,
+        gaps={role: (before, before) for role, (before, _) in verdict.gaps.items()},
+        remainder=case.confirm.gap(left_over(case.fit, case.confirm, base)),
+        before=where,
+        after=where,
+        rivals=(),
+        hints=(Hint(verdict.effects, verdict.tied, verdict.closed_held_out()),),
     )
 
 

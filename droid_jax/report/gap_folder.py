@@ -46,6 +46,7 @@ _SCHEMA = {
 }
 _HANDED_ON = {"fitted_to": [str], "gaps": {str: _MAYBE}}
 _ABOUT = {"what": str, "mark": str, "confused_with": [str]}
+_HINT = {"effects": [str], "tied": [[str]], "closed": {str: _NUMBER}}
 _SPLIT = {"by": str, "limits": str}
 _LINES = ("measured", "scatter", "before", "after")
 
@@ -126,6 +127,11 @@ class Gap:
         return self.found.get("handed_on", {}).get("fitted_to", [self.recording("fit")])
 
     @property
+    def hints(self) -> list[Mapping[str, Any]]:
+        """Effects that close too little to be named; an older search named them."""
+        return self.found.get("hints", [])
+
+    @property
     def amendments(self) -> Mapping[str, str]:
         """What was added to the verdict after it was written, and whether: name -> state; an older search added all."""
         return self.found.get("amendments", {})
@@ -182,6 +188,7 @@ def read_gap(folder: str | Path) -> Gap:
     _READ.check(said_split(found), _SPLIT, "gap.json, 'split'")
     _READ.check(found.get("shapes", []), [_SIZE], "gap.json, 'shapes'")
     _READ.check(found.get("about", {}), {str: _ABOUT}, "gap.json, 'about'")
+    _READ.check(found.get("hints", []), [_HINT], "gap.json, 'hints'")
     _READ.check(found.get("amendments", {}), {str: str}, "gap.json, 'amendments'")
     for entry in found["experiments"]:
         _READ.check(entry.get("not_made", ""), str, "gap.json, 'experiments', 'not_made'")

@@ -121,6 +121,8 @@ def _row(found: Mapping[str, Any], name: str, entry: Any, trial: Mapping[str, An
 
 def _passed_over(found: Mapping[str, Any], trial: Mapping[str, Any]) -> str:
     """Why a model that passed its trial is not the answer."""
+    if any(set(trial["name"].split(BETWEEN)) <= set(hint["effects"]) for hint in found.get("hints", [])):
+        return "passed, but closes too little for a name: a hint"
     if found["verdict"] == "fit not converged":
         return "passed, but a fit did not converge"
     left = [found["gaps"]["confirm"]["after"], *(t["gap_confirm"] for t in found["trials"])]

@@ -53,7 +53,8 @@ def readable(text: str, found: Mapping[str, Any]) -> str:
     """A text of gap.json, the names of candidates and parameters in it, and what confirms, as they are read."""
     text = text.replace(OTHER, parts_of(found).other)
     names = {r["candidate"] for screen in found["screens"] for r in screen["ranking"]}
-    names |= {*found["effects"], *(name for rivals in found["tied"] for name in rivals)}
+    for said in (found, *found.get("hints", [])):
+        names |= {*said["effects"], *(name for rivals in said["tied"] for name in rivals)}
     for name in sorted(names, key=len, reverse=True):
         text = text.replace(name, model_words(name))
     return re.sub(r"\b\w+_\w+(\[\w+\])?", lambda m: label(m[0]).lower(), text)
@@ -241,13 +242,31 @@ def _next(gap: Gap) -> str:
         "named": f"look for the {named} on the hardware, and simulate with {it}{_file(gap)}",
         "tie": f"take no name for the cause yet. {_separate(gap)}",
         "partly explained": _partly(gap, named),
-        "unexplained": f"look at the hardware {_where(gap)}. No effect of the library passed{clearly}: where one came "
-        f"close it needs {gap.parts.more}, else write one of your own or correct the scene there, and run again. Do "
-        "not train on this part of the motion",
+        "unexplained": _unnamed(gap, clearly),
         "fit not converged": f"{_longer(gap)}give the parameters tighter priors, and run again; take no number from "
         "this page until the fit settles",
     }
     return f"Next: {steps[gap.found['verdict']]}."
+
+
+def _unnamed(gap: Gap, clearly: str) -> str:
+    """What to do where something is missing and nothing is named."""
+    hinted = [model_words(BETWEEN.join(hint["effects"])) for hint in gap.hints]
+    if hinted:
+        least = percent(gap.found.get("thresholds", {}).get("least_closed", math.nan))
+        what = (
+            f"{listed(hinted)} passed, but closes less than {least} on a held-out recording and leaves the rest, so it "
+            "may only imitate what is there: write an effect of your own"
+        )
+    else:
+        what = (
+            f"No effect of the library passed{clearly}: where one came close it needs {gap.parts.more}, else write one "
+            "of your own"
+        )
+    return (
+        f"look at the hardware {_where(gap)}. {what[:1].upper()}{what[1:]} or correct the scene there, and run again. "
+        "Do not train on this part of the motion"
+    )
 
 
 def _longer(gap: Gap) -> str:

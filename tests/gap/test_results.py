@@ -13,6 +13,7 @@ from small_gap import FLOOR, JOINTS, PRELOAD, Small, small
 from droid_jax.gap.results import gap_arrays, gap_json, write_gap
 from droid_jax.gap.split import ROLES
 from droid_jax.gap.verdict import Experiment, Kind
+from droid_jax.gap.workflow import unnamed
 from droid_jax.report.gap_folder import read_gap
 from droid_jax.report.gap_words import deviations, largest_shifts
 
@@ -172,6 +173,17 @@ def test_ties_experiments_and_cuts_come_along(found: Small):
     assert set(answer["about"]) == {"hinge_preload", "drag"}
     assert answer["tied"] == [["drag at door"]] and answer["cut"] == "two candidates were not tried"
     assert answer["experiments"] == [{"what": "open further", "apart": 7.5}]
+
+
+def test_hints_and_the_threshold_that_made_them_are_in_the_file(found: Small):
+    hinted = unnamed(found.case, dataclasses.replace(found.verdict, tied=(("drag at door",),)))
+    answer = gap_json(found.case, hinted)
+    closed = {"confirm": found.verdict.closed("confirm")}
+    assert answer["hints"] == [{"effects": ("hinge_preload at door",), "tied": (("drag at door",),), "closed": closed}]
+    assert answer["thresholds"] == {"least_closed": found.case.config.least_closed}
+    assert answer["verdict"] == "unexplained" and answer["effects"] == [] and answer["explained"] is None
+    assert set(answer["about"]) == {"hinge_preload", "drag"}
+    assert all(gap["closed"] == 0.0 and gap["before"] == gap["after"] for gap in answer["gaps"].values())
 
 
 def test_shapes_come_once_with_their_intervals(found: Small):

@@ -211,6 +211,53 @@ def test_what_is_left_counts_where_chance_would_not_leave_it(found: Small):
     assert not workflow._remains(hunt, by_chance, quiet=True) and workflow._remains(hunt, by_chance, quiet=False)
 
 
+LITTLE = {"fit": (4.0, 2.0), "confirm": (4.0, 2.8), "sealed": (3.0, 2.07)}  # closes 30 and 31 % of held-out data
+
+
+@pytest.mark.parametrize(
+    ("kind", "gaps", "least", "little"),
+    [
+        (Kind.PARTLY, LITTLE, 0.4, True),
+        (Kind.PARTLY, LITTLE, 0.25, False),
+        (Kind.PARTLY, {**LITTLE, "confirm": (4.0, 0.8)}, 0.4, True),  # the sealed motion alone says so
+        (Kind.PARTLY, {**LITTLE, "sealed": (3.0, 0.3)}, 0.4, True),
+        (Kind.PARTLY, {"fit": (4.0, 3.6), "confirm": (4.0, 0.8)}, 0.4, False),  # what was fitted decides nothing
+        (
+            Kind.PARTLY,
+            {"fit": (4.0, 2.0), "confirm": (4.0, 0.8), "sealed": (0.011, 0.0105)},
+            0.4,
+            False,
+        ),  # no gap there
+        (Kind.NAMED, LITTLE, 0.4, False),  # nothing significant is left
+        (Kind.TIE, LITTLE, 0.4, False),
+    ],
+)
+def test_beside_a_remainder_a_name_needs_its_share_of_held_out_data(
+    found: Small, kind: Kind, gaps: dict[str, tuple[float, float]], least: float, little: bool
+):
+    verdict = replace(found.verdict, kind=kind, gaps=gaps)
+    assert workflow.too_little(verdict, least) is little
+
+
+def test_a_name_for_a_third_of_a_discrepancy_is_a_hint(found: Small, monkeypatch: pytest.MonkeyPatch):
+    """An effect that passed, a significant remainder, and 31 % closed on one held-out motion: unexplained."""
+    monkeypatch.setattr(workflow, "_remains", lambda *arguments: True)
+    monkeypatch.setattr(workflow, "_gaps", lambda hunt, base, model: {"fit": (4.0, 2.0), "confirm": (4.01, 2.77)})
+    verdict = find(found.case, found.base, FLOOR)
+    assert verdict.kind is Kind.UNEXPLAINED and (verdict.effects, verdict.tied, verdict.rivals) == ((), (), ())
+    assert verdict.model is found.base and verdict.gaps["confirm"] == (4.01, 4.01)
+    (hint,) = verdict.hints
+    assert hint.effects == ("hinge_preload at door",) and hint.closed == {"confirm": pytest.approx(0.31)}
+    assert verdict.sentence == (
+        "The model lacks something that is not in the library. Hints, not names, since they may only imitate it: "
+        "hinge_preload at door (closes 31%)."
+    )
+    assert any(trial.passed for trial in verdict.trials)  # the grounds are told
+    weaker = replace(found.case, config=replace(found.case.config, least_closed=0.3))
+    verdict = find(weaker, found.base, FLOOR)
+    assert verdict.kind is Kind.PARTLY and verdict.effects == ("hinge_preload at door",) and verdict.hints == ()
+
+
 def candidate(name: str, place: str = "door", **shapes: float) -> Candidate:
     return Candidate(name, place, (f"{name}[{place}]",), shapes)
 

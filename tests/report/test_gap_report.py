@@ -462,3 +462,35 @@ def test_settings_are_those_that_a_person_reads(tmp_path: Path) -> None:
     setup = {**asked, "command": "gap", "recordings_sha256": ["12ab"], "start": [0.1, 0.2], "stand_in": False}
     folder = make_gap(tmp_path / "run", "named", setup=setup)
     assert gap_words.settings(read_gap(folder)) == ["preset quick", "recording a.npz, b.npz", "budget 0.5"]
+
+
+def test_a_hint_is_no_name(tmp_path: Path, quick: None) -> None:
+    """What closes a third and leaves the rest is told as a hint, on the page and of its trial."""
+    said = f"The model lacks something that is not in the library. Hints, not names: {LATCH} (closes 31%)."
+    hints = [{"effects": [LATCH], "tied": [[]], "closed": {"confirm": 0.31}}]
+    trials = gap_json("partly explained", ("fit", "confirm"))["trials"]
+    folder = make_gap(
+        tmp_path, "unexplained", sentence=said, hints=hints, thresholds={"least_closed": 0.4}, trials=trials
+    )
+    text = page.write_report(folder).read_text()
+    assert "latch at door hinge (closes 31%)" in text
+    assert "Latch at door hinge passed, but closes less than 40\u00a0% on a held-out recording" in text
+    assert "passed, but closes too little for a name: a hint" in text
+    assert gap_words.untrusted(read_gap(folder))
+
+
+def test_an_amendment_that_is_not_there_is_said(tmp_path: Path, quick: None) -> None:
+    experiments = [
+        {"what": "the same motion twice as fast", "apart": 7.1, "not_made": ""},
+        {"what": "the same motion three times slower", "apart": None, "not_made": "a stretch that no repeat measured"},
+    ]
+    states = {"experiments": "made", "final_refit": "not made: the fit to both motions did not converge"}
+    folder = make_gap(tmp_path, "tie", experiments=experiments, amendments=states)
+    text = page.write_report(folder).read_text()
+    assert "not made: a stretch that no repeat measured" in text and "the same motion twice as fast" in text
+    assert (
+        "The final refit to both motions was not made: the fit to both motions did not converge; extended.json" in text
+    )
+    states = {"experiments": "to be made", "final_refit": "made"}
+    text = page.write_report(make_gap(tmp_path, "tie", experiments=[], amendments=states)).read_text()
+    assert "were not made yet, since the run was stopped: the same command makes" in text and "final refit" not in text
