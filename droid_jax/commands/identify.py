@@ -182,7 +182,7 @@ def model_of(command: Identify) -> tuple[Scene, Space, Space | None]:
     from droid_jax.model.door_scene import door_scene
 
     if command.scene is not None:
-        scene, listed = own_scene(command)
+        scene, listed = own_scene(command, engine=command.engine, mj_step=command.mj_step)
         if all(p.nuisance for p in listed.parameters):
             raise ValueError(f"{command.parameters}: every entry is a nuisance; identify fits at least one that is not")
         main = listed.select(p.name for p in listed.parameters if not p.nuisance)

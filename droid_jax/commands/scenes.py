@@ -60,8 +60,11 @@ def compared(motion_cutoff: float | None, **changes: Any) -> CompareConfig:
     return usual if motion_cutoff is None else replace(usual, motion_cutoff=motion_cutoff)
 
 
-def own_scene(options: OwnScene) -> tuple[Scene, Space]:
-    """The scene and its listed parameters, nuisances among them; ValueError for what the files or names lack."""
+def own_scene(options: OwnScene, *, engine: str = "mjx", mj_step: bool = False) -> tuple[Scene, Space]:
+    """The scene and its listed parameters, nuisances among them; ValueError for what the files or names lack.
+
+    engine, mj_step: of the replays.
+    """
     from droid_jax.model.own import friction_joints, load_parameters
     from droid_jax.model.scene import load_scene
 
@@ -72,6 +75,8 @@ def own_scene(options: OwnScene) -> tuple[Scene, Space]:
         joints=options.joints or None,
         object_joint=options.object_joint,
         friction_joints=friction_joints(options.parameters),
+        engine=engine,
+        mj_step=mj_step,
     )
     return scene, load_parameters(options.parameters, scene)
 

@@ -17,11 +17,11 @@ from mujoco import mjx
 from droid_jax.compare.replay import observed
 from droid_jax.measure.motion import Motion
 from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
+from droid_jax.model.ignored import refuse_fluid
 from droid_jax.model.joint_friction import direction
 from droid_jax.model.physics import Physics
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, Rollout, State, Theta, column, complete
-from droid_jax.model.step import refuse_fluid
 
 
 def prescribed(scene: Scene, recording: Recording) -> tuple[str, ...]:

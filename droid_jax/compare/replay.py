@@ -21,10 +21,11 @@ from droid_jax.measure.checks import check_joints
 from droid_jax.measure.clocks import interpolate
 from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.model.actuators import has_servo_damping
+from droid_jax.model.ignored import check_options
 from droid_jax.model.physics import Physics
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, Rollout, State, Theta, column, complete
-from droid_jax.model.step import check_options, servo_force
+from droid_jax.model.step import servo_force
 from droid_jax.model.step import step as simulate_step
 
 Replay = Callable[[Physics], Rollout]

@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 
 from droid_jax.model.actuators import actuator_names, drives_joint, of_joint
-from droid_jax.model.ignored import refuse_ignored
+from droid_jax.model.ignored import check_options, refuse_ignored, refuse_missing
 from droid_jax.model.looks import compiled, look_geoms, without_looks
 
 PICTURE = (480, 640)  # height, width of the largest picture that is drawn
@@ -250,6 +250,8 @@ def compile_scene(
     object_joint: str | None = None,
     grip: Grip | None = None,
     unlimited: Iterable[str] = (),
+    engine: str = "mjx",
+    mj_step: bool = False,
 ) -> Scene:
     """Compile a spec into a Scene and check it.
 
@@ -257,8 +259,10 @@ def compile_scene(
     unlimited: joints whose range is not enforced in the replay.  Every limited joint costs a
       constraint row per step (a third of the time for the Panda), and a recording that keeps
       inside its ranges never feels them; the servo's command range still holds.
-    Raises ValueError for unknown names, for joints of several degrees of freedom and for
-    features that MJX would silently ignore.
+    engine, mj_step: of the replays.  "mujoco" lets pass what the C engine has and MJX has not (integrators, friction
+      cones, fluids, kinds of actuators and equalities); mj_step what MJX has in its own steps alone.
+    Raises ValueError for unknown names, for joints of several degrees of freedom, for
+    features that MJX would silently ignore, for plugins, and for what the replays have not.
     """
     bare, free = without_looks(spec), set(unlimited)
     for joint in bare.joints:
@@ -268,7 +272,10 @@ def compile_scene(
         if joint.name == object_joint and joint.type in ONE_DEGREE and joint.frictionloss <= 0:
             joint.frictionloss = TINY_FRICTIONLOSS
     model = bare.compile()
-    refuse_ignored(model, name)
+    refuse_ignored(model, name, tuple(dict.fromkeys(plugin.plugin_name for plugin in spec.plugins)))
+    if engine == "mjx":
+        refuse_missing(model, name)
+        check_options(model, mj_step, f"a replay of scene {name!r}")
     command_names = actuator_names(model)
     driven = tuple(n for n, of in zip(command_names, of_joint(model, command_names), strict=True) if of)
     scene = Scene(
@@ -295,12 +302,15 @@ def load_scene(
     object_joint: str | None = None,
     friction_joints: Sequence[str] = (),
     assets: Mapping[str, bytes] | None = None,
+    engine: str = "mjx",
+    mj_step: bool = False,
 ) -> Scene:
     """A user's own MJCF as a Scene.
 
     assets: contents of files that it names, by name, where they do not lie beside it: `env.model_assets` of
       mujoco_playground.  An MJCF that is written of the scene later names them as this one does.
     friction_joints: joints whose friction loss will be a parameter though the file gives none.
+    engine, mj_step: as in `compile_scene`.
     Raises FileNotFoundError or ValueError (the file does not compile, unknown names, ...).
     """
     path = Path(path)
@@ -319,7 +329,7 @@ def load_scene(
             raise ValueError(f"unknown joint {joint!r}; {path} {has}")
         named[joint].frictionloss = max(named[joint].frictionloss, TINY_FRICTIONLOSS)
     try:
-        return compile_scene(spec, path.stem, joints=joints, object_joint=object_joint)
+        return compile_scene(spec, path.stem, joints=joints, object_joint=object_joint, engine=engine, mj_step=mj_step)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 

@@ -23,6 +23,7 @@ import numpy as np
 from mujoco import mjx
 
 from droid_jax.model.actuators import drives_joint
+from droid_jax.model.ignored import check_options
 from droid_jax.model.patches import exact_segments, midpoint_constraints
 
 ITERATIONS = 8  # at most; two or three are usual from a warm start
@@ -49,6 +50,8 @@ def step(model: Any, data: Any, *, parity: bool = False, servo_damping: bool = T
     data = mjx.fwd_actuation(model, data)
     data = mjx.fwd_acceleration(model, data)
     inertia = mjx.full_m(model, data)
+    if np.any(model.actuator_gaintype == mujoco.mjtGain.mjGAIN_AFFINE):
+        data = _within_range(model, data)
     if servo_damping:
         model = _without_held(model, data, parity)
     if not parity:
@@ -62,7 +65,10 @@ def step(model: Any, data: Any, *, parity: bool = False, servo_damping: bool = T
         data = solve(inertia, data)
     if not parity:
         return mjx.euler(_undamped(model), data)
-    return mjx.euler(model, data) if _is_euler(model) else mjx.implicit(model, data)
+    if not _is_euler(model):
+        return mjx.implicit(model, data)
+    without = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_DAMPER  # which mjx.euler does not look at
+    return mjx.euler(_undamped(model) if without else model, data)
 
 
 def servo_force(model: Any, data: Any, velocity: jax.Array) -> jax.Array:
@@ -72,6 +78,14 @@ def servo_force(model: Any, data: Any, velocity: jax.Array) -> jax.Array:
     """
     moving = data.tree_replace({"_impl.actuator_velocity": data._impl.actuator_moment @ velocity})
     return mjx.fwd_actuation(model, moving).qfrc_actuator
+
+
+def _within_range(model: Any, data: Any) -> Any:
+    """The data with controls inside their ranges, as the forces took them: mjx's derivative of a damper does not."""
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:
+        return data
+    low, high = model.actuator_ctrlrange.T
+    return data.replace(ctrl=jnp.where(model.actuator_ctrllimited, jnp.clip(data.ctrl, low, high), data.ctrl))
 
 
 def _without_held(model: Any, data: Any, parity: bool) -> Any:
@@ -99,32 +113,6 @@ def _outside(values: jax.Array, bounds: jax.Array) -> jax.Array:
 
 def _is_euler(model: Any) -> bool:
     return model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
-
-
-def check_options(model: Any, parity: bool, what: str = "a replay") -> None:
-    """Raise ValueError for an integrator, a friction cone or a fluid that `step` has not; what: asks for it."""
-    if not _is_euler(model) and model.opt.integrator != mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
-        raise ValueError(f"{what} integrates with Euler or implicitfast; set <option integrator=...> to one of them")
-    if model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC and not parity:
-        raise ValueError(f"{what} needs pyramidal friction cones; set <option cone='pyramidal'>")
-    if not parity:
-        refuse_fluid(model, what)
-
-
-def refuse_fluid(model: Any, what: str) -> None:
-    """Raise ValueError where bodies move through air or water.
-
-    model: MuJoCo's, or MJX's, in which the numbers may be traced.
-    """
-    if isinstance(model, mujoco.MjModel):
-        fluid = model.opt.density > 0 or model.opt.viscosity > 0 or np.any(model.opt.wind)
-    else:
-        fluid = model.opt._impl.has_fluid_params
-    if fluid:
-        raise ValueError(
-            f"{what} has no air or water: take density, viscosity and wind out of <option>; the effect `drag` is for "
-            "doors"
-        )
 
 
 def _undamped(model: Any) -> Any:

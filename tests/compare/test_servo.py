@@ -505,7 +505,7 @@ def test_commanded_joints_without_an_actuator_are_the_scenes_fault(left: int, sa
 @pytest.mark.parametrize(("option", "says"), [('integrator="RK4"', "Euler"), ('cone="elliptic"', "pyramidal")])
 def test_an_option_that_no_replay_has_is_told_with_the_scene(option: str, says: str):
     xml = ARM.format(gravcomp='gravcomp="1"', friction="", sensor="").replace('integrator="implicitfast"', option)
-    odd = compile_scene(mujoco.MjSpec.from_string(xml), "odd", joints=JOINTS)
+    odd = compile_scene(mujoco.MjSpec.from_string(xml), "odd", joints=JOINTS, engine="mujoco")
     with pytest.raises(ValueError, match=f"a replay of scene 'odd' .*{says}"):
         servo_replay(odd, make_drive(odd, recording()))
 

@@ -390,12 +390,12 @@ def test_a_body_may_weigh_by_its_looks_alone(compiler: str):
         np.testing.assert_allclose(getattr(model, field), getattr(whole, field), rtol=1e-12)
 
 
-@pytest.mark.parametrize("option", ['integrator="implicit"', 'solver="PGS"'])
+@pytest.mark.parametrize("option", ['integrator="implicit"', 'solver="PGS"'])  # a scene for the C engine alone
 def test_what_mjx_has_not_is_said_in_a_sentence(option: str):
     xml = f"""<mujoco><option {option}/><worldbody><body><joint name="j"/><geom size=".1"/></body></worldbody>
       <actuator><position name="j" joint="j" kp="9"/></actuator></mujoco>"""
     with pytest.raises(ValueError, match="scene 'new' uses something that MJX has not"):
-        compile_scene(mujoco.MjSpec.from_string(xml), "new").mjx  # noqa: B018
+        compile_scene(mujoco.MjSpec.from_string(xml), "new", engine="mujoco").mjx  # noqa: B018
 
 
 def test_a_file_that_is_missing_or_broken_is_named(tmp_path: Path):
