@@ -36,6 +36,12 @@ def shown(value: Any, longest: int = 80) -> str:
     return text if len(text) <= longest else f"{text[: longest - 3]}..."
 
 
+def said(error: BaseException, longest: int = 300) -> str:
+    """What another library's error says, in one line that can be printed, cut where it is long: for messages."""
+    text = _UNPRINTABLE.sub("?", " ".join(str(error).split()))
+    return text if len(text) <= longest else f"{text[: longest - 3]}..."
+
+
 def name(value: Any, what: str, *, file: bool = False, empty: bool = False) -> str:
     """A name: text without control characters, of at most LONGEST_NAME characters.
 

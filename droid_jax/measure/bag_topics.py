@@ -14,6 +14,8 @@ import numpy as np
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
+from droid_jax.arguments import said
+
 _DAY = 86400 * 10**9  # ns
 
 # channel -> field of sensor_msgs/JointState
@@ -47,7 +49,7 @@ def read_bag(bag: Path, topics: Mapping[str, tuple[tuple[str, ...], str]]) -> di
     except Exception as error:  # damaged bags fail in many ways: AssertionError, OverflowError, UnicodeDecodeError, ...
         if isinstance(error, ValueError) and str(error).startswith(str(bag)):
             raise
-        what = f"{type(error).__name__}: {error}"
+        what = f"{type(error).__name__}: {said(error)}"
         raise ValueError(f"{bag}: not a readable ROS bag, or one that was cut off ({what})") from error
 
 

@@ -17,10 +17,12 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from droid_jax.arguments import said
 from droid_jax.model.actuators import actuator_names, drives_joint, of_joint
 from droid_jax.model.ignored import check_options, refuse_ignored, refuse_missing
 from droid_jax.model.looks import compiled, look_geoms, without_looks
 
+LONGEST = 900  # characters of what is wrong with a scene, lists of names among it
 PICTURE = (480, 640)  # height, width of the largest picture that is drawn
 TINY_FRICTIONLOSS = 1e-6  # N m: enough to give a joint its friction-loss row
 ONE_DEGREE = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
@@ -321,7 +323,7 @@ def load_scene(
     try:
         spec = _read(path, assets or {})
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+        raise ValueError(f"{path}: {said(error)}") from None
     named = {j.name: j for j in spec.joints}
     for joint in friction_joints:
         if joint not in named:
@@ -331,7 +333,7 @@ def load_scene(
     try:
         return compile_scene(spec, path.stem, joints=joints, object_joint=object_joint, engine=engine, mj_step=mj_step)
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+        raise ValueError(f"{path}: {said(error, LONGEST)}") from None
 
 
 def _read(path: Path, assets: Mapping[str, bytes]) -> mujoco.MjSpec:

@@ -37,6 +37,7 @@ SCRIPTS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(DATA, ()),
     "benchmarks/candidates.py": (),
     "benchmarks/default_run.py": (),
+    "benchmarks/robustness.py": (),
     "benchmarks/step_accuracy.py": (),
     "benchmarks/time_to_fit.py": (),
     "benchmarks/training.py": (),

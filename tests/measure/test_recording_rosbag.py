@@ -665,3 +665,13 @@ def test_bags_beside_the_tables_of_a_recording_are_passed_over(tmp_path: Path) -
     bag.rename(tmp_path / "csv" / "raw.bag")
     assert recording_at(tmp_path / "csv").repeats == 1  # as identify and gap read it
     assert convert(tmp_path / "csv", "--out", tmp_path / "door.npz") == 0
+
+
+def test_a_damaged_metadata_file_is_told_in_one_line(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "mcap")
+    bag.state(0.0)
+    path = bag.write()
+    (path / "metadata.yaml").write_text("a: b: c\n")
+    with pytest.raises(ValueError, match="not a readable ROS bag") as refused:
+        read_bags([path], joints=JOINTS, torque=TORQUE)
+    assert len(str(refused.value).splitlines()) == 1

@@ -475,3 +475,20 @@ def test_joints_between_the_world_and_what_is_measured():
     scene = compile_scene(spec, "legs")
     assert scene.carriers(scene.joints) == ("the joint of body 'hip'", "knee")
     assert scene.floating(scene.joints) == ("root",)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "<mujoco><worldbody><geom size='1'></worldbody></mujoco>",
+        "<mujoco><asset><asset/></asset></mujoco>",
+        "<mujoco><worldbody><geom size='1' material='none'/></worldbody></mujoco>",
+        "<mujoco><worldbody><body name='\u202ea\u2028b'><geom size='0'/></body></worldbody></mujoco>",
+    ],
+)
+def test_what_mujoco_says_of_a_file_is_one_line(tmp_path, text):
+    path = tmp_path / "own.xml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ValueError) as refused:
+        load_scene(path)
+    assert str(refused.value).startswith(f"{path}: ") and len(str(refused.value).splitlines()) == 1

@@ -1,0 +1,323 @@
+"""Damaged files, damaged scenes and wrong arguments, by the thousand: is each refused in a sentence?
+
+    python benchmarks/robustness.py [--quick] [--out DIR] [--only WORD ...]
+
+Mutations of every kind of file that the program reads back (tests/fuzz/file_kinds.py) and every public function with
+every wrong argument (tests/fuzz/api_calls.py), in worker processes that a watchdog ends.  An input is either accepted,
+and then what was read is of use, or refused by a ValueError or an OSError whose message is one line that names it.  A
+run that was stopped goes on; what was found lies in runs/robustness.  Kills of whole runs are benchmarks/kills.py's:
+their numbers are taken from its result, beside which this one is written.
+"""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import json
+import multiprocessing
+import os
+import resource
+import sys
+import tempfile
+import threading
+import time
+import traceback
+from collections.abc import Iterator
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from random import Random
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "experiments"), str(ROOT / "tests" / "fuzz")]
+
+# ruff: noqa: E402  (what is imported lies in folders that are no packages)
+# isort: split
+
+import tuned  # noqa: F401  (before jax starts)
+
+# isort: split
+
+import api_calls
+import file_kinds
+import kinds
+import tyro
+from outcome import MOST_SECONDS, Outcome
+
+from benchmarks.common import CODE, publish
+from benchmarks.sharing import code_name
+
+WORKERS = 2
+WALL = 60.0  # s after which a case that does not compute either is given up
+ROOM = 16 << 30  # bytes of address space that a worker may map beyond what it has before its first case
+TOO_MUCH = 2 << 30  # bytes of memory in use beyond that, at which a worker is ended at once
+START, READY = 300.0, "ready"  # s in which a worker must start; what it then says
+BEHIND = 5.0  # s of processor time beyond the limit that a worker is given to say by itself that it took too long
+EXAMPLES = 5  # faults kept of each place in the code
+ARGUMENTS = "arguments"
+SEVERAL = 0.3  # share of calls with two wrong arguments
+
+Case = tuple[str, int]  # kind, number
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Options."""
+
+    quick: bool = False
+    """A hundredth of the cases."""
+    files: int = 20_000
+    """Mutated files."""
+    arguments: int = 4_000
+    """Calls with wrong arguments."""
+    seed: int = 0
+    """Of all mutations."""
+    only: tuple[str, ...] = ()
+    """Kinds whose name holds one of these words."""
+    workers: int = WORKERS
+    """Processes."""
+    out: Path = ROOT / "benchmarks" / "results"
+    """Folder of robustness.json."""
+
+
+def main(arguments: Arguments) -> None:
+    state = ROOT / "runs" / "robustness" / f"{code_name(CODE.get('git'))}_{arguments.seed}.jsonl"
+    state.parent.mkdir(parents=True, exist_ok=True)
+    began = time.monotonic()
+    asked = list(cases(arguments))
+    found = {} if arguments.only else kept(state)
+    waiting = collections.deque(case for case in asked if case not in found)
+    lock = threading.Lock()
+    with state.open("a") as file:
+
+        def done(case: Case, outcome: Outcome) -> None:
+            with lock:
+                found[case] = outcome
+                file.write(json.dumps([*case, outcome.to_json()]) + "\n")
+                file.flush()
+                if outcome.fault or len(found) % 1000 == 0:
+                    print(f"{len(found)} of {len(asked)}: {case} {outcome}", file=sys.stderr, flush=True)
+
+        def serve() -> None:
+            worker = Worker(arguments.seed)
+            with contextlib.closing(worker):
+                while True:
+                    try:
+                        case = waiting.popleft()
+                    except IndexError:
+                        return
+                    done(case, worker.judged_twice(case))
+
+        threads = [threading.Thread(target=serve) for _ in range(arguments.workers)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    result = summary({case: found[case] for case in asked if case in found}) | kills(arguments.out)
+    result["seconds"] = round(time.monotonic() - began, 1)
+    line = {key: result[key] for key in KEYS}
+    publish(arguments.out, "robustness", arguments.quick or bool(arguments.only), arguments.seed, result, line)
+
+
+def cases(arguments: Arguments) -> Iterator[Case]:
+    """Which cases there are, those of all kinds by turns."""
+    share = 100 if arguments.quick else 1
+    tried = file_kinds.KINDS.values()
+    whole = sum(kind.weight for kind in tried)
+    counts = {kind.name: max(3, round(arguments.files * kind.weight / whole / share)) for kind in tried}
+    counts[ARGUMENTS] = max(3, arguments.arguments // share)
+    if arguments.only:
+        counts = {name: n for name, n in counts.items() if any(word in name for word in arguments.only)}
+    last = {kind.name for kind in tried if kind.drawn}  # they are slow
+    order = [(name in last, number / count, name, number) for name, count in counts.items() for number in range(count)]
+    yield from ((name, number) for *_, name, number in sorted(order))
+
+
+def kept(path: Path) -> dict[Case, Outcome]:
+    """What an earlier start of the same code found."""
+    if not path.is_file():
+        return {}
+    lines = [json.loads(line) for line in path.read_text().splitlines() if line.endswith("]")]
+    return {(name, number): Outcome(**outcome) for name, number, outcome in lines}
+
+
+# ---------------------------------------------------------------- a worker and its watchdog
+
+
+class Worker:
+    """A process that judges one case after the other; started again where a case ended it."""
+
+    def __init__(self, seed: int) -> None:
+        self.seed, self.process = seed, None
+        self.pipe: Connection
+
+    def _start(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.pipe, theirs = context.Pipe()
+        self.process = context.Process(target=serve_cases, args=(theirs, self.seed), daemon=True)
+        self.process.start()
+        theirs.close()
+        said = self.pipe.recv() if self.pipe.poll(START) else "nothing"
+        if said != READY:
+            raise RuntimeError(f"a worker did not start, it said: {said}")
+
+    def close(self) -> None:
+        if self.process is not None:
+            self.process.kill()
+            self.process.join()
+            self.process = None
+
+    def judged_twice(self, case: Case) -> Outcome:
+        """A case that took too long is tried once more: the machine may have been busy."""
+        outcome = self.judged(case)
+        return self.judged(case) if outcome.result == "hang" else outcome
+
+    def judged(self, case: Case) -> Outcome:
+        if self.process is None:
+            self._start()
+        assert self.process is not None
+        try:
+            self.pipe.send(case)
+            began, used, held = time.monotonic(), processor_seconds(self.process.pid), resident(self.process.pid)
+            while not self.pipe.poll(0.2):
+                if resident(self.process.pid) - held > TOO_MUCH:
+                    self.close()
+                    return Outcome("memory", f"ended at {TOO_MUCH >> 20} MiB")
+                took = processor_seconds(self.process.pid) - used
+                if took > MOST_SECONDS + BEHIND or time.monotonic() - began > WALL:
+                    self.close()
+                    return Outcome("hang", f"ended after {took:.0f} s of processor time", seconds=took)
+            return Outcome(**self.pipe.recv())
+        except (EOFError, OSError):
+            self.process.join(10)
+            code = self.process.exitcode
+            self.close()
+            return Outcome("foreign", f"the process ended with exit code {code}")
+
+
+def processor_seconds(pid: int | None) -> float:
+    """Processor time of a process so far, s."""
+    try:
+        words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def resident(pid: int | None) -> int:
+    """Bytes of memory that a process has in use."""
+    try:
+        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * resource.getpagesize()
+    except OSError:
+        return 0
+
+
+def serve_cases(pipe: Connection, seed: int) -> None:
+    """Judges the cases that come through the pipe, in a folder of its own, with a bound on memory."""
+    with tempfile.TemporaryDirectory(prefix="robustness-") as folder:
+        os.chdir(folder)
+        said = os.open("said.txt", os.O_WRONLY | os.O_CREAT)
+        for stream in (1, 2):  # MuJoCo and XLA write there
+            os.dup2(said, stream)
+        try:
+            bench = Bench(Path(folder), seed)
+        except Exception:
+            pipe.send(traceback.format_exc())
+            raise
+        mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (mapped + ROOM, resource.RLIM_INFINITY))
+        pipe.send(READY)
+        while True:
+            try:
+                name, number = pipe.recv()
+            except EOFError:
+                return
+            try:
+                outcome = bench.judged(name, number)
+            except Exception:  # of the tests themselves
+                outcome = Outcome("harness", traceback.format_exc())
+            pipe.send(outcome.to_json())
+            os.ftruncate(said, 0)
+
+
+class Bench:
+    """Valid files of every kind, and the cases made from them."""
+
+    def __init__(self, folder: Path, seed: int) -> None:
+        self.folder, self.seed = folder, seed
+        self.valid: dict[str, Path] = {}
+        (folder / "api").mkdir()
+        self.calls = api_calls.calls(folder / "api")
+        self.wrong = api_calls.cases(self.calls)
+        for call in self.calls:  # imported, and found to be valid
+            with contextlib.suppress(api_calls.Read):
+                call.run(**call.valid)
+
+    def judged(self, name: str, number: int) -> Outcome:
+        random = Random(f"{self.seed}/{name}/{number}")
+        if name == ARGUMENTS:
+            call, argument, wrong = random.choice(self.wrong)
+            return api_calls.attempt(self.calls[call], argument, wrong, random if random.random() < SEVERAL else None)
+        kind = file_kinds.KINDS[name]
+        if name not in self.valid:
+            self.valid[name] = self._made(kind)
+        return kinds.attempt(kind, self.valid[name], self.folder / "input", random)
+
+    def _made(self, kind: kinds.Kind) -> Path:
+        """A folder with the valid example; RuntimeError where that is not accepted."""
+        at = self.folder / f"valid_{len(self.valid)}"
+        at.mkdir(exist_ok=True)
+        kind.make(at)
+        outcome = kinds.attempt_valid(kind, at, self.folder / "input")
+        if outcome.fault and outcome.result != "hang":  # the first of a kind imports, and may compile
+            raise RuntimeError(f"{kind.name}: the valid example is not accepted: {outcome}")
+        return at
+
+
+# ---------------------------------------------------------------- what is written
+
+KEYS = ("tried", "foreign_exceptions", "hangs", "memory_over_1gib", "kills", "kills_resumed_identical")
+
+
+def summary(found: dict[Case, Outcome]) -> dict[str, Any]:
+    """Counts over all cases and by kind, and some faults of each place in the code."""
+    results = collections.Counter(outcome.result for outcome in found.values())
+    by_kind = collections.defaultdict[str, collections.Counter[str]](collections.Counter)
+    faults = collections.defaultdict[str, list[dict[str, Any]]](list)
+    for (name, number), outcome in sorted(found.items()):
+        by_kind[name][outcome.result] += 1
+        if outcome.fault:
+            faults[f"{outcome.result}: {outcome.place or outcome.message}"].append(
+                {"kind": name, "number": number, "message": outcome.message}
+            )
+    return {
+        "tried": len(found),
+        "foreign_exceptions": results["foreign"],
+        "hangs": results["hang"],
+        "memory_over_1gib": results["memory"],
+        "bad_messages": results["message"],
+        "warning_floods": results["warnings"],
+        "accepted": results["accepted"],
+        "refused": results["refused"],
+        "slowest_s": round(max((o.seconds for o in found.values()), default=0.0), 2),
+        "by_kind": {
+            name: {"tried": sum(of.values()), **dict(sorted(of.items()))} for name, of in sorted(by_kind.items())
+        },
+        "faults": {place: {"count": len(of), "examples": of[:EXAMPLES]} for place, of in sorted(faults.items())},
+    }
+
+
+def kills(out: Path) -> dict[str, Any]:
+    """How many killed runs resumed to the same result, of kills.json; null where there is none."""
+    path = out / "kills.json"
+    found = json.loads(path.read_text()) if path.is_file() else {}
+    return {
+        "kills": found.get("kills"),
+        "kills_resumed_identical": found.get("kills_resumed_identical"),
+        "kills_commit": found.get("commit"),
+    }
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments, description=__doc__))

@@ -1,0 +1,212 @@
+"""Folders of runs and the pages made from them, cut down so that they are quick to draw."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import json
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import jinja2
+import jinja2.bccache
+import numpy as np
+from kinds import ROOT, Kind, use
+from markupsafe import Markup
+from recording_kinds import recording
+
+sys.path.append(str(ROOT / "tests" / "report"))
+
+# isort: split
+
+from made_up_gap import make_gap as made_up_gap
+from made_up_policy import make_policy as made_up_policy
+from made_up_run import make_run as made_up_run
+
+from droid_jax.commands import source
+from droid_jax.commands.folder import OtherRun, finished
+from droid_jax.commands.gap import values_of
+from droid_jax.commands.stand_in import known_stand_in
+from droid_jax.files import (
+    CONFIG,
+    CORRELATION,
+    DISTRIBUTION,
+    FIT,
+    GAP,
+    GAP_TRACES,
+    HISTORY,
+    HISTORY_TABLE,
+    LAST_FILES,
+    SAMPLES,
+    SETUP,
+    STAND_IN,
+    TRACES,
+    TRAINING,
+    TRANSFER,
+)
+from droid_jax.measure.formats import save
+from droid_jax.model.parameters import Parameter, Space
+from droid_jax.report import drawings, gap_drawings, page, policy_drawings, stages
+from droid_jax.report.tables import frames
+
+CHOSEN = [0, 2, -1]  # of the made-up fit's parameters
+FITTED = Space((Parameter("hinge_stiffness", "N m/rad", 0.8, 0.4, 0.0, 5.0),))  # one of them
+TRIALS = 6  # of the made-up policy's
+
+
+def make_run(folder: Path) -> None:
+    """The made-up fit of the report's tests with three parameters, two joints and 40 instants."""
+    made_up_run(folder)
+    fit = json.loads((folder / FIT).read_text())
+    fit["parameters"] = [fit["parameters"][i] for i in CHOSEN]
+    for of in fit["gap"].values():
+        of |= {key: of[key][:2] for key in ("per_joint_before", "per_joint_after")}
+    (folder / FIT).write_text(json.dumps(fit))
+    _cut(folder / TRACES, _short_traces)
+    _cut(folder / HISTORY, lambda key, a: a[CHOSEN] if key == "names" else a[:9][:, CHOSEN] if a.ndim == 2 else a[:9])
+    _cut(folder / CORRELATION, lambda key, a: a[CHOSEN] if a.ndim == 1 else a[np.ix_(CHOSEN, CHOSEN)])
+    _cut(folder / DISTRIBUTION, lambda key, a: a[:50])
+    shutil.rmtree(folder / "frames")
+    setup = {"command": "identify", "preset": "quick", "recording": ["wave.npz"], "recordings_sha256": ["ab" * 32],
+             "scene": None, "scene_sha256": "cd" * 32, "extended": None, "seed": 0, "versions": {"jax": "0.9.2"},
+             "hide": [], "springs": 1, "stand_in": {}, "fit": None, "fit_sha256": None}  # fmt: skip
+    (folder / SETUP).write_text(json.dumps(setup))
+
+
+def _short_traces(key: str, array: np.ndarray) -> np.ndarray:
+    if key.endswith("joints"):
+        return array[:2]
+    return array[:400:10, :2] if array.ndim == 2 else array[:400:10] if array.ndim else array
+
+
+def _cut(path: Path, how: Callable[[str, np.ndarray], np.ndarray]) -> None:
+    with np.load(path) as file:
+        arrays: dict[str, Any] = {key: how(key, file[key]) for key in file.files}
+    np.savez_compressed(path, **arrays)
+
+
+def make_gap(folder: Path) -> None:
+    """The made-up search with one joint and few candidates."""
+    made_up_gap(folder, "named", sealed=False)
+    found = json.loads((folder / GAP).read_text())
+    found["screens"] = [{**s, "ranking": s["ranking"][:3]} for s in found["screens"]]
+    found["cells"] = {key: cells[::40] for key, cells in found["cells"].items()}
+    (folder / GAP).write_text(json.dumps(found))
+    _cut(folder / GAP_TRACES, lambda key, a: a[:1] if key == "joints" else a[::5, :1] if a.ndim == 2 else a[::5])
+
+
+def make_policy_run(folder: Path) -> None:
+    """The made-up policy with few trials and no films."""
+    folder.mkdir(exist_ok=True)
+    folder.rmdir()
+    made_up_policy(folder)
+    transfer = json.loads((folder / TRANSFER).read_text())
+    for of in ("simulation", "stand_in"):
+        found = transfer[of]
+        whole = found["trials"]
+        found |= {key: v[:TRIALS] for key, v in found.items() if isinstance(v, list) and len(v) == whole}
+        for key in ("angle_deg", "steps"):
+            found[key]["all"] = found[key]["all"][:TRIALS]
+        found["trials"] = TRIALS
+    (folder / TRANSFER).write_text(json.dumps(transfer))
+    shutil.rmtree(folder / "films")
+
+
+def make_whole(folder: Path) -> None:
+    """A folder of `all`."""
+    for make, stage in zip((make_run, make_gap, make_policy_run), LAST_FILES, strict=True):
+        make(folder / stage)
+
+
+class _Templates(jinja2.BytecodeCache):
+    """Compiled templates, kept in memory."""
+
+    def __init__(self) -> None:
+        self.kept: dict[str, bytes] = {}
+
+    def load_bytecode(self, bucket: jinja2.bccache.Bucket) -> None:
+        if bucket.key in self.kept:
+            bucket.bytecode_from_string(self.kept[bucket.key])
+
+    def dump_bytecode(self, bucket: jinja2.bccache.Bucket) -> None:
+        self.kept[bucket.key] = bucket.bytecode_to_string()
+
+
+_TEMPLATES = _Templates()
+
+
+@contextlib.contextmanager
+def undrawn() -> Iterator[None]:
+    """No figure is drawn inside: the page's words alone are made, by templates compiled once."""
+
+    def drawing(folder: Path, stem: str, title: str, caption: str, make: Any, *args: Any) -> drawings.Drawing:
+        return drawings.Drawing(folder / "figures", stem, title, caption, Markup(""), Markup(""))
+
+    with contextlib.ExitStack() as stack:
+        for module in (drawings, gap_drawings, policy_drawings):
+            stack.enter_context(mock.patch.object(module, "drawing", drawing))
+        environment = functools.partial(jinja2.Environment, bytecode_cache=_TEMPLATES)
+        stack.enter_context(mock.patch.object(jinja2, "Environment", environment))
+        yield
+
+
+def use_whole(folder: Path) -> None:
+    """What commands ask about the stages of a folder, and the page."""
+    stages.left_over(folder)
+    for stage, last in LAST_FILES.items():
+        at = folder / stage
+        use(stages.extended_of(at), stages.fingerprint(at), stages.unfinished(at))
+        use(source.stand_in_of(at), source.has_model(at))
+        with contextlib.suppress(OtherRun):  # only damage is of interest here
+            finished(at, {"seed": 0}, again=False, last=last)
+    source.model_folder(folder)
+    values_of(folder / "identify", FITTED)
+    with undrawn():
+        page.write_report(folder)
+
+
+def make_tables(folder: Path) -> None:
+    """A fit with its tables."""
+    make_run(folder)
+    costs = "generation,best_cost,median_cost,sigma,mean_a,std_a\r\n1,0.5,0.6,1.0,1.0,0.1\r\n2,0.4,0.5,0.9,1.1,0.1\r\n"
+    (folder / SAMPLES).write_text("a,b\r\n1.0,2.0\r\n0.5,0.25\r\n")
+    (folder / HISTORY_TABLE).write_text(costs)
+
+
+def use_tables(folder: Path) -> None:
+    """The tables, and a number of each."""
+    found = frames(folder)
+    use(found.samples.mean(), found.history["best_cost"].min())
+
+
+def make_synthetic(folder: Path) -> None:
+    """What is kept of the synthetic robot beside its recording."""
+    (folder / STAND_IN).write_text(json.dumps({"springs": 1, "seed": 3, "hide": ["magnetic_catch=1.5"]}))
+    save(replace(recording(), meta={}), folder / "a.npz")
+
+
+def use_synthetic(folder: Path) -> None:
+    """The file, as commands that go on with its robot read it."""
+    known = known_stand_in([folder / "a.npz"])
+    use(known.get("springs"), known.get("seed"), list(known.get("hide", [])))
+
+
+_whole = functools.partial(Kind, make=make_whole, read=use_whole)
+_FILES = {
+    **{f"identify/{FIT}": 4, f"identify/{CONFIG}": 2, f"identify/{TRACES}": 2, f"identify/{HISTORY}": 1},
+    **{f"identify/{CORRELATION}": 1, f"identify/{DISTRIBUTION}": 1, f"*/{SETUP}": 4, f"gap/{GAP}": 5},
+    **{f"gap/{GAP_TRACES}": 2, f"train/{TRAINING}": 2, f"train/{TRANSFER}": 2},
+}
+KINDS = (
+    *(_whole(Path(file).name, file, weight=weight) for file, weight in _FILES.items()),
+    Kind("fit's files, page drawn", "*.*", make_run, page.write_report, 0.3, drawn=True),
+    Kind("search's files, page drawn", "*.*", make_gap, page.write_report, 0.2, drawn=True),
+    Kind("policy's files, page drawn", "*.json", make_policy_run, page.write_report, 0.3, drawn=True),
+    Kind("fit's tables", "*.csv", make_tables, use_tables, 2),
+    Kind("synthetic robot's file", STAND_IN, make_synthetic, use_synthetic, 1),
+)
