@@ -3,7 +3,8 @@
     python experiments/search_figure.py [--quick] [--out DIR]
 
 Table I's distribution, 30 samples, the five best, linear coordinates, 100 generations on demonstration A of the door
-without a spring; the program's `identify --preset paper`, which goes on where it was stopped.  Writes
+without a spring; the program's `identify --preset paper`, which goes on where it was stopped (where it differs from
+the paper: docs/paper.md).  Writes
 search_torques, search_parameters and search_cost (.png and .pdf) and search_figure.json into DIR, the run into
 DIR/search_run.  The lines of the truth are the paper's fitted means; search_figure.json holds its deviations beside.
 Some five minutes on two cores.

@@ -34,8 +34,8 @@ class Identify:
     """
 
     preset: Preset = "quick"
-    """quick: a laptop, minutes.  standard: 100 generations, 2 ms steps.  paper: the paper's own
-    setting (Table I's servo, 30 samples, 5 parents, no refinement).  gpu: 1024 samples."""
+    """quick: a laptop, minutes.  standard: 100 generations, 2 ms steps.  paper: the paper's search
+    (Table I's prior and joint damping, 30 samples, 5 parents, no refinement).  gpu: 1024 samples."""
     recording: tuple[Path, ...] = ()
     """Recordings to fit (npz or CSV folder; ROS bags through convert); several of the same robot and object are
     fitted together."""

@@ -87,6 +87,15 @@ def test_a_column_is_the_mean_over_all_trials():
     assert column([case("mean", 0, 0.0)], "stand_in")["steps"] == {"mean": None, "std": None, "interval_95": None}
 
 
+def test_the_papers_success_is_an_angle_alone():
+    """Three of four trials pass 30 degrees, one of them without a grip that lasts."""
+    one = case("mean", 0, 0.5, 4)
+    one["stand_in"]["angle_deg"]["all"] = [40.0, 40.0, 31.0, 30.0]
+    found = column([one], "stand_in")
+    assert (found["success_rate"], found["beyond_30_deg"]) == (0.5, 0.75)
+    assert "| beyond 30 degrees, % (the paper's success) | 75.0 |" in as_text(summed_up([one], ["paper"]))
+
+
 def test_what_blew_up_is_counted_and_in_no_rate():
     """Ten trials of fifty: half of the others succeed, and one in eight of them was stopped by the control loop."""
     why = ["too fast: joint 1"] * 5 + ["the simulation blew up"] * 10
