@@ -148,7 +148,7 @@ def _sentence(value: Any, kind: Any, said: str) -> str:
         found, node = found[key], _inner(node, key, found)
     options = node.types if isinstance(node, inspect.UnionType) else (node,)
     if said.startswith("Object"):
-        return f"{_said(place)}: {_keys(found, options)}"
+        return f"{_said(place)}{_keys(found, options)}"
     if valid := [v for o in options for v in _values(o)]:
         return f"{_said(place) or ': the content'} must be one of {', '.join(map(str, valid))}, got {shown(found)}"
     wanted = re.sub(r"`([^`]*)`", lambda m: " or ".join(_WORDS.get(w, w) for w in m[1].split(" | ")), said)
@@ -160,10 +160,11 @@ def _keys(found: dict[str, Any], options: tuple[Any, ...]) -> str:
     """Which keys of an object are unknown and which are missing."""
     fields = next(o.fields for o in options if isinstance(o, (inspect.StructType, inspect.TypedDictType)))
     names = {f.encode_name: f.required for f in fields}
-    open_ended = any(isinstance(o, inspect.TypedDictType) for o in options)
-    unknown = [] if open_ended else sorted(map(str, found.keys() - names.keys()))
     missing = [key for key, required in names.items() if required and key not in found]
-    return f"{faults({'unknown keys:': unknown, 'missing keys:': missing})}; valid keys: {', '.join(names)}"
+    if any(isinstance(o, inspect.TypedDictType) for o in options):  # which may hold more, and in a later version does
+        return f" lacks {', '.join(map(repr, missing))}"
+    unknown = sorted(map(str, found.keys() - names.keys()))
+    return f": {faults({'unknown keys:': unknown, 'missing keys:': missing})}; valid keys: {', '.join(names)}"
 
 
 def _values(node: Any) -> Iterator[Any]:

@@ -37,6 +37,15 @@ NUMBERS, TEXT = "biuf", "U"  # kinds of numpy's dtypes that are read
 WIDEST = 8  # bytes of a number
 _END = struct.Struct("<4s4H2LH")  # the record that ends a zip: signature, .., bytes of the directory, its offset, ..
 _DEFLATED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_PAIRS = {  # of an npy head, in any order
+    "descr": r"['\"]descr['\"]\s*:\s*['\"]([<>|=]?[a-zA-Z]\d*)['\"]",
+    "fortran_order": r"['\"]fortran_order['\"]\s*:\s*(True|False)",
+    "shape": r"['\"]shape['\"]\s*:\s*\(([\d\s,]*)\)",
+}
+_PAIR = (
+    f"(?:{'|'.join(_PAIRS.values())})".replace("([<", "(?:[<").replace("(True", "(?:True").replace("([\\d", "(?:[\\d")
+)
+_HEAD = re.compile(rf"\s*\{{\s*{_PAIR}(?:\s*,\s*{_PAIR}){{2}}\s*,?\s*\}}\s*")
 _ENCRYPTED = 0x1  # in a member's flags
 
 
@@ -227,18 +236,12 @@ def _declared(head: str, where: str) -> tuple[np.dtype, tuple[int, ...], bool]:
     """dtype, shape and order of an npy head, "{'descr': '<f8', 'fortran_order': False, 'shape': (3, 4), }"."""
     import numpy as np
 
-    found = {
-        "descr": re.findall(r"['\"]descr['\"]\s*:\s*(?:['\"]([<>|=]?[a-zA-Z]\d*)['\"]|(\[))", head),
-        "fortran_order": re.findall(r"['\"]fortran_order['\"]\s*:\s*(True|False)", head),
-        "shape": re.findall(r"['\"]shape['\"]\s*:\s*\(([\d\s,]*)\)", head),
-    }
-    if any(len(each) != 1 for each in found.values()):
-        lacking = ", ".join(key for key, each in found.items() if len(each) != 1)
-        raise _Damage(f"{where}: its head states no {lacking}: {shown(head.strip())}")
-    descr, structured = found["descr"][0]
-    if structured:
+    if re.search(r"['\"]descr['\"]\s*:\s*\[", head):
         raise _Damage(f"{where}: holds records, plain numbers expected")
-    dtype = np.dtype(descr)
+    found = {key: re.findall(pattern, head) for key, pattern in _PAIRS.items()}
+    if not _HEAD.fullmatch(head) or any(len(each) != 1 for each in found.values()):
+        raise _Damage(f"{where}: its head does not state descr, fortran_order and shape: {shown(head.strip())}")
+    dtype = np.dtype(found["descr"][0])
     shape = tuple(int(n) for n in found["shape"][0].replace(",", " ").split())
     absurd = len(shape) > MOST_AXES or any(n > MOST_BYTES for n in shape)
     if absurd or (dtype.kind in NUMBERS and dtype.itemsize > WIDEST) or (not dtype.itemsize and math.prod(shape) > 1):

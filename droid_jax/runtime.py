@@ -16,7 +16,6 @@ import hashlib
 import importlib
 import importlib.metadata
 import io
-import json
 import os
 import platform
 import subprocess
@@ -221,7 +220,7 @@ def _flag_known(root: Path | None) -> bool:
     answers = root / f"flag-{EMITTERS}-jaxlib-{version}.json" if root else None
     if answers and answers.is_file():
         with contextlib.suppress(ValueError, OSError):
-            return json.loads(answers.read_text()) is True
+            return answers.read_text().strip() == "true"
     known = _probe_flag(_EMITTERS_OFF)
     if known is None:
         warnings.warn(f"could not find out whether jaxlib {version} knows {_EMITTERS_OFF}", stacklevel=4)

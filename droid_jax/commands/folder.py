@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from droid_jax.files import CONFIG, LAST_FILES, RESULTS, SETUP
-from droid_jax.report.stages import to_be_amended
+from droid_jax.read_json import read_json, typed
+from droid_jax.report.stages import Setup, to_be_amended
 from droid_jax.storage import file_sha256
 
 if TYPE_CHECKING:
@@ -92,10 +93,12 @@ def finished(out: Path, setup: dict[str, Any], again: bool, last: str = CONFIG) 
     if again or not path.is_file():
         return False
     try:
-        before = json.loads(path.read_text())
-        other = changed(before, setup)
-    except (json.JSONDecodeError, UnicodeDecodeError, AttributeError, TypeError):
-        raise ValueError(f"{path} is damaged; choose another --out, or start over with --again") from None
+        before = typed(read_json(path), dict[str, Any], str(path))
+        typed(before, Setup, str(path))
+    except ValueError as error:
+        said = str(error).removeprefix(f"{path}: ")
+        raise ValueError(f"{path} is damaged ({said}); choose another --out, or start over with --again") from None
+    other = changed(before, setup)
     whole = (out / last).is_file() and not to_be_amended(out)
     if not whole:
         other = [name for name in other if name not in LATER]

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 from droid_jax.commands import report
 from droid_jax.commands.folder import begin, fingerprints, finished, setup_of, stage_folder
@@ -18,6 +17,7 @@ from droid_jax.commands.presets import TIMESTEP, refine_config, search_config, w
 from droid_jax.commands.scenes import compared, needs_log, needs_recording, needs_scene, own_scene, recording_at
 from droid_jax.commands.stand_in import hidden_effects, kept_at, known_stand_in, record_stand_in, settled
 from droid_jax.files import FIT, GAP
+from droid_jax.read_json import read_json, typed
 from droid_jax.report.stages import needs_whole, to_be_amended
 
 if TYPE_CHECKING:
@@ -170,6 +170,17 @@ def model_of(command: Gap) -> tuple[Scene, Space]:
     return scene, door_space(scene) + door_nuisances(scene)
 
 
+class _Value(TypedDict):
+    name: str
+    best: float
+
+
+class _Fit(TypedDict):
+    """What a search reads of a fit.json."""
+
+    parameters: list[_Value]
+
+
 def values_of(folder: Path, base: Space) -> np.ndarray:
     """[F] values of the base parameters in a folder of `identify`; its nuisances where it fitted the same.
 
@@ -177,8 +188,9 @@ def values_of(folder: Path, base: Space) -> np.ndarray:
     """
     needs_whole(folder)
     try:
-        known = {p["name"]: float(p["best"]) for p in json.loads((folder / FIT).read_text())["parameters"]}
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        parameters = typed(read_json(folder / FIT), _Fit, FIT)["parameters"]
+        known = {p["name"]: p["best"] for p in parameters}
+    except (OSError, ValueError) as error:
         raise ValueError(f"--fit {folder} is no folder of a finished `identify`: {error}") from None
     lacking = [p.name for p in base.parameters if not p.nuisance and p.name not in known]
     if lacking:

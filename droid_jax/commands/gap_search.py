@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from droid_jax.read_json import read_json, typed
 from droid_jax.storage import write_json
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ class Clock:
 def _seconds(kept: Path) -> dict[str, float]:
     """What was counted before; nothing where that cannot be read, it decides nothing."""
     try:
-        before = json.loads(kept.read_text())
-        return {stage: float(before[stage]) for stage in BARS if stage in before}
-    except (OSError, ValueError, TypeError):
+        before = typed(read_json(kept), dict[str, float], str(kept))
+        return {stage: before[stage] for stage in BARS if stage in before}
+    except (OSError, ValueError):
         return {}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from droid_jax.commands.presets import TIMESTEP, Preset, refine_config, search_c
 from droid_jax.commands.scenes import compared, needs_log, needs_recording, needs_scene, own_scene, recording_at
 from droid_jax.commands.stand_in import known_stand_in, settled
 from droid_jax.files import EXTENDED, FIT
+from droid_jax.read_json import read_json
 
 if TYPE_CHECKING:
     from droid_jax.identify.pipeline import Identified, IdentifyConfig
@@ -146,7 +146,7 @@ def run(command: Identify) -> None:
         )  # fmt: skip
     draw(out, scene)
     report.run(report.Report(out))
-    _summary(found, json.loads((out / FIT).read_text()), [r.repeats for r in recordings])
+    _summary(found, read_json(out / FIT), [r.repeats for r in recordings])
 
 
 def _description(command: Identify, found: Identified, recordings: Sequence[Recording]) -> dict[str, Any]:

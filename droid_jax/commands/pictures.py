@@ -51,15 +51,14 @@ def draw(out: Path, scene: Scene) -> None:
     Where that cannot be done (no OpenGL, a replay that blew up) it is said, and the page has no pictures.
     """
     from droid_jax.report.film import film
-    from droid_jax.report.reading import Reader
+    from droid_jax.report.reading import Reader, read_replay
     from droid_jax.report.render import NoOpenGL, frames, save_frames
     from droid_jax.storage import new_folder
 
     if not (out / REPLAY).is_file() or (out / FRAMES).is_dir():
         return
     try:
-        replay = Reader("identify").arrays(out / REPLAY, ("time", "before", "after"))
-        time, before, after = replay["time"], replay["before"], replay["after"]
+        time, before, after = read_replay(out / REPLAY, Reader("identify"))
         model = scene.visual_model()
         camera = "front" if "front" in {model.camera(i).name for i in range(model.ncam)} else None
         rows = [int(f * (len(after) - 1)) for f in AT]

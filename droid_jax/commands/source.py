@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 from droid_jax.commands.stand_in import known_stand_in
 from droid_jax.errors import needs
 from droid_jax.files import CONFIG, GAP, GAUSSIAN
+from droid_jax.read_json import read_json, typed
 from droid_jax.report.stages import extended_of, left_over, needs_whole, setup, told_in, unfinished
 
 if TYPE_CHECKING:
@@ -70,6 +70,12 @@ def _check_door(path: Path, gaussian: Gaussian, scene: Scene) -> None:
             raise ValueError(f"{path} belongs to another scene: its {p.name} is not the built-in door's")
 
 
+class _Verdict(TypedDict):
+    """What training reads of a gap.json."""
+
+    effects: list[str]
+
+
 def model_folder(whole: Path) -> Path:
     """Where, in a folder of `all`, the model is that a policy shall be trained on: the extended one, if an effect was
     named.
@@ -79,8 +85,8 @@ def model_folder(whole: Path) -> Path:
     """
     path = whole / "gap" / GAP
     try:
-        named = path.is_file() and bool(json.loads(path.read_text())["effects"])
-    except (ValueError, KeyError, TypeError) as error:
+        named = path.is_file() and bool(typed(read_json(path), _Verdict, GAP)["effects"])
+    except ValueError as error:
         raise ValueError(f"{path} is damaged ({error}): run gap again with --again") from None
     return whole / ("gap" if named and "gap" not in left_over(whole) else "identify")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +9,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from droid_jax.commands.folder import kept_recordings
 from droid_jax.files import STAND_IN
+from droid_jax.read_json import read_json, typed
+from droid_jax.report.stages import Robot
 
 if TYPE_CHECKING:
     from droid_jax.measure.recording import Recording
@@ -111,7 +112,8 @@ def known_stand_in(recordings: Sequence[str | Path]) -> dict[str, Any]:
     """Springs, seed and hidden effects of the stand-in robot that made these files; empty where that is not known."""
     folders = {Path(path).resolve().parent for path in recordings}
     try:
-        return json.loads((folders.pop() / STAND_IN).read_text()) if len(folders) == 1 else {}
+        at = folders.pop() / STAND_IN
+        return dict(typed(read_json(at), Robot, str(at))) if not folders else {}
     except (OSError, ValueError):
         return _of_meta(recordings)
 

@@ -70,10 +70,10 @@ def replay_of(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     """
     import numpy as np
 
-    from droid_jax.report.reading import Reader
+    from droid_jax.report.reading import Reader, read_replay
 
-    replay = Reader("identify", "--again").arrays(folder / REPLAY, ("time", "before", "after"))
-    return replay["time"], np.concatenate([replay["before"], replay["after"]], axis=1)
+    time, before, after = read_replay(folder / REPLAY, Reader("identify", "--again"))
+    return time, np.concatenate([before, after], axis=1)
 
 
 def side_by_side(mjcf: Path) -> tuple[mujoco.MjModel, np.ndarray]:

@@ -14,6 +14,9 @@ or `control.drive(loop, robot, seconds)` with an object that reads, sends and wa
 
 from __future__ import annotations
 
+import io
+import math
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -35,6 +38,7 @@ SHAPES: dict[str, tuple[int, ...]] = {  # of an `Interface`
     "stiffness": (ARM,), "damping": (ARM,), "workspace": (2, 3), "chain": (ARM + 1, 4, 4), "pads": (FINGERS, 3),
     "slides": (FINGERS, 3), "start": (ARM + FINGERS,), "knob": (4, 4),
 }  # fmt: skip
+MOST_ARRAYS, MOST_BYTES, MOST_HEAD = 100, 64 * 2**20, 4096  # of a policy's file, and of one array's head
 POSITIVE = ("period", "reach", "width", "speed", "effort", "stiffness")  # of these
 
 
@@ -106,12 +110,12 @@ def arrays(policy: Policy) -> dict[str, Any]:
 def load(path: str | Path) -> Policy:
     """ValueError names what is wrong with a file: missing, damaged, no numbers, of another layout of observations."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            found = {name: file[name] for name in file.files}
+        found = _arrays(Path(path))
     except FileNotFoundError:
         raise ValueError(f"{path}: there is no such file; `train` and `export` write it") from None
-    except Exception as error:  # what numpy and zipfile raise on damaged files is of many kinds
-        raise ValueError(f"{path} cannot be read: {error}") from None
+    except Exception as error:  # what zipfile, zlib and numpy raise on damaged files is of many kinds
+        said = (str(error).splitlines() or [type(error).__name__])[0][:200]
+        raise ValueError(f"{path} cannot be read: {said}") from None
     if str(found.get("format")) != FORMAT:
         raise ValueError(f"{path} is no policy: expected format {FORMAT!r}, got {str(found.get('format'))!r}")
     layers = range(sum(name.startswith("weight_") for name in found))
@@ -132,6 +136,42 @@ def load(path: str | Path) -> Policy:
     weights, biases = (tuple(found[f"{kind}_{k}"] for k in layers) for kind in ("weight", "bias"))
     interface: Any = {f.name: found[f.name] if found[f.name].ndim else float(found[f.name]) for f in fields(Interface)}
     return Policy(found["mean"], found["std"], weights, biases, Interface(**interface))
+
+
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a policy's file: numbers and text whose sizes are known before memory is taken.
+
+    Of its own, since this file goes to the robot alone.
+    """
+    if not path.is_file() and path.exists():
+        raise ValueError("it is no regular file")
+    out: dict[str, np.ndarray] = {}
+    with zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        if len(members) > MOST_ARRAYS or sum(m.file_size for m in members) > MOST_BYTES:
+            raise ValueError(f"it declares {len(members)} arrays of {sum(m.file_size for m in members)} bytes")
+        for member in members:
+            name = member.filename.removesuffix(".npy")
+            if name in out:
+                raise ValueError(f"{name!r} is there twice")
+            out[name] = _array(archive.read(member), name)
+    return out
+
+
+def _array(content: bytes, name: str) -> np.ndarray:
+    """The array of an npy file's content."""
+    stream = io.BytesIO(content)
+    version = np.lib.format.read_magic(stream)
+    if version != (1, 0):
+        raise ValueError(f"{name!r} has npy version {version}")
+    shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream, max_header_size=MOST_HEAD)
+    declared = math.prod(shape) * dtype.itemsize
+    if dtype.kind not in "fiuU" or dtype.names or declared != len(content) - stream.tell():
+        raise ValueError(f"{name!r} declares {dtype} of shape {shape}, where {len(content) - stream.tell()} bytes are")
+    data = stream.read()
+    if dtype.kind == "U":
+        data.decode("utf-32-be" if dtype.byteorder == ">" else "utf-32-le")  # raises where bytes are no characters
+    return np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C").copy()
 
 
 def _misshapen(found: Mapping[str, np.ndarray], layers: int) -> str | None:

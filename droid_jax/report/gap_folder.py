@@ -11,7 +11,7 @@ import numpy as np
 
 from droid_jax.files import GAP, GAP_TRACES
 from droid_jax.report.gap_parts import PARTS, Parts, parts_of, said_split
-from droid_jax.report.reading import Reader
+from droid_jax.report.reading import Maybe, Reader
 
 VERDICTS = ("none", "named", "tie", "partly explained", "unexplained", "fit not converged")
 ROLES = ("fit", "confirm", "sealed")
@@ -33,6 +33,10 @@ _SIZE = {
 }
 _SHIFT = {"name": str, "unit": str, **dict.fromkeys(("before", "after", "deviation_before"), _MAYBE)}
 _TREND = {**dict.fromkeys(("candidate", "amplitude", "unit"), str), "per_repeat": _MAYBE, "p": _MAYBE}
+_ABOUT = {"what": str, "mark": str, "confused_with": [str]}
+_SETUP = {"robot": Maybe({"hide": Maybe([str])}), "stand_in": Maybe(bool), "recording": Maybe([str])}
+_EXPERIMENT = {"what": str, "apart": _MAYBE, "not_made": Maybe(str)}
+_HINT = {"effects": [str], "tied": [[str]], "closed": {str: _NUMBER}}
 _SCHEMA = {
     **{"verdict": str, "sentence": str, "effects": [str], "tied": [[str]], "p": _MAYBE, "floor": _MAYBE},
     **{"converged": bool, "cut": str, "seconds": {str: _NUMBER}, "gaps": {str: _GAP}},
@@ -40,14 +44,15 @@ _SCHEMA = {
     "screens": [{"p": _MAYBE, "ranking": [{"candidate": str, "t": _MAYBE, "explained": _MAYBE}], "failed": [str]}],
     "trials": [_TRIAL],
     "cells": {"before": [_CELL], "after": [_CELL]},
-    **{"amplitudes": [_SIZE], "shifts": [_SHIFT], "experiments": [{"what": str, "apart": _MAYBE}]},
+    **{"amplitudes": [_SIZE], "shifts": [_SHIFT], "experiments": [_EXPERIMENT]},
     "trends": [_TREND],
-    **{"units": str, "versions": dict, "device": str, "setup": dict},
+    **{"units": str, "versions": {str: str}, "device": str, "setup": _SETUP},
+    # what older files lack
+    **{"split": Maybe({"by": str, "limits": str}), "shapes": Maybe([_SIZE]), "about": Maybe({str: _ABOUT})},
+    **{"handed_on": Maybe({"fitted_to": [str], "gaps": {str: _MAYBE}}), "amendments": Maybe({str: str})},
+    **{"remainder": Maybe(_MAYBE), "explained": Maybe(_MAYBE), "failed": Maybe([str])},
+    "hints": Maybe([_HINT]),
 }
-_HANDED_ON = {"fitted_to": [str], "gaps": {str: _MAYBE}}
-_ABOUT = {"what": str, "mark": str, "confused_with": [str]}
-_HINT = {"effects": [str], "tied": [[str]], "closed": {str: _NUMBER}}
-_SPLIT = {"by": str, "limits": str}
 _LINES = ("measured", "scatter", "before", "after")
 
 
@@ -185,15 +190,6 @@ def read_gap(folder: str | Path) -> Gap:
     path = folder / GAP
     found = (_READ if path.exists() else Reader("gap")).json(path)
     _READ.check(found, _SCHEMA, GAP)
-    _READ.check(said_split(found), _SPLIT, "gap.json, 'split'")
-    _READ.check(found.get("shapes", []), [_SIZE], "gap.json, 'shapes'")
-    _READ.check(found.get("about", {}), {str: _ABOUT}, "gap.json, 'about'")
-    _READ.check(found.get("hints", []), [_HINT], "gap.json, 'hints'")
-    _READ.check(found.get("amendments", {}), {str: str}, "gap.json, 'amendments'")
-    for entry in found["experiments"]:
-        _READ.check(entry.get("not_made", ""), str, "gap.json, 'experiments', 'not_made'")
-    if "handed_on" in found:
-        _READ.check(found["handed_on"], _HANDED_ON, "gap.json, 'handed_on'")
     for fault in _faults(found):
         raise _READ.fault(f"gap.json, {fault}")
     roles = [r for r in ROLES if r in found["gaps"]]
@@ -207,9 +203,6 @@ def _faults(found: Mapping[str, Any]) -> Iterator[str]:
     by = said_split(found)["by"]
     if by not in PARTS:
         yield f"'split', 'by' must be one of {', '.join(PARTS)}, got {by!r}"
-    for name in ("remainder", "explained"):  # older files have none
-        if not isinstance(found.get(name), _MAYBE):
-            yield f"{name!r} must be a number or null, got {found[name]!r}"
     absent = [r for r in ROLES[:2] if r not in found["gaps"]]
     if absent:
         yield f"'gaps' lacks {', '.join(map(repr, absent))}"
@@ -219,7 +212,10 @@ def _faults(found: Mapping[str, Any]) -> Iterator[str]:
 
 def _traces(path: Path, roles: Sequence[str], phases: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Arrays by role, their shapes checked against time [K] and joints [J]."""
-    arrays = _READ.arrays(path, ["joints", *(f"{r}.{key}" for r in roles for key in ("time", *_LINES))])
+    keys = ["joints", *(f"{r}.{key}" for r in roles for key in ("time", *_LINES))]
+    arrays = _READ.arrays(path, keys, texts=["joints"])
+    for key in ("joints", *(f"{r}.time" for r in roles)):
+        _READ.shaped(arrays[key], (None,), f"{path}, {key}")
     traces: dict[str, dict[str, Any]] = {}
     for role in roles:
         shape = (len(arrays[f"{role}.time"]), len(arrays["joints"]))

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from droid_jax.files import FILMS, TRAINING, TRANSFER
 from droid_jax.policy.trials import BLOWN_UP
-from droid_jax.report.reading import Reader
+from droid_jax.report.reading import Maybe, Reader
 
 _READ = Reader("train")
 _NUMBER = (int, float)
 _TRAINING = {
-    "setup": {"method": str, "preset": str, "knob": int, "seed": int},
+    "setup": {"method": str, "preset": str, "knob": int, "seed": int, "fit": Maybe((str, type(None)))},
     "stand_in": dict,
     **{"task": {"opened": _NUMBER, "held": _NUMBER, "control": _NUMBER, "steps": int}, "scene": str},
     **{"effects": [str], "versions": dict, "device": str},
@@ -24,9 +24,12 @@ _MAYBE = (int, float, type(None))
 _SPREAD = {"mean": _MAYBE, "std": _MAYBE, "all": [_NUMBER]}
 _TRIALS = {
     **{"trials": int, "success_rate": _NUMBER, "interval_95": [_NUMBER], "success": [bool], "stopped": {str: int}},
-    **{"angle_deg": _SPREAD, "steps": _SPREAD, "grip": {"mean": _NUMBER}},
+    **{"angle_deg": _SPREAD, "steps": _SPREAD, "grip": {"mean": _NUMBER}, "stopped_each": Maybe([str])},
 }
-_TRANSFER = {"simulation": _TRIALS, "stand_in": _TRIALS, "robot": {"hidden": [{"name": str, "amplitude": _NUMBER}]}}
+_TRANSFER = {
+    **{"simulation": _TRIALS, "stand_in": _TRIALS, "robot": {"hidden": [{"name": str, "amplitude": _NUMBER}]}},
+    **{"no_films": Maybe(str), "setup": Maybe(dict)},
+}
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,18 @@ def _without_blown_up(found: Mapping[str, Any]) -> dict[str, Any]:
     return {**found, "counted": found["trials"] - found["stopped"].get(BLOWN_UP, 0), "angles": angles}
 
 
+def _faults(trials: Mapping[str, Any]) -> Iterator[str]:
+    """What the schema cannot say."""
+    count = trials["trials"]
+    for key, of in (("angle_deg", trials["angle_deg"]["all"]), ("success", trials["success"])):
+        if len(of) != count:
+            yield f"{key!r} tells of {len(of)} trials, 'trials' says {count}"
+    if len(trials.get("stopped_each", [""] * count)) != count:
+        yield f"'stopped_each' tells of {len(trials['stopped_each'])} trials, 'trials' says {count}"
+    if len(trials["interval_95"]) != 2:
+        yield f"'interval_95' must be two numbers, got {len(trials['interval_95'])}"
+
+
 def has_policy(folder: Path) -> bool:
     """Whether a folder holds, or should hold, a trained policy."""
     return (folder / TRAINING).exists()
@@ -82,5 +97,8 @@ def read_policy(folder: Path) -> Trained:
         read = Reader("evaluate")
         transfer = read.json(folder / TRANSFER)
         read.check(transfer, _TRANSFER, TRANSFER)
+        for where in ("simulation", "stand_in"):
+            for fault in _faults(transfer[where]):
+                raise read.fault(f"{TRANSFER}, {where!r}, {fault}")
     films = {path.stem: path for path in sorted((folder / FILMS).glob("*.webp"))}
     return Trained(folder, training, transfer, films)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import json
-import zipfile
-import zlib
-from collections.abc import Iterable, Mapping
+import functools
+import operator
+from collections.abc import Container, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NotRequired, TypedDict
 
 import numpy as np
+
+from droid_jax.read_json import read_json, typed
+from droid_jax.read_npz import NUMBERS, TEXT, NpzFile
 
 
 @dataclass(frozen=True)
@@ -24,38 +26,51 @@ class Reader:
     command: str
     option: str = ""
 
-    def fault(self, what: str) -> ValueError:
+    def fault(self, what: str) -> Fault:
         """The error for a fault, with what to do about it."""
         how = f" with the same options and {self.option}" if self.option else ""
-        return ValueError(
+        return Fault(
             f"{what}; run `python -m droid_jax.run {self.command}` again{how}, or pass the folder that it wrote"
         )
 
-    def json(self, path: Path) -> dict[str, Any]:
-        """A JSON object."""
+    def json(self, path: Path, schema: Any = dict) -> dict[str, Any]:
+        """A JSON object as its schema says, see `check`."""
         try:
-            value = json.loads(path.read_text(encoding="utf-8"))
+            value = read_json(path)
         except FileNotFoundError:
             raise self.fault(f"{path} is missing") from None
-        except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-            raise self.fault(f"{path} cannot be read ({error})") from None
-        if not isinstance(value, dict):
-            raise self.fault(f"{path} must hold a JSON object, got {type(value).__name__}")
+        except (OSError, ValueError) as error:
+            raise self.fault(f"{path} cannot be read ({_reason(path, error)})") from None
+        self.check(value, schema, str(path))
         return value
 
-    def arrays(self, path: Path, keys: Iterable[str] = ()) -> dict[str, np.ndarray]:
-        """The arrays of an npz file, of which `keys` must be there."""
+    def arrays(
+        self, path: Path, keys: Iterable[str], optional: Iterable[str] = (), texts: Iterable[str] = ()
+    ) -> dict[str, np.ndarray]:
+        """Arrays of an npz file that must be there, and of those that may be; numbers, and of `texts` text."""
+        texts = frozenset(texts)
         try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = {k: file[k] for k in file.files}
+            with NpzFile(path) as file:
+                self.need(file, keys := tuple(keys), path.name)
+                wanted = (*keys, *(key for key in optional if key in file))
+                return {key: file.array(key, TEXT if key in texts else NUMBERS) for key in wanted}
         except FileNotFoundError:
             raise self.fault(f"{path} is missing") from None
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-            raise self.fault(f"{path} cannot be read ({error})") from None
-        self.need(arrays, keys, path.name)
-        return arrays
+        except Fault:
+            raise
+        except (OSError, ValueError) as error:
+            raise self.fault(f"{path} cannot be read ({_reason(path, error)})") from None
 
-    def need(self, table: Mapping[str, Any], keys: Iterable[str], where: str) -> None:
+    def shaped(self, array: np.ndarray, shape: tuple[int | None, ...], where: str, finite: bool = True) -> None:
+        """Fault where an array has another shape (None: any length) or, unless it may, holds NaN or infinities."""
+        fits = len(array.shape) == len(shape) and all(w in (None, n) for w, n in zip(shape, array.shape, strict=True))
+        if not fits:
+            wanted = ", ".join("any" if n is None else str(n) for n in shape)
+            raise self.fault(f"{where} must have shape [{wanted}], got {list(array.shape)}")
+        if finite and array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise self.fault(f"{where} holds NaN or infinite values")
+
+    def need(self, table: Container[str], keys: Iterable[str], where: str) -> None:
         """Fault where a key is absent."""
         absent = [k for k in keys if k not in table]
         if absent:
@@ -65,29 +80,54 @@ class Reader:
         """Fault at the first place where a value read from JSON is not as its schema says.
 
         schema: a type or tuple of types; {"key": schema} for an object with these keys (more may be
-        there); {str: schema} for one with keys of any name; [schema] for a list.
+        there), of which those with a Maybe may be absent; {str: schema} for one with keys of any name;
+        [schema] for a list.
         """
-        if isinstance(schema, list):
-            self._type(value, list, where)
-            for i, item in enumerate(value):
-                self.check(item, schema[0], f"{where}, entry {i}")
-        elif isinstance(schema, dict):
-            self._type(value, dict, where)
-            keyed = {k: schema[str] for k in value} if str in schema else schema
-            self.need(value, keyed, where)
-            for key, inner in keyed.items():
-                self.check(value[key], inner, f"{where}, {key!r}")
-        else:
-            self._type(value, schema, where)
-
-    def _type(self, value: Any, kind: type | tuple[type, ...], where: str) -> None:
-        if not isinstance(value, kind):
-            kinds = kind if isinstance(kind, tuple) else (kind,)
-            wanted = " or ".join(dict.fromkeys(_JSON_NAMES[k] for k in kinds))
-            raise self.fault(f"{where} must be {wanted}, got {type(value).__name__}")
+        try:
+            typed(value, _kind(schema), where)
+        except ValueError as error:
+            raise self.fault(str(error)) from None
 
 
-_JSON_NAMES = {
-    **{dict: "an object", list: "a list", str: "a text", bool: "true or false"},
-    **{int: "a number", float: "a number", type(None): "null"},
-}
+def read_replay(path: Path, read: Reader) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times [K] s of a replay.npz, and the states [K, nq] before and after the fit."""
+    replay = read.arrays(path, ("time", "before", "after"))
+    time, before, after = replay["time"], replay["before"], replay["after"]
+    read.shaped(time, (None,), f"{path}, time")
+    read.shaped(before, (len(time), None), f"{path}, before", finite=False)  # one that blew up is not drawn
+    read.shaped(after, before.shape, f"{path}, after", finite=False)
+    if not len(time):
+        raise read.fault(f"{path} is empty")
+    return time, before, after
+
+
+@dataclass(frozen=True)
+class Maybe:
+    """The schema of a key that need not be there."""
+
+    schema: Any
+
+
+class Fault(ValueError):
+    """What is wrong with a run's file, and what to do about it."""
+
+
+def _reason(path: Path, error: Exception) -> str:
+    """The message of an error without the path in front."""
+    return str(error).removeprefix(f"{path}: ")
+
+
+def _kind(schema: Any) -> Any:
+    """A schema of `Reader.check` as a type; int and float together are a number."""
+    if isinstance(schema, list):
+        return list[_kind(schema[0])]
+    if isinstance(schema, dict):
+        if str in schema:
+            return dict[str, _kind(schema[str])]
+        return TypedDict("Object", {key: _kind(inner) for key, inner in schema.items()})  # pyright: ignore
+    if isinstance(schema, Maybe):
+        return NotRequired[_kind(schema.schema)]
+    if isinstance(schema, tuple):
+        kinds = [_kind(kind) for kind in schema if not (kind is int and float in schema)]
+        return functools.reduce(operator.or_, kinds)
+    return schema

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,30 +10,37 @@ from typing import Any
 import numpy as np
 
 from droid_jax.files import CONFIG, CORRELATION, DISTRIBUTION, FILMS, FIT, HISTORY, REPLAY, REPLAY_FILM, TRACES
-from droid_jax.report.reading import Reader
+from droid_jax.read_json import parse_json
+from droid_jax.report.reading import Maybe, Reader
 
 _READ = Reader("identify")
-_ARRAYS = {
-    "history": ("names", "generation", "mean", "std", "best_cost", "median_cost"),
-    "correlation": ("names", "correlation"),
-    "distribution": ("initial_cost", "fitted_cost"),
+_NUMBER, _MAYBE = (int, float), (int, float, type(None))
+_PARAMETER = {
+    **dict.fromkeys(("name", "unit", "group", "reason"), str),
+    **dict.fromkeys(("nuisance", "identifiable", "on_bound"), bool),
+    **dict.fromkeys(("initial_mean", "initial_std", "low", "high", "best", "mean", "std"), _NUMBER),
+    **{"interval": tuple[float, float], "truth": _MAYBE, "partners": [{"name": str, "correlation": _NUMBER}]},
 }
-_PARAMETER_KEYS = (
-    *(
-        "name",
-        "unit",
-        "group",
-        "nuisance",
-        "initial_mean",
-        "initial_std",
-        "low",
-        "high",
-        "best",
-        "mean",
-        "std",
-    ),
-    *("interval", "identifiable", "reason", "truth", "on_bound", "partners"),
-)
+_GAP = {
+    **{"before": _NUMBER, "after": _NUMBER, "per_joint_before": [_NUMBER], "per_joint_after": [_NUMBER]},
+    **{"floor": Maybe(_MAYBE), "closed": Maybe(_MAYBE), "judged": Maybe(str)},
+    "per_joint_floor": Maybe(([_NUMBER], type(None))),
+}
+_FIT = {
+    **{"parameters": [_PARAMETER], "gap": {str: _GAP}, "stop": str, "rule": str},
+    "cost": {"initial": Maybe(_MAYBE), "best": Maybe(_MAYBE), "floor": Maybe(_MAYBE), "unit": Maybe(str)},
+    **{"torque_unit": Maybe(str), "converged": Maybe((bool, type(None))), "mean_square": Maybe(_MAYBE)},
+    **{"generations": Maybe(int), "evaluations": Maybe(int), "seconds": Maybe({str: _NUMBER})},
+    **{"mjcf_lacks": Maybe([str]), "notes": Maybe([str])},
+}
+_RECORDING = {
+    **{"name": str, "sha256": Maybe(str), "repeats": Maybe(int), "heldout": Maybe([int]), "duration": Maybe(_NUMBER)},
+}
+_CONFIG = {
+    **{"preset": str, "scene": str, "engine": str, "recordings": [_RECORDING], "seed": int, "stand_in": bool},
+    **{"started": Maybe(str), "device": Maybe(str), "versions": Maybe({str: str}), "setup": Maybe(dict)},
+}
+_ROWS, _TABLES = ("generation", "best_cost", "median_cost"), ("mean", "std")  # of history.npz, [G] and [G, D]
 _TRACE_KEYS = ("time", "measured_mean", "measured_low", "measured_high", "before", "after", "joints")
 
 NO_REPLAY = "No pictures: a log without commands has no replay to show."
@@ -92,12 +98,14 @@ def read_run(run: Path) -> Run:
     if not run.is_dir():
         raise _READ.fault(f"there is no folder {run}")
     config, fit = _READ.json(run / CONFIG), _READ.json(run / FIT)
-    _READ.need(config, ("preset", "scene", "engine", "recordings", "seed", "stand_in"), CONFIG)
-    _READ.need(fit, ("parameters", "cost", "gap", "stop", "rule"), FIT)
-    for i, p in enumerate(fit["parameters"]):
-        _READ.need(p, _PARAMETER_KEYS, f"fit.json, parameter {p.get('name', i)!r}")
-    for name, gap in fit["gap"].items():
-        _READ.need(gap, ("before", "after", "per_joint_before", "per_joint_after"), f"fit.json, gap {name!r}")
+    _READ.check(config, _CONFIG, CONFIG)
+    _READ.check(fit, _FIT, FIT)
+    for key in ("parameters", "gap"):
+        if not fit[key]:
+            raise _READ.fault(f"{FIT}, {key!r} is empty")
+    names = [p["name"] for p in fit["parameters"]]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise _READ.fault(f"{FIT}, 'parameters' holds {', '.join(twice)} more than once")
     missing = []
     distribution = None
     if not (run / DISTRIBUTION).is_file():
@@ -105,7 +113,9 @@ def read_run(run: Path) -> Run:
             "distribution.npz is not there: the initial and the fitted Gaussian are not compared by samples."
         )
     else:
-        distribution = _READ.arrays(run / DISTRIBUTION, _ARRAYS["distribution"])
+        distribution = _READ.arrays(run / DISTRIBUTION, ("initial_cost", "fitted_cost"))
+        for key, costs in distribution.items():
+            _READ.shaped(costs, (None,), f"{run / DISTRIBUTION}, {key}", finite=False)
     frames = tuple(sorted((run / "frames").glob("*.png")))
     film = run / FILMS / REPLAY_FILM
     if not frames:
@@ -115,8 +125,8 @@ def read_run(run: Path) -> Run:
         config=config,
         fit=fit,
         traces=_traces(run / TRACES, list(fit["gap"])),
-        history=_READ.arrays(run / HISTORY, _ARRAYS["history"]),
-        correlation=_READ.arrays(run / CORRELATION, _ARRAYS["correlation"]),
+        history=_history(run / HISTORY),
+        correlation=_correlation(run / CORRELATION),
         distribution=distribution,
         frames=frames,
         film=film if film.is_file() else None,
@@ -124,16 +134,50 @@ def read_run(run: Path) -> Run:
     )
 
 
+def _history(path: Path) -> dict[str, np.ndarray]:
+    """names [D]; generation, best_cost, median_cost [G]; mean, std [G, D]."""
+    arrays = _READ.arrays(path, ("names", *_ROWS, *_TABLES), texts=("names",))
+    _READ.shaped(arrays["names"], (None,), f"{path}, names")
+    _READ.shaped(arrays["generation"], (None,), f"{path}, generation")
+    rows, columns = len(arrays["generation"]), len(arrays["names"])
+    for key in (*_ROWS, *_TABLES):
+        shape = (rows, columns) if key in _TABLES else (rows,)
+        _READ.shaped(arrays[key], shape, f"{path}, {key}", finite=False)
+    return arrays
+
+
+def _correlation(path: Path) -> dict[str, np.ndarray]:
+    """names [D] and correlation [D, D]."""
+    arrays = _READ.arrays(path, ("names", "correlation"), texts=("names",))
+    _READ.shaped(arrays["names"], (None,), f"{path}, names")
+    _READ.shaped(arrays["correlation"], (len(arrays["names"]),) * 2, f"{path}, correlation")
+    return arrays
+
+
 def _traces(path: Path, recordings: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Arrays per recording, their shapes checked against time [T] and joints [J]."""
-    arrays = _READ.arrays(path, [f"{r}/{key}" for r in recordings for key in _TRACE_KEYS])
+    keys, phases = [f"{r}/{key}" for r in recordings for key in _TRACE_KEYS], [f"{r}/phases" for r in recordings]
+    arrays = _READ.arrays(path, keys, phases, texts=[*(f"{r}/joints" for r in recordings), *phases])
     traces: dict[str, dict[str, Any]] = {}
     for r in recordings:
         one: dict[str, Any] = {key: arrays[f"{r}/{key}"] for key in _TRACE_KEYS}
+        for key in ("time", "joints"):
+            _READ.shaped(one[key], (None,), f"{path}, {r}/{key}")
         shape = (len(one["time"]), len(one["joints"]))
         for key in _TRACE_KEYS[1:-1]:
             if one[key].shape != shape:
                 raise _READ.fault(f"{path}, {r}/{key} must be [time, joints] = {shape}, got {one[key].shape}")
-        one["phases"] = json.loads(str(arrays[f"{r}/phases"])) if f"{r}/phases" in arrays else []
+        one["phases"] = _phases(arrays[f"{r}/phases"], f"{path}, {r}/phases") if f"{r}/phases" in arrays else []
         traces[r] = one
     return traces
+
+
+def _phases(text: np.ndarray, where: str) -> list[dict[str, Any]]:
+    """The phases of a recording, which traces.npz keeps as JSON."""
+    _READ.shaped(text, (), where)
+    try:
+        phases = parse_json(str(text), where)
+    except ValueError as error:
+        raise _READ.fault(str(error)) from None
+    _READ.check(phases, [{"name": str, "start": _NUMBER, "end": _NUMBER}], where)
+    return phases

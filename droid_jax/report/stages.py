@@ -6,25 +6,76 @@ Light: commands ask before anything is imported that takes time.
 from __future__ import annotations
 
 import hashlib
-import json
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 from droid_jax.files import EXTENDED, GAP, GAUSSIAN, LAST_FILES, SETUP, TO_BE_MADE
+from droid_jax.read_json import read_json, typed
+
+_MEND = "start the run of this folder over with --again"
+
+
+class Robot(TypedDict, total=False):
+    """What is known of a synthetic robot that was recorded."""
+
+    springs: int
+    seed: int
+    hide: list[str]
+
+
+class Setup(TypedDict, total=False):
+    """What other commands read of a setup.json; it holds every option of its own."""
+
+    command: str
+    preset: str
+    recording: list[str]
+    scene: str | None
+    extended: str | None
+    own_effects: str | None
+    fit: str | None
+    fit_sha256: str | None
+    scene_sha256: str
+    recordings_sha256: list[str]
+    stand_in: bool | dict[str, Any]
+    robot: Robot
+    springs: int | None
+    seed: int
+    hide: list[str]
+    generations: int | None
+    versions: dict[str, str]
+
+
+class Told(TypedDict, total=False):
+    """What other commands read of a config.json or gap.json."""
+
+    stand_in: bool
+    robot: Robot
+    setup: Setup
+    amendments: dict[str, str]
 
 
 def setup(folder: Path) -> dict[str, Any]:
-    """setup.json of a run's folder; empty where there is none that can be read."""
-    return told_in(folder / SETUP)
+    """setup.json of a run's folder, empty where there is none; ValueError for one that is damaged."""
+    return _read(folder / SETUP, Setup)
 
 
 def told_in(path: Path) -> dict[str, Any]:
-    """What a JSON file of a run says; empty where there is none that can be read."""
+    """What a config.json or gap.json says, empty where there is none; ValueError for one that is damaged."""
+    return _read(path, Told)
+
+
+def _read(path: Path, kind: type) -> dict[str, Any]:
     try:
-        told = json.loads(path.read_text())
-    except (OSError, ValueError):
+        content = read_json(path)
+    except FileNotFoundError:
         return {}
-    return told if isinstance(told, dict) else {}
+    except ValueError as error:
+        raise ValueError(f"{error}; {_MEND}") from None
+    try:
+        typed(content, kind, str(path))
+    except ValueError as error:
+        raise ValueError(f"{error}; {_MEND}") from None
+    return content
 
 
 def unfinished(folder: Path) -> bool:

@@ -10,9 +10,13 @@ from droid_jax.errors import lacking
 from droid_jax.files import HISTORY_TABLE, SAMPLES
 from droid_jax.report.reading import Reader
 from droid_jax.report.stages import needs_whole
+from droid_jax.storage import check_size
 
 if TYPE_CHECKING:
     import pandas as pd
+
+COSTS = ("best_cost", "median_cost", "sigma")  # columns of the history's table
+MOST_BYTES = 256 * 2**20  # of a table
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,12 +38,32 @@ def frames(folder: str | Path) -> Frames:
     """
     if told := lacking("droid_jax.frames needs", "frames", "pandas"):
         raise ImportError(told)
-    import pandas as pd
-
     folder = Path(folder)
     at = next((f for f in (folder, folder / "identify") if (f / SAMPLES).is_file()), folder)
     needs_whole(at)
+    read = Reader("identify")
     try:
-        return Frames(pd.read_csv(at / SAMPLES), pd.read_csv(at / HISTORY_TABLE, index_col="generation"))
+        samples, history = (_table(at / name) for name in (SAMPLES, HISTORY_TABLE))
     except (OSError, ValueError) as error:
-        raise Reader("identify").fault(f"{at} holds no tables of a fit ({error})") from None
+        said = (str(error).splitlines() or [""])[0]
+        raise read.fault(f"{at} holds no tables of a fit ({said})") from None
+    expected = ["generation", *COSTS, *(f"{of}_{name}" for of in ("mean", "std") for name in samples.columns)]
+    if list(history.columns) != expected:
+        raise read.fault(f"{at / HISTORY_TABLE} must have the columns {', '.join(expected)}")
+    return Frames(samples, history.set_index("generation"))
+
+
+def _table(path: Path) -> pd.DataFrame:
+    """A table of numbers with named columns; ValueError or OSError where there is none."""
+    import pandas as pd
+
+    check_size(path, MOST_BYTES)
+    table = pd.read_csv(path)
+    if not isinstance(table.index, pd.RangeIndex):  # pandas takes the first of too many cells for row names
+        raise ValueError(f"{path}: its rows are longer than its header")
+    numeric = table.select_dtypes("number").columns
+    if other := [str(column) for column in table.columns if column not in numeric]:
+        raise ValueError(f"{path}: the columns {', '.join(other)} do not hold numbers")
+    if table.isna().to_numpy().any():
+        raise ValueError(f"{path}: has empty cells")
+    return table

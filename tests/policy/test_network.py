@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import zipfile
 from pathlib import Path
 
 import jax
@@ -83,6 +84,19 @@ def rewritten(path: Path, change) -> None:
     np.savez(path, **found)
 
 
+HEAD = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000,), }"
+BOMB = b"\x93NUMPY\1\0" + len(HEAD).to_bytes(2, "little") + HEAD  # an array of 8 GB that is not there
+
+
+def damaged(path: Path, name: str, content: bytes) -> None:
+    """A policy's file with other bytes in one member."""
+    with zipfile.ZipFile(path) as archive:
+        members = {member: archive.read(member) for member in archive.namelist()}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for member, old in members.items():
+            archive.writestr(member, content if member == name else old)
+
+
 @pytest.mark.parametrize(
     ("spoil", "expected"),
     [
@@ -97,6 +111,12 @@ def rewritten(path: Path, change) -> None:
             lambda path: rewritten(path, lambda found: found["period"].fill(-0.02)),
             "period must be above zero, got -0.02",
         ),
+        (lambda path: damaged(path, "mean.npy", b"no array"), "cannot be read: the magic string"),
+        (lambda path: damaged(path, "mean.npy", BOMB), "cannot be read: 'mean' declares float64"),
+        (lambda path: damaged(path, "mean.npy", bytes(65 * 2**20)), "cannot be read: it declares \\d+ arrays of 68"),
+        (lambda path: np.savez(path, format=np.array([{}])), "cannot be read: 'format' declares object"),
+        (lambda path: rewritten(path, lambda found: found.update(std=np.array("x"))), "std hold NaN"),
+        (lambda path: (path.unlink(), path.mkdir()), "cannot be read: it is no regular file"),
         (
             lambda path: rewritten(path, lambda found: found["mean"].fill(np.nan)),
             "mean hold NaN, infinite values or text",

@@ -366,10 +366,10 @@ def test_one_page_for_a_folder_with_both(tmp_path: Path) -> None:
     ("break_it", "message"),
     [
         (lambda f: f.pop("floor"), r"gap.json lacks 'floor'"),
-        (lambda f: f["trials"][2].pop("p"), r"gap.json, 'trials', entry 2 lacks 'p'"),
+        (lambda f: f["trials"][2].pop("p"), r"gap.json: 'trials', entry 2 lacks 'p'"),
         (lambda f: f["gaps"].pop("confirm"), r"'gaps' lacks 'confirm'"),
-        (lambda f: f["gaps"]["fit"].update(before="4"), r"'gaps', 'fit', 'before' must be a number or null, got str"),
-        (lambda f: f["cells"].update(after={}), r"'cells', 'after' must be a list, got dict"),
+        (lambda f: f["gaps"]["fit"].update(before="4"), r"'gaps', 'fit', 'before' must be a number or null, got '4'"),
+        (lambda f: f["cells"].update(after={}), r"'cells', 'after' must be a list, got {}"),
         (lambda f: f.update(verdict="maybe"), r"'verdict' must be one of none, named.*got 'maybe'"),
         (lambda f: f.update(remainder="much"), r"'remainder' must be a number or null, got 'much'"),
         (lambda f: f.update(split={"by": "halves", "limits": ""}), r"'by' must be one of recordings.*got 'halves'"),

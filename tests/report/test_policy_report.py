@@ -96,7 +96,7 @@ def test_a_search_and_a_policy_share_a_page(tmp_path: Path):
 @pytest.mark.parametrize(
     ("name", "content", "fault"),
     [
-        ("training.json", "{}", "training.json.* lacks 'setup'.*run train` again"),
+        ("training.json", "{}", "training.json lacks .*'setup'.*run train` again"),
         ("training.json", "{", "cannot be read"),
         ("transfer.json", '{"simulation": {}}', "lacks .*run evaluate` again"),
     ],

@@ -334,7 +334,7 @@ def test_a_missing_key_and_a_wrong_shape_are_named(tmp_path: Path) -> None:
     fit = json.loads((run / "fit.json").read_text())
     del fit["parameters"][2]["truth"]
     (run / "fit.json").write_text(json.dumps(fit))
-    with pytest.raises(ValueError, match=r"hinge_friction_loss.*'truth'"):
+    with pytest.raises(ValueError, match=r"fit\.json: 'parameters', entry 2 lacks 'truth'; run .*identify"):
         read_run(run)
     run = make_run(tmp_path / "other")
     arrays = dict(np.load(run / "traces.npz"))
@@ -342,6 +342,31 @@ def test_a_missing_key_and_a_wrong_shape_are_named(tmp_path: Path) -> None:
     np.savez(run / "traces.npz", **arrays)
     with pytest.raises(ValueError, match=r"open_close/after must be .*\(3840, 7\).*\(3839, 7\); run .*identify"):
         read_run(run)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda fit: fit.update(parameters=-0.0), r"fit\.json: 'parameters' must be a list, got -0\.0"),
+        (lambda fit: fit.update(parameters=[]), r"fit\.json, 'parameters' is empty"),
+        (lambda fit: fit.update(gap={}), r"fit\.json, 'gap' is empty"),
+        (lambda fit: fit["gap"].update(open_close=0.1), r"'gap', 'open_close' must be an object, got 0\.1"),
+        (lambda fit: fit["parameters"][2].update(initial_mean=10**400), r"a whole number beyond 2\^63"),
+        (lambda fit: fit["parameters"][2].update(low=float("inf")), "Infinity is no number of JSON"),
+        (lambda fit: fit["parameters"][2].update(name="a\0"), r"U\+0000"),
+        (lambda fit: fit["parameters"].append(fit["parameters"][0]), "holds hinge_stiffness more than once"),
+        (lambda fit: fit["parameters"][0].update(interval=[1.0]), "'interval' must be a list of length 2"),
+        (lambda fit: fit.update(notes="cold"), "'notes' must be a list, got 'cold'"),
+    ],
+)
+def test_a_damaged_fit_is_one_sentence(tmp_path: Path, change, said: str) -> None:
+    run = make_run(tmp_path / "run")
+    fit = json.loads((run / "fit.json").read_text())
+    change(fit)
+    (run / "fit.json").write_text(json.dumps(fit))
+    with pytest.raises(ValueError, match=said) as caught:
+        page.write_report(run)
+    assert "fit.json" in str(caught.value) and "run identify` again" in str(caught.value)
 
 
 @pytest.mark.parametrize(

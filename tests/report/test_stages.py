@@ -66,10 +66,25 @@ def test_a_run_is_whole_with_what_is_written_last(tmp_path: Path, stage: str):
     assert not unfinished(tmp_path)
 
 
-@pytest.mark.parametrize("text", ["{", "[]", "7"])
-def test_a_damaged_setup_tells_nothing(tmp_path: Path, text: str):
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("{", "not valid JSON, line 1"),
+        ("[]", "must be an object"),
+        ("7", "must be an object"),
+        ('{"recordings_sha256": 0}', "'recordings_sha256' must be a list, got 0"),
+        ('{"preset": 5}', "'preset' must be text, got 5"),
+        ('{"seed": NaN}', "NaN is no number"),
+    ],
+)
+def test_a_damaged_setup_is_said(tmp_path: Path, text: str, said: str):
+    """What was made together cannot be told from it: silence could pass an earlier run's results off as this one's."""
     (tmp_path / "setup.json").write_text(text)
-    assert setup(tmp_path) == {} and extended_of(tmp_path) is None
+    for ask in (setup, extended_of, unfinished, needs_whole):
+        with pytest.raises(ValueError, match=r"setup\.json.*start the run of this folder over with --again") as caught:
+            ask(tmp_path)
+        assert said in str(caught.value)
+    assert setup(tmp_path / "none") == {}
 
 
 def test_the_extended_model_is_the_folders_own_or_the_one_that_was_fitted(tmp_path: Path):

@@ -10,12 +10,16 @@ import pytest
 import droid_jax as dj
 from droid_jax.storage import write_csv
 
-HISTORY = ["generation", "best_cost", "median_cost", "sigma", "mean_mass", "std_mass"]
+HISTORY = ["generation", "best_cost", "median_cost", "sigma", "mean_mass", "mean_damping", "std_mass", "std_damping"]
 
 
 def fit(folder: Path) -> Path:
     write_csv(folder / "samples.csv", ["mass", "damping"], [[1.0, 2.0], [1.5, 2.5], [1.25, 2.25]])
-    write_csv(folder / "history.csv", HISTORY, [[1, 0.5, 0.7, 1.0, 1.2, 0.3], [2, 0.4, 0.5, 0.8, 1.3, 0.2]])
+    write_csv(
+        folder / "history.csv",
+        HISTORY,
+        [[1, 0.5, 0.7, 1.0, 1.2, 2.0, 0.3, 0.1], [2, 0.4, 0.5, 0.8, 1.3, 2.1, 0.2, 0.1]],
+    )
     return folder
 
 
@@ -35,6 +39,24 @@ def test_tables_of_an_earlier_run_are_not_those_of_one_that_is_not_whole(tmp_pat
         dj.frames(tmp_path)
     (tmp_path / "config.json").write_text("{}")
     assert len(dj.frames(tmp_path).samples) == 3
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("mean_damping,std_mass", "mean_damping$std_mass", "must have the columns generation, best_cost"),
+        ("0.5,0.7", "0.5,0.7,0.9", "holds no tables of a fit"),
+        ("0.5,0.7", "0.5,x", "the columns median_cost do not hold numbers"),
+        ("0.5,0.7", "0.5,", "has empty cells"),
+        ("generation", "", "must have the columns"),
+    ],
+)
+def test_damaged_tables_are_refused(tmp_path: Path, old: str, new: str, said: str):
+    pytest.importorskip("pandas")
+    path = fit(tmp_path) / "history.csv"
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(ValueError, match=said):
+        dj.frames(tmp_path)
 
 
 def test_what_is_missing_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
