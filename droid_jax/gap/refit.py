@@ -7,7 +7,7 @@ measured only after everything else has been allowed to move.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.stats
@@ -105,7 +105,8 @@ def look(
 def vanishing(evidence: Evidence, model: Model, part: Candidate) -> bool:
     """Whether all amplitudes of a part may be zero together, by their posterior covariance, bounds or no bounds.
 
-    Together, because two that trade with each other (a friction's slope and curve) may each be zero and not both.
+    Together, because two that trade with each other (a friction's slope and curve) may each be zero and not both.  Of
+    one amplitude it is the same as its interval (`intervals`) holding zero.
     """
     at, space = [model.space.index(a) for a in part.amplitudes], evidence.cost.space
     away = [(model.values[space.index(a)] - space[a].mean) / space[a].std for a in part.amplitudes]
@@ -120,7 +121,28 @@ def deviations(evidence: Evidence, model: Model) -> dict[str, float]:
 
 
 def intervals(evidence: Evidence, model: Model, names: Iterable[str] | None = None) -> dict[str, tuple[float, float]]:
-    """Interval of free parameters, each in its own unit; of every amplitude unless named."""
-    low, high = told(model.refined, evidence.cost.comparisons).interval(LEVEL)
+    """Interval of free parameters, each in its own unit; of every amplitude unless named.
+
+    Around the model's own values, so that each holds what is reported.  Amplitudes that may all be zero together
+    (`vanishing`) have intervals that reach zero: one statement, whichever is read.
+    """
+    space = model.space
+    values = model.values[evidence.cost.space.columns(space)]
+    about = replace(told(model.refined, evidence.cost.comparisons), mean=space.to_search(values))
+    low, high = about.interval(LEVEL)
+    for part in model.parts:
+        if part.amplitudes and vanishing(evidence, model, part):
+            at = [space.index(a) for a in part.amplitudes]
+            low[at], high[at] = np.minimum(low[at], space.mean[at]), np.maximum(high[at], space.mean[at])
     asked = model.amplitudes if names is None else names
-    return {a: (float(low[model.space.index(a)]), float(high[model.space.index(a)])) for a in asked}
+    return {a: (float(low[space.index(a)]), float(high[space.index(a)])) for a in asked}
+
+
+def zero_words(evidence: Evidence, model: Model, part: Candidate) -> str:
+    """ "its amplitude may be zero (90 % interval 0 to 0.58 N m)" of a part of which that is so; empty else."""
+    if not vanishing(evidence, model, part):
+        return ""
+    spans = intervals(evidence, model, part.amplitudes)
+    each = [f"{low:.3g} to {high:.3g} {model.space[a].unit}".removesuffix(" -") for a, (low, high) in spans.items()]
+    what = "its amplitude may be zero" if len(each) == 1 else "its amplitudes may all be zero"
+    return f"{what} ({LEVEL:.0%} interval {' and '.join(each)})".replace("%", " %")

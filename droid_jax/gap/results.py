@@ -17,6 +17,7 @@ import numpy as np
 from droid_jax.files import GAP, GAP_TRACES
 from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.case import Case
+from droid_jax.gap.doubts import bound_at
 from droid_jax.gap.evidence import Evidence
 from droid_jax.gap.extended import extended, save_extended
 from droid_jax.gap.handover import HandedOn
@@ -68,6 +69,7 @@ def gap_json(case: Case, verdict: Verdict) -> dict[str, Any]:
         "sentence": verdict.sentence,
         "effects": list(verdict.effects),
         "tied": [list(rivals) for rivals in verdict.tied],
+        "doubts": list(verdict.doubts),
         "hints": [asdict(hint) for hint in verdict.hints],
         "thresholds": {"least_closed": case.config.least_closed},
         "about": _about(case, verdict),
@@ -212,6 +214,7 @@ def _sizes(case: Case, verdict: Verdict, kind: Literal["amplitudes", "shapes"]) 
             "value": float(model.values[case.whole.index(name)]),
             "low": spans[name][0],
             "high": spans[name][1],
+            "bound": bound_at(case.fit, model, name),
             "effect": part.name,
             "what": what[part.effect],
         }

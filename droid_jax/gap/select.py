@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from droid_jax.gap.evidence import Evidence
-from droid_jax.gap.refit import Model, intervals, vanishing
+from droid_jax.gap.refit import Model, intervals, zero_words
 from droid_jax.gap.transfer import remainder
 
 SIGNIFICANT = 0.01  # p below which something is missing
@@ -167,14 +167,17 @@ def _too_small(
 
 
 def _amplitude_reasons(fit: Evidence, model: Model, spans: Mapping[str, tuple[float, float]]) -> list[str]:
-    """An interval ends at its bound, often neutral: whether an amplitude may be zero is asked of its deviation."""
     new = [c for c in model.parts if set(c.amplitudes) <= set(spans)]
-    reasons = ["its amplitude may be zero"] if any(vanishing(fit, model, c) for c in new) else []
-    return reasons + [f"{a} {AT_BOUND}" for a in spans if _on_bound(fit, model, a)]
+    reasons = [said for c in new if (said := zero_words(fit, model, c))][:1]
+    return reasons + [f"{a} {AT_BOUND}: {beyond}" for a in spans if (beyond := past_bound(fit, model, a))]
 
 
-def _on_bound(fit: Evidence, model: Model, amplitude: str) -> bool:
-    """At a bound that is not neutral."""
+def past_bound(fit: Evidence, model: Model, amplitude: str) -> str:
+    """ "more than 0.5 N m" of an amplitude at a bound that is not neutral; empty of others."""
     p = fit.cost.space[amplitude]
     value, reach = model.values[fit.cost.space.index(amplitude)], EDGE * (p.high - p.low)
-    return (p.high != p.mean and value > p.high - reach) or (p.low != p.mean and value < p.low + reach)
+    if p.high != p.mean and value > p.high - reach:
+        return f"more than {p.high:g} {p.unit}".removesuffix(" -")
+    if p.low != p.mean and value < p.low + reach:
+        return f"less than {p.low:g} {p.unit}".removesuffix(" -")
+    return ""

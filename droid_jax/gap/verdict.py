@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from droid_jax.gap.floor import above
@@ -18,6 +19,12 @@ HALF = 0.5  # share of the gap: an effect that explains less may only imitate wh
 def open_share(left: float, before: float, floor: float) -> float:
     """Share of a gap that is left open: of U before and U left, both above the floor."""
     return (left - floor) / max(before - floor, 1e-12)
+
+
+def _beyond(reasons: Iterable[str]) -> str:
+    """ " (servo_gain[elbow] more than 0.5)" of reasons that name an amplitude and its bound; empty where none does."""
+    told = [r.replace(f" {AT_BOUND}:", "") for r in reasons if f"{AT_BOUND}:" in r]
+    return f" ({' and '.join(told)})" if told else ""
 
 
 class Kind(enum.Enum):
@@ -79,7 +86,8 @@ class Verdict:
     before, after: where the gap lives on the fitted recording.  rivals: models that do as well as `model`, refitted;
     experiments: what would tell them apart, the best first.  cut: in words what the budget left out, empty for nothing.
     trend: what changes from repeat to repeat, None where nothing was asked.
-    hints: effects that close too little to be named, see `unnamed`; the model is without them.
+    hints: effects that close too little to be named, see `workflow.unnamed`; the model is without them.
+    doubts: what is to be doubted of the effects in the model (`doubts.doubts`).
     """
 
     kind: Kind
@@ -100,6 +108,7 @@ class Verdict:
     cut: str = ""
     trend: Trend | None = None
     hints: tuple[Hint, ...] = ()
+    doubts: tuple[str, ...] = ()
 
     def closed(self, role: str) -> float:
         """1 - (U_after - U0) / (U_before - U0) on "fit", "confirm" or "sealed"."""
@@ -135,11 +144,15 @@ class Verdict:
         """Where a candidate lost for its size or its significance alone, it may be all there is."""
         lost = [t for t in self.trials if t.reasons]
         small = dict.fromkeys(t.name for t in lost if t.reasons == (TOO_SMALL,))
-        large = dict.fromkeys(t.name for t in lost if all(r.endswith(AT_BOUND) for r in t.reasons))
+        large = {t.name: _beyond(t.reasons) for t in lost if all(AT_BOUND in r for r in t.reasons)}
         chance = dict.fromkeys(t.name for t in lost if all(r.startswith(UNCONFIRMED) for r in t.reasons))
         return "".join(
             f", or {' or '.join(names)}, {why}"
-            for names, why in ((small, TOO_SMALL), (large, "larger than its bounds allow"), (chance, UNCONFIRMED))
+            for names, why in (
+                (small, TOO_SMALL),
+                ([f"{name}{beyond}" for name, beyond in large.items()], "larger than its bounds allow"),
+                (chance, UNCONFIRMED),
+            )
             if names
         )
 
@@ -160,7 +173,12 @@ class Verdict:
 
     @property
     def sentence(self) -> str:
-        """The answer in words."""
+        """The answer in words, and what is to be doubted of it."""
+        doubted = [f" But {doubt}." for doubt in self.doubts]
+        return "".join([self._answer, *doubted])
+
+    @property
+    def _answer(self) -> str:
         return {
             Kind.NONE: "Nothing is missing that these recordings could tell.",
             Kind.NAMED: f"The model lacks: {self._lacking}.",

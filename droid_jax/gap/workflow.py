@@ -10,6 +10,7 @@ import numpy as np
 
 from droid_jax.gap.candidates import candidates
 from droid_jax.gap.case import Case
+from droid_jax.gap.doubts import doubts
 from droid_jax.gap.floor import above
 from droid_jax.gap.hunt import Budget, Hunt
 from droid_jax.gap.localise import localise
@@ -137,6 +138,7 @@ def _verdict(hunt: Hunt, base: Model, model: Model, rounds: list[Round], quiet: 
         rivals=next((r.rivals for r in reversed(rounds) if r.winner is not None), ()),
         cut=hunt.budget.cut,
         trend=trend(rounds[0].screen, base.residuals, case.config.seed) if rounds and case.fit.repeated else None,
+        doubts=doubts(case.fit, model),
     )
     return unnamed(case, verdict) if too_little(verdict, case.config.least_closed) else verdict
 
@@ -165,6 +167,7 @@ def unnamed(case: Case, verdict: Verdict) -> Verdict:
         before=where,
         after=where,
         rivals=(),
+        doubts=(),
         hints=(Hint(verdict.effects, verdict.tied, verdict.closed_held_out()),),
     )
 

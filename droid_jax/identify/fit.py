@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from droid_jax.identify.gaussian import Gaussian
-from droid_jax.model.parameters import Space
+from droid_jax.model.parameters import Parameter, Space
 
 BOUND_SHARE = 0.01  # a best value this close to a bound, as a share of the range in x, counts as on it
 
@@ -98,6 +99,13 @@ class Progress:
 
 def on_bound(space: Space, best: np.ndarray) -> tuple[str, ...]:
     """Names of the parameters whose value lies within BOUND_SHARE of the range, in x, of a bound."""
-    low, x, high = (space.to_search(v) for v in (space.low, best, space.high))
-    near = np.minimum(x - low, high - x) <= BOUND_SHARE * (high - low)
-    return tuple(n for n, on in zip(space.names, near, strict=True) if on)
+    return tuple(p.name for p, value in zip(space.parameters, best, strict=True) if bound_of(p, float(value)))
+
+
+def bound_of(parameter: Parameter, value: float) -> Literal["lower", "upper", ""]:
+    """On which bound a value sits, within BOUND_SHARE of the range in x; empty for none."""
+    low, x, high = (float(parameter.to_search(v)) for v in (parameter.low, value, parameter.high))
+    reach = BOUND_SHARE * (high - low)
+    if min(x - low, high - x) > reach:
+        return ""
+    return "lower" if x - low <= high - x else "upper"

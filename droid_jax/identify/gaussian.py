@@ -31,6 +31,7 @@ from typing import Any, Literal, get_args
 
 import msgspec
 import numpy as np
+from scipy import special
 
 from droid_jax.arguments import instance, note, number, numeric, one_of, shown, whole
 from droid_jax.identify.truncated import gibbs, quantiles
@@ -122,21 +123,27 @@ class Gaussian:
         q = numeric(q, "q")
         if q.ndim != 1 or not np.all((q >= 0) & (q <= 1)):
             raise ValueError(f"q must be a list of levels between 0 and 1, got {q}")
-        low, high = self._box()
-        columns = [
-            _truncated_quantiles(q, m, s, a, b)
-            for m, s, a, b in zip(self.mean, np.sqrt(np.diag(self.cov)), low, high, strict=True)
-        ]
-        return self._to_physical(np.stack(columns, axis=-1))
+        return self._to_physical(self._in_coordinates(q))
 
     def interval(self, level: float = 0.9) -> tuple[np.ndarray, np.ndarray]:
-        """Equal-tailed marginal interval that holds `level` of the mass: (low [D], high [D]).
+        """Central marginal interval of the normal, cut at the bounds: (low [D], high [D]) in physical units.
+
+        It holds at least `level` of the mass inside the bounds, and always `centre`, the value that a fit reports.
+        Where the normal reaches beyond a bound the interval ends there: equal tails inside the bounds would leave out
+        a value that sits on one.  Of a normal whose mean lies outside the bounds it begins at the nearest one.
 
         Raises ValueError unless 0 < level < 1.
         """
         level = number(level, "level", above=0, below=1)
-        low, high = self.quantiles([(1 - level) / 2, (1 + level) / 2])
-        return low, high
+        half = float(special.ndtri((1 + level) / 2)) * np.sqrt(np.diag(self.cov))
+        ends = np.stack([self.mean - half, self.mean + half])
+        low, high = self._box()
+        from_low, from_high = self.mean < low, self.mean > high
+        if np.any(from_low | from_high):
+            rest, most = self._in_coordinates([1 - level, level])
+            ends = np.where(from_low, [low, most], np.where(from_high, [rest, high], ends))
+        ends = self._to_physical(ends)
+        return ends[0], ends[1]
 
     @property
     def centre(self) -> np.ndarray:
@@ -185,6 +192,15 @@ class Gaussian:
     def _grid(self) -> np.ndarray:
         """[MOMENT_POINTS, D] physical values that each stand for an equal share of a marginal."""
         return self.quantiles((np.arange(MOMENT_POINTS) + 0.5) / MOMENT_POINTS)
+
+    def _in_coordinates(self, q: Sequence[float] | np.ndarray) -> np.ndarray:
+        """[Q, D] marginal quantiles at levels q [Q] inside the box that draws must lie in, in `coordinates`."""
+        q = np.asarray(q, dtype=np.float64)
+        columns = [
+            _truncated_quantiles(q, m, s, a, b)
+            for m, s, a, b in zip(self.mean, np.sqrt(np.diag(self.cov)), *self._box(), strict=True)
+        ]
+        return np.stack(columns, axis=-1)
 
     def _draw(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """[n, D] draws in `coordinates`, bounds ignored."""

@@ -30,6 +30,7 @@ _TRIAL = {
 _SIZE = {
     **dict.fromkeys(("name", "unit", "effect", "what"), str),
     **dict.fromkeys(("value", "low", "high"), _MAYBE),
+    "bound": Maybe(str),
 }
 _SHIFT = {"name": str, "unit": str, **dict.fromkeys(("before", "after", "deviation_before"), _MAYBE)}
 _TREND = {**dict.fromkeys(("candidate", "amplitude", "unit"), str), "per_repeat": _MAYBE, "p": _MAYBE}
@@ -51,7 +52,7 @@ _SCHEMA = {
     **{"split": Maybe({"by": str, "limits": str}), "shapes": Maybe([_SIZE]), "about": Maybe({str: _ABOUT})},
     **{"handed_on": Maybe({"fitted_to": [str], "gaps": {str: _MAYBE}}), "amendments": Maybe({str: str})},
     **{"remainder": Maybe(_MAYBE), "explained": Maybe(_MAYBE), "failed": Maybe([str])},
-    "hints": Maybe([_HINT]),
+    **{"hints": Maybe([_HINT]), "doubts": Maybe([str]), "thresholds": Maybe({str: _NUMBER})},
 }
 _LINES = ("measured", "scatter", "before", "after")
 

@@ -110,6 +110,8 @@ def _row(found: Mapping[str, Any], name: str, entry: Any, trial: Mapping[str, An
         fate = "screened only: explains less"
     elif trial["reasons"]:
         fate = "; ".join(readable(r, found) for r in trial["reasons"])
+        if parts < set(effects):
+            fate = f"without the model's other effects: {fate}"
     elif kept:
         tied = any(ties for effect, ties in zip(effects, found["tied"], strict=False) if effect in parts)
         fate = "in the model, and others do as well" if tied else "in the model"

@@ -210,14 +210,29 @@ def _added(sizes: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def size_words(a: Mapping[str, Any]) -> str:
     """ "latch 0.72 N m, 0.60 to 0.84 N m": an amplitude or a shape of gap.json with its interval."""
-    bound = " (at its bound)" if at_bound(a) else ""
-    value, high = (quantity(a[k], a["unit"]) for k in ("value", "high"))
-    return f"{label(a['name']).lower()} {value}{bound}, {number(a['low'])} to {high}"
+    bound = f" (at its {side})" if (side := at_bound(a)) else ""
+    low, high = span_of(a)
+    return f"{label(a['name']).lower()} {quantity(a['value'], a['unit'])}{bound}, {number(low)} to " + quantity(
+        high, a["unit"]
+    )
 
 
-def at_bound(a: Mapping[str, Any]) -> bool:
-    """Whether a value lies outside its own interval, whose tails are equal: only one at a bound does."""
-    return a["low"] is not None and a["high"] is not None and not a["low"] <= a["value"] <= a["high"]
+def span_of(a: Mapping[str, Any]) -> tuple[float | None, float | None]:
+    """A size's interval; of an older search, whose intervals could leave out a value at a bound, up to the value."""
+    if a["low"] is None or a["high"] is None or a["value"] is None:
+        return a["low"], a["high"]
+    return min(a["low"], a["value"]), max(a["high"], a["value"])
+
+
+def at_bound(a: Mapping[str, Any]) -> str:
+    """ "lower bound", "upper bound"; empty off them.  An older search does not tell: outside its interval lies a value
+    at a bound alone.
+    """
+    if "bound" in a:
+        return f"{a['bound']} bound" if a["bound"] else ""
+    if a["low"] is None or a["high"] is None or a["low"] <= a["value"] <= a["high"]:
+        return ""
+    return "lower bound" if a["value"] < a["low"] else "upper bound"
 
 
 def _trends(found: Mapping[str, Any]) -> list[str]:
@@ -239,7 +254,7 @@ def _next(gap: Gap) -> str:
     clearly = " clearly enough" if any(t["passed"] for t in gap.found["trials"]) else " its trial"
     steps = {
         "none": f"go on with the base model; a smaller effect would need {gap.parts.more}",
-        "named": f"look for the {named} on the hardware, and simulate with {it}{_file(gap)}",
+        "named": f"look for the {named} on the hardware, and simulate with {it}{_file(gap)}{_doubted(gap)}",
         "tie": f"take no name for the cause yet. {_separate(gap)}",
         "partly explained": _partly(gap, named),
         "unexplained": _unnamed(gap, clearly),
@@ -247,6 +262,10 @@ def _next(gap: Gap) -> str:
         "this page until the fit settles",
     }
     return f"Next: {steps[gap.found['verdict']]}."
+
+
+def _doubted(gap: Gap) -> str:
+    return "; take its numbers with care, for the reason given above" if gap.found.get("doubts") else ""
 
 
 def _unnamed(gap: Gap, clearly: str) -> str:

@@ -53,6 +53,7 @@ from droid_jax.report.gap_words import (
     readable,
     role_words,
     settings,
+    span_of,
     unit_words,
 )
 from droid_jax.report.lead import doubt, lead
@@ -124,12 +125,13 @@ def write_report(run: Path) -> Path:
         "judged": judged,
         "effect": effect_words,
         "unit": unit_words,
+        "at_bound": at_bound,
+        "span": span_of,
         "speak": speaker(loaded) if loaded else str,
         "from_page": lambda path: path.relative_to(folder).as_posix(),
         "nested": _nested,
         "unbroken": lambda text: re.sub(r"(?<=\d) (?=N m|%)", "\u00a0", text).replace("N m", "N\u00a0m"),
     }
-    environment.tests["at_bound"] = at_bound
     parts = (_policy(policy, gap, doubt(loaded, gap, policy)) if policy else {}) | (_search(gap) if gap else {})
     parts |= _identification(loaded, gap is not None) if loaded else {}
     if len([part for part in (loaded, gap, policy) if part]) > 1:

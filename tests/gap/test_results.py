@@ -172,7 +172,7 @@ def test_ties_experiments_and_cuts_come_along(found: Small):
     answer = gap_json(found.case, verdict)
     assert set(answer["about"]) == {"hinge_preload", "drag"}
     assert answer["tied"] == [["drag at door"]] and answer["cut"] == "two candidates were not tried"
-    assert answer["experiments"] == [{"what": "open further", "apart": 7.5}]
+    assert answer["experiments"] == [{"what": "open further", "apart": 7.5, "not_made": ""}]
 
 
 def test_hints_and_the_threshold_that_made_them_are_in_the_file(found: Small):

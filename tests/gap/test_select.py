@@ -13,9 +13,10 @@ from droid_jax.gap import refit as refit_module
 from droid_jax.gap import select
 from droid_jax.gap.candidates import candidates
 from droid_jax.gap.flips import steady
-from droid_jax.gap.refit import deviations, intervals, refit, vanishing
+from droid_jax.gap.refit import deviations, intervals, refit, vanishing, zero_words
 from droid_jax.gap.select import UNCONFIRMED, _gap_reasons, judge, much_more
 from droid_jax.identify.search import NotReplayed
+from droid_jax.identify.uncertainty import told
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +49,7 @@ def test_an_effect_smaller_than_is_worth_a_name_is_weak(found: Small):
 
 
 def test_an_amplitude_at_its_neutral_bound_may_be_zero(found: Small):
-    """Its interval ends at the bound and so never holds zero inside: the deviation is asked."""
+    """What is said of it and its interval are one statement: zero lies in the interval, or it is not zero."""
     model = extended(found, "hinge_preload at door")
     (name,) = model.amplitudes
     at, deviation = found.case.whole.index(name), deviations(found.case.fit, model)[name]
@@ -57,7 +58,33 @@ def test_an_amplitude_at_its_neutral_bound_may_be_zero(found: Small):
     for factor, zero in ((1.0, True), (2.5, False)):
         values = model.values.copy()
         values[at] = factor * deviation
-        assert ("its amplitude may be zero" in tried(found, replace(model, values=values)).reasons) is zero
+        trial = tried(found, replace(model, values=values))
+        low, high = trial.interval[name]
+        assert (low <= 0.0 <= high) is zero and low <= values[at] <= high
+        said = [r for r in trial.reasons if "may be zero" in r]
+        assert said == ([f"its amplitude may be zero (90 % interval {low:.3g} to {high:.3g} N m)"] if zero else [])
+
+
+def test_amplitudes_that_may_all_be_zero_have_intervals_that_say_so(found: Small, monkeypatch: pytest.MonkeyPatch):
+    """1.8 deviations off, one alone is within chance of two and its own interval would leave zero out; both are not."""
+    model = extended(found, "payload at elbow")
+    (part,) = model.parts
+    assert len(part.amplitudes) == 2
+    at, true = [model.space.index(a) for a in part.amplitudes], told(model.refined, found.case.fit.cost.comparisons)
+    cov = true.cov.copy()
+    cov[at], cov[:, at] = 0.0, 0.0
+    cov[at, at] = 1.0
+    monkeypatch.setattr(refit_module, "told", lambda *args: replace(true, cov=cov))
+    space, values = found.case.whole, model.values.copy()
+    for name, off, zero in ((part.amplitudes, 1.8, False), (part.amplitudes[:1], 1.8, True)):
+        values[[space.index(a) for a in part.amplitudes]] = 0.0
+        for a in name:
+            values[space.index(a)] = off * space[a].std
+        moved = replace(model, values=values.copy())
+        assert vanishing(found.case.fit, moved, part) is zero
+        holds = [low <= 0.0 <= high for low, high in intervals(found.case.fit, moved).values()]
+        assert all(holds) is zero
+        assert ("its amplitudes may all be zero (90 % interval" in zero_words(found.case.fit, moved, part)) is zero
 
 
 @pytest.mark.parametrize(("signs", "zero"), [((1.2, 1.2), False), ((1.2, -1.2), True), ((0.0, 2.0), False)])
@@ -82,7 +109,10 @@ def test_an_amplitude_at_its_other_bound_has_run_into_it(found: Small):
     (name,) = model.amplitudes
     values = model.values.copy()
     values[found.case.whole.index(name)] = found.case.whole[name].high
-    assert f"{name} ran into its bound" in tried(found, replace(model, values=values)).reasons
+    p = found.case.whole[name]
+    assert f"{name} ran into its bound: more than {p.high:g} N m" in tried(found, replace(model, values=values)).reasons
+    values[found.case.whole.index(name)] = p.low
+    assert f"{name} ran into its bound: less than {p.low:g} N m" in tried(found, replace(model, values=values)).reasons
 
 
 def test_what_the_repeats_do_not_agree_on_is_not_confirmed(found: Small):

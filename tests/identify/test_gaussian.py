@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import os
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -287,3 +288,22 @@ def test_missing_and_truncated_files_are_named(saved):
         load(path.parent / "nowhere.json")
     with pytest.raises(ValueError, match=r"is a folder; a run keeps its Gaussian in gaussian\.json there"):
         load(path.parent)
+
+
+@pytest.mark.parametrize("mean", [-0.4, 0.0, 0.3, 1.0, 4.0])
+@pytest.mark.parametrize("coordinates", ["search", "physical"])
+def test_an_interval_holds_its_centre_and_enough_of_the_mass_and_ends_at_the_bounds(
+    mean: float, coordinates: Literal["search", "physical"]
+):
+    """One parameter of 0 or more, unit deviation: away from the bound 1.645 to either side, at it one-sided."""
+    space = Space((Parameter("a", "N m", 1.0, 1.0, 0.0, 10.0),))
+    at = np.array([mean]) if coordinates == "physical" else space.to_search(np.array([mean]))
+    gaussian = Gaussian(space, at, np.eye(1), "made up", coordinates)
+    (low,), (high,) = gaussian.interval(0.9)
+    assert 0.0 <= low <= gaussian.centre[0] <= high <= 10.0
+    beyond = stats.truncnorm(-mean, 10.0 - mean, loc=mean)
+    assert 0.9 - 1e-6 <= beyond.cdf(high) - beyond.cdf(low) <= 0.95
+    if mean >= 0.0:
+        assert low == pytest.approx(max(0.0, mean - 1.6449), abs=1e-4) and high == pytest.approx(
+            mean + 1.6449, abs=1e-4
+        )

@@ -449,11 +449,39 @@ def test_names_and_units_are_written_as_they_are_read(tmp_path: Path) -> None:
 
 
 def test_a_value_at_its_bound_is_said_to_lie_there() -> None:
-    """Its interval's tails are equal, so it lies outside: without a word it reads like a fault."""
-    size = {"name": "latch_exponent", "unit": "-", "value": 0.5, "low": 0.503, "high": 0.606}
-    assert gap_words.size_words(size) == "latch exponent 0.500 (at its bound), 0.503 to 0.606"
-    assert gap_words.size_words({**size, "low": 0.5}) == "latch exponent 0.500, 0.500 to 0.606"
-    assert gap_words.size_words({**size, "low": None, "high": None}) == "latch exponent 0.500, – to –"
+    """And its interval holds it, also of an older search, whose intervals had equal tails inside the bounds."""
+    size = {"name": "latch_exponent", "unit": "-", "value": 0.5, "low": 0.5, "high": 0.606, "bound": "lower"}
+    assert gap_words.size_words(size) == "latch exponent 0.500 (at its lower bound), 0.500 to 0.606"
+    assert gap_words.size_words({**size, "bound": ""}) == "latch exponent 0.500, 0.500 to 0.606"
+    old = {k: v for k, v in size.items() if k != "bound"}
+    assert gap_words.size_words({**old, "low": 0.503}) == "latch exponent 0.500 (at its lower bound), 0.500 to 0.606"
+    assert gap_words.size_words(old) == "latch exponent 0.500, 0.500 to 0.606"
+    assert gap_words.size_words({**old, "low": None, "high": None}) == "latch exponent 0.500, – to –"
+
+
+def test_a_form_that_does_not_fit_is_said_with_the_answer(tmp_path: Path, quick: None) -> None:
+    """A width at its bound: in the sentence, in the table with an interval that holds the value, and in what to do."""
+    doubt = "the form of latch at door_hinge does not fit: latch_width at its lower bound, 0.01 rad"
+    sentence = f"The model lacks: {LATCH}. But {doubt}."
+    shapes = [
+        {**gap_json("named", ("fit",))["shapes"][0], "value": 0.01, "low": 0.01, "high": 0.0143, "bound": "lower"}
+    ]
+    text = page.write_report(make_gap(tmp_path, sentence=sentence, doubts=[doubt], shapes=shapes)).read_text()
+    assert "the form of latch at door hinge does not fit: latch width at its lower bound, 0.01 rad" in text
+    assert "at its lower bound</span>" in text and "take its numbers with care" in text
+
+
+def test_what_failed_by_itself_and_is_in_the_model_beside_others_is_no_contradiction(tmp_path: Path) -> None:
+    """Its interval in the final model leaves zero out, and in the model without the others it did not."""
+    found = gap_json("named", ("fit", "confirm")) | {"effects": [LATCH, CLOSER], "tied": [[], []]}
+    alone = {
+        **found["trials"][0],
+        "passed": False,
+        "reasons": ["its amplitude may be zero (90 % interval 0 to 0.9 N m)"],
+    }
+    found["trials"] = [alone]
+    (row,) = (r for g in groups(read_gap(make_gap(tmp_path, **found)).found) for r in g.tried)
+    assert row.fate == "without the model's other effects: its amplitude may be zero (90 % interval 0 to 0.9 N m)"
 
 
 def test_settings_are_those_that_a_person_reads(tmp_path: Path) -> None:
