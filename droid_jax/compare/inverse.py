@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
+from droid_jax.compare.loops import coupled_to_others
 from droid_jax.compare.replay import observed
 from droid_jax.measure.motion import Motion
 from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
@@ -48,6 +49,12 @@ def prescribed(scene: Scene, recording: Recording) -> tuple[str, ...]:
     whole = {j for i, j in enumerate(channel.columns) if channel.mask[:, :, i].any(axis=0).all()}
     others = [j for j in scene.single_joints if j in whole and j not in scene.joints]
     joints = (*scene.joints, *others)
+    if coupled := coupled_to_others(scene, joints):
+        warnings.warn(
+            f"recording {recording.name!r} holds no commands, and a prescribed motion leaves {', '.join(coupled)} of "
+            f"scene {scene.name!r} out, with what it moves: measure the positions of all its joints, or record the commands",
+            stacklevel=3,
+        )
     stated = {j for j in recording.qpos0 if j not in channel.columns}  # of a measured one it is where it began
     still = [j for j in scene.carriers(scene.joints) if j not in joints and j not in stated]
     if still:

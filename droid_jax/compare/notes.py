@@ -7,7 +7,8 @@ import warnings
 
 import numpy as np
 
-from droid_jax.compare.start import sent_to
+from droid_jax.compare.loops import OPEN, open_loops
+from droid_jax.compare.start import sent_to, told_start
 from droid_jax.measure.recording import Channel, Recording
 from droid_jax.model.actuators import has_feedback
 from droid_jax.model.scene import Scene
@@ -21,7 +22,12 @@ TURNS = 4  # from its zero, that a hinge without a range is believed to make; de
 def command_notes(scene: Scene, recording: Recording) -> list[str]:
     """What is to be known of the commands: a <motor> that takes radians for torques, geared servos, actuators that got
     none."""
-    said = (open_loop(scene, recording), geared(scene, recording), left_alone(scene, recording))
+    said = (
+        open_loop(scene, recording),
+        geared(scene, recording),
+        left_alone(scene, recording),
+        closed_loop(scene, recording),
+    )
     return [text for text in said if text]
 
 
@@ -72,6 +78,19 @@ def left_alone(scene: Scene, recording: Recording) -> str:
     }
     told = "; ".join(f"{', '.join(names)} {what}" for what, names in said.items() if names)
     return f"recording {recording.name!r} has not all commands: {told}" if told else ""
+
+
+def closed_loop(scene: Scene, recording: Recording) -> str:
+    """What is to be known where the recording starts with a closed loop open, which other joints then close."""
+    if not recording.command.size or not scene.model.neq:
+        return ""
+    wide = [loop for loop in open_loops(scene, told_start(scene, recording)) if loop.turn > OPEN]
+    if not wide:
+        return ""
+    return (
+        f"recording {recording.name!r} starts where {wide[0].name} would be open by {wide[0].gap:.3g} (m or rad): the "
+        "joints of that loop that nobody commands or measures start where they close it"
+    )
 
 
 def warn_if_moving(recording: Recording) -> None:

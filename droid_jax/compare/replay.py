@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
+from droid_jax.compare.floating import refuse_floating
 from droid_jax.compare.start import check_weight, holding, start_pose, weight_share
 from droid_jax.measure.checks import check_joints
 from droid_jax.measure.clocks import interpolate
@@ -76,7 +77,9 @@ def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True) -> Dri
     clock = start + np.arange(steps) * timestep
     gains = recording.gains
     qpos0 = start_pose(scene, recording)
-    command = np.tile(holding(scene, qpos0), (steps, 1))
+    held = holding(scene, qpos0)
+    refuse_floating(scene, recording, qpos0, held)
+    command = np.tile(held, (steps, 1))
     sent = np.flatnonzero(columns >= 0)
     if sent.size:
         command[:, sent] = interpolate(clock, recording.time, recording.command[:, columns[sent]])

@@ -8,6 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from droid_jax.compare.loops import OPEN, closed, moved_by_loops, open_loops
 from droid_jax.measure.recording import Recording
 from droid_jax.model.actuators import has_feedback
 from droid_jax.model.scene import Scene
@@ -20,18 +21,17 @@ POSES = 50  # of a motion, at which the weight is looked at
 def start_pose(scene: Scene, recording: Recording) -> np.ndarray:
     """[nq] where the motion starts: as stated (qpos0), else as measured, else where its servos were sent first.
 
-    Of joints that nobody commanded or measured one that an equality couples to another starts where that has it, all
-    others stand as in the scene.
-    Raises ValueError for a joint that has or needs a command and of which nothing says where it starts, and for one
-    that the scene does not have.
+    Of joints that nobody commanded or measured one that an equality couples to another starts where that has it, those
+    of a closed loop where they close it, all others stand as in the scene.
+    Raises ValueError for a joint that has or needs a command and of which nothing says where it starts, for one
+    that the scene does not have, and for a loop that no such joint can close.
     """
     for joint in recording.qpos0:
         try:
             scene.qpos(joint)
         except ValueError as error:
             raise ValueError(f"recording {recording.name!r}, qpos0: {error}") from None
-    sent = {joint: path[0] for joint, path in sent_to(scene, recording).items()}
-    told = {**sent, **_measured(scene, recording), **recording.qpos0}
+    told = _told(scene, recording)
     asked = {*scene.needs_command, *recording.command_names}
     guessed = [j for j in scene.driven_joints if j in asked and j not in told]
     if guessed:
@@ -39,7 +39,25 @@ def start_pose(scene: Scene, recording: Recording) -> np.ndarray:
             f"recording {recording.name!r} does not tell where {', '.join(guessed)} starts: state it in qpos0 "
             "or measure its position"
         )
-    return _coupled(scene, told)
+    qpos = closed(scene, _coupled(scene, told), [scene.qpos(joint) for joint in told])
+    if wide := [loop for loop in open_loops(scene, qpos) if loop.turn > OPEN]:
+        raise ValueError(
+            f"recording {recording.name!r} starts where {wide[0].name} of scene {scene.name!r} is open by "
+            f"{wide[0].gap:.3g} (m or rad), and no joint that nobody commands, measures or states can close it: state "
+            "a start that closes it (qpos0), or mend the lengths or the equality in the MJCF"
+        )
+    return qpos
+
+
+def told_start(scene: Scene, recording: Recording) -> np.ndarray:
+    """[nq] where the motion starts, before the joints of closed loops are moved to close them."""
+    return _coupled(scene, _told(scene, recording))
+
+
+def _told(scene: Scene, recording: Recording) -> dict[str, float]:
+    """Joint -> where it starts, rad or m, of those of which the recording says it."""
+    sent = {joint: path[0] for joint, path in sent_to(scene, recording).items()}
+    return {**sent, **_measured(scene, recording), **recording.qpos0}
 
 
 def _coupled(scene: Scene, told: Mapping[str, float]) -> np.ndarray:
@@ -70,7 +88,7 @@ def following(scene: Scene, qpos: np.ndarray) -> set[int]:
         there = np.polyval(c[::-1], qpos[second] - model.qpos0[second])
         if np.isclose(qpos[first] - model.qpos0[first], there, atol=1e-9):
             found |= {first if first not in own else second} - own
-    return found
+    return found | (moved_by_loops(scene, qpos) - own)
 
 
 def _couplings(model: mujoco.MjModel) -> list[tuple[int, int, np.ndarray]]:

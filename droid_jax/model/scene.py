@@ -110,11 +110,15 @@ class Scene:
 
         One without a name goes by its body's.
         """
-        return tuple(self._called(j) for j in self._above(joints) if self._is_single(j))
+        return tuple(self.joint_called(j) for j in self._above(joints) if self._is_single(j))
 
     def floating(self, joints: Iterable[str]) -> tuple[str, ...]:
         """Joints of several degrees (free ones, balls) between the world and the bodies that these joints move."""
-        return tuple(self._called(j) for j in self._above(joints) if not self._is_single(j))
+        return tuple(self.joint_called(j) for j in self.floating_ids(joints))
+
+    def floating_ids(self, joints: Iterable[str]) -> tuple[int, ...]:
+        """Ids of the joints that `floating` names."""
+        return tuple(j for j in self._above(joints) if not self._is_single(j))
 
     def _above(self, joints: Iterable[str]) -> list[int]:
         model, above = self.model, set[int]()
@@ -128,7 +132,8 @@ class Scene:
     def _is_single(self, joint: int) -> bool:
         return mujoco.mjtJoint(self.model.jnt_type[joint]) in ONE_DEGREE
 
-    def _called(self, joint: int) -> str:
+    def joint_called(self, joint: int) -> str:
+        """A joint's name by its id; one without a name goes by its body's."""
         name = mujoco.mj_id2name(self.model, mujoco.mjtObj.mjOBJ_JOINT, joint)
         return name or f"the joint of body {self.model.body(self.model.jnt_bodyid[joint]).name!r}"
 
