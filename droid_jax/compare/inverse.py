@@ -52,7 +52,8 @@ def prescribed(scene: Scene, recording: Recording) -> tuple[str, ...]:
     if coupled := coupled_to_others(scene, joints):
         warnings.warn(
             f"recording {recording.name!r} holds no commands, and a prescribed motion leaves {', '.join(coupled)} of "
-            f"scene {scene.name!r} out, with what it moves: measure the positions of all its joints, or record the commands",
+            f"scene {scene.name!r} out, with what it moves: measure the positions of all its joints, or record the "
+            "commands",
             stacklevel=3,
         )
     stated = {j for j in recording.qpos0 if j not in channel.columns}  # of a measured one it is where it began

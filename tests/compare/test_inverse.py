@@ -209,7 +209,7 @@ def test_effects_that_a_prescribed_motion_cannot_have_are_refused(part: str):
 
 def test_air_and_water_are_refused():
     xml = PLANAR.format(gravcomp="", spring="", more='<option density="1000" integrator="Euler"/>')
-    scene = compile_scene(mujoco.MjSpec.from_string(xml), "pool")
+    scene = compile_scene(mujoco.MjSpec.from_string(xml), "pool", engine="mujoco")
     with pytest.raises(ValueError, match="a replay of scene 'pool' has no air or water"):
         inverse_replay(scene, motion(scene, MOTOR, False))
 
