@@ -7,6 +7,8 @@ import warnings
 
 import numpy as np
 
+from droid_jax.compare.creep import creep_note
+from droid_jax.compare.limits import clipped_commands, exceeded_torques
 from droid_jax.compare.loops import OPEN, open_loops
 from droid_jax.compare.start import sent_to, told_start
 from droid_jax.measure.recording import Channel, Recording
@@ -21,12 +23,16 @@ TURNS = 4  # from its zero, that a hinge without a range is believed to make; de
 
 def command_notes(scene: Scene, recording: Recording) -> list[str]:
     """What is to be known of the commands: a <motor> that takes radians for torques, geared servos, actuators that got
-    none."""
+    none, loops that are closed first, commands and torques beyond limits, joints that creep while friction holds them.
+    """
     said = (
         open_loop(scene, recording),
         geared(scene, recording),
         left_alone(scene, recording),
         closed_loop(scene, recording),
+        clipped_commands(scene, recording),
+        exceeded_torques(scene, recording),
+        creep_note(scene, recording),
     )
     return [text for text in said if text]
 

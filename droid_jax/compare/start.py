@@ -163,6 +163,12 @@ def _poses(scene: Scene, recording: Recording, qpos0: np.ndarray) -> np.ndarray:
     return poses
 
 
+def sent_columns(scene: Scene, recording: Recording) -> dict[int, int]:
+    """Actuator -> column of the recording's command that it gets, of those that get one."""
+    columns = scene.command_index(recording.command_names)
+    return {int(u): int(columns[u]) for u in np.flatnonzero(columns >= 0)}
+
+
 def sent_to(scene: Scene, recording: Recording) -> dict[str, np.ndarray]:
     """Joint -> the positions [T] its servo is sent to, rad or m; what drives no position (a motor) is left out."""
     model = scene.model
