@@ -273,6 +273,7 @@ def _recordings(
 
 def _summary(found: Identified, fit: Mapping[str, Any], repeats: Sequence[int]) -> None:
     """A few lines that say how it went; fit: of fit.json; repeats: of each recording."""
+    from droid_jax.report.told import moved_words, unsure_words, went_far
     from droid_jax.report.words import DOUBT, asked_of, far_off, judged, lacks_something, needed, noiseless, percent
 
     for name, gap in found.gaps.items():
@@ -282,9 +283,12 @@ def _summary(found: Identified, fit: Mapping[str, Any], repeats: Sequence[int]) 
             way = f"a perfect model: {gap.floor:.3f}; {closed}"
         on = judged(fit["gap"][name])
         print(f"{name}: torque distance {gap.before:.3f} -> {gap.after:.3f} {fit['torque_unit']} {on} ({way})")
-    silent = [t.name for t in found.tells if not t.identifiable and not found.full[t.name].nuisance]
+    silent = [p for p in fit["parameters"] if not p["identifiable"] and not p["nuisance"]]
     if silent and found.refined is not None:
-        print(f"this demonstration tells little about: {', '.join(silent)}")
+        if still := [p["name"] for p in silent if not went_far(p)]:
+            print(f"this demonstration tells little about: {', '.join(still)}")
+        for p in filter(went_far, silent):
+            print(f"{p['name']} {moved_words(p)}, but its value is not sure: {unsure_words(p)}")
     if found.refined is not None and not found.refined.converged:
         print("the refinement did not converge: take values and intervals with care")
     print(f"search stopped: {found.search.stop}; {sum(found.seconds.values()):.0f} s")

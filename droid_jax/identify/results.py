@@ -7,6 +7,7 @@ correlation.npz, fitted.xml; docs/results-folder.md lists them, `report` turns t
 from __future__ import annotations
 
 import json
+import math
 import tempfile
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
@@ -32,7 +33,7 @@ from droid_jax.identify.gaussian import prior
 from droid_jax.identify.pipeline import Identified
 from droid_jax.model.mjcf import fitted_mjcf, unwritten
 from droid_jax.model.parameters import Space
-from droid_jax.storage import write_csv, write_json, write_npz, write_text
+from droid_jax.storage import finite, write_csv, write_json, write_npz, write_text
 
 
 def prepare_folder(folder: Path) -> Path:
@@ -91,6 +92,7 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
     initial = np.stack(prior(found.full).interval(0.9), axis=1)
     mean, std = found.full_gaussian.physical_mean, found.full_gaussian.physical_std
     bound = on_bound(found.full, found.best)
+    x, initial_x = (found.full.to_search(v).tolist() for v in (found.best, found.full.mean))
     parameters = []
     for i, p in enumerate(found.full.parameters):
         tells = found.tells[i]
@@ -111,6 +113,7 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
                 "interval": [float(low[i]), float(high[i])],
                 "identifiable": tells.identifiable,
                 "reason": tells.reason,
+                "moved": finite(x[i] - initial_x[i] if math.isnan(tells.moved) else tells.moved),
                 "truth": truth.get(p.name),
                 "on_bound": p.name in bound,
                 "partners": [{"name": n, "correlation": c} for n, c in tells.partners],

@@ -18,6 +18,7 @@ handed on holds the data's information as it was widened, and the stated prior a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -35,13 +36,17 @@ PARTNER = 0.7  # absolute correlation from which two parameters are called partn
 
 @dataclass(frozen=True)
 class Identifiability:
-    """What the data tell about one parameter: identifiable or not, why, and who it trades with."""
+    """What the data tell about one parameter: identifiable or not, why, and who it trades with.
+
+    moved: deviations of its stated prior by which the fit moved it, search units; NaN where that was not judged.
+    """
 
     name: str
     identifiable: bool
     shrinkage: float
     partners: tuple[tuple[str, float], ...]
     reason: str
+    moved: float = math.nan
 
 
 def posterior(refined: Refined, comparisons: Sequence[Comparison]) -> Gaussian:
@@ -159,13 +164,14 @@ def identifiability(gaussian: Gaussian, prior: np.ndarray) -> tuple[Identifiabil
     deviation = np.sqrt(np.diag(gaussian.cov))
     correlation = gaussian.cov / np.outer(deviation, deviation)
     space = gaussian.space
+    away = gaussian.mean if gaussian.coordinates == "search" else space.to_search(gaussian.mean)
     out = []
     for i, name in enumerate(space.names):
         shrinkage = float(deviation[i] / min(prior[i], STATED))
         others = [(space.names[j], float(correlation[i, j])) for j in np.argsort(-np.abs(correlation[i])) if j != i]
         partners = tuple((n, c) for n, c in others if abs(c) > PARTNER)[:3]
         known = shrinkage < IDENTIFIABLE
-        out.append(Identifiability(name, known, shrinkage, partners, _reason(known, shrinkage)))
+        out.append(Identifiability(name, known, shrinkage, partners, _reason(known, shrinkage), float(away[i])))
     return tuple(out)
 
 

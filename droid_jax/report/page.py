@@ -62,6 +62,7 @@ from droid_jax.report.policy_folder import Trained, has_policy, read_policy
 from droid_jax.report.policy_words import policy_summary
 from droid_jax.report.run_folder import Run, has_run, read_run
 from droid_jax.report.stages import left_over, needs_whole
+from droid_jax.report.told import moved_words, went_far
 from droid_jax.report.words import (
     counted,
     grouped,
@@ -125,6 +126,7 @@ def write_report(run: Path) -> Path:
         "judged": judged,
         "effect": effect_words,
         "unit": unit_words,
+        "moved": moved_words,
         "at_bound": at_bound,
         "span": span_of,
         "speak": speaker(loaded) if loaded else str,
@@ -132,6 +134,7 @@ def write_report(run: Path) -> Path:
         "nested": _nested,
         "unbroken": lambda text: re.sub(r"(?<=\d) (?=N m|%)", "\u00a0", text).replace("N m", "N\u00a0m"),
     }
+    environment.tests["went_far"] = went_far
     parts = (_policy(policy, gap, doubt(loaded, gap, policy)) if policy else {}) | (_search(gap) if gap else {})
     parts |= _identification(loaded, gap is not None) if loaded else {}
     if len([part for part in (loaded, gap, policy) if part]) > 1:

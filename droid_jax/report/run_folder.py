@@ -20,6 +20,7 @@ _PARAMETER = {
     **dict.fromkeys(("nuisance", "identifiable", "on_bound"), bool),
     **dict.fromkeys(("initial_mean", "initial_std", "low", "high", "best", "mean", "std"), _NUMBER),
     **{"interval": tuple[float, float], "truth": _MAYBE, "partners": [{"name": str, "correlation": _NUMBER}]},
+    "moved": Maybe(_MAYBE),
 }
 _GAP = {
     **{"before": _NUMBER, "after": _NUMBER, "per_joint_before": [_NUMBER], "per_joint_after": [_NUMBER]},

@@ -106,7 +106,7 @@ def judged(gap: Mapping[str, Any]) -> str:
 
 def summary(run: Run, searched: bool = False) -> list[str]:
     """The sentences at the top of the page, from the numbers alone; searched: the page has a search of the gap too."""
-    sentences = [_what(run), *(_gap(run, name) for name in run.fit["gap"]), *_settled(run), _told(run), *_truth(run)]
+    sentences = [_what(run), *(_gap(run, name) for name in run.fit["gap"]), *_settled(run), *_told(run), *_truth(run)]
     bound = [_bound(p) for p in run.fit["parameters"] if p["on_bound"]]
     if bound:
         sentences.append(f"On a bound of its range: {listed(bound)}.")
@@ -152,14 +152,12 @@ def _settled(run: Run) -> list[str]:
     return ["The refinement did not converge: take values and intervals with care, and fit again with a longer preset."]
 
 
-def _told(run: Run) -> str:
+def _told(run: Run) -> list[str]:
+    from droid_jax.report.told import told_words  # only here: it takes its words from this module
+
     if unjudged(run.fit):
-        return "Which of them the demonstration tells was not judged: this preset ends with the search."
-    untold = [label(p["name"]).lower() for p in run.parameters if not p["identifiable"]]
-    if not untold:
-        return "Every parameter of interest can be told from this demonstration."
-    rows = "its row" if len(untold) == 1 else "their rows"
-    return f"This demonstration does not tell {listed(untold)}; take no number from {rows}."
+        return ["Which of them the demonstration tells was not judged: this preset ends with the search."]
+    return told_words(run.parameters)
 
 
 def _truth(run: Run) -> list[str]:
@@ -174,14 +172,20 @@ def _truth(run: Run) -> list[str]:
 
 
 def _bound(p: Mapping[str, Any]) -> str:
-    return f"{label(p['name']).lower()} ({which_bound(p)})"
+    """ "hinge friction loss (lower bound 0 N m)", "servo scale (more than 1.50, its upper bound)"."""
+    low = abs(p["best"] - p["low"]) <= abs(p["best"] - p["high"])
+    if low and p["low"] == 0.0:  # there is nothing below
+        return f"{label(p['name']).lower()} ({which_bound(p)})"
+    end = f"{number(p['low' if low else 'high'])} {p['unit']}".removesuffix(" -").strip()
+    than, side = ("less", "lower") if low else ("more", "upper")
+    return f"{label(p['name']).lower()} ({than} than {end}, its {side} bound)"
 
 
 def which_bound(p: Mapping[str, Any]) -> str:
     """ "lower bound 0 N m", for a parameter that sits on one."""
     low = abs(p["best"] - p["low"]) <= abs(p["best"] - p["high"])
     value = number(p["low"] if low else p["high"])
-    return f"{'lower' if low else 'upper'} bound {value} {p['unit']}".strip()
+    return f"{'lower' if low else 'upper'} bound {value} {p['unit']}".removesuffix(" -").strip()
 
 
 def unjudged(fit: Mapping[str, Any]) -> bool:

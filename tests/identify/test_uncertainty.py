@@ -325,6 +325,13 @@ def test_reasons_say_how_much_of_the_prior_is_left_and_partners_who_trades():
     ]
 
 
+def test_how_far_the_fit_moved_each_is_in_deviations_of_its_stated_prior():
+    space = space_of(2)
+    for coordinates, mean in (("search", np.array([5.0, -0.5])), ("physical", space.from_search([5.0, -0.5]))):
+        gaussian = Gaussian(space, mean, 0.09 * np.eye(2), "test", coordinates)
+        assert [v.moved for v in identifiability(gaussian, np.full(2, 4.0))] == pytest.approx([5.0, -0.5])
+
+
 def test_what_the_data_do_not_see_keeps_its_prior_and_is_not_identifiable():
     """From jacobian to verdict: p1 moves the residuals a thousand times less than its prior is wide."""
     fit = fitted(SQUARE * [1.0, 1e-5])
