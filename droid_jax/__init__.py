@@ -13,11 +13,12 @@ docs/own-robot.md shows the names at work.
 from __future__ import annotations
 
 import importlib
-import inspect
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    import inspect
+
     from droid_jax.compare.cost import make_cost as make_cost
     from droid_jax.gap.case import GapConfig as GapConfig
     from droid_jax.gap.extended import load_extended as load_extended
@@ -116,7 +117,7 @@ def __dir__() -> list[str]:
 
 def _load(module: str, name: str) -> Any:
     """A name out of a module of this package."""
-    from droid_jax.runtime import quiet
+    from droid_jax.quiet import quiet
 
     with quiet():
         return getattr(importlib.import_module(f"{__name__}.{module}"), name)
@@ -136,6 +137,8 @@ class _Room(ModuleType):
     @property
     def __signature__(self) -> inspect.Signature:
         """The function's own, for help() and editors."""
+        import inspect  # only here: it takes half the time that importing the package does
+
         return inspect.signature(_load("identify.pipeline", "identify"))
 
 

@@ -11,6 +11,7 @@ TO_BE_MADE, NOT_MADE = "to be made", "not made"
 EXTENDED, EXTENDED_MJCF = "extended.json", "extended.xml"
 POLICY, TRAINING, TRANSFER, FILMS = "policy.npz", "training.json", "transfer.json", "films"
 STAND_IN = "stand_in.json"  # beside the stand-in's recordings: its springs, seed and hidden effects
+STAND_IN_SOURCE = "stand-in robot (plain C MuJoCo), not a real one"  # in the metadata of what it recorded
 # Folders in one of `all`, and what is written last in each: its presence says that the run is whole.
 LAST_FILES = {"identify": CONFIG, "gap": GAP, "train": TRAINING}
 # What else is in them that would be taken for the next run's.
@@ -19,3 +20,14 @@ RESULTS = {
     "gap": (GAP_TRACES, EXTENDED, EXTENDED_MJCF),
     "train": (POLICY, TRANSFER, EXTENDED, FILMS, "export"),
 }
+# Held while a run writes to the folder; not there otherwise.
+LOCK = ".droid_jax.lock"
+# Every name that a stage writes in its folder, or removes there before it begins.
+WRITTEN = {
+    stage: (SETUP, last, *RESULTS[stage], "report.html", "figures", "checkpoints", "tensorboard")
+    for stage, last in LAST_FILES.items()
+}
+WRITTEN["identify"] += ("gaussian_full.json", SAMPLES, TRACES, CORRELATION, DISTRIBUTION, HISTORY, HISTORY_TABLE)
+WRITTEN["identify"] += (FITTED, REPLAY, FILMS, "frames")
+WRITTEN["train"] += (GAUSSIAN,)
+WRITTEN["all"] = ("all.json", "report.html")

@@ -6,10 +6,20 @@ and so that --help is quick.
 
 from __future__ import annotations
 
-import contextlib
-import importlib.metadata
 import os
+import signal
 import sys
+
+if __name__ == "__main__":  # before what is imported below, which takes a while: a stop meanwhile is no traceback
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, lambda *_: (os.write(2, b"interrupted\n"), os._exit(130)))
+    from droid_jax.console import program
+
+    sys.exit(program())
+
+import contextlib
+import errno
+import importlib.metadata
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -17,6 +27,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from droid_jax import console
 from droid_jax.commands import convert, evaluate, export, gap, identify, record, report, train, view, whole
 from droid_jax.commands.folder import BEGUN
 
@@ -48,6 +59,8 @@ _ACTIONS: dict[type, Callable[[Any], None]] = {
 
 SCRIPT = "droid-jax"  # as pyproject.toml installs it
 WHOLE = ("-h", "--help", "--tyro-")  # options of the program itself: help, shell completion
+# Errors of the machine, not of what it was given: no room, a quota, a file larger than allowed, a broken disk.
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 RESUMED = (whole.All, identify.Identify, gap.Gap, train.Train)  # commands that go on where they were stopped
 WHAT = """From recordings of a robot to a fitted simulation, to what that simulation lacks, and to a policy.
 
@@ -55,34 +68,69 @@ Without a command: `all`, on a stand-in robot.  --version says which version thi
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; bad input ends with one line on stderr and exit code 2."""
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
-    if arguments == ["--version"]:
-        print(f"droid_jax {importlib.metadata.version('droid_jax')}")
-        return 0
-    if not arguments or (arguments[0].startswith("-") and not arguments[0].startswith(WHOLE)):
-        arguments = ["all", *arguments]
-    if _names_nothing(arguments, "--recording"):
-        print("error: --recording names no file; was it an empty shell variable?", file=sys.stderr)
+    """Run a command; what goes wrong ends with one line on stderr and the exit code of `console`."""
+    BEGUN.clear()
+    given = _given(list(sys.argv[1:] if arguments is None else arguments))
+    command: Any = None
+    with console.last_words(lambda: _going_on(command)):
+        try:
+            if given == ["--version"]:
+                print(f"droid_jax {importlib.metadata.version('droid_jax')}")
+                return 0
+            if _names_nothing(given, "--recording"):
+                raise ValueError("--recording names no file; was it an empty shell variable?")
+            script = Path(sys.argv[0]).name
+            prog = script if script == SCRIPT else "python -m droid_jax.run"
+            command = tyro.cli(Command, default=whole.All(), args=given, prog=prog, description=WHAT)
+            with _plain_warnings():
+                _check_seeds(command)
+                _ACTIONS[type(command)](command)
+            return 0
+        except SystemExit:  # --help, and options that do not exist
+            raise
+        except BaseException as error:
+            if (code := _ended(error, command)) is None:
+                raise
+            return code
+
+
+def _given(arguments: list[str]) -> list[str]:
+    """The arguments, the command `all` named where none is."""
+    if arguments == ["--version"] or (arguments and not arguments[0].startswith("-")):
+        return arguments
+    return arguments if arguments and arguments[0].startswith(WHOLE) else ["all", *arguments]
+
+
+def _ended(error: BaseException, command: Any) -> int | None:
+    """The exit code for what ended a command, once it is said; None for an error of the program itself."""
+    if isinstance(error, KeyboardInterrupt):  # where main is called by another program: `console` lets none through
+        print(console.words(signal.SIGINT), file=sys.stderr)
+        return 128 + signal.SIGINT
+    if isinstance(error, BrokenPipeError) and console.nobody_reads():
+        console.drop_output()
+        if command is None:  # --help | head: nobody reads on, which is no error
+            return 0
+        if how := _going_on(command):  # others stop without a word, as in a shell
+            print(f"stopped: nobody reads the output any more{how}", file=sys.stderr)
+        return console.CLOSED
+    if isinstance(error, OSError) and error.errno in FULL:
+        place = f"{error.filename}: " if error.filename else "what was to be written: "
+        print(f"error: {place}{(error.strerror or str(error)).lower()}{_going_on(command)}", file=sys.stderr)
+        return 1
+    if isinstance(error, MemoryError):
+        print(f"error: out of memory{_going_on(command)}", file=sys.stderr)
+        return 1
+    if isinstance(error, (ValueError, OSError)):
+        print(f"error: {_one_sentence(error)}", file=sys.stderr)
         return 2
-    script = Path(sys.argv[0]).name
-    prog = script if script == SCRIPT else "python -m droid_jax.run"
-    try:
-        command = tyro.cli(Command, default=whole.All(), args=arguments, prog=prog, description=WHAT)
-    except BrokenPipeError:  # --help | head: nobody reads on, which is no error
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is flushed at the end
-        return 0
-    try:
-        with _plain_warnings():
-            _check_seeds(command)
-            _ACTIONS[type(command)](command)
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print(f"interrupted{_going_on(command)}", file=sys.stderr)
-        return 130
-    return 0
+    return None
+
+
+def _one_sentence(error: Exception) -> str:
+    """An error's text; of the file system's, the file first and without its number."""
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        return f"{error.filename}: {error.strerror[:1].lower()}{error.strerror[1:]}"
+    return str(error)
 
 
 def _check_seeds(command: Any) -> None:
@@ -121,7 +169,3 @@ def _going_on(command: Any) -> str:
         return ""
     how = "the same command without --again" if command.again and BEGUN else "the same command"
     return f"; {how} goes on from here"
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -13,20 +13,19 @@ from __future__ import annotations
 import contextlib
 import functools
 import hashlib
-import importlib
 import importlib.metadata
-import io
+import math
 import os
 import platform
 import subprocess
 import sys
 import warnings
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from droid_jax.quiet import before_jax, import_mjx, quiet_cache
+from droid_jax.quiet import quiet as quiet
 from droid_jax.storage import write_json
 
 if TYPE_CHECKING:
@@ -37,10 +36,6 @@ CACHE_VARIABLE = "DROID_JAX_CACHE"
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "evosax", "brax", "numpy", "scipy")
 _EMITTERS_OFF = f"--{EMITTERS}=false"
 _DEVICE_COUNT = "--xla_force_host_platform_device_count="
-_NO_WARP = (
-    "Failed to import warp: No module named 'warp'",
-    "Failed to import mujoco_warp: No module named 'warp'",
-)
 
 
 @dataclass(frozen=True)
@@ -72,11 +67,10 @@ def tune(devices: int | None = None, cache_dir: str | Path | None = None) -> Run
     if devices is not None and devices < 1:
         raise ValueError(f"devices: expected at least 1 virtual CPU device, got {devices}")
     root = _cache_root(cache_dir)
-    if "jax" not in sys.modules:
-        # Loading a cached CPU program prints an error of several kB about two tuning preferences
-        # that no host can report (openxla/xla#44565); jax reads this variable when it is imported.
-        os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    before_jax()
     import jax
+
+    quiet_cache()
 
     count = devices or _configured_devices() or cores()
     flags = _with_emitters_off(os.environ.get("XLA_FLAGS", ""), root)
@@ -139,31 +133,45 @@ def device() -> str:
 
 
 def cores() -> int:
-    """Cores this process may run on."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    """Cores this process may keep busy: those it may run on, or fewer where a CPU quota of its cgroup allows fewer."""
+    allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    quota = cpu_quota()
+    return allowed if quota is None else max(1, min(allowed, math.ceil(quota)))
 
 
-@contextlib.contextmanager
-def quiet() -> Iterator[None]:
-    """Leave out the two lines that the first import of mujoco.mjx prints where warp is not installed.
+def cpu_quota(proc: Path = Path("/proc/self"), mounted: Path = Path("/sys/fs/cgroup")) -> float | None:
+    """Cores' worth of time that the control groups of this process grant; None for no limit, or no cgroups.
 
-    Everything else printed inside the block appears when the block ends.
+    Args:
+        proc: folder with the process's file `cgroup`.
+        mounted: where version 2, or the controllers of version 1, are mounted.
     """
-    printed = io.StringIO()
     try:
-        with contextlib.redirect_stdout(printed):
-            yield
-    finally:
-        lines = printed.getvalue().splitlines(keepends=True)
-        sys.stdout.write("".join(line for line in lines if line.rstrip() not in _NO_WARP))
+        lines = [line.split(":", 2) for line in (proc / "cgroup").read_text().splitlines()]
+    except OSError:
+        return None
+    granted = []
+    for _, controllers, path in (line for line in lines if len(line) == 3):
+        if controllers and "cpu" not in controllers.split(","):
+            continue
+        root = mounted / controllers if controllers else mounted
+        inside = root / path.lstrip("/")
+        # A limit of a group above counts too; in a container the path may be the host's, and the root its own group.
+        for group in (inside, *inside.parents):
+            if group.is_relative_to(root):
+                granted += _granted(group)
+    return min(granted, default=None)
 
 
-def import_mjx() -> ModuleType:
-    """mujoco.mjx, imported without its two lines about warp."""
-    with quiet():
-        return importlib.import_module("mujoco.mjx")
+def _granted(group: Path) -> list[float]:
+    """Cores' worth of time that one control group grants, of version 2 or 1; empty for no limit."""
+    with contextlib.suppress(OSError, ValueError):
+        quota, period = (group / "cpu.max").read_text().split()
+        return [] if quota == "max" else [int(quota) / int(period)]
+    with contextlib.suppress(OSError, ValueError, ZeroDivisionError):
+        quota, period = ((group / f"cpu.cfs_{name}_us").read_text() for name in ("quota", "period"))
+        return [int(quota) / int(period)] if int(quota) > 0 else []
+    return []
 
 
 @functools.cache
@@ -226,7 +234,8 @@ def _flag_known(root: Path | None) -> bool:
         warnings.warn(f"could not find out whether jaxlib {version} knows {_EMITTERS_OFF}", stacklevel=4)
         return False
     if answers:
-        write_json(answers, known)
+        with contextlib.suppress(OSError):  # a full disk: asked again the next time
+            write_json(answers, known)
     return known
 
 
@@ -263,16 +272,20 @@ def _option_known() -> bool:
 def _cache_root(cache_dir: str | Path | None) -> Path | None:
     """The cache folder, made if needed; None where the default one cannot be made."""
     chosen = cache_dir or os.environ.get(CACHE_VARIABLE)
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
-    root = Path(chosen).expanduser().resolve() if chosen else home / "droid_jax"
     try:
+        home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
+        root = Path(chosen).expanduser().resolve() if chosen else home / "droid_jax"
         root.mkdir(parents=True, exist_ok=True)
         if not os.access(root, os.W_OK):
             raise PermissionError(f"the cache folder {root} is not writable")
-    except OSError as error:
+    except (OSError, RuntimeError) as error:  # RuntimeError: nobody knows this user's home
         if chosen:
-            raise
-        warnings.warn(f"working without a compilation cache: {error}", stacklevel=3)
+            raise OSError(f"the cache folder {chosen} cannot be written: {error}") from None
+        warnings.warn(
+            f"working without a compilation cache, every start compiles anew: {error}; set {CACHE_VARIABLE} to a "
+            "folder that can be written",
+            stacklevel=3,
+        )
         return None
     return root
 

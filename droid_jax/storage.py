@@ -4,7 +4,11 @@ What is written stands beside its final name first and is then moved there: a re
 content or the new one, and a run that is killed or finds the disk full leaves the old one behind.
 Folders alone have an instant between the two: a run killed then leaves old and new beside the name,
 in a folder that begins with a dot and it.
-Folders that are missing are made.  OSError where a place cannot be written.
+Folders that are missing are made.  OSError, with the file's name, where a place cannot be written.
+
+Only plain files and folders are replaced: a device, a pipe, a socket, a symbolic link, or a folder where a file is to
+be, is a ValueError.  Whoever writes to a name that somebody gave also says which content is this program's own
+(`refuse_foreign`, `write_own`).
 """
 
 from __future__ import annotations
@@ -20,23 +24,115 @@ import secrets
 import shutil
 import stat
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
+
+from droid_jax.console import at_the_end
+
+WRITTEN = ".written.json"  # in a folder of `write_own`: SHA-256 of what was written there, by name
+_KINDS = (
+    (stat.S_ISLNK, "a symbolic link"),
+    (stat.S_ISDIR, "a folder"),
+    (stat.S_ISREG, "a file"),
+    (stat.S_ISFIFO, "a pipe"),
+    (stat.S_ISSOCK, "a socket"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+)
+
+
+def kind_of(path: Path) -> str:
+    """ "a file", "a folder", "a device" ...: what stands at a path, links not followed; empty where nothing does."""
+    try:
+        mode = os.lstat(path).st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        return ""
+    return next((name for test, name in _KINDS if test(mode)), "a special file")
+
+
+def refuse_foreign(path: Path, wanted: str, own: Callable[[Path], bool], what: str) -> None:
+    """ValueError where something stands at a path that is not this program's to replace.
+
+    Args:
+        path: where something is to be written.
+        wanted: "a file" or "a folder".
+        own: whether the file or folder there is one that this program wrote.
+        what: what this program would write there, "a recording".
+    """
+    refuse_special(path, wanted)
+    if kind_of(path) and not own(path):
+        raise ValueError(f"{path} exists and is not {what}: it is not replaced; give another path, or move it away")
+
+
+def refuse_special(path: Path, wanted: str) -> None:
+    """ValueError where anything but "a file" or "a folder", whichever is wanted, stands at a path."""
+    if (kind := kind_of(path)) and kind != wanted:
+        raise ValueError(f"{path} is {kind}, where {wanted} is to be written: it is not replaced; give another path")
+
+
+@contextlib.contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Errors of the file system name this path: those of a full disk name no file, others the temporary one."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(error.errno, error.strerror or str(error), str(path)) from None
 
 
 def write_bytes(path: Path, content: bytes) -> None:
     """A file of these bytes; an existing one is replaced, and who may read it stays as it was."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    refuse_special(path, "a file")
+    temporary = path.with_name(f".{path.name[:100]}.{secrets.token_hex(4)}")
+    with _named(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with temporary.open("xb") as file:  # not mkstemp: that keeps others out, whatever the umask says
+                file.write(content)
+            with contextlib.suppress(FileNotFoundError):
+                temporary.chmod(stat.S_IMODE(path.stat().st_mode))
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+def write_own(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Files of these contents in a folder that others may keep files in too.
+
+    Args:
+        folder: made where it is missing.
+        files: content by name.
+
+    Raises:
+        ValueError: a file of one of the names is not one that an earlier call wrote, or was changed since.
+    """
+    refuse_special(folder, "a folder")
+    known = _written(folder)
+    for name, content in files.items():
+        refuse_special(folder / name, "a file")
+        if (folder / name).exists() and file_sha256(folder / name) not in {*known.get(name, ()), _sha256(content)}:
+            raise ValueError(
+                f"{folder / name} was not written by this program, or was changed since: it is not replaced; give "
+                "another folder (--out), or move it away"
+            )
+    # First, with what was written before: after a stop on the way old and new files are known as this program's.
+    now = {name: sorted({*known.get(name, ()), _sha256(content)}) for name, content in files.items()}
+    write_json(folder / WRITTEN, {**known, **now})
+    for name, content in files.items():
+        write_bytes(folder / name, content)
+
+
+def _written(folder: Path) -> dict[str, list[str]]:
+    """SHA-256 of all that `write_own` ever wrote, by name; empty where that is not known."""
     try:
-        with temporary.open("xb") as file:  # not mkstemp: that keeps others out, whatever the umask says
-            file.write(content)
-        if path.exists():
-            temporary.chmod(stat.S_IMODE(path.stat().st_mode))
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+        known = json.loads((folder / WRITTEN).read_text())
+        return {name: [str(sha) for sha in shas] for name, shas in known.items()}
+    except (OSError, ValueError, TypeError, AttributeError, RecursionError):
+        return {}
+
+
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
 
 
 def write_text(path: Path, text: str) -> None:
@@ -83,11 +179,16 @@ def finite(number: float) -> float | None:
 
 def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
     """A compressed npz file of these arrays by name; ValueError for objects, which would be pickled."""
+    write_bytes(path, npz_bytes(arrays))
+
+
+def npz_bytes(arrays: Mapping[str, Any]) -> bytes:
+    """What `write_npz` writes: the same bytes for the same arrays."""
     import numpy as np  # only here: droid_jax.runtime imports this module, and `--help` waits for that
 
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **arrays)
-    write_bytes(path, buffer.getvalue())
+    return buffer.getvalue()
 
 
 def write_csv(path: Path, header: Iterable[str], rows: Iterable[Iterable[Any]], *, line_end: str = "\r\n") -> None:
@@ -102,17 +203,22 @@ def write_csv(path: Path, header: Iterable[str], rows: Iterable[Iterable[Any]], 
 @contextlib.contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
     """An empty folder to fill, which takes the place of `path` when the block ends without an error."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+    refuse_special(path, "a folder")
+    with _named(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name[:100]}."))
     try:
         new = temporary / "new"
         new.mkdir()
-        yield new
-        # A folder cannot be replaced in one step: the old one steps aside first, and for an instant there is none.
-        if path.exists():
-            os.replace(path, temporary / "old")
-        os.replace(new, path)
+        with at_the_end(lambda: shutil.rmtree(temporary, ignore_errors=True)):
+            yield new
+        refuse_special(path, "a folder")  # again: filling it may have taken long
+        with _named(path):
+            # A folder cannot be replaced in one step: the old one steps aside first, and for an instant there is none.
+            if path.exists():
+                os.replace(path, temporary / "old")
+            os.replace(new, path)
     finally:
         if (temporary / "old").exists() and not path.exists():
             os.replace(temporary / "old", path)
-        shutil.rmtree(temporary)
+        shutil.rmtree(temporary, ignore_errors=True)

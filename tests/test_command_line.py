@@ -20,7 +20,7 @@ import pytest
 from small_log import elbow_log, write_elbow
 
 from droid_jax import run
-from droid_jax.commands import convert, presets
+from droid_jax.commands import convert, folder, presets
 from droid_jax.commands.folder import OtherRun, changed, finished, setup_of
 from droid_jax.commands.identify import Identify
 from droid_jax.commands.own_effects import load_effects
@@ -589,18 +589,23 @@ def test_it_says_its_version(capsys: pytest.CaptureFixture[str]):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "begun", "said"),
     [
-        (["identify"], "interrupted; the same command goes on from here"),
-        (["identify", "--again"], "interrupted; the same command without --again goes on from here"),
-        (["record"], "interrupted"),
-        (["evaluate", "--again"], "interrupted"),
+        (["identify"], True, "interrupted; the same command goes on from here"),
+        (["identify", "--again"], True, "interrupted; the same command without --again goes on from here"),
+        (["identify", "--again"], False, "interrupted; the same command goes on from here"),
+        (["record"], False, "interrupted"),
+        (["evaluate", "--again"], False, "interrupted"),
     ],
 )
 def test_what_an_interrupted_command_promises(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], begun: bool, said: str
 ):
+    """begun: whether the run has set its folder up, so that --again would start over once more."""
+
     def stopped(command: object) -> None:
+        if begun:
+            folder.BEGUN.add(Path("run"))
         raise KeyboardInterrupt
 
     monkeypatch.setattr(run, "_ACTIONS", dict.fromkeys(run._ACTIONS, stopped))

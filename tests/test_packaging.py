@@ -49,7 +49,7 @@ def test_wheel_says_what_it_is(built):
     info = next(n for n in wheel.namelist() if n.endswith(".dist-info/METADATA")).removesuffix("METADATA")
     metadata = Parser().parsestr(wheel.read(f"{info}METADATA").decode())
     assert (metadata["Name"], metadata["License-Expression"]) == ("droid_jax", "Apache-2.0")
-    assert "droid-jax = droid_jax.run:main" in wheel.read(f"{info}entry_points.txt").decode()
+    assert "droid-jax = droid_jax.console:program" in wheel.read(f"{info}entry_points.txt").decode()
     assert any(n.startswith(info) and n.endswith("/LICENSE") for n in wheel.namelist())
 
 

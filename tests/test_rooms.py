@@ -10,7 +10,7 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "droid_jax"
 ORDER = ("model", "measure", "compare", "identify", "gap", "policy", "report", "commands", "run")
-FOR_ALL = ("storage", "runtime", "errors", "files", "arguments", "read_json", "read_npz")
+FOR_ALL = ("storage", "runtime", "quiet", "console", "errors", "files", "arguments", "read_json", "read_npz")
 # Third-party package -> the only file or folder of droid_jax that may import it.
 ONLY_IN = {
     "evosax": "identify/cma.py",

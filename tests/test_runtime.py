@@ -254,3 +254,111 @@ def test_quiet_drops_only_the_two_lines():
 def test_mjx_is_imported_without_a_word():
     run = fresh("from droid_jax.runtime import import_mjx; assert import_mjx().put_model")
     assert (run.returncode, run.stdout) == (0, "")
+
+
+# ----- quotas
+
+
+def control_groups(tmp_path: Path, memberships: str, files: dict[str, str]) -> tuple[Path, Path]:
+    """A made-up /proc/self and /sys/fs/cgroup."""
+    proc, mounted = tmp_path / "proc", tmp_path / "cgroup"
+    proc.mkdir()
+    (proc / "cgroup").write_text(memberships)
+    for name, text in files.items():
+        (mounted / name).parent.mkdir(parents=True, exist_ok=True)
+        (mounted / name).write_text(text)
+    return proc, mounted
+
+
+V1 = "12:pids:/docker/a\n4:cpu,cpuacct:/docker/a\n1:name=systemd:/docker/a\n"
+
+
+@pytest.mark.parametrize(
+    ("memberships", "files", "expected"),
+    [
+        ("0::/user/app\n", {"user/app/cpu.max": "150000 100000\n"}, 1.5),
+        ("0::/user/app\n", {"user/app/cpu.max": "max 100000\n"}, None),
+        ("0::/user/app\n", {"user/app/cpu.max": "max 100000\n", "user/cpu.max": "200000 100000\n"}, 2.0),
+        ("0::/user/app\n", {"user/app/cpu.max": "400000 100000\n", "user/cpu.max": "50000 100000\n"}, 0.5),
+        ("0::/\n", {"cpu.max": "100000 100000\n"}, 1.0),  # a container with a view of its own
+        ("0::/docker/of/the/host\n", {"cpu.max": "300000 100000\n"}, 3.0),  # one with the host's
+        (V1, {"cpu,cpuacct/cpu.cfs_quota_us": "250000\n", "cpu,cpuacct/cpu.cfs_period_us": "100000\n"}, 2.5),
+        (V1, {"cpu,cpuacct/docker/a/cpu.cfs_quota_us": "-1\n", "cpu,cpuacct/docker/a/cpu.cfs_period_us": "1\n"}, None),
+        (V1, {"pids/docker/a/cpu.max": "1 100\n"}, None),
+        ("0::/user\n", {"user/cpu.max": "nonsense\n"}, None),
+        ("nonsense\n", {}, None),
+    ],
+)
+def test_a_quota_of_control_groups(tmp_path: Path, memberships: str, files: dict[str, str], expected: float | None):
+    assert runtime.cpu_quota(*control_groups(tmp_path, memberships, files)) == expected
+
+
+@pytest.mark.parametrize(("quota", "expected"), [(None, 8), (1.5, 2), (0.2, 1), (3.0, 3), (64.0, 8)])
+def test_a_quota_counts_as_cores_do(monkeypatch: pytest.MonkeyPatch, quota: float | None, expected: int):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(8)), raising=False)
+    monkeypatch.setattr(runtime, "cpu_quota", lambda: quota)
+    assert runtime.cores() == expected
+
+
+def test_without_control_groups_there_is_no_quota(tmp_path: Path):
+    assert runtime.cpu_quota(tmp_path, tmp_path) is None
+
+
+# ----- quiet
+
+FIRST_COST = """
+{first}
+import droid_jax
+droid_jax.tune(cache_dir={cache!r})
+import jax
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+import jax.numpy as jnp
+import droid_jax.compare.cost
+found = []
+jax.monitoring.register_event_listener(lambda name, **_: found.append(name.endswith("compilation_cache/cache_hits")))
+jax.block_until_ready(jax.jit(lambda x: jnp.sin(x) @ x.T)(jnp.ones((8, 8))))
+assert any(found) is {warm}
+"""
+
+
+@pytest.mark.parametrize("first", ["", "import jax", "import jax.numpy; import mujoco", "import droid_jax.model.step"])
+def test_it_prints_nothing_even_with_a_warm_cache(tmp_path: Path, first: str):
+    """XLA has 2 kB to say of every program that it loads; whether jax or this package was imported first."""
+    for warm in (False, True):
+        done = fresh(FIRST_COST.format(first=first, cache=str(tmp_path), warm=warm))
+        assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_other_messages_of_the_cache_are_not_hidden(tmp_path: Path):
+    """What is no known message comes through, and so does what a program prints itself."""
+    code = """
+import os, re, sys
+from droid_jax.quiet import _OF_THE_CACHE, _without
+with _without(_OF_THE_CACHE):
+    os.write(2, b"E1 cpu_aot_loader.cc:220] X. Target machine feature +prefer-no-gather is not  supported on the h\\n")
+    os.write(2, b"E1 cpu_aot_loader.cc:220] X. Target machine feature +avx512f is not  supported on the host\\n")
+    print("mine", file=sys.stderr)
+os.write(2, b"behind\\n")
+"""
+    done = fresh(code)
+    assert done.stderr.splitlines() == [
+        "E1 cpu_aot_loader.cc:220] X. Target machine feature +avx512f is not  supported on the host",
+        "mine",
+        "behind",
+    ]
+
+
+@pytest.mark.parametrize(
+    "module", ["compare.cost", "model.step", "policy.train", "policy.doors", "measure.surrogate", "gap.missing"]
+)
+def test_importing_a_module_prints_nothing(module: str):
+    done = fresh(f"import droid_jax.{module}")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_mjx_is_imported_in_one_place():
+    """Whoever imports it first sees its two lines about warp."""
+    package = ROOT / "droid_jax"
+    own = re.compile(r"^\s*(from|import) mujoco.*\bmjx", re.MULTILINE)
+    found = [path.name for path in package.rglob("*.py") if own.search(path.read_text())]
+    assert found == ["quiet_mjx.py"]

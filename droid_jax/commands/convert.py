@@ -70,8 +70,9 @@ class Convert:
 
 def run(command: Convert) -> None:
     """Load whatever it is, validate, cut, and save."""
-    from droid_jax.measure.formats import bags_at, load, rosbag_reader, save
+    from droid_jax.measure.formats import bags_at, check_target, load, rosbag_reader, save
 
+    check_target(command.out)  # before bags are read, which may take long
     if not command.source:
         raise ValueError("convert needs the files or folders to read")
     path, *others = command.source

@@ -16,6 +16,7 @@ from droid_jax.commands.folder import changed, setup_of, stage_folder
 from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.source import needs_brax, source
 from droid_jax.commands.stand_in import hidden_effects
+from droid_jax.commands.writer import writes
 from droid_jax.files import FILMS, POLICY, TRAINING, TRANSFER
 
 if TYPE_CHECKING:
@@ -51,6 +52,7 @@ class Evaluate:
     """Try again what was tried already."""
 
 
+@writes("train", lambda command: stage_folder(command.run, "train", TRAINING), make=False)
 def run(command: Evaluate) -> None:
     """Try the policy, write transfer.json and the films, and build the page; not again where that was done."""
     needs_brax()

@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from droid_jax.commands.folder import stage_folder
+from droid_jax.commands.writer import writes
 from droid_jax.files import POLICY
 
 
@@ -23,12 +24,17 @@ class Export:
     """Folder to write; default: RUN/export."""
 
 
+@writes(None, lambda command: command.out or _policy_folder(command) / "export")
 def run(command: Export) -> None:
     """Write policy.npz, policy.onnx and control.py."""
     from droid_jax.policy.control import load
     from droid_jax.policy.export import export
 
-    folder = stage_folder(command.run, "train", POLICY)
+    folder = _policy_folder(command)
     out = command.out or folder / "export"
     apart = export(out, load(folder / POLICY))
     print(f"policy.npz, policy.onnx and control.py: {out}; ONNX and JAX differ by at most {apart:.1e} in an action")
+
+
+def _policy_folder(command: Export) -> Path:
+    return stage_folder(command.run, "train", POLICY)

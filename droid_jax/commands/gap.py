@@ -16,6 +16,7 @@ from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.presets import TIMESTEP, refine_config, search_config, warn_of_cpu
 from droid_jax.commands.scenes import compared, needs_log, needs_recording, needs_scene, own_scene, recording_at
 from droid_jax.commands.stand_in import hidden_effects, kept_at, known_stand_in, record_stand_in, settled
+from droid_jax.commands.writer import writes
 from droid_jax.files import FIT, GAP
 from droid_jax.read_json import read_json, typed
 from droid_jax.report.stages import needs_whole, to_be_amended
@@ -88,6 +89,7 @@ class Gap:
     """Start over, even if the folder holds a finished or interrupted run."""
 
 
+@writes("gap")
 def run(command: Gap) -> None:
     """Record or load, fit, search, write the run's folder and its page."""
     from droid_jax import runtime

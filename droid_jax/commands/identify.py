@@ -15,6 +15,7 @@ from droid_jax.commands.pictures import draw, keep_replay
 from droid_jax.commands.presets import TIMESTEP, Preset, refine_config, search_config, warn_of_cpu
 from droid_jax.commands.scenes import compared, needs_log, needs_recording, needs_scene, own_scene, recording_at
 from droid_jax.commands.stand_in import known_stand_in, settled
+from droid_jax.commands.writer import writes
 from droid_jax.files import EXTENDED, FIT
 from droid_jax.read_json import read_json
 
@@ -84,6 +85,7 @@ class Identify:
     """Start over, even if the folder holds a finished or interrupted run."""
 
 
+@writes("identify")
 def run(command: Identify) -> None:
     """Record or load, fit, write the run's folder and its page."""
     from droid_jax import runtime

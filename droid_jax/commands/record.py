@@ -27,14 +27,12 @@ class Record:
 
 def run(command: Record) -> None:
     """Record the stand-in robot and save what it measured."""
-    from droid_jax import runtime
-
-    runtime.import_mjx()  # the first import of it prints two lines about warp
     from droid_jax.measure.demonstration import PLANS, demonstration_path
-    from droid_jax.measure.formats import load, save
+    from droid_jax.measure.formats import check_target, load, save
     from droid_jax.measure.surrogate import SurrogateConfig, record, stand_in_truth
     from droid_jax.model.door_scene import door_scene
 
+    check_target(command.out)
     scene = door_scene(springs=command.springs, gains=command.gains)
     demonstration = load(demonstration_path(command.demonstration, gains=command.gains))
     truth = stand_in_truth(scene, command.springs, command.seed)
@@ -43,6 +41,5 @@ def run(command: Record) -> None:
     recording = record(scene, demonstration, truth, seed=seed, config=SurrogateConfig(repeats=command.repeats))
     of = {"springs": str(command.springs), "robot": str(command.seed)}
     recording = replace(recording, meta={**recording.meta, **of})
-    command.out.parent.mkdir(parents=True, exist_ok=True)
     path = save(recording, command.out)
     print(f"stand-in robot recorded {recording.repeats} repeats of {recording.duration:.1f} s: {path}")

@@ -12,6 +12,7 @@ from droid_jax.commands.folder import RUNS, begin, finished, setup_of
 from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.presets import warn_of_cpu
 from droid_jax.commands.source import has_model, model_folder, needs_brax, source, stand_in_of
+from droid_jax.commands.writer import writes
 from droid_jax.files import EXTENDED, GAUSSIAN, POLICY, TRAINING
 from droid_jax.report.stages import extended_of, fingerprint
 
@@ -53,6 +54,7 @@ class Train:
     """Start over, even if the folder holds a finished or interrupted run."""
 
 
+@writes("train")
 def run(command: Train) -> None:
     """Train, and write the run's folder and its page."""
     needs_brax()

@@ -16,6 +16,7 @@ from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.scenes import needs_log, needs_recording, needs_scene
 from droid_jax.commands.source import model_folder, needs_brax
 from droid_jax.commands.stand_in import DEMONSTRATIONS, hidden_effects, kept_at, record_stand_in, settled
+from droid_jax.commands.writer import writes
 from droid_jax.files import FIT, GAP, LAST_FILES, TRANSFER
 from droid_jax.report.stages import left_over, setup, unfinished
 from droid_jax.storage import write_json
@@ -89,6 +90,7 @@ class All:
     """Start over, even if the folder holds a finished or interrupted run."""
 
 
+@writes("all")
 def run(command: All) -> None:
     """Every stage in a folder of its own below OUT, then the page of all of them; where one fails, of those before."""
     started = time.monotonic()

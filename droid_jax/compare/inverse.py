@@ -12,7 +12,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from mujoco import mjx
 
 from droid_jax.compare.loops import coupled_to_others
 from droid_jax.compare.replay import observed
@@ -21,6 +20,7 @@ from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.model.ignored import refuse_fluid
 from droid_jax.model.joint_friction import direction
 from droid_jax.model.physics import Physics
+from droid_jax.model.quiet_mjx import mjx
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, Rollout, State, Theta, column, complete
 

@@ -14,7 +14,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from mujoco import mjx
 
 from droid_jax.compare.floating import refuse_floating
 from droid_jax.compare.start import check_weight, holding, start_pose, weight_share
@@ -24,6 +23,7 @@ from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.model.actuators import has_servo_damping
 from droid_jax.model.ignored import check_options
 from droid_jax.model.physics import Physics
+from droid_jax.model.quiet_mjx import mjx
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, Rollout, State, Theta, column, complete
 from droid_jax.model.step import servo_force

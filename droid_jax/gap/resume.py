@@ -63,14 +63,26 @@ class Remembered(Cost):
         path = self.folder / f"{what}_{hashlib.sha256(rows.tobytes()).hexdigest()[:32]}.npz"
         try:
             with np.load(path, allow_pickle=False) as file:
-                return file["rows"]
+                kept, digest = file["rows"], str(file["digest"])
+            if digest != _digest(self.folder.name, what, rows, kept):
+                raise ValueError("its content is not what was written")
+            return kept
         except FileNotFoundError:
             pass
-        except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile, zlib.error) as error:
+        except (ValueError, KeyError, TypeError, EOFError, OSError, zipfile.BadZipFile, zlib.error) as error:
             warnings.warn(f"{path} is damaged and is computed again: {error}", stacklevel=3)
         out = compute(values)
-        write_npz(path, {"rows": out})
+        write_npz(path, {"rows": out, "digest": np.array(_digest(self.folder.name, what, rows, out))})
         return out
+
+
+def _digest(role: str, what: str, rows: np.ndarray, out: np.ndarray) -> str:
+    """sha256 over what was asked for, in which recording, and what came of it."""
+    sha = hashlib.sha256(f"{role} {what} {rows.shape}".encode())
+    sha.update(np.ascontiguousarray(rows).tobytes())
+    sha.update(f"{out.dtype.str} {out.shape}".encode())
+    sha.update(np.ascontiguousarray(out).tobytes())
+    return sha.hexdigest()
 
 
 def kept_model(folder: Path | None, base: Space, whole: Space, fit: Callable[[], Model]) -> Model:
@@ -95,7 +107,7 @@ def _kept(folder: Path | None, make: Callable[[], Tree], fits: Callable[[Tree], 
     """Damage, and what does not fit, is reported as a warning that names the checkpoint."""
     if folder is None:
         return make()
-    with Checkpoints(folder, keep=1) as checkpoints:
+    with Checkpoints(folder, keep=1, fingerprint={"what": folder.name}) as checkpoints:
         found = checkpoints.restore()
         if found is not None:
             if fits(found[1]):

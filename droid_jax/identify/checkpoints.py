@@ -2,14 +2,16 @@
 
 Any loop whose state is a nested dictionary of numpy arrays can use them.  A checkpoint is a folder,
 written by orbax under a temporary name and renamed when complete.  Beside the arrays it holds a
-fingerprint, what the state belongs to, and a digest over both, because a damaged file is not always
-one that cannot be read.
+fingerprint, what the state belongs to, and a digest over both and the number of the step, because a
+damaged file is not always one that cannot be read, and a folder can be renamed.
 """
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
+import os
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -64,9 +66,12 @@ class Checkpoints:
         for old in self.steps():
             if old >= step:
                 self._manager.delete(old)
-        meta = {"fingerprint": self.fingerprint, "digest": _digest(self.fingerprint, tree)}
+        meta = {"fingerprint": self.fingerprint, "digest": _digest(step, self.fingerprint, tree)}
         items = ocp.args.Composite(state=ocp.args.StandardSave(tree), meta=ocp.args.JsonSave(meta))
-        self._manager.save(step, args=items, force=True)
+        try:
+            self._manager.save(step, args=items, force=True)
+        except _DAMAGE as error:
+            raise _not_written(self.folder / str(step), error) from error
 
     def restore(self) -> tuple[int, Tree] | None:
         """(step, tree) of the newest checkpoint that is whole; None when there is none.
@@ -92,8 +97,8 @@ class Checkpoints:
         items = ocp.args.Composite(state=ocp.args.StandardRestore(), meta=ocp.args.JsonRestore())
         read = self._manager.restore(step, args=items)
         fingerprint, digest = read["meta"]["fingerprint"], read["meta"]["digest"]
-        if _digest(fingerprint, read["state"]) != digest:
-            raise ValueError("its content does not match its digest")
+        if _digest(step, fingerprint, read["state"]) != digest:
+            raise ValueError("its step or its content is not what was written")
         return fingerprint, read["state"]
 
     def _check_fingerprint(self, step: int, found: dict[str, str]) -> None:
@@ -107,9 +112,9 @@ class Checkpoints:
             )
 
 
-def _digest(fingerprint: Mapping[str, str], tree: Tree) -> str:
-    """sha256 over the fingerprint and every array's path, type, shape and bytes."""
-    sha = hashlib.sha256(json.dumps(dict(fingerprint), sort_keys=True).encode())
+def _digest(step: int, fingerprint: Mapping[str, str], tree: Tree) -> str:
+    """sha256 over the step, the fingerprint and every array's path, type, shape and bytes."""
+    sha = hashlib.sha256(json.dumps([int(step), dict(fingerprint)], sort_keys=True).encode())
     for path, leaf in _leaves(tree):
         array = np.ascontiguousarray(leaf)
         sha.update(f"{path} {array.dtype.str} {np.shape(leaf)}".encode())
@@ -124,6 +129,16 @@ def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
         return
     for name in sorted(tree):
         yield from _leaves(tree[name], f"{path}/{name}")
+
+
+def _not_written(path: Path, error: BaseException) -> OSError:
+    """The file system's error behind one of the store's, which says it in a text of its own; names the checkpoint."""
+    number = error.errno if isinstance(error, OSError) else None
+    if number is None:
+        known = {os.strerror(code).lower(): code for code in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)}
+        number = next((code for text, code in known.items() if text in str(error).lower()), errno.EIO)
+    told = os.strerror(number) if number != errno.EIO else _first_line(error)
+    return OSError(number, f"the checkpoint cannot be written: {told}", str(path))
 
 
 def _first_line(error: BaseException) -> str:

@@ -26,12 +26,17 @@ MOST_LINE = 2**16  # characters of one of its lines
 MOST_COLUMNS = 1000
 
 
-def save_csv(recording: Recording, path: Path) -> None:
-    """Write a recording, which is taken to be valid; ValueError where the folder holds something else."""
-    if path.is_file() or (path.is_dir() and any(path.iterdir())):
+def check_folder(path: Path) -> None:
+    """ValueError where a folder is not empty and holds anything but a recording: it would be lost."""
+    if path.is_dir() and any(path.iterdir()):
         if not (path / "recording.json").exists():
             raise ValueError(f"{path}: exists and is not a recording's folder, it is not replaced")
         _only_a_recording(path)
+
+
+def save_csv(recording: Recording, path: Path) -> None:
+    """Write a recording, which is taken to be valid; ValueError where the folder holds something else."""
+    check_folder(path)
     with new_folder(path) as new:
         write_text(new / "recording.json", metadata_to_json(recording) + "\n")
         if recording.command_names:

@@ -20,9 +20,10 @@ from typing import Any
 from droid_jax.arguments import shown
 from droid_jax.errors import needs
 from droid_jax.measure.checks import validate
-from droid_jax.measure.csv_folder import load_csv, save_csv
-from droid_jax.measure.npz_file import load_npz, save_npz
+from droid_jax.measure.csv_folder import check_folder, load_csv, save_csv
+from droid_jax.measure.npz_file import is_npz, load_npz, save_npz
 from droid_jax.measure.recording import JITTER, Recording
+from droid_jax.storage import refuse_foreign, refuse_special
 
 SUPPORTED = (
     ".npz, a folder with recording.json and CSV files, a ROS 1 .bag, a ROS 2 .mcap or .db3, "
@@ -79,15 +80,25 @@ def load(
     return validate(accepted, source=str(path), allow_jitter=True)
 
 
+def check_target(path: Path) -> None:
+    """ValueError where `save` would not write: another suffix, or what stands there is no recording."""
+    if path.suffix not in ("", ".npz"):
+        raise ValueError(f"{path}: expected the suffix .npz or none (a CSV folder), got {path.suffix!r}")
+    if path.suffix == ".npz":
+        refuse_foreign(path, "a file", is_npz, "a recording")
+    else:
+        refuse_special(path, "a folder")
+        check_folder(path)
+
+
 def save(recording: Recording, path: str | os.PathLike[str]) -> Path:
     """Writes an npz file (suffix .npz) or a CSV folder (no suffix), atomically; returns its path.
 
     An existing recording of that name is replaced.  Raises ValueError when the recording is
-    not valid, the suffix is another one, or the folder holds something else.
+    not valid, the suffix is another one, or something else stands there.
     """
     path = _path(path)
-    if path.suffix not in ("", ".npz"):
-        raise ValueError(f"{path}: expected the suffix .npz or none (a CSV folder), got {path.suffix!r}")
+    check_target(path)
     # Irregular clocks were a question when the data came in; here they are only kept.
     validate(recording, allow_jitter=True)
     if path.suffix == ".npz":

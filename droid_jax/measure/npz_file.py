@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,8 @@ from droid_jax.measure.metadata import FORMAT, metadata_from_json, metadata_to_j
 from droid_jax.measure.recording import Channel, Recording
 from droid_jax.read_npz import NpzFile
 from droid_jax.storage import write_npz
+
+KIND = "droid_jax recording"  # FORMAT of any version
 
 
 def save_npz(recording: Recording, path: Path) -> None:
@@ -23,6 +27,19 @@ def save_npz(recording: Recording, path: Path) -> None:
     for key, c in recording.channels.items():
         arrays |= {f"{key}.time": c.time, f"{key}.values": c.values, f"{key}.mask": c.mask}
     write_npz(path, arrays)
+
+
+def is_npz(path: Path) -> bool:
+    """Whether a file is a recording of this program, or what damage left of one; reads a few kB at most."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(40)
+        if not zipfile.is_zipfile(path):  # cut off: its first member's name is left
+            return head.startswith(b"PK\x03\x04") and head.endswith(b"format.npy")
+        with zipfile.ZipFile(path) as members, members.open("format.npy") as member:
+            return KIND.encode("utf-32-le") in member.read(4096)  # numpy's text
+    except (OSError, ValueError, KeyError, RuntimeError, NotImplementedError, EOFError, zlib.error, zipfile.BadZipFile):
+        return False
 
 
 def load_npz(path: Path) -> Recording:

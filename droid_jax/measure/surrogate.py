@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 import scipy.signal
 
+from droid_jax.files import STAND_IN_SOURCE as SOURCE
 from droid_jax.measure.checks import validate
 from droid_jax.measure.clocks import interpolate
 from droid_jax.measure.engine import Trace, instrument, simulate
@@ -82,7 +83,6 @@ class StandIn:
     rng: np.random.Generator
 
 
-SOURCE = "stand-in robot (plain C MuJoCo), not a real one"
 DRIFT_TIME = 0.15  # s
 _WRIST = 4  # joints from here on have the smaller noise
 

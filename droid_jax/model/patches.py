@@ -1,4 +1,7 @@
-"""Two functions of mujoco-mjx 3.17.0 that are replaced while a simulation step is traced, and only then.
+"""Two functions of mujoco-mjx 3.17.0 that act differently while a simulation step is traced, and only then.
+
+The functions in mjx's modules are exchanged once, for ones that ask what holds where they are called: other threads,
+and other programs' traces, find what mjx does by itself.
 
 `exact_segments`: MJX adds 1e-6 m^2 to the squared length of a segment before it divides by it.  On
 a rail of 18 mm that moves a capsule's contact by 28 micrometres and turns its normal by 2 mrad.
@@ -14,13 +17,16 @@ J a = (-b v - k d r - R f) / (1 + b h / 2): b, k and R are divided by 1 + b h / 
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Callable, Iterator
+from contextvars import ContextVar
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from mujoco.mjx._src import constraint as mjx_constraint
-from mujoco.mjx._src import math as mjx_math
+
+from droid_jax.model.quiet_mjx import constraint as mjx_constraint
+from droid_jax.model.quiet_mjx import math as mjx_math
 
 _TINY = 1e-12  # m^2: keeps a segment of no length finite
 
@@ -48,25 +54,48 @@ def midpoint_law(original: Callable) -> Callable:
     return law
 
 
+def _switched(module: Any, name: str, new: Callable[[Callable], Callable]) -> ContextVar[bool]:
+    """Exchange a function of a module for one with two ways to act; the switch between them, off at first.
+
+    new: of the module's own function, what acts while the switch is on.
+    """
+    original = getattr(module, name)
+    if (before := getattr(original, "switch", None)) is not None:  # this module was loaded a second time
+        return before
+    switch = ContextVar(name, default=False)
+    other = new(original)
+
+    @functools.wraps(original)
+    def function(*args: Any, **kwargs: Any) -> Any:
+        return (other if switch.get() else original)(*args, **kwargs)
+
+    function.switch = switch  # type: ignore[attr-defined]
+    setattr(module, name, function)
+    return switch
+
+
+_SEGMENTS = _switched(mjx_math, "closest_segment_point", lambda original: closest_segment_point)
+_MIDPOINT = _switched(mjx_constraint, "_kbi", midpoint_law)
+
+
 @contextlib.contextmanager
 def exact_segments() -> Iterator[None]:
-    """While active, traces of mjx's capsule contacts use the unbiased closest point."""
-    with _replaced(mjx_math, "closest_segment_point", closest_segment_point):
+    """While active, traces of mjx's capsule contacts in this thread use the unbiased closest point."""
+    with _on(_SEGMENTS):
         yield
 
 
 @contextlib.contextmanager
 def midpoint_constraints() -> Iterator[None]:
-    """While active, traces of mjx's constraints are damped with the mean velocity of the step."""
-    with _replaced(mjx_constraint, "_kbi", midpoint_law(mjx_constraint._kbi)):
+    """While active, traces of mjx's constraints in this thread are damped with the mean velocity of the step."""
+    with _on(_MIDPOINT):
         yield
 
 
 @contextlib.contextmanager
-def _replaced(module: Any, name: str, new: Callable) -> Iterator[None]:
-    old = getattr(module, name)
-    setattr(module, name, new)
+def _on(switch: ContextVar[bool]) -> Iterator[None]:
+    before = switch.set(True)
     try:
         yield
     finally:
-        setattr(module, name, old)
+        switch.reset(before)

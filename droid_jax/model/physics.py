@@ -18,11 +18,11 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
-from mujoco.mjx._src import math as mjx_math
 
 from droid_jax.model.ignored import IGNORED
 from droid_jax.model.parameters import Space, Write
+from droid_jax.model.quiet_mjx import math as mjx_math
+from droid_jax.model.quiet_mjx import mjx
 from droid_jax.model.scene import Scene
 
 # Writing one of these changes what the compiler derives.

@@ -162,7 +162,8 @@ class Scene:
     def mjx(self) -> Any:
         """The mjx.Model on the default device; ValueError for a model that MJX has not everything for."""
         import jax
-        from mujoco import mjx
+
+        from droid_jax.model.quiet_mjx import mjx
 
         try:
             with jax.ensure_compile_time_eval():  # else a first use inside jit would keep that trace's values

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from droid_jax.model.quiet_mjx import mjx  # first: brax would import mujoco.mjx with its two lines about warp
+
+# isort: split
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -10,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from brax.envs.base import Env
 from brax.envs.base import State as EnvState
-from mujoco import mjx
 
 from droid_jax.compare.replay import check_stateless, pushed, rubbing, servo_given, through
 from droid_jax.measure.demonstration import OPEN, grasp_pose, solve_pose

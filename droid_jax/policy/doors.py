@@ -6,6 +6,9 @@ And it draws them anew for every part of a training that was interrupted.
 
 from __future__ import annotations
 
+import droid_jax.model.quiet_mjx  # noqa: F401  brax would import mujoco.mjx with its two lines about warp
+
+# isort: split
 import contextlib
 import itertools
 from collections.abc import Callable, Iterator

@@ -13,9 +13,8 @@ import numpy as np
 from droid_jax.errors import needs
 from droid_jax.files import POLICY
 from droid_jax.policy import control
-from droid_jax.policy.control import ACTIONS, ARM, LAYOUT, OBSERVED, Policy
-from droid_jax.policy.network import save_policy
-from droid_jax.storage import write_bytes
+from droid_jax.policy.control import ACTIONS, ARM, LAYOUT, OBSERVED, Policy, arrays
+from droid_jax.storage import npz_bytes, write_own
 
 OPSET = 17
 CLOSE = 2e-5  # largest difference of an action, of -1 .. 1, between float32 programs
@@ -28,17 +27,16 @@ OUTPUTS = (
 def export(folder: Path, policy: Policy) -> float:
     """Write policy.npz, policy.onnx and control.py; the largest difference of an action between ONNX and JAX.
 
-    Raises ValueError where onnx or onnxruntime is not installed, or the two differ by more than `CLOSE`.
+    Raises ValueError where onnx or onnxruntime is not installed, the two differ by more than `CLOSE`, or the folder
+    holds a file of one of these names that `export` did not write, or that was changed since.
     """
     needs("export needs", "export", "onnx", "onnxruntime")
     model = to_onnx(policy)
     apart = difference(policy, model)
     if not apart <= CLOSE:
         raise ValueError(f"the ONNX policy differs from the JAX policy by {apart:.2g} in an action: it is not written")
-    folder.mkdir(parents=True, exist_ok=True)
-    save_policy(folder / POLICY, policy)
-    write_bytes(folder / "policy.onnx", model)
-    write_bytes(folder / "control.py", Path(control.__file__).read_bytes())
+    code = Path(control.__file__).read_bytes()
+    write_own(folder, {POLICY: npz_bytes(arrays(policy)), "policy.onnx": model, "control.py": code})
     return apart
 
 

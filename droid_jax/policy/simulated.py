@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import droid_jax.model.quiet_mjx  # noqa: F401  brax would import mujoco.mjx with its two lines about warp
+
+# isort: split
 import functools
 from typing import Any
 

@@ -5,6 +5,9 @@ Paper, section IV-D: actor and critic of two hidden layers of 64, tanh, Adam wit
 
 from __future__ import annotations
 
+import droid_jax.model.quiet_mjx  # noqa: F401  brax would import mujoco.mjx with its two lines about warp
+
+# isort: split
 import contextlib
 import functools
 import time

@@ -75,7 +75,7 @@ from droid_jax.report.words import (
     speaker,
     summary,
 )
-from droid_jax.storage import write_text
+from droid_jax.storage import refuse_foreign, write_text
 
 _DOWNLOADS = (
     (GAUSSIAN, "the Gaussian of the model's parameters, for training"),
@@ -101,6 +101,7 @@ def write_report(run: Path) -> Path:
     Raises ValueError that names the file when a required one is missing or broken.
     """
     folder = Path(run)
+    path = folder / "report.html"
     old = left_over(folder)
     places = [folder, *(folder / stage for stage in LAST_FILES if stage not in old)]
     gap = read_gap(at) if (at := _part(places, has_gap)) else None
@@ -144,9 +145,16 @@ def write_report(run: Path) -> Path:
         folder=folder, run=loaded, gap=gap, policy=policy, downloads=list(_downloads(parts_at)),
         **{"lead": [], **parts},
     )  # fmt: skip
-    path = folder / "report.html"
+    refuse_foreign(path, "a file", _is_page, "a page of this program")
     write_text(path, html)
     return path
+
+
+def _is_page(path: Path) -> bool:
+    """Whether a file is a page that `write_report` wrote, now or before pages named their generator."""
+    with path.open("rb") as file:
+        head = file.read(2000)
+    return b'name="generator" content="droid_jax"' in head or b"default-src 'none'; img-src data:" in head
 
 
 def _part(places: Sequence[Path], has: Callable[[Path], bool]) -> Path | None:

@@ -11,6 +11,8 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from droid_jax.console import at_the_end
+
 Report = Callable[[str, Any], None]
 COMPILING = "compiling, a minute"
 QUIET = 20.0  # s between two lines of one stage where there is no terminal
@@ -36,7 +38,7 @@ def stages(names: Sequence[str], most: Mapping[str, int] | None = None) -> Itera
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns) as bars:
+    with Progress(*columns) as bars, at_the_end(bars.stop):  # which shows the cursor again
         tasks = {n: bars.add_task(n, total=1, text="", start=False) for n in names}
         current: list[str] = []
 
@@ -104,7 +106,7 @@ def training(steps: int) -> Iterator[Callable[[Any], None]]:
         TimeElapsedColumn(),
         TextColumn("left {task.fields[left]}"),
     )
-    with Progress(*columns) as bars:
+    with Progress(*columns) as bars, at_the_end(bars.stop):  # which shows the cursor again
         task = bars.add_task("training", total=steps, text=COMPILING, left="–")
 
         def report(now: Any) -> None:
@@ -130,7 +132,7 @@ def counting(what: str, total: int) -> Iterator[Callable[[int], None]]:
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns) as bars:
+    with Progress(*columns) as bars, at_the_end(bars.stop):  # which shows the cursor again
         task = bars.add_task(what, total=total)
         yield lambda done: bars.update(task, completed=done)
 

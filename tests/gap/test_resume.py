@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -68,6 +70,36 @@ def test_a_damaged_memory_is_reported_and_computed_again(found: Small, tmp_path:
     with pytest.warns(UserWarning, match=f"{path.name} is damaged"):
         np.testing.assert_array_equal(case.fit.cost.whitened(row), whitened)
     np.testing.assert_array_equal(case.fit.cost.whitened(row), whitened)
+
+
+def changed_rows(path: Path) -> None:
+    with np.load(path) as file:
+        np.savez(path, rows=file["rows"] + 1e-3, digest=file["digest"])
+
+
+def of_another_row(path: Path) -> None:
+    (other,) = (p for p in path.parent.iterdir() if p != path)
+    path.write_bytes(other.read_bytes())
+
+
+@pytest.mark.parametrize("change", [changed_rows, of_another_row])
+def test_a_memory_of_something_else_is_computed_again(found: Small, tmp_path: Path, change: Callable[[Path], None]):
+    """A file that can be read, and is not what was written there."""
+    case = remembering(found.case, tmp_path)
+    row = found.case.whole.mean[None]
+    whitened = case.fit.cost.whitened(row)
+    (path,) = (tmp_path / "fit").iterdir()
+    case.fit.cost.whitened(1.01 * row)
+    change(path)
+    with pytest.warns(UserWarning, match=f"{path.name} is damaged"):
+        np.testing.assert_array_equal(case.fit.cost.whitened(row), whitened)
+
+
+def test_a_floor_is_no_base_fit(tmp_path: Path):
+    kept_number(tmp_path / "floor", lambda: 0.125)
+    shutil.copytree(tmp_path / "floor", tmp_path / "other")
+    with pytest.raises(ValueError, match="belongs to another run: it differs in what"):
+        kept_number(tmp_path / "other", lambda: 0.25)
 
 
 def test_a_search_that_is_run_again_replays_nothing_and_ends_alike(found: Small, tmp_path: Path):

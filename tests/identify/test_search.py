@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import shutil
 import warnings
 
 import jax.numpy as jnp
@@ -505,9 +506,15 @@ def remove_state(folder):
             file.unlink()
 
 
+def swap_with_an_older(folder):
+    """Whole, with its own digest, under the number of another step."""
+    shutil.rmtree(folder)
+    shutil.copytree(folder.parent / "6", folder)
+
+
 # orbax leaves cancelled reads behind when a file is damaged; their complaint is not ours
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-@pytest.mark.parametrize("damage", [truncate, flip_digest, remove_state])
+@pytest.mark.parametrize("damage", [truncate, flip_digest, remove_state, swap_with_an_older])
 def test_a_damaged_checkpoint_is_reported_and_the_one_before_used(tmp_path, whole, damage):
     interrupted(tmp_path)
     damage(tmp_path / "9")

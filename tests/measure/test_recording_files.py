@@ -210,6 +210,7 @@ def test_damaged_npz(tmp_path: Path) -> None:
     fails(path, "the file is empty")
     path.write_text("hello, this is text")
     fails(path, "not an npz file")
+    path.unlink()  # no recording: `save` would not replace it
     whole = save(make(), path).read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     fails(path, "cut off")

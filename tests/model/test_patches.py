@@ -1,14 +1,17 @@
-"""Closest points of capsule axes against a float64 search, and the patch that puts them into MJX."""
+"""Closest points of capsule axes against a float64 search, and the switch that puts them into MJX."""
 
 from __future__ import annotations
+
+import threading
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mujoco.mjx._src import constraint as mjx_constraint
 from mujoco.mjx._src import math as mjx_math
 
-from droid_jax.model.patches import closest_segment_point, exact_segments
+from droid_jax.model.patches import closest_segment_point, exact_segments, midpoint_constraints
 
 
 def brute_point(a: np.ndarray, b: np.ndarray, p: np.ndarray) -> np.ndarray:
@@ -91,11 +94,47 @@ def test_the_bias_it_removes_is_real():
 
 
 def test_the_original_comes_back_even_after_an_error():
-    original = mjx_math.closest_segment_point
+    a, b = jnp.zeros(3), jnp.array([0.018, 0.0, 0.0])
+    biased = mjx_math.closest_segment_point(a, b, b)
     with pytest.raises(RuntimeError), exact_segments():
-        assert mjx_math.closest_segment_point is closest_segment_point
+        np.testing.assert_array_equal(mjx_math.closest_segment_point(a, b, b), b)
         raise RuntimeError
-    assert mjx_math.closest_segment_point is original
+    np.testing.assert_array_equal(mjx_math.closest_segment_point(a, b, b), biased)
     with exact_segments(), exact_segments():
         pass
-    assert mjx_math.closest_segment_point is original
+    np.testing.assert_array_equal(mjx_math.closest_segment_point(a, b, b), biased)
+
+
+def test_two_threads_that_trace_at_once_leave_mjx_as_it_was():
+    """One enters while the other is inside, and leaves after it."""
+    functions = mjx_math.closest_segment_point, mjx_constraint._kbi
+    a, b = jnp.zeros(3), jnp.array([0.018, 0.0, 0.0])
+    biased = mjx_math.closest_segment_point(a, b, b)
+    first_is_in, second_is_in, first_is_out = (threading.Event() for _ in range(3))
+    seen = {}
+
+    def first() -> None:
+        with exact_segments(), midpoint_constraints():
+            first_is_in.set()
+            assert second_is_in.wait(60)
+        first_is_out.set()
+
+    def second() -> None:
+        assert first_is_in.wait(60)
+        seen["before"] = mjx_math.closest_segment_point(a, b, b)
+        with exact_segments(), midpoint_constraints():
+            second_is_in.set()
+            assert first_is_out.wait(60)
+            seen["inside"] = mjx_math.closest_segment_point(a, b, b)
+        seen["after"] = mjx_math.closest_segment_point(a, b, b)
+
+    threads = [threading.Thread(target=run) for run in (first, second)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(120)
+    np.testing.assert_array_equal(seen["before"], biased)  # whatever another thread traces meanwhile
+    np.testing.assert_array_equal(seen["inside"], b)
+    np.testing.assert_array_equal(seen["after"], biased)
+    assert (mjx_math.closest_segment_point, mjx_constraint._kbi) == functions
+    np.testing.assert_array_equal(mjx_math.closest_segment_point(a, b, b), biased)

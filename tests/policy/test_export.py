@@ -14,6 +14,7 @@ import pytest
 from droid_jax.policy import control
 from droid_jax.policy.control import ACTIONS, LAYOUT, OBSERVED, SHAPES, Interface, Policy, load
 from droid_jax.policy.export import CLOSE, difference, export, to_onnx
+from droid_jax.storage import WRITTEN
 
 onnx = pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
@@ -57,7 +58,7 @@ def test_the_file_says_what_its_numbers_mean(policy):
 
 def test_the_folder_holds_all_a_robot_needs(policy, tmp_path: Path):
     assert export(tmp_path / "out", policy) <= CLOSE
-    assert {p.name for p in (tmp_path / "out").iterdir()} == {"policy.npz", "policy.onnx", "control.py"}
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"policy.npz", "policy.onnx", "control.py", WRITTEN}
     assert (tmp_path / "out" / "control.py").read_text() == Path(control.__file__).read_text()
     observation = np.linspace(-1, 1, OBSERVED)
     np.testing.assert_array_equal(load(tmp_path / "out" / "policy.npz").act(observation), policy.act(observation))

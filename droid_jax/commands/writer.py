@@ -1,0 +1,194 @@
+"""Who writes to a results folder: one process at a time, and only where nothing of somebody else's would be replaced.
+
+The lock is the operating system's: a process that is killed leaves none behind.  Its file is there while a run writes;
+`report`, `view` and whatever only reads need no lock.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import json
+import os
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+from droid_jax import console
+from droid_jax.files import CONFIG, FIT, GAP, LOCK, SETUP, STAND_IN, STAND_IN_SOURCE, TRAINING, WRITTEN
+from droid_jax.storage import kind_of
+
+_HELD = set[Path]()  # folders whose lock this process holds
+T = TypeVar("T")
+
+
+class InUse(ValueError):
+    """Another run writes to the folder."""
+
+
+def writes(
+    stage: str | None, folder: Callable[[Any], Path] = lambda command: command.out, make: bool = True
+) -> Callable[..., Any]:
+    """Decorator of a command's `run`: it is the one writer of its results folder for as long as it runs.
+
+    Args:
+        stage: "identify", "gap", "train" or "all", whose names in the folder must be this program's; None: the command
+            looks for itself.
+        folder: of a command; default: its --out.
+        make: the folder where it is missing.
+    """
+
+    def of(run: Callable[[T], None]) -> Callable[[T], None]:
+        @functools.wraps(run)
+        def alone(command: T) -> None:
+            at = folder(command)
+            with one_writer(at, stage) if make or at.is_dir() else contextlib.nullcontext():
+                run(command)
+
+        return alone
+
+    return of
+
+
+@contextlib.contextmanager
+def one_writer(folder: Path, stage: str | None) -> Iterator[None]:
+    """Hold a results folder for this process while the block runs; folders that stay empty are removed again.
+
+    Raises:
+        InUse: another process writes there, or to the folder of `all` above it.
+        ValueError: the folder cannot be written, or holds files of others under names that the stage writes.
+    """
+    if stage is not None:
+        check_own(folder, stage)
+    try:
+        made = _make(folder)
+    except OSError as error:
+        raise ValueError(f"the results folder {folder} cannot be written: {error.strerror or error}") from None
+
+    def remove_empty() -> None:
+        for path in made:
+            with contextlib.suppress(OSError):
+                path.rmdir()
+
+    try:
+        with console.at_the_end(remove_empty), _locked(folder):
+            yield
+    finally:
+        remove_empty()
+
+
+@contextlib.contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    from filelock import FileLock, Timeout  # only here: `--help` waits for what is imported above
+
+    here = folder.resolve()
+    if here in _HELD:
+        yield
+        return
+    if here.parent not in _HELD and _is_locked(here.parent / LOCK):
+        raise InUse(_in_use(here.parent))
+    lock = FileLock(here / LOCK, timeout=0)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise InUse(_in_use(folder)) from None
+    except (OSError, NotImplementedError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ValueError(f"the results folder {folder} cannot be written: {reason}") from None
+
+    def leave() -> None:
+        # While the lock is held: whoever has opened its file meanwhile sees that it is gone, and makes another.
+        (here / LOCK).unlink(missing_ok=True)
+
+    _HELD.add(here)
+    try:
+        with console.at_the_end(leave):
+            (here / LOCK).write_text(f"{os.getpid()}\n")
+            yield
+    finally:
+        _HELD.discard(here)
+        leave()
+        lock.release()
+
+
+def _in_use(folder: Path) -> str:
+    """Who writes there, as far as the lock's file says."""
+    try:
+        process = f" (process {int((folder / LOCK).read_text())})"
+    except (OSError, ValueError):
+        process = ""
+    return f"another run writes to {folder}{process}: wait for its end, or choose another --out"
+
+
+def _is_locked(path: Path) -> bool:
+    """Whether another process holds the lock of a file."""
+    from filelock import FileLock, Timeout
+
+    if not path.is_file():
+        return False
+    try:
+        with FileLock(path, timeout=0):
+            return False
+    except Timeout:
+        return True
+    except (OSError, NotImplementedError):  # of somebody else, and not to be opened: no lock of ours
+        return False
+
+
+def _make(folder: Path) -> list[Path]:
+    """Make a folder; those that were missing, the deepest first."""
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    return missing
+
+
+# What says that this program ran in a folder: these keys in one of these files.
+_SIGNS = {
+    SETUP: ("preset", "seed"),
+    "all.json": ("preset", "seed", "effect_scale", "files"),
+    CONFIG: ("preset", "recordings", "stand_in"),
+    FIT: ("parameters",),
+    GAP: ("verdict", "gaps"),
+    TRAINING: ("setup", "history"),
+}
+_STAND_INS = re.compile(r"[A-Z](_springs\d_seed\d+(_paper)?)?\.npz")  # recordings of the stand-in robot
+
+
+def check_own(folder: Path, stage: str) -> None:
+    """ValueError where a folder holds what this program did not write under a name that the stage writes or removes."""
+    if not folder.is_dir() or any(_is_sign(folder / name, keys) for name, keys in _SIGNS.items()):
+        return
+    strange = [name for name in WRITTEN[stage] if kind_of(folder / name)]
+    strange += [f"recordings/{path.name}" for path in _strange_recordings(folder / "recordings")]
+    if strange:
+        raise ValueError(
+            f"{folder} holds {strange[0]}, and no run of this program: it is not replaced; choose another --out, or "
+            "move it away"
+        )
+
+
+def _is_sign(path: Path, keys: tuple[str, ...]) -> bool:
+    """Whether a JSON file holds these keys, or is a setup that is damaged, which the command has its own words for."""
+    try:
+        found = json.loads(path.read_text())
+    except OSError:
+        return False
+    except (ValueError, RecursionError):
+        return path.name == SETUP
+    return isinstance(found, dict) and all(key in found for key in keys)
+
+
+def _strange_recordings(folder: Path) -> list[Path]:
+    """Files of others in a folder of recordings under names of the stand-in robot's."""
+    if not folder.is_dir() or (folder / STAND_IN).is_file():
+        return []
+    from droid_jax.measure.formats import load
+
+    def strange(path: Path) -> bool:
+        try:
+            return load(path).meta.get("source") != STAND_IN_SOURCE
+        except (OSError, ValueError):
+            return True
+
+    return [path for path in sorted(folder.iterdir()) if _STAND_INS.fullmatch(path.name) and strange(path)]

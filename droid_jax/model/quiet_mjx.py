@@ -1,0 +1,11 @@
+"""mujoco.mjx as the package imports it: without the two lines that it prints where warp is not installed."""
+
+from droid_jax.quiet import import_mjx
+
+import_mjx()
+# isort: split
+import mujoco.mjx as mjx  # noqa: E402
+import mujoco.mjx._src.constraint as constraint  # noqa: E402
+import mujoco.mjx._src.math as math  # noqa: E402
+
+__all__ = ["constraint", "math", "mjx"]

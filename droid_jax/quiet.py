@@ -1,0 +1,113 @@
+"""Messages of other programs that nobody can do anything about are left out; all else they print is printed.
+
+Two of them:
+
+- mujoco.mjx prints two lines where warp is not installed, which it only needs on some GPUs.
+- XLA writes errors of 2 kB when it loads a compiled CPU program from the cache: about two tuning preferences that it
+  gives itself when it compiles and that no host can report (openxla/xla#44565), and about versions that jax's key to
+  the cache contains.  Compiled programs lie in a folder of this processor's, see `runtime.tune`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib
+import io
+import os
+import re
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator
+from types import ModuleType
+from typing import Any
+
+LOG_LEVEL = "TF_CPP_MIN_LOG_LEVEL"  # read once, when jaxlib is loaded
+_NO_WARP = (
+    "Failed to import warp: No module named 'warp'",
+    "Failed to import mujoco_warp: No module named 'warp'",
+)
+_OF_THE_CACHE = re.compile(
+    rb"cpu_aot_loader\.cc.* Target machine feature \+prefer-no-(gather|scatter) is not +supported"
+    rb"|pjrt_executable\.cc.* Assume version compatibility\. PjRt-IFRT does not track XLA executable versions"
+)
+_lock = threading.Lock()
+_settled: list[str] = []  # the log level that jaxlib was loaded with, where this package set it
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Leave out the two lines that the first import of mujoco.mjx prints where warp is not installed.
+
+    Everything else printed inside the block appears when the block ends.
+    """
+    printed = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(printed):
+            yield
+    finally:
+        lines = printed.getvalue().splitlines(keepends=True)
+        if kept := "".join(line for line in lines if line.rstrip() not in _NO_WARP):
+            print(kept, end="")
+
+
+def import_mjx() -> ModuleType:
+    """mujoco.mjx, imported without its two lines about warp, and jax's cache without XLA's errors about it."""
+    before_jax()
+    with quiet():
+        mjx = importlib.import_module("mujoco.mjx")
+    quiet_cache()
+    return mjx
+
+
+def before_jax() -> None:
+    """Let XLA keep its log to itself, where jax is not imported yet and nobody chose otherwise."""
+    if "jaxlib" not in sys.modules:
+        os.environ.setdefault(LOG_LEVEL, "3")
+        _settled.append(os.environ[LOG_LEVEL])
+
+
+def quiet_cache() -> None:
+    """Leave out what XLA writes about each program that jax loads from its cache, where its log is on."""
+    if _settled == ["3"]:  # it is off
+        return
+    try:
+        cache: Any = importlib.import_module("jax._src.compilation_cache")
+        load = cache.get_executable_and_time
+    except (ImportError, AttributeError):  # another jax: then its messages are seen
+        return
+    if hasattr(load, "quiet"):
+        return
+
+    @functools.wraps(load)
+    def loaded(*args: Any, **kwargs: Any) -> Any:
+        with _without(_OF_THE_CACHE):
+            return load(*args, **kwargs)
+
+    loaded.quiet = True  # type: ignore[attr-defined]
+    cache.get_executable_and_time = loaded
+
+
+@contextlib.contextmanager
+def _without(pattern: re.Pattern[bytes]) -> Iterator[None]:
+    """Leave out the lines that match of what is written to the process's standard error inside the block.
+
+    Everything else, of other threads too, appears when the block ends.
+    """
+    with _lock, tempfile.TemporaryFile() as kept:
+        try:
+            stderr = os.dup(2)
+        except OSError:  # closed: nothing is written
+            yield
+            return
+        try:
+            os.dup2(kept.fileno(), 2)
+            yield
+        finally:
+            os.dup2(stderr, 2)
+            kept.seek(0)
+            for line in kept:
+                if not pattern.search(line):
+                    os.write(stderr, line)
+            os.close(stderr)
