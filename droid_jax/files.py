@@ -5,6 +5,7 @@ GAUSSIAN, SAMPLES = "gaussian.json", "samples.csv"
 TRACES, CORRELATION, DISTRIBUTION = "traces.npz", "correlation.npz", "distribution.npz"
 HISTORY, HISTORY_TABLE = "history.npz", "history.csv"
 FITTED, REPLAY, REPLAY_FILM = "fitted.xml", "replay.npz", "replay.webp"
+ASKED = "all.json"  # the options of a run of all stages, beside their folders
 GAP, GAP_TRACES = "gap.json", "gap.npz"
 # States in "amendments" of gap.json: the run was stopped before; "not made: " and the reason.
 TO_BE_MADE, NOT_MADE = "to be made", "not made"
@@ -30,4 +31,4 @@ WRITTEN = {
 WRITTEN["identify"] += ("gaussian_full.json", SAMPLES, TRACES, CORRELATION, DISTRIBUTION, HISTORY, HISTORY_TABLE)
 WRITTEN["identify"] += (FITTED, REPLAY, FILMS, "frames")
 WRITTEN["train"] += (GAUSSIAN,)
-WRITTEN["all"] = ("all.json", "report.html")
+WRITTEN["all"] = (ASKED, "report.html")

@@ -17,13 +17,12 @@ from droid_jax.commands.scenes import needs_log, needs_recording, needs_scene
 from droid_jax.commands.source import model_folder, needs_brax
 from droid_jax.commands.stand_in import DEMONSTRATIONS, hidden_effects, kept_at, record_stand_in, settled
 from droid_jax.commands.writer import writes
-from droid_jax.files import FIT, GAP, LAST_FILES, TRANSFER
+from droid_jax.files import ASKED, FIT, GAP, LAST_FILES, TRANSFER
 from droid_jax.report.stages import left_over, setup, unfinished
 from droid_jax.storage import write_json
 
 Stage = Literal["identify", "gap", "train", "evaluate"]
 STAGES: tuple[Stage, ...] = typing.get_args(Stage)
-ASKED = "all.json"  # the options of a run of all stages, beside their folders
 IN_A_SCENE: tuple[Stage, ...] = ("identify", "gap")  # of one's own: policies are trained at the built-in door
 
 

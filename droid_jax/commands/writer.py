@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from droid_jax import console
-from droid_jax.files import CONFIG, FIT, GAP, LOCK, SETUP, STAND_IN, STAND_IN_SOURCE, TRAINING, WRITTEN
+from droid_jax.files import ASKED, CONFIG, FIT, GAP, LOCK, SETUP, STAND_IN, STAND_IN_SOURCE, TRAINING, WRITTEN
 from droid_jax.storage import kind_of
 
 _HELD = set[Path]()  # folders whose lock this process holds
@@ -146,7 +146,7 @@ def _make(folder: Path) -> list[Path]:
 # What says that this program ran in a folder: these keys in one of these files.
 _SIGNS = {
     SETUP: ("preset", "seed"),
-    "all.json": ("preset", "seed", "effect_scale", "files"),
+    ASKED: ("preset", "seed", "effect_scale", "files"),
     CONFIG: ("preset", "recordings", "stand_in"),
     FIT: ("parameters",),
     GAP: ("verdict", "gaps"),
@@ -175,7 +175,7 @@ def _is_sign(path: Path, keys: tuple[str, ...]) -> bool:
     except OSError:
         return False
     except (ValueError, RecursionError):
-        return path.name == SETUP
+        return path.name in (SETUP, ASKED)
     return isinstance(found, dict) and all(key in found for key in keys)
 
 
