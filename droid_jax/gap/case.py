@@ -121,7 +121,7 @@ def make_case(
     scene = ready(scene)
     base = restrained(base)
     whole = joined(base, effects)
-    spaces = [whole, *[_unbounded(whole, _own(base))] * (len(recordings) - 1)]
+    spaces = [whole, *[unbounded(whole, own_nuisances(base))] * (len(recordings) - 1)]
     made = zip(recordings, spaces, strict=True)
     costs = [make_cost(scene, space, [r], config=config.compare, effects=effects) for r, space in made]
     return _case(costs, base, tuple(effects), config)
@@ -129,16 +129,16 @@ def make_case(
 
 def _case(costs: Sequence[Cost], base: Space, effects: tuple[Effect, ...], config: GapConfig) -> Case:
     fit, *others = (evidence(c) for c in costs)
-    confirm, *sealed = (e.with_own(_own(base)) for e in others)
+    confirm, *sealed = (e.with_own(own_nuisances(base)) for e in others)
     return Case(fit, confirm, sealed[0] if sealed else None, base, effects, config)
 
 
-def _own(base: Space) -> list[str]:
+def own_nuisances(base: Space) -> list[str]:
     """Nuisances that every recording has for itself: what a sensor shows at rest changes from day to day."""
     return [p.name for p in base.parameters if p.nuisance and p.name.startswith("torque_offset[")]
 
 
-def _unbounded(whole: Space, names: Sequence[str]) -> Space:
+def unbounded(whole: Space, names: Sequence[str]) -> Space:
     """The space of a recording whose own nuisances `names` are solved for, however far off they are."""
     far = {n: FAR * whole[n].std for n in names}
     return Space(

@@ -28,7 +28,7 @@ from droid_jax.compare.cost import Cost, make_cost
 from droid_jax.compare.measured import MINIMUM_NOISE
 from droid_jax.gap.blocks import OUTSIDE, Blocks, block_length, blocks, interleaved
 from droid_jax.gap.candidates import candidates
-from droid_jax.gap.case import Case, GapConfig, restrained
+from droid_jax.gap.case import Case, GapConfig, own_nuisances, restrained, unbounded
 from droid_jax.gap.evidence import only_comparison
 from droid_jax.gap.flips import FEWEST
 from droid_jax.gap.rank import proposals
@@ -151,7 +151,7 @@ def single_case(
     config: GapConfig | None = None,
     start: np.ndarray | None = None,
 ) -> Case:
-    """A case from one log, or from two of which the second is sealed.
+    """A case from one log, or from two of which the second is sealed, with its own torque offsets.
 
     start: [D] where fits begin, fitted to this motion before; the prior's mean unless given.
     Raises ValueError where the log is too short for its residual's correlation time.
@@ -165,12 +165,15 @@ def single_case(
     name = only_comparison(log).name
     turns = (f"{name}, every other block", f"{name}, the blocks between")
     fit, confirm = (_blocks(log.part(n), deviation, part) for n, part in zip(turns, parts, strict=True))
+    own = [] if sealed is None else own_nuisances(base)  # another day's; the rest of the same log has the same
     rest = log.part(f"{name}, last third") if sealed is None else sealed
     judged = _blocks(
-        rest,
+        replace(rest, space=unbounded(rest.space, own)) if own else rest,
         deviation[[log.columns.index(c) for c in rest.columns]],
         _any_blocks(rest.clock, end if sealed is None else rest.clock[0]),
     )
+    if own:
+        judged = judged.with_own(own)
     return Case(fit, confirm, judged, restrained(base), tuple(effects), config)
 
 

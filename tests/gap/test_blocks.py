@@ -21,7 +21,9 @@ from droid_jax.gap.single import Log, base_model, make_log, single_case
 from droid_jax.gap.verdict import Kind
 from droid_jax.gap.workflow import find
 from droid_jax.measure.noise import RATE, coarse_clock
+from droid_jax.measure.recording import Recording
 from droid_jax.model.effects.registry import library, ready
+from droid_jax.model.parameters import Space
 
 # Arithmetic --------------------------------------------------------------------------------
 
@@ -184,6 +186,37 @@ def test_each_joint_of_a_sealed_log_has_its_own_noise(monkeypatch: pytest.Monkey
         "log, the blocks between": [1.0, 2.0],
         "sealed": [2.0, 1.0],
     }
+
+
+def offset_by(recording: Recording, torque: float, name: str) -> Recording:
+    """A recording whose torque sensor shows so much more at rest."""
+    channel = recording.channel("torque")
+    shifted = replace(channel, values=channel.values + torque)
+    return replace(recording, name=name, channels={**recording.channels, "torque": shifted})
+
+
+@pytest.mark.parametrize("off", [0.0, 0.4, 3.0])
+def test_a_sealed_log_has_torque_offsets_of_its_own(off: float):
+    """Zeroed on another day, by 0 to 10 deviations of the offset's prior: what is sealed then shows no more than noise.
+
+    As on recordings with repeats, however far off it is; the model that explains the rest stays as it is.
+    """
+    scene = elbow()
+    damping, offset = elbow_space(scene).parameters
+    base = Space((damping, replace(offset, nuisance=True)))
+    effects, log = library(scene, ["joint_coulomb"]), elbow_log(COULOMB)
+    other = offset_by(elbow_log(COULOMB, 30.0), off, "another day")
+    logs = [make_log(scene, base, effects, each, CONFIG) for each in (log, other)]
+    case = single_case(logs[0], base, effects, logs[1], CONFIG)
+    assert case.sealed is not None and case.sealed.own == ("torque_offset[elbow]",) and case.confirm.own == ()
+    truth = case.whole.values({"elbow_damping": 0.6, "torque_offset[elbow]": 0.1, "joint_coulomb[elbow]": COULOMB})
+    least = case.confirm.gap_at(truth)
+    assert case.sealed.gap_at(truth) == pytest.approx(least, rel=0.3)
+    best = case.sealed.with_own_at_best(truth)[0]
+    assert best[case.whole.index("torque_offset[elbow]")] == pytest.approx(0.1 + off, abs=0.03)
+    assert single_case(logs[0], base, effects, None, CONFIG).sealed.own == ()  # pyright: ignore
+    if off:
+        assert replace(case.sealed, own=(), own_columns=None).gap_at(truth) > 2.0 * least
 
 
 def test_repeats_need_no_blocks():
