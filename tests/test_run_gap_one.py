@@ -68,11 +68,17 @@ def test_halves_are_the_first_and_the_last_repeats():
     np.testing.assert_array_equal(joined, whole.channel("torque").values)
 
 
+LOST = ("Lost are effects of commands, servos and contacts", "U then holds the noise", "docs/own-robot.md")
+
+
 @pytest.mark.parametrize(
     ("recordings", "expected"),
     [
         ([with_repeats(15)], ["is the only one and has 15 repeats", "Record 16 or more", "droid_jax.run identify"]),
         ([with_repeats(1)], ["is the only one and has 1 repeat:", "another motion, 8 repeats or more of each"]),
+        ([with_repeats(1)], ["without its commands it can be searched as a log", *LOST]),
+        ([with_repeats(3)], ["has 3 repeats:", "one repeat of it, without its commands, it can be searched", *LOST]),
+        ([with_repeats(3)] * 2, ["the fit recording 'servo' has 3 repeats:", "searched as a log", *LOST]),
         ([elbow_log(0.0, 2.0, repeats=2)], ["has 2 repeats", "one repeat alone is searched as a log"]),
         ([LOG, elbow_log(0.0, 2.0, repeats=3)], ["the second recording 'elbow' has 3 repeats", "Leave the second out"]),
         ([LOG, with_repeats(1)], ["the second recording 'servo' has commands", "log without repeats and commands"]),
@@ -84,6 +90,17 @@ def test_too_few_repeats_say_what_can_still_be_done(recordings: list[Recording],
     with pytest.raises(ValueError) as refused:
         split_of(recordings)
     assert [words for words in expected if words not in str(refused.value)] == []
+
+
+def test_what_is_offered_instead_can_be_done():
+    """One repeat without its commands is a log; without measured positions there is nothing to replay along."""
+    chirp = with_repeats(3)
+    log = replace(chirp.repeats_subset([0]), time=np.zeros(0), command=np.zeros((0, 0)), command_names=())
+    assert split_of([log]) is Split.BLOCKS
+    blind = replace(chirp, channels={"torque": chirp.channel("torque")})
+    with pytest.raises(ValueError) as refused:
+        split_of([blind])
+    assert "searched as a log" not in str(refused.value)
 
 
 def test_a_second_log_is_another_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -21,6 +21,9 @@ ELSE = (
 )
 
 
+ALONE = "one repeat alone"  # of a log without commands
+
+
 class Split(enum.Enum):
     """What fitted and confirming part differ in."""
 
@@ -76,6 +79,21 @@ def roles_of(split: Split, recordings: Sequence[Recording]) -> dict[str, Recordi
     }
 
 
+def _as_log(recording: Recording) -> str:
+    """How a commanded recording with too few repeats can be searched today, and what that loses; empty where it cannot.
+
+    A log is replayed along its measured positions, so it must hold them.
+    """
+    if not recording.command.size or "position" not in recording.channels:
+        return ""
+    one = "without its commands" if recording.repeats == 1 else "one repeat of it, without its commands,"
+    return (
+        f"; and {one} it can be searched as a log, in blocks of time, if it lasts a minute or more (docs/own-robot.md, "
+        '"Logs without commands"). Lost are effects of commands, servos and contacts (delays, gains, elastic gears, '
+        "the grip), and U then holds the noise"
+    )
+
+
 def _check_sealed(first: Recording, other: Recording) -> None:
     if other.repeats == 1 and not other.command.size:
         return
@@ -95,18 +113,18 @@ def _check_halves(recording: Recording) -> None:
         f"confirm, and with fewer than {FEWEST} repeats in a half no effect can be told from chance. Record "
         f"{HALVES} or more, or better another motion, {FEWEST} repeats or more of each: "
         f"--recording FIT CONFIRM. {ELSE}"
-        + ("" if recording.command.size else "; and one repeat alone is searched as a log, in blocks of time")
+        + (_as_log(recording) if recording.command.size else f"; and {ALONE} is searched as a log, in blocks of time")
     )
 
 
 def _check_repeats(role: str, recording: Recording) -> None:
     if recording.repeats >= FEWEST:
         return
-    log = recording.repeats == 1 and not recording.command.size
+    log = not recording.command.size
     raise ValueError(
         f"the {role} recording {recording.name!r} has {_repeats(recording)}: with fewer than {FEWEST} no effect can be "
         f"told from chance. {ELSE}"
-        + ("; and one log without repeats and commands, or two of them, are searched in blocks of time" if log else "")
+        + (f"; and {ALONE}, or of each of two logs, is searched in blocks of time" if log else _as_log(recording))
     )
 
 
