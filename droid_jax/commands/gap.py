@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
@@ -100,6 +100,7 @@ def run(command: Gap) -> None:
     needs_writer(command.tensorboard)
     runtime.start()
     warn_of_cpu(command.preset)
+    from droid_jax.compare.log_checks import check_log
     from droid_jax.gap.inputs import shared_out
     from droid_jax.gap.missing import case_of
     from droid_jax.gap.results import write_amended, write_gap
@@ -138,6 +139,7 @@ def run(command: Gap) -> None:
     stand_in = all(is_stand_in(r) for r in roles.values())
     robot = known_stand_in(command.recording or kept_at(out)) if stand_in else {}
     description = {
+        "findings": [asdict(f) for recording in given or roles.values() for f in check_log(scene, recording)],
         "split": {"by": split.value, "limits": split.limits},
         "versions": runtime.versions(),
         "device": runtime.device(),

@@ -96,6 +96,7 @@ def run(command: Identify) -> None:
     needs_writer(command.tensorboard)
     runtime.start()
     warn_of_cpu(command.preset)
+    from droid_jax.compare.log_checks import check_log
     from droid_jax.compare.notes import command_notes
     from droid_jax.identify.pipeline import cost_samples, prepare, solve
     from droid_jax.identify.results import prepare_folder, write_run
@@ -145,6 +146,7 @@ def run(command: Identify) -> None:
         write_run(
             out, found, description, truth=truth, samples=lambda: cost_samples(found, config.samples, config.seed),
             notes=[text for recording in recordings for text in command_notes(scene, recording)],
+            findings=[finding for recording in recordings for finding in check_log(scene, recording)],
         )  # fmt: skip
     draw(out, scene)
     report.run(report.Report(out))

@@ -19,6 +19,7 @@ import numpy as np
 
 from droid_jax import runtime
 from droid_jax.compare.inverse import Path, path_of, path_replay, prescribed
+from droid_jax.compare.log_checks import warn_of_log
 from droid_jax.compare.notes import check_range, warn_if_moving, warn_of_commands
 from droid_jax.compare.population import in_blocks, over_block
 from droid_jax.compare.replay import Drive, Replay, check_gains, make_drive, servo_replay, torque_offset_effect
@@ -139,6 +140,7 @@ def make_cost(
     engine: str = "mjx",
     config: CompareConfig | None = None,
     effects: Sequence[Effect] = (),
+    check: bool = True,
 ) -> Cost:
     """The cost of a scene over one or more recordings.
 
@@ -147,6 +149,7 @@ def make_cost(
     engine: "mjx" (compiled, all devices) or "mujoco" (plain C, all cores; the parity oracle).
     effects: extra physics or observation models whose parameters are part of the space; torque
       offsets, and joint friction behind the sensor where the space holds any, are there already.
+    check: warn of units, signs and clocks in the recordings that can hardly be right (`log_checks.check_log`).
     Raises ValueError for unknown engines, joints, channels, parameters that nothing reads, or gains that do not match.
     """
     config = config or CompareConfig()
@@ -154,6 +157,8 @@ def make_cost(
     if not recordings:
         raise ValueError("a cost needs at least one recording")
     drives = [followed(scene, r, config) for r in recordings]
+    for recording in recordings if check else ():
+        warn_of_log(scene, recording)
     given = {e.name for e in effects}
     check_read(scene, space, effects)
     if not any(isinstance(drive, Drive) for drive in drives):

@@ -6,7 +6,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from droid_jax.compare.log_checks import warn_of_log
 from droid_jax.gap.split import Split, roles_of, split_of
+from droid_jax.measure.checks import validate
 from droid_jax.measure.recording import Channel, Recording
 from droid_jax.model.scene import Scene
 
@@ -18,10 +20,17 @@ APART = 0.05  # s: repeats that are further apart in time were not cut alike
 
 
 def shared_out(scene: Scene, recordings: Sequence[Recording]) -> tuple[Split, dict[str, Recording]]:
-    """How recordings share the work, and each by its role; ValueError where a search in them could not end well."""
+    """How recordings share the work, and each by its role; ValueError where a search in them could not end well.
+
+    Warns of what in them can hardly be right (`check_log`).
+    """
+    for recording in recordings:
+        validate(recording, allow_jitter=True)  # one made in Python may not have been
     split = split_of(recordings)
     roles = roles_of(split, recordings)
     check_recordings(scene, {"only": recordings[0]} if split is Split.REPEATS else roles)
+    for recording in recordings:
+        warn_of_log(scene, recording)
     return split, roles
 
 

@@ -137,7 +137,7 @@ def make_log(
     if recording.repeats > 1:
         raise ValueError(f"recording {recording.name!r} has {recording.repeats} repeats: use make_case")
     whole, config = joined(restrained(base), effects), config or GapConfig()
-    cost = make_cost(ready(scene), whole, [recording], config=config.compare, effects=[*known, *effects])
+    cost = make_cost(ready(scene), whole, [recording], config=config.compare, effects=[*known, *effects], check=False)
     if not isinstance(cost.drives[0], Motion):
         raise ValueError(f"recording {recording.name!r} holds commands; blocks are for logs in inverse mode")
     return Log(**{f.name: getattr(cost, f.name) for f in fields(cost)})

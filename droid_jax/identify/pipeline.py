@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from droid_jax.compare.cost import Cost, make_cost
+from droid_jax.compare.log_checks import warn_of_log
 from droid_jax.compare.residuals import CompareConfig
 from droid_jax.identify.fit import Fit
 from droid_jax.identify.gaussian import Gaussian, prior, space_to_json
@@ -154,11 +155,17 @@ def prepare(
     _check_names([r.name for r in recordings], config)
     fitted, held, numbers = zip(*(split(r, config.heldout) for r in recordings), strict=True)
     full = space if nuisances is None or config.refine is None else space + nuisances
-    base = make_cost(scene, full, fitted, engine=config.engine, config=config.compare, effects=effects)
+    base = make_cost(scene, full, fitted, engine=config.engine, config=config.compare, effects=effects, check=False)
+    for recording in recordings:  # whole: copies among its repeats may be fitted and held out
+        warn_of_log(scene, recording)
     # now, since what is held out may have faults of its own, and those are to be told before anything long
     plain = replace(config.compare, whitened=False)
     commanded = all(r.command.size for r in recordings)
-    heldout = base.against(held, plain) if commanded else make_cost(scene, full, held, config=plain, effects=effects)
+    heldout = (
+        base.against(held, plain)
+        if commanded
+        else make_cost(scene, full, held, config=plain, effects=effects, check=False)
+    )
     _check_start(base, full)
     return Problem(
         scene=scene,

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from droid_jax.compare.findings import Finding
 from droid_jax.files import (
     CONFIG,
     CORRELATION,
@@ -55,18 +56,20 @@ def write_run(
     truth: Mapping[str, float] | None = None,
     samples: Callable[[], Mapping[str, np.ndarray]] | None = None,
     notes: Iterable[str] = (),
+    findings: Iterable[Finding] = (),
 ) -> None:
     """Write all files of a run into `folder` (see the module's text).
 
     truth: hidden values where they are known (the stand-in robot); samples: draws them (see `cost_samples`), once
       the fit itself is on disk.
+    findings: what the checks of the recordings found.
     """
     mjcf, notes = None, list(notes)
     try:
         mjcf = fitted_mjcf(found.scene, found.full, found.best)
     except ValueError as error:  # the fit itself is whole
         notes.append(f"fitted.xml is not written: {error}")
-    write_json(folder / FIT, fit_json(found, truth or {}, notes))
+    write_json(folder / FIT, {**fit_json(found, truth or {}, notes), "findings": [asdict(f) for f in findings]})
     found.gaussian.save(folder / GAUSSIAN)
     found.full_gaussian.save(folder / "gaussian_full.json")
     _write_history(folder, found)

@@ -11,7 +11,7 @@ import numpy as np
 
 from droid_jax.files import GAP, GAP_TRACES
 from droid_jax.report.gap_parts import PARTS, Parts, parts_of, said_split
-from droid_jax.report.reading import Maybe, Reader
+from droid_jax.report.reading import FINDING, Maybe, Reader
 
 VERDICTS = ("none", "named", "tie", "partly explained", "unexplained", "fit not converged")
 ROLES = ("fit", "confirm", "sealed")
@@ -53,6 +53,7 @@ _SCHEMA = {
     **{"handed_on": Maybe({"fitted_to": [str], "gaps": {str: _MAYBE}}), "amendments": Maybe({str: str})},
     **{"remainder": Maybe(_MAYBE), "explained": Maybe(_MAYBE), "failed": Maybe([str])},
     **{"hints": Maybe([_HINT]), "doubts": Maybe([str]), "thresholds": Maybe({str: _NUMBER})},
+    "findings": Maybe([FINDING]),
 }
 _LINES = ("measured", "scatter", "before", "after")
 

@@ -14,6 +14,8 @@ import numpy as np
 from droid_jax.read_json import read_json, typed
 from droid_jax.read_npz import NUMBERS, TEXT, NpzFile
 
+FINDING = dict.fromkeys(("kind", "column", "severity", "sentence"), str)  # of what a check of a recording found
+
 
 @dataclass(frozen=True)
 class Reader:

@@ -11,7 +11,7 @@ import numpy as np
 
 from droid_jax.files import CONFIG, CORRELATION, DISTRIBUTION, FILMS, FIT, HISTORY, REPLAY, REPLAY_FILM, TRACES
 from droid_jax.read_json import parse_json
-from droid_jax.report.reading import Maybe, Reader
+from droid_jax.report.reading import FINDING, Maybe, Reader
 
 _READ = Reader("identify")
 _NUMBER, _MAYBE = (int, float), (int, float, type(None))
@@ -32,7 +32,7 @@ _FIT = {
     "cost": {"initial": Maybe(_MAYBE), "best": Maybe(_MAYBE), "floor": Maybe(_MAYBE), "unit": Maybe(str)},
     **{"torque_unit": Maybe(str), "converged": Maybe((bool, type(None))), "mean_square": Maybe(_MAYBE)},
     **{"generations": Maybe(int), "evaluations": Maybe(int), "seconds": Maybe({str: _NUMBER})},
-    **{"mjcf_lacks": Maybe([str]), "notes": Maybe([str])},
+    **{"mjcf_lacks": Maybe([str]), "notes": Maybe([str]), "findings": Maybe([FINDING])},
 }
 _RECORDING = {
     **{"name": str, "sha256": Maybe(str), "repeats": Maybe(int), "heldout": Maybe([int]), "duration": Maybe(_NUMBER)},

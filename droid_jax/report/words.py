@@ -195,7 +195,9 @@ def unjudged(fit: Mapping[str, Any]) -> bool:
 
 def _next(run: Run, searched: bool) -> str:
     steps = []
-    if far_off(run.fit):
+    if wrong := [f["kind"] for f in run.fit.get("findings", ()) if f["severity"] == "certain"]:
+        steps.append(f"do not train on this fit: mend the {listed(list(dict.fromkeys(wrong)))} of the recording")
+    elif far_off(run.fit):
         steps.append(f"do not train on this fit: {DOUBT}")
     if any(p["on_bound"] for p in run.fit["parameters"]):
         steps.append("ask whether the bound is real; if not, widen it and fit again")

@@ -1,0 +1,25 @@
+"""What a check of a recording finds: `Finding`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Kind = Literal["units", "sign", "order", "gravity", "clock", "repeats", "sensor", "unused"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What of a recording can hardly be right.
+
+    kind: of the fault.  column: the joint, channel or pair of repeats that it is about.  value: as measured; expected:
+    what it should be near; both in the sentence's terms.  severity: "certain" where no fit of this recording can mean
+    anything, else "likely".  sentence: what is wrong, where, and what to do.
+    """
+
+    kind: Kind
+    column: str
+    value: float
+    expected: float
+    severity: Literal["likely", "certain"]
+    sentence: str

@@ -1,0 +1,52 @@
+"""Whether a recording can be what it says: units, signs, order of the joints, weight, clocks and repeats.
+
+`check_log` compares what is in the recording with what the scene expects at its nominal values.  An alternative is
+named only where the recording as stated explains hardly anything and the alternative nearly everything, so a model
+that is merely wrong raises nothing.  Nothing is refused: what is found is said, and stands in the results.
+"""
+
+from __future__ import annotations
+
+import warnings
+import weakref
+
+from droid_jax.compare.findings import Finding
+from droid_jax.compare.log_clocks import check_clocks
+from droid_jax.compare.log_motion import log_motion
+from droid_jax.compare.log_repeats import check_repeats
+from droid_jax.compare.log_torque import check_torque
+from droid_jax.compare.log_tracking import check_tracking
+from droid_jax.measure.recording import Recording
+from droid_jax.model.scene import Scene
+
+_Found = weakref.WeakKeyDictionary[Scene, tuple[Finding, ...]]
+_FOUND: weakref.WeakKeyDictionary[Recording, _Found] = weakref.WeakKeyDictionary()  # so that each is checked once
+
+
+def check_log(scene: Scene, recording: Recording) -> tuple[Finding, ...]:
+    """What of a recording can hardly be right in this scene, the gravest first.
+
+    Args:
+        scene: with its nominal values: masses right to a factor of three, servo gains as on the robot.
+        recording: a valid one (`measure.checks.validate`).
+
+    Returns:
+        The findings; none where all is as it should be, or where too little was measured to tell.
+    """
+    known = _FOUND.setdefault(recording, weakref.WeakKeyDictionary())
+    if scene not in known:
+        found = [*check_repeats(recording), *check_clocks(scene, recording)]
+        motion = log_motion(scene, recording)
+        if motion is not None:
+            tracking = check_tracking(scene, recording, motion)
+            found += tracking
+            if not tracking:  # else the torque is judged by a motion that is wrong
+                found += check_torque(scene, recording, motion)
+        known[scene] = tuple(sorted(found, key=lambda finding: finding.severity != "certain"))
+    return known[scene]
+
+
+def warn_of_log(scene: Scene, recording: Recording) -> None:
+    """Warn of each finding of `check_log`."""
+    for finding in check_log(scene, recording):
+        warnings.warn(finding.sentence, stacklevel=2)
