@@ -31,7 +31,7 @@ def test_a_failed_check_is_on_the_page(make: Callable[[Path], Path], name: str, 
     assert "A check of the recordings failed" in html
     assert "the torque of &lt;elbow&gt; runs against its command" in html
     (folder / name).write_text(json.dumps({**content, "findings": [{"kind": 3}]}))
-    with pytest.raises(ValueError, match=rf"{name}, 'findings', entry 0"):
+    with pytest.raises(ValueError, match=rf"{name}: 'findings', entry 0"):
         page.write_report(folder)
 
 
