@@ -29,7 +29,7 @@ from droid_jax.compare.twin import twin_replay
 from droid_jax.measure.checks import validate
 from droid_jax.measure.motion import Motion, measured_motion
 from droid_jax.measure.recording import Recording
-from droid_jax.model.joint_friction import TERMS, joint_friction_effect
+from droid_jax.model.joint_friction import TERMS, direction, joint_friction_effect
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_physics
 from droid_jax.model.scene import Scene
@@ -163,8 +163,11 @@ def make_cost(
     check_read(scene, space, effects)
     if not any(isinstance(drive, Drive) for drive in drives):
         _warn_of_commanded(space)
-    effects = (*effects, *(e for e in _sensor_effects(scene, space) if e.name not in given))
-    replays = tuple(_engine(engine, scene, space, d, effects, config.mj_step) for d in drives)
+
+    def with_sensors(drive: Drive | Motion) -> tuple[Effect, ...]:
+        return (*effects, *(e for e in _sensor_effects(scene, space, drive) if e.name not in given))
+
+    replays = tuple(_engine(engine, scene, space, d, with_sensors(d), config.mj_step) for d in drives)
     comparisons = tuple(
         _compared(scene, recording, drive, replay, config)
         for recording, drive, replay in zip(recordings, drives, replays, strict=True)
@@ -239,7 +242,9 @@ def followed(scene: Scene, recording: Recording, config: CompareConfig) -> Drive
     if not scene.joints:
         raise ValueError(f"no joint of scene {scene.name!r} is driven: name the measured ones (--joints)")
     felt = (*scene.joints, *scene.carriers(scene.joints))  # by the torques that are compared
-    return measured_motion(recording, prescribed(scene, recording), cutoff=config.motion_cutoff, alike=felt)
+    return measured_motion(
+        recording, prescribed(scene, recording), cutoff=config.motion_cutoff, alike=felt, rest=config.rest
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,7 +273,8 @@ def _compared(
 ) -> Comparison:
     """What a recording is compared with its replay by."""
     apart = _apart(replay, scene, recording, config) if isinstance(replay, Along) else None
-    return make_comparison(scene, recording, _clock(recording, follows), config, apart)
+    rest = follows.rest if isinstance(follows, Motion) else None
+    return make_comparison(scene, recording, _clock(recording, follows), config, apart, rest)
 
 
 def _apart(along: Along, scene: Scene, recording: Recording, config: CompareConfig) -> np.ndarray | None:
@@ -280,7 +286,9 @@ def _apart(along: Along, scene: Scene, recording: Recording, config: CompareConf
     if recording.repeats == 1 or not recording.channel("position").mask.all():
         return None
     motions = [
-        measured_motion(recording.repeats_subset([n]), along.motion.joints, cutoff=config.motion_cutoff)
+        measured_motion(
+            recording.repeats_subset([n]), along.motion.joints, cutoff=config.motion_cutoff, rest=config.rest
+        )
         for n in range(recording.repeats)
     ]
     paths = [path_of(scene, motion) for motion in motions]
@@ -318,11 +326,14 @@ def _clock(recording: Recording, follows: Drive | Motion) -> np.ndarray:
     return follows.time if isinstance(follows, Motion) else float(recording.time[0]) + follows.time
 
 
-def _sensor_effects(scene: Scene, space: Space) -> tuple[Effect, ...]:
+def _sensor_effects(scene: Scene, space: Space, drive: Drive | Motion) -> tuple[Effect, ...]:
     """What the torque sensors add: always the offsets, friction behind them where the space asks for it."""
     friction = any(name.startswith(("viscous[", "coulomb[")) for name in space.names)
     offsets = torque_offset_effect(scene.joints)
-    return (joint_friction_effect(scene.joints), offsets) if friction else (offsets,)
+    if not friction:
+        return (offsets,)
+    sign = jnp.sign if isinstance(drive, Motion) else direction
+    return (joint_friction_effect(scene.joints, sign), offsets)
 
 
 def _engine(

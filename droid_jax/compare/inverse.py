@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -18,7 +19,6 @@ from droid_jax.compare.replay import observed
 from droid_jax.measure.motion import Motion
 from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.model.ignored import refuse_fluid
-from droid_jax.model.joint_friction import direction
 from droid_jax.model.physics import Physics
 from droid_jax.model.quiet_mjx import mjx
 from droid_jax.model.scene import Scene
@@ -70,20 +70,26 @@ def prescribed(scene: Scene, recording: Recording) -> tuple[str, ...]:
 class Path(NamedTuple):
     """The arrays of a motion, single precision: [T] s, [T, J] rad, rad/s, rad/s^2 (m for slides).
 
-    rest: [nq] where all joints that do not move stand.
+    at_rest: [T, J] bool, samples at which friction is not known from the speed.  measured: [T, J] N m (N), the torque
+    measured there, NaN where none was.  still: [nq] where all joints that do not move stand.
     """
 
     time: jax.Array
     position: jax.Array
     velocity: jax.Array
     acceleration: jax.Array
-    rest: jax.Array
+    at_rest: jax.Array
+    measured: jax.Array
+    still: jax.Array
 
 
 def path_of(scene: Scene, motion: Motion) -> Path:
     """What a compiled replay is given of a motion; ValueError where it states a joint that the scene has not."""
-    arrays = (motion.time, motion.position, motion.velocity, motion.acceleration, scene.initial_qpos(motion.others))
-    return Path(*(jnp.asarray(a, jnp.float32) for a in arrays))
+    rest = motion.velocity == 0.0 if motion.rest is None else motion.rest
+    measured = np.full(motion.velocity.shape, np.nan) if motion.measured is None else motion.measured
+    rows = (jnp.asarray(a, jnp.float32) for a in (motion.time, motion.position, motion.velocity, motion.acceleration))
+    still = jnp.asarray(scene.initial_qpos(motion.others), jnp.float32)
+    return Path(*rows, jnp.asarray(rest), jnp.asarray(measured, jnp.float32), still)
 
 
 def path_replay(
@@ -93,7 +99,10 @@ def path_replay(
 
     joints: those of the paths, the scene's first (default: these alone).
 
-    tau = M(q) qdd + c(q, qd) - passive forces [+ g(q)] and, on the motor side, + armature qdd + dry friction sgn(qd).
+    tau = M(q) qdd + c(q, qd) - passive forces [+ g(q)] and, on the motor side, + armature qdd + dry friction.
+    Dry friction, the model's own and that of effects, is loss * sgn(qd).  At rest it is set-valued: of all values
+    between -loss and loss the one that comes nearest to the measured torque, so that a residual is the distance to
+    that interval.
     Passive are springs and dampers of joints and tendons; joints' damping on the motor side only: on the link side none
     of the motor's own terms appear, and what the joint adds there (Coulomb and viscous friction, offset) is an
     observation effect.  Constraints (contacts, limits, equalities) take no part.
@@ -120,41 +129,57 @@ def path_replay(
         def at(time, position, velocity, acceleration):
             full = jnp.zeros(scene.model.nv, jnp.float32)
             velocity = full.at[dofs].set(velocity)
-            data = mjx.make_data(link_model).replace(qpos=path.rest.at[positions].set(position), qvel=velocity)
+            data = mjx.make_data(link_model).replace(qpos=path.still.at[positions].set(position), qvel=velocity)
             data = mjx.fwd_velocity(link_model, mjx.fwd_position(link_model, data))
             torque = mjx.full_m(link_model, data) @ full.at[dofs].set(acceleration) + data.qfrc_bias
             torque = torque - (data.qfrc_passive - compensated * data.qfrc_gravcomp)
-            if motor:
-                torque = torque + model.dof_frictionloss * jnp.sign(velocity)
-            state = State(time, data.qpos, velocity, torque, model)
+            direction = jnp.sign(velocity)
+            felt = torque + model.dof_frictionloss * direction if motor else torque
+            state = State(time, data.qpos, velocity, felt, model)
             own = model.dof_frictionloss if motor else _behind_the_sensor(scene, theta)
-            return (torque + _resistance(theta, state, own, effects))[scene.joint_dofs]
+            force, loss = _resistance(theta, state, own, effects)
+            # On the link side the own friction is added by `joint_friction_effect`, as an observation.
+            friction = (loss if motor else loss - own) * direction
+            rows = (torque + force + friction, loss * direction, loss)
+            return tuple(row[scene.joint_dofs] for row in rows)
 
-        torque = jax.vmap(at)(*path[:-1])
+        torque, friction, loss = jax.vmap(at)(path.time, path.position, path.velocity, path.acceleration)
         hinge = joints.index(scene.object_joint) if scene.object_joint in joints else None
+        count = len(scene.joints)
         rollout = Rollout(
             time=path.time,
             torque=torque,
-            position=path.position[:, : len(scene.joints)],
-            velocity=path.velocity[:, : len(scene.joints)],
+            position=path.position[:, :count],
+            velocity=path.velocity[:, :count],
             object_angle=jnp.zeros(len(path.time)) if hinge is None else path.position[:, hinge],
             contact=jnp.zeros((len(path.time), 0), bool),
             finite=jnp.array(True),
         )
-        return observed(rollout, theta, effects)
+        seen = observed(rollout, theta, effects)
+        held = held_torque(seen.torque - friction, jnp.maximum(loss, 0.0), path.measured[:, :count])
+        return replace(seen, torque=jnp.where(path.at_rest[:, :count], held, seen.torque))
 
     return replay
 
 
-def _resistance(theta: Theta, state: State, own: jax.Array, effects: Sequence[Effect]) -> jax.Array:
-    """[nv] N m that the effects' forces, and their friction beyond the model's own [nv], take to overcome."""
+def held_torque(free: jax.Array, loss: jax.Array, measured: jax.Array) -> jax.Array:
+    """Torque at rest: `free`, without dry friction, and the friction within +-loss that comes nearest to `measured`.
+
+    All N m (N for slides) and of one shape; where nothing was measured (NaN), no friction.
+    """
+    friction = jnp.clip(measured - free, -loss, loss)
+    return free + jnp.where(jnp.isnan(measured), 0.0, friction)
+
+
+def _resistance(theta: Theta, state: State, own: jax.Array, effects: Sequence[Effect]) -> tuple[jax.Array, jax.Array]:
+    """[nv] N m that the effects' forces take to overcome, and [nv] all dry friction, `own` [nv] and that of effects."""
     loss, resistance = own, jnp.zeros_like(state.qvel)
     for effect in effects:
         if effect.frictionloss is not None:
             loss = effect.frictionloss(theta, state, loss)
         if effect.force is not None:
             resistance = resistance - effect.force(theta, state)
-    return resistance + (loss - own) * direction(state.qvel)
+    return resistance, loss
 
 
 def _behind_the_sensor(scene: Scene, theta: Theta) -> jax.Array:

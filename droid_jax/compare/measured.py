@@ -18,6 +18,7 @@ from droid_jax.measure.noise import RATE, Noise, coarse_clock, estimate_noise, l
 from droid_jax.measure.recording import Channel
 from droid_jax.model.scene import Scene
 
+MOVES = 0.5  # share of the filter's window at least in which a joint moves, where what is left tells of noise
 ENOUGH = 0.1  # share of the time that two repeats must have measured
 # Deviation below which a channel's noise is never believed, in the channel's unit.
 MINIMUM_NOISE = {"torque": 0.01, "position": 2e-5, "velocity": 5e-4, "object_angle": 2e-4}
@@ -33,7 +34,8 @@ class Measured:
 
     unit: of the channel.  at: [Tc] fractional rows of the simulated trace; values [N,Tc,C], mask [N,Tc,C]; columns [C]
     of the simulated channel; kernel [C or 1,K,T] and noise for the whitened form; span [2] s of the
-    coarse clock; weight in the distance.
+    coarse clock; weight in the distance; moves [K,C] bool, instants at which a column's joint moves: at rest along a
+    prescribed motion friction takes what is left, and what is left tells nothing of noise.
     """
 
     name: str
@@ -46,6 +48,7 @@ class Measured:
     noise: Noise
     span: tuple[float, float]
     weight: float
+    moves: np.ndarray
 
     @property
     def clock(self) -> np.ndarray:
@@ -53,8 +56,15 @@ class Measured:
         return coarse_clock(*self.span)
 
 
-def prepared(scene: Scene, channel: Channel, clock: np.ndarray, weight: float, apart: np.ndarray | None) -> Measured:
-    """A channel made ready for a replay whose rows have the times `clock` [T] s; apart: as in `make_comparison`.
+def prepared(
+    scene: Scene,
+    channel: Channel,
+    clock: np.ndarray,
+    weight: float,
+    apart: np.ndarray | None = None,
+    rest: np.ndarray | None = None,
+) -> Measured:
+    """A channel made ready for a replay whose rows have the times `clock` [T] s; apart, rest: as in `make_comparison`.
 
     Raises ValueError for a channel that no replay produces, unknown columns, a constant one, one outside the motion,
     one with a stretch that nothing measured, and one too long for the memory.
@@ -89,6 +99,7 @@ def prepared(scene: Scene, channel: Channel, clock: np.ndarray, weight: float, a
     repeats, measured = _fill(repeats, channel, coarse)
     noise = estimate_noise(repeats, minimum=MINIMUM_NOISE[channel.name], measured=measured)
     step = clock[1] - clock[0]
+    still = np.zeros((len(clock), len(scene.joints)), bool) if rest is None else rest[:, : len(scene.joints)]
     return Measured(
         name=channel.name,
         unit=channel.unit,
@@ -100,6 +111,7 @@ def prepared(scene: Scene, channel: Channel, clock: np.ndarray, weight: float, a
         noise=noise,
         span=(float(coarse[0]), float(coarse[-1])),
         weight=weight,
+        moves=kernel @ (resampling @ (~still[:, columns]).astype(float)) > MOVES,
     )
 
 

@@ -18,6 +18,7 @@ from droid_jax.compare.measured import MINIMUM_NOISE, Measured, prepared
 from droid_jax.measure.motion import CUTOFF
 from droid_jax.measure.noise import discrepancy
 from droid_jax.measure.recording import Phase, Recording
+from droid_jax.measure.rest import RestConfig
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Rollout
 
@@ -34,6 +35,7 @@ class CompareConfig:
     grip_share: share of the gripping time that all fingers must touch.
     whitened: the cost is the root mean square of the whitened residuals instead of N m.
     motion_cutoff: Hz, filter of the measured positions of a recording without commands.
+    rest: below which speed a joint of such a recording counts as at rest, where its friction is only bounded.
     mj_step: replay as a MuJoCo program logs itself: mj_step's own steps of first order, each row the state before a
       step and the command of that step.  For recordings that MuJoCo made with the scene's own time step; of a real
       robot, or of a finer simulation, the default is the better one by far.
@@ -46,6 +48,7 @@ class CompareConfig:
     grip_share: float = 0.95
     whitened: bool = False
     motion_cutoff: float = CUTOFF
+    rest: RestConfig = field(default_factory=RestConfig)
     mj_step: bool = False
 
 
@@ -117,7 +120,8 @@ class Comparison:
         """
 
         def stated(channel: Measured) -> Measured:
-            left = discrepancy(channel.noise.mean - np.asarray(_smooth(channel, _trace(rollout, channel))))
+            left = channel.noise.mean - np.asarray(_smooth(channel, _trace(rollout, channel)))
+            left = discrepancy(left, channel.moves)
             return replace(channel, noise=channel.noise.stated(np.maximum(left, MINIMUM_NOISE[channel.name])))
 
         return replace(self, channels=tuple(stated(c) for c in self.channels))
@@ -165,17 +169,23 @@ def _distance(channel: Measured, trace: jax.Array) -> jax.Array:
 
 
 def make_comparison(
-    scene: Scene, recording: Recording, clock: np.ndarray, config: CompareConfig, apart: np.ndarray | None = None
+    scene: Scene,
+    recording: Recording,
+    clock: np.ndarray,
+    config: CompareConfig,
+    apart: np.ndarray | None = None,
+    rest: np.ndarray | None = None,
 ) -> Comparison:
     """Prepare a recording's channels for comparison with a replay whose rows have the times `clock` [T] s, regular.
 
     apart: [N, T, J] N m by which the repeats' torques may differ because they moved, or measured their motion,
     differently, with mean zero; it is taken off them where their noise is estimated.
+    rest: [T, J] bool, rows at which a joint is at rest along a prescribed motion (`measure.rest`).
     Raises ValueError for a channel the recording does not have, one that no replay produces, or a
     constant (dead) channel.
     """
     channels = tuple(
-        prepared(scene, recording.channel(name), clock, weight, apart if name == "torque" else None)
+        prepared(scene, recording.channel(name), clock, weight, *((apart, rest) if name == "torque" else (None, None)))
         for name, weight in config.channels.items()
     )
     acts = scene.grip is not None and recording.command.size > 0  # along a prescribed motion nothing is gripped

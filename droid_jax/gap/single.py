@@ -97,6 +97,11 @@ class Log(Cost):
         """[K] s."""
         return only_comparison(self).channel("torque").clock
 
+    @property
+    def moves(self) -> np.ndarray:
+        """[K, C] bool, instants at which each joint moves: at rest friction takes what is left."""
+        return only_comparison(self).channel("torque").moves
+
     def left(self, values: np.ndarray) -> np.ndarray:
         """[K, C] measured minus simulated torques of one vector [D]."""
         return self.measured - self.simulated(values[None])[0]
@@ -203,14 +208,14 @@ def noise_of(
     least = _least(found, whole, log.space, config.most)
     noise = least if least @ least < EXPLAINED * (whole @ whole) else whole
     left = (noise.reshape(len(deviation), -1).T * deviation)[inside]
-    return discrepancy(left), block_length(left)
+    return discrepancy(left, log.moves[inside]), block_length(left)
 
 
 def _rough_fit(
     log: Log, base: Space, effects: Sequence[Effect], values: np.ndarray, block: np.ndarray, config: GapConfig
 ) -> tuple[Case, Model, np.ndarray]:
     """The base fitted with the noise [C] stated that `values` [D] leave."""
-    deviation = np.maximum(discrepancy(log.left(values)[block >= 0]), MINIMUM_NOISE["torque"])
+    deviation = np.maximum(discrepancy(log.left(values)[block >= 0], log.moves[block >= 0]), MINIMUM_NOISE["torque"])
     evidence = _blocks(log, deviation, block)
     case = Case(evidence, evidence, None, base, tuple(effects), config)
     return case, base_model(case, values), deviation

@@ -9,6 +9,7 @@ import numpy as np
 from scipy import interpolate, signal
 
 from droid_jax.measure.recording import Recording, TorqueConvention
+from droid_jax.measure.rest import RestConfig, rest_speed, torque_at
 
 CUTOFF = 20.0  # Hz, of the position before it is differentiated; above that of the torques, which are compared
 OVERSAMPLING = 6.0  # rows of a motion per period of its cutoff
@@ -25,6 +26,8 @@ class Motion:
 
     joints: J names.  time: [T] s, regular.  position, velocity, acceleration: [T, J] rad, rad/s, rad/s^2 (m for
     slides).  torque: convention of the measured torque.  others: joints that stand still -> where, as far as stated.
+    rest: [T, J] bool, samples at rest (`measure.rest`); None: those of speed zero.
+    measured: [T, J] N m (N), measured torque at these times, NaN where there is none; None: nowhere.
     """
 
     joints: tuple[str, ...]
@@ -34,6 +37,8 @@ class Motion:
     acceleration: np.ndarray
     torque: TorqueConvention
     others: Mapping[str, float] = field(default_factory=dict)
+    rest: np.ndarray | None = None
+    measured: np.ndarray | None = None
 
     @property
     def timestep(self) -> float:
@@ -42,7 +47,12 @@ class Motion:
 
 
 def measured_motion(
-    recording: Recording, joints: Sequence[str], *, cutoff: float = CUTOFF, alike: Sequence[str] | None = None
+    recording: Recording,
+    joints: Sequence[str],
+    *,
+    cutoff: float = CUTOFF,
+    alike: Sequence[str] | None = None,
+    rest: RestConfig | None = None,
 ) -> Motion:
     """The motion of `joints` in a recording: the mean of the repeats' positions, smoothed and differentiated.
 
@@ -51,6 +61,7 @@ def measured_motion(
     of the quintic spline through it; measured velocities are not used.  EDGE s at both ends are left out.
     A clock that jitters is made regular first, along a cubic spline.
     alike: joints of which all repeats must be one motion; None: all.
+    rest: below which speed a sample counts as at rest.
     Raises ValueError where a joint's position was not measured throughout, the log is too slow for
     the cutoff (in one long step too), or too short.
     """
@@ -85,8 +96,16 @@ def measured_motion(
     q = signal.sosfiltfilt(signal.butter(4, cutoff, fs=rate, output="sos"), position, axis=0)
     path = interpolate.make_interp_spline(even, q, k=5)  # differences lose 3 to 15 % of a fast motion in a slow log
     rows = (path(clock), path.derivative(1)(clock), path.derivative(2)(clock))
-    others = {joint: q for joint, q in recording.qpos0.items() if joint not in joints}
-    return Motion(tuple(joints), clock, *rows, torque=recording.torque, others=others)
+    slowest = rest_speed(position, q, rows[1], rate, cutoff, rest or RestConfig())
+    return Motion(
+        tuple(joints),
+        clock,
+        *rows,
+        torque=recording.torque,
+        others={joint: q for joint, q in recording.qpos0.items() if joint not in joints},
+        rest=np.abs(rows[1]) < slowest,
+        measured=torque_at(recording, joints, clock, 2.0 * cutoff),
+    )
 
 
 def _common(values: np.ndarray, mask: np.ndarray) -> np.ndarray:

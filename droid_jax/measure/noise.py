@@ -161,7 +161,11 @@ def correlation_time(residuals: np.ndarray) -> np.ndarray:
     return np.array(times)
 
 
-def discrepancy(residuals: np.ndarray) -> np.ndarray:
-    """[C] deviation to state as noise so that correlated residuals [K, C] count as often as they are independent."""
-    rms = np.sqrt(np.mean(residuals**2, axis=0))
+def discrepancy(residuals: np.ndarray, counts: np.ndarray | None = None) -> np.ndarray:
+    """[C] deviation to state as noise so that correlated residuals [K, C] count as often as they are independent.
+
+    counts: [K, C] bool, the residuals that tell of noise; all unless given, and of a column that has none.
+    """
+    counts = np.ones(residuals.shape, bool) if counts is None else counts | ~counts.any(axis=0)
+    rms = np.sqrt(np.sum(np.where(counts, residuals, 0.0) ** 2, axis=0) / counts.sum(axis=0))
     return rms * np.sqrt(np.maximum(1.0, correlation_time(residuals) * RATE))

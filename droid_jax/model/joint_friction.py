@@ -10,7 +10,7 @@ RA-L 2019, with a smooth sign (`direction`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -31,8 +31,11 @@ def direction(velocity: jax.Array) -> jax.Array:
     return jnp.tanh(velocity / SMOOTHING)
 
 
-def joint_friction_effect(joints: Sequence[str]) -> Effect:
+def joint_friction_effect(joints: Sequence[str], direction: Callable[[jax.Array], jax.Array] = direction) -> Effect:
     """Adds viscous and Coulomb friction to the torque of `joints`, the channel order of the scene.
+
+    direction: of a speed.  Along a prescribed motion jnp.sign, since samples at rest are known there (`measure.rest`);
+    a servo's simulated joints have none.
 
     Reads `viscous[joint]` and `coulomb[joint]` from theta; absent means zero.  The offset is left to
     `droid_jax.compare.replay.torque_offset_effect`, which reads `torque_offset[joint]`.
