@@ -71,7 +71,8 @@ class Path(NamedTuple):
     """The arrays of a motion, single precision: [T] s, [T, J] rad, rad/s, rad/s^2 (m for slides).
 
     at_rest: [T, J] bool, samples at which friction is not known from the speed.  measured: [T, J] N m (N), the torque
-    measured there, NaN where none was.  still: [nq] where all joints that do not move stand.
+    measured there, NaN where none was.  torque_slack: [J] N m (N), acceleration_slack: [J] rad/s^2 (m/s^2), by which
+    noise may take it out of the interval of friction.  still: [nq] where all joints that do not move stand.
     """
 
     time: jax.Array
@@ -80,6 +81,8 @@ class Path(NamedTuple):
     acceleration: jax.Array
     at_rest: jax.Array
     measured: jax.Array
+    torque_slack: jax.Array
+    acceleration_slack: jax.Array
     still: jax.Array
 
 
@@ -87,9 +90,15 @@ def path_of(scene: Scene, motion: Motion) -> Path:
     """What a compiled replay is given of a motion; ValueError where it states a joint that the scene has not."""
     rest = motion.velocity == 0.0 if motion.rest is None else motion.rest
     measured = np.full(motion.velocity.shape, np.nan) if motion.measured is None else motion.measured
-    rows = (jnp.asarray(a, jnp.float32) for a in (motion.time, motion.position, motion.velocity, motion.acceleration))
+    given = [
+        np.zeros(motion.velocity.shape[1]) if slack is None else slack
+        for slack in (motion.torque_slack, motion.acceleration_slack)
+    ]
+    arrays = (motion.time, motion.position, motion.velocity, motion.acceleration, measured, *given)
+    time, position, velocity, acceleration, measured, *slacks = (jnp.asarray(a, jnp.float32) for a in arrays)
     still = jnp.asarray(scene.initial_qpos(motion.others), jnp.float32)
-    return Path(*rows, jnp.asarray(rest), jnp.asarray(measured, jnp.float32), still)
+    at_rest = jnp.asarray(rest)
+    return Path(time, position, velocity, acceleration, at_rest, measured, slacks[0], slacks[1], still)
 
 
 def path_replay(
@@ -101,8 +110,8 @@ def path_replay(
 
     tau = M(q) qdd + c(q, qd) - passive forces [+ g(q)] and, on the motor side, + armature qdd + dry friction.
     Dry friction, the model's own and that of effects, is loss * sgn(qd).  At rest it is set-valued: of all values
-    between -loss and loss the one that comes nearest to the measured torque, so that a residual is the distance to
-    that interval.
+    between -loss and loss, and a slack for noise, the one that comes nearest to the measured torque, so that a residual
+    is the distance to that interval.
     Passive are springs and dampers of joints and tendons; joints' damping on the motor side only: on the link side none
     of the motor's own terms appear, and what the joint adds there (Coulomb and viscous friction, offset) is an
     observation effect.  Constraints (contacts, limits, equalities) take no part.
@@ -131,19 +140,22 @@ def path_replay(
             velocity = full.at[dofs].set(velocity)
             data = mjx.make_data(link_model).replace(qpos=path.still.at[positions].set(position), qvel=velocity)
             data = mjx.fwd_velocity(link_model, mjx.fwd_position(link_model, data))
-            torque = mjx.full_m(link_model, data) @ full.at[dofs].set(acceleration) + data.qfrc_bias
+            inertia = mjx.full_m(link_model, data)
+            torque = inertia @ full.at[dofs].set(acceleration) + data.qfrc_bias
             torque = torque - (data.qfrc_passive - compensated * data.qfrc_gravcomp)
             direction = jnp.sign(velocity)
             felt = torque + model.dof_frictionloss * direction if motor else torque
             state = State(time, data.qpos, velocity, felt, model)
-            own = model.dof_frictionloss if motor else _behind_the_sensor(scene, theta)
+            behind = _behind_the_sensor(scene, theta)
+            own = model.dof_frictionloss if motor else behind
             force, loss = _resistance(theta, state, own, effects)
-            # On the link side the own friction is added by `joint_friction_effect`, as an observation.
-            friction = (loss if motor else loss - own) * direction
-            rows = (torque + force + friction, loss * direction, loss)
+            # What is behind the sensor `joint_friction_effect` adds, as an observation.
+            friction = (loss if motor else loss - behind) * direction
+            loss = loss + behind if motor else loss
+            rows = (torque + force + friction, loss * direction, loss, jnp.diagonal(inertia))
             return tuple(row[scene.joint_dofs] for row in rows)
 
-        torque, friction, loss = jax.vmap(at)(path.time, path.position, path.velocity, path.acceleration)
+        torque, friction, loss, inertia = jax.vmap(at)(path.time, path.position, path.velocity, path.acceleration)
         hinge = joints.index(scene.object_joint) if scene.object_joint in joints else None
         count = len(scene.joints)
         rollout = Rollout(
@@ -156,18 +168,33 @@ def path_replay(
             finite=jnp.array(True),
         )
         seen = observed(rollout, theta, effects)
-        held = held_torque(seen.torque - friction, jnp.maximum(loss, 0.0), path.measured[:, :count])
-        return replace(seen, torque=jnp.where(path.at_rest[:, :count], held, seen.torque))
+        # The slack is there without friction too: else any friction would pay by taking the noise at rest.
+        slack = jnp.hypot(path.torque_slack[:count], inertia * path.acceleration_slack[:count])
+        bound = jnp.maximum(loss, 0.0) + slack
+        held = held_torque(seen.torque - friction, bound, path.measured[:, :count])
+        rest = path.at_rest[:, :count] & _may_rub(scene, theta, effects, motor)
+        return replace(seen, torque=jnp.where(rest, held, seen.torque))
 
     return replay
 
 
-def held_torque(free: jax.Array, loss: jax.Array, measured: jax.Array) -> jax.Array:
-    """Torque at rest: `free`, without dry friction, and the friction within +-loss that comes nearest to `measured`.
+def _may_rub(scene: Scene, theta: Theta, effects: Sequence[Effect], motor: bool) -> np.ndarray:
+    """[J] bool, joints that dry friction of this replay could hold; at rest the others are compared as ever.
+
+    Which could is known before any value is: every model of a search has the same, so that none of them takes noise.
+    """
+    if any(effect.frictionloss is not None for effect in effects):
+        return np.ones(len(scene.joints), bool)
+    behind = np.array([f"coulomb[{joint}]" in theta for joint in scene.joints])
+    return behind | (motor & (scene.model.dof_frictionloss[scene.joint_dofs] > 0.0))
+
+
+def held_torque(free: jax.Array, bound: jax.Array, measured: jax.Array) -> jax.Array:
+    """Torque at rest: `free`, without dry friction, and the friction within +-bound that comes nearest to `measured`.
 
     All N m (N for slides) and of one shape; where nothing was measured (NaN), no friction.
     """
-    friction = jnp.clip(measured - free, -loss, loss)
+    friction = jnp.clip(measured - free, -bound, bound)
     return free + jnp.where(jnp.isnan(measured), 0.0, friction)
 
 

@@ -21,6 +21,8 @@ from droid_jax.model.scene import Scene
 MOVES = 0.5  # share of the filter's window at least in which a joint moves, where what is left tells of noise
 ENOUGH = 0.1  # share of the time that two repeats must have measured
 # Deviation below which a channel's noise is never believed, in the channel's unit.
+# Of a channel that one repeat measured: no larger than this share of what moves in it, where its motor is small.
+LEAST_SHARE = 1e-3
 MINIMUM_NOISE = {"torque": 0.01, "position": 2e-5, "velocity": 5e-4, "object_angle": 2e-4}
 
 
@@ -54,6 +56,15 @@ class Measured:
     def clock(self) -> np.ndarray:
         """[K] s, the coarse clock: the times of what is smoothed and whitened."""
         return coarse_clock(*self.span)
+
+
+def least_noise(name: str, mean: np.ndarray) -> np.ndarray:
+    """[C] deviation below which the noise of a channel that one repeat measured is never believed, in its unit.
+
+    mean: [K, C] what was measured, smoothed.  Noise is told from what a fit leaves, which a model with too many
+    parameters takes away.
+    """
+    return np.minimum(MINIMUM_NOISE[name], LEAST_SHARE * np.maximum(np.std(mean, axis=0), 1e-9))
 
 
 def prepared(

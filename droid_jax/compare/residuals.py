@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from droid_jax.compare.measured import MINIMUM_NOISE, Measured, prepared
+from droid_jax.compare.measured import Measured, least_noise, prepared
 from droid_jax.measure.motion import CUTOFF
 from droid_jax.measure.noise import discrepancy
 from droid_jax.measure.recording import Phase, Recording
@@ -122,7 +122,9 @@ class Comparison:
         def stated(channel: Measured) -> Measured:
             left = channel.noise.mean - np.asarray(_smooth(channel, _trace(rollout, channel)))
             left = discrepancy(left, channel.moves)
-            return replace(channel, noise=channel.noise.stated(np.maximum(left, MINIMUM_NOISE[channel.name])))
+            return replace(
+                channel, noise=channel.noise.stated(np.maximum(left, least_noise(channel.name, channel.noise.mean)))
+            )
 
         return replace(self, channels=tuple(stated(c) for c in self.channels))
 

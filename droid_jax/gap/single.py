@@ -25,7 +25,7 @@ import jax
 import numpy as np
 
 from droid_jax.compare.cost import Cost, make_cost
-from droid_jax.compare.measured import MINIMUM_NOISE
+from droid_jax.compare.measured import least_noise
 from droid_jax.gap.blocks import OUTSIDE, Blocks, block_length, blocks, interleaved
 from droid_jax.gap.candidates import candidates
 from droid_jax.gap.case import Case, GapConfig, own_nuisances, restrained, unbounded
@@ -108,7 +108,7 @@ class Log(Cost):
 
     def stated(self, deviation: np.ndarray, instants: np.ndarray) -> Log:
         """With noise of a deviation [C], in the channel's unit, at some instants [K] bool; the rest does not count."""
-        noise = self._noise.stated(np.maximum(deviation, MINIMUM_NOISE["torque"]))
+        noise = self._noise.stated(np.maximum(deviation, least_noise("torque", self.measured)))
         return self._with(replace(noise, whitener=noise.whitener * instants[:, None]))
 
     def holding(self, torque: np.ndarray) -> Log:
@@ -215,7 +215,8 @@ def _rough_fit(
     log: Log, base: Space, effects: Sequence[Effect], values: np.ndarray, block: np.ndarray, config: GapConfig
 ) -> tuple[Case, Model, np.ndarray]:
     """The base fitted with the noise [C] stated that `values` [D] leave."""
-    deviation = np.maximum(discrepancy(log.left(values)[block >= 0], log.moves[block >= 0]), MINIMUM_NOISE["torque"])
+    left = discrepancy(log.left(values)[block >= 0], log.moves[block >= 0])
+    deviation = np.maximum(left, least_noise("torque", log.measured))
     evidence = _blocks(log, deviation, block)
     case = Case(evidence, evidence, None, base, tuple(effects), config)
     return case, base_model(case, values), deviation

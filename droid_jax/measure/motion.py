@@ -9,7 +9,7 @@ import numpy as np
 from scipy import interpolate, signal
 
 from droid_jax.measure.recording import Recording, TorqueConvention
-from droid_jax.measure.rest import RestConfig, rest_speed, torque_at
+from droid_jax.measure.rest import RestConfig, at_rest, derivative_noise, torque_at, white_noise
 
 CUTOFF = 20.0  # Hz, of the position before it is differentiated; above that of the torques, which are compared
 OVERSAMPLING = 6.0  # rows of a motion per period of its cutoff
@@ -28,6 +28,8 @@ class Motion:
     slides).  torque: convention of the measured torque.  others: joints that stand still -> where, as far as stated.
     rest: [T, J] bool, samples at rest (`measure.rest`); None: those of speed zero.
     measured: [T, J] N m (N), measured torque at these times, NaN where there is none; None: nowhere.
+    torque_slack: [J] N m (N), acceleration_slack: [J] rad/s^2 (m/s^2): by how much a torque at rest may leave the
+    interval of its friction, because measured torque and acceleration are noisy; None: not at all.
     """
 
     joints: tuple[str, ...]
@@ -39,6 +41,8 @@ class Motion:
     others: Mapping[str, float] = field(default_factory=dict)
     rest: np.ndarray | None = None
     measured: np.ndarray | None = None
+    torque_slack: np.ndarray | None = None
+    acceleration_slack: np.ndarray | None = None
 
     @property
     def timestep(self) -> float:
@@ -96,15 +100,19 @@ def measured_motion(
     q = signal.sosfiltfilt(signal.butter(4, cutoff, fs=rate, output="sos"), position, axis=0)
     path = interpolate.make_interp_spline(even, q, k=5)  # differences lose 3 to 15 % of a fast motion in a slow log
     rows = (path(clock), path.derivative(1)(clock), path.derivative(2)(clock))
-    slowest = rest_speed(position, q, rows[1], rate, cutoff, rest or RestConfig())
+    config, timestep = rest or RestConfig(), (clock[-1] - clock[0]) / (len(clock) - 1)
+    white = white_noise(position - q, rate, cutoff)
+    torque, noise = torque_at(recording, joints, clock, 2.0 * cutoff)
     return Motion(
         tuple(joints),
         clock,
         *rows,
         torque=recording.torque,
         others={joint: q for joint, q in recording.qpos0.items() if joint not in joints},
-        rest=np.abs(rows[1]) < slowest,
-        measured=torque_at(recording, joints, clock, 2.0 * cutoff),
+        rest=at_rest(white, rows[1], timestep, rate, cutoff, config),
+        measured=torque,
+        torque_slack=config.tolerance * noise,
+        acceleration_slack=config.tolerance * derivative_noise(white, 2, rate, cutoff),
     )
 
 
