@@ -277,7 +277,7 @@ def _done(out: Path) -> None:
     print(f"gap, noise units squared: {', '.join(gaps)}")
     if found["cut"]:
         print(f"left out for lack of time (--budget): {found['cut']}")
-    for line in amendment_words(gap):
+    for line in amendment_words(found):
         print(line)
     if gap.limits:
         print(gap.limits)

@@ -298,7 +298,7 @@ def _fitted(folder: Path, command: All, recordings: Sequence[Path]) -> bool:
 def told(out: Path) -> list[str]:
     """One line for each stage that has a result."""
     from droid_jax.report.gap_folder import hidden_in
-    from droid_jax.report.gap_words import readable
+    from droid_jax.report.gap_words import amendment_words, readable
     from droid_jax.report.policy_folder import read_training
     from droid_jax.report.policy_words import another_robot
     from droid_jax.report.words import hidden_words, judged, percent
@@ -315,6 +315,7 @@ def told(out: Path) -> list[str]:
         closed = size["closed"] if found["effects"] else None
         share = "" if closed is None else f"; {percent(closed)} of the gap U closed on the {role} motion"
         lines.append(f"gap: {readable(found['sentence'], found).rstrip('.')}{share}")
+        lines += amendment_words(found)
         if hidden := hidden_words(hidden_in(found)):
             lines.append(f"hidden in the stand-in robot: {hidden}")
     if tried := None if "train" in old else _json(out / "train" / TRANSFER):

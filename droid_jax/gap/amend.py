@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from droid_jax.errors import reason
 from droid_jax.files import NOT_MADE, TO_BE_MADE
 from droid_jax.gap.case import Case
+from droid_jax.gap.extended import extended
 from droid_jax.gap.handover import HandedOn, due, handed_on
 from droid_jax.gap.menu import separating
 from droid_jax.gap.verdict import Verdict
@@ -68,6 +69,7 @@ def _with_experiments(now: Amended, case: Case, recording: Recording) -> Amended
 def _refitted(now: Amended, case: Case, progress: Progress) -> Amended:
     try:
         handed = handed_on(case, now.verdict.model, progress)
+        extended(case, handed)  # what is written of it can be made
     except Exception as error:  # as above; the search's own model is handed on
         handed = replace(now.handed, not_made=reason(error))
     state = f"{NOT_MADE}: {handed.not_made}" if handed.not_made else MADE

@@ -73,7 +73,7 @@ def quantity(value: float | None, unit: str, digits: int = 3) -> str:
 def gap_summary(gap: Gap) -> list[str]:
     """The sentences under the answer, from the numbers alone; the last says what to do."""
     sentences = [_fitted(gap), _significance(gap), _size(gap), _allowed(gap), *_added(gap.sizes)]
-    said = [*sentences, *_trends(gap.found), gap.limits, *amendment_words(gap)]
+    said = [*sentences, *_trends(gap.found), gap.limits, *amendment_words(gap.found)]
     return [*(s for s in said if s), _next(gap)]
 
 
@@ -83,11 +83,11 @@ AMENDMENTS = {  # of gap.json: what it is called, and what there is without it
 }
 
 
-def amendment_words(gap: Gap) -> list[str]:
-    """One sentence for each addition to the verdict that is not there, with the reason and what that means."""
+def amendment_words(found: Mapping[str, Any]) -> list[str]:
+    """Of a gap.json, a sentence for each addition to the verdict that is not there: why, and what that means."""
     out = []
     for name, (what, without) in AMENDMENTS.items():
-        state, verb = gap.amendments.get(name, ""), "were" if name == "experiments" else "was"
+        state, verb = found.get("amendments", {}).get(name, ""), "were" if name == "experiments" else "was"
         if state == TO_BE_MADE:
             out.append(f"{what} {verb} not made yet, since the run was stopped: the same command makes it; {without}.")
         elif state.startswith(NOT_MADE):

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -120,6 +120,8 @@ def describe(case: Case, verdict: Verdict) -> dict[str, Any]:
         "sentence": verdict.sentence,
         "effects": list(verdict.effects),
         "tied": [list(t) for t in verdict.tied],
+        "hints": [asdict(hint) for hint in verdict.hints],
+        "doubts": list(verdict.doubts),
         "remainder": verdict.remainder,
         "p": verdict.screens[0].p if verdict.screens else None,
         "gaps": {role: list(pair) for role, pair in verdict.gaps.items()},

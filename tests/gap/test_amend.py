@@ -31,7 +31,7 @@ def failing(error: BaseException) -> Callable[..., Any]:
 
 
 def test_the_verdict_comes_first_and_then_each_amendment(found: Small, monkeypatch: pytest.MonkeyPatch):
-    tie, both = replace(found.verdict, rivals=(found.base,)), HandedOn(found.base, (found.case.fit, found.case.confirm))
+    tie, both = replace(found.verdict, rivals=(found.base,)), HandedOn(found.base, (found.case.fit,))
     monkeypatch.setattr(amend, "separating", lambda case, models, recording: FASTER)
     monkeypatch.setattr(amend, "handed_on", lambda *arguments: both)
     first, second, third = amended(found.case, tie, record("fit"))
@@ -52,7 +52,7 @@ def test_the_verdict_comes_first_and_then_each_amendment(found: Small, monkeypat
 def test_what_fails_is_said_and_what_comes_after_it_is_made(
     found: Small, monkeypatch: pytest.MonkeyPatch, error: Exception, said: str
 ):
-    tie, both = replace(found.verdict, rivals=(found.base,)), HandedOn(found.base, (found.case.fit, found.case.confirm))
+    tie, both = replace(found.verdict, rivals=(found.base,)), HandedOn(found.base, (found.case.fit,))
     monkeypatch.setattr(amend, "separating", failing(error))
     monkeypatch.setattr(amend, "handed_on", lambda *arguments: both)
     *_, last = amended(found.case, tie, record("fit"))
@@ -62,6 +62,13 @@ def test_what_fails_is_said_and_what_comes_after_it_is_made(
     *_, last = amended(found.case, tie, record("fit"))
     assert last.states[REFIT].startswith(f"not made: {said}")
     assert last.handed.model is tie.model and last.handed.of == (found.case.fit,)
+
+
+def test_a_refit_that_cannot_be_written_is_not_handed_on(found: Small, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(amend, "handed_on", lambda *arguments: HandedOn(found.base, (found.case.fit,)))
+    monkeypatch.setattr(amend, "extended", failing(ValueError("its covariance is singular")))
+    *_, last = amended(found.case, found.verdict, record("fit"))
+    assert last.states[REFIT] == "not made: its covariance is singular" and last.handed.model is found.verdict.model
 
 
 def test_a_refit_that_does_not_converge_is_said(found: Small, monkeypatch: pytest.MonkeyPatch):
