@@ -22,13 +22,18 @@ from small_log import elbow_log, write_elbow
 from droid_jax import run
 from droid_jax.commands import convert, folder, presets
 from droid_jax.commands.folder import OtherRun, changed, finished, setup_of
+from droid_jax.commands.gap import Gap
 from droid_jax.commands.identify import Identify
 from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.stand_in import known_stand_in, settled
+from droid_jax.commands.train import Train
+from droid_jax.commands.whole import All
 from droid_jax.identify import pipeline
 from droid_jax.measure.demonstration import demonstration_path
 from droid_jax.measure.formats import load, save
 from droid_jax.model.effects import registry
+from droid_jax.read_json import typed
+from droid_jax.report.stages import Setup
 from droid_jax.run import main
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -222,6 +227,17 @@ def test_a_file_above_the_results_folder(refused, tmp_path: Path):
     (tmp_path / "file").write_text("mine")
     assert "cannot be written" in refused("identify", "--out", tmp_path / "file" / "run")
     assert (tmp_path / "file").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    "command",
+    [Identify(), Gap(), Gap((Path("log.npz"),)), Identify(scene=Path("own.xml")), Train(), Train(Path("fit")), All()],
+    ids=lambda command: type(command).__name__,
+)
+def test_what_a_run_was_asked_for_can_be_read_back(command: object):
+    """Options that were not given are null."""
+    asked = json.loads(json.dumps(setup_of(command)))
+    typed(asked, Setup, "setup.json")
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "\udcff"])

@@ -40,7 +40,7 @@ class Setup(TypedDict, total=False):
     robot: Robot
     springs: int | None
     seed: int
-    hide: list[str]
+    hide: list[str] | None
     generations: int | None
     versions: dict[str, str]
 
