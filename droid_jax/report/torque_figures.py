@@ -27,6 +27,7 @@ from droid_jax.report.style import (
 from droid_jax.report.words import label
 
 BUCKETS = 140  # pieces of a drawn line, and points of a band
+SHORT = 0.1  # of the motion; the name of a last phase below that would be cut by the panel's edge
 RESIDUAL_BUCKETS = 60  # of a line of residuals: the figure must fit into the page as SVG
 _TRACES = ("measured_mean", "measured_low", "measured_high", "before", "after")
 _FITS: dict[str, dict[str, Any]] = {
@@ -140,15 +141,17 @@ def fill(
 def shade(axes: Axes, phases: Sequence[Mapping[str, Any]], named: bool) -> None:
     """Every other phase of the motion shaded; names at the top where asked for."""
     for i, phase in enumerate(phases):
+        start, end = phase["start"], phase["end"]
         if i % 2 == 0:
-            axes.axvspan(phase["start"], phase["end"], color=MUTED, alpha=0.10, linewidth=0)
+            axes.axvspan(start, end, color=MUTED, alpha=0.10, linewidth=0)
         if named:
+            cut = phase is phases[-1] and end - start < SHORT * (end - phases[0]["start"])
             axes.text(
-                (phase["start"] + phase["end"]) / 2,
+                end if cut else (start + end) / 2,
                 0.98,
                 phase["name"],
                 transform=axes.get_xaxis_transform(),
-                ha="center",
+                ha="right" if cut else "center",
                 va="top",
                 fontsize=7,
                 color=MUTED,

@@ -47,7 +47,7 @@ from experiments.policies.cases import (
     run_all,
 )
 from experiments.policies.figure import OPENED_WORDS, as_text, histograms, knob_histograms, knobs_as_text
-from experiments.policies.robots import fitted, robots_of
+from experiments.policies.robots import fitted, robots_of, truth_of
 from experiments.policies.settings import SETTINGS, Setting, setting_of
 from experiments.policies.store import Doors, decided_by, place_of, trained
 from experiments.policies.table import PLACES, apart, column, rate_interval, resampled, spread, summed_up
@@ -189,7 +189,9 @@ def test_the_table_holds_what_was_run_and_the_papers_own():
     assert percent_in(panels) == pytest.approx([100, 0, 100])  # of each panel's trials
     assert panels[0].get_ylabel() == "trials [%]"
     lines = [line for line in panels[0].lines if line.get_label() == OPENED_WORDS]
-    assert [line.get_xdata()[0] for line in lines] == [30.0] and "30°" in [t.get_text() for t in panels[0].texts]
+    assert [np.asarray(line.get_xdata())[0] for line in lines] == [30.0] and "30°" in [
+        t.get_text() for t in panels[0].texts
+    ]
 
 
 def test_the_table_shows_stops_slippery_pads_and_what_blew_up():
@@ -239,6 +241,25 @@ def test_a_door_that_opens_to_its_stop_is_in_the_histogram():
     wide = case("prior", 0, 0.5)
     wide["stand_in"]["angle_deg"]["all"] = [100.3] * 50
     assert percent_in(histograms([wide], ["paper"]).axes[:1]) == pytest.approx([100])
+
+
+@pytest.mark.parametrize(
+    ("setting", "far"),
+    [
+        (
+            "paper",
+            {"hinge_damping": -3.7, "torsional_friction_right": 2.6, "knob_mass": 2.4, "link_mass_scale_2": -3.0},
+        ),
+        ("dry", {"hinge_frictionloss": 5.5, "hinge_stiffness": 3.5, "knob_mass": 2.6, "link_mass_scale_5": 2.7}),
+    ],
+)
+def test_the_hidden_values_lie_as_far_from_the_prior_as_the_paper_page_says(setting: str, far: dict[str, float]):
+    scene = door_scene()
+    space, truth = door_space(scene) + door_nuisances(scene), truth_of(SETTINGS[setting])
+    found = dict(zip(space.names, space.to_search(np.array([truth[name] for name in space.names])), strict=True))
+    assert {name: round(float(found[name]), 1) for name in far} == far
+    inside = {name for name, distance in found.items() if abs(distance) < 2.6}
+    assert inside.isdisjoint(far.keys() - {"knob_mass"})
 
 
 def test_slippery_pads_are_all_that_differs_from_the_settings_robot():

@@ -414,6 +414,15 @@ def test_torque_figure_draws_the_given_traces(run: Path) -> None:
             np.testing.assert_array_equal(left.get_ydata(), (measured[:, j] - traces[key][:, j])[rows])
 
 
+def test_the_name_of_a_short_last_phase_is_not_cut(run: Path) -> None:
+    traces = read_run(run).traces["open_close"]
+    end = float(traces["time"][-1])
+    phases = [{"name": "opening", "start": 0.0, "end": 0.97 * end}, {"name": "hold", "start": 0.97 * end, "end": end}]
+    figure = settled(torque_figures.torque_traces(traces, phases))
+    name = next(text for text in figure.axes[0].texts if text.get_text() == "hold")
+    assert name.get_window_extent().x1 <= figure.axes[0].get_window_extent().x1 + 0.5  # pixels
+
+
 def test_a_long_torque_figure_stays_a_drawing_on_the_page(run: Path) -> None:
     traces = read_run(run).traces["open_close"]
     for width in (WIDE, NARROW):
