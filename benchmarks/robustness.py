@@ -114,7 +114,9 @@ def main(arguments: Arguments) -> None:
             thread.start()
         for thread in threads:
             thread.join()
-    result = summary({case: found[case] for case in asked if case in found}) | kills(arguments.out)
+    if missing := [case for case in asked if case not in found]:
+        sys.exit(f"error: {len(missing)} cases were not tried, {missing[0]} the first: the next start goes on")
+    result = summary({case: found[case] for case in asked}) | kills(arguments.out)
     result["seconds"] = round(time.monotonic() - began, 1)
     line = {key: result[key] for key in KEYS}
     publish(arguments.out, "robustness", arguments.quick or bool(arguments.only), arguments.seed, result, line)

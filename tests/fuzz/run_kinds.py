@@ -174,7 +174,7 @@ def make_tables(folder: Path) -> None:
     """A fit with its tables."""
     make_run(folder)
     costs = "generation,best_cost,median_cost,sigma,mean_a,std_a\r\n1,0.5,0.6,1.0,1.0,0.1\r\n2,0.4,0.5,0.9,1.1,0.1\r\n"
-    (folder / SAMPLES).write_text("a,b\r\n1.0,2.0\r\n0.5,0.25\r\n")
+    (folder / SAMPLES).write_text("a\r\n1.0\r\n0.5\r\n")
     (folder / HISTORY_TABLE).write_text(costs)
 
 
