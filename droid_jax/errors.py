@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
+
+from droid_jax.arguments import shown
 
 
 def faults(found: Mapping[str, Collection[str]]) -> str:
     """ "missing: a, b; unknown: c": what is wrong and the names it is wrong with; empty where no names are."""
-    return "; ".join(f"{what} {', '.join(names)}" for what, names in found.items() if names)
+    return "; ".join(f"{what} {named(names)}" for what, names in found.items() if names)
+
+
+def named(names: Iterable[str], most: int = 20) -> str:
+    """ "a, b and 3 more": names of a file or a caller, printable and cut where they are long."""
+    texts = [shown(name).strip("'") for name in names]
+    more = f" and {len(texts) - most} more" if len(texts) > most else ""
+    return ", ".join(texts[:most]) + more
 
 
 def lacking(what: str, extra: str, *packages: str) -> str:

@@ -15,6 +15,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from droid_jax.arguments import said
+from droid_jax.errors import named
 
 _DAY = 86400 * 10**9  # ns
 
@@ -56,12 +57,12 @@ def read_bag(bag: Path, topics: Mapping[str, tuple[tuple[str, ...], str]]) -> di
 def _read_topic(reader: AnyReader, bag: Path, topic: str, joints: tuple[str, ...], needed: str) -> Track:
     connections = [c for c in reader.connections if c.topic == topic]
     if not connections:
-        have = ", ".join(sorted({c.topic for c in reader.connections})) or "none"
+        have = named(sorted({c.topic for c in reader.connections})) or "none"
         raise ValueError(f"{bag}: no topic {topic!r}; the bag has: {have}")
     for kind in {c.msgtype for c in connections} - set(reader.typestore.fielddefs):
         raise ValueError(
-            f"{bag}, topic {topic!r}: the bag does not define {kind}, as bags in sqlite3 of ROS 2 before Iron do not; "
-            "`ros2 bag convert` makes an mcap of it that does"
+            f"{bag}, topic {topic!r}: the bag does not define {named([kind])}, as bags in sqlite3 of ROS 2 before Iron "
+            "do not; `ros2 bag convert` makes an mcap of it that does"
         )
     received, stamped, rows, numbers = [], [], [], []
     seen: set[str] = set()
@@ -78,7 +79,7 @@ def _read_topic(reader: AnyReader, bag: Path, topic: str, joints: tuple[str, ...
             received.append(nanoseconds + offset)
             stamped.append(_header_stamp(message, offset))
     if not rows and seen:
-        raise ValueError(f"{bag}, topic {topic!r}: no joint of {', '.join(joints)}; it has: {', '.join(sorted(seen))}")
+        raise ValueError(f"{bag}, topic {topic!r}: no joint of {', '.join(joints)}; it has: {named(sorted(seen))}")
     if not rows:
         raise ValueError(f"{bag}, topic {topic!r}: no messages")
     without = [number for number, row in zip(numbers, rows, strict=True) if needed not in row]
@@ -125,7 +126,7 @@ def _samples(
         numbers = np.asarray(message.data, dtype=np.float64)
     else:
         raise ValueError(
-            f"{where}: cannot read {kind}; expected JointState, JointTrajectory, JointTrajectoryPoint, "
+            f"{where}: cannot read {named([kind])}; expected JointState, JointTrajectory, JointTrajectoryPoint, "
             "Float64MultiArray or JointTrajectoryControllerState"
         )
     if len(numbers) != len(joints):
@@ -148,7 +149,7 @@ def _pick(
     if len(missing) == len(joints):
         return None
     if missing:
-        raise ValueError(f"{where}: no joint {', '.join(missing)}; the message has: {', '.join(names)}")
+        raise ValueError(f"{where}: no joint {', '.join(missing)}; the message has: {named(names)}")
     order = [names.index(j) for j in joints]
     picked = {}
     for field, numbers in fields.items():

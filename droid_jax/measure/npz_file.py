@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from droid_jax.arguments import shown
 from droid_jax.measure.metadata import FORMAT, metadata_from_json, metadata_to_json, recording_of
 from droid_jax.measure.recording import Channel, Recording
 from droid_jax.read_npz import NpzFile
@@ -47,7 +48,7 @@ def load_npz(path: Path) -> Recording:
     with NpzFile(path) as file:
         if "format" not in file or (found := file.text("format")) != FORMAT:
             got = found if "format" in file else None
-            raise ValueError(f"{path}: expected the key 'format' with {FORMAT!r}, got {got!r}")
+            raise ValueError(f"{path}: expected the key 'format' with {FORMAT!r}, got {shown(got)}")
         meta = metadata_from_json(file.text("metadata"), f"{path}, metadata")
         channels = {}
         for key, unit in meta.units.items():

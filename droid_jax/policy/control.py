@@ -117,15 +117,16 @@ def load(path: str | Path) -> Policy:
         said = (str(error).splitlines() or [type(error).__name__])[0][:200]
         raise ValueError(f"{path} cannot be read: {said}") from None
     if str(found.get("format")) != FORMAT:
-        raise ValueError(f"{path} is no policy: expected format {FORMAT!r}, got {str(found.get('format'))!r}")
+        raise ValueError(f"{path} is no policy: expected format {FORMAT!r}, got {ascii(str(found.get('format')))[:80]}")
     layers = range(sum(name.startswith("weight_") for name in found))
     names = [f"{kind}_{k}" for kind in ("weight", "bias") for k in layers]
     numeric = ("mean", "std", *names, *(f.name for f in fields(Interface)))
     lacking = [name for name in dict.fromkeys(("layout", *numeric, "weight_0")) if name not in found]
     if lacking:
         raise ValueError(f"{path} lacks {', '.join(lacking)}")
-    if tuple(found["layout"].tolist()) != LAYOUT:
-        other = [name for name in found["layout"].tolist() if name not in LAYOUT] or ["another order"]
+    layout = [str(name) for name in found["layout"].reshape(-1)]
+    if found["layout"].shape != (OBSERVED,) or tuple(layout) != LAYOUT:
+        other = [ascii(name)[1:-1][:80] for name in layout if name not in LAYOUT] or ["another order"]
         raise ValueError(f"{path} was trained on another observation: {', '.join(other[:3])}")
     broken = [n for n in numeric if found[n].dtype.kind not in "fiu" or not np.isfinite(found[n]).all()]
     if broken:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
+from droid_jax.arguments import shown
 from droid_jax.files import CONFIG, CORRELATION, DISTRIBUTION, FILMS, FIT, HISTORY, REPLAY, REPLAY_FILM, TRACES
 from droid_jax.read_json import parse_json
 from droid_jax.report.reading import FINDING, Maybe, Reader
@@ -24,18 +25,18 @@ _PARAMETER = {
 }
 _GAP = {
     **{"before": _NUMBER, "after": _NUMBER, "per_joint_before": [_NUMBER], "per_joint_after": [_NUMBER]},
-    **{"floor": Maybe(_MAYBE), "closed": Maybe(_MAYBE), "judged": Maybe(str)},
+    **{"floor": Maybe(_MAYBE), "closed": Maybe(_MAYBE), "judged": Maybe(Literal["repeats", "time", "same"])},
     "per_joint_floor": Maybe(([_NUMBER], type(None))),
 }
 _FIT = {
     **{"parameters": [_PARAMETER], "gap": {str: _GAP}, "stop": str, "rule": str},
-    "cost": {"initial": Maybe(_MAYBE), "best": Maybe(_MAYBE), "floor": Maybe(_MAYBE), "unit": Maybe(str)},
+    "cost": {**dict.fromkeys(("initial", "best", "floor"), _MAYBE), "unit": Maybe(str)},
     **{"torque_unit": Maybe(str), "converged": Maybe((bool, type(None))), "mean_square": Maybe(_MAYBE)},
     **{"generations": Maybe(int), "evaluations": Maybe(int), "seconds": Maybe({str: _NUMBER})},
     **{"mjcf_lacks": Maybe([str]), "notes": Maybe([str]), "findings": Maybe([FINDING])},
 }
 _RECORDING = {
-    **{"name": str, "sha256": Maybe(str), "repeats": Maybe(int), "heldout": Maybe([int]), "duration": Maybe(_NUMBER)},
+    **{"name": str, "sha256": str, "repeats": int, "heldout": [int], "duration": _NUMBER},
 }
 _CONFIG = {
     **{"preset": str, "scene": str, "engine": str, "recordings": [_RECORDING], "seed": int, "stand_in": bool},
@@ -104,6 +105,8 @@ def read_run(run: Path) -> Run:
     for key in ("parameters", "gap"):
         if not fit[key]:
             raise _READ.fault(f"{FIT}, {key!r} is empty")
+    if other := [r["name"] for r in config["recordings"] if r["name"] not in fit["gap"]]:
+        raise _READ.fault(f"{CONFIG}, 'recordings' names {shown(other[0])}, of which {FIT} has no 'gap'")
     names = [p["name"] for p in fit["parameters"]]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise _READ.fault(f"{FIT}, 'parameters' holds {', '.join(twice)} more than once")

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from droid_jax.errors import lacking
+from droid_jax.arguments import said
+from droid_jax.errors import lacking, named
 from droid_jax.files import HISTORY_TABLE, SAMPLES
 from droid_jax.report.reading import Reader
 from droid_jax.report.stages import needs_whole
@@ -45,11 +46,10 @@ def frames(folder: str | Path) -> Frames:
     try:
         samples, history = (_table(at / name) for name in (SAMPLES, HISTORY_TABLE))
     except (OSError, ValueError) as error:
-        said = (str(error).splitlines() or [""])[0]
-        raise read.fault(f"{at} holds no tables of a fit ({said})") from None
+        raise read.fault(f"{at} holds no tables of a fit ({said(error)})") from None
     expected = ["generation", *COSTS, *(f"{of}_{name}" for of in ("mean", "std") for name in samples.columns)]
     if list(history.columns) != expected:
-        raise read.fault(f"{at / HISTORY_TABLE} must have the columns {', '.join(expected)}")
+        raise read.fault(f"{at / HISTORY_TABLE} must have the columns {named(expected)}")
     return Frames(samples, history.set_index("generation"))
 
 
@@ -63,7 +63,7 @@ def _table(path: Path) -> pd.DataFrame:
         raise ValueError(f"{path}: its rows are longer than its header")
     numeric = table.select_dtypes("number").columns
     if other := [str(column) for column in table.columns if column not in numeric]:
-        raise ValueError(f"{path}: the columns {', '.join(other)} do not hold numbers")
+        raise ValueError(f"{path}: the columns {named(other)} do not hold numbers")
     if table.isna().to_numpy().any():
         raise ValueError(f"{path}: has empty cells")
     return table

@@ -138,3 +138,13 @@ def test_another_layout_of_observations_is_refused(policy, tmp_path: Path):
     rewritten(path, lambda found: found.update(layout=other))
     with pytest.raises(ValueError, match="trained on another observation: temperature of the knob, K"):
         load(path)
+
+
+@pytest.mark.parametrize("other", [[LAYOUT], ["y" * 100_000], [f"\x1b{LAYOUT[0]}", *LAYOUT[1:]]])
+def test_a_layout_that_is_no_list_of_short_names_is_told_in_one_short_line(policy, tmp_path: Path, other):
+    path = tmp_path / "policy.npz"
+    save_policy(path, policy)
+    rewritten(path, lambda found: found.update(layout=np.array(other)))
+    with pytest.raises(ValueError, match="trained on another observation") as refused:
+        load(path)
+    assert str(refused.value).isprintable() and len(str(refused.value)) < 500
