@@ -9,8 +9,11 @@ from __future__ import annotations
 import enum
 import math
 import numbers
+import os
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
+from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
@@ -104,6 +107,7 @@ def number(
     least: float | None = None,
     below: float | None = None,
     most: float | None = None,
+    infinite: bool = False,
 ) -> float:
     """A finite number; true and false are none, nor is text that looks like one.
 
@@ -111,7 +115,7 @@ def number(
         value: a Python or numpy number.
         what: begins the message.
         above: it must be larger.  least: it must not be smaller.  below: it must be smaller.
-        most: it must not be larger.
+        most: it must not be larger.  infinite: whether infinities are numbers too.
     """
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
         raise ValueError(f"{what} must be a number, got {shown(value)}")
@@ -119,7 +123,7 @@ def number(
         out = float(value)
     except (OverflowError, ValueError):
         raise ValueError(f"{what} must be a number, got {shown(value)}") from None
-    if not math.isfinite(out):
+    if math.isnan(out) or (math.isinf(out) and not infinite):
         raise ValueError(f"{what} must be finite, got {shown(value)}")
     _check_range(out, what, above, least, below, most)
     return out
@@ -173,7 +177,7 @@ def flag(value: Any, what: str) -> bool:
     raise ValueError(f"{what} must be True or False, got {shown(value)}")
 
 
-def choice(value: Any, kind: type[Chosen], what: str) -> Chosen:
+def choice(value: Any, what: str, kind: type[Chosen]) -> Chosen:
     """A member of an enum; its value, as files state it, is converted."""
     if isinstance(value, kind):
         return value
@@ -183,28 +187,75 @@ def choice(value: Any, kind: type[Chosen], what: str) -> Chosen:
     raise ValueError(f"{what} must be one of {', '.join(str(m.value) for m in kind)}, got {shown(value)}")
 
 
-def one_of(value: Any, valid: Collection[str], what: str) -> str:
+def one_of(value: Any, what: str, valid: Collection[str]) -> str:
     """One of these texts."""
     if not isinstance(value, str) or value not in valid:
         raise ValueError(f"{what} must be one of {', '.join(valid)}, got {shown(value)}")
     return value
 
 
-def instance(value: Any, kind: type[Kind], what: str) -> Kind:
+def instance(value: Any, what: str, kind: type[Kind]) -> Kind:
     """An object of a class."""
     if not isinstance(value, kind):
         raise ValueError(f"{what} must be {_article(kind.__name__)}, got {_got(value)}")
     return value
 
 
-def instances(value: Any, kind: type[Kind], what: str, *, empty: bool = True) -> tuple[Kind, ...]:
+def instances(value: Any, what: str, kind: type[Kind], *, empty: bool = True) -> tuple[Kind, ...]:
     """A list of objects of a class."""
     if isinstance(value, (str, bytes, dict)) or not isinstance(value, Iterable):
         raise ValueError(f"{what} must be a list of {kind.__name__} objects, got {_got(value)}")
-    out = tuple(instance(one, kind, f"{what}, entry {i}") for i, one in enumerate(value))
+    out = tuple(instance(one, f"{what}, entry {i}", kind) for i, one in enumerate(value))
     if not out and not empty:
         raise ValueError(f"{what} must not be empty")
     return out
+
+
+def path_of(value: Any, what: str) -> Path:
+    """A path, given as one or as text."""
+    if not isinstance(value, (str, PathLike)) or isinstance(value, bytes) or "\0" in os.fspath(value):
+        raise ValueError(f"{what} must be text or a Path, got {shown(value)}")
+    return Path(value)
+
+
+def optional(check: Callable[[Any, str], Any]) -> Callable[[Any, str], Any]:
+    """The same check, which lets None pass."""
+    return lambda value, what: None if value is None else check(value, what)
+
+
+def several(check: Callable[[Any, str], Any], count: int | None = None) -> Callable[[Any, str], tuple[Any, ...]]:
+    """A check of every entry of a list; count: how many there must be, None for one or more."""
+
+    def each(value: Any, what: str) -> tuple[Any, ...]:
+        if isinstance(value, (str, bytes, dict, set)) or not isinstance(value, Iterable):
+            raise ValueError(f"{what} must be a list, got {_got(value)}")
+        out = tuple(check(one, f"{what}, entry {i}") for i, one in enumerate(value))
+        if not out or len(out) != (count or len(out)):
+            raise ValueError(f"{what} must have {count or 'one or more'} entries, got {len(out)}")
+        return out
+
+    return each
+
+
+def weights(value: Any, what: str) -> dict[str, float]:
+    """Names, each with a number of 0 or more, at least one of them above."""
+    if not isinstance(value, Mapping) or not value:
+        raise ValueError(f"{what} must map names to weights, got {shown(value)}")
+    out = {name(key, f"a name of {what}"): number(w, f"{what}, {key!r}", least=0) for key, w in value.items()}
+    if not any(out.values()):
+        raise ValueError(f"{what} must have a weight above 0, got {shown(value)}")
+    return out
+
+
+def check_fields(of: Any, **checks: Callable[[Any, str], Any]) -> None:
+    """Check fields of a frozen dataclass, in its __post_init__, and keep what the checks return.
+
+    Args:
+        of: the dataclass.
+        checks: field name -> function of its value and its name, as those of this module.
+    """
+    for field, check in checks.items():
+        set_field(of, field, check(getattr(of, field), field))
 
 
 def set_field(of: Any, field: str, value: Any) -> None:

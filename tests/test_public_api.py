@@ -118,7 +118,7 @@ def test_identify_passes_everything_on():
     with pytest.raises(ValueError, match="different names"):
         dj.identify(None, None, [TINY, TINY])
     with pytest.raises(ValueError, match="an identification compares torques"):  # one alone is a list of one
-        dj.identify(None, None, TINY, config=dj.IdentifyConfig(compare=CompareConfig(channels={})))
+        dj.identify(None, None, TINY, config=dj.IdentifyConfig(compare=CompareConfig(channels={"position": 1.0})))
     with pytest.raises(TypeError, match="colour"):
         dj.identify(None, None, [TINY], colour="red")
 

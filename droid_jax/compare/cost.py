@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from droid_jax import runtime
+from droid_jax.arguments import instance, instances, one_of
 from droid_jax.compare.inverse import Path, path_of, path_replay, prescribed
 from droid_jax.compare.log_checks import warn_of_log
 from droid_jax.compare.notes import check_range, warn_if_moving, warn_of_commands
@@ -28,7 +29,8 @@ from droid_jax.compare.start import AJAR, following
 from droid_jax.compare.twin import twin_replay
 from droid_jax.measure.checks import validate
 from droid_jax.measure.motion import Motion, measured_motion
-from droid_jax.measure.recording import Recording
+from droid_jax.measure.recording import Recording, recordings_of
+from droid_jax.model.fields import check_space
 from droid_jax.model.joint_friction import TERMS, direction, joint_friction_effect
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_physics
@@ -107,6 +109,7 @@ class Cost:
         none, as many instants on the same clock and the same joints with positions throughout) and the same torque
         convention.
         """
+        recordings = recordings_of(recordings)
         if len(recordings) != len(self.drives):
             raise ValueError(f"expected repeats of {len(self.drives)} replayed recordings, got {len(recordings)}")
         made, drives, replays = [], [], []
@@ -150,12 +153,13 @@ def make_cost(
     effects: extra physics or observation models whose parameters are part of the space; torque
       offsets, and joint friction behind the sensor where the space holds any, are there already.
     check: warn of units, signs and clocks in the recordings that can hardly be right (`log_checks.check_log`).
-    Raises ValueError for unknown engines, joints, channels, parameters that nothing reads, or gains that do not match.
+    Raises ValueError for a space of another scene, unknown engines, joints, channels, parameters that nothing reads,
+      or gains that do not match.
     """
-    config = config or CompareConfig()
-    recordings = [recordings] if isinstance(recordings, Recording) else recordings
-    if not recordings:
-        raise ValueError("a cost needs at least one recording")
+    config = instance(CompareConfig() if config is None else config, "config", CompareConfig)
+    check_space(instance(scene, "scene", Scene), instance(space, "space", Space))
+    recordings, effects = recordings_of(recordings), instances(effects, "effects", Effect)
+    one_of(engine, "engine", ENGINES)
     drives = [followed(scene, r, config) for r in recordings]
     for recording in recordings if check else ():
         warn_of_log(scene, recording)
@@ -339,8 +343,6 @@ def _sensor_effects(scene: Scene, space: Space, drive: Drive | Motion) -> tuple[
 def _engine(
     engine: str, scene: Scene, space: Space, drive: Drive | Motion, effects: Sequence[Effect], mj_step: bool
 ) -> Callable[[np.ndarray], Rollout]:
-    if engine not in ENGINES:
-        raise ValueError(f"unknown engine {engine!r}; valid: {', '.join(ENGINES)}")
     late = 0.0 if mj_step else 0.5
     if isinstance(drive, Motion):
         if mj_step:

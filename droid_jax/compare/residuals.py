@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from droid_jax.arguments import check_fields, flag, instance, number, weights
 from droid_jax.compare.measured import Measured, least_noise, prepared
 from droid_jax.measure.motion import CUTOFF
 from droid_jax.measure.noise import discrepancy
@@ -50,6 +52,20 @@ class CompareConfig:
     motion_cutoff: float = CUTOFF
     rest: RestConfig = field(default_factory=RestConfig)
     mj_step: bool = False
+
+    def __post_init__(self) -> None:
+        check_fields(
+            self,
+            channels=weights,
+            failure_cost=partial(number, least=0),
+            non_finite_cost=partial(number, above=0),
+            shut_angle=partial(number, least=0),
+            grip_share=partial(number, least=0, most=1),
+            whitened=flag,
+            motion_cutoff=partial(number, above=0),
+            rest=partial(instance, kind=RestConfig),
+            mj_step=flag,
+        )
 
 
 @dataclass(frozen=True, eq=False)

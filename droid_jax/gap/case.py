@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
+from droid_jax.arguments import check_fields, instance, number, optional, whole
 from droid_jax.compare.cost import Cost, make_cost
 from droid_jax.compare.residuals import CompareConfig
 from droid_jax.gap.evidence import Evidence, evidence
@@ -49,11 +51,16 @@ class GapConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("looked", "refitted", "most"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if not 0.0 <= self.least_closed <= 1.0:
-            raise ValueError(f"least_closed must lie between 0 and 1, got {self.least_closed}")
+        check_fields(
+            self,
+            **dict.fromkeys(("looked", "refitted", "most"), partial(whole, least=1)),
+            **dict.fromkeys(("refine", "refit"), partial(instance, kind=RefineConfig)),
+            search=partial(instance, kind=SearchConfig),
+            budget=optional(partial(number, least=0)),
+            least_closed=partial(number, least=0, most=1),
+            compare=partial(instance, kind=CompareConfig),
+            seed=partial(whole, least=0),
+        )
         if set(self.compare.channels) != {"torque"}:
             names = ", ".join(self.compare.channels)
             raise ValueError(f"a search for missing effects compares torques alone, got the channels {names}")
@@ -111,7 +118,8 @@ def make_case(
     Raises ValueError for too few repeats: with fewer than eight, no flip of signs could ever be
     significant.
     """
-    config = config or GapConfig()
+    config = instance(GapConfig() if config is None else config, "config", GapConfig)
+    instance(base, "base", Space)
     recordings = [r for r in (fit, confirm, sealed) if r is not None]
     few = [r.name for r in recordings if r.repeats < FEWEST]
     if few:

@@ -16,7 +16,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from droid_jax.arguments import instance
+from droid_jax.arguments import instance, path_of
 from droid_jax.files import EXTENDED, EXTENDED_MJCF
 from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.case import Case
@@ -103,7 +103,7 @@ def load_extended(path: str | Path, scene: Scene) -> Extended:
 
     Raises ValueError that names the file where it is missing or damaged, or belongs to another scene.
     """
-    path, scene = Path(path), instance(scene, Scene, "scene")
+    path, scene = path_of(path, "the path of an extended model"), instance(scene, "scene", Scene)
     try:
         content = read_json(path)
     except FileNotFoundError:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from droid_jax.arguments import instance, instances
 from droid_jax.gap.amend import amended
 from droid_jax.gap.anew import base_fit
 from droid_jax.gap.candidates import candidates, possible
@@ -24,8 +25,9 @@ from droid_jax.gap.split import Split
 from droid_jax.gap.verdict import Verdict
 from droid_jax.gap.workflow import find
 from droid_jax.identify.pipeline import Progress
-from droid_jax.measure.recording import Recording
+from droid_jax.measure.recording import Recording, recordings_of
 from droid_jax.model.effects.registry import checked
+from droid_jax.model.fields import check_space
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
@@ -58,13 +60,17 @@ def find_missing(
     Raises ValueError for recordings in which a search could not end well, and for effects that are none or that a
     recording without commands cannot have.
     """
+    config = instance(GapConfig() if config is None else config, "config", GapConfig)
+    check_space(instance(scene, "scene", Scene), instance(space, "space", Space))
+    recordings = recordings_of(recordings)
     split, roles = shared_out(scene, recordings)
-    asked = possible(scene, recordings) if effects is None else tuple(map(checked, effects))
+    given = None if effects is None else instances(effects, "effects", Effect)
+    asked = possible(scene, recordings) if given is None else tuple(map(checked, given))
     if not asked:
         raise ValueError("effects: there is none to ask about; None asks about all of the library")
     candidates(asked)  # refused before the base fit, and not after it
     start = None if start is None else space.check(start)
-    case = case_of(split, scene, space, asked, roles, config or GapConfig())
+    case = case_of(split, scene, space, asked, roles, config)
     tell = progress or (lambda stage, value: None)
     case, verdict = answer(split, case, roles, start, tell)
     *_, whole = amended(case, verdict, roles["fit"], tell)

@@ -11,10 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from droid_jax.arguments import check_fields, number, whole
 from droid_jax.model.parameters import Scaling, Space
 
 Residuals = Callable[[np.ndarray], np.ndarray]
@@ -46,6 +48,16 @@ class StepConfig:
     main_prior: float = 4.0
     chord: float = 0.03
     spreads: int = 2
+
+    def __post_init__(self) -> None:
+        check_fields(
+            self,
+            step=partial(number, above=0),
+            smallest_step=partial(number, above=0),
+            main_prior=partial(number, above=0),
+            chord=partial(number, least=0),
+            spreads=partial(whole, least=0),
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,7 +33,7 @@ import msgspec
 import numpy as np
 from scipy import special
 
-from droid_jax.arguments import instance, note, number, numeric, one_of, shown, whole
+from droid_jax.arguments import instance, note, number, numeric, one_of, path_of, shown, whole
 from droid_jax.identify.truncated import gibbs, quantiles
 from droid_jax.model.parameters import Mode, Parameter, Scaling, Space, Write
 from droid_jax.read_json import read_json, typed
@@ -67,9 +67,9 @@ class Gaussian:
     coordinates: Coordinates = "search"
 
     def __post_init__(self) -> None:
-        instance(self.space, Space, "space")
+        instance(self.space, "space", Space)
         note(self.rule, "rule")
-        one_of(self.coordinates, get_args(Coordinates), "coordinates")
+        one_of(self.coordinates, "coordinates", get_args(Coordinates))
         d = len(self.space)
         mean, cov = _numbers("mean", self.mean, (d,)), _numbers("cov", self.cov, (d, d))
         _check_covariance(cov)
@@ -237,7 +237,7 @@ def prior(space: Space) -> Gaussian:
 
 def load(path: str | Path) -> Gaussian:
     """Read a file written by `Gaussian.save`; ValueError names the file and what is wrong in it."""
-    path = Path(path)
+    path = path_of(path, "the path of a Gaussian")
     if path.is_dir():
         raise ValueError(f"{path} is a folder; a run keeps its Gaussian in gaussian.json there")
     try:

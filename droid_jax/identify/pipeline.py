@@ -6,12 +6,14 @@ import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from droid_jax.compare.cost import Cost, make_cost
+from droid_jax.arguments import check_fields, instance, number, one_of, optional, whole
+from droid_jax.compare.cost import ENGINES, Cost, make_cost
 from droid_jax.compare.log_checks import warn_of_log
 from droid_jax.compare.residuals import CompareConfig
 from droid_jax.identify.fit import Fit
@@ -20,7 +22,7 @@ from droid_jax.identify.judge import Gap, gaps_of, split
 from droid_jax.identify.refine import RefineConfig, Refined, refine
 from droid_jax.identify.search import SearchConfig, search
 from droid_jax.identify.uncertainty import Identifiability, identifiability, not_judged, posterior
-from droid_jax.measure.recording import Recording
+from droid_jax.measure.recording import Recording, recordings_of
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
@@ -46,6 +48,18 @@ class IdentifyConfig:
     samples: int = 200
     seed: int = 0
     compare: CompareConfig = field(default_factory=CompareConfig)
+
+    def __post_init__(self) -> None:
+        check_fields(
+            self,
+            engine=partial(one_of, valid=ENGINES),
+            heldout=partial(number, least=0, below=1),
+            search=partial(instance, kind=SearchConfig),
+            refine=optional(partial(instance, kind=RefineConfig)),
+            samples=partial(whole, least=0),
+            seed=partial(whole, least=0),
+            compare=partial(instance, kind=CompareConfig),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,24 +139,14 @@ def identify(
     Raises ValueError for recordings of one name, where no torque is compared, where several recordings are to be fitted
     without the refinement (the search sees the first alone), and where the initial means cannot be simulated.
     """
-    recordings = [recordings] if isinstance(recordings, Recording) else recordings
     problem = prepare(scene, space, recordings, nuisances=nuisances, config=config, effects=effects)
     return solve(problem, checkpoints=checkpoints, progress=progress)
-
-
-def _check_recordings(recordings: Sequence[Recording]) -> None:
-    """ValueError where there is none, or where a file's name was given for what is in it."""
-    if not recordings:
-        raise ValueError("no recording to fit: give one, or several")
-    other = [r for r in recordings if not isinstance(r, Recording)]
-    if other:
-        raise ValueError(f"expected a Recording, got {other[0]!r}; load_recording reads one from a file or folder")
 
 
 def prepare(
     scene: Scene,
     space: Space,
-    recordings: Sequence[Recording],
+    recordings: Recording | Sequence[Recording],
     *,
     nuisances: Space | None = None,
     config: IdentifyConfig | None = None,
@@ -150,9 +154,12 @@ def prepare(
 ) -> Problem:
     """The part of `identify` before the search: whatever is wrong with the input is told here, and nothing written."""
     began = time.monotonic()
-    config = config or IdentifyConfig()
-    _check_recordings(recordings)
+    config = instance(IdentifyConfig() if config is None else config, "config", IdentifyConfig)
+    recordings = recordings_of(recordings)
     _check_names([r.name for r in recordings], config)
+    instance(space, "space", Space)
+    if nuisances is not None:
+        instance(nuisances, "nuisances", Space)
     fitted, held, numbers = zip(*(split(r, config.heldout) for r in recordings), strict=True)
     full = space if nuisances is None or config.refine is None else space + nuisances
     base = make_cost(scene, full, fitted, engine=config.engine, config=config.compare, effects=effects, check=False)

@@ -12,10 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from droid_jax import arguments
+from droid_jax.arguments import check_fields, several, whole
 from droid_jax.identify.damped import Problem, Residuals, State, StepConfig, curvature, fall
 from droid_jax.identify.search import NotReplayed, SearchConfig, search
 from droid_jax.model.parameters import Parameter, Space
@@ -61,6 +64,21 @@ class RefineConfig(StepConfig):
     hold: int = 2
     hops: int = 4
     hop_generations: int = 20
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_fields(
+            self,
+            iterations=partial(whole, least=0),
+            tolerance=partial(arguments.number, least=0),
+            rough=partial(arguments.number, least=0),
+            aim=partial(arguments.number, infinite=True),
+            keep=several(partial(arguments.number, least=1)),
+            doubt=partial(arguments.number, least=0),
+            hold=partial(whole, least=0),
+            hops=partial(whole, least=0),
+            hop_generations=partial(whole, least=1),
+        )
 
 
 @dataclass(frozen=True, eq=False)

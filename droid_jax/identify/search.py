@@ -11,16 +11,17 @@ fold_in(key(seed), generation), so a resumed search repeats an uninterrupted one
 from __future__ import annotations
 
 import json
-import math
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from droid_jax.arguments import check_fields, flag, number, one_of, optional, whole
 from droid_jax.identify.cma import Strategy, recombination
 from droid_jax.identify.fit import Fit, History, Progress, Restart, on_bound
 from droid_jax.identify.gaussian import space_to_json
@@ -79,26 +80,24 @@ class SearchConfig:
     checkpoint_every: int = 5
 
     def __post_init__(self) -> None:
-        for name in ("generations", "restarts", "patience", "checkpoint_every"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.population < 2:
-            raise ValueError(f"population must be at least 2, got {self.population}")
+        check_fields(
+            self,
+            **dict.fromkeys(("generations", "restarts", "patience", "checkpoint_every"), partial(whole, least=1)),
+            **dict.fromkeys(("tol_cost", "tol_sigma"), partial(number, least=0)),
+            population=partial(whole, least=2),
+            parents=optional(whole),
+            sigma=partial(number, above=0),
+            bounds=partial(one_of, valid=("resample", "clip")),
+            active=optional(flag),
+            max_seconds=optional(partial(number, above=0)),
+            seed=whole,
+        )
         if self.parents is not None and not 1 <= self.parents < self.population:
             raise ValueError(
                 f"parents must lie between 1 and population - 1 = {self.population - 1}, got {self.parents}"
             )
-        if not (math.isfinite(self.sigma) and self.sigma > 0):
-            raise ValueError(f"sigma must be positive, got {self.sigma}")
-        for name in ("tol_cost", "tol_sigma"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} must be 0 or more, got {getattr(self, name)}")
-        if self.max_seconds is not None and not self.max_seconds > 0:
-            raise ValueError(f"max_seconds must be positive or None, got {self.max_seconds}")
         if not 0 <= self.seed < 2**31 - self.restarts:
             raise ValueError(f"seed must lie between 0 and 2^31 - restarts, got {self.seed}")
-        if self.bounds not in ("resample", "clip"):
-            raise ValueError(f"bounds must be 'resample' or 'clip', got {self.bounds!r}")
 
     @property
     def elite(self) -> int:

@@ -41,7 +41,7 @@ def validate(recording: Recording, *, source: str = "", allow_jitter: bool = Fal
     allow_jitter: accept clocks whose steps differ from their median by more than half of it.
     Rows and repeats in messages count from 0, as numpy does.
     """
-    instance(recording, Recording, "a recording")
+    instance(recording, "a recording", Recording)
     where = source or f"recording {shown(recording.name)}"
     name(recording.name, f"{where}: its name", file=True)
     _check_types(recording, where)
@@ -77,12 +77,12 @@ def _check_types(recording: Recording, where: str) -> None:
         if not isinstance(mapping, Mapping):
             raise ValueError(f"{where}: {what} must map {mapped}, got {shown(mapping)}")
     for key, channel in recording.channels.items():
-        instance(channel, Channel, f"{where}: channel {shown(key)}")
-    instances(recording.phases, Phase, f"{where}: phases")
+        instance(channel, f"{where}: channel {shown(key)}", Channel)
+    instances(recording.phases, f"{where}: phases", Phase)
     if recording.gains is not None:
-        instance(recording.gains, ServoGains, f"{where}: gains")
+        instance(recording.gains, f"{where}: gains", ServoGains)
     if recording.object_pose is not None:
-        instance(recording.object_pose, ObjectPose, f"{where}: object_pose")
+        instance(recording.object_pose, f"{where}: object_pose", ObjectPose)
 
 
 def _check_texts(recording: Recording, where: str) -> None:

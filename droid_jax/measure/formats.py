@@ -17,7 +17,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from droid_jax.arguments import shown
+from droid_jax.arguments import flag, path_of
 from droid_jax.errors import needs
 from droid_jax.measure.checks import validate
 from droid_jax.measure.csv_folder import check_folder, load_csv, save_csv
@@ -52,7 +52,8 @@ def load(
     Raises FileNotFoundError when there is no such path, ValueError for everything in the
     file that is not as it should be.
     """
-    path = _path(path)
+    path = path_of(path, "the path of a recording")
+    resample, allow_jitter = flag(resample, "resample"), flag(allow_jitter, "allow_jitter")
     if not path.exists():
         raise FileNotFoundError(f"no recording at {path}: there is no such file or folder")
     bags = bags_at(path)
@@ -97,7 +98,7 @@ def save(recording: Recording, path: str | os.PathLike[str]) -> Path:
     An existing recording of that name is replaced.  Raises ValueError when the recording is
     not valid, the suffix is another one, or something else stands there.
     """
-    path = _path(path)
+    path = path_of(path, "the path of a recording")
     check_target(path)
     # Irregular clocks were a question when the data came in; here they are only kept.
     validate(recording, allow_jitter=True)
@@ -106,13 +107,6 @@ def save(recording: Recording, path: str | os.PathLike[str]) -> Path:
     else:
         save_csv(recording, path)
     return path
-
-
-def _path(path: Any) -> Path:
-    """A path, or ValueError for what is none."""
-    if not isinstance(path, (str, os.PathLike)) or "\0" in os.fspath(path):
-        raise ValueError(f"a recording's path must be text or a Path, got {shown(path)}")
-    return Path(path)
 
 
 def _supported() -> str:

@@ -11,12 +11,15 @@ from __future__ import annotations
 import enum
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
+from os import PathLike
 from typing import Any
 
 import numpy as np
 
+from droid_jax.arguments import check_fields, choice, flag, number, shown, whole
 from droid_jax.measure.clocks import SLACK
 
 START = 0.1  # s: a channel that begins no later than this after the command still tells where the motion started
@@ -38,12 +41,15 @@ JITTER = "allow_jitter"  # in `meta` of a recording whose irregular clocks were 
 class TorqueConvention:
     """What the torque channel holds.
 
-    side:    motor or link side of the gear.
+    side:    motor or link side of the gear; "motor" or "link" is converted.
     gravity: True when the measured torque contains the torque that carries the arm's weight.
     """
 
     side: TorqueSide
     gravity: bool
+
+    def __post_init__(self) -> None:
+        check_fields(self, side=partial(choice, kind=TorqueSide), gravity=flag)
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,9 +169,9 @@ class Recording:
         """The channel of that name; ValueError lists the valid names."""
         try:
             return self.channels[name]
-        except KeyError:
+        except (KeyError, TypeError):
             have = ", ".join(sorted(self.channels))
-            raise ValueError(f"unknown channel {name!r}; recording {self.name!r} has: {have}") from None
+            raise ValueError(f"unknown channel {shown(name)}; recording {self.name!r} has: {have}") from None
 
     @property
     def grip_window(self) -> tuple[float, float] | None:
@@ -186,7 +192,7 @@ class Recording:
 
         Raises ValueError when no index is given or one lies outside 0 .. N - 1.
         """
-        chosen = [int(i) for i in indices]
+        chosen = [whole(i, "a repeat") for i in indices]
         bad = [i for i in chosen if not 0 <= i < self.repeats]
         if not chosen or bad:
             raise ValueError(f"repeats must be out of 0 .. {self.repeats - 1}, got {bad if bad else 'none'}")
@@ -201,6 +207,7 @@ class Recording:
         window is empty for the command or a channel, or a joint's position at its beginning is
         neither given nor measured.
         """
+        start, end = number(start, "start of a window"), number(end, "end of a window")
         if not start < end:
             raise ValueError(f"a window needs start < end, got {start} and {end} s")
         rows = _rows(self.time, start, end)
@@ -225,6 +232,21 @@ class Recording:
             phases=phases,
             qpos0=_positions_at(self, start, qpos0 or {}),
         )
+
+
+def recordings_of(given: Any) -> tuple[Recording, ...]:
+    """One recording or several as a tuple; ValueError where there is none, or a file's name stands for its content."""
+    if isinstance(given, Recording):
+        return (given,)
+    if isinstance(given, (str, bytes, PathLike)) or not isinstance(given, Iterable):
+        given = [given]
+    out = tuple(given)
+    if not out:
+        raise ValueError("no recording to fit: give one, or several")
+    for one in out:
+        if not isinstance(one, Recording):
+            raise ValueError(f"expected a Recording, got {shown(one)}; load_recording reads one from a file or folder")
+    return out
 
 
 def _rows(time: np.ndarray, start: float, end: float) -> np.ndarray:

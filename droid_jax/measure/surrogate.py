@@ -11,11 +11,13 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import mujoco
 import numpy as np
 import scipy.signal
 
+from droid_jax.arguments import check_fields, choice, number, several, whole
 from droid_jax.files import STAND_IN_SOURCE as SOURCE
 from droid_jax.measure.checks import validate
 from droid_jax.measure.clocks import interpolate
@@ -58,6 +60,17 @@ class SurrogateConfig:
     start_noise: float = 2e-4
     pose_noise: float = 1e-4
     side: TorqueSide = TorqueSide.MOTOR
+
+    def __post_init__(self) -> None:
+        noises = ("position_noise", "angle_noise", "start_noise", "pose_noise")
+        check_fields(
+            self,
+            **dict.fromkeys(noises, partial(number, least=0)),
+            **dict.fromkeys(("torque_noise", "torque_drift"), several(partial(number, least=0), 2)),
+            **dict.fromkeys(("timestep", "rate", "angle_rate"), partial(number, above=0)),
+            repeats=partial(whole, least=1),
+            side=partial(choice, kind=TorqueSide),
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from droid_jax.arguments import instance, one_of
 from droid_jax.model.builtin import ARM, HINGE
 from droid_jax.model.door_scene import PAPER_DAMPING
 from droid_jax.model.fields import (
@@ -62,8 +63,8 @@ def door_space(scene: Scene, *, preset: str = "impedance") -> Space:
       Table I's deviations away, is still found.
     Raises ValueError for other presets and for a scene without a grip.
     """
-    if preset not in ("impedance", "paper"):
-        raise ValueError(f"preset must be 'impedance' or 'paper', got {preset!r}")
+    one_of(preset, "preset", ("impedance", "paper"))
+    instance(scene, "scene", Scene)
     if scene.grip is None:
         raise ValueError(f"scene {scene.name!r} has no grip, whose fingers' friction is part of Table I")
     left, right = scene.grip.fingers
@@ -104,6 +105,7 @@ def door_nuisances(scene: Scene) -> Space:
     gains, timing and torque offsets.  Deviations: 2 mm and 0.5 degree of door pose, 1 mm at the
     knob, 3 % of link masses and servo gains, 1 ms, 0.1 N m (0.03 at the wrist).
     """
+    instance(scene, "scene", Scene)
     note: dict[str, Any] = dict(nuisance=True, group="Nuisance")
     pose = [
         body_position(scene, "cabinet", k, std=0.002, limit=0.02, name=f"door_{'xyz'[k]}", **note) for k in range(3)

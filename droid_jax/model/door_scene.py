@@ -8,6 +8,7 @@ from pathlib import Path
 
 import mujoco
 
+from droid_jax.arguments import flag, number, one_of, whole
 from droid_jax.model.builtin import ARM, HINGE, mjcf_dir
 from droid_jax.model.looks import LOOK_GROUP
 from droid_jax.model.scene import Grip, Scene, compile_scene
@@ -41,12 +42,11 @@ def door_scene(
     limits:  enforce the arm's joint ranges (needed when a policy drives the arm; a replay keeps inside).
     Raises ValueError for other springs, knobs or gains.
     """
-    if springs not in SPRINGS:
-        raise ValueError(f"springs must be one of {sorted(SPRINGS)}, got {springs}")
-    if knob not in range(len(LEVERS)):
-        raise ValueError(f"knob must be 0..{len(LEVERS) - 1}, got {knob}")
-    if gains not in ("impedance", "paper"):
-        raise ValueError(f"gains must be 'impedance' or 'paper', got {gains!r}")
+    whole(springs, "springs", least=0, most=max(SPRINGS))
+    whole(knob, "knob", least=0, most=len(LEVERS) - 1)
+    one_of(gains, "gains", ("impedance", "paper"))
+    number(timestep, "timestep", above=0)
+    flag(limits, "limits")
     folder = mjcf_dir()
     spec = mujoco.MjSpec.from_file(str(folder / "room.xml"))
     _attach(spec, folder / "panda.xml", "robot")

@@ -20,8 +20,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from droid_jax.model.actuators import has_servo_damping
-from droid_jax.model.parameters import Mode, Parameter, Scaling, Write
+from droid_jax.model.actuators import drives_joint, has_servo_damping
+from droid_jax.model.parameters import Mode, Parameter, Scaling, Space, Write
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
 
 _KIND = {
@@ -58,12 +58,41 @@ def element_index(scene: Scene, field: str, element: str) -> int:
 
 
 def element_name(model: mujoco.MjModel, field: str, index: Sequence[int]) -> str:
-    """Name of the element that an entry of a model field belongs to, "" where it has none."""
+    """Name of the element that an entry of a model field belongs to, "" where it has none.
+
+    Of an actuator without a name it is its joint's.
+    """
     kind = field.split("_")[0]
     if kind not in _KIND:
         return ""
     number = model.dof_jntid[index[0]] if kind == "dof" else index[0]
-    return getattr(model, _KIND[kind])(number).name
+    name = getattr(model, _KIND[kind])(number).name
+    if not name and kind == "actuator" and drives_joint(model)[number]:  # most servos have no name of their own
+        return model.joint(model.actuator_trnid[number, 0]).name
+    return name
+
+
+def check_space(scene: Scene, space: Space) -> None:
+    """ValueError where a space writes entries that the scene's model does not have, or has of another element."""
+    for p in space.parameters:
+        for w in p.writes:
+            array = getattr(scene.model, w.field, None)
+            if not isinstance(array, np.ndarray):
+                raise ValueError(
+                    f"parameter {p.name!r} writes {w.field}, which the model of {scene.name!r} does not have"
+                )
+            if len(w.index) != array.ndim or any(i >= n for i, n in zip(w.index, array.shape, strict=True)):
+                raise ValueError(
+                    f"parameter {p.name!r} writes {w.field}[{', '.join(map(str, w.index))}]"
+                    f"{f' of {w.element!r}' if w.element else ''}, but in {scene.name!r} that field has shape "
+                    f"{array.shape}: it belongs to another scene"
+                )
+            own = element_name(scene.model, w.field, w.index)
+            if w.element and w.element != own:
+                raise ValueError(
+                    f"parameter {p.name!r} writes {w.field} of {w.element!r}, but in {scene.name!r} that entry is of "
+                    f"{own or 'an element without a name'!r}: it belongs to another scene"
+                )
 
 
 def write(

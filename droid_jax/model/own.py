@@ -28,6 +28,7 @@ from typing import Any
 
 import msgspec
 
+from droid_jax.arguments import instance, path_of
 from droid_jax.errors import faults
 from droid_jax.model.door import time_offset
 from droid_jax.model.fields import body_mass, model_parameter, servo_scale
@@ -67,7 +68,8 @@ _KNOWN = _Entry.__struct_fields__
 
 def load_parameters(path: str | Path, scene: Scene) -> Space:
     """The space described in a JSON file; ValueError names the file, the entry and what is wrong with it."""
-    entries, first = _entries(Path(path)), dict[str, int]()
+    entries, first = _entries(path_of(path, "the path of a parameter file")), dict[str, int]()
+    instance(scene, "scene", Scene)
     parameters = [_parameter(scene, entry, f"{path}, entry {i}") for i, entry in enumerate(entries, 1)]
     for i, p in enumerate(parameters, 1):
         if first.setdefault(p.name, i) != i:

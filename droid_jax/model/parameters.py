@@ -66,7 +66,7 @@ class Write:
         if not isinstance(self.index, (tuple, list)) or not self.index:
             raise ValueError(f"{where}: index must be a tuple of whole numbers, got {shown(self.index)}")
         set_field(self, "index", tuple(whole(i, f"{where}: index", least=0, most=MOST_ROWS) for i in self.index))
-        set_field(self, "mode", choice(self.mode, Mode, f"{where}: mode"))
+        set_field(self, "mode", choice(self.mode, f"{where}: mode", Mode))
         set_field(self, "gain", number(self.gain, f"{where}: gain"))
         set_field(self, "offset", number(self.offset, f"{where}: offset"))
         name(self.element, f"{where}: element", empty=True)
@@ -133,9 +133,9 @@ class Parameter:
         name(self.group, f"{where}: group", empty=True)
         for key in ("mean", "std", "low", "high", "floor"):
             set_field(self, key, number(getattr(self, key), f"{where}: {key}"))
-        set_field(self, "writes", instances(self.writes, Write, f"{where}: writes"))
+        set_field(self, "writes", instances(self.writes, f"{where}: writes", Write))
         set_field(self, "nuisance", flag(self.nuisance, f"{where}: nuisance"))
-        set_field(self, "scaling", choice(self.scaling, Scaling, f"{where}: scaling"))
+        set_field(self, "scaling", choice(self.scaling, f"{where}: scaling", Scaling))
         if self.width is not None:
             set_field(self, "width", number(self.width, f"{where}: width", above=0))
         if not self.low < self.high:
@@ -194,7 +194,7 @@ class Space:
     _index: dict[str, int] = field(init=False, repr=False, compare=False, hash=False, default_factory=dict)
 
     def __post_init__(self) -> None:
-        set_field(self, "parameters", instances(self.parameters, Parameter, "the parameters of a space"))
+        set_field(self, "parameters", instances(self.parameters, "the parameters of a space", Parameter))
         names = [p.name for p in self.parameters]
         if not names:
             raise ValueError("a space needs at least one parameter")

@@ -17,6 +17,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from droid_jax import arguments
 from droid_jax.arguments import said
 from droid_jax.model.actuators import actuator_names, drives_joint, of_joint
 from droid_jax.model.ignored import check_options, refuse_ignored, refuse_missing
@@ -231,11 +232,12 @@ class Scene:
 def name_to_id(model: mujoco.MjModel, kind: str, name: str) -> int:
     """Id of a named joint, body, geom, pair, actuator or site; an unknown name lists the valid ones."""
     obj = getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
-    found = mujoco.mj_name2id(model, obj, name)
+    plain = isinstance(name, str) and bool(name) and name.isprintable()
+    found = mujoco.mj_name2id(model, obj, name) if plain else -1
     if found < 0:
         valid = [v for v in (mujoco.mj_id2name(model, obj, i) for i in range(_count(model, kind))) if v]
         has = f"has: {', '.join(valid)}" if valid else f"has no {kind} with a name"
-        raise ValueError(f"unknown {kind} {name!r}; this scene {has}")
+        raise ValueError(f"unknown {kind} {arguments.shown(name)}; this scene {has}")
     return found
 
 
@@ -272,6 +274,9 @@ def compile_scene(
     Raises ValueError for unknown names, for joints of several degrees of freedom, for
     features that MJX would silently ignore, for plugins, and for what the replays have not.
     """
+    arguments.one_of(engine, "engine", ("mjx", "mujoco"))
+    joints = None if joints is None else arguments.names(joints, "joints")
+    object_joint = None if object_joint is None else arguments.name(object_joint, "object_joint")
     bare, free = without_looks(spec), set(unlimited)
     for joint in bare.joints:
         if joint.name in free:
@@ -290,7 +295,7 @@ def compile_scene(
         name=name,
         spec=spec,
         model=model,
-        joints=tuple(joints) if joints is not None else driven,
+        joints=driven if joints is None else joints,
         command_names=command_names,
         object_joint=object_joint,
         grip=grip,
@@ -321,13 +326,18 @@ def load_scene(
     engine, mj_step: as in `compile_scene`.
     Raises FileNotFoundError or ValueError (the file does not compile, unknown names, ...).
     """
-    path = Path(path)
+    path = arguments.path_of(path, "the path of an MJCF")
+    friction_joints = arguments.names(friction_joints, "friction_joints")
+    assets = {} if assets is None else arguments.instance(assets, "assets", Mapping)
+    for key, content in assets.items():
+        if not isinstance(key, str) or not isinstance(content, bytes):
+            raise ValueError(f"assets must map file names to bytes, got {arguments.shown(key)}")
     if path.is_dir():
         raise FileNotFoundError(f"{path} is a folder, not an MJCF file")
     if not path.is_file():
         raise FileNotFoundError(f"no MJCF file at {path}")
     try:
-        spec = _read(path, assets or {})
+        spec = _read(path, assets)
     except ValueError as error:
         raise ValueError(f"{path}: {said(error)}") from None
     named = {j.name: j for j in spec.joints}
@@ -358,5 +368,8 @@ def with_options(scene: Scene, **changes: Any) -> Scene:
     for name, value in changes.items():
         if not hasattr(model.opt, name):
             raise ValueError(f"unknown option {name!r} of mujoco.MjOption")
-        setattr(model.opt, name, value)
+        try:
+            setattr(model.opt, name, value)
+        except (TypeError, ValueError):
+            raise ValueError(f"option {name!r} of mujoco.MjOption cannot be {arguments.shown(value)}") from None
     return dataclasses.replace(scene, model=model)

@@ -15,8 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from droid_jax.arguments import instance
 from droid_jax.identify.gaussian import Gaussian
-from droid_jax.model.fields import element_name
+from droid_jax.model.fields import check_space, element_name
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import POSE, UNIT, Physics, joined_bodies, make_physics, model_writes, written_fields
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
@@ -29,7 +30,7 @@ def randomised(scene: Scene, gaussian: Gaussian) -> Randomise:
 
     Raises ValueError for a Gaussian of another scene.
     """
-    check_scene(scene, gaussian.space)
+    check_space(instance(scene, "scene", Scene), instance(gaussian, "gaussian", Gaussian).space)
 
     def randomise(sys: Physics, rng: jax.Array) -> tuple[Physics, Physics]:
         values = gaussian.sample(_seed(rng), _count(rng))
@@ -115,7 +116,7 @@ def _check_friction_rows(scene: Scene, model: Any, written: Iterable[tuple[int, 
 
 def fixed(scene: Scene, space: Space, values: np.ndarray) -> Randomise:
     """The same values [D] in every environment: no randomisation."""
-    check_scene(scene, space)
+    check_space(scene, space)
 
     def randomise(sys: Physics, rng: jax.Array) -> tuple[Physics, Physics]:
         return physics_of(scene, space, np.repeat(values[None], _count(rng), axis=0)), axes(scene, space)
@@ -145,29 +146,6 @@ def _zeros(model: Any, fields: Sequence[str]) -> Any:
     """The model's tree with 0 in these fields and None in all others."""
     zeros = {field: jax.tree.map(lambda leaf: 0, getattr(model, field)) for field in fields}
     return jax.tree.map(lambda leaf: None, model).replace(**zeros)
-
-
-def check_scene(scene: Scene, space: Space) -> None:
-    """ValueError where a space writes entries that the scene's model does not have, or has of another element."""
-    for column, write in model_writes(space):
-        array = getattr(scene.model, write.field, None)
-        name = space.parameters[column].name
-        if array is None:
-            raise ValueError(
-                f"parameter {name!r} writes {write.field}, which the model of {scene.name!r} does not have"
-            )
-        shape = np.shape(array)
-        if len(write.index) != len(shape) or any(i >= n for i, n in zip(write.index, shape, strict=True)):
-            raise ValueError(
-                f"parameter {name!r} writes {write.field}[{', '.join(map(str, write.index))}], but in {scene.name!r} "
-                f"that field has shape {shape}: the Gaussian belongs to another scene"
-            )
-        own = element_name(scene.model, write.field, write.index)
-        if write.element and write.element != own:
-            raise ValueError(
-                f"parameter {name!r} writes {write.field} of {write.element!r}, but in {scene.name!r} that entry is of "
-                f"{own or 'an element without a name'!r}: the Gaussian belongs to another scene"
-            )
 
 
 def _count(rng: jax.Array) -> int:

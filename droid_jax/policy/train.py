@@ -14,6 +14,7 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.agents.ppo import train as ppo
 
+from droid_jax.arguments import check_fields, number, optional, several, whole
 from droid_jax.identify.checkpoints import Checkpoints
 from droid_jax.policy.control import LAYOUT, Policy
 from droid_jax.policy.door_env import DoorEnv
@@ -67,8 +69,17 @@ class TrainConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if min(self.steps, self.evaluations) < 1:
-            raise ValueError(f"steps and evaluations must be 1 or more, got {self.steps} and {self.evaluations}")
+        counts = ("steps", "envs", "unroll", "batch", "minibatches", "epochs", "evaluations", "eval_envs")
+        check_fields(
+            self,
+            **dict.fromkeys(counts, partial(whole, least=1)),
+            **dict.fromkeys(("learning_rate", "clip", "reward_scaling"), partial(number, above=0)),
+            **dict.fromkeys(("discount", "gae"), partial(number, least=0, most=1)),
+            devices=optional(partial(whole, least=1)),
+            hidden=several(partial(whole, least=1)),
+            entropy=partial(number, least=0),
+            seed=partial(whole, least=0),
+        )
         if (self.batch * self.minibatches) % self.envs:
             raise ValueError(
                 f"batch x minibatches ({self.batch} x {self.minibatches}) must be a multiple of the {self.envs} "

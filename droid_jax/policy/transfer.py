@@ -10,11 +10,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import mujoco
 import numpy as np
 
 from droid_jax import runtime
+from droid_jax.arguments import check_fields, number, whole
 from droid_jax.measure.hidden import LONGEST_STEP, Applied, at_work, check
 from droid_jax.measure.hidden_hooks import Influence, edited, under
 from droid_jax.measure.surrogate import own_engine
@@ -44,6 +46,15 @@ class TransferConfig:
     velocity_noise: float = 5e-3
     knob_noise: float = 1e-3
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_fields(
+            self,
+            **dict.fromkeys(("position_noise", "velocity_noise", "knob_noise"), partial(number, least=0)),
+            trials=partial(whole, least=1),
+            timestep=partial(number, above=0),
+            seed=partial(whole, least=0),
+        )
 
 
 @dataclass(frozen=True, eq=False)

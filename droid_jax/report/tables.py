@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from droid_jax.arguments import said
+from droid_jax.arguments import path_of, said
 from droid_jax.errors import lacking, named
 from droid_jax.files import HISTORY_TABLE, SAMPLES
 from droid_jax.report.reading import Reader
@@ -39,7 +39,7 @@ def frames(folder: str | Path) -> Frames:
     """
     if told := lacking("droid_jax.frames needs", "frames", "pandas"):
         raise ImportError(told)
-    folder = Path(folder)
+    folder = path_of(folder, "the folder of a fit")
     at = next((f for f in (folder, folder / "identify") if (f / SAMPLES).is_file()), folder)
     needs_whole(at)
     read = Reader("identify")

@@ -1,0 +1,159 @@
+"""Arguments are checked as files are: one sentence that names the argument, its place and what it was."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import droid_jax as dj
+from droid_jax import arguments
+from droid_jax.arguments import check_fields, number, whole
+from droid_jax.compare.residuals import CompareConfig
+from droid_jax.gap.case import GapConfig
+from droid_jax.identify.pipeline import IdentifyConfig
+from droid_jax.identify.refine import RefineConfig
+from droid_jax.identify.search import SearchConfig
+from droid_jax.measure.recording import TorqueConvention, TorqueSide
+from droid_jax.measure.surrogate import SurrogateConfig
+from droid_jax.model.parameters import Mode, Parameter, Scaling, Space, Write
+from droid_jax.policy.train import TrainConfig
+from droid_jax.policy.transfer import TransferConfig
+
+GOOD = {"name": "a", "unit": "kg", "mean": 1.0, "std": 0.5, "low": 0.1, "high": 5.0}
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: IdentifyConfig(heldout=math.nan), "heldout must be finite, got nan"),
+        (lambda: IdentifyConfig(heldout=-0.1), "heldout must be at least 0, got -0.1"),
+        (lambda: IdentifyConfig(heldout=1.0), "heldout must be below 1, got 1.0"),
+        (lambda: IdentifyConfig(heldout="0.3"), "heldout must be a number, got '0.3'"),  # pyright: ignore
+        (lambda: IdentifyConfig(heldout=True), "heldout must be a number, got True"),
+        (lambda: IdentifyConfig(engine="mjxx"), "engine must be one of mjx, mujoco, got 'mjxx'"),
+        (lambda: IdentifyConfig(search={}), "search must be a SearchConfig, got a dict"),  # pyright: ignore
+        (lambda: IdentifyConfig(samples=-1), "samples must be at least 0, got -1"),
+        (lambda: CompareConfig(motion_cutoff=0.0), "motion_cutoff must be above 0, got 0.0"),
+        (lambda: CompareConfig(motion_cutoff=math.inf), "motion_cutoff must be finite, got inf"),
+        (lambda: CompareConfig(channels={"torque": -1.0}), "channels, 'torque' must be at least 0, got -1.0"),
+        (lambda: CompareConfig(channels={"torque": "1"}), "channels, 'torque' must be a number"),  # pyright: ignore
+        (lambda: CompareConfig(channels={"torque": 0.0}), "channels must have a weight above 0"),
+        (lambda: CompareConfig(channels=["torque"]), "channels must map names to weights"),  # pyright: ignore
+        (lambda: CompareConfig(whitened="yes"), "whitened must be True or False, got 'yes'"),  # pyright: ignore
+        (lambda: CompareConfig(grip_share=1.5), "grip_share must be at most 1, got 1.5"),
+        (lambda: SearchConfig(population=2.5), "population must be a whole number, got 2.5"),  # pyright: ignore
+        (lambda: SearchConfig(sigma=math.nan), "sigma must be finite, got nan"),
+        (lambda: SearchConfig(tol_cost=-1.0), "tol_cost must be at least 0, got -1.0"),
+        (lambda: SearchConfig(max_seconds=math.inf), "max_seconds must be finite, got inf"),
+        (lambda: SearchConfig(bounds="bounce"), "bounds must be one of resample, clip"),  # pyright: ignore
+        (lambda: RefineConfig(iterations=0), "iterations must be at least 1, got 0"),
+        (lambda: RefineConfig(step=0.0), "step must be above 0, got 0.0"),
+        (lambda: RefineConfig(keep=3.0), "keep must be a list, got 3.0"),  # pyright: ignore
+        (lambda: RefineConfig(keep=()), "keep must have one or more entries, got 0"),
+        (lambda: RefineConfig(keep=(3.0, math.nan)), "keep, entry 1 must be finite, got nan"),
+        (lambda: RefineConfig(tolerance=math.nan), "tolerance must be finite, got nan"),
+        (lambda: RefineConfig(aim=math.nan), "aim must be finite, got nan"),
+        (lambda: GapConfig(looked=0), "looked must be at least 1, got 0"),
+        (lambda: GapConfig(budget=-1.0), "budget must be at least 0, got -1.0"),
+        (lambda: GapConfig(least_closed="0.4"), "least_closed must be a number"),  # pyright: ignore
+        (lambda: GapConfig(refine=None), "refine must be a RefineConfig, got None"),  # pyright: ignore
+        (lambda: TrainConfig(learning_rate=-1.0), "learning_rate must be above 0, got -1.0"),
+        (lambda: TrainConfig(hidden=(0,)), "hidden, entry 0 must be at least 1, got 0"),
+        (lambda: TransferConfig(timestep=0.0), "timestep must be above 0, got 0.0"),
+        (lambda: SurrogateConfig(torque_noise=(0.1,)), "torque_noise must have 2 entries"),  # pyright: ignore
+        (lambda: SurrogateConfig(side="joint"), "side must be one of motor, link"),  # pyright: ignore
+        (lambda: TorqueConvention("joint", True), "side must be one of motor, link, got 'joint'"),  # pyright: ignore
+        (lambda: TorqueConvention(TorqueSide.LINK, "yes"), "gravity must be True or False"),  # pyright: ignore
+        (lambda: TorqueConvention(TorqueSide.LINK, 1), "gravity must be True or False, got 1"),  # pyright: ignore
+        (lambda: Parameter(**{**GOOD, "scaling": "cubic"}), "parameter 'a': scaling must be one of linear, log"),
+        (lambda: Parameter(**{**GOOD, "mean": "1"}), "parameter 'a': mean must be a number, got '1'"),
+        (lambda: Parameter(**{**GOOD, "std": True}), "parameter 'a': std must be a number, got True"),
+        (lambda: Parameter(**{**GOOD, "high": 10**400}), "parameter 'a': high must be a number"),
+        (lambda: Parameter(**{**GOOD, "name": "a\0"}), "its name holds the character U+0000"),
+        (lambda: Parameter(**{**GOOD, "name": 3}), "its name must be text, got 3"),
+        (lambda: Parameter(**{**GOOD, "writes": ["x"]}), "writes, entry 0 must be a Write, got 'x'"),
+        (lambda: Parameter(**{**GOOD, "high": 1e308, "low": -1e308}), "too large or too small to search among"),
+        (lambda: Parameter(**{**GOOD, "scaling": "log", "std": 1e-320}), "too large or too small to search among"),
+        (lambda: Write("dof_damping", (-1,)), "index must be at least 0, got -1"),
+        (lambda: Write("dof_damping", (0.5,)), "index must be a whole number, got 0.5"),  # pyright: ignore
+        (lambda: Write("dof_damping", 0), "index must be a tuple of whole numbers, got 0"),  # pyright: ignore
+        (lambda: Write("dof_damping", (0,), "cube"), "mode must be one of set, "),  # pyright: ignore
+        (lambda: Space("ab"), "the parameters of a space must be a list of Parameter objects"),  # pyright: ignore
+        (lambda: Space((1,)), "the parameters of a space, entry 0 must be a Parameter, got 1"),  # pyright: ignore
+        (lambda: dj.door_scene(springs=True), "springs must be a whole number, got True"),
+        (lambda: dj.door_scene(timestep=math.nan), "timestep must be finite, got nan"),
+        (lambda: dj.load_scene(3), "the path of an MJCF must be text or a Path, got 3"),  # pyright: ignore
+        (lambda: dj.load_recording("a\0b.npz"), "the path of a recording must be text or a Path"),
+        (lambda: dj.load_recording("a.npz", resample=1), "resample must be True or False, got 1"),  # pyright: ignore
+    ],
+)
+def test_a_wrong_argument_is_one_sentence(make: Any, said: str) -> None:
+    with pytest.raises(ValueError) as caught:
+        make()
+    assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_texts_that_stand_for_a_choice_are_converted() -> None:
+    assert TorqueConvention("link", True) == TorqueConvention(TorqueSide.LINK, True)  # pyright: ignore
+    assert Parameter(**{**GOOD, "scaling": "log"}).scaling is Scaling.LOG
+    assert Write("dof_damping", [0], "add") == Write("dof_damping", (0,), Mode.ADD)  # pyright: ignore
+
+
+def test_numbers_of_numpy_become_pythons() -> None:
+    made = Parameter(**{**GOOD, "mean": np.float32(0.5), "nuisance": np.bool_(True)})
+    assert type(made.mean) is float and made.nuisance is True
+    assert type(SearchConfig(population=np.int64(8)).population) is int  # pyright: ignore
+
+
+def test_two_joints_of_one_name_and_a_text_for_a_list(tmp_path: Path) -> None:
+    path = tmp_path / "hinge.xml"
+    path.write_text(
+        '<mujoco><worldbody><body><joint name="j" axis="0 1 0"/><geom size="0.1"/></body></worldbody>'
+        '<actuator><position joint="j" kp="10" kv="1"/></actuator></mujoco>'
+    )
+    for joints, said in ((["j", "j"], "joints must be unique, repeated: j"), ("j", "joints must be a list of names")):
+        with pytest.raises(ValueError, match=said):
+            dj.load_scene(path, joints=joints)
+    with pytest.raises(ValueError, match="friction_joints must be a list of names, got 'j'"):
+        dj.load_scene(path, friction_joints="j")
+    scene = dj.load_scene(path)
+    with pytest.raises(ValueError, match="space must be a Space, got a list"):
+        dj.make_cost(scene, [], [])  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="scene must be a Scene, got a PosixPath"):
+        dj.load_parameters(_json(tmp_path), path)  # pyright: ignore[reportArgumentType]
+
+
+def _json(folder: Path) -> Path:
+    (folder / "p.json").write_text('[{"field": "dof_damping", "element": "j", "std": 1, "high": 2}]')
+    return folder / "p.json"
+
+
+@dataclass(frozen=True)
+class Config:
+    size: float
+    count: int = 1
+
+    def __post_init__(self) -> None:
+        check_fields(self, size=partial(number, above=0, most=3), count=partial(whole, least=1))
+
+
+def test_fields_are_kept_as_the_checks_return_them() -> None:
+    assert Config(np.float32(2.0), np.int8(3)) == Config(2.0, 3)  # pyright: ignore
+    with pytest.raises(ValueError, match="size must be at most 3, got 4"):
+        Config(4)
+
+
+def test_what_is_shown_of_a_value_is_one_short_line() -> None:
+    class Rude:
+        def __repr__(self) -> str:
+            raise RuntimeError("no")
+
+    assert arguments.shown(Rude()) == "a Rude"
+    assert arguments.shown("\x1b[2J\ud800\n") == r"'\x1b[2J\ud800\n'"
+    assert len(arguments.shown(np.zeros((50, 50)))) == 80
