@@ -9,7 +9,6 @@ from __future__ import annotations
 import enum
 import math
 import numbers
-import os
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping
 from os import PathLike
@@ -20,6 +19,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 LONGEST_NAME = 200  # characters of a name; of a name that becomes a file's, bytes in UTF-8 (file systems allow 255)
+LONGEST_PATH = 4096  # characters, as Linux allows bytes
 LONGEST_NOTE = 10_000  # characters of a free text
 # Control characters, half surrogate pairs and line separators: no file name, figure or page can hold all of them.
 _UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff\u2028\u2029]")
@@ -213,7 +213,7 @@ def instances(value: Any, what: str, kind: type[Kind], *, empty: bool = True) ->
 
 def path_of(value: Any, what: str) -> Path:
     """A path, given as one or as text."""
-    if not isinstance(value, (str, PathLike)) or isinstance(value, bytes) or "\0" in os.fspath(value):
+    if not isinstance(value, (str, PathLike)) or "\0" in str(value) or len(str(value)) > LONGEST_PATH:
         raise ValueError(f"{what} must be text or a Path, got {shown(value)}")
     return Path(value)
 

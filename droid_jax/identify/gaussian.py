@@ -33,7 +33,7 @@ import msgspec
 import numpy as np
 from scipy import special
 
-from droid_jax.arguments import instance, note, number, numeric, one_of, path_of, shown, whole
+from droid_jax.arguments import instance, name, note, number, numeric, one_of, path_of, several, shown, whole
 from droid_jax.identify.truncated import gibbs, quantiles
 from droid_jax.model.parameters import Mode, Parameter, Scaling, Space, Write
 from droid_jax.read_json import read_json, typed
@@ -73,9 +73,9 @@ class Gaussian:
         d = len(self.space)
         mean, cov = _numbers("mean", self.mean, (d,)), _numbers("cov", self.cov, (d, d))
         _check_covariance(cov)
-        for name, array in (("mean", mean), ("cov", (cov + cov.T) / 2)):
+        for of, array in (("mean", mean), ("cov", (cov + cov.T) / 2)):
             array.setflags(write=False)
-            object.__setattr__(self, name, array)
+            object.__setattr__(self, of, array)
 
     def sample(self, seed: int | np.random.Generator, n: int) -> np.ndarray:
         """[n, D] physical values, all inside the bounds; the same seed gives the same rows."""
@@ -167,7 +167,7 @@ class Gaussian:
 
     def marginal(self, names: Iterable[str]) -> Gaussian:
         """The Gaussian of these parameters alone, in the order given."""
-        names = list(names)
+        names = several(name)(names, "names")
         index = [self.space.index(n) for n in names]
         cov = self.cov[np.ix_(index, index)]
         return Gaussian(self.space.select(names), self.mean[index], cov, self.rule, self.coordinates)

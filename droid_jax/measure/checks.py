@@ -142,7 +142,7 @@ def _check_array(array: Any, shape: tuple[int | None, ...], kind: str, where: st
 
 def _check_names(names: Sequence[str], where: str, what: str) -> None:
     """ValueError unless all names are non-empty strings and none is given twice."""
-    if isinstance(names, str) or not all(isinstance(n, str) and n for n in names):
+    if not isinstance(names, (tuple, list)) or not all(isinstance(n, str) and n for n in names):
         raise ValueError(f"{where}: {what} must be non-empty names, got {shown(names)}")
     for one in names:
         name(one, f"{where}: one of the {what}")

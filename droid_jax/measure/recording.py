@@ -192,6 +192,8 @@ class Recording:
 
         Raises ValueError when no index is given or one lies outside 0 .. N - 1.
         """
+        if isinstance(indices, (str, bytes)) or not isinstance(indices, Iterable):
+            raise ValueError(f"repeats must be a list of whole numbers, got {shown(indices)}")
         chosen = [whole(i, "a repeat") for i in indices]
         bad = [i for i in chosen if not 0 <= i < self.repeats]
         if not chosen or bad:

@@ -10,6 +10,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from droid_jax.arguments import instance, instances, numeric, shown
+from droid_jax.model.fields import check_space
 from droid_jax.model.looks import compiled, keep_inertia, look_geoms, weigh
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model
@@ -56,6 +58,10 @@ def fitted_mjcf(scene: Scene, space: Space, values: np.ndarray, effects: Sequenc
     Raises ValueError for values of another shape, and where MuJoCo compiles no model of them: a replay takes an inertia
     that no body can have (fitted about one axis alone, say), the compiler does not.
     """
+    check_space(instance(scene, "scene", Scene), instance(space, "space", Space))
+    values, effects = numeric(values, "values"), instances(effects, "effects", Effect)
+    if not np.isfinite(values).all():
+        raise ValueError(f"values must be finite, got {shown(values)}")
     if np.shape(values) != (len(space),):
         raise ValueError(f"expected values [{len(space)}], one for each of {space.names}, got {list(np.shape(values))}")
     spec, model = scene.spec.copy(), make_c_model(scene, space, values)

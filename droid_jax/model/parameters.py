@@ -18,13 +18,25 @@ from __future__ import annotations
 import dataclasses
 import enum
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from droid_jax.arguments import choice, flag, instances, name, number, numeric, set_field, shown, whole
+from droid_jax.arguments import (
+    choice,
+    flag,
+    instance,
+    instances,
+    name,
+    number,
+    numeric,
+    set_field,
+    several,
+    shown,
+    whole,
+)
 
 MOST_ROWS = 10**9  # of a model's field
 ROUNDING = 1e-6  # share of a parameter's range by which a value may miss a bound
@@ -253,7 +265,7 @@ class Space:
 
     def select(self, names: Iterable[str]) -> Space:
         """The sub-space of these names, in the order given."""
-        return Space(tuple(self[n] for n in names))
+        return Space(tuple(self[n] for n in several(name)(names, "names")))
 
     def with_prior(self, **prior: tuple[float, float]) -> Space:
         """A copy in which some parameters start from another (mean, std)."""
@@ -272,7 +284,7 @@ class Space:
     def values(self, values: dict[str, float] | None = None) -> np.ndarray:
         """[D] the means, with some entries replaced by name."""
         out = self.mean
-        for of, value in (values or {}).items():
+        for of, value in instance({} if values is None else values, "values", Mapping).items():
             out[self.index(of)] = number(value, f"the value of {of!r}")
         return out
 
@@ -316,14 +328,16 @@ class Space:
 
     def _columns(self, array: Any, function: Callable[[Parameter, Any], Any]) -> Any:
         xp = _namespace(array)
-        array = xp.asarray(array)
+        array = numeric(array, "parameter vectors") if xp is np else array
+        if array.shape[-1:] != (len(self),):
+            raise ValueError(f"expected parameter vectors [..., {len(self)}], got shape {array.shape}")
         columns = [function(p, array[..., i]) for i, p in enumerate(self.parameters)]
         return xp.stack(columns, axis=-1)
 
 
 def _namespace(array: Any) -> Any:
     """numpy for host values, jax.numpy for anything jax holds or traces."""
-    if isinstance(array, (np.ndarray, np.generic, float, int, Sequence)):
+    if type(array).__module__.split(".")[0] not in ("jax", "jaxlib"):  # without importing jax, which takes a second
         return np
     import jax.numpy as jnp
 

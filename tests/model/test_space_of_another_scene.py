@@ -48,9 +48,7 @@ def one(tmp_path: Path) -> Scene:
 
 def test_rows_that_are_not_there(one: Scene, two: Scene) -> None:
     space = Space((joint_damping(two, "elbow", std=0.5, high=10.0),))
-    with pytest.raises(
-        ValueError, match=r"'elbow_damping' writes dof_damping\[1\] of 'elbow', but in .j. "
-    ):
+    with pytest.raises(ValueError, match=r"'elbow_damping' writes dof_damping\[1\] of 'elbow', but in .j. "):
         dj.make_cost(one, space, log("j"))
     with pytest.raises(ValueError, match=r"'elbow_damping'.*belongs to another scene"):
         dj.identify(one, space, log("j"))
@@ -60,9 +58,7 @@ def test_rows_that_are_not_there(one: Scene, two: Scene) -> None:
 def test_rows_of_another_joint(one: Scene, two: Scene, make) -> None:
     options = {"std": 0.5, "high": 10.0} if make is joint_damping else {}
     space = Space((make(two, "shoulder", **options),))
-    with pytest.raises(
-        ValueError, match="but in .j. that entry is of .j.: it belongs to another scene"
-    ):
+    with pytest.raises(ValueError, match=r"but in .j. that entry is of .j.: it belongs to another scene"):
         dj.make_cost(one, space, log("j"))
 
 
