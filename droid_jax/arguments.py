@@ -227,7 +227,7 @@ def several(check: Callable[[Any, str], Any], count: int | None = None) -> Calla
     """A check of every entry of a list; count: how many there must be, None for one or more."""
 
     def each(value: Any, what: str) -> tuple[Any, ...]:
-        if isinstance(value, (str, bytes, dict, set)) or not isinstance(value, Iterable):
+        if isinstance(value, (str, bytes)) or not isinstance(value, Iterable):
             raise ValueError(f"{what} must be a list, got {_got(value)}")
         out = tuple(check(one, f"{what}, entry {i}") for i, one in enumerate(value))
         if not out or len(out) != (count or len(out)):
