@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -100,6 +101,7 @@ def run(command: Identify) -> None:
     from droid_jax.compare.notes import command_notes
     from droid_jax.identify.pipeline import cost_samples, prepare, solve
     from droid_jax.identify.results import prepare_folder, write_run
+    from droid_jax.identify.solution_checks import creep_of_fit
     from droid_jax.report.progress import stages
     from droid_jax.report.scalars import FOLDER, scalars
     from droid_jax.storage import write_bytes
@@ -145,7 +147,10 @@ def run(command: Identify) -> None:
         keep_replay(out, found, recordings[0])
         write_run(
             out, found, description, truth=truth, samples=lambda: cost_samples(found, config.samples, config.seed),
-            notes=[text for recording in recordings for text in command_notes(scene, recording)],
+            notes=[
+                *(text for recording in recordings for text in command_notes(scene, recording)),
+                *creep_of_fit(scene, found.full, found.best, recordings),
+            ],
             findings=[finding for recording in recordings for finding in check_log(scene, recording)],
         )  # fmt: skip
     draw(out, scene)
@@ -277,6 +282,7 @@ def _recordings(
 
 def _summary(found: Identified, fit: Mapping[str, Any], repeats: Sequence[int]) -> None:
     """A few lines that say how it went; fit: of fit.json; repeats: of each recording."""
+    from droid_jax.identify.solution_checks import solution_notes
     from droid_jax.report.told import moved_words, unsure_words, went_far
     from droid_jax.report.words import DOUBT, asked_of, far_off, judged, lacks_something, needed, noiseless, percent
 
@@ -295,6 +301,8 @@ def _summary(found: Identified, fit: Mapping[str, Any], repeats: Sequence[int]) 
             print(f"{p['name']} {moved_words(p)}, but its value is not sure: {unsure_words(p)}")
     if found.refined is not None and not found.refined.converged:
         print("the refinement did not converge: take values and intervals with care")
+    for text in solution_notes(found.checks, found.scene.name):
+        warnings.warn(text, stacklevel=2)
     print(f"search stopped: {found.search.stop}; {sum(found.seconds.values()):.0f} s")
     if far_off(fit):
         print(f"the fit stays far from the data: {DOUBT}")

@@ -163,15 +163,12 @@ def make_cost(
     drives = [followed(scene, r, config) for r in recordings]
     for recording in recordings if check else ():
         warn_of_log(scene, recording)
-    given = {e.name for e in effects}
     check_read(scene, space, effects)
     if not any(isinstance(drive, Drive) for drive in drives):
         _warn_of_commanded(space)
-
-    def with_sensors(drive: Drive | Motion) -> tuple[Effect, ...]:
-        return (*effects, *(e for e in _sensor_effects(scene, space, drive) if e.name not in given))
-
-    replays = tuple(_engine(engine, scene, space, d, with_sensors(d), config.mj_step) for d in drives)
+    replays = tuple(
+        _engine(engine, scene, space, d, with_sensors(scene, space, d, effects), config.mj_step) for d in drives
+    )
     comparisons = tuple(
         _compared(scene, recording, drive, replay, config)
         for recording, drive, replay in zip(recordings, drives, replays, strict=True)
@@ -240,9 +237,10 @@ def followed(scene: Scene, recording: Recording, config: CompareConfig) -> Drive
     validate(recording, allow_jitter=True)  # one made in Python may not have been
     check_range(scene, recording)
     if recording.command.size:
+        drive = make_drive(scene, recording, weigh="torque" in config.channels)
         warn_of_commands(scene, recording)
         warn_if_moving(recording)
-        return make_drive(scene, recording, weigh="torque" in config.channels)
+        return drive
     if not scene.joints:
         raise ValueError(f"no joint of scene {scene.name!r} is driven: name the measured ones (--joints)")
     felt = (*scene.joints, *scene.carriers(scene.joints))  # by the torques that are compared
@@ -328,6 +326,12 @@ def _same(scene: Scene, new: Drive | Motion, old: Drive | Motion) -> bool:
 def _clock(recording: Recording, follows: Drive | Motion) -> np.ndarray:
     """[T] s of a replay's rows, on the recording's clock."""
     return follows.time if isinstance(follows, Motion) else float(recording.time[0]) + follows.time
+
+
+def with_sensors(scene: Scene, space: Space, drive: Drive | Motion, effects: Sequence[Effect]) -> tuple[Effect, ...]:
+    """The effects, and those of the torque sensors that are not among them: what a replay is made with."""
+    given = {e.name for e in effects}
+    return (*effects, *(e for e in _sensor_effects(scene, space, drive) if e.name not in given))
 
 
 def _sensor_effects(scene: Scene, space: Space, drive: Drive | Motion) -> tuple[Effect, ...]:

@@ -21,6 +21,7 @@ from droid_jax.identify.gaussian import Gaussian, prior, space_to_json
 from droid_jax.identify.judge import Gap, gaps_of, split
 from droid_jax.identify.refine import RefineConfig, Refined, refine
 from droid_jax.identify.search import SearchConfig, search
+from droid_jax.identify.solution_checks import SolutionCheck, check_solution
 from droid_jax.identify.uncertainty import Identifiability, identifiability, not_judged, posterior
 from droid_jax.measure.recording import Recording, recordings_of
 from droid_jax.model.parameters import Space
@@ -39,6 +40,8 @@ class IdentifyConfig:
     samples: replays drawn from the initial and from the fitted Gaussian to compare their costs.
     seed: of those samples (the search has its own).
     compare: how simulation and measurement are compared.
+    checks: measure what the time step and the engine leave at the fitted values (`solution_checks`), which takes one
+      more compilation.
     """
 
     engine: str = "mjx"
@@ -48,6 +51,7 @@ class IdentifyConfig:
     samples: int = 200
     seed: int = 0
     compare: CompareConfig = field(default_factory=CompareConfig)
+    checks: bool = True
 
     def __post_init__(self) -> None:
         check_fields(
@@ -70,7 +74,7 @@ class Identified:
     best: [F] physical values over `full`.  gaussian: over `space`, the one to hand on; full_gaussian
     over `full`.  search: the CMA-ES part.  refined: or None.  tells: per parameter of `full`.
     gaps: by recording name.  fit, heldout: costs over `full` on the fitted and the held-out repeats.
-    heldout_repeats: by recording name.  seconds: by stage.
+    heldout_repeats: by recording name.  seconds: by stage.  checks: by recording name, of those with commands.
     """
 
     scene: Scene
@@ -87,6 +91,7 @@ class Identified:
     heldout: Cost
     heldout_repeats: dict[str, tuple[int, ...]]
     seconds: dict[str, float]
+    checks: dict[str, SolutionCheck] = field(default_factory=dict)
 
     @property
     def start(self) -> np.ndarray:
@@ -236,6 +241,10 @@ def solve(problem: Problem, *, checkpoints: Path | None = None, progress: Progre
     report("judge", None)
     gaps = gaps_of(problem.heldout, problem.recordings, problem.held, full.mean, best)
     seconds["judge"] = time.monotonic() - began
+
+    began = time.monotonic()
+    checks = check_solution(base, problem.recordings, best, config.engine, problem.effects) if config.checks else {}
+    seconds["checks"] = time.monotonic() - began
     names = [r.name for r in problem.recordings]
     return Identified(
         scene=problem.scene,
@@ -252,6 +261,7 @@ def solve(problem: Problem, *, checkpoints: Path | None = None, progress: Progre
         heldout=problem.heldout,
         heldout_repeats=dict(zip(names, problem.heldout_repeats, strict=True)),
         seconds=seconds,
+        checks=checks,
     )
 
 

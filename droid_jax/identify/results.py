@@ -32,6 +32,7 @@ from droid_jax.files import (
 from droid_jax.identify.fit import on_bound
 from droid_jax.identify.gaussian import prior
 from droid_jax.identify.pipeline import Identified
+from droid_jax.identify.solution_checks import solution_notes
 from droid_jax.model.mjcf import fitted_mjcf, unwritten
 from droid_jax.model.parameters import Space
 from droid_jax.storage import finite, write_csv, write_json, write_npz, write_text
@@ -64,7 +65,7 @@ def write_run(
       the fit itself is on disk.
     findings: what the checks of the recordings found.
     """
-    mjcf, notes = None, list(notes)
+    mjcf, notes = None, [*notes, *solution_notes(found.checks, found.scene.name)]
     try:
         mjcf = fitted_mjcf(found.scene, found.full, found.best)
     except ValueError as error:  # the fit itself is whole
@@ -147,6 +148,10 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
         "rule": found.gaussian.rule,
         "mjcf_lacks": list(unwritten(found.scene, found.full)),
         "notes": notes,
+        "checks": {
+            name: {**asdict(check), "too_coarse": check.too_coarse, "engines_differ": check.engines_differ}
+            for name, check in found.checks.items()
+        },
     }
 
 

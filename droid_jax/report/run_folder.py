@@ -28,12 +28,18 @@ _GAP = {
     **{"floor": Maybe(_MAYBE), "closed": Maybe(_MAYBE), "judged": Maybe(Literal["repeats", "time", "same"])},
     "per_joint_floor": Maybe(([_NUMBER], type(None))),
 }
+_CHECK = {
+    **{"unit": str, "time_step": _NUMBER, "remaining": _NUMBER, "unmeasured": str},
+    **dict.fromkeys(("discretisation", "parity_torque", "parity_rms", "parity_angle"), _MAYBE),
+    **{"too_coarse": bool, "engines_differ": bool},
+}
 _FIT = {
     **{"parameters": [_PARAMETER], "gap": {str: _GAP}, "stop": str, "rule": str},
     "cost": {**dict.fromkeys(("initial", "best", "floor"), _MAYBE), "unit": Maybe(str)},
     **{"torque_unit": Maybe(str), "converged": Maybe((bool, type(None))), "mean_square": Maybe(_MAYBE)},
     **{"generations": Maybe(int), "evaluations": Maybe(int), "seconds": Maybe({str: _NUMBER})},
     **{"mjcf_lacks": Maybe([str]), "notes": Maybe([str]), "findings": Maybe([FINDING])},
+    "checks": Maybe({str: _CHECK}),
 }
 _RECORDING = {
     **{"name": str, "sha256": str, "repeats": int, "heldout": [int], "duration": _NUMBER},

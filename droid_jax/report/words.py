@@ -110,7 +110,28 @@ def summary(run: Run, searched: bool = False) -> list[str]:
     bound = [_bound(p) for p in run.fit["parameters"] if p["on_bound"]]
     if bound:
         sentences.append(f"On a bound of its range: {listed(bound)}.")
+    sentences += _simulated(run)
     return [*sentences, _next(run, searched)]
+
+
+def _simulated(run: Run) -> list[str]:
+    """What the time step and the engine leave, where it is too much."""
+    said = []
+    for name, check in run.fit.get("checks", {}).items():
+        where = f" in “{name}”" if len(run.fit["checks"]) > 1 else ""
+        if check["too_coarse"]:
+            said.append(
+                f"The time step of {number(1e3 * check['time_step'])} ms is too coarse for this scene: at half of it "
+                f"the fitted torques{where} change by {number(check['discretisation'])} {check['unit']}, where the fit "
+                f"leaves {number(check['remaining'])} {check['unit']} (root mean squares)."
+            )
+        elif check["engines_differ"]:
+            said.append(
+                f"MJX and plain C MuJoCo differ at the fitted values{where} by {number(check['parity_rms'])} "
+                f"{check['unit']}, where the fit leaves {number(check['remaining'])} {check['unit']} (root mean "
+                "squares)."
+            )
+    return said
 
 
 def _what(run: Run) -> str:
@@ -195,6 +216,8 @@ def unjudged(fit: Mapping[str, Any]) -> bool:
 
 def _next(run: Run, searched: bool) -> str:
     steps = []
+    if any(check["too_coarse"] for check in run.fit.get("checks", {}).values()):
+        steps.append("give the scene a smaller timestep and fit again: these values make up for its error")
     if wrong := [f["kind"] for f in run.fit.get("findings", ()) if f["severity"] == "certain"]:
         steps.append(f"do not train on this fit: mend the {listed(list(dict.fromkeys(wrong)))} of the recording")
     elif far_off(run.fit):

@@ -526,3 +526,24 @@ def test_a_backend_that_cannot_draw_is_a_message_not_a_crash() -> None:
     assert "invalid value" in render._child("nonsense", None, 60.0)
     assert render._candidates("glfw", "linux") == ["glfw", "egl", "osmesa"]
     assert render._candidates("", "linux") == ["egl", "osmesa"]
+
+
+def test_a_time_step_that_is_too_coarse_leads_and_is_on_the_page(tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "run")
+    fit = json.loads((folder / "fit.json").read_text())
+    check = {
+        "unit": "N m", "time_step": 0.1, "remaining": 0.05, "discretisation": 0.041, "parity_torque": 0.9,
+        "parity_rms": 0.06, "parity_angle": 0.012, "unmeasured": "", "too_coarse": True, "engines_differ": False,
+    }  # fmt: skip
+    fit["checks"] = {"open_close": check}
+    (folder / "fit.json").write_text(json.dumps(fit))
+    said = " ".join(summary(read_run(folder)))
+    assert "The time step of 100 ms is too coarse for this scene" in said and "change by 0.0410 N m" in said
+    assert "Next: give the scene a smaller timestep and fit again" in said
+    page.write_report(folder)
+    text = " ".join((folder / "report.html").read_text().split())
+    assert "The time step of 100 ms changes the fitted torques by 0.0410 N m" in text
+    assert "Plain C MuJoCo differs by 0.900 N m and 0.0120 rad (or m) at most." in text
+    fit["checks"]["open_close"] |= {"too_coarse": False, "engines_differ": True}
+    (folder / "fit.json").write_text(json.dumps(fit))
+    assert "MJX and plain C MuJoCo differ at the fitted values by 0.0600 N m" in " ".join(summary(read_run(folder)))
