@@ -20,6 +20,7 @@ from droid_jax.identify.search import NotReplayed
 # priors as they are, 6 of 200 recordings of a lone hinge with nothing missing fell below p = 0.01.  Within three
 # deviations a nuisance is no effect (`case.BEYOND`), so its mark may as well be taken away up to there.
 SLACK = 3.0
+AT_REST = 2  # steps of Gauss and Newton for a recording's own nuisances where joints are at rest along its motion
 TIE = 3.0  # times what the best model leaves above the floor: a rival that leaves no more does as well
 
 
@@ -80,28 +81,30 @@ class Evidence:
 
         NaN throughout where a replay blew up.
         """
-        _, common, best = self._own_fitted(values)
-        return common if self.own_columns is None else common + best @ self.own_columns.T
+        return self._own_fitted(values)[1]
 
     def with_own_at_best(self, values: np.ndarray) -> np.ndarray:
         """[P, D] -> [P, D] with the recording's own nuisances where `common` has them."""
-        rows, _, best = self._own_fitted(values)
-        space, own = self.cost.space, [self.cost.space.index(name) for name in self.own]
-        rows[:, own] += space.std[own] * best
-        return rows
+        return self._own_fitted(values)[0]
 
-    def _own_fitted(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rows [P, D] with own nuisances at their means, their residuals [P, M], and these nuisances' best values
-        [P, own] in prior deviations.
-        """
+    def _own_fitted(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows [P, D] with own nuisances at their best, and their residuals [P, M]."""
         rows = np.array(np.atleast_2d(values), dtype=np.float64)
-        space = self.cost.space
-        rows[:, [space.index(name) for name in self.own]] = [space[name].mean for name in self.own]
+        space, own = self.cost.space, [self.cost.space.index(name) for name in self.own]
+        rows[:, own] = space.mean[own]
         common = self._common(rows)
         if self.own_columns is None:
-            return rows, common, np.zeros((len(rows), 0))
-        normal = self.own_columns.T @ self.own_columns + np.eye(len(self.own)) / self.repeats
-        return rows, common, -np.linalg.solve(normal, self.own_columns.T @ common.T).T
+            return rows, common
+        moves = _moves(self.cost)
+        columns = self.own_columns * moves[:, None]
+        normal = columns.T @ columns + np.eye(len(self.own)) / self.repeats
+        best = np.zeros((len(rows), len(self.own)))
+        # Where a joint is at rest its friction takes up an offset as far as it can: there it is replayed again.
+        for _ in range(1 if moves.all() else AT_REST):
+            best -= np.linalg.solve(normal, (common @ columns + best / self.repeats).T).T
+            rows[:, own] = space.mean[own] + space.std[own] * best
+            common = common + best @ self.own_columns.T if moves.all() else self._common(rows)
+        return rows, common
 
     def _common(self, rows: np.ndarray) -> np.ndarray:
         return -self.cost.whitened(rows).astype(np.float64) / np.sqrt(self.repeats)
@@ -165,6 +168,11 @@ class Evidence:
         grows or fades steadily over the repeats is no scatter.
         """
         return np.sum(commons**2, axis=1) + 2 * draws @ (steady(self.deviations) @ commons.T)
+
+
+def _moves(cost: Cost) -> np.ndarray:
+    """[M] bool, residuals at which their joint moves; all of them where motions are not prescribed."""
+    return np.concatenate([channel.moves.T.ravel() for channel in only_comparison(cost).channels])
 
 
 def evidence(cost: Cost) -> Evidence:

@@ -122,8 +122,9 @@ def test_friction_has_to_be_overcome(inverse: Inverse, name: str, coulomb: float
     scene = inverse.scene
     motors = scene.model.dof_frictionloss[scene.joint_dofs]
     own = np.broadcast_to(motors if inverse.side is MOTOR else np.full(len(JOINTS), coulomb), neutral.shape)
-    direction = np.tanh(inverse.motion.velocity / SLOW)
-    more = inverse.by_formula(oracle.loss, oracle.values, neutral - coulomb * direction)
+    direction = np.sign(inverse.motion.velocity)
+    behind = coulomb * np.tanh(inverse.motion.velocity / SLOW)  # as the bench's own effect reads it
+    more = inverse.by_formula(oracle.loss, oracle.values, neutral - behind)
     loss = np.where(np.isnan(more), own, np.maximum(own + more, 0.0))
     expected = (loss - own) * direction
     np.testing.assert_allclose(got - neutral, expected, atol=TOLERANCE)
