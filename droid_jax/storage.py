@@ -124,10 +124,11 @@ def write_own(folder: Path, files: Mapping[str, bytes]) -> None:
 
 def _written(folder: Path) -> dict[str, list[str]]:
     """SHA-256 of all that `write_own` ever wrote, by name; empty where that is not known."""
+    from droid_jax.read_json import read_json, typed  # only here: it imports this module
+
     try:
-        known = json.loads((folder / WRITTEN).read_text())
-        return {name: [str(sha) for sha in shas] for name, shas in known.items()}
-    except (OSError, ValueError, TypeError, AttributeError, RecursionError):
+        return typed(read_json(folder / WRITTEN), dict[str, list[str]], WRITTEN)
+    except (OSError, ValueError):
         return {}
 
 

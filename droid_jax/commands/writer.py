@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import json
 import os
 import re
 from collections.abc import Callable, Iterator
@@ -17,6 +16,7 @@ from typing import Any, TypeVar
 
 from droid_jax import console
 from droid_jax.files import ASKED, CONFIG, FIT, GAP, LOCK, SETUP, STAND_IN, STAND_IN_SOURCE, TRAINING, WRITTEN
+from droid_jax.read_json import read_json
 from droid_jax.storage import kind_of
 
 _HELD = set[Path]()  # folders whose lock this process holds
@@ -171,10 +171,10 @@ def check_own(folder: Path, stage: str) -> None:
 def _is_sign(path: Path, keys: tuple[str, ...]) -> bool:
     """Whether a JSON file holds these keys, or is a setup that is damaged, which the command has its own words for."""
     try:
-        found = json.loads(path.read_text())
+        found = read_json(path)
     except OSError:
         return False
-    except (ValueError, RecursionError):
+    except ValueError:
         return path.name in (SETUP, ASKED)
     return isinstance(found, dict) and all(key in found for key in keys)
 
