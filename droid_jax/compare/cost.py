@@ -31,6 +31,7 @@ from droid_jax.measure.checks import validate
 from droid_jax.measure.motion import Motion, measured_motion
 from droid_jax.measure.recording import Recording, recordings_of
 from droid_jax.model.fields import check_space
+from droid_jax.model.inertia import check_inertia, free_inertias, inertia_possible
 from droid_jax.model.joint_friction import TERMS, direction, joint_friction_effect
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_physics
@@ -164,6 +165,7 @@ def make_cost(
     for recording in recordings if check else ():
         warn_of_log(scene, recording)
     check_read(scene, space, effects)
+    check_inertia(scene, space)
     if not any(isinstance(drive, Drive) for drive in drives):
         _warn_of_commanded(space)
     replays = tuple(
@@ -229,7 +231,19 @@ def assemble(
 
 def batch_replay(scene: Scene, space: Space, replay: Replay) -> Callable[[np.ndarray], Rollout]:
     """One compiled, sharded block of a per-sample replay: [B, D] -> Rollout [B, ...]."""
-    return over_block(lambda values: replay(make_physics(scene, space, values)))
+    return over_block(_of_bodies(scene, space, lambda values: replay(make_physics(scene, space, values))))
+
+
+def _of_bodies(scene: Scene, space: Space, replay: Callable[..., Rollout]) -> Callable[..., Rollout]:
+    """The replay of a row of values [D], which gives no numbers where no body can have the row's inertia."""
+    if not free_inertias(scene, space):
+        return replay
+
+    def checked(values: Any, *more: Any) -> Rollout:
+        rollout = replay(values, *more)
+        return replace(rollout, finite=rollout.finite & inertia_possible(scene, space, values))
+
+    return checked
 
 
 def followed(scene: Scene, recording: Recording, config: CompareConfig) -> Drive | Motion:
@@ -356,7 +370,7 @@ def _engine(
         along = path_replay(scene, drive.torque, effects, drive.joints)
         means = jnp.asarray(space.mean, jnp.float32)
         return Along(
-            over_block(lambda values, path: along(make_physics(scene, space, values), path)),
+            over_block(_of_bodies(scene, space, lambda values, path: along(make_physics(scene, space, values), path))),
             scene,
             drive,
             _compiled(lambda path: along(make_physics(scene, space, means), path).torque),
@@ -364,7 +378,8 @@ def _engine(
     if engine == "mjx":
         return batch_replay(scene, space, servo_replay(scene, drive, effects, parity=mj_step, late=late))
     twin = twin_replay(scene, space, drive, [e for e in effects if e.name != "torque offset"], late=late)
-    return lambda values: jax.tree.map(_single, twin(values))
+    checked = _of_bodies(scene, space, twin)
+    return lambda values: jax.tree.map(_single, checked(values))
 
 
 def _single(array: np.ndarray) -> jax.Array:

@@ -16,6 +16,7 @@ from droid_jax.arguments import check_fields, instance, number, one_of, optional
 from droid_jax.compare.cost import ENGINES, Cost, make_cost
 from droid_jax.compare.log_checks import warn_of_log
 from droid_jax.compare.residuals import CompareConfig
+from droid_jax.identify.blow_up import blow_up
 from droid_jax.identify.fit import Fit
 from droid_jax.identify.gaussian import Gaussian, prior, space_to_json
 from droid_jax.identify.judge import Gap, gaps_of, split
@@ -24,9 +25,10 @@ from droid_jax.identify.search import SearchConfig, search
 from droid_jax.identify.solution_checks import SolutionCheck, check_solution
 from droid_jax.identify.uncertainty import Identifiability, identifiability, not_judged, posterior
 from droid_jax.measure.recording import Recording, recordings_of
+from droid_jax.model.inertia import possible_draws
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect
+from droid_jax.model.seam import Effect, Rollout
 
 
 @dataclass(frozen=True)
@@ -100,6 +102,7 @@ class Identified:
 
 
 Progress = Callable[[str, Any], None]
+_FIELDS = tuple(Rollout.__dataclass_fields__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,9 +286,11 @@ def _check_start(cost: Cost, space: Space) -> None:
     twice = np.stack([space.mean, space.mean])  # as many rows as are judged at the end: compiled once
     for comparison, rollout in zip(cost.comparisons, cost.rollouts(twice), strict=True):
         if not np.all(rollout.finite):
+            why = blow_up(cost.scene, type(rollout)(**{f: np.asarray(getattr(rollout, f))[0] for f in _FIELDS}))
             raise ValueError(
-                f"the simulation of {comparison.name!r} blows up at the parameters' initial means: shorten the scene's "
-                "time step, or begin at other means (stiff servos on light links are the usual cause)"
+                f"the simulation of {comparison.name!r} blows up at the parameters' initial means"
+                f"{f' ({why})' if why else ''}: shorten the scene's time step, give light joints armature, or begin at "
+                "other means (stiff servos on light links are the usual cause)"
             )
 
 
@@ -350,14 +355,19 @@ def _fingerprint(
     return json.dumps(made_from, sort_keys=True)
 
 
+def _possible(scene: Scene, gaussian: Gaussian, seed: int, count: int) -> np.ndarray:
+    """[count, D] draws with inertias that bodies can have."""
+    rng = np.random.default_rng(seed)
+    return possible_draws(scene, gaussian.space, lambda n: gaussian.sample(rng, n), count)
+
+
 def cost_samples(found: Identified, count: int, seed: int) -> dict[str, np.ndarray]:
     """Costs on held-out repeats of samples from the initial and from the fitted Gaussian.
 
     initial, fitted: [n, D] values; initial_cost, fitted_cost: [n] N m, failed replays carry their penalty;
     names: [D] of the parameters.
     """
-    first = prior(found.space).sample(seed, count)
-    last = found.full_gaussian.sample(seed, count)
+    first, last = (_possible(found.scene, g, seed, count) for g in (prior(found.space), found.full_gaussian))
     return {
         "initial": first,
         "fitted": last[:, found.full.columns(found.space)],

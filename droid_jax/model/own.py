@@ -21,6 +21,7 @@ servo have no element.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -39,6 +40,7 @@ from droid_jax.read_json import read_json, typed
 
 _NEEDED = ("element", "std", "high")
 _TIME = "time_offset"
+SMALL = 1e-3  # of its deviation: a mean (and floor) below it is out of reach of a search in the logarithm
 
 
 class _Entry(msgspec.Struct, forbid_unknown_fields=True):
@@ -74,7 +76,15 @@ def load_parameters(path: str | Path, scene: Scene) -> Space:
     for i, p in enumerate(parameters, 1):
         if first.setdefault(p.name, i) != i:
             raise ValueError(f'{path}, entry {i}: {p.name!r} is entry {first[p.name]} already; give it a unique "name"')
-    return Space(tuple(parameters))
+    space = Space(tuple(parameters))
+    for p in space.parameters:
+        if p.scaling is Scaling.LOG and p.mean + p.floor < SMALL * p.std:
+            warnings.warn(
+                f"{path}: {p.name!r} is searched in the logarithm from {p.mean:g} {p.unit}, where nothing that it does "
+                'is felt yet: give a "mean" of the size that you expect, or a "floor"',
+                stacklevel=2,
+            )
+    return space
 
 
 def friction_joints(path: str | Path) -> tuple[str, ...]:

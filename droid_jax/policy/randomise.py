@@ -18,6 +18,7 @@ import numpy as np
 from droid_jax.arguments import instance
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.model.fields import check_space, element_name
+from droid_jax.model.inertia import possible_draws
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import POSE, UNIT, Physics, joined_bodies, make_physics, model_writes, written_fields
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
@@ -33,7 +34,8 @@ def randomised(scene: Scene, gaussian: Gaussian) -> Randomise:
     check_space(instance(scene, "scene", Scene), instance(gaussian, "gaussian", Gaussian).space)
 
     def randomise(sys: Physics, rng: jax.Array) -> tuple[Physics, Physics]:
-        values = gaussian.sample(_seed(rng), _count(rng))
+        seed = _seed(rng)
+        values = possible_draws(scene, gaussian.space, lambda n: gaussian.sample(seed, n), _count(rng))
         return physics_of(scene, gaussian.space, values), axes(scene, gaussian.space)
 
     return randomise
