@@ -20,7 +20,8 @@ from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import Scene, compile_scene
 
 XML = """<mujoco><option integrator="implicitfast"/><worldbody>
-  <body name="a"><joint name="j" axis="0 1 0" frictionloss="1e-6"/><inertial mass="1" pos="0 0 -.1" diaginertia=".005 .005 .005"/></body></worldbody>
+  <body name="a"><joint name="j" axis="0 1 0" frictionloss="1e-6"/>
+    <inertial mass="1" pos="0 0 -.1" diaginertia=".005 .005 .005"/></body></worldbody>
   <actuator><position joint="j" kp="30" kv="1"/></actuator></mujoco>"""
 
 
