@@ -38,6 +38,9 @@ class Convert:
     """Bags: motor (current, actuator force) or link (a sensor behind the gear, a Panda's tau_J)."""
     gravity: bool = False
     """Bags: the torque contains what carries the arm's weight."""
+    torque_constant: tuple[float, ...] = ()
+    """N m (N) that one unit of the logged torque is, for each torque or one for all: of efforts that are amperes or
+    per cent. A negative one turns the sign."""
     state_topic: str = "/joint_states"
     """Bags: topic of sensor_msgs/JointState."""
     command_topic: str | None = None
@@ -71,6 +74,7 @@ class Convert:
 def run(command: Convert) -> None:
     """Load whatever it is, validate, cut, and save."""
     from droid_jax.measure.formats import bags_at, check_target, load, rosbag_reader, save
+    from droid_jax.measure.torque_constants import with_torque_constants
 
     check_target(command.out)  # before bags are read, which may take long
     if not command.source:
@@ -90,6 +94,8 @@ def run(command: Convert) -> None:
         usual = {"name": command.name, "allow_jitter": command.allow_jitter}
         options = usual if strange else _bag_options(command)
         recording = load(path, resample=command.resample, **options)
+    if command.torque_constant:
+        recording = with_torque_constants(recording, command.torque_constant)
     if command.start is not None or command.end is not None:
         first, last = recording.span
         start, end = command.start, command.end

@@ -8,6 +8,7 @@ cost.rollouts(values)   # [P, D] -> one Rollout per recording
 
 from __future__ import annotations
 
+import functools
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
@@ -22,6 +23,7 @@ from droid_jax.arguments import instance, instances, one_of
 from droid_jax.compare.inverse import Path, path_of, path_replay, prescribed
 from droid_jax.compare.log_checks import warn_of_log
 from droid_jax.compare.notes import check_range, warn_if_moving, warn_of_commands
+from droid_jax.compare.own_starts import from_one_start, own_starts
 from droid_jax.compare.population import in_blocks, over_block
 from droid_jax.compare.replay import Drive, Replay, check_gains, make_drive, servo_replay, torque_offset_effect
 from droid_jax.compare.residuals import CompareConfig, Comparison, make_comparison
@@ -39,7 +41,7 @@ from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, Rollout
 
 ENGINES = ("mjx", "mujoco")
-SCATTER = 0.01  # rad or m: repeats of one motion whose start was measured begin no further apart
+ALIKE = 2e-3  # rad or m: measured starts that are closer differ by the noise of a sensor
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -105,29 +107,34 @@ class Cost:
     def against(self, recordings: Sequence[Recording], config: CompareConfig | None = None) -> Cost:
         """The same compiled replays compared with other repeats of the same recordings, or in another way.
 
-        A recording without commands may hold another motion: its replay is given it.
-        Raises ValueError unless these are as many, with the same commands from the same start (where there are
-        none, as many instants on the same clock and the same joints with positions throughout) and the same torque
-        convention.
+        Repeats that start elsewhere are replayed from there.  A recording without commands may hold another motion:
+        its replay is given it.
+        Raises ValueError unless these are as many, with the same commands (where there are none, as many instants on
+        the same clock and the same joints with positions throughout) and the same torque convention.
         """
         recordings = recordings_of(recordings)
         if len(recordings) != len(self.drives):
             raise ValueError(f"expected repeats of {len(self.drives)} replayed recordings, got {len(recordings)}")
         made, drives, replays = [], [], []
-        for recording, old, drive, replay in zip(recordings, self.comparisons, self.drives, self._replays, strict=True):
+        for given, old, drive, replay in zip(recordings, self.comparisons, self.drives, self._replays, strict=True):
+            recording = own_starts(given)
             new = followed(self.scene, recording, config or old.config)
             if isinstance(new, Drive):
                 check_gains(self.scene, new)
             if not _same(self.scene, new, drive):
                 raise ValueError(
-                    f"recording {recording.name!r} holds other commands than {old.name!r} had, starts elsewhere "
-                    "(qpos0), measured another torque (side, gravity) or, without commands, has another clock or other "
-                    "joints whose positions were measured throughout"
+                    f"recording {recording.name!r} holds other commands than {old.name!r} had, measured another torque "
+                    "(side, gravity) or, without commands, has another clock or other joints whose positions were "
+                    "measured throughout"
                 )
-            drives.append(new if isinstance(new, Motion) else drive)
+            drives.append(drive if _start_alike(self.scene, new, drive) else new)
             replays.append(_along(replay, drives[-1]))
-            made.append(_compared(self.scene, recording, new, replays[-1], config or old.config))
+            made.append(_compared(self.scene, self.space, recording, drives[-1], replays[-1], config or old.config))
         return assemble(self.scene, self.space, made, replays, drives)
+
+    def from_one_start(self, index: int, recording: Recording) -> Recording:
+        """Repeats of a recording as if all had started where its replay does (`own_starts.from_one_start`)."""
+        return _from_one_start(self.scene, self.space, own_starts(recording), self.drives[index], self._replays[index])
 
     def _blockwise(self, values: Any, functions: Sequence[Callable], join: Callable) -> Any:
         def block(rows: np.ndarray) -> Any:
@@ -161,6 +168,7 @@ def make_cost(
     check_space(instance(scene, "scene", Scene), instance(space, "space", Space))
     recordings, effects = recordings_of(recordings), instances(effects, "effects", Effect)
     one_of(engine, "engine", ENGINES)
+    recordings = [own_starts(recording) for recording in recordings]
     drives = [followed(scene, r, config) for r in recordings]
     for recording in recordings if check else ():
         warn_of_log(scene, recording)
@@ -172,7 +180,7 @@ def make_cost(
         _engine(engine, scene, space, d, with_sensors(scene, space, d, effects), config.mj_step) for d in drives
     )
     comparisons = tuple(
-        _compared(scene, recording, drive, replay, config)
+        _compared(scene, space, recording, drive, replay, config)
         for recording, drive, replay in zip(recordings, drives, replays, strict=True)
     )
     return assemble(scene, space, comparisons, replays, drives)
@@ -279,16 +287,51 @@ class Along:
         return self.compiled(values, path_of(self.scene, self.motion))
 
 
+@dataclass(frozen=True, eq=False)
+class Driven:
+    """A batch of servo replays of a drive: [B, D] -> Rollout [B, ...].
+
+    make: drive -> its batch; one of another start, or of other commands of the same length, compiles nothing anew.
+    """
+
+    make: Callable[[Drive], Callable[[np.ndarray], Rollout]]
+    drive: Drive
+
+    @functools.cached_property
+    def _batch(self) -> Callable[[np.ndarray], Rollout]:
+        return self.make(self.drive)
+
+    def __call__(self, values: np.ndarray) -> Rollout:
+        return self._batch(values)
+
+
 def _along(replay: Callable[[np.ndarray], Rollout], follows: Drive | Motion) -> Callable[[np.ndarray], Rollout]:
-    """The same compiled batch along another motion."""
-    return replace(replay, motion=follows) if isinstance(replay, Along) and isinstance(follows, Motion) else replay
+    """The same compiled batch along another motion, or from another start."""
+    if isinstance(replay, Along) and isinstance(follows, Motion):
+        return replace(replay, motion=follows)
+    if isinstance(replay, Driven) and isinstance(follows, Drive):
+        return replay if follows is replay.drive else replace(replay, drive=follows)
+    return replay
+
+
+def _from_one_start(
+    scene: Scene, space: Space, recording: Recording, follows: Drive | Motion, replay: Callable
+) -> Recording:
+    if not isinstance(follows, Drive) or not isinstance(replay, Driven):
+        return recording
+
+    def alone(drive: Drive) -> Rollout:
+        return jax.tree.map(lambda a: a[0], in_blocks(replace(replay, drive=drive), space.mean[None]))
+
+    return from_one_start(scene, recording, follows, alone)
 
 
 def _compared(
-    scene: Scene, recording: Recording, follows: Drive | Motion, replay: Callable, config: CompareConfig
+    scene: Scene, space: Space, recording: Recording, follows: Drive | Motion, replay: Callable, config: CompareConfig
 ) -> Comparison:
     """What a recording is compared with its replay by."""
     apart = _apart(replay, scene, recording, config) if isinstance(replay, Along) else None
+    recording = _from_one_start(scene, space, recording, follows, replay)
     rest = follows.rest if isinstance(follows, Motion) else None
     return make_comparison(scene, recording, _clock(recording, follows), config, apart, rest)
 
@@ -313,28 +356,31 @@ def _apart(along: Along, scene: Scene, recording: Recording, config: CompareConf
 
 
 def _same(scene: Scene, new: Drive | Motion, old: Drive | Motion) -> bool:
-    """Whether what was compiled for the one serves the other.
-
-    An object that stands ajar by about AJAR is put back for some repeats and not for others.
-    """
+    """Whether what was compiled for the one serves the other, from its own start."""
     if new.torque != old.torque:
         return False
     if isinstance(new, Motion) and isinstance(old, Motion):
         return new.joints == old.joints and np.array_equal(new.time, old.time)
     if isinstance(new, Motion) or isinstance(old, Motion):
         return False
-    apart = np.full(scene.model.nq, SCATTER)
+    sent, before = (np.ones(d.command.shape[1], bool) if d.sent is None else d.sent for d in (new, old))
+    return np.array_equal(sent, before) and np.array_equal(new.command[:, sent], old.command[:, sent])
+
+
+def _start_alike(scene: Scene, new: Drive | Motion, old: Drive | Motion) -> bool:
+    """Whether two drives start at one place, but for ALIKE; motions, which are followed as they are, never do.
+
+    An object that stands ajar by about AJAR is put back for some repeats and not for others.
+    """
+    if isinstance(new, Motion) or isinstance(old, Motion):
+        return False
+    apart = np.full(scene.model.nq, ALIKE)
     if scene.object_joint and scene.object_joint not in scene.joints:
         hinge = scene.qpos(scene.object_joint)
         if scene.model.qpos0[hinge] in (new.qpos0[hinge], old.qpos0[hinge]):
             apart[hinge] += AJAR
     apart[list(following(scene, new.qpos0) & following(scene, old.qpos0))] = np.inf  # by as much as what has them there
-    sent, before = (np.ones(d.command.shape[1], bool) if d.sent is None else d.sent for d in (new, old))
-    return (
-        np.array_equal(sent, before)
-        and np.array_equal(new.command[:, sent], old.command[:, sent])  # what is held follows from the start
-        and bool(np.all(np.abs(new.qpos0 - old.qpos0) <= apart))
-    )
+    return bool(np.all(np.abs(new.qpos0 - old.qpos0) <= apart))
 
 
 def _clock(recording: Recording, follows: Drive | Motion) -> np.ndarray:
@@ -376,10 +422,23 @@ def _engine(
             _compiled(lambda path: along(make_physics(scene, space, means), path).torque),
         )
     if engine == "mjx":
-        return batch_replay(scene, space, servo_replay(scene, drive, effects, parity=mj_step, late=late))
-    twin = twin_replay(scene, space, drive, [e for e in effects if e.name != "torque offset"], late=late)
-    checked = _of_bodies(scene, space, twin)
-    return lambda values: jax.tree.map(_single, checked(values))
+        replay = servo_replay(scene, drive, effects, parity=mj_step, late=late)
+        compiled = over_block(
+            _of_bodies(scene, space, lambda values, *of_drive: replay(make_physics(scene, space, values), *of_drive))
+        )
+
+        def driven(drive: Drive) -> Callable[[np.ndarray], Rollout]:
+            of_drive = jnp.asarray(drive.command, jnp.float32), jnp.asarray(drive.qpos0, jnp.float32)
+            return lambda values: compiled(values, *of_drive)
+
+        return Driven(driven, drive)
+    known = [e for e in effects if e.name != "torque offset"]
+
+    def twin(drive: Drive) -> Callable[[np.ndarray], Rollout]:
+        checked = _of_bodies(scene, space, twin_replay(scene, space, drive, known, late=late))
+        return lambda values: jax.tree.map(_single, checked(values))
+
+    return Driven(twin, drive)
 
 
 def _single(array: np.ndarray) -> jax.Array:

@@ -14,12 +14,13 @@ class Finding:
 
     kind: of the fault.  column: the joint, channel or pair of repeats that it is about.  value: as measured; expected:
     what it should be near; both in the sentence's terms.  severity: "certain" where no fit of this recording can mean
-    anything, else "likely".  sentence: what is wrong, where, and what to do.
+    anything, "likely" where something is wrong most often, "note" where nothing is, but has to be known.  sentence:
+    what is wrong, where, and what to do.
     """
 
     kind: Kind
     column: str
     value: float
     expected: float
-    severity: Literal["likely", "certain"]
+    severity: Literal["note", "likely", "certain"]
     sentence: str

@@ -35,15 +35,27 @@ def check_log(scene: Scene, recording: Recording) -> tuple[Finding, ...]:
     """
     known = _FOUND.setdefault(recording, weakref.WeakKeyDictionary())
     if scene not in known:
-        found = [*check_repeats(recording), *check_clocks(scene, recording)]
+        found = [*check_repeats(recording), *check_clocks(scene, recording), *_unused(recording)]
         motion = log_motion(scene, recording)
         if motion is not None:
             tracking = check_tracking(scene, recording, motion)
             found += tracking
             if not tracking:  # else the torque is judged by a motion that is wrong
                 found += check_torque(scene, recording, motion)
-        known[scene] = tuple(sorted(found, key=lambda finding: finding.severity != "certain"))
+        known[scene] = tuple(sorted(found, key=lambda finding: ("certain", "likely", "note").index(finding.severity)))
     return known[scene]
+
+
+def _unused(recording: Recording) -> list[Finding]:
+    """Set-points that were in the log and are in no replay."""
+    fields = recording.meta.get("unused_setpoints", "")
+    if not fields:
+        return []
+    sentence = (
+        f"recording {recording.name!r}: its commands had set-points of {fields} beside the positions, which no replay "
+        "uses: a servo that follows them lags less than its replay, which looks like damping, a delay or another gain"
+    )
+    return [Finding("unused", fields, 1.0, 0.0, "note", sentence)]
 
 
 def warn_of_log(scene: Scene, recording: Recording) -> None:

@@ -7,17 +7,35 @@ import itertools
 import numpy as np
 
 from droid_jax.compare.findings import Finding
+from droid_jax.compare.own_starts import spread
 from droid_jax.measure.recording import Channel, Recording
 
 COPY = 1e-6  # of a channel's size: repeats that differ by less were measured once (float32 rounds by less)
 LEVELS = 8  # a column that moves and takes no more different values is coarse
+RESTS = {"position": 0.02, "velocity": 0.1, "torque": 0.2}  # rad, rad/s, N m: a column that changes by less may rest
 NAMED = 3  # pairs of copies that are named
 
 
 def check_repeats(recording: Recording) -> list[Finding]:
     """What is wrong with the repeats and the sensors."""
     where = f"recording {recording.name!r}"
-    return _copies(recording, where) + [f for c in recording.channels.values() for f in _sensors(c, where)]
+    sensors = [finding for channel in recording.channels.values() for finding in _sensors(channel, where)]
+    return _copies(recording, where) + sensors + _apart(recording, where)
+
+
+def _apart(recording: Recording, where: str) -> list[Finding]:
+    """How far apart the repeats start, where that is visible."""
+    apart = spread(recording)
+    if not apart:
+        return []
+    most = max(apart, key=lambda joint: apart[joint])
+    return [
+        Finding(
+            "repeats", most, apart[most], 0.0, "note",
+            f"{where}: its repeats start up to {apart[most]:.2g} rad or m apart, {most} most: each is compared with "
+            "a replay from its own measured start",
+        )
+    ]  # fmt: skip
 
 
 def _copies(recording: Recording, where: str) -> list[Finding]:
@@ -52,15 +70,13 @@ def _same(channel: Channel, first: int, second: int) -> bool:
 
 
 def _sensors(channel: Channel, where: str) -> list[Finding]:
-    """Columns that never change, and columns of very few different values.
-
-    A velocity or a torque of zero, or a position that rests, is no fault of a sensor where the joint is not driven.
-    """
+    """Columns that change, in steps as large as the motion."""
     found = []
     for c, column in enumerate(channel.columns):
         values = channel.values[:, :, c][channel.mask[:, :, c]]
         levels = np.unique(values[:: max(1, len(values) // 20000)])
-        if 1 < len(levels) <= LEVELS and len(values) > 10 * LEVELS:
+        moves = channel.name in RESTS and len(levels) > 1 and np.ptp(levels) > RESTS[channel.name]
+        if moves and len(levels) <= LEVELS and len(values) > 10 * LEVELS:
             found.append(
                 Finding(
                     "sensor", column, float(len(levels)), float(LEVELS), "likely",

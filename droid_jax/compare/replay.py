@@ -139,6 +139,7 @@ def servo_replay(
 
     The scan carries only position, velocity and the solver's warm start: everything else in
     mjx.Data is rebuilt each step, so that XLA drops what nobody reads.
+    The replay also takes another command [T, U] and start [nq]: repeats that start apart share one compiled program.
     parity: step exactly as the C engine does (see `droid_jax.model.step`), for comparisons with it; then
       `late` steps late (see `_command`).
     """
@@ -147,15 +148,14 @@ def servo_replay(
     check_stateless(scene)
     template = mjx.make_data(scene.mjx)
     fingers = finger_geoms(scene)
-    table = jnp.asarray(drive.command, jnp.float32)
-    start = jnp.asarray(drive.qpos0, jnp.float32)
+    own = jnp.asarray(drive.command, jnp.float32), jnp.asarray(drive.qpos0, jnp.float32)
     joints, positions = scene.joint_dofs, scene.joint_qpos
     hinge = scene.qpos(scene.object_joint) if scene.object_joint else None
     shift = late if parity else 0.0  # steps, of the command; of positions in the other direction
     half = late if parity else 0.5  # steps from the velocity before a step to the one that is told
     damping = has_servo_damping(scene.model)
 
-    def replay(physics: Physics) -> Rollout:
+    def replay(physics: Physics, table: jax.Array = own[0], start: jax.Array = own[1]) -> Rollout:
         model, theta = physics.model, complete(physics.theta, effects)
 
         def step(carry, k):

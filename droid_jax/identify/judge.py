@@ -74,7 +74,8 @@ def gaps_of(
     out = []
     for i, (one, recording, own) in enumerate(zip(cost.comparisons, recordings, held, strict=True)):
         rms = np.sqrt(np.mean((smoothed[i] - one.channel("torque").noise.mean) ** 2, axis=1))
-        everything = make_comparison(cost.scene, recording, one.clock, one.config) if recording.repeats > 1 else None
+        alike = cost.from_one_start(i, recording)  # as the held-out repeats that `cost` compares
+        everything = make_comparison(cost.scene, alike, one.clock, one.config) if recording.repeats > 1 else None
         floor = None if everything is None else _floor(everything)
         first, last = penalty_free[0, i], penalty_free[1, i]
         out.append(

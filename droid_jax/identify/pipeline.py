@@ -15,6 +15,7 @@ import numpy as np
 from droid_jax.arguments import check_fields, instance, number, one_of, optional, whole
 from droid_jax.compare.cost import ENGINES, Cost, make_cost
 from droid_jax.compare.log_checks import warn_of_log
+from droid_jax.compare.own_starts import own_starts
 from droid_jax.compare.residuals import CompareConfig
 from droid_jax.identify.blow_up import blow_up
 from droid_jax.identify.fit import Fit
@@ -168,6 +169,7 @@ def prepare(
     instance(space, "space", Space)
     if nuisances is not None:
         instance(nuisances, "nuisances", Space)
+    recordings = [own_starts(recording) for recording in recordings]
     fitted, held, numbers = zip(*(split(r, config.heldout) for r in recordings), strict=True)
     full = space if nuisances is None or config.refine is None else space + nuisances
     base = make_cost(scene, full, fitted, engine=config.engine, config=config.compare, effects=effects, check=False)

@@ -115,11 +115,11 @@ def _samples(
         return [(0, tuple(message.name), fields)]
     if hasattr(message, "joint_names") and hasattr(message, "points"):  # JointTrajectory
         names = tuple(message.joint_names)
-        return [(_nanoseconds(p.time_from_start), names, {"position": np.asarray(p.positions)}) for p in message.points]
+        return [(_nanoseconds(p.time_from_start), names, _setpoints(p)) for p in message.points]
     if hasattr(message, "joint_names") and (hasattr(message, "reference") or hasattr(message, "desired")):
         # JointTrajectoryControllerState, in older versions with the second name
         point = message.reference if hasattr(message, "reference") else message.desired
-        return [(0, tuple(message.joint_names), {"position": np.asarray(point.positions)})]
+        return [(0, tuple(message.joint_names), _setpoints(point))]
     if hasattr(message, "positions"):  # JointTrajectoryPoint
         numbers = np.asarray(message.positions, dtype=np.float64)
     elif hasattr(message, "data") and np.ndim(message.data) == 1:  # Float64MultiArray
@@ -131,7 +131,17 @@ def _samples(
         )
     if len(numbers) != len(joints):
         raise ValueError(f"{where}: expected {len(joints)} numbers ({', '.join(joints)}), got {len(numbers)}")
-    return [(0, joints, {"position": numbers})]
+    return [(0, joints, {**_setpoints(message), "position": numbers})]
+
+
+def _setpoints(point: Any) -> dict[str, np.ndarray]:
+    """field -> numbers of a trajectory point, or of a message without names: positions, and what stands beside them."""
+    found = {"position": np.asarray(getattr(point, "positions", ()), dtype=np.float64)}
+    for field, of_point in {"velocity": "velocities", "effort": "effort"}.items():
+        numbers = np.asarray(getattr(point, of_point, ()), dtype=np.float64)
+        if len(numbers) == len(found["position"]):
+            found[field] = numbers
+    return found
 
 
 def _nanoseconds(duration: Any) -> int:

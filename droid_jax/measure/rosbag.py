@@ -12,6 +12,7 @@ from __future__ import annotations
 import enum
 import itertools
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -31,6 +32,9 @@ class Stamps(enum.Enum):
     BAG = "bag"  # when the recorder received it
 
 
+UNUSED = "unused_setpoints"  # in `meta`: what the commands held beside positions
+DRIFT = 0.03  # s by which a log at its nominal rate may be off at its end unremarked
+NEAR = 0.05  # relative deviation within which a stated rate is meant to be that of the stamps
 _Timed = tuple[np.ndarray, dict[str, np.ndarray]]  # stamps [M] s, and values [M, J] by field
 
 
@@ -95,6 +99,8 @@ def read_bags(
 
     channels = _channels(states, clock, tuple(joints), slides, bags)
     command = np.zeros((0, 0))
+    _warn_of_rate(states[0][0], rate, bags[0])
+    unused = _unused(commands, command_topic)
     if commands:
         command = _command(commands, clock, command_joints, command_tolerance, bags)
     recording = Recording(
@@ -112,9 +118,40 @@ def read_bags(
             "stamps": "header" if use_header else "bag",
             "state_topic": state_topic,
             "command_topic": command_topic or "",
+            **({UNUSED: ", ".join(unused)} if unused else {}),
         },
     )
     return validate(recording, source=", ".join(str(bag) for bag in bags))
+
+
+def _unused(commands: Sequence[_Timed], topic: str | None) -> list[str]:
+    """Set-points other than positions that the command messages hold and the recording does not; they are warned of."""
+    found = [
+        field
+        for field in ("velocity", "effort")
+        if any(np.any(np.nan_to_num(fields[field])) for _, fields in commands if field in fields)
+    ]
+    if found:
+        warnings.warn(
+            f"the commands on {topic} have set-points of {' and '.join(found)} beside the positions, and these are "
+            "not used: a servo that follows them lags less than its replay, which looks like damping or a delay",
+            stacklevel=3,
+        )
+    return found
+
+
+def _warn_of_rate(stamps: np.ndarray, rate: float | None, bag: Path) -> None:
+    """Warn of a stated rate that is nearly that of the stamps [M] s: who states it may take it for theirs."""
+    if not rate or len(stamps) < 3:
+        return
+    own = (len(stamps) - 1) / float(stamps[-1] - stamps[0])
+    late = abs((len(stamps) - 1) / rate - float(stamps[-1] - stamps[0]))
+    if late > DRIFT and abs(own / rate - 1.0) < NEAR:
+        warnings.warn(
+            f"{bag}: the stamps are at {own:.5g} Hz, not at the {rate:g} Hz of --rate; they are used and the log is "
+            f"resampled (by its number of samples it would be {late:.2g} s off at the end)",
+            stacklevel=3,
+        )
 
 
 def _bags(paths: Sequence[str | os.PathLike[str]]) -> list[Path]:

@@ -433,16 +433,19 @@ def test_a_cost_serves_other_repeats_of_the_same_motion_alone(scene: Scene):
     elsewhere = {"shoulder": 0.5, "elbow": -0.3}
     for other in (
         recording(command=motion()[1] + 0.1),
-        recording(qpos0=elsewhere),
         recording(torque=TorqueConvention(TorqueSide.LINK, False)),
         recording(torque=TorqueConvention(TorqueSide.MOTOR, True)),
     ):
-        with pytest.raises(ValueError, match="other commands than 'wave' had, starts elsewhere"):
+        with pytest.raises(ValueError, match="other commands than 'wave' had, measured another torque"):
             cost.against([other])
     with pytest.raises(ValueError, match="servo gain of 30 for elbow"):
         cost.against([recording(gains=ServoGains(np.array([60.0, 30.0]), np.array([3.0, 1.0])))])
-    near = cost.against([recording(qpos0={"shoulder": 0.002, "elbow": -0.3})])  # measured starts scatter
+    near = cost.against([recording(qpos0={"shoulder": 0.0008, "elbow": -0.3})])  # measured starts scatter
     np.testing.assert_array_equal(near.drives[0].qpos0, cost.drives[0].qpos0)  # pyright: ignore
+    moved = cost.against([recording(qpos0=elsewhere)]).rollouts(SPACE.mean[None])[0]  # each starts where it starts
+    anew = make_cost(scene, SPACE, [recording(qpos0=elsewhere)]).rollouts(SPACE.mean[None])[0]
+    assert moved.position[0, 0].tolist() == pytest.approx([0.5, -0.3])
+    np.testing.assert_allclose(moved.torque, anew.torque, atol=1e-4)
 
 
 def test_joint_friction_that_is_given_as_an_effect_counts_once(scene: Scene):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from two_link import ARM, JOINTS, arm, measured, motion, recording
 
-from droid_jax.compare.cost import _same, followed, make_cost
+from droid_jax.compare.cost import _start_alike, followed, make_cost
 from droid_jax.compare.notes import check_range, geared, open_loop
 from droid_jax.compare.replay import Drive, check_gains, make_drive
 from droid_jax.compare.residuals import CompareConfig
@@ -183,8 +183,8 @@ def test_repeats_serve_a_door_that_is_seen_just_ajar():
 
     shut, ajar, open_ = (seen(angle) for angle in (AJAR - 1e-3, AJAR + 1e-3, 2 * AJAR))
     assert shut.qpos0[door.qpos("hinge")] == 0.0 and ajar.qpos0[door.qpos("hinge")] > AJAR
-    assert _same(door, shut, ajar) and _same(door, ajar, shut) and not _same(door, shut, open_)
-    assert not _same(door, open_, seen(2 * AJAR + 0.015))  # neither is put back: these are two motions
+    assert _start_alike(door, shut, ajar) and _start_alike(door, ajar, shut) and not _start_alike(door, shut, open_)
+    assert not _start_alike(door, open_, seen(2 * AJAR + 0.015))  # neither is put back: these are two motions
 
 
 COUPLED = """<mujoco><worldbody><body><joint name="shoulder" axis="0 1 0"/><geom size=".1" pos="0 0 .2"/>
@@ -240,6 +240,6 @@ def test_coupled_joints_follow_the_scatter_of_what_has_them():
     heavy = {"torque": replace(recording().torque, gravity=True), "gains": None}
     one, other = (make_drive(scene, recording(qpos0={"shoulder": 0.2, "elbow": q}, **heavy)) for q in (0.4, 0.401))
     assert np.abs(one.qpos0 - other.qpos0).max() == pytest.approx(0.05)
-    assert _same(scene, one, other)
+    assert _start_alike(scene, one, other)
     stated = {"shoulder": 0.2, "elbow": 0.401, "mimic": float(other.qpos0[scene.qpos("mimic")]) + 0.2}
-    assert not _same(scene, one, make_drive(scene, recording(qpos0=stated, **heavy)))
+    assert not _start_alike(scene, one, make_drive(scene, recording(qpos0=stated, **heavy)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+import warnings
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -125,13 +126,15 @@ def multi_array(bag: Bag, t: float, q: np.ndarray) -> None:
     bag.add("/command", "std_msgs/msg/Float64MultiArray", t, layout=layout, data=q)
 
 
-def controller_state(bag: Bag, t: float, q: np.ndarray, names: tuple[str, str] = ("reference", "feedback")) -> None:
+def controller_state(
+    bag: Bag, t: float, q: np.ndarray, names: tuple[str, str] = ("reference", "feedback"), **changes: np.ndarray
+) -> None:
     """What ros2_control publishes; its position lags behind its command."""
     if CONTROLLER not in bag.store.types:
         points = "".join(f"trajectory_msgs/JointTrajectoryPoint {name}\n" for name in names)
         bag.store.register(get_types_from_msg(f"std_msgs/Header header\nstring[] joint_names\n{points}", CONTROLLER))
     make = bag.store.types["trajectory_msgs/msg/JointTrajectoryPoint"]
-    command, measured = (make(**point_fields(bag, x, 0.0)) for x in (q[::-1].copy(), q[::-1] - 0.1))
+    command, measured = (make(**{**point_fields(bag, x, 0.0), **changes}) for x in (q[::-1].copy(), q[::-1] - 0.1))
     bag.add("/command", CONTROLLER, t, joint_names=["j2", "j1"], **dict(zip(names, (command, measured), strict=True)))
 
 
@@ -541,6 +544,47 @@ def test_convert_turns_bags_into_a_recording(tmp_path: Path, capsys: pytest.Capt
     assert convert(out, "--start", "0.2", "--end", "0.6", "--out", tmp_path / "part") == 0
     part = load(tmp_path / "part")
     assert (part.span, part.repeats) == (pytest.approx((0.2, 0.6)), 3)
+
+
+def test_set_points_beside_positions_are_told(tmp_path: Path) -> None:
+    """A controller that follows velocities too lags less than a servo of positions."""
+
+    def moving(bag: Bag, t: float, q: np.ndarray) -> None:
+        controller_state(bag, t, q, ("reference", "feedback"), velocities=np.array([0.3, 0.1]))
+
+    paths = [pulled(tmp_path, "mcap", "run0", command=moving)]
+    with pytest.warns(UserWarning, match="on /command have set-points of velocity beside the positions"):
+        found = read_bags(paths, joints=JOINTS, torque=TORQUE, command_topic="/command")
+    assert found.meta["unused_setpoints"] == "velocity"
+    still = [pulled(tmp_path, "mcap", "run1", command=controller_state)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = read_bags(still, joints=JOINTS, torque=TORQUE, command_topic="/command")
+    assert "unused_setpoints" not in found.meta
+
+
+def test_a_rate_that_the_stamps_do_not_have_is_told(tmp_path: Path) -> None:
+    paths = [pulled(tmp_path, "ros1", "run0")]
+    with pytest.warns(UserWarning, match=r"the stamps are at .* Hz, not at the 97 Hz of --rate; they are used"):
+        read_bags(paths, joints=JOINTS, torque=TORQUE, rate=97.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read_bags(paths, joints=JOINTS, torque=TORQUE, rate=50.0)
+
+
+def test_efforts_that_are_amperes(tmp_path: Path, refused: Callable[..., str]) -> None:
+    paths = [pulled(tmp_path, "ros1", f"run{i}") for i in range(2)]
+    said = ["--joints", *JOINTS, "--torque", "motor"]
+    assert convert(*paths, *said, "--out", tmp_path / "plain.npz") == 0
+    assert convert(*paths, *said, "--torque-constant", "8", "-12", "--out", tmp_path / "scaled.npz") == 0
+    plain, scaled = (load(tmp_path / f"{name}.npz") for name in ("plain", "scaled"))
+    torque = plain.channels["torque"].values
+    np.testing.assert_allclose(scaled.channels["torque"].values, torque * [8.0, -12.0])
+    assert scaled.meta["torque_constants"] == "8 -12"
+    assert convert(tmp_path / "plain.npz", "--torque-constant", "2", "--out", tmp_path / "one") == 0
+    np.testing.assert_allclose(load(tmp_path / "one").channels["torque"].values, 2.0 * torque)
+    for wrong, what in ((("1", "2", "3"), "got 3 torque constants"), (("0",), "other than 0, got 0")):
+        assert what in refused("convert", tmp_path / "plain.npz", "--torque-constant", *wrong, "--out", tmp_path / "no")
 
 
 def test_convert_takes_several_folders_of_bags(tmp_path: Path) -> None:
