@@ -1,8 +1,9 @@
 """Messages of other programs that nobody can do anything about are left out; all else they print is printed.
 
-Two of them:
+Three of them:
 
 - mujoco.mjx prints two lines where warp is not installed, which it only needs on some GPUs.
+- matplotlib says, in two lines, where it keeps its fonts' list if there is no home to keep it in.
 - XLA writes errors of 2 kB when it loads a compiled CPU program from the cache: about two tuning preferences that it
   gives itself when it compiles and that no host can report (openxla/xla#44565), and about versions that jax's key to
   the cache contains.  Compiled programs lie in a folder of this processor's, see `runtime.tune`.
@@ -14,6 +15,7 @@ import contextlib
 import functools
 import importlib
 import io
+import logging
 import os
 import re
 import sys
@@ -34,6 +36,18 @@ _OF_THE_CACHE = re.compile(
 )
 _lock = threading.Lock()
 _settled: list[str] = []  # the log level that jaxlib was loaded with, where this package set it
+
+
+_NO_HOME = re.compile(r"mkdir -p failed for path|Matplotlib created a temporary cache directory")
+
+
+def quiet_matplotlib() -> None:
+    """Leave out what matplotlib logs when it is imported and there is no folder for its cache."""
+    logging.getLogger("matplotlib").addFilter(_of_use)
+
+
+def _of_use(record: logging.LogRecord) -> bool:
+    return not _NO_HOME.match(str(record.msg))
 
 
 @contextlib.contextmanager

@@ -356,6 +356,11 @@ def test_importing_a_module_prints_nothing(module: str):
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
+def test_matplotlib_without_a_home_prints_nothing():
+    done = fresh("import droid_jax.report.style", HOME="/dev/null", XDG_CONFIG_HOME="", XDG_CACHE_HOME="")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
 def test_mjx_is_imported_in_one_place():
     """Whoever imports it first sees its two lines about warp."""
     package = ROOT / "droid_jax"

@@ -1,0 +1,5 @@
+"""What is drawn: pages, figures, films."""
+
+from droid_jax.quiet import quiet_matplotlib
+
+quiet_matplotlib()  # before a module of this folder imports it
