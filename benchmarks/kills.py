@@ -43,7 +43,7 @@ from droid_jax.storage import write_json
 
 COMMANDS = ("identify", "gap", "train")
 RUNS, QUICK = 20, 2  # of each command
-LONGEST = 900.0  # s that one process may take; longer counts as a hang
+LONGEST = 3600.0  # s that one process may take, on a machine with much else to do; longer counts as a hang
 FROM, TO = 0.02, 0.98  # of an uninterrupted run's seconds, between which it is killed
 AGAIN = 0.3  # share of runs that are killed a second time
 # What names a moment, a duration or a place, or says which code ran: no result.
