@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from droid_jax.compare.floating import refuse_floating
@@ -104,9 +105,12 @@ def _check_driven(scene: Scene, recording: Recording) -> None:
     left = [j for j in recording.command_names if j in has and j not in scene.command_names]
     if left or not scene.command_names:
         lacks = f"actuator for {', '.join(left)}" if scene.command_names else "actuators"
+        coupled = int(np.sum(scene.model.eq_type == mujoco.mjtEq.mjEQ_JOINT))
+        mimic = f"; its {coupled} <mimic> became <equality><joint>" if coupled else ""
+        urdf = f" (a URDF holds none: save it as MJCF and add them there{mimic})" if not scene.command_names else ""
         raise ValueError(
             f"scene {scene.name!r} has no {lacks}, and recording {recording.name!r} holds commands: give each "
-            "commanded joint a <position> servo in the MJCF"
+            f"commanded joint a <position> servo in the MJCF{urdf}"
         )
 
 
@@ -126,9 +130,11 @@ def check_gains(scene: Scene, drive: Drive) -> None:
 def check_stateless(scene: Scene) -> None:
     """Raise ValueError for actuators with an activation of their own, which the scan does not carry."""
     if scene.model.na:
+        own = np.flatnonzero(scene.model.actuator_actnum > 0)
         raise ValueError(
-            f"scene {scene.name!r} has actuators with a state of their own (activation); a replay needs plain "
-            "position servos or motors: remove dyntype or timeconst"
+            f"scene {scene.name!r} has actuators with a state of their own (activation), "
+            f"{', '.join(scene.command_names[u] for u in own)}; a replay needs plain position servos or motors: remove "
+            "dyntype or timeconst, and use <velocity> or <position> in place of <intvelocity>, <cylinder> and <muscle>"
         )
 
 

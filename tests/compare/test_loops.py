@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -14,7 +15,7 @@ from droid_jax.compare.loops import OPEN, open_loops
 from droid_jax.compare.notes import closed_loop
 from droid_jax.compare.replay import make_drive
 from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
-from droid_jax.model.scene import Scene, compile_scene
+from droid_jax.model.scene import Scene, compile_scene, load_scene
 
 TIME = np.arange(0.0, 1.0, 0.01)
 
@@ -183,3 +184,20 @@ def test_a_thing_that_floats_and_carries_nothing_is_no_base():
         "</worldbody>", '<body pos="1 0 1"><freejoint/><geom size=".1"/></body></worldbody>'
     )
     make_drive(compile_scene(mujoco.MjSpec.from_string(xml), "table", joints=["crank"]), recording())
+
+
+def test_a_urdf_without_servos_says_where_to_add_them(tmp_path: Path):
+    """What became of its mimic joint is said too."""
+    inertia = '<inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/>'
+    link = f'<link name="{{0}}"><inertial><mass value="1"/>{inertia}</inertial></link>'
+    joint = (
+        '<joint name="{0}" type="revolute"><parent link="{1}"/><child link="{2}"/><axis xyz="0 1 0"/>'
+        '<limit lower="-1" upper="1" effort="9" velocity="9"/>{3}</joint>'
+    )
+    parts = [link.format(name) for name in ("base", "a", "b")]
+    parts += [joint.format("crank", "base", "a", ""), joint.format("finger", "a", "b", '<mimic joint="crank"/>')]
+    file = tmp_path / "arm.urdf"
+    file.write_text(f'<robot name="arm">{"".join(parts)}</robot>')
+    said = "a URDF holds none: save it as MJCF and add them there; its 1 <mimic> became"
+    with pytest.raises(ValueError, match=said):
+        make_drive(load_scene(file, joints=["crank"]), recording())
