@@ -34,7 +34,7 @@ from droid_jax.measure.motion import Motion, measured_motion
 from droid_jax.measure.recording import Recording, recordings_of
 from droid_jax.model.fields import check_space
 from droid_jax.model.inertia import check_inertia, free_inertias, inertia_possible
-from droid_jax.model.joint_friction import TERMS, direction, joint_friction_effect
+from droid_jax.model.joint_friction import FRICTION, GAIN, TERMS, direction, joint_friction_effect, torque_gain_effect
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_physics
 from droid_jax.model.scene import Scene
@@ -202,11 +202,11 @@ def check_read(scene: Scene, space: Space, effects: Sequence[Effect]) -> None:
 
 
 def _warn_of_commanded(space: Space) -> None:
-    """Warn of parameters that act through commands, where no recording has any: they change nothing."""
+    """Warn of parameters that act through commands or constraints, where no recording has any: they change nothing."""
     idle = [
         p.name
         for p in space.parameters
-        if p.name == "time_offset" or (p.writes and all(w.field.startswith("actuator_") for w in p.writes))
+        if p.name == "time_offset" or (p.writes and all(w.field.startswith(("actuator_", "dof_sol")) for w in p.writes))
     ]
     if idle:
         warnings.warn(
@@ -395,13 +395,15 @@ def with_sensors(scene: Scene, space: Space, drive: Drive | Motion, effects: Seq
 
 
 def _sensor_effects(scene: Scene, space: Space, drive: Drive | Motion) -> tuple[Effect, ...]:
-    """What the torque sensors add: always the offsets, friction behind them where the space asks for it."""
-    friction = any(name.startswith(("viscous[", "coulomb[")) for name in space.names)
-    offsets = torque_offset_effect(scene.joints)
-    if not friction:
-        return (offsets,)
+    """What the torque sensors add: always the offsets, all else where the space asks for it."""
+
+    def asked(*terms: str) -> bool:
+        return any(name.startswith(tuple(f"{term}[" for term in terms)) for name in space.names)
+
     sign = jnp.sign if isinstance(drive, Motion) else direction
-    return (joint_friction_effect(scene.joints, sign), offsets)
+    found = [joint_friction_effect(scene.joints, sign)] if asked(*FRICTION) else []
+    found += [torque_gain_effect(scene.joints)] if asked(GAIN) else []
+    return (*found, torque_offset_effect(scene.joints))
 
 
 def _engine(

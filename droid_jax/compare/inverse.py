@@ -18,6 +18,7 @@ from droid_jax.compare.loops import coupled_to_others
 from droid_jax.compare.replay import observed
 from droid_jax.measure.motion import Motion
 from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
+from droid_jax.model.encoders import encoder_error, misplaced_weight
 from droid_jax.model.ignored import refuse_fluid
 from droid_jax.model.physics import Physics
 from droid_jax.model.quiet_mjx import mjx
@@ -116,6 +117,7 @@ def path_replay(
     of the motor's own terms appear, and what the joint adds there (Coulomb and viscous friction, offset) is an
     observation effect.  Constraints (contacts, limits, equalities) take no part.
     Whether g(q) is there is the recording's word alone, not the MJCF's gravcomp.
+    The path is what encoders read.
     Forces and friction of effects are what the torque has to overcome, on either side.
     Raises ValueError for effects of command and servo, which a prescribed motion has not, and for air or water.
     """
@@ -130,6 +132,7 @@ def path_replay(
 
     def replay(physics: Physics, path: Path) -> Rollout:
         model, theta = physics.model, complete(physics.theta, effects)
+        error = encoder_error(scene, model)
         none = {name: jnp.zeros_like(getattr(model, name)) for name in ("dof_armature", "dof_damping")}
         link_model = model if motor else model.replace(**none)
         if not convention.gravity:
@@ -143,9 +146,11 @@ def path_replay(
             inertia = mjx.full_m(link_model, data)
             torque = inertia @ full.at[dofs].set(acceleration) + data.qfrc_bias
             torque = torque - (data.qfrc_passive - compensated * data.qfrc_gravcomp)
+            if error is not None and not convention.gravity:
+                torque = torque + misplaced_weight(model, data, error)
             direction = jnp.sign(velocity)
             felt = torque + model.dof_frictionloss * direction if motor else torque
-            state = State(time, data.qpos, velocity, felt, model)
+            state = State(time, data.qpos, velocity, felt, model, data)
             behind = _behind_the_sensor(scene, theta)
             own = model.dof_frictionloss if motor else behind
             force, loss = _resistance(theta, state, own, effects)

@@ -22,6 +22,7 @@ from droid_jax.measure.checks import check_joints
 from droid_jax.measure.clocks import interpolate
 from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.model.actuators import has_servo_damping
+from droid_jax.model.encoders import encoder_error, misplaced_compensation
 from droid_jax.model.ignored import check_options
 from droid_jax.model.physics import Physics
 from droid_jax.model.quiet_mjx import mjx
@@ -163,6 +164,7 @@ def servo_replay(
 
     def replay(physics: Physics, table: jax.Array = own[0], start: jax.Array = own[1]) -> Rollout:
         model, theta = physics.model, complete(physics.theta, effects)
+        error = encoder_error(scene, model)
 
         def step(carry, k):
             qpos, qvel, warm, load = carry
@@ -171,14 +173,19 @@ def servo_replay(
             before = template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm, ctrl=ctrl)
             after = simulate_step(
                 rubbing(model, theta, state, effects),
-                pushed(before, theta, state, effects),
+                before,
                 parity=parity,
                 servo_damping=damping,
+                push=push(theta, state, effects, error),
             )
             mean = 0.5 * (qvel + after.qvel)
             servo = servo_force(model, after, mean) if damping and not parity else after.qfrc_actuator
+            torque = _joint_torque(model, before, after, servo, joints, drive, parity)
+            astray = misplaced_compensation(model, after, error)
+            if astray is not None and drive.torque.gravity:  # a torque with the weight holds what compensates it
+                torque = torque + astray[joints]
             out = (
-                _joint_torque(model, before, after, servo, joints, drive, parity),
+                torque,
                 qpos[positions] + shift * drive.timestep * qvel[joints],
                 (qvel + half * (after.qvel - qvel))[joints],
                 qpos[hinge] + shift * drive.timestep * qvel[hinge] if hinge is not None else jnp.zeros(()),
@@ -248,10 +255,23 @@ def rubbing(model, theta: Theta, state: State, effects: Sequence[Effect]):
     return model if loss is model.dof_frictionloss else model.replace(dof_frictionloss=loss)
 
 
-def pushed(data, theta: Theta, state: State, effects: Sequence[Effect]):
-    """The data with the forces of effects in this state."""
-    forces = [effect.force(theta, state) for effect in effects if effect.force is not None]
-    return data.replace(qfrc_applied=sum(forces)) if forces else data
+def push(
+    theta: Theta, state: State, effects: Sequence[Effect], error: jax.Array | None = None
+) -> Callable[[Any], jax.Array] | None:
+    """The forces of effects in this state, and of a gravity compensation that goes by encoders: of the pose, [nv].
+
+    error: [nv] by which joints stand further than their encoders say, None for nothing.
+    """
+    laws = [effect.force for effect in effects if effect.force is not None]
+    if not laws and error is None:
+        return None
+
+    def forces(pose: Any) -> jax.Array:
+        at = replace(state, pose=pose)
+        astray = misplaced_compensation(state.model, pose, error)
+        return sum((law(theta, at) for law in laws), jnp.zeros_like(state.qvel) if astray is None else astray)
+
+    return forces
 
 
 def observed(rollout: Rollout, theta: Theta, effects: Sequence[Effect]) -> Rollout:

@@ -47,6 +47,8 @@ def twin_replay(
             "the C engine replays the actuators' torque alone: motor-side, and without gravity where the scene "
             "compensates it; use MJX for this recording"
         )
+    if scene.model.body_gravcomp.any() and any(w.field == "qpos0" for p in space.parameters for w in p.writes):
+        raise ValueError("the C engine compensates gravity where joints are, not where encoders say: use MJX")
     plain = replace(scene, model=instrument(scene))
 
     def piece(values: np.ndarray) -> Rollout:

@@ -12,6 +12,8 @@ from droid_jax.model.effects.registry import library
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
 
+STEERED = ("actuator_", "dof_sol", "pair_")  # how model fields begin that inverse dynamics does not read
+
 
 @dataclass(frozen=True)
 class Candidate:
@@ -56,15 +58,16 @@ def possible(scene: Scene, recordings: Iterable[Recording], scale: float = 1.0) 
 
 
 def steers(effect: Effect) -> bool:
-    """Whether an effect is one of commands, servos or actuators alone, which a motion without commands does not have.
+    """Whether an effect is one of commands, servos or constraints alone, which a prescribed motion does not have.
 
-    Also one without laws of its own whose parameters write nothing but fields of actuators (`servo_gain`).
+    Also one without laws of its own whose parameters write nothing but fields of these (`servo_gain`, `soft_friction`).
     """
     if effect.command or effect.servo:
         return True
     fields = [w.field for p in effect.parameters for w in p.writes]
-    acts = effect.force or effect.frictionloss or effect.observe or not all(p.writes for p in effect.parameters)
-    return bool(fields) and not acts and all(field.startswith("actuator_") for field in fields)
+    laws = (effect.force, effect.frictionloss, effect.observe)
+    acts = any(laws) or not all(p.writes for p in effect.parameters)
+    return bool(fields) and not acts and all(field.startswith(STEERED) for field in fields)
 
 
 def candidates(effects: Iterable[Effect]) -> tuple[Candidate, ...]:

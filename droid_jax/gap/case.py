@@ -101,6 +101,11 @@ class Case:
         """Amplitude -> size worth naming."""
         return {a: e.smallest for e in self.effects for amplitudes in e.places.values() for a in amplitudes}
 
+    @property
+    def ends(self) -> frozenset[str]:
+        """Amplitudes whose bounds are where nature ends, not where the search does."""
+        return frozenset(name for e in self.effects for name in e.ends)
+
 
 def make_case(
     scene: Scene,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 from droid_jax.gap.evidence import Evidence
 from droid_jax.gap.refit import Model, intervals, zero_words
 from droid_jax.gap.select import past_bound
@@ -12,11 +14,12 @@ from droid_jax.identify.fit import bound_of
 OPEN = 0.5
 
 
-def doubts(evidence: Evidence, model: Model) -> tuple[str, ...]:
+def doubts(evidence: Evidence, model: Model, ends: Collection[str] = ()) -> tuple[str, ...]:
     """One text for each: "the form of latch at door does not fit: latch_width at its lower bound, 0.01 rad".
 
     A shape is bounded by what such a thing can be.  One that the recordings tell, and that wants beyond, says that the
-    library's form is not the robot's, although its place and kind may be right.
+    library's form is not the robot's, although its place and kind may be right.  ends: amplitudes that may stand at
+    their bound.
     """
     out = []
     for part in model.parts:
@@ -25,7 +28,7 @@ def doubts(evidence: Evidence, model: Model) -> tuple[str, ...]:
             out.append(f"the form of {part.name} does not fit: {' and '.join(wrong)}")
         if zero := zero_words(evidence, model, part) if part.amplitudes else "":
             out.append(f"of {part.name}, {zero}")
-        large = [f"{a} {said}" for a in part.amplitudes if (said := past_bound(evidence, model, a))]
+        large = [f"{a} {said}" for a in part.amplitudes if a not in ends and (said := past_bound(evidence, model, a))]
         if large:
             out.append(f"{part.name} is larger than its bounds allow: {' and '.join(large)}")
     return tuple(out)

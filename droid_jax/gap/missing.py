@@ -26,7 +26,7 @@ from droid_jax.gap.verdict import Verdict
 from droid_jax.gap.workflow import find
 from droid_jax.identify.pipeline import Progress
 from droid_jax.measure.recording import Recording, recordings_of
-from droid_jax.model.effects.registry import checked
+from droid_jax.model.effects.registry import beside, checked
 from droid_jax.model.fields import check_space
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
@@ -122,8 +122,10 @@ def case_of(
 ) -> Case:
     """Of recordings by role (see `shared_out`), which are one or two logs where the split is by blocks.
 
+    Sensors' gains and encoders' offsets that the base has as parameters are not asked about there.
     Raises ValueError for what is wrong with them, or does not fit the scene.
     """
+    effects = beside(base, effects)
     if split is not Split.BLOCKS:
         return make_case(scene, base, effects, **roles, config=config)
     config = replace(config, refine=replace(config.refine, hops=0, spreads=0))  # inverse dynamics is smooth

@@ -188,7 +188,15 @@ def _decided(hunt: Hunt, before: Model, begun: Round, tried: Sequence[Model]) ->
     if not tried:
         return done
     trials = judge(
-        case.fit, case.confirm, before, tried, case.smallest, hunt.whole_gap, floor=hunt.floor, seed=case.config.seed
+        case.fit,
+        case.confirm,
+        before,
+        tried,
+        case.smallest,
+        hunt.whole_gap,
+        floor=hunt.floor,
+        seed=case.config.seed,
+        ends=case.ends,
     )
     judged = list(zip(tried, trials, strict=True))
     won = winning(judged, hunt.floor, hunt.whole_gap)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,11 +67,13 @@ def judge(
     whole_gap: float,
     floor: float = 0.0,
     seed: int = 0,
+    ends: Collection[str] = (),
 ) -> list[Trial]:
     """Put extended models on trial against the one without their last effects, and against each other.
 
     before: that model.  smallest: amplitude -> size worth naming.  whole_gap: U of the model without
-    any effect on the confirming demonstration.  One batch of replays; U of one that blows up is infinite.
+    any effect on the confirming demonstration.  ends: amplitudes that may stand at their bound.  One batch of
+    replays; U of one that blows up is infinite.
     """
     commons = confirm.common(np.stack([before.values, *(m.values for m in models)]))
     repeats = [confirm.residuals(c) for c in commons]
@@ -95,7 +97,7 @@ def judge(
         else:
             taken = left[k + 1] <= (1 - LESS) * left[0]
         reasons = _gap_reasons(left[0], left[k + 1], whole_gap, taken, floor)
-        reasons += _amplitude_reasons(fit, model, spans)
+        reasons += _amplitude_reasons(fit, model, spans, ends)
         if chosen < CHOSEN:
             leader = min(zip(left[1:], models, strict=True), key=lambda lm: lm[0])[1].name
             reasons.append(f"wins only {chosen:.0%} of the resamples; {leader} does better")
@@ -166,10 +168,14 @@ def _too_small(
     return [TOO_SMALL] if small else []
 
 
-def _amplitude_reasons(fit: Evidence, model: Model, spans: Mapping[str, tuple[float, float]]) -> list[str]:
+def _amplitude_reasons(
+    fit: Evidence, model: Model, spans: Mapping[str, tuple[float, float]], ends: Collection[str]
+) -> list[str]:
     new = [c for c in model.parts if set(c.amplitudes) <= set(spans)]
     reasons = [said for c in new if (said := zero_words(fit, model, c))][:1]
-    return reasons + [f"{a} {AT_BOUND}: {beyond}" for a in spans if (beyond := past_bound(fit, model, a))]
+    return reasons + [
+        f"{a} {AT_BOUND}: {beyond}" for a in spans if a not in ends and (beyond := past_bound(fit, model, a))
+    ]
 
 
 def past_bound(fit: Evidence, model: Model, amplitude: str) -> str:

@@ -138,7 +138,7 @@ def _verdict(hunt: Hunt, base: Model, model: Model, rounds: list[Round], quiet: 
         rivals=next((r.rivals for r in reversed(rounds) if r.winner is not None), ()),
         cut=hunt.budget.cut,
         trend=trend(rounds[0].screen, base.residuals, case.config.seed) if rounds and case.fit.repeated else None,
-        doubts=doubts(case.fit, model),
+        doubts=doubts(case.fit, model, case.ends),
     )
     return unnamed(case, verdict) if too_little(verdict, case.config.least_closed) else verdict
 

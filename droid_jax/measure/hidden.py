@@ -2,7 +2,7 @@
 
 Written without knowledge of the library of effects that the search offers: forms, constants and
 time step are the stand-in's own.  What was hidden stands nowhere in the recording.  The formulas
-are in `hidden_door`, `hidden_friction`, `hidden_arm` and `hidden_signals`.
+are in `hidden_door`, `hidden_friction`, `hidden_arm`, `hidden_base` and `hidden_signals`.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 from droid_jax import runtime
 from droid_jax.measure.engine import split
 from droid_jax.measure.hidden_arm import ARM_EFFECTS
+from droid_jax.measure.hidden_base import BASE
 from droid_jax.measure.hidden_door import DOOR
 from droid_jax.measure.hidden_friction import FRICTION
 from droid_jax.measure.hidden_hooks import Hidden, Influence, Place, Seen, edited, step_through
@@ -27,8 +28,9 @@ from droid_jax.measure.surrogate import StandIn, SurrogateConfig, as_recording, 
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 
-HIDDEN: dict[str, Hidden] = {h.name: h for h in (*DOOR, *FRICTION, *ARM_EFFECTS, *SIGNALS)}
-# What the library of effects calls them; what is missing here it has no form of.  No two forms are the same.
+HIDDEN: dict[str, Hidden] = {h.name: h for h in (*DOOR, *FRICTION, *ARM_EFFECTS, *BASE, *SIGNALS)}
+# What the library of effects calls them; what is missing here it has no form of.  No two forms are the same, but of
+# what has one form only (a base that leans, an encoder's zero), which is computed in another way.
 LIBRARY = {
     "hinge_preload": "hinge_preload",
     "binding_spring": "hardening_spring",
@@ -45,12 +47,15 @@ LIBRARY = {
     "load_friction": "load_friction",
     "bristle_friction": "joint_coulomb",
     "warm_up_friction": "joint_coulomb",
+    "firm_friction": "soft_friction",
     "payload": "payload",
     "cable_pull": "cable_pull",
     "torque_ripple": "torque_ripple",
     "joint_elasticity": "joint_compliance",
     "servo_gains": "servo_gain",
     "grip_compliance": "contact_compliance",
+    "tilted_base": "gravity_direction",
+    "encoder_zero": "encoder_offset",
     "command_delay": "command_delay",
     "sensor_delay": "sensor_delay",
     "torque_bias": "torque_bias",
@@ -140,6 +145,8 @@ def _lacks(effect: Hidden, scene: Scene) -> str | None:
     """What a scene would need and does not have."""
     if effect.on == "hinge" and not scene.object_joint:
         return "an object joint"
+    if effect.on == "base" and not scene.model.opt.gravity.any():
+        return "gravity"
     if effect.on == "grip" and not (scene.grip and any(scene.grip.fingers)):
         return "a grip"
     return None

@@ -124,7 +124,7 @@ class Hidden:
     unit, typical: of its amplitude, and the range in which it is felt but safe on the door and the
       Panda; zero is exactly no effect.
     on: "hinge" (the object's joint), "arm" (measured joints), "joint" (measured joints, or the hinge
-      by name), "hand" (the last body), "grip" (contact pairs).
+      by name), "hand" (the last body), "base" (what the arm stands on), "grip" (contact pairs).
     make: the effect in one repeat, with a state of its own.
     what: for lists, in a few words.
     signed: a negative amplitude has a meaning.

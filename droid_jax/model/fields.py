@@ -40,6 +40,7 @@ _LIMITED = {
     "jnt_actfrcrange": "jnt_actfrclimited",
 }
 _POSITION_GAIN = (("actuator_gainprm", 0), ("actuator_biasprm", 1))  # both of them, with opposite signs
+ENCODER = "encoder_offset"
 _SERVO, _VELOCITY_GAIN = ("actuator_gainprm", "actuator_biasprm"), 2  # fields, and their column of the velocity gain
 
 
@@ -62,6 +63,8 @@ def element_name(model: mujoco.MjModel, field: str, index: Sequence[int]) -> str
 
     Of an actuator without a name it is its joint's.
     """
+    if field in ("qpos0", "qpos_spring"):
+        return model.joint(int(np.searchsorted(model.jnt_qposadr, index[0], side="right")) - 1).name
     kind = field.split("_")[0]
     if kind not in _KIND:
         return ""
@@ -287,6 +290,20 @@ def servo_scale(scene: Scene, joint: str, *, std: float = 0.03, **options: Any) 
     )
     options = {"name": f"{joint}_servo_scale", "unit": "-", "mean": 1.0, "low": 0.5, "high": 1.5, **options}
     return Parameter(std=std, writes=writes, **options)
+
+
+def encoder_offset(scene: Scene, joint: str, *, std: float, high: float, **options: Any) -> Parameter:
+    """How much further a joint stands than its encoder says, rad (m for slides); 0 at nominal (`model.encoders`).
+
+    Reference, spring and range of a joint are told in what its encoder reads: all go down by the offset.
+    """
+    row, address = scene.id("joint", joint), scene.qpos(joint)
+    entries = [("qpos0", (address,)), ("qpos_spring", (address,))]
+    entries += [("jnt_range", (row, k)) for k in (0, 1) if scene.model.jnt_limited[row]]
+    writes = tuple(write(scene, field, index, Mode.ADD, gain=-1.0) for field, index in entries)
+    options = {"name": f"{ENCODER}[{joint}]", "unit": scene.position_unit([joint]), "mean": 0.0, "low": -high,
+               "group": "Sensors", **options}  # fmt: skip
+    return Parameter(std=std, high=high, writes=writes, **options)
 
 
 def body_position(scene: Scene, body: str, axis: int, *, std: float, limit: float, **options: Any) -> Parameter:

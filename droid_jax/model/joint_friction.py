@@ -1,4 +1,4 @@
-"""Friction of a joint as the link-side torque sensor sees it: viscous, Coulomb and a constant.
+"""What the torque sensor of a joint adds: friction as it sees it on the link side, a constant, a gain.
 
     tau += viscous * qd + coulomb * tanh(qd / SMOOTHING) + torque_offset        [N m]
 
@@ -6,6 +6,8 @@ These are observation parameters: they change what is read, not how the arm move
 `joint_damping` and `joint_frictionloss` lie on the motor side, where a link-side sensor cannot see
 them; what it does see is friction of the bearings behind it.  Model: the linear friction of Gaz et al.,
 RA-L 2019, with a smooth sign (`direction`).
+
+A torque sensor of another gain reads (1 + torque_gain) tau.
 """
 
 from __future__ import annotations
@@ -21,8 +23,11 @@ from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.seam import Effect, Rollout, Theta, column
 
 SMOOTHING = 0.01  # rad/s: `direction` reaches 0.96 at twice this speed
-TERMS = ("viscous", "coulomb", "torque_offset")
-_UNITS = {"viscous": "N m s/rad", "coulomb": "N m", "torque_offset": "N m"}
+FRICTION = ("viscous", "coulomb")
+GAIN = "torque_gain"
+TERMS = (*FRICTION, "torque_offset", GAIN)
+_UNITS = {"viscous": "N m s/rad", "coulomb": "N m", "torque_offset": "N m", GAIN: "-"}
+_GROUPS = {GAIN: "Sensors"}
 _DEVIATIONS = {"viscous": 0.3, "coulomb": 0.5, "torque_offset": 0.3}  # of the prior
 
 
@@ -51,6 +56,15 @@ def joint_friction_effect(joints: Sequence[str], direction: Callable[[jax.Array]
     return Effect("joint friction", parameters=parameters, observe=observe)
 
 
+def torque_gain_effect(joints: Sequence[str]) -> Effect:
+    """Torque sensors of another gain: reads `torque_gain[joint]` of `joints`, the channel order of the scene."""
+
+    def observe(theta: Theta, rollout: Rollout) -> Rollout:
+        return replace(rollout, torque=rollout.torque * (1.0 + column(theta, GAIN, joints)))
+
+    return Effect(GAIN, observe=observe)
+
+
 def joint_friction_space(joints: Sequence[str]) -> Space:
     """Three parameters a joint, `viscous[joint]`, `coulomb[joint]` and `torque_offset[joint]`, all zero at first.
 
@@ -77,5 +91,5 @@ def sensor_parameter(
         raise ValueError(f"unknown sensor term {term!r}; valid: {', '.join(TERMS)}")
     if joint not in joints:
         raise ValueError(f"unknown joint {joint!r}; measured joints: {', '.join(joints)}")
-    options = {"unit": _UNITS[term], "mean": 0.0, "group": "Joint friction", **options}
+    options = {"unit": _UNITS[term], "mean": 0.0, "group": _GROUPS.get(term, "Joint friction"), **options}
     return Parameter(f"{term}[{joint}]", std=std, low=-high if low is None else low, high=high, **options)

@@ -22,7 +22,7 @@ from droid_jax.model.seam import Effect
 _ATTRIBUTES = {
     "dof_damping": "damping", "dof_frictionloss": "frictionloss", "dof_armature": "armature",
     "dof_solref": "solref_friction", "dof_solimp": "solimp_friction",
-    "qpos_spring": "springref",
+    "qpos_spring": "springref", "qpos0": "ref",
     "jnt_stiffness": "stiffness", "jnt_range": "range", "jnt_margin": "margin", "jnt_pos": "pos", "jnt_axis": "axis",
     "jnt_solref": "solref_limit", "jnt_solimp": "solimp_limit", "jnt_actfrcrange": "actfrcrange",
     "body_pos": "pos", "body_quat": "quat", "body_gravcomp": "gravcomp",
@@ -37,7 +37,7 @@ _ATTRIBUTES = {
 _WEIGHT = {"body_mass", "body_inertia", "body_ipos", "body_iquat"}  # written as the body's own <inertial>
 _FOLLOWING = {"geom_rbound", "geom_aabb"}  # the compiler works them out
 WORDS = frozenset({*_ATTRIBUTES, *_WEIGHT, *_FOLLOWING})  # model fields that MJCF can say
-_ANGLES = {"jnt_range", "qpos_spring"}  # written in the compiler's unit
+_ANGLES = {"jnt_range", "qpos_spring", "qpos0"}  # written in the compiler's unit
 _PLACE = {"body_pos", "body_quat"}  # written together
 # Compared with the model once more, a compiler may know more ways to work numbers out.
 _SURE = (
@@ -143,7 +143,7 @@ def _elements(spec: mujoco.MjSpec, model: mujoco.MjModel) -> dict[str, dict[int,
 
 def _write_changed(kind: str, element: Any, row: int, before: mujoco.MjModel, after: mujoco.MjModel) -> None:
     """Write into an element what differs between its rows in two models."""
-    fields = [f for f in _ATTRIBUTES if f.startswith(f"{kind}_")]
+    fields = [f for f in _ATTRIBUTES if f.startswith((f"{kind}_", f"{kind}0"))]
     changed = {f for f in fields if np.any(getattr(before, f)[row] != getattr(after, f)[row])}
     if kind == "geom" and before.geom_type[row] in _OF_FILES:  # compiled numbers hold the file's own frame
         changed -= _SHAPE

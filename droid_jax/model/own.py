@@ -9,8 +9,9 @@ Every entry needs field, element, std and high; optional: column, name, unit, me
 
     {"sensor": "coulomb", "element": "elbow", "std": 0.5, "high": 5}
 
-What a torque sensor sees beyond the model has "sensor" in place of "field": viscous, coulomb or
-torque_offset of a joint (model/joint_friction.py), zero at first and between -high and high.
+What a joint's sensors see beyond the model has "sensor" in place of "field": viscous, coulomb, torque_offset,
+torque_gain (model/joint_friction.py) or encoder_offset (model/encoders.py) of a joint, zero at first and between -high
+and high.
 
     {"sensor": "time_offset", "std": 0.001, "high": 0.05}
     {"servo": "elbow", "std": 0.03}
@@ -32,8 +33,8 @@ import msgspec
 from droid_jax.arguments import instance, path_of
 from droid_jax.errors import faults
 from droid_jax.model.door import time_offset
-from droid_jax.model.fields import body_mass, model_parameter, servo_scale
-from droid_jax.model.joint_friction import sensor_parameter
+from droid_jax.model.fields import ENCODER, body_mass, encoder_offset, model_parameter, servo_scale
+from droid_jax.model.joint_friction import TERMS, sensor_parameter
 from droid_jax.model.parameters import Mode, Parameter, Scaling, Space
 from droid_jax.model.scene import Scene
 from droid_jax.read_json import read_json, typed
@@ -124,6 +125,11 @@ def _parameter(scene: Scene, entry: Any, where: str) -> Parameter:
         if sensor == _TIME:
             return replace(time_offset(options.pop("std"), options.pop("high")), **options)
         element = options.pop("element")
+        if sensor is not None and sensor not in (*TERMS, ENCODER):
+            raise ValueError(f"unknown sensor term {sensor!r}; valid: {', '.join((*TERMS, ENCODER))}")
+        if sensor == ENCODER:
+            _check_measured(scene, element)
+            return encoder_offset(scene, element, **options)
         if sensor is not None:
             return sensor_parameter(scene.joints, sensor, element, **options)
         if field == "body_mass" and options.get("mode", Mode.SET) is Mode.SET:
@@ -132,6 +138,11 @@ def _parameter(scene: Scene, entry: Any, where: str) -> Parameter:
         return model_parameter(scene, field, element, options.pop("column", None), **{"unit": "", **options})
     except (ValueError, TypeError) as error:
         raise ValueError(f"{where}: {error}") from None
+
+
+def _check_measured(scene: Scene, joint: str) -> None:
+    if joint not in scene.joints:
+        raise ValueError(f"unknown joint {joint!r}; measured joints: {', '.join(scene.joints)}")
 
 
 def _useless(entry: Mapping[str, Any]) -> tuple[str, ...]:

@@ -29,6 +29,7 @@ class State:
     load: [nv] N m, in a servo replay the actuators' torque in the step before, along a prescribed motion the torque
     of the same instant, without effects.
     model: the sample's mjx.Model, with the values of its parameters (fitted servo gains, say).
+    pose: mjx.Data with the kinematics of qpos, for forces; None where nobody has worked them out.
     """
 
     time: jax.Array
@@ -36,6 +37,7 @@ class State:
     qvel: jax.Array
     load: jax.Array
     model: Any = None
+    pose: Any = None
 
 
 @jax.tree_util.register_dataclass
@@ -85,6 +87,7 @@ class Effect:
                   them the effect is of no interest to the search.
     shapes:       parameters that matter only beside an amplitude, and the values to try.
     smallest:     amplitude below which it is not worth a name, in its own unit.
+    ends:         amplitudes whose bounds are where nature ends (friction that is wholly firm): a fit may stand there.
     """
 
     name: str
@@ -102,6 +105,7 @@ class Effect:
     places: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     shapes: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     smallest: float = 0.0
+    ends: tuple[str, ...] = ()
 
 
 def complete(theta: Theta, effects: Sequence[Effect]) -> Theta:

@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jax.core import Tracer
 
 from droid_jax.model.actuators import drives_joint
 from droid_jax.model.ignored import check_options
@@ -28,11 +29,20 @@ from droid_jax.model.quiet_mjx import mjx
 
 ITERATIONS = 8  # at most; two or three are usual from a warm start
 LINE_SEARCH = 6  # corners of the piecewise linear slope followed in one step
+FIRM_LINE_SEARCH = 12  # the same where joint friction is firm: its part of the slope is steep and narrow
+FIRM = 0.95  # impedance of a friction constraint above which it is
 _TOLERANCE = 3e-6  # of the acceleration's scale: what float32 can still tell apart
 _ROUNDING = 1e-5  # of a Newton step: how exactly float32 solves for it
 
 
-def step(model: Any, data: Any, *, parity: bool = False, servo_damping: bool = True) -> Any:
+def step(
+    model: Any,
+    data: Any,
+    *,
+    parity: bool = False,
+    servo_damping: bool = True,
+    push: Callable[[Any], jax.Array] | None = None,
+) -> Any:
     """Advance mjx.Data by one time step; integrators Euler and implicitfast.
 
     parity=False: second order in the time step.  Positions belong to the time of the step,
@@ -40,12 +50,14 @@ def step(model: Any, data: Any, *, parity: bool = False, servo_damping: bool = T
       velocity of the step, and constraints are solved with the inertia that follows, M + h/2 D.
     parity=True: what C MuJoCo's implicitfast and Euler do, first order, for comparisons step by step.
     servo_damping: False spares what only actuators with a velocity gain need (see `actuators.has_servo_damping`).
+    push: mjx.Data with the kinematics of the pose -> [nv] generalised forces, which take the place of qfrc_applied.
     Leaves out what no replay reads: sensors, cameras, lights.
     Raises ValueError for other integrators, and for elliptic cones, air and water unless parity.
     """
     check_options(model, parity)
     with exact_segments(), contextlib.nullcontext() if parity else midpoint_constraints():
         data = mjx.fwd_position(model, data)
+    data = data if push is None else data.replace(qfrc_applied=push(data))
     data = mjx.fwd_velocity(model, data)
     data = mjx.fwd_actuation(model, data)
     data = mjx.fwd_acceleration(model, data)
@@ -62,7 +74,7 @@ def step(model: Any, data: Any, *, parity: bool = False, servo_damping: bool = T
     elif model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
         data = mjx.solve(model, data)
     else:
-        data = solve(inertia, data)
+        data = solve(inertia, data, FIRM_LINE_SEARCH if _may_be_firm(model) else LINE_SEARCH)
     if not parity:
         return mjx.euler(_undamped(model), data)
     if not _is_euler(model):
@@ -121,12 +133,19 @@ def _undamped(model: Any) -> Any:
     return model.replace(opt=model.opt.replace(disableflags=flags))
 
 
-def solve(inertia: jax.Array, data: Any) -> Any:
+def _may_be_firm(model: Any) -> bool:
+    """Whether a joint's friction is firm, or may be because its impedance is a parameter."""
+    if isinstance(model.dof_solimp, Tracer):
+        return True
+    return bool(np.any(np.asarray(model.dof_solimp)[np.asarray(model._impl.dof_hasfrictionloss), 0] > FIRM))
+
+
+def solve(inertia: jax.Array, data: Any, corners: int = LINE_SEARCH) -> Any:
     """Newton's method on the primal problem of MuJoCo's solver, from the warm start.
 
     min over a: a^T M a / 2 - a^T f + sum_i s_i(J_i a - aref_i), with the smooth forces f and s_i
     quadratic while a row is active (equality: always; dry friction: inside its bounds; the rest:
-    while negative).  inertia: [nv, nv] M, or what the integrator will use in its place.
+    while negative).  inertia: [nv, nv] M, or what the integrator will use in its place.  corners: followed in a step.
     Source: MuJoCo documentation, "Computation", section "Solver" (primal problem).
     """
     rows = data._impl
@@ -149,7 +168,9 @@ def solve(inertia: jax.Array, data: Any) -> Any:
         factor = jax.lax.linalg.cholesky(hessian, symmetrize_input=False)
         change = _solve_factored(factor, _times(jacobian.T, force) - pull)
         along = _times(jacobian, change)
-        share = _line_search(forces, residual, along, _dot(pull, change), _dot(change, _times(inertia, change)))
+        share = _line_search(
+            forces, residual, along, _dot(pull, change), _dot(change, _times(inertia, change)), corners
+        )
         qacc, residual = qacc + share * change, residual + share * along
         force, new_curvature = forces(residual)
         # What is left of the way: all of it, but where no row changed sides the problem was quadratic
@@ -208,6 +229,7 @@ def _line_search(
     along: jax.Array,
     linear: jax.Array,
     quadratic: jax.Array,
+    corners: int,
 ) -> jax.Array:
     """Root of the cost's slope along a step: Newton's method on the share taken, kept in a bracket.
 
@@ -217,7 +239,7 @@ def _line_search(
     low: jax.Array = jnp.zeros(())
     high: jax.Array = jnp.full((), jnp.inf)
     share: jax.Array = jnp.ones(())
-    for _ in range(LINE_SEARCH):
+    for _ in range(corners):
         force, curvature = forces(residual + share * along)
         slope = linear + share * quadratic - _dot(force, along)
         low, high = jnp.where(slope < 0, share, low), jnp.where(slope < 0, high, share)

@@ -14,10 +14,11 @@ import numpy as np
 from brax.envs.base import Env
 from brax.envs.base import State as EnvState
 
-from droid_jax.compare.replay import check_stateless, pushed, rubbing, servo_given, through
+from droid_jax.compare.replay import check_stateless, push, rubbing, servo_given, through
 from droid_jax.measure.demonstration import OPEN, grasp_pose, solve_pose
 from droid_jax.model.actuators import has_servo_damping
 from droid_jax.model.effects.registry import ready
+from droid_jax.model.encoders import encoder_error
 from droid_jax.model.physics import Physics
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, State, Theta, complete
@@ -156,8 +157,9 @@ class DoorEnv(Env):
             data = self._template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm, ctrl=ctrl)
             after = simulate_step(
                 rubbing(model, theta, now, self.effects),
-                pushed(data, theta, now, self.effects),
+                data,
                 servo_damping=self._servo_damping,
+                push=push(theta, now, self.effects, encoder_error(self.scene, model)),
             )
             force = finger_forces(self._hand, after)
             return (after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator, force), None

@@ -86,6 +86,12 @@ ANSWERS: dict[str, Answer] = {
         "servo_gain", ("joint_compliance",), "a lower gain is exactly an elastic gear's", SERVO
     ),
     "grip_compliance": Answer("contact_compliance"),
+    "firm_friction": Answer("soft_friction", scenes=("bench",), why="only the elbow there has friction of its own"),
+    "tilted_base": Answer("gravity_direction", scenes=("bench", "arm", "door")),
+    "encoder_zero": Answer(
+        "encoder_offset", ("gravity_direction",), "of links in one plane a lean is an offset of the first joint",
+        ("bench", "arm", "door"),
+    ),
     "command_delay": Answer(
         "command_delay", ("sensor_delay",), "positions are not scored", HINGED
     ),
@@ -99,13 +105,14 @@ ANSWERS: dict[str, Answer] = {
     "torque_drift": Answer("torque_drift", ("torque_bias",), "it warms up mostly between the repeats"),
 }  # fmt: skip
 NO_HINGE = ("cable_pull", "torque_ripple", "dry_friction", "bristle_friction", "warm_up_friction", "load_friction",
-            "joint_elasticity", "backlash", "servo_gains")  # fmt: skip
-PLACES = {"command_delay": "commands", "sensor_delay": "sensors", "contact_compliance": "grip"}
+            "joint_elasticity", "backlash", "servo_gains", "firm_friction", "encoder_zero")  # fmt: skip
+PLACES = {"command_delay": "commands", "sensor_delay": "sensors", "contact_compliance": "grip",
+          "gravity_direction": "base"}  # fmt: skip
 OF_HINGE = frozenset({
     "hinge_preload", "tilted_frame", "hardening_spring", "over_centre_spring", "latch", "door_closer", "opening_check",
     "drag", "angle_friction", "hinge_stribeck", "hinge_directional",
 })  # fmt: skip
-WHOLE = ("command_delay", "sensor_delay", "payload", "grip_compliance")  # not one joint's
+WHOLE = ("command_delay", "sensor_delay", "payload", "grip_compliance", "tilted_base")  # not one joint's
 
 
 def inside(name: str) -> bool:
@@ -116,7 +123,7 @@ def inside(name: str) -> bool:
 def targets(setting: Setting, name: str) -> tuple[str, ...]:
     """Joints on which something is hidden in a scene ("" for none in particular); empty where it cannot be.
 
-    Dry friction of a joint whose friction is a base parameter is no missing effect.
+    Dry friction of a joint whose friction is a base parameter is no missing effect; where there is none, none is firm.
     """
     scene, answer, hidden = setting.scene, ANSWERS[name], HIDDEN[name]
     if answer.scenes and setting.name not in answer.scenes:
@@ -130,6 +137,8 @@ def targets(setting: Setting, name: str) -> tuple[str, ...]:
     joints = (*arm, str(scene.object_joint)) if on_hinge and (sensed or hidden.on == "joint") else arm
     if answer.exact == "joint_coulomb":
         joints = tuple(j for j in joints if f"{j}_frictionloss" not in setting.base.names)
+    if answer.exact == "soft_friction":
+        joints = tuple(j for j in joints if scene.spec.joint(j).frictionloss > 0)
     return joints
 
 

@@ -166,9 +166,14 @@ def test_hinge_effects_act_on_the_hinge_only(scene: Scene, name: str):
     assert not applied[1:].any() and not loss[1:].any() and not control.any()
 
 
-@pytest.mark.parametrize("name", [h.name for h in HIDDEN.values() if h.on in ("arm", "joint")])
+@pytest.mark.parametrize(
+    "name", [h.name for h in HIDDEN.values() if h.on in ("arm", "joint") and h.name != "firm_friction"]
+)
 def test_joint_effects_act_on_their_joint_only(scene: Scene, demonstration: Recording, plain: Recording, name: str):
-    """The flap is not coupled to the arm: its torque, noise included, is the same to the bit."""
+    """The flap is not coupled to the arm: its torque, noise included, is the same to the bit.
+
+    Firm friction is of the flap alone, which has some, and has tests of its own.
+    """
     recording = hidden(scene, demonstration, Applied(name, HIDDEN[name].typical[1], "elbow"))
     difference = np.abs(recording.channel("torque").values - plain.channel("torque").values)[0].max(axis=0)
     assert difference[0] == 0.0 and difference[2] > 1e-4
@@ -222,12 +227,12 @@ def test_what_cannot_be_is_refused(scene: Scene, demonstration: Recording):
 def test_every_effect_says_what_it_is():
     for name, effect in HIDDEN.items():
         assert effect is hidden_effect(name) and effect.what and effect.unit
-        assert effect.on in ("hinge", "arm", "joint", "hand", "grip")
+        assert effect.on in ("hinge", "arm", "joint", "hand", "base", "grip")
 
 
 def test_the_hidden_effects_know_nothing_of_the_programs_library():
     files = sorted(Path(hidden_hooks.__file__).parent.glob("hidden*.py"))
-    assert len(files) == 6
+    assert len(files) == 7
     for file in files:
         for node in ast.walk(ast.parse(file.read_text())):
             if isinstance(node, ast.ImportFrom):
@@ -519,6 +524,86 @@ def test_grip_compliance_softens_the_grips_pairs(scene: Scene):
     model = live_at(scene).model
     made(scene, "grip_compliance", 0.001).edit(model)  # type: ignore[misc]
     assert model.pair_solimp[0, 2] == pytest.approx(0.002) and model.pair_solref[0, 0] == pytest.approx(0.02 * 1.4)
+
+
+# ----- the base and the encoders
+
+
+def compensated(scene: Scene, share: float) -> Scene:
+    """The small scene with every body's weight compensated in that share."""
+    model = copy.copy(scene.model)
+    model.body_gravcomp[:] = share
+    return replace(scene, model=model)
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_a_tilted_base_is_gravity_turned_and_an_upright_compensation(scene: Scene, share: float):
+    """Against MuJoCo's own gravity, of which the compensation is a vector by hand; the flap hangs upright."""
+    q, v, lean = (0.3, 0.7, -0.9), (0.2, 1.0, -2.0), 0.03
+    scene = compensated(scene, share)
+    live, influence = live_at(scene, q, v), made(scene, "tilted_base", lean)
+    influence.edit(live.model)  # type: ignore[misc]
+    stepped(influence, live)
+    mujoco.mj_forward(live.model, live.data)
+    got = live.data.qfrc_applied + live.data.qfrc_passive - live.data.qfrc_bias
+
+    line, turned, quaternion = np.array([math.cos(0.6), math.sin(0.6), 0.0]), np.zeros(3), np.zeros(4)
+    mujoco.mju_axisAngle2Quat(quaternion, line, lean)
+    mujoco.mju_rotVecQuat(turned, np.array([0.0, 0.0, -9.81]), quaternion)
+    upright = live_at(scene, q, v)
+    mujoco.mj_forward(upright.model, upright.data)
+    leaning = live_at(compensated(scene, 0.0), q, v)
+    leaning.model.opt.gravity[:] = turned
+    mujoco.mj_forward(leaning.model, leaning.data)
+    expected = leaning.data.qfrc_passive - leaning.data.qfrc_bias + upright.data.qfrc_gravcomp
+    np.testing.assert_allclose(got[1:], expected[1:], atol=1e-12)
+    as_it_hangs = upright.data.qfrc_passive - upright.data.qfrc_bias
+    assert got[0] == pytest.approx(as_it_hangs[0], abs=1e-12)
+    assert np.abs(got - as_it_hangs).max() > 0.05
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_an_encoders_zero_shifts_where_the_joint_stands_and_what_holds_its_weight(
+    scene: Scene, demonstration: Recording, share: float
+):
+    """Held still, the servo gives what the true pose asks for beyond the compensation of the pose that is read."""
+    scene, off = compensated(scene, share), 0.05
+    still = replace(demonstration, command=np.tile([0.0, 0.9, 0.3], (401, 1)))
+    still = replace(still, qpos0={"flap": 0.0, "shoulder": 0.9, "elbow": 0.3})
+    quiet = dict(torque_noise=(0.0, 0.0), torque_drift=(0.0, 0.0), position_noise=0.0, start_noise=0.0)
+    recording = hidden(scene, still, Applied("encoder_zero", off, "elbow"), **quiet)
+    torque, read = (recording.channel(name).values[0, -1].astype(float) for name in ("torque", "position"))
+    true = live_at(compensated(scene, 0.0), np.add(read, [0.0, 0.0, off]).tolist())
+    seen = live_at(scene, read)
+    for live in (true, seen):
+        mujoco.mj_forward(live.model, live.data)
+    np.testing.assert_allclose(torque, true.data.qfrc_bias - seen.data.qfrc_gravcomp, atol=0.01)
+    np.testing.assert_allclose(torque, [60, 200, 100] * (np.array([0.0, 0.9, 0.3]) - read), atol=1e-3)
+    assert recording.channel("position").values[0, 0, 2] == pytest.approx(0.3, abs=1e-6)
+
+
+def test_firm_friction_holds_what_mujocos_lets_creep():
+    """0.2 of 0.3 N m at an inertia of 0.03 kg m2: 7 mrad/s in MuJoCo; where it is firm it bends, and stands."""
+    mjcf = """<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="j" armature="0.03" frictionloss="0.3"/>
+      <inertial pos="0 0 0" mass="1e-3" diaginertia="1e-9 1e-9 1e-9"/></body></worldbody>
+      <actuator><motor joint="j"/></actuator></mujoco>"""
+    scene = compile_scene(mujoco.MjSpec.from_string(mjcf), "held")
+    clock = np.arange(1001) / 500
+    push = Recording("push", clock, np.full((1001, 1), 0.2), ("j",), {}, TorqueConvention(TorqueSide.MOTOR, True))
+    push = replace(push, qpos0={"j": 0.0})
+    quiet = dict(torque_noise=(0.0, 0.0), torque_drift=(0.0, 0.0), position_noise=0.0, start_noise=0.0)
+
+    def path(share: float) -> np.ndarray:
+        """[T] rad at 500 Hz."""
+        return hidden(scene, push, Applied("firm_friction", share), **quiet).channel("position").values[0, :, 0]
+
+    creep = 0.2 * (0.1 / 0.9) / (2 / 0.95 / 0.02) / 0.03  # rad/s
+    assert path(0.0)[-1] == pytest.approx(2.0 * creep, rel=0.02)
+    firm, half = path(1.0), path(0.5)
+    assert 0.0 < firm[500] < 0.002 and firm[-1] - firm[500] < 1e-6
+    assert 0.0 < half[-1] - half[500] < 0.6 * creep
+    with pytest.raises(ValueError, match="at most 1"):
+        path(1.5)
 
 
 # ----- signals

@@ -11,6 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from droid_jax.model.effects.sizes import sized
+from droid_jax.model.fields import ENCODER
+from droid_jax.model.joint_friction import GAIN
 from droid_jax.model.parameters import Scaling, Space
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
 from droid_jax.model.seam import Effect
@@ -133,6 +135,28 @@ def joined(base: Space, effects: Iterable[Effect]) -> Space:
             'file of parameters with "name", or leave these effects away (gap --without)'
         )
     return base + effect_space(effects)
+
+
+def beside(base: Space, effects: Iterable[Effect]) -> tuple[Effect, ...]:
+    """Effects less their places where the base has the sensor parameters that they would ask about.
+
+    A sensor's gain or an encoder's offset that is fitted as a parameter is no missing effect there.
+    """
+    taken = {f"{term}[{joint}]" for term in (GAIN, ENCODER) for joint in _joints_of(base)} & {*base.names}
+    found = []
+    for effect in effects:
+        if not taken & {p.name for p in effect.parameters}:
+            found.append(effect)
+            continue
+        places = {at: names for at, names in effect.places.items() if not taken & {*names}}
+        if places:
+            left = tuple(p for p in effect.parameters if p.name not in taken)
+            found.append(replace(effect, places=places, parameters=left))
+    return tuple(found)
+
+
+def _joints_of(base: Space) -> set[str]:
+    return {name[name.index("[") + 1 : -1] for name in base.names if name.endswith("]")}
 
 
 def effect_space(effects: Iterable[Effect]) -> Space:

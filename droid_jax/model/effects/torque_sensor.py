@@ -4,10 +4,11 @@ from dataclasses import replace
 
 from droid_jax.model.effects import amplitudes as a
 from droid_jax.model.effects.registry import register
+from droid_jax.model.joint_friction import GAIN, torque_gain_effect
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect, column
 
-BIAS, GAIN, DRIFT = "torque_bias", "torque_gain", "torque_drift"
+BIAS, DRIFT = "torque_bias", "torque_drift"
 
 
 @register
@@ -32,14 +33,10 @@ def torque_bias(scene: Scene) -> Effect | None:
 @register
 def torque_gain(scene: Scene) -> Effect | None:
     """(1 + g) tau."""
-
-    def observe(theta, rollout):
-        return replace(rollout, torque=rollout.torque * (1.0 + column(theta, GAIN, scene.joints)))
-
     return Effect(
         GAIN,
         a.of_joints(GAIN, scene.joints, "-", 0.03, 0.3),
-        observe=observe,
+        observe=torque_gain_effect(scene.joints).observe,
         what="a wrong gain of a joint's torque sensor",
         mark="one joint, in proportion to its torque",
         confused_with=("servo_gain", "load_friction"),

@@ -16,6 +16,9 @@ ELBOW_REFERENCE = 0.2  # rad, as in the MJCF
 LEAN = (0.05, -0.08)  # of gravity, to x and to y
 MOMENT = 2.0 * 0.2  # kg m: the panel's mass times its distance from the hinge; shut, it lies along x
 GRAVITY = 9.81
+FOREARM = 0.5 * 0.125 + 0.6 * 0.25  # kg m about the elbow: forearm and hand, both compensated
+CARRIED = 1.1 * 0.3  # kg m about the shoulder, of their mass at the elbow
+UPPER_ARM = 1.5 * 0.15 + CARRIED
 
 
 @dataclass(frozen=True)
@@ -103,6 +106,46 @@ def hangs_further_out(v: Values, now: Now) -> ByJoint:
     return dict.fromkeys(ARM, -GRAVITY * v["payload_moment"] * np.sin(leans))
 
 
+def leaning(v: Values, now: Now) -> ByJoint:
+    """Gravity turned about y pushes the arm's masses along x (and less downwards), nobody compensates the difference.
+
+    Every mass hangs straight below its joint where all angles are zero.
+    """
+    shift = GRAVITY * np.array([-np.sin(v["gravity_about_y"]), 1 - np.cos(v["gravity_about_y"])])  # along x and z
+
+    def pull(angle: float, moment: float) -> float:  # about y, of a mass that hangs at an angle from straight down
+        return moment * (-np.cos(angle) * shift[0] + np.sin(angle) * shift[1])
+
+    upper, lower = now.q["shoulder"], now.q["shoulder"] + now.q["elbow"] - ELBOW_REFERENCE
+    behind = pull(lower, FOREARM)
+    return {"shoulder": pull(upper, UPPER_ARM) + behind, "elbow": behind}
+
+
+def compensated_elsewhere(v: Values, now: Now) -> ByJoint:
+    """What carries forearm and hand where the encoders have them, less what carries them where they are."""
+    off = {j: v[f"encoder_offset[{j}]"] for j in ARM}
+    upper, lower = now.q["shoulder"], now.q["shoulder"] + now.q["elbow"] - ELBOW_REFERENCE
+
+    def carried(upper: float, lower: float) -> np.ndarray:
+        elbow = GRAVITY * FOREARM * np.sin(lower)
+        return np.array([elbow + GRAVITY * CARRIED * np.sin(upper), elbow])
+
+    there = carried(upper + off["shoulder"], lower + off["shoulder"] + off["elbow"])
+    return dict(zip(ARM, carried(upper, lower) - there, strict=True))
+
+
+def turned_encoders(spec: mujoco.MjSpec, v: Values) -> None:
+    """Joints are where they are at lower readings."""
+    for name in ARM:
+        joint = spec.joint(name)
+        joint.ref, joint.springref = joint.ref - v[f"encoder_offset[{name}]"], -v[f"encoder_offset[{name}]"]
+
+
+def firmer(spec: mujoco.MjSpec, v: Values) -> None:
+    share, joint = v["friction_firmness[elbow]"], spec.joint("elbow")
+    joint.solimp_friction[:2] = [0.9 + share * 0.0999, 0.95 + share * 0.0499]
+
+
 def other_gains(spec: mujoco.MjSpec, share: Callable[[float, str], float]) -> None:
     for actuator in spec.actuators:
         if actuator.target in ARM:
@@ -158,6 +201,10 @@ ORACLES = {
     "command_delay": Oracle({"command_delay": 0.0123}, late=lambda v: v["command_delay"]),
     "door_closer": Oracle({"closer_damping": 3.0, "closer_exponent": 1.4}, force=at_door(closer)),
     "drag": Oracle({"drag": 1.2}, force=at_door(lambda v, phi, w: -v["drag"] * w**2 * np.sign(w))),
+    "encoder_offset": Oracle(
+        each(*ARM, encoder_offset=(0.03, -0.05)), edit=turned_encoders, beside=compensated_elsewhere
+    ),
+    "gravity_direction": Oracle({"gravity_about_y": 0.04}, force=leaning),
     "hardening_spring": Oracle(
         {"hardening_square": 1.5, "hardening_cube": -0.8},
         force=at_door(lambda v, phi, w: -v["hardening_square"] * phi * abs(phi) - v["hardening_cube"] * phi**3),
@@ -206,6 +253,7 @@ ORACLES = {
         each(*ARM, servo_gain=(0.1, -0.2)),
         edit=lambda spec, v: other_gains(spec, lambda kp, j: 1 + v[f"servo_gain[{j}]"]),
     ),
+    "soft_friction": Oracle({"friction_firmness[elbow]": 0.8}, edit=firmer),
     "tilted_frame": Oracle(  # the arm's weight leans with it: the door alone
         {"tilt_sine": MOMENT * GRAVITY * LEAN[0], "tilt_cosine": -MOMENT * GRAVITY * LEAN[1]},
         edit=gravity_leans,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -152,6 +153,31 @@ def test_a_payload_is_carried(inverse: Inverse):
     assert np.abs(expected).max() > 100 * TOLERANCE
 
 
+def test_a_path_is_what_the_encoders_read(inverse: Inverse):
+    """The links ask for what they do where they are; a torque without weight lost that of the pose that is read."""
+    oracle = ORACLES["encoder_offset"]
+    neutral, got = inverse.torque({}, dict(oracle.values))
+    read, off = inverse.motion, np.array([oracle.values.get(f"encoder_offset[{j}]", 0.0) for j in JOINTS])
+    true = replace(read, position=read.position + off)
+
+    def asked(motion: Motion, gravity: bool) -> np.ndarray:
+        return mj_inverse(mujoco.MjSpec.from_string(MECHANISM), motion, gravity)
+
+    def weight(motion: Motion) -> np.ndarray:
+        return asked(motion, True) - asked(motion, False)
+
+    expected = asked(true, True) - asked(read, True)
+    if not read.torque.gravity:
+        expected = asked(true, False) - asked(read, False) + weight(true) - weight(read)
+    np.testing.assert_allclose(got - neutral, expected, atol=TOLERANCE)
+    assert np.abs(expected).max() > 100 * TOLERANCE
+
+
+def test_firm_friction_is_nothing_to_overcome(inverse: Inverse):
+    neutral, got = inverse.torque({}, dict(ORACLES["soft_friction"].values))
+    np.testing.assert_array_equal(got, neutral)
+
+
 def test_gains_of_servos_that_nobody_asks_change_nothing(inverse: Inverse):
     neutral, got = inverse.torque({}, dict(ORACLES["servo_gain"].values))
     np.testing.assert_array_equal(got, neutral)
@@ -160,7 +186,7 @@ def test_gains_of_servos_that_nobody_asks_change_nothing(inverse: Inverse):
 def test_these_are_all_effects(scene: Scene):
     """Whatever is added to the library has to find its place here."""
     left = {n for n, o in ORACLES.items() if not (o.force or o.loss or o.read)}
-    assert left == {"payload", "servo_gain", *STEERING}
+    assert left == {"payload", "servo_gain", "encoder_offset", "soft_friction", *STEERING}
     assert {e.name for e in library(scene)} == set(ORACLES)
 
 

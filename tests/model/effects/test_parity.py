@@ -15,6 +15,7 @@ TIMESTEP = 0.001  # s
 # At the same time step both engines do the same arithmetic, C in float64.  float32 resolves an angle of 1 rad to
 # 6e-8, which a servo of 80 N m/rad turns into 5e-6 N m a step; over 4000 steps 4e-5 N m were seen at most.
 PARITY = 1e-4  # N m
+FAINT = {"soft_friction": 5}  # by how many tolerances it is seen at least, of other effects by 20
 # Friction that depends on the speed closes a loop: while a joint nearly sticks, rounding of the speed comes back.
 # 2e-4 N m were seen at most.
 PARITY_RUBBING = 5e-4  # N m
@@ -97,7 +98,7 @@ def test_the_effect_is_what_c_does(exact: Bench, torques: dict[str, np.ndarray],
     np.testing.assert_allclose(torques[name][:, columns(oracle)], expected, atol=tolerance)
     places = [j for j in exact.effect(name).places if j in oracle.joints] or oracle.joints
     apart = np.abs(torques[name] - torques[""]).max(axis=0)
-    assert (apart[[JOINTS.index(j) for j in places]] > 20 * tolerance).all()
+    assert (apart[[JOINTS.index(j) for j in places]] > FAINT.get(name, 20) * tolerance).all()
 
 
 @pytest.mark.parametrize("name", ["hinge_preload", "joint_coulomb", "tilted_frame"])

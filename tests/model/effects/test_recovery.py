@@ -48,7 +48,7 @@ def check_recovery(bench: Bench, name: str, truth: Mapping[str, float]) -> None:
     assert (deviation < KNOWN * np.abs(true)).all(), (true, deviation)
 
 
-@pytest.mark.parametrize("name", ORACLES)
+@pytest.mark.parametrize("name", [n for n in ORACLES if n != "soft_friction"])  # which test_soft_friction.py has
 def test_the_effects_parameters_come_back(small: Bench, name: str):
     check_recovery(small, name, ORACLES[name].values)
 

@@ -1,0 +1,96 @@
+"""An encoder's zero as a parameter: the same robot in other readings, in the model, in C and in the MJCF."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from droid_jax.compare.cost import make_cost
+from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
+from droid_jax.model.fields import encoder_offset
+from droid_jax.model.mjcf import fitted_mjcf, unwritten
+from droid_jax.model.own import load_parameters
+from droid_jax.model.parameters import Space
+from droid_jax.model.physics import make_c_model
+from droid_jax.model.scene import Scene, compile_scene
+
+MJCF = """<mujoco><worldbody><body name="upper" gravcomp="SHARE"><joint name="shoulder" axis="0 1 0" ref="10"/>
+  <geom size="0.03" type="capsule" fromto="0 0 0 0.3 0 0" mass="2" contype="0" conaffinity="0"/>
+  <body name="fore" pos="0.3 0 0" gravcomp="SHARE">
+    <joint name="elbow" axis="0 1 0" stiffness="3" springref="20" range="-60 40" armature="0.5"/>
+    <geom size="0.02" type="capsule" fromto="0 0 0 0.3 0 0" mass="1" contype="0" conaffinity="0"/>
+    <body name="rail" pos="0.3 0 0" gravcomp="SHARE"><joint name="slide" type="slide" axis="1 0 0"/>
+      <geom size="0.02" mass="0.3" contype="0" conaffinity="0"/></body></body></body></worldbody>
+  <actuator><position joint="shoulder" kp="80"/><position joint="elbow" kp="40"/></actuator></mujoco>"""
+OFF = 0.07  # rad
+
+
+def scene_of(share: str = "0") -> Scene:
+    return compile_scene(mujoco.MjSpec.from_string(MJCF.replace("SHARE", share)), "arm")
+
+
+def loaded(folder: Path, scene: Scene, *entries: dict) -> Space:
+    path = folder / "parameters.json"
+    path.write_text(json.dumps(entries))
+    return load_parameters(path, scene)
+
+
+def forces(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
+    """Weight, springs and limits at rest, [3, nv]."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)  # a servo goes by the reading
+    mujoco.mj_forward(model, data)
+    return np.array([data.qfrc_bias, data.qfrc_passive, data.qfrc_constraint])
+
+
+@pytest.mark.parametrize("reading", [-0.4, 0.8])  # the second beyond its limit of 40 degrees
+def test_the_robot_is_the_same_at_readings_lower_by_the_offset(reading: float):
+    scene = scene_of()
+    space = Space((encoder_offset(scene, "elbow", std=0.02, high=0.1),))
+    model = make_c_model(scene, space, np.array([OFF]))
+    read = np.array([0.3, reading, 0.05])
+    expected = forces(scene.model, np.add(read, [0.0, OFF, 0.0]))
+    np.testing.assert_allclose(forces(model, read), expected, atol=1e-9)
+    assert (np.abs(expected[2]).max() > 0.1) == (reading > 0)
+    written = mujoco.MjModel.from_xml_string(fitted_mjcf(scene, space, np.array([OFF])))
+    np.testing.assert_allclose(forces(written, read), expected, rtol=1e-4, atol=1e-4)
+    assert unwritten(scene, space) == ()
+
+
+def test_a_file_asks_for_it_by_the_sensor(tmp_path: Path):
+    scene = scene_of()
+    entry = {"sensor": "encoder_offset", "element": "elbow", "std": 0.02, "high": 0.1}
+    p = loaded(tmp_path, scene, entry)["encoder_offset[elbow]"]
+    assert (p.unit, p.mean, p.low, p.high, p.std, p.nuisance) == ("rad", 0.0, -0.1, 0.1, 0.02, False)
+    assert {w.element for w in p.writes} == {"elbow"}
+    gain = loaded(tmp_path, scene, {**entry, "sensor": "torque_gain"})["torque_gain[elbow]"]
+    assert (gain.unit, gain.mean, gain.writes) == ("-", 0.0, ())
+    for change, says in (
+        ({"element": "slide"}, "unknown joint 'slide'; measured joints: shoulder, elbow"),
+        ({"name": "zero"}, "leave name out"),
+        ({"sensor": "encoder"}, "unknown sensor term 'encoder'; valid: .*torque_gain, encoder_offset"),
+    ):
+        with pytest.raises(ValueError, match=f"entry 1: .*{says}"):
+            loaded(tmp_path, scene, {**entry, **change})
+
+
+def test_c_compensates_by_the_joint_and_says_so():
+    """The C engine replays encoders' zeros where nothing is compensated."""
+    scene, clock = scene_of("1"), np.arange(0, 0.4, 0.002)
+    size = (1, len(clock), 2)
+    torque = Channel(
+        "torque", "N m", scene.joints, clock, np.random.default_rng(0).normal(size=size), np.ones(size, bool)
+    )
+    convention = TorqueConvention(TorqueSide.MOTOR, gravity=False)
+    start = dict.fromkeys(scene.joints, 0.0)
+    recording = Recording(
+        "still", clock, np.zeros((len(clock), 2)), scene.joints, {"torque": torque}, convention, start
+    )
+    space = Space((encoder_offset(scene, "elbow", std=0.02, high=0.1),))
+    with pytest.raises(ValueError, match="compensates gravity where joints are, not where encoders say: use MJX"):
+        make_cost(scene, space, [recording], engine="mujoco").distances(space.mean[None])
