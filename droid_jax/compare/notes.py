@@ -18,6 +18,7 @@ from droid_jax.model.scene import Scene
 BEGINNING = 0.02  # s (six rows at least), in which the speed at the start is looked at
 MOVING = 0.25  # of the motion's largest speed: a joint that is faster at the start does not begin at rest
 BEYOND = 0.05  # of its range, by which a joint may be outside of it unremarked
+PERCENT = 100.0  # what drivers of small servos normalise a joint's travel to
 TURNS = 4  # from its zero, that a hinge without a range is believed to make; degrees look like that from 25 on
 
 
@@ -156,7 +157,11 @@ def _check_reach(scene: Scene, joint: str, path: np.ndarray, begin: str) -> None
     if low < high:  # whether the replay holds it there or not
         beyond = np.maximum(low - path, path - high)
         worst = int(np.nanargmax(beyond))
-        unit = "m: are these millimetres?" if slide else "rad: are these degrees?"
+        unit = (
+            f"m: are these millimetres?{_other_units(path)}"
+            if slide
+            else f"rad: are these degrees?{_other_units(path)}"
+        )
         if beyond[worst] > high - low:
             raise ValueError(f"{begin} {path[worst]:.4g}, far outside its range {low:.4g} .. {high:.4g} {unit}")
         if beyond[worst] > BEYOND * (high - low):
@@ -165,4 +170,14 @@ def _check_reach(scene: Scene, joint: str, path: np.ndarray, begin: str) -> None
         turns = np.abs(path) / (2 * np.pi)
         worst = int(np.nanargmax(turns))
         if turns[worst] > TURNS:
-            warnings.warn(f"{begin} {path[worst]:.4g} rad, {turns[worst]:.3g} turns: are these degrees?", stacklevel=3)
+            units = f"are these degrees?{_other_units(path)}"
+            warnings.warn(f"{begin} {path[worst]:.4g} rad, {turns[worst]:.3g} turns: {units}", stacklevel=3)
+
+
+def _other_units(path: np.ndarray) -> str:
+    """What else than degrees or millimetres a path [K] may be in, as a question."""
+    seen = path[~np.isnan(path)]
+    counts = len(seen) > 1 and np.ptp(seen) > 1 and bool(np.all(seen == np.round(seen)))
+    if counts and np.abs(seen).max() > PERCENT:
+        return " Or encoder counts?"
+    return " Or normalised to -100 .. 100, or 0 .. 100?" if np.abs(seen).max() <= PERCENT else ""

@@ -106,6 +106,16 @@ def test_degrees_are_no_radians(measured: bool, limited: str):
         check_range(scene, replace(fine, qpos0={"elbow": -17.2}))
 
 
+def test_normalised_positions_and_encoder_counts_are_named(scene: Scene):
+    fine = recording()
+    percent = replace(fine, command=60.0 * np.sin(5.0 * fine.time)[:, None] * np.ones(2))
+    with pytest.warns(UserWarning, match=r"turns: are these degrees\? Or normalised to -100 \.\. 100, or 0 \.\. 100\?"):
+        check_range(scene, percent)
+    counts = replace(fine, command=np.round(2048.0 + 300.0 * np.sin(5.0 * fine.time)[:, None] * np.ones(2)))
+    with pytest.warns(UserWarning, match=r"turns: are these degrees\? Or encoder counts\?"):
+        check_range(scene, counts)
+
+
 def test_a_little_outside_of_a_range_may_be_degrees_too(scene: Scene):
     """Eight degrees are twice as far as an arm can reach that turns by four radians; a servo overshoots by less."""
     xml = ARM.format(gravcomp='gravcomp="1"', friction='range="-2 2"', sensor="")
