@@ -204,7 +204,7 @@ ORACLES = {
     "encoder_offset": Oracle(
         each(*ARM, encoder_offset=(0.03, -0.05)), edit=turned_encoders, beside=compensated_elsewhere
     ),
-    "gravity_direction": Oracle({"gravity_about_y": 0.04}, force=leaning),
+    "gravity_direction": Oracle({"gravity_about_y": 0.04}, force=leaning, joints=ARM),
     "hardening_spring": Oracle(
         {"hardening_square": 1.5, "hardening_cube": -0.8},
         force=at_door(lambda v, phi, w: -v["hardening_square"] * phi * abs(phi) - v["hardening_cube"] * phi**3),
