@@ -314,11 +314,8 @@ def kills(out: Path) -> dict[str, Any]:
     """How many killed runs resumed to the same result, of kills.json; null where there is none."""
     path = out / "kills.json"
     found = json.loads(path.read_text()) if path.is_file() else {}
-    return {
-        "kills": found.get("kills"),
-        "kills_resumed_identical": found.get("kills_resumed_identical"),
-        "kills_commit": found.get("commit"),
-    }
+    keys = ("kills", "kills_resumed_identical", "kills_resumed_to_an_end")
+    return {**{key: found.get(key) for key in keys}, "kills_commit": found.get("commit")}
 
 
 if __name__ == "__main__":
