@@ -70,7 +70,7 @@ def name(value: Any, what: str, *, file: bool = False, empty: bool = False) -> s
 
 def names(value: Any, what: str, *, empty: bool = True) -> tuple[str, ...]:
     """Several names, none of them twice; one text is no list of its letters."""
-    if isinstance(value, (str, bytes)) or not isinstance(value, Iterable):
+    if not listed(value):
         raise ValueError(f"{what} must be a list of names, got {shown(value)}")
     out = tuple(name(one, f"{what}, entry {i}") for i, one in enumerate(value, 1))
     if not out and not empty:
@@ -78,6 +78,13 @@ def names(value: Any, what: str, *, empty: bool = True) -> tuple[str, ...]:
     if twice := sorted({one for one in out if out.count(one) > 1}):
         raise ValueError(f"{what} must be unique, repeated: {', '.join(twice)}")
     return out
+
+
+def listed(value: Any) -> bool:
+    """Whether a value has entries: texts and arrays without axes have none."""
+    return (
+        isinstance(value, Iterable) and not isinstance(value, (str, bytes, PathLike)) and getattr(value, "ndim", 1) > 0
+    )
 
 
 def note(value: Any, what: str) -> str:
@@ -203,7 +210,7 @@ def instance(value: Any, what: str, kind: type[Kind]) -> Kind:
 
 def instances(value: Any, what: str, kind: type[Kind], *, empty: bool = True) -> tuple[Kind, ...]:
     """A list of objects of a class."""
-    if isinstance(value, (str, bytes, dict)) or not isinstance(value, Iterable):
+    if isinstance(value, dict) or not listed(value):
         raise ValueError(f"{what} must be a list of {kind.__name__} objects, got {_got(value)}")
     out = tuple(instance(one, f"{what}, entry {i}", kind) for i, one in enumerate(value))
     if not out and not empty:
@@ -213,8 +220,9 @@ def instances(value: Any, what: str, kind: type[Kind], *, empty: bool = True) ->
 
 def path_of(value: Any, what: str) -> Path:
     """A path, given as one or as text."""
-    if not isinstance(value, (str, PathLike)) or "\0" in str(value) or len(str(value)) > LONGEST_PATH:
+    if not isinstance(value, (str, PathLike)) or len(str(value)) > LONGEST_PATH:
         raise ValueError(f"{what} must be text or a Path, got {shown(value)}")
+    printable(str(value), what)
     return Path(value)
 
 
@@ -227,7 +235,7 @@ def several(check: Callable[[Any, str], Any], count: int | None = None) -> Calla
     """A check of every entry of a list; count: how many there must be, None for one or more."""
 
     def each(value: Any, what: str) -> tuple[Any, ...]:
-        if isinstance(value, (str, bytes)) or not isinstance(value, Iterable):
+        if not listed(value):
             raise ValueError(f"{what} must be a list, got {_got(value)}")
         out = tuple(check(one, f"{what}, entry {i}") for i, one in enumerate(value))
         if not out or len(out) != (count or len(out)):

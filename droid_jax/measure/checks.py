@@ -181,11 +181,13 @@ def _check_command(recording: Recording, where: str, allow_jitter: bool) -> None
 
 def _check_channel(channel: Channel, key: str, where: str, allow_jitter: bool) -> None:
     here = f"{where}, channel {key!r}"
-    if channel.name != key or not re.fullmatch(r"[A-Za-z]\w*", key):
-        raise ValueError(f"{here}: a channel's name must be an identifier and equal its key, got {channel.name!r}")
+    if not isinstance(channel.name, str) or channel.name != key or not re.fullmatch(r"[A-Za-z]\w*", key):
+        raise ValueError(f"{here}: a channel's name must be an identifier and equal its key, got {shown(channel.name)}")
     valid = UNITS.get(key, ())
     if not channel.unit or (valid and not set(channel.unit.split(" or ")) <= set(valid)):
-        raise ValueError(f"{here}: expected the unit {' or '.join(map(repr, valid)) or 'of SI'}, got {channel.unit!r}")
+        raise ValueError(
+            f"{here}: expected the unit {' or '.join(map(repr, valid)) or 'of SI'}, got {shown(channel.unit)}"
+        )
     _check_names(channel.columns, here, "column names")
     n_columns = len(channel.columns)
     _check_array(channel.time, (None,), "f", here, "time [Tc]")

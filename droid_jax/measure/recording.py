@@ -11,15 +11,14 @@ from __future__ import annotations
 import enum
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from os import PathLike
 from typing import Any
 
 import numpy as np
 
-from droid_jax.arguments import check_fields, choice, flag, number, shown, whole
+from droid_jax.arguments import check_fields, choice, flag, instance, listed, number, shown, whole
 from droid_jax.measure.clocks import SLACK
 
 START = 0.1  # s: a channel that begins no later than this after the command still tells where the motion started
@@ -192,7 +191,7 @@ class Recording:
 
         Raises ValueError when no index is given or one lies outside 0 .. N - 1.
         """
-        if isinstance(indices, (str, bytes)) or not isinstance(indices, Iterable):
+        if not listed(indices):
             raise ValueError(f"repeats must be a list of whole numbers, got {shown(indices)}")
         chosen = [whole(i, "a repeat") for i in indices]
         bad = [i for i in chosen if not 0 <= i < self.repeats]
@@ -210,6 +209,9 @@ class Recording:
         neither given nor measured.
         """
         start, end = number(start, "start of a window"), number(end, "end of a window")
+        if qpos0 is not None:
+            given = instance(qpos0, "qpos0", Mapping).items()
+            qpos0 = {str(joint): number(q, f"qpos0, joint {shown(joint)}") for joint, q in given}
         if not start < end:
             raise ValueError(f"a window needs start < end, got {start} and {end} s")
         rows = _rows(self.time, start, end)
@@ -240,7 +242,7 @@ def recordings_of(given: Any) -> tuple[Recording, ...]:
     """One recording or several as a tuple; ValueError where there is none, or a file's name stands for its content."""
     if isinstance(given, Recording):
         return (given,)
-    if isinstance(given, (str, bytes, PathLike)) or not isinstance(given, Iterable):
+    if not listed(given):
         given = [given]
     out = tuple(given)
     if not out:
