@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import io
 import struct
+import warnings
 import zipfile
 import zlib
 from random import Random
@@ -51,7 +52,8 @@ def read_members(content: bytes) -> list[tuple[str, bytes]]:
 def write_members(members: list[tuple[str, bytes]], method: int = zipfile.ZIP_DEFLATED) -> bytes:
     """A zip file of these members; names may stand there twice."""
     buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", method) as file:
+    with warnings.catch_warnings(), zipfile.ZipFile(buffer, "w", method) as file:
+        warnings.simplefilter("ignore")  # of names that stand there twice
         for name, content in members:
             info = zipfile.ZipInfo(name.encode("utf-8", "replace").decode())
             info.compress_type = method

@@ -75,9 +75,8 @@ def mutate_csv(random: Random, content: bytes) -> bytes:
     rows = [line.split(",") for line in content.decode().splitlines()]
     for _ in range(random.choice((1, 1, 1, 2, 3))):
         random.choice(_CSV)(random, rows)
-    text = random.choice(("\n", "\n", "\n", "\r\n", "\r")).join(
-        random.choice((",", ",", ",", ",", ";", "\t")).join(row) for row in rows
-    )
+    end, between = random.choices(("\n", "\r\n", "\r"), (8, 1, 1))[0], random.choices((",", ";", "\t"), (18, 1, 1))[0]
+    text = end.join(between.join(row) for row in rows)
     encoding = random.choices(("utf-8", "utf-8-sig", "utf-16", "latin-1", "utf-32"), (20, 1, 1, 1, 1))[0]
     return (text + "\n").encode(encoding, errors="surrogatepass" if encoding.startswith("utf") else "replace")
 
