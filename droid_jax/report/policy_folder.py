@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from droid_jax.files import FILMS, TRAINING, TRANSFER
 from droid_jax.policy.trials import BLOWN_UP
@@ -14,11 +14,16 @@ from droid_jax.report.reading import Maybe, Reader
 _READ = Reader("train")
 _NUMBER = (int, float)
 _TRAINING = {
-    "setup": {"method": str, "preset": str, "knob": int, "seed": int, "fit": Maybe((str, type(None)))},
-    "stand_in": dict,
+    "setup": {
+        **{"method": Literal["fitted", "mean", "prior"], "preset": str, "knob": int, "seed": int},
+        "fit": (str, type(None)),
+    },
+    "stand_in": {"springs": Maybe(int), "seed": Maybe(int), "hide": Maybe([str])},
     **{"task": {"opened": _NUMBER, "held": _NUMBER, "control": _NUMBER, "steps": int}, "scene": str},
     **{"effects": [str], "versions": dict, "device": str},
-    "history": [{"step": int, **dict.fromkeys(("seconds", "rate", "reward", "success"), _NUMBER)}],
+    "history": [
+        {"step": int, **dict.fromkeys(("seconds", "rate", "reward", "success"), _NUMBER), "of": Maybe(_NUMBER)}
+    ],
 }
 _MAYBE = (int, float, type(None))
 _SPREAD = {"mean": _MAYBE, "std": _MAYBE, "all": [_NUMBER]}
@@ -26,8 +31,9 @@ _TRIALS = {
     **{"trials": int, "success_rate": _NUMBER, "interval_95": [_NUMBER], "success": [bool], "stopped": {str: int}},
     **{"angle_deg": _SPREAD, "steps": _SPREAD, "grip": {"mean": _NUMBER}, "stopped_each": Maybe([str])},
 }
+_HIDDEN = {"name": str, "amplitude": _NUMBER, "joint": Maybe((str, type(None))), "unit": Maybe(str)}
 _TRANSFER = {
-    **{"simulation": _TRIALS, "stand_in": _TRIALS, "robot": {"hidden": [{"name": str, "amplitude": _NUMBER}]}},
+    **{"simulation": _TRIALS, "stand_in": _TRIALS, "robot": {"hidden": [_HIDDEN]}},
     **{"no_films": Maybe(str), "setup": Maybe(dict)},
 }
 
