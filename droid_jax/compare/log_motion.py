@@ -79,7 +79,12 @@ class LogMotion:
 
 
 def log_motion(scene: Scene, recording: Recording) -> LogMotion | None:
-    """The recording's signals of the scene's joints; None where it is too short or too sparse to be judged."""
+    """The recording's signals of the scene's joints; None where it is too short or too sparse to be judged.
+
+    None too where commands are missing that the scene needs: the replay says so.
+    """
+    if _commands(recording) and not set(scene.needs_command) <= set(recording.command_names):
+        return None
     channels = {name: recording.channels[name] for name in ("torque", "position") if name in recording.channels}
     sent = (
         {j: q for j, q in sent_to(scene, recording).items() if j in scene.single_joints} if _commands(recording) else {}
