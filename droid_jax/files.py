@@ -24,7 +24,7 @@ RESULTS = {
 # Held while a run writes to the folder; not there otherwise.
 LOCK = ".droid_jax.lock"
 # Every name that a stage writes in its folder, or removes there before it begins.
-WRITTEN = {
+WRITTEN: dict[str, tuple[str, ...]] = {
     stage: (SETUP, last, *RESULTS[stage], "report.html", "figures", "checkpoints", "tensorboard")
     for stage, last in LAST_FILES.items()
 }

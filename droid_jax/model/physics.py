@@ -12,7 +12,7 @@ import dataclasses
 import functools
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -86,7 +86,7 @@ def check_field(scene: Scene, field: str) -> None:
 @functools.cache
 def _varied_fields() -> frozenset[str]:
     """Fields of mjx.Model that are arrays of its program's input, not constants of the program, and are read."""
-    arrays = {f.name for f in dataclasses.fields(mjx.Model) if "jax.Array" in str(f.type)}
+    arrays = {f.name for f in dataclasses.fields(cast(Any, mjx.Model)) if "jax.Array" in str(f.type)}
     return frozenset(arrays - {field for field, _ in IGNORED})
 
 
@@ -125,7 +125,7 @@ def derive(model: Any) -> Any:
     As in C, free and ball joints average over their degrees of freedom, a lone body on slides counts with its
     mass alone, and dof_M0 alone knows no armature of tendons.
     """
-    data = mjx.make_data(model).replace(qpos=model.qpos0)
+    data: Any = mjx.make_data(model).replace(qpos=model.qpos0)
     data = mjx.kinematics(model, data)
     data = mjx.com_pos(model, data)
     data = mjx.crb(model, data)
