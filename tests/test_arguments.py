@@ -157,3 +157,23 @@ def test_what_is_shown_of_a_value_is_one_short_line() -> None:
     assert arguments.shown(Rude()) == "a Rude"
     assert arguments.shown("\x1b[2J\ud800\n") == r"'\x1b[2J\ud800\n'"
     assert len(arguments.shown(np.zeros((50, 50)))) == 80
+
+
+def test_arrays_without_axes_are_no_lists() -> None:
+    for value in (np.array(1.0), np.array("j"), Path("j"), "j", b"j", 3):
+        assert not arguments.listed(value)
+    assert all(map(arguments.listed, ([], (), {"a"}, np.zeros(2), (x for x in "ab"))))
+    with pytest.raises(ValueError, match="joints must be a list of names"):
+        arguments.names(np.array("j"), "joints")
+
+
+@pytest.mark.parametrize("text", ["a\ud800", "a\0", "y" * 100_000])
+def test_a_path_that_no_file_can_have_is_told_in_one_short_line(text: str) -> None:
+    with pytest.raises(ValueError, match=r"^path ") as refused:
+        arguments.path_of(text, "path")
+    assert str(refused.value).isprintable() and len(str(refused.value)) < 300
+
+
+def test_what_another_library_says_is_one_printable_line() -> None:
+    assert arguments.said(ValueError("line 1\n  line 2\x1b")) == "line 1 line 2?"
+    assert len(arguments.said(ValueError("y" * 5000))) == 300

@@ -335,6 +335,12 @@ def test_window_says_what_it_lacks() -> None:
         r.window(0.01, 0.03)
     with pytest.raises(ValueError, match=r"start < end, got 0.6 and 0.3"):
         r.window(0.6, 0.3)
+    for wrong, said in (
+        (["j1"], "qpos0 must be a Mapping, got a list"),
+        ({"j1": "x"}, "qpos0, joint 'j1' must be a number"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            r.window(0.3, 0.6, qpos0=wrong)
     blind = replace(r, channels={"torque": r.channels["torque"]})
     with pytest.raises(ValueError, match=r"not measured: j1, j2, hinge; begin it at the recording's start"):
         blind.window(0.3, 0.6)

@@ -108,6 +108,25 @@ def test_broken_files_are_named(tmp_path: Path, name: str, content: str, fault: 
         page.write_report(made)
 
 
+@pytest.mark.parametrize(
+    ("name", "change", "fault"),
+    [
+        ("training.json", lambda of: of["setup"].pop("fit"), "'setup' lacks 'fit'"),
+        ("training.json", lambda of: of["setup"].update(method="x"), "'method' must be one of"),
+        ("training.json", lambda of: of["history"][-1].update(of=[]), r"'of' must be a number, got \[\]"),
+        ("training.json", lambda of: of["stand_in"].update(springs="1"), "'springs' must be a whole number, got '1'"),
+        ("transfer.json", lambda of: of["robot"]["hidden"][0].update(joint=["x"]), "'joint' must be text or null"),
+    ],
+)
+def test_what_the_page_reads_is_checked(tmp_path: Path, name: str, change, fault: str):
+    made = make_policy(tmp_path / "run")
+    content = json.loads((made / name).read_text())
+    change(content)
+    (made / name).write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=fault):
+        page.write_report(made)
+
+
 def test_trials_that_blew_up_are_said_and_not_counted() -> None:
     angle = {"mean": 40.0, "std": 1.0}
     found = {
