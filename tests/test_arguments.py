@@ -89,7 +89,7 @@ GOOD = {"name": "a", "unit": "kg", "mean": 1.0, "std": 0.5, "low": 0.1, "high": 
         (lambda: dj.door_scene(springs=True), "springs must be a whole number, got True"),
         (lambda: dj.door_scene(timestep=math.nan), "timestep must be finite, got nan"),
         (lambda: dj.load_scene(3), "the path of an MJCF must be text or a Path, got 3"),  # pyright: ignore
-        (lambda: dj.load_recording("a\0b.npz"), "the path of a recording must be text or a Path"),
+        (lambda: dj.load_recording("a\0b.npz"), "the path of a recording holds the character U+0000"),
         (lambda: dj.load_recording("a.npz", resample=1), "resample must be True or False, got 1"),  # pyright: ignore
     ],
 )
