@@ -30,9 +30,9 @@ Kind = TypeVar("Kind")
 
 
 def shown(value: Any, longest: int = 80) -> str:
-    """The repr of a value in one line of ASCII-safe text, cut where it is long: for messages."""
+    """The repr of a value in one printable line, cut where it is long: for messages."""
     try:
-        text = ascii(value) if isinstance(value, str) else repr(value)
+        text = repr(value)
     except Exception:  # a repr of a user's class may raise anything
         text = f"a {type(value).__name__}"
     text = _UNPRINTABLE.sub("?", " ".join(text.split()))

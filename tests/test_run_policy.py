@@ -254,7 +254,7 @@ def test_settings_that_cannot_be_trained_with_leave_the_folder_as_it_was(tmp_pat
     run = tmp_path / "run"
     command = ["train", "--method", "prior", "--steps", "0", "--out", "run", *again]
     assert main(command) == 2 and not run.exists()
-    assert "steps and evaluations must be 1 or more, got 0" in capsys.readouterr().err
+    assert "steps must be at least 1, got 0" in capsys.readouterr().err
     for name in ("training.json", "policy.npz", "checkpoints/1"):
         (run / name).parent.mkdir(parents=True, exist_ok=True)
         (run / name).write_text("old")

@@ -161,7 +161,7 @@ def test_a_hypothesis_finds_the_lower_basin_that_descent_misses():
 
 def test_a_hypothesis_that_is_worse_changes_nothing():
     plain = refine(two_basins, BASINS, [-3.1, -12.0], FLAT)
-    tried = dataclasses.replace(FLAT, doubt=-1.0)
+    tried = dataclasses.replace(FLAT, doubt=0.0)
     fit = refine(two_basins, BASINS, [-3.1, -12.0], tried, hypotheses=[{"s": 3.0}])
     assert fit.evaluations > plain.evaluations
     np.testing.assert_allclose(fit.best, plain.best, atol=1e-6)

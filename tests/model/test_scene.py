@@ -186,7 +186,7 @@ def test_scene_variants_are_named_when_refused():
     for wrong, says in (
         (dict(springs=3), "springs must be at most 2, got 3"),
         (dict(knob=4), "knob must be at most 3, got 4"),
-        (dict(gains="stiff"), "'impedance' or 'paper', got 'stiff'"),
+        (dict(gains="stiff"), "must be one of impedance, paper, got 'stiff'"),
     ):
         with pytest.raises(ValueError, match=says):
             door_scene(**wrong)

@@ -40,7 +40,7 @@ def effect(request: pytest.FixtureRequest, scene: Scene) -> Effect:
     made = library(scene, [request.param])
     if not made:
         where = scene.name.split(" (")[0]
-    assert (request.param, where) in (("contact_compliance", "mechanism"), ("soft_friction", "door"))
+        assert (request.param, where) in (("contact_compliance", "mechanism"), ("soft_friction", "door"))
         pytest.skip("nothing is gripped in the small scene, and the Panda's model has no friction that could be soft")
     return made[0]
 
