@@ -130,7 +130,13 @@ def stopped(after: float, number: int, *arguments: str, cwd: Path) -> tuple[int,
     """Exit code and stderr of a command that is sent a signal some seconds after it listens to signals."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     with subprocess.Popen(
-        [*RUN, *arguments], cwd=cwd, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [*RUN, *arguments],
+        cwd=cwd,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # these tests may run in the background
     ) as process:
         while process.poll() is None and not caught(process.pid) >> (signal.SIGTERM - 1) & 1:
             time.sleep(0.01)
