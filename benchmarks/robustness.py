@@ -49,10 +49,10 @@ from benchmarks.common import CODE, publish
 from benchmarks.sharing import code_name
 
 WORKERS = 2
-WALL = 60.0  # s after which a case that does not compute either is given up
+STILL = 60.0  # s for which a worker may neither compute nor wait for a processor: it is blocked
 ROOM = 16 << 30  # bytes of address space that a worker may map beyond what it has before its first case
 TOO_MUCH = 2 << 30  # bytes of memory in use beyond that, at which a worker is ended at once
-START, READY = 300.0, "ready"  # s in which a worker must start; what it then says
+START, READY = 1800.0, "ready"  # s in which a worker must start; what it then says
 BEHIND = 5.0  # s of processor time beyond the limit that a worker is given to say by itself that it took too long
 EXAMPLES = 5  # faults kept of each place in the code
 ARGUMENTS = "arguments"
@@ -181,21 +181,32 @@ class Worker:
         assert self.process is not None
         try:
             self.pipe.send(case)
-            began, used, held = time.monotonic(), processor_seconds(self.process.pid), resident(self.process.pid)
+            used, held = processor_seconds(self.process.pid), resident(self.process.pid)
+            moved, before = time.monotonic(), used
             while not self.pipe.poll(0.2):
                 if resident(self.process.pid) - held > TOO_MUCH:
                     self.close()
                     return Outcome("memory", f"ended at {TOO_MUCH >> 20} MiB")
-                took = processor_seconds(self.process.pid) - used
-                if took > MOST_SECONDS + BEHIND or time.monotonic() - began > WALL:
+                now = processor_seconds(self.process.pid)
+                if now > before or runnable(self.process.pid):
+                    moved, before = time.monotonic(), now
+                if now - used > MOST_SECONDS + BEHIND or time.monotonic() - moved > STILL:
                     self.close()
-                    return Outcome("hang", f"ended after {took:.0f} s of processor time", seconds=took)
+                    return Outcome("hang", f"ended after {now - used:.0f} s of processor time", seconds=now - used)
             return Outcome(**self.pipe.recv())
         except (EOFError, OSError):
             self.process.join(10)
             code = self.process.exitcode
             self.close()
             return Outcome("foreign", f"the process ended with exit code {code}")
+
+
+def runnable(pid: int | None) -> bool:
+    """Whether a process computes or waits for a processor."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "R"
+    except OSError:
+        return False
 
 
 def processor_seconds(pid: int | None) -> float:
