@@ -114,7 +114,7 @@ def test_a_name_that_an_effect_has_is_refused_with_what_to_do():
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"recordings": []}, "one to three are searched (fit, confirm, sealed), got 0"),
+        ({"recordings": []}, "no recording to fit: give one, or several"),
         ({"recordings": [elbow_log(0.0, 2.0, 8)] * 4}, "got 4"),
         ({"recordings": [elbow_log(0.0, 2.0, 15)]}, "is the only one and has 15 repeats"),
         ({"recordings": [elbow_log(0.0, 2.0, 8)] * 2}, "the fit and the confirm recording are the same"),
