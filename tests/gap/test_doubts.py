@@ -64,5 +64,5 @@ def test_an_amplitude_past_its_bound_is_larger_than_its_bounds_allow(found: Smal
 
 def test_the_verdict_carries_its_doubts(found: Small, monkeypatch: pytest.MonkeyPatch):
     assert found.verdict.doubts == ()
-    monkeypatch.setattr(workflow, "doubts", lambda evidence, model: ("the form of it does not fit",))
+    monkeypatch.setattr(workflow, "doubts", lambda evidence, model, ends: ("the form of it does not fit",))
     assert workflow.find(found.case, found.base, FLOOR).doubts == ("the form of it does not fit",)
