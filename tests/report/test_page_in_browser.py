@@ -120,8 +120,8 @@ def test_everything_is_drawn_and_nothing_overflows(
     found = _probe(report, size)
     assert found["images"] == found["loaded"] == 5
     vectors = 7 if shown == "wide" else 6  # the narrow figure of torques and residuals is a picture: the fifth image
-    assert found[shown] == vectors and found[hidden] == 0
-    assert found["drawn"] == 7
+    assert found[shown] == 7 and found[hidden] == 0
+    assert found["drawn"] == vectors
     assert found["overflow"] == 0
 
 
