@@ -24,6 +24,7 @@ from droid_jax.gap.handover import HandedOn
 from droid_jax.identify.gaussian import Coordinates, Gaussian, ParameterEntry, matrix, space_of, space_to_json
 from droid_jax.identify.uncertainty import posterior
 from droid_jax.model.effects.registry import effect_space, library, ready
+from droid_jax.model.fields import check_space
 from droid_jax.model.mjcf import WORDS, fitted_mjcf, native
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_c_model
@@ -195,10 +196,11 @@ def _of_file(file: _File, scene: Scene) -> Extended:
     )
     effects = library(scene, dict.fromkeys(p.effect for p in parts))
     _check_known(parts, effects, space)
+    check_space(made := ready(scene), space)
     g = file.gaussian
     gaussian = Gaussian(space, matrix("mean", g.mean), matrix("cov", g.cov), g.rule, g.coordinates)
     values = space.check(np.array([file.values[name] for name in space.names]))
-    return Extended(ready(scene), parts, effects, values, gaussian)
+    return Extended(made, parts, effects, values, gaussian)
 
 
 def _check_known(parts: tuple[Candidate, ...], effects: tuple[Effect, ...], space: Space) -> None:

@@ -236,6 +236,8 @@ def test_a_missing_file(tmp_path: Path):
         (lambda c: c["effects"][0].update(colour="red"), "'effects', entry 0: unknown keys: colour"),
         (lambda c: c["space"][-1].update(writes=[{"field": "body_mass", "index": [1], "mode": "set", "gain": 1}]),
          "'hinge_preload' is not in this version's library"),
+        (lambda c: c["space"][0]["writes"][0].update(index=[1, 1]), "'forearm_mass' writes body_mass.*another scene"),
+        (lambda c: c["space"][0]["writes"][0].update(field="made_up"), "writes made_up, which the model of"),
     ],
 )  # fmt: skip
 def test_a_damaged_file(saved: Path, tmp_path: Path, change: Any, expected: str):
