@@ -21,9 +21,12 @@ if TYPE_CHECKING:
 LONGEST_NAME = 200  # characters of a name; of a name that becomes a file's, bytes in UTF-8 (file systems allow 255)
 LONGEST_PATH = 4096  # characters, as Linux allows bytes
 LONGEST_NOTE = 10_000  # characters of a free text
-# Control characters, half surrogate pairs and line separators: no file name, figure or page can hold all of them.
-_UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff\u2028\u2029]")
-_UNPRINTABLE_NOTE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff]")  # tabs and line ends are fine
+# Control characters, half surrogate pairs, line separators, and what turns the direction of the text behind it: no file
+# name, figure or page can hold all of them.
+_UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff\u2028-\u202e\u2066-\u2069]")
+_UNPRINTABLE_NOTE = re.compile(
+    "[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff\u202a-\u202e\u2066-\u2069]"
+)  # tabs and line ends are fine
 
 Chosen = TypeVar("Chosen", bound=enum.Enum)
 Kind = TypeVar("Kind")

@@ -76,6 +76,7 @@ GOOD = {"name": "a", "unit": "kg", "mean": 1.0, "std": 0.5, "low": 0.1, "high": 
         (lambda: Parameter(**{**GOOD, "std": True}), "parameter 'a': std must be a number, got True"),
         (lambda: Parameter(**{**GOOD, "high": 10**400}), "parameter 'a': high must be a number"),
         (lambda: Parameter(**{**GOOD, "name": "a\0"}), "its name holds the character U+0000"),
+        (lambda: Parameter(**{**GOOD, "name": "a\u202ecba"}), "its name holds the character U+202E"),
         (lambda: Parameter(**{**GOOD, "name": 3}), "its name must be text, got 3"),
         (lambda: Parameter(**{**GOOD, "writes": ["x"]}), "writes, entry 0 must be a Write, got 'x'"),
         (lambda: Parameter(**{**GOOD, "high": 1e308, "low": -1e308}), "too large or too small to search among"),

@@ -16,7 +16,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from droid_jax.arguments import instance, path_of
+from droid_jax.arguments import instance, path_of, shown
 from droid_jax.files import EXTENDED, EXTENDED_MJCF
 from droid_jax.gap.candidates import Candidate
 from droid_jax.gap.case import Case
@@ -186,6 +186,8 @@ def _of_file(file: _File, scene: Scene) -> Extended:
         raise ValueError(f"it was fitted with another scene, {file.scene}; this one is {own}")
     space = space_of(file.space)
     free = [name for effect in file.effects for name in (*effect.amplitudes, *effect.shapes)]
+    if without := [effect.effect for effect in file.effects if not effect.amplitudes]:
+        raise ValueError(f"'effects': {shown(without[0])} has no amplitudes")
     if absent := [name for name in free if name not in space.names]:
         raise ValueError(f"the effects have parameters that the space lacks: {', '.join(absent)}")
     if absent := [name for name in space.names if name not in file.values]:

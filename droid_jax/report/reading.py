@@ -11,6 +11,7 @@ from typing import Any, NotRequired, TypedDict
 
 import numpy as np
 
+from droid_jax.arguments import LONGEST_NAME
 from droid_jax.read_json import read_json, typed
 from droid_jax.read_npz import NUMBERS, TEXT, NpzFile
 
@@ -55,13 +56,17 @@ class Reader:
             with NpzFile(path) as file:
                 self.need(file, keys := tuple(keys), path.name)
                 wanted = (*keys, *(key for key in optional if key in file))
-                return {key: file.array(key, TEXT if key in texts else NUMBERS) for key in wanted}
+                found = {key: file.array(key, TEXT if key in texts else NUMBERS) for key in wanted}
         except FileNotFoundError:
             raise self.fault(f"{path} is missing") from None
         except Fault:
             raise
         except (OSError, ValueError) as error:
             raise self.fault(f"{path} cannot be read ({_reason(path, error)})") from None
+        for key in texts & found.keys():  # names, which figures hold; a text without axes is JSON
+            if found[key].ndim and (longest := max(map(len, found[key].flat), default=0)) > LONGEST_NAME:
+                raise self.fault(f"{path}, {key} holds a name of {longest} characters, at most {LONGEST_NAME} are read")
+        return found
 
     def shaped(self, array: np.ndarray, shape: tuple[int | None, ...], where: str, finite: bool = True) -> None:
         """Fault where an array has another shape (None: any length) or, unless it may, holds NaN or infinities."""

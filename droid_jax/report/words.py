@@ -71,7 +71,9 @@ def like(value: float | None, deviation: float) -> str:
 
 
 def percent(share: float) -> str:
-    """A share as a whole percentage; 100 % only when it is all of it, 0 % only when it is nothing."""
+    """A share as a whole percentage: 100 % only when it is all of it, 0 % only when it is nothing, a dash for none."""
+    if not math.isfinite(100 * share):
+        return "–"
     nearest = round(100 * share)
     if nearest == 100 and share < 1.0:
         nearest = 99

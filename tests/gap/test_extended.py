@@ -232,6 +232,7 @@ def test_a_missing_file(tmp_path: Path):
         (lambda c: c["gaussian"].update(cov=[[1.0]]), "cov must have shape"),
         (lambda c: c.update(scene=3), "'scene' must be an object, got 3"),
         (lambda c: c["effects"][0].update(amplitudes=None), "entry 0, 'amplitudes' must be a list, got None"),
+        (lambda c: c["effects"][0].update(amplitudes=[]), "'hinge_preload' has no amplitudes"),
         (lambda c: c["effects"][0].update(amplitudes=["x"]), "parameters that the space lacks: x"),
         (lambda c: c["effects"][0].update(colour="red"), "'effects', entry 0: unknown keys: colour"),
         (lambda c: c["space"][-1].update(writes=[{"field": "body_mass", "index": [1], "mode": "set", "gain": 1}]),

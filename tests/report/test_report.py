@@ -344,6 +344,15 @@ def test_a_missing_key_and_a_wrong_shape_are_named(tmp_path: Path) -> None:
         read_run(run)
 
 
+def test_a_name_too_long_to_draw_is_refused(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run")
+    arrays = dict(np.load(run / "traces.npz"))
+    arrays["open_close/joints"] = np.array(["y" * 100_000, *arrays["open_close/joints"][1:]])
+    np.savez(run / "traces.npz", **arrays)
+    with pytest.raises(ValueError, match=r"holds a name of 100000 characters, at most 200 are read; run .*identify"):
+        read_run(run)
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -387,6 +396,7 @@ def test_numbers_follow_their_deviation() -> None:
     assert like(-1234.5, 40.0) == "−1234"  # half to even, and no digits that mean nothing
     assert percent(0.999) == "99 %" and percent(1.0) == "100 %"
     assert percent(0.837) == "84 %" and percent(0.001) == "< 1 %" and percent(0.0) == "0 %"
+    assert percent(float("inf")) == percent(1e307) == "–"
 
 
 def test_long_traces_are_thinned_without_losing_a_spike() -> None:
