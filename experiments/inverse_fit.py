@@ -34,7 +34,9 @@ from droid_jax.identify.uncertainty import calibrated, identifiability, time_blo
 from droid_jax.measure import noise
 from droid_jax.measure.checks import validate
 from droid_jax.measure.clocks import interpolate
+from droid_jax.measure.motion import Motion
 from droid_jax.measure.recording import Channel, Recording, TorqueConvention
+from droid_jax.measure.rest import RestConfig
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.model.seam import Effect
@@ -99,12 +101,28 @@ def make_recording(
 # Comparison --------------------------------------------------------------------------------
 
 
+# Dry friction is loss * sgn(speed) at every sample, at rest too: the law with which published values were fitted.
+SIGN_LAW = RestConfig(speed=0.0, noise=0.0, share=0.0)
+
+
 def inverse_cost(
-    scene: Scene, space: Space, recording: Recording, motion_cutoff: float, effects: Sequence[Effect] = ()
+    scene: Scene,
+    space: Space,
+    recording: Recording,
+    motion_cutoff: float,
+    effects: Sequence[Effect] = (),
+    rest: RestConfig = SIGN_LAW,
 ) -> Cost:
     """The inverse-mode cost of a log: root mean square of the residuals in units of the noise stated."""
-    config = CompareConfig(whitened=True, motion_cutoff=motion_cutoff)
+    config = CompareConfig(whitened=True, motion_cutoff=motion_cutoff, rest=rest)
     return make_cost(scene, space, [recording], config=config, effects=effects)
+
+
+def share_at_rest(cost: Cost) -> float:
+    """Share of the motion's samples, over all joints, at which friction is an interval."""
+    (motion,) = cost.drives
+    assert isinstance(motion, Motion) and motion.rest is not None
+    return round(float(np.mean(motion.rest)), 3)
 
 
 def measured_torque(cost: Cost) -> np.ndarray:

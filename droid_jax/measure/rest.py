@@ -35,7 +35,7 @@ class RestConfig:
       friction jumps, where a joint turns round too.  Of 100 synthetic hinges the 90 % intervals held damping, friction
       and armature in 84, 83 and 61 at 1, in 94, 92 and 84 at 2 (least squares on the same samples), at 3 no more.
     kept: share of a usual stretch of motion at least that they leave: a joint may reverse faster than the low-pass
-      settles.  Of each single stretch it would keep MuJoCo's creeping between two holds (friction off by 10 deviations).
+      settles.  Of each single stretch it would keep MuJoCo's creep between two holds (friction off by 10 deviations).
     tolerance: standard deviations of the torques' noise by which a torque at rest may leave the interval: noise at its
       edge would pull the friction up otherwise.
     Measured on 60 + 48 synthetic hinges, `experiments/friction_at_rest.py`.
