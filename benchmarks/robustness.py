@@ -181,6 +181,9 @@ class Worker:
         assert self.process is not None
         try:
             self.pipe.send(case)
+            if not self.pipe.poll(START):  # it makes the kind's valid example: imports, and compiles
+                raise RuntimeError(f"a worker did not begin with {case}")
+            self.pipe.recv()
             used, held = processor_seconds(self.process.pid), resident(self.process.pid)
             moved, before = time.monotonic(), used
             while not self.pipe.poll(0.2):
@@ -247,6 +250,10 @@ def serve_cases(pipe: Connection, seed: int) -> None:
             except EOFError:
                 return
             try:
+                try:
+                    bench.prepare(name)
+                finally:
+                    pipe.send(READY)
                 outcome = bench.judged(name, number)
             except Exception:  # of the tests themselves
                 outcome = Outcome("harness", traceback.format_exc())
@@ -272,10 +279,13 @@ class Bench:
         if name == ARGUMENTS:
             call, argument, wrong = random.choice(self.wrong)
             return api_calls.attempt(self.calls[call], argument, wrong, random if random.random() < SEVERAL else None)
-        kind = file_kinds.KINDS[name]
-        if name not in self.valid:
-            self.valid[name] = self._made(kind)
-        return kinds.attempt(kind, self.valid[name], self.folder / "input", random)
+        self.prepare(name)
+        return kinds.attempt(file_kinds.KINDS[name], self.valid[name], self.folder / "input", random)
+
+    def prepare(self, name: str) -> None:
+        """Make a kind's valid example, where it is not there yet."""
+        if name != ARGUMENTS and name not in self.valid:
+            self.valid[name] = self._made(file_kinds.KINDS[name])
 
     def _made(self, kind: kinds.Kind) -> Path:
         """A folder with the valid example; RuntimeError where that is not accepted."""
