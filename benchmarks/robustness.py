@@ -53,6 +53,7 @@ STILL = 60.0  # s for which a worker may neither compute nor wait for a processo
 ROOM = 16 << 30  # bytes of address space that a worker may map beyond what it has before its first case
 TOO_MUCH = 2 << 30  # bytes of memory in use beyond that, at which a worker is ended at once
 START, READY = 1800.0, "ready"  # s in which a worker must start; what it then says
+SLOWER = 2.0  # than the valid page may a damaged one be
 BEHIND = 5.0  # s of processor time beyond the limit that a worker is given to say by itself that it took too long
 EXAMPLES = 5  # faults kept of each place in the code
 ARGUMENTS = "arguments"
@@ -183,7 +184,7 @@ class Worker:
             self.pipe.send(case)
             if not self.pipe.poll(START):  # it makes the kind's valid example: imports, and compiles
                 raise RuntimeError(f"a worker did not begin with {case}")
-            self.pipe.recv()
+            most = self.pipe.recv()
             used, held = processor_seconds(self.process.pid), resident(self.process.pid)
             moved, before = time.monotonic(), used
             while not self.pipe.poll(0.2):
@@ -193,7 +194,7 @@ class Worker:
                 now = processor_seconds(self.process.pid)
                 if now > before or runnable(self.process.pid):
                     moved, before = time.monotonic(), now
-                if now - used > MOST_SECONDS + BEHIND or time.monotonic() - moved > STILL:
+                if now - used > most + BEHIND or time.monotonic() - moved > STILL:
                     self.close()
                     return Outcome("hang", f"ended after {now - used:.0f} s of processor time", seconds=now - used)
             return Outcome(**self.pipe.recv())
@@ -253,7 +254,7 @@ def serve_cases(pipe: Connection, seed: int) -> None:
                 try:
                     bench.prepare(name)
                 finally:
-                    pipe.send(READY)
+                    pipe.send(bench.most(name))
                 outcome = bench.judged(name, number)
             except Exception:  # of the tests themselves
                 outcome = Outcome("harness", traceback.format_exc())
@@ -267,6 +268,7 @@ class Bench:
     def __init__(self, folder: Path, seed: int) -> None:
         self.folder, self.seed = folder, seed
         self.valid: dict[str, Path] = {}
+        self.seconds: dict[str, float] = {}  # of processor time, of valid pages
         (folder / "api").mkdir()
         self.calls = api_calls.calls(folder / "api")
         self.wrong = api_calls.cases(self.calls)
@@ -280,7 +282,13 @@ class Bench:
             call, argument, wrong = random.choice(self.wrong)
             return api_calls.attempt(self.calls[call], argument, wrong, random if random.random() < SEVERAL else None)
         self.prepare(name)
-        return kinds.attempt(file_kinds.KINDS[name], self.valid[name], self.folder / "input", random)
+        return kinds.attempt(
+            file_kinds.KINDS[name], self.valid[name], self.folder / "input", random, most=self.most(name)
+        )
+
+    def most(self, name: str) -> float:
+        """Seconds of processor time beyond which a case of a kind hangs: a page may take longer than a file."""
+        return max(MOST_SECONDS, SLOWER * self.seconds.get(name, 0.0))
 
     def prepare(self, name: str) -> None:
         """Make a kind's valid example, where it is not there yet."""
@@ -293,8 +301,12 @@ class Bench:
         at.mkdir(exist_ok=True)
         kind.make(at)
         outcome = kinds.attempt_valid(kind, at, self.folder / "input")
-        if outcome.fault and outcome.result != "hang":  # the first of a kind imports, and may compile
+        if outcome.result == "hang":  # the first of a kind imports, and may compile
+            outcome = kinds.attempt_valid(kind, at, self.folder / "input")
+        if outcome.fault and not (kind.drawn and outcome.result == "hang"):
             raise RuntimeError(f"{kind.name}: the valid example is not accepted: {outcome}")
+        if kind.drawn:
+            self.seconds[kind.name] = outcome.seconds
         return at
 
 

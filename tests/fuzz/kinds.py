@@ -13,7 +13,7 @@ from mutate_json import mutate_json
 from mutate_npz import mutate_npz
 from mutate_text import mutate_bytes, mutate_csv
 from mutate_xml import mutate_xml
-from outcome import Outcome, judged
+from outcome import MOST_SECONDS, Outcome, judged
 
 ROOT = Path(__file__).resolve().parents[2]
 STRUCTURE = 0.75  # share of mutations that know the format
@@ -53,13 +53,13 @@ def mutated(kind: Kind, valid: Path, random: Random) -> tuple[str, bytes]:
         return name, mutate_bytes(random, content)
 
 
-def attempt(kind: Kind, valid: Path, place: Path, random: Random) -> Outcome:
-    """Reads one mutation of a kind's valid folder, in a copy at `place`."""
+def attempt(kind: Kind, valid: Path, place: Path, random: Random, most: float = MOST_SECONDS) -> Outcome:
+    """Reads one mutation of a kind's valid folder, in a copy at `place`; most: s beyond which it hangs."""
     shutil.rmtree(place, ignore_errors=True)
     shutil.copytree(valid, place)
     name, content = mutated(kind, valid, random)
     (place / name).write_bytes(content)
-    return judged(lambda: kind.read(place), (Path(name).name, str(place)), hide=str(place))
+    return judged(lambda: kind.read(place), (Path(name).name, str(place)), hide=str(place), most=most)
 
 
 def attempt_valid(kind: Kind, valid: Path, place: Path) -> Outcome:

@@ -63,6 +63,7 @@ def judged(
     names: tuple[str, ...],
     hide: str = "",
     refusals: tuple[type[Exception], ...] = REFUSALS,
+    most: float = MOST_SECONDS,
 ) -> Outcome:
     """Calls, and judges what comes of it.
 
@@ -70,6 +71,7 @@ def judged(
     by other words in a message of this program's own.
     hide: the made-up folder of a file, which does not count in a message's length; empty for arguments.
     refusals: errors that may say so.
+    most: s of processor time beyond which it hangs.
     """
     forget_peak()
     before, began, error = peak(), time.process_time(), None
@@ -84,7 +86,7 @@ def judged(
     if used > MOST_MEMORY or _ran_out(error):
         why = f"{used >> 20} MiB" if error is None else f"{used >> 20} MiB, {_short(error)}"
         return Outcome("memory", why, "" if error is None else _place(error), seconds)
-    if seconds > MOST_SECONDS:
+    if seconds > most:
         return Outcome("hang", f"{seconds:.1f} s", "" if error is None else _place(error), seconds)
     shown = [w for w in caught if not issubclass(w.category, (DeprecationWarning, ResourceWarning))]
     if len(shown) > MOST_WARNINGS:

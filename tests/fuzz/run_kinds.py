@@ -204,9 +204,9 @@ _FILES = {
 }
 KINDS = (
     *(_whole(Path(file).name, file, weight=weight) for file, weight in _FILES.items()),
-    Kind("fit's files, page drawn", "*.*", make_run, page.write_report, 0.3, drawn=True),
-    Kind("search's files, page drawn", "*.*", make_gap, page.write_report, 0.2, drawn=True),
-    Kind("policy's files, page drawn", "*.json", make_policy_run, page.write_report, 0.3, drawn=True),
+    Kind("fit's files, page drawn", "*.*", make_run, page.write_report, 0.1, drawn=True),
+    Kind("search's files, page drawn", "*.*", make_gap, page.write_report, 0.1, drawn=True),
+    Kind("policy's files, page drawn", "*.json", make_policy_run, page.write_report, 0.1, drawn=True),
     Kind("fit's tables", "*.csv", make_tables, use_tables, 2),
     Kind("synthetic robot's file", STAND_IN, make_synthetic, use_synthetic, 1),
 )
