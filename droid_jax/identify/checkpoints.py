@@ -11,15 +11,18 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+import math
 import os
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
+MOST_BYTES = 2**30  # of a checkpoint's arrays, which are read whole; a search with 1024 samples writes 10 MB
 Tree = dict[str, Any]  # nested dictionary whose leaves are numpy arrays, none of them empty
 
 # what orbax and the store below it raise where a checkpoint cannot be written
@@ -94,12 +97,22 @@ class Checkpoints:
 
     def _read(self, step: int) -> tuple[dict[str, str], Tree]:
         """Fingerprint and tree of one checkpoint; raises anything when it is not as written."""
+        self._check_size(step)
         items = ocp.args.Composite(state=ocp.args.StandardRestore(), meta=ocp.args.JsonRestore())
         read = self._manager.restore(step, args=items)
         fingerprint, digest = read["meta"]["fingerprint"], read["meta"]["digest"]
         if _digest(step, fingerprint, read["state"]) != digest:
             raise ValueError("its step or its content is not what was written")
         return fingerprint, read["state"]
+
+    def _check_size(self, step: int) -> None:
+        """ValueError where a checkpoint declares more than is read: a damaged shape must not fill the memory."""
+        folder = self.folder / str(step)
+        told = (folder / "meta" / "metadata").stat().st_size
+        arrays = jax.tree.leaves(ocp.StandardCheckpointHandler().metadata(cast(Any, folder / "state")).tree)
+        declared = told + sum(math.prod(a.shape) * np.dtype(a.dtype).itemsize for a in arrays)
+        if declared > MOST_BYTES:
+            raise ValueError(f"it declares {declared / 2**20:.0f} MiB, at most {MOST_BYTES >> 20} MiB are read")
 
     def _check_fingerprint(self, step: int, found: dict[str, str]) -> None:
         """ValueError that names the texts in which a checkpoint differs from this loop."""

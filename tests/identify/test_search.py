@@ -543,6 +543,16 @@ def test_somebody_else_s_checkpoint_is_refused(tmp_path):
         search(BOWL, box(2), config, checkpoint_dir=tmp_path, fingerprint="door 1", start=np.ones(2))
 
 
+def test_a_checkpoint_that_declares_too_much_is_not_read(tmp_path, monkeypatch):
+    with Checkpoints(tmp_path) as checkpoints:
+        checkpoints.save(1, {"a": np.arange(3.0)})
+        checkpoints.save(2, {"a": np.zeros(2**20)})  # 8 MiB, of which a compressed file shows nothing
+        monkeypatch.setattr("droid_jax.identify.checkpoints.MOST_BYTES", 2**20)
+        with pytest.warns(UserWarning, match="2 is damaged and was passed over: .* declares 8 MiB"):
+            restored = checkpoints.restore()
+    assert restored is not None and restored[0] == 1
+
+
 def test_checkpoints_keep_the_newest_and_their_types(tmp_path):
     tree = {"a": np.arange(3) / 3, "b": {"c": np.array([[1.5]], np.float32), "n": np.array(7)}}
     with Checkpoints(tmp_path, keep=2, fingerprint={"data": "x"}) as checkpoints:
