@@ -293,6 +293,13 @@ def test_links_into_documents_lead_to_a_heading(document: str):
     assert [(t, a) for t, a in links if a not in anchors(path.parent / t if t else path)] == []
 
 
+def test_links_lead_to_files_that_are_there():
+    """In all documents."""
+    documents = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    links = {(d, to) for d in documents for to in re.findall(r"\]\(([\w./-]+)(?:#[\w-]*)?\)", d.read_text())}
+    assert len(links) > 100 and [(d.name, to) for d, to in sorted(links) if not (d.parent / to).exists()] == []
+
+
 def test_the_documents_name_only_files_that_exist():
     """Paths of this repository in backticks."""
     text = "".join((ROOT / d).read_text() for d in ("README.md", "docs/paper.md", "docs/own-robot.md"))

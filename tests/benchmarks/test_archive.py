@@ -1,0 +1,81 @@
+"""Archives of scored runs: back byte for byte, held against their manifest, and scored as when they were folders."""
+
+from __future__ import annotations
+
+import json
+import lzma
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks import archive
+
+ROOT = Path(__file__).resolve().parents[2]
+CONTENTS = {"results/a.json": b'{"x": "\xc3\xa9\\n"}\r\n', "sealed/deep/a.json": b"{}", "made": b"\x00\xff\xfe"}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for name, content in CONTENTS.items():
+        (tmp_path / "run" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "run" / name).write_bytes(content)
+    (tmp_path / "run" / "results" / "a.json.lock").touch()
+    return tmp_path / "run"
+
+
+def test_files_come_back_byte_for_byte(folder: Path, tmp_path: Path):
+    packed = archive.pack(folder, tmp_path / "archive", "run")
+    assert archive.unpack(packed, tmp_path / "back") == len(CONTENTS)
+    found = {p.relative_to(tmp_path / "back").as_posix(): p for p in (tmp_path / "back").rglob("*") if p.is_file()}
+    assert {name: path.read_bytes() for name, path in found.items()} == CONTENTS
+    assert archive.faults(tmp_path / "archive") == []
+
+
+def test_what_was_changed_is_found(folder: Path, tmp_path: Path):
+    place = tmp_path / "archive"
+    for name in ("changed", "gone"):
+        archive.pack(folder, place, name)
+    (place / f"changed{archive.ENDING}").write_bytes(lzma.compress(b""))
+    (place / f"gone{archive.ENDING}").rename(place / f"strange{archive.ENDING}")
+    assert {fault.split(":")[0] for fault in archive.faults(place)} == {"changed", "gone", "strange"}
+
+
+@pytest.mark.parametrize(
+    "line", ['{"path": "../a", "text": ""}', '{"path": "/a", "text": ""}', '{"path": "a"}', "[]", "no JSON"]
+)
+def test_what_is_no_archive_is_refused(tmp_path: Path, line: str):
+    path = tmp_path / f"bad{archive.ENDING}"
+    path.write_bytes(lzma.compress(line.encode()))
+    with pytest.raises(ValueError, match="is no archive of"):
+        archive.unpack(path, tmp_path / "out")
+    assert not (tmp_path / "a").exists()
+
+
+def test_an_empty_folder_is_no_archive(tmp_path: Path):
+    with pytest.raises(FileNotFoundError, match="no files to pack"):
+        archive.pack(tmp_path, tmp_path / "archive", "empty")
+
+
+def test_those_of_this_repository_are_whole():
+    assert archive.faults(archive.PLACE) == [] and len(archive.manifest(archive.PLACE)) > 20
+
+
+def test_a_scored_run_is_scored_again_as_it_was(tmp_path: Path):
+    """The blind run that the results cite, with its oracles."""
+    archive.unpack(archive.PLACE / f"blind_d1a4e04{archive.ENDING}", tmp_path / "run")
+    before = json.loads((tmp_path / "run" / "hidden_effects.json").read_text())
+    script = [sys.executable, ROOT / "experiments" / "hidden_effects.py", "score", "--out", tmp_path / "run"]
+    subprocess.run(script, cwd=ROOT, check=True, capture_output=True)
+    after = json.loads((tmp_path / "run" / "hidden_effects.json").read_text())
+    assert {k for k in before if before[k] != after.get(k)} <= {
+        "commit",
+        "versions",
+        "device",
+        "platform",
+        "jax_devices",
+        "cores",
+        "date",
+    }
+    assert before["summary"] == after["summary"]
