@@ -35,7 +35,7 @@ from droid_jax.measure.surrogate import SurrogateConfig, set_up  # noqa: E402
 from droid_jax.model.door_scene import door_scene  # noqa: E402
 from droid_jax.policy.control import load  # noqa: E402
 from droid_jax.policy.transfer import watched  # noqa: E402
-from experiments.pad_friction import WATCHED, Opening, made, robots  # noqa: E402
+from experiments.pad_friction import REPORTED, WATCHED, Opening, made, robots  # noqa: E402
 from experiments.pad_friction import Arguments as PadArguments  # noqa: E402
 from experiments.policies.cases import RESULTS  # noqa: E402
 from experiments.policies.robots import truth_of  # noqa: E402
@@ -46,8 +46,8 @@ from experiments.policies.settings import SETTINGS, Setting  # noqa: E402
 class Arguments:
     """Options of the experiment."""
 
-    policies: Path = RESULTS
-    """Where table2.py has left its policies."""
+    policies: Path = REPORTED
+    """Where table2.py has left its policies; default: the reported ones, of benchmarks/results/archive."""
     quick: bool = False
     """One setting, one motion, one short trial of one policy of each method: shows that it runs."""
     out: Path = RESULTS

@@ -37,6 +37,7 @@ import tyro  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.progress import track  # noqa: E402
 
+from benchmarks import archive  # noqa: E402
 from benchmarks.common import origin, stem  # noqa: E402
 from droid_jax.files import POLICY  # noqa: E402
 from droid_jax.model.door_scene import door_scene  # noqa: E402
@@ -51,6 +52,7 @@ from experiments.policies.robots import pads_of, truth_of  # noqa: E402
 from experiments.policies.settings import SETTINGS, Setting  # noqa: E402
 from experiments.policies.table import METHODS  # noqa: E402
 
+REPORTED = ROOT / "runs" / "policies"  # where the archive of that name is unpacked
 PARTS = ("across", "along", "sliding", "torsional")
 WATCHED = 5  # trials of each policy with each kind of pads
 NEEDED = 0.2  # a policy that succeeds more often without friction does not need its grip
@@ -66,8 +68,8 @@ class Arguments:
     """Sliding frictions of both pads."""
     trials: int = 20
     """Trials of each policy at each friction."""
-    policies: Path = RESULTS
-    """Where table2.py has left its policies."""
+    policies: Path = REPORTED
+    """Where table2.py has left its policies; default: the reported ones, of benchmarks/results/archive."""
     quick: bool = False
     """One policy of each method, one short trial: shows that it runs."""
     out: Path = RESULTS
@@ -158,6 +160,8 @@ def openings(policy: Policy, robot: TrialRobot, trials: int) -> dict[str, Any]:
 def made(arguments: Arguments) -> list[dict[str, Any]]:
     """The cases of Table II that are there, method by method.  Ends the program where they are of another robot."""
     folder = arguments.policies / "table2_cases" / arguments.setting
+    if arguments.policies == REPORTED and not folder.is_dir():
+        archive.unpack(archive.PLACE / f"policies{archive.ENDING}", REPORTED)
     found = [json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))]
     if not found:
         raise SystemExit(f"error: no policies in {folder}; run experiments/table2.py first")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import archive
 from droid_jax import runtime
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -49,6 +51,19 @@ def _choose_gl() -> bool:
 
 HAS_GL = _choose_gl()
 runtime.tune(devices=2, cache_dir=os.environ.get(runtime.CACHE_VARIABLE) or CACHE)
+
+
+@pytest.fixture(scope="session")
+def archived(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """The folder of a scored run in benchmarks/results/archive, by name."""
+
+    @functools.cache
+    def of(name: str) -> Path:
+        folder = tmp_path_factory.mktemp("archived") / name
+        archive.unpack(archive.PLACE / f"{name}{archive.ENDING}", folder)
+        return folder
+
+    return of
 
 
 @pytest.fixture

@@ -1,6 +1,6 @@
 """The doors on which methods are compared; nothing here changes after a run.
 
-Their reasons: experiments/results/pilots/README.md.
+Their reasons: docs/history/pilots.md.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -277,10 +277,11 @@ def test_slippery_pads_are_all_that_differs_from_the_settings_robot():
 
 
 @pytest.mark.parametrize("door", SETTINGS)
-def test_a_trained_policy_opens_by_its_grip(door: str):
+def test_a_trained_policy_opens_by_its_grip(door: str, archived: Callable[[str], Path]):
     """A reported policy of each door, tried again: with slippery pads a hook or a push would still open it."""
-    kept = json.loads((RESULTS / "table2_cases" / door / "prior_0.json").read_text())
-    policy = load(RESULTS / "trained_cases" / kept["trained"] / POLICY)
+    results = archived("policies")
+    kept = json.loads((results / "table2_cases" / door / "prior_0.json").read_text())
+    policy = load(results / "trained_cases" / kept["trained"] / POLICY)
     env = DoorEnv(door_scene(timestep=TIMESTEP, limits=True), Task())
     rates = {name: transfer(policy, robot).rate for name, robot in robots_of(SETTINGS[door], env, 10).items()}
     assert rates["stand_in"] >= 0.8 and rates["slippery"] < 0.2
@@ -289,9 +290,9 @@ def test_a_trained_policy_opens_by_its_grip(door: str):
 WITHOUT_A_GRIP = {"paper/mean_4", "paper/fitted_3", "paper/fitted_4"}  # docs/paper.md says how they open it
 
 
-def test_which_reported_policies_open_without_a_grip():
+def test_which_reported_policies_open_without_a_grip(archived: Callable[[str], Path]):
     """Every reported policy should fail with slippery pads; those that do not are known by name, and no others."""
-    files = sorted((RESULTS / "table2_cases").glob("*/*.json"))
+    files = sorted((archived("policies") / "table2_cases").glob("*/*.json"))
     rates = {f"{f.parent.name}/{f.stem}": json.loads(f.read_text())["slippery"]["success_rate"] for f in files}
     assert len(rates) >= 30 and {name for name, rate in rates.items() if rate >= 0.2} == WITHOUT_A_GRIP
 
@@ -605,9 +606,9 @@ def test_a_policy_that_two_experiments_need_is_trained_once(monkeypatch: pytest.
 
 
 @pytest.mark.parametrize(("name", "method"), [("paper", "prior"), ("paper", "fitted"), ("dry", "mean")])
-def test_the_reported_policies_are_found_by_what_decided_them(name: str, method: str):
-    case = json.loads((RESULTS / "table2_cases" / name / f"{method}_3.json").read_text())
-    task, options = Task(**setting_of(name, None).task), Options()
+def test_the_reported_policies_are_found_by_what_decided_them(name: str, method: str, archived: Callable[[str], Path]):
+    case = json.loads((archived("policies") / "table2_cases" / name / f"{method}_3.json").read_text())
+    task, options = Task(**setting_of(name, None).task), Options(out=archived("policies"))
     env = DoorEnv(door_scene(timestep=TIMESTEP, limits=True), task)
     space = door_space(env.scene) + door_nuisances(env.scene)
     gaussian = prior(space) if method == "prior" else load_gaussian(RESULTS / f"fit_{name}_cases" / GAUSSIAN)

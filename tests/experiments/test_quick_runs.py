@@ -68,10 +68,10 @@ def test_a_script_that_lacks_a_case_says_how_to_make_it(tmp_path: Path, script: 
     assert f"run experiments/identify_suite.py --parts {part} --quick --out {tmp_path}" in done.stderr
 
 
-def test_the_poses_panels_say_their_units(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_poses_panels_say_their_units(monkeypatch: pytest.MonkeyPatch, archived: Callable[[str], Path]) -> None:
     monkeypatch.syspath_prepend(str(ROOT / "experiments"))
     figure = importlib.import_module("pose_figure")
-    cases = [json.loads((ROOT / f"benchmarks/results/identify_cases/pose_{pose}.json").read_text()) for pose in "AB"]
+    cases = [json.loads((archived("identify") / "identify_cases" / f"pose_{pose}.json").read_text()) for pose in "AB"]
     panels = [axes for axes in figure.densities(*(case["parameters"] for case in cases)).axes if axes.get_visible()]
     said = {axes.get_title("left"): axes.get_xlabel() for axes in panels}
     assert said["Hinge stiffness"] == "[N m/rad]" and all(said.values())
