@@ -216,7 +216,10 @@ def kept_cases(out: Path, quick: bool, part: Part, names: Sequence[str]) -> list
     paths = [out / stem("identify_cases", quick) / f"{name}.json" for name in names]
     if missing := [path for path in paths if not path.is_file()]:
         options = f"--parts {part}{' --quick' if quick else ''} --out {out}"
-        raise SystemExit(f"error: there is no {missing[0]}: run experiments/identify_suite.py {options}")
+        raise SystemExit(
+            f"error: there is no {missing[0]}: run experiments/identify_suite.py {options} "
+            f"(the reported cases: benchmarks/archive.py unpack identify --out {out})"
+        )
     return [json.loads(path.read_text()) for path in paths]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,6 +13,8 @@ import numpy as np
 import pytest
 
 from benchmarks.common import publish
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_searches_of_several_machines_are_not_drawn_over_one_wall_time():
@@ -66,3 +69,14 @@ def test_the_cones_are_compared_on_the_robot_that_is_searched(monkeypatch: pytes
     monkeypatch.setattr(module, "recorded", lambda *_: "never held its door")
     with pytest.raises(SystemExit, match="error: case door/cone/0: never held its door"):
         module.between_cones("door", 0)
+
+
+@pytest.mark.parametrize("folder", ["experiments", "benchmarks"])
+def test_every_script_is_in_the_list_of_its_folder(folder: str):
+    """And nothing else is; helpers are named below the table."""
+    text = (ROOT / folder / "README.md").read_text()
+    listed = re.findall(r"^\| `(\w+\.py)` \|", text, re.MULTILINE)
+    scripts = {p.name for p in (ROOT / folder).glob("*.py") if "tyro.cli(" in p.read_text()} - {"archive.py"}
+    assert len(listed) == len(set(listed)) and set(listed) == scripts
+    helpers = {p.name for p in (ROOT / folder).glob("*.py")} - scripts
+    assert [name for name in sorted(helpers) if f"`{name}`" not in text] == []
