@@ -8,9 +8,11 @@ damaged file is not always one that cannot be read, and a folder can be renamed.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import hashlib
 import json
+import logging
 import math
 import os
 import warnings
@@ -72,7 +74,8 @@ class Checkpoints:
         meta = {"fingerprint": self.fingerprint, "digest": _digest(step, self.fingerprint, tree)}
         items = ocp.args.Composite(state=ocp.args.StandardSave(tree), meta=ocp.args.JsonSave(meta))
         try:
-            self._manager.save(step, args=items, force=True)
+            with _quiet():
+                self._manager.save(step, args=items, force=True)
         except _DAMAGE as error:
             raise _not_written(self.folder / str(step), error) from error
 
@@ -123,6 +126,18 @@ class Checkpoints:
                 f"checkpoint {self.folder / str(step)} belongs to another run: it differs in "
                 f"{', '.join(other)}; use another folder, or remove this one to start over"
             )
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Without orbax's warning of what a killed run has left half written, which it removes."""
+    logger = logging.getLogger("absl")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 def _digest(step: int, fingerprint: Mapping[str, str], tree: Tree) -> str:

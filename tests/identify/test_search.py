@@ -543,6 +543,15 @@ def test_somebody_else_s_checkpoint_is_refused(tmp_path):
         search(BOWL, box(2), config, checkpoint_dir=tmp_path, fingerprint="door 1", start=np.ones(2))
 
 
+def test_what_a_killed_run_left_half_written_is_replaced_without_a_word(tmp_path, caplog):
+    (tmp_path / "1.orbax-checkpoint-tmp").mkdir()
+    with Checkpoints(tmp_path) as checkpoints:
+        (tmp_path / "1.orbax-checkpoint-tmp").mkdir(exist_ok=True)  # opening the folder may have tidied it up
+        checkpoints.save(1, {"a": np.arange(3.0)})
+        assert checkpoints.restore() is not None
+    assert not caplog.records
+
+
 def test_a_checkpoint_that_declares_too_much_is_not_read(tmp_path, monkeypatch):
     with Checkpoints(tmp_path) as checkpoints:
         checkpoints.save(1, {"a": np.arange(3.0)})
