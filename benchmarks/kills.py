@@ -4,8 +4,9 @@
 
 `identify` and `gap` on a log of a lone hinge, `train` on the built-in door, each with a budget of seconds.  Each run is
 killed with SIGKILL, once or twice, at a moment drawn from the seconds that an uninterrupted run takes, and then given
-again until it ends.  All numbers of its files are compared bit for bit with those of the uninterrupted run; what names
-a moment or a duration is left out.
+again until it ends.  Every second training is killed just behind its first or second checkpoint instead: a small one
+compiles for most of its time.  All numbers of a run's files are compared bit for bit with those of the uninterrupted
+run; what names a moment or a duration is left out.
 
 A training goes on from its last checkpoint with Adam's moments and starts drawn anew (`policy.train`), so that it ends
 elsewhere than one that was not stopped.  It is compared with an uninterrupted training (`identical`) and, beside it,
@@ -45,6 +46,7 @@ COMMANDS = ("identify", "gap", "train")
 RUNS, QUICK = 20, 2  # of each command
 LONGEST = 3600.0  # s that one process may take, on a machine with much else to do; longer counts as a hang
 FROM, TO = 0.02, 0.98  # of an uninterrupted run's seconds, between which it is killed
+JUST_BEHIND = 0.5  # s behind a checkpoint in which a training is killed that compiles for most of its time
 AGAIN = 0.3  # share of runs that are killed a second time
 # What names a moment, a duration or a place, or says which code ran: no result.
 NOT_COMPARED = {"seconds", "started", "versions", "device", "rate", "left", "setup", "recordings", "seconds_total"}
@@ -173,16 +175,17 @@ def killed(place: Path, command: str, number: int, seconds: float, random: Rando
     out = f"{command}_{number:02d}"
     shutil.rmtree(place / out, ignore_errors=True)
     at, kept = [], 0
-    while not at or (len(at) < 2 and random.random() < AGAIN):
-        moment = random.uniform(FROM, TO) * seconds
-        process = start(place, command, out)
+    awaited = 1 + number // 2 % 2 if command == "train" and number % 2 else 0  # checkpoints
+    while not at or (len(at) < 2 and not awaited and random.random() < AGAIN):
+        process, began = start(place, command, out), time.monotonic()
+        _await_checkpoints(process, place / out, awaited)
         try:
-            process.wait(moment)
+            process.wait(random.uniform(0.0, JUST_BEHIND) if awaited else random.uniform(FROM, TO) * seconds)
             break  # it was quicker than the reference: nothing was killed
         except subprocess.TimeoutExpired:
             os.killpg(process.pid, signal.SIGKILL)
             process.wait()
-        at.append(round(moment, 2))
+        at.append(round(time.monotonic() - began, 2))
         kept = _last_checkpoint(place / out)
     if not at:
         return killed(place, command, number, 0.9 * seconds, random)
@@ -196,6 +199,12 @@ def killed(place: Path, command: str, number: int, seconds: float, random: Rando
         "at": at, "ended": code == 0, "identical": identical, "as_stopped_there": there, "kept": kept,
         "differ": differ, "said": said,
     }  # fmt: skip
+
+
+def _await_checkpoints(process: subprocess.Popen[str], folder: Path, count: int) -> None:
+    """Return once a run has written some checkpoints, or ended."""
+    while process.poll() is None and sum(p.name.isdecimal() for p in folder.glob("checkpoints/*")) < count:
+        time.sleep(0.01)
 
 
 def _last_checkpoint(folder: Path) -> int:
