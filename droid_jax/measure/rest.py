@@ -38,7 +38,7 @@ class RestConfig:
       settles.  Of each single stretch it would keep MuJoCo's creep between two holds (friction off by 10 deviations).
     tolerance: standard deviations of the torques' noise by which a torque at rest may leave the interval: noise at its
       edge would pull the friction up otherwise.
-    Measured on 60 + 48 synthetic hinges, `experiments/friction_at_rest.py`.
+    Measured on 100 synthetic hinges, `experiments/friction_at_rest.py`.
     """
 
     speed: float = 0.01
