@@ -72,7 +72,7 @@ class Path(NamedTuple):
     """The arrays of a motion, single precision: [T] s, [T, J] rad, rad/s, rad/s^2 (m for slides).
 
     at_rest: [T, J] bool, samples at which friction is not known from the speed.  measured: [T, J] N m (N), the torque
-    measured there, NaN where none was.  torque_slack: [T, J] N m (N), acceleration_slack: [J] rad/s^2 (m/s^2), by which
+    measured there, NaN where none was.  torque_slack: [J] N m (N), acceleration_slack: [J] rad/s^2 (m/s^2), by which
     noise may take it out of the interval of friction.  still: [nq] where all joints that do not move stand.
     """
 
@@ -91,9 +91,10 @@ def path_of(scene: Scene, motion: Motion) -> Path:
     """What a compiled replay is given of a motion; ValueError where it states a joint that the scene has not."""
     rest = motion.velocity == 0.0 if motion.rest is None else motion.rest
     measured = np.full(motion.velocity.shape, np.nan) if motion.measured is None else motion.measured
-    none = np.zeros(motion.velocity.shape[1])
-    slack = np.broadcast_to(none if motion.torque_slack is None else motion.torque_slack, motion.velocity.shape)
-    given = (slack, none if motion.acceleration_slack is None else motion.acceleration_slack)
+    given = [
+        np.zeros(motion.velocity.shape[1]) if slack is None else slack
+        for slack in (motion.torque_slack, motion.acceleration_slack)
+    ]
     arrays = (motion.time, motion.position, motion.velocity, motion.acceleration, measured, *given)
     time, position, velocity, acceleration, measured, *slacks = (jnp.asarray(a, jnp.float32) for a in arrays)
     still = jnp.asarray(scene.initial_qpos(motion.others), jnp.float32)
@@ -173,7 +174,7 @@ def path_replay(
         )
         seen = observed(rollout, theta, effects)
         # The slack is there without friction too: else any friction would pay by taking the noise at rest.
-        slack = jnp.hypot(path.torque_slack[:, :count], inertia * path.acceleration_slack[:count])
+        slack = jnp.hypot(path.torque_slack[:count], inertia * path.acceleration_slack[:count])
         bound = jnp.maximum(loss, 0.0) + slack
         held = held_torque(seen.torque - friction, bound, path.measured[:, :count])
         rest = path.at_rest[:, :count] & _may_rub(scene, theta, effects, motor)

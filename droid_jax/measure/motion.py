@@ -9,7 +9,7 @@ import numpy as np
 from scipy import interpolate, signal
 
 from droid_jax.measure.recording import Recording, TorqueConvention
-from droid_jax.measure.rest import RestConfig, at_rest, derivative_noise, is_slow, torque_at, white_noise
+from droid_jax.measure.rest import RestConfig, at_rest, derivative_noise, torque_at, white_noise
 
 CUTOFF = 20.0  # Hz, of the position before it is differentiated; above that of the torques, which are compared
 OVERSAMPLING = 6.0  # rows of a motion per period of its cutoff
@@ -28,9 +28,8 @@ class Motion:
     slides).  torque: convention of the measured torque.  others: joints that stand still -> where, as far as stated.
     rest: [T, J] bool, samples at rest (`measure.rest`); None: those of speed zero.
     measured: [T, J] N m (N), measured torque at these times, NaN where there is none; None: nowhere.
-    torque_slack: [J] or [T, J] N m (N), acceleration_slack: [J] rad/s^2 (m/s^2): by how much a torque at rest may leave
-    the interval of its friction, because measured torque and acceleration are noisy, infinite where the acceleration is
-    not known; None: not at all.
+    torque_slack: [J] N m (N), acceleration_slack: [J] rad/s^2 (m/s^2): by how much a torque at rest may leave the
+    interval of its friction, because measured torque and acceleration are noisy; None: not at all.
     """
 
     joints: tuple[str, ...]
@@ -104,7 +103,6 @@ def measured_motion(
     config, timestep = rest or RestConfig(), (clock[-1] - clock[0]) / (len(clock) - 1)
     white = white_noise(position - q, rate, cutoff)
     torque, noise = torque_at(recording, joints, clock, 2.0 * cutoff)
-    slow = is_slow(white, rows[1], rate, cutoff, config)
     return Motion(
         tuple(joints),
         clock,
@@ -113,7 +111,7 @@ def measured_motion(
         others={joint: q for joint, q in recording.qpos0.items() if joint not in joints},
         rest=at_rest(white, rows[1], timestep, rate, cutoff, config),
         measured=torque,
-        torque_slack=np.where(slow, config.tolerance * noise, np.inf),
+        torque_slack=config.tolerance * noise,
         acceleration_slack=config.tolerance * derivative_noise(white, 2, rate, cutoff),
     )
 

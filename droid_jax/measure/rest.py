@@ -4,8 +4,6 @@ A joint that stands still may be held by any friction between -Fc and Fc.  Below
 whether a joint moves, nor in which direction: because of the noise of the measured positions, because friction of real
 joints (and MuJoCo's soft friction constraint) changes over gradually, or because the joint really holds.  Samples
 below that speed count as at rest: they are compared with the interval of friction, all others with sign(speed) Fc.
-Those just before and after, whose acceleration is not known, are compared with nothing: noise that leaves the interval
-would pull the friction up (by 1.3 deviations where it is correlated for a fifth of a second).
 Source: the set-valued law of dry friction, e.g. Acary and Brogliato, Numerical Methods for Nonsmooth Dynamical
 Systems, 2008, ch. 1.
 """
@@ -54,7 +52,7 @@ class RestConfig:
 def at_rest(
     position_noise: np.ndarray, velocity: np.ndarray, timestep: float, rate: float, cutoff: float, config: RestConfig
 ) -> np.ndarray:
-    """[T, J] bool, samples of a smoothed motion at rest: slow ones, and those before and after that settle.
+    """[T, J] bool, samples of a smoothed motion at rest.
 
     Args:
         position_noise: [J] rad (m), deviation of the white noise of the measured positions.
@@ -64,15 +62,6 @@ def at_rest(
         cutoff: Hz, of their low-pass.
         config: the thresholds.
     """
-    slow = is_slow(position_noise, velocity, rate, cutoff, config)
-    settling = math.ceil(config.settle / cutoff / timestep)
-    return np.stack([_settled(column, settling, config.kept) for column in slow.T], axis=1)
-
-
-def is_slow(
-    position_noise: np.ndarray, velocity: np.ndarray, rate: float, cutoff: float, config: RestConfig
-) -> np.ndarray:
-    """[T, J] bool, samples of which nobody knows whether the joint moves; arguments as of `at_rest`."""
     slowest = np.maximum.reduce(
         [
             np.full(velocity.shape[1], config.speed),
@@ -80,7 +69,8 @@ def is_slow(
             config.share * np.sqrt(np.mean(velocity**2, axis=0)),
         ]
     )
-    return np.abs(velocity) < slowest
+    settling = math.ceil(config.settle / cutoff / timestep)
+    return np.stack([_settled(column, settling, config.kept) for column in (np.abs(velocity) < slowest).T], axis=1)
 
 
 def _settled(slow: np.ndarray, settling: int, kept: float) -> np.ndarray:
