@@ -12,7 +12,6 @@ Files come back byte for byte.
 from __future__ import annotations
 
 import base64
-import hashlib
 import json
 import lzma
 import sys
@@ -27,7 +26,7 @@ sys.path[:0] = [str(ROOT)]
 # ruff: noqa: E402
 import tyro
 
-from droid_jax.storage import write_bytes, write_json
+from droid_jax.storage import file_sha256, write_bytes, write_json
 
 PLACE = ROOT / "benchmarks" / "results" / "archive"
 ENDING, MANIFEST = ".jsonl.xz", "manifest.json"
@@ -83,16 +82,17 @@ def pack(folder: Path, place: Path, name: str) -> Path:
     lines = [json.dumps(_packed(path.relative_to(folder).as_posix(), path.read_bytes())) for path in files]
     data = lzma.compress("".join(f"{line}\n" for line in lines).encode(), preset=9 | lzma.PRESET_EXTREME)
     place.mkdir(parents=True, exist_ok=True)
-    write_bytes(place / (name + ENDING), data)
-    known = manifest(place) | {name: {"files": len(files), "bytes": len(data), "sha256": _sha256(data)}}
+    path = place / (name + ENDING)
+    write_bytes(path, data)
+    known = manifest(place) | {name: {"files": len(files), "bytes": len(data), "sha256": file_sha256(path)}}
     write_json(place / MANIFEST, dict(sorted(known.items())))
-    return place / (name + ENDING)
+    return path
 
 
-def unpack(archive: Path, folder: Path) -> int:
+def unpack(name: str, folder: Path, place: Path = PLACE) -> int:
     """Write the files of an archive into a folder; how many.  ValueError where it is not of `pack`."""
     count = 0
-    for path, content in contents(archive):
+    for path, content in contents(place / (name + ENDING)):
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
         write_bytes(folder / path, content)
         count += 1
@@ -131,7 +131,7 @@ def faults(place: Path) -> list[str]:
     for name, path in found.items():
         if name not in known:
             out.append(f"{name}: not in the manifest")
-        elif _sha256(path.read_bytes()) != known[name]["sha256"]:
+        elif file_sha256(path) != known[name]["sha256"]:
             out.append(f"{name}: not what was packed, by its SHA-256")
         elif sum(1 for _ in contents(path)) != known[name]["files"]:
             out.append(f"{name}: another number of files than the manifest says")
@@ -143,10 +143,6 @@ def _packed(path: str, content: bytes) -> dict[str, str]:
         return {"path": path, "text": content.decode("utf-8")}
     except UnicodeDecodeError:
         return {"path": path, "base64": base64.b64encode(content).decode()}
-
-
-def _sha256(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()
 
 
 def main(command: List | Check | Unpack | Pack) -> None:
@@ -163,7 +159,7 @@ def main(command: List | Check | Unpack | Pack) -> None:
             folder = out or ROOT / "runs" / name
             if name not in manifest(place):
                 sys.exit(f"error: no archive {name!r} in {place}; there are {', '.join(manifest(place)) or 'none'}")
-            result = {"folder": str(folder), "files": unpack(place / (name + ENDING), folder)}
+            result = {"folder": str(folder), "files": unpack(name, folder, place)}
         case Pack(name, folder, place):
             result = {"archive": str(pack(folder, place, name)), **manifest(place)[name]}
     print(json.dumps(result))

@@ -249,7 +249,7 @@ def finish(place: Path, command: str, out: str) -> tuple[int, list[str]]:
         os.killpg(process.pid, signal.SIGKILL)
         process.communicate()
         return 124, ["it did not end"]
-    return process.returncode, said.splitlines()[-5:]
+    return process.returncode, said.replace(str(place), "DIR").splitlines()[-5:]
 
 
 def child(words: list[str]) -> int:

@@ -277,14 +277,13 @@ class Bench:
                 call.run(**call.valid)
 
     def judged(self, name: str, number: int) -> Outcome:
+        """A case of a kind that was prepared."""
         random = Random(f"{self.seed}/{name}/{number}")
         if name == ARGUMENTS:
             call, argument, wrong = random.choice(self.wrong)
             return api_calls.attempt(self.calls[call], argument, wrong, random if random.random() < SEVERAL else None)
-        self.prepare(name)
-        return kinds.attempt(
-            file_kinds.KINDS[name], self.valid[name], self.folder / "input", random, most=self.most(name)
-        )
+        kind, valid = file_kinds.KINDS[name], self.valid[name]
+        return kinds.attempt(kind, valid, self.folder / "input", random, most=self.most(name))
 
     def most(self, name: str) -> float:
         """Seconds of processor time beyond which a case of a kind hangs: a page may take longer than a file."""

@@ -161,7 +161,7 @@ def made(arguments: Arguments) -> list[dict[str, Any]]:
     """The cases of Table II that are there, method by method.  Ends the program where they are of another robot."""
     folder = arguments.policies / "table2_cases" / arguments.setting
     if arguments.policies == REPORTED and not folder.is_dir():
-        archive.unpack(archive.PLACE / f"policies{archive.ENDING}", REPORTED)
+        archive.unpack("policies", REPORTED)
     found = [json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))]
     if not found:
         raise SystemExit(f"error: no policies in {folder}; run experiments/table2.py first")

@@ -60,7 +60,7 @@ def archived(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     @functools.cache
     def of(name: str) -> Path:
         folder = tmp_path_factory.mktemp("archived") / name
-        archive.unpack(archive.PLACE / f"{name}{archive.ENDING}", folder)
+        archive.unpack(name, folder)
         return folder
 
     return of

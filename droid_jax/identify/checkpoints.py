@@ -111,9 +111,9 @@ class Checkpoints:
     def _check_size(self, step: int) -> None:
         """ValueError where a checkpoint declares more than is read: a damaged shape must not fill the memory."""
         folder = self.folder / str(step)
-        told = (folder / "meta" / "metadata").stat().st_size
+        described = (folder / "meta" / "metadata").stat().st_size
         arrays = jax.tree.leaves(ocp.StandardCheckpointHandler().metadata(cast(Any, folder / "state")).tree)
-        declared = told + sum(math.prod(a.shape) * np.dtype(a.dtype).itemsize for a in arrays)
+        declared = described + sum(math.prod(a.shape) * np.dtype(a.dtype).itemsize for a in arrays)
         if declared > MOST_BYTES:
             raise ValueError(f"it declares {declared / 2**20:.0f} MiB, at most {MOST_BYTES >> 20} MiB are read")
 

@@ -26,8 +26,8 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_files_come_back_byte_for_byte(folder: Path, tmp_path: Path):
-    packed = archive.pack(folder, tmp_path / "archive", "run")
-    assert archive.unpack(packed, tmp_path / "back") == len(CONTENTS)
+    archive.pack(folder, tmp_path / "archive", "run")
+    assert archive.unpack("run", tmp_path / "back", tmp_path / "archive") == len(CONTENTS)
     found = {p.relative_to(tmp_path / "back").as_posix(): p for p in (tmp_path / "back").rglob("*") if p.is_file()}
     assert {name: path.read_bytes() for name, path in found.items()} == CONTENTS
     assert archive.faults(tmp_path / "archive") == []
@@ -46,10 +46,9 @@ def test_what_was_changed_is_found(folder: Path, tmp_path: Path):
     "line", ['{"path": "../a", "text": ""}', '{"path": "/a", "text": ""}', '{"path": "a"}', "[]", "no JSON"]
 )
 def test_what_is_no_archive_is_refused(tmp_path: Path, line: str):
-    path = tmp_path / f"bad{archive.ENDING}"
-    path.write_bytes(lzma.compress(line.encode()))
+    (tmp_path / f"bad{archive.ENDING}").write_bytes(lzma.compress(line.encode()))
     with pytest.raises(ValueError, match="is no archive of"):
-        archive.unpack(path, tmp_path / "out")
+        archive.unpack("bad", tmp_path / "out", tmp_path)
     assert not (tmp_path / "a").exists()
 
 
@@ -64,7 +63,7 @@ def test_those_of_this_repository_are_whole():
 
 def test_a_scored_run_is_scored_again_as_it_was(tmp_path: Path):
     """The blind run that the results cite, with its oracles."""
-    archive.unpack(archive.PLACE / f"blind_d1a4e04{archive.ENDING}", tmp_path / "run")
+    archive.unpack("blind_d1a4e04", tmp_path / "run")
     before = json.loads((tmp_path / "run" / "hidden_effects.json").read_text())
     script = [sys.executable, ROOT / "experiments" / "hidden_effects.py", "score", "--out", tmp_path / "run"]
     subprocess.run(script, cwd=ROOT, check=True, capture_output=True)

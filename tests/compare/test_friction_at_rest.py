@@ -119,8 +119,8 @@ def test_which_samples_are_at_rest():
     edges = 2.0 / 20.0  # two periods of 50 ms
     inside = (clock > 2 - edges + 0.02) & (clock < 3 + edges - 0.02)
     assert found[inside].all() and not found[(clock < 2 - edges - 0.02) | (clock > 3 + edges + 0.02)].any()
-    shaking = at_rest(np.zeros(1), np.sin(2 * np.pi * 4.0 * clock)[:, None], 0.01, 200.0, 20.0, RestConfig())
-    assert 0.3 < shaking.mean() < 0.6  # of the 125 ms from one turn to the next a half is kept
+    turning = np.where((clock > 2) & (clock < 2.06), 0.0, 1.0)[:, None]  # less than 1.5 periods of 50 ms
+    assert at_rest(np.zeros(1), turning, 0.01, 200.0, 20.0, RestConfig()).sum() == np.sum(turning == 0.0)
     noisy = at_rest(np.array([1e-2]), 0.2 * speed, 0.01, 200.0, 20.0, RestConfig())  # its speed's noise is 0.34 rad/s
     assert noisy.all()
 

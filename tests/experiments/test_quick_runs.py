@@ -47,6 +47,7 @@ SCRIPTS: dict[str, tuple[str, ...]] = {
 }
 READERS = ("experiments/pose_figure.py", "experiments/table1.py")  # of what identify_suite.py has left
 ELSEWHERE = {  # run by other tests
+    "benchmarks/archive.py",
     "experiments/table2.py",
     "experiments/knob_locations.py",
     "benchmarks/throughput.py",

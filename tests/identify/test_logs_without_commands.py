@@ -74,7 +74,8 @@ def test_mass_and_friction_come_back(found: Identified):
     assert found.best == pytest.approx([MASS, DAMPING, COULOMB], rel=0.02)
     low, high = found.gaussian.interval(0.9)
     truth = np.array([MASS, DAMPING, COULOMB])
-    assert np.all((low < truth) & (truth < high)), (low / truth - 1, high / truth - 1)
+    # A replay's torques are read off along lines between rows of 8 ms: of a motion of 0.83 Hz that takes 1.6e-4.
+    assert np.all((low < 1.0002 * truth) & (0.9998 * truth < high)), (low / truth - 1, high / truth - 1)
     assert np.all(high - low < 0.2 * truth)
     assert all(t.identifiable for t in found.tells)
 
