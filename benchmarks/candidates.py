@@ -23,18 +23,18 @@ import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 
 from benchmarks.common import interleave, publish  # noqa: E402
-from droid_jax.compare.cost import Cost, make_cost  # noqa: E402
-from droid_jax.gap.candidates import candidates  # noqa: E402
-from droid_jax.gap.case import GapConfig  # noqa: E402
-from droid_jax.gap.screen import questions_of  # noqa: E402
-from droid_jax.identify.damped import CHORDS, TRIALS  # noqa: E402
-from droid_jax.measure.demonstration import demonstration_path  # noqa: E402
-from droid_jax.measure.formats import load  # noqa: E402
-from droid_jax.measure.recording import Recording  # noqa: E402
-from droid_jax.measure.surrogate import SurrogateConfig, record, stand_in_truth  # noqa: E402
-from droid_jax.model.door import door_nuisances, door_space  # noqa: E402
-from droid_jax.model.door_scene import door_scene  # noqa: E402
+from droid_jax.cost.cost import Cost, make_cost  # noqa: E402
+from droid_jax.discrepancy.candidates import candidates  # noqa: E402
+from droid_jax.discrepancy.case import GapConfig  # noqa: E402
+from droid_jax.discrepancy.screen import questions_of  # noqa: E402
+from droid_jax.door.demonstration import demonstration_path  # noqa: E402
+from droid_jax.door.scene import door_scene  # noqa: E402
+from droid_jax.door.space import door_nuisances, door_space  # noqa: E402
+from droid_jax.identify.levenberg_marquardt import CHORDS, TRIALS  # noqa: E402
 from droid_jax.model.effects.registry import effect_space, library, ready  # noqa: E402
+from droid_jax.recordings.formats import load  # noqa: E402
+from droid_jax.recordings.recording import Recording  # noqa: E402
+from droid_jax.synthetic.robot import SurrogateConfig, record, stand_in_truth  # noqa: E402
 
 TIMESTEP = 0.004  # s
 SHORT = 1.0  # s of the demonstration with --quick

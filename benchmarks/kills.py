@@ -130,8 +130,8 @@ def write_inputs(place: Path) -> None:
     """Scene, parameters and a log of 24 s with dry friction that the scene lacks."""
     if (place / "log.npz").exists():
         return
-    from droid_jax.measure.formats import save
-    from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
+    from droid_jax.recordings.formats import save
+    from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
 
     time_, size, rate = np.arange(0.0, 24.0, 0.01), np.array([[0.5], [0.15]]), 2 * np.pi * np.array([[0.23], [0.51]])
     phase = rate * time_

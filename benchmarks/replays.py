@@ -16,18 +16,18 @@ import numpy as np
 from mujoco import mjx
 
 from droid_jax import runtime
-from droid_jax.compare.cost import batch_replay
-from droid_jax.compare.population import over_block, over_population
-from droid_jax.compare.replay import Drive, make_drive, servo_replay
-from droid_jax.compare.twin import control_of
-from droid_jax.measure.demonstration import demonstration_path
-from droid_jax.measure.engine import instrument, simulate
-from droid_jax.measure.formats import load
-from droid_jax.model.door import door_space
-from droid_jax.model.door_scene import door_scene
+from droid_jax.cost.cost import batch_replay
+from droid_jax.door.demonstration import demonstration_path
+from droid_jax.door.scene import door_scene
+from droid_jax.door.space import door_space
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_c_model, make_physics
 from droid_jax.model.scene import Scene
+from droid_jax.recordings.formats import load
+from droid_jax.simulate.batching import over_block, over_population
+from droid_jax.simulate.c_engine import instrument, simulate
+from droid_jax.simulate.c_reference import control_of
+from droid_jax.simulate.replay import Drive, make_drive, servo_replay
 
 C_CHUNK = 64  # samples of which the C engine holds traces at once
 Run = Callable[[], Any]

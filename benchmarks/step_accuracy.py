@@ -24,16 +24,16 @@ import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 
 from benchmarks.common import publish  # noqa: E402
-from droid_jax.compare.population import over_population  # noqa: E402
-from droid_jax.compare.replay import make_drive, servo_replay  # noqa: E402
-from droid_jax.compare.twin import twin_replay  # noqa: E402
-from droid_jax.measure.demonstration import demonstration_path  # noqa: E402
-from droid_jax.measure.engine import instrument, simulate  # noqa: E402
-from droid_jax.measure.formats import load  # noqa: E402
-from droid_jax.model.door import door_space, truth  # noqa: E402
-from droid_jax.model.door_scene import door_scene  # noqa: E402
+from droid_jax.door.demonstration import demonstration_path  # noqa: E402
+from droid_jax.door.scene import door_scene  # noqa: E402
+from droid_jax.door.space import door_space, truth  # noqa: E402
 from droid_jax.model.physics import make_c_model, make_physics  # noqa: E402
 from droid_jax.model.scene import with_options  # noqa: E402
+from droid_jax.recordings.formats import load  # noqa: E402
+from droid_jax.simulate.batching import over_population  # noqa: E402
+from droid_jax.simulate.c_engine import instrument, simulate  # noqa: E402
+from droid_jax.simulate.c_reference import twin_replay  # noqa: E402
+from droid_jax.simulate.replay import make_drive, servo_replay  # noqa: E402
 
 FINE = 1e-4  # s
 DEMONSTRATION = load(demonstration_path("A"))

@@ -45,13 +45,13 @@ def fit(generations: int) -> dict[str, Any]:
     """The search alone: s of the whole, and of its first generation, which compiles."""
     import tuned  # noqa: F401  (before jax starts)
 
-    from droid_jax.compare.cost import make_cost
+    from droid_jax.cost.cost import make_cost
+    from droid_jax.door.demonstration import demonstration_path
+    from droid_jax.door.scene import door_scene
+    from droid_jax.door.space import door_space
     from droid_jax.identify.search import SearchConfig, search
-    from droid_jax.measure.demonstration import demonstration_path
-    from droid_jax.measure.formats import load
-    from droid_jax.measure.surrogate import record, stand_in_truth
-    from droid_jax.model.door import door_space
-    from droid_jax.model.door_scene import door_scene
+    from droid_jax.recordings.formats import load
+    from droid_jax.synthetic.robot import record, stand_in_truth
 
     scene = door_scene(timestep=TIMESTEP)
     recording = record(scene, load(demonstration_path("A")), stand_in_truth(scene, 1, 1), seed=1, name="A")

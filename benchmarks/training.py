@@ -36,19 +36,19 @@ import jax  # noqa: E402
 import tyro  # noqa: E402
 
 from benchmarks.common import origin, stem  # noqa: E402
+from droid_jax.door.environment import DoorEnv  # noqa: E402
+from droid_jax.door.scene import door_scene  # noqa: E402
+from droid_jax.door.space import door_nuisances, door_space  # noqa: E402
+from droid_jax.door.task import Task  # noqa: E402
 from droid_jax.files import GAUSSIAN, POLICY  # noqa: E402
 from droid_jax.identify.gaussian import prior  # noqa: E402
-from droid_jax.measure.surrogate import stand_in_truth  # noqa: E402
-from droid_jax.model.door import door_nuisances, door_space  # noqa: E402
-from droid_jax.model.door_scene import door_scene  # noqa: E402
-from droid_jax.policy.door_env import DoorEnv  # noqa: E402
+from droid_jax.policy.evaluate import simulated  # noqa: E402
 from droid_jax.policy.network import save_policy  # noqa: E402
 from droid_jax.policy.randomise import randomised  # noqa: E402
-from droid_jax.policy.simulated import simulated  # noqa: E402
-from droid_jax.policy.task import Task  # noqa: E402
 from droid_jax.policy.train import PRESETS, TrainProgress, train  # noqa: E402
-from droid_jax.policy.transfer import TransferConfig, stand_in, transfer  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
+from droid_jax.synthetic.policy_trials import TransferConfig, stand_in, transfer  # noqa: E402
+from droid_jax.synthetic.robot import stand_in_truth  # noqa: E402
 from experiments.policies.cases import TIMESTEP, Options  # noqa: E402
 
 ENOUGH = 0.95  # success in the evaluations during training

@@ -19,22 +19,19 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import inspect
 
-    from droid_jax.compare.cost import make_cost as make_cost
-    from droid_jax.gap.case import GapConfig as GapConfig
-    from droid_jax.gap.extended import load_extended as load_extended
-    from droid_jax.gap.missing import find_missing as find_missing
+    from droid_jax.cost.cost import make_cost as make_cost
+    from droid_jax.discrepancy.case import GapConfig as GapConfig
+    from droid_jax.discrepancy.extended import load_extended as load_extended
+    from droid_jax.discrepancy.missing import find_missing as find_missing
+    from droid_jax.door.scene import door_scene as door_scene
+    from droid_jax.door.space import door_nuisances as door_nuisances
+    from droid_jax.door.space import door_space as door_space
     from droid_jax.identify.gaussian import Gaussian as Gaussian
     from droid_jax.identify.gaussian import load as load_gaussian
     from droid_jax.identify.pipeline import IdentifyConfig as IdentifyConfig
     from droid_jax.identify.pipeline import identify as identify
-    from droid_jax.measure.formats import load as load_recording
-    from droid_jax.measure.formats import save as save_recording
-    from droid_jax.measure.recording import Recording as Recording
-    from droid_jax.model.door import door_nuisances as door_nuisances
-    from droid_jax.model.door import door_space as door_space
-    from droid_jax.model.door_scene import door_scene as door_scene
     from droid_jax.model.mjcf import fitted_mjcf as fitted_mjcf
-    from droid_jax.model.own import load_parameters as load_parameters
+    from droid_jax.model.parameter_file import load_parameters as load_parameters
     from droid_jax.model.parameters import Parameter as Parameter
     from droid_jax.model.parameters import Scaling as Scaling
     from droid_jax.model.parameters import Space as Space
@@ -42,6 +39,9 @@ if TYPE_CHECKING:
     from droid_jax.model.scene import load_scene as load_scene
     from droid_jax.policy.randomise import randomised as randomised
     from droid_jax.policy.randomise import randomised_model as randomised_model
+    from droid_jax.recordings.formats import load as load_recording
+    from droid_jax.recordings.formats import save as save_recording
+    from droid_jax.recordings.recording import Recording as Recording
     from droid_jax.report.tables import frames as frames
     from droid_jax.runtime import tune as tune
 
@@ -80,22 +80,22 @@ _HOMES = {
     "Space": ("model.parameters", "Space"),
     "Scaling": ("model.parameters", "Scaling"),
     "Scene": ("model.scene", "Scene"),
-    "door_scene": ("model.door_scene", "door_scene"),
+    "door_scene": ("door.scene", "door_scene"),
     "load_scene": ("model.scene", "load_scene"),
-    "load_parameters": ("model.own", "load_parameters"),
-    "door_space": ("model.door", "door_space"),
-    "door_nuisances": ("model.door", "door_nuisances"),
-    "Recording": ("measure.recording", "Recording"),
-    "load_recording": ("measure.formats", "load"),
-    "save_recording": ("measure.formats", "save"),
-    "make_cost": ("compare.cost", "make_cost"),
+    "load_parameters": ("model.parameter_file", "load_parameters"),
+    "door_space": ("door.space", "door_space"),
+    "door_nuisances": ("door.space", "door_nuisances"),
+    "Recording": ("recordings.recording", "Recording"),
+    "load_recording": ("recordings.formats", "load"),
+    "save_recording": ("recordings.formats", "save"),
+    "make_cost": ("cost.cost", "make_cost"),
     "IdentifyConfig": ("identify.pipeline", "IdentifyConfig"),
     "Gaussian": ("identify.gaussian", "Gaussian"),
     "load_gaussian": ("identify.gaussian", "load"),
     "fitted_mjcf": ("model.mjcf", "fitted_mjcf"),
-    "find_missing": ("gap.missing", "find_missing"),
-    "GapConfig": ("gap.case", "GapConfig"),
-    "load_extended": ("gap.extended", "load_extended"),
+    "find_missing": ("discrepancy.missing", "find_missing"),
+    "GapConfig": ("discrepancy.case", "GapConfig"),
+    "load_extended": ("discrepancy.extended", "load_extended"),
     "randomised": ("policy.randomise", "randomised"),
     "randomised_model": ("policy.randomise", "randomised_model"),
     "frames": ("report.tables", "frames"),

@@ -28,11 +28,11 @@ from typing import Annotated, Any
 import tyro
 
 from droid_jax import console
-from droid_jax.commands import convert, evaluate, export, gap, identify, record, report, train, view, whole
+from droid_jax.commands import all_stages, convert, evaluate, export, gap, identify, record, report, train, view
 from droid_jax.commands.folder import BEGUN
 
 Command = (
-    Annotated[whole.All, tyro.conf.subcommand("all")]
+    Annotated[all_stages.All, tyro.conf.subcommand("all")]
     | identify.Identify
     | gap.Gap
     | train.Train
@@ -44,7 +44,7 @@ Command = (
     | view.View
 )
 _ACTIONS: dict[type, Callable[[Any], None]] = {
-    whole.All: whole.run,
+    all_stages.All: all_stages.run,
     identify.Identify: identify.run,
     gap.Gap: gap.run,
     train.Train: train.run,
@@ -61,7 +61,7 @@ SCRIPT = "droid-jax"  # as pyproject.toml installs it
 WHOLE = ("-h", "--help", "--tyro-")  # options of the program itself: help, shell completion
 # Errors of the machine, not of what it was given: no room, a quota, a file larger than allowed, a broken disk.
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
-RESUMED = (whole.All, identify.Identify, gap.Gap, train.Train)  # commands that go on where they were stopped
+RESUMED = (all_stages.All, identify.Identify, gap.Gap, train.Train)  # commands that go on where they were stopped
 WHAT = """From recordings of a robot to a fitted simulation, to what that simulation lacks, and to a policy.
 
 Without a command: `all`, on a stand-in robot.  --version says which version this is."""
@@ -81,7 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 raise ValueError("--recording names no file; was it an empty shell variable?")
             script = Path(sys.argv[0]).name
             prog = script if script == SCRIPT else "python -m droid_jax.run"
-            command = tyro.cli(Command, default=whole.All(), args=given, prog=prog, description=WHAT)
+            command = tyro.cli(Command, default=all_stages.All(), args=given, prog=prog, description=WHAT)
             with _plain_warnings():
                 _check_seeds(command)
                 _ACTIONS[type(command)](command)

@@ -27,8 +27,8 @@ import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 
 from benchmarks.common import publish  # noqa: E402
-from droid_jax.measure.recording import Recording  # noqa: E402
 from droid_jax.model.scene import with_options  # noqa: E402
+from droid_jax.recordings.recording import Recording  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 from experiments.blind.cases import Plan  # noqa: E402
 from experiments.blind.draws import commit_of, folder_of, seed_of  # noqa: E402

@@ -27,14 +27,14 @@ import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 
 from benchmarks.common import publish  # noqa: E402
+from droid_jax.door.demonstration import demonstration_path  # noqa: E402
+from droid_jax.door.scene import door_scene  # noqa: E402
 from droid_jax.files import POLICY  # noqa: E402
-from droid_jax.measure.demonstration import demonstration_path  # noqa: E402
-from droid_jax.measure.engine import simulate  # noqa: E402
-from droid_jax.measure.formats import load as load_recording  # noqa: E402
-from droid_jax.measure.surrogate import SurrogateConfig, set_up  # noqa: E402
-from droid_jax.model.door_scene import door_scene  # noqa: E402
 from droid_jax.policy.control import load  # noqa: E402
-from droid_jax.policy.transfer import watched  # noqa: E402
+from droid_jax.recordings.formats import load as load_recording  # noqa: E402
+from droid_jax.simulate.c_engine import simulate  # noqa: E402
+from droid_jax.synthetic.policy_trials import watched  # noqa: E402
+from droid_jax.synthetic.robot import SurrogateConfig, set_up  # noqa: E402
 from experiments.pad_friction import REPORTED, WATCHED, Opening, made, robots  # noqa: E402
 from experiments.pad_friction import Arguments as PadArguments  # noqa: E402
 from experiments.policies.cases import RESULTS  # noqa: E402

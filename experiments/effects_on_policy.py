@@ -33,19 +33,19 @@ from rich.progress import track  # noqa: E402
 
 from benchmarks.common import origin  # noqa: E402
 from benchmarks.sharing import claimed  # noqa: E402
-from droid_jax.commands.stand_in import hidden_effects  # noqa: E402
+from droid_jax.commands.synthetic import hidden_effects  # noqa: E402
+from droid_jax.door.demonstration import demonstration_path  # noqa: E402
+from droid_jax.door.environment import DoorEnv  # noqa: E402
+from droid_jax.door.scene import door_scene  # noqa: E402
+from droid_jax.door.task import Task  # noqa: E402
 from droid_jax.files import POLICY  # noqa: E402
-from droid_jax.measure.demonstration import demonstration_path  # noqa: E402
-from droid_jax.measure.formats import load as load_recording  # noqa: E402
-from droid_jax.measure.hidden import HIDDEN, LONGEST_STEP, Applied, listed, possible, record_hidden  # noqa: E402
-from droid_jax.measure.surrogate import SurrogateConfig  # noqa: E402
-from droid_jax.model.door_scene import door_scene  # noqa: E402
 from droid_jax.model.scene import Scene  # noqa: E402
 from droid_jax.policy.control import Policy, load  # noqa: E402
-from droid_jax.policy.door_env import DoorEnv  # noqa: E402
-from droid_jax.policy.task import Task  # noqa: E402
-from droid_jax.policy.transfer import TransferConfig, check_playable, stand_in, transfer  # noqa: E402
+from droid_jax.recordings.formats import load as load_recording  # noqa: E402
 from droid_jax.storage import file_sha256, write_json  # noqa: E402
+from droid_jax.synthetic.hidden_effects import HIDDEN, LONGEST_STEP, Applied, listed, possible, record_hidden  # noqa: E402
+from droid_jax.synthetic.policy_trials import TransferConfig, check_playable, stand_in, transfer  # noqa: E402
+from droid_jax.synthetic.robot import SurrogateConfig  # noqa: E402
 from experiments.policies.cases import RESULTS, TIMESTEP, Case, Options, finish, run_all  # noqa: E402
 from experiments.policies.robots import truth_of  # noqa: E402
 from experiments.policies.settings import Setting, setting_of  # noqa: E402

@@ -31,13 +31,13 @@ import tyro  # noqa: E402
 
 from benchmarks.common import origin  # noqa: E402
 from benchmarks.sharing import claimed  # noqa: E402
-from droid_jax.gap.missing import find_missing  # noqa: E402
+from droid_jax.discrepancy.missing import find_missing  # noqa: E402
 from droid_jax.identify.pipeline import IdentifyConfig, identify  # noqa: E402
 from droid_jax.identify.search import SearchConfig  # noqa: E402
-from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide  # noqa: E402
 from droid_jax.model.fields import joint_damping, joint_frictionloss, model_parameter  # noqa: E402
 from droid_jax.model.parameters import Space  # noqa: E402
 from droid_jax.model.scene import Scene, compile_scene  # noqa: E402
+from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 from experiments.blind.rates import rate  # noqa: E402
 

@@ -51,13 +51,13 @@ import tyro
 from inverse_fit import RESULTS, make_recording, read_npz, rms, run
 
 from benchmarks.common import publish, stem
-from droid_jax.gap.verdict import Verdict
-from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
+from droid_jax.discrepancy.verdict import Verdict
+from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects.registry import library
 from droid_jax.model.fields import joint_frictionloss
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene, load_scene
-from droid_jax.model.seam import Effect
+from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSide
 
 HINGE = "hinge"
 FIT, JUDGE = "ikea_cabinet_2", "ikea_cabinet_log"

@@ -5,7 +5,7 @@
 
 The base model is mass, viscous damping and a constant offset.  The published model has dry friction beside them
 (20.4 N), and a better one that differs between the directions, above all in its viscous part (167 and 240 N s/m).
-One log, no repeats: the search of `droid_jax.gap.single` on the first two thirds of DATA_EMPS, judged on its
+One log, no repeats: the search of `droid_jax.discrepancy.single` on the first two thirds of DATA_EMPS, judged on its
 last third and on DATA_EMPS_PULSES, another run.  Data and filter: see real_emps.py.
 
 The library has no viscous friction that differs between the directions.  `uneven_damping` below is such an effect
@@ -41,12 +41,12 @@ from inverse_fit import RESULTS, rms, rounded, run
 from real_emps import FIT, JUDGE, MOTION_CUTOFF, SLIDE, SOURCE, emps_space, load_emps
 
 from benchmarks.common import publish, stem
-from droid_jax.gap.single import make_log
-from droid_jax.gap.verdict import Verdict
+from droid_jax.discrepancy.single import make_log
+from droid_jax.discrepancy.verdict import Verdict
+from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects.registry import library
 from droid_jax.model.parameters import Parameter
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene, load_scene
-from droid_jax.model.seam import Effect
 
 NEWTONS = 30.0  # N of the carriage for each N m of a robot's joint: priors, bounds and sizes worth naming
 NOT_ASKED = ("torque_bias", "payload", "torque_ripple")  # the base has offset and mass; and a slide makes no turns

@@ -5,7 +5,7 @@
 
 The base model is the bare arm: link masses (3 %) and centres of mass (5 mm) as nuisances, viscous friction and a
 constant offset in every joint.  Published for this very log is dry friction in every joint.  One log, no repeats: the
-search of `droid_jax.gap.single` on the first two thirds, judged on the last, which repeats a motion that was fitted.
+search of `discrepancy.single` on the first two thirds, judged on the last, which repeats a motion that was fitted.
 
 Each joint's friction is a seventh of what is missing, and no seventh takes a fifth of the gap, which an effect must.
 So every effect of a joint is also asked about in all joints at once, as one candidate with an amplitude for each; in
@@ -43,14 +43,14 @@ from inverse_fit import RESULTS, rounded, run
 from real_panda import MOTION_CUTOFF, SOURCE, link_nuisances, load_panda, load_published
 
 from benchmarks.common import publish, stem
-from droid_jax.gap.candidates import possible
-from droid_jax.measure.recording import Recording
-from droid_jax.model.arm import panda_arm_scene
-from droid_jax.model.builtin import ARM
+from droid_jax.discrepancy.candidates import possible
+from droid_jax.door.arm import panda_arm_scene
+from droid_jax.door.builtin import ARM
+from droid_jax.model.effect_interface import Effect
 from droid_jax.model.joint_friction import joint_friction_space
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect
+from droid_jax.recordings.recording import Recording
 
 NOT_ASKED = ("torque_bias", "payload")  # the base has offsets and the last link's mass
 NINETY = 1.645  # deviations from which on zero is outside of a 90 % interval

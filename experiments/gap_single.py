@@ -29,22 +29,22 @@ from inverse_fit import rms, rounded
 
 from benchmarks.common import CODE
 from benchmarks.sharing import code_name, kept
-from droid_jax.compare.residuals import CompareConfig
-from droid_jax.gap.blocks import Blocks
-from droid_jax.gap.case import Case, GapConfig
-from droid_jax.gap.evidence import only_comparison
-from droid_jax.gap.refit import deviations, intervals
-from droid_jax.gap.select import SIGNIFICANT
-from droid_jax.gap.single import Log, base_model, make_log, single_case
-from droid_jax.gap.verdict import Verdict
-from droid_jax.gap.workflow import find
-from droid_jax.identify.refine import RefineConfig
-from droid_jax.measure.recording import Recording
+from droid_jax.cost.residuals import CompareConfig
+from droid_jax.discrepancy.blocks import Blocks
+from droid_jax.discrepancy.case import Case, GapConfig
+from droid_jax.discrepancy.refit import deviations, intervals
+from droid_jax.discrepancy.residual_set import only_comparison
+from droid_jax.discrepancy.select import SIGNIFICANT
+from droid_jax.discrepancy.single import Log, base_model, make_log, single_case
+from droid_jax.discrepancy.verdict import Verdict
+from droid_jax.discrepancy.workflow import find
+from droid_jax.identify.multistart import RefineConfig
+from droid_jax.model.effect_interface import Effect, Theta
 from droid_jax.model.effects.registry import effect_space
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect, Theta
 from droid_jax.policy.trials import wilson
+from droid_jax.recordings.recording import Recording
 from experiments.trials import trial_json
 
 ORDER = 20  # of the noise's autoregression, at 20 Hz: one second

@@ -32,27 +32,27 @@ import tyro  # noqa: E402
 from benchmarks.common import origin  # noqa: E402
 from benchmarks.sharing import claimed, code_name  # noqa: E402
 from droid_jax.commands.gap_search import searched  # noqa: E402
-from droid_jax.commands.stand_in import hidden_effects, record_stand_in  # noqa: E402
+from droid_jax.commands.synthetic import hidden_effects, record_stand_in  # noqa: E402
+from droid_jax.discrepancy.case import GapConfig  # noqa: E402
+from droid_jax.discrepancy.extended import extended, load_extended, save_extended  # noqa: E402
+from droid_jax.discrepancy.missing import case_of  # noqa: E402
+from droid_jax.discrepancy.split import Split  # noqa: E402
+from droid_jax.discrepancy.verdict import Kind  # noqa: E402
+from droid_jax.door.environment import DoorEnv  # noqa: E402
+from droid_jax.door.scene import door_scene  # noqa: E402
+from droid_jax.door.space import door_nuisances, door_space  # noqa: E402
+from droid_jax.door.task import Task  # noqa: E402
 from droid_jax.files import EXTENDED  # noqa: E402
-from droid_jax.gap.case import GapConfig  # noqa: E402
-from droid_jax.gap.extended import extended, load_extended, save_extended  # noqa: E402
-from droid_jax.gap.missing import case_of  # noqa: E402
-from droid_jax.gap.split import Split  # noqa: E402
-from droid_jax.gap.verdict import Kind  # noqa: E402
 from droid_jax.identify.gaussian import load as load_gaussian  # noqa: E402
 from droid_jax.identify.gaussian import prior  # noqa: E402
-from droid_jax.identify.refine import RefineConfig  # noqa: E402
+from droid_jax.identify.identifiability import posterior  # noqa: E402
+from droid_jax.identify.multistart import RefineConfig  # noqa: E402
 from droid_jax.identify.search import SearchConfig  # noqa: E402
-from droid_jax.identify.uncertainty import posterior  # noqa: E402
-from droid_jax.measure.hidden import listed  # noqa: E402
-from droid_jax.measure.surrogate import stand_in_truth  # noqa: E402
-from droid_jax.model.door import door_nuisances, door_space  # noqa: E402
-from droid_jax.model.door_scene import door_scene  # noqa: E402
 from droid_jax.model.effects.registry import library  # noqa: E402
-from droid_jax.policy.door_env import DoorEnv  # noqa: E402
-from droid_jax.policy.task import Task  # noqa: E402
-from droid_jax.policy.transfer import TransferConfig, check_playable, stand_in  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
+from droid_jax.synthetic.hidden_effects import listed  # noqa: E402
+from droid_jax.synthetic.policy_trials import TransferConfig, check_playable, stand_in  # noqa: E402
+from droid_jax.synthetic.robot import stand_in_truth  # noqa: E402
 from experiments.policies.cases import TIMESTEP, Case, Options, finish, found_of, made_by, run_all, tried  # noqa: E402
 from experiments.policies.store import Doors  # noqa: E402
 from experiments.policies.table import better_than, columns, line_of  # noqa: E402

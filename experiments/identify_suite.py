@@ -29,19 +29,19 @@ import tyro  # noqa: E402
 
 from benchmarks.common import commits, origin, publish, stem  # noqa: E402
 from benchmarks.sharing import kept  # noqa: E402
-from droid_jax.compare.cost import make_cost  # noqa: E402
+from droid_jax.cost.cost import make_cost  # noqa: E402
+from droid_jax.door.demonstration import demonstration_path  # noqa: E402
+from droid_jax.door.scene import door_scene  # noqa: E402
+from droid_jax.door.space import JOINT_DAMPING, door_nuisances, door_space  # noqa: E402
+from droid_jax.door.space import truth as table_i  # noqa: E402
 from droid_jax.identify.gaussian import prior  # noqa: E402
+from droid_jax.identify.multistart import RefineConfig  # noqa: E402
 from droid_jax.identify.pipeline import Identified, IdentifyConfig, cost_samples, identify  # noqa: E402
-from droid_jax.identify.refine import RefineConfig  # noqa: E402
 from droid_jax.identify.search import SearchConfig  # noqa: E402
-from droid_jax.measure.demonstration import demonstration_path  # noqa: E402
-from droid_jax.measure.formats import load  # noqa: E402
-from droid_jax.measure.recording import Recording  # noqa: E402
-from droid_jax.measure.surrogate import draw_nuisances, record, stand_in_truth  # noqa: E402
-from droid_jax.model.door import JOINT_DAMPING, door_nuisances, door_space  # noqa: E402
-from droid_jax.model.door import truth as table_i  # noqa: E402
-from droid_jax.model.door_scene import door_scene  # noqa: E402
 from droid_jax.model.scene import Scene  # noqa: E402
+from droid_jax.recordings.formats import load  # noqa: E402
+from droid_jax.recordings.recording import Recording  # noqa: E402
+from droid_jax.synthetic.robot import draw_nuisances, record, stand_in_truth  # noqa: E402
 
 Part = Literal["doors", "calibration", "pose", "parity"]
 MUST_BE_KNOWN = ("hinge_stiffness", "hinge_frictionloss", "hinge_damping", *JOINT_DAMPING)

@@ -4,8 +4,8 @@ A log without commands is replayed in inverse mode: its measured motion is presc
 that this takes is compared with the measured one.  One filter chain, fixed beforehand:
 
 1. Motion: the measured position, zero-phase Butterworth of order 4 at the experiment's cutoff, then
-   central differences at the log's own rate (`droid_jax.measure.motion`).
-2. Torque: measured and simulated pass through the program's own low-pass (`droid_jax.measure.noise`,
+   central differences at the log's own rate (`droid_jax.simulate.measured_motion`).
+2. Torque: measured and simulated pass through the program's own low-pass (`droid_jax.cost.noise`,
    windowed sinc, 8 Hz, read off at 20 Hz), the same kernel for both.
 """
 
@@ -24,24 +24,24 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks import common
-from droid_jax.compare.cost import Cost, make_cost
-from droid_jax.compare.residuals import CompareConfig
+from droid_jax.cost import noise
+from droid_jax.cost.cost import Cost, make_cost
+from droid_jax.cost.residuals import CompareConfig
 from droid_jax.identify.fit import Fit
 from droid_jax.identify.gaussian import Gaussian
-from droid_jax.identify.refine import Refined, refine
+from droid_jax.identify.identifiability import calibrated, identifiability, time_blocks
+from droid_jax.identify.multistart import Refined, refine
 from droid_jax.identify.search import SearchConfig, search
-from droid_jax.identify.uncertainty import calibrated, identifiability, time_blocks
-from droid_jax.measure import noise
-from droid_jax.measure.checks import validate
-from droid_jax.measure.clocks import interpolate
-from droid_jax.measure.motion import Motion
-from droid_jax.measure.recording import Channel, Recording, TorqueConvention
-from droid_jax.measure.rest import RestConfig
+from droid_jax.model.effect_interface import Effect
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect
+from droid_jax.recordings.checks import validate
+from droid_jax.recordings.clocks import interpolate
+from droid_jax.recordings.recording import Channel, Recording, TorqueConvention
 from droid_jax.report import style
 from droid_jax.report.export import png_bytes
+from droid_jax.simulate.measured_motion import Motion
+from droid_jax.simulate.rest import RestConfig
 from droid_jax.storage import write_bytes
 
 RESULTS = Path(__file__).parent / "results"

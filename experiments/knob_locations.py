@@ -30,11 +30,11 @@ import json  # noqa: E402
 import tyro  # noqa: E402
 
 from benchmarks.common import origin  # noqa: E402
-from droid_jax.model.door_scene import LEVERS, door_scene  # noqa: E402
-from droid_jax.policy.door_env import DoorEnv  # noqa: E402
-from droid_jax.policy.task import Task  # noqa: E402
-from droid_jax.policy.transfer import TransferConfig, stand_in  # noqa: E402
+from droid_jax.door.environment import DoorEnv  # noqa: E402
+from droid_jax.door.scene import LEVERS, door_scene  # noqa: E402
+from droid_jax.door.task import Task  # noqa: E402
 from droid_jax.storage import write_json, write_text  # noqa: E402
+from droid_jax.synthetic.policy_trials import TransferConfig, stand_in  # noqa: E402
 from experiments.policies.cases import TIMESTEP, Case, Options, finish, found_of, made_by, run_all, tried  # noqa: E402
 from experiments.policies.figure import knob_histograms, knobs_as_text  # noqa: E402
 from experiments.policies.robots import fitted, truth_of  # noqa: E402

@@ -31,11 +31,11 @@ import tyro  # noqa: E402
 
 from benchmarks.common import CODE, origin, stem  # noqa: E402
 from benchmarks.sharing import claimed  # noqa: E402
-from droid_jax.gap.anew import base_fit  # noqa: E402
-from droid_jax.gap.candidates import candidates  # noqa: E402
-from droid_jax.gap.screen import questions_of  # noqa: E402
-from droid_jax.gap.select import SIGNIFICANT  # noqa: E402
-from droid_jax.gap.workflow import ask, find  # noqa: E402
+from droid_jax.discrepancy.candidates import candidates  # noqa: E402
+from droid_jax.discrepancy.restart import base_fit  # noqa: E402
+from droid_jax.discrepancy.screen import questions_of  # noqa: E402
+from droid_jax.discrepancy.select import SIGNIFICANT  # noqa: E402
+from droid_jax.discrepancy.workflow import ask, find  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 from experiments.blind.cases import Plan  # noqa: E402
 from experiments.blind.draws import commit_of, seed_of  # noqa: E402

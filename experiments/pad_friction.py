@@ -39,14 +39,14 @@ from rich.progress import track  # noqa: E402
 
 from benchmarks import archive  # noqa: E402
 from benchmarks.common import origin, stem  # noqa: E402
+from droid_jax.door.environment import DoorEnv  # noqa: E402
+from droid_jax.door.hand import finger_forces_c, hand_of, looked  # noqa: E402
+from droid_jax.door.scene import door_scene  # noqa: E402
+from droid_jax.door.task import Task, gripped  # noqa: E402
 from droid_jax.files import POLICY  # noqa: E402
-from droid_jax.model.door_scene import door_scene  # noqa: E402
 from droid_jax.policy.control import Policy, load  # noqa: E402
-from droid_jax.policy.door_env import DoorEnv  # noqa: E402
-from droid_jax.policy.hand import finger_forces_c, hand_of, looked  # noqa: E402
-from droid_jax.policy.task import Task, gripped  # noqa: E402
-from droid_jax.policy.transfer import TransferConfig, TrialRobot, stand_in, transfer, watched  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
+from droid_jax.synthetic.policy_trials import TransferConfig, TrialRobot, stand_in, transfer, watched  # noqa: E402
 from experiments.policies.cases import QUICK_STEPS, RESULTS, TIMESTEP, made_by  # noqa: E402
 from experiments.policies.robots import pads_of, truth_of  # noqa: E402
 from experiments.policies.settings import SETTINGS, Setting  # noqa: E402

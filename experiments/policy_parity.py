@@ -31,22 +31,22 @@ import tyro  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 
 from benchmarks.common import origin, stem  # noqa: E402
+from droid_jax.door.environment import DoorEnv  # noqa: E402
+from droid_jax.door.scene import door_scene  # noqa: E402
+from droid_jax.door.space import door_nuisances, door_space  # noqa: E402
+from droid_jax.door.task import Task  # noqa: E402
 from droid_jax.files import GAUSSIAN  # noqa: E402
 from droid_jax.identify.gaussian import Gaussian, prior  # noqa: E402
 from droid_jax.identify.gaussian import load as load_gaussian  # noqa: E402
-from droid_jax.model.door import door_nuisances, door_space  # noqa: E402
-from droid_jax.model.door_scene import door_scene  # noqa: E402
 from droid_jax.policy.control import Policy, load  # noqa: E402
-from droid_jax.policy.door_env import DoorEnv  # noqa: E402
+from droid_jax.policy.evaluate import simulated  # noqa: E402
 from droid_jax.policy.randomise import axes, physics_of, randomised  # noqa: E402
-from droid_jax.policy.simulated import simulated  # noqa: E402
-from droid_jax.policy.task import Task  # noqa: E402
 from droid_jax.policy.train import train  # noqa: E402
-from droid_jax.policy.transfer import TransferConfig, stand_in, transfer  # noqa: E402
 from droid_jax.policy.trials import Trials  # noqa: E402
 from droid_jax.report.export import png_bytes  # noqa: E402
 from droid_jax.report.style import AFTER, INK, styled  # noqa: E402
 from droid_jax.storage import file_sha256, write_bytes, write_json  # noqa: E402
+from droid_jax.synthetic.policy_trials import TransferConfig, stand_in, transfer  # noqa: E402
 from experiments.policies.cases import QUICK_STEPS, RESULTS, TIMESTEP, Options  # noqa: E402
 
 WITHIN = 3.0  # degrees

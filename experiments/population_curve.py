@@ -29,15 +29,15 @@ from matplotlib.figure import Figure  # noqa: E402
 
 from benchmarks.common import commits, origin, publish, stem  # noqa: E402
 from benchmarks.sharing import kept  # noqa: E402
-from droid_jax.compare.cost import Cost, make_cost  # noqa: E402
-from droid_jax.identify.judge import split  # noqa: E402
+from droid_jax.cost.cost import Cost, make_cost  # noqa: E402
+from droid_jax.door.demonstration import demonstration_path  # noqa: E402
+from droid_jax.door.scene import door_scene  # noqa: E402
+from droid_jax.door.space import door_space  # noqa: E402
+from droid_jax.identify.holdout import split  # noqa: E402
 from droid_jax.identify.search import SearchConfig, search  # noqa: E402
-from droid_jax.measure.demonstration import demonstration_path  # noqa: E402
-from droid_jax.measure.formats import load  # noqa: E402
-from droid_jax.measure.surrogate import record, stand_in_truth  # noqa: E402
-from droid_jax.model.door import door_space  # noqa: E402
-from droid_jax.model.door_scene import door_scene  # noqa: E402
+from droid_jax.recordings.formats import load  # noqa: E402
 from droid_jax.storage import write_bytes  # noqa: E402
+from droid_jax.synthetic.robot import record, stand_in_truth  # noqa: E402
 
 COLOURS = ("#2b6cb0", "#c05621", "#2f855a", "#6b46c1")
 

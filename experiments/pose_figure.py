@@ -23,8 +23,8 @@ from matplotlib.figure import Figure  # noqa: E402
 from scipy import stats  # noqa: E402
 
 from benchmarks.common import stem  # noqa: E402
-from droid_jax.model.door import door_space  # noqa: E402
-from droid_jax.model.door_scene import door_scene  # noqa: E402
+from droid_jax.door.scene import door_scene  # noqa: E402
+from droid_jax.door.space import door_space  # noqa: E402
 from droid_jax.report.export import save  # noqa: E402
 from droid_jax.report.style import AFTER, BEFORE, TRUTH, WIDE, styled  # noqa: E402
 from droid_jax.report.words import label  # noqa: E402

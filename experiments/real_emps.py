@@ -50,16 +50,16 @@ from inverse_fit import (
     table,
 )
 
-from droid_jax.compare.cost import Cost
+from droid_jax.cost.cost import Cost
+from droid_jax.cost.noise import CUTOFF, correlation_time
 from droid_jax.identify.search import SearchConfig
-from droid_jax.measure.motion import OVERSAMPLING
-from droid_jax.measure.noise import CUTOFF, correlation_time
-from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
-from droid_jax.measure.rest import RestConfig
 from droid_jax.model.fields import body_mass, joint_damping, joint_frictionloss
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import Scene, load_scene
+from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.report import style
+from droid_jax.simulate.measured_motion import OVERSAMPLING
+from droid_jax.simulate.rest import RestConfig
 
 SLIDE = "slide"
 FIT, JUDGE = "DATA_EMPS", "DATA_EMPS_PULSES"

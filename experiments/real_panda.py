@@ -64,21 +64,21 @@ from inverse_fit import (
     table,
 )
 
-from droid_jax.compare.cost import Cost
+from droid_jax.cost.cost import Cost
+from droid_jax.cost.noise import CUTOFF, correlation_time
+from droid_jax.door.arm import panda_arm_scene
+from droid_jax.door.builtin import ARM
 from droid_jax.identify.search import SearchConfig
-from droid_jax.measure.motion import OVERSAMPLING
-from droid_jax.measure.noise import CUTOFF, correlation_time
-from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
-from droid_jax.measure.rest import RestConfig
-from droid_jax.model.arm import panda_arm_scene
-from droid_jax.model.builtin import ARM
+from droid_jax.model.effect_interface import Effect, Rollout, Theta
 from droid_jax.model.fields import body_mass_scale, model_parameter
 from droid_jax.model.joint_friction import SMOOTHING, joint_friction_space
 from droid_jax.model.parameters import Mode, Parameter, Space
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect, Rollout, Theta
+from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.report import style
 from droid_jax.report.words import label
+from droid_jax.simulate.measured_motion import OVERSAMPLING
+from droid_jax.simulate.rest import RestConfig
 
 FILE, REFERENCE = "panda_exciting_traj1.npz", "reference_values.json"
 SOURCE = (

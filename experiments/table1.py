@@ -25,8 +25,8 @@ import tyro  # noqa: E402
 from identify_suite import kept_cases  # noqa: E402
 
 from benchmarks.common import commits, stem  # noqa: E402
-from droid_jax.model.door import door_space  # noqa: E402
-from droid_jax.model.door_scene import door_scene  # noqa: E402
+from droid_jax.door.scene import door_scene  # noqa: E402
+from droid_jax.door.space import door_space  # noqa: E402
 from droid_jax.report.words import label, like, number  # noqa: E402
 from droid_jax.storage import write_json, write_text  # noqa: E402
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from droid_jax.gap.select import Trial
+from droid_jax.discrepancy.select import Trial
 from droid_jax.storage import finite
 
 

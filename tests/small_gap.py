@@ -13,21 +13,21 @@ from pathlib import Path
 
 import numpy as np
 
-from droid_jax.gap.anew import base_fit
-from droid_jax.gap.case import Case, GapConfig, make_case
-from droid_jax.gap.handover import HandedOn
-from droid_jax.gap.refit import Model
-from droid_jax.gap.verdict import Verdict
-from droid_jax.gap.workflow import find
-from droid_jax.identify.refine import RefineConfig
+from droid_jax.discrepancy.case import Case, GapConfig, make_case
+from droid_jax.discrepancy.final_refit import HandedOn
+from droid_jax.discrepancy.refit import Model
+from droid_jax.discrepancy.restart import base_fit
+from droid_jax.discrepancy.verdict import Verdict
+from droid_jax.discrepancy.workflow import find
+from droid_jax.identify.multistart import RefineConfig
 from droid_jax.identify.search import SearchConfig
-from droid_jax.measure.hidden import record_hidden
-from droid_jax.measure.recording import Phase, Recording, TorqueConvention, TorqueSide
-from droid_jax.measure.surrogate import SurrogateConfig
 from droid_jax.model.effects.registry import library
-from droid_jax.model.own import load_parameters
+from droid_jax.model.parameter_file import load_parameters
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene, load_scene
+from droid_jax.recordings.recording import Phase, Recording, TorqueConvention, TorqueSide
+from droid_jax.synthetic.hidden_effects import record_hidden
+from droid_jax.synthetic.robot import SurrogateConfig
 
 SCENE = Path(__file__).resolve().parents[1] / "experiments" / "bench.xml"
 JOINTS = ("shoulder", "elbow", "door")

@@ -8,14 +8,14 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from droid_jax.compare.residuals import CompareConfig
-from droid_jax.gap.case import GapConfig
-from droid_jax.identify.refine import RefineConfig
-from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
+from droid_jax.cost.residuals import CompareConfig
+from droid_jax.discrepancy.case import GapConfig
+from droid_jax.identify.multistart import RefineConfig
 from droid_jax.model.fields import joint_damping
 from droid_jax.model.joint_friction import SMOOTHING
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import Scene, compile_scene
+from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
 
 MJCF = """
 <mujoco>

@@ -14,16 +14,16 @@ import pytest
 import droid_jax as dj
 from droid_jax import arguments
 from droid_jax.arguments import check_fields, number, whole
-from droid_jax.compare.residuals import CompareConfig
-from droid_jax.gap.case import GapConfig
+from droid_jax.cost.residuals import CompareConfig
+from droid_jax.discrepancy.case import GapConfig
+from droid_jax.identify.multistart import RefineConfig
 from droid_jax.identify.pipeline import IdentifyConfig
-from droid_jax.identify.refine import RefineConfig
 from droid_jax.identify.search import SearchConfig
-from droid_jax.measure.recording import TorqueConvention, TorqueSide
-from droid_jax.measure.surrogate import SurrogateConfig
 from droid_jax.model.parameters import Mode, Parameter, Scaling, Space, Write
 from droid_jax.policy.train import TrainConfig
-from droid_jax.policy.transfer import TransferConfig
+from droid_jax.recordings.recording import TorqueConvention, TorqueSide
+from droid_jax.synthetic.policy_trials import TransferConfig
+from droid_jax.synthetic.robot import SurrogateConfig
 
 GOOD = {"name": "a", "unit": "kg", "mean": 1.0, "std": 0.5, "low": 0.1, "high": 5.0}
 

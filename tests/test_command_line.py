@@ -21,18 +21,18 @@ from small_log import elbow_log, write_elbow
 
 from droid_jax import run
 from droid_jax.commands import convert, folder, presets
+from droid_jax.commands.all_stages import All
 from droid_jax.commands.folder import OtherRun, changed, finished, setup_of
 from droid_jax.commands.gap import Gap
 from droid_jax.commands.identify import Identify
-from droid_jax.commands.own_effects import load_effects
-from droid_jax.commands.stand_in import known_stand_in, settled
+from droid_jax.commands.synthetic import known_stand_in, settled
 from droid_jax.commands.train import Train
-from droid_jax.commands.whole import All
+from droid_jax.commands.user_effects import load_effects
+from droid_jax.door.demonstration import demonstration_path
 from droid_jax.identify import pipeline
-from droid_jax.measure.demonstration import demonstration_path
-from droid_jax.measure.formats import load, save
 from droid_jax.model.effects import registry
 from droid_jax.read_json import typed
+from droid_jax.recordings.formats import load, save
 from droid_jax.report.stages import Setup
 from droid_jax.run import main
 
@@ -470,7 +470,7 @@ def test_what_record_wrote_says_which_robot_it_was(tmp_path: Path):
     """A fit of it knows its truth, and a policy is tried on this robot and no other."""
     recording = replace(load(demonstration_path("A")), meta={"springs": "2", "robot": "7"})
     save(recording, tmp_path / "c.npz")
-    assert known_stand_in([tmp_path / "c.npz"]) == {"springs": 2, "seed": 7, "hide": []}
+    assert known_stand_in([tmp_path / "c.npz"]) == {"springs": 2, "seed": 7, "hide": [], "hidden": ""}
     save(replace(recording, meta={"springs": "1", "robot": "7"}), tmp_path / "d.npz")
     assert known_stand_in([tmp_path / "c.npz", tmp_path / "d.npz"]) == {}
     save(replace(recording, meta={}), tmp_path / "d.npz")

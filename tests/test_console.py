@@ -14,7 +14,7 @@ import pytest
 
 from droid_jax import run
 from droid_jax.commands import convert
-from droid_jax.measure.demonstration import demonstration_path
+from droid_jax.door.demonstration import demonstration_path
 from droid_jax.run import main
 
 ROOT = Path(__file__).resolve().parents[1]

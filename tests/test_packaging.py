@@ -58,7 +58,7 @@ def test_installed_package_finds_its_own_mjcf(built, tmp_path):
     run("-m", "pip", "install", "--no-deps", "--no-index", "--target", str(target), str(built[0]))
     code = (
         f"import sys; sys.path.insert(0, {str(target)!r})\n"
-        "import mujoco, droid_jax.model.builtin as builtin\n"
+        "import mujoco, droid_jax.door.builtin as builtin\n"
         "folder = builtin.mjcf_dir()\n"
         "print(builtin.__file__, folder, mujoco.MjModel.from_xml_path(str(folder / 'panda.xml')).nu, sep='\\n')"
     )

@@ -10,8 +10,8 @@ import pytest
 from droid_jax.commands import identify
 from droid_jax.commands.identify import Identify
 from droid_jax.commands.pictures import draw, keep_replay
-from droid_jax.measure.recording import Recording
 from droid_jax.model.scene import Scene, load_scene
+from droid_jax.recordings.recording import Recording
 from droid_jax.report import film, render
 from droid_jax.storage import write_npz
 

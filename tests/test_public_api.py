@@ -20,14 +20,14 @@ import pytest
 import droid_jax as dj
 from droid_jax import runtime
 from droid_jax.commands.identify import Identify, config_of, model_of
-from droid_jax.compare.residuals import CompareConfig
+from droid_jax.cost.residuals import CompareConfig
+from droid_jax.door.scene import door_scene
+from droid_jax.identify.multistart import RefineConfig
 from droid_jax.identify.pipeline import identify as identify_function
-from droid_jax.identify.refine import RefineConfig
 from droid_jax.identify.search import SearchConfig
-from droid_jax.model.door_scene import door_scene
+from droid_jax.model.effect_interface import State
 from droid_jax.model.effects import registry
-from droid_jax.model.own import load_parameters
-from droid_jax.model.seam import State
+from droid_jax.model.parameter_file import load_parameters
 from droid_jax.run import main
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -71,7 +71,7 @@ def test_tune_can_follow_any_import_that_does_not_start_jax():
     """`import droid_jax`, scene and parameters first, then tune: what the documents do."""
     code = (
         "import droid_jax as dj\nfrom droid_jax.model.fields import joint_damping\n"
-        "from droid_jax.measure.recording import Channel\ndj.load_scene, dj.Space\n"
+        "from droid_jax.recordings.recording import Channel\ndj.load_scene, dj.Space\n"
         "assert dj.tune(devices=2).devices == 2\nimport jax; assert jax.local_device_count() == 2"
     )
     assert "jax" in loaded(code)
@@ -82,7 +82,7 @@ def test_every_public_name_is_there_and_kept():
     for name in dj.__all__:
         assert getattr(dj, name) is getattr(dj, name)
         assert name in dir(dj)
-    assert dj.load_recording is importlib.import_module("droid_jax.measure.formats").load
+    assert dj.load_recording is importlib.import_module("droid_jax.recordings.formats").load
     assert dj.tune is runtime.tune
 
 

@@ -13,16 +13,16 @@ import numpy as np
 import pytest
 from small_log import elbow_log, write_elbow
 
-from droid_jax.commands import evaluate, gap, identify, report, stand_in, train, whole
+from droid_jax.commands import all_stages, evaluate, gap, identify, report, synthetic, train
 from droid_jax.commands.folder import OtherRun
 from droid_jax.commands.presets import TIMESTEP
 from droid_jax.commands.source import stand_in_of
-from droid_jax.commands.stand_in import known_stand_in
-from droid_jax.measure.formats import load, save
-from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
-from droid_jax.measure.surrogate import SOURCE
-from droid_jax.model.door_scene import door_scene
+from droid_jax.commands.synthetic import known_stand_in
+from droid_jax.door.scene import door_scene
+from droid_jax.recordings.formats import load, save
+from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
 from droid_jax.run import main
+from droid_jax.synthetic.robot import SOURCE
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -34,7 +34,7 @@ def called(tuned: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list
     monkeypatch.chdir(tmp_path)
     for module in (identify, gap, train, evaluate):
         monkeypatch.setattr(module, "run", commands.append)
-    monkeypatch.setattr(stand_in, "kept_recordings", lambda paths, again, record: dict.fromkeys(paths))
+    monkeypatch.setattr(synthetic, "kept_recordings", lambda paths, again, record: dict.fromkeys(paths))
     monkeypatch.setattr(report, "write", lambda folder: folder / "report.html")
     return commands
 
@@ -78,7 +78,7 @@ def found(folder: Path, effects: list[str], stand_in: bool = True) -> None:
                 "screens": [],
                 "sentence": "The model lacks: latch.",
                 "gaps": gaps,
-                "setup": {"stand_in": stand_in, "robot": {"hide": ["magnetic_catch=1.5"]}},
+                "setup": {"stand_in": stand_in, "robot": {"hidden": "magnetic catch (1.5 N m; in the library: latch)"}},
             }
         )
     )
@@ -90,7 +90,8 @@ def test_without_arguments_every_stage_runs_on_one_recording(called, tmp_path: P
     files = tuple(Path("runs/all/recordings") / f"{name}.npz" for name in "CBA")
     assert fit.recording == files[:2] and search.recording == files
     assert policy.fit == fit.out and policy.out == trials.run == Path("runs/all/train")
-    assert known_stand_in(files) == {"springs": 1, "seed": 0, "hide": ["magnetic_catch=1.5"]}
+    assert known_stand_in(files) == {"springs": 1, "seed": 0, "hide": ["magnetic_catch=1.5"],
+                                     "hidden": "magnetic catch (1.5 N m; in the library: latch)"}  # fmt: skip
     lines = capsys.readouterr().out.splitlines()
     stages = {"record": 19, "identify": 19, "gap": 15, "train": 7, "evaluate": 1}
     assert [line for line in lines if line.startswith("[")] == [
@@ -289,9 +290,9 @@ def test_a_damaged_file_is_named(called, tmp_path: Path, name: str, text: str):
     (run / name).write_text(text)
     with pytest.raises(ValueError, match=f"{name}[ :]"):
         if name == "all.json":
-            whole._remember(whole.All(), run)
+            all_stages._remember(all_stages.All(), run)
         else:
-            whole.told(run)
+            all_stages.told(run)
 
 
 def test_another_runs_results_are_not_written_over(called, capsys):
@@ -465,22 +466,22 @@ def test_presets_reach_the_stages(called, capsys):
     fit, search, policy, _ = called
     assert (fit.preset, search.preset, policy.preset) == ("standard", "standard", "paper")
     assert {c.seed for c in called} == {3}
-    assert whole.PRESETS["gpu"] == ("gpu", "gpu")
+    assert all_stages.PRESETS["gpu"] == ("gpu", "gpu")
     assert "left on two cores" not in capsys.readouterr().out  # which was measured for quick alone
 
 
 def test_jax_is_tuned_before_the_stand_in_is_recorded(tmp_path: Path):
     """In a process of its own, where nothing has started jax: it could not be tuned afterwards."""
     code = (
-        "from droid_jax.commands import identify, report, stand_in, whole\n"
-        "stand_in.kept_recordings = lambda paths, again, record: dict.fromkeys(paths)\n"
+        "from droid_jax.commands import all_stages, identify, report, synthetic\n"
+        "synthetic.kept_recordings = lambda paths, again, record: dict.fromkeys(paths)\n"
         "def fit(command):\n"
         "    from droid_jax import runtime\n"
         "    runtime.tune()\n"
         "    print('tuned twice')\n"
         "identify.run = fit\n"
         "report.write = lambda folder: folder\n"
-        "whole.run(whole.All(stages=('identify',)))\n"
+        "all_stages.run(all_stages.All(stages=('identify',)))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)},
                           capture_output=True, text=True, timeout=120)  # fmt: skip

@@ -17,16 +17,16 @@ import pytest
 from small_gap import EFFECTS, FLOOR, JOINTS, PRELOAD, QUICK, SCENE, record, small, small_scene, write_parameters
 
 from droid_jax.commands import gap, report
-from droid_jax.commands.stand_in import hidden_effects, record_stand_in
-from droid_jax.gap import amend, anew, missing
-from droid_jax.gap.inputs import check_recordings, lags
-from droid_jax.gap.verdict import Experiment
-from droid_jax.measure.formats import save
-from droid_jax.measure.recording import Channel, Recording
-from droid_jax.model.door_scene import door_scene
+from droid_jax.commands.synthetic import hidden_effects, record_stand_in
+from droid_jax.discrepancy import amendments, missing, restart
+from droid_jax.discrepancy.inputs import check_recordings, lags
+from droid_jax.discrepancy.verdict import Experiment
+from droid_jax.door.scene import door_scene
+from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects import registry
 from droid_jax.model.parameters import Parameter, Scaling
-from droid_jax.model.seam import Effect
+from droid_jax.recordings.formats import save
+from droid_jax.recordings.recording import Channel, Recording
 from droid_jax.report.gap_folder import read_gap
 from droid_jax.run import main
 
@@ -346,7 +346,7 @@ def test_what_is_hidden():
 
 def test_the_stand_in_records_each_demonstration_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """C is fitted, B confirms, A stays sealed; nothing in the files says what was hidden."""
-    from droid_jax.measure import hidden
+    from droid_jax.synthetic import hidden_effects as hidden
 
     asked = []
 
@@ -391,14 +391,14 @@ def test_the_base_fit_begins_at_an_earlier_fit(place: Path, quick: None, monkeyp
     The folder may be one of `all`.
     """
     base = small().case.base
-    monkeypatch.setattr(anew, "search", lambda *a, **k: pytest.fail("there is nothing to search for"))
+    monkeypatch.setattr(restart, "search", lambda *a, **k: pytest.fail("there is nothing to search for"))
     begun = []
 
     def refit(evidence, space, parts, starts, *rest, **more):
         begun.append(starts)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(anew, "refit", refit)
+    monkeypatch.setattr(restart, "refit", refit)
     known = {p.name: 0.5 * (p.mean + p.high) for p in base.parameters if not p.nuisance}
     first = next(iter(known))
     folder = fit_json(place / "all" / "identify", **{**known, first: 1e9, "of_another_model": 1.0})
@@ -491,7 +491,7 @@ def test_ties_come_with_an_experiment(place: Path, quick: None, monkeypatch: pyt
         return (Experiment("the same motion twice as fast", 8.5), Experiment("slower", None, "too long"))
 
     tied(monkeypatch)
-    monkeypatch.setattr(amend, "separating", apart)
+    monkeypatch.setattr(amendments, "separating", apart)
     assert main(arguments(place, "--effects", *EFFECTS)) == 0
     assert asked == [(["hinge_preload at door", "base"], "fit")]
     found = read_gap(place / "run").found
@@ -516,7 +516,7 @@ def test_the_verdict_is_there_whatever_becomes_of_what_is_added_to_it(
         assert read_gap(out).found["verdict"] == "named"  # it stayed there while the run went on
         raise ValueError("no motion can be asked for")
 
-    monkeypatch.setattr(amend, "separating", stopped)
+    monkeypatch.setattr(amendments, "separating", stopped)
     assert main(command) == 130
     said = capsys.readouterr()
     assert f"the verdict is in {out / 'gap.json'}: The model lacks: hinge_preload at door." in said.out
@@ -525,7 +525,7 @@ def test_the_verdict_is_there_whatever_becomes_of_what_is_added_to_it(
     assert first.found["verdict"] == "named" and first.fitted_to == ["fit"]
     assert {"gap.npz", "extended.json", "checkpoints"} <= {p.name for p in out.iterdir()}
 
-    monkeypatch.setattr(amend, "separating", failing)
+    monkeypatch.setattr(amendments, "separating", failing)
     assert main(command) == 0
     said = capsys.readouterr().out
     assert "holds this run unfinished; going on" in said

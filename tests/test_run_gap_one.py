@@ -16,13 +16,13 @@ from small_log import ASKED, CONFIG, COULOMB, elbow, elbow_log, write_elbow
 from droid_jax import runtime
 from droid_jax.commands import gap
 from droid_jax.commands.gap_search import IN_BLOCKS
-from droid_jax.gap import missing
-from droid_jax.gap.extended import load_extended
-from droid_jax.gap.single import Log
-from droid_jax.gap.split import Split, roles_of, split_of
+from droid_jax.discrepancy import missing
+from droid_jax.discrepancy.extended import load_extended
+from droid_jax.discrepancy.single import Log
+from droid_jax.discrepancy.split import Split, roles_of, split_of
 from droid_jax.identify.search import SearchConfig
-from droid_jax.measure.formats import save
-from droid_jax.measure.recording import Recording
+from droid_jax.recordings.formats import save
+from droid_jax.recordings.recording import Recording
 from droid_jax.report.gap_folder import Gap, read_gap
 from droid_jax.run import main
 

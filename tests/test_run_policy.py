@@ -16,12 +16,12 @@ from droid_jax.commands.evaluate import Evaluate, _film, _robot, _task, _tell
 from droid_jax.commands.folder import begin, setup_of, stage_folder
 from droid_jax.commands.source import source, stand_in_of
 from droid_jax.commands.train import Train, _fit_folder
+from droid_jax.door.environment import DoorEnv
+from droid_jax.door.scene import door_scene
+from droid_jax.door.space import door_nuisances, door_space
+from droid_jax.door.task import Task
 from droid_jax.identify.gaussian import prior
-from droid_jax.model.door import door_nuisances, door_space
-from droid_jax.model.door_scene import door_scene
 from droid_jax.policy.control import load
-from droid_jax.policy.door_env import DoorEnv
-from droid_jax.policy.task import Task
 from droid_jax.policy.trials import BLOWN_UP, Trials
 from droid_jax.report.render import NoOpenGL
 from droid_jax.report.stages import extended_of
@@ -275,7 +275,7 @@ def test_films_are_of_the_trials_of_median_angle(tmp_path: Path, monkeypatch: py
         made[path.name] = states[0]
 
     monkeypatch.setattr("droid_jax.report.film.film", film)
-    monkeypatch.setattr("droid_jax.policy.transfer.filmed", lambda policy, robot, number: number)
+    monkeypatch.setattr("droid_jax.synthetic.policy_trials.filmed", lambda policy, robot, number: number)
     robot: Any = SimpleNamespace(scene=SimpleNamespace(visual_model=lambda: None), task=Task())
     why = _film(tmp_path, None, robot, trials)  # type: ignore[arg-type]
     assert why is None if opengl else str(why).startswith("no OpenGL here; ")

@@ -313,7 +313,7 @@ droid_jax.tune(cache_dir={cache!r})
 import jax
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 import jax.numpy as jnp
-import droid_jax.compare.cost
+import droid_jax.cost.cost
 found = []
 jax.monitoring.register_event_listener(lambda name, **_: found.append(name.endswith("compilation_cache/cache_hits")))
 jax.block_until_ready(jax.jit(lambda x: jnp.sin(x) @ x.T)(jnp.ones((8, 8))))

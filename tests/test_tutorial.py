@@ -12,11 +12,11 @@ from typing import Any
 import matplotlib
 import pytest
 
-from droid_jax.gap.extended import Extended
+from droid_jax.discrepancy.extended import Extended
 from droid_jax.identify.gaussian import prior
-from droid_jax.measure.formats import load
 from droid_jax.model.effects.registry import effect_space, library, ready
-from droid_jax.model.own import load_parameters
+from droid_jax.model.parameter_file import load_parameters
+from droid_jax.recordings.formats import load
 from droid_jax.run import main
 
 HERE = Path(__file__).resolve().parents[1] / "docs" / "tutorial"

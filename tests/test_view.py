@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from droid_jax.commands.view import replay_of, side_by_side
+from droid_jax.door.scene import door_scene
+from droid_jax.door.space import door_space
 from droid_jax.files import FITTED, REPLAY
-from droid_jax.model.door import door_space
-from droid_jax.model.door_scene import door_scene
 from droid_jax.model.mjcf import fitted_mjcf
 from droid_jax.run import main
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from droid_jax.commands.writer import InUse, one_writer
+from droid_jax.door.demonstration import demonstration_path
 from droid_jax.files import LOCK
-from droid_jax.measure.demonstration import demonstration_path
 from droid_jax.run import main
 from droid_jax.storage import new_folder, write_bytes, write_own
 

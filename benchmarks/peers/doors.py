@@ -19,18 +19,18 @@ from identify_suite import recordings, settings
 
 from benchmarks.peers import sysid as peer
 from benchmarks.peers.gap import run_gap
-from droid_jax.compare.cost import make_cost
-from droid_jax.identify.judge import split
+from droid_jax.cost.cost import make_cost
+from droid_jax.door.demonstration import demonstration_path
+from droid_jax.door.scene import door_scene
+from droid_jax.door.space import JOINT_DAMPING, door_nuisances, door_space
+from droid_jax.identify.holdout import split
 from droid_jax.identify.pipeline import identify
-from droid_jax.measure.demonstration import demonstration_path
-from droid_jax.measure.formats import load
-from droid_jax.measure.hidden import record_hidden
-from droid_jax.measure.recording import Recording
-from droid_jax.measure.surrogate import stand_in_truth
-from droid_jax.model.door import JOINT_DAMPING, door_nuisances, door_space
-from droid_jax.model.door_scene import door_scene
 from droid_jax.model.parameters import Space
+from droid_jax.recordings.formats import load
+from droid_jax.recordings.recording import Recording
 from droid_jax.storage import finite
+from droid_jax.synthetic.hidden_effects import record_hidden
+from droid_jax.synthetic.robot import stand_in_truth
 
 OURS, THEIRS, JUDGE = 0.004, 0.002, 0.0005  # s, time steps; ours is of second order
 WAYS: dict[str, dict[str, bool]] = {

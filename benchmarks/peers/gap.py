@@ -13,8 +13,8 @@ from typing import Any
 
 from benchmarks.common import ROOT
 from droid_jax.files import GAP
-from droid_jax.measure.formats import save
-from droid_jax.measure.recording import Recording
+from droid_jax.recordings.formats import save
+from droid_jax.recordings.recording import Recording
 
 
 def run_gap(recordings: Sequence[Recording], folder: Path, arguments: Sequence[str] = ()) -> dict[str, Any]:

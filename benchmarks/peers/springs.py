@@ -17,16 +17,16 @@ import numpy as np
 
 from benchmarks.peers import sysid as peer
 from benchmarks.peers.gap import run_gap
-from droid_jax.compare.cost import ENGINES, make_cost
-from droid_jax.compare.residuals import CompareConfig
+from droid_jax.cost.cost import ENGINES, make_cost
+from droid_jax.cost.residuals import CompareConfig
+from droid_jax.discrepancy.extended import load_extended
 from droid_jax.files import EXTENDED
-from droid_jax.gap.extended import load_extended
-from droid_jax.identify.refine import RefineConfig, refine
-from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
+from droid_jax.identify.multistart import RefineConfig, refine
 from droid_jax.model.fields import model_parameter
-from droid_jax.model.own import load_parameters
+from droid_jax.model.parameter_file import load_parameters
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import Scene, load_scene
+from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
 from droid_jax.storage import finite
 
 FORCE_NOISE, POSITION_NOISE = 0.02, 1e-5  # N and m, white, of the measured log

@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.compare.replay import make_drive
-from droid_jax.measure.clocks import interpolate
-from droid_jax.measure.engine import instrument
-from droid_jax.measure.recording import Recording
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene
+from droid_jax.recordings.clocks import interpolate
+from droid_jax.recordings.recording import Recording
+from droid_jax.simulate.c_engine import instrument
+from droid_jax.simulate.replay import make_drive
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,8 +14,8 @@ import mujoco
 import numpy as np
 
 import droid_jax as dj
-from droid_jax.measure.recording import Channel, ServoGains, TorqueConvention, TorqueSide
 from droid_jax.model.fields import body_mass, joint_damping, joint_frictionloss
+from droid_jax.recordings.recording import Channel, ServoGains, TorqueConvention, TorqueSide
 
 if TYPE_CHECKING:
     from droid_jax.identify.pipeline import Identified

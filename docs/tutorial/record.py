@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 import droid_jax as dj
-from droid_jax.measure.recording import Channel, ServoGains, TorqueConvention, TorqueSide
+from droid_jax.recordings.recording import Channel, ServoGains, TorqueConvention, TorqueSide
 
 HERE = Path(__file__).resolve().parent
 JOINTS = ("shoulder", "elbow")

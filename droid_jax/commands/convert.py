@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 if TYPE_CHECKING:
-    from droid_jax.measure.recording import Phase
+    from droid_jax.recordings.recording import Phase
 
 OF_BAGS = (
     "joints", "slides", "torque", "gravity", "state_topic", "command_topic", "stiffness", "damping", "command_joints",
@@ -73,8 +73,8 @@ class Convert:
 
 def run(command: Convert) -> None:
     """Load whatever it is, validate, cut, and save."""
-    from droid_jax.measure.formats import bags_at, check_target, load, rosbag_reader, save
-    from droid_jax.measure.torque_constants import with_torque_constants
+    from droid_jax.recordings.formats import bags_at, check_target, load, rosbag_reader, save
+    from droid_jax.recordings.torque_constants import with_torque_constants
 
     check_target(command.out)  # before bags are read, which may take long
     if not command.source:
@@ -122,7 +122,7 @@ def _bag_options(command: Convert) -> dict[str, Any]:
     """What bags do not say; ValueError names what is missing."""
     import numpy as np
 
-    from droid_jax.measure.recording import ServoGains, TorqueConvention, TorqueSide
+    from droid_jax.recordings.recording import ServoGains, TorqueConvention, TorqueSide
 
     if not command.joints or command.torque is None:
         raise ValueError("a ROS bag does not say which joints to read or what its efforts are: give --joints, --torque")
@@ -144,7 +144,7 @@ def _bag_options(command: Convert) -> dict[str, Any]:
         "phases": [_phase(words) for words in command.phases],
     }
     if command.stamps != "auto":
-        from droid_jax.measure.formats import rosbag_reader
+        from droid_jax.recordings.formats import rosbag_reader
 
         options["stamps"] = rosbag_reader().Stamps(command.stamps)
     return options
@@ -152,7 +152,7 @@ def _bag_options(command: Convert) -> dict[str, Any]:
 
 def _phase(words: str) -> Phase:
     """ "grasp=1.5:2" as a phase; ValueError for other words."""
-    from droid_jax.measure.recording import Phase
+    from droid_jax.recordings.recording import Phase
 
     name, _, span = words.partition("=")
     start, _, end = span.partition(":")

@@ -13,18 +13,18 @@ import tyro
 
 from droid_jax.commands import report
 from droid_jax.commands.folder import changed, setup_of, stage_folder
-from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.source import needs_brax, source
-from droid_jax.commands.stand_in import hidden_effects
+from droid_jax.commands.synthetic import hidden_effects
+from droid_jax.commands.user_effects import load_effects
 from droid_jax.commands.writer import writes
 from droid_jax.files import FILMS, POLICY, TRAINING, TRANSFER
 
 if TYPE_CHECKING:
+    from droid_jax.door.environment import DoorEnv
+    from droid_jax.door.task import Task
     from droid_jax.policy.control import Policy
-    from droid_jax.policy.door_env import DoorEnv
-    from droid_jax.policy.task import Task
-    from droid_jax.policy.transfer import TrialRobot
     from droid_jax.policy.trials import Trials
+    from droid_jax.synthetic.policy_trials import TrialRobot
 
 
 @dataclass(frozen=True)
@@ -60,15 +60,15 @@ def run(command: Evaluate) -> None:
     from droid_jax import runtime
 
     runtime.start()
-    from droid_jax.measure.hidden import HIDDEN
+    from droid_jax.door.environment import DoorEnv
     from droid_jax.policy.control import load
-    from droid_jax.policy.door_env import DoorEnv
+    from droid_jax.policy.evaluate import simulated
     from droid_jax.policy.randomise import of_method
-    from droid_jax.policy.simulated import simulated
-    from droid_jax.policy.transfer import transfer
     from droid_jax.report.policy_folder import read_training
     from droid_jax.report.progress import counting
     from droid_jax.storage import file_sha256, new_folder, write_json
+    from droid_jax.synthetic.hidden_effects import HIDDEN
+    from droid_jax.synthetic.policy_trials import transfer
 
     folder = stage_folder(command.run, "train", TRAINING)
     load_effects(command.own_effects, folder)
@@ -129,7 +129,7 @@ def _done(folder: Path, setup: dict[str, Any]) -> Mapping[str, Any] | None:
 
 def _task(folder: Path, known: Mapping[str, Any]) -> Task:
     """The task that a policy was trained for; ValueError where this program knows another one."""
-    from droid_jax.policy.task import Task
+    from droid_jax.door.task import Task
 
     strange = sorted(set(known) - {f.name for f in dataclasses.fields(Task)})
     if strange:
@@ -153,10 +153,10 @@ def _tell(found: Mapping[str, Any], trained: Mapping[str, Any]) -> None:
 
 def _robot(command: Evaluate, trained: Mapping[str, Any], env: DoorEnv) -> tuple[TrialRobot, dict[str, float]]:
     """The stand-in robot, the one that was fitted unless asked for another; and its hidden values."""
-    from droid_jax.measure.hidden import listed
-    from droid_jax.measure.surrogate import stand_in_truth
-    from droid_jax.model.door_scene import door_scene
-    from droid_jax.policy.transfer import TransferConfig, stand_in
+    from droid_jax.door.scene import door_scene
+    from droid_jax.synthetic.hidden_effects import listed
+    from droid_jax.synthetic.policy_trials import TransferConfig, stand_in
+    from droid_jax.synthetic.robot import stand_in_truth
 
     asked = {"springs": command.springs, "seed": command.robot, "hide": command.hide}
     usual = {"springs": 1, "seed": 0, "hide": ()}
@@ -174,9 +174,9 @@ def _film(folder: Path, policy: Policy, robot: TrialRobot, found: Trials) -> str
     """
     import numpy as np
 
-    from droid_jax.policy.transfer import filmed
     from droid_jax.report.film import film
     from droid_jax.report.render import NoOpenGL
+    from droid_jax.synthetic.policy_trials import filmed
 
     chosen = {"good": np.flatnonzero(found.success), "bad": np.flatnonzero(~found.success & found.counted)}
     for name, numbers in chosen.items():

@@ -16,9 +16,9 @@ from droid_jax.report.stages import Setup, to_be_amended
 from droid_jax.storage import file_sha256
 
 if TYPE_CHECKING:
-    from droid_jax.measure.recording import Recording
     from droid_jax.model.parameters import Space
     from droid_jax.model.scene import Scene
+    from droid_jax.recordings.recording import Recording
 
 RUNS = Path("runs")  # where results go unless --out says otherwise
 BEGUN = set[Path]()  # folders of the runs that this process began
@@ -155,7 +155,7 @@ def kept_recordings(paths: Mapping[str, Path], again: bool, record: Callable[[st
 
     paths: by name.  record: of a recording's name.
     """
-    from droid_jax.measure.formats import load, save
+    from droid_jax.recordings.formats import load, save
     from droid_jax.report.progress import counting
 
     absent = [name for name, path in paths.items() if again or not path.is_file()]

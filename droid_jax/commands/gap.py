@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict
 from droid_jax.commands import report
 from droid_jax.commands.folder import begin, fingerprints, finished, setup_of, stage_folder
 from droid_jax.commands.gap_search import searched
-from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.presets import TIMESTEP, refine_config, search_config, warn_of_cpu
 from droid_jax.commands.scenes import compared, needs_log, needs_recording, needs_scene, own_scene, recording_at
-from droid_jax.commands.stand_in import hidden_effects, kept_at, known_stand_in, record_stand_in, settled
+from droid_jax.commands.synthetic import hidden_effects, kept_at, known_stand_in, record_stand_in, settled
+from droid_jax.commands.user_effects import load_effects
 from droid_jax.commands.writer import writes
 from droid_jax.files import FIT, GAP
 from droid_jax.read_json import read_json, typed
@@ -24,12 +24,12 @@ from droid_jax.report.stages import needs_whole, to_be_amended
 if TYPE_CHECKING:
     import numpy as np
 
-    from droid_jax.gap.amend import Amended
-    from droid_jax.gap.case import Case, GapConfig
-    from droid_jax.measure.recording import Recording
+    from droid_jax.discrepancy.amendments import Amended
+    from droid_jax.discrepancy.case import Case, GapConfig
+    from droid_jax.model.effect_interface import Effect
     from droid_jax.model.parameters import Space
     from droid_jax.model.scene import Scene
-    from droid_jax.model.seam import Effect
+    from droid_jax.recordings.recording import Recording
     from droid_jax.report.gap_folder import Gap as Found
 
 
@@ -100,13 +100,13 @@ def run(command: Gap) -> None:
     needs_writer(command.tensorboard)
     runtime.start()
     warn_of_cpu(command.preset)
-    from droid_jax.compare.log_checks import check_log
-    from droid_jax.gap.inputs import shared_out
-    from droid_jax.gap.missing import case_of
-    from droid_jax.gap.results import write_amended, write_gap
-    from droid_jax.gap.split import Split
+    from droid_jax.discrepancy.inputs import shared_out
+    from droid_jax.discrepancy.missing import case_of
+    from droid_jax.discrepancy.results import write_amended, write_gap
+    from droid_jax.discrepancy.split import Split
     from droid_jax.identify.results import prepare_folder
-    from droid_jax.measure.surrogate import is_stand_in
+    from droid_jax.preflight.check_log import check_log
+    from droid_jax.synthetic.robot import is_stand_in
 
     out = command.out
     fit = None if command.fit is None else stage_folder(command.fit, "identify", FIT)
@@ -165,8 +165,8 @@ def run(command: Gap) -> None:
 
 def model_of(command: Gap) -> tuple[Scene, Space]:
     """The scene and all that is fitted without any effect, nuisances among it."""
-    from droid_jax.model.door import door_nuisances, door_space
-    from droid_jax.model.door_scene import door_scene
+    from droid_jax.door.scene import door_scene
+    from droid_jax.door.space import door_nuisances, door_space
 
     if command.scene is not None:
         return own_scene(command)
@@ -207,7 +207,7 @@ def chosen_effects(command: Gap, scene: Scene, recordings: list[Recording]) -> t
 
     Raises ValueError for unknown names, for effects that this scene cannot have, and where none is left.
     """
-    from droid_jax.gap.candidates import possible
+    from droid_jax.discrepancy.candidates import possible
     from droid_jax.model.effects.registry import library
 
     library(scene, command.without)  # names are checked there
@@ -230,8 +230,8 @@ def chosen_effects(command: Gap, scene: Scene, recordings: list[Recording]) -> t
 
 def config_of(command: Gap) -> GapConfig:
     """The preset with the command's own numbers."""
-    from droid_jax.gap.case import SETTLED, GapConfig
-    from droid_jax.identify.refine import RefineConfig
+    from droid_jax.discrepancy.case import SETTLED, GapConfig
+    from droid_jax.identify.multistart import RefineConfig
 
     if command.budget is not None and not command.budget > 0:
         raise ValueError(f"--budget must be above 0 minutes, got {command.budget:g}")

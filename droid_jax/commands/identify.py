@@ -11,21 +11,21 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from droid_jax.commands import report
 from droid_jax.commands.folder import begin, fingerprints, finished, kept_recordings, setup_of
-from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.pictures import draw, keep_replay
 from droid_jax.commands.presets import TIMESTEP, Preset, refine_config, search_config, warn_of_cpu
 from droid_jax.commands.scenes import compared, needs_log, needs_recording, needs_scene, own_scene, recording_at
-from droid_jax.commands.stand_in import known_stand_in, settled
+from droid_jax.commands.synthetic import known_stand_in, settled
+from droid_jax.commands.user_effects import load_effects
 from droid_jax.commands.writer import writes
 from droid_jax.files import EXTENDED, FIT
 from droid_jax.read_json import read_json
 
 if TYPE_CHECKING:
     from droid_jax.identify.pipeline import Identified, IdentifyConfig
-    from droid_jax.measure.recording import Recording
+    from droid_jax.model.effect_interface import Effect
     from droid_jax.model.parameters import Space
     from droid_jax.model.scene import Scene
-    from droid_jax.model.seam import Effect
+    from droid_jax.recordings.recording import Recording
 
 
 @dataclass(frozen=True)
@@ -97,11 +97,11 @@ def run(command: Identify) -> None:
     needs_writer(command.tensorboard)
     runtime.start()
     warn_of_cpu(command.preset)
-    from droid_jax.compare.log_checks import check_log
-    from droid_jax.compare.notes import command_notes
     from droid_jax.identify.pipeline import cost_samples, prepare, solve
     from droid_jax.identify.results import prepare_folder, write_run
     from droid_jax.identify.solution_checks import creep_of_fit
+    from droid_jax.preflight.check_log import check_log
+    from droid_jax.preflight.preflight import command_notes
     from droid_jax.report.progress import stages
     from droid_jax.report.scalars import FOLDER, scalars
     from droid_jax.storage import write_bytes
@@ -161,7 +161,7 @@ def run(command: Identify) -> None:
 def _description(command: Identify, found: Identified, recordings: Sequence[Recording]) -> dict[str, Any]:
     """What config.json says of a fit, its setup apart."""
     from droid_jax import runtime
-    from droid_jax.measure.surrogate import is_stand_in
+    from droid_jax.synthetic.robot import is_stand_in
 
     return {
         "command": "identify",
@@ -187,8 +187,8 @@ def _description(command: Identify, found: Identified, recordings: Sequence[Reco
 
 def model_of(command: Identify) -> tuple[Scene, Space, Space | None]:
     """The scene, what is fitted, and the nuisances beside it."""
-    from droid_jax.model.door import door_nuisances, door_space
-    from droid_jax.model.door_scene import door_scene
+    from droid_jax.door.scene import door_scene
+    from droid_jax.door.space import door_nuisances, door_space
 
     if command.scene is not None:
         scene, listed = own_scene(command, engine=command.engine, mj_step=command.mj_step)
@@ -223,7 +223,7 @@ def _extended(command: Identify, scene: Scene, space: Space) -> tuple[Scene, Spa
     """Scene and space with the effects of --extended in them, and what `identify` has to be told of these."""
     if command.extended is None:
         return scene, space, {}
-    from droid_jax.gap.extended import load_extended
+    from droid_jax.discrepancy.extended import load_extended
 
     model = load_extended(command.extended, scene)
     return model.scene, space + model.effect_space, {"effects": model.effects}
@@ -246,7 +246,7 @@ def _given(command: Identify) -> list[Recording]:
 
 def _needs_demonstrations(command: Identify, given: list[Recording]) -> None:
     """ValueError for a demonstration that there is none of."""
-    from droid_jax.measure.demonstration import demonstration_path
+    from droid_jax.door.demonstration import demonstration_path
 
     for name in () if given else command.demonstrations or ():
         demonstration_path(name)
@@ -257,15 +257,15 @@ def _recordings(
 ) -> tuple[list[Recording], dict[str, float] | None, dict[str, Any]]:
     """The given recordings, or the stand-in's (kept in the run's folder); with its hidden truth and, of given ones,
     springs, seed and hidden effects where these are known."""
-    from droid_jax.measure.formats import load
-    from droid_jax.measure.surrogate import is_stand_in, stand_in_truth
+    from droid_jax.recordings.formats import load
+    from droid_jax.synthetic.robot import is_stand_in, stand_in_truth
 
     if given:  # a robot's own may lie beside what is known of a stand-in
         stand_in = command.scene is None and all(is_stand_in(r) for r in given)
         known = known_stand_in(command.recording) if stand_in else {}
         return given, stand_in_truth(scene, known["springs"], known["seed"]) if known else None, known
-    from droid_jax.measure.demonstration import PLANS, demonstration_path
-    from droid_jax.measure.surrogate import record
+    from droid_jax.door.demonstration import PLANS, demonstration_path
+    from droid_jax.synthetic.robot import record
 
     assert command.springs is not None and command.demonstrations is not None  # settled
     gains = "paper" if command.preset == "paper" else "impedance"

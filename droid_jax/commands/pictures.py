@@ -11,8 +11,8 @@ from droid_jax.files import FILMS, REPLAY, REPLAY_FILM
 
 if TYPE_CHECKING:
     from droid_jax.identify.pipeline import Identified
-    from droid_jax.measure.recording import Recording
     from droid_jax.model.scene import Scene
+    from droid_jax.recordings.recording import Recording
 
 RATE = 25.0  # states per second
 AT = (0.0, 0.33, 0.6, 1.0)  # of the motion, where a frame is taken
@@ -27,9 +27,9 @@ def keep_replay(out: Path, found: Identified, recording: Recording) -> None:
     """
     import numpy as np
 
-    from droid_jax.compare.replay import make_drive
-    from droid_jax.measure.engine import poses
     from droid_jax.model.physics import make_c_model
+    from droid_jax.simulate.c_engine import poses
+    from droid_jax.simulate.replay import make_drive
     from droid_jax.storage import write_npz
 
     _forget(out)

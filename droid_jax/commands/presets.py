@@ -7,7 +7,7 @@ import sys
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
-    from droid_jax.identify.refine import RefineConfig
+    from droid_jax.identify.multistart import RefineConfig
     from droid_jax.identify.search import SearchConfig
 
 Preset = Literal["quick", "standard", "paper", "gpu"]
@@ -42,7 +42,7 @@ def search_config(preset: Preset, seed: int, **changes: int | None) -> SearchCon
 
 def refine_config(preset: Preset) -> RefineConfig | None:
     """The preset's refinement; None: the paper has none."""
-    from droid_jax.identify.refine import RefineConfig
+    from droid_jax.identify.multistart import RefineConfig
 
     if preset == "paper":
         return None

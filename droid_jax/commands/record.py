@@ -27,10 +27,10 @@ class Record:
 
 def run(command: Record) -> None:
     """Record the stand-in robot and save what it measured."""
-    from droid_jax.measure.demonstration import PLANS, demonstration_path
-    from droid_jax.measure.formats import check_target, load, save
-    from droid_jax.measure.surrogate import SurrogateConfig, record, stand_in_truth
-    from droid_jax.model.door_scene import door_scene
+    from droid_jax.door.demonstration import PLANS, demonstration_path
+    from droid_jax.door.scene import door_scene
+    from droid_jax.recordings.formats import check_target, load, save
+    from droid_jax.synthetic.robot import SurrogateConfig, record, stand_in_truth
 
     check_target(command.out)
     scene = door_scene(springs=command.springs, gains=command.gains)

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
-    from droid_jax.compare.residuals import CompareConfig
-    from droid_jax.measure.recording import Recording
+    from droid_jax.cost.residuals import CompareConfig
     from droid_jax.model.parameters import Space
     from droid_jax.model.scene import Scene
+    from droid_jax.recordings.recording import Recording
 
 
 class OwnScene(Protocol):
@@ -54,7 +54,7 @@ def needs_log(motion_cutoff: float | None, recordings: Sequence[Recording]) -> N
 
 def compared(motion_cutoff: float | None, **changes: Any) -> CompareConfig:
     """How recordings are compared, with what the command line says of it."""
-    from droid_jax.compare.residuals import CompareConfig
+    from droid_jax.cost.residuals import CompareConfig
 
     usual = CompareConfig(**changes)
     return usual if motion_cutoff is None else replace(usual, motion_cutoff=motion_cutoff)
@@ -65,7 +65,7 @@ def own_scene(options: OwnScene, *, engine: str = "mjx", mj_step: bool = False) 
 
     engine, mj_step: of the replays.
     """
-    from droid_jax.model.own import friction_joints, load_parameters
+    from droid_jax.model.parameter_file import friction_joints, load_parameters
     from droid_jax.model.scene import load_scene
 
     if options.scene is None or options.parameters is None:
@@ -83,7 +83,7 @@ def own_scene(options: OwnScene, *, engine: str = "mjx", mj_step: bool = False) 
 
 def recording_at(path: Path) -> Recording:
     """A recording; ValueError for ROS bags, which do not say what a fit must know of them."""
-    from droid_jax.measure.formats import bags_at, load
+    from droid_jax.recordings.formats import bags_at, load
 
     if bags_at(path):
         raise ValueError(

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
 
-from droid_jax.commands.stand_in import known_stand_in
+from droid_jax.commands.synthetic import known_stand_in
 from droid_jax.errors import needs
 from droid_jax.files import CONFIG, GAP, GAUSSIAN
 from droid_jax.read_json import read_json, typed
@@ -14,8 +14,8 @@ from droid_jax.report.stages import extended_of, left_over, needs_whole, setup, 
 
 if TYPE_CHECKING:
     from droid_jax.identify.gaussian import Gaussian
+    from droid_jax.model.effect_interface import Effect
     from droid_jax.model.scene import Scene
-    from droid_jax.model.seam import Effect
 
 TIMESTEP = 0.004  # s
 
@@ -26,10 +26,10 @@ def source(folder: Path | None, knob: int) -> tuple[Scene, Gaussian, tuple[Effec
     folder: None for the prior of the built-in door.
     Raises ValueError where the folder holds no Gaussian, one of another scene or servo, or a run that is not whole.
     """
-    from droid_jax.gap.extended import load_extended
+    from droid_jax.discrepancy.extended import load_extended
+    from droid_jax.door.scene import door_scene
+    from droid_jax.door.space import door_nuisances, door_space
     from droid_jax.identify.gaussian import load, prior
-    from droid_jax.model.door import door_nuisances, door_space
-    from droid_jax.model.door_scene import door_scene
 
     scene = door_scene(timestep=TIMESTEP, limits=True, knob=knob)
     if folder is None:  # over what a fit is over, so that what a policy meets differs in nothing but the ranges
@@ -60,7 +60,7 @@ def _check_door(path: Path, gaussian: Gaussian, scene: Scene) -> None:
 
     Its entries of the model may exist here too and mean another joint.
     """
-    from droid_jax.model.door import door_nuisances, door_space
+    from droid_jax.door.space import door_nuisances, door_space
 
     known = {p.name: p for p in (door_space(scene) + door_nuisances(scene)).parameters}
     for p in gaussian.space.parameters:
@@ -122,8 +122,8 @@ def _robot(folder: Path | None) -> dict[str, Any]:
 
 def _hold(paths: Sequence[str | Path], hashes: Sequence[str]) -> bool:
     """Whether these files are there and hold a stand-in's recordings of these hashes: others may have their names."""
-    from droid_jax.measure.formats import load
-    from droid_jax.measure.surrogate import is_stand_in
+    from droid_jax.recordings.formats import load
+    from droid_jax.synthetic.robot import is_stand_in
 
     try:
         recordings = [load(path) for path in paths]

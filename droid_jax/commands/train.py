@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from droid_jax.commands import report
 from droid_jax.commands.folder import RUNS, begin, finished, setup_of
-from droid_jax.commands.own_effects import load_effects
 from droid_jax.commands.presets import warn_of_cpu
 from droid_jax.commands.source import has_model, model_folder, needs_brax, source, stand_in_of
+from droid_jax.commands.user_effects import load_effects
 from droid_jax.commands.writer import writes
 from droid_jax.files import EXTENDED, GAUSSIAN, POLICY, TRAINING
 from droid_jax.report.stages import extended_of, fingerprint
 
 if TYPE_CHECKING:
+    from droid_jax.door.environment import DoorEnv
     from droid_jax.identify.gaussian import Gaussian
-    from droid_jax.policy.door_env import DoorEnv
     from droid_jax.policy.train import TrainConfig, Trained, TrainProgress
 
 Method = Literal["fitted", "mean", "prior"]
@@ -64,8 +64,8 @@ def run(command: Train) -> None:
     needs_writer(command.tensorboard)
     runtime.start()
     warn_of_cpu(command.preset)
+    from droid_jax.door.environment import DoorEnv
     from droid_jax.identify.results import prepare_folder
-    from droid_jax.policy.door_env import DoorEnv
     from droid_jax.policy.network import save_policy
     from droid_jax.policy.randomise import of_method
     from droid_jax.policy.train import train

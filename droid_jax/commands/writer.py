@@ -183,7 +183,7 @@ def _strange_recordings(folder: Path) -> list[Path]:
     """Files of others in a folder of recordings under names of the stand-in robot's."""
     if not folder.is_dir() or (folder / STAND_IN).is_file():
         return []
-    from droid_jax.measure.formats import load
+    from droid_jax.recordings.formats import load
 
     def strange(path: Path) -> bool:
         try:

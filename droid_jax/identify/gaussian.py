@@ -34,7 +34,7 @@ import numpy as np
 from scipy import special
 
 from droid_jax.arguments import instance, name, note, number, numeric, one_of, path_of, several, shown, whole
-from droid_jax.identify.truncated import gibbs, quantiles
+from droid_jax.identify.truncated_normal import gibbs, quantiles
 from droid_jax.model.parameters import Mode, Parameter, Scaling, Space, Write
 from droid_jax.read_json import read_json, typed
 from droid_jax.storage import write_json

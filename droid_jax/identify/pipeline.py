@@ -13,23 +13,23 @@ from typing import Any
 import numpy as np
 
 from droid_jax.arguments import check_fields, instance, number, one_of, optional, whole
-from droid_jax.compare.cost import ENGINES, Cost, make_cost
-from droid_jax.compare.log_checks import warn_of_log
-from droid_jax.compare.own_starts import own_starts
-from droid_jax.compare.residuals import CompareConfig
-from droid_jax.identify.blow_up import blow_up
+from droid_jax.cost.cost import ENGINES, Cost, make_cost
+from droid_jax.cost.residuals import CompareConfig
+from droid_jax.identify.divergence import blow_up
 from droid_jax.identify.fit import Fit
 from droid_jax.identify.gaussian import Gaussian, prior, space_to_json
-from droid_jax.identify.judge import Gap, gaps_of, split
-from droid_jax.identify.refine import RefineConfig, Refined, refine
+from droid_jax.identify.holdout import Gap, gaps_of, split
+from droid_jax.identify.identifiability import Identifiability, identifiability, not_judged, posterior
+from droid_jax.identify.multistart import RefineConfig, Refined, refine
 from droid_jax.identify.search import SearchConfig, search
 from droid_jax.identify.solution_checks import SolutionCheck, check_solution
-from droid_jax.identify.uncertainty import Identifiability, identifiability, not_judged, posterior
-from droid_jax.measure.recording import Recording, recordings_of
+from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.inertia import possible_draws
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect, Rollout
+from droid_jax.preflight.check_log import warn_of_log
+from droid_jax.recordings.recording import Recording, recordings_of
+from droid_jax.simulate.repeat_starts import own_starts
 
 
 @dataclass(frozen=True)

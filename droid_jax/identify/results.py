@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.compare.findings import Finding
 from droid_jax.files import (
     CONFIG,
     CORRELATION,
@@ -35,6 +34,7 @@ from droid_jax.identify.pipeline import Identified
 from droid_jax.identify.solution_checks import solution_notes
 from droid_jax.model.mjcf import fitted_mjcf, unwritten
 from droid_jax.model.parameters import Space
+from droid_jax.preflight.findings import Finding
 from droid_jax.storage import finite, write_csv, write_json, write_npz, write_text
 
 

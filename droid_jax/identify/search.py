@@ -25,7 +25,7 @@ from droid_jax.arguments import check_fields, flag, number, one_of, optional, wh
 from droid_jax.identify.cma import Strategy, recombination
 from droid_jax.identify.fit import Fit, History, Progress, Restart, on_bound
 from droid_jax.identify.gaussian import space_to_json
-from droid_jax.identify.state import REASONS, Run
+from droid_jax.identify.search_state import REASONS, Run
 from droid_jax.model.parameters import Space
 
 if TYPE_CHECKING:

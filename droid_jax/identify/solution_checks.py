@@ -14,17 +14,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from droid_jax import runtime
-from droid_jax.compare.cost import Cost, with_sensors
-from droid_jax.compare.creep import creep_note
-from droid_jax.compare.measured import MINIMUM_NOISE
-from droid_jax.compare.replay import Drive, make_drive, servo_replay
-from droid_jax.compare.residuals import Comparison
-from droid_jax.compare.twin import twin_replay
-from droid_jax.measure.recording import Recording
+from droid_jax.cost.cost import Cost, with_sensors
+from droid_jax.cost.observation import MINIMUM_NOISE
+from droid_jax.cost.residuals import Comparison
+from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_c_model, make_physics
 from droid_jax.model.scene import Scene, with_options
-from droid_jax.model.seam import Effect, Rollout
+from droid_jax.preflight.creep import creep_note
+from droid_jax.recordings.recording import Recording
+from droid_jax.simulate.c_reference import twin_replay
+from droid_jax.simulate.replay import Drive, make_drive, servo_replay
 
 LARGE = 0.1  # share of the remaining error from which on a time step is too coarse, or two engines too far apart
 EXPLAINED = 2.0  # times what half a time step changes: of an error of first order all of it

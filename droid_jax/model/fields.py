@@ -361,3 +361,8 @@ def pair_friction(
 
 def _inertia(scene: Scene, body: int, mode: Mode, gain: float) -> tuple[Write, ...]:
     return tuple(write(scene, "body_inertia", (body, k), mode, gain=gain) for k in range(3))
+
+
+def time_offset(std: float = 0.001, limit: float = 0.05) -> Parameter:
+    """Delay of the command against the measurement's clock, s (read by the replay, not by the model)."""
+    return Parameter("time_offset", "s", 0.0, std, -limit, limit, nuisance=True, group="Nuisance")

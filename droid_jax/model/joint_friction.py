@@ -19,8 +19,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from droid_jax.model.effect_interface import Effect, Rollout, Theta, column
 from droid_jax.model.parameters import Parameter, Space
-from droid_jax.model.seam import Effect, Rollout, Theta, column
 
 SMOOTHING = 0.01  # rad/s: `direction` reaches 0.96 at twice this speed
 FRICTION = ("viscous", "coulomb")
@@ -43,7 +43,7 @@ def joint_friction_effect(joints: Sequence[str], direction: Callable[[jax.Array]
     a servo's simulated joints have none.
 
     Reads `viscous[joint]` and `coulomb[joint]` from theta; absent means zero.  The offset is left to
-    `droid_jax.compare.replay.torque_offset_effect`, which reads `torque_offset[joint]`.
+    `droid_jax.simulate.replay.torque_offset_effect`, which reads `torque_offset[joint]`.
     """
     joints = tuple(joints)
 

@@ -11,12 +11,12 @@ import mujoco
 import numpy as np
 
 from droid_jax.arguments import instance, instances, numeric, shown
+from droid_jax.model.effect_interface import Effect
 from droid_jax.model.fields import check_space
-from droid_jax.model.looks import compiled, keep_inertia, look_geoms, weigh
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect
+from droid_jax.model.visual_geoms import compiled, keep_inertia, look_geoms, weigh
 
 # Model field -> attribute of the element that holds a row of it, or its first numbers.
 _ATTRIBUTES = {

@@ -19,11 +19,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from droid_jax.model.ignored import IGNORED
 from droid_jax.model.parameters import Space, Write
 from droid_jax.model.quiet_mjx import math as mjx_math
 from droid_jax.model.quiet_mjx import mjx
 from droid_jax.model.scene import Scene
+from droid_jax.model.unsupported_features import IGNORED
 
 # Writing one of these changes what the compiler derives.
 _SOURCES = {"body_mass", "body_inertia", "body_pos", "body_quat", "body_ipos", "body_iquat", "dof_armature",

@@ -20,8 +20,8 @@ import numpy as np
 from droid_jax import arguments
 from droid_jax.arguments import said
 from droid_jax.model.actuators import actuator_names, drives_joint, of_joint
-from droid_jax.model.ignored import check_options, refuse_ignored, refuse_missing
-from droid_jax.model.looks import compiled, look_geoms, without_looks
+from droid_jax.model.unsupported_features import check_options, refuse_ignored, refuse_missing
+from droid_jax.model.visual_geoms import compiled, look_geoms, without_looks
 
 LONGEST = 900  # characters of what is wrong with a scene, lists of names among it
 PICTURE = (480, 640)  # height, width of the largest picture that is drawn

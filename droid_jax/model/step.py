@@ -23,9 +23,9 @@ import numpy as np
 from jax.core import Tracer
 
 from droid_jax.model.actuators import drives_joint
-from droid_jax.model.ignored import check_options
 from droid_jax.model.patches import exact_segments, midpoint_constraints
 from droid_jax.model.quiet_mjx import mjx
+from droid_jax.model.unsupported_features import check_options
 
 ITERATIONS = 8  # at most; two or three are usual from a warm start
 LINE_SEARCH = 6  # corners of the piecewise linear slope followed in one step

@@ -29,9 +29,9 @@ from brax.training.agents.ppo import train as ppo
 from droid_jax.arguments import check_fields, number, optional, several, whole
 from droid_jax.identify.checkpoints import Checkpoints
 from droid_jax.policy.control import LAYOUT, Policy
-from droid_jax.policy.door_env import DoorEnv
-from droid_jax.policy.doors import wrapped
+from droid_jax.policy.environment import Environment
 from droid_jax.policy.network import layer_sizes, policy_of
+from droid_jax.policy.parallel import wrapped
 from droid_jax.policy.randomise import Randomise
 
 
@@ -130,7 +130,7 @@ class Trained:
 
 
 def train(
-    env: DoorEnv,
+    env: Environment,
     randomise: Randomise | None = None,
     config: TrainConfig | None = None,
     *,
@@ -174,7 +174,7 @@ def _devices(config: TrainConfig) -> int:
 
 
 def _brax(
-    env: DoorEnv,
+    env: Environment,
     randomise: Randomise | None,
     config: TrainConfig,
     tree: dict[str, Any] | None,
@@ -233,7 +233,9 @@ def _brax(
     return Trained(policy_of(normaliser, actor, layer_sizes(config.hidden), env.interface), tuple(history))
 
 
-def _ppo(env: DoorEnv, randomise: Randomise | None, config: TrainConfig, done: int, restore: Any, **hooks: Any) -> Any:
+def _ppo(
+    env: Environment, randomise: Randomise | None, config: TrainConfig, done: int, restore: Any, **hooks: Any
+) -> Any:
     """brax's own function with the settings of `config`, for what is left of its actions after `done`."""
     steps = config.steps - done
     return ppo.train(
@@ -279,10 +281,11 @@ def _networks(config: TrainConfig) -> Callable[..., Any]:
     )
 
 
-def _blank(env: DoorEnv, config: TrainConfig) -> Any:
+def _blank(env: Environment, config: TrainConfig) -> Any:
     """Parameters as brax has them, (normaliser, actor, critic), to be filled."""
     nets, key = _networks(config)(env.observation_size, env.action_size), jax.random.key(0)
-    normaliser = running_statistics.init_state(specs.Array((env.observation_size,), jnp.dtype("float32")))
+    size: Any = env.observation_size
+    normaliser = running_statistics.init_state(specs.Array((size,), jnp.dtype("float32")))
     return normaliser, nets.policy_network.init(key), nets.value_network.init(key)
 
 

@@ -35,7 +35,7 @@ _SIZE = {
 _SHIFT = {"name": str, "unit": str, **dict.fromkeys(("before", "after", "deviation_before"), _MAYBE)}
 _TREND = {**dict.fromkeys(("candidate", "amplitude", "unit"), str), "per_repeat": _MAYBE, "p": _MAYBE}
 _ABOUT = {"what": str, "mark": str, "confused_with": [str]}
-_SETUP = {"robot": Maybe({"hide": Maybe([str])}), "stand_in": Maybe(bool), "recording": Maybe([str])}
+_SETUP = {"robot": Maybe({"hidden": Maybe(str)}), "stand_in": Maybe(bool), "recording": Maybe([str])}
 _EXPERIMENT = {"what": str, "apart": _MAYBE, "not_made": Maybe(str)}
 _HINT = {"effects": [str], "tied": [[str]], "closed": {str: _NUMBER}}
 _SCHEMA = {
@@ -93,14 +93,14 @@ class Gap:
     @property
     def lost(self) -> bool:
         """Whether a recording was kept sealed and could not be replayed in the end."""
-        from droid_jax.gap.verdict import LOST  # only here: it imports what computes
+        from droid_jax.discrepancy.verdict import LOST  # only here: it imports what computes
 
         return LOST in self.found.get("failed", ())
 
     @property
     def blown_up(self) -> list[str]:
         """Candidates and models that were left out since their replay blew up, each once."""
-        from droid_jax.gap.verdict import LOST  # as above
+        from droid_jax.discrepancy.verdict import LOST  # as above
 
         names = [
             *(name for screen in self.found["screens"] for name in screen["failed"]),
@@ -166,7 +166,7 @@ class Gap:
         return self.found["setup"].get("stand_in", self.found["setup"].get("recording") == [])
 
     @property
-    def hidden(self) -> list[str]:
+    def hidden(self) -> str:
         """See `hidden_in`."""
         return hidden_in(self.found)
 
@@ -175,10 +175,10 @@ class Gap:
         return self.found["gaps"][role]["recording"]
 
 
-def hidden_in(found: Mapping[str, Any]) -> list[str]:
-    """What the stand-in robot hid that was searched, of gap.json: "name=amplitude" each; empty where none is known."""
+def hidden_in(found: Mapping[str, Any]) -> str:
+    """What the stand-in robot hid that was searched, of gap.json, in words; empty where nothing is known."""
     setup = found["setup"]
-    return setup.get("robot", {}).get("hide", []) if setup.get("stand_in") else []
+    return setup.get("robot", {}).get("hidden", "") if setup.get("stand_in") else ""
 
 
 def has_gap(folder: Path) -> bool:

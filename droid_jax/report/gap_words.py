@@ -137,7 +137,7 @@ def _fitted(gap: Gap) -> str:
 
 
 def _significance(gap: Gap) -> str:
-    from droid_jax.gap.select import SIGNIFICANT  # only here: it imports the search
+    from droid_jax.discrepancy.select import SIGNIFICANT  # only here: it imports the search
 
     p, bar = gap.found["p"], number(SIGNIFICANT, 1)
     if p is None:
@@ -237,7 +237,7 @@ def at_bound(a: Mapping[str, Any]) -> str:
 
 def _trends(found: Mapping[str, Any]) -> list[str]:
     """What changes from repeat to repeat, which is in no gap: the repeats pass for the same."""
-    from droid_jax.gap.select import SIGNIFICANT  # only here: it imports the search
+    from droid_jax.discrepancy.select import SIGNIFICANT  # only here: it imports the search
 
     return [
         f"The repeats are not alike: {effect_words(t['candidate'])} changes by about "
@@ -305,7 +305,7 @@ def untrusted(gap: Gap) -> bool:
 
 
 def _mostly_open(gap: Gap) -> bool:
-    from droid_jax.gap.verdict import HALF  # only here: it imports what computes
+    from droid_jax.discrepancy.verdict import HALF  # only here: it imports what computes
 
     explained = gap.found.get("explained")
     return gap.found["verdict"] == "partly explained" and explained is not None and explained < HALF

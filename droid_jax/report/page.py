@@ -66,7 +66,6 @@ from droid_jax.report.told import moved_words, went_far
 from droid_jax.report.words import (
     counted,
     grouped,
-    hidden_words,
     judged,
     label,
     like,
@@ -182,7 +181,7 @@ def _together(folder: Path, run: Run | None, gap: Gap | None, policy: Trained | 
     return {
         "title": f"Report: {name}",
         "heading": f"Report: {scene or name}",
-        "lead": lead(run, gap, policy, hidden_words(gap.hidden if gap else ())),
+        "lead": lead(run, gap, policy, gap.hidden if gap else ""),
     }
 
 

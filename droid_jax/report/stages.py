@@ -16,11 +16,12 @@ _MEND = "start the run of this folder over with --again"
 
 
 class Robot(TypedDict, total=False):
-    """What is known of a synthetic robot that was recorded."""
+    """What is known of a synthetic robot that was recorded; hidden: what `hide` means, in words."""
 
     springs: int
     seed: int
     hide: list[str]
+    hidden: str
 
 
 class Setup(TypedDict, total=False):

@@ -7,8 +7,6 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from droid_jax.measure.hidden import HIDDEN, LIBRARY, ON_HINGE
-from droid_jax.model.builtin import HINGE
 from droid_jax.report.run_folder import Run
 
 # Words before "joint" that name the arm as a whole: its number alone tells a joint.
@@ -80,20 +78,6 @@ def percent(share: float) -> str:
     if nearest == 0 and share > 0.0:
         return "< 1 %"
     return f"{nearest} %".replace("-", "−")
-
-
-def hidden_words(hide: Sequence[str]) -> str:
-    """["magnetic_catch=1.5"] -> "magnetic catch (1.5 N m; in the library: latch)"; empty for nothing."""
-    said = []
-    for entry in hide:
-        name, _, amplitude = entry.partition("=")
-        kind, _, joint = name.rstrip("]").partition("[")
-        effect, called = HIDDEN.get(kind), LIBRARY.get(kind, "")
-        called = ON_HINGE.get(called, called) if joint == HINGE else called
-        size = f"{amplitude} {effect.unit}".removesuffix(" -") if effect else amplitude
-        library = f"in the library: {label(called).lower()}" if called else "the library has no form of it"
-        said.append(f"{label(name).lower()} ({size}; {library})")
-    return listed(said)
 
 
 def listed(names: Sequence[str]) -> str:
@@ -252,8 +236,8 @@ def _next(run: Run, searched: bool) -> str:
 
 def needed(repeats: Sequence[int]) -> str:
     """What the search of the gap takes beside recordings of so many repeats, in brackets; empty where they will do."""
-    from droid_jax.gap.flips import FEWEST  # only here: these import distributions of scipy
-    from droid_jax.gap.split import HALVES
+    from droid_jax.discrepancy.sign_flips import FEWEST  # only here: these import distributions of scipy
+    from droid_jax.discrepancy.split import HALVES
 
     alone = len(repeats) == 1
     if (alone and (repeats[0] == 1 or repeats[0] >= HALVES)) or (not alone and min(repeats) >= FEWEST):

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.optimize
 
-from droid_jax.measure.hidden import HIDDEN, ON_HINGE, Applied
 from droid_jax.model.scene import Scene
+from droid_jax.synthetic.hidden_effects import HIDDEN, ON_HINGE, Applied
 from experiments.blind.scenes import Setting
 
 

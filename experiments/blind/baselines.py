@@ -15,12 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from droid_jax.gap.case import Case
-from droid_jax.gap.evidence import Evidence
-from droid_jax.gap.refit import Model
-from droid_jax.gap.screen import Screen, project
-from droid_jax.measure.noise import lowpass, smooth
-from droid_jax.measure.recording import Recording
+from droid_jax.cost.noise import lowpass, smooth
+from droid_jax.discrepancy.case import Case
+from droid_jax.discrepancy.refit import Model
+from droid_jax.discrepancy.residual_set import Evidence
+from droid_jax.discrepancy.screen import Screen, project
+from droid_jax.recordings.recording import Recording
 from experiments.blind.answers import beside, matched
 from experiments.blind.units import torques, whitened
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.measure.hidden import HIDDEN, ON_HINGE, Applied
+from droid_jax.synthetic.hidden_effects import HIDDEN, ON_HINGE, Applied
 from experiments.blind.answers import ANSWERS, inside, targets
 from experiments.blind.draws import seed_of
 from experiments.blind.scenes import Setting

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from droid_jax.measure.demonstration import CLOSED, OPEN, POSE_A, POSE_B, Plan, Segment, demonstrate
-from droid_jax.measure.formats import load, save
-from droid_jax.measure.recording import Recording
-from droid_jax.model.door_scene import door_scene
+from droid_jax.door.demonstration import CLOSED, OPEN, POSE_A, POSE_B, Plan, Segment, demonstrate
+from droid_jax.door.scene import door_scene
+from droid_jax.recordings.formats import load, save
+from droid_jax.recordings.recording import Recording
 
 _DEG = np.pi / 180
 POSE_BETWEEN = (1.24, -0.87, -0.94, -2.14, -2.17, 2.65, -0.87)  # rad, the arm near B's, the hand as in A

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from droid_jax.measure.surrogate import stand_in_truth
 from droid_jax.model.parameters import Space
+from droid_jax.synthetic.robot import stand_in_truth
 from experiments.blind.scenes import ROLES, Setting
 
 DEVELOPMENT = "development"  # in place of a commit: cases to tune with, which prove nothing

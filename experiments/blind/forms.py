@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.gap.candidates import Candidate
-from droid_jax.measure.hidden import Applied
+from droid_jax.discrepancy.candidates import Candidate
+from droid_jax.synthetic.hidden_effects import Applied
 from experiments.blind.answers import right
 from experiments.blind.cases import NAMELESS
 from experiments.blind.marks import Ground, by_candidate, dense

@@ -18,12 +18,12 @@ import numpy as np
 
 from benchmarks.common import CODE
 from benchmarks.sharing import code_name
-from droid_jax.gap.candidates import candidates
-from droid_jax.gap.flips import largest_steady_t
-from droid_jax.gap.screen import questions_of
-from droid_jax.gap.select import SIGNIFICANT
-from droid_jax.measure.hidden import HIDDEN, Applied
+from droid_jax.discrepancy.candidates import candidates
+from droid_jax.discrepancy.screen import questions_of
+from droid_jax.discrepancy.select import SIGNIFICANT
+from droid_jax.discrepancy.sign_flips import largest_steady_t
 from droid_jax.storage import write_json
+from droid_jax.synthetic.hidden_effects import HIDDEN, Applied
 from experiments.blind.cases import SAFE, key, keys
 from experiments.blind.draws import DEVELOPMENT, draw_truths, seed_of
 from experiments.blind.forms import Forms, forms_of

@@ -14,11 +14,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from droid_jax.measure.formats import save
-from droid_jax.measure.hidden import Applied, record_hidden
-from droid_jax.measure.recording import Recording
-from droid_jax.measure.surrogate import SurrogateConfig
+from droid_jax.recordings.formats import save
+from droid_jax.recordings.recording import Recording
 from droid_jax.storage import new_folder, write_json
+from droid_jax.synthetic.hidden_effects import Applied, record_hidden
+from droid_jax.synthetic.robot import SurrogateConfig
 from experiments.blind.answers import without
 from experiments.blind.cases import Limits, Plan, applied
 from experiments.blind.draws import Truth, draw_truths, folder_of, seed_of

@@ -13,18 +13,18 @@ import numpy as np
 import scipy.linalg
 import scipy.optimize
 
-from droid_jax.gap.candidates import Candidate, candidates
-from droid_jax.gap.case import make_case
-from droid_jax.gap.evidence import Evidence
-from droid_jax.gap.refit import Model, refit
-from droid_jax.gap.screen import Question, marks, project, questions_of
-from droid_jax.identify.refine import RefineConfig
-from droid_jax.measure.hidden import Applied
-from droid_jax.measure.noise import lowpass, smooth
-from droid_jax.measure.recording import Recording
-from droid_jax.measure.surrogate import SurrogateConfig
+from droid_jax.cost.noise import lowpass, smooth
+from droid_jax.discrepancy.candidates import Candidate, candidates
+from droid_jax.discrepancy.case import make_case
+from droid_jax.discrepancy.refit import Model, refit
+from droid_jax.discrepancy.residual_set import Evidence
+from droid_jax.discrepancy.screen import Question, marks, project, questions_of
+from droid_jax.identify.multistart import RefineConfig
+from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects.registry import effect_space
-from droid_jax.model.seam import Effect
+from droid_jax.recordings.recording import Recording
+from droid_jax.synthetic.hidden_effects import Applied
+from droid_jax.synthetic.robot import SurrogateConfig
 from experiments.blind.draws import Truth
 from experiments.blind.make import Drawn, record
 from experiments.blind.scenes import Setting

@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 
 from benchmarks.sharing import claimed
-from droid_jax.gap.candidates import Candidate, candidates
-from droid_jax.gap.case import Case
-from droid_jax.gap.refit import Model, refit
-from droid_jax.identify.refine import RefineConfig
-from droid_jax.measure.formats import load
-from droid_jax.measure.hidden import Applied
+from droid_jax.discrepancy.candidates import Candidate, candidates
+from droid_jax.discrepancy.case import Case
+from droid_jax.discrepancy.refit import Model, refit
+from droid_jax.identify.multistart import RefineConfig
+from droid_jax.recordings.formats import load
 from droid_jax.storage import file_sha256, write_json
+from droid_jax.synthetic.hidden_effects import Applied
 from experiments.blind.answers import right
 from experiments.blind.quiet import settled
 from experiments.blind.scenes import ROLES

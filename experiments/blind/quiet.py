@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.gap.candidates import Candidate, candidates
-from droid_jax.gap.case import Case
-from droid_jax.gap.refit import refit
-from droid_jax.identify.refine import RefineConfig
-from droid_jax.measure.hidden import Applied
-from droid_jax.measure.recording import Recording
-from droid_jax.measure.surrogate import SurrogateConfig
+from droid_jax.discrepancy.candidates import Candidate, candidates
+from droid_jax.discrepancy.case import Case
+from droid_jax.discrepancy.refit import refit
+from droid_jax.identify.multistart import RefineConfig
+from droid_jax.recordings.recording import Recording
+from droid_jax.synthetic.hidden_effects import Applied
+from droid_jax.synthetic.robot import SurrogateConfig
 from experiments.blind.make import Drawn, record
 from experiments.blind.search import Bench
 

@@ -19,13 +19,12 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from droid_jax.gap.candidates import steers
-from droid_jax.measure.demonstration import minimum_jerk
-from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
-from droid_jax.model.arm import panda_arm_scene
-from droid_jax.model.builtin import ARM
-from droid_jax.model.door import door_nuisances, door_space, time_offset, torque_offsets
-from droid_jax.model.door_scene import door_scene
+from droid_jax.discrepancy.candidates import steers
+from droid_jax.door.arm import panda_arm_scene
+from droid_jax.door.builtin import ARM
+from droid_jax.door.scene import door_scene
+from droid_jax.door.space import door_nuisances, door_space, torque_offsets
+from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects.registry import library, ready
 from droid_jax.model.fields import (
     body_mass,
@@ -34,11 +33,13 @@ from droid_jax.model.fields import (
     joint_frictionloss,
     joint_stiffness,
     servo_scale,
+    time_offset,
 )
 from droid_jax.model.joint_friction import joint_friction_space
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import Scene, compile_scene
-from droid_jax.model.seam import Effect
+from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSide
+from droid_jax.simulate.hand_path import minimum_jerk
 from experiments.blind.door_motion import door_demonstrations
 
 FOLDER = Path(__file__).resolve().parents[1]

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.measure.hidden import Applied
 from droid_jax.storage import file_sha256
+from droid_jax.synthetic.hidden_effects import Applied
 from experiments.blind.answers import beside, matched, parts, right
 from experiments.blind.baselines import bic_outcome
 from experiments.blind.cases import amplitude, key

@@ -14,16 +14,16 @@ from typing import Any
 
 from benchmarks.common import CODE
 from benchmarks.sharing import claimed
-from droid_jax.compare.cost import Cost
-from droid_jax.gap.anew import base_fit
-from droid_jax.gap.case import Case, make_case
-from droid_jax.gap.evidence import Evidence, evidence
-from droid_jax.gap.floor import finer, numerical_floor
-from droid_jax.gap.refit import Model, intervals
-from droid_jax.gap.verdict import Verdict
-from droid_jax.gap.workflow import find
-from droid_jax.measure.formats import load
-from droid_jax.measure.recording import Recording
+from droid_jax.cost.cost import Cost
+from droid_jax.discrepancy.case import Case, make_case
+from droid_jax.discrepancy.discretisation_error import finer, numerical_floor
+from droid_jax.discrepancy.refit import Model, intervals
+from droid_jax.discrepancy.residual_set import Evidence, evidence
+from droid_jax.discrepancy.restart import base_fit
+from droid_jax.discrepancy.verdict import Verdict
+from droid_jax.discrepancy.workflow import find
+from droid_jax.recordings.formats import load
+from droid_jax.recordings.recording import Recording
 from droid_jax.storage import write_json
 from experiments.blind.baselines import baselines
 from experiments.blind.scenes import ROLES, Setting, setting

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from droid_jax.gap.evidence import Evidence
+from droid_jax.discrepancy.residual_set import Evidence
 
 
 def whitened(evidence: Evidence, torque: np.ndarray) -> np.ndarray:

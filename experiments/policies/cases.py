@@ -16,17 +16,17 @@ from matplotlib.figure import Figure
 from benchmarks.common import commits, stem
 from benchmarks.sharing import claimed
 from droid_jax.commands.source import TIMESTEP as TIMESTEP
+from droid_jax.door.environment import DoorEnv
+from droid_jax.door.task import Task
 from droid_jax.files import POLICY
 from droid_jax.policy.control import load
-from droid_jax.policy.door_env import DoorEnv
+from droid_jax.policy.evaluate import simulated
 from droid_jax.policy.randomise import of_method
-from droid_jax.policy.simulated import simulated
-from droid_jax.policy.task import Task
 from droid_jax.policy.train import PRESETS, TrainConfig
-from droid_jax.policy.transfer import TrialRobot, transfer
 from droid_jax.policy.trials import LEARNED
 from droid_jax.report.export import save
 from droid_jax.storage import write_json
+from droid_jax.synthetic.policy_trials import TrialRobot, transfer
 from experiments.policies.store import Doors, sha256, trained
 from experiments.policies.table import PLACES
 

@@ -8,16 +8,16 @@ from dataclasses import asdict
 from typing import Any
 
 from benchmarks.sharing import claimed
+from droid_jax.door.environment import DoorEnv
+from droid_jax.door.scene import door_scene
+from droid_jax.door.space import door_nuisances, door_space
 from droid_jax.files import GAUSSIAN
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.gaussian import load as load_gaussian
 from droid_jax.identify.pipeline import identify
-from droid_jax.measure.surrogate import stand_in_truth
-from droid_jax.model.door import door_nuisances, door_space
-from droid_jax.model.door_scene import door_scene
-from droid_jax.policy.door_env import DoorEnv
-from droid_jax.policy.transfer import TransferConfig, TrialRobot, stand_in
 from droid_jax.storage import write_json
+from droid_jax.synthetic.policy_trials import TransferConfig, TrialRobot, stand_in
+from droid_jax.synthetic.robot import stand_in_truth
 from experiments.identify_suite import describe, recordings, settings
 from experiments.policies.cases import TIMESTEP, Options
 from experiments.policies.settings import Setting

@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.sharing import claimed, code_name
+from droid_jax.door.environment import DoorEnv
 from droid_jax.files import GAUSSIAN, POLICY, TRAINING
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.model.scene import Scene
-from droid_jax.policy.door_env import DoorEnv
 from droid_jax.policy.network import save_policy
 from droid_jax.policy.randomise import of_method
 from droid_jax.policy.train import TrainConfig, train

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks import default_run
 from benchmarks.default_run import Line, command_lines, figures
-from droid_jax.commands import whole
+from droid_jax.commands import all_stages as whole
 
 
 def test_times_are_those_of_the_lines():

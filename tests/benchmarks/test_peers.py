@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from benchmarks.peers import springs, sysid
-from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
 from droid_jax.model.parameters import Parameter, Space
+from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
 
 
 def space() -> Space:

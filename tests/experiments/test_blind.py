@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from droid_jax.measure.formats import load
-from droid_jax.measure.hidden import HIDDEN, LIBRARY, ON_HINGE, Applied, possible
 from droid_jax.model.effects.registry import registered
 from droid_jax.model.parameters import Parameter, Space
+from droid_jax.recordings.formats import load
+from droid_jax.synthetic.hidden_effects import HIDDEN, LIBRARY, ON_HINGE, Applied, possible
 from experiments import hidden_effects, null_calibration
 from experiments.blind import limits, marks, oracle, score
 from experiments.blind import rates as summing

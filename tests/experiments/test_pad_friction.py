@@ -10,11 +10,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from droid_jax.measure.demonstration import PLANS, joint_path
-from droid_jax.measure.surrogate import stand_in_truth
-from droid_jax.model.door_scene import door_scene
-from droid_jax.policy.task import Task
-from droid_jax.policy.transfer import TransferConfig, TrialRobot, stand_in
+from droid_jax.door.demonstration import PLANS, joint_path
+from droid_jax.door.scene import door_scene
+from droid_jax.door.task import Task
+from droid_jax.synthetic.policy_trials import TransferConfig, TrialRobot, stand_in
+from droid_jax.synthetic.robot import stand_in_truth
 from experiments.pad_friction import NEEDED, PARTS, Arguments, Opening, hinge_torques, made, needless
 from experiments.policies.robots import pads_of
 from experiments.policies.settings import SETTINGS, setting_of

@@ -22,18 +22,18 @@ import pytest
 import scipy.stats
 
 from benchmarks.sharing import claimed
+from droid_jax.door.environment import DoorEnv
+from droid_jax.door.scene import door_scene
+from droid_jax.door.space import door_nuisances, door_space
+from droid_jax.door.task import Task
 from droid_jax.files import GAUSSIAN, POLICY
 from droid_jax.identify.gaussian import load as load_gaussian
 from droid_jax.identify.gaussian import prior
-from droid_jax.measure.hidden import Applied, possible
-from droid_jax.model.door import door_nuisances, door_space
-from droid_jax.model.door_scene import door_scene
 from droid_jax.policy.control import load
-from droid_jax.policy.door_env import DoorEnv
-from droid_jax.policy.task import Task
 from droid_jax.policy.train import TrainConfig
-from droid_jax.policy.transfer import transfer
 from droid_jax.policy.trials import Trials
+from droid_jax.synthetic.hidden_effects import Applied, possible
+from droid_jax.synthetic.policy_trials import transfer
 from experiments.policies import store
 from experiments.policies.cases import (
     RESULTS,

@@ -28,14 +28,14 @@ from recording_kinds import make_npz, recording
 from run_kinds import make_tables
 
 import droid_jax
-from droid_jax.compare import cost as cost_module
-from droid_jax.compare.residuals import CompareConfig
+from droid_jax.cost import cost as cost_module
+from droid_jax.cost.residuals import CompareConfig
 from droid_jax.identify import pipeline
 from droid_jax.identify.gaussian import prior
-from droid_jax.identify.refine import RefineConfig
+from droid_jax.identify.multistart import RefineConfig
 from droid_jax.identify.search import SearchConfig
-from droid_jax.measure.recording import Channel, ObjectPose, Phase, ServoGains, TorqueConvention
 from droid_jax.model.parameters import Mode, Parameter, Scaling, Write
+from droid_jax.recordings.recording import Channel, ObjectPose, Phase, ServoGains, TorqueConvention
 
 DEEP = 100  # levels of nesting, more than numpy has axes
 

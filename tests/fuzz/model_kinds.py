@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 from kinds import ROOT, Kind, use
 
+from droid_jax.discrepancy.candidates import Candidate
+from droid_jax.discrepancy.extended import Extended, load_extended, save_extended
 from droid_jax.files import EXTENDED, GAUSSIAN
-from droid_jax.gap.candidates import Candidate
-from droid_jax.gap.extended import Extended, load_extended, save_extended
 from droid_jax.identify.gaussian import Gaussian, prior
 from droid_jax.identify.gaussian import load as load_gaussian
 from droid_jax.model.effects.registry import effect_space, library, ready
 from droid_jax.model.mjcf import fitted_mjcf
-from droid_jax.model.own import friction_joints, load_parameters
+from droid_jax.model.parameter_file import friction_joints, load_parameters
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene, load_scene

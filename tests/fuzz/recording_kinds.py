@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from kinds import Kind, use
 
-from droid_jax.measure.formats import load, save
-from droid_jax.measure.recording import (
+from droid_jax.recordings.formats import load, save
+from droid_jax.recordings.recording import (
     Channel,
     ObjectPose,
     Phase,

@@ -31,7 +31,7 @@ from made_up_run import make_run as made_up_run
 from droid_jax.commands import source
 from droid_jax.commands.folder import OtherRun, finished
 from droid_jax.commands.gap import values_of
-from droid_jax.commands.stand_in import known_stand_in
+from droid_jax.commands.synthetic import known_stand_in
 from droid_jax.files import (
     CONFIG,
     CORRELATION,
@@ -49,8 +49,8 @@ from droid_jax.files import (
     TRAINING,
     TRANSFER,
 )
-from droid_jax.measure.formats import save
 from droid_jax.model.parameters import Parameter, Space
+from droid_jax.recordings.formats import save
 from droid_jax.report import drawings, gap_drawings, page, policy_drawings, stages
 from droid_jax.report.tables import frames
 

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from kinds import Kind
 
-from droid_jax.compare.cost import Cost
+from droid_jax.cost.cost import Cost
+from droid_jax.discrepancy.resume import Remembered
 from droid_jax.files import POLICY
-from droid_jax.gap.resume import Remembered
 from droid_jax.identify.checkpoints import Checkpoints
 from droid_jax.policy.control import ACTIONS, FORMAT, LAYOUT, OBSERVED, SHAPES
 from droid_jax.policy.control import load as load_policy

@@ -5,9 +5,9 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from droid_jax.identify.blow_up import blow_up
+from droid_jax.identify.divergence import blow_up
+from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.scene import Scene, compile_scene
-from droid_jax.model.seam import Rollout
 
 ARM = """<mujoco><compiler autolimits="true"/><option timestep="0.002" integrator="Euler"/><worldbody><body>
   <joint name="shoulder" axis="0 1 0" range="-90 90"/><geom type="capsule" fromto="0 0 0 0 0 -.4" size=".03" mass="2"/>

@@ -11,7 +11,7 @@ import pytest
 from scipy import integrate, stats
 
 from droid_jax.identify.gaussian import Gaussian, load, prior, space_from_json, space_to_json
-from droid_jax.identify.truncated import gibbs, quantiles
+from droid_jax.identify.truncated_normal import gibbs, quantiles
 from droid_jax.model.parameters import Mode, Parameter, Scaling, Space, Write
 
 

@@ -8,16 +8,16 @@ import mujoco
 import numpy as np
 import pytest
 
-from droid_jax.compare.cost import Along, make_cost
-from droid_jax.compare.residuals import CompareConfig
-from droid_jax.identify.judge import split
+from droid_jax.cost.cost import Along, make_cost
+from droid_jax.cost.residuals import CompareConfig
+from droid_jax.identify.holdout import split
 from droid_jax.identify.pipeline import Identified, IdentifyConfig, identify
 from droid_jax.identify.search import SearchConfig
-from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
 from droid_jax.model.fields import body_mass, joint_damping
 from droid_jax.model.joint_friction import joint_friction_space, sensor_parameter
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene, compile_scene
+from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
 
 XML = """<mujoco><option gravity="0 0 0"/><worldbody><body name="carriage">
   <joint name="slide" type="slide" axis="1 0 0" damping="10" frictionloss="1e-6"/><geom size=".1" mass="8"/></body>

@@ -15,20 +15,20 @@ import pytest
 from small_log import COULOMB, elbow, elbow_log, elbow_space
 
 from droid_jax.commands.identify import _summary
-from droid_jax.compare.residuals import CompareConfig, make_comparison
+from droid_jax.cost.residuals import CompareConfig, make_comparison
+from droid_jax.door.scene import door_scene
+from droid_jax.door.space import door_space
 from droid_jax.identify import pipeline, results
 from droid_jax.identify.fit import on_bound
 from droid_jax.identify.gaussian import prior
-from droid_jax.identify.judge import WORTH, _closed, _floor, _scatter, judged_on, split
+from droid_jax.identify.holdout import WORTH, _closed, _floor, _scatter, judged_on, split
+from droid_jax.identify.multistart import RefineConfig, refine
 from droid_jax.identify.pipeline import Identified, IdentifyConfig, cost_samples, grip_hypotheses, identify, starts
-from droid_jax.identify.refine import RefineConfig, refine
 from droid_jax.identify.results import traces, write_run
 from droid_jax.identify.search import SearchConfig
-from droid_jax.measure.recording import Channel
-from droid_jax.model.door import door_space
-from droid_jax.model.door_scene import door_scene
+from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Rollout
+from droid_jax.recordings.recording import Channel
 
 QUICK = IdentifyConfig(search=SearchConfig(population=8, parents=None, generations=2), refine=None, samples=2)
 

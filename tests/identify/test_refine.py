@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from droid_jax.identify.damped import Problem
-from droid_jax.identify.refine import HOP_POPULATION, RefineConfig, chord, refine
+from droid_jax.identify.levenberg_marquardt import Problem
+from droid_jax.identify.multistart import HOP_POPULATION, RefineConfig, chord, refine
 from droid_jax.model.parameters import Parameter, Scaling, Space
 
 

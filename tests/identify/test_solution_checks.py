@@ -8,13 +8,13 @@ import mujoco
 import numpy as np
 import pytest
 
-from droid_jax.compare.cost import Cost, make_cost
-from droid_jax.compare.residuals import CompareConfig
+from droid_jax.cost.cost import Cost, make_cost
+from droid_jax.cost.residuals import CompareConfig
 from droid_jax.identify.solution_checks import SolutionCheck, check_solution, creep_of_fit, solution_notes
-from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
 from droid_jax.model.fields import joint_damping, joint_frictionloss
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene, compile_scene
+from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
 
 HINGE = """<mujoco><option integrator="implicitfast" timestep="{step}"/><worldbody><body><joint name="j" axis="0 1 0"
     damping="0.9" frictionloss="1e-6" armature="0.02"/><geom type="capsule" fromto="0 0 0 0 0 -.3" size=".03" mass="1"/>

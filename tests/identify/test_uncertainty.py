@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from droid_jax.identify import uncertainty
+from droid_jax.identify import identifiability as uncertainty
 from droid_jax.identify.gaussian import Gaussian, prior
-from droid_jax.identify.refine import Refined
-from droid_jax.identify.uncertainty import (
+from droid_jax.identify.identifiability import (
     POOL,
     calibrated,
     identifiability,
@@ -19,6 +18,7 @@ from droid_jax.identify.uncertainty import (
     time_blocks,
     with_stated_prior,
 )
+from droid_jax.identify.multistart import Refined
 from droid_jax.model.parameters import Parameter, Space
 
 

@@ -9,14 +9,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from droid_jax.compare.cost import make_cost
-from droid_jax.measure.recording import Channel, Recording, TorqueConvention, TorqueSide
+from droid_jax.cost.cost import make_cost
 from droid_jax.model.fields import encoder_offset
 from droid_jax.model.mjcf import fitted_mjcf, unwritten
-from droid_jax.model.own import load_parameters
+from droid_jax.model.parameter_file import load_parameters
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene, compile_scene
+from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
 
 MJCF = """<mujoco><worldbody><body name="upper" gravcomp="SHARE"><joint name="shoulder" axis="0 1 0" ref="10"/>
   <geom size="0.03" type="capsule" fromto="0 0 0 0.3 0 0" mass="2" contype="0" conaffinity="0"/>

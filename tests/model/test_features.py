@@ -11,9 +11,9 @@ import pytest
 from mujoco import mjx
 from mujoco.mjx._src import types
 
-from droid_jax.model.ignored import IGNORED, refuse_ignored
 from droid_jax.model.scene import compile_scene, load_scene
 from droid_jax.model.step import step
+from droid_jax.model.unsupported_features import IGNORED, refuse_ignored
 
 ARM = """<mujoco><option integrator="implicitfast" {option}><flag {flag}/></option><extension>{extension}</extension>
   <worldbody><body name="upper"><joint name="shoulder" axis="0 1 0" {joint}/>

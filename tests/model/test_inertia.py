@@ -15,7 +15,7 @@ import pytest
 from droid_jax.identify.gaussian import prior
 from droid_jax.model.fields import body_mass, body_mass_scale, model_parameter
 from droid_jax.model.inertia import check_inertia, free_inertias, inertia_possible, possible_draws
-from droid_jax.model.own import load_parameters
+from droid_jax.model.parameter_file import load_parameters
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import Scene, compile_scene
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import droid_jax as dj
-from droid_jax.model.door import door_nuisances
+from droid_jax.door.space import door_nuisances
 from droid_jax.model.fields import body_mass, joint_damping
 from droid_jax.model.mjcf import fitted_mjcf, unwritten
 from droid_jax.model.parameters import Parameter, Space, Write

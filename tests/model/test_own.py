@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from droid_jax.model.own import load_parameters
+from droid_jax.model.parameter_file import load_parameters
 from droid_jax.model.parameters import Mode, Scaling
 from droid_jax.model.scene import Scene, compile_scene
 

@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
-from droid_jax.model.builtin import ARM
-from droid_jax.model.door import door_nuisances, door_space
-from droid_jax.model.door_scene import door_scene
+from droid_jax.door.builtin import ARM
+from droid_jax.door.scene import door_scene
+from droid_jax.door.space import door_nuisances, door_space
 from droid_jax.model.fields import body_mass, model_parameter, servo_scale
-from droid_jax.model.looks import LOOK_GROUP
 from droid_jax.model.parameters import Mode, Parameter, Space, Write
 from droid_jax.model.physics import derive, make_c_model, make_physics, theta_of, written_fields
 from droid_jax.model.scene import Scene, compile_scene
+from droid_jax.model.visual_geoms import LOOK_GROUP
 
 # The compiler's bounding-volume tree: explicit contact pairs never look at it.
 NOT_DERIVED = {"bvh_aabb", "oct_aabb"}

@@ -8,13 +8,13 @@ import mujoco
 import numpy as np
 import pytest
 
-from droid_jax.measure.engine import instrument
-from droid_jax.model.builtin import ARM, FINGERS
-from droid_jax.model.door import door_space, truth
-from droid_jax.model.door_scene import LEVERS, door_scene
+from droid_jax.door.builtin import ARM, FINGERS
+from droid_jax.door.scene import LEVERS, door_scene
+from droid_jax.door.space import door_space, truth
 from droid_jax.model.fields import body_mass, joint_damping, joint_frictionloss, model_parameter, servo_scale
-from droid_jax.model.looks import LOOK_GROUP
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Grip, Scene, compile_scene, load_scene, with_options
+from droid_jax.model.visual_geoms import LOOK_GROUP
+from droid_jax.simulate.c_engine import instrument
 
 # Franka's documentation, "Denavit-Hartenberg parameters" (Craig's convention): a, d [m], alpha [rad].
 DH = (

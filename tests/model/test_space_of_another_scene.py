@@ -9,10 +9,10 @@ import pytest
 
 import droid_jax as dj
 from droid_jax.identify.gaussian import prior
-from droid_jax.measure.recording import Channel, Recording, TorqueConvention
 from droid_jax.model.fields import body_mass, check_space, joint_damping, servo_scale
 from droid_jax.model.parameters import Parameter, Scaling, Space, Write
 from droid_jax.model.scene import Scene
+from droid_jax.recordings.recording import Channel, Recording, TorqueConvention
 
 
 def arm(folder: Path, *joints: str) -> Scene:

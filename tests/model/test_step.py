@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
-from droid_jax.model.ignored import check_options
 from droid_jax.model.patches import exact_segments, midpoint_law
 from droid_jax.model.step import solve, step
+from droid_jax.model.unsupported_features import check_options
 
 # A three-link arm over a floor: contacts, limits, dry friction, a coupled and a pinned joint.
 ARM = """

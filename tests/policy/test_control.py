@@ -13,15 +13,15 @@ import mujoco
 import numpy as np
 import pytest
 
-from droid_jax.model.door_scene import door_scene
+from droid_jax.door.environment import start_pose
+from droid_jax.door.hand import hand_of, looked
+from droid_jax.door.policy_interface import interface_of
+from droid_jax.door.scene import door_scene
+from droid_jax.door.task import Task
+from droid_jax.door.task import observation as trained_on
 from droid_jax.policy import control
 from droid_jax.policy.control import ACTIONS, OBSERVED, Command, Controller, Interface, Policy, Reading, Safety, drive
-from droid_jax.policy.door_env import start_pose
-from droid_jax.policy.hand import hand_of, looked
-from droid_jax.policy.interface import interface_of
 from droid_jax.policy.network import save_policy
-from droid_jax.policy.task import Task
-from droid_jax.policy.task import observation as trained_on
 
 TASK = Task()
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from brax.envs.base import Env, State
 
-from droid_jax.policy.doors import AXIS, Doors, wrapped
+from droid_jax.policy.parallel import AXIS, Doors, wrapped
 
 COUNT = 3
 

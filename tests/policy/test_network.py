@@ -13,12 +13,12 @@ import pytest
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks as ppo_networks
 
-from droid_jax.model.door_scene import door_scene
+from droid_jax.door.environment import start_pose
+from droid_jax.door.policy_interface import interface_of
+from droid_jax.door.scene import door_scene
+from droid_jax.door.task import Task
 from droid_jax.policy.control import ACTIONS, FORMAT, LAYOUT, OBSERVED, Interface, Policy, load
-from droid_jax.policy.door_env import start_pose
-from droid_jax.policy.interface import interface_of
 from droid_jax.policy.network import layer_sizes, policy_of, save_policy
-from droid_jax.policy.task import Task
 
 HIDDEN = (64, 64)
 

@@ -15,9 +15,9 @@ import pytest
 from mujoco import mjx
 
 from droid_jax.commands import train
+from droid_jax.door.scene import door_scene
+from droid_jax.door.space import door_space
 from droid_jax.identify.gaussian import Gaussian, load, prior
-from droid_jax.model.door import door_space
-from droid_jax.model.door_scene import door_scene
 from droid_jax.model.effects.registry import effect_space, library
 from droid_jax.model.fields import (
     body_mass,

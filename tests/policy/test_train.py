@@ -11,13 +11,13 @@ import jax
 import numpy as np
 import pytest
 
+from droid_jax.door.environment import DoorEnv
+from droid_jax.door.scene import door_scene
+from droid_jax.door.space import door_space
+from droid_jax.door.task import Task
 from droid_jax.identify.gaussian import prior
-from droid_jax.model.door import door_space
-from droid_jax.model.door_scene import door_scene
 from droid_jax.policy.control import OBSERVED
-from droid_jax.policy.door_env import DoorEnv
 from droid_jax.policy.randomise import randomised
-from droid_jax.policy.task import Task
 from droid_jax.policy.train import (
     PRESETS,
     TrainConfig,

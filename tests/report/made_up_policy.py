@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from droid_jax.policy.task import Task
+from droid_jax.door.task import Task
 from droid_jax.policy.trials import Trials
 
 

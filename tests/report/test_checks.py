@@ -11,7 +11,7 @@ import pytest
 from made_up_gap import make_gap
 from made_up_run import make_run
 
-from droid_jax.compare.findings import Finding
+from droid_jax.preflight.findings import Finding
 from droid_jax.report import page
 from droid_jax.report.run_folder import read_run
 from droid_jax.report.words import summary

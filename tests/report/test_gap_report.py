@@ -415,9 +415,9 @@ def test_a_wrong_shape_is_named(tmp_path: Path) -> None:
 
 
 def test_words_agree_with_the_search() -> None:
-    from droid_jax.gap import select
-    from droid_jax.gap.split import Split
-    from droid_jax.gap.verdict import Kind
+    from droid_jax.discrepancy import select
+    from droid_jax.discrepancy.split import Split
+    from droid_jax.discrepancy.verdict import Kind
 
     assert {k.value for k in Kind} == set(VERDICTS)
     assert {s.value for s in Split} == set(PARTS)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from droid_jax.identify.refine import RefineProgress
+from droid_jax.identify.multistart import RefineProgress
 from droid_jax.policy.train import TrainProgress
 from droid_jax.report.scalars import numbers_of, scalars
 

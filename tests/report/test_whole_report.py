@@ -14,7 +14,7 @@ from made_up_whole import make_whole
 from reader import read_page
 
 from droid_jax.report import page
-from droid_jax.report.words import hidden_words
+from droid_jax.synthetic.hidden_effects import in_words
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def test_what_the_stand_in_robot_hid_is_said_in_the_librarys_words_too(tmp_path:
     assert "hid" not in lead()  # a robot's own recordings were searched, and the stand-in's lie beside them
     path = tmp_path / "gap" / "gap.json"
     searched = json.loads(path.read_text())
-    searched["setup"] |= {"stand_in": True, "robot": {"hide": ["magnetic_catch=1.5", "detent=0.5"]}}
+    searched["setup"] |= {"stand_in": True, "robot": {"hidden": in_words({"magnetic_catch": 1.5, "detent": 0.5})}}
     path.write_text(json.dumps(searched))
     assert (
         "What the stand-in robot hid: magnetic catch (1.5 N m; in the library: latch) and detent (0.5 N m; the library "
@@ -157,12 +157,12 @@ def test_a_stage_alone_has_no_lead(tmp_path: Path):
 @pytest.mark.parametrize(
     ("hidden", "called"),
     [
-        ("stribeck_friction[hinge]=1", "hinge stribeck"),
-        ("directional_friction[hinge]=1", "hinge directional"),
-        ("stribeck_friction[panda_joint2]=1", "joint stribeck"),
-        ("stribeck_friction=1", "joint stribeck"),
-        ("dry_friction[hinge]=1", "joint coulomb"),
+        ("stribeck_friction[hinge]", "hinge stribeck"),
+        ("directional_friction[hinge]", "hinge directional"),
+        ("stribeck_friction[panda_joint2]", "joint stribeck"),
+        ("stribeck_friction", "joint stribeck"),
+        ("dry_friction[hinge]", "joint coulomb"),
     ],
 )
 def test_what_was_hidden_is_called_as_the_library_does_there(hidden: str, called: str):
-    assert f"in the library: {called})" in hidden_words([hidden])
+    assert f"in the library: {called})" in in_words({hidden: 1.0})

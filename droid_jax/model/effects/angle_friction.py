@@ -1,9 +1,9 @@
 """Dry friction of the hinge that changes as the door opens: a door that drags on the floor."""
 
-from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effect_interface import Effect
+from droid_jax.model.effects import coefficients as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect
 
 SLOPE, CURVE = "angle_friction_slope", "angle_friction_curve"
 

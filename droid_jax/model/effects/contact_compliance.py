@@ -1,11 +1,11 @@
 """Fingers and knob that give way more (or less) than the model's contact does."""
 
-from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effect_interface import Effect
+from droid_jax.model.effects import coefficients as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.fields import write
 from droid_jax.model.parameters import Mode, Parameter
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect
 
 SOFTNESS = "contact_softness"
 

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import jax.numpy as jnp
 
-from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effect_interface import Effect
+from droid_jax.model.effects import coefficients as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect
 
 COMMAND, SENSOR = "command_delay", "sensor_delay"
 MEASURED = ("torque",)  # what comes late; positions come from other sensors

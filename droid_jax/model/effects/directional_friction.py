@@ -1,10 +1,10 @@
 """Dry friction that differs between the two directions: of the arm's joints, of the hinge."""
 
-from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effect_interface import Effect, column
+from droid_jax.model.effects import coefficients as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.joint_friction import direction
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect, column
 
 JOINT, HINGE = "joint_directional", "hinge_directional"
 

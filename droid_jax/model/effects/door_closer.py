@@ -2,10 +2,10 @@
 
 import jax.numpy as jnp
 
-from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effect_interface import Effect
+from droid_jax.model.effects import coefficients as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect
 
 DAMPING, EXPONENT = "closer_damping", "closer_exponent"
 

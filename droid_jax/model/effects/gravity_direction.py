@@ -3,11 +3,11 @@
 import mujoco
 import numpy as np
 
-from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effect_interface import Effect
+from droid_jax.model.effects import coefficients as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.gravity import field_force, lean, placed
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect
 
 NAME = "gravity_about"
 FELT = 1e-3  # N m/rad: a lean that no measured joint of the arm feels more of is no candidate

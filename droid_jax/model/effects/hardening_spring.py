@@ -1,9 +1,9 @@
 """A hinge spring that stiffens as the door opens."""
 
-from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effect_interface import Effect
+from droid_jax.model.effects import coefficients as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect
 
 SQUARE, CUBE = "hardening_square", "hardening_cube"
 

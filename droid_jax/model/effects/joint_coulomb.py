@@ -1,9 +1,9 @@
 """Dry friction of the arm's joints beyond what the model has."""
 
-from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effect_interface import Effect, column
+from droid_jax.model.effects import coefficients as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect, column
 
 LOSS = "joint_coulomb"
 

@@ -17,10 +17,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effect_interface import Effect, State, column
+from droid_jax.model.effects import coefficients as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect, State, column
 
 LEAST = 0.2  # of 1 + k c: a fitted servo may be stiffer than the one of which the bounds below zero are
 COMPLIANCE, BACKLASH = "joint_compliance", "joint_backlash"

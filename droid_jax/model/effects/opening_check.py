@@ -3,10 +3,10 @@
 import jax
 import jax.numpy as jnp
 
-from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effect_interface import Effect
+from droid_jax.model.effects import coefficients as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect
 
 DAMPING, ANGLE, EXPONENT = "check_damping", "check_angle", "check_exponent"
 ANGLES = (0.3, 0.5, 0.7)  # rad, where the braking begins

@@ -2,10 +2,10 @@
 
 import jax.numpy as jnp
 
-from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effect_interface import Effect
+from droid_jax.model.effects import coefficients as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect
 
 TORQUE, ANGLE = "over_centre_torque", "over_centre_angle"
 ANGLES = (0.1, 0.2, 0.35, 0.55)  # rad, of the peak: 5 to 30 degrees

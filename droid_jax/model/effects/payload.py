@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from droid_jax.model.effects import amplitudes as a
-from droid_jax.model.effects.chain import turned
+from droid_jax.model.effect_interface import Effect, State, Theta
+from droid_jax.model.effects import coefficients as a
+from droid_jax.model.effects.kinematics import turned
 from droid_jax.model.effects.registry import register
 from droid_jax.model.fields import write
 from droid_jax.model.parameters import Mode, Parameter
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect, State, Theta
 
 MASS, MOMENT = "payload_mass", "payload_moment"
 

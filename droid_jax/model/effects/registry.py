@@ -10,12 +10,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from droid_jax.model.effects.sizes import sized
+from droid_jax.model.effect_interface import Effect
+from droid_jax.model.effects.effect_scaling import sized
 from droid_jax.model.fields import ENCODER
 from droid_jax.model.joint_friction import GAIN
 from droid_jax.model.parameters import Scaling, Space
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
-from droid_jax.model.seam import Effect
 
 Maker = Callable[[Scene], Effect | None]
 _MAKERS: dict[str, Maker] = {}

@@ -2,12 +2,12 @@
 
 from dataclasses import replace
 
-from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effect_interface import Effect
+from droid_jax.model.effects import coefficients as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.fields import servo_scale
 from droid_jax.model.parameters import Parameter
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect
 
 GAIN = "servo_gain"
 

@@ -1,11 +1,11 @@
 """Dry friction of the arm's joints that holds where MuJoCo's lets a joint creep."""
 
-from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effect_interface import Effect
+from droid_jax.model.effects import coefficients as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.fields import write
 from droid_jax.model.parameters import Mode, Parameter
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect
 
 FIRM = 0.9999  # mjMAXIMP, the firmest constraint that MuJoCo has
 FIRMNESS = "friction_firmness"

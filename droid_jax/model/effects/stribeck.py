@@ -5,10 +5,10 @@ exp(-|v/vs|^n): n = 1 after Tustin, n = 2 after Armstrong-Helouvry (Automatica 1
 
 import jax.numpy as jnp
 
-from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effect_interface import Effect, column
+from droid_jax.model.effects import coefficients as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect, column
 
 JOINT, JOINT_SPEED, JOINT_EXPONENT = "joint_stribeck", "joint_stribeck_speed", "joint_stribeck_exponent"
 HINGE, HINGE_SPEED, HINGE_EXPONENT = "hinge_stribeck", "hinge_stribeck_speed", "hinge_stribeck_exponent"

@@ -2,10 +2,10 @@
 
 import jax.numpy as jnp
 
-from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effect_interface import Effect, column
+from droid_jax.model.effects import coefficients as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect, column
 
 SINE, COSINE, PERIODS = "ripple_sine", "ripple_cosine", "ripple_periods"
 # Periods a turn.  Between two of them the phase drifts by four radians over one radian of motion: were it more, a

@@ -2,11 +2,11 @@
 
 from dataclasses import replace
 
-from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effect_interface import Effect, column
+from droid_jax.model.effects import coefficients as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.joint_friction import GAIN, torque_gain_effect
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect, column
 
 BIAS, DRIFT = "torque_bias", "torque_drift"
 

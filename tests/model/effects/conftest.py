@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from effect_bench import Bench, bare, door_bench, mechanism_bench
 
-from droid_jax.model.seam import Rollout
+from droid_jax.model.effect_interface import Rollout
 
 
 @pytest.fixture(scope="session")

@@ -9,17 +9,17 @@ import jax
 import mujoco
 import numpy as np
 
-from droid_jax.compare.population import over_population
-from droid_jax.compare.replay import Drive, make_drive, servo_replay
-from droid_jax.measure.demonstration import demonstration_path
-from droid_jax.measure.formats import load
-from droid_jax.measure.recording import TorqueConvention, TorqueSide
-from droid_jax.model.door_scene import door_scene
+from droid_jax.door.demonstration import demonstration_path
+from droid_jax.door.scene import door_scene
+from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.effects.registry import effect_space, library, ready
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_physics
 from droid_jax.model.scene import Scene, compile_scene, with_options
-from droid_jax.model.seam import Effect, Rollout
+from droid_jax.recordings.formats import load
+from droid_jax.recordings.recording import TorqueConvention, TorqueSide
+from droid_jax.simulate.batching import over_population
+from droid_jax.simulate.replay import Drive, make_drive, servo_replay
 
 # An arm of two links with a hand, and a door with a servo of its own.  Degrees of freedom, measured joints and
 # actuators stand in three different orders, the hand is heavier than the forearm, and the elbow's reference is not

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from effect_bench import door, mechanism
 
-from droid_jax.model.effects.chain import turned
+from droid_jax.model.effects.kinematics import turned
 from droid_jax.model.scene import Scene, compile_scene
 
 

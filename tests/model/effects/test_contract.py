@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from effect_bench import Bench, amplitudes, bare, door, door_bench, everywhere, make_bench, mechanism, typical
 
+from droid_jax.model.effect_interface import Effect, Rollout, State
 from droid_jax.model.effects.registry import library, registered
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import DERIVED, Physics, make_physics, written_fields
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect, Rollout, State
 
 EFFECTS = registered()
 NEUTRAL = 1e-3  # N m: what a program compiled with the effects may differ by from one without

@@ -11,17 +11,17 @@ import pytest
 from effect_bench import JOINTS, MECHANISM, mechanism
 from effect_oracles import ORACLES, SLOW, Now
 
-from droid_jax.compare.inverse import path_of, path_replay
-from droid_jax.compare.population import over_population
-from droid_jax.compare.replay import Replay
-from droid_jax.measure.motion import Motion
-from droid_jax.measure.recording import TorqueConvention, TorqueSide
+from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects.registry import effect_space, library
 from droid_jax.model.joint_friction import joint_friction_effect, joint_friction_space
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_physics
 from droid_jax.model.scene import Scene
-from droid_jax.model.seam import Effect
+from droid_jax.recordings.recording import TorqueConvention, TorqueSide
+from droid_jax.simulate.batching import over_population
+from droid_jax.simulate.inverse_dynamics import path_of, path_replay
+from droid_jax.simulate.measured_motion import Motion
+from droid_jax.simulate.replay import Replay
 
 MOTOR, LINK = TorqueSide.MOTOR, TorqueSide.LINK
 STEERING = ("command_delay", "joint_backlash", "joint_compliance")

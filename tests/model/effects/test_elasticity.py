@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from effect_bench import ARM, mechanism
 
+from droid_jax.model.effect_interface import State
 from droid_jax.model.effects.registry import library
 from droid_jax.model.fields import servo_scale
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_physics
-from droid_jax.model.seam import State
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.4])

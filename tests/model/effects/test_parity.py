@@ -8,8 +8,8 @@ import pytest
 from effect_bench import JOINTS, MECHANISM, Bench, mechanism_bench
 from effect_oracles import ORACLES, Now, Oracle
 
-from droid_jax.compare.replay import Drive
 from droid_jax.model.scene import TINY_FRICTIONLOSS
+from droid_jax.simulate.replay import Drive
 
 TIMESTEP = 0.001  # s
 # At the same time step both engines do the same arithmetic, C in float64.  float32 resolves an angle of 1 rad to

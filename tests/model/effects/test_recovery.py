@@ -10,9 +10,9 @@ import pytest
 from effect_bench import Bench
 from effect_oracles import ORACLES
 
-from droid_jax.identify.refine import RefineConfig, refine
+from droid_jax.identify.multistart import RefineConfig, refine
+from droid_jax.model.effect_interface import Effect
 from droid_jax.model.parameters import Space
-from droid_jax.model.seam import Effect
 
 NOISE = 0.003  # N m: a sensor's 0.01, the mean of ten repeats
 FAR = 5.0  # posterior deviations: 52 parameters stay inside unless something is wrong

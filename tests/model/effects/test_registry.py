@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from effect_bench import ARM, JOINTS, MECHANISM, MOTOR, Bench, make_bench, mechanism
 
-from droid_jax.compare.replay import Drive, servo_replay
-from droid_jax.model.effects import amplitudes as a
+from droid_jax.model.effect_interface import Effect
+from droid_jax.model.effects import coefficients as a
 from droid_jax.model.effects import registry
 from droid_jax.model.effects.registry import effect_space, library, ready, register, registered
 from droid_jax.model.mjcf import native
 from droid_jax.model.parameters import Parameter
 from droid_jax.model.physics import make_physics
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene, compile_scene
-from droid_jax.model.seam import Effect
+from droid_jax.simulate.replay import Drive, servo_replay
 
 OF_HINGES = {"angle_friction", "door_closer", "drag", "hardening_spring", "hinge_directional", "hinge_preload",
              "hinge_stribeck", "latch", "opening_check", "over_centre_spring", "tilted_frame"}  # fmt: skip

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from effect_bench import Bench, make_bench
 
-from droid_jax.compare.replay import Drive
-from droid_jax.gap.candidates import possible, steers
-from droid_jax.measure.recording import Recording, TorqueConvention, TorqueSide
+from droid_jax.discrepancy.candidates import possible, steers
 from droid_jax.model.effects.registry import effect_space, library, ready
 from droid_jax.model.mjcf import fitted_mjcf, unwritten
 from droid_jax.model.scene import Scene, compile_scene
+from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSide
+from droid_jax.simulate.replay import Drive
 
 MJCF = """<mujoco><option timestep="0.002" integrator="implicitfast" gravity="0 0 0"/><worldbody><body>
   <joint name="j" axis="0 1 0" armature="INERTIA" frictionloss="0.3"/>

@@ -1,0 +1,133 @@
+"""The stand-in robot: its options, and one with something hidden in it for a `gap` without recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from droid_jax.commands.folder import kept_recordings
+from droid_jax.files import STAND_IN
+from droid_jax.read_json import read_json, typed
+from droid_jax.report.stages import Robot
+
+if TYPE_CHECKING:
+    from droid_jax.model.scene import Scene
+    from droid_jax.recordings.recording import Recording
+
+DEMONSTRATIONS = {"fit": "C", "confirm": "B", "sealed": "A"}
+HIDE = ("magnetic_catch=1.5",)  # N m
+OPTIONS = {"hide": None, "springs": 1, "demonstrations": ("A", "C")}  # of a stand-in, as they are where not given
+
+T = TypeVar("T")
+
+
+def settled(command: T) -> T:
+    """A command with the options of its stand-in robot filled in, where it records one.
+
+    Raises ValueError where some were given beside recordings, which come from another robot.
+    """
+    usual = {name: value for name, value in OPTIONS.items() if hasattr(command, name)}
+    if "demonstrations" in usual and command.preset == "paper":  # type: ignore[attr-defined]
+        usual["demonstrations"] = ("A",)  # one is fitted there
+    given = [name for name in usual if getattr(command, name) is not None]
+    if not command.recording:  # type: ignore[attr-defined]
+        return replace(command, **{k: v for k, v in usual.items() if k not in given})  # type: ignore[type-var]
+    if given:
+        raise ValueError(f"--{given[0]} is for the stand-in robot, and --recording says that there is none")
+    return command
+
+
+def hidden_effects(entries: Sequence[str] | None, scene: Scene) -> dict[str, float]:
+    """What --hide says: name or name[joint] -> amplitude.
+
+    entries: "name=amplitude" each, or "none" alone; None: one effect of this program's choice.
+    Raises ValueError for what they cannot mean, listing the valid names, and for what the scene cannot have.
+    """
+    from droid_jax.synthetic.hidden_effects import check, hidden_effect, listed, possible
+
+    entries = HIDE if entries is None else tuple(entries)
+    if entries in ((), ("none",)):
+        return {}
+    found = {}
+    for entry in entries:
+        name, _, amplitude = entry.partition("=")
+        try:
+            found[name] = float(amplitude)
+        except ValueError:
+            raise ValueError(
+                f"--hide takes name=amplitude, for example {HIDE[0]}, or none; got {entry!r}. "
+                f"There are: {', '.join(possible(scene))}"
+            ) from None
+        hidden_effect(name.partition("[")[0])
+    for one in listed(found):
+        check(one, scene)
+    return found
+
+
+def record_stand_in(
+    scene: Scene, hidden: Mapping[str, float], out: Path, springs: int, seed: int, again: bool
+) -> dict[str, Recording]:
+    """Role -> what the stand-in robot measured; kept in the run's folder.
+
+    Recorded anew where `again` asks for it, and where the folder is not known to hold recordings of this very robot.
+    """
+    from droid_jax.door.demonstration import demonstration_path
+    from droid_jax.recordings.formats import load
+    from droid_jax.storage import write_json
+    from droid_jax.synthetic.hidden_effects import record_hidden
+    from droid_jax.synthetic.robot import stand_in_truth
+
+    truth = stand_in_truth(scene, springs, seed)
+
+    names = list(DEMONSTRATIONS.values())
+
+    def recorded(name: str) -> Recording:
+        demonstration = load(demonstration_path(name))
+        return record_hidden(scene, demonstration, truth, hidden, seed=1000 * seed + names.index(name), name=name)
+
+    files = kept_at(out)
+    paths = dict(zip(names, files, strict=True))
+    this = stand_in_json(hidden, springs, seed)
+    if again or known_stand_in(files) != this:
+        for path in paths.values():
+            path.unlink(missing_ok=True)
+    write_json(out / "recordings" / STAND_IN, this)  # before the first: a stop leaves no recordings of an unknown robot
+    found = kept_recordings(paths, False, recorded)
+    return {role: found[name] for role, name in DEMONSTRATIONS.items()}
+
+
+def kept_at(out: Path) -> tuple[Path, ...]:
+    """Files of the stand-in robot's motions in a run's folder: fit, confirm, sealed."""
+    return tuple(out / "recordings" / f"{name}.npz" for name in DEMONSTRATIONS.values())
+
+
+def stand_in_json(hidden: Mapping[str, float], springs: int, seed: int) -> dict[str, Any]:
+    """What is known of the stand-in robot that made some recordings."""
+    from droid_jax.synthetic.hidden_effects import in_words
+
+    hide = [f"{name}={amplitude:g}" for name, amplitude in hidden.items()]
+    return {"springs": springs, "seed": seed, "hide": hide, "hidden": in_words(hidden)}
+
+
+def known_stand_in(recordings: Sequence[str | Path]) -> dict[str, Any]:
+    """Springs, seed and hidden effects of the stand-in robot that made these files; empty where that is not known."""
+    folders = {Path(path).resolve().parent for path in recordings}
+    try:
+        at = folders.pop() / STAND_IN
+        return dict(typed(read_json(at), Robot, str(at))) if not folders else {}
+    except (OSError, ValueError):
+        return _of_meta(recordings)
+
+
+def _of_meta(recordings: Sequence[str | Path]) -> dict[str, Any]:
+    """The same from what `record` wrote into the files themselves, where they all say the same."""
+    from droid_jax.recordings.formats import load
+
+    try:
+        metas = [load(path).meta for path in recordings]
+        said = {(int(meta["springs"]), int(meta["robot"])) for meta in metas}
+    except (OSError, ValueError, KeyError):
+        return {}
+    return stand_in_json({}, *said.pop()) if len(said) == 1 else {}

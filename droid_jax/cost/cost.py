@@ -1,0 +1,452 @@
+"""The vmapped cost: parameter vectors in, disagreement with the recordings out.
+
+cost = make_cost(scene, space, [recording])
+cost(values)            # [P, D] -> [P]   N m
+cost.whitened(values)   # [P, D] -> [P, M] residuals in noise units
+cost.rollouts(values)   # [P, D] -> one Rollout per recording
+"""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from droid_jax import runtime
+from droid_jax.arguments import instance, instances, one_of
+from droid_jax.cost.residuals import CompareConfig, Comparison, make_comparison
+from droid_jax.model.effect_interface import Effect, Rollout
+from droid_jax.model.fields import check_space
+from droid_jax.model.inertia import check_inertia, free_inertias, inertia_possible
+from droid_jax.model.joint_friction import FRICTION, GAIN, TERMS, direction, joint_friction_effect, torque_gain_effect
+from droid_jax.model.parameters import Space
+from droid_jax.model.physics import make_physics
+from droid_jax.model.scene import Scene
+from droid_jax.preflight.check_log import warn_of_log
+from droid_jax.preflight.preflight import check_range, warn_if_moving, warn_of_commands
+from droid_jax.recordings.checks import validate
+from droid_jax.recordings.recording import Recording, recordings_of
+from droid_jax.simulate.batching import in_blocks, over_block
+from droid_jax.simulate.c_reference import twin_replay
+from droid_jax.simulate.initial_state import AJAR, following
+from droid_jax.simulate.inverse_dynamics import Path, path_of, path_replay, prescribed
+from droid_jax.simulate.measured_motion import Motion, measured_motion
+from droid_jax.simulate.repeat_starts import from_one_start, own_starts
+from droid_jax.simulate.replay import Drive, Replay, check_gains, make_drive, servo_replay, torque_offset_effect
+
+ENGINES = ("mjx", "mujoco")
+ALIKE = 2e-3  # rad or m: measured starts that are closer differ by the noise of a sensor
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Cost:
+    """A cost over a space. Call it with [P, D] physical values; everything returns host arrays."""
+
+    scene: Scene
+    space: Space
+    comparisons: tuple[Comparison, ...]
+    drives: tuple[Drive | Motion, ...]
+    _replays: tuple[Callable[[np.ndarray], Rollout], ...]
+    _distances: tuple[Callable[[Rollout], jax.Array], ...]
+    _whitened: tuple[Callable[[Rollout], jax.Array], ...]
+    _failed: tuple[Callable[[Rollout], jax.Array], ...]
+    _beta: tuple[Callable[[Rollout], jax.Array], ...]
+    _smoothed: tuple[Callable[[Rollout], jax.Array], ...]
+
+    def __repr__(self) -> str:
+        names = ", ".join(c.name for c in self.comparisons)
+        return f"<Cost of {names} over {len(self.space)} parameters of scene {self.scene.name!r}>"
+
+    def __call__(self, values: Any) -> np.ndarray:
+        """[P, D] -> [P] cost, the mean over the recordings; never NaN."""
+        return np.mean(self.distances(values), axis=1)
+
+    def distances(self, values: Any) -> np.ndarray:
+        """[P, D] -> [P, R] cost of each recording."""
+        return self._blockwise(values, self._distances, lambda parts: np.stack(parts, axis=1))
+
+    def whitened(self, values: Any) -> np.ndarray:
+        """[P, D] -> [P, M] residuals of all recordings, in units of the noise of the repeats' mean."""
+        return self._blockwise(values, self._whitened, lambda parts: np.concatenate(parts, axis=1))
+
+    def failed(self, values: Any) -> np.ndarray:
+        """[P, D] -> [P] bool: the grasp was lost, the door stayed shut, or the replay blew up."""
+        return self._blockwise(values, self._failed, lambda parts: np.any(np.stack(parts), axis=0))
+
+    def penalties(self, values: Any) -> np.ndarray:
+        """[P, D] -> [P, R] N m: the part c beta of each recording's cost."""
+        failed = self._blockwise(values, self._beta, lambda parts: np.stack(parts, axis=1))
+        return failed * np.array([c.config.failure_cost for c in self.comparisons])
+
+    def smoothed(self, values: Any) -> tuple[np.ndarray, ...]:
+        """[P, D] -> for each recording the torques through the data's filter, [P, K, J] N m."""
+        return self._blockwise(values, self._smoothed, tuple)
+
+    def rollouts(self, values: Any) -> tuple[Rollout, ...]:
+        """[P, D] -> for each recording a Rollout of host arrays [P, T, ...]."""
+        identity = tuple((lambda r: r) for _ in self._replays)
+        return self._blockwise(values, identity, tuple)
+
+    def first(self) -> Cost:
+        """The cost of the first recording alone, on the same compiled functions."""
+        each = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("scene", "space")}
+        return replace(self, **{name: of_recordings[:1] for name, of_recordings in each.items()})
+
+    def restated(self, values: np.ndarray) -> Cost:
+        """The same replays, with the noise of single repeats restated from what `values` [D] leaves unexplained."""
+        rollouts = [jax.tree.map(lambda a: a[0], r) for r in self.rollouts(values[None])]
+        made = [c.restated(r) if c.repeats == 1 else c for c, r in zip(self.comparisons, rollouts, strict=True)]
+        return assemble(self.scene, self.space, made, self._replays, self.drives)
+
+    def against(self, recordings: Sequence[Recording], config: CompareConfig | None = None) -> Cost:
+        """The same compiled replays compared with other repeats of the same recordings, or in another way.
+
+        Repeats that start elsewhere are replayed from there.  A recording without commands may hold another motion:
+        its replay is given it.
+        Raises ValueError unless these are as many, with the same commands (where there are none, as many instants on
+        the same clock and the same joints with positions throughout) and the same torque convention.
+        """
+        recordings = recordings_of(recordings)
+        if len(recordings) != len(self.drives):
+            raise ValueError(f"expected repeats of {len(self.drives)} replayed recordings, got {len(recordings)}")
+        made, drives, replays = [], [], []
+        for given, old, drive, replay in zip(recordings, self.comparisons, self.drives, self._replays, strict=True):
+            recording = own_starts(given)
+            new = followed(self.scene, recording, config or old.config)
+            if isinstance(new, Drive):
+                check_gains(self.scene, new)
+            if not _same(self.scene, new, drive):
+                raise ValueError(
+                    f"recording {recording.name!r} holds other commands than {old.name!r} had, measured another torque "
+                    "(side, gravity) or, without commands, has another clock or other joints whose positions were "
+                    "measured throughout"
+                )
+            drives.append(drive if _start_alike(self.scene, new, drive) else new)
+            replays.append(_along(replay, drives[-1]))
+            made.append(_compared(self.scene, self.space, recording, drives[-1], replays[-1], config or old.config))
+        return assemble(self.scene, self.space, made, replays, drives)
+
+    def from_one_start(self, index: int, recording: Recording) -> Recording:
+        """Repeats of a recording as if all had started where its replay does (`own_starts.from_one_start`)."""
+        return _from_one_start(self.scene, self.space, own_starts(recording), self.drives[index], self._replays[index])
+
+    def _blockwise(self, values: Any, functions: Sequence[Callable], join: Callable) -> Any:
+        def block(rows: np.ndarray) -> Any:
+            return join([f(replay(rows)) for f, replay in zip(functions, self._replays, strict=True)])
+
+        return in_blocks(block, self.space.check(values))
+
+
+def make_cost(
+    scene: Scene,
+    space: Space,
+    recordings: Recording | Sequence[Recording],
+    *,
+    engine: str = "mjx",
+    config: CompareConfig | None = None,
+    effects: Sequence[Effect] = (),
+    check: bool = True,
+) -> Cost:
+    """The cost of a scene over one or more recordings.
+
+    A recording with commands is replayed by its servo, one without by inverse dynamics of its
+    measured motion.
+    engine: "mjx" (compiled, all devices) or "mujoco" (plain C, all cores; the parity oracle).
+    effects: extra physics or observation models whose parameters are part of the space; torque
+      offsets, and joint friction behind the sensor where the space holds any, are there already.
+    check: warn of units, signs and clocks in the recordings that can hardly be right (`log_checks.check_log`).
+    Raises ValueError for a space of another scene, unknown engines, joints, channels, parameters that nothing reads,
+      or gains that do not match.
+    """
+    config = instance(CompareConfig() if config is None else config, "config", CompareConfig)
+    check_space(instance(scene, "scene", Scene), instance(space, "space", Space))
+    recordings, effects = recordings_of(recordings), instances(effects, "effects", Effect)
+    one_of(engine, "engine", ENGINES)
+    recordings = [own_starts(recording) for recording in recordings]
+    drives = [followed(scene, r, config) for r in recordings]
+    for recording in recordings if check else ():
+        warn_of_log(scene, recording)
+    check_read(scene, space, effects)
+    check_inertia(scene, space)
+    if not any(isinstance(drive, Drive) for drive in drives):
+        _warn_of_commanded(space)
+    replays = tuple(
+        _engine(engine, scene, space, d, with_sensors(scene, space, d, effects), config.mj_step) for d in drives
+    )
+    comparisons = tuple(
+        _compared(scene, space, recording, drive, replay, config)
+        for recording, drive, replay in zip(recordings, drives, replays, strict=True)
+    )
+    return assemble(scene, space, comparisons, replays, drives)
+
+
+def check_read(scene: Scene, space: Space, effects: Sequence[Effect]) -> None:
+    """Raise ValueError for parameters that write no model field and are read by no replay: they would change nothing.
+
+    An effect that states no parameters may read any of them.
+    """
+    sensed = [f"{what}[{joint}]" for what in TERMS for joint in scene.joints]
+    read = {"time_offset", *sensed, *(p.name for e in effects for p in e.parameters)}
+    unread = [p.name for p in space.parameters if not p.writes and p.name not in read]
+    if unread and all(e.parameters for e in effects):
+        raise ValueError(
+            f"parameters {', '.join(unread)} write no field of the model, and nothing in the replay reads them; names "
+            f"that it reads: time_offset, {', '.join(sensed)}, and those of the effects that it is given"
+        )
+
+
+def _warn_of_commanded(space: Space) -> None:
+    """Warn of parameters that act through commands or constraints, where no recording has any: they change nothing."""
+    idle = [
+        p.name
+        for p in space.parameters
+        if p.name == "time_offset" or (p.writes and all(w.field.startswith(("actuator_", "dof_sol")) for w in p.writes))
+    ]
+    if idle:
+        warnings.warn(
+            f"parameters {', '.join(idle)} change nothing where no recording holds commands: its motion is prescribed",
+            stacklevel=3,
+        )
+
+
+def assemble(
+    scene: Scene,
+    space: Space,
+    comparisons: Sequence[Comparison],
+    replays: Sequence[Callable[[np.ndarray], Rollout]],
+    drives: Sequence[Drive | Motion],
+) -> Cost:
+    """A Cost from batch replays ([B, D] -> Rollout), what each is compared with, and what each follows."""
+    return Cost(
+        scene=scene,
+        space=space,
+        comparisons=tuple(comparisons),
+        drives=tuple(drives),
+        _replays=tuple(replays),
+        _distances=tuple(_compiled(c.distance) for c in comparisons),
+        _whitened=tuple(_compiled(c.whitened) for c in comparisons),
+        _failed=tuple(_compiled(lambda r, c=c: c.failed(r) | ~r.finite) for c in comparisons),
+        _beta=tuple(_compiled(c.failed) for c in comparisons),
+        _smoothed=tuple(_compiled(c.smoothed) for c in comparisons),
+    )
+
+
+def batch_replay(scene: Scene, space: Space, replay: Replay) -> Callable[[np.ndarray], Rollout]:
+    """One compiled, sharded block of a per-sample replay: [B, D] -> Rollout [B, ...]."""
+    return over_block(_of_bodies(scene, space, lambda values: replay(make_physics(scene, space, values))))
+
+
+def _of_bodies(scene: Scene, space: Space, replay: Callable[..., Rollout]) -> Callable[..., Rollout]:
+    """The replay of a row of values [D], which gives no numbers where no body can have the row's inertia."""
+    if not free_inertias(scene, space):
+        return replay
+
+    def checked(values: Any, *more: Any) -> Rollout:
+        rollout = replay(values, *more)
+        return replace(rollout, finite=rollout.finite & inertia_possible(scene, space, values))
+
+    return checked
+
+
+def followed(scene: Scene, recording: Recording, config: CompareConfig) -> Drive | Motion:
+    """What a replay follows: the recording's commands or, where it holds none, its measured motion."""
+    validate(recording, allow_jitter=True)  # one made in Python may not have been
+    check_range(scene, recording)
+    if recording.command.size:
+        drive = make_drive(scene, recording, weigh="torque" in config.channels)
+        warn_of_commands(scene, recording)
+        warn_if_moving(recording)
+        return drive
+    if not scene.joints:
+        raise ValueError(f"no joint of scene {scene.name!r} is driven: name the measured ones (--joints)")
+    felt = (*scene.joints, *scene.carriers(scene.joints))  # by the torques that are compared
+    return measured_motion(
+        recording, prescribed(scene, recording), cutoff=config.motion_cutoff, alike=felt, rest=config.rest
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Along:
+    """A compiled batch of inverse replays along a motion: [B, D] -> Rollout [B, ...].
+
+    torques: the torques [N, T, J] of N paths at the space's means.
+    """
+
+    compiled: Callable[..., Rollout]
+    scene: Scene
+    motion: Motion
+    torques: Callable[[Path], jax.Array]
+
+    def __call__(self, values: np.ndarray) -> Rollout:
+        return self.compiled(values, path_of(self.scene, self.motion))
+
+
+@dataclass(frozen=True, eq=False)
+class Driven:
+    """A batch of servo replays of a drive: [B, D] -> Rollout [B, ...].
+
+    make: drive -> its batch; one of another start, or of other commands of the same length, compiles nothing anew.
+    """
+
+    make: Callable[[Drive], Callable[[np.ndarray], Rollout]]
+    drive: Drive
+
+    @functools.cached_property
+    def _batch(self) -> Callable[[np.ndarray], Rollout]:
+        return self.make(self.drive)
+
+    def __call__(self, values: np.ndarray) -> Rollout:
+        return self._batch(values)
+
+
+def _along(replay: Callable[[np.ndarray], Rollout], follows: Drive | Motion) -> Callable[[np.ndarray], Rollout]:
+    """The same compiled batch along another motion, or from another start."""
+    if isinstance(replay, Along) and isinstance(follows, Motion):
+        return replace(replay, motion=follows)
+    if isinstance(replay, Driven) and isinstance(follows, Drive):
+        return replay if follows is replay.drive else replace(replay, drive=follows)
+    return replay
+
+
+def _from_one_start(
+    scene: Scene, space: Space, recording: Recording, follows: Drive | Motion, replay: Callable
+) -> Recording:
+    if not isinstance(follows, Drive) or not isinstance(replay, Driven):
+        return recording
+
+    def alone(drive: Drive) -> Rollout:
+        return jax.tree.map(lambda a: a[0], in_blocks(replace(replay, drive=drive), space.mean[None]))
+
+    return from_one_start(scene, recording, follows, alone)
+
+
+def _compared(
+    scene: Scene, space: Space, recording: Recording, follows: Drive | Motion, replay: Callable, config: CompareConfig
+) -> Comparison:
+    """What a recording is compared with its replay by."""
+    apart = _apart(replay, scene, recording, config) if isinstance(replay, Along) else None
+    recording = _from_one_start(scene, space, recording, follows, replay)
+    rest = follows.rest if isinstance(follows, Motion) else None
+    return make_comparison(scene, recording, _clock(recording, follows), config, apart, rest)
+
+
+def _apart(along: Along, scene: Scene, recording: Recording, config: CompareConfig) -> np.ndarray | None:
+    """[N, T, J] N m: torques of the repeats' own measured motions, less their mean; None unless each measured its own.
+
+    A replay follows the mean of the measured positions, whose noise, differentiated twice, all repeats share.  What
+    the repeats' own motions would take tells how large it is (errors in variables).
+    """
+    if recording.repeats == 1 or not recording.channel("position").mask.all():
+        return None
+    motions = [
+        measured_motion(
+            recording.repeats_subset([n]), along.motion.joints, cutoff=config.motion_cutoff, rest=config.rest
+        )
+        for n in range(recording.repeats)
+    ]
+    paths = [path_of(scene, motion) for motion in motions]
+    torques = np.asarray(along.torques(jax.tree.map(lambda *a: jnp.stack(a), *paths)), np.float64)
+    return torques - torques.mean(axis=0)
+
+
+def _same(scene: Scene, new: Drive | Motion, old: Drive | Motion) -> bool:
+    """Whether what was compiled for the one serves the other, from its own start."""
+    if new.torque != old.torque:
+        return False
+    if isinstance(new, Motion) and isinstance(old, Motion):
+        return new.joints == old.joints and np.array_equal(new.time, old.time)
+    if isinstance(new, Motion) or isinstance(old, Motion):
+        return False
+    sent, before = (np.ones(d.command.shape[1], bool) if d.sent is None else d.sent for d in (new, old))
+    return np.array_equal(sent, before) and np.array_equal(new.command[:, sent], old.command[:, sent])
+
+
+def _start_alike(scene: Scene, new: Drive | Motion, old: Drive | Motion) -> bool:
+    """Whether two drives start at one place, but for ALIKE; motions, which are followed as they are, never do.
+
+    An object that stands ajar by about AJAR is put back for some repeats and not for others.
+    """
+    if isinstance(new, Motion) or isinstance(old, Motion):
+        return False
+    apart = np.full(scene.model.nq, ALIKE)
+    if scene.object_joint and scene.object_joint not in scene.joints:
+        hinge = scene.qpos(scene.object_joint)
+        if scene.model.qpos0[hinge] in (new.qpos0[hinge], old.qpos0[hinge]):
+            apart[hinge] += AJAR
+    apart[list(following(scene, new.qpos0) & following(scene, old.qpos0))] = np.inf  # by as much as what has them there
+    return bool(np.all(np.abs(new.qpos0 - old.qpos0) <= apart))
+
+
+def _clock(recording: Recording, follows: Drive | Motion) -> np.ndarray:
+    """[T] s of a replay's rows, on the recording's clock."""
+    return follows.time if isinstance(follows, Motion) else float(recording.time[0]) + follows.time
+
+
+def with_sensors(scene: Scene, space: Space, drive: Drive | Motion, effects: Sequence[Effect]) -> tuple[Effect, ...]:
+    """The effects, and those of the torque sensors that are not among them: what a replay is made with."""
+    given = {e.name for e in effects}
+    return (*effects, *(e for e in _sensor_effects(scene, space, drive) if e.name not in given))
+
+
+def _sensor_effects(scene: Scene, space: Space, drive: Drive | Motion) -> tuple[Effect, ...]:
+    """What the torque sensors add: always the offsets, all else where the space asks for it."""
+
+    def asked(*terms: str) -> bool:
+        return any(name.startswith(tuple(f"{term}[" for term in terms)) for name in space.names)
+
+    sign = jnp.sign if isinstance(drive, Motion) else direction
+    found = [joint_friction_effect(scene.joints, sign)] if asked(*FRICTION) else []
+    found += [torque_gain_effect(scene.joints)] if asked(GAIN) else []
+    return (*found, torque_offset_effect(scene.joints))
+
+
+def _engine(
+    engine: str, scene: Scene, space: Space, drive: Drive | Motion, effects: Sequence[Effect], mj_step: bool
+) -> Callable[[np.ndarray], Rollout]:
+    late = 0.0 if mj_step else 0.5
+    if isinstance(drive, Motion):
+        if mj_step:
+            raise ValueError("mj_step replays commands; this recording has none")
+        if engine != "mjx":
+            raise ValueError("a recording without commands is replayed by inverse dynamics, which needs engine 'mjx'")
+        along = path_replay(scene, drive.torque, effects, drive.joints)
+        means = jnp.asarray(space.mean, jnp.float32)
+        return Along(
+            over_block(_of_bodies(scene, space, lambda values, path: along(make_physics(scene, space, values), path))),
+            scene,
+            drive,
+            _compiled(lambda path: along(make_physics(scene, space, means), path).torque),
+        )
+    if engine == "mjx":
+        replay = servo_replay(scene, drive, effects, parity=mj_step, late=late)
+        compiled = over_block(
+            _of_bodies(scene, space, lambda values, *of_drive: replay(make_physics(scene, space, values), *of_drive))
+        )
+
+        def driven(drive: Drive) -> Callable[[np.ndarray], Rollout]:
+            of_drive = jnp.asarray(drive.command, jnp.float32), jnp.asarray(drive.qpos0, jnp.float32)
+            return lambda values: compiled(values, *of_drive)
+
+        return Driven(driven, drive)
+    known = [e for e in effects if e.name != "torque offset"]
+
+    def twin(drive: Drive) -> Callable[[np.ndarray], Rollout]:
+        checked = _of_bodies(scene, space, twin_replay(scene, space, drive, known, late=late))
+        return lambda values: jax.tree.map(_single, checked(values))
+
+    return Driven(twin, drive)
+
+
+def _single(array: np.ndarray) -> jax.Array:
+    return jnp.asarray(array, jnp.float32) if np.issubdtype(array.dtype, np.floating) else jnp.asarray(array)
+
+
+def _compiled(function: Callable[[Any], jax.Array]) -> Callable[[Any], jax.Array]:
+    """Of one row of a batch, a Rollout or a Path -> of all, in one compiled piece."""
+    return jax.jit(jax.vmap(function), compiler_options=runtime.compiler_options())

@@ -1,0 +1,233 @@
+"""One measured channel made ready to be compared with a replay: its clock, its filter and its noise.
+
+A replay's trace goes through exactly what the data went through: resampling, the low pass with the repeats' masks,
+and the mean over the repeats, all of it one matrix.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from typing import Any
+
+import mujoco
+import numpy as np
+from scipy import sparse
+
+from droid_jax.cost.noise import RATE, Noise, coarse_clock, estimate_noise, lowpass, smooth
+from droid_jax.model.scene import Scene
+from droid_jax.recordings.recording import Channel
+
+MOVES = 0.5  # share of the filter's window at least in which a joint moves, where what is left tells of noise
+ENOUGH = 0.1  # share of the time that two repeats must have measured
+# Deviation below which a channel's noise is never believed, in the channel's unit.
+# Of a channel that one repeat measured: no larger than this share of what moves in it, where its motor is small.
+LEAST_SHARE = 1e-3
+MINIMUM_NOISE = {"torque": 0.01, "position": 2e-5, "velocity": 5e-4, "object_angle": 2e-4}
+
+
+class TooLong(ValueError):
+    """A recording whose filter and covariance would fill the memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """One channel ready to be compared.
+
+    unit: of the channel.  at: [Tc] fractional rows of the simulated trace; values [N,Tc,C], mask [N,Tc,C]; columns [C]
+    of the simulated channel; kernel [C or 1,K,T] and noise for the whitened form; span [2] s of the
+    coarse clock; weight in the distance; moves [K,C] bool, instants at which a column's joint moves: at rest along a
+    prescribed motion friction takes what is left, and what is left tells nothing of noise.
+    """
+
+    name: str
+    unit: str
+    at: np.ndarray
+    values: np.ndarray
+    mask: np.ndarray
+    columns: np.ndarray
+    kernel: np.ndarray
+    noise: Noise
+    span: tuple[float, float]
+    weight: float
+    moves: np.ndarray
+
+    @property
+    def clock(self) -> np.ndarray:
+        """[K] s, the coarse clock: the times of what is smoothed and whitened."""
+        return coarse_clock(*self.span)
+
+
+def least_noise(name: str, mean: np.ndarray) -> np.ndarray:
+    """[C] deviation below which the noise of a channel that one repeat measured is never believed, in its unit.
+
+    mean: [K, C] what was measured, smoothed.  Noise is told from what a fit leaves, which a model with too many
+    parameters takes away.
+    """
+    return np.minimum(MINIMUM_NOISE[name], LEAST_SHARE * np.maximum(np.std(mean, axis=0), 1e-9))
+
+
+def prepared(
+    scene: Scene,
+    channel: Channel,
+    clock: np.ndarray,
+    weight: float,
+    apart: np.ndarray | None = None,
+    rest: np.ndarray | None = None,
+) -> Measured:
+    """A channel made ready for a replay whose rows have the times `clock` [T] s; apart, rest: as in `make_comparison`.
+
+    Raises ValueError for a channel that no replay produces, unknown columns, a constant one, one outside the motion,
+    one with a stretch that nothing measured, and one too long for the memory.
+    """
+    if channel.name not in MINIMUM_NOISE:
+        raise ValueError(f"channel {channel.name!r} has no simulated counterpart; known: {', '.join(MINIMUM_NOISE)}")
+    if channel.name == "object_angle":
+        if scene.object_joint is None or len(channel.columns) != 1:
+            raise ValueError(
+                f"channel 'object_angle' needs a scene with an object joint and one column; scene {scene.name!r} has "
+                f"{scene.object_joint or 'none'}, the channel {', '.join(channel.columns)}"
+            )
+        columns = np.zeros(1, dtype=int)
+    else:
+        channel = _of_joints(scene, channel)
+        columns = np.array([scene.joints.index(c) for c in channel.columns], dtype=int)
+    _refuse_constant(channel)
+    inside = (channel.time >= clock[0] - 1e-9) & (channel.time <= clock[-1] + 1e-9)
+    if inside.sum() < 2:
+        raise ValueError(
+            f"channel {channel.name!r} runs {channel.time[0]:g} .. {channel.time[-1]:g} s, "
+            f"outside the motion that is replayed, {clock[0]:g} .. {clock[-1]:g} s"
+        )
+    time, values, mask = channel.time[inside], channel.values[:, inside], channel.mask[:, inside]
+    coarse = coarse_clock(float(time[0]), float(time[-1]))
+    _needs_memory(channel, len(clock), len(coarse))
+    kernel = lowpass(time, coarse)
+    resampling = _resampling(clock, time)
+    off = 0.0 if apart is None else np.stack([resampling @ a[:, columns] for a in apart])
+    repeats = smooth(values - off, mask, kernel)
+    seen = _same_filter(kernel, mask, ~np.isnan(repeats), resampling)
+    repeats, measured = _fill(repeats, channel, coarse)
+    noise = estimate_noise(repeats, minimum=MINIMUM_NOISE[channel.name], measured=measured)
+    step = clock[1] - clock[0]
+    still = np.zeros((len(clock), len(scene.joints)), bool) if rest is None else rest[:, : len(scene.joints)]
+    return Measured(
+        name=channel.name,
+        unit=channel.unit,
+        at=(time - clock[0]) / step,
+        values=values,
+        mask=mask,
+        columns=columns,
+        kernel=seen,
+        noise=noise,
+        span=(float(coarse[0]), float(coarse[-1])),
+        weight=weight,
+        moves=kernel @ (resampling @ (~still[:, columns]).astype(float)) > MOVES,
+    )
+
+
+def _of_joints(scene: Scene, channel: Channel) -> Channel:
+    """The columns of a channel that the scene's measured joints are: others that it has were left out on purpose."""
+    joints = [mujoco.mj_id2name(scene.model, mujoco.mjtObj.mjOBJ_JOINT, i) for i in range(scene.model.njnt)]
+    unknown = [c for c in channel.columns if c not in joints]
+    kept = [i for i, c in enumerate(channel.columns) if c in scene.joints]
+    if unknown or not kept:
+        raise ValueError(
+            f"channel {channel.name!r}: unknown joints {', '.join(unknown or channel.columns)}; "
+            f"valid: {', '.join(scene.joints)}"
+        )
+    columns = tuple(channel.columns[i] for i in kept)
+    return replace(channel, columns=columns, values=channel.values[..., kept], mask=channel.mask[..., kept])
+
+
+def _needs_memory(channel: Channel, steps: int, instants: int) -> None:
+    """Raise TooLong where filter and covariance, which grow with the square of the duration, fill the memory."""
+    filters = 1 if channel.mask.all() or np.all(channel.mask == channel.mask[..., :1]) else len(channel.columns)
+    needed = 8.0 * instants * (filters * steps + len(channel.columns) * instants)
+    if not hasattr(os, "sysconf"):  # elsewhere than on Linux and macOS
+        return
+    there = float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
+    if 2.0 * needed > there:  # what computes with them needs as much again
+        raise TooLong(
+            f"channel {channel.name!r} of {instants / RATE:.0f} s needs {needed / 1e9:.1f} GB for its filter and the "
+            f"covariance of its noise, and half of this machine's memory is {there / 2e9:.1f} GB: cut the recording "
+            "(`python -m droid_jax.run convert --start S --end S`), or fit its parts as several"
+        )
+
+
+def _resampling(clock: np.ndarray, time: np.ndarray) -> sparse.csr_array:
+    """[Tc, T] linear interpolation from the replay's clock to a channel's."""
+    at = np.clip((time - clock[0]) / (clock[1] - clock[0]), 0, len(clock) - 1)
+    low = np.minimum(at.astype(int), len(clock) - 2)
+    rows, share = np.arange(len(time)), at - low
+    entries = np.concatenate([1 - share, share]), (np.tile(rows, 2), np.concatenate([low, low + 1]))
+    return sparse.csr_array(entries, shape=(len(time), len(clock)))
+
+
+def _same_filter(
+    kernel: sparse.csr_array, mask: np.ndarray, kept: np.ndarray, resampling: sparse.csr_array
+) -> np.ndarray:
+    """[C or 1, K, T] what resampling, smoothing with a mask and averaging over the repeats does to a replay's trace.
+
+    kernel [K, Tc]; mask [N, Tc, C]; kept [N, K, C], the outputs that enter the mean; resampling [Tc, T].
+    """
+    if mask.all():
+        return _dense(kernel @ resampling)[None]
+    columns = list(zip(mask.transpose(2, 0, 1), kept.transpose(2, 0, 1), strict=True))
+    if all(np.array_equal(m, columns[0][0]) and np.array_equal(k, columns[0][1]) for m, k in columns):
+        columns = columns[:1]  # a log that was silent for a while was so in all of them
+    return np.stack([_dense(_mean_filter(kernel, *column) @ resampling) for column in columns])
+
+
+def _dense(matrix: Any) -> np.ndarray:
+    """A sparse array written out; scipy's types say that a product of two may be dense."""
+    return matrix.toarray()
+
+
+def _mean_filter(kernel: sparse.csr_array, mask: np.ndarray, kept: np.ndarray) -> sparse.csr_array:
+    """[K, Tc] the mean of one column's filters: kernel [K, Tc], renormalised over each repeat's mask [N, Tc].
+
+    kept: [N, K].
+    """
+    total = sparse.csr_array(kernel.shape)
+    for seen, own in zip(mask, kept, strict=True):
+        share = np.where(own, 1.0 / np.where(own, kernel @ seen.astype(float), 1.0), 0.0)
+        total += sparse.diags_array(share) @ kernel @ sparse.diags_array(seen.astype(float))
+    return sparse.diags_array(1.0 / np.maximum(kept.sum(axis=0), 1)) @ total
+
+
+def _refuse_constant(channel: Channel) -> None:
+    for c, column in enumerate(channel.columns):
+        repeats = [values[mask] for values, mask in zip(channel.values[:, :, c], channel.mask[:, :, c], strict=True)]
+        still = [k for k, values in enumerate(repeats) if values.size and np.ptp(values) == 0]
+        if still:
+            where = "" if len(still) == len(repeats) else f" in repeat {still[0]}"
+            raise ValueError(
+                f"channel {channel.name!r}, column {column!r} never changes{where} ({repeats[still[0]][0]:g} "
+                f"{channel.unit}): a dead sensor? mask it out or leave {'that repeat' if where else 'the joint'} away"
+                f"{'' if where else ' (--joints)'}"
+            )
+
+
+def _fill(repeats: np.ndarray, channel: Channel, clock: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Repeats [N, K, C] whose gaps take the other repeats' mean there, and what was measured.
+
+    Raises ValueError for a gap in all repeats, and for a column that hardly two of several measured: nothing says then
+    how noisy it is.
+    """
+    measured = ~np.isnan(repeats)
+    count = measured.sum(axis=0)
+    gaps = np.argwhere(count == 0)
+    if len(gaps):
+        instant, column = gaps[0]
+        raise ValueError(
+            f"channel {channel.name!r}, column {channel.columns[column]!r} has a stretch that no repeat measured, at "
+            f"{clock[instant]:.3g} s: cut the recording there (window), or leave the column away"
+        )
+    alone = np.flatnonzero((count - 1).sum(axis=0) < ENOUGH * len(clock))
+    if len(repeats) > 1 and len(alone):
+        raise ValueError(
+            f"channel {channel.name!r}, column {channel.columns[alone[0]]!r} was measured by one repeat only for most "
+            "of the time, so its noise is not known: leave the column away, or the other repeats"
+        )
+    return (repeats if measured.all() else np.where(measured, repeats, np.nanmean(repeats, axis=0)[None])), measured

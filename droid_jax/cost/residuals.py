@@ -1,0 +1,228 @@
+"""Simulation against measurement: what of a recording is compared, and the residuals.
+
+A `Comparison` holds a recording's measured channels on the host and two traceable functions of a
+`Rollout` of one sample: the distance in units (equation 1 of the paper) and the whitened
+residuals, in units of the noise of the repeats' mean.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from droid_jax.arguments import check_fields, flag, instance, number, weights
+from droid_jax.cost.noise import discrepancy
+from droid_jax.cost.observation import Measured, least_noise, prepared
+from droid_jax.model.effect_interface import Rollout
+from droid_jax.model.scene import Scene
+from droid_jax.recordings.recording import Phase, Recording
+from droid_jax.simulate.measured_motion import CUTOFF
+from droid_jax.simulate.rest import RestConfig
+
+
+@dataclass(frozen=True)
+class CompareConfig:
+    """How simulation and measurement are compared.
+
+    channels: weight of each compared channel in the distance (per unit of the channel).
+    failure_cost: c of equation 1, N m, added where the grasp is lost or the door stays shut.
+    non_finite_cost: N m, the cost of a replay that blew up.
+    shut_angle: rad; a door that moves less than this (or half of what the measured one does) stayed shut; of a slide
+      only the measured one tells.
+    grip_share: share of the gripping time that all fingers must touch.
+    whitened: the cost is the root mean square of the whitened residuals instead of N m.
+    motion_cutoff: Hz, filter of the measured positions of a recording without commands.
+    rest: below which speed a joint of such a recording counts as at rest, where its friction is only bounded.
+    mj_step: replay as a MuJoCo program logs itself: mj_step's own steps of first order, each row the state before a
+      step and the command of that step.  For recordings that MuJoCo made with the scene's own time step; of a real
+      robot, or of a finer simulation, the default is the better one by far.
+    """
+
+    channels: Mapping[str, float] = field(default_factory=lambda: {"torque": 1.0})
+    failure_cost: float = 10.0
+    non_finite_cost: float = 1000.0
+    shut_angle: float = 0.0873
+    grip_share: float = 0.95
+    whitened: bool = False
+    motion_cutoff: float = CUTOFF
+    rest: RestConfig = field(default_factory=RestConfig)
+    mj_step: bool = False
+
+    def __post_init__(self) -> None:
+        check_fields(
+            self,
+            channels=weights,
+            failure_cost=partial(number, least=0),
+            non_finite_cost=partial(number, above=0),
+            shut_angle=partial(number, least=0),
+            grip_share=partial(number, least=0, most=1),
+            whitened=flag,
+            motion_cutoff=partial(number, above=0),
+            rest=partial(instance, kind=RestConfig),
+            mj_step=flag,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Everything measured in one recording that a replay is compared with; clock: [T] s of the replay's rows."""
+
+    name: str
+    clock: np.ndarray
+    channels: tuple[Measured, ...]
+    grip_rows: tuple[int, int] | None
+    shut_travel: float | None
+    phases: tuple[Phase, ...]
+    config: CompareConfig
+
+    def distance(self, rollout: Rollout) -> jax.Array:
+        """[] N m: equation 1, mean over repeats of ||tau_s - tau_r|| + c beta; finite always.
+
+        The norm is the time mean of the Euclidean norm over the joints.
+        """
+        if self.config.whitened:
+            z = self.whitened(rollout)
+            total = jnp.sqrt(jnp.mean(z**2))
+        else:
+            total = sum(c.weight * _distance(c, _trace(rollout, c)) for c in self.channels)
+        cost = total + self.config.failure_cost * self.failed(rollout)
+        return jnp.where(rollout.finite & jnp.isfinite(cost), cost, self.config.non_finite_cost)
+
+    def failed(self, rollout: Rollout) -> jax.Array:
+        """[] bool, beta of equation 1: the grasp was lost or the door stayed shut."""
+        failed = jnp.array(False)
+        if self.grip_rows is not None and rollout.contact.shape[-1]:
+            held = jnp.all(rollout.contact[self.grip_rows[0] : self.grip_rows[1]], axis=-1)
+            failed = failed | (jnp.mean(held) < self.config.grip_share) | ~held[-1]
+        if self.shut_travel is not None:
+            failed = failed | (jnp.ptp(rollout.object_angle) < self.shut_travel)
+        return failed
+
+    def whitened(self, rollout: Rollout) -> jax.Array:
+        """[M] residuals of the repeats' mean in noise units; NaN throughout where the replay blew up."""
+        parts = [
+            jnp.einsum(
+                "ckl,lc->ck",
+                jnp.asarray(c.noise.whitener, jnp.float32),
+                _smooth(c, _trace(rollout, c)) - jnp.asarray(c.noise.mean, jnp.float32),
+            ).ravel()
+            for c in self.channels
+        ]
+        residual = jnp.concatenate(parts)
+        return jnp.where(rollout.finite & jnp.all(jnp.isfinite(residual)), residual, jnp.nan)
+
+    @property
+    def repeats(self) -> int:
+        """N."""
+        return len(self.channels[0].values)
+
+    def deviations(self) -> np.ndarray:
+        """[N, M] deviations of the repeats from their mean, whitened as the residuals are."""
+        parts = []
+        for c in self.channels:
+            apart = c.noise.repeats - c.noise.mean  # [N, K, C]
+            parts.append(np.einsum("ckl,nlc->nck", c.noise.whitener, apart).reshape(len(apart), -1))
+        return np.concatenate(parts, axis=1)
+
+    def restated(self, rollout: Rollout) -> Comparison:
+        """The comparison with a noise of every channel that a model's own rollout of one sample leaves plausible.
+
+        One repeat does not tell its noise, and what a model cannot explain is far larger anyway.
+        """
+
+        def stated(channel: Measured) -> Measured:
+            left = channel.noise.mean - np.asarray(_smooth(channel, _trace(rollout, channel)))
+            left = discrepancy(left, channel.moves)
+            return replace(
+                channel, noise=channel.noise.stated(np.maximum(left, least_noise(channel.name, channel.noise.mean)))
+            )
+
+        return replace(self, channels=tuple(stated(c) for c in self.channels))
+
+    def smoothed(self, rollout: Rollout) -> jax.Array:
+        """[K, C] the rollout's torque through the filter the data went through."""
+        c = self.channel("torque")
+        return _smooth(c, _trace(rollout, c))
+
+    def channel(self, name: str) -> Measured:
+        """A compared channel by name; an unknown one lists those compared."""
+        for channel in self.channels:
+            if channel.name == name:
+                return channel
+        raise ValueError(f"channel {name!r} is not compared; compared: {', '.join(c.name for c in self.channels)}")
+
+
+def _trace(rollout: Rollout, channel: Measured) -> jax.Array:
+    """[T, C] the simulated channel that a measured one is compared with."""
+    trace = getattr(rollout, channel.name)
+    trace = trace[:, None] if trace.ndim == 1 else trace
+    return trace[:, channel.columns]
+
+
+def _smooth(channel: Measured, trace: jax.Array) -> jax.Array:
+    """[K, C] a simulated trace [T, C] through exactly what the channel's data went through."""
+    kernel = jnp.asarray(channel.kernel, jnp.float32)
+    if len(kernel) == 1:
+        return kernel[0] @ trace
+    return jnp.einsum("ckt,tc->kc", kernel, trace)
+
+
+def _distance(channel: Measured, trace: jax.Array) -> jax.Array:
+    """[] mean over repeats and time of the Euclidean norm over columns; what was not measured is left out."""
+    last = trace.shape[0] - 1
+    low = np.clip(np.floor(channel.at).astype(int), 0, last)
+    part = jnp.asarray((channel.at - low)[:, None], jnp.float32)
+    simulated = trace[low] * (1 - part) + trace[np.minimum(low + 1, last)] * part
+    mask = jnp.asarray(channel.mask)
+    error = jnp.where(mask, simulated[None] - jnp.asarray(np.where(channel.mask, channel.values, 0), jnp.float32), 0)
+    norm = jnp.sqrt(jnp.sum(error**2, axis=-1) + 1e-20)  # [N, Tc]
+    measured = jnp.any(mask, axis=-1)
+    samples = jnp.sum(measured, axis=1)  # [N], none where a repeat was not measured during the replay
+    return jnp.sum(jnp.sum(norm * measured, axis=1) / jnp.maximum(samples, 1)) / jnp.maximum(jnp.sum(samples > 0), 1)
+
+
+def make_comparison(
+    scene: Scene,
+    recording: Recording,
+    clock: np.ndarray,
+    config: CompareConfig,
+    apart: np.ndarray | None = None,
+    rest: np.ndarray | None = None,
+) -> Comparison:
+    """Prepare a recording's channels for comparison with a replay whose rows have the times `clock` [T] s, regular.
+
+    apart: [N, T, J] N m by which the repeats' torques may differ because they moved, or measured their motion,
+    differently, with mean zero; it is taken off them where their noise is estimated.
+    rest: [T, J] bool, rows at which a joint is at rest along a prescribed motion (`measure.rest`).
+    Raises ValueError for a channel the recording does not have, one that no replay produces, or a
+    constant (dead) channel.
+    """
+    channels = tuple(
+        prepared(scene, recording.channel(name), clock, weight, *((apart, rest) if name == "torque" else (None, None)))
+        for name, weight in config.channels.items()
+    )
+    acts = scene.grip is not None and recording.command.size > 0  # along a prescribed motion nothing is gripped
+    grip = recording.grip_window if acts else None
+    shut = _shut_travel(scene, recording, config) if acts else None
+    rows = None
+    if grip is not None:
+        steps, timestep = len(clock), clock[1] - clock[0]
+        first, end = (int(np.clip(round((t - clock[0]) / timestep), 0, steps)) for t in grip)
+        rows = (min(first, steps - 1), max(end, first + 1))
+    return Comparison(recording.name, clock, channels, rows, shut, recording.phases, config)
+
+
+def _shut_travel(scene: Scene, recording: Recording, config: CompareConfig) -> float | None:
+    """rad (m of a slide): an object that moves less than this stayed shut; None where nothing tells what is little."""
+    if scene.object_joint is None:
+        return None
+    least = None if scene.slides(scene.object_joint) else config.shut_angle
+    if "object_angle" not in recording.channels:
+        return least
+    angle = recording.channels["object_angle"]
+    return max(least or 0.0, 0.5 * float(np.ptp(angle.values[angle.mask])))

@@ -1,0 +1,59 @@
+"""A demonstration on another clock: slower, faster, there and back, with a stop half-way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from droid_jax.recordings.clocks import interpolate
+from droid_jax.recordings.recording import Channel, Recording
+
+STOP = 2.0  # s
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An experiment of the menu.
+
+    what: in words.  seconds: duration of a motion of `duration` s on the new clock; clock: (new instants [K],
+    duration) -> instants of the demonstration, s from its start.
+    """
+
+    what: str
+    seconds: Callable[[float], float]
+    clock: Callable[[np.ndarray, float], np.ndarray]
+
+
+MENU = (
+    Entry("the same motion three times slower", lambda d: 3 * d, lambda t, d: t / 3),
+    Entry("the same motion twice as fast", lambda d: d / 2, lambda t, d: 2 * t),
+    Entry("the same motion there and back again", lambda d: 2 * d, lambda t, d: np.minimum(t, 2 * d - t)),
+    Entry(
+        f"the same motion with a stop of {STOP:.0f} s half-way",
+        lambda d: d + STOP,
+        lambda t, d: np.where(t < d / 2, t, np.maximum(d / 2, t - STOP)),
+    ),
+)
+
+
+def warped(recording: Recording, entry: Entry) -> Recording:
+    """A recording as if its motion had been made on another clock; its noise comes along."""
+    first, duration = recording.time[0], recording.duration
+
+    def instants(clock: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        step = np.median(np.diff(clock))
+        new = np.arange(0.0, entry.seconds(duration) + 0.5 * step, step)
+        return first + new, first + np.clip(entry.clock(new, duration), 0.0, duration)
+
+    def channel(c: Channel) -> Channel:
+        new, old = instants(c.time)
+        near = np.clip(np.searchsorted(c.time, old), 0, len(c.time) - 1)
+        values = np.nan_to_num(c.values)[:, near]
+        return replace(c, time=new, values=values, mask=c.mask[:, near])
+
+    time, old = instants(recording.time)
+    command = interpolate(old, recording.time, recording.command)
+    channels = {name: channel(c) for name, c in recording.channels.items()}
+    return replace(recording, name=entry.what, time=time, command=command, channels=channels, phases=())

@@ -1,0 +1,134 @@
+"""What a fit is judged on: repeats that it does not see, and the gap to them before and after."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from droid_jax.cost.cost import Cost
+from droid_jax.cost.residuals import Comparison, make_comparison
+from droid_jax.recordings.recording import Recording
+
+WORTH = 0.1  # share of the floor by which the start must exceed it, else there was no gap to close
+
+
+Judged = Literal["repeats", "time", "same"]
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Disagreement with held-out repeats of one recording, N m, before and after the fit.
+
+    before, after, floor: equation 1 without penalty terms, all compared channels; floor is what a perfect
+    model would leave, estimated from the scatter of all repeats, fitted and held out, about their mean.
+    closed: share of the way from before to floor; None where before does not exceed it by WORTH of it.
+    Floors and closed are None where there is one repeat only.
+    per_joint_*: [J] root mean square of the smoothed torques' difference.
+    judged: on what: "repeats" that were held out, the last part in "time" of a log, or the "same" one repeat that was
+    fitted.
+    """
+
+    before: float
+    after: float
+    floor: float | None
+    closed: float | None
+    per_joint_before: tuple[float, ...]
+    per_joint_after: tuple[float, ...]
+    per_joint_floor: tuple[float, ...] | None
+    judged: Judged
+
+
+def split(recording: Recording, share: float) -> tuple[Recording, Recording, tuple[int, ...]]:
+    """Fitted and held-out repeats (the last ones), and the latter's indices.
+
+    Of one repeat without commands the last part in time is held out; with commands, one serves as both.
+    """
+    count = recording.repeats
+    if count == 1 and not recording.command.size:
+        first, last = recording.span
+        cut = last - max(share, 1 / 3) * (last - first)
+        return recording.window(first, cut), recording.window(cut, last), (0,)
+    held = min(count - 1, max(1, round(share * count))) if count > 1 else 0
+    if held == 0:
+        return recording, recording, tuple(range(count))
+    rows = tuple(range(count - held, count))
+    return recording.repeats_subset(range(count - held)), recording.repeats_subset(rows), rows
+
+
+def judged_on(recording: Recording, held: Recording) -> Judged:
+    """What `split` held out of a recording."""
+    if held is recording:
+        return "same"
+    return "time" if recording.repeats == 1 else "repeats"
+
+
+def gaps_of(
+    cost: Cost, recordings: Sequence[Recording], held: Sequence[Recording], before: np.ndarray, after: np.ndarray
+) -> list[Gap]:
+    """The gap to what was held out of each recording, of which `cost` is, at two parameter vectors [F]."""
+    penalty_free = cost.distances(np.stack([before, after])) - cost.penalties(np.stack([before, after]))
+    smoothed = cost.smoothed(np.stack([before, after]))
+    out = []
+    for i, (one, recording, own) in enumerate(zip(cost.comparisons, recordings, held, strict=True)):
+        rms = np.sqrt(np.mean((smoothed[i] - one.channel("torque").noise.mean) ** 2, axis=1))
+        alike = cost.from_one_start(i, recording)  # as the held-out repeats that `cost` compares
+        everything = make_comparison(cost.scene, alike, one.clock, one.config) if recording.repeats > 1 else None
+        floor = None if everything is None else _floor(everything)
+        first, last = penalty_free[0, i], penalty_free[1, i]
+        out.append(
+            Gap(
+                before=float(first),
+                after=float(last),
+                floor=floor,
+                closed=_closed(float(first), float(last), floor),
+                per_joint_before=tuple(rms[0].tolist()),
+                per_joint_after=tuple(rms[1].tolist()),
+                per_joint_floor=None if everything is None else _smooth_floor(everything, one.repeats),
+                judged=judged_on(recording, own),
+            )
+        )
+    return out
+
+
+def _closed(before: float, after: float, floor: float | None) -> float | None:
+    """Share of the way from before to the floor that was gone; None where there was hardly any (WORTH)."""
+    if floor is None or before - floor <= WORTH * floor:
+        return None
+    return 1 - (after - floor) / (before - floor)
+
+
+def _floor(everything: Comparison) -> float | None:
+    """Equation 1 of a perfect model, from the scatter of all repeats; None where no instant was measured twice."""
+    total = 0.0
+    for channel in everything.channels:
+        scatter = _scatter(channel.values, channel.mask)
+        if scatter is None:
+            return None
+        total += channel.weight * scatter
+    return total
+
+
+def _scatter(values: np.ndarray, mask: np.ndarray) -> float | None:
+    """The repeats' [N, T, C] distance to their mean, corrected for the mean's own noise, where two or more measured."""
+    count = mask.sum(axis=0)  # [T, C]
+    filled = np.where(mask, values, 0.0)
+    mean = filled.sum(axis=0) / np.maximum(count, 1)
+    seen = mask & (count > 1)
+    error = np.where(seen, (filled - mean) / np.sqrt(1 - 1 / np.maximum(count, 2)), 0.0)
+    rows = seen.any(axis=-1)  # [N, T]
+    repeats = rows.any(axis=1)
+    if not repeats.any():
+        return None
+    distance = np.linalg.norm(error, axis=-1).sum(axis=1)[repeats] / rows.sum(axis=1)[repeats]
+    return float(np.mean(distance))
+
+
+def _smooth_floor(everything: Comparison, held: int) -> tuple[float, ...]:
+    """[J] N m, what the noise of the mean of `held` repeats leaves of a smoothed difference."""
+    noise = everything.channel("torque").noise
+    squares = ((noise.repeats - noise.mean) ** 2).sum(axis=0)
+    variance = squares.sum(axis=0) / (noise.count - 1).sum(axis=0)
+    return tuple(np.sqrt(variance / held).tolist())

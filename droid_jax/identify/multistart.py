@@ -1,0 +1,335 @@
+"""Batched Gauss-Newton (Levenberg-Marquardt) on whitened residuals, from several starts at once.
+
+Works in search coordinates x. The objective is |r(x)|^2 / 2 + |(x - x0) / w|^2 / 2, a negative log
+posterior, with a prior of deviation w: one unit for nuisances (their own prior), `main_prior` units
+for the parameters of interest, so that what the data do not tell stays put instead of drifting.
+
+An iteration is `identify.damped`'s.  What is here decides which starts go on, when to stop, and how to leave a basin
+that is none of the best: hypotheses, initial means, and CMA-ES around where the iterations stood still.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from droid_jax import arguments
+from droid_jax.arguments import check_fields, several, whole
+from droid_jax.identify.levenberg_marquardt import Problem, Residuals, State, StepConfig, curvature, fall
+from droid_jax.identify.search import NotReplayed, SearchConfig, search
+from droid_jax.model.parameters import Parameter, Space
+
+Hypotheses = Sequence[Mapping[str, float]]
+
+HOPELESS = 30.0  # iterations like the last: an aim farther off than that is given up
+HOP_POPULATION = 32
+HOP_SIGMA = 1.5  # posterior deviations
+HOP_TOLERANCE = 2.0  # of the objective: a hop that finds less ends the refinement
+FAR, HOP_FAR = 5e-4, 4e-3  # the same as shares of what the objective is above noise alone
+# Search units: what strayed further from its initial mean, and is not told to much less than that, is put back once.
+STRAYED, UNTOLD = 1.0, 0.05
+FOLLOWED = 2  # hypotheses: once all else has settled a little, the best go on
+AT_BOUND = 1e-4  # search units: no further from it a parameter counts as stuck there
+HOP_LONGEST = 1.0  # search units: what the data do not tell is not searched far
+
+
+@dataclass(frozen=True)
+class RefineConfig(StepConfig):
+    """Settings of the refinement, beside those of an iteration (`StepConfig`).
+
+    iterations: Jacobians at most.
+    tolerance: stop when an iteration lowers the objective (a log likelihood) by less than this, or by less than a
+      share FAR of what it is above that of noise alone: a model that misses something may be far from any fit.
+    rough: while starts and hypotheses are sorted out, already when it lowers it by less than this share.
+    aim: an objective to reach: stop where the last iteration's gain, HOPELESS times over, would not do.
+    keep: after iteration i only starts within keep[i] times the best objective go on (the last
+      number holds from there on).
+    doubt: hypotheses are tried where the residuals' mean square stays above this.
+    hold: iterations for which the values of a hypothesis are held while all else settles.
+    hops: searches at most for a better basin around where the iterations stood still; with none of them nothing is
+      put back to its initial mean either (see `STRAYED`).
+    hop_generations: generations of each.
+    """
+
+    iterations: int = 30
+    tolerance: float = 0.5
+    rough: float = 5e-3
+    aim: float = np.inf
+    keep: tuple[float, ...] = (100.0, 20.0, 3.0, 1.3, 1.0)
+    doubt: float = 1.1
+    hold: int = 2
+    hops: int = 4
+    hop_generations: int = 20
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_fields(
+            self,
+            iterations=partial(whole, least=0),
+            tolerance=partial(arguments.number, least=0),
+            rough=partial(arguments.number, least=0),
+            aim=partial(arguments.number, infinite=True),
+            keep=several(partial(arguments.number, least=1)),
+            doubt=partial(arguments.number, least=0),
+            hold=partial(whole, least=0),
+            hops=partial(whole, least=0),
+            hop_generations=partial(whole, least=1),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """Where the refinement ended.
+
+    space; x [D] search coordinates and best [D] physical values of the best start;
+    objective: |r|^2 / 2 plus the prior's part; residual [M] and jacobian [M, D] there;
+    prior [D] deviations, search units; starts: objective each start ended at; evaluations: replays;
+    iterations; converged: it ended before its iterations ran out, since they no longer paid; not where it was given
+    up because `aim` was out of reach.
+    """
+
+    space: Space
+    x: np.ndarray
+    best: np.ndarray
+    objective: float
+    residual: np.ndarray
+    jacobian: np.ndarray
+    prior: np.ndarray
+    starts: np.ndarray
+    evaluations: int
+    iterations: int
+    converged: bool
+
+    @property
+    def free(self) -> np.ndarray:
+        """[D] bool, parameters that are not at a bound."""
+        space = self.space
+        return (self.x > space.to_search(space.low) + AT_BOUND) & (self.x < space.to_search(space.high) - AT_BOUND)
+
+    @property
+    def hessian(self) -> np.ndarray:
+        """[D, D] Gauss-Newton curvature, prior included."""
+        return curvature(self.jacobian, self.prior)
+
+
+@dataclass(frozen=True)
+class RefineProgress:
+    """Reported after every iteration: its number, of how many, and the best objective per residual."""
+
+    iteration: int
+    iterations: int
+    mean_square: float
+
+
+def refine(
+    residuals: Residuals,
+    space: Space,
+    starts: Any,
+    config: RefineConfig | None = None,
+    *,
+    first: Residuals | None = None,
+    hypotheses: Hypotheses = (),
+    progress: Callable[[RefineProgress], None] | None = None,
+) -> Refined:
+    """Refine one or several starts [D] or [S, D] (physical values).
+
+    residuals: [P, D] physical values -> [P, M] whitened residuals (rows are independent).
+    first: the same for a part of the data that is cheaper to replay; starts and hypotheses are sorted
+      out there, and only the best goes on to all of it.
+    hypotheses: assignments {name: value} that may lie in another basin (a finger that slips, say),
+      each tried once from where the starts converged, if that leaves doubt.
+    Raises NotReplayed where no start gives finite residuals; others that do not are left out.
+    """
+    config = config or RefineConfig()
+    rough = _Descent(residuals if first is None else first, space, config, progress)
+    begun = rough.start(rough.inside(space.to_search(space.check(np.atleast_2d(starts)))))
+    ended, alive = begun.objective, np.isfinite(begun.objective)
+    if not alive.any():
+        raise NotReplayed("none of the starts could be replayed; widen the bounds or start nearer to the truth")
+    state, ended[alive] = rough.descend(begun.rows(alive), config.rough)
+    if hypotheses and np.mean(state.residual**2) > config.doubt:
+        state, _ = rough.descend(rough.explore(state, hypotheses), config.rough)
+    problem = rough
+    if first is not None:
+        problem = _Descent(residuals, space, config, progress, rough)
+        state = problem.start(state.x)
+        if not np.isfinite(state.objective[0]):
+            raise NotReplayed(
+                "the best start on the first recording could not be replayed on all; start nearer to the truth"
+            )
+    state, _ = problem.descend(state)
+    if config.hops:
+        state = problem.back(state)
+    state, slopes, settled = problem.hopped(state)
+    return Refined(
+        space=space,
+        x=state.x[0],
+        best=space.from_search(state.x[0]),
+        objective=float(state.objective[0]),
+        residual=state.residual[0],
+        jacobian=problem.wide_jacobian(state, problem.jacobian(state)[0] if slopes is None else slopes),
+        prior=problem.prior,
+        starts=ended,
+        evaluations=problem.evaluations,
+        iterations=problem.iterations,
+        converged=settled and problem.iterations < config.iterations and not problem.given_up,
+    )
+
+
+def chord(residuals: Residuals, space: Space, starts: np.ndarray, jacobian: np.ndarray) -> tuple[np.ndarray, float]:
+    """What steps with a Jacobian [M, D] known from elsewhere reach from the best start [S, D]: values [D], objective.
+
+    A few batches of trials and no differences: a first look at what a refinement would find.
+    """
+    problem = Problem(residuals, space, StepConfig())
+    state = problem.start(problem.inside(space.to_search(space.check(starts))))
+    state = problem.trials(state, np.repeat(jacobian[None], len(state.x), axis=0))
+    best = int(np.argmin(state.objective))
+    return space.from_search(state.x[best]), float(state.objective[best])
+
+
+class _Descent(Problem):
+    """Iterations until they no longer pay, and the ways out of a basin."""
+
+    def __init__(
+        self,
+        residuals: Residuals,
+        space: Space,
+        config: RefineConfig,
+        progress: Callable[[RefineProgress], None] | None = None,
+        before: Problem | None = None,
+    ) -> None:
+        super().__init__(residuals, space, config, before)
+        self.config, self.progress = config, progress
+        self.given_up = False
+
+    def excess(self, state: State) -> np.ndarray:
+        """[S] by how much the objectives are above half a unit for each residual, which noise alone leaves."""
+        return np.maximum(state.objective - 0.5 * state.residual.shape[1], 0.0)
+
+    def descend(self, state: State, rough: float = 0.0) -> tuple[State, np.ndarray]:
+        """Iterate until the best start stands still; that start, and the objective [S] each one ended at.
+
+        rough: a share of the objective that is not worth an iteration either.
+        """
+        ended, alive, self.given_up = state.objective.copy(), np.arange(len(state.x)), False
+        keep = self.config.keep
+        for number in range(self.config.iterations - self.iterations):
+            state, gain = self.step(state)
+            ended[alive] = state.objective
+            leader = int(np.argmin(state.objective))
+            self._report(state.objective[leader], state.residual.shape[1])
+            if gain[leader] <= max(self.least(state), rough * state.objective[leader]):
+                break
+            self.given_up = bool(HOPELESS * gain[leader] < state.objective[leader] - self.config.aim)
+            if self.given_up:
+                break
+            good = state.objective <= keep[min(number, len(keep) - 1)] * state.objective[leader]
+            state, alive = state.rows(good), alive[good]
+        return state.rows([int(np.argmin(state.objective))]), ended
+
+    def back(self, state: State) -> State:
+        """Leave a basin that the data hardly chose: put back to its initial mean what strayed, and follow that.
+
+        In logarithms a small mass is a plateau, and a finger that sticks is one in its friction: where another
+        parameter pushed them there, no slope leads back.  Not with the last iterations: they are for what is there.
+        """
+        tried, last = set[str](), self.config.iterations - 2 * (self.config.hold + 1)
+        while self.iterations <= last and (strayed := [n for n in self.strayed(state) if n not in tried]):
+            tried.update(strayed)
+            means = {name: self.space[name].mean for name in strayed}
+            alone = [{name: mean} for name, mean in means.items()]
+            found = self.explore(state, [*alone, means] if len(alone) > 1 else alone)
+            if fall(state.objective, found.objective)[0] <= self.least(state):
+                break
+            state, _ = self.descend(found)
+        return state
+
+    def least(self, state: State) -> float:
+        """By how much the best objective must fall for it to be worth an iteration."""
+        leader = int(np.argmin(state.objective))
+        return max(self.config.tolerance, FAR * float(self.excess(state)[leader]))
+
+    def strayed(self, state: State) -> list[str]:
+        """Parameters of interest far from their initial means that the data do not tell sharply."""
+        slopes = self.jacobian(state)[0]
+        deviation = np.sqrt(np.diag(np.linalg.inv(curvature(slopes, self.prior))))
+        which = ~self.space.nuisance & (np.abs(state.x[0]) > STRAYED) & (deviation > UNTOLD)
+        return [self.space.names[k] for k in np.flatnonzero(which)]
+
+    def hopped(self, state: State) -> tuple[State, np.ndarray | None, bool]:
+        """Leave small basins, as often as that pays and no more than `hops` times; one start.
+
+        Returns where that ended, its slopes [M, D] where they are known, and whether a hop found nothing more.
+        """
+        settled, slopes = self.config.hops == 0, None
+        for number in range(self.config.hops):
+            slopes = self.jacobian(state)[0]
+            hopped = self.hop(state, slopes, number)
+            least = max(HOP_TOLERANCE, HOP_FAR * self.excess(state)[0])
+            settled = bool(state.objective[0] - hopped.objective[0] <= least)
+            if hopped.objective[0] < state.objective[0]:
+                state, slopes = hopped, None
+            if settled:
+                break
+            state, _ = self.descend(state)
+            slopes = None
+        return state, slopes, settled
+
+    def hop(self, state: State, jacobian: np.ndarray, seed: int) -> State:
+        """Leave a small basin: CMA-ES in the metric of the posterior, from a start that stands still.
+
+        In x = x0 + L u, L L^T the posterior's covariance, the objective is about |u|^2 / 2 and what
+        remains are the steps where a finger begins to stick or to slip, which no derivative sees.
+        """
+        factor = self.axes(jacobian, HOP_LONGEST)
+
+        def around(u: np.ndarray) -> np.ndarray:
+            return self.inside(state.x + u @ factor.T)
+
+        def cost(u: np.ndarray) -> np.ndarray:
+            x = around(u)
+            return self.objective(x, self.replay(x))
+
+        unit = Space(tuple(Parameter(f"u{i}", "-", 0.0, 1.0, -50.0, 50.0) for i in range(len(self.space))))
+        settings = SearchConfig(
+            population=HOP_POPULATION, parents=None, generations=self.config.hop_generations, sigma=HOP_SIGMA, seed=seed
+        )
+        try:
+            return self.start(around(search(cost, unit, settings).best[None]))
+        except NotReplayed:  # nothing around here can be
+            return state
+
+    def explore(self, state: State, hypotheses: Hypotheses) -> State:
+        """Follow each hypothesis from a converged start: hold its values while all else settles, then free them.
+
+        After one iteration only the best of them go on.  Returns the better of what they found and `state`, one start.
+        """
+        x = np.repeat(state.x, len(hypotheses), axis=0)
+        held = np.zeros(x.shape, bool)
+        for row, hypothesis in enumerate(hypotheses):
+            for name, value in hypothesis.items():
+                column = self.space.index(name)
+                x[row, column] = self.space[name].to_search(value)
+                held[row, column] = True
+        branches = self.start(self.inside(x))
+        alive = np.isfinite(branches.objective)
+        if not alive.any():
+            return state
+        branches, held = branches.rows(alive), held[alive]
+        for iteration in range(self.config.hold + 1):
+            branches, _ = self.step(branches, held if iteration < self.config.hold else None)
+            ahead = np.argsort(branches.objective)[:FOLLOWED]
+            branches, held = branches.rows(ahead), held[ahead]
+        found = branches.rows([int(np.argmin(branches.objective))])
+        best = found if found.objective[0] < state.objective[0] else state
+        self._report(best.objective[0], best.residual.shape[1])
+        return best
+
+    def _report(self, objective: float, residuals: int) -> None:
+        if self.progress is not None:
+            self.progress(RefineProgress(self.iterations, self.config.iterations, 2 * objective / residuals))

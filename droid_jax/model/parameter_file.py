@@ -1,0 +1,153 @@
+"""Parameters of a user's own scene, from a JSON file.
+
+    [{"field": "dof_damping", "element": "elbow", "unit": "N m s/rad", "std": 0.5, "high": 10, "scaling": "log",
+      "floor": 0.05},
+     {"field": "body_mass", "element": "forearm", "std": 0.2, "high": 5}]
+
+Every entry needs field, element, std and high; optional: column, name, unit, mean, low, mode
+(set, scale, divide, add, negative), scaling (linear, log), floor, width, nuisance, group.
+
+    {"sensor": "coulomb", "element": "elbow", "std": 0.5, "high": 5}
+
+What a joint's sensors see beyond the model has "sensor" in place of "field": viscous, coulomb, torque_offset,
+torque_gain (model/joint_friction.py) or encoder_offset (model/encoders.py) of a joint, zero at first and between -high
+and high.
+
+    {"sensor": "time_offset", "std": 0.001, "high": 0.05}
+    {"servo": "elbow", "std": 0.03}
+
+The delay of the commands, s, a nuisance unless it says otherwise, and a factor on the position gain of a joint's
+servo have no element.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from droid_jax.arguments import instance, path_of
+from droid_jax.errors import faults
+from droid_jax.model.fields import ENCODER, body_mass, encoder_offset, model_parameter, servo_scale, time_offset
+from droid_jax.model.joint_friction import TERMS, sensor_parameter
+from droid_jax.model.parameters import Mode, Parameter, Scaling, Space
+from droid_jax.model.scene import Scene
+from droid_jax.read_json import read_json, typed
+
+_NEEDED = ("element", "std", "high")
+_TIME = "time_offset"
+SMALL = 1e-3  # of its deviation: a mean (and floor) below it is out of reach of a search in the logarithm
+
+
+class _Entry(msgspec.Struct, forbid_unknown_fields=True):
+    """An entry of the file, whatever its kind."""
+
+    field: str | msgspec.UnsetType = msgspec.UNSET
+    sensor: str | msgspec.UnsetType = msgspec.UNSET
+    servo: str | msgspec.UnsetType = msgspec.UNSET
+    element: str | msgspec.UnsetType = msgspec.UNSET
+    name: str | msgspec.UnsetType = msgspec.UNSET
+    unit: str | msgspec.UnsetType = msgspec.UNSET
+    group: str | msgspec.UnsetType = msgspec.UNSET
+    std: float | msgspec.UnsetType = msgspec.UNSET
+    high: float | msgspec.UnsetType = msgspec.UNSET
+    low: float | msgspec.UnsetType = msgspec.UNSET
+    mean: float | msgspec.UnsetType = msgspec.UNSET
+    floor: float | msgspec.UnsetType = msgspec.UNSET
+    width: float | msgspec.UnsetType = msgspec.UNSET
+    mode: Mode | msgspec.UnsetType = msgspec.UNSET
+    scaling: Scaling | msgspec.UnsetType = msgspec.UNSET
+    column: int | msgspec.UnsetType = msgspec.UNSET
+    nuisance: bool | msgspec.UnsetType = msgspec.UNSET
+
+
+_KNOWN = _Entry.__struct_fields__
+
+
+def load_parameters(path: str | Path, scene: Scene) -> Space:
+    """The space described in a JSON file; ValueError names the file, the entry and what is wrong with it."""
+    entries, first = _entries(path_of(path, "the path of a parameter file")), dict[str, int]()
+    instance(scene, "scene", Scene)
+    parameters = [_parameter(scene, entry, f"{path}, entry {i}") for i, entry in enumerate(entries, 1)]
+    for i, p in enumerate(parameters, 1):
+        if first.setdefault(p.name, i) != i:
+            raise ValueError(f'{path}, entry {i}: {p.name!r} is entry {first[p.name]} already; give it a unique "name"')
+    space = Space(tuple(parameters))
+    for p in space.parameters:
+        if p.scaling is Scaling.LOG and p.mean + p.floor < SMALL * p.std:
+            warnings.warn(
+                f"{path}: {p.name!r} is searched in the logarithm from {p.mean:g} {p.unit}, where nothing that it does "
+                'is felt yet: give a "mean" of the size that you expect, or a "floor"',
+                stacklevel=2,
+            )
+    return space
+
+
+def friction_joints(path: str | Path) -> tuple[str, ...]:
+    """Joints whose friction loss the file asks for: the scene must be compiled with a row for them."""
+    entries = [e for e in _entries(Path(path)) if isinstance(e, dict)]
+    return tuple(str(e["element"]) for e in entries if e.get("field") == "dof_frictionloss" and "element" in e)
+
+
+def _entries(path: Path) -> list[Any]:
+    if not path.is_file():
+        raise FileNotFoundError(f"no parameter file at {path}")
+    entries = read_json(path)
+    if not isinstance(entries, list) or not entries:
+        got = "an empty one" if entries == [] else type(entries).__name__
+        raise ValueError(f"{path}: expected a list of parameters, got {got}")
+    return entries
+
+
+def _parameter(scene: Scene, entry: Any, where: str) -> Parameter:
+    if not isinstance(entry, dict):
+        raise ValueError(f"{where}: expected an object, got {type(entry).__name__}")
+    needed = ("std",) if "servo" in entry else ("std", "high") if entry.get("sensor") == _TIME else _NEEDED
+    missing = [k for k in needed if k not in entry]
+    if sum(kind in entry for kind in ("field", "sensor", "servo")) != 1:
+        missing.insert(0, "one of field, sensor and servo")
+    unknown = [k for k in entry if k not in _KNOWN]
+    if wrong := faults({"missing": missing, "unknown": unknown}):
+        raise ValueError(f"{where}: {wrong}; known keys: {', '.join(_KNOWN)}")
+    if extra := [k for k in _useless(entry) if k in entry]:
+        raise ValueError(f"{where}: leave {', '.join(extra)} out, which an entry of its kind has no use for")
+    read = msgspec.structs.asdict(typed(entry, _Entry, where))
+    options = {key: value for key, value in read.items() if value is not msgspec.UNSET}
+    try:
+        field, sensor, servo = (options.pop(kind, None) for kind in ("field", "sensor", "servo"))
+        if servo is not None:
+            return servo_scale(scene, servo, **options)
+        if sensor == _TIME:
+            return replace(time_offset(options.pop("std"), options.pop("high")), **options)
+        element = options.pop("element")
+        if sensor is not None and sensor not in (*TERMS, ENCODER):
+            raise ValueError(f"unknown sensor term {sensor!r}; valid: {', '.join((*TERMS, ENCODER))}")
+        if sensor == ENCODER:
+            _check_measured(scene, element)
+            return encoder_offset(scene, element, **options)
+        if sensor is not None:
+            return sensor_parameter(scene.joints, sensor, element, **options)
+        if field == "body_mass" and options.get("mode", Mode.SET) is Mode.SET:
+            options.pop("mode", None)
+            return body_mass(scene, element, **options)
+        return model_parameter(scene, field, element, options.pop("column", None), **{"unit": "", **options})
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+def _check_measured(scene: Scene, joint: str) -> None:
+    if joint not in scene.joints:
+        raise ValueError(f"unknown joint {joint!r}; measured joints: {', '.join(scene.joints)}")
+
+
+def _useless(entry: Mapping[str, Any]) -> tuple[str, ...]:
+    """Keys that an entry of this kind does not have: a sensor's name is the one that the replay looks it up by."""
+    if "servo" in entry:
+        return ("element", "column", "mode")
+    if "sensor" in entry:
+        return ("column", "mode", "name", *(["element"] if entry["sensor"] == _TIME else []))
+    return ("column",) if entry["field"] == "body_mass" else ()

@@ -1,0 +1,64 @@
+"""Whether a recording can be what it says: units, signs, order of the joints, weight, clocks and repeats.
+
+`check_log` compares what is in the recording with what the scene expects at its nominal values.  An alternative is
+named only where the recording as stated explains hardly anything and the alternative nearly everything, so a model
+that is merely wrong raises nothing.  Nothing is refused: what is found is said, and stands in the results.
+"""
+
+from __future__ import annotations
+
+import warnings
+import weakref
+
+from droid_jax.model.scene import Scene
+from droid_jax.preflight.clocks import check_clocks
+from droid_jax.preflight.findings import Finding
+from droid_jax.preflight.repeats import check_repeats
+from droid_jax.preflight.signals import log_motion
+from droid_jax.preflight.torques import check_torque
+from droid_jax.preflight.tracking import check_tracking
+from droid_jax.recordings.recording import Recording
+
+_Found = weakref.WeakKeyDictionary[Scene, tuple[Finding, ...]]
+_FOUND: weakref.WeakKeyDictionary[Recording, _Found] = weakref.WeakKeyDictionary()  # so that each is checked once
+
+
+def check_log(scene: Scene, recording: Recording) -> tuple[Finding, ...]:
+    """What of a recording can hardly be right in this scene, the gravest first.
+
+    Args:
+        scene: with its nominal values: masses right to a factor of three, servo gains as on the robot.
+        recording: a valid one (`measure.checks.validate`).
+
+    Returns:
+        The findings; none where all is as it should be, or where too little was measured to tell.
+    """
+    known = _FOUND.setdefault(recording, weakref.WeakKeyDictionary())
+    if scene not in known:
+        found = [*check_repeats(recording), *check_clocks(scene, recording), *_unused(recording)]
+        motion = log_motion(scene, recording)
+        if motion is not None:
+            tracking = check_tracking(scene, recording, motion)
+            found += tracking
+            if not tracking:  # else the torque is judged by a motion that is wrong
+                found += check_torque(scene, recording, motion)
+        known[scene] = tuple(sorted(found, key=lambda finding: ("certain", "likely", "note").index(finding.severity)))
+    return known[scene]
+
+
+def _unused(recording: Recording) -> list[Finding]:
+    """Set-points that were in the log and are in no replay."""
+    fields = recording.meta.get("unused_setpoints", "")
+    if not fields:
+        return []
+    sentence = (
+        f"recording {recording.name!r}: its commands had set-points of {fields} beside the positions, which no replay "
+        "uses: a servo that follows them lags less than its replay, which looks like damping, a delay or another gain"
+    )
+    return [Finding("unused", fields, 1.0, 0.0, "note", sentence)]
+
+
+def warn_of_log(scene: Scene, recording: Recording) -> None:
+    """Warn of each finding of `check_log`."""
+    for finding in check_log(scene, recording):
+        warnings.warn(finding.sentence, stacklevel=2)

@@ -1,0 +1,106 @@
+"""Clocks that disagree: a nominal rate where stamps say another, and measurements that run away from the commands."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from droid_jax.model.scene import Scene
+from droid_jax.preflight.findings import Finding
+from droid_jax.preflight.signals import log_motion
+from droid_jax.preflight.tracking import FOLLOWS, MOVES
+from droid_jax.recordings.recording import Recording
+
+DRIFT = 0.03  # s by which two clocks may run apart over a recording: a delay, damping and armature hardly take more in
+NEAR = 0.05  # relative deviation within which two rates are meant to be one
+LATEST = 1.0  # s: a drift that is looked for
+WINDOW = 0.25  # share of a recording, at its beginning and end, in which a lag is looked for
+RATES = ("rate", "rate_hz", "frequency", "frequency_hz", "fps", "hz")  # in `meta`
+
+
+def check_clocks(scene: Scene, recording: Recording) -> list[Finding]:
+    """What is wrong with the clocks."""
+    return _rows(recording) or _nominal(recording) or _drift(scene, recording)
+
+
+def _rows(recording: Recording) -> list[Finding]:
+    """A channel with as many rows as commands whose clock is of another, near, rate: one of them is no stamp."""
+    count = len(recording.time)
+    for key, channel in recording.channels.items():
+        if count > 2 and len(channel.time) == count:
+            command, own = recording.time[-1] - recording.time[0], channel.time[-1] - channel.time[0]
+            if DRIFT < abs(own - command) < NEAR * command:
+                ends = f"{abs(own - command):.2g} s apart at the end"
+                return [
+                    Finding(
+                        "clock", key, 1e3 * own / (count - 1), 1e3 * command / (count - 1), "likely",
+                        f"recording {recording.name!r}: channel {key!r} has as many rows as the commands, at "
+                        f"{1e3 * own / (count - 1):.5g} ms where these are at {1e3 * command / (count - 1):.5g} ms, "
+                        f"{ends}: is one of the two clocks a nominal rate? Use the stamps for both",
+                    )
+                ]  # fmt: skip
+    return []
+
+
+def _nominal(recording: Recording) -> list[Finding]:
+    """A rate in `meta` that the stamps do not have."""
+    clocks = {"commands": recording.time, **{f"channel {k!r}": c.time for k, c in recording.channels.items()}}
+    for note in (k for k in recording.meta if k.lower() in RATES):
+        try:
+            stated = float(recording.meta[note])
+        except ValueError:
+            continue
+        for what, time in clocks.items():
+            if len(time) < 3 or not stated > 0:
+                continue
+            rate = (len(time) - 1) / float(time[-1] - time[0])
+            apart = abs((len(time) - 1) / stated - float(time[-1] - time[0]))
+            if apart > DRIFT and abs(rate / stated - 1) < NEAR:
+                return [nominal(f"recording {recording.name!r}: the {what}", stated, rate, apart)]
+    return []
+
+
+def nominal(where: str, stated: float, rate: float, apart: float) -> Finding:
+    """Of stamps of a rate, Hz, other than the one that is stated; apart: s by which both differ at the end."""
+    return Finding(
+        "clock", where, rate, stated, "likely",
+        f"{where} are at {rate:.5g} Hz by their stamps, not at the stated {stated:g} Hz; the stamps are used (at "
+        f"{stated:g} Hz they would be {apart:.2g} s off at the end)",
+    )  # fmt: skip
+
+
+def _drift(scene: Scene, recording: Recording) -> list[Finding]:
+    """Positions that lag their commands by more and more, or less and less."""
+    motion = log_motion(scene, recording)
+    if motion is None:
+        return []
+    rows = len(motion.time)
+    part, most = int(WINDOW * rows), min(round(LATEST / motion.step), int(WINDOW * rows) // 2)
+    drifts = []
+    for joint in (j for j in motion.command if j in motion.position):
+        lags = []
+        for begin in (most, rows - part - most):
+            command, position = motion.command[joint], motion.position[joint][begin : begin + part]
+            if np.ptp(position) < MOVES:
+                break
+            shifted = {
+                lag: float(np.corrcoef(command[begin - lag : begin - lag + part], position)[0, 1])
+                for lag in range(-most, most + 1)
+                if np.ptp(command[begin - lag : begin - lag + part]) > MOVES
+            }
+            best = max(shifted, key=lambda lag: shifted[lag], default=None)
+            if best is None or shifted[best] < FOLLOWS + 0.05 or abs(best) == most:
+                break
+            lags.append(best * motion.step)
+        if len(lags) == 2:
+            drifts.append(lags[1] - lags[0])
+    if len(drifts) < 1 or abs(np.median(drifts)) < 2 * DRIFT or np.ptp(drifts) > 0.5 * abs(np.median(drifts)):
+        return []
+    drift = float(np.median(drifts)) / (1 - WINDOW)
+    return [
+        Finding(
+            "clock", "position", drift, 0.0, "likely",
+            f"recording {recording.name!r}: the positions lag the commands by {abs(drift):.2g} s "
+            f"{'more' if drift > 0 else 'less'} at the end than at the beginning: do their clocks run at different "
+            "rates, or is one of them a nominal rate? Use the stamps for both",
+        )
+    ]  # fmt: skip

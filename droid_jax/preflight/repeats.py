@@ -1,0 +1,87 @@
+"""Repeats that are copies, and columns that a sensor did not measure."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from droid_jax.preflight.findings import Finding
+from droid_jax.recordings.recording import Channel, Recording
+from droid_jax.simulate.repeat_starts import spread
+
+COPY = 1e-6  # of a channel's size: repeats that differ by less were measured once (float32 rounds by less)
+LEVELS = 8  # a column that moves and takes no more different values is coarse
+RESTS = {"position": 0.02, "velocity": 0.1, "torque": 0.2}  # rad, rad/s, N m: a column that changes by less may rest
+NAMED = 3  # pairs of copies that are named
+
+
+def check_repeats(recording: Recording) -> list[Finding]:
+    """What is wrong with the repeats and the sensors."""
+    where = f"recording {recording.name!r}"
+    sensors = [finding for channel in recording.channels.values() for finding in _sensors(channel, where)]
+    return _copies(recording, where) + sensors + _apart(recording, where)
+
+
+def _apart(recording: Recording, where: str) -> list[Finding]:
+    """How far apart the repeats start, where that is visible."""
+    apart = spread(recording)
+    if not apart:
+        return []
+    most = max(apart, key=lambda joint: apart[joint])
+    return [
+        Finding(
+            "repeats", most, apart[most], 0.0, "note",
+            f"{where}: its repeats start up to {apart[most]:.2g} rad or m apart, {most} most: each is compared with "
+            "a replay from its own measured start",
+        )
+    ]  # fmt: skip
+
+
+def _copies(recording: Recording, where: str) -> list[Finding]:
+    pairs: dict[tuple[int, int], list[str]] = {}
+    for key, channel in recording.channels.items():
+        for pair in itertools.combinations(range(recording.repeats), 2):
+            if _same(channel, *pair):
+                pairs.setdefault(pair, []).append(key)
+    if not pairs:
+        return []
+    named = ", ".join(f"{i} and {j}" for i, j in list(pairs)[:NAMED]) + (", ..." if len(pairs) > NAMED else "")
+    whole = all(len(keys) == len(recording.channels) for keys in pairs.values())
+    what = "" if whole else f" in channel {', '.join(sorted({k for keys in pairs.values() for k in keys}))}"
+    first = next(iter(pairs))
+    return [
+        Finding(
+            "repeats", f"{first[0]} and {first[1]}", float(len(pairs)), 0.0, "likely",
+            f"{where}: repeats {named} are identical{what}: are they copies of one? Copies do not tell how noisy the "
+            "measurement is, and intervals, floor and p-values mean nothing then; give each measurement once",
+        )
+    ]  # fmt: skip
+
+
+def _same(channel: Channel, first: int, second: int) -> bool:
+    """Whether two repeats of a channel hold the same numbers."""
+    one, other = channel.mask[first], channel.mask[second]
+    if not np.array_equal(one, other):
+        return False
+    a, b = channel.values[first][one], channel.values[second][one]
+    size = float(np.abs(a).max(initial=0.0))
+    return size > 0 and np.ptp(a) > 0 and bool(np.abs(a - b).max() <= COPY * size)
+
+
+def _sensors(channel: Channel, where: str) -> list[Finding]:
+    """Columns that change, in steps as large as the motion."""
+    found = []
+    for c, column in enumerate(channel.columns):
+        values = channel.values[:, :, c][channel.mask[:, :, c]]
+        levels = np.unique(values[:: max(1, len(values) // 20000)])
+        moves = channel.name in RESTS and len(levels) > 1 and np.ptp(levels) > RESTS[channel.name]
+        if moves and len(levels) <= LEVELS and len(values) > 10 * LEVELS:
+            found.append(
+                Finding(
+                    "sensor", column, float(len(levels)), float(LEVELS), "likely",
+                    f"{where}: channel {channel.name!r}, column {column!r} takes {len(levels)} different values only, "
+                    f"{np.diff(levels).min():.3g} {channel.unit} apart: is it rounded?",
+                )
+            )  # fmt: skip
+    return found

@@ -1,0 +1,339 @@
+"""Whether the measured torques are those of the motion: sign, unit, order of the joints, and the arm's weight.
+
+Three expectations, each at the scene's nominal values: the rigid body's torque along the measured motion, the servo's
+at the measured tracking error and, where no position was measured, the replay's.  Each is fitted within bounds that a
+wrong model may reach; what it leaves of the torque is compared with what it leaves under an alternative.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from droid_jax.model.scene import Scene
+from droid_jax.preflight.findings import Finding, Kind
+from droid_jax.preflight.signals import (
+    FEWEST,
+    Expected,
+    LogMotion,
+    compensated,
+    rigid_body,
+    servo_torque,
+    simulated,
+)
+from droid_jax.recordings.recording import Recording, TorqueSide
+from droid_jax.simulate.initial_state import weight_share
+
+BOUND = 3.0  # factor by which nominal masses and servo gains may be wrong
+LEAST_INERTIA = 0.1  # of the nominal inertia that must be seen, and three times of it at most
+OFFSET = 0.3  # of a torque's root mean square, that a sensor's constant error may have
+LATE = (0.0, 0.01, 0.02, 0.04, 0.06, 0.1)  # s by which a command may take effect late
+BAD = 0.3  # share of a torque's mean square that stays unexplained, from which on an expectation has failed
+GOOD = 0.2  # share below which an alternative explains it,
+BETTER = 0.25  # and of what the expectation left
+VISIBLE, CLEARLY = 0.03, 0.1  # share from which on the weight in a torque is looked for, and what it must leave of it
+ROTOR = 100.0  # times a link's own inertia, that a rotor behind its gear may have
+SURE = 0.05  # share below which it does so beyond doubt
+SAME = 0.25  # relative deviation within which a factor is that of degrees
+DEGREE = np.pi / 180
+
+Left = Callable[[np.ndarray], float]  # torque [K] -> share that an expectation leaves
+
+
+def check_torque(scene: Scene, recording: Recording, motion: LogMotion) -> list[Finding]:
+    """What is wrong with the torques, or with what they are judged by."""
+    if not motion.torque:
+        return []
+    if not motion.position:
+        return _of_replay(scene, recording, motion)
+    bodies = rigid_body(scene, recording, motion)
+    return _of_bodies(scene, recording, motion, bodies) or _of_servos(scene, recording, motion, bodies)
+
+
+# What is left ---------------------------------------------------------------------------------
+
+
+def left_by(torque: np.ndarray, terms: Iterable[tuple[np.ndarray, float, float]]) -> float:
+    """Share of a torque's mean square that terms, each [K] with the bounds of its factor, and a constant leave."""
+    terms = list(terms)
+    seen = np.isfinite([torque, *(term for term, _, _ in terms)]).all(axis=0)  # a replay may have ended before
+    power = float(np.mean(torque[seen] ** 2)) if seen.sum() >= FEWEST else 0.0
+    if power < 1e-18:
+        return 1.0
+    columns, low, high = [np.ones(int(seen.sum()))], [-OFFSET], [OFFSET]
+    for term, least, most in terms:
+        size = float(np.sqrt(np.mean(term[seen] ** 2)))
+        if size > 1e-9:
+            columns.append(term[seen] / size)
+            low.append(least * size / np.sqrt(power))
+            high.append(most * size / np.sqrt(power))
+    found = lsq_linear(np.stack(columns, axis=1), torque[seen] / np.sqrt(power), bounds=(low, high))
+    return min(1.0, 2.0 * float(found.cost) / len(columns[0]))
+
+
+def left_by_body(torque: np.ndarray, expected: Expected, *, gravity: bool, motor: bool) -> float:
+    """Share of a joint's torque [K] that rigid body, friction and, at the motor, a rotor's inertia leave.
+
+    gravity: the torque contains the weight.
+    """
+    terms = [(expected.inertial, LEAST_INERTIA, BOUND), *((t, 0.0, np.inf) for t in _friction(expected))]
+    if gravity:
+        terms.append((expected.weight, 1 / BOUND, BOUND))
+    if motor:
+        own = float(np.sqrt(np.mean(expected.inertial**2) / (np.mean(expected.acceleration**2) + 1e-12)))
+        terms.append((expected.acceleration, 0.0, ROTOR * own))
+    return left_by(torque, terms)
+
+
+def _friction(expected: Expected) -> list[np.ndarray]:
+    """[K] each: viscous and dry, of a size that is to be found."""
+    v = expected.velocity
+    return [v, np.tanh(v / max(0.05 * float(np.abs(v).max(initial=0.0)), 1e-3))]
+
+
+def factor(torque: np.ndarray, expected: np.ndarray, *others: np.ndarray) -> float:
+    """By how much a torque [K] is larger than an expected one, beside others of free size and a constant."""
+    columns = np.stack([expected, *others, np.ones(len(torque))], axis=1)
+    seen = np.isfinite(columns).all(axis=1)
+    if seen.sum() < FEWEST:
+        return np.nan
+    columns, torque = columns[seen], torque[seen]
+    size = np.sqrt(np.mean(columns**2, axis=0)) + 1e-12
+    return float(np.linalg.lstsq(columns / size, torque, rcond=None)[0][0] / size[0])
+
+
+# The rigid body -------------------------------------------------------------------------------
+
+
+def _of_bodies(scene: Scene, recording: Recording, motion: LogMotion, bodies: Mapping[str, Expected]) -> list[Finding]:
+    """By inverse dynamics of the measured positions."""
+    gravity, motor = recording.torque.gravity, recording.torque.side is TorqueSide.MOTOR
+    torques = {joint: motion.torque[joint][motion.inner] for joint in bodies}
+
+    def lefts(bodies: Mapping[str, Expected], torques: Mapping[str, np.ndarray], gravity: bool) -> dict[str, float]:
+        return {j: left_by_body(torques[j], bodies[j], gravity=gravity, motor=motor) for j in torques}
+
+    stated, weightless = lefts(bodies, torques, gravity), lefts(bodies, torques, not gravity)
+    if found := _of_gravity(recording, stated, weightless, "the rigid body's torques"):
+        return found
+    bad = [joint for joint, left in stated.items() if left > BAD]
+    if not bad:
+        return []
+    whole: list[tuple[Kind, str, dict[str, float], str]] = []
+
+    def tried(kind: Kind, joint: str, words: str, other: LogMotion, swap: bool = True) -> None:
+        mine = {j: (other if swap else motion).torque[j][motion.inner] for j in torques}
+        left = lefts(rigid_body(scene, recording, other), mine, gravity)
+        whole.append((kind, joint, left, words))
+
+    tried("units", "", "the positions are not in the unit that is stated: are these degrees?", motion.scaled(DEGREE))
+    for joint in bodies:
+        tried("sign", joint, f"the position of {joint} has the wrong sign", motion.turned(joint))
+    for one, other in itertools.combinations(bodies, 2):
+        names = {one: other, other: one}
+        if one in bad or other in bad:
+            swapped = {j: torques[names.get(j, j)] for j in torques}
+            whole.append(("order", one, lefts(bodies, swapped, gravity), _order_words(one, other, "torque")))
+            tried("order", one, _order_words(one, other, "position"), motion.swapped(one, other), swap=False)
+            tried("order", one, _order_words(one, other, "all channels"), motion.swapped(one, other))
+    explained = [w for w in whole if _explains(w[2], stated, bad)]
+    others_right = len(bad) < len(bodies)
+    alone = {
+        joint: _alone(joint, torques[joint], bodies[joint], gravity, motor, stated[joint], others_right)
+        for joint in bad
+    }
+    best = min(explained, key=lambda w: _mean(w[2]), default=None)
+    where = f"recording {recording.name!r}: "
+    if best is not None and not all(f is not None and f[1] <= best[2][j] + 0.02 for j, f in alone.items()):
+        kind, joint, left, words = best
+        most = max(bad, key=lambda j: stated[j])
+        return [
+            _finding(kind, joint or most, most, stated[most], left[most], where + words, "the rigid body's torques")
+        ]
+    return [replace(f[0], sentence=where + f[0].sentence) for f in alone.values() if f is not None]
+
+
+def _of_gravity(
+    recording: Recording, stated: Mapping[str, float], other: Mapping[str, float], by: str
+) -> list[Finding]:
+    """What is left with the weight in the torque, as stated, against what is left without, or the other way round."""
+    if not stated or _mean(stated) < VISIBLE or _mean(other) > CLEARLY * _mean(stated):
+        return []
+    most = max(stated, key=lambda j: stated[j] - other[j])
+    words = f"recording {recording.name!r}: {_weight_words(recording.torque.gravity)}"
+    return [_finding("gravity", most, most, stated[most], other[most], words, by)]
+
+
+def _explains(left: Mapping[str, float], stated: Mapping[str, float], bad: Sequence[str]) -> bool:
+    """Whether an alternative explains the torques of the joints where the expectation failed, and spoils no other."""
+    spoilt = [j for j in left if left[j] > max(BAD, stated[j] + 0.05)]
+    return not spoilt and _better(float(np.mean([left[j] for j in bad])), float(np.mean([stated[j] for j in bad])))
+
+
+def _better(left: float, stated: float) -> bool:
+    return left < min(GOOD, BETTER * stated)
+
+
+def _alone(
+    joint: str, torque: np.ndarray, body: Expected, gravity: bool, motor: bool, stated: float, others_right: bool
+) -> tuple[Finding, float] | None:
+    """What is wrong with one joint's torque: its sign or its unit; with what it leaves."""
+    left = partial(left_by_body, expected=body, gravity=gravity, motor=motor)
+    expected = body.weight * gravity + body.inertial
+    size = factor(torque, expected, *_friction(body))
+    by = "weight, inertia and friction"
+    if _better(turned := left(-torque), stated):
+        words = f"the torque of {joint} has the wrong sign, or its position has"
+        return _finding("sign", joint, joint, stated, turned, words, by, value=-1.0), turned
+    if size > 0 and not 1 / BOUND < size < BOUND and _better(scaled := left(torque / size), stated):
+        weight = gravity and np.std(body.weight) + np.abs(np.mean(body.weight)) > np.std(body.inertial)
+        of = "the arm's weight there" if weight else "what the motion takes"
+        words = f"the torque of {joint} is {size:.2g} of {of}: {_unit_words(size)}"
+        if size > 1 and others_right:
+            words += " Or does the robot carry a load that the scene lacks?"
+        return _finding("units", joint, joint, stated, scaled, words, by, value=size), scaled
+    return None
+
+
+# The servo ------------------------------------------------------------------------------------
+
+
+def _of_servos(scene: Scene, recording: Recording, motion: LogMotion, bodies: Mapping[str, Expected]) -> list[Finding]:
+    """By stiffness times tracking error."""
+    joints = [j for j in motion.command if j in motion.position and j in motion.torque and j in scene.joints]
+    servos = {j: [servo_torque(scene, motion, j, late) for late in LATE] for j in joints}
+    gravity, by = recording.torque.gravity, "kp x tracking error"
+    carried = compensated(scene, recording, motion)
+    torques, flipped = (
+        {j: motion.torque[j] - weight_share(scene.model, np.array([scene.dof(j)]), holds) * carried[j] for j in joints}
+        for holds in (gravity, not gravity)
+    )
+    stated, other = ({j: _least(t, servos[j]) for j, t in of.items()} for of in (torques, flipped))
+    if found := _of_gravity(recording, stated, other, by):
+        return found
+    motor = recording.torque.side is TorqueSide.MOTOR
+    right = [
+        joint
+        for joint, body in bodies.items()
+        if left_by_body(motion.torque[joint][motion.inner], body, gravity=gravity, motor=motor) < GOOD
+        and gravity and np.mean(body.weight**2) > 0.25 * np.mean(motion.torque[joint] ** 2)
+    ]  # fmt: skip
+    return _compared(recording, torques, servos, by, right)
+
+
+def _of_replay(scene: Scene, recording: Recording, motion: LogMotion) -> list[Finding]:
+    """By a replay of the commands, of a recording without positions."""
+    if not motion.command:
+        return []
+    replays, by = simulated(scene, recording, motion), "the torque of its replay"
+    torques = {j: motion.torque[j] for j in replays}
+    stated = {j: _least(torques[j], [x]) for j, x in replays.items()}
+    bad = [j for j, share in stated.items() if share > BAD]
+    if not bad:
+        return []
+    if found := _compared(recording, torques, {j: [x] for j, x in replays.items()}, by, ()):
+        return found
+    small = simulated(scene, recording, motion.scaled(DEGREE))
+    left = {j: _least(torques[j], [x]) for j, x in small.items()}
+    if _explains(left, stated, bad):
+        joint = max(bad, key=lambda j: stated[j])
+        words = f"recording {recording.name!r}: the commands are not in the unit that is stated: are these degrees?"
+        return [_finding("units", joint, joint, stated[joint], left[joint], words, by)]
+    return []
+
+
+def _least(torque: np.ndarray, expected: Sequence[np.ndarray]) -> float:
+    """The least share of a torque [K] that one of several expected ones leaves."""
+    return min(left_by(torque, [(x, 1 / BOUND, BOUND)]) for x in expected)
+
+
+def _likest(torque: np.ndarray, expected: Sequence[np.ndarray]) -> np.ndarray:
+    """[K] of several expected torques the one that is most like the measured one, whatever its size."""
+    if len(expected) == 1:
+        return expected[0]
+    known = [x for x in expected if np.isfinite(x).all() and np.std(x) > 0]
+    return (
+        max(known, key=lambda x: float(np.corrcoef(torque, x)[0, 1])) if known and np.std(torque) > 0 else expected[0]
+    )
+
+
+def _compared(
+    recording: Recording, torques: Mapping[str, np.ndarray], expected: Mapping[str, Sequence[np.ndarray]], by: str,
+    right: Sequence[str],
+) -> list[Finding]:  # fmt: skip
+    """Torques compared with the expected traces of each joint.
+
+    right: joints whose torque is known to be in its unit.
+    """
+    where = f"recording {recording.name!r}: "
+    stated = {j: _least(torque, expected[j]) for j, torque in torques.items()}
+    bad = [j for j, share in stated.items() if share > BAD]
+    for one, other in itertools.combinations(bad, 2):
+        crossed = max(_least(torques[one], expected[other]), _least(torques[other], expected[one]))
+        if _better(crossed, min(stated[one], stated[other])):
+            return [_finding("order", one, one, stated[one], crossed, where + _order_words(one, other, "torque"), by)]
+    found, sizes = [], {}
+    for joint, torque in torques.items():
+        if joint in bad and _better(turned := _least(-torque, expected[joint]), stated[joint]):
+            words = f"{where}the torque of {joint} runs against {by}: one of the two has the wrong sign"
+            found.append(_finding("sign", joint, joint, stated[joint], turned, words, by, value=-1.0))
+            continue
+        like = _likest(torque, expected[joint])
+        size, share = factor(torque, like), _least(torque, [like])
+        other = size > 0 and not 1 / BOUND < size < BOUND
+        if share > BAD and other and _better(scaled := _least(torque / size, [like]), share):
+            sizes[joint] = size, share, scaled
+    degrees = bool(sizes) and all(abs(size / DEGREE - 1) < SAME for size, _, _ in sizes.values())
+    for joint, (size, share, scaled) in sizes.items():
+        if degrees:
+            why = "are positions and commands in degrees?"
+        elif joint in right:
+            why = "are the servo's gains in the MJCF those of the robot?"
+        else:
+            why = f"{_unit_words(size)} Or are the servo's gains in the MJCF others than the robot's?"
+        words = f"{where}the torque of {joint} is {size:.2g} of {by}: {why}"
+        found.append(_finding("units", joint, joint, share, scaled, words, by, value=size))
+    return found
+
+
+# Words ----------------------------------------------------------------------------------------
+
+
+def _finding(
+    kind: Kind, column: str, joint: str, stated: float, left: float, words: str, by: str, value: float = 0.0
+) -> Finding:
+    """stated, left: what `by` leaves of a joint's torque as recorded, and under the alternative."""
+    sure = stated > 1 - SURE and left < SURE
+    grounds = f"left unexplained of the torque of {joint} by {by}: {100 * stated:.0f} % as recorded"
+    sentence = f"{words.rstrip('.')} ({grounds}, {100 * left:.0f} % otherwise)"
+    return Finding(kind, column, value or stated, 1.0 if value else left, "certain" if sure else "likely", sentence)
+
+
+def _unit_words(size: float) -> str:
+    """What a torque may be that is `size` times as large as it should be."""
+    if size < 1:
+        what = "are these amperes, or shares of the largest torque?"
+    else:
+        what = "are these milliamperes, N mm or per cent?"
+    return f"{what} `convert --torque-constant` takes what one unit is in N m."
+
+
+def _weight_words(gravity: bool) -> str:
+    return (
+        "the torque is said to contain the arm's weight and holds none: leave --gravity away (TorqueConvention.gravity)"
+        if gravity
+        else "the torque is said to hold no weight, and holds the arm's: state it (--gravity, TorqueConvention.gravity)"
+    )
+
+
+def _order_words(one: str, other: str, what: str) -> str:
+    return f"{one} and {other} seem to be exchanged in {what}: check the columns' names"
+
+
+def _mean(lefts: Mapping[str, float]) -> float:
+    return float(np.mean(list(lefts.values())))

@@ -1,0 +1,123 @@
+"""Whether the measured positions follow the commands: sign, unit and order of the joints; and whether any joint could
+move as fast as the positions say."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from droid_jax.model.scene import Scene
+from droid_jax.preflight.findings import Finding
+from droid_jax.preflight.signals import LogMotion
+from droid_jax.recordings.recording import Recording
+
+MOVES = 0.01  # rad or m (of both, in their own units): a joint that is sent less far tells nothing
+LATEST = 0.15  # s by which a position may lag its command; of faster swings than half of it no sign is told
+FOLLOWS = 0.9  # correlation from which on a position follows a command, and its size can be compared
+AGAINST = -0.8  # correlation at which it runs against it
+UNRELATED = 0.3  # correlation below which it does not follow its own command at all
+RATIO = 3.0  # a servo that goes a third, or three times, as far as it is sent has other units
+SAME = 0.25  # relative deviation within which a ratio is that of known units
+STUCK = 1e-3  # of the way it is sent: a position that moves less does not move, or is not measured
+FASTEST = {"hinge": 30.0, "slide": 10.0}  # rad/s, m/s: no arm, leg or gripper is as fast; wheels turn one way
+_UNITS = {"hinge": {180 / np.pi: "degrees"}, "slide": {1000.0: "millimetres", 100.0: "centimetres"}}
+
+
+def check_tracking(scene: Scene, recording: Recording, motion: LogMotion) -> list[Finding]:
+    """What is wrong with positions and commands."""
+    where = f"recording {recording.name!r}"
+    joints = [j for j in motion.command if j in motion.position and np.ptp(motion.command[j]) > MOVES]
+    found = _order(motion, joints, where)
+    if not found:
+        for joint in joints:
+            found += _of_joint(scene, motion, joint, where)
+    return found or _too_fast(scene, motion, where)
+
+
+def correlations(motion: LogMotion, sent: str, measured: str) -> tuple[np.ndarray, np.ndarray]:
+    """[L] correlation of a position with a command, and [L] the ratio of their deviations, at lags up to LATEST."""
+    most = max(1, min(round(LATEST / motion.step), len(motion.time) // 4))
+    pairs = []
+    for lag in range(most + 1):
+        command = motion.command[sent][: len(motion.time) - lag]
+        position = motion.position[measured][lag:]
+        deviations = np.std(command), np.std(position)
+        if min(deviations) < 1e-9:
+            pairs.append((0.0, 0.0))
+            continue
+        pairs.append((float(np.corrcoef(command, position)[0, 1]), float(deviations[1] / deviations[0])))
+    r, ratio = np.array(pairs).T
+    return r, ratio
+
+
+def _of_joint(scene: Scene, motion: LogMotion, joint: str, where: str) -> list[Finding]:
+    if np.ptp(motion.position[joint]) < STUCK * np.ptp(motion.command[joint]):
+        unit = "m" if scene.slides(joint) else "rad"
+        return [
+            Finding(
+                "sensor", joint, float(np.ptp(motion.position[joint])), float(np.ptp(motion.command[joint])), "likely",
+                f"{where}: the position of {joint} moves by {np.ptp(motion.position[joint]):.2g} {unit} while its "
+                f"command moves by {np.ptp(motion.command[joint]):.2g}: is the sensor dead, or in another unit?",
+            )
+        ]  # fmt: skip
+    r, ratios = correlations(motion, joint, joint)
+    if r.max() < 0 and r.min() < AGAINST:
+        return [
+            Finding(
+                "sign", joint, float(r.min()), 1.0, "certain",
+                f"{where}: the position of {joint} runs against its command (correlation {r.min():.2f}, expected near "
+                "1): one of the two has the wrong sign",
+            )
+        ]  # fmt: skip
+    best = int(np.argmax(r))
+    if r[best] < FOLLOWS or 1 / RATIO < ratios[best] < RATIO:
+        return []
+    return [_ratio(scene, joint, float(ratios[best]), where)]
+
+
+def _ratio(scene: Scene, joint: str, ratio: float, where: str) -> Finding:
+    """Of a position that follows its command, but is `ratio` times as large."""
+    units, certain = "are both in the same unit?", False
+    for size, unit in _UNITS["slide" if scene.slides(joint) else "hinge"].items():
+        for of, what in ((ratio / size, "position"), (1 / (ratio * size), "command")):
+            if abs(of - 1) < SAME:
+                units, certain = f"is the {what} in {unit}?", what == "position"
+    return Finding(
+        "units", joint, ratio, 1.0, "certain" if certain else "likely",
+        f"{where}: the position of {joint} is {ratio:.3g} times its command: {units}",
+    )  # fmt: skip
+
+
+def _order(motion: LogMotion, joints: list[str], where: str) -> list[Finding]:
+    """Joints of which each follows another one's command, and not its own."""
+    if len(joints) < 2:
+        return []
+    r = np.array([[correlations(motion, sent, seen)[0].max() for sent in joints] for seen in joints])
+    seen, sent = linear_sum_assignment(-r)
+    wrong = [(i, j) for i, j in zip(seen, sent, strict=True) if i != j]
+    if not wrong or any(r[i, i] > UNRELATED or r[i, j] < FOLLOWS for i, j in wrong):
+        return []
+    pairs = ", ".join(f"{joints[i]} follows the command of {joints[j]}" for i, j in wrong)
+    first = int(wrong[0][0])
+    sentence = (
+        f"{where}: the joints seem to be in another order in positions than in commands ({pairs}): check the columns' "
+        "names"
+    )
+    return [Finding("order", joints[first], float(r[first, first]), 1.0, "certain", sentence)]
+
+
+def _too_fast(scene: Scene, motion: LogMotion, where: str) -> list[Finding]:
+    """Joints that go to and fro faster than any robot's."""
+    for joint, path in motion.position.items():
+        slides = scene.slides(joint)
+        speed = motion.rate_of(path)[motion.inner]
+        if len(speed) and min(speed.max(), -speed.min()) > FASTEST["slide" if slides else "hinge"]:
+            fastest, unit = float(np.abs(speed).max()), "m/s" if slides else "rad/s"
+            units = "millimetres" if slides else "degrees, or normalised (-100 .. 100)"
+            return [
+                Finding(
+                    "units", joint, fastest, FASTEST["slide" if slides else "hinge"], "likely",
+                    f"{where}: the positions of {joint} mean a speed of {fastest:.3g} {unit}: are these {units}?",
+                )
+            ]  # fmt: skip
+    return []

@@ -1,0 +1,150 @@
+"""Recordings on disk: one npz file, or a folder of CSV files that any spreadsheet opens.
+
+`load` also reads ROS bags, through `rosbag.py`, which is imported only then.  The layouts are
+described in docs/file-formats.md.  Both formats keep every number exactly: a recording that
+was saved and loaded has the same `sha256`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from droid_jax.arguments import flag, path_of
+from droid_jax.errors import needs
+from droid_jax.recordings.checks import validate
+from droid_jax.recordings.csv_folder import check_folder, load_csv, save_csv
+from droid_jax.recordings.npz_file import is_npz, load_npz, save_npz
+from droid_jax.recordings.recording import JITTER, Recording
+from droid_jax.storage import refuse_foreign, refuse_special
+
+SUPPORTED = (
+    ".npz, a folder with recording.json and CSV files, a ROS 1 .bag, a ROS 2 .mcap or .db3, "
+    "a ROS 2 bag folder with metadata.yaml, or a folder of such bags, one per repeat"
+)
+_BAG_SUFFIXES = (".bag", ".mcap", ".db3")
+
+
+def load(
+    path: str | os.PathLike[str],
+    *,
+    name: str | None = None,
+    resample: bool = False,
+    allow_jitter: bool = False,
+    **bag_options: Any,
+) -> Recording:
+    """Reads a recording from an npz file, a CSV folder or ROS bags, and validates it.
+
+    name:         replaces the stored name.
+    resample:     repeats with clocks of their own are interpolated onto the first's; those of bags always are, those
+                  of an npz file share one.
+    allow_jitter: accept irregular clocks, see `validate`; a recording that was accepted says so in its `meta`, and is
+                  read without being asked again once it is saved.
+    bag_options:  passed to `rosbag.read_bags`; `joints` and `torque` are required for bags.
+
+    Raises FileNotFoundError when there is no such path, ValueError for everything in the
+    file that is not as it should be.
+    """
+    path = path_of(path, "the path of a recording")
+    resample, allow_jitter = flag(resample, "resample"), flag(allow_jitter, "allow_jitter")
+    if not path.exists():
+        raise FileNotFoundError(f"no recording at {path}: there is no such file or folder")
+    bags = bags_at(path)
+    if bags:
+        return _load_bags(bags, name, allow_jitter, bag_options)
+    if bag_options:
+        raise ValueError(f"{path}: not a ROS bag, it takes no option {', '.join(sorted(bag_options))}")
+    if resample and path.suffix == ".npz" and not path.is_dir():
+        raise ValueError(f"{path}: resample is for CSV folders; the repeats of an npz file share one clock already")
+    if path.is_dir():
+        if not (path / "recording.json").exists():
+            raise ValueError(f"{path}: not a recording, the folder has no recording.json; {_supported()}")
+        recording = load_csv(path, resample, allow_jitter)
+    elif path.suffix == ".npz":
+        recording = load_npz(path)
+    else:
+        raise ValueError(f"{path}: unknown suffix {path.suffix!r}; {_supported()}")
+    if name is not None:
+        recording = replace(recording, name=name)
+    if not allow_jitter:
+        return validate(recording, source=str(path), allow_jitter=JITTER in recording.meta)
+    with contextlib.suppress(ValueError):
+        return validate(recording, source=str(path))
+    accepted = replace(recording, meta={**recording.meta, JITTER: "accepted when it was read"})
+    return validate(accepted, source=str(path), allow_jitter=True)
+
+
+def check_target(path: Path) -> None:
+    """ValueError where `save` would not write: another suffix, or what stands there is no recording."""
+    if path.suffix not in ("", ".npz"):
+        raise ValueError(f"{path}: expected the suffix .npz or none (a CSV folder), got {path.suffix!r}")
+    if path.suffix == ".npz":
+        refuse_foreign(path, "a file", is_npz, "a recording")
+    else:
+        refuse_special(path, "a folder")
+        check_folder(path)
+
+
+def save(recording: Recording, path: str | os.PathLike[str]) -> Path:
+    """Writes an npz file (suffix .npz) or a CSV folder (no suffix), atomically; returns its path.
+
+    An existing recording of that name is replaced.  Raises ValueError when the recording is
+    not valid, the suffix is another one, or something else stands there.
+    """
+    path = path_of(path, "the path of a recording")
+    check_target(path)
+    # Irregular clocks were a question when the data came in; here they are only kept.
+    validate(recording, allow_jitter=True)
+    if path.suffix == ".npz":
+        save_npz(recording, path)
+    else:
+        save_csv(recording, path)
+    return path
+
+
+def _supported() -> str:
+    return f"supported are: {SUPPORTED}"
+
+
+def bags_at(path: Path) -> list[Path]:
+    """The ROS bags meant by a path, one per repeat, run_2 before run_10; none when it is something else.
+
+    A folder with a recording.json is a recording, whatever lies beside its tables.
+    """
+
+    def is_bag(p: Path) -> bool:
+        return (p / "metadata.yaml").exists() if p.is_dir() else p.suffix in _BAG_SUFFIXES
+
+    def numbered(p: Path) -> list[str | int]:  # texts and numbers by turns
+        return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", p.name)]
+
+    if (path / "recording.json").exists():
+        return []
+    if is_bag(path):
+        return [path]
+    if path.is_dir():
+        return sorted((p for p in path.iterdir() if is_bag(p)), key=numbered)
+    return []
+
+
+def rosbag_reader() -> ModuleType:
+    """`droid_jax.recordings.rosbag`, imported where bags are read; ValueError where what it needs is not installed."""
+    needs("ROS bags need", "ros", "rosbags")
+    return importlib.import_module("droid_jax.recordings.rosbag")
+
+
+def _load_bags(bags: list[Path], name: str | None, allow_jitter: bool, options: Mapping[str, Any]) -> Recording:
+    missing = [key for key in ("joints", "torque") if key not in options]
+    if missing:
+        raise ValueError(
+            f"{bags[0]}: a ROS bag does not say which joints to read or what its efforts are; "
+            f"pass {' and '.join(missing)} as well"
+        )
+    return rosbag_reader().read_bags(bags, name=name, allow_jitter=allow_jitter, **options)

@@ -1,0 +1,327 @@
+"""Recordings from ROS bags: one bag per repeat, ROS 1 or ROS 2.
+
+The joint state topic gives torque (effort), position and velocity; an optional command topic
+gives the position command.  Every bag starts at its first command (at its first joint state
+when there is no command topic), and all are interpolated onto one uniform clock.  Repeats are in
+the order in which they were recorded.  Nothing is invented: samples that fall into a gap of the
+log are masked out.
+"""
+
+from __future__ import annotations
+
+import enum
+import itertools
+import os
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from droid_jax.recordings.bag_topics import FIELDS, Track, read_bag
+from droid_jax.recordings.checks import UNITS, validate
+from droid_jax.recordings.clocks import check_clock, in_gap, interpolate
+from droid_jax.recordings.recording import Channel, Phase, Recording, ServoGains, TorqueConvention
+
+
+class Stamps(enum.Enum):
+    """Which time stamp of a message counts."""
+
+    AUTO = "auto"  # header stamps where all messages used have one, else BAG
+    HEADER = "header"  # when the message was made
+    BAG = "bag"  # when the recorder received it
+
+
+UNUSED = "unused_setpoints"  # in `meta`: what the commands held beside positions
+DRIFT = 0.03  # s by which a log at its nominal rate may be off at its end unremarked
+NEAR = 0.05  # relative deviation within which a stated rate is meant to be that of the stamps
+_Timed = tuple[np.ndarray, dict[str, np.ndarray]]  # stamps [M] s, and values [M, J] by field
+
+
+def read_bags(
+    paths: Sequence[str | os.PathLike[str]],
+    *,
+    joints: Sequence[str],
+    slides: Sequence[str] = (),
+    torque: TorqueConvention,
+    state_topic: str = "/joint_states",
+    command_topic: str | None = None,
+    command_joints: Sequence[str] | None = None,
+    rate: float | None = None,
+    stamps: Stamps = Stamps.AUTO,
+    command_tolerance: float = 5e-3,
+    name: str | None = None,
+    qpos0: Mapping[str, float] | None = None,
+    gains: ServoGains | None = None,
+    phases: Sequence[Phase] = (),
+    allow_jitter: bool = False,
+) -> Recording:
+    """Reads one bag per repeat into a Recording.
+
+    The repeats are in the order of recording, or in that of `paths` where the bags' times overlap.
+
+    joints:            measured joints, in the order wanted.
+    slides:            those of them that slide; a bag does not say.
+    torque:            what the efforts are; a bag does not say.
+    state_topic:       sensor_msgs/JointState.
+    command_topic:     JointState, JointTrajectory, JointTrajectoryPoint, Float64MultiArray or
+                       JointTrajectoryControllerState, of which the reference counts; None reads
+                       a log without commands.
+    command_joints:    commanded joints, and the order of numbers in messages without names;
+                       `joints` by default.
+    rate:              Hz of the common clock; the usual rate of the first bag's joint states
+                       by default.
+    stamps:            which time stamps count.
+    command_tolerance: rad or m by which the repeats' commands may differ (jitter of arrival).
+    qpos0:             initial positions to add to, or put in place of, the measured ones.
+    gains, phases:     passed on; phases count from each bag's start.
+    allow_jitter:      accept stamps at an irregular rate.
+
+    Raises FileNotFoundError for a missing bag and ValueError, naming the bag, for a missing
+    topic or joint, a topic without messages, efforts that are not finite, stamps that do not
+    increase, commands that differ between repeats, or bags without a common part.
+    """
+    bags = _bags(paths)
+    command_joints = tuple(joints if command_joints is None else command_joints)
+    topics = _topics(joints, slides, state_topic, command_topic, command_joints)
+    tracks = [read_bag(bag, topics) for bag in bags]
+    order = _as_recorded([track[state_topic].received for track in tracks])
+    bags, tracks = [bags[i] for i in order], [tracks[i] for i in order]
+    use_header = _use_header(tracks, stamps, bags)
+
+    timed = [
+        _timed(track, use_header, bag, command_topic or state_topic, state_topic, allow_jitter)
+        for track, bag in zip(tracks, bags, strict=True)
+    ]
+    states = [topics[state_topic] for topics in timed]
+    commands = [] if command_topic is None else [topics[command_topic] for topics in timed]
+    clock = _clock(states, rate, bags)
+
+    channels = _channels(states, clock, tuple(joints), slides, bags)
+    command = np.zeros((0, 0))
+    _warn_of_rate(states[0][0], rate, bags[0])
+    unused = _unused(commands, command_topic)
+    if commands:
+        command = _command(commands, clock, command_joints, command_tolerance, bags)
+    recording = Recording(
+        name=name or bags[0].stem,
+        time=clock if commands else np.zeros(0),
+        command=command,
+        command_names=command_joints if commands else (),
+        channels=channels,
+        torque=torque,
+        qpos0={**_initial(channels), **(qpos0 or {})},
+        gains=gains,
+        phases=tuple(phases),
+        meta={
+            "bags": ", ".join(bag.name for bag in bags),
+            "stamps": "header" if use_header else "bag",
+            "state_topic": state_topic,
+            "command_topic": command_topic or "",
+            **({UNUSED: ", ".join(unused)} if unused else {}),
+        },
+    )
+    return validate(recording, source=", ".join(str(bag) for bag in bags))
+
+
+def _unused(commands: Sequence[_Timed], topic: str | None) -> list[str]:
+    """Set-points other than positions that the command messages hold and the recording does not; they are warned of."""
+    found = [
+        field
+        for field in ("velocity", "effort")
+        if any(np.any(np.nan_to_num(fields[field])) for _, fields in commands if field in fields)
+    ]
+    if found:
+        warnings.warn(
+            f"the commands on {topic} have set-points of {' and '.join(found)} beside the positions, and these are "
+            "not used: a servo that follows them lags less than its replay, which looks like damping or a delay",
+            stacklevel=3,
+        )
+    return found
+
+
+def _warn_of_rate(stamps: np.ndarray, rate: float | None, bag: Path) -> None:
+    """Warn of a stated rate that is nearly that of the stamps [M] s: who states it may take it for theirs."""
+    if not rate or len(stamps) < 3:
+        return
+    own = (len(stamps) - 1) / float(stamps[-1] - stamps[0])
+    late = abs((len(stamps) - 1) / rate - float(stamps[-1] - stamps[0]))
+    if late > DRIFT and abs(own / rate - 1.0) < NEAR:
+        warnings.warn(
+            f"{bag}: the stamps are at {own:.5g} Hz, not at the {rate:g} Hz of --rate; they are used and the log is "
+            f"resampled (by its number of samples it would be {late:.2g} s off at the end)",
+            stacklevel=3,
+        )
+
+
+def _bags(paths: Sequence[str | os.PathLike[str]]) -> list[Path]:
+    """The bags, or ValueError where there is none or one is there twice."""
+    bags = [Path(p) for p in paths]
+    if not bags:
+        raise ValueError("expected one ROS bag per repeat, got none")
+    if twice := [bag for i, bag in enumerate(bags) if bag.resolve() in [other.resolve() for other in bags[:i]]]:
+        raise ValueError(f"{twice[0]}: given twice; every bag is one repeat of its own")
+    return bags
+
+
+def _topics(
+    joints: Sequence[str],
+    slides: Sequence[str],
+    state_topic: str,
+    command_topic: str | None,
+    command_joints: tuple[str, ...],
+) -> dict[str, tuple[tuple[str, ...], str]]:
+    """What `read_bag` is asked for: topic -> its joints, and the field that must be finite.
+
+    ValueError where the two topics are one, or slides are no joints.
+    """
+    if command_topic == state_topic:
+        raise ValueError(f"command and joint states need topics of their own, got {state_topic!r} for both")
+    if strange := [slide for slide in slides if slide not in joints]:
+        raise ValueError(f"slides must be among the joints {', '.join(joints)}, got {', '.join(strange)}")
+    topics = {state_topic: (tuple(joints), "effort")}
+    return topics if command_topic is None else {**topics, command_topic: (command_joints, "position")}
+
+
+def _as_recorded(received: Sequence[np.ndarray]) -> list[int]:
+    """The bags with these recorder's stamps [M] ns in order of time, or as they are.
+
+    Bags whose times overlap have clocks that do not compare, as simulations that each begin at zero.
+    """
+    order = sorted(range(len(received)), key=lambda i: received[i][0])
+    apart = all(received[i][-1] < received[j][0] for i, j in itertools.pairwise(order))
+    return order if apart else list(range(len(received)))
+
+
+def _use_header(tracks: Sequence[Mapping[str, Track]], stamps: Stamps, bags: Sequence[Path]) -> bool:
+    """Whether header stamps count: one choice for all, two clocks would shift the topics."""
+    bare = [(bag, topic) for bag, t in zip(bags, tracks, strict=True) for topic in t if t[topic].stamped is None]
+    if stamps is Stamps.HEADER and bare:
+        raise ValueError(
+            f"{bare[0][0]}, topic {bare[0][1]!r}: messages have no header stamp; use --stamps bag (Stamps.BAG)"
+        )
+    return stamps is not Stamps.BAG and not bare
+
+
+def _timed(
+    tracks: Mapping[str, Track],
+    use_header: bool,
+    bag: Path,
+    first_topic: str,
+    state_topic: str,
+    allow_jitter: bool,
+) -> dict[str, _Timed]:
+    """topic -> checked stamps [M] s since the first message of first_topic, and the fields."""
+
+    def stamps(track: Track) -> np.ndarray:
+        return track.stamped if use_header and track.stamped is not None else track.received
+
+    start = stamps(tracks[first_topic])[0]
+    timed = {}
+    for topic, track in tracks.items():
+        time = 1e-9 * (stamps(track) - start)
+        where = f"{bag}, topic {topic!r} ({'header' if use_header else 'bag'} stamps)"
+        _check_trajectories(time, track.numbers, where)
+        # Commands may pause while the robot holds still, or be waypoints seconds apart: their rate is not checked.
+        state = topic == state_topic
+        jitter = allow_jitter or not state
+        check_clock(time, where, allow_jitter=jitter, seconds=state, label=lambda i, n=track.numbers: f"message {n[i]}")
+        timed[topic] = (time, track.fields)
+    return timed
+
+
+def _check_trajectories(time: np.ndarray, numbers: Sequence[int], where: str) -> None:
+    """ValueError where a message of several points, at times [M] s, was still running when the next one began."""
+    for row in range(2, len(numbers)):
+        several = numbers[row - 1] == numbers[row - 2]
+        if several and numbers[row] != numbers[row - 1] and time[row] <= time[row - 1]:
+            raise ValueError(
+                f"{where}, message {numbers[row]}: begins before the trajectory of message {numbers[row - 1]} has "
+                "ended, and what the controller made of both is not in this topic: read its state, "
+                "--command-topic .../controller_state (JointTrajectoryControllerState)"
+            )
+
+
+def _clock(states: Sequence[_Timed], rate: float | None, bags: Sequence[Path]) -> np.ndarray:
+    """[T] s, uniform, a multiple of its step, over the part that all repeats cover from 0 on."""
+    for bag, (time, _) in zip(bags, states, strict=True):
+        if len(time) < 2 or time[-1] <= 0:
+            raise ValueError(
+                f"{bag}: needs two joint states or more after the first command; there are {len(time)}, from "
+                f"{time[0]:.3f} to {time[-1]:.3f} s of it (are the header stamps of two clocks? then --stamps bag)"
+            )
+    if rate is not None and not rate > 0:
+        raise ValueError(f"rate must be positive, got {rate} Hz")
+    step = 1.0 / rate if rate else float(np.median(np.diff(states[0][0])))
+    ends = [float(t[-1]) for t, _ in states]
+    if min(ends) < 0.5 * max(ends):
+        i = int(np.argmin(ends))
+        raise ValueError(
+            f"{bags[i]}: lasts {ends[i]:.3f} s, less than half of the longest repeat's {max(ends):.3f} s; "
+            "was it cut off?"
+        )
+    first = max(0.0, *(float(t[0]) for t, _ in states))
+    # A sample that misses the end by rounding still counts.
+    low, high = int(np.ceil(first / step - 1e-6)), int(np.floor(min(ends) / step + 1e-6))
+    if high - low < 1:
+        raise ValueError(f"the repeats have no common part: {', '.join(str(b) for b in bags)}")
+    return step * np.arange(low, high + 1)
+
+
+def _channels(
+    states: Sequence[_Timed],
+    clock: np.ndarray,
+    joints: tuple[str, ...],
+    slides: Sequence[str],
+    bags: Sequence[Path],
+) -> dict[str, Channel]:
+    """torque, position and velocity on the common clock, those of them that all bags hold and measured."""
+    lacking = [bag for bag, (_, fields) in zip(bags, states, strict=True) if "effort" not in fields]
+    if lacking:
+        raise ValueError(f"{lacking[0]}: the joint states hold no effort, so there is no torque to compare")
+    channels = {}
+    for name, field in FIELDS.items():
+        if not all(field in fields for _, fields in states):
+            continue
+        values = np.stack([interpolate(clock, t, fields[field]) for t, fields in states])
+        seen = np.stack([~in_gap(clock, t) for t, _ in states])
+        mask = seen[:, :, None] & np.isfinite(values)
+        if not mask.any(axis=(1, 2)).all():  # a driver that does not measure it says NaN
+            continue
+        hinge, slide = UNITS[name]
+        unit = " or ".join(dict.fromkeys(slide if joint in slides else hinge for joint in joints))
+        channels[name] = Channel(name, unit, joints, clock, values, mask)
+    return channels
+
+
+def _command(
+    commands: Sequence[_Timed],
+    clock: np.ndarray,
+    joints: tuple[str, ...],
+    tolerance: float,
+    bags: Sequence[Path],
+) -> np.ndarray:
+    """[T, U] the first bag's command; ValueError when another bag's differs by more than tolerance."""
+    for bag, (_, fields) in zip(bags, commands, strict=True):
+        if "position" not in fields:
+            raise ValueError(f"{bag}: the command messages hold no positions")
+    every = [interpolate(clock, t, fields["position"]) for t, fields in commands]
+    for bag, command in zip(bags[1:], every[1:], strict=True):
+        gap = np.abs(command - every[0])
+        i, j = np.unravel_index(int(np.argmax(gap)), gap.shape)
+        if gap[i, j] > tolerance:
+            raise ValueError(
+                f"{bag}: its command is not that of {bags[0]}, joint {joints[j]!r} differs by "
+                f"{gap[i, j]:.4g} at {clock[i]:.3f} s; repeats must replay one motion, within "
+                f"--command-tolerance {tolerance:g} (command_tolerance)"
+            )
+    return every[0]
+
+
+def _initial(channels: Mapping[str, Channel]) -> dict[str, float]:
+    """Joint -> first measured position, mean over the repeats that measured it; nothing without positions."""
+    if "position" not in channels:
+        return {}
+    position = channels["position"]
+    first, seen = position.values[:, 0], position.mask[:, 0]
+    return {joint: float(first[seen[:, c], c].mean()) for c, joint in enumerate(position.columns) if seen[:, c].any()}

@@ -1,0 +1,94 @@
+"""The C twin of the servo replay: the same commands, values and outputs through plain C MuJoCo.
+
+It is the parity oracle, the CPU benchmark, and the engine of `--engine mujoco`.  Of effects it knows those
+that write model fields, and the torque offsets; everything else needs MJX.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from droid_jax.model.effect_interface import Effect, Rollout
+from droid_jax.model.parameters import Space
+from droid_jax.model.physics import make_c_model, theta_of
+from droid_jax.model.scene import Scene
+from droid_jax.recordings.clocks import interpolate
+from droid_jax.recordings.recording import TorqueSide
+from droid_jax.simulate.c_engine import instrument, simulate
+from droid_jax.simulate.initial_state import weight_share
+from droid_jax.simulate.replay import Drive, check_gains, check_stateless
+
+CHUNK = 64  # samples whose traces of the whole state are held at once
+
+
+def twin_replay(
+    scene: Scene, space: Space, drive: Drive, effects: Sequence[Effect] = (), *, late: float = 0.5
+) -> Callable[[np.ndarray], Rollout]:
+    """values [P, D] -> Rollout with a leading [P], float64, on all cores.
+
+    late: steps by which commands come late, and positions and velocities are told ahead, which takes most of the
+    first-order error of C's steps out; 0 for what mj_step itself logs.
+    Effects with functions of their own raise ValueError, as does a recording whose torque is on the link
+    side, or contains the arm's weight where the actuators do not carry it, or the other way round (the C batch
+    interface returns the actuators' torque alone).
+    """
+    check_gains(scene, drive)
+    check_stateless(scene)
+    functions = ("command", "servo", "force", "frictionloss", "observe")
+    active = [e.name for e in effects if any(getattr(e, f) is not None for f in functions)]
+    if active:
+        raise ValueError(f"the C engine cannot run effects that depend on the state: {', '.join(active)}; use MJX")
+    share = weight_share(scene.model, scene.joint_dofs, drive.torque.gravity)
+    if drive.torque.side is TorqueSide.LINK or (scene.model.body_gravcomp.any() and share.any()):
+        raise ValueError(
+            "the C engine replays the actuators' torque alone: motor-side, and without gravity where the scene "
+            "compensates it; use MJX for this recording"
+        )
+    if scene.model.body_gravcomp.any() and any(w.field == "qpos0" for p in space.parameters for w in p.writes):
+        raise ValueError("the C engine compensates gravity where joints are, not where encoders say: use MJX")
+    plain = replace(scene, model=instrument(scene))
+
+    def piece(values: np.ndarray) -> Rollout:
+        models = [make_c_model(plain, space, row) for row in values]
+        thetas = [theta_of(space, row) for row in values]
+        control = np.stack([control_of(drive, t.get("time_offset", 0.0), late) for t in thetas])
+        trace = simulate(plain, models, drive.qpos0[None], control)
+        traces = (trace.torque, trace.position, trace.velocity, trace.object_angle[..., None])
+        ahead = late * drive.timestep
+        return Rollout(
+            time=np.broadcast_to(drive.time, trace.object_angle.shape),
+            torque=trace.torque + _offsets(scene, thetas)[:, None],
+            position=trace.position + ahead * trace.velocity,
+            velocity=_later(trace.velocity, late),
+            object_angle=trace.object_angle + ahead * trace.object_velocity,
+            contact=trace.contact,
+            finite=np.all([np.isfinite(t).all(axis=(1, 2)) for t in traces], axis=0),
+        )
+
+    def replay(values: np.ndarray) -> Rollout:
+        values = np.atleast_2d(np.asarray(values, dtype=np.float64))
+        pieces = [piece(values[i : i + CHUNK]) for i in range(0, len(values), CHUNK)]
+        fields = Rollout.__dataclass_fields__
+        return Rollout(**{f: np.concatenate([getattr(p, f) for p in pieces]) for f in fields})
+
+    return replay
+
+
+def _later(velocity: np.ndarray, late: float) -> np.ndarray:
+    """[P, T, J] velocities `late` steps ahead, the last one on a line: C's are half a step behind its positions."""
+    after = np.concatenate([velocity[:, 1:], 2 * velocity[:, -1:] - velocity[:, -2:-1]], axis=1)
+    return velocity + late * (after - velocity)
+
+
+def control_of(drive: Drive, time_offset: float = 0.0, late: float = 0.5) -> np.ndarray:
+    """[T, U] the command so many steps (and the time offset) late."""
+    at = drive.time - late * drive.timestep - time_offset
+    return interpolate(at, drive.time, drive.command)
+
+
+def _offsets(scene: Scene, thetas: Sequence[dict[str, float]]) -> np.ndarray:
+    """[P, J] N m constant torque-sensor errors."""
+    return np.array([[t.get(f"torque_offset[{j}]", 0.0) for j in scene.joints] for t in thetas])

@@ -1,0 +1,333 @@
+"""Replay one recording in simulation: the servo mode, a scan over time steps.
+
+`servo_replay` follows the recorded command through grasp and pull, as the paper does.  Recordings
+without commands are replayed by `compare.inverse`.  Both return a function Physics -> Rollout for
+ONE sample; `compare.population` makes a compiled, sharded batch of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from droid_jax.model.actuators import has_servo_damping
+from droid_jax.model.effect_interface import Effect, Rollout, State, Theta, column, complete
+from droid_jax.model.encoders import encoder_error, misplaced_compensation
+from droid_jax.model.physics import Physics
+from droid_jax.model.quiet_mjx import mjx
+from droid_jax.model.scene import Scene
+from droid_jax.model.step import servo_force
+from droid_jax.model.step import step as simulate_step
+from droid_jax.model.unsupported_features import check_options
+from droid_jax.recordings.checks import check_joints
+from droid_jax.recordings.clocks import interpolate
+from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSide
+from droid_jax.simulate.floating_base import refuse_floating
+from droid_jax.simulate.initial_state import check_weight, holding, start_pose, weight_share
+
+Replay = Callable[[Physics], Rollout]
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """A recording's command on the simulation's clock.
+
+    command: [T, U] rad or m, in the scene's actuator order, at times k * timestep.
+    qpos0:   [nq] start pose.
+    timestep: s.
+    torque:  convention of the measured torque.
+    stiffness: [U] servo gains stated by the recording, or None: the scene's own.
+    sent: [U] bool, actuators that the recording commands, the others hold their start; None: all.
+    """
+
+    command: np.ndarray
+    qpos0: np.ndarray
+    timestep: float
+    torque: TorqueConvention
+    stiffness: np.ndarray | None = None
+    sent: np.ndarray | None = None
+
+    @property
+    def time(self) -> np.ndarray:
+        """[T] s, from 0."""
+        return np.arange(len(self.command)) * self.timestep
+
+
+def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True) -> Drive:
+    """Resample a recording's command onto the simulation's clock and order its columns.
+
+    weigh: False where no torque is compared, so that it does not matter whether it contains the arm's weight.
+    Raises ValueError where the recording has no commands, its joints or the weight in its torque do not fit the
+    scene, or nothing tells where a joint starts (see `compare.start`).
+    """
+    if recording.command.size == 0:
+        raise ValueError(
+            f"recording {recording.name!r} holds no commands, so its servo cannot be replayed; use the inverse mode"
+        )
+    _check_driven(scene, recording)
+    columns = scene.command_index(recording.command_names)
+    check_joints(recording, scene.needs_command, also=(*scene.command_names, *scene.single_joints))
+    timestep = float(scene.model.opt.timestep)
+    start, end = float(recording.time[0]), float(recording.time[-1])
+    steps = int(np.floor((end - start) / timestep + 1e-6)) + 1
+    clock = start + np.arange(steps) * timestep
+    gains = recording.gains
+    qpos0 = start_pose(scene, recording)
+    held = holding(scene, qpos0)
+    refuse_floating(scene, recording, qpos0, held)
+    command = np.tile(held, (steps, 1))
+    sent = np.flatnonzero(columns >= 0)
+    if sent.size:
+        command[:, sent] = interpolate(clock, recording.time, recording.command[:, columns[sent]])
+    stiffness = scene.model.actuator_gainprm[:, 0] * scene.model.actuator_gear[:, 0] ** 2
+    if gains is not None:
+        stiffness[sent] = np.asarray(gains.stiffness, dtype=float)[columns[sent]]
+    if weigh:
+        check_weight(scene, recording, qpos0)
+    return Drive(
+        command=command,
+        qpos0=qpos0,
+        timestep=timestep,
+        torque=recording.torque,
+        stiffness=None if gains is None else stiffness,
+        sent=columns >= 0,
+    )
+
+
+def _check_driven(scene: Scene, recording: Recording) -> None:
+    """Raise ValueError where the scene has a joint that is commanded and no actuator for it."""
+    has = {scene.model.joint(i).name for i in range(scene.model.njnt)}
+    left = [j for j in recording.command_names if j in has and j not in scene.command_names]
+    if left or not scene.command_names:
+        lacks = f"actuator for {', '.join(left)}" if scene.command_names else "actuators"
+        coupled = int(np.sum(scene.model.eq_type == mujoco.mjtEq.mjEQ_JOINT))
+        mimic = f"; its {coupled} <mimic> became <equality><joint>" if coupled else ""
+        urdf = f" (a URDF holds none: save it as MJCF and add them there{mimic})" if not scene.command_names else ""
+        raise ValueError(
+            f"scene {scene.name!r} has no {lacks}, and recording {recording.name!r} holds commands: give each "
+            f"commanded joint a <position> servo in the MJCF{urdf}"
+        )
+
+
+def check_gains(scene: Scene, drive: Drive) -> None:
+    """Raise ValueError where the recording states servo gains that the scene does not have."""
+    if drive.stiffness is None:
+        return
+    own = scene.model.actuator_gainprm[:, 0] * scene.model.actuator_gear[:, 0] ** 2  # at the joint
+    servos = scene.model.actuator_biasprm[:, 1] != 0
+    for name, stated, has, servo in zip(scene.command_names, drive.stiffness, own, servos, strict=True):
+        if not np.isclose(stated, has, rtol=1e-3):
+            do = "build the scene with the recording's gains" if servo else "make it a <position> servo in the MJCF"
+            has_it = f"the scene has {has:g}" + ("" if servo else " and its actuator is no position servo")
+            raise ValueError(f"the recording states a servo gain of {stated:g} for {name}, {has_it}; {do}")
+
+
+def check_stateless(scene: Scene) -> None:
+    """Raise ValueError for actuators with an activation of their own, which the scan does not carry."""
+    if scene.model.na:
+        own = np.flatnonzero(scene.model.actuator_actnum > 0)
+        raise ValueError(
+            f"scene {scene.name!r} has actuators with a state of their own (activation), "
+            f"{', '.join(scene.command_names[u] for u in own)}; a replay needs plain position servos or motors: remove "
+            "dyntype or timeconst, and use <velocity> or <position> in place of <intvelocity>, <cylinder> and <muscle>"
+        )
+
+
+def servo_replay(
+    scene: Scene, drive: Drive, effects: Sequence[Effect] = (), *, parity: bool = False, late: float = 0.5
+) -> Replay:
+    """The scan over time steps that follows the command. Torques carry the time of the state they act on.
+
+    The scan carries only position, velocity and the solver's warm start: everything else in
+    mjx.Data is rebuilt each step, so that XLA drops what nobody reads.
+    The replay also takes another command [T, U] and start [nq]: repeats that start apart share one compiled program.
+    parity: step exactly as the C engine does (see `droid_jax.model.step`), for comparisons with it; then
+      `late` steps late (see `_command`).
+    """
+    check_options(scene.model, parity, f"a replay of scene {scene.name!r}")
+    check_gains(scene, drive)
+    check_stateless(scene)
+    template = mjx.make_data(scene.mjx)
+    fingers = finger_geoms(scene)
+    own = jnp.asarray(drive.command, jnp.float32), jnp.asarray(drive.qpos0, jnp.float32)
+    joints, positions = scene.joint_dofs, scene.joint_qpos
+    hinge = scene.qpos(scene.object_joint) if scene.object_joint else None
+    shift = late if parity else 0.0  # steps, of the command; of positions in the other direction
+    half = late if parity else 0.5  # steps from the velocity before a step to the one that is told
+    damping = has_servo_damping(scene.model)
+
+    def replay(physics: Physics, table: jax.Array = own[0], start: jax.Array = own[1]) -> Rollout:
+        model, theta = physics.model, complete(physics.theta, effects)
+        error = encoder_error(scene, model)
+
+        def step(carry, k):
+            qpos, qvel, warm, load = carry
+            state = State(k * drive.timestep, qpos, qvel, load, model)
+            ctrl = servo_given(_command(table, drive.timestep, k, shift, theta, effects), theta, state, effects)
+            before = template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm, ctrl=ctrl)
+            after = simulate_step(
+                rubbing(model, theta, state, effects),
+                before,
+                parity=parity,
+                servo_damping=damping,
+                push=push(theta, state, effects, error),
+            )
+            mean = 0.5 * (qvel + after.qvel)
+            servo = servo_force(model, after, mean) if damping and not parity else after.qfrc_actuator
+            torque = _joint_torque(model, before, after, servo, joints, drive, parity)
+            astray = misplaced_compensation(model, after, error)
+            if astray is not None and drive.torque.gravity:  # a torque with the weight holds what compensates it
+                torque = torque + astray[joints]
+            out = (
+                torque,
+                qpos[positions] + shift * drive.timestep * qvel[joints],
+                (qvel + half * (after.qvel - qvel))[joints],
+                qpos[hinge] + shift * drive.timestep * qvel[hinge] if hinge is not None else jnp.zeros(()),
+                _touching(after, fingers),
+            )
+            return (after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator), out
+
+        zero = jnp.zeros(scene.model.nv, jnp.float32)
+        steps = jnp.arange(len(drive.command), dtype=jnp.int32)
+        _, (torque, position, velocity, angle, contact) = jax.lax.scan(step, (start, zero, zero, zero), steps)
+        time = jnp.asarray(drive.time, jnp.float32)
+        rollout = Rollout(time, torque, position, velocity, angle, contact, jnp.array(True))
+        return observed(rollout, theta, effects)
+
+    return replay
+
+
+def _command(
+    table: jax.Array, timestep: float, k: jax.Array, late: float, theta: Theta, effects: Sequence[Effect]
+) -> jax.Array:
+    """[U] the command of step k, `late` steps late, and by `time_offset` of theta [s] on top.
+
+    C MuJoCo's implicitfast damps with a velocity half a step ahead of the position it computes
+    torques from; half a step of delay takes most of that first-order error out.  The replay's own
+    second-order step needs none.
+    """
+    last = table.shape[0] - 1
+
+    def look(time: jax.Array) -> jax.Array:
+        at = jnp.clip(time / timestep, 0.0, float(last))
+        low = jnp.minimum(at.astype(jnp.int32), last - 1)
+        part = at - low
+        return table[low] * (1 - part) + table[low + 1] * part
+
+    # In steps first: seconds that are added up in float32 lose a fifth of a step in ten seconds.
+    delay = late + jnp.asarray(theta.get("time_offset", 0.0), jnp.float32) / timestep
+    whole = jnp.floor(delay)
+    low = jnp.clip(k - whole.astype(jnp.int32) - 1, 0, last)
+    high = jnp.clip(k - whole.astype(jnp.int32), 0, last)
+    part = delay - whole
+    ctrl = table[high] * (1 - part) + table[low] * part
+    laws = [effect.command for effect in effects if effect.command is not None]
+    for law in laws:  # each law sees what the one before it made of the command
+        look = through(law, theta, look)
+    return look((k - delay) * timestep) if laws else ctrl
+
+
+def through(law: Callable, theta: Theta, look: Callable) -> Callable:
+    """What an effect's law makes of a command, look(t) -> [U]."""
+    return lambda time: law(theta, time, look)
+
+
+def servo_given(ctrl: jax.Array, theta: Theta, state: State, effects: Sequence[Effect]) -> jax.Array:
+    """[U] what the servos are given in place of the command."""
+    for effect in effects:
+        if effect.servo is not None:
+            ctrl = effect.servo(theta, state, ctrl)
+    return ctrl
+
+
+def rubbing(model, theta: Theta, state: State, effects: Sequence[Effect]):
+    """The model with the friction losses that effects give it in this state."""
+    loss = model.dof_frictionloss
+    for effect in effects:
+        if effect.frictionloss is not None:
+            loss = effect.frictionloss(theta, state, loss)
+    return model if loss is model.dof_frictionloss else model.replace(dof_frictionloss=loss)
+
+
+def push(
+    theta: Theta, state: State, effects: Sequence[Effect], error: jax.Array | None = None
+) -> Callable[[Any], jax.Array] | None:
+    """The forces of effects in this state, and of a gravity compensation that goes by encoders: of the pose, [nv].
+
+    error: [nv] by which joints stand further than their encoders say, None for nothing.
+    """
+    laws = [effect.force for effect in effects if effect.force is not None]
+    if not laws and error is None:
+        return None
+
+    def forces(pose: Any) -> jax.Array:
+        at = replace(state, pose=pose)
+        astray = misplaced_compensation(state.model, pose, error)
+        return sum((law(theta, at) for law in laws), jnp.zeros_like(state.qvel) if astray is None else astray)
+
+    return forces
+
+
+def observed(rollout: Rollout, theta: Theta, effects: Sequence[Effect]) -> Rollout:
+    """What the sensors make of a rollout, and the verdict on finiteness."""
+    for effect in effects:
+        if effect.observe is not None:
+            rollout = effect.observe(theta, rollout)
+    traces = (rollout.torque, rollout.position, rollout.velocity, rollout.object_angle)
+    finite = [jnp.all(jnp.isfinite(trace)) for trace in traces]
+    return replace(rollout, finite=jnp.all(jnp.stack(finite)))
+
+
+def torque_offset_effect(joints: Sequence[str]) -> Effect:
+    """Constant torque-sensor errors: reads `torque_offset[joint]` from theta, N m; absent means zero."""
+
+    def observe(theta: Theta, rollout: Rollout) -> Rollout:
+        return replace(rollout, torque=rollout.torque + column(theta, "torque_offset", joints))
+
+    return Effect("torque offset", observe=observe)
+
+
+def _joint_torque(model, before, after, servo: jax.Array, joints: np.ndarray, drive: Drive, parity: bool) -> jax.Array:
+    """[J] what the torque sensor reads: the motor's torque, or what reaches the link.
+
+    servo: [nv] N m, the actuators' forces of the step.
+    Between the two lie rotor inertia (armature) and the damping and dry friction of the joint, as
+    the step integrated them: with the velocity's difference over the step, and its mean (the C
+    engine: its end).
+    """
+    torque = servo[joints]
+    if drive.torque.side is TorqueSide.LINK:
+        gain = (after.qvel - before.qvel)[joints]
+        velocity = after.qvel[joints] - (0.0 if parity else 0.5) * gain
+        torque = torque - model.dof_armature[joints] * gain / drive.timestep - model.dof_damping[joints] * velocity
+        rows = after._impl
+        dry = slice(rows.ne, rows.ne + rows.nf)
+        torque = torque + (rows.efc_J[dry].T @ rows.efc_force[dry])[joints]
+    share = weight_share(model, joints, drive.torque.gravity)
+    return torque + share * after.qfrc_gravcomp[joints] if share.any() else torque
+
+
+def finger_geoms(scene: Scene) -> tuple[np.ndarray, ...]:
+    """For each finger, [pairs, 2] the sorted geom ids of its contact pairs."""
+    both = np.sort(np.stack([scene.model.pair_geom1, scene.model.pair_geom2], axis=1), axis=1)
+    return tuple(both[pairs] for pairs in scene.finger_pairs)
+
+
+def of_fingers(contact: Any, fingers: Sequence[np.ndarray]) -> list[jax.Array]:
+    """For each finger, [contacts] bool: which of MJX's contacts are of its pairs, as `finger_geoms` has them."""
+    geoms = jnp.sort(contact.geom, axis=1)  # [contacts, 2]
+    return [jnp.any(jnp.all(geoms[:, None] == pairs[None], axis=-1), axis=1) for pairs in fingers]
+
+
+def _touching(data, fingers: Sequence[np.ndarray]) -> jax.Array:
+    """[F] bool: does any contact of a finger's pairs penetrate?"""
+    if not fingers:
+        return jnp.zeros((0,), bool)
+    contact = data._impl.contact
+    return jnp.stack([jnp.any(mine & (contact.dist < 0)) for mine in of_fingers(contact, fingers)])

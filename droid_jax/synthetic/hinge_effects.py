@@ -1,0 +1,197 @@
+"""Hidden effects on a door's hinge.  Angle in rad from closed, speed in rad/s, torque in N m, positive opens.
+
+Each formula is a pure function of amplitude, angle and speed where it can be; its numbers are
+those of ordinary cabinet hardware and stand beside it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+import numpy as np
+
+from droid_jax.synthetic.hooks import Hidden, Influence, Live, Place, hinge_loss, hinge_torque
+
+BENT = 0.25  # of a leaning door's torque: hinges that are not in line
+
+
+def preload(a: float, q: float, v: float) -> float:
+    """-a (1 + q / 5): a coil spring wound up by 5 rad before it was mounted; a in N m at the closed door."""
+    return -a * (1.0 + q / 5.0)
+
+
+def binding_spring(a: float, q: float, v: float) -> float:
+    """-a s ln(1 + exp((q - 0.45) / s)): a second spring that the door meets at 0.45 rad, rounded over s = 0.02 rad.
+
+    a in N m/rad.
+    """
+    return -a * 0.02 * _softplus((q - 0.45) / 0.02)
+
+
+def over_centre(a: float, q: float, v: float) -> float:
+    """a g(q) / -g(0): a tension spring whose line of pull crosses the hinge axis at q_c = 0.40 rad.
+
+    L = sqrt(R² + r² + 2 R r cos(q - q_c)) is its length between the case (R = 34 mm from the axis) and
+    the door (r = 22 mm); g = (L - L_0) R r sin(q - q_c) / L with a free length L_0 of 30 mm.  It closes
+    below q_c and opens above; a in N m at the closed door.
+    """
+
+    def moment(angle: float) -> float:
+        length = math.sqrt(0.034**2 + 0.022**2 + 2 * 0.034 * 0.022 * math.cos(angle - 0.40))
+        return (length - 0.030) * math.sin(angle - 0.40) / length
+
+    return a * moment(q) / -moment(0.0)
+
+
+def magnetic_catch(a: float, q: float, v: float) -> float:
+    """-a (1 / (1 + (q / 0.03)²) - 0.12 exp(-((q - 0.14) / 0.04)²)): pulls in; further out its ring of iron pushes.
+
+    0.03 rad are 9 mm of gap at a lever of 0.3 m; a closed door (or one pressed in) has the full a, N m.
+    """
+    q = max(q, 0.0)
+    return -a * (1.0 / (1.0 + (q / 0.03) ** 2) - 0.12 * math.exp(-(((q - 0.14) / 0.04) ** 2)))
+
+
+def closer(a: float, q: float, v: float) -> float:
+    """a z(q) (|v| / 0.3)^1.6 while closing, nothing while opening: oil through a valve, and a check ball.
+
+    The latch valve below 0.15 rad is further open: z = 0.35 + 0.65 σ((q - 0.15) / 0.02), σ the logistic
+    function.  a in N m at 0.3 rad/s.
+    """
+    if v >= 0.0:
+        return 0.0
+    return a * (0.35 + 0.65 * _logistic((q - 0.15) / 0.02)) * (-v / 0.3) ** 1.6
+
+
+def opening_check(a: float, q: float, v: float) -> float:
+    """-a r(q) (v / 0.3)² while opening, r rising linearly from 0 at 0.35 rad to 1 at 0.70 rad; a in N m."""
+    if v <= 0.0:
+        return 0.0
+    return -a * min(max((q - 0.35) / 0.35, 0.0), 1.0) * (v / 0.3) ** 2
+
+
+def air_drag(a: float, q: float, v: float) -> float:
+    """-a (1 + 1.5 exp(-q / 0.12)) v |v|: drag of a panel, more of it where air must pass a narrow gap.
+
+    a in N m s²/rad².
+    """
+    return -a * (1.0 + 1.5 * math.exp(-max(q, 0.0) / 0.12)) * v * abs(v)
+
+
+def detent(a: float, q: float, v: float) -> float:
+    """-a x exp((1 - x²) / 2), x = (q - 0.50) / w: a ball in a worn groove, w = 0.04 rad before and 0.06 behind it.
+
+    a in N m, the largest torque on both flanks.
+    """
+    x = (q - 0.50) / (0.04 if q < 0.50 else 0.06)
+    return -a * x * math.exp(0.5 * (1.0 - x * x))
+
+
+def neighbour_door(a: float, q: float, v: float) -> float:
+    """-a (d / 0.1)^1.5 (1 + 0.8 v), never pulling, d = q - 0.55: a door that touches another one.
+
+    Contact after Hunt and Crossley (1975); a in N m at 0.1 rad of penetration.
+    """
+    if q <= 0.55:
+        return 0.0
+    return -a * ((q - 0.55) / 0.1) ** 1.5 * max(1.0 + 0.8 * v, 0.0)
+
+
+def floor_friction(a: float, q: float) -> float:
+    """a (0.6 σ((q - 0.30) / 0.03) + 0.4 σ((q - 0.60) / 0.04)): the door meets the floor, then a carpet's edge.
+
+    σ is the logistic function; a in N m of friction once both are met.
+    """
+    return a * (0.6 * _logistic((q - 0.30) / 0.03) + 0.4 * _logistic((q - 0.60) / 0.04))
+
+
+def pin_wobble(a: float, q: float) -> float:
+    """a cos⁴(5.5 q + 0.35): a bent pin that binds in its knuckles twice a revolution of 11; a in N m of friction."""
+    return a * math.cos(5.5 * q + 0.35) ** 4
+
+
+def tilted_frame(place: Place, a: float) -> Influence:
+    """The frame leans by a rad: axis · (c x M (R g - g)), the door's gravity torque as it turns, on bent hinges.
+
+    Its two hinges are not quite in line, so 0.25 of the torque's size comes and goes with the sine of three times
+    the angle turned.  R turns gravity about a horizontal line 30 degrees off the world's x axis (in the built-in
+    scene the door's inward normal: it leans along its panel and a little forward); c is the centre of everything
+    that the hinge carries, M its mass.  A positive lean closes the built-in door; a negative one swings
+    it open before it is grasped unless friction holds it.
+    """
+    q, v = place.scene.qpos(place.hinge), place.scene.dof(place.hinge)
+    start = [0.0, 0.0, 0.0]  # angle, and the torques before cosine and sine
+
+    def begin(live: Live) -> None:
+        torques = lean_torque(live.model, live.data, place.scene.id("joint", place.hinge), a)
+        start[:] = [float(live.position[q]), *torques]
+
+    def step(live: Live) -> None:
+        turned = float(live.position[q]) - start[0]
+        bent = BENT * math.hypot(*start[1:]) * math.sin(3.0 * turned)
+        live.applied[v] += start[1] * math.cos(turned) + start[2] * math.sin(turned) + bent
+
+    return Influence(begin=begin, step=step)
+
+
+def lean_torque(model: mujoco.MjModel, data: mujoco.MjData, joint: int, lean: float) -> list[float]:
+    """N m before the cosine and the sine of the angle turned since data's pose, for a lean in rad."""
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    body = int(model.jnt_bodyid[joint])
+    axis, arm = data.xaxis[joint], data.subtree_com[body] - data.xanchor[joint]
+    line = -np.array([math.cos(math.pi / 6), math.sin(math.pi / 6), 0.0])
+    g = model.opt.gravity
+    # Rodrigues' rotation, less the vector itself; all of it vanishes exactly with the lean
+    extra = np.cross(line, g) * math.sin(lean) + np.cross(line, np.cross(line, g)) * (1.0 - math.cos(lean))
+    weight = float(model.body_subtreemass[body]) * extra
+    return [float(axis @ np.cross(arm, weight)), float(axis @ np.cross(np.cross(axis, arm), weight))]
+
+
+def gasket(place: Place, a: float) -> Influence:
+    """-a s: a seal that holds the door by suction, s in 0..1 with a memory; a in N m.
+
+    s' = max(v, 0) / 0.015 (1 - s) - s / T: opening stretches the gap under the seal, air leaks in with
+    T = 0.5 s, or 8 ms once the lip has let go at 0.05 rad.
+    """
+    q, v = place.scene.qpos(place.hinge), place.scene.dof(place.hinge)
+    state = [0.0]
+
+    def step(live: Live) -> None:
+        state[0] = suction(state[0], float(live.position[q]), float(live.velocity[v]), live.timestep)
+        live.applied[v] += -a * state[0]
+
+    return Influence(step=step)
+
+
+def suction(s: float, q: float, v: float, h: float) -> float:
+    """The seal's state one step of h s later, exact for angle and speed held over the step."""
+    grow, leak = (max(v, 0.0) / 0.015 if q < 0.05 else 0.0), 1.0 / (0.5 if q < 0.05 else 0.008)
+    end = grow / (grow + leak)
+    return end + (s - end) * math.exp(-(grow + leak) * h)
+
+
+def _logistic(x: float) -> float:
+    return 0.5 * (1.0 + math.tanh(0.5 * x))
+
+
+def _softplus(x: float) -> float:
+    return max(x, 0.0) + math.log1p(math.exp(-abs(x)))
+
+
+DOOR = (
+    Hidden("hinge_preload", "N m", (0.2, 1.5), "hinge", hinge_torque(preload), "a wound coil spring", signed=True),
+    Hidden("binding_spring", "N m/rad", (1.0, 5.0), "hinge", hinge_torque(binding_spring), "a progressive spring"),
+    Hidden("over_centre", "N m", (0.2, 1.5), "hinge", hinge_torque(over_centre), "a self-closing hinge"),
+    Hidden("magnetic_catch", "N m", (0.3, 2.5), "hinge", hinge_torque(magnetic_catch), "a magnet at the frame"),
+    Hidden("closer", "N m", (0.3, 2.0), "hinge", hinge_torque(closer), "an oil damper that slows closing"),
+    Hidden("opening_check", "N m", (0.3, 2.0), "hinge", hinge_torque(opening_check), "a check near the end of opening"),
+    Hidden("air_drag", "N m s²/rad²", (1.0, 6.0), "hinge", hinge_torque(air_drag), "drag with the square of speed"),
+    Hidden("floor_friction", "N m", (0.3, 2.0), "hinge", hinge_loss(floor_friction), "the door drags on the floor"),
+    Hidden("tilted_frame", "rad", (0.02, 0.15), "hinge", tilted_frame, "the frame is out of plumb", signed=True),
+    Hidden("detent", "N m", (0.3, 1.5), "hinge", hinge_torque(detent), "a ball detent half-way; in no library"),
+    Hidden("pin_wobble", "N m", (0.2, 1.5), "hinge", hinge_loss(pin_wobble), "a bent hinge pin; in no library"),
+    Hidden("gasket", "N m", (0.3, 2.0), "hinge", gasket, "a seal that sucks; in no library"),
+    Hidden("neighbour_door", "N m", (0.1, 0.5), "hinge", hinge_torque(neighbour_door), "another door; in no library"),
+)

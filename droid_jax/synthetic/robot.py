@@ -1,0 +1,356 @@
+"""The stand-in robot: plain C MuJoCo with hidden physics, in place of a real Panda and a real door.
+
+It runs at another time step and integrator than the analysis, with values the analysis does not
+know, small errors from repeat to repeat, and sensor noise at the levels of a real Panda.  Its
+torque is the motor's, as the simulated servo's damping (Table I) cannot be seen on the link side;
+`SurrogateConfig.side` asks for the link side.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import mujoco
+import numpy as np
+import scipy.signal
+
+from droid_jax.arguments import check_fields, choice, number, several, whole
+from droid_jax.door.builtin import HINGE
+from droid_jax.door.space import JOINT_DAMPING, door_nuisances, door_space, torque_offsets
+from droid_jax.door.space import truth as table_i
+from droid_jax.files import STAND_IN_SOURCE as SOURCE
+from droid_jax.model.fields import time_offset
+from droid_jax.model.parameters import Parameter, Space
+from droid_jax.model.physics import make_c_model
+from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
+from droid_jax.recordings.checks import validate
+from droid_jax.recordings.clocks import interpolate
+from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
+from droid_jax.simulate.c_engine import Trace, instrument, simulate
+
+
+@dataclass(frozen=True)
+class SurrogateConfig:
+    """How the stand-in robot moves and measures.
+
+    repeats: N.
+    timestep: s; C MuJoCo's semi-implicit Euler, first order, so fine enough to stand for continuous time
+      (the analysis takes steps twenty or forty times as long, second order).  At 0.25 ms a door's recordings hold
+      U of about 0.001 that no parameter takes away: something seems to be missing where nothing is.
+    rate: Hz of torque and position samples.
+    torque_noise: N m, white, joints 1-4 and 5-7 (a real Panda: 0.03 to 0.08 at 1 kHz).
+    torque_drift: N m, first-order noise with a correlation time of 0.15 s, joints 1-4 and 5-7.
+    position_noise: rad.
+    angle_noise: rad, angle_rate: Hz: a camera on the door.
+    start_noise: rad, error of the start pose in each repeat.
+    pose_noise: m, error of the door's position in each repeat.
+    side: side of the joints at which the torque is measured.
+    """
+
+    repeats: int = 10
+    timestep: float = 0.0001
+    rate: float = 500.0
+    torque_noise: tuple[float, float] = (0.05, 0.03)
+    torque_drift: tuple[float, float] = (0.03, 0.015)
+    position_noise: float = 2e-5
+    angle_noise: float = 0.0035
+    angle_rate: float = 30.0
+    start_noise: float = 2e-4
+    pose_noise: float = 1e-4
+    side: TorqueSide = TorqueSide.MOTOR
+
+    def __post_init__(self) -> None:
+        noises = ("position_noise", "angle_noise", "start_noise", "pose_noise")
+        check_fields(
+            self,
+            **dict.fromkeys(noises, partial(number, least=0)),
+            **dict.fromkeys(("torque_noise", "torque_drift"), several(partial(number, least=0), 2)),
+            **dict.fromkeys(("timestep", "rate", "angle_rate"), partial(number, above=0)),
+            repeats=partial(whole, least=1),
+            side=partial(choice, kind=TorqueSide),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class StandIn:
+    """The stand-in robot before it moves, and what it shall repeat.
+
+    demonstration, truth, config, seed: as given to `record`.
+    scene: instrumented, at the stand-in's own time step and integrator.
+    models: [N], qpos0: [N, nq], each repeat with its own small errors.
+    clock: [T] s and control: [T, U] at the stand-in's own time step.
+    rng: what is left of the recording's randomness, for the sensors.
+    """
+
+    demonstration: Recording
+    truth: Mapping[str, float]
+    config: SurrogateConfig
+    seed: int
+    scene: Scene
+    models: list[mujoco.MjModel]
+    qpos0: np.ndarray
+    clock: np.ndarray
+    control: np.ndarray
+    rng: np.random.Generator
+
+
+DRIFT_TIME = 0.15  # s
+_WRIST = 4  # joints from here on have the smaller noise
+
+
+def draw_nuisances(scene: Scene, seed: int) -> dict[str, float]:
+    """One draw from the nuisances' priors: the same robot and door for all recordings made with it."""
+    space = door_nuisances(scene)
+    draw = np.random.default_rng([seed, 1]).normal(space.mean, space.std)
+    return dict(zip(space.names, np.clip(draw, space.low, space.high).tolist(), strict=True))
+
+
+def record(
+    scene: Scene,
+    demonstration: Recording,
+    truth: Mapping[str, float],
+    *,
+    seed: int,
+    config: SurrogateConfig | None = None,
+    name: str | None = None,
+) -> Recording:
+    """Repeat a demonstration N times on the stand-in robot and record it.
+
+    truth: hidden values by parameter name, of the door space and of its nuisances; what it does
+      not name has the scene's own value.
+    Raises ValueError for unknown names, and where a repeat blows up or loses the door (a
+    demonstration is safe by definition: choose another truth).
+    """
+    config = config or SurrogateConfig()
+    stand_in = set_up(scene, demonstration, truth, seed=seed, config=config)
+    trace = simulate(stand_in.scene, stand_in.models, stand_in.qpos0, stand_in.control[None])
+    return as_recording(stand_in, trace, sensor_torque(stand_in, trace), trace.position, name=name)
+
+
+def set_up(
+    scene: Scene,
+    demonstration: Recording,
+    truth: Mapping[str, float],
+    *,
+    seed: int,
+    config: SurrogateConfig,
+    space: Space | None = None,
+) -> StandIn:
+    """Models, start poses and commands of every repeat; `space` is what truth may speak of (default: the door's)."""
+    if config.repeats < 1:
+        raise ValueError(f"the stand-in robot needs at least one repeat, got {config.repeats}")
+    if not 0 < config.rate * config.timestep <= 1:
+        raise ValueError(
+            f"the stand-in robot measures at most once per time step, at {1 / config.timestep:g} Hz, got a rate of "
+            f"{config.rate:g} Hz"
+        )
+    rng = np.random.default_rng([seed, 2])
+    hidden = _hidden_scene(scene, config)
+    nominal = hidden.initial_qpos(dict(demonstration.qpos0))
+    models, qpos0 = _repeats(hidden, truth, nominal, config, rng, space)
+    if config.side is TorqueSide.LINK:
+        _check_link_side(hidden, models)
+    clock, control = _control(hidden, demonstration, config.timestep, truth.get("time_offset", 0.0))
+    return StandIn(demonstration, truth, config, seed, hidden, models, qpos0, clock, control, rng)
+
+
+def as_recording(
+    stand_in: StandIn, trace: Trace, torque: np.ndarray, position: np.ndarray, *, name: str | None = None
+) -> Recording:
+    """What the sensors make of a trace: torque and position [N, T, J] with offset and noise at the sensors' rates."""
+    demonstration, config = stand_in.demonstration, stand_in.config
+    scene, clock, rng = stand_in.scene, stand_in.clock, stand_in.rng
+    _check_opened(demonstration, clock, trace)
+    every = round(1.0 / (config.rate * config.timestep))
+    time = clock[::every]
+    torque = torque[:, ::every] + _offset(scene, stand_in.truth)
+    channels = {
+        "torque": _channel(
+            "torque",
+            scene.torque_unit(scene.joints),
+            scene.joints,
+            time,
+            torque + _torque_noise(torque.shape, config, rng),
+        ),
+        "position": _channel(
+            "position",
+            scene.position_unit(scene.joints),
+            scene.joints,
+            time,
+            position[:, ::every] + rng.normal(0, config.position_noise, torque.shape),
+        ),
+    }
+    if scene.object_joint:
+        channels["object_angle"] = _camera(scene, clock, trace.object_angle, config, rng)
+    return validate(
+        replace(
+            demonstration,
+            name=name or demonstration.name,
+            channels=channels,
+            torque=TorqueConvention(config.side, gravity=_carries_weight(scene)),
+            meta={"source": SOURCE, "seed": str(stand_in.seed)},
+        )
+    )
+
+
+def _carries_weight(scene: Scene) -> bool:
+    """Whether the measured torques contain the arm's weight: where no body of a measured joint is compensated,
+    or where the joints' own motors do it (actuatorgravcomp)."""
+    model = scene.model
+    joints = [scene.id("joint", j) for j in scene.joints]
+    elsewhere = (model.body_gravcomp[model.jnt_bodyid[joints]] != 0) & (model.jnt_actgravcomp[joints] == 0)
+    return bool(model.opt.gravity.any()) and not elsewhere.any()
+
+
+def _hidden_scene(scene: Scene, config: SurrogateConfig) -> Scene:
+    """The scene instrumented, at the stand-in's own time step, integrator and solver effort."""
+    hidden = replace(scene, model=own_engine(copy.copy(scene.model), config.timestep))
+    return replace(hidden, model=instrument(hidden))
+
+
+def own_engine(model: mujoco.MjModel, timestep: float) -> mujoco.MjModel:
+    """The model with the stand-in's own time step, integrator and solver effort set."""
+    model.opt.timestep, model.opt.integrator = timestep, mujoco.mjtIntegrator.mjINT_EULER
+    model.opt.iterations, model.opt.ls_iterations = 100, 50
+    return model
+
+
+def _repeats(
+    hidden: Scene,
+    truth: Mapping[str, float],
+    nominal: np.ndarray,
+    config: SurrogateConfig,
+    rng: np.random.Generator,
+    space: Space | None,
+) -> tuple[list[mujoco.MjModel], np.ndarray]:
+    """Models [N] and start poses [N, nq], each with its own small errors."""
+    space = _space(hidden, truth, space)
+    axes = [axis for axis in ("door_x", "door_y") if axis in space.names]
+    models, poses = [], []
+    for _ in range(config.repeats):
+        values = space.values(dict(truth))
+        for axis in axes:
+            values[space.index(axis)] += rng.normal(0, config.pose_noise)
+        models.append(make_c_model(hidden, space, values))
+        pose = nominal.copy()
+        pose[hidden.joint_qpos] += rng.normal(0, config.start_noise, len(hidden.joints))
+        poses.append(pose)
+    return models, np.array(poses)
+
+
+def _space(hidden: Scene, truth: Mapping[str, float], space: Space | None) -> Space:
+    """Every parameter the stand-in can have, around the scene's own values.
+
+    Without a space: Table I and the nuisances for a door that is held, sensor offsets and timing otherwise.
+    """
+    if space is None and hidden.object_joint == HINGE and hidden.grip:
+        space = door_space(hidden) + door_nuisances(hidden)
+    elif space is None:
+        space = Space((time_offset(), *torque_offsets(hidden.joints)))
+    own = {p.name: (_own_value(hidden, p), p.std) for p in space.parameters if p.writes and not p.nuisance}
+    for name in truth:
+        space.index(name)
+    return space.with_prior(**own)
+
+
+def _own_value(scene: Scene, parameter: Parameter) -> float:
+    """The parameter's value in the scene as it is."""
+    first = parameter.writes[0]
+    return float(first.neutral(getattr(scene.model, first.field)[first.index]))
+
+
+def _control(hidden: Scene, demonstration: Recording, timestep: float, delay: float) -> tuple[np.ndarray, np.ndarray]:
+    """Clock [T] and commands [T, U] of the stand-in's own time step."""
+    columns = hidden.command_index(demonstration.command_names)
+    if without := [n for n, c in zip(hidden.command_names, columns, strict=True) if c < 0]:
+        raise ValueError(f"the stand-in robot needs a command for {', '.join(without)} too; the demonstration has none")
+    start, end = demonstration.time[0], demonstration.time[-1]
+    clock = start + np.arange(int((end - start) / timestep + 1e-6) + 1) * timestep
+    return clock, interpolate(clock - delay, demonstration.time, demonstration.command[:, columns])
+
+
+def _check_opened(demonstration: Recording, clock: np.ndarray, trace: Trace) -> None:
+    if not np.isfinite(trace.torque).all():
+        raise ValueError("the stand-in robot's simulation became unstable with these values")
+    window = demonstration.grip_window
+    if window is None or trace.contact.shape[-1] == 0:
+        return
+    held = trace.contact[:, (clock >= window[0]) & (clock <= window[1])].all(axis=-1)
+    lost = np.flatnonzero(held.mean(axis=1) < 0.99)
+    if lost.size:
+        raise ValueError(f"the stand-in robot lost its grasp in repeat {lost[0]} (too little friction for this door?)")
+
+
+def _check_link_side(scene: Scene, models: Sequence[mujoco.MjModel]) -> None:
+    """ValueError where the model's own dry friction stands between motor and link: no sensor of C MuJoCo tells it."""
+    friction = np.max([m.dof_frictionloss[scene.joint_dofs] for m in models], axis=0)
+    if rubs := [joint for joint, loss in zip(scene.joints, friction, strict=True) if loss > 1.001 * TINY_FRICTIONLOSS]:
+        raise ValueError(
+            f"the stand-in robot cannot tell the torque on the link side of joints with a frictionloss of their own "
+            f"({', '.join(rubs)}): take it out of the scene and hide joint_stribeck instead, or measure at the motor"
+        )
+
+
+def sensor_torque(stand_in: StandIn, trace: Trace) -> np.ndarray:
+    """[N, T, J] N m at the motor, or at the link: without rotor inertia and joint damping."""
+    if stand_in.config.side is TorqueSide.MOTOR:
+        return trace.torque
+    dofs = stand_in.scene.joint_dofs
+    acceleration = np.gradient(trace.velocity, stand_in.config.timestep, axis=1)
+    armature = np.array([m.dof_armature[dofs] for m in stand_in.models])[:, None]
+    damping = np.array([m.dof_damping[dofs] for m in stand_in.models])[:, None]
+    return trace.torque - armature * acceleration - damping * trace.velocity
+
+
+def _offset(scene: Scene, truth: Mapping[str, float]) -> np.ndarray:
+    """[J] N m constant sensor errors."""
+    return np.array([truth.get(f"torque_offset[{j}]", 0.0) for j in scene.joints])
+
+
+def _torque_noise(shape: tuple[int, ...], config: SurrogateConfig, rng: np.random.Generator) -> np.ndarray:
+    """White noise and slow first-order noise, [N, T, J] N m."""
+    wrist = np.arange(shape[-1]) >= _WRIST
+    white = np.where(wrist, config.torque_noise[1], config.torque_noise[0])
+    slow = np.where(wrist, config.torque_drift[1], config.torque_drift[0])
+    keep = np.exp(-1.0 / (config.rate * DRIFT_TIME))
+    innovation = rng.normal(size=shape) * np.sqrt(1 - keep**2)
+    innovation[:, 0] = rng.normal(size=(shape[0], shape[2]))
+    drift = scipy.signal.lfilter([1.0], [1.0, -keep], innovation, axis=1)
+    return white * rng.normal(size=shape) + slow * drift
+
+
+def _camera(
+    scene: Scene, clock: np.ndarray, angle: np.ndarray, config: SurrogateConfig, rng: np.random.Generator
+) -> Channel:
+    """The door's angle on the camera's own clock, [N, Tc, 1] rad (m of a slide)."""
+    joint = str(scene.object_joint)
+    time = np.arange(clock[0], clock[-1], 1.0 / config.angle_rate)
+    values = np.stack([np.interp(time, clock, row) for row in angle])[..., None]
+    return _channel(
+        "object_angle",
+        scene.position_unit([joint]),
+        (joint,),
+        time,
+        values + rng.normal(0, config.angle_noise, values.shape),
+    )
+
+
+def _channel(name: str, unit: str, columns: tuple[str, ...], time: np.ndarray, values: np.ndarray) -> Channel:
+    return Channel(name, unit, columns, time, values.astype(np.float32), np.ones(values.shape, bool))
+
+
+def is_stand_in(recording: Recording) -> bool:
+    """Whether the stand-in robot made a recording, whichever file it has been through since."""
+    return recording.meta.get("source") == SOURCE
+
+
+def stand_in_truth(scene: Scene, springs: int, seed: int, *, nuisances: bool = True) -> dict[str, float]:
+    """Hidden values of a stand-in robot and door: a fitted column of Table I, joint dampings up to
+    some 15 % off the scene's, and (optionally) one draw of the nuisances."""
+    rng = np.random.default_rng([seed, 3])
+    space = door_space(scene)
+    damping = {n: float(space[n].mean * np.exp(rng.normal(0, 0.07))) for n in JOINT_DAMPING}
+    return {**table_i(springs), **damping, **(draw_nuisances(scene, seed) if nuisances else {})}

@@ -1,0 +1,470 @@
+"""Equation 1 against a plain loop, the failure term, and residuals in noise units."""
+
+from __future__ import annotations
+
+import copy
+import tracemalloc
+from collections.abc import Mapping
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+
+from droid_jax.cost import observation as measured
+from droid_jax.cost.residuals import CompareConfig, Comparison, make_comparison
+from droid_jax.door.scene import door_scene
+from droid_jax.model.effect_interface import Rollout
+from droid_jax.model.scene import Scene, compile_scene
+from droid_jax.recordings.recording import Channel, Phase, Recording, TorqueConvention, TorqueSide
+
+JOINTS = ("a", "b", "c")
+STEP, STEPS = 0.002, 1001
+CLOCK = STEP * np.arange(STEPS)
+XML = """<mujoco><worldbody><body><joint name="a" axis="0 1 0"/><geom size=".1"/>
+  <body pos="0 0 1"><joint name="b" axis="0 1 0"/><geom size=".1"/>
+  <body pos="0 0 1"><joint name="c" axis="0 1 0"/><geom size=".1"/></body></body></body></worldbody>
+  <actuator><position joint="a"/><position joint="b"/><position joint="c"/></actuator></mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return compile_scene(mujoco.MjSpec.from_string(XML), "chain")
+
+
+@pytest.fixture(scope="module")
+def door() -> Scene:
+    return door_scene()
+
+
+def smooth_traces(columns: int, seed: int, clock: np.ndarray = CLOCK) -> np.ndarray:
+    """[T, C] sums of sines below 3 Hz with an amplitude of about 3."""
+    rng = np.random.default_rng(seed)
+    waves = [
+        rng.normal(0, 1.5, columns)
+        * np.sin(2 * np.pi * rng.uniform(0.2, 3, columns) * clock[:, None] + rng.normal(size=columns))
+        for _ in range(4)
+    ]
+    return np.sum(waves, axis=0) + rng.normal(0, 2, columns)
+
+
+def rollout(**parts) -> Rollout:
+    start = dict(
+        time=CLOCK,
+        torque=smooth_traces(3, 1),
+        position=smooth_traces(3, 2),
+        velocity=smooth_traces(3, 3),
+        object_angle=np.linspace(0, 0.8, STEPS),
+        contact=np.ones((STEPS, 2), bool),
+        finite=np.array(True),
+    )
+    return Rollout(**{**start, **parts})
+
+
+def channel(name: str, time: np.ndarray, values: np.ndarray, columns=JOINTS, mask: np.ndarray | None = None) -> Channel:
+    unit = {"torque": "N m", "velocity": "rad/s"}.get(name, "rad")
+    return Channel(name, unit, tuple(columns), time, values, np.ones(values.shape, bool) if mask is None else mask)
+
+
+def recording(*channels: Channel, start: float = 0.0, phases: tuple[Phase, ...] = ()) -> Recording:
+    return Recording(
+        name="test",
+        time=start + CLOCK,
+        command=np.zeros((STEPS, 3)),
+        command_names=JOINTS,
+        channels={c.name: c for c in channels},
+        torque=TorqueConvention(TorqueSide.MOTOR, False),
+        qpos0={},
+        phases=phases,
+    )
+
+
+def rows(data: Recording) -> np.ndarray:
+    """[STEPS] s, the replay's clock."""
+    return data.time[0] + STEP * np.arange(STEPS)
+
+
+def compare(scene: Scene, data: Recording, **config) -> Comparison:
+    return make_comparison(scene, data, rows(data), CompareConfig(**config))
+
+
+def equation_1(channels: Mapping[str, tuple[Channel, float, np.ndarray]], clock: np.ndarray) -> float:
+    """sum over channels of w * 1/N sum_r 1/T_r sum_t ||tau_s(t) - tau_r(t)||, one number at a time."""
+    total = 0.0
+    for c, weight, simulated in channels.values():
+        repeats = []
+        for n in range(len(c.values)):
+            norms = []
+            for k, at in enumerate(c.time):
+                if not clock[0] <= at <= clock[-1]:
+                    continue
+                squares = [
+                    (np.interp(at, clock, simulated[:, JOINTS.index(j)]) - c.values[n, k, i]) ** 2
+                    for i, j in enumerate(c.columns)
+                    if c.mask[n, k, i]
+                ]
+                if squares:
+                    norms.append(np.sqrt(sum(squares)))
+            repeats.append(np.mean(norms))
+        total += weight * np.mean(repeats)
+    return float(total)
+
+
+def test_distance_is_equation_1(scene: Scene):
+    """Three repeats, other clocks, columns in another order, holes, NaN where nothing was measured."""
+    rng = np.random.default_rng(4)
+    time = np.sort(rng.uniform(0, 2.0, 150))
+    values = rng.normal(0, 2, (3, 150, 2))
+    mask = rng.random(values.shape) > 0.3
+    mask[1, 20:60] = False
+    torque = channel("torque", time, np.where(mask, values, np.nan), ("c", "a"), mask)
+    slow = np.arange(0, 2.0, 1 / 30)
+    position = channel("position", slow, rng.normal(size=(3, len(slow), 3)))
+    weights = {"torque": 0.7, "position": 4.0}
+    # the holes of `torque` are too long to be whitened: the loop must agree before any of that
+    mask[0, :, :] |= True
+    torque.values[:] = np.where(mask, values, np.nan)
+    comparison = compare(scene, recording(torque, position), channels=weights)
+    simulated = rollout()
+    expected = equation_1(
+        {"torque": (torque, 0.7, simulated.torque), "position": (position, 4.0, simulated.position)}, CLOCK
+    )
+    assert float(comparison.distance(simulated)) == pytest.approx(expected, rel=1e-5)
+
+
+def test_a_clock_that_starts_late_is_understood(scene: Scene):
+    """Recording and channel in seconds since something: only differences count."""
+    values = np.random.default_rng(0).normal(size=(2, STEPS, 3))
+    now = compare(scene, recording(channel("torque", CLOCK, values)))
+    later = compare(scene, recording(channel("torque", 100.0 + CLOCK, values), start=100.0))
+    assert float(later.distance(rollout())) == pytest.approx(float(now.distance(rollout())), rel=1e-5)
+    expected = np.mean(np.linalg.norm(values - rollout().torque, axis=-1))
+    assert float(now.distance(rollout())) == pytest.approx(expected, rel=1e-5)
+
+
+def test_samples_beyond_the_replay_are_left_out(scene: Scene):
+    time = np.arange(-0.5, 3.0, 0.01)
+    inside = (time >= 0) & (time <= CLOCK[-1] + 1e-9)
+    values = np.random.default_rng(1).normal(size=(1, len(time), 3))
+    values[:, ~inside] = 1e6
+    simulated = np.stack([np.interp(time[inside], CLOCK, c) for c in rollout().torque.T], axis=1)
+    expected = np.mean(np.linalg.norm(values[0, inside] - simulated, axis=-1))
+    got = compare(scene, recording(channel("torque", time, values))).distance(rollout())
+    assert float(got) == pytest.approx(expected, rel=1e-5)
+
+
+def test_a_repeat_that_was_not_measured_counts_in_no_mean(scene: Scene):
+    simulated = rollout()
+    values = np.stack([np.asarray(simulated.torque) + np.array([1.0, 0.0, 0.0])] * 4)
+    mask = np.ones(values.shape, bool)
+    mask[3] = False
+    measured = recording(channel("torque", CLOCK, values, mask=mask))
+    assert float(compare(scene, measured).distance(simulated)) == pytest.approx(1.0, rel=1e-5)
+
+
+# ----- beta
+
+
+PHASES = (Phase("approach", 0.0, 0.4), Phase("grasp", 0.4, 0.6), Phase("opening", 0.6, 1.8))
+
+
+def door_comparison(door: Scene, *, angle: np.ndarray | None = None, phases=PHASES, **config) -> Comparison:
+    values = np.random.default_rng(0).normal(size=(2, STEPS, 7))
+    channels = [channel("torque", CLOCK, values, [f"panda_joint{i}" for i in range(1, 8)])]
+    if angle is not None:
+        channels.append(channel("object_angle", CLOCK, np.tile(angle[:, None], (2, 1, 1)), ["hinge"]))
+    data = recording(*channels, phases=phases)
+    return make_comparison(door, data, rows(data), CompareConfig(**config))
+
+
+def door_rollout(**parts) -> Rollout:
+    return rollout(torque=smooth_traces(7, 1), **parts)
+
+
+def contact(*gaps: tuple[float, float, int]) -> np.ndarray:
+    """Both fingers touch from 0.5 s on, but for gaps (start, end, finger)."""
+    out = np.zeros((STEPS, 2), bool)
+    out[CLOCK >= 0.5] = True
+    for start, end, finger in gaps:
+        out[(start <= CLOCK) & (end > CLOCK), finger] = False
+    return out
+
+
+@pytest.mark.parametrize(
+    ("gaps", "lost"),
+    [
+        ((), False),
+        (((0.8, 0.85, 0),), False),  # a bounce: 3.6 % of the gripping time
+        (((0.8, 0.95, 1),), True),
+        (((0.8, 0.84, 0), (1.0, 1.04, 1)), True),  # 2.9 % each, 5.7 % together
+        (((1.99, 2.1, 0),), True),  # lost at the very end
+        (((0.0, 0.55, 0),), False),  # before the grasp has ended nothing is asked
+    ],
+)
+def test_a_lost_grasp_costs_c(door: Scene, gaps: tuple, lost: bool):
+    comparison = door_comparison(door)
+    held = door_rollout(contact=contact())
+    tried = door_rollout(contact=contact(*gaps))
+    assert bool(comparison.failed(tried)) is lost
+    extra = float(comparison.distance(tried)) - float(comparison.distance(held))
+    assert extra == pytest.approx(10.0 if lost else 0.0, abs=1e-4)
+
+
+def test_after_the_release_nothing_is_held(door: Scene):
+    phases = (*PHASES, Phase("release", 1.8, 2.0))
+    let_go = contact((1.8, 2.1, 0), (1.8, 2.1, 1))
+    assert not door_comparison(door, phases=phases).failed(door_rollout(contact=let_go))
+    assert door_comparison(door).failed(door_rollout(contact=let_go))
+
+
+def test_without_phases_no_grasp_is_asked_for(door: Scene):
+    nothing = door_rollout(contact=np.zeros((STEPS, 2), bool))
+    assert not door_comparison(door, phases=()).failed(nothing)
+
+
+@pytest.mark.parametrize(("opened", "shut"), [(0.05, True), (0.086, True), (0.09, False), (0.5, False)])
+def test_a_door_that_stays_shut_costs_c(door: Scene, opened: float, shut: bool):
+    """Five degrees at least."""
+    tried = door_rollout(object_angle=np.linspace(0, opened, STEPS))
+    comparison = door_comparison(door, failure_cost=3.0)
+    assert bool(comparison.failed(tried)) is shut
+    extra = float(comparison.distance(tried)) - float(comparison.distance(door_rollout()))
+    assert extra == pytest.approx(3.0 if shut else 0.0, abs=1e-4)
+
+
+def test_a_door_must_open_half_as_far_as_the_measured_one(door: Scene):
+    comparison = door_comparison(door, angle=np.linspace(0, 0.8, STEPS))
+    for opened, shut in ((0.39, True), (0.41, False)):
+        assert bool(comparison.failed(door_rollout(object_angle=np.linspace(0, opened, STEPS)))) is shut
+
+
+def test_a_lid_may_open_downwards_from_anywhere(door: Scene):
+    """Its angle grows less: how far it has moved counts, and not where it is."""
+    comparison = door_comparison(door, angle=np.linspace(-0.3, -1.1, STEPS))
+    for opened, shut in ((0.39, True), (0.41, False)):
+        assert bool(comparison.failed(door_rollout(object_angle=np.linspace(-0.3, -0.3 - opened, STEPS)))) is shut
+
+
+def test_of_a_drawer_only_the_measured_one_says_what_is_shut(door: Scene):
+    """Five degrees are no distance."""
+    model = copy.copy(door.model)
+    model.jnt_type[door.id("joint", "hinge")] = mujoco.mjtJoint.mjJNT_SLIDE
+    drawer = replace(door, model=model)
+    assert not door_comparison(drawer).failed(door_rollout(object_angle=np.zeros(STEPS)))
+    comparison = door_comparison(drawer, angle=np.linspace(0, 0.06, STEPS))
+    for opened, shut in ((0.025, True), (0.035, False)):
+        assert bool(comparison.failed(door_rollout(object_angle=np.linspace(0, opened, STEPS)))) is shut
+
+
+def test_a_log_without_commands_grips_and_opens_nothing(door: Scene):
+    """Nothing was replayed that could have failed."""
+    values = np.random.default_rng(0).normal(size=(2, STEPS, 7))
+    joints = [f"panda_joint{i}" for i in range(1, 8)]
+    log = recording(channel("torque", CLOCK, values, joints), phases=PHASES)
+    log = replace(log, time=np.zeros(0), command=np.zeros((0, 0)), command_names=())
+    comparison = make_comparison(door, log, CLOCK, CompareConfig())
+    assert not comparison.failed(door_rollout(object_angle=np.zeros(STEPS), contact=np.zeros((STEPS, 0), bool)))
+
+
+# ----- replays that blew up
+
+
+@pytest.mark.parametrize("whitened", [False, True])
+def test_a_replay_that_blew_up_has_finite_costs(scene: Scene, whitened: bool):
+    values = np.random.default_rng(0).normal(size=(2, STEPS, 3))
+    comparison = compare(scene, recording(channel("torque", CLOCK, values)), whitened=whitened)
+    for bad in (np.nan, np.inf, 1e38):
+        torque = smooth_traces(3, 1)
+        torque[400:] = bad
+        tried = rollout(torque=torque, finite=np.array(bool(np.isfinite(torque).all())))
+        cost = float(comparison.distance(tried))
+        assert np.isfinite(cost) and cost >= 999.9
+        assert np.isnan(np.asarray(comparison.whitened(tried))).all()
+
+
+# ----- whitened residuals
+
+
+def noisy(truth: np.ndarray, rng: np.random.Generator, repeats: int) -> np.ndarray:
+    """White and first-order noise on every repeat, [N, T, C]."""
+    out = np.empty((repeats, *truth.shape))
+    for n in range(repeats):
+        slow = np.zeros(truth.shape)
+        for t in range(1, len(truth)):
+            slow[t] = 0.987 * slow[t - 1] + 0.16 * 0.03 * rng.normal(size=truth.shape[1])
+        out[n] = truth + slow + 0.05 * rng.normal(size=truth.shape)
+    return out
+
+
+def test_the_truth_has_residuals_of_one(scene: Scene):
+    truth, rng = smooth_traces(3, 1), np.random.default_rng(8)
+    squares, other = [], []
+    for _ in range(6):
+        data = recording(channel("torque", CLOCK, noisy(truth, rng, 10)))
+        comparison = compare(scene, data)
+        squares.append(np.mean(np.asarray(comparison.whitened(rollout(torque=truth))) ** 2))
+        other.append(np.mean(np.asarray(comparison.whitened(rollout(torque=truth + 0.2))) ** 2))
+    # Ten repeats know their own noise to a quarter; shrinking towards white noise errs on the large side.
+    assert 0.5 < np.mean(squares) < 1.3
+    assert np.mean(other) > 3 * np.mean(squares)
+
+
+def without_noise(scene: Scene, time: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
+    """Whitened residuals of a simulation that equals the data, in units of 0.01 N m white noise."""
+    truth = smooth_traces(3, 1)
+    data = np.stack([np.interp(time, CLOCK, c) for c in truth.T], axis=1)[None]
+    values = np.repeat(data, 2, axis=0)
+    comparison = compare(scene, recording(channel("torque", time, values, mask=mask)))
+    return np.asarray(comparison.whitened(rollout(torque=truth)))
+
+
+def test_equal_traces_have_no_residual(scene: Scene):
+    assert np.abs(without_noise(scene, CLOCK)).max() < 0.02
+
+
+def test_other_clocks_have_no_residual(scene: Scene):
+    """1 kHz and 200 Hz: the same filter, sampled otherwise."""
+    for rate in (1000.0, 200.0):
+        time = np.arange(0, CLOCK[-1] + 1e-9, 1 / rate)
+        assert np.abs(without_noise(scene, time)).max() < 1.0, rate
+
+
+def test_a_channel_that_covers_part_of_the_motion_has_no_residual(scene: Scene):
+    """The filter is cut at the ends of the data; the simulation must be cut in the same place."""
+    time = np.arange(0.5, 1.5, STEP)
+    assert np.abs(without_noise(scene, time)).max() < 1.0
+
+
+def test_holes_in_the_data_make_no_residual(scene: Scene):
+    """Single samples and stretches of 50 ms that were not measured, in either repeat."""
+    mask = np.random.default_rng(5).random((2, STEPS, 3)) > 0.05
+    mask[0, 300:325] = False
+    mask[1, 600:625] = False
+    assert np.abs(without_noise(scene, CLOCK, mask)).max() < 3.0
+
+
+def test_holes_do_not_multiply_the_memory(scene: Scene):
+    """The filter of each column stands for all repeats: no array of repeats x columns x samples x samples."""
+    values = np.random.default_rng(0).normal(size=(12, STEPS, 3))
+    mask = np.random.default_rng(1).random(values.shape) > 0.05
+    tracemalloc.start()
+    comparison = compare(scene, recording(channel("torque", CLOCK, values, mask=mask)))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 4 * comparison.channels[0].kernel.nbytes
+
+
+def test_the_noise_of_a_single_repeat_is_restated_for_every_channel(scene: Scene):
+    """What is left of a replay, in the channel's own unit."""
+    values = rollout().torque[None], rollout().position[None]
+    channels = [channel(n, CLOCK, v) for n, v in zip(("torque", "position"), values, strict=True)]
+    comparison = compare(scene, recording(*channels), channels={"torque": 1.0, "position": 1.0})
+    wave = np.sin(2 * np.pi * 1.5 * CLOCK)[:, None]
+    tried = rollout(torque=rollout().torque + 0.5 * wave, position=rollout().position + 0.02 * wave)
+    restated = comparison.restated(tried)
+    torque, position = (1 / restated.channel(n).noise.whitener[:, 0, 0] for n in ("torque", "position"))
+    np.testing.assert_allclose(torque / position, 25.0, rtol=0.01)
+    assert np.all(torque > 0.3)
+    shape = restated.channel("position").noise.whitener.shape
+    assert np.mean(np.asarray(restated.whitened(tried)) ** 2) < 1.0 and shape == (3, shape[1], shape[1])
+
+
+def test_repeats_deviate_as_they_are_whitened(scene: Scene):
+    """A model that is one repeat leaves what the model that is the mean leaves, and that repeat's deviation."""
+    clean = smooth_traces(3, 2)
+    values = clean + np.array([0.2, -0.5, 0.3])[:, None, None] * smooth_traces(3, 5) + 0.01
+    comparison = compare(scene, recording(channel("torque", CLOCK, values)))
+    mean = np.asarray(comparison.whitened(rollout(torque=values.mean(axis=0))))
+    deviations = comparison.deviations()
+    assert np.abs(deviations).max() > 1.0
+    for n in range(3):
+        own = np.asarray(comparison.whitened(rollout(torque=values[n])))
+        np.testing.assert_allclose(deviations[n], own - mean, atol=0.02 * np.abs(deviations).max())
+
+
+@pytest.mark.parametrize("start", [0.0, 100.0])
+def test_the_grasp_is_looked_at_on_the_recordings_own_clock(door: Scene, start: float):
+    phases = tuple(Phase(p.name, p.start + start, p.end + start) for p in PHASES)
+    values = np.random.default_rng(0).normal(size=(2, STEPS, 7))
+    torque = channel("torque", start + CLOCK, values, [f"panda_joint{i}" for i in range(1, 8)])
+    data = recording(torque, start=start, phases=phases)
+    found = make_comparison(door, data, rows(data), CompareConfig())
+    assert found.grip_rows == door_comparison(door).grip_rows
+
+
+# ----- what is refused
+
+
+def test_a_dead_channel_is_refused(scene: Scene):
+    values = np.random.default_rng(0).normal(size=(2, STEPS, 3))
+    values[:, :, 1] = 0.0
+    with pytest.raises(ValueError, match=r"'torque', column 'b' never changes \(0 N m\)"):
+        compare(scene, recording(channel("torque", CLOCK, values)))
+
+
+def test_unknown_channels_and_joints_are_named(scene: Scene):
+    values = np.random.default_rng(0).normal(size=(2, STEPS, 3))
+    torque = channel("torque", CLOCK, values)
+    with pytest.raises(ValueError, match=r"unknown channel 'velocity'.*has: torque"):
+        compare(scene, recording(torque), channels={"velocity": 1.0})
+    current = Channel("current", "A", JOINTS, CLOCK, values, np.ones(values.shape, bool))
+    with pytest.raises(ValueError, match="'current' has no simulated counterpart"):
+        compare(scene, recording(current), channels={"current": 1.0})
+    with pytest.raises(ValueError, match="unknown joints d; valid: a, b, c"):
+        compare(scene, recording(channel("torque", CLOCK, values, ("a", "b", "d"))))
+    with pytest.raises(ValueError, match="'position' is not compared; compared: torque"):
+        compare(scene, recording(torque)).channel("position")
+
+
+def test_joints_that_were_left_out_are_not_compared(scene: Scene):
+    """A dead sensor among them harms nobody."""
+    values = np.random.default_rng(0).normal(size=(2, STEPS, 3))
+    values[:, :, 1] = 0.0
+    of = compare(replace(scene, joints=("c", "a")), recording(channel("torque", CLOCK, values)))
+    measured = of.channel("torque")
+    np.testing.assert_array_equal(measured.columns, [1, 0])  # a and c, in the recording's order
+    alone = compare(scene, recording(channel("torque", CLOCK, values[:, :, [0, 2]], ("a", "c"))))
+    np.testing.assert_allclose(measured.noise.mean, alone.channel("torque").noise.mean)
+
+
+def test_a_stretch_that_nobody_measured_is_refused(scene: Scene):
+    values = np.random.default_rng(0).normal(size=(2, STEPS, 3))
+    mask = np.ones(values.shape, bool)
+    mask[:, 200:600, 1] = False
+    with pytest.raises(ValueError, match=r"'torque', column 'b' has a stretch that no repeat measured, at 0\.45 s"):
+        compare(scene, recording(channel("torque", CLOCK, values, mask=mask)))
+
+
+def test_a_channel_outside_the_replay_is_refused(scene: Scene):
+    values = np.random.default_rng(0).normal(size=(2, 100, 3))
+    with pytest.raises(ValueError, match="torque"):
+        compare(scene, recording(channel("torque", 50.0 + 0.01 * np.arange(100), values)))
+
+
+def test_an_angle_without_an_object_is_refused(scene: Scene):
+    values = np.random.default_rng(0).normal(size=(2, STEPS, 1))
+    with pytest.raises(ValueError, match="object_angle"):
+        compare(scene, recording(channel("object_angle", CLOCK, values, ["hinge"])), channels={"object_angle": 1.0})
+
+
+def test_columns_that_were_silent_together_share_a_filter(scene: Scene):
+    values = np.stack([smooth_traces(3, 1)] * 3) + np.random.default_rng(0).normal(0, 0.05, (3, STEPS, 3))
+    mask = np.ones(values.shape, bool)
+    mask[1, 300:420] = False
+    together = make_comparison(
+        scene, recording(channel("torque", CLOCK, values, mask=mask)), CLOCK, CompareConfig()
+    ).channel("torque")
+    mask[1, 420, 0] = False  # and apart
+    apart = make_comparison(
+        scene, recording(channel("torque", CLOCK, values, mask=mask)), CLOCK, CompareConfig()
+    ).channel("torque")
+    assert len(together.kernel) == 1 and len(apart.kernel) == 3
+    np.testing.assert_allclose(apart.kernel[1], together.kernel[0], atol=1e-12)
+
+
+def test_a_recording_that_does_not_fit_into_memory_is_refused(scene: Scene, monkeypatch: pytest.MonkeyPatch):
+    given = recording(channel("torque", CLOCK, np.stack([smooth_traces(3, 1)] * 2)))
+    sizes = {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 100}
+    monkeypatch.setattr(measured.os, "sysconf", sizes.__getitem__)
+    with pytest.raises(ValueError, match=r"'torque' of 2 s needs 0\.0 GB.*convert --start S --end S"):
+        make_comparison(scene, given, CLOCK, CompareConfig())

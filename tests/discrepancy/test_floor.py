@@ -1,0 +1,54 @@
+"""U0: what a finer simulation does otherwise, less what the base parameters absorb, in one repeat's noise."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from small_gap import Small, small
+
+from droid_jax.discrepancy import discretisation_error as floor
+from droid_jax.discrepancy.discretisation_error import numerical_floor
+from droid_jax.identify.search import NotReplayed
+
+
+@pytest.fixture(scope="module")
+def found() -> Small:
+    return small()
+
+
+def of(found: Small, difference: np.ndarray) -> float:
+    """U0 where the finer simulation differs by [M] of the noise of the repeats' mean."""
+    case, base = found.case, found.base
+    coarse = case.fit.cost.whitened(base.values[None])
+    made: Any = SimpleNamespace(whitened=lambda rows: coarse + difference[None])
+    fine: Any = SimpleNamespace(against=lambda recordings: made)
+    return numerical_floor(case.fit, base, found.recordings["fit"], fine)
+
+
+def test_what_no_base_parameter_can_do_is_the_floor(found: Small):
+    jacobian, count = found.base.refined.jacobian, found.case.fit.repeats
+    off = np.random.default_rng(0).normal(size=len(jacobian))
+    off -= jacobian @ np.linalg.lstsq(jacobian, off, rcond=None)[0]
+    assert of(found, off) == pytest.approx(np.mean(off**2) / count, rel=0.01)
+
+
+def test_what_a_base_parameter_can_do_is_none(found: Small):
+    jacobian = found.base.refined.jacobian
+    told = int(np.argmax(np.linalg.norm(jacobian, axis=0)))
+    off = 0.5 * jacobian[:, told]
+    assert of(found, off) < 0.01 * np.mean(off**2) / found.case.fit.repeats
+
+
+def test_a_finer_simulation_that_blows_up_is_no_floor(found: Small):
+    """It would be so high that nothing could be missing."""
+    with pytest.raises(NotReplayed, match="blows up at a quarter of its time step"):
+        of(found, np.full(len(found.base.refined.jacobian), np.nan))
+
+
+def test_the_finer_simulation_has_a_quarter_of_the_step(found: Small, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(floor, "make_cost", lambda scene, *_, **__: scene)
+    fine: Any = floor.finer(found.case.fit, found.base.space, found.recordings["fit"])
+    assert fine.model.opt.timestep == pytest.approx(found.scene.model.opt.timestep / 4)

@@ -1,0 +1,139 @@
+"""What a fit leaves on another motion: only what its own uncertainty cannot be is something missing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from small_gap import FLOOR, Small, record, small
+
+from droid_jax.discrepancy.case import Case, make_case
+from droid_jax.discrepancy.refit import Model, refit
+from droid_jax.discrepancy.restart import base_fit
+from droid_jax.discrepancy.screen import project
+from droid_jax.discrepancy.transfer import LONGEST, beyond, left_over, spread
+from droid_jax.identify.identifiability import told
+
+
+@pytest.fixture(scope="module")
+def found() -> Small:
+    return small()
+
+
+@pytest.fixture(scope="module")
+def whole(found: Small) -> tuple[Case, Model]:
+    """Nothing is hidden."""
+    case = make_case(
+        found.scene, found.case.base, found.case.effects, record("fit", preload=0.0), record("confirm", preload=0.0),
+        config=found.case.config,
+    )  # fmt: skip
+    return case, base_fit(case, lambda stage, value: None)
+
+
+def kept(case: Case, model: Model, off: np.ndarray) -> float:
+    """Share that stays of what the other recording does otherwise by `off` [M]."""
+    confirm = case.confirm
+    other: Any = SimpleNamespace(
+        cost=confirm.cost,
+        repeats=confirm.repeats,
+        common=lambda values: confirm.common(values) + off,
+        residuals=confirm.residuals,
+    )
+    left = np.mean(beyond(case.fit, other, model) - beyond(case.fit, confirm, model), axis=0)
+    return float(np.sum(left**2) / np.sum(off**2))
+
+
+def test_what_the_fit_does_not_tell_is_allowed_for_and_nothing_else(whole: tuple[Case, Model]):
+    """Two deviations along the axis that the other recording shows best, and something that no axis does."""
+    case, model = whole
+    slopes = spread(case.fit, case.confirm, model)
+    shown = slopes[:, np.argmax(np.linalg.norm(slopes, axis=0))]
+    else_ = np.random.default_rng(0).normal(size=len(slopes))
+    else_ -= slopes @ np.linalg.lstsq(slopes, else_, rcond=None)[0]
+    assert kept(case, model, 2.0 * shown) < 0.3
+    assert kept(case, model, else_) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_the_slopes_are_of_one_deviation(whole: tuple[Case, Model]):
+    """One for each axis; together they span what any one parameter does."""
+    case, model = whole
+    slopes, refined = spread(case.fit, case.confirm, model), model.refined
+    assert slopes.shape == (len(case.confirm.common(model.values)[0]), len(refined.x))
+    step = np.zeros(len(refined.x))
+    step[0] = 0.01
+    here, there = (case.whole.embed(model.space, model.space.from_search(x)[None], model.values)
+                   for x in (refined.x, refined.x + step))  # fmt: skip
+    moved = (case.confirm.common(there) - case.confirm.common(here))[0]
+    # What one parameter does is inside the span of what all axes do, as far as they are told.
+    assert np.linalg.norm(project(moved[None], slopes, np.full(len(slopes.T), 1e6))[0]) < 0.1 * np.linalg.norm(moved)
+
+
+def test_what_is_really_missing_stays(found: Small):
+    """The hidden preload acts on the other motion in a way that no uncertain parameter does."""
+    case, base = found.case, found.base
+    whole_gap, left = case.confirm.gap_at(base.values), left_over(case.fit, case.confirm, base)
+    assert whole_gap > FLOOR and case.confirm.gap(left) > 0.5 * whole_gap
+
+
+def test_the_verdict_says_what_remains(found: Small):
+    case, verdict = found.case, found.verdict
+    assert verdict.remainder == pytest.approx(case.confirm.gap(left_over(case.fit, case.confirm, verdict.model)))
+    # Where little is taken away it may lie above U by noise, of which both are free on average only.
+    assert verdict.remainder is not None and verdict.remainder <= 1.1 * verdict.gaps["confirm"][1]
+
+
+def test_of_noise_alone_nothing_remains_on_average(whole: tuple[Case, Model]):
+    """Noise about the model's own replay: U is zero on average, not less for what the projection takes of the mean."""
+    case, model = whole
+    confirm = case.confirm
+    slopes = spread(case.fit, confirm, model)
+    rng, gaps, mean_only = np.random.default_rng(0), list[float](), list[float]()
+    for _ in range(300):
+        noise = rng.normal(size=confirm.deviations.shape)
+        left = project(noise, slopes, np.full(len(slopes.T), confirm.repeats**0.5))
+        gaps.append(confirm.gap(left))
+        mean_only.append(confirm.gap(noise - noise.mean(axis=0) + left.mean(axis=0)))
+    less = np.array(gaps) - mean_only
+    assert abs(np.mean(gaps)) < 3 * np.std(gaps) / len(gaps) ** 0.5
+    assert np.mean(less) > 10 * np.std(less) / len(less) ** 0.5
+    drawn = replace(confirm, deviations=noise - noise.mean(axis=0))
+    common = drawn.residuals(drawn.common(model.values)[0])
+    np.testing.assert_allclose(
+        beyond(case.fit, drawn, model), project(common, slopes, np.full(len(slopes.T), confirm.repeats**0.5))
+    )
+
+
+def test_more_repeats_of_the_fit_allow_less(found: Small):
+    """What is told better may be off by less."""
+
+    def size(repeats: int) -> float:
+        made = {role: record(role, repeats, preload=0.0) for role in ("fit", "confirm")}
+        case = make_case(found.scene, found.case.base, found.case.effects, **made, config=found.case.config)
+        model = refit(case.fit, case.base, (), case.whole.mean[None], case.config.refine)
+        return float(np.mean(np.sum(spread(case.fit, case.confirm, model) ** 2, axis=1)))
+
+    assert size(32) < 0.6 * size(8)
+
+
+def test_a_bound_does_not_halve_a_slope(whole: tuple[Case, Model]):
+    """On a replay that is linear, one of the parameters at its bound, each parameter an axis of its own."""
+    case, model = whole
+    space, count = model.space, len(model.space)
+    x = model.refined.x.copy()
+    stuck = space.index("forearm_mass")
+    x[stuck] = space.to_search(space.high)[stuck]
+    jacobian = np.zeros_like(model.refined.jacobian)
+    jacobian[:count] = np.diag(np.linspace(20.0, 40.0, count))
+    refined = replace(model.refined, x=x, jacobian=jacobian)
+    matrix = np.random.default_rng(0).normal(size=(count, 30))
+    linear: Any = SimpleNamespace(
+        cost=case.confirm.cost, common=lambda rows: space.to_search(rows[:, case.whole.columns(space)]) @ matrix
+    )
+    slopes = spread(case.fit, linear, replace(model, refined=refined))
+    along = np.linalg.lstsq(matrix.T, slopes, rcond=None)[0]  # each column is an axis in search units
+    assert np.all(np.count_nonzero(np.abs(along) > 1e-9, axis=0) == 1)
+    deviation = np.sqrt(np.diag(told(refined, case.fit.cost.comparisons, misfit=False).cov))
+    np.testing.assert_allclose(np.abs(along).sum(axis=1), np.minimum(deviation, LONGEST), rtol=1e-6)

@@ -1,0 +1,196 @@
+"""Experiments that tell tied effects apart: clocks in closed form, and rivals whose difference is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+from small_gap import record, small
+
+from droid_jax.cost.observation import TooLong
+from droid_jax.discrepancy import candidate_experiments as menu
+from droid_jax.discrepancy.candidate_experiments import CARRIED, IN_THE_AIR, WEIGHT, separating, untouched
+from droid_jax.discrepancy.case import Case
+from droid_jax.discrepancy.refit import Model
+from droid_jax.discrepancy.time_scaling import MENU, STOP, warped
+from droid_jax.discrepancy.workspace_extrapolation import FURTHER
+from droid_jax.door.demonstration import PLANS, grasp_pose
+from droid_jax.door.scene import door_scene
+from droid_jax.model.scene import Grip
+from droid_jax.recordings.recording import Recording
+from droid_jax.simulate.hand_path import solve_pose
+
+
+@pytest.fixture(scope="module")
+def demonstration():
+    return record("fit")
+
+
+@pytest.mark.parametrize(
+    ("number", "seconds", "at"),
+    [
+        (0, lambda d: 3 * d, {0.9: 0.3, 6.0: 2.0}),
+        (1, lambda d: d / 2, {0.5: 1.0, 1.2: 2.4}),
+        (2, lambda d: 2 * d, {1.0: 1.0, 5.0: 0.996}),
+        (3, lambda d: d + STOP, {1.0: 1.0, 2.5: 1.499, 4.5: 2.5}),
+    ],
+)
+def test_a_motion_on_another_clock(demonstration, number, seconds, at):
+    """`at`: instants of the new motion and of the demonstration (2.998 s long) that have the same command."""
+    new = warped(demonstration, MENU[number])
+    assert new.duration == pytest.approx(seconds(demonstration.duration), abs=0.005)
+    for later, before in at.items():
+        expected = [np.interp(before, demonstration.time, c) for c in demonstration.command.T]
+        found = [np.interp(later, new.time, c) for c in new.command.T]
+        np.testing.assert_allclose(found, expected, atol=2e-3)
+    for channel in new.channels.values():
+        assert channel.values.shape[1] == len(channel.time) == channel.mask.shape[1]
+        assert channel.time[-1] <= new.time[-1] + 0.1
+
+
+def model(name: str, value: float) -> Model:
+    """The base fit with one effect beside it."""
+    found = small()
+    values = found.base.values.copy()
+    values[found.case.whole.index(name)] = value
+    return replace(found.base, values=values)
+
+
+def test_a_drag_is_told_from_a_preload_by_another_speed(demonstration, monkeypatch):
+    """Rivals that differ in a speed-dependent torque: three times slower they come closer, twice as fast they part."""
+    monkeypatch.setattr(menu, "MENU", MENU[:2])
+    rivals = (model("drag", 0.0), model("drag", 0.8))
+    found = {e.what: e.apart or 0.0 for e in separating(small().case, rivals, demonstration)}
+    slower, faster = (found[entry.what] for entry in MENU[:2])
+    assert faster > 3.0 * slower > 0.0
+    weighed = next(apart for what, apart in found.items() if "weighed" in what)
+    assert slower < weighed < faster
+
+
+def test_an_experiment_that_cannot_be_made_says_why_and_ends_nothing(demonstration, monkeypatch):
+    """The search is done by then.  Those that can be made come first."""
+    make, raised = menu.make_cost, [TooLong("needs 9.0 GB"), RuntimeError("RESOURCE_EXHAUSTED\nout of memory")]
+
+    def short_of_memory(scene, space, recordings, **options):
+        if recordings[0].time[-1] > demonstration.time[-1] + 0.1:
+            raise raised.pop(0)
+        return make(scene, space, recordings, **options)
+
+    monkeypatch.setattr(menu, "MENU", MENU[:3])
+    monkeypatch.setattr(menu, "make_cost", short_of_memory)
+    found = separating(small().case, (model("drag", 0.0), model("drag", 0.8)), demonstration)
+    said = {e.what: (e.apart is None, e.not_made) for e in found}
+    assert said[MENU[0].what] == (True, "needs 9.0 GB")
+    assert said[MENU[1].what] == (False, "")
+    assert said[MENU[2].what] == (True, "RuntimeError: RESOURCE_EXHAUSTED")
+    assert [e.apart is None for e in found] == sorted(e.apart is None for e in found)
+
+
+def dropped(recording: Recording, seconds: float) -> Recording:
+    """A recording whose torque sensor gave nothing for a while, in all repeats."""
+    channel = recording.channels["torque"]
+    mask = channel.mask.copy()
+    mask[:, (channel.time > 1.0) & (channel.time < 1.0 + seconds)] = False
+    return replace(recording, channels={**recording.channels, "torque": replace(channel, mask=mask)})
+
+
+def test_a_dropout_that_a_slower_motion_makes_too_long_is_said(demonstration):
+    """60 ms without torques are filled in; three times slower they are too long."""
+    rivals = (model("drag", 0.0), model("drag", 0.8))
+    found = {e.what: e for e in separating(small().case, rivals, dropped(demonstration, 0.06))}
+    slower, faster = (found[entry.what] for entry in MENU[:2])
+    assert slower.apart is None and "a stretch that no repeat measured" in slower.not_made
+    assert faster.apart is not None and faster.apart > 0.0
+
+
+def test_a_known_weight_tells_only_what_acts_through_it(demonstration, monkeypatch):
+    """Two payloads differ by as much with a weight beside them as without; two preloads likewise."""
+    monkeypatch.setattr(menu, "MENU", ())
+    case = small().case
+    rivals = (model(CARRIED, 0.0), model(CARRIED, 0.2))
+    (found,) = separating(case, rivals, demonstration)
+    plain = case.fit.cost.whitened(np.stack([m.values for m in rivals])).astype(float)
+    assert f"{WEIGHT:g} kg" in found.what
+    assert found.apart == pytest.approx(np.linalg.norm(plain[0] - plain[1]), rel=0.2)
+
+
+def gripping(case: Case) -> Case:
+    """The small scene as if its hand, which holds nothing, gripped by contact."""
+    cost = replace(case.fit.cost, scene=replace(case.fit.cost.scene, grip=Grip(())))
+    return replace(case, fit=replace(case.fit, cost=cost))
+
+
+def test_in_the_air_only_the_robot_is_seen(demonstration, monkeypatch):
+    """Two payloads part without the held thing, and as in the plain model: the small scene's hand holds nothing."""
+    monkeypatch.setattr(menu, "MENU", ())
+    case = small().case
+    rivals = (model(CARRIED, 0.0), model(CARRIED, 0.2))
+    found = {e.what: e.apart or 0.0 for e in separating(gripping(case), rivals, demonstration)}
+    plain = case.fit.cost.whitened(np.stack([m.values for m in rivals])).astype(float)
+    assert found[IN_THE_AIR] == pytest.approx(np.linalg.norm(plain[0] - plain[1]), rel=0.2)
+    assert IN_THE_AIR not in {e.what for e in separating(case, rivals, demonstration)}
+
+
+def test_a_hand_that_gets_no_further_is_said(demonstration, monkeypatch):
+    monkeypatch.setattr(menu, "MENU", ())
+    monkeypatch.setattr(menu, "opened_further", lambda *arguments: None)
+    found = {
+        e.what: e for e in separating(gripping(small().case), (model("drag", 0.0), model("drag", 0.8)), demonstration)
+    }
+    assert found[FURTHER].apart is None and "does not reach further" in found[FURTHER].not_made
+
+
+def test_a_motion_within_reach_is_on_the_menu(demonstration, monkeypatch):
+    """Where the hand could go on, what the rivals do on that motion counts (here the same motion again)."""
+    monkeypatch.setattr(menu, "MENU", ())
+    monkeypatch.setattr(menu, "opened_further", lambda scene, recording, replayed: replace(recording, name=FURTHER))
+    case = small().case
+    rivals = (model("drag", 0.0), model("drag", 0.8))
+    found = {e.what: e.apart or 0.0 for e in separating(gripping(case), rivals, demonstration)}
+    assert FURTHER not in {e.what for e in separating(case, rivals, demonstration)}
+    plain = case.fit.cost.whitened(np.stack([m.values for m in rivals])).astype(float)
+    assert found[FURTHER] == pytest.approx(np.linalg.norm(plain[0] - plain[1]), rel=1e-3)
+
+
+def test_an_untouched_scene_has_no_contact():
+    """The C engine: fingers closed on the knob press and pull with contacts, and pass through it without."""
+    scene, plan = door_scene(springs=1), PLANS["A"]
+    alone = untouched(scene)
+    assert alone.grip is None and scene.grip is not None
+    touching = []
+    for each in (scene, alone):
+        data = mujoco.MjData(each.model)  # fingers shut
+        data.qpos[each.joint_qpos] = solve_pose(each, np.array(plan.pose), *grasp_pose(each, 0.0, 0.0, plan.roll))
+        mujoco.mj_forward(each.model, data)
+        touching.append(data.ncon)
+    assert touching[0] > 0 and touching[1] == 0
+
+
+def test_an_experiment_is_as_good_as_what_it_tells_apart_least():
+    at = {0.0: 0.0, 1.0: 1.0, 2.0: 6.0}
+
+    class Cost:
+        def failed(self, values):
+            return values[:, 0] < 0
+
+        def whitened(self, values):
+            return np.array([[at[abs(v)], 0.0] for v in values[:, 0]])
+
+    rivals = np.array([[0.0], [1.0], [2.0]])
+    found = menu._experiment("so", Cost(), rivals)  # type: ignore[arg-type]
+    assert (found.what, found.apart) == ("so", 1.0)
+    lost = menu._made("so", lambda: menu._experiment("so", Cost(), -rivals))  # type: ignore[arg-type]
+    assert (lost.what, lost.apart) == ("so", None) and "fails on this motion" in lost.not_made
+
+
+def test_the_best_experiment_comes_first(demonstration, monkeypatch):
+    monkeypatch.setattr(menu, "MENU", MENU[:2])
+    found = separating(small().case, (model("drag", 0.0), model("drag", 0.8)), demonstration)
+    apart = [e.apart or 0.0 for e in found]
+    assert apart == sorted(apart, reverse=True) and apart[0] > apart[-1]
+
+
+def test_one_model_needs_no_experiment(demonstration):
+    assert separating(small().case, (model("drag", 0.0),), demonstration) == ()

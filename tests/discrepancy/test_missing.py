@@ -1,0 +1,131 @@
+"""The search for a missing effect in one call: one joint, three ways to share the work."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from small_log import CONFIG, COULOMB, MJCF, elbow, elbow_log, elbow_space
+
+import droid_jax as dj
+from droid_jax.cost.residuals import CompareConfig
+from droid_jax.discrepancy import missing
+from droid_jax.discrepancy.candidates import possible, steers
+from droid_jax.discrepancy.split import Split
+from droid_jax.discrepancy.verdict import Kind
+from droid_jax.identify.search import SearchConfig
+from droid_jax.model.effect_interface import Effect
+from droid_jax.model.effects.registry import joined, library
+from droid_jax.model.parameters import Parameter, Space
+from droid_jax.model.scene import compile_scene
+from droid_jax.recordings.recording import Recording
+
+SEARCH = replace(CONFIG, search=SearchConfig(population=8, parents=None, generations=2), most=1)
+
+LATE = Effect("late", (Parameter("late", "s", 0.0, 0.01, -0.1, 0.1),), command=lambda theta, time, look: look(time),
+              places={"elbow": ("late",)})  # fmt: skip
+THREE = [replace(elbow_log(COULOMB, seconds, 8), name=f"{seconds:g} s") for seconds in (7.0, 6.0, 5.0)]
+
+
+@pytest.mark.parametrize(
+    ("recordings", "judged", "searched"),
+    [
+        (THREE, ["fit", "confirm", "sealed"], True),
+        ([elbow_log(COULOMB, 7.0, repeats=16)], ["fit", "confirm"], True),
+        ([elbow_log(COULOMB)], ["fit", "confirm", "sealed"], False),
+    ],
+    ids=["recordings", "repeats", "blocks"],
+)
+def test_hidden_friction_is_named_and_in_the_extended_model(
+    recordings: Sequence[Recording], judged: list[str], searched: bool
+):
+    scene, stages = elbow(), []
+    verdict, extended = dj.find_missing(
+        scene,
+        elbow_space(scene),
+        recordings,
+        effects=library(scene, ["joint_coulomb", "cable_pull"]),
+        config=SEARCH,
+        progress=lambda stage, value: stages.append(stage),
+    )
+    assert (verdict.kind, verdict.effects) == (Kind.NAMED, ("joint_coulomb at elbow",))
+    assert list(verdict.gaps) == judged and all(verdict.closed(role) > 0.9 for role in judged)
+    assert [part.name for part in extended.parts] == ["joint_coulomb at elbow"]
+    assert extended.space.names == ("elbow_damping", "torque_offset[elbow]", "joint_coulomb[elbow]")
+    np.testing.assert_allclose(extended.values, [0.6, 0.1, COULOMB], rtol=0.1, atol=0.02)
+    assert ("search" in stages) is searched and {"screen", "refit", "judge"} <= set(stages)
+
+
+def test_a_log_without_commands_has_no_servo_to_ask_about():
+    """Nor gains of one, which are numbers of the model and change nothing there; laws that read them are kept."""
+    servo = '</worldbody><actuator><position name="servo" joint="elbow" kp="10"/></actuator>'
+    scene = compile_scene(mujoco.MjSpec.from_string(MJCF.replace("</worldbody>", servo)), "elbow", joints=["elbow"])
+    log = elbow_log(COULOMB)
+    commanded = {e.name for e in possible(scene, [replace(log, command=np.zeros((2, 1)))])}
+    assert commanded - {e.name for e in possible(scene, [log])} >= {"servo_gain", "command_delay"}
+    assert {"payload", "joint_coulomb", "sensor_delay", "torque_gain"} <= {e.name for e in possible(scene, [log])}
+    (gain,) = library(scene, ["servo_gain"])
+    assert steers(gain) and not steers(replace(gain, force=lambda theta, state: state.qvel))
+    assert not steers(replace(gain, parameters=(*gain.parameters, *library(scene, ["payload"])[0].parameters)))
+
+
+def test_unless_told_it_asks_about_all_that_could_show(monkeypatch: pytest.MonkeyPatch):
+    scene, begin = elbow(), np.array([0.6, 0.1])
+
+    def answer(split, case, roles, start, progress):
+        assert split is Split.RECORDINGS and list(roles) == ["fit", "confirm", "sealed"]
+        assert [e.name for e in case.effects] == [e.name for e in possible(scene, THREE)] and len(case.effects) > 5
+        assert case.config == dj.GapConfig()
+        np.testing.assert_array_equal(start, begin)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(missing, "answer", answer)
+    with pytest.raises(KeyboardInterrupt):
+        dj.find_missing(scene, elbow_space(scene), THREE, start=begin)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"most": 0}, "most must be at least 1, got 0"),
+        ({"compare": CompareConfig(channels={"torque": 1.0, "position": 1.0})}, "got the channels torque, position"),
+    ],
+)
+def test_settings_that_no_search_could_use_are_refused(changes: dict[str, Any], said: str):
+    with pytest.raises(ValueError, match=said):
+        dj.GapConfig(**changes)
+
+
+def test_a_name_that_an_effect_has_is_refused_with_what_to_do():
+    """A body called payload has a payload_mass; so has the library."""
+    scene = elbow()
+    space = elbow_space(scene)
+    taken = Space((*space.parameters[1:], replace(space.parameters[0], name="payload_mass[elbow]")))
+    twin = Effect("twin", (replace(space.parameters[0], name="payload_mass[elbow]", writes=()),), places={"elbow": ()})
+    with pytest.raises(ValueError, match=r"'payload_mass\[elbow\]' \(of the effect twin\); give yours others"):
+        joined(taken, (twin,))
+    assert joined(space, (twin,)).names == (*space.names, "payload_mass[elbow]")
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"recordings": []}, "no recording to fit: give one, or several"),
+        ({"recordings": [elbow_log(0.0, 2.0, 8)] * 4}, "got 4"),
+        ({"recordings": [elbow_log(0.0, 2.0, 15)]}, "is the only one and has 15 repeats"),
+        ({"recordings": [elbow_log(0.0, 2.0, 8)] * 2}, "the fit and the confirm recording are the same"),
+        ({"effects": ()}, "effects: there is none to ask about"),
+        ({"effects": [Effect("late")]}, "none of the effects says its places"),
+        ({"effects": [LATE]}, "no commands that an effect could change: late"),
+        ({"start": np.zeros(3)}, "expected parameter vectors [..., 2]"),
+    ],
+)
+def test_what_could_not_end_well_is_refused_first(changes: dict[str, Any], said: str):
+    scene = elbow()
+    with pytest.raises(ValueError) as refused:
+        dj.find_missing(scene, elbow_space(scene), **{"recordings": [elbow_log(0.0, 2.0, 16)], **changes})
+    assert said in str(refused.value)

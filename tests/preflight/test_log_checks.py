@@ -1,0 +1,228 @@
+"""Wrong units, signs, orders, clocks and copies are named; what is right raises nothing."""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+from two_link import arm
+
+from droid_jax.cost.cost import make_cost
+from droid_jax.model.fields import joint_damping
+from droid_jax.model.parameters import Space
+from droid_jax.model.scene import Scene
+from droid_jax.preflight.check_log import check_log
+from droid_jax.recordings.recording import Channel, Recording, ServoGains, TorqueConvention, TorqueSide
+
+JOINTS = ("shoulder", "elbow")
+RATE = 250.0  # Hz
+REPEATS = 3
+SIZE = 0.12  # rad, of the small motion: seven degrees
+SENT = np.array([[0.21, 0.47], [0.33, 0.59]])  # Hz, of two sines for each joint
+
+
+@functools.cache
+def scene(gravcomp: bool = False) -> Scene:
+    return arm(gravcomp=gravcomp)
+
+
+def path(seconds: float, size: float = SIZE) -> tuple[np.ndarray, np.ndarray]:
+    time = np.arange(0.0, seconds, 1.0 / RATE)
+    ease = np.clip(time / 1.0, 0, 1)[:, None] ** 2
+    waves = np.sin(2 * np.pi * SENT[:, :, None] * time + np.array([0.0, 0.7])[:, None]) - np.sin(
+        np.array([0.0, 0.7])[:, None] * np.ones((2, 2, 1))
+    )
+    return time, size * ease * waves.sum(axis=1).T + np.array([0.1, -0.3])
+
+
+@functools.cache
+def recording(gravcomp: bool = False, commands: bool = True, size: float = SIZE, seconds: float = 12.0) -> Recording:
+    """The arm with other masses, damping and friction than the scene's, in C, with noise; motor side."""
+    model = mujoco.MjModel.from_xml_string(scene(gravcomp).spec.to_xml())
+    model.body_mass[1:] *= np.array([1.3, 0.8])
+    model.body_inertia[1:] *= np.array([1.3, 0.8])[:, None]
+    model.dof_damping[:] = 2.0, 1.6
+    model.dof_frictionloss[:] = 0.1, 0.2
+    model.opt.timestep = 1.0 / (RATE * 4)
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    time, command = path(seconds, size)
+    data, seen = mujoco.MjData(model), np.empty((2, len(time), 2))
+    data.qpos[:] = command[0]
+    for k in range(4 * len(time)):
+        data.ctrl[:] = command[k // 4][::-1]  # the scene's actuators stand in the other order
+        at = data.qpos.copy()
+        mujoco.mj_step(model, data)
+        if k % 4 == 0:
+            seen[:, k // 4] = data.qfrc_actuator, at
+    rng = np.random.default_rng(4)
+    torque = seen[0] + rng.normal(0.0, 0.05, (REPEATS, *seen[0].shape))
+    position = seen[1] + rng.normal(0.0, 2e-4, (REPEATS, *seen[1].shape))
+    mask = np.ones(torque.shape, bool)
+    channels = {
+        "torque": Channel("torque", "N m", JOINTS, time, torque, mask),
+        "position": Channel("position", "rad", JOINTS, time, position, mask),
+    }
+    gains = ServoGains(np.array([60.0, 25.0]), np.zeros(2)) if commands else None
+    none = np.zeros((0, 0))
+    return Recording(
+        "log",
+        time if commands else np.zeros(0),
+        command if commands else none,
+        JOINTS if commands else (),
+        channels,
+        TorqueConvention(TorqueSide.MOTOR, gravity=not gravcomp),
+        qpos0={},
+        gains=gains,
+    )
+
+
+Change = Callable[[Recording], Recording]
+
+
+def of_channel(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Change:
+    def changed(r: Recording) -> Recording:
+        channel = replace(r.channels[name], values=change(r.channels[name].values))
+        return replace(r, channels={**r.channels, name: channel})
+
+    return changed
+
+
+def sign(name: str, column: int) -> Change:
+    turn = np.where(np.arange(2) == column, -1.0, 1.0)
+    if name == "command":
+        return lambda r: replace(r, command=r.command * turn)
+    return of_channel(name, lambda v: v * turn)
+
+
+def degrees(r: Recording) -> Recording:
+    wrong = of_channel("position", np.rad2deg)(r)
+    return replace(wrong, command=np.rad2deg(r.command)) if r.command.size else wrong
+
+
+def found(r: Recording, gravcomp: bool = False) -> list[tuple[str, str]]:
+    return [(f.kind, f.column) for f in check_log(scene(gravcomp), r)]
+
+
+@pytest.mark.parametrize("gravcomp", [False, True])
+@pytest.mark.parametrize("commands", [True, False])
+@pytest.mark.parametrize("size", [SIZE, 5 * SIZE])
+def test_what_is_right_raises_nothing(gravcomp: bool, commands: bool, size: float):
+    """Masses, damping and friction are others than the scene's."""
+    fine = recording(gravcomp, commands, size)
+    assert check_log(scene(gravcomp), fine) == ()
+    alone = fine.repeats_subset([0])
+    assert check_log(scene(gravcomp), alone) == ()
+    if commands:
+        blind = replace(
+            fine, channels={"torque": fine.channels["torque"]}, qpos0=dict(zip(JOINTS, (0.1, -0.3), strict=True))
+        )
+        assert check_log(scene(gravcomp), blind) == ()
+
+
+@pytest.mark.parametrize("commands", [True, False])
+@pytest.mark.parametrize("size", [0.3 * SIZE, SIZE])
+def test_degrees_of_a_small_motion(commands: bool, size: float):
+    """The larger is at 14 degrees at most, below four turns of radians, and slow."""
+    findings = check_log(scene(), degrees(recording(commands=commands, size=size)))
+    assert findings and findings[0].kind == "units"
+    assert any("degrees" in f.sentence for f in findings)
+
+
+@pytest.mark.parametrize("factor", [1000.0, 0.1, 1 / 12, 1 / 8])
+@pytest.mark.parametrize("commands", [True, False])
+def test_torques_in_another_unit(commands: bool, factor: float):
+    findings = check_log(scene(), of_channel("torque", lambda v: factor * v)(recording(commands=commands)))
+    assert findings and {f.kind for f in findings} == {"units"}
+    assert all(0.5 < f.value / factor < 2.0 for f in findings)
+    assert any(("milliamperes" if factor > 1 else "amperes") in f.sentence for f in findings)
+    assert "--torque-constant" in findings[0].sentence
+
+
+def test_each_joints_own_torque_constant():
+    constants = np.array([1 / 8, 1 / 12])
+    findings = check_log(scene(), of_channel("torque", lambda v: v * constants)(recording()))
+    assert {f.column for f in findings} == set(JOINTS)
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+@pytest.mark.parametrize("what", ["torque", "position", "command"])
+def test_one_joints_wrong_sign(what: str, joint: int):
+    assert found(sign(what, joint)(recording())) == [("sign", JOINTS[joint])]
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+def test_one_joints_wrong_sign_in_a_log_without_commands(joint: int):
+    assert ("sign", JOINTS[joint]) in found(sign("torque", joint)(recording(commands=False)))
+
+
+def test_all_torques_of_the_other_sign():
+    assert found(of_channel("torque", np.negative)(recording())) == [("sign", j) for j in JOINTS]
+
+
+@pytest.mark.parametrize("what", ["torque", "position", "command"])
+def test_columns_in_another_order(what: str):
+    if what == "command":
+        wrong = replace(recording(), command=recording().command[:, ::-1])
+    else:
+        wrong = of_channel(what, lambda v: v[..., ::-1])(recording())
+    assert [kind for kind, _ in found(wrong)] == ["order"]
+
+
+@pytest.mark.parametrize("gravcomp", [False, True])
+@pytest.mark.parametrize("commands", [True, False])
+def test_weight_that_the_torque_does_not_hold_or_does(gravcomp: bool, commands: bool):
+    fine = recording(gravcomp, commands, 5 * SIZE)
+    wrong = replace(fine, torque=replace(fine.torque, gravity=not fine.torque.gravity))
+    if commands and not gravcomp:  # refused: nothing in the scene would carry it
+        with pytest.raises(ValueError, match="holds no weight"):
+            make_cost(scene(), space(), [wrong])
+        return
+    assert [kind for kind, _ in found(wrong, gravcomp)] == ["gravity"]
+
+
+def space() -> Space:
+    return Space((joint_damping(scene(), "elbow", name="elbow_damping", std=0.1, high=50.0),))
+
+
+def test_copies_of_one_repeat():
+    copies = recording().repeats_subset([0, 1, 0, 2, 1])
+    (finding,) = check_log(scene(), copies)
+    assert finding.kind == "repeats" and "repeats 0 and 2, 1 and 4 are identical: are they copies" in finding.sentence
+    single = {k: replace(c, values=c.values.astype(np.float32)) for k, c in recording().channels.items()}
+    assert found(replace(recording(), channels=single)) == []
+
+
+def test_a_position_that_does_not_move():
+    dead = of_channel("position", lambda v: np.where(np.arange(2) == 1, 0.0, v))(recording())
+    assert ("sensor", "elbow") in found(dead)
+    coarse = of_channel("torque", lambda v: np.round(v / 4.0) * 4.0)(recording())
+    assert ("sensor", "elbow") in found(coarse)
+
+
+def test_a_nominal_rate_beside_stamps():
+    """Positions at 4.012 ms, commands played back at the nominal 4 ms."""
+    fine = recording(seconds=60.0)
+    stamped = {k: replace(c, time=1.003 * c.time) for k, c in fine.channels.items()}
+    (finding,) = check_log(scene(), replace(fine, channels=stamped))
+    assert finding.kind == "clock" and "4.012 ms where these are at 4 ms, 0.18 s apart" in finding.sentence
+    cut = {k: replace(c, time=c.time[:-9], values=c.values[:, :-9], mask=c.mask[:, :-9]) for k, c in stamped.items()}
+    (finding,) = check_log(scene(), replace(fine, channels=cut))
+    assert finding.kind == "clock" and "0.18 s" in finding.sentence.replace("0.17 s", "0.18 s")
+    noted = replace(fine, meta={"rate_hz": "249"})
+    (finding,) = check_log(scene(), noted)
+    assert finding.kind == "clock" and "stated 249 Hz; the stamps are used" in finding.sentence
+
+
+def test_a_cost_warns_of_it_and_goes_on():
+    with pytest.warns(UserWarning, match="position of elbow runs against its command") as said:
+        make_cost(scene(), space(), [sign("position", 1)(recording())])
+    assert len([w for w in said if "runs against" in str(w.message)]) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        make_cost(scene(), space(), [sign("position", 1)(recording())], check=False)
+        make_cost(scene(), space(), [recording()])

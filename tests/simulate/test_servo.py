@@ -1,0 +1,561 @@
+"""The servo replay on a small arm: commands, offsets, conventions and refusals against closed forms."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from two_link import ARM, JOINTS, KP, MOTOR, arm, measured, motion, recording
+
+from droid_jax import runtime
+from droid_jax.cost.cost import make_cost
+from droid_jax.cost.residuals import CompareConfig
+from droid_jax.door.space import torque_offsets
+from droid_jax.model.effect_interface import Effect, Rollout
+from droid_jax.model.fields import joint_damping, time_offset
+from droid_jax.model.joint_friction import joint_friction_effect, joint_friction_space
+from droid_jax.model.parameters import Scaling, Space
+from droid_jax.model.physics import make_physics
+from droid_jax.model.scene import Scene, compile_scene, with_options
+from droid_jax.recordings.recording import Channel, ServoGains, TorqueConvention, TorqueSide
+from droid_jax.simulate.batching import over_population
+from droid_jax.simulate.c_reference import twin_replay
+from droid_jax.simulate.replay import Drive, check_gains, make_drive, observed, servo_replay, torque_offset_effect
+
+SPACE = Space(
+    (time_offset(), *torque_offsets(JOINTS), joint_damping(arm(), "elbow", name="elbow_damping", std=0.1, high=50.0))
+)
+
+
+def run(scene: Scene, drive: Drive, rows: list[dict[str, float]], **options) -> Rollout:
+    replay = servo_replay(scene, drive, (torque_offset_effect(scene.joints),), **options)
+    batch = over_population(lambda values: replay(make_physics(scene, SPACE, values)))
+    return batch(np.array([SPACE.values(row) for row in rows]))
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return arm()
+
+
+@pytest.fixture(scope="module")
+def drive(scene: Scene) -> Drive:
+    return make_drive(scene, recording())
+
+
+ROWS = [
+    {},
+    {"time_offset": 0.0137},
+    {"time_offset": -0.0071},
+    {"torque_offset[elbow]": 0.5, "torque_offset[shoulder]": -0.25},
+    {"elbow_damping": 4.0},
+]
+
+
+@pytest.fixture(scope="module")
+def rollout(scene: Scene, drive: Drive) -> Rollout:
+    return run(scene, drive, ROWS)
+
+
+def servo_torque(position: np.ndarray, delay: float) -> np.ndarray:
+    """kp (command(t - delay) - q), the command held at its ends."""
+    time, command = motion()
+    late = np.stack([np.interp(time - delay, time, c) for c in command.T], axis=1)
+    return np.array([KP[j] for j in JOINTS]) * (late - position)
+
+
+def test_torque_is_the_servos_law(rollout: Rollout):
+    np.testing.assert_allclose(rollout.torque[0], servo_torque(rollout.position[0], 0.0), atol=2e-5)
+    assert np.abs(rollout.torque[0]).max() > 1.0
+
+
+@pytest.mark.parametrize("row", [1, 2])
+def test_a_time_offset_delays_the_command(rollout: Rollout, row: int):
+    delay = ROWS[row]["time_offset"]
+    expected = servo_torque(rollout.position[row], delay)
+    np.testing.assert_allclose(rollout.torque[row], expected, atol=5e-5)
+    assert np.abs(expected - servo_torque(rollout.position[row], 0.0)).max() > 0.1
+
+
+def test_a_delayed_command_gives_a_delayed_motion(rollout: Rollout):
+    """Seven whole steps: the same trajectory, 14 ms later (the arm rests at the start)."""
+    shifted = run(arm(), make_drive(arm(), recording()), [{"time_offset": 0.014}])
+    np.testing.assert_allclose(shifted.position[0, 7:], rollout.position[0, :-7], atol=1e-5)
+
+
+def test_torque_offsets_are_added_to_their_own_joint(rollout: Rollout):
+    np.testing.assert_array_equal(rollout.position[3], rollout.position[0])
+    np.testing.assert_allclose(rollout.torque[3] - rollout.torque[0], np.tile([-0.25, 0.5], (501, 1)), atol=1e-6)
+
+
+def test_parameters_reach_the_model(rollout: Rollout):
+    assert np.abs(rollout.position[4] - rollout.position[0]).max() > 0.01
+    assert rollout.finite.all()
+
+
+def test_columns_are_matched_by_name(scene: Scene, drive: Drive, rollout: Rollout):
+    _, command = motion()
+    swapped = make_drive(
+        scene,
+        recording(
+            command=command[:, ::-1],
+            command_names=JOINTS[::-1],
+            gains=ServoGains(np.array([25.0, 60.0]), np.array([1.0, 3.0])),
+        ),
+    )
+    np.testing.assert_allclose(swapped.command, drive.command, atol=1e-12)
+    np.testing.assert_array_equal(swapped.stiffness, drive.stiffness)
+    np.testing.assert_allclose(drive.command[:, 0], command[:, 1], atol=1e-12)  # actuators: elbow first
+
+
+def test_a_coarse_late_command_is_resampled_onto_the_steps(scene: Scene):
+    """100 Hz from t = 3 s becomes 500 Hz from 0, on the straight line between commands."""
+    time, command = motion(1.0, 100.0)
+    coarse = make_drive(scene, recording(time=time + 3.0, command=command, channels={}))
+    assert len(coarse.time) == 501 and coarse.time[0] == 0.0
+    np.testing.assert_allclose(coarse.command[::5, 1], command[:, 0], atol=1e-12)
+    np.testing.assert_allclose(coarse.command[2, 1], 0.6 * command[0, 0] + 0.4 * command[1, 0], atol=1e-12)
+
+
+# ----- parity with plain C
+
+
+def rms(array: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(array))))
+
+
+def c_rollout(scene: Scene, drive: Drive, *, delay: float, **options) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Position, velocity and actuator torque before each step, by mj_step."""
+    model = with_options(scene, **options).model
+    data = mujoco.MjData(model)
+    data.qpos[:] = drive.qpos0
+    sub = round(drive.timestep / model.opt.timestep)
+    clock = np.arange(len(drive.command) * sub) * model.opt.timestep - delay
+    out = np.empty((3, len(clock), 2))
+    for k, at in enumerate(clock):
+        data.ctrl[:] = [np.interp(at, drive.time, c) for c in drive.command.T]
+        out[0, k], out[1, k] = data.qpos[scene.joint_qpos], data.qvel[scene.joint_dofs]
+        mujoco.mj_step(model, data)
+        out[2, k] = data.qfrc_actuator[scene.joint_dofs]
+    return out[0, ::sub], out[1, ::sub], out[2, ::sub]
+
+
+def test_parity_replay_is_mj_step(scene: Scene, drive: Drive):
+    got = run(scene, drive, [{}], parity=True)
+    position, velocity, torque = c_rollout(scene, drive, delay=0.001)
+    np.testing.assert_allclose(got.torque[0], torque, atol=5e-5)
+    np.testing.assert_allclose(got.position[0], position + 0.001 * velocity, atol=2e-6)
+
+
+def test_the_twin_is_mj_step(scene: Scene, drive: Drive):
+    got = twin_replay(scene, SPACE, drive)(SPACE.mean[None])
+    position, velocity, torque = c_rollout(scene, drive, delay=0.001)
+    np.testing.assert_allclose(got.torque[0], torque, atol=1e-12)
+    np.testing.assert_allclose(got.position[0], position + 0.001 * velocity, atol=1e-12)
+    told = velocity[:-1] + 0.5 * np.diff(velocity, axis=0)
+    np.testing.assert_allclose(got.velocity[0, :-1], told, atol=1e-12)
+
+
+def test_the_twin_tells_what_the_parity_replay_tells(scene: Scene, drive: Drive):
+    twin, parity = twin_replay(scene, SPACE, drive)(SPACE.mean[None]), run(scene, drive, [{}], parity=True)
+    for channel in ("torque", "position", "velocity"):
+        np.testing.assert_allclose(getattr(twin, channel)[0, :-1], getattr(parity, channel)[0, :-1], atol=5e-5)
+
+
+def test_without_delay_both_tell_what_mj_step_logs(scene: Scene, drive: Drive):
+    logged = c_rollout(scene, drive, delay=0.0)
+    twin = twin_replay(scene, SPACE, drive, late=0.0)(SPACE.mean[None])
+    mjx = run(scene, drive, [{}], parity=True, late=0.0)
+    for rollout, atol in ((twin, (1e-12, 1e-12, 1e-12)), (mjx, (2e-6, 1e-4, 5e-5))):
+        told = (rollout.position[0], rollout.velocity[0], rollout.torque[0])
+        for got, expected, within in zip(told, logged, atol, strict=True):
+            np.testing.assert_allclose(got, expected, atol=within)
+
+
+@pytest.mark.parametrize("engine", ["mjx", "mujoco"])
+def test_a_cost_can_replay_as_mj_step_logs(scene: Scene, drive: Drive, engine: str):
+    """What MuJoCo itself logged with these steps costs nothing then, a hundred times less than as a robot's log."""
+    *_, torque = c_rollout(scene, drive, delay=0.0)
+    values = np.stack([torque, torque])
+    channel = Channel("torque", "N m", JOINTS, drive.time, values, np.ones(values.shape, bool))
+    logged = recording(channels={"torque": channel})
+
+    def cost(mj_step: bool) -> float:
+        made = make_cost(scene, SPACE, [logged], engine=engine, config=CompareConfig(mj_step=mj_step))
+        return float(made(SPACE.mean[None])[0])
+
+    assert cost(True) < 2e-5
+    assert cost(True) < 0.01 * cost(False)
+
+
+IDLE = "parameters time_offset change nothing where no recording holds commands"
+
+
+def test_mj_step_needs_commands(scene: Scene):
+    time, path = motion(2.0)
+    values = np.stack([path, path])
+    position = Channel("position", "rad", JOINTS, time, values, np.ones(values.shape, bool))
+    channels = {"position": position, "torque": replace(position, name="torque", unit="N m")}
+    alone = recording(time=np.zeros(0), command=np.zeros((0, 0)), command_names=(), channels=channels, gains=None)
+    with pytest.raises(ValueError, match="mj_step replays commands"), pytest.warns(UserWarning, match=IDLE):
+        make_cost(scene, SPACE, [alone], config=CompareConfig(mj_step=True))
+    with pytest.raises(ValueError, match="no commands and no measured positions: there is no motion"):
+        make_cost(scene, SPACE, [replace(alone, channels={"torque": channels["torque"]})])
+
+
+def test_the_replay_is_closer_to_the_continuous_arm_than_the_c_engine(scene: Scene, drive: Drive, rollout: Rollout):
+    """Against C at 20 microseconds; C at 2 ms is off by its first-order error, delayed command or not."""
+    _, _, truth = c_rollout(scene, drive, delay=0.0, timestep=2e-5, integrator=mujoco.mjtIntegrator.mjINT_RK4)
+    first_order = min(rms(c_rollout(scene, drive, delay=d)[2] - truth) for d in (0.0, 0.001))
+    assert rms(rollout.torque[0] - truth) < 0.1 * first_order
+
+
+def test_a_files_own_sensors_do_not_disturb_the_twin(scene: Scene, drive: Drive):
+    busy = arm(sensor='<jointpos joint="elbow"/><actuatorfrc actuator="s"/>')
+    expected = twin_replay(scene, SPACE, drive)(SPACE.mean[None])
+    got = twin_replay(busy, SPACE, drive)(SPACE.mean[None])
+    np.testing.assert_array_equal(got.torque, expected.torque)
+    np.testing.assert_array_equal(got.position, expected.position)
+
+
+def test_the_twin_keeps_every_option(drive: Drive):
+    light = with_options(arm(gravcomp=False), gravity=[0.0, 0.0, -1.6])
+    got = twin_replay(light, SPACE, drive)(SPACE.mean[None])
+    np.testing.assert_allclose(got.torque[0], c_rollout(light, drive, delay=0.001)[2], atol=1e-12)
+
+
+# ----- torque conventions
+
+
+def inverse(scene: Scene, q: np.ndarray, v: np.ndarray, a: np.ndarray, *, armature: bool, gravity: bool) -> np.ndarray:
+    """[T, 2] N m that rigid links ask for, from C: M(q) a + c(q, v) [+ g(q)]."""
+    model = scene.model.__copy__()
+    if not armature:
+        model.dof_armature[:] = 0
+    if not gravity:
+        model.opt.gravity[:] = 0
+    data, out, M = mujoco.MjData(model), np.empty_like(q), np.zeros((2, 2))
+    for k in range(len(q)):
+        data.qpos[:], data.qvel[:] = q[k], v[k]
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, M)
+        out[k] = M @ a[k] + data.qfrc_bias
+    return out
+
+
+@pytest.mark.parametrize("gravity", [False, True])
+@pytest.mark.parametrize("friction", [0.0, 0.4])
+def test_link_side_torque_is_what_moves_the_links(gravity: bool, friction: float):
+    """Without rotor inertia, joint damping and the joint's dry friction; with gravity where stated."""
+    scene = arm(friction=friction)
+    convention = TorqueConvention(TorqueSide.LINK, gravity)
+    drive = make_drive(scene, recording(torque=convention))
+    got = run(scene, drive, [{}])
+    h = drive.timestep
+    q = got.position[0].astype(float)
+    acceleration = (q[2:] - 2 * q[1:-1] + q[:-2]) / h**2
+    velocity = (q[2:] - q[:-2]) / (2 * h)
+    expected = inverse(scene, q[1:-1], velocity, acceleration, armature=False, gravity=gravity)
+    off = got.torque[0, 1:-1] - expected
+    # Second differences of float32 positions: 6e-8 / h^2 = 0.015 rad/s^2, on 0.3 kg m^2.
+    assert np.sqrt(np.mean(off**2)) < 0.01, np.sqrt(np.mean(off**2, axis=0))
+    motor = run(scene, make_drive(scene, recording()), [{}])
+    assert np.sqrt(np.mean((motor.torque[0, 1:-1] - expected) ** 2)) > 0.3
+
+
+def test_motor_side_with_gravity_adds_the_compensated_weight(scene: Scene, drive: Drive, rollout: Rollout):
+    heavy = run(scene, make_drive(scene, recording(torque=TorqueConvention(TorqueSide.MOTOR, True))), [{}])
+    np.testing.assert_array_equal(heavy.position[0], rollout.position[0])
+    q = heavy.position[0].astype(float)
+    weight = inverse(scene, q, 0 * q, 0 * q, armature=True, gravity=True)
+    np.testing.assert_allclose(heavy.torque[0] - rollout.torque[0], weight, atol=1e-4)
+
+
+def weighed(gravcomp: bool, motors: bool, gravity: bool) -> tuple[Rollout, np.ndarray]:
+    """A replay of the arm, and the weight [T, 2] N m at its poses; motors: actuatorgravcomp on the joints."""
+    xml = ARM.format(gravcomp='gravcomp="1"' if gravcomp else "", friction="", sensor="")
+    xml = xml.replace('axis="0 1 0"', f'axis="0 1 0" actuatorgravcomp="{str(motors).lower()}"')
+    scene = compile_scene(mujoco.MjSpec.from_string(xml), "arm", joints=JOINTS)
+    convention = TorqueConvention(TorqueSide.MOTOR, gravity)
+    got = run(scene, make_drive(scene, recording(torque=convention)), [{}])
+    q = got.position[0].astype(float)
+    return got, inverse(scene, q, 0 * q, 0 * q, armature=True, gravity=True)
+
+
+@pytest.mark.parametrize("gravity", [False, True])
+def test_weight_that_the_motors_compensate_is_counted_once(gravity: bool):
+    """With actuatorgravcomp the motors' torque contains the weight, and only then."""
+    (by_motors, weight), (elsewhere, _) = weighed(True, True, gravity), weighed(True, False, gravity)
+    np.testing.assert_allclose(by_motors.position[0], elsewhere.position[0], atol=1e-5)
+    np.testing.assert_allclose(by_motors.torque[0], elsewhere.torque[0], atol=1e-3)
+    servo = servo_torque(by_motors.position[0], 0.0) + gravity * weight
+    np.testing.assert_allclose(by_motors.torque[0], servo, atol=2e-4)
+    assert np.abs(weight).max() > 3.0
+
+
+def test_weight_that_nothing_compensates_is_refused_where_the_torque_holds_none(tmp_path: Path):
+    heavy = arm(gravcomp=False)
+    with pytest.raises(ValueError, match=r"'wave' says that its torque holds no weight.*shoulder, elbow.*gravcomp"):
+        make_drive(heavy, recording())
+    carried = TorqueConvention(TorqueSide.MOTOR, gravity=True)
+    torque = run(heavy, make_drive(heavy, recording(torque=carried)), [{}])
+    np.testing.assert_allclose(torque.torque[0], servo_torque(torque.position[0], 0.0), atol=2e-5)
+    make_drive(with_options(heavy, gravity=[0, 0, 0]), recording())
+    make_drive(arm(), recording())
+    make_cost(heavy, SPACE, [recording(channels=measured(0.2))], config=CompareConfig(channels={"position": 1.0}))
+
+
+def test_upright_axes_feel_no_weight():
+    xml = ARM.format(gravcomp="", friction="", sensor="").replace('axis="0 1 0"', 'axis="0 0 1"')
+    make_drive(compile_scene(mujoco.MjSpec.from_string(xml), "arm", joints=JOINTS), recording())
+
+
+# ----- servos with a velocity gain
+
+PENDULUM = """<mujoco><option timestep="{step}" integrator="implicitfast"/><worldbody>
+  <body gravcomp="1"><joint name="j" axis="0 1 0" armature="0.1" damping="0.5" {joint}/>
+    <geom type="capsule" size=".03" fromto="0 0 0 0 0 -.5" mass="2" contype="0" conaffinity="0"/></body>
+</worldbody><actuator><position name="j" joint="j" kp="600" kv="50" {actuator}/></actuator></mujoco>"""
+NOTHING = Space((time_offset(),))
+
+
+def pendulum(step: float = 0.004, *, joint: str = "", actuator: str = "") -> Scene:
+    spec = mujoco.MjSpec.from_string(PENDULUM.format(step=step, joint=joint, actuator=actuator))
+    return compile_scene(spec, "pendulum", joints=("j",))
+
+
+def swung(scene: Scene) -> tuple[Rollout, np.ndarray, np.ndarray]:
+    """The replay at 4 ms, and the torque and position of plain C at 0.05 ms."""
+    time = np.arange(251) * 0.004
+    command = 0.3 * np.sin(6 * time)[:, None] * np.clip(time / 0.3, 0, 1)[:, None]
+    drive = Drive(command, np.zeros(1), 0.004, MOTOR)
+    replay = servo_replay(scene, drive)
+    batch = over_population(lambda values: replay(make_physics(scene, NOTHING, values)))
+    fine = pendulum_c(scene, command, 5e-5)
+    return batch(NOTHING.mean[None]), *fine
+
+
+def pendulum_c(scene: Scene, command: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+    model = with_options(scene, timestep=step).model
+    data, sub = mujoco.MjData(model), round(0.004 / step)
+    out = np.empty((2, len(command)))
+    for k in range(len(command) * sub):
+        data.ctrl[:] = np.interp(k * step, np.arange(len(command)) * 0.004, command[:, 0])
+        position = data.qpos[0]
+        mujoco.mj_step(model, data)
+        if k % sub == 0:
+            out[:, k // sub] = data.qfrc_actuator[0], position
+    return out
+
+
+def test_a_servos_velocity_gain_acts_at_the_time_of_the_position():
+    """The torque is the servo's at the mean velocity of the step; at the velocity before it, it is 0.1 of it off."""
+    got, torque, _ = swung(pendulum())
+    assert rms(got.torque[0, :, 0] - torque) < 0.02 * rms(torque)
+
+
+@pytest.mark.parametrize("limit", [{"actuator": 'forcerange="-2 2"'}, {"joint": 'actuatorfrcrange="-2 2"'}])
+def test_a_servo_at_its_force_limit_damps_nothing(limit: dict[str, str]):
+    """What the limit holds does not follow the velocity: neither its torque nor the motion it makes."""
+    scene = pendulum(**limit)
+    got, torque, position = swung(scene)
+    assert np.mean(np.abs(torque) >= 2.0) > 0.2 and got.torque.max() <= 2.0
+    np.testing.assert_allclose(got.position[0, :, 0], position, atol=0.02 * np.ptp(position))
+
+
+def test_parity_with_a_velocity_gain_is_mj_step():
+    scene = pendulum(actuator='forcerange="-2 2"')
+    time = np.arange(251) * 0.004
+    command = 0.3 * np.sin(6 * time)[:, None]
+    replay = servo_replay(scene, Drive(command, np.zeros(1), 0.004, MOTOR), parity=True)
+    got = over_population(lambda values: replay(make_physics(scene, NOTHING, values)))(NOTHING.mean[None])
+    delayed = np.interp(time - 0.002, time, command[:, 0])[:, None]
+    torque, _ = pendulum_c(scene, delayed, 0.004)
+    np.testing.assert_allclose(got.torque[0, :, 0], torque, atol=1e-3)
+
+
+# ----- effects
+
+
+def test_effects_enter_where_they_say(scene: Scene, drive: Drive):
+    """A constant force, a command law and an observation, each against what it must do."""
+    seen = {}
+
+    def force(theta, state):
+        seen["shapes"] = (state.qpos.shape, state.qvel.shape, state.load.shape)
+        return jnp.array([0.0, 1.5])
+
+    kick = Effect("kick", force=force)
+    hold = Effect("hold", command=lambda theta, time, look: 0.5 * (look(time) + look(time - 0.01)))
+    scale = Effect("scale", observe=lambda theta, r: replace(r, torque=2.0 * r.torque))
+    physics = make_physics(scene, SPACE, jnp.asarray(SPACE.mean, jnp.float32))
+
+    def compiled(*effects: Effect) -> Rollout:
+        return jax.jit(servo_replay(scene, drive, effects), compiler_options=runtime.compiler_options())(physics)
+
+    plain, kicked, held, scaled = compiled(), compiled(kick), compiled(hold), compiled(scale)
+    assert seen["shapes"] == ((2,), (2,), (2,))
+    np.testing.assert_array_equal(scaled.torque, 2.0 * plain.torque)
+    # at rest the servo gives way until kp dq = 1.5 N m
+    assert float(kicked.torque[-1, 1] - plain.torque[-1, 1]) < -0.5
+    q = np.asarray(held.position)
+    expected = 0.5 * (servo_torque(q, 0.0) + servo_torque(q, 0.01))
+    np.testing.assert_allclose(held.torque, expected, atol=2e-4)
+
+
+def test_command_effects_act_one_after_the_other(scene: Scene, drive: Drive):
+    """A delay of 10 ms behind a delay of 20 ms is a delay of 30 ms."""
+    late = [Effect(f"{d}", command=lambda theta, time, look, d=d: look(time - d)) for d in (0.01, 0.02)]
+    physics = make_physics(scene, SPACE, jnp.asarray(SPACE.mean, jnp.float32))
+    rollout = jax.jit(servo_replay(scene, drive, late), compiler_options=runtime.compiler_options())(physics)
+    np.testing.assert_allclose(rollout.torque, servo_torque(np.asarray(rollout.position), 0.03), atol=2e-4)
+
+
+def test_the_twin_refuses_what_it_cannot_run(scene: Scene, drive: Drive):
+    kick = Effect("kick", force=lambda theta, state: state.qvel)
+    with pytest.raises(ValueError, match="cannot run effects that depend on the state: kick"):
+        twin_replay(scene, SPACE, drive, [kick])
+    for convention in (TorqueConvention(TorqueSide.LINK, False), TorqueConvention(TorqueSide.MOTOR, True)):
+        with pytest.raises(ValueError, match="the actuators' torque alone: motor-side"):
+            twin_replay(scene, SPACE, replace(drive, torque=convention))
+
+
+# ----- a cost over such replays
+
+
+def test_a_cost_serves_other_repeats_of_the_same_motion_alone(scene: Scene):
+    cost = make_cost(scene, SPACE, [recording()])
+    elsewhere = {"shoulder": 0.5, "elbow": -0.3}
+    for other in (
+        recording(command=motion()[1] + 0.1),
+        recording(torque=TorqueConvention(TorqueSide.LINK, False)),
+        recording(torque=TorqueConvention(TorqueSide.MOTOR, True)),
+    ):
+        with pytest.raises(ValueError, match="other commands than 'wave' had, measured another torque"):
+            cost.against([other])
+    with pytest.raises(ValueError, match="servo gain of 30 for elbow"):
+        cost.against([recording(gains=ServoGains(np.array([60.0, 30.0]), np.array([3.0, 1.0])))])
+    near = cost.against([recording(qpos0={"shoulder": 0.0008, "elbow": -0.3})])  # measured starts scatter
+    np.testing.assert_array_equal(near.drives[0].qpos0, cost.drives[0].qpos0)  # pyright: ignore
+    moved = cost.against([recording(qpos0=elsewhere)]).rollouts(SPACE.mean[None])[0]  # each starts where it starts
+    anew = make_cost(scene, SPACE, [recording(qpos0=elsewhere)]).rollouts(SPACE.mean[None])[0]
+    assert moved.position[0, 0].tolist() == pytest.approx([0.5, -0.3])
+    np.testing.assert_allclose(moved.torque, anew.torque, atol=1e-4)
+
+
+def test_joint_friction_that_is_given_as_an_effect_counts_once(scene: Scene):
+    friction = joint_friction_space(JOINTS).select(["coulomb[elbow]"])
+    values = np.array([[0.5]])
+    own = make_cost(scene, friction, [recording()]).rollouts(values)[0]
+    given = make_cost(scene, friction, [recording()], effects=(joint_friction_effect(JOINTS),)).rollouts(values)[0]
+    np.testing.assert_allclose(given.torque, own.torque, atol=1e-6)
+
+
+# ----- what is refused
+
+
+def test_gains_must_match(scene: Scene):
+    wrong = make_drive(scene, recording(gains=ServoGains(np.array([60.0, 30.0]), np.array([3.0, 1.0]))))
+    for check in (check_gains, servo_replay):
+        with pytest.raises(ValueError, match="servo gain of 30 for elbow, the scene has 25"):
+            check(scene, wrong)
+    with pytest.raises(ValueError, match="servo gain of 30 for elbow"):
+        twin_replay(scene, SPACE, wrong)
+    check_gains(scene, make_drive(scene, recording(gains=None)))
+
+
+def test_a_recording_without_commands_is_refused(scene: Scene):
+    log = recording(time=np.zeros(0), command=np.zeros((0, 0)), command_names=())
+    with pytest.raises(ValueError, match=r"'wave' holds no commands.*inverse mode"):
+        make_drive(scene, log)
+
+
+def test_gains_of_what_is_no_servo_are_told_to_need_one():
+    spec = arm().spec.copy()
+    spec.actuators[1].set_to_motor()
+    scene = compile_scene(spec, "driven", joints=JOINTS)
+    stated = make_drive(arm(), recording(gains=ServoGains(np.array([60.0, 25.0]), np.array([3.0, 1.0]))))
+    with pytest.raises(ValueError, match="no position servo; make it a <position> servo in the MJCF"):
+        check_gains(scene, stated)
+
+
+def test_missing_and_foreign_columns_are_named(scene: Scene):
+    _, command = motion()
+    with pytest.raises(ValueError, match="missing: elbow; given: shoulder"):
+        make_drive(scene, recording(command=command[:, :1], command_names=("shoulder",), gains=None))
+    with pytest.raises(ValueError, match="unknown: wrist"):
+        more = np.concatenate([command, command[:, :1]], axis=1)
+        make_drive(scene, recording(command=more, command_names=(*JOINTS, "wrist"), gains=None))
+    with pytest.raises(ValueError, match=r"recording 'wave', qpos0: unknown joint 'wrist'.*shoulder, elbow"):
+        make_drive(scene, recording(qpos0={"wrist": 0.0}))
+
+
+@pytest.mark.parametrize(("left", "says"), [(0, "has no actuators"), (1, "has no actuator for shoulder")])
+def test_commanded_joints_without_an_actuator_are_the_scenes_fault(left: int, says: str):
+    xml = ARM.format(gravcomp="", friction="", sensor="")
+    start, end = xml.index("<actuator>"), xml.index("<sensor>")
+    kept = '<actuator><position name="e" joint="elbow" kp="25"/></actuator>' * left
+    bare = compile_scene(mujoco.MjSpec.from_string(xml[:start] + kept + xml[end:]), "bare")
+    with pytest.raises(ValueError, match=f"scene 'bare' {says}, and recording 'wave' holds commands"):
+        make_drive(bare, recording(gains=None))
+
+
+@pytest.mark.parametrize(("option", "says"), [('integrator="RK4"', "Euler"), ('cone="elliptic"', "pyramidal")])
+def test_an_option_that_no_replay_has_is_told_with_the_scene(option: str, says: str):
+    xml = ARM.format(gravcomp='gravcomp="1"', friction="", sensor="").replace('integrator="implicitfast"', option)
+    odd = compile_scene(mujoco.MjSpec.from_string(xml), "odd", joints=JOINTS, engine="mujoco")
+    with pytest.raises(ValueError, match=f"a replay of scene 'odd' .*{says}"):
+        servo_replay(odd, make_drive(odd, recording()))
+
+
+def test_a_cost_takes_one_recording_and_is_written_in_a_line(scene: Scene):
+    space = Space((joint_damping(scene, "elbow", std=0.1, high=50.0),))
+    assert repr(make_cost(scene, space, recording())) == "<Cost of wave over 1 parameters of scene 'arm'>"
+
+
+# ----- replays that blow up
+
+
+UNSTABLE = Space(
+    (joint_damping(arm(), "elbow", name="elbow_damping", std=1.0, low=-2000.0, high=50.0, scaling=Scaling.LINEAR),)
+)
+
+
+@pytest.mark.parametrize("engine", ["mjx", "mujoco"])
+def test_a_replay_that_blows_up_costs_the_penalty_and_harms_no_other(engine: str):
+    """Negative damping of 1500 N m s/rad flings the arm to infinity within a few steps."""
+    scene = arm()
+    cost = make_cost(scene, UNSTABLE, [recording()], engine=engine)
+    good = np.array([[1.0], [2.0]])
+    mixed = np.array([[1.0], [-1500.0], [2.0]])
+    np.testing.assert_array_equal(cost(mixed)[[0, 2]], cost(good))
+    assert cost(mixed)[1] == cost.comparisons[0].config.non_finite_cost == 1000.0
+    np.testing.assert_array_equal(cost.failed(mixed), [False, True, False])
+    np.testing.assert_array_equal(cost.rollouts(mixed)[0].finite, [True, False, True])
+    z = cost.whitened(mixed)
+    assert np.isnan(z[1]).all() and np.isfinite(z[[0, 2]]).all()
+
+
+@pytest.mark.parametrize("trace", ["torque", "position", "velocity", "object_angle"])
+def test_a_rollout_with_a_number_that_is_none_is_not_finite(trace: str):
+    still = Rollout(*np.zeros((7, 5, 2)))
+    assert observed(still, {}, ()).finite
+    broken = getattr(still, trace).copy()
+    broken[3, 1] = np.inf
+    assert not observed(replace(still, **{trace: broken}), {}, ()).finite
+
+
+def test_actuators_with_a_state_of_their_own_are_refused(tmp_path: Path):
+    """The scan does not carry activations: a filtered actuator would be reset at every step."""
+    xml = ARM.format(gravcomp='gravcomp="1"', friction="", sensor="").replace(
+        '<position name="s" joint="shoulder" kp="60"/>',
+        '<position name="s" joint="shoulder" kp="60" timeconst="0.1"/>',
+    )
+    with pytest.raises(ValueError, match=r"activation|state"):
+        filtered = compile_scene(mujoco.MjSpec.from_string(xml), "arm", joints=JOINTS)
+        servo_replay(filtered, make_drive(filtered, recording()))

@@ -1,0 +1,255 @@
+"""Where a motion starts, and what is said where that is a guess."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+from two_link import ARM, JOINTS, arm, measured, motion, recording
+
+from droid_jax.cost.cost import _start_alike, followed, make_cost
+from droid_jax.cost.residuals import CompareConfig
+from droid_jax.door.demonstration import demonstration_path
+from droid_jax.door.scene import door_scene
+from droid_jax.model.effect_interface import Effect
+from droid_jax.model.fields import joint_damping
+from droid_jax.model.parameters import Parameter, Space
+from droid_jax.model.scene import Scene, compile_scene
+from droid_jax.preflight.preflight import check_range, geared, open_loop
+from droid_jax.recordings.formats import load
+from droid_jax.recordings.recording import Channel, Recording, ServoGains
+from droid_jax.simulate.initial_state import AJAR
+from droid_jax.simulate.replay import Drive, check_gains, make_drive
+
+SPACE = Space((joint_damping(arm(), "elbow", name="elbow_damping", std=0.1, high=50.0),))
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return arm()
+
+
+def test_a_motion_starts_where_it_says_else_where_it_was_measured_else_where_it_was_sent(scene: Scene):
+    _, command = motion()
+
+    def start(**changes) -> list[float]:
+        return make_drive(scene, recording(**changes)).qpos0.tolist()
+
+    assert start() == [0.0, -0.3]
+    assert start(qpos0={"elbow": 0.7}, channels=measured(0.2)) == pytest.approx([0.25, 0.7])
+    assert start(qpos0={}, channels=measured(0.2, ("shoulder",))) == pytest.approx([0.25, command[0, 1]])
+    assert start(qpos0={}) == pytest.approx([0.0, -0.3])
+
+
+@pytest.mark.parametrize(("late", "jerky", "warned"), [(0.0, 0, False), (0.15, 0, True), (0.0, 1, False)])
+def test_a_recording_that_begins_in_motion_is_warned_of(scene: Scene, late: float, jerky: int, warned: bool):
+    """Cut where the robot moves, it is not what a replay from rest does; neither noise of the sensors is a motion, nor
+    a quick start from rest."""
+    time, _ = motion(2.0)
+    swing = 0.4 * (1 - np.cos(2 * (time + late))) + jerky * 0.3 * np.clip(time / 0.1, 0, 1) ** 3
+    path = np.stack([swing, np.full_like(time, -0.3)], axis=1)
+    values = path + np.random.default_rng(2).normal(0, 2e-5, (3, *path.shape))
+    position = Channel("position", "rad", JOINTS, time, values, np.ones(values.shape, bool))
+    torque = replace(position, name="torque", unit="N m")
+    cut = recording(time=time, command=path, channels={"position": position, "torque": torque}, qpos0={})
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        followed(scene, cut, CompareConfig())
+    found = [str(w.message) for w in said if "begins at rest" in str(w.message)]
+    assert len(found) == warned
+    assert all("'wave' begins while shoulder moves" in text for text in found)
+
+
+def in_degrees(fine: Recording, measured: bool) -> Recording:
+    """The same motion with its commands, or with measured positions, in degrees."""
+    wrong = np.rad2deg(fine.command)
+    if not measured:
+        return replace(fine, command=wrong)
+    seen = Channel("position", "rad", JOINTS, fine.time, wrong[None].repeat(2, 0), np.ones((2, *wrong.shape), bool))
+    return replace(fine, channels={**fine.channels, "position": seen})
+
+
+def test_a_recording_made_in_python_is_checked_like_one_from_a_file(scene: Scene):
+    fine = recording()
+    torque = fine.channels["torque"]
+    values = torque.values.copy()
+    values[0, 3, 1] = np.nan
+    broken = replace(fine, channels={"torque": replace(torque, values=values)})
+    with pytest.raises(ValueError, match=r"channel 'torque', repeat 0, row 3, column 'elbow': expected a finite"):
+        make_cost(scene, SPACE, [broken])
+
+
+def test_a_parameter_that_nothing_reads_is_refused(scene: Scene):
+    """A slip in a name would be a parameter that no data tell, and nobody would know why."""
+    wrong = Space((*SPACE.parameters, Parameter("torque_offset[elbo]", "N m", 0.0, 0.1, -1.0, 1.0)))
+    with pytest.raises(ValueError, match=r"parameters torque_offset\[elbo\] write no field.*torque_offset\[elbow\]"):
+        make_cost(scene, wrong, [recording()])
+    effect = Effect("slip", (wrong["torque_offset[elbo]"],), observe=lambda theta, rollout: rollout)
+    make_cost(scene, wrong, [recording()], effects=[effect])
+
+
+@pytest.mark.parametrize("limited", ["true", "false"])
+@pytest.mark.parametrize("measured", [False, True])
+def test_degrees_are_no_radians(measured: bool, limited: str):
+    """Whether the replay holds the joint within its range or not, as the built-in scenes do not."""
+    xml = ARM.format(gravcomp='gravcomp="1"', friction=f'limited="{limited}" range="-2 2"', sensor="")
+    scene = compile_scene(mujoco.MjSpec.from_string(xml), "arm", joints=JOINTS)
+    fine = recording()
+    make_cost(scene, SPACE, [fine])
+    said = "shoulder is measured at" if measured else "elbow is sent to"
+    with pytest.raises(ValueError, match=said + r" .* far outside its range -2 \.\. 2 rad: are these degrees"):
+        make_cost(scene, SPACE, [in_degrees(fine, measured)])
+    with pytest.raises(ValueError, match=r"elbow starts at -17.* far outside its range"):
+        check_range(scene, replace(fine, qpos0={"elbow": -17.2}))
+
+
+def test_normalised_positions_and_encoder_counts_are_named(scene: Scene):
+    fine = recording()
+    percent = replace(fine, command=60.0 * np.sin(5.0 * fine.time)[:, None] * np.ones(2))
+    with pytest.warns(UserWarning, match=r"turns: are these degrees\? Or normalised to -100 \.\. 100, or 0 \.\. 100\?"):
+        check_range(scene, percent)
+    counts = replace(fine, command=np.round(2048.0 + 300.0 * np.sin(5.0 * fine.time)[:, None] * np.ones(2)))
+    with pytest.warns(UserWarning, match=r"turns: are these degrees\? Or encoder counts\?"):
+        check_range(scene, counts)
+
+
+def test_a_little_outside_of_a_range_may_be_degrees_too(scene: Scene):
+    """Eight degrees are twice as far as an arm can reach that turns by four radians; a servo overshoots by less."""
+    xml = ARM.format(gravcomp='gravcomp="1"', friction='range="-2 2"', sensor="")
+    limited = compile_scene(mujoco.MjSpec.from_string(xml), "arm", joints=JOINTS)
+    fine = recording()
+    for q in (2.3, 5.0, -5.9):
+        with pytest.warns(UserWarning, match=rf"elbow starts at {q:g}, outside its range -2 \.\. 2 rad: are these deg"):
+            check_range(limited, replace(fine, qpos0={"elbow": q}))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_range(limited, replace(fine, qpos0={"elbow": 2.1}))
+
+
+@pytest.mark.parametrize("measured", [False, True])
+def test_degrees_are_no_radians_of_a_hinge_without_a_range_either(scene: Scene, measured: bool):
+    """A wheel may turn often, so it is a warning."""
+    fine = recording()
+    said = "elbow is measured at" if measured else "elbow is sent to"
+    with pytest.warns(UserWarning, match=rf"'wave': {said} .* turns: are these degrees\?"):
+        check_range(scene, in_degrees(fine, measured))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_range(scene, fine)
+
+
+def motors() -> Scene:
+    """The arm whose shoulder a motor drives, not a servo."""
+    xml = ARM.format(gravcomp='gravcomp="1"', friction="", sensor="")
+    xml = xml.replace('<position name="s" joint="shoulder" kp="60"/>', '<motor name="s" joint="shoulder"/>')
+    return compile_scene(mujoco.MjSpec.from_string(xml), "arm", joints=JOINTS)
+
+
+def test_commands_of_an_actuator_without_position_feedback_are_said_to_be_torques(scene: Scene):
+    said = "the actuators of shoulder have no position feedback: the commands of recording 'wave' are taken as"
+    with pytest.warns(UserWarning, match=said):
+        followed(motors(), recording(gains=None), CompareConfig())
+    assert not open_loop(scene, recording())
+
+
+def test_a_start_that_would_be_a_guess_is_refused():
+    driven = motors()
+    with pytest.raises(ValueError, match="does not tell where shoulder starts"):
+        make_drive(driven, recording(qpos0={}, gains=None))
+    started = make_drive(driven, recording(qpos0={}, gains=None, channels=measured(0.2)))
+    np.testing.assert_allclose(started.qpos0, [0.25, 0.25])
+
+
+def test_an_object_starts_where_it_was_seen_unless_a_cameras_noise_is_all(scene: Scene):
+    spec = mujoco.MjSpec.from_string(ARM.format(gravcomp='gravcomp="1"', friction="", sensor=""))
+    door = spec.worldbody.add_body(name="door", pos=[0, 2, 0])
+    door.add_joint(name="hinge", axis=[0, 0, 1])
+    door.add_geom(size=[0.1, 0, 0])
+    scene = compile_scene(spec, "arm and door", joints=JOINTS, object_joint="hinge")
+    time, _ = motion()
+
+    def start(angle: float, **named: float) -> float:
+        seen = np.full((2, len(time), 1), angle) + 0.1 * time[:, None]
+        camera = Channel("object_angle", "rad", ("lid",), time, seen, np.ones(seen.shape, bool))
+        channels = {**recording().channels, "object_angle": camera}
+        drive = make_drive(scene, recording(channels=channels, qpos0={**recording().qpos0, **named}))
+        return float(drive.qpos0[scene.qpos("hinge")])
+
+    assert start(0.005) == 0.0 and start(0.4) == pytest.approx(0.4) and start(0.4, hinge=0.1) == 0.1
+
+
+def test_repeats_serve_a_door_that_is_seen_just_ajar():
+    """About AJAR the mean of some repeats is put back to the scene's pose, and that of others is not."""
+    door, demonstration = door_scene(), load(demonstration_path("A"))
+    time = demonstration.time[::30]
+
+    def seen(angle: float) -> Drive:
+        values = np.full((2, len(time), 1), angle)
+        channel = Channel("object_angle", "rad", ("hinge",), time, values, np.ones(values.shape, bool))
+        return make_drive(door, replace(demonstration, channels={"object_angle": channel}), weigh=False)
+
+    shut, ajar, open_ = (seen(angle) for angle in (AJAR - 1e-3, AJAR + 1e-3, 2 * AJAR))
+    assert shut.qpos0[door.qpos("hinge")] == 0.0 and ajar.qpos0[door.qpos("hinge")] > AJAR
+    assert _start_alike(door, shut, ajar) and _start_alike(door, ajar, shut) and not _start_alike(door, shut, open_)
+    assert not _start_alike(door, open_, seen(2 * AJAR + 0.015))  # neither is put back: these are two motions
+
+
+COUPLED = """<mujoco><worldbody><body><joint name="shoulder" axis="0 1 0"/><geom size=".1" pos="0 0 .2"/>
+  <body pos="0 0 .4"><joint name="elbow" axis="0 1 0"/><geom size=".1" pos="0 0 .2"/>
+    <body pos="0 0 .2"><joint name="mimic" axis="0 1 0" ref="0.1"/><geom size=".05" pos="0 0 .1"/></body>
+    <body pos="0 0 .3"><joint name="last" axis="0 1 0"/><geom size=".05" pos="0 0 .1"/></body></body></body></worldbody>
+  <equality><joint joint1="last" joint2="mimic" polycoef="0 2 1 0 0"/>
+    <joint joint1="{first}" joint2="{second}" polycoef="0.05 -2 0 0 0"/></equality>
+  <actuator><position joint="shoulder" kp="80" kv="5"/><position joint="elbow" kp="80" kv="5"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("driver", ["elbow", "mimic"])
+def test_a_joint_that_follows_another_starts_where_that_has_it(driver: str):
+    """Else the replay begins with a constraint that is broken, and yanks the joints together."""
+    first, second = ("mimic", "elbow") if driver == "elbow" else ("elbow", "mimic")
+    scene = compile_scene(
+        mujoco.MjSpec.from_string(COUPLED.format(first=first, second=second)), "coupled", joints=("shoulder", "elbow")
+    )
+    heavy = {"torque": replace(recording().torque, gravity=True), "gains": None}
+    model, data = scene.model, mujoco.MjData(scene.model)
+    data.qpos[:] = make_drive(scene, recording(qpos0={"shoulder": 0.2, "elbow": 0.4}, **heavy)).qpos0
+    mujoco.mj_fwdPosition(model, data)
+    rows = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+    assert rows.sum() == 2 and np.abs(data.efc_pos[rows]).max() < 1e-9
+    assert data.qpos[scene.qpos("elbow")] == 0.4 and abs(data.qpos[scene.qpos("mimic")]) > 0.1
+    near = float(data.qpos[scene.qpos("mimic")]) + 0.003
+    stated = make_drive(scene, recording(qpos0={"shoulder": 0.2, "elbow": 0.4, "mimic": near}, **heavy)).qpos0
+    assert stated[scene.qpos("mimic")] == near  # what a recording says is not touched
+    with pytest.raises(ValueError, match=r"starts where <joint> of (mimic|elbow) and (mimic|elbow) .* is open by "):
+        make_drive(scene, recording(qpos0={"shoulder": 0.2, "elbow": 0.4, "mimic": 0.3}, **heavy))
+
+
+def test_a_servo_with_a_gear_is_sent_its_control_and_that_is_said():
+    spec = arm().spec.copy()
+    for actuator in spec.actuators:
+        actuator.gear[0] = 50.0
+    scene = compile_scene(spec, "geared", joints=JOINTS)
+    assert "the servos of elbow, shoulder have a gear" in geared(scene, recording())
+    assert not geared(arm(), recording())
+    kp = np.array([60.0, 25.0])
+    given = recording(gains=ServoGains(kp * 50.0**2, np.zeros(2)))  # N m/rad at the joint
+    check_gains(scene, make_drive(scene, given))
+    with pytest.raises(ValueError, match="the recording states a servo gain of"):
+        check_gains(scene, make_drive(scene, recording(gains=ServoGains(kp, np.zeros(2)))))
+
+
+def test_coupled_joints_follow_the_scatter_of_what_has_them():
+    """Starts that differ by a milliradian differ by fifty in a rotor behind a gear: the same replay serves both."""
+    text = (
+        COUPLED.format(first="mimic", second="elbow").replace("0.05 -2 0 0 0", "0 50 0 0 0").replace("0 2 1 0 0", "0 1")
+    )
+    scene = compile_scene(mujoco.MjSpec.from_string(text), "geared", joints=("shoulder", "elbow"))
+    heavy = {"torque": replace(recording().torque, gravity=True), "gains": None}
+    one, other = (make_drive(scene, recording(qpos0={"shoulder": 0.2, "elbow": q}, **heavy)) for q in (0.4, 0.401))
+    assert np.abs(one.qpos0 - other.qpos0).max() == pytest.approx(0.05)
+    assert _start_alike(scene, one, other)
+    stated = {"shoulder": 0.2, "elbow": 0.401, "mimic": float(other.qpos0[scene.qpos("mimic")]) + 0.2}
+    assert not _start_alike(scene, one, make_drive(scene, recording(qpos0=stated, **heavy)))

@@ -1,0 +1,136 @@
+"""The folder list is the data flow: imports point only to layers further up."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / "droid_jax"
+ORDER = (
+    *("model", "recordings", "simulate", "preflight", "cost", "identify", "discrepancy", "policy", "report"),
+    *("door", "synthetic"),  # the leaves: of the paper's door and of the synthetic robot no layer above knows anything
+    *("commands", "run"),
+)
+FOR_ALL = ("storage", "runtime", "quiet", "console", "errors", "files", "arguments", "read_json", "read_npz")
+# Third-party package -> the only files or folders of droid_jax that may import it.
+ONLY_IN = {
+    "evosax": ("identify/cma.py",),
+    "brax": ("policy", "door/environment.py"),
+    "matplotlib": ("report",),
+    "jinja2": ("report",),
+    "PIL": ("report",),
+    "imageio": ("report",),
+}
+
+
+def imports(source: str, module: tuple[str, ...], is_package: bool) -> Iterator[str]:
+    """Dotted names a module imports, at any depth of its code, relative ones made absolute.
+
+    module: the dotted name as a tuple, e.g. ("droid_jax", "model", "scene"); `from a import b`
+    yields "a.b", which may name a module or something inside one.
+    """
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base: tuple[str, ...] = ()
+            if node.level:
+                base = module[: len(module) - node.level + is_package]
+            start = [*base, *([node.module] if node.module else [])]
+            yield from (".".join([*start, alias.name]) for alias in node.names)
+
+
+def layer_fault(path: str, imported: str) -> str | None:
+    """What is wrong with a file (relative to the package, "model/scene.py") importing a name, if anything."""
+    parts = imported.split(".")
+    if parts[0] != "droid_jax":
+        homes = ONLY_IN.get(parts[0])
+        allowed = homes is None or any(path == home or path.startswith(f"{home}/") for home in homes)
+        return None if allowed else f"{path} imports {imported}, which belongs in {' or '.join(homes or ())}"
+    here = path.removesuffix(".py").split("/")[0]
+    there = parts[1] if len(parts) > 1 else ""
+    if here == "__init__" or there in FOR_ALL:
+        return None
+    if here in FOR_ALL:
+        return f"{path} imports {imported}, but every layer may import {path}"
+    if there not in ORDER:
+        return f"{path} imports {imported}, which is in no layer"
+    if here == "__main__" or ORDER.index(there) <= ORDER.index(here):
+        return None
+    return f"{path} imports {imported}, but {there} comes after {here}"
+
+
+def faults(folder: Path) -> list[str]:
+    """All faults of a package folder."""
+    found = []
+    for file in sorted(folder.rglob("*.py")):
+        relative = file.relative_to(folder)
+        module = ("droid_jax", *relative.with_suffix("").parts)
+        is_package = file.name == "__init__.py"
+        names = imports(file.read_text(), module[:-1] if is_package else module, is_package)
+        found += [fault for name in names if (fault := layer_fault(relative.as_posix(), name))]
+    return found
+
+
+def test_imports_point_only_to_layers_further_up():
+    assert faults(PACKAGE) == []
+
+
+def test_every_folder_and_file_of_the_package_is_a_layer():
+    names = {p.stem for p in PACKAGE.iterdir() if p.suffix == ".py" or (p.is_dir() and any(p.glob("*.py")))}
+    assert names <= {*ORDER, *FOR_ALL, "__init__", "__main__"}
+
+
+@pytest.mark.parametrize(
+    ("path", "source"),
+    [
+        ("model/scene.py", "from droid_jax.cost import residuals"),
+        ("model/scene.py", "from ..cost import residuals"),
+        ("model/__init__.py", "from ..cost import residuals"),
+        ("model/effects/delay.py", "from ...recordings.recording import Recording"),
+        ("cost/cost.py", "def late():\n    import droid_jax.report.page"),
+        ("cost/cost.py", "from droid_jax import run"),
+        ("cost/cost.py", "from droid_jax import Parameter"),
+        ("simulate/replay.py", "from droid_jax.door.scene import door_scene"),
+        ("report/page.py", "from droid_jax.synthetic.hidden_effects import HIDDEN"),
+        ("runtime.py", "from droid_jax.model import parameters"),
+        ("storage.py", "from droid_jax.recordings import recording"),
+        ("identify/gaussian.py", "import evosax"),
+        ("identify/multistart.py", "from evosax.algorithms import CMA_ES"),
+        ("discrepancy/screen.py", "import brax.envs"),
+        ("discrepancy/screen.py", "import matplotlib.pyplot as plt"),
+        ("report/page.py", "from droid_jax.commands import gap"),
+        ("commands/gap.py", "from droid_jax.run import main"),
+        ("run.py", "from PIL import Image"),
+    ],
+)
+def test_a_wrong_import_is_found(tmp_path, path, source):
+    file = tmp_path / path
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(source)
+    assert len(faults(tmp_path)) == 1
+
+
+@pytest.mark.parametrize(
+    ("path", "source"),
+    [
+        ("cost/cost.py", "from droid_jax.model.parameters import Space"),
+        ("cost/cost.py", "from .residuals import torque_distance\nfrom ..model import scene"),
+        ("simulate/__init__.py", "from .replay import make_replay"),
+        ("cost/cost.py", "from droid_jax.runtime import compiler_options\nfrom droid_jax import errors"),
+        ("model/parameter_file.py", "from droid_jax.storage import write_json"),
+        ("identify/cma.py", "from evosax.algorithms import CMA_ES"),
+        ("policy/train.py", "from brax.training.agents.ppo import train"),
+        ("commands/gap.py", "from droid_jax.discrepancy.case import make_case\nfrom droid_jax.report import page"),
+        ("run.py", "from droid_jax.commands import gap\nimport numpy, pathlib"),
+        ("__init__.py", "from droid_jax.report.page import write"),
+    ],
+)
+def test_a_right_import_passes(tmp_path, path, source):
+    file = tmp_path / path
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(source)
+    assert faults(tmp_path) == []
