@@ -34,7 +34,7 @@ from droid_jax.identify.levenberg_marquardt import CHORDS, TRIALS  # noqa: E402
 from droid_jax.model.effects.registry import effect_space, library, ready  # noqa: E402
 from droid_jax.recordings.formats import load  # noqa: E402
 from droid_jax.recordings.recording import Recording  # noqa: E402
-from droid_jax.synthetic.robot import SurrogateConfig, record, stand_in_truth  # noqa: E402
+from droid_jax.synthetic.robot import SyntheticRobotConfig, record, synthetic_truth  # noqa: E402
 
 TIMESTEP = 0.004  # s
 SHORT = 1.0  # s of the demonstration with --quick
@@ -55,12 +55,12 @@ class Arguments:
 
 
 def recording(quick: bool) -> Recording:
-    """Two repeats of the stand-in robot: what they hold does not matter here."""
+    """Two repeats of the synthetic robot: what they hold does not matter here."""
     scene, demonstration = door_scene(), load(demonstration_path("A"))
     if quick:
         first = float(demonstration.time[0])
         demonstration = demonstration.window(first, first + SHORT)
-    return record(scene, demonstration, stand_in_truth(scene, 1, 0), seed=0, config=SurrogateConfig(repeats=2))
+    return record(scene, demonstration, synthetic_truth(scene, 1, 0), seed=0, config=SyntheticRobotConfig(repeats=2))
 
 
 def main() -> None:

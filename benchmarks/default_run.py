@@ -112,7 +112,7 @@ def results(out: Path) -> dict[str, Any]:
         "verdict": gap["verdict"],
         "effects": gap["effects"],
         "sentence": gap["sentence"],
-        "success": {place: transfer[place]["success_rate"] for place in ("simulation", "stand_in")},
+        "success": {place: transfer[place]["success_rate"] for place in ("simulation", "synthetic_robot")},
     }
 
 

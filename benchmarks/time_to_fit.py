@@ -51,10 +51,10 @@ def fit(generations: int) -> dict[str, Any]:
     from droid_jax.door.space import door_space
     from droid_jax.identify.search import SearchConfig, search
     from droid_jax.recordings.formats import load
-    from droid_jax.synthetic.robot import record, stand_in_truth
+    from droid_jax.synthetic.robot import record, synthetic_truth
 
     scene = door_scene(timestep=TIMESTEP)
-    recording = record(scene, load(demonstration_path("A")), stand_in_truth(scene, 1, 1), seed=1, name="A")
+    recording = record(scene, load(demonstration_path("A")), synthetic_truth(scene, 1, 1), seed=1, name="A")
     began = time.perf_counter()
     cost = make_cost(scene, door_space(scene), [recording])
     config = SearchConfig(population=POPULATION, parents=5, generations=generations, tol_cost=0, tol_sigma=0)

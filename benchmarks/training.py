@@ -3,7 +3,8 @@
     python benchmarks/training.py [--quick] [--out DIR] [--preset quick] [--seed 0]
 
 One policy on doors drawn from the prior, on all devices, from an empty compilation cache; then it is tried in the
-simulation and on the stand-in robot (Table I's door without a spring).  Writes DIR/training.json, by preset and device:
+simulation and on the synthetic robot (Table I's door without a spring).  Writes DIR/training.json, by preset and
+device:
 what the file holds of others stays.  The policy and the Gaussian of its doors are left in DIR/training_policy/PRESET
 (PRESET_gpu of a GPU), where experiments/policy_parity.py can take them.
 """
@@ -47,12 +48,12 @@ from droid_jax.policy.network import save_policy  # noqa: E402
 from droid_jax.policy.randomise import randomised  # noqa: E402
 from droid_jax.policy.train import PRESETS, TrainProgress, train  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
-from droid_jax.synthetic.policy_trials import TransferConfig, stand_in, transfer  # noqa: E402
-from droid_jax.synthetic.robot import stand_in_truth  # noqa: E402
+from droid_jax.synthetic.policy_trials import TransferConfig, synthetic_robot, transfer  # noqa: E402
+from droid_jax.synthetic.robot import synthetic_truth  # noqa: E402
 from experiments.policies.cases import TIMESTEP, Options  # noqa: E402
 
 ENOUGH = 0.95  # success in the evaluations during training
-TRUTH = (0, 0)  # springs and seed of the stand-in robot
+TRUTH = (0, 0)  # springs and seed of the synthetic robot
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,7 @@ class Arguments:
     seed: int = 0
     """Of the policy."""
     trials: int = 100
-    """Episodes in simulation, and trials on the stand-in robot."""
+    """Episodes in simulation, and trials on the synthetic robot."""
 
 
 def measured(arguments: Arguments) -> dict[str, Any]:
@@ -91,8 +92,8 @@ def measured(arguments: Arguments) -> dict[str, Any]:
     physics = round(env.task.control / TIMESTEP)  # steps of the simulation in an action
     rates = [now.rate for now in found.history[2:]] or [found.history[-1].rate]  # the first part compiles
     reached = [now for now in found.history if now.success >= ENOUGH]
-    robot = stand_in(
-        door_scene(limits=True), env.start, stand_in_truth(door_scene(), *TRUTH), (), env.task,
+    robot = synthetic_robot(
+        door_scene(limits=True), env.start, synthetic_truth(door_scene(), *TRUTH), (), env.task,
         TransferConfig(trials=budget.trials),
     )  # fmt: skip
     return {
@@ -102,7 +103,7 @@ def measured(arguments: Arguments) -> dict[str, Any]:
         "seconds_to_95": reached[0].seconds if reached else None,
         "actions_to_95": reached[0].step if reached else None,
         "simulation": simulated(found.policy, env, doors, budget.trials, arguments.seed).to_json(),
-        "stand_in": transfer(found.policy, robot).to_json(),
+        "synthetic_robot": transfer(found.policy, robot).to_json(),
         "history": [asdict(now) for now in found.history],
         "config": asdict(config),
     }
@@ -119,7 +120,7 @@ def main() -> None:
     path = arguments.out / f"{stem('training', arguments.quick)}.json"
     known = json.loads(path.read_text()) if path.is_file() else {}
     write_json(path, {**known, f"{arguments.preset}, {code['device']}": result})
-    rates = {where: result[where]["success_rate"] for where in ("simulation", "stand_in")}
+    rates = {where: result[where]["success_rate"] for where in ("simulation", "synthetic_robot")}
     figures = {name: result[name] for name in ("seconds", "actions_per_s", "steps_per_s", "seconds_to_95")}
     print(json.dumps({**figures, **rates, "devices": jax.local_device_count()}))
 

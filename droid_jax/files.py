@@ -11,8 +11,10 @@ GAP, GAP_TRACES = "gap.json", "gap.npz"
 TO_BE_MADE, NOT_MADE = "to be made", "not made"
 EXTENDED, EXTENDED_MJCF = "extended.json", "extended.xml"
 POLICY, TRAINING, TRANSFER, FILMS = "policy.npz", "training.json", "transfer.json", "films"
-STAND_IN = "stand_in.json"  # beside the stand-in's recordings: its springs, seed and hidden effects
-STAND_IN_SOURCE = "stand-in robot (plain C MuJoCo), not a real one"  # in the metadata of what it recorded
+SYNTHETIC_ROBOT = (
+    "synthetic_robot.json"  # beside the synthetic robot's recordings: its springs, seed and hidden effects
+)
+STAND_IN_SOURCE = "synthetic robot (plain C MuJoCo), not a real one"  # in the metadata of what it recorded
 # Folders in one of `all`, and what is written last in each: its presence says that the run is whole.
 LAST_FILES = {"identify": CONFIG, "gap": GAP, "train": TRAINING}
 # What else is in them that would be taken for the next run's.

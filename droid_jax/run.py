@@ -64,7 +64,7 @@ FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 RESUMED = (all_stages.All, identify.Identify, gap.Gap, train.Train)  # commands that go on where they were stopped
 WHAT = """From recordings of a robot to a fitted simulation, to what that simulation lacks, and to a policy.
 
-Without a command: `all`, on a stand-in robot.  --version says which version this is."""
+Without a command: `all`, on a synthetic robot.  --version says which version this is."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -135,7 +135,7 @@ def _one_sentence(error: Exception) -> str:
 
 def _check_seeds(command: Any) -> None:
     """ValueError for a negative seed, of which numpy's generators say less."""
-    for name in ("seed", "robot"):  # of what is drawn, and of the stand-in robot
+    for name in ("seed", "robot"):  # of what is drawn, and of the synthetic robot
         if (value := getattr(command, name, None)) is not None and value < 0:
             raise ValueError(f"--{name} must not be negative, got {value}")
 

@@ -2,7 +2,8 @@
 
     python experiments/cone_mismatch.py [--quick] [--out DIR] [--cases 4] [--commit HASH]
 
-The stand-in's contacts get MuJoCo's elliptic cone; the simulation keeps its pyramid.  First the torques' difference of
+The synthetic robot's contacts get MuJoCo's elliptic cone; the simulation keeps its pyramid.  First the torques'
+difference of
 one robot with either cone, then the whole search on robots of the blind suite's nulls.  One small JSON a case under
 OUT/cone_cases: the run can be stopped and goes on where it was.  --quick leaves the searches out.
 """

@@ -2,7 +2,7 @@
 
     python experiments/door_work.py [--quick] [--out DIR] [--policies DIR]
 
-For the stand-in robot of each setting of Table II: the work of the arm's servos (actuator torque times joint motion,
+For the synthetic robot of each setting of Table II: the work of the arm's servos (actuator torque times joint motion,
 summed over the joints) and the work that the door takes.  In demonstrations A and C the door's work is what the hinge's
 friction loss and damping dissipate over the whole motion.  In the first trials of every policy of Table II it is what
 the pads do to the knob about the hinge until the door is open, its kinetic energy included.  Nothing is trained or
@@ -34,7 +34,7 @@ from droid_jax.policy.control import load  # noqa: E402
 from droid_jax.recordings.formats import load as load_recording  # noqa: E402
 from droid_jax.simulate.c_engine import simulate  # noqa: E402
 from droid_jax.synthetic.policy_trials import watched  # noqa: E402
-from droid_jax.synthetic.robot import SurrogateConfig, set_up  # noqa: E402
+from droid_jax.synthetic.robot import SyntheticRobotConfig, set_up  # noqa: E402
 from experiments.pad_friction import REPORTED, WATCHED, Opening, made, robots  # noqa: E402
 from experiments.pad_friction import Arguments as PadArguments  # noqa: E402
 from experiments.policies.cases import RESULTS  # noqa: E402
@@ -56,7 +56,7 @@ class Arguments:
 
 def of_demonstration(setting: Setting, name: str) -> dict[str, float]:
     """J of door and servos over one repeat of a demonstration, without sensor noise."""
-    truth, config = truth_of(setting), SurrogateConfig(repeats=1)
+    truth, config = truth_of(setting), SyntheticRobotConfig(repeats=1)
     robot = set_up(
         door_scene(), load_recording(demonstration_path(name)), truth, seed=100 * setting.robot, config=config
     )

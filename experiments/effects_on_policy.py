@@ -3,7 +3,7 @@
     python experiments/effects_on_policy.py [--quick] [--out DIR] [--springs 0] [--trials 12]
     python experiments/effects_on_policy.py --policy runs/train/policy.npz --hide closer=2 payload=0.5 --out runs/felt
 
-A policy is trained on draws of the prior, unless one is given.  Then the stand-in robot hides each effect of the blind
+A policy is trained on draws of the prior, unless one is given.  Then the synthetic robot hides each effect of the blind
 suite in turn, at the largest amplitude that is usual and at three times that, and the policy is tried on it; and it is
 asked whether the demonstration still holds its grasp there, for what cannot be recorded cannot be searched either.
 A pilot: robot and seeds are others than those of the runs that are reported; hidden_effect_policy.py's effect was
@@ -44,8 +44,8 @@ from droid_jax.policy.control import Policy, load  # noqa: E402
 from droid_jax.recordings.formats import load as load_recording  # noqa: E402
 from droid_jax.storage import file_sha256, write_json  # noqa: E402
 from droid_jax.synthetic.hidden_effects import HIDDEN, LONGEST_STEP, Applied, listed, possible, record_hidden  # noqa: E402
-from droid_jax.synthetic.policy_trials import TransferConfig, check_playable, stand_in, transfer  # noqa: E402
-from droid_jax.synthetic.robot import SurrogateConfig  # noqa: E402
+from droid_jax.synthetic.policy_trials import TransferConfig, check_playable, synthetic_robot, transfer  # noqa: E402
+from droid_jax.synthetic.robot import SyntheticRobotConfig  # noqa: E402
 from experiments.policies.cases import RESULTS, TIMESTEP, Case, Options, finish, run_all  # noqa: E402
 from experiments.policies.robots import truth_of  # noqa: E402
 from experiments.policies.settings import Setting, setting_of  # noqa: E402
@@ -61,7 +61,7 @@ class Arguments(Options):
     """Options of the experiment."""
 
     springs: int = 0
-    """The stand-in's column of Table I."""
+    """The synthetic robot's column of Table I."""
     policy: Path | None = None
     """A policy.npz of any run, instead of one that is trained."""
     hide: tuple[str, ...] = ()
@@ -69,7 +69,7 @@ class Arguments(Options):
     first: int = PILOT
     """Seed of the policy."""
     robot: int | None = PILOT
-    """Seed of the stand-in robot's hidden errors and of its trials."""
+    """Seed of the synthetic robot's hidden errors and of its trials."""
     trials: int = 12
     """Trials with each effect."""
 
@@ -91,7 +91,7 @@ def applicable(scene: Scene, arguments: Arguments) -> list[Applied]:
 
 def recordable(scene: Scene, setting: Setting, hidden: Sequence[Applied]) -> bool:
     """Whether demonstration A keeps its grasp on a robot with these effects."""
-    once, shown = SurrogateConfig(timestep=LONGEST_STEP, repeats=1), load_recording(demonstration_path("A"))
+    once, shown = SyntheticRobotConfig(timestep=LONGEST_STEP, repeats=1), load_recording(demonstration_path("A"))
     try:
         record_hidden(scene, shown, truth_of(setting), hidden, seed=setting.robot, config=once)
     except ValueError:
@@ -107,8 +107,10 @@ def rows(policy: Policy, setting: Setting, task: Task, arguments: Arguments) -> 
     effects: list[Applied | None] = [None, *applicable(scene, arguments)]
     for hidden in track(effects, "effects", console=Console(stderr=True)):
         applied = [hidden] if hidden else []
-        robot = stand_in(scene, start, truth_of(setting), applied, task, config)
-        found = column([{"stand_in": transfer(policy, robot).to_json(), "seed": setting.robot}], "stand_in")
+        robot = synthetic_robot(scene, start, truth_of(setting), applied, task, config)
+        found = column(
+            [{"synthetic_robot": transfer(policy, robot).to_json(), "seed": setting.robot}], "synthetic_robot"
+        )
         yield {
             "hidden": hidden.name if hidden else "nothing",
             "joint": hidden.joint if hidden else "",

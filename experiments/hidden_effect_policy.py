@@ -2,7 +2,7 @@
 
     python experiments/hidden_effect_policy.py [--quick] [--out DIR] [--hide magnetic_catch=12] [--seeds 5]
 
-The stand-in robot hides an effect.  It is recorded in three motions and searched once (`gap`); the verdict, right or
+The synthetic robot hides an effect.  It is recorded in three motions and searched once (`gap`); the verdict, right or
 wrong, is taken as it comes.  Then policies are trained on draws of the base model's Gaussian, of the extended model's
 and of the prior, alike in everything else, and tried on the robot that hides the effect.  Where the search names no
 effect, there is nothing to compare.  Every policy is one JSON file under DIR/hidden_effect_cases and is not trained
@@ -32,7 +32,7 @@ import tyro  # noqa: E402
 from benchmarks.common import origin  # noqa: E402
 from benchmarks.sharing import claimed, code_name  # noqa: E402
 from droid_jax.commands.gap_search import searched  # noqa: E402
-from droid_jax.commands.synthetic import hidden_effects, record_stand_in  # noqa: E402
+from droid_jax.commands.synthetic import hidden_effects, record_synthetic  # noqa: E402
 from droid_jax.discrepancy.case import GapConfig  # noqa: E402
 from droid_jax.discrepancy.extended import extended, load_extended, save_extended  # noqa: E402
 from droid_jax.discrepancy.missing import case_of  # noqa: E402
@@ -51,15 +51,18 @@ from droid_jax.identify.search import SearchConfig  # noqa: E402
 from droid_jax.model.effects.registry import library  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 from droid_jax.synthetic.hidden_effects import listed  # noqa: E402
-from droid_jax.synthetic.policy_trials import TransferConfig, check_playable, stand_in  # noqa: E402
-from droid_jax.synthetic.robot import stand_in_truth  # noqa: E402
+from droid_jax.synthetic.policy_trials import TransferConfig, check_playable, synthetic_robot  # noqa: E402
+from droid_jax.synthetic.robot import synthetic_truth  # noqa: E402
 from experiments.policies.cases import TIMESTEP, Case, Options, finish, found_of, made_by, run_all, tried  # noqa: E402
 from experiments.policies.store import Doors  # noqa: E402
 from experiments.policies.table import better_than, columns, line_of  # noqa: E402
 
 MODELS = ("prior", "base", "extended")
 BASE, SETUP = "base.json", "setup.json"
-SPRINGS, ROBOT = 0, 21  # the stand-in's column of Table I, and the seed of its hidden errors unless --robot is given
+SPRINGS, ROBOT = (
+    0,
+    21,
+)  # the synthetic robot's column of Table I, and the seed of its hidden errors unless --robot is given
 
 
 @dataclass(frozen=True)
@@ -67,13 +70,13 @@ class Arguments(Options):
     """Options of the experiment."""
 
     hide: tuple[str, ...] = ("magnetic_catch=12",)
-    """What the stand-in robot hides, name=amplitude."""
+    """What the synthetic robot hides, name=amplitude."""
     steps_allowed: int = 512
     """Actions of an episode."""
 
     @property
     def seed_of_robot(self) -> int:
-        """Of the stand-in's hidden errors."""
+        """Of the synthetic robot's hidden errors."""
         return ROBOT if self.robot is None else self.robot
 
     @property
@@ -102,7 +105,7 @@ def _searched(arguments: Arguments, folder: Path, code: Mapping[str, Any]) -> di
         return json.loads((folder / "verdict.json").read_text())
     scene = door_scene(timestep=TIMESTEP)
     base = door_space(scene) + door_nuisances(scene)
-    roles = record_stand_in(scene, hidden_effects(arguments.hide, scene), folder, SPRINGS, robot, again=False)
+    roles = record_synthetic(scene, hidden_effects(arguments.hide, scene), folder, SPRINGS, robot, again=False)
     config = GapConfig()
     if arguments.quick:
         small = RefineConfig(iterations=1, hops=0, spreads=0)
@@ -149,8 +152,8 @@ def case(model: str, seed: int, folder: Path, arguments: Arguments, code: Mappin
         known = load_extended(folder / EXTENDED, scene)
         env, gaussian = DoorEnv(known.scene, task, known.effects), known.gaussian
     hidden, config = listed(hidden_effects(arguments.hide, scene)), TransferConfig(trials=budget.trials, seed=robot)
-    truth = stand_in_truth(door_scene(), SPRINGS, robot)
-    robots = {"stand_in": stand_in(door_scene(limits=True), env.start, truth, hidden, task, config)}
+    truth = synthetic_truth(door_scene(), SPRINGS, robot)
+    robots = {"synthetic_robot": synthetic_robot(door_scene(limits=True), env.start, truth, hidden, task, config)}
     return tried(arguments, env, Doors(gaussian), robots, seed, code)
 
 

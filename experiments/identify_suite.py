@@ -1,4 +1,4 @@
-"""What identification reaches on the stand-in robot: doors of Table I, calibration, second arm pose, C parity.
+"""What identification reaches on the synthetic robot: doors of Table I, calibration, second arm pose, C parity.
 
     python experiments/identify_suite.py [--quick] [--out DIR] [--parts doors calibration pose parity]
 
@@ -41,7 +41,7 @@ from droid_jax.identify.search import SearchConfig  # noqa: E402
 from droid_jax.model.scene import Scene  # noqa: E402
 from droid_jax.recordings.formats import load  # noqa: E402
 from droid_jax.recordings.recording import Recording  # noqa: E402
-from droid_jax.synthetic.robot import draw_nuisances, record, stand_in_truth  # noqa: E402
+from droid_jax.synthetic.robot import draw_nuisances, record, synthetic_truth  # noqa: E402
 
 Part = Literal["doors", "calibration", "pose", "parity"]
 MUST_BE_KNOWN = ("hinge_stiffness", "hinge_frictionloss", "hinge_damping", *JOINT_DAMPING)
@@ -70,7 +70,7 @@ def settings(quick: bool, seed: int) -> IdentifyConfig:
 
 
 def recordings(scene: Scene, truth: dict[str, float], names: str, seed: int) -> list[Recording]:
-    """Ten repeats of each demonstration on the stand-in robot."""
+    """Ten repeats of each demonstration on the synthetic robot."""
     return [record(scene, load(demonstration_path(n)), truth, seed=100 * seed + i, name=n) for i, n in enumerate(names)]
 
 
@@ -123,7 +123,7 @@ def fit(truth: dict[str, float], names: str, seed: int, quick: bool) -> tuple[Id
 
 def door_case(springs: int, quick: bool) -> dict[str, Any]:
     """A door of Table I from demonstrations A and C, with 200 samples of the initial and fitted Gaussian."""
-    truth = stand_in_truth(door_scene(), springs, springs)
+    truth = synthetic_truth(door_scene(), springs, springs)
     found, result = fit(truth, "A" if quick else "AC", springs, quick)
     samples = cost_samples(found, 20 if quick else 200, springs)
     for key in ("initial_cost", "fitted_cost"):
@@ -137,7 +137,7 @@ def door_case(springs: int, quick: bool) -> dict[str, Any]:
 def calibration_case(number: int, quick: bool) -> dict[str, Any]:
     """A random door: hinge log-uniform, the rest around Table I, nuisances on.
 
-    Doors whose grip fails on the stand-in are drawn again: a demonstration opens the door.
+    Doors whose grip fails on the synthetic robot are drawn again: a demonstration opens the door.
     """
     scene = door_scene()
     space = door_space(scene)
@@ -158,7 +158,7 @@ def calibration_case(number: int, quick: bool) -> dict[str, Any]:
 
 def pose_case(demonstration: str, quick: bool) -> dict[str, Any]:
     """The one-spring door from one opening alone, with the arm pose of A or of B (paper, section IV-C)."""
-    truth = stand_in_truth(door_scene(), 1, 1)
+    truth = synthetic_truth(door_scene(), 1, 1)
     _, result = fit(truth, demonstration, 900 + ord(demonstration), quick)
     return result
 
@@ -167,7 +167,7 @@ def parity_case(seed: int, quick: bool) -> dict[str, Any]:
     """MJX against the C engine over the whole opening: traces, and the rank correlation of the cost."""
     scene = door_scene(timestep=0.002)
     space = door_space(scene)
-    truth = stand_in_truth(scene, 1, 1)
+    truth = synthetic_truth(scene, 1, 1)
     data = recordings(scene, truth, "A", seed)
     values = prior(space).sample(0, 8 if quick else 200)
     tables = np.stack([space.values(table_i(k)) for k in (0, 1, 2)])

@@ -3,7 +3,7 @@
     python experiments/knob_locations.py [--quick] [--out DIR] [--seeds 5] [--trials 100]
 
 The door is demonstrated and fitted with the knob in its first place.  For each of the four places, 5 cm apart along the
-lever, policies are trained on doors drawn from that one Gaussian and tried on the stand-in robot with the knob there.
+lever, policies are trained on doors drawn from that one Gaussian and tried on the synthetic robot with the knob there.
 Every policy is one JSON file under DIR/knob_cases and is not trained again; the fit, and the policies of the first
 place, are those of table2.py's setting "paper".  DIR/knob_locations.json sums them up; knob_locations.md is the
 table, knob_locations.png and .pdf are histograms of the angles.
@@ -34,7 +34,7 @@ from droid_jax.door.environment import DoorEnv  # noqa: E402
 from droid_jax.door.scene import LEVERS, door_scene  # noqa: E402
 from droid_jax.door.task import Task  # noqa: E402
 from droid_jax.storage import write_json, write_text  # noqa: E402
-from droid_jax.synthetic.policy_trials import TransferConfig, stand_in  # noqa: E402
+from droid_jax.synthetic.policy_trials import TransferConfig, synthetic_robot  # noqa: E402
 from experiments.policies.cases import TIMESTEP, Case, Options, finish, found_of, made_by, run_all, tried  # noqa: E402
 from experiments.policies.figure import knob_histograms, knobs_as_text  # noqa: E402
 from experiments.policies.robots import fitted, truth_of  # noqa: E402
@@ -56,8 +56,8 @@ def case(knob: int, seed: int, setting: Setting, arguments: Arguments, code: Map
     budget = arguments.budget
     env = DoorEnv(door_scene(timestep=TIMESTEP, limits=True, knob=knob), budget.task(Task()))
     config = TransferConfig(trials=budget.trials, seed=setting.robot)
-    robot = stand_in(door_scene(limits=True, knob=knob), env.start, truth_of(setting), (), env.task, config)
-    return tried(arguments, env, Doors(fitted(setting, arguments, code)), {"stand_in": robot}, seed, code)
+    robot = synthetic_robot(door_scene(limits=True, knob=knob), env.start, truth_of(setting), (), env.task, config)
+    return tried(arguments, env, Doors(fitted(setting, arguments, code)), {"synthetic_robot": robot}, seed, code)
 
 
 def planned_case(knob: int, seed: int, arguments: Arguments, code: Mapping[str, Any]) -> Case:

@@ -1,4 +1,4 @@
-"""Do the policies of Table II need their grip?  Each is tried on the stand-in robot with pads that hold less and less.
+"""Do the policies of Table II need their grip?  Each is tried on the synthetic robot with pads that hold less and less.
 
     python experiments/pad_friction.py [--quick] [--out DIR] [--setting paper] [--frictions 0.05 0.005]
 
@@ -46,7 +46,7 @@ from droid_jax.door.task import Task, gripped  # noqa: E402
 from droid_jax.files import POLICY  # noqa: E402
 from droid_jax.policy.control import Policy, load  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
-from droid_jax.synthetic.policy_trials import TransferConfig, TrialRobot, stand_in, transfer, watched  # noqa: E402
+from droid_jax.synthetic.policy_trials import PolicyRobot, TransferConfig, synthetic_robot, transfer, watched  # noqa: E402
 from experiments.policies.cases import QUICK_STEPS, RESULTS, TIMESTEP, made_by  # noqa: E402
 from experiments.policies.robots import pads_of, truth_of  # noqa: E402
 from experiments.policies.settings import SETTINGS, Setting  # noqa: E402
@@ -76,14 +76,14 @@ class Arguments:
     """Folder of the result."""
 
 
-def robots(setting: Setting, arguments: Arguments) -> dict[str, TrialRobot]:
+def robots(setting: Setting, arguments: Arguments) -> dict[str, PolicyRobot]:
     """The setting's robot ("own") and the same with pads of each friction; it hears the same noise with all."""
     task = Task(**{**setting.task, **({"steps": QUICK_STEPS} if arguments.quick else {})})
     start = DoorEnv(door_scene(timestep=TIMESTEP, limits=True), task).start
     config = TransferConfig(trials=1 if arguments.quick else arguments.trials, seed=setting.robot)
     scene, truth = door_scene(limits=True), truth_of(setting)
     pads: dict[str, Mapping[str, float]] = {"own": {}, **{f"{mu:g}": pads_of(mu) for mu in arguments.frictions}}
-    return {name: stand_in(scene, start, {**truth, **of}, (), task, config) for name, of in pads.items()}
+    return {name: synthetic_robot(scene, start, {**truth, **of}, (), task, config) for name, of in pads.items()}
 
 
 def hinge_torques(model: mujoco.MjModel, data: mujoco.MjData, knob: int, hinge: int) -> np.ndarray:
@@ -108,7 +108,7 @@ class Opening:
     on.  work: [4] J by PARTS.  servo: J that the arm's actuators give meanwhile, summed over the joints.
     """
 
-    def __init__(self, robot: TrialRobot):
+    def __init__(self, robot: PolicyRobot):
         self.robot, self.hand = robot, hand_of(robot.scene)
         self.knob, self.hinge = robot.scene.id("geom", "knob"), robot.scene.id("joint", str(robot.scene.object_joint))
         self.opened, self.way, self.held, self.work, self.servo = False, 0.0, 0.0, np.zeros(4), 0.0
@@ -143,7 +143,7 @@ class Opening:
         self.held += (self.way - before) * bool(gripped(task, seen))
 
 
-def openings(policy: Policy, robot: TrialRobot, trials: int) -> dict[str, Any]:
+def openings(policy: Policy, robot: PolicyRobot, trials: int) -> dict[str, Any]:
     """What opens the door in a policy's first trials."""
     each = [Opening(robot) for _ in range(trials)]
     for number, opening in enumerate(each):
@@ -181,7 +181,7 @@ def rows(cases: Sequence[dict[str, Any]], arguments: Arguments) -> Iterator[dict
         policy = load(arguments.policies / "trained_cases" / case["trained"] / POLICY)
         row = {"policy": f"{case['method']} {case['seed']}", "trained": case["trained"], "pads": {}}
         for name, robot in by_pads.items():
-            tried = case["stand_in"] if name == "own" else transfer(policy, robot).to_json()
+            tried = case["synthetic_robot"] if name == "own" else transfer(policy, robot).to_json()
             row["pads"][name] = {
                 "success_rate": tried["success_rate"],
                 "grip_time_share": tried["grip"]["mean"],

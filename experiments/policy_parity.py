@@ -46,7 +46,7 @@ from droid_jax.policy.trials import Trials  # noqa: E402
 from droid_jax.report.export import png_bytes  # noqa: E402
 from droid_jax.report.style import AFTER, INK, styled  # noqa: E402
 from droid_jax.storage import file_sha256, write_bytes, write_json  # noqa: E402
-from droid_jax.synthetic.policy_trials import TransferConfig, stand_in, transfer  # noqa: E402
+from droid_jax.synthetic.policy_trials import TransferConfig, synthetic_robot, transfer  # noqa: E402
 from experiments.policies.cases import QUICK_STEPS, RESULTS, TIMESTEP, Options  # noqa: E402
 
 WITHIN = 3.0  # degrees
@@ -104,7 +104,7 @@ def in_mjx(policy: Policy, env: DoorEnv, gaussian: Gaussian, values: np.ndarray)
 def in_c(policy: Policy, env: DoorEnv, gaussian: Gaussian, values: np.ndarray) -> Trials:
     """The same in plain C, door by door."""
     rows = [dict(zip(gaussian.space.names, row.tolist(), strict=True)) for row in values]
-    made = [transfer(policy, stand_in(env.scene, env.start, truth, (), env.task, EXACT)) for truth in rows]
+    made = [transfer(policy, synthetic_robot(env.scene, env.start, truth, (), env.task, EXACT)) for truth in rows]
     return Trials(
         *(np.concatenate([getattr(t, f) for t in made]) for f in ("success", "angle", "steps", "grip", "stopped"))
     )

@@ -37,7 +37,7 @@ from droid_jax.identify.holdout import split  # noqa: E402
 from droid_jax.identify.search import SearchConfig, search  # noqa: E402
 from droid_jax.recordings.formats import load  # noqa: E402
 from droid_jax.storage import write_bytes  # noqa: E402
-from droid_jax.synthetic.robot import record, stand_in_truth  # noqa: E402
+from droid_jax.synthetic.robot import record, synthetic_truth  # noqa: E402
 
 COLOURS = ("#2b6cb0", "#c05621", "#2f855a", "#6b46c1")
 
@@ -61,7 +61,7 @@ class Arguments:
 def prepare() -> tuple[Cost, Cost]:
     """Cost of the fitted repeats, and of the held-out ones."""
     scene = door_scene(timestep=0.004)
-    truth = stand_in_truth(scene, 1, 1)
+    truth = synthetic_truth(scene, 1, 1)
     recording = record(scene, load(demonstration_path("A")), truth, seed=100, name="A")
     fitted, held, _ = split(recording, 0.3)
     cost = make_cost(scene, door_space(scene), [fitted])

@@ -3,7 +3,7 @@
     python experiments/table1.py [--quick] [--out DIR]
 
 Reads the cases door_0, door_1 and door_2 of `identify_suite.py` in DIR/identify_cases (that script makes them);
-writes DIR/table1.md and DIR/table1.json.  The paper's fitted means are the hidden truth of the stand-in robot (its
+writes DIR/table1.md and DIR/table1.json.  The paper's fitted means are the hidden truth of the synthetic robot (its
 recordings are not public), all but the joints' damping, which here is the servo's (docs/paper.md).  So the
 program's best fit is to be near the paper's mean; widths are each one's own: the paper's deviation, and here the ends
 of the 90 % interval, which of a value that is fitted in its logarithm do not lie alike on both sides.
@@ -81,7 +81,7 @@ CAPTION = """# Table I: initial and fitted distributions of the three doors
 
 - **Paper**: its mean ± its `diag(Sigma)`, read as a deviation. The paper gives no unit but kg; the others are a
   reading ([paper.md](../../docs/paper.md)).
-- **Truth here**: the hidden value of the stand-in robot. For door and fingers it is the paper's fitted mean; joint
+- **Truth here**: the hidden value of the synthetic robot. For door and fingers it is the paper's fitted mean; joint
   damping is that of the servo used here, not the paper's.
 - **Best here**: the fit to demonstrations A and C with its 90 % interval. *Italics*: the motion does not constrain the
   parameter; take no number from it.

@@ -2,9 +2,9 @@
 
     python experiments/table2.py [--quick] [--out DIR] [--settings paper] [--seeds 5] [--trials 100]
 
-For each setting: the stand-in robot is recorded and fitted once; then policies are trained on draws of the prior, on
+For each setting: the synthetic robot is recorded and fitted once; then policies are trained on draws of the prior, on
 the fitted mean alone and on draws of the fitted Gaussian, alike in everything else, and tried in simulation and on the
-stand-in robot.  Every policy is one JSON file under DIR/table2_cases and is not trained again (nor is one that another
+synthetic robot.  Every policy is one JSON file under DIR/table2_cases and is not trained again (nor is one that another
 experiment has trained, DIR/trained_cases): the experiment can be stopped and goes on where it was, and the same
 command started twice shares the work.  DIR/table2.json sums up all that are there, with intervals by bootstrap over
 policies; table2.md is laid out as in the paper, table2.png and table2.pdf are its histogram.  Where

@@ -27,7 +27,7 @@ from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene, load_scene
 from droid_jax.recordings.recording import Phase, Recording, TorqueConvention, TorqueSide
 from droid_jax.synthetic.hidden_effects import record_hidden
-from droid_jax.synthetic.robot import SurrogateConfig
+from droid_jax.synthetic.robot import SyntheticRobotConfig
 
 SCENE = Path(__file__).resolve().parents[1] / "experiments" / "bench.xml"
 JOINTS = ("shoulder", "elbow", "door")
@@ -78,10 +78,10 @@ def demonstration(name: str) -> Recording:
 
 @functools.cache
 def record(name: str, repeats: int = 8, preload: float = PRELOAD, friction: float = 0.0) -> Recording:
-    """What the stand-in measures."""
+    """What the synthetic robot measures."""
     scene, space = small_scene()
     seed = 1 + ("fit", "confirm", "sealed").index(name)
-    config = SurrogateConfig(repeats=repeats, timestep=0.00025)
+    config = SyntheticRobotConfig(repeats=repeats, timestep=0.00025)
     hidden = {name: size for name, size in (("hinge_preload", preload), ("dry_friction[elbow]", friction)) if size}
     return record_hidden(scene, demonstration(name), TRUTH, hidden, seed=seed, config=config, name=name, space=space)
 

@@ -23,7 +23,7 @@ from droid_jax.model.parameters import Mode, Parameter, Scaling, Space, Write
 from droid_jax.policy.train import TrainConfig
 from droid_jax.recordings.recording import TorqueConvention, TorqueSide
 from droid_jax.synthetic.policy_trials import TransferConfig
-from droid_jax.synthetic.robot import SurrogateConfig
+from droid_jax.synthetic.robot import SyntheticRobotConfig
 
 GOOD = {"name": "a", "unit": "kg", "mean": 1.0, "std": 0.5, "low": 0.1, "high": 5.0}
 
@@ -66,8 +66,8 @@ GOOD = {"name": "a", "unit": "kg", "mean": 1.0, "std": 0.5, "low": 0.1, "high": 
         (lambda: TrainConfig(learning_rate=-1.0), "learning_rate must be above 0, got -1.0"),
         (lambda: TrainConfig(hidden=(0,)), "hidden, entry 0 must be at least 1, got 0"),
         (lambda: TransferConfig(timestep=0.0), "timestep must be above 0, got 0.0"),
-        (lambda: SurrogateConfig(torque_noise=(0.1,)), "torque_noise must have 2 entries"),  # pyright: ignore
-        (lambda: SurrogateConfig(side="joint"), "side must be one of motor, link"),  # pyright: ignore
+        (lambda: SyntheticRobotConfig(torque_noise=(0.1,)), "torque_noise must have 2 entries"),  # pyright: ignore
+        (lambda: SyntheticRobotConfig(side="joint"), "side must be one of motor, link"),  # pyright: ignore
         (lambda: TorqueConvention("joint", True), "side must be one of motor, link, got 'joint'"),  # pyright: ignore
         (lambda: TorqueConvention(TorqueSide.LINK, "yes"), "gravity must be True or False"),  # pyright: ignore
         (lambda: TorqueConvention(TorqueSide.LINK, 1), "gravity must be True or False, got 1"),  # pyright: ignore

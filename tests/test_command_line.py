@@ -25,7 +25,7 @@ from droid_jax.commands.all_stages import All
 from droid_jax.commands.folder import OtherRun, changed, finished, setup_of
 from droid_jax.commands.gap import Gap
 from droid_jax.commands.identify import Identify
-from droid_jax.commands.synthetic import known_stand_in, settled
+from droid_jax.commands.synthetic import known_robot, settled
 from droid_jax.commands.train import Train
 from droid_jax.commands.user_effects import load_effects
 from droid_jax.door.demonstration import demonstration_path
@@ -76,7 +76,7 @@ def parameters(tmp_path: Path, *entries: object) -> Path:
 @pytest.mark.parametrize("arguments", [["--recording"], ["--recording", ""], ["--recording", "--preset", "quick"]])
 @pytest.mark.parametrize("command", ["all", "identify", "gap"])
 def test_recordings_that_an_empty_variable_named(refused, command: str, arguments: list[str]):
-    """Left away, a stand-in robot would record, and its results pass for one's own."""
+    """Left away, a synthetic robot would record, and its results pass for one's own."""
     assert "--recording names no file" in refused(command, *arguments)
 
 
@@ -413,13 +413,15 @@ def test_an_option_of_a_scene_without_a_scene(refused, tmp_path: Path, command: 
         ("identify", ("--demonstrations", "A")),
     ],
 )
-def test_an_option_of_the_stand_in_beside_recordings(refused, tmp_path: Path, command: str, option: tuple[str, str]):
+def test_an_option_of_the_synthetic_robot_beside_recordings(
+    refused, tmp_path: Path, command: str, option: tuple[str, str]
+):
     said = refused(command, *option, "--recording", "log.npz", "--out", tmp_path / "run")
-    assert f"{option[0]} is for the stand-in robot, and --recording says that there is none" in said
+    assert f"{option[0]} is for the synthetic robot, and --recording says that there is none" in said
     assert not (tmp_path / "run").exists()
 
 
-def test_options_of_the_stand_in_are_filled_in_where_it_records():
+def test_options_of_the_synthetic_robot_are_filled_in_where_it_records():
     """A page lists what was asked for: of a robot's own recordings it would say a number of springs that is none's."""
     assert settled(Identify()) == Identify(springs=1, demonstrations=("A", "C"))
     assert settled(Identify(springs=2)).springs == 2
@@ -470,11 +472,11 @@ def test_what_record_wrote_says_which_robot_it_was(tmp_path: Path):
     """A fit of it knows its truth, and a policy is tried on this robot and no other."""
     recording = replace(load(demonstration_path("A")), meta={"springs": "2", "robot": "7"})
     save(recording, tmp_path / "c.npz")
-    assert known_stand_in([tmp_path / "c.npz"]) == {"springs": 2, "seed": 7, "hide": [], "hidden": ""}
+    assert known_robot([tmp_path / "c.npz"]) == {"springs": 2, "seed": 7, "hide": [], "hidden": ""}
     save(replace(recording, meta={"springs": "1", "robot": "7"}), tmp_path / "d.npz")
-    assert known_stand_in([tmp_path / "c.npz", tmp_path / "d.npz"]) == {}
+    assert known_robot([tmp_path / "c.npz", tmp_path / "d.npz"]) == {}
     save(replace(recording, meta={}), tmp_path / "d.npz")
-    assert known_stand_in([tmp_path / "d.npz"]) == {}
+    assert known_robot([tmp_path / "d.npz"]) == {}
 
 
 @pytest.mark.parametrize(

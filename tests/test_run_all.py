@@ -16,8 +16,8 @@ from small_log import elbow_log, write_elbow
 from droid_jax.commands import all_stages, evaluate, gap, identify, report, synthetic, train
 from droid_jax.commands.folder import OtherRun
 from droid_jax.commands.presets import TIMESTEP
-from droid_jax.commands.source import stand_in_of
-from droid_jax.commands.synthetic import known_stand_in
+from droid_jax.commands.source import synthetic_robot_of
+from droid_jax.commands.synthetic import known_robot
 from droid_jax.door.scene import door_scene
 from droid_jax.recordings.formats import load, save
 from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
@@ -66,7 +66,7 @@ def motions(*files: str, repeats: int = 8, commands: bool = True, **meta: str) -
     return files
 
 
-def found(folder: Path, effects: list[str], stand_in: bool = True) -> None:
+def found(folder: Path, effects: list[str], synthetic_robot: bool = True) -> None:
     """A folder with the results of a search."""
     folder.mkdir(parents=True)
     gaps = {role: {"closed": 0.5 + 0.1 * k} for k, role in enumerate(("fit", "confirm", "sealed"))}
@@ -78,7 +78,10 @@ def found(folder: Path, effects: list[str], stand_in: bool = True) -> None:
                 "screens": [],
                 "sentence": "The model lacks: latch.",
                 "gaps": gaps,
-                "setup": {"stand_in": stand_in, "robot": {"hidden": "magnetic catch (1.5 N m; in the library: latch)"}},
+                "setup": {
+                    "synthetic_robot": synthetic_robot,
+                    "robot": {"hidden": "magnetic catch (1.5 N m; in the library: latch)"},
+                },
             }
         )
     )
@@ -90,7 +93,7 @@ def test_without_arguments_every_stage_runs_on_one_recording(called, tmp_path: P
     files = tuple(Path("runs/all/recordings") / f"{name}.npz" for name in "CBA")
     assert fit.recording == files[:2] and search.recording == files
     assert policy.fit == fit.out and policy.out == trials.run == Path("runs/all/train")
-    assert known_stand_in(files) == {"springs": 1, "seed": 0, "hide": ["magnetic_catch=1.5"],
+    assert known_robot(files) == {"springs": 1, "seed": 0, "hide": ["magnetic_catch=1.5"],
                                      "hidden": "magnetic catch (1.5 N m; in the library: latch)"}  # fmt: skip
     lines = capsys.readouterr().out.splitlines()
     stages = {"record": 19, "identify": 19, "gap": 15, "train": 7, "evaluate": 1}
@@ -154,31 +157,31 @@ def test_a_policy_is_trained_on_the_extended_model_where_there_is_one(called, tm
     assert "gap: The model lacks: latch; 70 % of the gap U closed on the sealed motion" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("stand_in", [True, False])
-def test_the_last_lines_say_what_was_hidden_in_what_was_searched(called, tmp_path: Path, capsys, stand_in: bool):
-    """Recordings of a stand-in may lie beside a search in a robot's own."""
-    found(tmp_path / "runs" / "all" / "gap", ["latch at door_hinge"], stand_in)
+@pytest.mark.parametrize("synthetic_robot", [True, False])
+def test_the_last_lines_say_what_was_hidden_in_what_was_searched(called, tmp_path: Path, capsys, synthetic_robot: bool):
+    """Recordings of a synthetic robot may lie beside a search in a robot's own."""
+    found(tmp_path / "runs" / "all" / "gap", ["latch at door_hinge"], synthetic_robot)
     assert main([]) == 0
     said = capsys.readouterr().out
-    assert ("hidden in the stand-in robot: magnetic catch (1.5 N m; in the library: latch)" in said) == stand_in
+    assert ("hidden in the synthetic robot: magnetic catch (1.5 N m; in the library: latch)" in said) == synthetic_robot
 
 
 @pytest.mark.parametrize("robot", [{}, {"springs": 1, "seed": 0}])
 def test_a_success_on_another_robot_than_the_fitted_one_is_no_promise(called, tmp_path: Path, capsys, robot: dict):
-    """The policy of a fit of one's own recordings is tried on the stand-in robot all the same."""
+    """The policy of a fit of one's own recordings is tried on the synthetic robot all the same."""
     folder = tmp_path / "runs" / "all" / "train"
     folder.mkdir(parents=True)
     trials = {"success_rate": 1.0, "interval_95": [0.9, 1.0]}
-    (folder / "transfer.json").write_text(json.dumps({"simulation": trials, "stand_in": trials}))
+    (folder / "transfer.json").write_text(json.dumps({"simulation": trials, "synthetic_robot": trials}))
     setup = {"method": "fitted", "preset": "quick", "knob": 0, "seed": 0, "fit": "runs/all/identify"}
     task = {"opened": 0.7, "held": 1.0, "control": 0.02, "steps": 512}
-    training = {"setup": setup, "stand_in": robot, "task": task, "scene": "door", "effects": [], "versions": {},
+    training = {"setup": setup, "synthetic_robot": robot, "task": task, "scene": "door", "effects": [], "versions": {},
                 "device": "cpu", "history": []}  # fmt: skip
     (folder / "training.json").write_text(json.dumps(training))
     assert main(["all", "--stages", "identify"]) == 0
     said = capsys.readouterr().out
-    assert "policy: 100 % success on the stand-in robot" in said
-    assert ("The fit is of your own recordings: the stand-in robot is another one" in said) == (not robot)
+    assert "policy: 100 % success on the synthetic robot" in said
+    assert ("The fit is of your own recordings: the synthetic robot is another one" in said) == (not robot)
 
 
 def test_without_a_named_effect_it_is_trained_on_the_fit(called, tmp_path: Path):
@@ -265,7 +268,7 @@ def test_nothing_is_said_to_be_closed_where_nothing_is_named(called, tmp_path: P
     assert "gap: The model lacks" in said and "closed" not in said
 
 
-def test_another_stand_in_is_recorded_anew(called, tmp_path: Path):
+def test_another_synthetic_robot_is_recorded_anew(called, tmp_path: Path):
     """Also where a stop left some recordings of the one before."""
     files = [tmp_path / "runs" / "all" / "recordings" / f"{name}.npz" for name in "CB"]
     for springs, kept in (("1", True), ("2", False), ("2", True)):
@@ -332,21 +335,21 @@ def test_a_search_in_other_recordings_is_not_trained_on(called, tmp_path: Path):
     assert [c.fit for c in called] == [Path("run/identify"), Path("run/gap")]
 
 
-def test_your_own_recordings_know_no_stand_in(called, tmp_path: Path):
+def test_your_own_recordings_know_no_synthetic_robot(called, tmp_path: Path):
     motions("a.npz", "b.npz")
     assert main(["all", "--recording", "a.npz", "b.npz", "--stages", "identify", "gap"]) == 0
     assert called[0].recording == called[1].recording == (Path("a.npz"), Path("b.npz"))
     (tmp_path / "setup.json").write_text(json.dumps({"command": "identify", "recording": ["a.npz", "b.npz"]}))
-    assert stand_in_of(tmp_path) == {}
+    assert synthetic_robot_of(tmp_path) == {}
 
 
-def test_a_stand_in_left_over_in_the_folder_is_not_the_robot_of_your_recordings(tmp_path: Path, monkeypatch):
+def test_a_synthetic_robot_left_over_in_the_folder_is_not_the_robot_of_your_recordings(tmp_path: Path, monkeypatch):
     """`all` made recordings of its own before: the same names do not make them those of the fit."""
     monkeypatch.chdir(tmp_path)
     made, stage = tmp_path / "recordings", tmp_path / "identify"
     made.mkdir()
     stage.mkdir()
-    (made / "stand_in.json").write_text(json.dumps({"springs": 1, "seed": 0, "hide": []}))
+    (made / "synthetic_robot.json").write_text(json.dumps({"springs": 1, "seed": 0, "hide": []}))
 
     def told(recordings: list[str]) -> None:
         own = {"command": "identify", "recording": ["a.npz", "b.npz"], "recordings_sha256": recordings}
@@ -355,24 +358,24 @@ def test_a_stand_in_left_over_in_the_folder_is_not_the_robot_of_your_recordings(
     for meta, known in (({}, {}), ({"source": SOURCE}, {"springs": 1, "seed": 0, "hide": []})):
         motions("a.npz", "b.npz", **meta)
         told([load(Path(name)).sha256 for name in ("a.npz", "b.npz")])
-        assert stand_in_of(stage) == {}
+        assert synthetic_robot_of(stage) == {}
         for name in ("a.npz", "b.npz"):
             (tmp_path / name).rename(made / name)
-        assert stand_in_of(stage) == known  # moved with the folder; a robot's own may be copied there
+        assert synthetic_robot_of(stage) == known  # moved with the folder; a robot's own may be copied there
     told(["another", "two"])
-    assert stand_in_of(stage) == {}
+    assert synthetic_robot_of(stage) == {}
 
 
-def test_a_fit_keeps_which_stand_in_it_is_of(tmp_path: Path, monkeypatch):
+def test_a_fit_keeps_which_synthetic_robot_it_is_of(tmp_path: Path, monkeypatch):
     """Wherever the recordings are by now, and wherever the next command runs."""
     robot = {"springs": 2, "seed": 5, "hide": []}
     (tmp_path / "setup.json").write_text(json.dumps({"recording": ["recs/A.npz"], "recordings_sha256": ["a"]}))
-    assert stand_in_of(tmp_path) == {}
-    (tmp_path / "config.json").write_text(json.dumps({"stand_in": True, "robot": robot}))
-    assert stand_in_of(tmp_path) == robot
+    assert synthetic_robot_of(tmp_path) == {}
+    (tmp_path / "config.json").write_text(json.dumps({"synthetic_robot": True, "robot": robot}))
+    assert synthetic_robot_of(tmp_path) == robot
     (tmp_path / "config.json").unlink()
-    (tmp_path / "gap.json").write_text(json.dumps({"setup": {"stand_in": True, "robot": robot}}))
-    assert stand_in_of(tmp_path) == robot
+    (tmp_path / "gap.json").write_text(json.dumps({"setup": {"synthetic_robot": True, "robot": robot}}))
+    assert synthetic_robot_of(tmp_path) == robot
 
 
 def test_options_of_stages_that_are_left_out_are_refused(called, refused):
@@ -390,12 +393,12 @@ def test_a_folder_of_identify_is_no_folder_of_all(called, refused, tmp_path: Pat
 
 
 @pytest.mark.parametrize(("meta", "known"), [({"source": SOURCE}, True), ({}, False)])
-def test_a_robots_own_recording_beside_a_stand_ins_has_no_known_truth(
+def test_a_robots_own_recording_beside_a_synthetic_robots_has_no_known_truth(
     tmp_path: Path, meta: dict[str, str], known: bool
 ):
     own = tmp_path / "mine.npz"
     motions(str(own), **meta)
-    (tmp_path / "stand_in.json").write_text(json.dumps({"springs": 1, "seed": 0, "hide": []}))
+    (tmp_path / "synthetic_robot.json").write_text(json.dumps({"springs": 1, "seed": 0, "hide": []}))
     command = identify.Identify(recording=(own,))
     _, truth, _ = identify._recordings(command, door_scene(), tmp_path, [load(own)])
     assert (truth is not None) == known
@@ -470,7 +473,7 @@ def test_presets_reach_the_stages(called, capsys):
     assert "left on two cores" not in capsys.readouterr().out  # which was measured for quick alone
 
 
-def test_jax_is_tuned_before_the_stand_in_is_recorded(tmp_path: Path):
+def test_jax_is_tuned_before_the_synthetic_robot_is_recorded(tmp_path: Path):
     """In a process of its own, where nothing has started jax: it could not be tuned afterwards."""
     code = (
         "from droid_jax.commands import all_stages, identify, report, synthetic\n"

@@ -17,7 +17,7 @@ import pytest
 from small_gap import EFFECTS, FLOOR, JOINTS, PRELOAD, QUICK, SCENE, record, small, small_scene, write_parameters
 
 from droid_jax.commands import gap, report
-from droid_jax.commands.synthetic import hidden_effects, record_stand_in
+from droid_jax.commands.synthetic import hidden_effects, record_synthetic
 from droid_jax.discrepancy import amendments, missing, restart
 from droid_jax.discrepancy.inputs import check_recordings, lags
 from droid_jax.discrepancy.verdict import Experiment
@@ -283,7 +283,7 @@ def test_no_time_is_no_budget(place: Path, refused):
     assert "--budget must be above 0 minutes, got 0" in refused(*arguments(place, "--budget", "0"))
 
 
-# ----- the stand-in
+# ----- the synthetic robot
 
 
 @pytest.mark.parametrize(
@@ -300,8 +300,8 @@ def test_what_cannot_be_hidden(tmp_path: Path, refused, options: list[str], expe
     assert not (tmp_path / "run").exists()  # nothing was begun
 
 
-def test_hiding_is_for_the_stand_in(place: Path, refused):
-    assert "--hide is for the stand-in robot" in refused(*arguments(place, "--hide", "closer=1"))
+def test_hiding_is_for_the_synthetic_robot(place: Path, refused):
+    assert "--hide is for the synthetic robot" in refused(*arguments(place, "--hide", "closer=1"))
 
 
 def test_effects_of_ones_own_are_asked_about_like_the_others(place: Path, refused, monkeypatch: pytest.MonkeyPatch):
@@ -344,7 +344,7 @@ def test_what_is_hidden():
     assert hidden_effects(entries, scene) == {"closer": 1.0, "torque_gain[panda_joint4]": -0.05}
 
 
-def test_the_stand_in_records_each_demonstration_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_synthetic_robot_records_each_demonstration_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """C is fitted, B confirms, A stays sealed; nothing in the files says what was hidden."""
     from droid_jax.synthetic import hidden_effects as hidden
 
@@ -355,13 +355,13 @@ def test_the_stand_in_records_each_demonstration_once(tmp_path: Path, monkeypatc
         return replace(record("fit"), name=name)
 
     monkeypatch.setattr(hidden, "record_hidden", instead)
-    roles = record_stand_in(door_scene(), {"closer": 1.0}, tmp_path, 1, 3, False)
+    roles = record_synthetic(door_scene(), {"closer": 1.0}, tmp_path, 1, 3, False)
     assert {role: r.name for role, r in roles.items()} == {"fit": "C", "confirm": "B", "sealed": "A"}
     assert asked == [("C", {"closer": 1.0}, 3000), ("B", {"closer": 1.0}, 3001), ("A", {"closer": 1.0}, 3002)]
-    record_stand_in(door_scene(), {"closer": 1.0}, tmp_path, 1, 3, False)
+    record_synthetic(door_scene(), {"closer": 1.0}, tmp_path, 1, 3, False)
     assert len(asked) == 3
     assert sorted(p.name for p in (tmp_path / "recordings").iterdir()) == [
-        "A.npz", "B.npz", "C.npz", "stand_in.json",
+        "A.npz", "B.npz", "C.npz", "synthetic_robot.json",
     ]  # fmt: skip
 
 
@@ -458,7 +458,7 @@ def test_a_run_goes_on_after_a_stop_and_is_whole(
     answer = read_gap(out).found
     assert answer["amplitudes"][0]["value"] == pytest.approx(PRELOAD, rel=0.05)
     assert {"search", "refine", "floor", "screen", "refit"} <= set(answer["seconds"])
-    assert answer["setup"]["stand_in"] is True and answer["setup"]["command"] == "gap"
+    assert answer["setup"]["synthetic_robot"] is True and answer["setup"]["command"] == "gap"
     places = {when: [(c["variable"], c["where"]) for c in answer["cells"][when]] for when in ("before", "after")}
     assert places["before"] == places["after"]
     assert answer["versions"]["jax"] and answer["device"]

@@ -14,7 +14,7 @@ import pytest
 from droid_jax.commands import report
 from droid_jax.commands.evaluate import Evaluate, _film, _robot, _task, _tell
 from droid_jax.commands.folder import begin, setup_of, stage_folder
-from droid_jax.commands.source import source, stand_in_of
+from droid_jax.commands.source import source, synthetic_robot_of
 from droid_jax.commands.train import Train, _fit_folder
 from droid_jax.door.environment import DoorEnv
 from droid_jax.door.scene import door_scene
@@ -56,12 +56,12 @@ def test_a_fit_that_is_not_whole_is_refused(scene, tmp_path: Path):
         source(folder, knob=0)
 
 
-def test_a_fit_brings_its_gaussian_and_its_stand_in(scene, tmp_path: Path):
+def test_a_fit_brings_its_gaussian_and_its_synthetic_robot(scene, tmp_path: Path):
     folder = fit(tmp_path, scene, springs=2, seed=7, recording=[])
     found, gaussian, effects = source(folder, knob=1)
     assert gaussian.space.names == ("hinge_stiffness", "hinge_damping") and effects == () and "knob 1" in found.name
-    assert stand_in_of(folder) == {"springs": 2, "seed": 7} and extended_of(folder) is None
-    assert stand_in_of(fit(tmp_path, scene, springs=1, recording=["own.npz"])) == {}
+    assert synthetic_robot_of(folder) == {"springs": 2, "seed": 7} and extended_of(folder) is None
+    assert synthetic_robot_of(fit(tmp_path, scene, springs=1, recording=["own.npz"])) == {}
 
 
 def test_fits_for_another_servo_or_scene_are_refused(scene, tmp_path: Path):
@@ -90,9 +90,9 @@ def test_a_gaussian_that_came_without_its_setup_is_known_by_its_parameters(scene
             source(tmp_path, knob=0)
 
 
-def test_a_trained_folder_hands_on_its_stand_in(scene, tmp_path: Path):
-    fit(tmp_path, scene, command="train", seed=9, stand_in={"springs": 2, "seed": 3})
-    assert stand_in_of(tmp_path) == {"springs": 2, "seed": 3}
+def test_a_trained_folder_hands_on_its_synthetic_robot(scene, tmp_path: Path):
+    fit(tmp_path, scene, command="train", seed=9, synthetic_robot={"springs": 2, "seed": 3})
+    assert synthetic_robot_of(tmp_path) == {"springs": 2, "seed": 3}
 
 
 def test_the_setup_of_every_command_can_be_written():
@@ -114,7 +114,7 @@ def test_a_new_training_forgets_the_old_policy(tmp_path: Path):
 def test_without_a_fit_there_is_the_prior(scene):
     _, gaussian, _ = source(None, knob=0)
     of_a_fit = door_space(scene) + door_nuisances(scene)  # Table II's three methods differ in nothing but the ranges
-    assert gaussian.space.names == of_a_fit.names and stand_in_of(None) == {}
+    assert gaussian.space.names == of_a_fit.names and synthetic_robot_of(None) == {}
     np.testing.assert_array_equal(gaussian.cov, prior(of_a_fit).cov)
 
 
@@ -147,8 +147,10 @@ def test_what_is_missing_is_said(arguments: list[str], said: str, capsys: pytest
         ({"springs": 2, "hide": ["closer=2"]}, {"springs": 0, "hide": ("none",)}, 0.002, ()),
     ],
 )
-def test_the_stand_in_is_the_fitted_one_unless_asked(scene, fitted, asked, stiffness: float, hidden: tuple[str, ...]):
-    trained = {"stand_in": fitted, "setup": {"knob": 0}}
+def test_the_synthetic_robot_is_the_fitted_one_unless_asked(
+    scene, fitted, asked, stiffness: float, hidden: tuple[str, ...]
+):
+    trained = {"synthetic_robot": fitted, "setup": {"knob": 0}}
     robot, truth = _robot(Evaluate(trials=3, **asked), trained, DoorEnv(scene))
     assert truth["hinge_stiffness"] == pytest.approx(stiffness, rel=0.3)
     assert tuple(a.name for a in robot.hidden) == hidden and robot.config.trials == 3
@@ -287,12 +289,14 @@ def test_films_are_of_the_trials_of_median_angle(tmp_path: Path, monkeypatch: py
     ("fit", "robot", "another"), [("fit", {}, True), ("fit", {"springs": 1, "seed": 0}, False), (None, {}, False)]
 )
 def test_trials_on_another_robot_than_the_fitted_one_say_so(fit: str | None, robot: dict, another: bool, capsys):
-    """With recordings of one's own the stand-in is another robot; without a fit there is none that it could be."""
+    """With recordings of one's own the synthetic robot is another robot; without a fit there is none that it
+    could be.
+    """
     trials = {"success_rate": 1.0, "interval_95": [0.9, 1.0], "angle_deg": {"mean": 40.0, "std": 1.0}}
-    _tell({"simulation": trials, "stand_in": trials}, {"setup": {"fit": fit}, "stand_in": robot})
+    _tell({"simulation": trials, "synthetic_robot": trials}, {"setup": {"fit": fit}, "synthetic_robot": robot})
     said = capsys.readouterr().out
-    assert "stand-in robot: 100 % success" in said
-    assert ("The fit is of your own recordings: the stand-in robot is another one" in said) == another
+    assert "synthetic robot: 100 % success" in said
+    assert ("The fit is of your own recordings: the synthetic robot is another one" in said) == another
 
 
 @pytest.mark.slow
@@ -306,19 +310,19 @@ def test_train_evaluate_export(scene, tmp_path: Path, capsys: pytest.CaptureFixt
     before = transfer_json.stat().st_mtime_ns
     assert main(["evaluate", "run", "--trials", "4", "--no-film"]) == 0
     said = capsys.readouterr().out
-    assert "holds these trials already" in said and said.count("stand-in robot: 0 % success") == 2
+    assert "holds these trials already" in said and said.count("synthetic robot: 0 % success") == 2
     assert transfer_json.stat().st_mtime_ns == before
     assert main(["evaluate", str(tmp_path / "run"), "--trials", "4", "--no-film"]) == 0  # by another path
     assert transfer_json.stat().st_mtime_ns == before
     assert main(["evaluate", "run", "--trials", "3", "--no-film"]) == 0  # others are
-    assert json.loads(transfer_json.read_text())["stand_in"]["trials"] == 3
+    assert json.loads(transfer_json.read_text())["synthetic_robot"]["trials"] == 3
     assert main(["evaluate", "run", "--trials", "4", "--no-film"]) == 0
     pytest.importorskip("onnxruntime")
     assert main(["export", "run"]) == 0
     said = capsys.readouterr().out
-    assert "stand-in robot: 0 % success" in said and "ONNX and JAX differ by at most" in said
+    assert "synthetic robot: 0 % success" in said and "ONNX and JAX differ by at most" in said
     transfer = json.loads((tmp_path / "run" / "transfer.json").read_text())
-    assert transfer["simulation"]["trials"] == transfer["stand_in"]["trials"] == 4
+    assert transfer["simulation"]["trials"] == transfer["synthetic_robot"]["trials"] == 4
     assert np.isfinite(load(tmp_path / "run" / "export" / "policy.npz").act(np.zeros(23))).all()
     assert "Learning" in (tmp_path / "run" / "report.html").read_text()
     assert main(["train", "--fit", "fit", "--steps", "20000", "--out", "run"]) == 0

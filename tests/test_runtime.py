@@ -349,7 +349,7 @@ os.write(2, b"behind\\n")
 
 
 @pytest.mark.parametrize(
-    "module", ["compare.cost", "model.step", "policy.train", "policy.doors", "measure.surrogate", "gap.missing"]
+    "module", ["cost.cost", "model.step", "policy.train", "policy.parallel", "synthetic.robot", "discrepancy.missing"]
 )
 def test_importing_a_module_prints_nothing(module: str):
     done = fresh(f"import droid_jax.{module}")

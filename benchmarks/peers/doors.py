@@ -30,7 +30,7 @@ from droid_jax.recordings.formats import load
 from droid_jax.recordings.recording import Recording
 from droid_jax.storage import finite
 from droid_jax.synthetic.hidden_effects import record_hidden
-from droid_jax.synthetic.robot import stand_in_truth
+from droid_jax.synthetic.robot import synthetic_truth
 
 OURS, THEIRS, JUDGE = 0.004, 0.002, 0.0005  # s, time steps; ours is of second order
 WAYS: dict[str, dict[str, bool]] = {
@@ -44,7 +44,7 @@ HINGE = ("hinge_stiffness", "hinge_frictionloss", "hinge_damping")
 def door(springs: int, quick: bool) -> dict[str, Any]:
     """A door of Table I: what is left on held-out repeats, errors of parameters, intervals, time."""
     scene = door_scene(timestep=OURS)
-    truth = stand_in_truth(scene, springs, springs)
+    truth = synthetic_truth(scene, springs, springs)
     data = recordings(scene, truth, "A" if quick else "AC", springs)
     space, nuisances = door_space(scene), door_nuisances(scene)
     full = space + nuisances
@@ -117,7 +117,7 @@ def heldout_gap(space: Space, data: Sequence[Recording], values: Mapping[str, np
 def hidden(effect: str, amplitude: float, quick: bool) -> dict[str, Any]:
     """A door with something hidden in it: what each program says, and the gap on motions that were not fitted."""
     scene = door_scene(timestep=OURS)
-    truth = stand_in_truth(scene, 1, 1)
+    truth = synthetic_truth(scene, 1, 1)
     data = {
         n: record_hidden(scene, load(demonstration_path(n)), truth, {effect: amplitude}, seed=i, name=n)
         for i, n in enumerate("CBA")

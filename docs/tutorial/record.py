@@ -1,4 +1,4 @@
-"""The logs of the tutorial: a two-link arm in plain C MuJoCo, a stand-in for a robot.
+"""The logs of the tutorial: a two-link arm in plain C MuJoCo, a synthetic robot for a robot.
 
     python docs/tutorial/record.py
 
@@ -37,7 +37,7 @@ def command_of(motion: tuple[float, float, float, float], time: np.ndarray) -> n
 
 
 def arm() -> mujoco.MjModel:
-    """The stand-in's own model."""
+    """The synthetic robot's own model."""
     model = mujoco.MjModel.from_xml_path(str(HERE / "arm.xml"))
     model.opt.timestep = 1.0 / (RATE * FINE)
     forearm = model.body("forearm").id
@@ -85,7 +85,7 @@ def recording(name: str, seed: int) -> dj.Recording:
         torque=TorqueConvention(TorqueSide.MOTOR, gravity=True),
         qpos0=dict.fromkeys(JOINTS, 0.0),
         gains=ServoGains(np.array(STIFFNESS), np.array([0.0, 0.0])),
-        meta={"source": "stand-in for a robot (plain C MuJoCo), docs/tutorial/record.py"},
+        meta={"source": "synthetic robot for a robot (plain C MuJoCo), docs/tutorial/record.py"},
     )
 
 

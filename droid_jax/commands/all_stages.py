@@ -14,7 +14,7 @@ from droid_jax.commands import evaluate, gap, identify, report, train
 from droid_jax.commands.folder import OtherRun, changed, forget, setup_of
 from droid_jax.commands.scenes import needs_log, needs_recording, needs_scene
 from droid_jax.commands.source import model_folder, needs_brax
-from droid_jax.commands.synthetic import DEMONSTRATIONS, hidden_effects, kept_at, record_stand_in, settled
+from droid_jax.commands.synthetic import DEMONSTRATIONS, hidden_effects, kept_at, record_synthetic, settled
 from droid_jax.commands.user_effects import load_effects
 from droid_jax.commands.writer import writes
 from droid_jax.files import ASKED, FIT, GAP, LAST_FILES, TRANSFER
@@ -47,7 +47,7 @@ MINUTES = {"record": 0.3, "identify": 4.0, "gap": 7.5, "train": 6.0, "evaluate":
 class All:
     """Everything: record, identify, search for what the model lacks, train a policy, try it, and one page.
 
-    Without --recording a stand-in robot is recorded that hides an effect.  A stage whose inputs are as they were is
+    Without --recording a synthetic robot is recorded that hides an effect.  A stage whose inputs are as they were is
     not run again.
     """
 
@@ -72,13 +72,13 @@ class All:
     own_effects: Path | None = None
     """Python file that registers effects of your own (docs/method-gap.md); it is run."""
     hide: tuple[str, ...] | None = None
-    """What the stand-in robot hides, name=amplitude; none for nothing. Default: magnetic_catch=1.5 (N m)."""
+    """What the synthetic robot hides, name=amplitude; none for nothing. Default: magnetic_catch=1.5 (N m)."""
     springs: Literal[0, 1, 2] | None = None
-    """Springs on the stand-in's door. Default: 1."""
+    """Springs on the synthetic robot's door. Default: 1."""
     seed: int = 0
-    """Seed of every stage and of the stand-in robot."""
+    """Seed of every stage and of the synthetic robot."""
     trials: int = 100
-    """Trials of the policy on the stand-in robot, and episodes in simulation."""
+    """Trials of the policy on the synthetic robot, and episodes in simulation."""
     stages: tuple[Stage, ...] = STAGES
     """Which stages; those left out are read from the folder where they are in it."""
     tensorboard: bool = False
@@ -129,7 +129,7 @@ def run(command: All) -> None:
 
 
 def _needs_stages(command: All) -> None:
-    """ValueError for options of the stand-in robot where no stage records one: they would change nothing."""
+    """ValueError for options of the synthetic robot where no stage records one: they would change nothing."""
     given = [name for name in ("hide", "springs") if getattr(command, name) is not None]
     if given and not {*IN_A_SCENE} & {*command.stages}:
         raise ValueError(
@@ -197,12 +197,12 @@ def _left(command: All, stages: Sequence[str]) -> str:
 
 
 def _records(command: All) -> bool:
-    """Whether the stand-in robot records: the stages after the search need no recording."""
+    """Whether the synthetic robot records: the stages after the search need no recording."""
     return not command.recording and bool({*IN_A_SCENE} & {*command.stages})
 
 
 def _needs_robot(command: All) -> None:
-    """ValueError for a stand-in robot that there cannot be, rather now than when the folder says it was asked for."""
+    """ValueError for a synthetic robot that there cannot be, rather now than when the folder says it was asked for."""
     from droid_jax.door.scene import door_scene
 
     if not _records(command):
@@ -317,9 +317,9 @@ def told(out: Path) -> list[str]:
         lines.append(f"gap: {readable(found['sentence'], found).rstrip('.')}{share}")
         lines += amendment_words(found)
         if hidden := hidden_in(found):
-            lines.append(f"hidden in the stand-in robot: {hidden}")
+            lines.append(f"hidden in the synthetic robot: {hidden}")
     if tried := None if "train" in old else _json(out / "train" / TRANSFER):
-        for name, where in (("simulation", "in simulation"), ("stand_in", "on the stand-in robot")):
+        for name, where in (("simulation", "in simulation"), ("synthetic_robot", "on the synthetic robot")):
             rate, (low, high) = tried[name]["success_rate"], tried[name]["interval_95"]
             lines.append(f"policy: {percent(rate)} success {where} ({percent(low)} to {percent(high)})")
         if other := another_robot(read_training(out / "train")):
@@ -328,13 +328,13 @@ def told(out: Path) -> list[str]:
 
 
 def _record(command: All) -> None:
-    """Let the stand-in robot record its motions."""
+    """Let the synthetic robot record its motions."""
     from droid_jax.commands.presets import TIMESTEP
     from droid_jax.door.scene import door_scene
 
     assert command.springs is not None  # settled
     scene = door_scene(timestep=TIMESTEP[PRESETS[command.preset].identify])
-    record_stand_in(
+    record_synthetic(
         scene, hidden_effects(command.hide, scene), command.out, command.springs, command.seed, command.again
     )
 

@@ -1,4 +1,4 @@
-"""`evaluate`: a trained policy in its simulation and on the stand-in robot."""
+"""`evaluate`: a trained policy in its simulation and on the synthetic robot."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ if TYPE_CHECKING:
     from droid_jax.door.task import Task
     from droid_jax.policy.control import Policy
     from droid_jax.policy.trials import Trials
-    from droid_jax.synthetic.policy_trials import TrialRobot
+    from droid_jax.synthetic.policy_trials import PolicyRobot
 
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Try a trained policy: in the simulation it was trained in, and on the stand-in robot (plain C MuJoCo with hidden
+    """Try a trained policy: in the simulation it was trained in, and on the synthetic robot (plain C MuJoCo with hidden
     physics, sensor noise and, where wanted, a hidden effect)."""
 
     run: Annotated[Path | None, tyro.conf.Positional] = None
     """Folder of `train` or of `all`. Default: runs/train where it holds a policy, else runs/all."""
     trials: int = 100
-    """Trials on the stand-in robot, and episodes in simulation."""
+    """Trials on the synthetic robot, and episodes in simulation."""
     springs: Literal[0, 1, 2] | None = None
-    """Springs on the stand-in's door. Default: those of the stand-in that was fitted, else 1."""
+    """Springs on the synthetic robot's door. Default: those of the synthetic robot that was fitted, else 1."""
     hide: tuple[str, ...] | None = None
-    """What the stand-in hides, name=amplitude; none for nothing. Default: what the fitted one hid."""
+    """What the synthetic robot hides, name=amplitude; none for nothing. Default: what the fitted one hid."""
     robot: int | None = None
-    """Seed of the stand-in's hidden values. Default: that of the one that was fitted, else 0."""
+    """Seed of the synthetic robot's hidden values. Default: that of the one that was fitted, else 0."""
     seed: int = 0
     """Seed of start poses and sensor noise."""
     film: bool = True
@@ -87,7 +87,7 @@ def run(command: Evaluate) -> None:
     with counting("episodes in simulation, a minute of compiling first", command.trials) as count:
         inside = simulated(policy, env, of_method(setup["method"], scene, gaussian), command.trials, command.seed)
         count(command.trials)
-    with counting("trials on the stand-in robot", command.trials) as count:
+    with counting("trials on the synthetic robot", command.trials) as count:
         outside = transfer(policy, robot, count)
     inside.check()
     outside.check()
@@ -95,7 +95,7 @@ def run(command: Evaluate) -> None:
         no_films = _film(films, policy, robot, outside) if command.film else "they were not asked for (--no-film)"
     content = {
         "simulation": inside.to_json(),
-        "stand_in": outside.to_json(),
+        "synthetic_robot": outside.to_json(),
         "robot": {
             "truth": truth,
             "hidden": [{**dataclasses.asdict(a), "unit": HIDDEN[a.name].unit} for a in robot.hidden],
@@ -142,7 +142,7 @@ def _tell(found: Mapping[str, Any], trained: Mapping[str, Any]) -> None:
     from droid_jax.report.policy_words import another_robot
     from droid_jax.report.words import percent
 
-    for name, where in (("simulation", "simulation"), ("stand_in", "stand-in robot")):
+    for name, where in (("simulation", "simulation"), ("synthetic_robot", "synthetic robot")):
         of = found[name]
         low, high = of["interval_95"]
         angle = f"opened to {of['angle_deg']['mean']:.1f} ± {of['angle_deg']['std']:.1f} degrees"
@@ -151,23 +151,23 @@ def _tell(found: Mapping[str, Any], trained: Mapping[str, Any]) -> None:
         print(other)
 
 
-def _robot(command: Evaluate, trained: Mapping[str, Any], env: DoorEnv) -> tuple[TrialRobot, dict[str, float]]:
-    """The stand-in robot, the one that was fitted unless asked for another; and its hidden values."""
+def _robot(command: Evaluate, trained: Mapping[str, Any], env: DoorEnv) -> tuple[PolicyRobot, dict[str, float]]:
+    """The synthetic robot, the one that was fitted unless asked for another; and its hidden values."""
     from droid_jax.door.scene import door_scene
     from droid_jax.synthetic.hidden_effects import listed
-    from droid_jax.synthetic.policy_trials import TransferConfig, stand_in
-    from droid_jax.synthetic.robot import stand_in_truth
+    from droid_jax.synthetic.policy_trials import TransferConfig, synthetic_robot
+    from droid_jax.synthetic.robot import synthetic_truth
 
     asked = {"springs": command.springs, "seed": command.robot, "hide": command.hide}
     usual = {"springs": 1, "seed": 0, "hide": ()}
-    own = usual | trained["stand_in"] | {name: value for name, value in asked.items() if value is not None}
+    own = usual | trained["synthetic_robot"] | {name: value for name, value in asked.items() if value is not None}
     scene = door_scene(limits=True, knob=trained["setup"]["knob"])
-    truth = stand_in_truth(scene, own["springs"], own["seed"])
+    truth = synthetic_truth(scene, own["springs"], own["seed"])
     config = TransferConfig(trials=command.trials, seed=command.seed)
-    return stand_in(scene, env.start, truth, listed(hidden_effects(own["hide"], scene)), env.task, config), truth
+    return synthetic_robot(scene, env.start, truth, listed(hidden_effects(own["hide"], scene)), env.task, config), truth
 
 
-def _film(folder: Path, policy: Policy, robot: TrialRobot, found: Trials) -> str | None:
+def _film(folder: Path, policy: Policy, robot: PolicyRobot, found: Trials) -> str | None:
     """good.webp and bad.webp: of the trials that succeeded and of those that failed, the one of median angle.
 
     Trials that blew up are no failures.  Returns why nothing could be drawn, where nothing could.

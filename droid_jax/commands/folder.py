@@ -26,7 +26,7 @@ HASHED = ("own_effects", "extended")  # options whose file is in no other hash o
 LATER = ("budget",)  # options of which nothing that an unfinished run has kept depends
 CODE = "versions"  # in setup.json: of the code that began the run, which others may go on with
 PATHS = ("recording", "scene", "parameters", "fit", "run", *HASHED)  # beside each a setup holds what the file says
-INPUTS = ("start", "stand_in")  # in a setup: of what a run was given by another, as are all that end in _sha256
+INPUTS = ("start", "synthetic_robot")  # in a setup: of what a run was given by another, as are all that end in _sha256
 
 
 def setup_of(command: Any) -> dict[str, Any]:
@@ -151,7 +151,7 @@ def forget(out: Path, stage: str, results_alone: bool = False) -> None:
 
 
 def kept_recordings(paths: Mapping[str, Path], again: bool, record: Callable[[str], Recording]) -> dict[str, Recording]:
-    """What the stand-in robot recorded earlier into this run's folder, by name; recorded now where it did not.
+    """What the synthetic robot recorded earlier into this run's folder, by name; recorded now where it did not.
 
     paths: by name.  record: of a recording's name.
     """
@@ -160,7 +160,7 @@ def kept_recordings(paths: Mapping[str, Path], again: bool, record: Callable[[st
 
     absent = [name for name, path in paths.items() if again or not path.is_file()]
     if absent:
-        with counting("recording the stand-in robot", len(absent)) as count:
+        with counting("recording the synthetic robot", len(absent)) as count:
             for done, name in enumerate(absent, 1):
                 paths[name].parent.mkdir(parents=True, exist_ok=True)
                 save(record(name), paths[name])

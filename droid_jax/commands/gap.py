@@ -14,7 +14,7 @@ from droid_jax.commands.folder import begin, fingerprints, finished, setup_of, s
 from droid_jax.commands.gap_search import searched
 from droid_jax.commands.presets import TIMESTEP, refine_config, search_config, warn_of_cpu
 from droid_jax.commands.scenes import compared, needs_log, needs_recording, needs_scene, own_scene, recording_at
-from droid_jax.commands.synthetic import hidden_effects, kept_at, known_stand_in, record_stand_in, settled
+from droid_jax.commands.synthetic import hidden_effects, kept_at, known_robot, record_synthetic, settled
 from droid_jax.commands.user_effects import load_effects
 from droid_jax.commands.writer import writes
 from droid_jax.files import FIT, GAP
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 class Gap:
     """Find the physical effect that the model lacks: fit, ask a library of effects, confirm on what was not fitted.
 
-    Without --recording a stand-in robot with a hidden effect is recorded first.
+    Without --recording a synthetic robot with a hidden effect is recorded first.
     """
 
     recording: tuple[Path, ...] = ()
@@ -75,12 +75,12 @@ class Gap:
     budget: float | None = None
     """Minutes after which no further candidate is tried; the report says what was left out."""
     hide: tuple[str, ...] | None = None
-    """What the stand-in robot hides, name=amplitude or name[joint]=amplitude; none for nothing.
+    """What the synthetic robot hides, name=amplitude or name[joint]=amplitude; none for nothing.
     Default: magnetic_catch=1.5 (N m)."""
     springs: Literal[0, 1, 2] | None = None
-    """Springs on the stand-in's door. Default: 1."""
+    """Springs on the synthetic robot's door. Default: 1."""
     seed: int = 0
-    """Seed of the search, of the stand-in robot and of the resamples."""
+    """Seed of the search, of the synthetic robot and of the resamples."""
     tensorboard: bool = False
     """Write scalars of the base fit for TensorBoard while it runs, to OUT/tensorboard."""
     out: Path = Path("runs/gap")
@@ -106,7 +106,7 @@ def run(command: Gap) -> None:
     from droid_jax.discrepancy.split import Split
     from droid_jax.identify.results import prepare_folder
     from droid_jax.preflight.check_log import check_log
-    from droid_jax.synthetic.robot import is_stand_in
+    from droid_jax.synthetic.robot import is_synthetic
 
     out = command.out
     fit = None if command.fit is None else stage_folder(command.fit, "identify", FIT)
@@ -131,19 +131,19 @@ def run(command: Gap) -> None:
     prepare_folder(out)  # only now, with all input read
     if not given:
         assert command.springs is not None  # settled
-        roles = record_stand_in(scene, hidden, out, command.springs, command.seed, command.again)
+        roles = record_synthetic(scene, hidden, out, command.springs, command.seed, command.again)
     print("compiling the replay ...", flush=True)
     case = case_of(split, scene, base, effects, roles, config)
     begin(out, setup, command.again, "gap", keep=known)  # and only now, with all of it found good
     board = out / FOLDER if command.tensorboard else None
-    stand_in = all(is_stand_in(r) for r in roles.values())
-    robot = known_stand_in(command.recording or kept_at(out)) if stand_in else {}
+    synthetic_robot = all(is_synthetic(r) for r in roles.values())
+    robot = known_robot(command.recording or kept_at(out)) if synthetic_robot else {}
     description = {
         "findings": [asdict(f) for recording in given or roles.values() for f in check_log(scene, recording)],
         "split": {"by": split.value, "limits": split.limits},
         "versions": runtime.versions(),
         "device": runtime.device(),
-        "setup": {**setup, "stand_in": stand_in, "robot": robot},
+        "setup": {**setup, "synthetic_robot": synthetic_robot, "robot": robot},
     }
     written = list[str]()
 
@@ -246,7 +246,7 @@ def config_of(command: Gap) -> GapConfig:
 
 
 def given_to(command: Gap) -> list[Recording]:
-    """The recordings, none where the stand-in robot shall record."""
+    """The recordings, none where the synthetic robot shall record."""
     needs_recording(command)
     if len(command.recording) > 3:
         raise ValueError(

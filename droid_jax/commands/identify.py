@@ -14,7 +14,7 @@ from droid_jax.commands.folder import begin, fingerprints, finished, kept_record
 from droid_jax.commands.pictures import draw, keep_replay
 from droid_jax.commands.presets import TIMESTEP, Preset, refine_config, search_config, warn_of_cpu
 from droid_jax.commands.scenes import compared, needs_log, needs_recording, needs_scene, own_scene, recording_at
-from droid_jax.commands.synthetic import known_stand_in, settled
+from droid_jax.commands.synthetic import known_robot, settled
 from droid_jax.commands.user_effects import load_effects
 from droid_jax.commands.writer import writes
 from droid_jax.files import EXTENDED, FIT
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 class Identify:
     """Fit the physics to recorded torques: recordings in, a Gaussian over the parameters out.
 
-    Without --recording a stand-in robot (a simulation with hidden physics) is recorded first.
+    Without --recording a synthetic robot (a simulation with hidden physics) is recorded first.
     """
 
     preset: Preset = "quick"
@@ -42,9 +42,9 @@ class Identify:
     """Recordings to fit (npz or CSV folder; ROS bags through convert); several of the same robot and object are
     fitted together."""
     demonstrations: tuple[str, ...] | None = None
-    """What the stand-in robot repeats when no recording is given (A, B or C). Default: A C, in the paper preset A."""
+    """What the synthetic robot repeats when no recording is given (A, B or C). Default: A C, in the paper preset A."""
     springs: Literal[0, 1, 2] | None = None
-    """Springs on the stand-in's door (its values are the fitted columns of Table I). Default: 1."""
+    """Springs on the synthetic robot's door (its values are the fitted columns of Table I). Default: 1."""
     scene: Path | None = None
     """Your own MJCF instead of the built-in door."""
     parameters: Path | None = None
@@ -77,7 +77,7 @@ class Identify:
     motion_cutoff: float | None = None
     """Logs without commands: cutoff of the filter of the measured positions, Hz; default: 20."""
     seed: int = 0
-    """Seed of the search, of the stand-in robot and of the samples."""
+    """Seed of the search, of the synthetic robot and of the samples."""
     tensorboard: bool = False
     """Write scalars for TensorBoard while it runs, to OUT/tensorboard."""
     out: Path = Path("runs/identify")
@@ -161,7 +161,7 @@ def run(command: Identify) -> None:
 def _description(command: Identify, found: Identified, recordings: Sequence[Recording]) -> dict[str, Any]:
     """What config.json says of a fit, its setup apart."""
     from droid_jax import runtime
-    from droid_jax.synthetic.robot import is_stand_in
+    from droid_jax.synthetic.robot import is_synthetic
 
     return {
         "command": "identify",
@@ -181,7 +181,7 @@ def _description(command: Identify, found: Identified, recordings: Sequence[Reco
         "seed": command.seed,
         "versions": runtime.versions(),
         "device": runtime.device(),
-        "stand_in": all(is_stand_in(r) for r in recordings),
+        "synthetic_robot": all(is_synthetic(r) for r in recordings),
     }
 
 
@@ -230,7 +230,7 @@ def _extended(command: Identify, scene: Scene, space: Space) -> tuple[Scene, Spa
 
 
 def _given(command: Identify) -> list[Recording]:
-    """The recordings, none where the stand-in robot shall record; ValueError where two have one name."""
+    """The recordings, none where the synthetic robot shall record; ValueError where two have one name."""
     needs_recording(command)
     files: dict[str, Path] = {}
     recordings = [recording_at(path) for path in command.recording]
@@ -255,21 +255,21 @@ def _needs_demonstrations(command: Identify, given: list[Recording]) -> None:
 def _recordings(
     command: Identify, scene: Scene, out: Path, given: list[Recording]
 ) -> tuple[list[Recording], dict[str, float] | None, dict[str, Any]]:
-    """The given recordings, or the stand-in's (kept in the run's folder); with its hidden truth and, of given ones,
-    springs, seed and hidden effects where these are known."""
+    """The given recordings, or the synthetic robot's (kept in the run's folder); with its hidden truth and, of given
+    ones, springs, seed and hidden effects where these are known."""
     from droid_jax.recordings.formats import load
-    from droid_jax.synthetic.robot import is_stand_in, stand_in_truth
+    from droid_jax.synthetic.robot import is_synthetic, synthetic_truth
 
-    if given:  # a robot's own may lie beside what is known of a stand-in
-        stand_in = command.scene is None and all(is_stand_in(r) for r in given)
-        known = known_stand_in(command.recording) if stand_in else {}
-        return given, stand_in_truth(scene, known["springs"], known["seed"]) if known else None, known
+    if given:  # a robot's own may lie beside what is known of a synthetic robot
+        synthetic_robot = command.scene is None and all(is_synthetic(r) for r in given)
+        known = known_robot(command.recording) if synthetic_robot else {}
+        return given, synthetic_truth(scene, known["springs"], known["seed"]) if known else None, known
     from droid_jax.door.demonstration import PLANS, demonstration_path
     from droid_jax.synthetic.robot import record
 
     assert command.springs is not None and command.demonstrations is not None  # settled
     gains = "paper" if command.preset == "paper" else "impedance"
-    truth = stand_in_truth(scene, command.springs, command.seed, nuisances=command.preset != "paper")
+    truth = synthetic_truth(scene, command.springs, command.seed, nuisances=command.preset != "paper")
 
     def recorded(name: str) -> Recording:  # as `record` does, whatever stands beside it
         demonstration = load(demonstration_path(name, gains=gains))

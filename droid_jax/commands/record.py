@@ -1,4 +1,4 @@
-"""`record`: the stand-in robot repeats a demonstration."""
+"""`record`: the synthetic robot repeats a demonstration."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Record:
-    """Record the stand-in robot (plain C MuJoCo with hidden physics): repeats of a demonstration, as an npz file."""
+    """Record the synthetic robot (plain C MuJoCo with hidden physics): repeats of a demonstration, as an npz file."""
 
     demonstration: str = "A"
     """A, B or C."""
@@ -26,20 +26,20 @@ class Record:
 
 
 def run(command: Record) -> None:
-    """Record the stand-in robot and save what it measured."""
+    """Record the synthetic robot and save what it measured."""
     from droid_jax.door.demonstration import PLANS, demonstration_path
     from droid_jax.door.scene import door_scene
     from droid_jax.recordings.formats import check_target, load, save
-    from droid_jax.synthetic.robot import SurrogateConfig, record, stand_in_truth
+    from droid_jax.synthetic.robot import SyntheticRobotConfig, record, synthetic_truth
 
     check_target(command.out)
     scene = door_scene(springs=command.springs, gains=command.gains)
     demonstration = load(demonstration_path(command.demonstration, gains=command.gains))
-    truth = stand_in_truth(scene, command.springs, command.seed)
+    truth = synthetic_truth(scene, command.springs, command.seed)
     # one robot, whose demonstrations have noise and errors of grasp of their own
     seed = 1000 * command.seed + sorted(PLANS).index(command.demonstration)
-    recording = record(scene, demonstration, truth, seed=seed, config=SurrogateConfig(repeats=command.repeats))
+    recording = record(scene, demonstration, truth, seed=seed, config=SyntheticRobotConfig(repeats=command.repeats))
     of = {"springs": str(command.springs), "robot": str(command.seed)}
     recording = replace(recording, meta={**recording.meta, **of})
     path = save(recording, command.out)
-    print(f"stand-in robot recorded {recording.repeats} repeats of {recording.duration:.1f} s: {path}")
+    print(f"synthetic robot recorded {recording.repeats} repeats of {recording.duration:.1f} s: {path}")

@@ -39,11 +39,11 @@ def needs_scene(options: OwnScene) -> None:
 def needs_recording(options: OwnScene) -> None:
     """ValueError for a scene of one's own in which nothing was measured."""
     if options.scene is not None and not options.recording:
-        raise ValueError("--scene needs --recording: the stand-in robot only knows the built-in door")
+        raise ValueError("--scene needs --recording: the synthetic robot only knows the built-in door")
 
 
 def needs_log(motion_cutoff: float | None, recordings: Sequence[Recording]) -> None:
-    """ValueError for a --motion-cutoff that is none, or that filters nothing: a stand-in robot has commands."""
+    """ValueError for a --motion-cutoff that is none, or that filters nothing: a synthetic robot has commands."""
     if motion_cutoff is None:
         return
     if not motion_cutoff > 0:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
 
-from droid_jax.commands.synthetic import known_stand_in
+from droid_jax.commands.synthetic import known_robot
 from droid_jax.errors import needs
 from droid_jax.files import CONFIG, GAP, GAUSSIAN
 from droid_jax.read_json import read_json, typed
@@ -98,17 +98,17 @@ def has_model(folder: Path) -> bool:
     return (folder / GAUSSIAN).is_file() or extended_of(folder) is not None
 
 
-def stand_in_of(folder: Path | None) -> dict[str, Any]:
-    """Which stand-in robot a fit was made of, if it was one: its springs, seed and hidden effects."""
+def synthetic_robot_of(folder: Path | None) -> dict[str, Any]:
+    """Which synthetic robot a fit was made of, if it was one: its springs, seed and hidden effects."""
     known = {} if folder is None else setup(folder)
     if known.get("command") == "train":
-        return known.get("stand_in", {})
+        return known.get("synthetic_robot", {})
     if kept := _robot(folder):
         return kept
     if known.get("recording"):  # not kept by this run: as named where it ran; those of `all` lie beside its stages
         beside = [folder.parent / "recordings" / Path(name).name for name in known["recording"]] if folder else []
         hashes = known.get("recordings_sha256", [])
-        return next((known_stand_in(at) for at in (known["recording"], beside) if _hold(at, hashes)), {})
+        return next((known_robot(at) for at in (known["recording"], beside) if _hold(at, hashes)), {})
     return {k: known[k] for k in ("springs", "seed", "hide") if k in known}
 
 
@@ -117,19 +117,21 @@ def _robot(folder: Path | None) -> dict[str, Any]:
     if folder is None:
         return {}
     told = (told_in(folder / CONFIG), told_in(folder / GAP).get("setup", {}))
-    return next((of["robot"] for of in told if of.get("stand_in") and of.get("robot")), {})
+    return next((of["robot"] for of in told if of.get("synthetic_robot") and of.get("robot")), {})
 
 
 def _hold(paths: Sequence[str | Path], hashes: Sequence[str]) -> bool:
-    """Whether these files are there and hold a stand-in's recordings of these hashes: others may have their names."""
+    """Whether these files are there and hold a synthetic robot's recordings of these hashes: others may have
+    their names.
+    """
     from droid_jax.recordings.formats import load
-    from droid_jax.synthetic.robot import is_stand_in
+    from droid_jax.synthetic.robot import is_synthetic
 
     try:
         recordings = [load(path) for path in paths]
     except (OSError, ValueError):
         return False
-    return [r.sha256 for r in recordings] == list(hashes) and all(map(is_stand_in, recordings))
+    return [r.sha256 for r in recordings] == list(hashes) and all(map(is_synthetic, recordings))
 
 
 def needs_brax() -> None:

@@ -1,4 +1,4 @@
-"""The stand-in robot: its options, and one with something hidden in it for a `gap` without recordings."""
+"""The synthetic robot: its options, and one with something hidden in it for a `gap` without recordings."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from droid_jax.commands.folder import kept_recordings
-from droid_jax.files import STAND_IN
+from droid_jax.files import SYNTHETIC_ROBOT
 from droid_jax.read_json import read_json, typed
 from droid_jax.report.stages import Robot
 
@@ -18,13 +18,17 @@ if TYPE_CHECKING:
 
 DEMONSTRATIONS = {"fit": "C", "confirm": "B", "sealed": "A"}
 HIDE = ("magnetic_catch=1.5",)  # N m
-OPTIONS = {"hide": None, "springs": 1, "demonstrations": ("A", "C")}  # of a stand-in, as they are where not given
+OPTIONS = {
+    "hide": None,
+    "springs": 1,
+    "demonstrations": ("A", "C"),
+}  # of a synthetic robot, as they are where not given
 
 T = TypeVar("T")
 
 
 def settled(command: T) -> T:
-    """A command with the options of its stand-in robot filled in, where it records one.
+    """A command with the options of its synthetic robot filled in, where it records one.
 
     Raises ValueError where some were given beside recordings, which come from another robot.
     """
@@ -35,7 +39,7 @@ def settled(command: T) -> T:
     if not command.recording:  # type: ignore[attr-defined]
         return replace(command, **{k: v for k, v in usual.items() if k not in given})  # type: ignore[type-var]
     if given:
-        raise ValueError(f"--{given[0]} is for the stand-in robot, and --recording says that there is none")
+        raise ValueError(f"--{given[0]} is for the synthetic robot, and --recording says that there is none")
     return command
 
 
@@ -66,10 +70,10 @@ def hidden_effects(entries: Sequence[str] | None, scene: Scene) -> dict[str, flo
     return found
 
 
-def record_stand_in(
+def record_synthetic(
     scene: Scene, hidden: Mapping[str, float], out: Path, springs: int, seed: int, again: bool
 ) -> dict[str, Recording]:
-    """Role -> what the stand-in robot measured; kept in the run's folder.
+    """Role -> what the synthetic robot measured; kept in the run's folder.
 
     Recorded anew where `again` asks for it, and where the folder is not known to hold recordings of this very robot.
     """
@@ -77,9 +81,9 @@ def record_stand_in(
     from droid_jax.recordings.formats import load
     from droid_jax.storage import write_json
     from droid_jax.synthetic.hidden_effects import record_hidden
-    from droid_jax.synthetic.robot import stand_in_truth
+    from droid_jax.synthetic.robot import synthetic_truth
 
-    truth = stand_in_truth(scene, springs, seed)
+    truth = synthetic_truth(scene, springs, seed)
 
     names = list(DEMONSTRATIONS.values())
 
@@ -89,33 +93,35 @@ def record_stand_in(
 
     files = kept_at(out)
     paths = dict(zip(names, files, strict=True))
-    this = stand_in_json(hidden, springs, seed)
-    if again or known_stand_in(files) != this:
+    this = robot_json(hidden, springs, seed)
+    if again or known_robot(files) != this:
         for path in paths.values():
             path.unlink(missing_ok=True)
-    write_json(out / "recordings" / STAND_IN, this)  # before the first: a stop leaves no recordings of an unknown robot
+    write_json(
+        out / "recordings" / SYNTHETIC_ROBOT, this
+    )  # before the first: a stop leaves no recordings of an unknown robot
     found = kept_recordings(paths, False, recorded)
     return {role: found[name] for role, name in DEMONSTRATIONS.items()}
 
 
 def kept_at(out: Path) -> tuple[Path, ...]:
-    """Files of the stand-in robot's motions in a run's folder: fit, confirm, sealed."""
+    """Files of the synthetic robot's motions in a run's folder: fit, confirm, sealed."""
     return tuple(out / "recordings" / f"{name}.npz" for name in DEMONSTRATIONS.values())
 
 
-def stand_in_json(hidden: Mapping[str, float], springs: int, seed: int) -> dict[str, Any]:
-    """What is known of the stand-in robot that made some recordings."""
+def robot_json(hidden: Mapping[str, float], springs: int, seed: int) -> dict[str, Any]:
+    """What is known of the synthetic robot that made some recordings."""
     from droid_jax.synthetic.hidden_effects import in_words
 
     hide = [f"{name}={amplitude:g}" for name, amplitude in hidden.items()]
     return {"springs": springs, "seed": seed, "hide": hide, "hidden": in_words(hidden)}
 
 
-def known_stand_in(recordings: Sequence[str | Path]) -> dict[str, Any]:
-    """Springs, seed and hidden effects of the stand-in robot that made these files; empty where that is not known."""
+def known_robot(recordings: Sequence[str | Path]) -> dict[str, Any]:
+    """Springs, seed and hidden effects of the synthetic robot that made these files; empty where that is not known."""
     folders = {Path(path).resolve().parent for path in recordings}
     try:
-        at = folders.pop() / STAND_IN
+        at = folders.pop() / SYNTHETIC_ROBOT
         return dict(typed(read_json(at), Robot, str(at))) if not folders else {}
     except (OSError, ValueError):
         return _of_meta(recordings)
@@ -130,4 +136,4 @@ def _of_meta(recordings: Sequence[str | Path]) -> dict[str, Any]:
         said = {(int(meta["springs"]), int(meta["robot"])) for meta in metas}
     except (OSError, ValueError, KeyError):
         return {}
-    return stand_in_json({}, *said.pop()) if len(said) == 1 else {}
+    return robot_json({}, *said.pop()) if len(said) == 1 else {}

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from droid_jax.commands import report
 from droid_jax.commands.folder import RUNS, begin, finished, setup_of
 from droid_jax.commands.presets import warn_of_cpu
-from droid_jax.commands.source import has_model, model_folder, needs_brax, source, stand_in_of
+from droid_jax.commands.source import has_model, model_folder, needs_brax, source, synthetic_robot_of
 from droid_jax.commands.user_effects import load_effects
 from droid_jax.commands.writer import writes
 from droid_jax.files import EXTENDED, GAUSSIAN, POLICY, TRAINING
@@ -76,7 +76,11 @@ def run(command: Train) -> None:
     load_effects(command.own_effects, fit)
     scene, gaussian, effects = source(fit, command.knob)
     gaussian = _chosen(command, gaussian)
-    origin = {"fit": None if fit is None else str(fit), "fit_sha256": fingerprint(fit), "stand_in": stand_in_of(fit)}
+    origin = {
+        "fit": None if fit is None else str(fit),
+        "fit_sha256": fingerprint(fit),
+        "synthetic_robot": synthetic_robot_of(fit),
+    }
     setup = {**setup_of(command), "command": "train", **origin}
     if finished(out, setup, command.again, TRAINING):
         report.run(report.Report(out))
@@ -114,7 +118,7 @@ def _description(setup: dict[str, Any], config: TrainConfig, env: DoorEnv, found
 
     return {
         "setup": setup,
-        "stand_in": setup["stand_in"],
+        "synthetic_robot": setup["synthetic_robot"],
         "config": dataclasses.asdict(config),
         "task": dataclasses.asdict(env.task),
         "scene": env.scene.name,

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from droid_jax import console
-from droid_jax.files import ASKED, CONFIG, FIT, GAP, LOCK, SETUP, STAND_IN, STAND_IN_SOURCE, TRAINING, WRITTEN
+from droid_jax.files import ASKED, CONFIG, FIT, GAP, LOCK, SETUP, STAND_IN_SOURCE, SYNTHETIC_ROBOT, TRAINING, WRITTEN
 from droid_jax.read_json import read_json
 from droid_jax.storage import kind_of
 
@@ -147,12 +147,12 @@ def _make(folder: Path) -> list[Path]:
 _SIGNS = {
     SETUP: ("preset", "seed"),
     ASKED: ("preset", "seed", "effect_scale", "files"),
-    CONFIG: ("preset", "recordings", "stand_in"),
+    CONFIG: ("preset", "recordings", "synthetic_robot"),
     FIT: ("parameters",),
     GAP: ("verdict", "gaps"),
     TRAINING: ("setup", "history"),
 }
-_STAND_INS = re.compile(r"[A-Z](_springs\d_seed\d+(_paper)?)?\.npz")  # recordings of the stand-in robot
+_STAND_INS = re.compile(r"[A-Z](_springs\d_seed\d+(_paper)?)?\.npz")  # recordings of the synthetic robot
 
 
 def check_own(folder: Path, stage: str) -> None:
@@ -180,8 +180,8 @@ def _is_sign(path: Path, keys: tuple[str, ...]) -> bool:
 
 
 def _strange_recordings(folder: Path) -> list[Path]:
-    """Files of others in a folder of recordings under names of the stand-in robot's."""
-    if not folder.is_dir() or (folder / STAND_IN).is_file():
+    """Files of others in a folder of recordings under names of the synthetic robot's."""
+    if not folder.is_dir() or (folder / SYNTHETIC_ROBOT).is_file():
         return []
     from droid_jax.recordings.formats import load
 

@@ -1,4 +1,4 @@
-"""What is seen of hand and knob, from the state of a simulation: MJX for training, plain C for the stand-in robot."""
+"""What is seen of hand and knob, from the state of a simulation: MJX for training, plain C for the synthetic robot."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The door's parameter vector: Table I of the paper, and the nuisances beside it.
 
-`truth(column)` gives the fitted columns of Table I, used as hidden truths for the stand-in.
+`truth(column)` gives the fitted columns of Table I, used as hidden truths for the synthetic robot.
 `diag(Sigma_init)` of Table I is half of the mean for nearly every entry, so it is read as
 standard deviations.
 """

@@ -61,7 +61,7 @@ def write_run(
 ) -> None:
     """Write all files of a run into `folder` (see the module's text).
 
-    truth: hidden values where they are known (the stand-in robot); samples: draws them (see `cost_samples`), once
+    truth: hidden values where they are known (the synthetic robot); samples: draws them (see `cost_samples`), once
       the fit itself is on disk.
     findings: what the checks of the recordings found.
     """

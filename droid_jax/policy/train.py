@@ -328,7 +328,7 @@ _NAMES = ("normaliser", "actor", "critic")
 class replicated:
     """jax.device_put_replicated while brax needs it: jax 0.10 removed it, and brax 0.14.2 calls it once.
 
-    A stand-in with the same meaning (a leading axis over the devices); where jax still has it, nothing is touched.
+    A replacement with the same meaning (a leading axis over the devices); where jax still has it, nothing is touched.
     """
 
     def __init__(self, module: Any = jax) -> None:

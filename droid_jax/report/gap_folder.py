@@ -35,7 +35,7 @@ _SIZE = {
 _SHIFT = {"name": str, "unit": str, **dict.fromkeys(("before", "after", "deviation_before"), _MAYBE)}
 _TREND = {**dict.fromkeys(("candidate", "amplitude", "unit"), str), "per_repeat": _MAYBE, "p": _MAYBE}
 _ABOUT = {"what": str, "mark": str, "confused_with": [str]}
-_SETUP = {"robot": Maybe({"hidden": Maybe(str)}), "stand_in": Maybe(bool), "recording": Maybe([str])}
+_SETUP = {"robot": Maybe({"hidden": Maybe(str)}), "synthetic_robot": Maybe(bool), "recording": Maybe([str])}
 _EXPERIMENT = {"what": str, "apart": _MAYBE, "not_made": Maybe(str)}
 _HINT = {"effects": [str], "tied": [[str]], "closed": {str: _NUMBER}}
 _SCHEMA = {
@@ -161,9 +161,9 @@ class Gap:
         return [(roles, _joined([self.traces[r] for r in roles])) for roles in reversed(sheets)]
 
     @property
-    def stand_in(self) -> bool:
-        """Whether the run says that its torques come from a stand-in robot: no recording was given to it."""
-        return self.found["setup"].get("stand_in", self.found["setup"].get("recording") == [])
+    def synthetic_robot(self) -> bool:
+        """Whether the run says that its torques come from a synthetic robot: no recording was given to it."""
+        return self.found["setup"].get("synthetic_robot", self.found["setup"].get("recording") == [])
 
     @property
     def hidden(self) -> str:
@@ -176,9 +176,9 @@ class Gap:
 
 
 def hidden_in(found: Mapping[str, Any]) -> str:
-    """What the stand-in robot hid that was searched, of gap.json, in words; empty where nothing is known."""
+    """What the synthetic robot hid that was searched, of gap.json, in words; empty where nothing is known."""
     setup = found["setup"]
-    return setup.get("robot", {}).get("hidden", "") if setup.get("stand_in") else ""
+    return setup.get("robot", {}).get("hidden", "") if setup.get("synthetic_robot") else ""
 
 
 def has_gap(folder: Path) -> bool:

@@ -28,7 +28,7 @@ def doubt(run: Run | None, gap: Gap | None, policy: Trained) -> str:
 def lead(run: Run | None, gap: Gap | None, policy: Trained | None, hidden: str = "") -> list[str]:
     """From the numbers alone; the last sentence says what to do next.
 
-    hidden: what the stand-in robot hides, in words.
+    hidden: what the synthetic robot hides, in words.
     """
     sentences, following = [], ""
     if run:
@@ -36,7 +36,7 @@ def lead(run: Run | None, gap: Gap | None, policy: Trained | None, hidden: str =
         following = summary(run, gap is not None)[-1]
     if gap:
         sentences += [readable(gap.found["sentence"], gap.found), *_closed(gap)]
-        sentences += [f"What the stand-in robot hid: {hidden}."] if hidden else []
+        sentences += [f"What the synthetic robot hid: {hidden}."] if hidden else []
         following = gap_summary(gap)[-1]
         if run and far_off(run.fit):
             following = following.replace("Next: ", f"Next: {DOUBT}; then ", 1)
@@ -70,5 +70,5 @@ def _closed(gap: Gap) -> list[str]:
 
 
 def _opened(where: str, rate: float) -> str:
-    place = {"simulation": "in the simulation", "stand-in robot": "on the stand-in robot"}[where]
+    place = {"simulation": "in the simulation", "synthetic robot": "on the synthetic robot"}[where]
     return f"The policy opens the door in {percent(rate)} of its trials {place}."

@@ -11,11 +11,11 @@ from droid_jax.report.policy_folder import Trained
 
 CAPTIONS = {  # of a film, and what it shows to those who cannot see it
     "good": (
-        "A trial that succeeded, on the stand-in robot",
+        "A trial that succeeded, on the synthetic robot",
         "Film of the arm in front of the door: it takes the knob, pulls the door open and holds it there",
     ),
     "bad": (
-        "A trial that failed, on the stand-in robot",
+        "A trial that failed, on the synthetic robot",
         "Film of the arm in front of the door: it does not hold the door open far enough with the knob in hand",
     ),
 }

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from droid_jax.report.style import AFTER, BEFORE, INK, MUTED, WIDE, legend, styled
 
-COLOURS = {"simulation": AFTER, "stand-in robot": BEFORE}
+COLOURS = {"simulation": AFTER, "synthetic robot": BEFORE}
 
 
 @styled

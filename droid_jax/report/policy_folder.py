@@ -18,7 +18,7 @@ _TRAINING = {
         **{"method": Literal["fitted", "mean", "prior"], "preset": str, "knob": int, "seed": int},
         "fit": (str, type(None)),
     },
-    "stand_in": {"springs": Maybe(int), "seed": Maybe(int), "hide": Maybe([str])},
+    "synthetic_robot": {"springs": Maybe(int), "seed": Maybe(int), "hide": Maybe([str])},
     **{"task": {"opened": _NUMBER, "held": _NUMBER, "control": _NUMBER, "steps": int}, "scene": str},
     **{"effects": [str], "versions": dict, "device": str},
     "history": [
@@ -33,7 +33,7 @@ _TRIALS = {
 }
 _HIDDEN = {"name": str, "amplitude": _NUMBER, "joint": Maybe((str, type(None))), "unit": Maybe(str)}
 _TRANSFER = {
-    **{"simulation": _TRIALS, "stand_in": _TRIALS, "robot": {"hidden": [_HIDDEN]}},
+    **{"simulation": _TRIALS, "synthetic_robot": _TRIALS, "robot": {"hidden": [_HIDDEN]}},
     **{"no_films": Maybe(str), "setup": Maybe(dict)},
 }
 
@@ -55,7 +55,7 @@ class Trained:
         """Where the policy was tried -> what came of it; `counted` and `angles` without trials that blew up."""
         if self.transfer is None:
             return {}
-        places = {"simulation": "simulation", "stand-in robot": "stand_in"}
+        places = {"simulation": "simulation", "synthetic robot": "synthetic_robot"}
         return {where: _without_blown_up(self.transfer[name]) for where, name in places.items()}
 
     @property
@@ -103,7 +103,7 @@ def read_policy(folder: Path) -> Trained:
         read = Reader("evaluate")
         transfer = read.json(folder / TRANSFER)
         read.check(transfer, _TRANSFER, TRANSFER)
-        for where in ("simulation", "stand_in"):
+        for where in ("simulation", "synthetic_robot"):
             for fault in _faults(transfer[where]):
                 raise read.fault(f"{TRANSFER}, {where!r}, {fault}")
     films = {path.stem: path for path in sorted((folder / FILMS).glob("*.webp"))}

@@ -18,7 +18,7 @@ METHODS = {
     "mean": "one door, with the fitted means",
     "prior": "doors drawn from what was assumed before any fit",
 }
-ENOUGH = 0.8  # success on the stand-in from which the next step is the robot
+ENOUGH = 0.8  # success on the synthetic robot from which the next step is the robot
 
 
 def policy_summary(trained: Trained, gap: Gap | None = None, doubt: str = "") -> list[str]:
@@ -51,10 +51,12 @@ def policy_summary(trained: Trained, gap: Gap | None = None, doubt: str = "") ->
 
 
 def another_robot(training: Mapping[str, Any]) -> str:
-    """What trials on the stand-in robot do not tell where another one was fitted, of training.json; empty elsewhere."""
-    if training["setup"]["fit"] is None or training["stand_in"]:
+    """What trials on the synthetic robot do not tell where another one was fitted, of training.json; empty
+    elsewhere.
+    """
+    if training["setup"]["fit"] is None or training["synthetic_robot"]:
         return ""
-    return "The fit is of your own recordings: the stand-in robot is another one, and says little of it."
+    return "The fit is of your own recordings: the synthetic robot is another one, and says little of it."
 
 
 def _with(effects: list[str]) -> str:
@@ -64,7 +66,7 @@ def _with(effects: list[str]) -> str:
 
 def _tried(where: str, found: Mapping[str, Any], task: Mapping[str, Any]) -> str:
     low, high = found["interval_95"]
-    place = {"simulation": "In the simulation", "stand-in robot": "On the stand-in robot"}[where]
+    place = {"simulation": "In the simulation", "synthetic robot": "On the synthetic robot"}[where]
     stopped = "; ".join(f"{count} stopped: {why}" for why, count in found["stopped"].items())
     return (
         f"{place} it held the door open for {number(task['held'], 2)} s at {np.rad2deg(task['opened']):.0f} degrees "
@@ -80,13 +82,13 @@ def _next(trained: Trained, gap: Gap | None) -> str:
     if trained.transfer is None:
         learned = any(now["success"] >= LEARNED for now in trained.training["history"])
         return f"Next: python -m droid_jax.run evaluate {folder}" if learned else longer
-    if trained.transfer["stand_in"]["success_rate"] >= ENOUGH:
+    if trained.transfer["synthetic_robot"]["success_rate"] >= ENOUGH:
         return f"Next: python -m droid_jax.run export {folder}, and docs/policy-on-a-robot.md."
     if trained.transfer["simulation"]["success_rate"] < ENOUGH:
         return longer
     if another_robot(trained.training):
         return "It works in simulation and not on a robot that it was not fitted to, which was to be expected."
-    where = "It works in simulation and not on the stand-in robot"
+    where = "It works in simulation and not on the synthetic robot"
     held = trained.training["effects"]
     if gap is not None and gap.extended and not held:
         train = f"python -m droid_jax.run train --fit {shlex.quote(str(gap.folder))}"

@@ -45,7 +45,7 @@ _RECORDING = {
     **{"name": str, "sha256": str, "repeats": int, "heldout": [int], "duration": _NUMBER},
 }
 _CONFIG = {
-    **{"preset": str, "scene": str, "engine": str, "recordings": [_RECORDING], "seed": int, "stand_in": bool},
+    **{"preset": str, "scene": str, "engine": str, "recordings": [_RECORDING], "seed": int, "synthetic_robot": bool},
     **{"started": Maybe(str), "device": Maybe(str), "versions": Maybe({str: str}), "setup": Maybe(dict)},
 }
 _ROWS, _TABLES = ("generation", "best_cost", "median_cost"), ("mean", "std")  # of history.npz, [G] and [G, D]
@@ -81,8 +81,8 @@ class Run:
 
     @property
     def robot(self) -> str:
-        """How the page calls what was measured: a stand-in simulation is never called a robot."""
-        return "stand-in robot" if self.config["stand_in"] else "robot"
+        """How the page calls what was measured: a simulation is never called a robot."""
+        return "synthetic robot" if self.config["synthetic_robot"] else "robot"
 
     @property
     def torque_unit(self) -> str:

@@ -37,7 +37,7 @@ class Setup(TypedDict, total=False):
     fit_sha256: str | None
     scene_sha256: str
     recordings_sha256: list[str]
-    stand_in: bool | dict[str, Any]
+    synthetic_robot: bool | dict[str, Any]
     robot: Robot
     springs: int | None
     seed: int
@@ -49,7 +49,7 @@ class Setup(TypedDict, total=False):
 class Told(TypedDict, total=False):
     """What other commands read of a config.json or gap.json."""
 
-    stand_in: bool
+    synthetic_robot: bool
     robot: Robot
     setup: Setup
     amendments: dict[str, str]

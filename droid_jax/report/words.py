@@ -284,13 +284,13 @@ def far_off(fit: Mapping[str, Any]) -> bool:
 
 
 def speaker(run: Run) -> Callable[[str], str]:
-    """For texts of others: with a stand-in, "robot" becomes "stand-in robot"."""
+    """For texts of others: with a synthetic robot, "robot" becomes "synthetic robot"."""
 
     def speak(text: str) -> str:
-        if not run.config["stand_in"]:
+        if not run.config["synthetic_robot"]:
             return text
-        text = re.sub(r"(?<!stand-in )(?<!Stand-in )\brobot", "stand-in robot", text)
-        return re.sub(r"(?<!stand-in )(?<!Stand-in )\bRobot", "Stand-in robot", text)
+        text = re.sub(r"(?<!synthetic )(?<!Synthetic )\brobot", "synthetic robot", text)
+        return re.sub(r"(?<!synthetic )(?<!Synthetic )\bRobot", "Synthetic robot", text)
 
     return speak
 

@@ -1,7 +1,7 @@
-"""Hidden effects on the stand-in robot, for blind tests of the search for a gap.
+"""Hidden effects on the synthetic robot, for blind tests of the search for a gap.
 
 Written without knowledge of the library of effects that the search offers: forms, constants and
-time step are the stand-in's own.  What was hidden stands nowhere in the recording.  The formulas
+time step are the synthetic robot's own.  What was hidden stands nowhere in the recording.  The formulas
 are in `hidden_door`, `hidden_friction`, `hidden_arm`, `hidden_base` and `hidden_signals`.
 """
 
@@ -28,7 +28,7 @@ from droid_jax.synthetic.base_effects import BASE
 from droid_jax.synthetic.friction_effects import FRICTION
 from droid_jax.synthetic.hinge_effects import DOOR
 from droid_jax.synthetic.hooks import Hidden, Influence, Place, Seen, edited, step_through
-from droid_jax.synthetic.robot import StandIn, SurrogateConfig, as_recording, sensor_torque, set_up
+from droid_jax.synthetic.robot import SyntheticRobot, SyntheticRobotConfig, as_recording, sensor_torque, set_up
 from droid_jax.synthetic.signal_effects import SIGNALS
 
 HIDDEN: dict[str, Hidden] = {h.name: h for h in (*DOOR, *FRICTION, *ARM_EFFECTS, *BASE, *SIGNALS)}
@@ -90,11 +90,11 @@ def record_hidden(
     effects: Mapping[str, float] | Sequence[Applied],
     *,
     seed: int,
-    config: SurrogateConfig | None = None,
+    config: SyntheticRobotConfig | None = None,
     name: str | None = None,
     space: Space | None = None,
 ) -> Recording:
-    """Like `surrogate.record`, with effects that no parameter of the model stands for.
+    """Like `robot.record`, with effects that no parameter of the model stands for.
 
     effects: amplitudes by name, or by "name[joint]"; or `Applied`.
     config: time steps of more than LONGEST_STEP are refused.
@@ -105,20 +105,20 @@ def record_hidden(
     measured joints, ripple.
     Raises ValueError for unknown names, joints or amplitudes, and like `record`.
     """
-    config = config or SurrogateConfig()
+    config = config or SyntheticRobotConfig()
     if config.timestep > LONGEST_STEP * (1 + 1e-9):
         raise ValueError(f"hidden effects need time steps of at most {LONGEST_STEP} s, got {config.timestep}")
     applied = listed(effects)
     for one in applied:
         check(one, scene)
-    stand_in = set_up(scene, demonstration, truth, seed=seed, config=config, space=space)
-    rows, gears, sensors, stand_in = _simulate(stand_in, applied)
-    trace = split(stand_in.scene, rows)
-    torque = sensor_torque(stand_in, trace)
+    synthetic_robot = set_up(scene, demonstration, truth, seed=seed, config=config, space=space)
+    rows, gears, sensors, synthetic_robot = _simulate(synthetic_robot, applied)
+    trace = split(synthetic_robot.scene, rows)
+    torque = sensor_torque(synthetic_robot, trace)
     if config.side is TorqueSide.LINK:
-        torque = torque + gears[..., stand_in.scene.joint_dofs]
-    torque, position = _sensed(stand_in, sensors, torque, trace.position)
-    return as_recording(stand_in, trace, torque, position, name=name)
+        torque = torque + gears[..., synthetic_robot.scene.joint_dofs]
+    torque, position = _sensed(synthetic_robot, sensors, torque, trace.position)
+    return as_recording(synthetic_robot, trace, torque, position, name=name)
 
 
 def listed(effects: Mapping[str, float] | Sequence[Applied]) -> list[Applied]:
@@ -199,38 +199,38 @@ def at_work(scene: Scene, applied: Sequence[Applied], repeat: int = 0, period: f
 
 
 def _simulate(
-    stand_in: StandIn, applied: Sequence[Applied]
-) -> tuple[np.ndarray, np.ndarray, list[list[Influence]], StandIn]:
+    synthetic_robot: SyntheticRobot, applied: Sequence[Applied]
+) -> tuple[np.ndarray, np.ndarray, list[list[Influence]], SyntheticRobot]:
     """Sensor rows [N, T, S], torques in the gears [N, T, nv] (N m; only for the link side), the
-    effects of every repeat, and the stand-in with the models that they edited."""
-    count = len(stand_in.models)
-    since = stand_in.clock - stand_in.clock[0]
+    effects of every repeat, and the synthetic robot with the models that they edited."""
+    count = len(synthetic_robot.models)
+    since = synthetic_robot.clock - synthetic_robot.clock[0]
     period = float(since[-1]) + PAUSE
-    effects = [at_work(stand_in.scene, applied, repeat, period) for repeat in range(count)]
-    models = [edited(model, own) for model, own in zip(stand_in.models, effects, strict=True)]
-    link = stand_in.config.side is TorqueSide.LINK
-    gears = np.zeros((count, len(stand_in.clock) if link else 0, stand_in.scene.model.nv))
+    effects = [at_work(synthetic_robot.scene, applied, repeat, period) for repeat in range(count)]
+    models = [edited(model, own) for model, own in zip(synthetic_robot.models, effects, strict=True)]
+    link = synthetic_robot.config.side is TorqueSide.LINK
+    gears = np.zeros((count, len(synthetic_robot.clock) if link else 0, synthetic_robot.scene.model.nv))
 
     def one(repeat: int) -> np.ndarray:
-        control = stand_in.control
+        control = synthetic_robot.control
         for influence in effects[repeat]:
             if influence.command:
                 control = influence.command(since, control)
-        qpos0, own = stand_in.qpos0[repeat], gears[repeat] if link else None
+        qpos0, own = synthetic_robot.qpos0[repeat], gears[repeat] if link else None
         return step_through(models[repeat], qpos0, control, effects[repeat], own)
 
     with ThreadPoolExecutor(max_workers=min(count, runtime.cores())) as pool:
         rows = np.stack(list(pool.map(one, range(count))))
-    return rows, gears, effects, replace(stand_in, models=models)
+    return rows, gears, effects, replace(synthetic_robot, models=models)
 
 
 def _sensed(
-    stand_in: StandIn, effects: Sequence[Sequence[Influence]], torque: np.ndarray, position: np.ndarray
+    synthetic_robot: SyntheticRobot, effects: Sequence[Sequence[Influence]], torque: np.ndarray, position: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Torque and position [N, T, J] behind the effects on the sensors."""
     seen = []
     for repeat, own in enumerate(effects):
-        now = Seen(stand_in.clock - stand_in.clock[0], torque[repeat], position[repeat])
+        now = Seen(synthetic_robot.clock - synthetic_robot.clock[0], torque[repeat], position[repeat])
         for influence in own:
             now = influence.sense(now) if influence.sense else now
         seen.append(now)

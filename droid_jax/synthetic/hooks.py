@@ -1,4 +1,4 @@
-"""Where a hidden effect takes hold of the stand-in robot, and the loop of mj_step around it.
+"""Where a hidden effect takes hold of the synthetic robot, and the loop of mj_step around it.
 
 Nothing here knows the library of effects with which a gap is searched: what is hidden must have
 been written without it, or a blind test would test nothing.

@@ -1,8 +1,8 @@
-"""A policy on the stand-in robot: plain MuJoCo C, a fine time step, hidden values and effects, noisy sensors.
+"""A policy on the synthetic robot: plain MuJoCo C, a fine time step, hidden values and effects, noisy sensors.
 
 The loop that closes it is the one that goes to a real robot, `control.Controller`.
 
-It stands for the paper's robot in Table II, and is called a stand-in wherever its figures are shown.
+It stands for the paper's robot in Table II, and is called a synthetic robot wherever its figures are shown.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ TRIAL = 4  # a stream of its own: those of the hidden errors are [seed, 1] to [s
 
 @dataclass(frozen=True)
 class TransferConfig:
-    """How the stand-in robot differs from what the policy was trained on, beside its hidden values.
+    """How the synthetic robot differs from what the policy was trained on, beside its hidden values.
 
     trials.  timestep: s, of the Euler integrator; hidden effects shorten it where they must.
     position_noise, velocity_noise: rad, rad/s of the joints' sensors; knob_noise: m, of the camera's sight of the
@@ -58,8 +58,8 @@ class TransferConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class TrialRobot:
-    """The stand-in robot before a trial; `stand_in` makes it.
+class PolicyRobot:
+    """The synthetic robot before a trial; `synthetic_robot` makes it.
 
     scene: with the hidden values, at the robot's own time step, integrator and solver effort.  start: [nq].
     hidden: effects, as of the blind suite.
@@ -72,14 +72,14 @@ class TrialRobot:
     config: TransferConfig
 
 
-def stand_in(
+def synthetic_robot(
     scene: Scene,
     start: np.ndarray,
     truth: Mapping[str, float],
     hidden: Sequence[Applied] = (),
     task: Task | None = None,
     config: TransferConfig | None = None,
-) -> TrialRobot:
+) -> PolicyRobot:
     """A robot with hidden values and effects.
 
     start: [nq] as in training (`DoorEnv.start`), off by `Task.spread` in every trial.  truth: hidden values, of the
@@ -91,11 +91,11 @@ def stand_in(
     check_playable(scene, hidden)
     if hidden:
         config = replace(config, timestep=min(config.timestep, LONGEST_STEP))
-    substeps_of(task.control, config.timestep, "the stand-in robot's")
+    substeps_of(task.control, config.timestep, "the synthetic robot's")
     space = door_space(scene) + door_nuisances(scene)
     model = make_c_model(scene, space, space.values(dict(truth)))
     own = replace(scene, model=own_engine(model, config.timestep))
-    return TrialRobot(own, start, tuple(hidden), task, config)
+    return PolicyRobot(own, start, tuple(hidden), task, config)
 
 
 def check_playable(scene: Scene, hidden: Sequence[Applied]) -> None:
@@ -110,8 +110,8 @@ def check_playable(scene: Scene, hidden: Sequence[Applied]) -> None:
         )
 
 
-def transfer(policy: Policy, robot: TrialRobot, progress: Callable[[int], None] = lambda done: None) -> Trials:
-    """Trials of a policy on the stand-in robot.  ValueError for a policy that acts at another rate than the task's.
+def transfer(policy: Policy, robot: PolicyRobot, progress: Callable[[int], None] = lambda done: None) -> Trials:
+    """Trials of a policy on the synthetic robot.  ValueError for a policy that acts at another rate than the task's.
 
     progress: is told how many trials are over.
     """
@@ -124,14 +124,14 @@ def transfer(policy: Policy, robot: TrialRobot, progress: Callable[[int], None] 
     return Trials(*(np.array(column) for column in zip(*done, strict=True)))
 
 
-def filmed(policy: Policy, robot: TrialRobot, number: int) -> np.ndarray:
+def filmed(policy: Policy, robot: PolicyRobot, number: int) -> np.ndarray:
     """[K, nq] the states of one of `transfer`'s trials, before each action and at the end."""
     states: list[np.ndarray] = []
     watched(policy, robot, number, lambda data: states.append(data.qpos.copy()))
     return np.array(states)
 
 
-def watched(policy: Policy, robot: TrialRobot, number: int, watch: Callable[[mujoco.MjData], None]) -> None:
+def watched(policy: Policy, robot: PolicyRobot, number: int, watch: Callable[[mujoco.MjData], None]) -> None:
     """One of `transfer`'s trials again; watch: sees the simulation before each action and at the end."""
     _check_rate(policy, robot.task)
     _trial(policy, robot, number, watch)
@@ -143,7 +143,7 @@ def _check_rate(policy: Policy, task: Task) -> None:
 
 
 def _trial(
-    policy: Policy, robot: TrialRobot, number: int, watch: Callable[[mujoco.MjData], None] = lambda data: None
+    policy: Policy, robot: PolicyRobot, number: int, watch: Callable[[mujoco.MjData], None] = lambda data: None
 ) -> tuple[bool, float, int, float, str]:
     """Success, largest angle, actions, share of them with the grip on, why the loop stopped."""
     scene, task, config = robot.scene, robot.task, robot.config
@@ -154,7 +154,7 @@ def _trial(
     data.qpos[:] = robot.start
     data.qpos[scene.joint_qpos] += rng.normal(0.0, task.spread, len(scene.joints))
     mujoco.mj_forward(model, data)
-    advance = _advancer(model, data, influences, substeps_of(task.control, config.timestep, "the stand-in robot's"))
+    advance = _advancer(model, data, influences, substeps_of(task.control, config.timestep, "the synthetic robot's"))
     sense = _senses(scene, data, config, rng)
     seen = looked(hand, data, finger_forces_c(hand, model, data), np.zeros((2, 3)), task.control, np)
     loop = Controller(policy)

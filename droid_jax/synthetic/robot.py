@@ -1,9 +1,9 @@
-"""The stand-in robot: plain C MuJoCo with hidden physics, in place of a real Panda and a real door.
+"""The synthetic robot: plain C MuJoCo with hidden physics, in place of a real Panda and a real door.
 
 It runs at another time step and integrator than the analysis, with values the analysis does not
 know, small errors from repeat to repeat, and sensor noise at the levels of a real Panda.  Its
 torque is the motor's, as the simulated servo's damping (Table I) cannot be seen on the link side;
-`SurrogateConfig.side` asks for the link side.
+`SyntheticRobotConfig.side` asks for the link side.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from droid_jax.simulate.c_engine import Trace, instrument, simulate
 
 
 @dataclass(frozen=True)
-class SurrogateConfig:
-    """How the stand-in robot moves and measures.
+class SyntheticRobotConfig:
+    """How the synthetic robot moves and measures.
 
     repeats: N.
     timestep: s; C MuJoCo's semi-implicit Euler, first order, so fine enough to stand for continuous time
@@ -75,19 +75,19 @@ class SurrogateConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class StandIn:
-    """The stand-in robot before it moves, and what it shall repeat.
+class SyntheticRobot:
+    """The synthetic robot before it moves, and what it shall repeat.
 
     demonstration, truth, config, seed: as given to `record`.
-    scene: instrumented, at the stand-in's own time step and integrator.
+    scene: instrumented, at the synthetic robot's own time step and integrator.
     models: [N], qpos0: [N, nq], each repeat with its own small errors.
-    clock: [T] s and control: [T, U] at the stand-in's own time step.
+    clock: [T] s and control: [T, U] at the synthetic robot's own time step.
     rng: what is left of the recording's randomness, for the sensors.
     """
 
     demonstration: Recording
     truth: Mapping[str, float]
-    config: SurrogateConfig
+    config: SyntheticRobotConfig
     seed: int
     scene: Scene
     models: list[mujoco.MjModel]
@@ -114,20 +114,22 @@ def record(
     truth: Mapping[str, float],
     *,
     seed: int,
-    config: SurrogateConfig | None = None,
+    config: SyntheticRobotConfig | None = None,
     name: str | None = None,
 ) -> Recording:
-    """Repeat a demonstration N times on the stand-in robot and record it.
+    """Repeat a demonstration N times on the synthetic robot and record it.
 
     truth: hidden values by parameter name, of the door space and of its nuisances; what it does
       not name has the scene's own value.
     Raises ValueError for unknown names, and where a repeat blows up or loses the door (a
     demonstration is safe by definition: choose another truth).
     """
-    config = config or SurrogateConfig()
-    stand_in = set_up(scene, demonstration, truth, seed=seed, config=config)
-    trace = simulate(stand_in.scene, stand_in.models, stand_in.qpos0, stand_in.control[None])
-    return as_recording(stand_in, trace, sensor_torque(stand_in, trace), trace.position, name=name)
+    config = config or SyntheticRobotConfig()
+    synthetic_robot = set_up(scene, demonstration, truth, seed=seed, config=config)
+    trace = simulate(
+        synthetic_robot.scene, synthetic_robot.models, synthetic_robot.qpos0, synthetic_robot.control[None]
+    )
+    return as_recording(synthetic_robot, trace, sensor_torque(synthetic_robot, trace), trace.position, name=name)
 
 
 def set_up(
@@ -136,15 +138,15 @@ def set_up(
     truth: Mapping[str, float],
     *,
     seed: int,
-    config: SurrogateConfig,
+    config: SyntheticRobotConfig,
     space: Space | None = None,
-) -> StandIn:
+) -> SyntheticRobot:
     """Models, start poses and commands of every repeat; `space` is what truth may speak of (default: the door's)."""
     if config.repeats < 1:
-        raise ValueError(f"the stand-in robot needs at least one repeat, got {config.repeats}")
+        raise ValueError(f"the synthetic robot needs at least one repeat, got {config.repeats}")
     if not 0 < config.rate * config.timestep <= 1:
         raise ValueError(
-            f"the stand-in robot measures at most once per time step, at {1 / config.timestep:g} Hz, got a rate of "
+            f"the synthetic robot measures at most once per time step, at {1 / config.timestep:g} Hz, got a rate of "
             f"{config.rate:g} Hz"
         )
     rng = np.random.default_rng([seed, 2])
@@ -154,19 +156,19 @@ def set_up(
     if config.side is TorqueSide.LINK:
         _check_link_side(hidden, models)
     clock, control = _control(hidden, demonstration, config.timestep, truth.get("time_offset", 0.0))
-    return StandIn(demonstration, truth, config, seed, hidden, models, qpos0, clock, control, rng)
+    return SyntheticRobot(demonstration, truth, config, seed, hidden, models, qpos0, clock, control, rng)
 
 
 def as_recording(
-    stand_in: StandIn, trace: Trace, torque: np.ndarray, position: np.ndarray, *, name: str | None = None
+    synthetic_robot: SyntheticRobot, trace: Trace, torque: np.ndarray, position: np.ndarray, *, name: str | None = None
 ) -> Recording:
     """What the sensors make of a trace: torque and position [N, T, J] with offset and noise at the sensors' rates."""
-    demonstration, config = stand_in.demonstration, stand_in.config
-    scene, clock, rng = stand_in.scene, stand_in.clock, stand_in.rng
+    demonstration, config = synthetic_robot.demonstration, synthetic_robot.config
+    scene, clock, rng = synthetic_robot.scene, synthetic_robot.clock, synthetic_robot.rng
     _check_opened(demonstration, clock, trace)
     every = round(1.0 / (config.rate * config.timestep))
     time = clock[::every]
-    torque = torque[:, ::every] + _offset(scene, stand_in.truth)
+    torque = torque[:, ::every] + _offset(scene, synthetic_robot.truth)
     channels = {
         "torque": _channel(
             "torque",
@@ -191,7 +193,7 @@ def as_recording(
             name=name or demonstration.name,
             channels=channels,
             torque=TorqueConvention(config.side, gravity=_carries_weight(scene)),
-            meta={"source": SOURCE, "seed": str(stand_in.seed)},
+            meta={"source": SOURCE, "seed": str(synthetic_robot.seed)},
         )
     )
 
@@ -205,14 +207,14 @@ def _carries_weight(scene: Scene) -> bool:
     return bool(model.opt.gravity.any()) and not elsewhere.any()
 
 
-def _hidden_scene(scene: Scene, config: SurrogateConfig) -> Scene:
-    """The scene instrumented, at the stand-in's own time step, integrator and solver effort."""
+def _hidden_scene(scene: Scene, config: SyntheticRobotConfig) -> Scene:
+    """The scene instrumented, at the synthetic robot's own time step, integrator and solver effort."""
     hidden = replace(scene, model=own_engine(copy.copy(scene.model), config.timestep))
     return replace(hidden, model=instrument(hidden))
 
 
 def own_engine(model: mujoco.MjModel, timestep: float) -> mujoco.MjModel:
-    """The model with the stand-in's own time step, integrator and solver effort set."""
+    """The model with the synthetic robot's own time step, integrator and solver effort set."""
     model.opt.timestep, model.opt.integrator = timestep, mujoco.mjtIntegrator.mjINT_EULER
     model.opt.iterations, model.opt.ls_iterations = 100, 50
     return model
@@ -222,7 +224,7 @@ def _repeats(
     hidden: Scene,
     truth: Mapping[str, float],
     nominal: np.ndarray,
-    config: SurrogateConfig,
+    config: SyntheticRobotConfig,
     rng: np.random.Generator,
     space: Space | None,
 ) -> tuple[list[mujoco.MjModel], np.ndarray]:
@@ -242,7 +244,7 @@ def _repeats(
 
 
 def _space(hidden: Scene, truth: Mapping[str, float], space: Space | None) -> Space:
-    """Every parameter the stand-in can have, around the scene's own values.
+    """Every parameter the synthetic robot can have, around the scene's own values.
 
     Without a space: Table I and the nuisances for a door that is held, sensor offsets and timing otherwise.
     """
@@ -263,10 +265,12 @@ def _own_value(scene: Scene, parameter: Parameter) -> float:
 
 
 def _control(hidden: Scene, demonstration: Recording, timestep: float, delay: float) -> tuple[np.ndarray, np.ndarray]:
-    """Clock [T] and commands [T, U] of the stand-in's own time step."""
+    """Clock [T] and commands [T, U] of the synthetic robot's own time step."""
     columns = hidden.command_index(demonstration.command_names)
     if without := [n for n, c in zip(hidden.command_names, columns, strict=True) if c < 0]:
-        raise ValueError(f"the stand-in robot needs a command for {', '.join(without)} too; the demonstration has none")
+        raise ValueError(
+            f"the synthetic robot needs a command for {', '.join(without)} too; the demonstration has none"
+        )
     start, end = demonstration.time[0], demonstration.time[-1]
     clock = start + np.arange(int((end - start) / timestep + 1e-6) + 1) * timestep
     return clock, interpolate(clock - delay, demonstration.time, demonstration.command[:, columns])
@@ -274,14 +278,14 @@ def _control(hidden: Scene, demonstration: Recording, timestep: float, delay: fl
 
 def _check_opened(demonstration: Recording, clock: np.ndarray, trace: Trace) -> None:
     if not np.isfinite(trace.torque).all():
-        raise ValueError("the stand-in robot's simulation became unstable with these values")
+        raise ValueError("the synthetic robot's simulation became unstable with these values")
     window = demonstration.grip_window
     if window is None or trace.contact.shape[-1] == 0:
         return
     held = trace.contact[:, (clock >= window[0]) & (clock <= window[1])].all(axis=-1)
     lost = np.flatnonzero(held.mean(axis=1) < 0.99)
     if lost.size:
-        raise ValueError(f"the stand-in robot lost its grasp in repeat {lost[0]} (too little friction for this door?)")
+        raise ValueError(f"the synthetic robot lost its grasp in repeat {lost[0]} (too little friction for this door?)")
 
 
 def _check_link_side(scene: Scene, models: Sequence[mujoco.MjModel]) -> None:
@@ -289,19 +293,19 @@ def _check_link_side(scene: Scene, models: Sequence[mujoco.MjModel]) -> None:
     friction = np.max([m.dof_frictionloss[scene.joint_dofs] for m in models], axis=0)
     if rubs := [joint for joint, loss in zip(scene.joints, friction, strict=True) if loss > 1.001 * TINY_FRICTIONLOSS]:
         raise ValueError(
-            f"the stand-in robot cannot tell the torque on the link side of joints with a frictionloss of their own "
+            f"the synthetic robot cannot tell the torque on the link side of joints with a frictionloss of their own "
             f"({', '.join(rubs)}): take it out of the scene and hide joint_stribeck instead, or measure at the motor"
         )
 
 
-def sensor_torque(stand_in: StandIn, trace: Trace) -> np.ndarray:
+def sensor_torque(synthetic_robot: SyntheticRobot, trace: Trace) -> np.ndarray:
     """[N, T, J] N m at the motor, or at the link: without rotor inertia and joint damping."""
-    if stand_in.config.side is TorqueSide.MOTOR:
+    if synthetic_robot.config.side is TorqueSide.MOTOR:
         return trace.torque
-    dofs = stand_in.scene.joint_dofs
-    acceleration = np.gradient(trace.velocity, stand_in.config.timestep, axis=1)
-    armature = np.array([m.dof_armature[dofs] for m in stand_in.models])[:, None]
-    damping = np.array([m.dof_damping[dofs] for m in stand_in.models])[:, None]
+    dofs = synthetic_robot.scene.joint_dofs
+    acceleration = np.gradient(trace.velocity, synthetic_robot.config.timestep, axis=1)
+    armature = np.array([m.dof_armature[dofs] for m in synthetic_robot.models])[:, None]
+    damping = np.array([m.dof_damping[dofs] for m in synthetic_robot.models])[:, None]
     return trace.torque - armature * acceleration - damping * trace.velocity
 
 
@@ -310,7 +314,7 @@ def _offset(scene: Scene, truth: Mapping[str, float]) -> np.ndarray:
     return np.array([truth.get(f"torque_offset[{j}]", 0.0) for j in scene.joints])
 
 
-def _torque_noise(shape: tuple[int, ...], config: SurrogateConfig, rng: np.random.Generator) -> np.ndarray:
+def _torque_noise(shape: tuple[int, ...], config: SyntheticRobotConfig, rng: np.random.Generator) -> np.ndarray:
     """White noise and slow first-order noise, [N, T, J] N m."""
     wrist = np.arange(shape[-1]) >= _WRIST
     white = np.where(wrist, config.torque_noise[1], config.torque_noise[0])
@@ -323,7 +327,7 @@ def _torque_noise(shape: tuple[int, ...], config: SurrogateConfig, rng: np.rando
 
 
 def _camera(
-    scene: Scene, clock: np.ndarray, angle: np.ndarray, config: SurrogateConfig, rng: np.random.Generator
+    scene: Scene, clock: np.ndarray, angle: np.ndarray, config: SyntheticRobotConfig, rng: np.random.Generator
 ) -> Channel:
     """The door's angle on the camera's own clock, [N, Tc, 1] rad (m of a slide)."""
     joint = str(scene.object_joint)
@@ -342,13 +346,13 @@ def _channel(name: str, unit: str, columns: tuple[str, ...], time: np.ndarray, v
     return Channel(name, unit, columns, time, values.astype(np.float32), np.ones(values.shape, bool))
 
 
-def is_stand_in(recording: Recording) -> bool:
-    """Whether the stand-in robot made a recording, whichever file it has been through since."""
+def is_synthetic(recording: Recording) -> bool:
+    """Whether the synthetic robot made a recording, whichever file it has been through since."""
     return recording.meta.get("source") == SOURCE
 
 
-def stand_in_truth(scene: Scene, springs: int, seed: int, *, nuisances: bool = True) -> dict[str, float]:
-    """Hidden values of a stand-in robot and door: a fitted column of Table I, joint dampings up to
+def synthetic_truth(scene: Scene, springs: int, seed: int, *, nuisances: bool = True) -> dict[str, float]:
+    """Hidden values of a synthetic robot and door: a fitted column of Table I, joint dampings up to
     some 15 % off the scene's, and (optionally) one draw of the nuisances."""
     rng = np.random.default_rng([seed, 3])
     space = door_space(scene)

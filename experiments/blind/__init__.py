@@ -1,6 +1,6 @@
 """The blind suite: can the search for a missing effect be trusted?
 
-The stand-in robot (plain C MuJoCo, another time step, its own formulas) hides something, or nothing; the search
+The synthetic robot (plain C MuJoCo, another time step, its own formulas) hides something, or nothing; the search
 gets the recordings and must say what.  Nobody who tunes the search sees the scored cases beforehand:
 
 * `make` writes recordings into OUT/cases/<scene>_<digits>/ and the truth into OUT/sealed/.  The search runs in a

@@ -20,7 +20,7 @@ from experiments.blind.scenes import Setting
 
 NAMELESS = 0.9  # share left over by a name that takes no fifth of the gap away: the search would not give it
 FACTORS = (1.0, 3.0, 10.0)  # of the detection limit
-SAFE = 2.0  # times the upper end of an effect's typical range: beyond it the stand-in may lose the door
+SAFE = 2.0  # times the upper end of an effect's typical range: beyond it the synthetic robot may lose the door
 
 Limits = Mapping[str, Mapping[str, Any]]
 

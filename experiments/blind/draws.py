@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from droid_jax.model.parameters import Space
-from droid_jax.synthetic.robot import stand_in_truth
+from droid_jax.synthetic.robot import synthetic_truth
 from experiments.blind.scenes import ROLES, Setting
 
 DEVELOPMENT = "development"  # in place of a commit: cases to tune with, which prove nothing
@@ -60,7 +60,9 @@ def _near(space: Space, truth: Truth) -> Truth:
 
 
 def _truth(setting: Setting, rng: np.random.Generator) -> Truth:
-    """Around the priors.  Friction that only a sensor sees stays zero: the stand-in has its own in its joints."""
+    """Around the priors.  Friction that only a sensor sees stays zero: the synthetic robot has its own in its
+    joints.
+    """
     space = setting.base
     values = rng.normal(space.mean, np.where(space.nuisance, space.std, SPREAD * space.std))
     values = np.clip(values, space.low, space.high)
@@ -70,5 +72,5 @@ def _truth(setting: Setting, rng: np.random.Generator) -> Truth:
 
 def _door_truth(setting: Setting, rng: np.random.Generator) -> Truth:
     """A door of Table I, its hinge varied by a third, with one draw of damping and nuisances."""
-    truth = stand_in_truth(setting.scene, int(rng.integers(3)), int(rng.integers(1 << 30)))
+    truth = synthetic_truth(setting.scene, int(rng.integers(3)), int(rng.integers(1 << 30)))
     return truth | {name: float(truth[name] * np.exp(rng.normal(0, 0.3))) for name in HINGE}

@@ -2,7 +2,7 @@
 
 The library form's amplitudes and shapes are fitted to what the hidden effect adds to the torques (linearly in
 the amplitudes, over a dense grid of shapes).  What is left over in N m, as a share of the effect's own root mean
-square, says how little of a mirror the stand-in is; the same in units of noise, after the base model has been
+square, says how little of a mirror the synthetic robot is; the same in units of noise, after the base model has been
 fitted again, says which forms no data could tell apart, and how much of the gap a right name can close at most.
 """
 

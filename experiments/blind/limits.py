@@ -1,7 +1,7 @@
 """Detection limits: the amplitude at which the sign-flip test finds an effect in half of the cases.
 
-Computed from the stand-in's noise before the method is frozen.  What a hidden effect adds is recorded once, small,
-with and without it and with the same noise; what the base model cannot absorb of it grows with the amplitude.
+Computed from the synthetic robot's noise before the method is frozen.  What a hidden effect adds is recorded once,
+small, with and without it and with the same noise; what the base model cannot absorb of it grows with the amplitude.
 Repeats are drawn, with replacement, from those of a long recording with nothing hidden; the test is `largest_steady_t`
 over the full list of candidates.
 """

@@ -18,7 +18,7 @@ from droid_jax.recordings.formats import save
 from droid_jax.recordings.recording import Recording
 from droid_jax.storage import new_folder, write_json
 from droid_jax.synthetic.hidden_effects import Applied, record_hidden
-from droid_jax.synthetic.robot import SurrogateConfig
+from droid_jax.synthetic.robot import SyntheticRobotConfig
 from experiments.blind.answers import without
 from experiments.blind.cases import Limits, Plan, applied
 from experiments.blind.draws import Truth, draw_truths, folder_of, seed_of
@@ -79,9 +79,9 @@ def draw(setting: Setting, plan: Plan, limits: Limits, rng: np.random.Generator)
 
 
 def record(
-    setting: Setting, drawn: Drawn, roles: tuple[str, ...] = ROLES, config: SurrogateConfig | None = None
+    setting: Setting, drawn: Drawn, roles: tuple[str, ...] = ROLES, config: SyntheticRobotConfig | None = None
 ) -> dict[str, Recording]:
-    """Role -> recording.  Raises ValueError where the stand-in loses the door."""
+    """Role -> recording.  Raises ValueError where the synthetic robot loses the door."""
     out = {}
     for role in roles:
         made = record_hidden(

@@ -24,7 +24,7 @@ from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects.registry import effect_space
 from droid_jax.recordings.recording import Recording
 from droid_jax.synthetic.hidden_effects import Applied
-from droid_jax.synthetic.robot import SurrogateConfig
+from droid_jax.synthetic.robot import SyntheticRobotConfig
 from experiments.blind.draws import Truth
 from experiments.blind.make import Drawn, record
 from experiments.blind.scenes import Setting
@@ -133,7 +133,7 @@ def ground(setting: Setting, truth: Truth, seed: int) -> Ground:
 
 def _recorded(setting: Setting, hidden: tuple[Applied, ...], truth: Truth, seed: int, repeats: int) -> Recording:
     drawn = Drawn(hidden, {"fit": truth}, {"fit": seed})
-    return record(setting, drawn, ("fit",), SurrogateConfig(repeats=repeats))["fit"]
+    return record(setting, drawn, ("fit",), SyntheticRobotConfig(repeats=repeats))["fit"]
 
 
 def dense(effects: tuple[Effect, ...]) -> tuple[Candidate, ...]:

@@ -19,12 +19,12 @@ from droid_jax.discrepancy.refit import refit
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.recordings.recording import Recording
 from droid_jax.synthetic.hidden_effects import Applied
-from droid_jax.synthetic.robot import SurrogateConfig
+from droid_jax.synthetic.robot import SyntheticRobotConfig
 from experiments.blind.make import Drawn, record
 from experiments.blind.search import Bench
 
 SETTLE = RefineConfig(iterations=20, hops=0, spreads=0)
-QUIET = SurrogateConfig(
+QUIET = SyntheticRobotConfig(
     torque_noise=(0.0, 0.0), torque_drift=(0.0, 0.0), position_noise=0.0, angle_noise=0.0,
     start_noise=0.0, pose_noise=0.0,
 )  # fmt: skip

@@ -26,7 +26,7 @@ from droid_jax.policy.train import PRESETS, TrainConfig
 from droid_jax.policy.trials import LEARNED
 from droid_jax.report.export import save
 from droid_jax.storage import write_json
-from droid_jax.synthetic.policy_trials import TrialRobot, transfer
+from droid_jax.synthetic.policy_trials import PolicyRobot, transfer
 from experiments.policies.store import Doors, sha256, trained
 from experiments.policies.table import PLACES
 
@@ -47,9 +47,9 @@ class Options:
     first: int = 0
     """Seed of the first policy: pilots use others than the runs that are reported."""
     robot: int | None = None
-    """Seed of the stand-in robot's hidden errors and of its trials; default: the setting's. Pilots use another."""
+    """Seed of the synthetic robot's hidden errors and of its trials; default: the setting's. Pilots use another."""
     trials: int = 100
-    """Trials of each policy on the stand-in robot, and episodes in simulation."""
+    """Trials of each policy on the synthetic robot, and episodes in simulation."""
     steps: int | None = None
     """Actions of each training; default: the preset's."""
     preset: Literal["quick", "paper", "gpu"] = "quick"
@@ -107,7 +107,7 @@ class Options:
 
 @dataclass(frozen=True)
 class Budget:
-    """How much a policy costs.  trials: on the stand-in robot, and episodes in simulation; again: see `Options`."""
+    """How much a policy costs.  trials: on the synthetic robot, and episodes in simulation; again: see `Options`."""
 
     config: TrainConfig
     trials: int
@@ -128,7 +128,7 @@ def tried(
     arguments: Options,
     env: DoorEnv,
     doors: Doors,
-    robots: Mapping[str, TrialRobot],
+    robots: Mapping[str, PolicyRobot],
     seed: int,
     code: Mapping[str, Any],
 ) -> dict[str, Any]:

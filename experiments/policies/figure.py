@@ -14,8 +14,8 @@ from experiments.policies.table import METHODS, OPENED, PAPER, SLIPPERY, trials
 WORDS = {"prior": "prior, randomised", "mean": "fitted mean alone", "fitted": "fitted, randomised"}
 WHERE = {
     "simulation": "simulation",
-    "stand_in": "stand-in robot",
-    SLIPPERY: "stand-in robot, pads with a friction of 0.05",
+    "synthetic_robot": "synthetic robot",
+    SLIPPERY: "synthetic robot, pads with a friction of 0.05",
 }
 TARGETS: dict[str, tuple[str, Callable[[float], bool]]] = {  # of every policy, by place
     "simulation": ("policies at 95 % or more", lambda rate: rate >= 0.95),
@@ -96,7 +96,7 @@ def _columns(of: Mapping[str, Any]) -> list[str]:
         row("largest angle, degrees (mean's 95 %)", [_spread(c["angle_deg"]) for c in cells])
         row("steps of successes (mean's 95 %)", [_spread(c["steps"]) for c in cells])
         row("actions with the grip on, %", [_percent(c["grip"]["mean"], 0) for c in cells])
-        if place == "stand_in":
+        if place == "synthetic_robot":
             row("stopped by the control loop, %", [_percent(c["stopped"], 1) for c in cells])
         if any(c["blown_up"] for c in cells):
             row("blew up, not counted above", [str(c["blown_up"]) for c in cells])
@@ -106,11 +106,11 @@ def _columns(of: Mapping[str, Any]) -> list[str]:
 def _apart(what: str, found: Mapping[str, Any]) -> str:
     success, angle = found["success"], found["angle"]
     if success["difference"] is None:
-        return f"{what}, stand-in robot: nothing to compare, all trials of one of them blew up."
+        return f"{what}, synthetic robot: nothing to compare, all trials of one of them blew up."
     welch = f"; Welch's {_between(success['welch_95'], _points)}" if success["welch_95"] else ""
     points = f"{_points(success['difference'])} points of success ({_between(success['interval_95'], _points)}{welch})"
     degrees = f"{angle['difference']:+.1f} degrees ({_between(angle['interval_95'], '{:+.1f}'.format)})"
-    return f"{what}, stand-in robot: {points}, {degrees}."
+    return f"{what}, synthetic robot: {points}, {degrees}."
 
 
 def _between(interval: Sequence[float], words: Callable[[float], str]) -> str:
@@ -150,7 +150,7 @@ def _points(share: float) -> str:
 
 @styled
 def histograms(cases: Sequence[Mapping[str, Any]], settings: Sequence[str]) -> Figure:
-    """Largest angles on the stand-in robot: a row for each setting that was run, a column for each method.
+    """Largest angles on the synthetic robot: a row for each setting that was run, a column for each method.
 
     A bar above each panel is the paper's mean and deviation on its real robot, whose doors are none of these.
     """
@@ -166,7 +166,7 @@ def histograms(cases: Sequence[Mapping[str, Any]], settings: Sequence[str]) -> F
 
 @styled
 def knob_histograms(places: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
-    """Largest angles on the stand-in robot, a panel for each place of the knob (its name: its policies)."""
+    """Largest angles on the synthetic robot, a panel for each place of the knob (its name: its policies)."""
     panels = [Panel(f"{lever} from the hinge", own, AFTER) for lever, own in places.items()]
     return _panels([panels])
 
@@ -181,12 +181,12 @@ class Panel(NamedTuple):
 
 
 def _panels(rows: Sequence[Sequence[Panel]]) -> Figure:
-    """Histograms of the largest angle on the stand-in robot, in per cent of each panel's trials, on common axes."""
+    """Histograms of the largest angle on the synthetic robot, in per cent of each panel's trials, on common axes."""
     figure = Figure(figsize=(7.0, 1.9 * len(rows) + 0.7), layout="constrained")
     grid = figure.subplots(len(rows), len(rows[0]), sharex=True, sharey=True, squeeze=False)
     for row, panels in zip(grid, rows, strict=True):
         for axes, panel in zip(row, panels, strict=True):
-            each = [trials(case, "stand_in")["angle"] for case in panel.cases]
+            each = [trials(case, "synthetic_robot")["angle"] for case in panel.cases]
             angles = np.concatenate(each) if each else np.zeros(0)
             axes.hist(angles, BINS, weights=np.full(len(angles), 100.0 / max(len(angles), 1)), color=panel.colour)
             axes.axvline(OPENED, color=INK, lw=0.8, ls=":", label=OPENED_WORDS)

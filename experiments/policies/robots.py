@@ -1,4 +1,4 @@
-"""The stand-in robot of a setting, and what identification makes of it."""
+"""The synthetic robot of a setting, and what identification makes of it."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.gaussian import load as load_gaussian
 from droid_jax.identify.pipeline import identify
 from droid_jax.storage import write_json
-from droid_jax.synthetic.policy_trials import TransferConfig, TrialRobot, stand_in
-from droid_jax.synthetic.robot import stand_in_truth
+from droid_jax.synthetic.policy_trials import PolicyRobot, TransferConfig, synthetic_robot
+from droid_jax.synthetic.robot import synthetic_truth
 from experiments.identify_suite import describe, recordings, settings
 from experiments.policies.cases import TIMESTEP, Options
 from experiments.policies.settings import Setting
@@ -29,8 +29,8 @@ CONTACT = 0.005  # m over which a pad touches.  Table I's torsional friction wou
 
 
 def truth_of(setting: Setting) -> dict[str, float]:
-    """The stand-in's hidden values."""
-    return {**stand_in_truth(door_scene(), setting.springs, setting.robot), **setting.truth}
+    """The synthetic robot's hidden values."""
+    return {**synthetic_truth(door_scene(), setting.springs, setting.robot), **setting.truth}
 
 
 def pads_of(sliding: float) -> dict[str, float]:
@@ -39,11 +39,11 @@ def pads_of(sliding: float) -> dict[str, float]:
     return {f"{kind}_friction_{side}": mu for kind, mu in kinds.items() for side in ("left", "right")}
 
 
-def robots_of(setting: Setting, env: DoorEnv, trials: int) -> dict[str, TrialRobot]:
+def robots_of(setting: Setting, env: DoorEnv, trials: int) -> dict[str, PolicyRobot]:
     """The setting's robot, and the same robot with slippery pads."""
     scene, truth, config = door_scene(limits=True), truth_of(setting), TransferConfig(trials=trials, seed=setting.robot)
-    of = {"stand_in": truth, SLIPPERY: {**truth, **pads_of(SLIDING)}}
-    return {name: stand_in(scene, env.start, hidden, (), env.task, config) for name, hidden in of.items()}
+    of = {"synthetic_robot": truth, SLIPPERY: {**truth, **pads_of(SLIDING)}}
+    return {name: synthetic_robot(scene, env.start, hidden, (), env.task, config) for name, hidden in of.items()}
 
 
 def fitted(setting: Setting, arguments: Options, code: Mapping[str, Any]) -> Gaussian:

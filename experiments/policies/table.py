@@ -11,8 +11,8 @@ import scipy.stats
 from droid_jax.policy.trials import BLOWN_UP, wilson
 
 METHODS = ("prior", "mean", "fitted")
-PLACES = ("simulation", "stand_in")
-SLIPPERY = "slippery"  # the stand-in robot with pads that do not hold
+PLACES = ("simulation", "synthetic_robot")
+SLIPPERY = "slippery"  # the synthetic robot with pads that do not hold
 RESAMPLES = 40_000  # the tails of five policies hold a thousandth each
 LEVEL = 0.95
 OPENED = 30.0  # degrees: a success of the paper; here it must also be held for half a second with the grip on
@@ -109,8 +109,10 @@ def trials(case: Mapping[str, Any], place: str) -> dict[str, np.ndarray]:
 
 
 def apart(better: Sequence[Mapping[str, Any]], worse: Sequence[Mapping[str, Any]], what: str) -> dict[str, Any]:
-    """Difference of two methods' means on the stand-in robot, with its interval, and Welch's of the policies' means."""
-    a, b = ([t for case in own if len(t := trials(case, "stand_in")[what])] for own in (better, worse))
+    """Difference of two methods' means on the synthetic robot, with its interval, and Welch's of the policies'
+    means.
+    """
+    a, b = ([t for case in own if len(t := trials(case, "synthetic_robot")[what])] for own in (better, worse))
     if not (a and b):  # nothing is left to compare
         return {"difference": None, "interval_95": None, "welch_95": None}
     draws = resampled(a, 1) - resampled(b, 2)

@@ -172,15 +172,15 @@ def test_each_joint_of_a_sealed_log_has_its_own_noise(monkeypatch: pytest.Monkey
     given: dict[str, np.ndarray] = {}
     clock = np.arange(0.0, 40.0, 0.02)
 
-    def stand_in(name: str, *columns: int) -> Any:
+    def synthetic_robot(name: str, *columns: int) -> Any:
         return SimpleNamespace(
-            name=name, clock=clock, columns=list(columns), part=lambda turn: stand_in(turn, *columns)
+            name=name, clock=clock, columns=list(columns), part=lambda turn: synthetic_robot(turn, *columns)
         )
 
     monkeypatch.setattr(single, "noise_of", lambda *_: (np.array([1.0, 2.0]), 1.0))
     monkeypatch.setattr(single, "only_comparison", lambda log: log)
     monkeypatch.setattr(single, "_blocks", lambda log, deviation, block: given.update({log.name: deviation}))
-    single_case(stand_in("log", 0, 1), elbow_space(elbow()), (), stand_in("sealed", 1, 0))
+    single_case(synthetic_robot("log", 0, 1), elbow_space(elbow()), (), synthetic_robot("sealed", 1, 0))
     assert {name: noise.tolist() for name, noise in given.items()} == {
         "log, every other block": [1.0, 2.0],
         "log, the blocks between": [1.0, 2.0],

@@ -1,4 +1,4 @@
-"""The whole search on recordings of the stand-in: nothing hidden, and two effects hidden at once."""
+"""The whole search on recordings of the synthetic robot: nothing hidden, and two effects hidden at once."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.simulate.hand_path import minimum_jerk
 from droid_jax.synthetic.hidden_effects import record_hidden
-from droid_jax.synthetic.robot import SurrogateConfig
+from droid_jax.synthetic.robot import SyntheticRobotConfig
 
 ARM = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
   <body name="column"><joint name="yaw" axis="0 0 1" armature="0.05" damping="10"/>
@@ -78,7 +78,7 @@ def recorded(compensated: bool, hidden: tuple[tuple[str, float], ...]) -> dict[s
             role, clock, command, JOINTS, {}, TorqueConvention(TorqueSide.MOTOR, gravity=not compensated),
             qpos0=dict(zip(JOINTS, command[0].tolist(), strict=True)),
         )  # fmt: skip
-        config = SurrogateConfig(repeats=8, timestep=0.00025)
+        config = SyntheticRobotConfig(repeats=8, timestep=0.00025)
         recording = record_hidden(scene, demonstration, {}, dict(hidden), seed=seed, config=config)
         found[role] = replace(recording, time=np.zeros(0), command=np.zeros((0, 0)), command_names=())
     return found

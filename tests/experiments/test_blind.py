@@ -271,7 +271,7 @@ def test_what_an_effect_adds_is_taken_on_the_same_robot_with_the_same_noise(hing
     assert np.ptp(one, axis=0).max() == 0.0 < np.ptp(where.hidden(Applied("torque_drift", 0.5)), axis=0).max()
 
 
-def test_the_stand_in_is_no_mirror_of_the_library():
+def test_the_synthetic_robot_is_no_mirror_of_the_library():
     """Of every hidden effect at least 5 % of its own root mean square is left by the library's form of it."""
     scenes = json.loads(LIMITS.read_text())["scenes"]
     assert {"hinge", "door"} <= set(scenes)

@@ -13,8 +13,8 @@ import pytest
 from droid_jax.door.demonstration import PLANS, joint_path
 from droid_jax.door.scene import door_scene
 from droid_jax.door.task import Task
-from droid_jax.synthetic.policy_trials import TransferConfig, TrialRobot, stand_in
-from droid_jax.synthetic.robot import stand_in_truth
+from droid_jax.synthetic.policy_trials import PolicyRobot, TransferConfig, synthetic_robot
+from droid_jax.synthetic.robot import synthetic_truth
 from experiments.pad_friction import NEEDED, PARTS, Arguments, Opening, hinge_torques, made, needless
 from experiments.policies.robots import pads_of
 from experiments.policies.settings import SETTINGS, setting_of
@@ -39,12 +39,12 @@ KNOB = """
 """
 
 
-def around_the_knob(pads: dict[str, float]) -> TrialRobot:
+def around_the_knob(pads: dict[str, float]) -> PolicyRobot:
     """A robot whose open hand is around the knob."""
     scene, task = door_scene(limits=True), Task(opened=float(np.deg2rad(10.0)))
     arm = dict(zip(scene.joints, joint_path(scene, PLANS["A"], np.zeros(1), np.zeros(1))[0], strict=True))
     start = scene.initial_qpos({**arm, **dict.fromkeys(scene.finger_joints, 0.02)})
-    return stand_in(scene, start, {**stand_in_truth(scene, 0, 0), **pads}, (), task, TransferConfig())
+    return synthetic_robot(scene, start, {**synthetic_truth(scene, 0, 0), **pads}, (), task, TransferConfig())
 
 
 def of_contacts(model: mujoco.MjModel, data: mujoco.MjData, dof: int) -> float:

@@ -69,7 +69,7 @@ def case(
         "seed": seed,
         "doors_sha256": fit,
         "trained_by": {"commit": "an older one"},
-        **{place: found.to_json() for place in ("simulation", "stand_in", "slippery")},
+        **{place: found.to_json() for place in ("simulation", "synthetic_robot", "slippery")},
     }
 
 
@@ -79,19 +79,23 @@ def percent_in(panels: Sequence[Any]) -> list[float]:
 
 
 def test_a_column_is_the_mean_over_all_trials():
-    found = column([case("mean", 0, 0.2), case("mean", 1, 0.8)], "stand_in")
+    found = column([case("mean", 0, 0.2), case("mean", 1, 0.8)], "synthetic_robot")
     assert (found["policies"], found["trials"], found["seeds"]) == (2, 100, [0, 1])
     assert found["success_rate"] == pytest.approx(0.5) and found["success_of_each"] == pytest.approx([0.2, 0.8])
     assert found["angle_deg"]["mean"] == pytest.approx(25.0) and found["angle_deg"]["std"] == pytest.approx(15.0)
     assert found["steps"]["mean"] == 100.0  # of successes
-    assert column([case("mean", 0, 0.0)], "stand_in")["steps"] == {"mean": None, "std": None, "interval_95": None}
+    assert column([case("mean", 0, 0.0)], "synthetic_robot")["steps"] == {
+        "mean": None,
+        "std": None,
+        "interval_95": None,
+    }
 
 
 def test_the_papers_success_is_an_angle_alone():
     """Three of four trials pass 30 degrees, one of them without a grip that lasts."""
     one = case("mean", 0, 0.5, 4)
-    one["stand_in"]["angle_deg"]["all"] = [40.0, 40.0, 31.0, 30.0]
-    found = column([one], "stand_in")
+    one["synthetic_robot"]["angle_deg"]["all"] = [40.0, 40.0, 31.0, 30.0]
+    found = column([one], "synthetic_robot")
     assert (found["success_rate"], found["beyond_30_deg"]) == (0.5, 0.75)
     assert "| beyond 30 degrees, % (the paper's success) | 75.0 |" in as_text(summed_up([one], ["paper"]))
 
@@ -99,16 +103,16 @@ def test_the_papers_success_is_an_angle_alone():
 def test_what_blew_up_is_counted_and_in_no_rate():
     """Ten trials of fifty: half of the others succeed, and one in eight of them was stopped by the control loop."""
     why = ["too fast: joint 1"] * 5 + ["the simulation blew up"] * 10
-    found = column([case("mean", 0, 0.4, stopped=why)], "stand_in")
+    found = column([case("mean", 0, 0.4, stopped=why)], "synthetic_robot")
     assert (found["trials"], found["blown_up"], found["success_rate"]) == (40, 10, pytest.approx(0.5))
     assert found["stopped"] == pytest.approx(5 / 40) and found["grip"]["mean"] == pytest.approx(0.5)
-    whole = column([case("mean", 0, 0.4)], "stand_in")
+    whole = column([case("mean", 0, 0.4)], "synthetic_robot")
     assert (whole["trials"], whole["blown_up"], whole["stopped"]) == (50, 0, 0.0)
     lost, kept = case("mean", 3, 0.4, 2, why[-2:]), [case("mean", k, 0.5) for k in range(2)]
-    found = column([lost, *kept], "stand_in")
+    found = column([lost, *kept], "synthetic_robot")
     assert (found["policies"], found["trials"], found["blown_up"]) == (3, 100, 2)
     assert found["success_of_each"] == [None, 0.5, 0.5] and found["success_rate"] == 0.5
-    none = column([lost], "stand_in")
+    none = column([lost], "synthetic_robot")
     assert none["success_rate"] is none["stopped"] is none["success_interval_95"] is none["angle_deg"]["mean"] is None
     assert apart([lost], kept, "success")["difference"] is None
     lost["setting"] = kept[0]["setting"]
@@ -121,7 +125,7 @@ def test_policies_that_differ_widen_the_interval():
     """A hundred trials of each say little where there are five policies: the interval is that of five draws."""
     alike = [case("mean", k, 0.5, 100) for k in range(5)]
     apart_ = [case("mean", k, float(k % 2), 100) for k in range(4)]
-    narrow, wide = (column(own, "stand_in")["success_interval_95"] for own in (alike, apart_))
+    narrow, wide = (column(own, "synthetic_robot")["success_interval_95"] for own in (alike, apart_))
     few = scipy.stats.t.ppf(0.975, 4) * np.sqrt(5 / 4)  # in place of 1.96: few policies
     assert narrow[1] - narrow[0] == pytest.approx(2 * few * 0.5 / np.sqrt(500), rel=0.1)
     assert wide == [0.0, 1.0]
@@ -138,7 +142,7 @@ def test_intervals_of_five_policies_hold_the_truth_as_often_as_they_say():
 
 
 def test_where_all_succeed_the_interval_has_a_width():
-    found = column([case("mean", k, 1.0) for k in range(5)], "stand_in")
+    found = column([case("mean", k, 1.0) for k in range(5)], "synthetic_robot")
     assert found["success_rate"] == 1.0 and found["success_interval_95"] == pytest.approx([0.985, 1.0], abs=1e-3)
     both = apart([case("fitted", k, 1.0) for k in range(5)], [case("prior", k, 0.0) for k in range(5)], "success")
     assert both["difference"] == 1.0 and 0.97 < both["interval_95"][0] < 0.99 and both["welch_95"] is None
@@ -178,12 +182,12 @@ def test_the_table_holds_what_was_run_and_the_papers_own():
     assert set(found["table"]["paper"]["methods"]) == {"prior", "fitted"}
     assert set(found["table"]["paper"]["fitted_better_than"]) == {"prior"}
     assert found["paper"]["mean"]["robot"][0] == 86.7
-    assert found["line"]["paper"]["fitted"]["stand_in"] == 0.5
+    assert found["line"]["paper"]["fitted"]["synthetic_robot"] == 0.5
     json.dumps(found)
     text = as_text(found)
-    assert "| stand-in robot: success, % (95 %) | 50.0 (36 to 64) | 50.0 (36 to 64) |" in text
+    assert "| synthetic robot: success, % (95 %) | 50.0 (36 to 64) | 50.0 (36 to 64) |" in text
     assert "| real robot: success, % | 20.0 | 86.7 | 80.0 |" in text
-    assert "Fitted against prior, stand-in robot: +0 points of success (-2" in text
+    assert "Fitted against prior, synthetic robot: +0 points of success (-2" in text
     assert "## Setting `paper`" in text and "`dry`" not in text  # which is still to be run
     panels = histograms(cases, ["paper", "dry"]).axes
     assert percent_in(panels) == pytest.approx([100, 0, 100])  # of each panel's trials
@@ -197,7 +201,7 @@ def test_the_table_holds_what_was_run_and_the_papers_own():
 def test_the_table_shows_stops_slippery_pads_and_what_blew_up():
     text = as_text(summed_up([case("prior", 0, 0.5, stopped=["late: 9 ms"] * 5)], ["paper"]))
     assert "| stopped by the control loop, % | 10.0 |" in text and "| actions with the grip on, % | 50 |" in text
-    assert "| stand-in robot, pads with a friction of 0.05: success, % (95 %) | 50.0 (36 to 64) |" in text
+    assert "| synthetic robot, pads with a friction of 0.05: success, % (95 %) | 50.0 (36 to 64) |" in text
     assert "blew up" not in text
     blown = as_text(summed_up([case("prior", 0, 0.5, stopped=["the simulation blew up"])], ["paper"]))
     assert "| blew up, not counted above | 1 |" in blown
@@ -216,7 +220,7 @@ def test_a_hidden_effect_is_the_tables_last_part():
     }
     text = as_text(found)
     assert "## A robot that hides closer=3: prior, base fit and extended model" in text and "It lacks a closer." in text
-    assert "| | base | extended |" in text and "Extended against base, stand-in robot: +40 points of success (" in text
+    assert "| | base | extended |" in text and "Extended against base, synthetic robot: +40 points of success (" in text
     found["hidden_effect"]["models"] = {}  # nothing was named
     assert "It lacks a closer." in as_text(found) and "No policy was trained." in as_text(found)
 
@@ -239,7 +243,7 @@ def test_a_summarys_figure_lies_beside_it_in_both_forms(tmp_path: Path):
 
 def test_a_door_that_opens_to_its_stop_is_in_the_histogram():
     wide = case("prior", 0, 0.5)
-    wide["stand_in"]["angle_deg"]["all"] = [100.3] * 50
+    wide["synthetic_robot"]["angle_deg"]["all"] = [100.3] * 50
     assert percent_in(histograms([wide], ["paper"]).axes[:1]) == pytest.approx([100])
 
 
@@ -265,7 +269,7 @@ def test_the_hidden_values_lie_as_far_from_the_prior_as_the_paper_page_says(sett
 def test_slippery_pads_are_all_that_differs_from_the_settings_robot():
     env: Any = SimpleNamespace(start=door_scene().initial_qpos({}), task=Task())
     robots = robots_of(SETTINGS["paper"], env, 100)
-    usual, slippery = (robots[name].scene.model for name in ("stand_in", "slippery"))
+    usual, slippery = (robots[name].scene.model for name in ("synthetic_robot", "slippery"))
     assert usual.pair_friction[:, 0].min() > 0.4 and not np.array_equal(usual.pair_friction, slippery.pair_friction)
     fingers = np.concatenate(door_scene().finger_pairs)
     np.testing.assert_allclose(slippery.pair_friction[fingers, :2], 0.05)
@@ -273,7 +277,7 @@ def test_slippery_pads_are_all_that_differs_from_the_settings_robot():
     np.testing.assert_allclose(slippery.pair_friction[fingers, 2], 0.05 * 0.005)
     np.testing.assert_array_equal(slippery.pair_friction[:, 3:], usual.pair_friction[:, 3:])
     np.testing.assert_array_equal(slippery.dof_damping, usual.dof_damping)
-    assert robots["slippery"].config == robots["stand_in"].config
+    assert robots["slippery"].config == robots["synthetic_robot"].config
 
 
 @pytest.mark.parametrize("door", SETTINGS)
@@ -284,7 +288,7 @@ def test_a_trained_policy_opens_by_its_grip(door: str, archived: Callable[[str],
     policy = load(results / "trained_cases" / kept["trained"] / POLICY)
     env = DoorEnv(door_scene(timestep=TIMESTEP, limits=True), Task())
     rates = {name: transfer(policy, robot).rate for name, robot in robots_of(SETTINGS[door], env, 10).items()}
-    assert rates["stand_in"] >= 0.8 and rates["slippery"] < 0.2
+    assert rates["synthetic_robot"] >= 0.8 and rates["slippery"] < 0.2
 
 
 WITHOUT_A_GRIP = {"paper/mean_4", "paper/fitted_3", "paper/fitted_4"}  # docs/paper.md says how they open it
@@ -459,7 +463,7 @@ def test_policies_of_the_extended_model_are_compared_with_both_others(monkeypatc
     monkeypatch.setattr(sys, "argv", ["hidden_effect_policy.py", "--out", str(tmp_path), "--at-most", "0"])
     module.main()
     found = json.loads((tmp_path / "hidden_effect_policy.json").read_text())
-    assert {m: c["stand_in"]["trials"] for m, c in found["models"].items()} == dict.fromkeys(module.MODELS, 250)
+    assert {m: c["synthetic_robot"]["trials"] for m, c in found["models"].items()} == dict.fromkeys(module.MODELS, 250)
     better = {m: what["success"] for m, what in found["extended_better_than"].items()}
     assert [better[m]["difference"] for m in ("base", "prior")] == pytest.approx([0.4, 0.6])
     assert all(what["interval_95"][0] > 0.1 for what in better.values())
@@ -473,7 +477,7 @@ def test_knob_places_are_summed_up_each_for_itself(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(sys, "argv", ["knob_locations.py", "--out", str(tmp_path), "--at-most", "0"])
     module.main()
     levers = json.loads((tmp_path / "knob_locations.json").read_text())["levers"]
-    assert [c["stand_in"]["success_rate"] for c in levers.values()] == pytest.approx([1.0, 0.8, 0.6])
+    assert [c["synthetic_robot"]["success_rate"] for c in levers.values()] == pytest.approx([1.0, 0.8, 0.6])
     assert list(levers) == [f"{lever:.2f} m" for lever in module.LEVERS[:3]]
     assert (tmp_path / "knob_locations.png").is_file()
 

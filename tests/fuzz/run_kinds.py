@@ -31,7 +31,7 @@ from made_up_run import make_run as made_up_run
 from droid_jax.commands import source
 from droid_jax.commands.folder import OtherRun, finished
 from droid_jax.commands.gap import values_of
-from droid_jax.commands.synthetic import known_stand_in
+from droid_jax.commands.synthetic import known_robot
 from droid_jax.files import (
     CONFIG,
     CORRELATION,
@@ -44,7 +44,7 @@ from droid_jax.files import (
     LAST_FILES,
     SAMPLES,
     SETUP,
-    STAND_IN,
+    SYNTHETIC_ROBOT,
     TRACES,
     TRAINING,
     TRANSFER,
@@ -74,7 +74,7 @@ def make_run(folder: Path) -> None:
     shutil.rmtree(folder / "frames")
     setup = {"command": "identify", "preset": "quick", "recording": ["wave.npz"], "recordings_sha256": ["ab" * 32],
              "scene": None, "scene_sha256": "cd" * 32, "extended": None, "seed": 0, "versions": {"jax": "0.9.2"},
-             "hide": [], "springs": 1, "stand_in": {}, "fit": None, "fit_sha256": None}  # fmt: skip
+             "hide": [], "springs": 1, "synthetic_robot": {}, "fit": None, "fit_sha256": None}  # fmt: skip
     (folder / SETUP).write_text(json.dumps(setup))
 
 
@@ -106,7 +106,7 @@ def make_policy_run(folder: Path) -> None:
     folder.rmdir()
     made_up_policy(folder)
     transfer = json.loads((folder / TRANSFER).read_text())
-    for of in ("simulation", "stand_in"):
+    for of in ("simulation", "synthetic_robot"):
         found = transfer[of]
         whole = found["trials"]
         found |= {key: v[:TRIALS] for key, v in found.items() if isinstance(v, list) and len(v) == whole}
@@ -161,7 +161,7 @@ def use_whole(folder: Path) -> None:
     for stage, last in LAST_FILES.items():
         at = folder / stage
         use(stages.extended_of(at), stages.fingerprint(at), stages.unfinished(at))
-        use(source.stand_in_of(at), source.has_model(at))
+        use(source.synthetic_robot_of(at), source.has_model(at))
         with contextlib.suppress(OtherRun):  # only damage is of interest here
             finished(at, {"seed": 0}, again=False, last=last)
     source.model_folder(folder)
@@ -186,13 +186,13 @@ def use_tables(folder: Path) -> None:
 
 def make_synthetic(folder: Path) -> None:
     """What is kept of the synthetic robot beside its recording."""
-    (folder / STAND_IN).write_text(json.dumps({"springs": 1, "seed": 3, "hide": ["magnetic_catch=1.5"]}))
+    (folder / SYNTHETIC_ROBOT).write_text(json.dumps({"springs": 1, "seed": 3, "hide": ["magnetic_catch=1.5"]}))
     save(replace(recording(), meta={}), folder / "a.npz")
 
 
 def use_synthetic(folder: Path) -> None:
     """The file, as commands that go on with its robot read it."""
-    known = known_stand_in([folder / "a.npz"])
+    known = known_robot([folder / "a.npz"])
     use(known.get("springs"), known.get("seed"), list(known.get("hide", [])))
 
 
@@ -208,5 +208,5 @@ KINDS = (
     Kind("search's files, page drawn", "*.*", make_gap, page.write_report, 0.1, drawn=True),
     Kind("policy's files, page drawn", "*.json", make_policy_run, page.write_report, 0.1, drawn=True),
     Kind("fit's tables", "*.csv", make_tables, use_tables, 2),
-    Kind("synthetic robot's file", STAND_IN, make_synthetic, use_synthetic, 1),
+    Kind("synthetic robot's file", SYNTHETIC_ROBOT, make_synthetic, use_synthetic, 1),
 )

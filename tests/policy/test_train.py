@@ -37,7 +37,7 @@ SHORT = TrainConfig(
 )
 
 
-def test_the_stand_in_for_braxs_missing_function_puts_a_copy_on_every_device():
+def test_the_replacement_of_braxs_missing_function_puts_a_copy_on_every_device():
     devices = jax.local_devices()
     found = put_replicated({"a": np.arange(3.0), "b": 2}, devices)
     assert found["a"].shape == (len(devices), 3) and found["b"].shape == (len(devices),)

@@ -29,16 +29,16 @@ def training_json(**changes: Any) -> dict[str, Any]:
     task = {f: getattr(Task(), f) for f in Task.__dataclass_fields__}
     setup = {"method": "fitted", "preset": "quick", "knob": 0, "seed": 3, "fit": "runs/identify"}
     of = {"setup": setup, "task": task, "scene": "door (knob 0, impedance gains)", "effects": []}
-    of |= {"stand_in": {"springs": 1, "seed": 0}, "config": {}, "versions": {}, "device": "cpu"}
+    of |= {"synthetic_robot": {"springs": 1, "seed": 0}, "config": {}, "versions": {}, "device": "cpu"}
     return {**of, "history": history, **changes}
 
 
 def make_policy(folder: Path, successes: int | None = 38, **changes: Any) -> Path:
-    """training.json and, where successes on the stand-in robot are given, transfer.json and two films."""
+    """training.json and, where successes on the synthetic robot are given, transfer.json and two films."""
     (folder / "films").mkdir(parents=True)
     (folder / "training.json").write_text(json.dumps(training_json(**changes)))
     if successes is not None:
-        found = {"simulation": trials(39, 33.0), "stand_in": trials(successes, 32.0)}
+        found = {"simulation": trials(39, 33.0), "synthetic_robot": trials(successes, 32.0)}
         robot = {"truth": {}, "hidden": [{"name": "closer", "amplitude": 2.0, "joint": ""}]}
         (folder / "transfer.json").write_text(json.dumps({**found, "robot": robot}))
         for name in ("good", "bad"):

@@ -46,7 +46,7 @@ def parameters() -> list[dict]:
     return out
 
 
-def make_run(folder: Path, stand_in: bool = True, recordings: tuple[str, ...] = ("open_close",)) -> Path:
+def make_run(folder: Path, synthetic_robot: bool = True, recordings: tuple[str, ...] = ("open_close",)) -> Path:
     """A run's folder with every file of the schema, filled with plausible made-up numbers."""
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(0)
@@ -66,7 +66,7 @@ def make_run(folder: Path, stand_in: bool = True, recordings: tuple[str, ...] = 
             for n in recordings
         ],
         "versions": {"mujoco": "3.17.0", "jax": "0.9.2"}, "device": "2 CPU cores",
-        "started": "2026-11-21T06:00:00Z", "stand_in": stand_in,
+        "started": "2026-11-21T06:00:00Z", "synthetic_robot": synthetic_robot,
     }  # fmt: skip
     fit = {
         "parameters": ps, "cost": {"initial": 1.22, "best": 0.119, "floor": 0.101}, "gap": gap,

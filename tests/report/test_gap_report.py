@@ -291,9 +291,9 @@ def test_an_object_on_a_slide_has_a_position_and_no_angle() -> None:
     assert gap_words.place_words(hinge) == "object angle 0.00 to 0.14 rad"
 
 
-def test_a_stand_in_is_said(tmp_path: Path, quick: None) -> None:
+def test_a_synthetic_robot_is_said(tmp_path: Path, quick: None) -> None:
     folder = make_gap(tmp_path / "run", "none", setup={"recording": []})
-    assert "stand-in robot" in read_page(page.write_report(folder)).text
+    assert "synthetic robot" in read_page(page.write_report(folder)).text
 
 
 def test_candidates_say_what_became_of_them(tmp_path: Path) -> None:
@@ -487,7 +487,7 @@ def test_what_failed_by_itself_and_is_in_the_model_beside_others_is_no_contradic
 def test_settings_are_those_that_a_person_reads(tmp_path: Path) -> None:
     """Fingerprints and the start of a base fit tell whether a run may go on; on the page they would be a wall."""
     asked = {"preset": "quick", "recording": ["a.npz", "b.npz"], "scene": None, "budget": 0.5}
-    setup = {**asked, "command": "gap", "recordings_sha256": ["12ab"], "start": [0.1, 0.2], "stand_in": False}
+    setup = {**asked, "command": "gap", "recordings_sha256": ["12ab"], "start": [0.1, 0.2], "synthetic_robot": False}
     folder = make_gap(tmp_path / "run", "named", setup=setup)
     assert gap_words.settings(read_gap(folder)) == ["preset quick", "recording a.npz, b.npz", "budget 0.5"]
 

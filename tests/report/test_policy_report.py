@@ -27,11 +27,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_page_shows_what_the_files_hold(folder: Path):
     text = (folder / "report.html").read_text().replace("\u00a0", " ")
     transfer = json.loads((folder / "transfer.json").read_text())
-    for name in ("simulation", "stand_in"):
+    for name in ("simulation", "synthetic_robot"):
         assert f'<data value="{transfer[name]["success_rate"]}">' in text
     assert "98 %" in text and "95 %" in text  # 39 and 38 of 40
     assert text.count("data:image/webp;base64,") == 2
-    assert "not hardware" in text and "The stand-in robot hid closer (2.00)" in text
+    assert "not hardware" in text and "The synthetic robot hid closer (2.00)" in text
     assert "2 million actions in 7 minutes" in text and "succeeded in 96 % of its episodes" in text
     for stem in ("learning", "angles"):
         assert (folder / "figures" / f"{stem}.pdf").is_file() and f'id="{stem}"' in text
@@ -69,8 +69,8 @@ def test_a_training_that_reached_95_percent_in_no_evaluation_is_not_tried_but_ma
         assert ("has not learned" in said) is not learned and ("droid_jax.run evaluate" in said) is learned
 
 
-def test_a_stand_in_that_was_not_fitted_says_little(tmp_path: Path):
-    said = policy_summary(read_policy(make_policy(tmp_path / "run", 10, stand_in={})))
+def test_a_synthetic_robot_that_was_not_fitted_says_little(tmp_path: Path):
+    said = policy_summary(read_policy(make_policy(tmp_path / "run", 10, synthetic_robot={})))
     assert "The fit is of your own recordings" in said[-2] and "was to be expected" in said[-1]
 
 
@@ -114,7 +114,11 @@ def test_broken_files_are_named(tmp_path: Path, name: str, content: str, fault: 
         ("training.json", lambda of: of["setup"].pop("fit"), "'setup' lacks 'fit'"),
         ("training.json", lambda of: of["setup"].update(method="x"), "'method' must be one of"),
         ("training.json", lambda of: of["history"][-1].update(of=[]), r"'of' must be a number, got \[\]"),
-        ("training.json", lambda of: of["stand_in"].update(springs="1"), "'springs' must be a whole number, got '1'"),
+        (
+            "training.json",
+            lambda of: of["synthetic_robot"].update(springs="1"),
+            "'springs' must be a whole number, got '1'",
+        ),
         ("transfer.json", lambda of: of["robot"]["hidden"][0].update(joint=["x"]), "'joint' must be text or null"),
     ],
 )
@@ -144,11 +148,11 @@ def test_trials_that_blew_up_are_said_and_not_counted() -> None:
 def test_trials_that_blew_up_are_in_no_figure_of_the_page(tmp_path: Path) -> None:
     made = make_policy(tmp_path / "run")
     transfer = json.loads((made / "transfer.json").read_text())
-    robot = transfer["stand_in"]
+    robot = transfer["synthetic_robot"]
     each = [BLOWN_UP, BLOWN_UP, *[""] * (robot["trials"] - 2)]
     robot |= {"stopped": {BLOWN_UP: 2}, "stopped_each": each}
     (made / "transfer.json").write_text(json.dumps(transfer))
-    found = read_policy(made).trials["stand-in robot"]
+    found = read_policy(made).trials["synthetic robot"]
     assert found["counted"] == robot["trials"] - 2 and found["angles"] == robot["angle_deg"]["all"][2:]
     html = page.write_report(made).read_text()
     assert f'<td data-label="Trials">{robot["trials"] - 2}</td>' in html

@@ -67,7 +67,7 @@ def test_groups_come_in_the_order_of_the_papers_table(written: Page) -> None:
 
 def test_summary_is_made_from_the_numbers(run: Path) -> None:
     text = " ".join(summary(read_run(run)))
-    assert "8 parameters (4 of the door, 2 of the stand-in robot and 2 of the gripper)" in text
+    assert "8 parameters (4 of the door, 2 of the synthetic robot and 2 of the gripper)" in text
     assert "2 nuisances" in text and "1.22 N m before the fit" in text and "0.119 N m after it" in text
     assert "98 % of what can be closed" in text
     assert "does not tell door mass;" in text
@@ -251,15 +251,15 @@ def test_residuals_far_above_noise_point_to_the_gap_command(tmp_path: Path) -> N
         assert ("droid_jax.run gap" in summary(read_run(run))[-1]) is said
 
 
-def test_a_stand_in_is_never_called_a_robot(written: Page) -> None:
-    assert len(re.findall("stand-in robot", written.text, flags=re.I)) > 5
-    assert not re.findall(r"(?<!stand-in )robot", written.text, flags=re.I)
+def test_a_synthetic_robot_is_never_called_a_robot(written: Page) -> None:
+    assert len(re.findall("synthetic robot", written.text, flags=re.I)) > 5
+    assert not re.findall(r"(?<!synthetic robot )robot", written.text, flags=re.I)
 
 
-def test_a_robot_is_not_called_a_stand_in(tmp_path: Path) -> None:
-    run = read_run(make_run(tmp_path / "run", stand_in=False))
+def test_a_robot_is_not_called_a_synthetic_robot(tmp_path: Path) -> None:
+    run = read_run(make_run(tmp_path / "run", synthetic_robot=False))
     assert "which the robot measured" in summary(run)[0]
-    assert "stand-in" not in " ".join(summary(run))
+    assert "synthetic robot" not in " ".join(summary(run))
 
 
 def test_the_page_loads_nothing_and_every_link_is_there(run: Path, written: Page) -> None:

@@ -38,12 +38,12 @@ def test_it_holds_every_part(folder: Path, text: str):
 
 def test_a_paragraph_says_what_was_fitted_what_is_missing_and_what_is_next(text: str):
     (lead,) = re.findall(r'<p class="summary lead">(.*?)</p>', text, re.S)
-    assert "parameters were fitted to what the stand-in robot measured" in lead and "N m in “open_close”" in lead
-    assert "of the gap on" in lead and "The policy opens the door in 95 % of its trials on the stand-in robot." in lead
+    assert "parameters were fitted to what the synthetic robot measured" in lead and "N m in “open_close”" in lead
+    assert "of the gap on" in lead and "The policy opens the door in 95 % of its trials on the synthetic robot." in lead
     assert '<span class="next">Next: python -m droid_jax.run export' in lead
 
 
-def test_what_the_stand_in_robot_hid_is_said_in_the_librarys_words_too(tmp_path: Path):
+def test_what_the_synthetic_robot_hid_is_said_in_the_librarys_words_too(tmp_path: Path):
     make_gap(tmp_path / "gap")
     make_policy(tmp_path / "train")
 
@@ -54,14 +54,18 @@ def test_what_the_stand_in_robot_hid_is_said_in_the_librarys_words_too(tmp_path:
 
     assert "hid" not in lead()
     (tmp_path / "recordings").mkdir()
-    (tmp_path / "recordings" / "stand_in.json").write_text('{"hide": ["closer=2"]}')
-    assert "hid" not in lead()  # a robot's own recordings were searched, and the stand-in's lie beside them
+    (tmp_path / "recordings" / "synthetic_robot.json").write_text('{"hide": ["closer=2"]}')
+    assert "hid" not in lead()  # a robot's own recordings were searched, and the synthetic robot's lie beside them
     path = tmp_path / "gap" / "gap.json"
     searched = json.loads(path.read_text())
-    searched["setup"] |= {"stand_in": True, "robot": {"hidden": in_words({"magnetic_catch": 1.5, "detent": 0.5})}}
+    searched["setup"] |= {
+        "synthetic_robot": True,
+        "robot": {"hidden": in_words({"magnetic_catch": 1.5, "detent": 0.5})},
+    }
     path.write_text(json.dumps(searched))
     assert (
-        "What the stand-in robot hid: magnetic catch (1.5 N m; in the library: latch) and detent (0.5 N m; the library "
+        "What the synthetic robot hid: magnetic catch (1.5 N m; in the library: latch) and detent (0.5 N m; the "
+        "library "
         "has no form of it)." in lead()
     )
 

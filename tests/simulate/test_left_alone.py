@@ -155,7 +155,7 @@ def test_what_is_held_starts_where_it_was_measured_in_each_part_of_the_repeats()
         cost.against([replace(last, command=last.command + 0.01)])
 
 
-def test_the_stand_in_robot_needs_all_commands():
+def test_the_synthetic_robot_needs_all_commands():
     arm = scene()
-    with pytest.raises(ValueError, match="the stand-in robot needs a command for grip, thumb too"):
+    with pytest.raises(ValueError, match="the synthetic robot needs a command for grip, thumb too"):
         _control(arm, recording(), 0.001, 0.0)

@@ -23,7 +23,7 @@ from droid_jax.simulate.c_engine import instrument
 from droid_jax.synthetic import arm_effects, friction_effects, hinge_effects, hooks
 from droid_jax.synthetic.hidden_effects import HIDDEN, LONGEST_STEP, Applied, hidden_effect, possible, record_hidden
 from droid_jax.synthetic.hooks import Influence, Live, Place, Seen
-from droid_jax.synthetic.robot import SurrogateConfig, record, stand_in_truth
+from droid_jax.synthetic.robot import SyntheticRobotConfig, record, synthetic_truth
 
 # A two-link arm and a servo-driven flap with a knob that the arm never touches.
 XML = """
@@ -54,7 +54,7 @@ XML = """
 </mujoco>
 """
 ARM = ("shoulder", "elbow")
-CONFIG = SurrogateConfig(repeats=1, timestep=LONGEST_STEP)
+CONFIG = SyntheticRobotConfig(repeats=1, timestep=LONGEST_STEP)
 SENSORS = ("sensor_delay", "torque_bias", "torque_gain", "torque_drift")
 
 
@@ -130,7 +130,9 @@ def stepped(influence: Influence, live: Live, times: int = 1) -> tuple[np.ndarra
 # ----- all of them
 
 
-def test_no_effects_are_the_stand_in_itself_bit_for_bit(scene: Scene, demonstration: Recording, plain: Recording):
+def test_no_effects_are_the_synthetic_robot_itself_bit_for_bit(
+    scene: Scene, demonstration: Recording, plain: Recording
+):
     assert hidden(scene, demonstration).sha256 == plain.sha256
 
 
@@ -653,7 +655,7 @@ def test_a_command_delay_moves_its_own_column(scene: Scene):
 @pytest.fixture(scope="module")
 def door() -> tuple[Scene, Recording, dict[str, float]]:
     scene = door_scene()
-    return scene, load(demonstration_path("C")), stand_in_truth(scene, 1, 5)
+    return scene, load(demonstration_path("C")), synthetic_truth(scene, 1, 5)
 
 
 @pytest.fixture(scope="module")
@@ -662,7 +664,9 @@ def bare(door: tuple[Scene, Recording, dict[str, float]]) -> Recording:
 
 
 @pytest.mark.slow
-def test_the_door_without_effects_is_the_stand_ins(door: tuple[Scene, Recording, dict[str, float]], bare: Recording):
+def test_the_door_without_effects_is_the_synthetic_robots(
+    door: tuple[Scene, Recording, dict[str, float]], bare: Recording
+):
     assert record(*door, seed=3, config=CONFIG).sha256 == bare.sha256
 
 

@@ -1,4 +1,4 @@
-"""The stand-in's errors and sensors: what was hidden is what a replay has to be given, with its sign."""
+"""The synthetic robot's errors and sensors: what was hidden is what a replay has to be given, with its sign."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from droid_jax.model.parameters import Space
 from droid_jax.recordings.formats import load
 from droid_jax.recordings.recording import TorqueSide
 from droid_jax.synthetic.hidden_effects import record_hidden
-from droid_jax.synthetic.robot import DRIFT_TIME, SurrogateConfig, _torque_noise, set_up
+from droid_jax.synthetic.robot import DRIFT_TIME, SyntheticRobotConfig, _torque_noise, set_up
 
-QUIET = SurrogateConfig(
+QUIET = SyntheticRobotConfig(
     repeats=2, timestep=0.00025, torque_noise=(1e-3, 1e-3), torque_drift=(0.0, 0.0), start_noise=0.0, pose_noise=0.0
 )
 
@@ -42,10 +42,10 @@ def test_a_hidden_delay_and_offset_come_back_with_their_signs():
 
 
 def test_noise_and_drift_are_as_large_as_they_say_at_arm_and_wrist():
-    config = SurrogateConfig(torque_noise=(0.05, 0.02), torque_drift=(0.0, 0.0))
+    config = SyntheticRobotConfig(torque_noise=(0.05, 0.02), torque_drift=(0.0, 0.0))
     white = _torque_noise((4, 20000, 7), config, np.random.default_rng(0)).std(axis=(0, 1))
     np.testing.assert_allclose(white, [0.05] * 4 + [0.02] * 3, rtol=0.02)
-    config = SurrogateConfig(torque_noise=(0.0, 0.0), torque_drift=(0.04, 0.01))
+    config = SyntheticRobotConfig(torque_noise=(0.0, 0.0), torque_drift=(0.04, 0.01))
     drift = _torque_noise((4, 200000, 7), config, np.random.default_rng(1))
     np.testing.assert_allclose(drift.std(axis=(0, 1)), [0.04] * 4 + [0.01] * 3, rtol=0.05)
     lag = round(DRIFT_TIME * config.rate)
@@ -72,7 +72,7 @@ def test_the_door_stands_a_little_otherwise_in_every_repeat():
         assert np.std(at) == pytest.approx(2e-3, rel=0.35)
 
 
-def test_without_a_truth_the_stand_in_is_the_scene():
+def test_without_a_truth_the_synthetic_robot_is_the_scene():
     """Whether a parameter sets a number of the model, scales it or adds to it."""
     scene, _ = small_scene()
     forearm, elbow = "forearm", "elbow"

@@ -1,4 +1,4 @@
-"""The stand-in robot in closed loop: what opens by the book opens, and what must fail fails."""
+"""The synthetic robot in closed loop: what opens by the book opens, and what must fail fails."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from droid_jax.door.task import Task
 from droid_jax.policy.trials import BLOWN_UP, Trials
 from droid_jax.synthetic import policy_trials as module
 from droid_jax.synthetic.hidden_effects import Applied
-from droid_jax.synthetic.policy_trials import TransferConfig, _senses, _trial, filmed, stand_in, transfer
-from droid_jax.synthetic.robot import stand_in_truth
+from droid_jax.synthetic.policy_trials import TransferConfig, _senses, _trial, filmed, synthetic_robot, transfer
+from droid_jax.synthetic.robot import synthetic_truth
 
 TASK = Task(steps=260, spread=0.0)
 ONE = TransferConfig(trials=1)
@@ -40,9 +40,9 @@ def commands(scene) -> np.ndarray:
 
 
 def tried(scene, start, commands, truth=None, hidden=(), task=TASK) -> Trials:
-    truth = stand_in_truth(scene, 0, 0) if truth is None else truth
+    truth = synthetic_truth(scene, 0, 0) if truth is None else truth
     script = Script(task, commands, interface_of(scene, task, start))
-    return transfer(script, stand_in(scene, start, truth, hidden, task, ONE))  # type: ignore[arg-type]
+    return transfer(script, synthetic_robot(scene, start, truth, hidden, task, ONE))  # type: ignore[arg-type]
 
 
 def test_an_opening_by_the_book_succeeds_with_the_grip_held(scene, start, commands):
@@ -53,8 +53,8 @@ def test_an_opening_by_the_book_succeeds_with_the_grip_held(scene, start, comman
 
 
 def test_a_film_shows_the_same_trial(scene, start, commands):
-    truth, task = stand_in_truth(scene, 0, 0), replace(TASK, steps=12, spread=0.02)
-    robot = stand_in(scene, start, truth, (), task, replace(ONE, trials=2))
+    truth, task = synthetic_truth(scene, 0, 0), replace(TASK, steps=12, spread=0.02)
+    robot = synthetic_robot(scene, start, truth, (), task, replace(ONE, trials=2))
 
     def script() -> Script:
         return Script(task, commands, interface_of(scene, task, start))
@@ -67,7 +67,7 @@ def test_a_film_shows_the_same_trial(scene, start, commands):
 
 def test_places_and_joints_that_are_seen_are_of_one_instant(scene, start, commands, monkeypatch: pytest.MonkeyPatch):
     task, late = replace(TASK, steps=12), []
-    robot = stand_in(scene, start, stand_in_truth(scene, 0, 0), (), task, ONE)
+    robot = synthetic_robot(scene, start, synthetic_truth(scene, 0, 0), (), task, ONE)
 
     def looking(hand, data, *rest):
         fresh = mujoco.MjData(robot.scene.model)
@@ -82,7 +82,7 @@ def test_places_and_joints_that_are_seen_are_of_one_instant(scene, start, comman
 
 
 def test_a_policy_of_another_rate_is_refused(scene, start, commands):
-    robot = stand_in(scene, start, {}, (), replace(TASK, control=0.04), ONE)
+    robot = synthetic_robot(scene, start, {}, (), replace(TASK, control=0.04), ONE)
     with pytest.raises(ValueError, match=r"the policy acts every 0.02 s, the task asks every 0.04 s"):
         transfer(Script(TASK, commands, interface_of(scene, TASK, start)), robot)  # type: ignore[arg-type]
 
@@ -94,7 +94,7 @@ def test_a_strong_closer_is_felt(scene, start, commands):
 
 
 def test_without_friction_on_the_pads_nothing_opens(scene, start, commands):
-    slippery = {**stand_in_truth(scene, 2, 0), "hinge_stiffness": 8.0}
+    slippery = {**synthetic_truth(scene, 2, 0), "hinge_stiffness": 8.0}
     slippery |= {n: 0.05 for n in slippery if n.startswith(("sliding_friction", "torsional_friction"))}
     found = tried(scene, start, commands, slippery)
     assert not found.success[0] and found.angle[0] < np.deg2rad(30.0)
@@ -109,10 +109,10 @@ def test_a_hand_that_stays_where_it_is_opens_nothing(scene, start):
 
 def test_trials_differ_and_the_same_seed_repeats_them(scene, start, commands):
     task = replace(TASK, steps=10, spread=0.05)
-    interface, truth = interface_of(scene, task, start), stand_in_truth(scene, 0, 0)
+    interface, truth = interface_of(scene, task, start), synthetic_truth(scene, 0, 0)
 
     def begun(seed: int) -> list[np.ndarray]:
-        robot = stand_in(scene, start, truth, (), task, replace(ONE, trials=3, seed=seed))
+        robot = synthetic_robot(scene, start, truth, (), task, replace(ONE, trials=3, seed=seed))
         return [filmed(Script(task, commands, interface), robot, number)[0] for number in range(3)]  # type: ignore[arg-type]
 
     first, again, other = begun(0), begun(0), begun(1)
@@ -132,7 +132,7 @@ def test_a_simulation_that_blows_up_is_said(scene, start, commands):
         if len(seen) == 5:
             data.qvel[hinge] = 1e12  # no sensor of the policy sees it
 
-    robot = stand_in(scene, start, stand_in_truth(scene, 0, 0), (), TASK, ONE)
+    robot = synthetic_robot(scene, start, synthetic_truth(scene, 0, 0), (), TASK, ONE)
     success, angle, steps, _, stopped = _trial(script, robot, 0, watch)  # type: ignore[arg-type]
     assert stopped == "the simulation blew up"
     assert not success and steps == 4 and len(seen) == 5 and 0 <= angle < 0.1
@@ -173,7 +173,7 @@ def test_trials_that_blew_up_are_in_no_rate_and_no_mean():
 
 def test_amplitudes_that_cannot_be_are_refused(scene, start):
     with pytest.raises(ValueError, match="hidden effect 'closer' needs a finite, not negative amplitude, got nan"):
-        stand_in(scene, start, {}, (Applied("closer", np.nan),), TASK, ONE)
+        synthetic_robot(scene, start, {}, (Applied("closer", np.nan),), TASK, ONE)
 
 
 def test_effects_on_whole_traces_are_refused(scene, start, commands):
@@ -202,5 +202,5 @@ def test_the_sensors_are_as_noisy_as_they_say(scene):
 def test_a_time_step_that_divides_no_action_is_refused():
     scene = door_scene(limits=True)
     for timestep in (0.0003, 0.05):
-        with pytest.raises(ValueError, match=f"is no multiple of the stand-in robot's time step, {timestep:g} s"):
-            stand_in(scene, np.zeros(scene.model.nq), {}, config=TransferConfig(trials=1, timestep=timestep))
+        with pytest.raises(ValueError, match=f"is no multiple of the synthetic robot's time step, {timestep:g} s"):
+            synthetic_robot(scene, np.zeros(scene.model.nq), {}, config=TransferConfig(trials=1, timestep=timestep))
