@@ -25,12 +25,12 @@ import tyro  # noqa: E402
 from benchmarks.common import interleave, publish  # noqa: E402
 from droid_jax.cost.cost import Cost, make_cost  # noqa: E402
 from droid_jax.discrepancy.candidates import candidates  # noqa: E402
-from droid_jax.discrepancy.case import GapConfig  # noqa: E402
-from droid_jax.discrepancy.screen import questions_of  # noqa: E402
+from droid_jax.discrepancy.case import DiscrepancyConfig  # noqa: E402
+from droid_jax.discrepancy.screen import directions_of  # noqa: E402
 from droid_jax.door.demonstration import demonstration_path  # noqa: E402
 from droid_jax.door.scene import door_scene  # noqa: E402
 from droid_jax.door.space import door_nuisances, door_space  # noqa: E402
-from droid_jax.identify.levenberg_marquardt import CHORDS, TRIALS  # noqa: E402
+from droid_jax.identify.levenberg_marquardt import CANDIDATE_STEPS, CHORDS  # noqa: E402
 from droid_jax.model.effects.registry import effect_space, library, ready  # noqa: E402
 from droid_jax.recordings.formats import load  # noqa: E402
 from droid_jax.recordings.recording import Recording  # noqa: E402
@@ -76,10 +76,10 @@ def main() -> None:
     repeats = 1 if arguments.quick else arguments.repeats
     first, usual = interleave({"bare": lambda: batch(bare), "full": lambda: batch(full)}, repeats)
     apart = np.abs(full.smoothed(full.space.mean[None])[0] - bare.smoothed(base.mean[None])[0]).max()
-    asked, config = candidates(effects), GapConfig()
-    questions = questions_of(asked)
+    asked, config = candidates(effects), DiscrepancyConfig()
+    questions = directions_of(asked)
     row = usual["full"] / arguments.rows
-    steps = CHORDS * TRIALS  # of an iteration: batches of steps along one Jacobian, where every one pays
+    steps = CHORDS * CANDIDATE_STEPS  # of an iteration: batches of steps along one Jacobian, where every one pays
     look_rows = 2 * (1 + steps)  # from two starts, whose Jacobian is known
     refit_rows = 2 * (len(base) + 2) + steps
     result = {

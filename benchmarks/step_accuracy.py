@@ -32,7 +32,7 @@ from droid_jax.model.scene import with_options  # noqa: E402
 from droid_jax.recordings.formats import load  # noqa: E402
 from droid_jax.simulate.batching import over_population  # noqa: E402
 from droid_jax.simulate.c_engine import instrument, simulate  # noqa: E402
-from droid_jax.simulate.c_reference import twin_replay  # noqa: E402
+from droid_jax.simulate.c_reference import c_replay  # noqa: E402
 from droid_jax.simulate.replay import make_drive, servo_replay  # noqa: E402
 
 FINE = 1e-4  # s
@@ -71,7 +71,7 @@ def coarse(values: np.ndarray, timestep: float, engine: str) -> np.ndarray:
     scene = door_scene(timestep=timestep)
     space, drive = door_space(scene), make_drive(scene, DEMONSTRATION)
     if engine == "c":
-        return twin_replay(scene, space, drive)(values).torque
+        return c_replay(scene, space, drive)(values).torque
     replay = servo_replay(scene, drive, parity=engine == "parity")
     return over_population(lambda v: replay(make_physics(scene, space, v)))(values).torque
 

@@ -13,23 +13,20 @@ docs/own-robot.md shows the names at work.
 from __future__ import annotations
 
 import importlib
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    import inspect
-
     from droid_jax.cost.cost import make_cost as make_cost
-    from droid_jax.discrepancy.case import GapConfig as GapConfig
+    from droid_jax.discrepancy.case import DiscrepancyConfig as DiscrepancyConfig
     from droid_jax.discrepancy.extended import load_extended as load_extended
-    from droid_jax.discrepancy.missing import find_missing as find_missing
+    from droid_jax.discrepancy.missing import find_missing_effects as find_missing_effects
     from droid_jax.door.scene import door_scene as door_scene
     from droid_jax.door.space import door_nuisances as door_nuisances
     from droid_jax.door.space import door_space as door_space
     from droid_jax.identify.gaussian import Gaussian as Gaussian
     from droid_jax.identify.gaussian import load as load_gaussian
     from droid_jax.identify.pipeline import IdentifyConfig as IdentifyConfig
-    from droid_jax.identify.pipeline import identify as identify
+    from droid_jax.identify.pipeline import identify_parameters as identify_parameters
     from droid_jax.model.mjcf import fitted_mjcf as fitted_mjcf
     from droid_jax.model.parameter_file import load_parameters as load_parameters
     from droid_jax.model.parameters import Parameter as Parameter
@@ -60,20 +57,20 @@ __all__ = [
     "load_recording",
     "save_recording",
     "make_cost",
-    "identify",
+    "identify_parameters",
     "IdentifyConfig",
     "Gaussian",
     "load_gaussian",
     "fitted_mjcf",
-    "find_missing",
-    "GapConfig",
+    "find_missing_effects",
+    "DiscrepancyConfig",
     "load_extended",
     "randomised",
     "randomised_model",
     "frames",
 ]
 
-# Public name -> (module, name in it).  `identify` is missing: see `_Room`.
+# Public name -> (module, name in it).
 _HOMES = {
     "tune": ("runtime", "tune"),
     "Parameter": ("model.parameters", "Parameter"),
@@ -89,12 +86,13 @@ _HOMES = {
     "load_recording": ("recordings.formats", "load"),
     "save_recording": ("recordings.formats", "save"),
     "make_cost": ("cost.cost", "make_cost"),
+    "identify_parameters": ("identify.pipeline", "identify_parameters"),
     "IdentifyConfig": ("identify.pipeline", "IdentifyConfig"),
     "Gaussian": ("identify.gaussian", "Gaussian"),
     "load_gaussian": ("identify.gaussian", "load"),
     "fitted_mjcf": ("model.mjcf", "fitted_mjcf"),
-    "find_missing": ("discrepancy.missing", "find_missing"),
-    "GapConfig": ("discrepancy.case", "GapConfig"),
+    "find_missing_effects": ("discrepancy.missing", "find_missing_effects"),
+    "DiscrepancyConfig": ("discrepancy.case", "DiscrepancyConfig"),
     "load_extended": ("discrepancy.extended", "load_extended"),
     "randomised": ("policy.randomise", "randomised"),
     "randomised_model": ("policy.randomise", "randomised_model"),
@@ -121,28 +119,3 @@ def _load(module: str, name: str) -> Any:
 
     with quiet():
         return getattr(importlib.import_module(f"{__name__}.{module}"), name)
-
-
-class _Room(ModuleType):
-    """The room `droid_jax.identify`, which can be called like the function of that name in it.
-
-    Importing anything from the room hangs the room here under its name, so the public name
-    `identify` would be a function before and a module after; a module that can be called is both.
-    """
-
-    def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        """`droid_jax.identify.pipeline.identify`."""
-        return _load("identify.pipeline", "identify")(*args, **kwargs)
-
-    @property
-    def __signature__(self) -> inspect.Signature:
-        """The function's own, for help() and editors."""
-        import inspect  # only here: it takes half the time that importing the package does
-
-        return inspect.signature(_load("identify.pipeline", "identify"))
-
-
-# The room's own file is empty: importing it loads nothing.
-_room = importlib.import_module(f"{__name__}.identify")
-_room.__class__ = _Room
-_room.__doc__ = "The fit; called, it is `droid_jax.identify.pipeline.identify`, whose text says more."

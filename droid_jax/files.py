@@ -1,4 +1,4 @@
-"""Names of files in a run's folder that one room writes and another reads; light, for the command line."""
+"""Names of files in a run's folder that one layer writes and another reads; light, for the command line."""
 
 SETUP, CONFIG, FIT = "setup.json", "config.json", "fit.json"
 GAUSSIAN, SAMPLES = "gaussian.json", "samples.csv"

@@ -79,10 +79,10 @@ def between_cones(where: Setting, seed: int) -> list[float]:
     """
     _, drawn, recordings = robot(where, 0, seed)
     try:
-        pyramidal = record(where, drawn, ("fit",))
+        pyramidal = record(where, drawn, ("train",))
     except ValueError as error:
         raise SystemExit(f"error: {plan_of(0).name} with pyramidal contacts: {error}") from None
-    torque = [_mean_torque(r["fit"]) for r in (pyramidal, recordings)]
+    torque = [_mean_torque(r["train"]) for r in (pyramidal, recordings)]
     return np.sqrt(np.mean((torque[1] - torque[0]) ** 2, axis=0)).tolist()
 
 

@@ -6,8 +6,8 @@
 Each seed draws a hinge with gravity and dry friction of 0.02 to 0.5 N m that moves, reverses and holds, and records
 two logs of 60 s without commands.  Even seeds integrate the set-valued law of friction exactly (Moreau's time stepping,
 written here, no MuJoCo); odd ones are plain C MuJoCo, whose soft friction creeps where it should hold.  `identify` fits
-damping, friction and armature to the first log, `find_missing` searches both.  One JSON a seed under OUT/seeds: the run
-goes on after a stop, and the same command started twice shares the seeds.
+damping, friction and armature to the first log, `find_missing_effects` searches both.  One JSON a seed under
+OUT/seeds: the run goes on after a stop, and the same command started twice shares the seeds.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ import tyro  # noqa: E402
 
 from benchmarks.common import origin  # noqa: E402
 from benchmarks.sharing import claimed  # noqa: E402
-from droid_jax.discrepancy.missing import find_missing  # noqa: E402
-from droid_jax.identify.pipeline import IdentifyConfig, identify  # noqa: E402
+from droid_jax.discrepancy.missing import find_missing_effects  # noqa: E402
+from droid_jax.identify.pipeline import IdentifyConfig, identify_parameters  # noqa: E402
 from droid_jax.identify.search import SearchConfig  # noqa: E402
 from droid_jax.model.fields import joint_damping, joint_frictionloss, model_parameter  # noqa: E402
 from droid_jax.model.parameters import Space  # noqa: E402
@@ -175,9 +175,9 @@ def one(seed: int, scene: Scene, space: Space) -> dict[str, Any]:
     (first, truth), (second, _) = recorded(seed, "a"), recorded(seed, "b")
     # Inverse dynamics is smooth in these parameters: a short search will do, the refinement does the rest.
     config = IdentifyConfig(search=SearchConfig(population=16, generations=8))
-    found = identify(scene, space, [first], config=config)
+    found = identify_parameters(scene, space, [first], config=config)
     low, high = found.full_gaussian.interval(LEVEL)
-    verdict, _ = find_missing(scene, space, [first, second])
+    verdict, _ = find_missing_effects(scene, space, [first, second])
     truths = (truth.damping, truth.friction, truth.armature)
     return {
         "seed": seed,
@@ -189,8 +189,8 @@ def one(seed: int, scene: Scene, space: Space) -> dict[str, Any]:
         },
         "verdict": verdict.kind.value,
         "effects": list(verdict.effects),
-        "tied": [list(names) for names in verdict.tied],
-        "p": float(verdict.screens[0].p) if verdict.screens else None,
+        "indistinguishable": [list(names) for names in verdict.indistinguishable],
+        "p": float(verdict.score_tests[0].p) if verdict.score_tests else None,
     }
 
 

@@ -123,7 +123,9 @@ def forces(search: Search, verdict: Verdict, radii: Mapping[str, float]) -> dict
     assert search.sealed is not None
     out = {}
     for name, log in ((FIT, search.log), (JUDGE, search.sealed)):
-        before, after = (float(rms(log.left(m.values))[0]) / radii[name] for m in (verdict.base, verdict.model))
+        before, after = (
+            float(rms(log.residual_torque(m.values))[0]) / radii[name] for m in (verdict.base, verdict.model)
+        )
         out[name] = {"before_N": round(before, 3), "after_N": round(after, 3), "less": round(1 - after / before, 3)}
     return out
 
@@ -146,15 +148,15 @@ def main(config: GapDoor) -> None:
     tangential = forces(search, verdict, radii)
     show("constant friction", found)
     print(f"  tangential force {tangential}")
-    named = [n.split(" at ")[0] for n in (*found["effects"], *(t for ts in found["tied"] for t in ts))]
+    named = [n.split(" at ")[0] for n in (*found["effects"], *(t for ts in found["indistinguishable"] for t in ts))]
     springs = [e for e in effects if e.name in named and e.name in SPRINGS][:1]
     again = with_known(springs, lambda known: make_search(scene, base, effects, both, gap, known))
     if again is not None:
         show("with the spring", again)
     added = {}
-    rest = search.log.simulated(verdict.base.values[None])[0] + search.log.left(verdict.model.values)
+    rest = search.log.simulated(verdict.base.values[None])[0] + search.log.residual_torque(verdict.model.values)
     for effect, amplitudes in ADDED.items():
-        log = adding(search.log.holding(rest), verdict.base.values, amplitudes)
+        log = adding(search.log.with_torques(rest), verdict.base.values, amplitudes)
         added[effect] = {"added": amplitudes, **answer(search, log)}
         show(f"{effect} added", added[effect])
     swapped = answer(make_search(scene, base, effects, both[::-1], gap))

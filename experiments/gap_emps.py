@@ -92,11 +92,11 @@ def uneven_damping(scene: Scene) -> Effect:
         name,
         (Parameter(name, "N s/m", 0.0, 50.0, -300.0, 300.0, group="Effect"),),
         force=lambda theta, state: jnp.zeros_like(state.qvel).at[dof].set(-theta[name] * jnp.abs(state.qvel[dof])),
-        what="viscous friction that differs between the two directions",
-        mark="an offset that grows with speed",
+        description="viscous friction that differs between the two directions",
+        signature="an offset that grows with speed",
         confused_with=("joint_directional",),
-        places={SLIDE: (name,)},
-        smallest=5.0,
+        locations={SLIDE: (name,)},
+        minimum_size=5.0,
     )
 
 
@@ -117,7 +117,7 @@ def searches(config: GapEmps, scene: Scene) -> dict[str, Search]:
 def judged(config: GapEmps, scene: Scene, search: Search, verdict: Verdict) -> dict[str, Any]:
     """RMS on the other file [N] before and after, and relative to the measured force."""
     log = make_log(scene, search.base, search.effects, load_emps(config.data, JUDGE), search.config, search.known)
-    left = [log.left(model.values) for model in (verdict.base, verdict.model)]
+    left = [log.residual_torque(model.values) for model in (verdict.base, verdict.model)]
     return {
         "rms_N": rounded([rms(x)[0] for x in left], 3),
         "relative": rounded([rms(x)[0] / rms(log.measured)[0] for x in left]),

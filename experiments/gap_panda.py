@@ -43,7 +43,7 @@ from inverse_fit import RESULTS, rounded, run
 from real_panda import MOTION_CUTOFF, SOURCE, link_nuisances, load_panda, load_published
 
 from benchmarks.common import publish, stem
-from droid_jax.discrepancy.candidates import possible
+from droid_jax.discrepancy.candidates import observable_effects
 from droid_jax.door.arm import panda_arm_scene
 from droid_jax.door.builtin import ARM
 from droid_jax.model.effect_interface import Effect
@@ -88,19 +88,19 @@ def base_space(scene: Scene) -> Space:
 
 def asked_about(scene: Scene, recording: Recording) -> list[Effect]:
     """What the log can show of the library, joint by joint and in all joints at once."""
-    return [_everywhere(e) for e in possible(scene, [recording]) if e.name not in NOT_ASKED]
+    return [_everywhere(e) for e in observable_effects(scene, [recording]) if e.name not in NOT_ASKED]
 
 
 def _everywhere(effect: Effect) -> Effect:
-    if len(effect.places) < len(ARM):
+    if len(effect.locations) < len(ARM):
         return effect
-    amplitudes = tuple(a for place in effect.places.values() for a in place)
-    return replace(effect, places={**effect.places, EVERYWHERE: amplitudes})
+    amplitudes = tuple(a for place in effect.locations.values() for a in place)
+    return replace(effect, locations={**effect.locations, EVERYWHERE: amplitudes})
 
 
 def by_joint(found: Mapping[str, Any], published: Mapping[str, Sequence[float]]) -> list[dict[str, Any]]:
     """Dry friction of each joint beside the published values, and how much of the torque error is left there."""
-    values, sealed = found["values"], found["rms"]["sealed"]
+    values, sealed = found["values"], found["rms"]["test"]
     out = []
     for j, joint in enumerate(ARM):
         entry = values.get(f"{FOUND}[{joint}]")
@@ -150,7 +150,7 @@ def main(config: GapPanda) -> None:
     joints = by_joint(found["rigid"], published)
     for row in joints:
         print(f"  {row}")
-    sealed = found["rigid"]["rms"]["sealed"]
+    sealed = found["rigid"]["rms"]["test"]
     most_left = max(of_joints(found["rigid"]), key=lambda cell: cell["after"])["where"].split(",")[0]
     result = {
         "experiment": "gap_panda",

@@ -30,14 +30,14 @@ from inverse_fit import rms, rounded
 from benchmarks.common import CODE
 from benchmarks.sharing import code_name, kept
 from droid_jax.cost.residuals import CompareConfig
-from droid_jax.discrepancy.blocks import Blocks
-from droid_jax.discrepancy.case import Case, GapConfig
+from droid_jax.discrepancy.blocks import BlockResidualSet
+from droid_jax.discrepancy.case import Case, DiscrepancyConfig
 from droid_jax.discrepancy.refit import deviations, intervals
 from droid_jax.discrepancy.residual_set import only_comparison
 from droid_jax.discrepancy.select import SIGNIFICANT
 from droid_jax.discrepancy.single import Log, base_model, make_log, single_case
 from droid_jax.discrepancy.verdict import Verdict
-from droid_jax.discrepancy.workflow import find
+from droid_jax.discrepancy.workflow import search_effects
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.model.effect_interface import Effect, Theta
 from droid_jax.model.effects.registry import effect_space
@@ -65,7 +65,7 @@ class Search:
     sealed: Log | None
     base: Space
     effects: tuple[Effect, ...]
-    config: GapConfig
+    config: DiscrepancyConfig
     known: tuple[Effect, ...] = ()
 
     def case(self, log: Log | None = None, start: np.ndarray | None = None) -> Case:
@@ -73,10 +73,10 @@ class Search:
         return single_case(log or self.log, self.base, self.effects, self.sealed, self.config, start)
 
 
-def settings(motion_cutoff: float, seed: int) -> GapConfig:
+def settings(motion_cutoff: float, seed: int) -> DiscrepancyConfig:
     """Inverse dynamics is smooth in its parameters: no search and no hops before the refinement."""
-    return GapConfig(
-        refine=RefineConfig(iterations=12, hops=0, spreads=0),
+    return DiscrepancyConfig(
+        refine=RefineConfig(iterations=12, basin_hops=0, spreads=0),
         compare=CompareConfig(whitened=True, motion_cutoff=motion_cutoff),
         seed=seed,
     )
@@ -87,7 +87,7 @@ def make_search(
     base: Space,
     effects: Sequence[Effect],
     recordings: Sequence[Recording],
-    config: GapConfig,
+    config: DiscrepancyConfig,
     known: Sequence[Effect] = (),
 ) -> Search:
     """A search in one recording, or in the first of two with the second sealed.
@@ -102,7 +102,7 @@ def make_search(
 def run_search(search: Search, log: Log | None = None, start: np.ndarray | None = None) -> tuple[Case, Verdict]:
     """Its case and the verdict."""
     case = search.case(log, start)
-    return case, find(case, base_model(case, start), 0.0)
+    return case, search_effects(case, base_model(case, start), 0.0)
 
 
 def answer(search: Search, log: Log | None = None) -> dict[str, Any]:
@@ -110,7 +110,7 @@ def answer(search: Search, log: Log | None = None) -> dict[str, Any]:
     try:
         return report(*run_search(search, log))
     except ValueError as error:
-        silent = {"effects": [], "tied": [], "p": [], "rms": {}}
+        silent = {"effects": [], "indistinguishable": [], "p": [], "rms": {}}
         return {"verdict": "refused", "sentence": str(error), **silent}
 
 
@@ -135,7 +135,7 @@ def as_known(effect: Effect) -> Effect:
 def adding(log: Log, values: np.ndarray, added: Mapping[str, float]) -> Log:
     """The log with what parameters `added` change in the simulation at `values` [D] added to its measurement."""
     without, with_it = log.simulated(np.stack([values, _changed(log, values, added)]))
-    return log.holding(log.measured + with_it - without)
+    return log.with_torques(log.measured + with_it - without)
 
 
 def _changed(log: Log, values: np.ndarray, added: Mapping[str, float]) -> np.ndarray:
@@ -168,12 +168,12 @@ def false_alarms(search: Search, verdict: Verdict, count: int, seed: int, folder
     folder: what is said of each log is kept there, so that a run that was stopped goes on where it was.
     """
     rng = np.random.default_rng(seed)
-    truth, left = verdict.base.values, search.log.left(verdict.model.values)
+    truth, left = verdict.base.values, search.log.residual_torque(verdict.model.values)
     simulated = search.log.simulated(truth[None])[0]
     code = code_name(CODE.get("git"))
     missing, named = [], []
     for number in range(count):
-        log = search.log.holding(simulated + coloured(left, rng))
+        log = search.log.with_torques(simulated + coloured(left, rng))
         path = folder / f"{number:04d}_{_key(log, code)}.json"
         said = kept(path, lambda log=log: _said_of(search, log, truth))
         print(f"  {number + 1:4d}: {said}", flush=True)
@@ -198,8 +198,8 @@ def _said_of(search: Search, log: Log, start: np.ndarray) -> dict[str, Any]:
         case, found = run_search(search, log, start)
     except ValueError as error:  # too short for the residual's correlation time
         return {"refused": str(error)}
-    said = {"p": found.screens[0].p, "verdict": found.kind.value, "effects": list(found.effects)}
-    return {**said, "blocks": case.fit.units}
+    said = {"p": found.score_tests[0].p, "verdict": found.kind.value, "effects": list(found.effects)}
+    return {**said, "blocks": case.train.units}
 
 
 def _key(log: Log, code: str) -> str:
@@ -219,49 +219,51 @@ def share(hits: int, count: int) -> dict[str, Any]:
 
 def report(case: Case, verdict: Verdict) -> dict[str, Any]:
     """A verdict with its grounds as JSON values."""
-    spans, widths = intervals(case.fit, verdict.model), deviations(case.fit, verdict.model)
-    torque = only_comparison(case.fit.cost).channel("torque")
+    spans, widths = intervals(case.train, verdict.model), deviations(case.train, verdict.model)
+    torque = only_comparison(case.train.cost).channel("torque")
     return {
         "verdict": verdict.kind.value,
         "sentence": verdict.sentence,
         "effects": list(verdict.effects),
-        "tied": [list(t) for t in verdict.tied],
+        "indistinguishable": [list(t) for t in verdict.indistinguishable],
         "values": {
             p.name: {
                 "unit": p.unit,
-                "value": float(verdict.model.values[case.whole.index(p.name)]),
+                "value": float(verdict.model.values[case.full_space.index(p.name)]),
                 **({"interval": rounded(spans[p.name]), "deviation": widths[p.name]} if p.name in spans else {}),
-                "base": float(verdict.base.values[case.whole.index(p.name)]),
+                "base": float(verdict.base.values[case.full_space.index(p.name)]),
             }
             for p in verdict.model.space.parameters
         },
-        "p": [s.p for s in verdict.screens],
-        "gaps": {role: {"before": b, "after": a, "closed": 1 - a / b} for role, (b, a) in verdict.gaps.items()},
-        "rms": {role: _rms_of(case, verdict, role) for role in ("fit", "confirm", "sealed")},
+        "p": [s.p for s in verdict.score_tests],
+        "gaps": {
+            role: {"before": b, "after": a, "closed": 1 - a / b} for role, (b, a) in verdict.discrepancies.items()
+        },
+        "rms": {role: _rms_of(case, verdict, role) for role in ("train", "validation", "test")},
         "noise_stated": rounded(1 / np.einsum("ckk->kc", torque.noise.whitener).max(axis=0)),
-        "blocks": {"each": case.fit.units, "seconds": round(_block_seconds(case), 3)},
+        "blocks": {"each": case.train.units, "seconds": round(_block_seconds(case), 3)},
         "where": [
-            {"variable": b.variable, "where": b.where, "before": b.gap, "after": a.gap}
+            {"variable": b.variable, "where": b.where, "before": b.discrepancy, "after": a.discrepancy}
             for b, a in zip(verdict.before.cells, verdict.after.cells, strict=True)
         ],
-        "trials": [trial_json(trial) for trial in verdict.trials],
+        "trials": [trial_json(trial) for trial in verdict.validation_tests],
     }
 
 
 def _block_seconds(case: Case) -> float:
     """Shortest of the blocks."""
-    assert isinstance(case.fit, Blocks)
-    block, time = case.fit.block[case.fit.column == 0], case.fit.time
-    return min(float(np.sum(block == b)) for b in range(case.fit.units)) * float(time[1] - time[0])
+    assert isinstance(case.train, BlockResidualSet)
+    block, time = case.train.block[case.train.column == 0], case.train.time
+    return min(float(np.sum(block == b)) for b in range(case.train.units)) * float(time[1] - time[0])
 
 
 def _rms_of(case: Case, verdict: Verdict, role: str) -> dict[str, list[float]]:
     """RMS of each column before and after, in its unit, over the instants of a role."""
-    evidence = case.judged[role]
+    evidence = case.held_sets[role]
     inside, log = evidence.instants, evidence.cost
     assert isinstance(log, Log)
     return {
-        when: rounded(rms(log.left(model.values)[inside]))
+        when: rounded(rms(log.residual_torque(model.values)[inside]))
         for when, model in (("before", verdict.base), ("after", verdict.model))
     }
 
@@ -277,7 +279,7 @@ def names_one_of(found: Mapping[str, Any], names: Sequence[str]) -> bool | None:
     """Whether one of some effects is named, be it in a tie; None where the search was refused and says nothing."""
     if found["verdict"] == "refused":
         return None
-    said = [*found["effects"], *(n for t in found["tied"] for n in t)]
+    said = [*found["effects"], *(n for t in found["indistinguishable"] for n in t)]
     return any(s.split(" at ")[0] in names for s in said)
 
 

@@ -33,11 +33,11 @@ from benchmarks.common import origin  # noqa: E402
 from benchmarks.sharing import claimed, code_name  # noqa: E402
 from droid_jax.commands.gap_search import searched  # noqa: E402
 from droid_jax.commands.synthetic import hidden_effects, record_synthetic  # noqa: E402
-from droid_jax.discrepancy.case import GapConfig  # noqa: E402
+from droid_jax.discrepancy.case import DiscrepancyConfig  # noqa: E402
 from droid_jax.discrepancy.extended import extended, load_extended, save_extended  # noqa: E402
 from droid_jax.discrepancy.missing import case_of  # noqa: E402
 from droid_jax.discrepancy.split import Split  # noqa: E402
-from droid_jax.discrepancy.verdict import Kind  # noqa: E402
+from droid_jax.discrepancy.verdict import Conclusion  # noqa: E402
 from droid_jax.door.environment import DoorEnv  # noqa: E402
 from droid_jax.door.scene import door_scene  # noqa: E402
 from droid_jax.door.space import door_nuisances, door_space  # noqa: E402
@@ -106,16 +106,16 @@ def _searched(arguments: Arguments, folder: Path, code: Mapping[str, Any]) -> di
     scene = door_scene(timestep=TIMESTEP)
     base = door_space(scene) + door_nuisances(scene)
     roles = record_synthetic(scene, hidden_effects(arguments.hide, scene), folder, SPRINGS, robot, again=False)
-    config = GapConfig()
+    config = DiscrepancyConfig()
     if arguments.quick:
-        small = RefineConfig(iterations=1, hops=0, spreads=0)
-        config = GapConfig(SearchConfig(population=8, parents=None, generations=1), small, small, 1, 1, 1)
+        small = RefineConfig(iterations=1, basin_hops=0, spreads=0)
+        config = DiscrepancyConfig(SearchConfig(population=8, parents=None, generations=1), small, small, 1, 1, 1)
     checkpoints = folder / "checkpoints" / code_name(code["commit"])
     case = case_of(Split.RECORDINGS, scene, base, library(scene), roles, config)
     case, verdict, handed, _ = searched(Split.RECORDINGS, case, roles, checkpoints)
-    posterior(verdict.base.refined, case.fit.cost.comparisons).save(folder / BASE)
+    posterior(verdict.base.refined, case.train.cost.comparisons).save(folder / BASE)
     save_extended(folder, extended(case, handed))
-    if verdict.kind is Kind.UNCONVERGED and not arguments.quick:  # no verdict: nothing is kept of it
+    if verdict.kind is Conclusion.UNCONVERGED and not arguments.quick:  # no verdict: nothing is kept of it
         raise SystemExit(f"error: {verdict.sentence}")
     found = {
         "hidden": list(arguments.hide),

@@ -36,7 +36,7 @@ from droid_jax.door.space import JOINT_DAMPING, door_nuisances, door_space  # no
 from droid_jax.door.space import truth as table_i  # noqa: E402
 from droid_jax.identify.gaussian import prior  # noqa: E402
 from droid_jax.identify.multistart import RefineConfig  # noqa: E402
-from droid_jax.identify.pipeline import Identified, IdentifyConfig, cost_samples, identify  # noqa: E402
+from droid_jax.identify.pipeline import Identified, IdentifyConfig, cost_samples, identify_parameters  # noqa: E402
 from droid_jax.identify.search import SearchConfig  # noqa: E402
 from droid_jax.model.scene import Scene  # noqa: E402
 from droid_jax.recordings.formats import load  # noqa: E402
@@ -90,15 +90,18 @@ def describe(found: Identified, truth: dict[str, float]) -> dict[str, Any]:
             "interval": [float(low[i]), float(high[i])],
             "search": [float(told.mean[i]), float(deviation[i])],
             "inside": bool(low[i] <= truth[p.name] <= high[i]),
-            "identifiable": found.tells[i].identifiable,
-            "shrinkage": found.tells[i].shrinkage,
+            "identifiable": found.identifiability[i].identifiable,
+            "shrinkage": found.identifiability[i].shrinkage,
             "nuisance": p.nuisance,
         }
         for i, p in enumerate(found.full.parameters)
     }
     refined = found.refined
     return {
-        "gap": {n: {k: getattr(g, k) for k in ("before", "after", "floor", "closed")} for n, g in found.gaps.items()},
+        "gap": {
+            n: {"before": g.before, "after": g.after, "floor": g.noise_floor, "closed": g.closed}
+            for n, g in found.torque_distances.items()
+        },
         "parameters": parameters,
         "mean_square": None if refined is None else float(np.mean(refined.residual**2)),
         "converged": None if refined is None else refined.converged,
@@ -111,7 +114,7 @@ def describe(found: Identified, truth: dict[str, float]) -> dict[str, Any]:
 def fit(truth: dict[str, float], names: str, seed: int, quick: bool) -> tuple[Identified, dict[str, Any]]:
     """Record, identify, describe."""
     scene = door_scene(timestep=TIMESTEP)
-    found = identify(
+    found = identify_parameters(
         scene,
         door_space(scene),
         recordings(scene, truth, names, seed),

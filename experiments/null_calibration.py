@@ -33,9 +33,9 @@ from benchmarks.common import CODE, origin, stem  # noqa: E402
 from benchmarks.sharing import claimed  # noqa: E402
 from droid_jax.discrepancy.candidates import candidates  # noqa: E402
 from droid_jax.discrepancy.restart import base_fit  # noqa: E402
-from droid_jax.discrepancy.screen import questions_of  # noqa: E402
+from droid_jax.discrepancy.screen import directions_of  # noqa: E402
 from droid_jax.discrepancy.select import SIGNIFICANT  # noqa: E402
-from droid_jax.discrepancy.workflow import ask, find  # noqa: E402
+from droid_jax.discrepancy.workflow import score, search_effects  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 from experiments.blind.cases import Plan  # noqa: E402
 from experiments.blind.draws import commit_of, seed_of  # noqa: E402
@@ -97,15 +97,15 @@ def run_case(plan: Plan, commit: str, bench: Bench, watch: Stopwatch) -> Iterato
     if isinstance(found, str):
         raise ValueError(f"case {plan.name}: {found}")
     recordings = found[2]
-    case = watch("prepare", lambda: bench.case(scene, {"fit": recordings["fit"]}))
+    case = watch("prepare", lambda: bench.case(scene, {"train": recordings["train"]}))
     model = watch("base", lambda: base_fit(case, silent))
-    screen = watch("screen", lambda: ask(case, model, questions_of(candidates(case.effects))))
+    screen = watch("screen", lambda: score(case, model, directions_of(candidates(case.effects))))
     best = screen.questions[int(np.argmax(np.abs(screen.t)))].candidate.name
     yield {"p": screen.p, "gap": model.gap, "converged": bool(model.refined.converged), "best": best}
     if screen.p < SIGNIFICANT:
-        floor = watch("floor", lambda: bench.floor(scene, case, model, recordings["fit"]))
+        floor = watch("floor", lambda: bench.floor(scene, case, model, recordings["train"]))
         whole = watch("prepare", lambda: bench.case(scene, recordings))
-        verdict = watch("find", lambda: find(whole, model, floor))
+        verdict = watch("find", lambda: search_effects(whole, model, floor))
         yield {"floor": floor, "verdict": verdict.kind.value, "effects": list(verdict.effects)}
 
 

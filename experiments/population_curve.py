@@ -33,7 +33,7 @@ from droid_jax.cost.cost import Cost, make_cost  # noqa: E402
 from droid_jax.door.demonstration import demonstration_path  # noqa: E402
 from droid_jax.door.scene import door_scene  # noqa: E402
 from droid_jax.door.space import door_space  # noqa: E402
-from droid_jax.identify.holdout import split  # noqa: E402
+from droid_jax.identify.holdout import split_repeats  # noqa: E402
 from droid_jax.identify.search import SearchConfig, search  # noqa: E402
 from droid_jax.recordings.formats import load  # noqa: E402
 from droid_jax.storage import write_bytes  # noqa: E402
@@ -63,7 +63,7 @@ def prepare() -> tuple[Cost, Cost]:
     scene = door_scene(timestep=0.004)
     truth = synthetic_truth(scene, 1, 1)
     recording = record(scene, load(demonstration_path("A")), truth, seed=100, name="A")
-    fitted, held, _ = split(recording, 0.3)
+    fitted, held, _ = split_repeats(recording, 0.3)
     cost = make_cost(scene, door_space(scene), [fitted])
     return cost, cost.against([held])
 

@@ -80,7 +80,9 @@ def main() -> None:
     }
     result = {
         "cost": found.fit["cost"],
-        "gap": {n: {k: g[k] for k in ("before", "after", "floor", "closed")} for n, g in found.fit["gap"].items()},
+        "gap": {
+            n: {k: g[k] for k in ("before", "after", "noise_floor", "closed")} for n, g in found.fit["gap"].items()
+        },
         "generations": found.fit["generations"],
         "seconds": found.fit["seconds"],
         "parameters": shown,

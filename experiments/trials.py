@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from typing import Any
 
-from droid_jax.discrepancy.select import Trial
+from droid_jax.discrepancy.select import ValidationTest
 from droid_jax.storage import finite
 
 
-def trial_json(trial: Trial) -> dict[str, Any]:
-    """Name, figures and what spoke against it; gap_confirm is None where the model blew up there."""
+def trial_json(trial: ValidationTest) -> dict[str, Any]:
+    """Name, figures and what spoke against it; discrepancy_validation is None where the model blew up there."""
     return {
         "name": trial.name,
         "passed": trial.passed,
         "p": trial.p,
-        "gap_fit": trial.gap_fit,
-        "gap_confirm": finite(trial.gap_confirm),
+        "discrepancy_train": trial.discrepancy_train,
+        "discrepancy_validation": finite(trial.discrepancy_validation),
         "chosen": trial.chosen,
-        "rivals": list(trial.rivals),
+        "rivals": list(trial.indistinguishable),
         "reasons": list(trial.reasons),
     }

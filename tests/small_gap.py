@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from droid_jax.discrepancy.case import Case, GapConfig, make_case
-from droid_jax.discrepancy.final_refit import HandedOn
-from droid_jax.discrepancy.refit import Model
+from droid_jax.discrepancy.case import Case, DiscrepancyConfig, make_case
+from droid_jax.discrepancy.final_refit import FinalModel
+from droid_jax.discrepancy.refit import FittedModel
 from droid_jax.discrepancy.restart import base_fit
 from droid_jax.discrepancy.verdict import Verdict
-from droid_jax.discrepancy.workflow import find
+from droid_jax.discrepancy.workflow import search_effects
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.identify.search import SearchConfig
 from droid_jax.model.effects.registry import library
@@ -35,7 +35,7 @@ SECONDS = 3.0
 PARAMETERS = [
     {"field": "body_mass", "element": "forearm", "std": 0.2, "high": 3.0},
     {"field": "dof_damping", "element": "door", "unit": "N m s/rad", "std": 0.3, "high": 10.0, "scaling": "log",
-     "floor": 0.05},
+     "log_offset": 0.05},
     {"field": "jnt_stiffness", "element": "door", "unit": "N m/rad", "std": 0.3, "high": 10.0},
     {"sensor": "torque_offset", "element": "elbow", "std": 0.1, "high": 2.0, "nuisance": True},
 ]  # fmt: skip
@@ -43,11 +43,11 @@ TRUTH = {"forearm_mass": 0.9, "door_damping": 0.6, "door_stiffness": 0.7, "torqu
 PRELOAD = 0.6  # N m
 FLOOR = 0.01
 EFFECTS = ("hinge_preload", "drag", "payload")
-QUICK = GapConfig(
+QUICK = DiscrepancyConfig(
     search=SearchConfig(population=12, parents=None, generations=4),
-    refine=RefineConfig(iterations=20, hops=0),
-    refit=RefineConfig(iterations=6, hops=0),
-    most=1,
+    refine=RefineConfig(iterations=20, basin_hops=0),
+    refit=RefineConfig(iterations=6, basin_hops=0),
+    max_effects=1,
 )
 
 
@@ -66,9 +66,9 @@ def small_scene() -> tuple[Scene, Space]:
 
 
 def demonstration(name: str) -> Recording:
-    """ "fit" and "confirm" open and close the door at different speeds; so does "sealed", less far."""
+    """ "train" and "validation" open and close the door at different speeds; so does "test", less far."""
     t = np.arange(0.0, SECONDS, 0.002)
-    period, reach, pace = {"fit": (1.5, 0.4, 2.0), "confirm": (3.0, 0.35, 1.5), "sealed": (2.5, 0.3, 1.0)}[name]
+    period, reach, pace = {"train": (1.5, 0.4, 2.0), "validation": (3.0, 0.35, 1.5), "test": (2.5, 0.3, 1.0)}[name]
     arm = [0.5 * np.sin(pace * t), 0.6 * np.sin(1.4 * pace * t)]
     command = np.stack([*arm, reach * (1 - np.cos(2 * np.pi * t / period))], axis=1)
     convention = TorqueConvention(TorqueSide.MOTOR, gravity=True)
@@ -80,7 +80,7 @@ def demonstration(name: str) -> Recording:
 def record(name: str, repeats: int = 8, preload: float = PRELOAD, friction: float = 0.0) -> Recording:
     """What the synthetic robot measures."""
     scene, space = small_scene()
-    seed = 1 + ("fit", "confirm", "sealed").index(name)
+    seed = 1 + ("train", "validation", "test").index(name)
     config = SyntheticRobotConfig(repeats=repeats, timestep=0.00025)
     hidden = {name: size for name, size in (("hinge_preload", preload), ("dry_friction[elbow]", friction)) if size}
     return record_hidden(scene, demonstration(name), TRUTH, hidden, seed=seed, config=config, name=name, space=space)
@@ -93,20 +93,20 @@ class Small:
     scene: Scene
     recordings: dict[str, Recording]
     case: Case
-    base: Model
+    base: FittedModel
     verdict: Verdict
 
     @property
-    def own(self) -> HandedOn:
+    def own(self) -> FinalModel:
         """The search's own model, of the first motion alone."""
-        return HandedOn(self.verdict.model, (self.case.fit,))
+        return FinalModel(self.verdict.model, (self.case.train,))
 
 
 @functools.cache
 def small() -> Small:
     """The search of this session."""
-    recordings = {name: record(name) for name in ("fit", "confirm")}
+    recordings = {name: record(name) for name in ("train", "validation")}
     scene, space = small_scene()
     case = make_case(scene, space, library(scene, EFFECTS), **recordings, config=QUICK)
     base = base_fit(case, lambda stage, value: None)
-    return Small(scene, recordings, case, base, find(case, base, FLOOR))
+    return Small(scene, recordings, case, base, search_effects(case, base, FLOOR))

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from droid_jax.cost.residuals import CompareConfig
-from droid_jax.discrepancy.case import GapConfig
+from droid_jax.discrepancy.case import DiscrepancyConfig
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.model.fields import joint_damping
 from droid_jax.model.joint_friction import SMOOTHING
@@ -28,8 +28,9 @@ MJCF = """
   </worldbody>
 </mujoco>
 """
-CONFIG = GapConfig(
-    refine=RefineConfig(iterations=10, hops=0, spreads=0), compare=CompareConfig(whitened=True, motion_cutoff=10.0)
+CONFIG = DiscrepancyConfig(
+    refine=RefineConfig(iterations=10, basin_hops=0, spreads=0),
+    compare=CompareConfig(whitened=True, motion_cutoff=10.0),
 )
 ASKED = ("joint_coulomb", "cable_pull", "torque_drift", "torque_gain")
 INERTIA = 0.09  # kg m^2 about the joint

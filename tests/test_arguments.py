@@ -15,7 +15,7 @@ import droid_jax as dj
 from droid_jax import arguments
 from droid_jax.arguments import check_fields, number, whole
 from droid_jax.cost.residuals import CompareConfig
-from droid_jax.discrepancy.case import GapConfig
+from droid_jax.discrepancy.case import DiscrepancyConfig
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.identify.pipeline import IdentifyConfig
 from droid_jax.identify.search import SearchConfig
@@ -54,15 +54,15 @@ GOOD = {"name": "a", "unit": "kg", "mean": 1.0, "std": 0.5, "low": 0.1, "high": 
         (lambda: SearchConfig(bounds="bounce"), "bounds must be one of resample, clip"),  # pyright: ignore
         (lambda: RefineConfig(iterations=-1), "iterations must be at least 0, got -1"),
         (lambda: RefineConfig(step=0.0), "step must be above 0, got 0.0"),
-        (lambda: RefineConfig(keep=3.0), "keep must be a list, got 3.0"),  # pyright: ignore
-        (lambda: RefineConfig(keep=()), "keep must have one or more entries, got 0"),
-        (lambda: RefineConfig(keep=(3.0, math.nan)), "keep, entry 1 must be finite, got nan"),
+        (lambda: RefineConfig(pruning_ratio=3.0), "keep must be a list, got 3.0"),  # pyright: ignore
+        (lambda: RefineConfig(pruning_ratio=()), "keep must have one or more entries, got 0"),
+        (lambda: RefineConfig(pruning_ratio=(3.0, math.nan)), "keep, entry 1 must be finite, got nan"),
         (lambda: RefineConfig(tolerance=math.nan), "tolerance must be finite, got nan"),
-        (lambda: RefineConfig(aim=math.nan), "aim must be finite, got nan"),
-        (lambda: GapConfig(looked=0), "looked must be at least 1, got 0"),
-        (lambda: GapConfig(budget=-1.0), "budget must be at least 0, got -1.0"),
-        (lambda: GapConfig(least_closed="0.4"), "least_closed must be a number"),  # pyright: ignore
-        (lambda: GapConfig(refine=None), "refine must be a RefineConfig, got None"),  # pyright: ignore
+        (lambda: RefineConfig(target_objective=math.nan), "aim must be finite, got nan"),
+        (lambda: DiscrepancyConfig(one_step_fits=0), "looked must be at least 1, got 0"),
+        (lambda: DiscrepancyConfig(budget_minutes=-1.0), "budget must be at least 0, got -1.0"),
+        (lambda: DiscrepancyConfig(minimum_closed="0.4"), "least_closed must be a number"),  # pyright: ignore
+        (lambda: DiscrepancyConfig(refine=None), "refine must be a RefineConfig, got None"),  # pyright: ignore
         (lambda: TrainConfig(learning_rate=-1.0), "learning_rate must be above 0, got -1.0"),
         (lambda: TrainConfig(hidden=(0,)), "hidden, entry 0 must be at least 1, got 0"),
         (lambda: TransferConfig(timestep=0.0), "timestep must be above 0, got 0.0"),

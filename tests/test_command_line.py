@@ -163,7 +163,7 @@ def stopped_in_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
         raise ValueError("stopped")
 
     monkeypatch.setattr(pipeline, "prepare", lambda *_, **__: None)
-    monkeypatch.setattr(pipeline, "solve", stopped)
+    monkeypatch.setattr(pipeline, "run_fit", stopped)
 
 
 def test_the_same_files_in_another_place_are_the_same_run(refused, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -180,14 +180,14 @@ def test_the_same_files_in_another_place_are_the_same_run(refused, tmp_path: Pat
 
     def run(folder: Path) -> str:
         files = {"scene": "two_link.xml", "parameters": "parameters.json", "recording": "small.npz"}
-        files |= {"own-effects": "mine.py"}
+        files |= {"user-effects": "mine.py"}
         options = [text for option, name in files.items() for text in (f"--{option}", folder / name)]
         return refused("identify", *options, "--out", tmp_path / "run")
 
     assert "stopped" in run(Path("one")) and "stopped" in run(tmp_path / "one") and "stopped" in run(Path("two"))
     assert json.loads((tmp_path / "run" / "setup.json").read_text())["scene"] == "two/two_link.xml"
     (tmp_path / "two" / "mine.py").write_text("\n")
-    assert "other settings (own_effects)" in run(Path("two"))
+    assert "other settings (user_effects)" in run(Path("two"))
 
 
 @pytest.mark.parametrize("command", ["identify", "gap", "all"])
@@ -511,7 +511,7 @@ def test_help_is_quick(command: str):
     assert all(text in run.stdout for text in said), run.stdout
 
 
-# ----- effects of one's own
+# ----- effects of your own
 
 EFFECT = """
 from droid_jax.model.effects.registry import register
@@ -550,20 +550,20 @@ def test_a_file_of_effects_is_in_the_library_from_then_on(library, tmp_path: Pat
 def test_a_file_of_effects_that_cannot_be(refused, library, tmp_path: Path, text: str | None, expected: str):
     if text is not None:
         (tmp_path / "mine.py").write_text(text)
-    said = refused("identify", "--own-effects", tmp_path / "mine.py", "--out", tmp_path / "run")
-    assert "--own-effects" in said and expected in said
+    said = refused("identify", "--user-effects", tmp_path / "mine.py", "--out", tmp_path / "run")
+    assert "--user-effects" in said and expected in said
 
 
 def test_results_with_effects_of_ones_own_ask_for_them_and_run_nothing(refused, library, tmp_path: Path):
     (tmp_path / "mine.py").write_text(EFFECT)
     (tmp_path / "gap").mkdir()
-    (tmp_path / "gap" / "setup.json").write_text(json.dumps({"own_effects": str(tmp_path / "mine.py")}))
+    (tmp_path / "gap" / "setup.json").write_text(json.dumps({"user_effects": str(tmp_path / "mine.py")}))
     said = refused("identify", "--extended", tmp_path / "gap" / "extended.json", "--out", tmp_path / "run")
-    assert f"give --own-effects {tmp_path / 'mine.py'}" in said and "gasket" not in library()
+    assert f"give --user-effects {tmp_path / 'mine.py'}" in said and "gasket" not in library()
 
 
 def test_a_changed_file_of_effects_makes_another_run(tmp_path: Path):
-    for option in ("own_effects", "extended"):
+    for option in ("user_effects", "extended"):
         (tmp_path / "mine.py").write_text(EFFECT)
         first = setup_of(Identify(**{option: tmp_path / "mine.py"}))
         (tmp_path / "mine.py").write_text(EFFECT + "\n")

@@ -1,4 +1,4 @@
-"""What errors of several rooms say alike."""
+"""What errors of several layers say alike."""
 
 from __future__ import annotations
 

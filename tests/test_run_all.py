@@ -69,12 +69,12 @@ def motions(*files: str, repeats: int = 8, commands: bool = True, **meta: str) -
 def found(folder: Path, effects: list[str], synthetic_robot: bool = True) -> None:
     """A folder with the results of a search."""
     folder.mkdir(parents=True)
-    gaps = {role: {"closed": 0.5 + 0.1 * k} for k, role in enumerate(("fit", "confirm", "sealed"))}
+    gaps = {role: {"closed": 0.5 + 0.1 * k} for k, role in enumerate(("train", "validation", "test"))}
     (folder / "gap.json").write_text(
         json.dumps(
             {
                 "effects": effects,
-                "tied": [],
+                "indistinguishable": [],
                 "screens": [],
                 "sentence": "The model lacks: latch.",
                 "gaps": gaps,
@@ -154,7 +154,7 @@ def test_a_policy_is_trained_on_the_extended_model_where_there_is_one(called, tm
     found(tmp_path / "runs" / "all" / "gap", ["latch at door_hinge"])
     assert main(["all", "--stages", "train"]) == 0
     assert called[0].fit == Path("runs/all/gap")
-    assert "gap: The model lacks: latch; 70 % of the gap U closed on the sealed motion" in capsys.readouterr().out
+    assert "gap: The model lacks: latch; 70 % of the gap U closed on the test motion" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("synthetic_robot", [True, False])
@@ -168,7 +168,7 @@ def test_the_last_lines_say_what_was_hidden_in_what_was_searched(called, tmp_pat
 
 @pytest.mark.parametrize("robot", [{}, {"springs": 1, "seed": 0}])
 def test_a_success_on_another_robot_than_the_fitted_one_is_no_promise(called, tmp_path: Path, capsys, robot: dict):
-    """The policy of a fit of one's own recordings is tried on the synthetic robot all the same."""
+    """The policy of a fit of your own recordings is tried on the synthetic robot all the same."""
     folder = tmp_path / "runs" / "all" / "train"
     folder.mkdir(parents=True)
     trials = {"success_rate": 1.0, "interval_95": [0.9, 1.0]}
@@ -459,8 +459,8 @@ def test_where_a_stage_fails_the_page_shows_those_before(called, monkeypatch: py
 def test_options_reach_the_stages(called, tmp_path: Path):
     (tmp_path / "mine.py").write_text("")
     pytest.importorskip("tensorboardX")
-    assert main(["all", "--tensorboard", "--own-effects", "mine.py"]) == 0
-    assert [c.own_effects for c in called] == 4 * [Path("mine.py")]
+    assert main(["all", "--tensorboard", "--user-effects", "mine.py"]) == 0
+    assert [c.user_effects for c in called] == 4 * [Path("mine.py")]
     assert all(c.tensorboard for c in called[:3])
 
 

@@ -36,14 +36,16 @@ pytestmark = pytest.mark.usefixtures("tuned")
 
 @pytest.fixture
 def place(tmp_path: Path) -> Path:
-    """A folder with parameters.json, fit.npz and confirm.npz."""
+    """A folder with parameters.json, fit.npz and validation.npz."""
     write_parameters(tmp_path)
-    for name in ("fit", "confirm"):
+    for name in ("train", "validation"):
         save(record(name), tmp_path / f"{name}.npz")
     return tmp_path
 
 
-def arguments(place: Path, *options: str | Path, recordings: tuple[str, ...] = ("fit.npz", "confirm.npz")) -> list[str]:
+def arguments(
+    place: Path, *options: str | Path, recordings: tuple[str, ...] = ("train.npz", "validation.npz")
+) -> list[str]:
     """A whole command line in the small scene."""
     files = [place / name for name in recordings]
     own = ("--scene", SCENE, "--parameters", place / "parameters.json", "--object-joint", "door")
@@ -61,33 +63,33 @@ def changed(recording: Recording, name: str, function: Callable[[np.ndarray], np
 
 
 def test_four_recordings_are_too_many(place: Path, refused):
-    said = refused(*arguments(place, recordings=("fit.npz", "confirm.npz", "fit.npz", "confirm.npz")))
-    assert "FIT CONFIRM [SEALED]" in said and "got 4" in said and "identify" in said
+    said = refused(*arguments(place, recordings=("train.npz", "validation.npz", "train.npz", "validation.npz")))
+    assert "TRAIN VALIDATION [TEST]" in said and "got 4" in said and "identify" in said
 
 
 def test_too_few_repeats_say_what_can_still_be_concluded(place: Path, refused):
-    save(record("fit").repeats_subset(range(5)), place / "fit.npz")
+    save(record("train").repeats_subset(range(5)), place / "train.npz")
     said = refused(*arguments(place))
-    assert "the fit recording 'fit' has 5 repeats" in said and "fewer than 8" in said
+    assert "the train recording 'train' has 5 repeats" in said and "fewer than 8" in said
     assert "droid_jax.run identify" in said and "in which joint and phase" in said
 
 
 def test_the_same_recording_twice(place: Path, refused):
-    said = refused(*arguments(place, recordings=("fit.npz", "fit.npz")))
-    assert "the fit and the confirm recording are the same" in said and "another motion" in said
+    said = refused(*arguments(place, recordings=("train.npz", "train.npz")))
+    assert "the train and the validation recording are the same" in said and "another motion" in said
 
 
 def test_two_recordings_of_one_name(place: Path, refused):
     other = place / "day2"
     other.mkdir()
-    save(replace(record("confirm"), name="fit"), other / "fit.npz")
-    said = refused(*arguments(place, recordings=("fit.npz", "day2/fit.npz")))
-    assert "the fit and the confirm recording have one name, 'fit'" in said
+    save(replace(record("validation"), name="train"), other / "train.npz")
+    said = refused(*arguments(place, recordings=("train.npz", "day2/fit.npz")))
+    assert "the train and the validation recording have one name, 'train'" in said
 
 
 def test_the_sealed_recording_once_more(place: Path, refused):
-    said = refused(*arguments(place, recordings=("fit.npz", "confirm.npz", "confirm.npz")))
-    assert "the confirm and the sealed recording are the same" in said
+    said = refused(*arguments(place, recordings=("train.npz", "validation.npz", "validation.npz")))
+    assert "the validation and the test recording are the same" in said
 
 
 def test_a_repeat_that_runs_late(place: Path, refused):
@@ -96,28 +98,28 @@ def test_a_repeat_that_runs_late(place: Path, refused):
         values[3, :75] = values[3, 75]
         return values
 
-    save(changed(record("confirm"), "position", late), place / "confirm.npz")
+    save(changed(record("validation"), "position", late), place / "validation.npz")
     said = refused(*arguments(place))
-    assert "the confirm recording 'confirm': repeat 3 runs 0.1" in said and "behind the others" in said
+    assert "the validation recording 'validation': repeat 3 runs 0.1" in said and "behind the others" in said
 
 
 def test_repeats_with_clocks_of_their_own(place: Path, refused):
-    save(record("confirm"), place / "csv")
+    save(record("validation"), place / "csv")
     path = place / "csv" / "torque_02.csv"
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:-20]))
-    said = refused(*arguments(place, recordings=("fit.npz", "csv")))
+    said = refused(*arguments(place, recordings=("train.npz", "csv")))
     assert "torque_02.csv: repeat 2 has another clock than repeat 0" in said
 
 
 def test_a_robot_that_never_moves(place: Path, refused):
-    save(changed(record("fit"), "position", lambda v: v[:, :1] + 1e-4 * np.sin(np.arange(v.shape[1]))[:, None]),
-         place / "fit.npz")  # fmt: skip
+    save(changed(record("train"), "position", lambda v: v[:, :1] + 1e-4 * np.sin(np.arange(v.shape[1]))[:, None]),
+         place / "train.npz")  # fmt: skip
     said = refused(*arguments(place))
-    assert "the fit recording 'fit' never moves" in said and "0.0002" in said
+    assert "the train recording 'train' never moves" in said and "0.0002" in said
 
 
 def test_a_door_that_never_opens(place: Path, refused):
-    save(changed(record("confirm"), "object_angle", lambda v: 0.02 * v), place / "confirm.npz")
+    save(changed(record("validation"), "object_angle", lambda v: 0.02 * v), place / "validation.npz")
     said = refused(*arguments(place))
     assert "the object joint 'door' moves by 0.0" in said and "record a motion that opens it" in said
 
@@ -127,7 +129,7 @@ def test_one_repeat_that_missed_its_grasp(place: Path, refused):
         values[4] *= 0.1
         return values
 
-    save(changed(record("confirm"), "object_angle", missed), place / "confirm.npz")
+    save(changed(record("validation"), "object_angle", missed), place / "validation.npz")
     said = refused(*arguments(place))
     assert "in repeat 4 the object joint 'door' moves by 0.0" in said and "leave that repeat away" in said
 
@@ -136,7 +138,7 @@ def test_one_repeat_that_missed_its_grasp(place: Path, refused):
     ("turned", "said"), [(lambda v: 0.02 * v, "moves by 0.0"), (lambda v: v, "in repeat 4 the object joint 'door'")]
 )
 def test_an_angle_that_one_repeat_did_not_measure_hides_no_other_fault(place: Path, refused, turned, said: str):
-    recording = record("confirm")
+    recording = record("validation")
     position = recording.channels["position"]
     mask = position.mask.copy()
     mask[1, :, position.columns.index("door")] = False
@@ -144,7 +146,7 @@ def test_an_angle_that_one_repeat_did_not_measure_hides_no_other_fault(place: Pa
     values[..., position.columns.index("door")] = turned(values[..., position.columns.index("door")])
     values[4, :, position.columns.index("door")] *= 0.1
     channels = {"torque": recording.channels["torque"], "position": replace(position, values=values, mask=mask)}
-    save(replace(recording, channels=channels), place / "confirm.npz")
+    save(replace(recording, channels=channels), place / "validation.npz")
     assert said in refused(*arguments(place))
 
 
@@ -153,7 +155,7 @@ def test_a_sensor_that_is_dead_in_one_repeat(place: Path, refused):
         values[2, :, 1] = 0.25
         return values
 
-    save(changed(record("fit"), "torque", dead), place / "fit.npz")
+    save(changed(record("train"), "torque", dead), place / "train.npz")
     said = refused(*arguments(place))
     assert "never changes in repeat 2 (0.25 N m)" in said and "leave that repeat away" in said
 
@@ -163,33 +165,33 @@ def test_a_dead_sensor(place: Path, refused):
         values[..., 1] = 1.5
         return values
 
-    save(changed(record("fit"), "torque", dead), place / "fit.npz")
+    save(changed(record("train"), "torque", dead), place / "train.npz")
     said = refused(*arguments(place, "--effects", "hinge_preload"))
     assert "channel 'torque', column 'elbow' never changes (1.5 N m)" in said
 
 
 def test_recordings_of_different_joints(place: Path, refused):
-    recording = record("confirm")
+    recording = record("validation")
     torque = recording.channels["torque"]
     fewer = replace(torque, columns=JOINTS[:2], values=torque.values[..., :2], mask=torque.mask[..., :2])
-    save(replace(recording, channels={**recording.channels, "torque": fewer}), place / "confirm.npz")
+    save(replace(recording, channels={**recording.channels, "torque": fewer}), place / "validation.npz")
     said = refused(*arguments(place))
-    assert "different joints" in said and "fit shoulder, elbow, door; confirm shoulder, elbow" in said
+    assert "different joints" in said and "train shoulder, elbow, door; validation shoulder, elbow" in said
 
 
 def test_good_recordings_are_not_refused():
     scene, _ = small_scene()
-    roles = {name: record(name) for name in ("fit", "confirm")}
+    roles = {name: record(name) for name in ("train", "validation")}
     check_recordings(replace(scene, object_joint="door"), roles)
 
 
 def test_a_hinge_that_opens_downwards_is_refused():
     """Half of the library would be neutral on it, without a word."""
-    scene, recording = replace(small_scene()[0], object_joint="door"), record("fit")
+    scene, recording = replace(small_scene()[0], object_joint="door"), record("train")
     angle = recording.channels["object_angle"]
     turned = replace(recording, channels={**recording.channels, "object_angle": replace(angle, values=-angle.values)})
     with pytest.raises(ValueError, match=r"'door' opens towards negative angles .* turn the joint's axis and range"):
-        check_recordings(scene, {"fit": turned, "confirm": record("confirm")})
+        check_recordings(scene, {"train": turned, "validation": record("validation")})
 
 
 def test_lags_are_measured_in_seconds():
@@ -212,7 +214,7 @@ def test_lags_are_measured_in_seconds():
 
 
 @pytest.mark.parametrize("option", ["--effects", "--without"])
-def test_unknown_effects_list_the_valid_ones(place: Path, refused, option: str):
+def test_unknuser_effects_list_the_valid_ones(place: Path, refused, option: str):
     said = refused(*arguments(place, option, "gravity_waves"))
     assert "unknown effects gravity_waves; valid: " in said and "hinge_preload" in said
 
@@ -248,7 +250,7 @@ def test_effects_of_a_larger_machine():
 
 def test_a_log_without_commands_has_no_servo_to_suspect():
     scene = door_scene()
-    log = replace(record("fit"), time=np.zeros(0), command=np.zeros((0, 0)), command_names=())
+    log = replace(record("train"), time=np.zeros(0), command=np.zeros((0, 0)), command_names=())
     names = {e.name for e in gap.chosen_effects(gap.Gap(), scene, [log])}
     assert "torque_bias" in names and not names & {"command_delay", "joint_backlash", "joint_compliance"}
     with pytest.raises(ValueError, match="cannot have command_delay"):
@@ -261,7 +263,7 @@ def test_a_log_without_commands_has_no_servo_to_suspect():
         (lambda: Parameter("gasket", "N m", 0.0, 0.5, 0.1, 5.0), "parameter 'gasket': the start 0.0 N m lies outside"),
         (lambda: Parameter("gasket", "N m", 0.5, 0.5, 0.1, 5.0), "neutral at 0, but 'gasket' starts at 0.5 N m"),
         (
-            lambda: Parameter("gasket", "N m", 0.0, 0.5, 0.0, 5.0, scaling=Scaling.LOG, floor=0.05),
+            lambda: Parameter("gasket", "N m", 0.0, 0.5, 0.0, 5.0, scaling=Scaling.LOG, log_offset=0.05),
             "'gasket' must be scaled linearly",
         ),
         (lambda: Parameter("seal", "N m", 0.0, 0.5, 0.0, 5.0), "speaks of a parameter 'gasket' that it does not have"),
@@ -274,7 +276,7 @@ def test_an_effect_that_cannot_be_neutral(
 
     @registry.register
     def gasket(scene):
-        return Effect("gasket", (make(),), force=lambda theta, state: state.qvel, places={"door": ("gasket",)})
+        return Effect("gasket", (make(),), force=lambda theta, state: state.qvel, locations={"door": ("gasket",)})
 
     assert expected in refused(*arguments(place, "--effects", "gasket"))
 
@@ -310,10 +312,10 @@ def test_effects_of_ones_own_are_asked_about_like_the_others(place: Path, refuse
     monkeypatch.setattr(registry, "_MAKERS", dict(registry._MAKERS))
     (code,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / "method-gap.md").read_text(), re.M | re.S)
     (place / "gasket.py").write_text(code)
-    options = ("--own-effects", place / "gasket.py", "--effects", "gasket", "nothing")
+    options = ("--user-effects", place / "gasket.py", "--effects", "gasket", "nothing")
     assert "unknown effects nothing; valid:" in (said := refused(*arguments(place, *options))) and "gasket" in said
     chosen = gap.chosen_effects(gap.Gap(effects=("gasket",)), small_scene()[0], [])
-    assert [e.name for e in chosen] == ["gasket"] and "door" in chosen[0].places
+    assert [e.name for e in chosen] == ["gasket"] and "door" in chosen[0].locations
 
 
 def test_an_effect_that_forgot_its_places_is_not_left_out_in_silence(monkeypatch: pytest.MonkeyPatch):
@@ -325,9 +327,9 @@ def test_an_effect_that_forgot_its_places_is_not_left_out_in_silence(monkeypatch
         return Effect("lost", (Parameter("lost", "N m", 0.0, 1.0, 0.0, 5.0),), force=lambda theta, state: state.qvel)
 
     scene = small_scene()[0]
-    with pytest.raises(ValueError, match="effects lost state no places"):
+    with pytest.raises(ValueError, match="effects lost state no locations"):
         gap.chosen_effects(gap.Gap(effects=("lost", "latch")), scene, [])
-    with pytest.warns(UserWarning, match="effects lost state no places .*: they are left out"):
+    with pytest.warns(UserWarning, match="effects lost state no locations .*: they are left out"):
         assert len(gap.chosen_effects(gap.Gap(), scene, [])) > 5
 
 
@@ -352,11 +354,11 @@ def test_the_synthetic_robot_records_each_demonstration_once(tmp_path: Path, mon
 
     def instead(scene, demonstration, truth, effects, *, seed, name):
         asked.append((demonstration.name, dict(effects), seed))
-        return replace(record("fit"), name=name)
+        return replace(record("train"), name=name)
 
     monkeypatch.setattr(hidden, "record_hidden", instead)
     roles = record_synthetic(door_scene(), {"closer": 1.0}, tmp_path, 1, 3, False)
-    assert {role: r.name for role, r in roles.items()} == {"fit": "C", "confirm": "B", "sealed": "A"}
+    assert {role: r.name for role, r in roles.items()} == {"train": "C", "validation": "B", "test": "A"}
     assert asked == [("C", {"closer": 1.0}, 3000), ("B", {"closer": 1.0}, 3001), ("A", {"closer": 1.0}, 3002)]
     record_synthetic(door_scene(), {"closer": 1.0}, tmp_path, 1, 3, False)
     assert len(asked) == 3
@@ -373,7 +375,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """A case compiled already, of small budgets; no replays at a quarter of the time step, and no page."""
     monkeypatch.setattr(gap, "config_of", lambda command: QUICK)
     monkeypatch.setattr(missing, "make_case", lambda *arguments, **roles: small().case)
-    monkeypatch.setattr(missing, "numerical_floor", lambda *arguments: FLOOR)
+    monkeypatch.setattr(missing, "discretisation_error", lambda *arguments: FLOOR)
     monkeypatch.setattr(report, "write", lambda folder: folder / "report.html")
 
 
@@ -404,7 +406,7 @@ def test_the_base_fit_begins_at_an_earlier_fit(place: Path, quick: None, monkeyp
     folder = fit_json(place / "all" / "identify", **{**known, first: 1e9, "of_another_model": 1.0})
     assert main(arguments(place, "--fit", folder.parent)) == 130
     (start,) = begun[0]
-    space = small().case.whole
+    space = small().case.full_space
     assert start[space.index(first)] == base[first].high
     for p in base.parameters:
         assert p.name == first or start[space.index(p.name)] == pytest.approx(known.get(p.name, p.mean))
@@ -423,13 +425,13 @@ def test_a_run_goes_on_after_a_stop_and_is_whole(
     """Killed in the search; then with the base fit gone missing, were it asked for again; then finished."""
     pytest.importorskip("tensorboardX")
     command = arguments(place, "--effects", *EFFECTS, "--tensorboard")
-    find = missing.find
+    find = missing.search_effects
 
     def killed(case, base, floor, progress):
         find(case, base, floor, progress)  # what it computed is remembered
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(missing, "find", killed)
+    monkeypatch.setattr(missing, "search_effects", killed)
     assert main(command) == 130
     assert "the same command goes on from here" in capsys.readouterr().err
     out = place / "run"
@@ -439,7 +441,7 @@ def test_a_run_goes_on_after_a_stop_and_is_whole(
 
     setup = json.loads((out / "setup.json").read_text())
     (out / "setup.json").write_text(json.dumps({**setup, "versions": {**setup["versions"], "jax": "0.0.1"}}))
-    monkeypatch.setattr(missing, "find", find)
+    monkeypatch.setattr(missing, "search_effects", find)
     monkeypatch.setattr(missing, "base_fit", lambda *a: pytest.fail("the base fit was kept"))
     assert main(command) == 0
     said = capsys.readouterr().out
@@ -448,7 +450,7 @@ def test_a_run_goes_on_after_a_stop_and_is_whole(
     assert lines[0] == "The model lacks: hinge_preload at door."
     assert re.fullmatch(r"hinge_preload at door: hinge preload \S+ N m, \S+ to \S+ N m \(90 % interval\)", lines[1])
     assert lines[2] == "p = 0.0078 if nothing were missing; base fit converged: yes"
-    assert lines[3].startswith("gap, noise units squared: fit ") and " % closed), confirm " in lines[3]
+    assert lines[3].startswith("gap, noise units squared: train ") and " % closed), validation " in lines[3]
     assert lines[4].startswith("shifted most: door_stiffness ") and lines[4].endswith(" deviations)")
     assert lines[5] == f"report: {out / 'report.html'}"
     files = {p.name for p in out.iterdir()}
@@ -463,14 +465,14 @@ def test_a_run_goes_on_after_a_stop_and_is_whole(
     assert places["before"] == places["after"]
     assert answer["versions"]["jax"] and answer["device"]
 
-    monkeypatch.setattr(missing, "find", lambda *a: pytest.fail("this run is whole"))
+    monkeypatch.setattr(missing, "search_effects", lambda *a: pytest.fail("this run is whole"))
     assert main(command) == 0
     said = capsys.readouterr().out
     assert "holds this run already" in said and said.splitlines()[-6:] == lines
 
     before = (out / "gap.json").read_bytes()
     assert "other settings (seed)" in refused(*command, "--seed", "1")
-    save(record("sealed"), place / "confirm.npz")
+    save(record("test"), place / "validation.npz")
     assert "other settings (recordings)" in refused(*command)
     assert (out / "gap.json").read_bytes() == before
 
@@ -479,7 +481,9 @@ def tied(monkeypatch: pytest.MonkeyPatch) -> None:
     """A search that ends with a tie at once."""
     done = small()
     monkeypatch.setattr(missing, "base_fit", lambda *a: done.base)
-    monkeypatch.setattr(missing, "find", lambda *a: replace(done.verdict, rivals=(done.base,)))
+    monkeypatch.setattr(
+        missing, "search_effects", lambda *a: replace(done.verdict, indistinguishable_models=(done.base,))
+    )
 
 
 def test_ties_come_with_an_experiment(place: Path, quick: None, monkeypatch: pytest.MonkeyPatch):
@@ -493,11 +497,11 @@ def test_ties_come_with_an_experiment(place: Path, quick: None, monkeypatch: pyt
     tied(monkeypatch)
     monkeypatch.setattr(amendments, "separating", apart)
     assert main(arguments(place, "--effects", *EFFECTS)) == 0
-    assert asked == [(["hinge_preload at door", "base"], "fit")]
+    assert asked == [(["hinge_preload at door", "base"], "train")]
     found = read_gap(place / "run").found
     assert found["experiments"] == [
-        {"what": "the same motion twice as fast", "apart": 8.5, "not_made": ""},
-        {"what": "slower", "apart": None, "not_made": "too long"},
+        {"what": "the same motion twice as fast", "distance": 8.5, "not_made": ""},
+        {"what": "slower", "distance": None, "not_made": "too long"},
     ]
     assert found["amendments"] == {"experiments": "made", "final_refit": "made"}
 
@@ -522,7 +526,7 @@ def test_the_verdict_is_there_whatever_becomes_of_what_is_added_to_it(
     assert f"the verdict is in {out / 'gap.json'}: The model lacks: hinge_preload at door." in said.out
     first = read_gap(out)
     assert first.amendments == {"experiments": "to be made", "final_refit": "to be made"}
-    assert first.found["verdict"] == "named" and first.fitted_to == ["fit"]
+    assert first.found["verdict"] == "named" and first.fitted_to == ["train"]
     assert {"gap.npz", "extended.json", "checkpoints"} <= {p.name for p in out.iterdir()}
 
     monkeypatch.setattr(amendments, "separating", failing)
@@ -532,9 +536,9 @@ def test_the_verdict_is_there_whatever_becomes_of_what_is_added_to_it(
     assert "would tell the tied effects apart were not made: no motion can be asked for; the tie stands" in said
     last = read_gap(out)
     assert last.amendments == {"experiments": "not made: no motion can be asked for", "final_refit": "made"}
-    assert last.fitted_to == ["fit", "confirm"] and last.found["effects"] == first.found["effects"]
+    assert last.fitted_to == ["train", "validation"] and last.found["effects"] == first.found["effects"]
 
-    monkeypatch.setattr(missing, "find", lambda *a: pytest.fail("this run is whole"))
+    monkeypatch.setattr(missing, "search_effects", lambda *a: pytest.fail("this run is whole"))
     assert main(command) == 0
 
 
@@ -557,7 +561,7 @@ def test_the_command_as_a_user_runs_it(place: Path):
     said = run(*arguments(place, "--effects", *EFFECTS))
     assert "hinge_preload" in said and (place / "run" / "report.html").stat().st_size > 10_000
     own = ("--scene", SCENE, "--parameters", place / "parameters.json", "--object-joint", "door")
-    again = ("identify", "--recording", place / "fit.npz", *own, "--extended", place / "run" / "extended.json",
+    again = ("identify", "--recording", place / "train.npz", *own, "--extended", place / "run" / "extended.json",
              "--generations", "4", "--population", "10", "--out", place / "identified")  # fmt: skip
     run(*(str(w) for w in again))
     fitted = json.loads((place / "identified" / "fit.json").read_text())

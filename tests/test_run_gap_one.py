@@ -26,7 +26,7 @@ from droid_jax.recordings.recording import Recording
 from droid_jax.report.gap_folder import Gap, read_gap
 from droid_jax.run import main
 
-SEARCH = replace(CONFIG, search=SearchConfig(population=8, parents=None, generations=2), most=1)
+SEARCH = replace(CONFIG, search=SearchConfig(population=8, parents=None, generations=2), max_effects=1)
 LOG = elbow_log(COULOMB)
 pytestmark = pytest.mark.usefixtures("tuned")
 
@@ -52,18 +52,18 @@ def with_repeats(count: int) -> Recording:
 def test_what_recordings_hold_says_how_they_are_used():
     logs = [LOG, replace(LOG, name="other")]
     assert split_of(logs[:1]) is split_of(logs) is Split.BLOCKS
-    assert roles_of(Split.BLOCKS, logs) == {"fit": logs[0], "sealed": logs[1]}
+    assert roles_of(Split.BLOCKS, logs) == {"train": logs[0], "test": logs[1]}
     assert split_of([with_repeats(16)]) is split_of([elbow_log(0.0, 2.0, repeats=16)]) is Split.REPEATS
     three = [with_repeats(8)] * 3
     assert split_of(three) is split_of(three[:2]) is Split.RECORDINGS
-    assert list(roles_of(Split.RECORDINGS, three)) == ["fit", "confirm", "sealed"]
+    assert list(roles_of(Split.RECORDINGS, three)) == ["train", "validation", "test"]
 
 
 def test_halves_are_the_first_and_the_last_repeats():
     whole = elbow_log(0.0, 2.0, repeats=17)
     halves = roles_of(Split.REPEATS, [whole])
     names = {role: r.name for role, r in halves.items()}
-    assert names == {"fit": "elbow, first 8 repeats", "confirm": "elbow, last 9 repeats"}
+    assert names == {"train": "elbow, first 8 repeats", "validation": "elbow, last 9 repeats"}
     joined = np.concatenate([r.channel("torque").values for r in halves.values()])
     np.testing.assert_array_equal(joined, whole.channel("torque").values)
 
@@ -83,7 +83,7 @@ LOST = ("Lost are effects of commands, servos and contacts", "U then holds the n
         ([LOG, elbow_log(0.0, 2.0, repeats=3)], ["the second recording 'elbow' has 3 repeats", "Leave the second out"]),
         ([LOG, with_repeats(1)], ["the second recording 'servo' has commands", "log without repeats and commands"]),
         ([LOG] * 3, ["the fit recording 'elbow' has 1 repeat:", "fewer than 8", "droid_jax.run identify"]),
-        ([with_repeats(8), LOG], ["the confirm recording 'elbow' has 1 repeat:"]),
+        ([with_repeats(8), LOG], ["the validation recording 'elbow' has 1 repeat:"]),
     ],
 )  # fmt: skip
 def test_too_few_repeats_say_what_can_still_be_done(recordings: list[Recording], expected: list[str]):
@@ -105,7 +105,7 @@ def test_what_is_offered_instead_can_be_done():
 
 def test_a_second_log_is_another_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert main(command(tmp_path, [LOG, LOG])) == 2
-    assert "the fit and the sealed recording are the same ('elbow')" in capsys.readouterr().err
+    assert "the fit and the test recording are the same ('elbow')" in capsys.readouterr().err
 
 
 def test_a_log_that_is_too_short_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -122,7 +122,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """A log's search, stopped and taken up again: its folder and what was printed at last."""
     place = tmp_path_factory.mktemp("log")
     words = command(place, [LOG], "--effects", *ASKED)
-    find = missing.find
+    find = missing.search_effects
 
     def killed(*arguments):
         find(*arguments)
@@ -135,9 +135,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(runtime, "tune", lambda *a, **k: None)
-        patch.setattr(missing, "find", killed)
+        patch.setattr(missing, "search_effects", killed)
         assert main(words) == 130
-        patch.setattr(missing, "find", remembered)
+        patch.setattr(missing, "search_effects", remembered)
         with contextlib.redirect_stdout(io.StringIO()) as said:
             assert main(words) == 0
     return place / "run", said.getvalue()
@@ -151,7 +151,7 @@ def found(run: tuple[Path, str]) -> Gap:
 def test_a_log_is_searched_and_its_limits_are_said(run: tuple[Path, str], found: Gap):
     lines = run[1].splitlines()[-7:]
     assert lines[0] == "The model lacks: joint_coulomb at elbow."
-    assert "closed), sealed " in lines[3] and lines[4] == Split.BLOCKS.limits == found.found["split"]["limits"]
+    assert "closed), test " in lines[3] and lines[4] == Split.BLOCKS.limits == found.found["split"]["limits"]
     assert found.found["split"]["by"] == "blocks" and "nothing tells a place from noise" in lines[4]
     (amplitude,) = found.found["amplitudes"]
     assert amplitude["low"] < COULOMB < amplitude["high"] and amplitude["value"] == pytest.approx(COULOMB, rel=0.1)
@@ -163,7 +163,7 @@ def test_a_log_is_searched_and_its_limits_are_said(run: tuple[Path, str], found:
 
 
 def test_each_role_has_its_own_instants(found: Gap):
-    clocks = [found.traces[role]["time"] for role in ("fit", "confirm", "sealed")]
+    clocks = [found.traces[role]["time"] for role in ("train", "validation", "test")]
     together = np.sort(np.concatenate(clocks))
     assert len(np.unique(together)) == len(together)
     assert np.ptp(np.diff(together)) < 1e-6  # nothing is left out
@@ -191,7 +191,7 @@ def test_the_page_of_a_log_claims_no_repeats(run: tuple[Path, str]):
     for untrue in ("repeats' mean", "one repeat's noise", "ten repeats", "Numerical floor", "whole repeats", "Hatched"):
         assert untrue not in page, untrue
     ((roles, sealed), (turns, drawn)) = read_gap(run[0]).sheets
-    assert (roles, turns) == (("sealed",), ("fit", "confirm"))
+    assert (roles, turns) == (("test",), ("train", "validation"))
     assert np.all(np.diff(drawn["time"]) > 0) and drawn["time"][-1] < sealed["time"][0]
 
 
@@ -200,7 +200,7 @@ def test_another_log_is_sealed(tmp_path: Path):
     assert main(command(tmp_path, [LOG.window(0.0, 24.0), other], "--effects", "joint_coulomb", "cable_pull")) == 0
     gaps = read_gap(tmp_path / "run").found["gaps"]
     assert [g["recording"] for g in gaps.values()] == ["elbow, every other block", "elbow, the blocks between", "other"]
-    assert gaps["sealed"]["after"] < 0.1 * gaps["sealed"]["before"]
+    assert gaps["test"]["after"] < 0.1 * gaps["test"]["before"]
 
 
 # ----- one recording with repeats
@@ -217,10 +217,10 @@ def test_the_second_half_of_the_repeats_confirms(
     answer = json.loads((tmp_path / "run" / "gap.json").read_text())
     assert answer["split"] == {"by": "repeats", "limits": Split.REPEATS.limits}
     names = {role: g["recording"] for role, g in answer["gaps"].items()}
-    assert names == {"fit": "elbow, first 8 repeats", "confirm": "elbow, last 8 repeats"}
+    assert names == {"train": "elbow, first 8 repeats", "validation": "elbow, last 8 repeats"}
     assert answer["amplitudes"][0]["value"] == pytest.approx(COULOMB, rel=0.05)
     page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
-    assert "acts alike in this motion" in page and "No recording was kept sealed" in page
+    assert "acts alike in this motion" in page and "No recording was kept as test data" in page
     assert "there is no numerical floor" in page and "Numerical floor" not in page
 
 

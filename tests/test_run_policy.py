@@ -289,7 +289,7 @@ def test_films_are_of_the_trials_of_median_angle(tmp_path: Path, monkeypatch: py
     ("fit", "robot", "another"), [("fit", {}, True), ("fit", {"springs": 1, "seed": 0}, False), (None, {}, False)]
 )
 def test_trials_on_another_robot_than_the_fitted_one_say_so(fit: str | None, robot: dict, another: bool, capsys):
-    """With recordings of one's own the synthetic robot is another robot; without a fit there is none that it
+    """With recordings of your own the synthetic robot is another robot; without a fit there is none that it
     could be.
     """
     trials = {"success_rate": 1.0, "interval_95": [0.9, 1.0], "angle_deg": {"mean": 40.0, "std": 1.0}}

@@ -35,14 +35,14 @@ def converted() -> list[str]:
     """The arguments of the page's first command."""
     text = (HERE / "README.md").read_text().replace("\\\n", " ")
     command = re.findall(r"^python -m droid_jax\.run (convert .*)$", text, re.MULTILINE)[0]
-    bags = sorted(str(path) for path in Path("data/fit").iterdir())
-    return [part for word in command.split() for part in (bags if word == "data/fit/*" else [word])]
+    bags = sorted(str(path) for path in Path("data/train").iterdir())
+    return [part for word in command.split() for part in (bags if word == "data/train/*" else [word])]
 
 
 def test_its_bags_become_a_recording(copy: Path, capsys: pytest.CaptureFixture[str]):
     assert main(converted()) == 0
     assert "10 repeats of 4.0 s, channels torque (2 x 400), position (2 x 400)" in capsys.readouterr().out
-    assert load("runs/fit.npz").name == "fit"  # as the page of the search calls the motion
+    assert load("runs/train.npz").name == "train"  # as the page of the search calls the motion
 
 
 def test_the_notebook_is_stored_without_outputs():
@@ -83,7 +83,7 @@ def test_the_notebook_runs_and_finds_the_friction(copy: Path, monkeypatch: pytes
             exec(compile("".join(cell["source"]), "your_robot.ipynb", "exec"), names)
     found = json.loads((copy / "runs" / "gap" / "gap.json").read_text())
     assert found["verdict"] == "named" and found["effects"] == ["joint_coulomb at shoulder"]
-    assert found["gaps"]["sealed"]["closed"] > 0.95
+    assert found["gaps"]["test"]["closed"] > 0.95
     at = dict(zip(names["extended"].space.names, names["extended"].values, strict=True))
     assert all(at[name] == pytest.approx(value, rel=0.1) for name, value in names["truth"].items())
     assert names["angles"].shape == (16, 200, 2)

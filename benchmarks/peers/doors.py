@@ -23,8 +23,8 @@ from droid_jax.cost.cost import make_cost
 from droid_jax.door.demonstration import demonstration_path
 from droid_jax.door.scene import door_scene
 from droid_jax.door.space import JOINT_DAMPING, door_nuisances, door_space
-from droid_jax.identify.holdout import split
-from droid_jax.identify.pipeline import identify
+from droid_jax.identify.holdout import split_repeats
+from droid_jax.identify.pipeline import identify_parameters
 from droid_jax.model.parameters import Space
 from droid_jax.recordings.formats import load
 from droid_jax.recordings.recording import Recording
@@ -49,10 +49,10 @@ def door(springs: int, quick: bool) -> dict[str, Any]:
     space, nuisances = door_space(scene), door_nuisances(scene)
     full = space + nuisances
     began = time.perf_counter()
-    found = identify(scene, space, data, nuisances=nuisances, config=settings(quick, springs))
+    found = identify_parameters(scene, space, data, nuisances=nuisances, config=settings(quick, springs))
     seconds = time.perf_counter() - began
     assert found.refined is not None
-    told = [t.identifiable and not p.nuisance for t, p in zip(found.tells, full.parameters, strict=True)]
+    told = [t.identifiable and not p.nuisance for t, p in zip(found.identifiability, full.parameters, strict=True)]
     at = np.array([truth[n] for n in full.names])
     fits = {"ours": _figures(full, at, found.best, found.full_gaussian.interval(0.95), np.array(told), seconds)}
     fits["ours"]["says"] = [f"{int(sum(told))} of {len(space)} parameters are told by this motion"]
@@ -67,7 +67,7 @@ def door(springs: int, quick: bool) -> dict[str, Any]:
 
 def _theirs(full: Space, data: Sequence[Recording], quick: bool) -> dict[str, peer.PeerFit]:
     """Its fits by name: from our start, from where its own warning advises, and with the priors of the nuisances."""
-    fitted = [split(r, 0.3)[0] for r in data]
+    fitted = [split_repeats(r, 0.3)[0] for r in data]
     scene = door_scene(timestep=THEIRS)
     out = {}
     for name, way in WAYS.items():
@@ -104,7 +104,7 @@ def _figures(
 
 def heldout_gap(space: Space, data: Sequence[Recording], values: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """Equation 1 without penalties, N m, of each vector on the repeats that no fit has seen, by recording."""
-    held = [split(r, 0.3)[1] for r in data]
+    held = [split_repeats(r, 0.3)[1] for r in data]
     judge = make_cost(door_scene(timestep=JUDGE), space, held, engine="mujoco")
     rows = np.stack(list(values.values()))
     distances = judge.distances(rows) - judge.penalties(rows)

@@ -166,7 +166,7 @@ def _ours(scene: Scene, space: Space, recording: Recording, engine: str, mj_step
     began = time.perf_counter()
     config = CompareConfig(channels={"position": 1.0, "velocity": 1.0}, whitened=True, mj_step=mj_step)
     cost = make_cost(scene, space, [recording], engine=engine, config=config)
-    found = refine(cost.whitened, space, space.mean[None], RefineConfig(hops=0, spreads=0))
+    found = refine(cost.whitened, space, space.mean[None], RefineConfig(basin_hops=0, spreads=0))
     return found.best, time.perf_counter() - began
 
 

@@ -2,7 +2,7 @@
 
     python docs/examples/two_link.py
 
-`fit` is all that a study of one's own needs; `record` stands in for the robot, with plain C MuJoCo.
+`fit` is all that a study of your own needs; `record` stands in for the robot, with plain C MuJoCo.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def fit(recording: dj.Recording, config: dj.IdentifyConfig | None = None) -> Ide
     )
     cost = dj.make_cost(scene, space, [recording])
     print(f"before: {cost(space.mean[None])[0]:.3f} N m")
-    found = dj.identify(scene, space, [recording], config=config)
+    found = dj.identify_parameters(scene, space, [recording], config=config)
     print(f"after:  {cost(found.best[None])[0]:.3f} N m")
     return found
 

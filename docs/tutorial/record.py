@@ -4,7 +4,7 @@
 
 It differs from arm.xml in its forearm's mass and its joints' damping, and in something that arm.xml has no number
 for: dry friction in the shoulder, a little less of it while the joint moves fast.  Ten repeats of each of three
-motions, with noise on the motor torques: fit as a ROS 2 bag for each repeat, confirm and sealed as CSV folders.
+motions, with noise on the motor torques: train as a ROS 2 bag for each repeat, validation and test as CSV folders.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ FRICTION = 0.7  # N m, of the shoulder
 STIFFNESS = (80.0, 40.0)  # N m/rad, as in arm.xml
 REPEATS, RATE, FINE = 10, 100.0, 20  # samples per second; steps of the simulation between two samples
 NOISE, START = 0.03, 0.002  # N m; rad by which a repeat starts elsewhere
-MOTIONS = {"fit": (0.5, 1.9, 0.8, 2.9), "confirm": (0.7, 1.2, 0.5, 2.3), "sealed": (0.4, 2.6, 0.9, 1.7)}
+MOTIONS = {"train": (0.5, 1.9, 0.8, 2.9), "validation": (0.7, 1.2, 0.5, 2.3), "test": (0.4, 2.6, 0.9, 1.7)}
 SECONDS = 4.0
 
 
@@ -124,7 +124,7 @@ def main() -> None:
     data.mkdir()
     for seed, name in enumerate(MOTIONS):
         made = recording(name, seed)
-        if name == "fit":
+        if name == "train":
             write_bags(data / name, made)
         else:
             print(dj.save_recording(made, data / name))

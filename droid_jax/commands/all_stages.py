@@ -23,7 +23,7 @@ from droid_jax.storage import write_json
 
 Stage = Literal["identify", "gap", "train", "evaluate"]
 STAGES: tuple[Stage, ...] = typing.get_args(Stage)
-IN_A_SCENE: tuple[Stage, ...] = ("identify", "gap")  # of one's own: policies are trained at the built-in door
+IN_A_SCENE: tuple[Stage, ...] = ("identify", "gap")  # of your own: policies are trained at the built-in door
 
 
 class _Presets(NamedTuple):
@@ -56,7 +56,7 @@ class All:
     standard (100 generations; not identify's paper, whose servo no policy can be trained on), train with paper; hours.
     gpu: all with gpu."""
     recording: tuple[Path, ...] = ()
-    """FIT CONFIRM [SEALED], ONE or LOG [SEALED], as in gap; with fewer repeats: --stages identify."""
+    """TRAIN VALIDATION [TEST], ONE or LOG [SEALED], as in gap; with fewer repeats: --stages identify."""
     scene: Path | None = None
     """Your own MJCF instead of the built-in door: identify and gap, policies are trained at the built-in one."""
     parameters: Path | None = None
@@ -69,7 +69,7 @@ class All:
     """Logs without commands: cutoff of the filter of the measured positions, Hz; default: 20."""
     effect_scale: float = 1.0
     """Forces and torques of the library's effects, relative to an arm of a Panda's size, as in gap."""
-    own_effects: Path | None = None
+    user_effects: Path | None = None
     """Python file that registers effects of your own (docs/method-gap.md); it is run."""
     hide: tuple[str, ...] | None = None
     """What the synthetic robot hides, name=amplitude; none for nothing. Default: magnetic_catch=1.5 (N m)."""
@@ -111,7 +111,7 @@ def run(command: All) -> None:
     from droid_jax.model.effects.registry import check_scale
 
     check_scale(command.effect_scale)
-    load_effects(command.own_effects)
+    load_effects(command.user_effects)
     roles = _roles(command)
     _needs_robot(command)
     out = prepare_folder(command.out)
@@ -220,7 +220,7 @@ def _needs_robot(command: All) -> None:
 
 
 def _roles(command: All) -> tuple[str, ...]:
-    """What each recording is for: "fit", "confirm" or "sealed".
+    """What each recording is for: "train", "validation" or "test".
 
     Raises ValueError, before anything long begins, where the search could not use them.  Without the search there is
     nothing to seal, unless a search could be made later.
@@ -228,26 +228,26 @@ def _roles(command: All) -> tuple[str, ...]:
     if not command.recording:
         needs_log(command.motion_cutoff, ())
         return tuple(DEMONSTRATIONS)
-    from droid_jax.discrepancy.inputs import shared_out
+    from droid_jax.discrepancy.inputs import assigned_roles
     from droid_jax.model.effects.registry import joined
 
     own = gap.Gap(command.recording, preset=PRESETS[command.preset].identify, **_own(command))
     scene, base = gap.model_of(own)
     given = gap.given_to(own)
     try:
-        _, roles = shared_out(scene, given)
+        _, roles = assigned_roles(scene, given)
         if "gap" in command.stages:  # names that are taken are told now, and not after the fit
             joined(base, gap.chosen_effects(own, scene, given))
     except ValueError:
         if "gap" in command.stages:
             raise
-        return ("fit",) * len(command.recording)
+        return ("train",) * len(command.recording)
     return tuple(roles)
 
 
 def _own(command: All) -> dict[str, Any]:
-    """The options of recordings, a scene and effects of one's own, which both stages with them take."""
-    names = ("scene", "parameters", "joints", "object_joint", "motion_cutoff", "own_effects")
+    """The options of recordings, a scene and effects of your own, which both stages with them take."""
+    names = ("scene", "parameters", "joints", "object_joint", "motion_cutoff", "user_effects")
     return {name: getattr(command, name) for name in names}
 
 
@@ -256,17 +256,17 @@ def _plan(
 ) -> dict[str, Callable[[], None]]:
     """The stages that were asked for."""
     presets = PRESETS[command.preset]
-    common: dict[str, Any] = {"seed": command.seed, "again": command.again, "own_effects": command.own_effects}
+    common: dict[str, Any] = {"seed": command.seed, "again": command.again, "user_effects": command.user_effects}
     own, board = _own(command) | common, {"tensorboard": command.tensorboard}
-    # A sealed one stays sealed until the search opens it.
-    seen = tuple(path for path, role in zip(recordings, roles, strict=False) if role != "sealed")
+    # Test data stay closed until the search opens them.
+    seen = tuple(path for path, role in zip(recordings, roles, strict=False) if role != "test")
 
     def fit() -> None:
         _stage(identify.run, identify.Identify(presets.identify, seen, out=out / "identify", **board, **own))
 
     def search() -> None:
-        # A log in blocks of time has no confirming recording, and its base fit needs no start.
-        fit = out / "identify" if "confirm" in roles and _fitted(out / "identify", command, recordings) else None
+        # A log in blocks of time has no validation recording, and its base fit needs no start.
+        fit = out / "identify" if "validation" in roles and _fitted(out / "identify", command, recordings) else None
         scale = command.effect_scale
         _stage(gap.run, gap.Gap(recordings, fit, presets.identify, effect_scale=scale, out=out / "gap", **board, **own))
 

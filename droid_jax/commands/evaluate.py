@@ -46,7 +46,7 @@ class Evaluate:
     """Seed of start poses and sensor noise."""
     film: bool = True
     """Film a good and a bad trial."""
-    own_effects: Path | None = None
+    user_effects: Path | None = None
     """Python file that registers effects of your own (docs/method-gap.md); it is run."""
     again: bool = False
     """Try again what was tried already."""
@@ -71,7 +71,7 @@ def run(command: Evaluate) -> None:
     from droid_jax.synthetic.policy_trials import transfer
 
     folder = stage_folder(command.run, "train", TRAINING)
-    load_effects(command.own_effects, folder)
+    load_effects(command.user_effects, folder)
     trained = read_training(folder)
     setup, policy = trained["setup"], load(folder / POLICY)
     setup_now = {**setup_of(command), "run": str(folder), "policy_sha256": file_sha256(folder / POLICY)}

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 RUNS = Path("runs")  # where results go unless --out says otherwise
 BEGUN = set[Path]()  # folders of the runs that this process began
-HASHED = ("own_effects", "extended")  # options whose file is in no other hash of a setup
+HASHED = ("user_effects", "extended")  # options whose file is in no other hash of a setup
 LATER = ("budget",)  # options of which nothing that an unfinished run has kept depends
 CODE = "versions"  # in setup.json: of the code that began the run, which others may go on with
 PATHS = ("recording", "scene", "parameters", "fit", "run", *HASHED)  # beside each a setup holds what the file says

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from droid_jax.discrepancy.amendments import Amended
-    from droid_jax.discrepancy.case import Case, GapConfig
+    from droid_jax.discrepancy.case import Case, DiscrepancyConfig
     from droid_jax.model.effect_interface import Effect
     from droid_jax.model.parameters import Space
     from droid_jax.model.scene import Scene
@@ -35,19 +35,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Gap:
-    """Find the physical effect that the model lacks: fit, ask a library of effects, confirm on what was not fitted.
+    """Find the physical effect that the model lacks: fit, ask a library of effects, validate on what was not fitted.
 
     Without --recording a synthetic robot with a hidden effect is recorded first.
     """
 
     recording: tuple[Path, ...] = ()
-    """FIT CONFIRM [SEALED]: two or three motions of the same robot and object, eight repeats or more of each.
+    """TRAIN VALIDATION [TEST]: two or three motions of the same robot and object, eight repeats or more of each.
     The fit sees the first, effects are chosen on the second, the third is opened when all is decided.
 
     ONE: one motion, sixteen repeats or more; the second half of them confirms.
 
-    LOG [SEALED]: without repeats and commands; blocks of time fit and confirm in turns, the last third or the second
-    log is sealed. Of one motion less can be concluded, and the report says what."""
+    LOG [TEST]: without repeats and commands; blocks of time train and validate in turns, the last third or the second
+    log is test data. Of one motion less can be concluded, and the report says what."""
     fit: Path | None = None
     """Folder of a finished `identify` (or `all`) of this robot and object: the base fit begins there instead of with a
     search."""
@@ -68,9 +68,9 @@ class Gap:
     without: tuple[str, ...] = ()
     """Effects of the library to leave out."""
     effect_scale: float = 1.0
-    """Forces and torques of the library's effects, relative to an arm of a Panda's size: priors, bounds and the sizes
-    worth a name are taken times this. An axis that is driven with a kilonewton: 30."""
-    own_effects: Path | None = None
+    """Forces and torques of the library's effects, relative to an arm of a Panda's size: priors, bounds and minimum
+    effect sizes are taken times this. An axis that is driven with a kilonewton: 30."""
+    user_effects: Path | None = None
     """Python file that registers effects of your own (docs/method-gap.md); it is run."""
     budget: float | None = None
     """Minutes after which no further candidate is tried; the report says what was left out."""
@@ -100,7 +100,7 @@ def run(command: Gap) -> None:
     needs_writer(command.tensorboard)
     runtime.start()
     warn_of_cpu(command.preset)
-    from droid_jax.discrepancy.inputs import shared_out
+    from droid_jax.discrepancy.inputs import assigned_roles
     from droid_jax.discrepancy.missing import case_of
     from droid_jax.discrepancy.results import write_amended, write_gap
     from droid_jax.discrepancy.split import Split
@@ -110,7 +110,7 @@ def run(command: Gap) -> None:
 
     out = command.out
     fit = None if command.fit is None else stage_folder(command.fit, "identify", FIT)
-    load_effects(command.own_effects, fit)
+    load_effects(command.user_effects, fit)
     scene, base = model_of(command)
     given = given_to(command)
     needs_log(command.motion_cutoff, given)
@@ -124,7 +124,7 @@ def run(command: Gap) -> None:
         _done(out)
         return
     known = not command.again and to_be_amended(out)  # its verdict is there and stays there
-    split, roles = shared_out(scene, given) if given else (Split.RECORDINGS, {})
+    split, roles = assigned_roles(scene, given) if given else (Split.RECORDINGS, {})
     if split is Split.BLOCKS and start is not None:
         print("a log without repeats is fitted without a search: --fit is not needed")
     config = config_of(command)
@@ -150,7 +150,7 @@ def run(command: Gap) -> None:
     def keep(case: Case, now: Amended, seconds: Mapping[str, float]) -> None:
         """First the verdict, then each amendment to it: a stop or an error between them loses neither."""
         write = write_amended if written else write_gap
-        write(out, case, now.verdict, now.handed, {**description, "seconds": dict(seconds)}, now.states)
+        write(out, case, now.verdict, now.final, {**description, "seconds": dict(seconds)}, now.states)
         written.append(now.verdict.sentence)
 
     try:
@@ -207,36 +207,36 @@ def chosen_effects(command: Gap, scene: Scene, recordings: list[Recording]) -> t
 
     Raises ValueError for unknown names, for effects that this scene cannot have, and where none is left.
     """
-    from droid_jax.discrepancy.candidates import possible
+    from droid_jax.discrepancy.candidates import observable_effects
     from droid_jax.model.effects.registry import library
 
     library(scene, command.without)  # names are checked there
-    here = possible(scene, recordings, command.effect_scale)
+    here = observable_effects(scene, recordings, command.effect_scale)
     asked = {e.name for e in library(scene, command.effects or None)}
     names = {e.name for e in here}
     impossible = [name for name in command.effects if name not in names]
     left = tuple(e for e in here if e.name in asked and e.name not in command.without)
-    nowhere = [e.name for e in left if not e.places]
+    nowhere = [e.name for e in left if not e.locations]
     if nowhere:
-        what = f"effects {', '.join(nowhere)} state no places (Effect.places), where they could be asked about"
+        what = f"effects {', '.join(nowhere)} state no locations (Effect.locations), where they could be asked about"
         if {*nowhere} & {*command.effects}:
             raise ValueError(what)
         warnings.warn(f"{what}: they are left out", stacklevel=2)
-    if impossible or not any(e.places for e in left):
+    if impossible or not any(e.locations for e in left):
         what = f"cannot have {', '.join(impossible)}" if impossible else "is left without any effect"
         raise ValueError(f"scene {scene.name!r} {what} here; it can have: {', '.join(sorted(names))}")
     return left
 
 
-def config_of(command: Gap) -> GapConfig:
+def config_of(command: Gap) -> DiscrepancyConfig:
     """The preset with the command's own numbers."""
-    from droid_jax.discrepancy.case import SETTLED, GapConfig
+    from droid_jax.discrepancy.case import SETTLED, DiscrepancyConfig
     from droid_jax.identify.multistart import RefineConfig
 
     if command.budget is not None and not command.budget > 0:
         raise ValueError(f"--budget must be above 0 minutes, got {command.budget:g}")
-    asked: dict[str, Any] = {} if command.budget is None else {"budget": command.budget}
-    return GapConfig(
+    asked: dict[str, Any] = {} if command.budget is None else {"budget_minutes": command.budget}
+    return DiscrepancyConfig(
         search=search_config(command.preset, command.seed),
         refine=replace(refine_config(command.preset) or RefineConfig(), iterations=SETTLED),
         compare=compared(command.motion_cutoff),
@@ -250,7 +250,7 @@ def given_to(command: Gap) -> list[Recording]:
     needs_recording(command)
     if len(command.recording) > 3:
         raise ValueError(
-            f"--recording takes FIT CONFIRM [SEALED], or ONE with repeats, or LOG [SEALED] without, got "
+            f"--recording takes TRAIN VALIDATION [TEST], or ONE with repeats, or LOG [SEALED] without, got "
             f"{len(command.recording)} recordings; `python -m droid_jax.run identify` fits any number"
         )
     return [recording_at(path) for path in command.recording]

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from droid_jax.discrepancy.amendments import Amended
     from droid_jax.discrepancy.case import Case
-    from droid_jax.discrepancy.final_refit import HandedOn
+    from droid_jax.discrepancy.final_refit import FinalModel
     from droid_jax.discrepancy.split import Split
     from droid_jax.discrepancy.verdict import Verdict
     from droid_jax.recordings.recording import Recording
@@ -32,7 +32,7 @@ def searched(
     start: np.ndarray | None = None,
     board: Path | None = None,
     keep: Callable[[Case, Amended, Mapping[str, float]], None] = lambda case, now, seconds: None,
-) -> tuple[Case, Verdict, HandedOn, dict[str, float]]:
+) -> tuple[Case, Verdict, FinalModel, dict[str, float]]:
     """The case, its verdict and the model to hand on, going on from `checkpoints`; and each stage's seconds.
 
     start: [F] values of the base parameters from which their fit begins, instead of a search.
@@ -40,20 +40,23 @@ def searched(
     keep: called with what there is and the seconds so far once the verdict is known, and after each amendment to it.
     """
     from droid_jax.discrepancy.amendments import amended
-    from droid_jax.discrepancy.missing import answer
+    from droid_jax.discrepancy.missing import search
     from droid_jax.discrepancy.split import Split
     from droid_jax.report.progress import stages
     from droid_jax.report.scalars import scalars
 
     names = IN_BLOCKS if split is Split.BLOCKS else BARS if start is None else BARS[1:]
-    with stages(names, {"look": case.config.looked, "refit": case.config.refitted}) as show, scalars(board) as write:
+    with (
+        stages(names, {"look": case.config.one_step_fits, "refit": case.config.full_refits}) as show,
+        scalars(board) as write,
+    ):
         clock = Clock(names, (show, write), checkpoints / "seconds.json")
         clock(names[0], None)
-        case, verdict = answer(split, case, roles, start, clock, checkpoints)
-        for now in amended(case, verdict, roles["fit"], clock):
+        case, verdict = search(split, case, roles, start, clock, checkpoints)
+        for now in amended(case, verdict, roles["train"], clock):
             clock.stop()
             keep(case, now, clock.seconds)
-            verdict, handed = now.verdict, now.handed
+            verdict, handed = now.verdict, now.final
     return case, verdict, handed, clock.seconds
 
 

@@ -55,7 +55,7 @@ class Identify:
     """Joint of the thing that is moved, in your own scene."""
     extended: Path | None = None
     """extended.json of a gap search: the effects that it named are in the model and fitted too."""
-    own_effects: Path | None = None
+    user_effects: Path | None = None
     """Python file that registers effects of your own (docs/method-gap.md); it is run."""
     engine: Literal["mjx", "mujoco"] = "mjx"
     """mjx: compiled, all devices.  mujoco: plain C, all cores; for motor-side torques, without gravity where the
@@ -97,7 +97,7 @@ def run(command: Identify) -> None:
     needs_writer(command.tensorboard)
     runtime.start()
     warn_of_cpu(command.preset)
-    from droid_jax.identify.pipeline import cost_samples, prepare, solve
+    from droid_jax.identify.pipeline import cost_samples, prepare, run_fit
     from droid_jax.identify.results import prepare_folder, write_run
     from droid_jax.identify.solution_checks import creep_of_fit
     from droid_jax.preflight.check_log import check_log
@@ -106,7 +106,7 @@ def run(command: Identify) -> None:
     from droid_jax.report.scalars import FOLDER, scalars
     from droid_jax.storage import write_bytes
 
-    load_effects(command.own_effects, None if command.extended is None else command.extended.parent)
+    load_effects(command.user_effects, None if command.extended is None else command.extended.parent)
     out = command.out
     scene, space, nuisances = model_of(command)
     scene, space, effects = _extended(command, scene, space)
@@ -136,7 +136,7 @@ def run(command: Identify) -> None:
             show(stage, value)
             write(stage, value)
 
-        found = solve(problem, checkpoints=out / "checkpoints", progress=progress)
+        found = run_fit(problem, checkpoints=out / "checkpoints", progress=progress)
         description = {
             **_description(command, found, recordings),
             "started": started,
@@ -286,11 +286,11 @@ def _summary(found: Identified, fit: Mapping[str, Any], repeats: Sequence[int]) 
     from droid_jax.report.told import moved_words, unsure_words, went_far
     from droid_jax.report.words import DOUBT, asked_of, far_off, judged, lacks_something, needed, noiseless, percent
 
-    for name, gap in found.gaps.items():
+    for name, gap in found.torque_distances.items():
         way = "one repeat: what noise alone would leave is not known"
-        if gap.floor is not None:
+        if gap.noise_floor is not None:
             closed = "there was none to close" if gap.closed is None else f"{percent(gap.closed)} of the gap closed"
-            way = f"a perfect model: {gap.floor:.3f}; {closed}"
+            way = f"a perfect model: {gap.noise_floor:.3f}; {closed}"
         on = judged(fit["gap"][name])
         print(f"{name}: torque distance {gap.before:.3f} -> {gap.after:.3f} {fit['torque_unit']} {on} ({way})")
     silent = [p for p in fit["parameters"] if not p["identifiable"] and not p["nuisance"]]

@@ -46,4 +46,4 @@ def refine_config(preset: Preset) -> RefineConfig | None:
 
     if preset == "paper":
         return None
-    return RefineConfig(hop_generations=12) if preset == "quick" else RefineConfig()
+    return RefineConfig(basin_hop_generations=12) if preset == "quick" else RefineConfig()

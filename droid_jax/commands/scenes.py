@@ -1,4 +1,4 @@
-"""A scene of one's own and recordings in it, as `identify` and `gap` take them from the command line."""
+"""A scene of your own and recordings in it, as `identify` and `gap` take them from the command line."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ class OwnScene(Protocol):
 
 
 def needs_scene(options: OwnScene) -> None:
-    """ValueError for options that describe a scene of one's own where none is given."""
+    """ValueError for options that describe a scene of your own where none is given."""
     for name in ("parameters", "joints", "object_joint"):
         if options.scene is None and getattr(options, name):
             raise ValueError(f"--{name.replace('_', '-')} is for a scene of your own: give --scene too")
 
 
 def needs_recording(options: OwnScene) -> None:
-    """ValueError for a scene of one's own in which nothing was measured."""
+    """ValueError for a scene of your own in which nothing was measured."""
     if options.scene is not None and not options.recording:
         raise ValueError("--scene needs --recording: the synthetic robot only knows the built-in door")
 

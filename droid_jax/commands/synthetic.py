@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from droid_jax.model.scene import Scene
     from droid_jax.recordings.recording import Recording
 
-DEMONSTRATIONS = {"fit": "C", "confirm": "B", "sealed": "A"}
+DEMONSTRATIONS = {"train": "C", "validation": "B", "test": "A"}
 HIDE = ("magnetic_catch=1.5",)  # N m
 OPTIONS = {
     "hide": None,
@@ -105,7 +105,7 @@ def record_synthetic(
 
 
 def kept_at(out: Path) -> tuple[Path, ...]:
-    """Files of the synthetic robot's motions in a run's folder: fit, confirm, sealed."""
+    """Files of the synthetic robot's motions in a run's folder: train, validation, test."""
     return tuple(out / "recordings" / f"{name}.npz" for name in DEMONSTRATIONS.values())
 
 

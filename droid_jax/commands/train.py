@@ -44,7 +44,7 @@ class Train:
     """Actions in all, rounded up to whole rounds; default: the preset's."""
     seed: int = 0
     """Seed of the networks and of the environments."""
-    own_effects: Path | None = None
+    user_effects: Path | None = None
     """Python file that registers effects of your own (docs/method-gap.md); it is run."""
     tensorboard: bool = False
     """Write scalars for TensorBoard while it runs, to OUT/tensorboard."""
@@ -73,7 +73,7 @@ def run(command: Train) -> None:
     from droid_jax.storage import write_bytes, write_json
 
     out, fit = command.out, _fit_folder(command)
-    load_effects(command.own_effects, fit)
+    load_effects(command.user_effects, fit)
     scene, gaussian, effects = source(fit, command.knob)
     gaussian = _chosen(command, gaussian)
     origin = {

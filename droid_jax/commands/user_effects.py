@@ -1,4 +1,4 @@
-"""Effects of one's own on the command line: a Python file that registers them."""
+"""Effects of your own on the command line: a Python file that registers them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from droid_jax.report.stages import setup
 
 
 def load_effects(path: Path | None, *folders: Path | None) -> None:
-    """Run a file of effects of one's own, which are in the library from then on (docs/method-gap.md).
+    """Run a file of effects of your own, which are in the library from then on (docs/method-gap.md).
 
     folders: of runs that are read: one that was made with such effects needs them.  Its setup.json is not followed to
     the file: results that come from elsewhere run no code.
@@ -18,18 +18,18 @@ def load_effects(path: Path | None, *folders: Path | None) -> None:
     """
     if path is None:
         for folder in (f for f in folders if f is not None):
-            if told := setup(folder).get("own_effects"):
-                raise ValueError(f"{folder} was made with effects of one's own: give --own-effects {told}")
+            if told := setup(folder).get("user_effects"):
+                raise ValueError(f"{folder} was made with effects of your own: give --user-effects {told}")
         return
     if not path.is_file():
-        raise ValueError(f"--own-effects: there is no file {path}")
+        raise ValueError(f"--user-effects: there is no file {path}")
     # One name for one file: read again by the next stage of `all`, it registers the same effects and no others.
-    name = f"own_effects_{path.stem}"
+    name = f"user_effects_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
-        raise ValueError(f"--own-effects takes a Python file (.py), got {path}")
+        raise ValueError(f"--user-effects takes a Python file (.py), got {path}")
     sys.modules[name] = module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
     except Exception as error:
-        raise ValueError(f"--own-effects {path}: {type(error).__name__}: {error}") from error
+        raise ValueError(f"--user-effects {path}: {type(error).__name__}: {error}") from error

@@ -33,7 +33,7 @@ from droid_jax.preflight.preflight import check_range, warn_if_moving, warn_of_c
 from droid_jax.recordings.checks import validate
 from droid_jax.recordings.recording import Recording, recordings_of
 from droid_jax.simulate.batching import in_blocks, over_block
-from droid_jax.simulate.c_reference import twin_replay
+from droid_jax.simulate.c_reference import c_replay
 from droid_jax.simulate.initial_state import AJAR, following
 from droid_jax.simulate.inverse_dynamics import Path, path_of, path_replay, prescribed
 from droid_jax.simulate.measured_motion import Motion, measured_motion
@@ -437,7 +437,7 @@ def _engine(
     known = [e for e in effects if e.name != "torque offset"]
 
     def twin(drive: Drive) -> Callable[[np.ndarray], Rollout]:
-        checked = _of_bodies(scene, space, twin_replay(scene, space, drive, known, late=late))
+        checked = _of_bodies(scene, space, c_replay(scene, space, drive, known, late=late))
         return lambda values: jax.tree.map(_single, checked(values))
 
     return Driven(twin, drive)

@@ -120,7 +120,7 @@ def _lags(error: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, float]:
     """
     length, count = error.shape[1], seen.sum(axis=0)
     enough = count >= STEADY
-    error = np.where(enough, untrended(error, seen), error)
+    error = np.where(enough, detrend(error, seen), error)
     lengths, freedom = seen.sum(axis=1, keepdims=True), (count - 1 - enough).clip(0).sum()
     if freedom == 0:
         return np.zeros(length), 0.0
@@ -134,7 +134,7 @@ def _lags(error: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, float]:
     return lags * window, float(np.sum(lengths * constants**2) / freedom)
 
 
-def untrended(x: np.ndarray, seen: np.ndarray | None = None) -> np.ndarray:
+def detrend(x: np.ndarray, seen: np.ndarray | None = None) -> np.ndarray:
     """x [N, ...] without its straight line over the order of the rows; their mean stays.
 
     seen: bool of the same shape, which entries count; all unless given.  Where fewer than two do, x stays.

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from droid_jax.discrepancy.candidate_experiments import separating
 from droid_jax.discrepancy.case import Case
 from droid_jax.discrepancy.extended import extended
-from droid_jax.discrepancy.final_refit import HandedOn, due, handed_on
+from droid_jax.discrepancy.final_refit import FinalModel, due, final_model
 from droid_jax.discrepancy.verdict import Verdict
 from droid_jax.errors import reason
 from droid_jax.files import NOT_MADE, TO_BE_MADE
@@ -27,12 +27,12 @@ MADE, NOT_NEEDED = "made", "not needed"
 class Amended:
     """A verdict with what has been added to it so far.
 
-    handed: the model to hand on, the search's own until the final refit is made.  states: amendment -> MADE,
+    final: the model to hand on, the search's own until the final refit is made.  states: amendment -> MADE,
     NOT_NEEDED, TO_BE_MADE, or "not made: " and the reason.
     """
 
     verdict: Verdict
-    handed: HandedOn
+    final: FinalModel
     states: dict[str, str] = field(default_factory=dict)
 
 
@@ -44,10 +44,10 @@ def amended(
     recording: what the case was fitted to.  An amendment that raises is left out and its state says why.
     """
     states = {
-        EXPERIMENTS: TO_BE_MADE if verdict.rivals else NOT_NEEDED,
+        EXPERIMENTS: TO_BE_MADE if verdict.indistinguishable_models else NOT_NEEDED,
         REFIT: TO_BE_MADE if due(case, verdict.model) else NOT_NEEDED,
     }
-    now = Amended(verdict, HandedOn(verdict.model, (case.fit,)), states)
+    now = Amended(verdict, FinalModel(verdict.model, (case.train,)), states)
     yield now
     if states[EXPERIMENTS] == TO_BE_MADE:
         now = _with_experiments(now, case, recording)
@@ -60,7 +60,7 @@ def amended(
 def _with_experiments(now: Amended, case: Case, recording: Recording) -> Amended:
     verdict = now.verdict
     try:
-        experiments = separating(case, (verdict.model, *verdict.rivals), recording)
+        experiments = separating(case, (verdict.model, *verdict.indistinguishable_models), recording)
     except Exception as error:  # whatever it is: the verdict stands
         return _state(now, EXPERIMENTS, f"{NOT_MADE}: {reason(error)}")
     return _state(replace(now, verdict=replace(verdict, experiments=experiments)), EXPERIMENTS, MADE)
@@ -68,12 +68,12 @@ def _with_experiments(now: Amended, case: Case, recording: Recording) -> Amended
 
 def _refitted(now: Amended, case: Case, progress: Progress) -> Amended:
     try:
-        handed = handed_on(case, now.verdict.model, progress)
+        handed = final_model(case, now.verdict.model, progress)
         extended(case, handed)  # what is written of it can be made
     except Exception as error:  # as above; the search's own model is handed on
-        handed = replace(now.handed, not_made=reason(error))
+        handed = replace(now.final, not_made=reason(error))
     state = f"{NOT_MADE}: {handed.not_made}" if handed.not_made else MADE
-    return _state(replace(now, handed=handed), REFIT, state)
+    return _state(replace(now, final=handed), REFIT, state)
 
 
 def _state(now: Amended, name: str, state: str) -> Amended:

@@ -24,8 +24,8 @@ import numpy as np
 
 from droid_jax.cost.cost import Cost
 from droid_jax.cost.noise import correlation_time
-from droid_jax.discrepancy.residual_set import Evidence, only_comparison, places
-from droid_jax.discrepancy.sign_flips import FEWEST, one_sided_p, sign_flips
+from droid_jax.discrepancy.residual_set import ResidualSet, only_comparison, residual_locations
+from droid_jax.discrepancy.sign_flips import FEWEST_REPEATS, one_sided_p, sign_flips
 
 LENGTH = 1.5  # correlation times of the residual, its columns' median: a block at least
 SHORTEST = 0.5  # s; the low-pass alone reaches 0.2 s to either side
@@ -36,7 +36,7 @@ CHUNK = 256  # flips at once
 
 
 @dataclass(frozen=True, eq=False)
-class Blocks(Evidence):
+class BlockResidualSet(ResidualSet):
     """Blocks of one recording of one repeat; rows of residuals are blocks.
 
     deviations: [1, M] zeros.  block: [M] of each residual, OUTSIDE for what belongs to another part.
@@ -65,12 +65,12 @@ class Blocks(Evidence):
         return int((self.block != OUTSIDE).sum())
 
     @property
-    def tie(self) -> float:
+    def equivalence_factor(self) -> float:
         """Closer to one than with repeats, whose U holds no noise."""
         return TIE
 
     @property
-    def slack(self) -> float:
+    def prior_slack(self) -> float:
         """Priors are loosened: what they hold back is in every block's residual alike and would look like an effect."""
         return SLACK
 
@@ -83,11 +83,11 @@ class Blocks(Evidence):
         """[B, M] B times each block's residuals, zero elsewhere: their mean is the whole residual."""
         return self.units * self._inside * common
 
-    def gap(self, residuals: np.ndarray) -> float:
+    def discrepancy(self, residuals: np.ndarray) -> float:
         """Mean square of the residual, noise included, over the blocks' instants."""
         return float(np.mean(residuals.mean(axis=0)[self.block != OUTSIDE] ** 2))
 
-    def gaps(self, residuals: np.ndarray, cells: np.ndarray) -> np.ndarray:
+    def discrepancies(self, residuals: np.ndarray, cells: np.ndarray) -> np.ndarray:
         """[K] mean square in each cell; cells: [K, M] bool."""
         inside = cells & (self.block != OUTSIDE)
         return inside @ residuals.mean(axis=0) ** 2 / np.maximum(inside.sum(axis=1), 1)
@@ -104,7 +104,7 @@ class Blocks(Evidence):
         """[R, K] squared residual of K models in resamples of the blocks; draws [R, B]."""
         return self.units * draws @ (self._inside @ commons.T**2)
 
-    def largest(
+    def largest_score(
         self, scores: np.ndarray, marks: np.ndarray, base: np.ndarray, prior: np.ndarray, seed: int = 0
     ) -> tuple[np.ndarray, float]:
         """[K] standardised scores of K questions, and the p-value of the largest under flips of blocks.
@@ -130,19 +130,21 @@ class Blocks(Evidence):
         return np.maximum(size - lost, 1e-9 * size)
 
 
-def blocks(cost: Cost, block: np.ndarray) -> Blocks:
-    """The evidence of a cost over one recording of one repeat; block: [K] of each instant of the coarse clock.
+def block_residual_set(cost: Cost, block: np.ndarray) -> BlockResidualSet:
+    """The residual_set of a cost over one recording of one repeat; block: [K] of each instant of the coarse clock.
 
     Raises ValueError for repeats, which need no blocks, and for fewer blocks than flips can use.
     """
     comparison = only_comparison(cost)
     if comparison.repeats > 1:
         raise ValueError(f"recording {comparison.name!r} has {comparison.repeats} repeats: flip these, not blocks")
-    if block.max() + 1 < FEWEST:
-        raise ValueError(f"recording {comparison.name!r}: {block.max() + 1} blocks, at least {FEWEST} are needed")
-    column, time = places(comparison)
+    if block.max() + 1 < FEWEST_REPEATS:
+        raise ValueError(
+            f"recording {comparison.name!r}: {block.max() + 1} blocks, at least {FEWEST_REPEATS} are needed"
+        )
+    column, time = residual_locations(comparison)
     whole = np.tile(block, int(column.max()) + 1)
-    return Blocks(cost, np.zeros((1, len(time))), column, time, whole)
+    return BlockResidualSet(cost, np.zeros((1, len(time))), column, time, whole)
 
 
 def block_length(residuals: np.ndarray) -> float:
@@ -162,11 +164,11 @@ def interleaved(
     would get fewer than FEWEST blocks; it says how long the log should be.
     """
     each = int((end - first) / length) // parts
-    if each < FEWEST:
-        needed = parts * FEWEST * length / share
+    if each < FEWEST_REPEATS:
+        needed = parts * FEWEST_REPEATS * length / share
         raise ValueError(
             f"{end - first:.3g} s hold {each} blocks of {length:.3g} s for each of {parts} parts; "
-            f"{FEWEST} are needed to tell an effect from noise: record for {np.ceil(needed):g} s or longer"
+            f"{FEWEST_REPEATS} are needed to tell an effect from noise: record for {np.ceil(needed):g} s or longer"
         )
     at = np.floor((clock - first) / (end - first) * parts * each).astype(int)
     inside = (clock >= first) & (clock < end)

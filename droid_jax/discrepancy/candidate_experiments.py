@@ -20,8 +20,8 @@ import numpy as np
 
 from droid_jax.cost.cost import Cost, make_cost
 from droid_jax.discrepancy.case import Case
-from droid_jax.discrepancy.refit import Model
-from droid_jax.discrepancy.time_scaling import MENU, warped
+from droid_jax.discrepancy.refit import FittedModel
+from droid_jax.discrepancy.time_scaling import TIME_SCALINGS, time_scaled
 from droid_jax.discrepancy.verdict import Experiment
 from droid_jax.discrepancy.workspace_extrapolation import FURTHER, opened_further
 from droid_jax.errors import reason
@@ -39,7 +39,7 @@ def untouched(scene: Scene) -> Scene:
     return replace(scene, model=model, grip=None)
 
 
-def separating(case: Case, models: Sequence[Model], recording: Recording) -> tuple[Experiment, ...]:
+def separating(case: Case, models: Sequence[FittedModel], recording: Recording) -> tuple[Experiment, ...]:
     """Experiments by how far apart they put the two models that they tell apart least, the best first.
 
     models: tied ones, each refitted.  recording: what the case was fitted to.  Empty for a log without
@@ -49,20 +49,20 @@ def separating(case: Case, models: Sequence[Model], recording: Recording) -> tup
         return ()
     values = np.stack([m.values for m in models])
     found = [_made(what, make) for what, make in _menu(case, values, recording)]
-    return tuple(sorted(found, key=lambda e: -np.inf if e.apart is None else e.apart, reverse=True))
+    return tuple(sorted(found, key=lambda e: -np.inf if e.distance is None else e.distance, reverse=True))
 
 
 def _menu(case: Case, values: np.ndarray, recording: Recording) -> Iterator[tuple[str, Callable[[], Experiment]]]:
     """What there is to try in this scene, in words, and how each is made for models [K, D]."""
-    known = case.fit.cost
+    known = case.train.cost
     config = known.comparisons[0].config
 
     def moved(what: str, motion: Callable[[], Recording]) -> Experiment:
-        cost = make_cost(known.scene, case.whole, [motion()], config=config, effects=case.effects, check=False)
+        cost = make_cost(known.scene, case.full_space, [motion()], config=config, effects=case.effects, check=False)
         return _experiment(what, cost, values)
 
-    for entry in MENU:
-        yield entry.what, functools.partial(moved, entry.what, functools.partial(warped, recording, entry))
+    for entry in TIME_SCALINGS:
+        yield entry.what, functools.partial(moved, entry.what, functools.partial(time_scaled, recording, entry))
     if known.scene.grip is not None:
         yield FURTHER, functools.partial(moved, FURTHER, lambda: _further(known, recording, values[:1]))
     seen = {name: weight for name, weight in config.channels.items() if name != "object_angle"}
@@ -71,12 +71,12 @@ def _menu(case: Case, values: np.ndarray, recording: Recording) -> Iterator[tupl
         def in_the_air() -> Experiment:
             alone = replace(config, channels=seen)
             cost = make_cost(
-                untouched(known.scene), case.whole, [recording], config=alone, effects=case.effects, check=False
+                untouched(known.scene), case.full_space, [recording], config=alone, effects=case.effects, check=False
             )
             return _experiment(IN_THE_AIR, cost, values)
 
         yield IN_THE_AIR, in_the_air
-    if CARRIED in case.whole.names:
+    if CARRIED in case.full_space.names:
         what = f"the same motion with {WEIGHT:g} kg more, weighed, at the hand"
         yield what, lambda: _experiment(what, known, _carrying(case, values))
 
@@ -110,6 +110,6 @@ def _experiment(what: str, cost: Cost, values: np.ndarray) -> Experiment:
 
 def _carrying(case: Case, values: np.ndarray) -> np.ndarray:
     """Models [K, D] with a known weight at the hand."""
-    out, column = values.copy(), case.whole.index(CARRIED)
-    out[:, column] = np.minimum(out[:, column] + WEIGHT, case.whole[CARRIED].high)
+    out, column = values.copy(), case.full_space.index(CARRIED)
+    out[:, column] = np.minimum(out[:, column] + WEIGHT, case.full_space[CARRIED].high)
     return out

@@ -19,45 +19,45 @@ STEERED = ("actuator_", "dof_sol", "pair_")  # how model fields begin that inver
 class Candidate:
     """An effect at a place.
 
-    amplitudes: names of the parameters that make it; shapes: name -> value tried.
+    coefficients: names of the parameters that make it; shape_parameters: name -> value tried.
     """
 
     effect: str
-    place: str
-    amplitudes: tuple[str, ...]
-    shapes: Mapping[str, float] = field(default_factory=dict)
+    location: str
+    coefficients: tuple[str, ...]
+    shape_parameters: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
         """ "latch at door_hinge"."""
-        return f"{self.effect} at {self.place}"
+        return f"{self.effect} at {self.location}"
 
     @property
     def key(self) -> tuple[Any, ...]:
         """Tells candidates apart, shapes included."""
-        return self.effect, self.place, *sorted(self.shapes.items())
+        return self.effect, self.location, *sorted(self.shape_parameters.items())
 
     @property
     def free(self) -> tuple[str, ...]:
         """Names of the parameters that a refit frees."""
-        return (*self.amplitudes, *self.shapes)
+        return (*self.coefficients, *self.shape_parameters)
 
 
-def joined(parts: Iterable[Candidate]) -> str:
+def joined_names(parts: Iterable[Candidate]) -> str:
     """ "latch at door_hinge + drag at door_hinge"."""
     return " + ".join(part.name for part in parts)
 
 
-def possible(scene: Scene, recordings: Iterable[Recording], scale: float = 1.0) -> tuple[Effect, ...]:
+def observable_effects(scene: Scene, recordings: Iterable[Recording], scale: float = 1.0) -> tuple[Effect, ...]:
     """The library's effects that could show in these recordings: in one without commands all but `steers`.
 
     scale: of their forces and torques, see `library`.
     """
     commanded = all(r.command.size for r in recordings)
-    return tuple(e for e in library(scene, scale=scale) if commanded or not steers(e))
+    return tuple(e for e in library(scene, scale=scale) if commanded or not acts_on_commands_only(e))
 
 
-def steers(effect: Effect) -> bool:
+def acts_on_commands_only(effect: Effect) -> bool:
     """Whether an effect is one of commands, servos or constraints alone, which a prescribed motion does not have.
 
     Also one without laws of its own whose parameters write nothing but fields of these (`servo_gain`, `soft_friction`).
@@ -77,11 +77,14 @@ def candidates(effects: Iterable[Effect]) -> tuple[Candidate, ...]:
     """
     out = []
     for effect in effects:
-        grid = [dict(zip(effect.shapes, values, strict=True)) for values in itertools.product(*effect.shapes.values())]
-        for (place, amplitudes), shapes in itertools.product(effect.places.items(), grid):
+        grid = [
+            dict(zip(effect.shape_parameters, values, strict=True))
+            for values in itertools.product(*effect.shape_parameters.values())
+        ]
+        for (place, amplitudes), shapes in itertools.product(effect.locations.items(), grid):
             out.append(Candidate(effect.name, place, amplitudes, shapes))
     if not out:
         raise ValueError(
-            "effects: there is nothing to ask about, none of the effects says its places (`Effect.places`)"
+            "effects: there is nothing to ask about, none of the effects says its locations (`Effect.locations`)"
         )
     return tuple(out)

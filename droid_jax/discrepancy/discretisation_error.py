@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from droid_jax.cost.cost import Cost, make_cost
-from droid_jax.discrepancy.refit import Model
-from droid_jax.discrepancy.residual_set import Evidence
+from droid_jax.discrepancy.refit import FittedModel
+from droid_jax.discrepancy.residual_set import ResidualSet
 from droid_jax.discrepancy.screen import project
 from droid_jax.identify.search import NotReplayed
 from droid_jax.model.parameters import Space
@@ -31,27 +31,29 @@ def above(gap: float, floor: float) -> bool:
     return gap > WORST * floor
 
 
-def finer(evidence: Evidence, base: Space, recording: Recording) -> Cost | None:
+def with_finer_step(residual_set: ResidualSet, base: Space, recording: Recording) -> Cost | None:
     """The cost of the base model at a quarter of the time step; None in inverse mode, which has no time step."""
-    cost = evidence.cost
+    cost = residual_set.cost
     if not isinstance(cost.drives[0], Drive):
         return None
     scene = with_options(cost.scene, timestep=float(cost.scene.model.opt.timestep) / FINER)
     return make_cost(scene, base, [recording], config=cost.comparisons[0].config, check=False)
 
 
-def numerical_floor(evidence: Evidence, model: Model, recording: Recording, fine: Cost | None = None) -> float:
+def discretisation_error(
+    residual_set: ResidualSet, model: FittedModel, recording: Recording, fine: Cost | None = None
+) -> float:
     """U0 of a fitted base model on the recording it was fitted to; zero in inverse mode.
 
     fine: what `finer` made, of this recording or of another with the same commands, to spare a compilation.
     Raises NotReplayed where the finer replay blows up.
     """
-    cost = evidence.cost
-    fine = finer(evidence, model.space, recording) if fine is None else fine.against([recording])
+    cost = residual_set.cost
+    fine = with_finer_step(residual_set, model.space, recording) if fine is None else fine.against([recording])
     if fine is None:
         return 0.0
     values = model.values[cost.space.columns(model.space)]
-    count = evidence.repeats
+    count = residual_set.repeats
     off = (fine.whitened(values[None])[0] - cost.whitened(model.values[None])[0]).astype(np.float64) / np.sqrt(count)
     if not np.isfinite(off).all():
         raise NotReplayed(f"the simulation of {recording.name!r} blows up at a quarter of its time step")

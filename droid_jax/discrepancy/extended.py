@@ -19,7 +19,7 @@ import numpy as np
 from droid_jax.arguments import instance, path_of, shown
 from droid_jax.discrepancy.candidates import Candidate
 from droid_jax.discrepancy.case import Case
-from droid_jax.discrepancy.final_refit import HandedOn
+from droid_jax.discrepancy.final_refit import FinalModel
 from droid_jax.files import EXTENDED, EXTENDED_MJCF
 from droid_jax.identify.gaussian import Coordinates, Gaussian, ParameterEntry, matrix, space_of, space_to_json
 from droid_jax.identify.identifiability import posterior
@@ -33,7 +33,7 @@ from droid_jax.model.scene import Scene
 from droid_jax.read_json import read_json, typed
 from droid_jax.storage import write_json, write_text
 
-FORMAT, VERSION = "droid_jax extended model", 1
+FORMAT, VERSION = "droid_jax extended model", 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,14 +78,14 @@ class Extended:
         return tuple(p.name for p in parts if not _in_mjcf(effects[p.effect], self.space.select(p.free)))
 
 
-def extended(case: Case, handed: HandedOn) -> Extended:
+def extended(case: Case, handed: FinalModel) -> Extended:
     """The extended model that a search hands on, as something to save."""
     model = handed.model
-    values = model.values[case.whole.columns(model.space)]
-    gaussian = posterior(model.refined, [c for evidence in handed.of for c in evidence.cost.comparisons])
+    values = model.values[case.full_space.columns(model.space)]
+    gaussian = posterior(model.refined, [c for residual_set in handed.fitted_to for c in residual_set.cost.comparisons])
     named = {part.effect for part in model.parts}
     effects = tuple(e for e in case.effects if e.name in named)
-    return Extended(case.fit.cost.scene, model.parts, effects, values, gaussian)
+    return Extended(case.train.cost.scene, model.parts, effects, values, gaussian)
 
 
 def save_extended(folder: Path, model: Extended) -> None:
@@ -127,10 +127,10 @@ def _in_mjcf(effect: Effect, free: Space) -> bool:
 
 class _Effect(msgspec.Struct, forbid_unknown_fields=True):
     effect: str
-    place: str
-    what: str
-    amplitudes: list[str]
-    shapes: list[str]
+    location: str
+    description: str
+    coefficients: list[str]
+    shape_parameters: list[str]
 
 
 class _Normal(msgspec.Struct, forbid_unknown_fields=True):
@@ -154,7 +154,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def _to_json(model: Extended) -> dict[str, Any]:
-    what = {e.name: e.what for e in model.effects}
+    what = {e.name: e.description for e in model.effects}
     gaussian = model.gaussian
     return {
         "format": FORMAT,
@@ -163,10 +163,10 @@ def _to_json(model: Extended) -> dict[str, Any]:
         "effects": [
             {
                 "effect": part.effect,
-                "place": part.place,
-                "what": what[part.effect],
-                "amplitudes": list(part.amplitudes),
-                "shapes": list(part.shapes),
+                "location": part.location,
+                "description": what[part.effect],
+                "coefficients": list(part.coefficients),
+                "shape_parameters": list(part.shape_parameters),
             }
             for part in model.parts
         ],
@@ -185,15 +185,15 @@ def _of_file(file: _File, scene: Scene) -> Extended:
     if (own := _scene_to_json(scene)) | {"name": ""} != file.scene | {"name": ""}:
         raise ValueError(f"it was fitted with another scene, {file.scene}; this one is {own}")
     space = space_of(file.space)
-    free = [name for effect in file.effects for name in (*effect.amplitudes, *effect.shapes)]
-    if without := [effect.effect for effect in file.effects if not effect.amplitudes]:
-        raise ValueError(f"'effects': {shown(without[0])} has no amplitudes")
+    free = [name for effect in file.effects for name in (*effect.coefficients, *effect.shape_parameters)]
+    if without := [effect.effect for effect in file.effects if not effect.coefficients]:
+        raise ValueError(f"'effects': {shown(without[0])} has no coefficients")
     if absent := [name for name in free if name not in space.names]:
         raise ValueError(f"the effects have parameters that the space lacks: {', '.join(absent)}")
     if absent := [name for name in space.names if name not in file.values]:
         raise ValueError(f"'values': missing keys: {', '.join(absent)}")
     parts = tuple(
-        Candidate(e.effect, e.place, tuple(e.amplitudes), {name: file.values[name] for name in e.shapes})
+        Candidate(e.effect, e.location, tuple(e.coefficients), {name: file.values[name] for name in e.shape_parameters})
         for e in file.effects
     )
     effects = library(scene, dict.fromkeys(p.effect for p in parts))

@@ -19,7 +19,7 @@ MISSED = 0.5  # of the usual travel: a repeat that moves the object by less has 
 APART = 0.05  # s: repeats that are further apart in time were not cut alike
 
 
-def shared_out(scene: Scene, recordings: Sequence[Recording]) -> tuple[Split, dict[str, Recording]]:
+def assigned_roles(scene: Scene, recordings: Sequence[Recording]) -> tuple[Split, dict[str, Recording]]:
     """How recordings share the work, and each by its role; ValueError where a search in them could not end well.
 
     Warns of what in them can hardly be right (`check_log`).
@@ -35,7 +35,7 @@ def shared_out(scene: Scene, recordings: Sequence[Recording]) -> tuple[Split, di
 
 
 def check_recordings(scene: Scene, roles: Mapping[str, Recording]) -> None:
-    """ValueError where a search in these recordings ("fit", "confirm", perhaps "sealed") could not end well.
+    """ValueError where a search in these recordings ("train", "validation", perhaps "test") could not end well.
 
     Each must hold repeats, cut alike, of a motion that moves the robot and the object; all must measure the same
     joints, and none may be another one once more.  How many repeats are enough: `droid_jax.discrepancy.split`.

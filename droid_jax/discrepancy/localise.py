@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.discrepancy.residual_set import Evidence
+from droid_jax.discrepancy.residual_set import ResidualSet
 from droid_jax.discrepancy.sign_flips import benjamini_hochberg
 from droid_jax.model.scene import Scene
 
@@ -31,7 +31,7 @@ class Cell:
 
     variable: str
     where: str
-    gap: float
+    discrepancy: float
     p: float
     found: bool
 
@@ -43,7 +43,7 @@ class Localisation:
     cells: tuple[Cell, ...]
 
 
-def localise(evidence: Evidence, values: np.ndarray, residuals: np.ndarray, motion: np.ndarray) -> Localisation:
+def localise(residual_set: ResidualSet, values: np.ndarray, residuals: np.ndarray, motion: np.ndarray) -> Localisation:
     """Cells by joint and phase, door angle, sign and size of the door's speed, each joint's direction, angle and load.
 
     What the repeats' order changes is no cell: U is what the repeats share (`trend`).
@@ -51,31 +51,31 @@ def localise(evidence: Evidence, values: np.ndarray, residuals: np.ndarray, moti
     values: [D] of the model; residuals: [N, M] of its repeats or blocks.  motion: [D] of the model whose angles, speeds
     and loads divide them: one for all models that are compared, each has loads of its own.
     """
-    names, masks = zip(*_cells(evidence, motion), strict=True)
+    names, masks = zip(*_cells(residual_set, motion), strict=True)
     cells = np.stack(masks)
     kept = cells.sum(axis=1) >= 5
     p = np.ones(len(cells))
-    p[kept] = evidence.cell_p_values(residuals, cells[kept])
+    p[kept] = residual_set.cell_p_values(residuals, cells[kept])
     found = np.zeros(len(cells), bool)
     found[kept] = benjamini_hochberg(p[kept], FALSE_DISCOVERIES)
-    size = evidence.gaps(residuals, cells)
+    size = residual_set.discrepancies(residuals, cells)
     cells = tuple(Cell(v, w, float(size[i]), float(p[i]), bool(found[i])) for i, (v, w) in enumerate(names))
-    return Localisation((*cells, *_parts(evidence, values, residuals)))
+    return Localisation((*cells, *_parts(residual_set, values, residuals)))
 
 
-def _parts(evidence: Evidence, values: np.ndarray, residuals: np.ndarray) -> tuple[Cell, ...]:
+def _parts(residual_set: ResidualSet, values: np.ndarray, residuals: np.ndarray) -> tuple[Cell, ...]:
     """U of three parts: what a torque of the hinge would do, what it cannot do, and the door not held.
 
     The first is the hinge's; the second pose, contact or the arm's; the third the arm's, its tool's or a sensor's.
     Empty where nothing tells the first: no hinge, a sensor on the hinge itself, or blocks instead of repeats.
     """
-    space, scene = evidence.cost.space, evidence.cost.scene
-    if ALONG not in space.names or scene.object_joint in scene.joints or not evidence.repeated:
+    space, scene = residual_set.cost.space, residual_set.cost.scene
+    if ALONG not in space.names or scene.object_joint in scene.joints or not residual_set.repeated:
         return ()
     pushed, at, step = values.copy(), space.index(ALONG), 0.5 * space[ALONG].std
     pushed[at] += step if values[at] + step <= space[ALONG].high else -step
-    without, with_it = -evidence.common(np.stack([values, pushed]))
-    columns = int(evidence.column.max()) + 1
+    without, with_it = -residual_set.common(np.stack([values, pushed]))
+    columns = int(residual_set.column.max()) + 1
     mark = (with_it - without).reshape(columns, -1)
     size = np.linalg.norm(mark, axis=0)
     held = size > HELD * np.quantile(size, 0.9)
@@ -89,24 +89,24 @@ def _parts(evidence: Evidence, values: np.ndarray, residuals: np.ndarray) -> tup
     free = each[..., ~held].reshape(len(residuals), -1)
     parts = (("along the hinge", along), ("door held, other directions", across), ("door not held", free))
     flat = [part.reshape(len(residuals), -1) for _, part in parts]
-    p = [evidence.cell_p_values(f, np.ones((1, f.shape[1]), bool))[0] for f in flat]
+    p = [residual_set.cell_p_values(f, np.ones((1, f.shape[1]), bool))[0] for f in flat]
     found = benjamini_hochberg(np.array(p), FALSE_DISCOVERIES)
     return tuple(
-        Cell("force", name, evidence.gap(f), float(p[i]), bool(found[i]))
+        Cell("force", name, residual_set.discrepancy(f), float(p[i]), bool(found[i]))
         for i, ((name, _), f) in enumerate(zip(parts, flat, strict=True))
     )
 
 
-def _cells(evidence: Evidence, values: np.ndarray) -> list[tuple[tuple[str, str], np.ndarray]]:
-    comparison, scene = evidence.cost.comparisons[0], evidence.cost.scene
+def _cells(residual_set: ResidualSet, values: np.ndarray) -> list[tuple[tuple[str, str], np.ndarray]]:
+    comparison, scene = residual_set.cost.comparisons[0], residual_set.cost.scene
     joints = [scene.joints[c] for c in comparison.channel("torque").columns]
-    (rollout,) = evidence.cost.rollouts(values[None])
-    clock = evidence.time
+    (rollout,) = residual_set.cost.rollouts(values[None])
+    clock = residual_set.time
     out: list[tuple[tuple[str, str], np.ndarray]] = []
     spans = [(p.name, p.start, p.end) for p in comparison.phases] or [("all", clock.min(), clock.max() + 1e-9)]
     for j, joint in enumerate(joints):
         for name, first, last in spans:
-            inside = (clock >= first) & (clock < last) & (evidence.column == j)
+            inside = (clock >= first) & (clock < last) & (residual_set.column == j)
             out.append((("joint x phase", f"{joint}, {name} {first:.1f} s"), inside))
     at = np.clip(np.searchsorted(comparison.clock, clock), 0, len(comparison.clock) - 1)
     angle = np.asarray(rollout.object_angle[0])
@@ -119,7 +119,7 @@ def _cells(evidence: Evidence, values: np.ndarray) -> list[tuple[tuple[str, str]
         out += [(("object direction", word), side) for word, side in sides.items()]
         out += _bins("object speed", np.abs(w), f"{length}/s")
     for j, joint in enumerate(joints):
-        mine = evidence.column == j
+        mine = residual_set.column == j
         column = comparison.channel("torque").columns[j]
         velocity = np.asarray(rollout.velocity[0])[at, column]
         for word, side in (("forward", velocity > 0.005), ("back", velocity < -0.005)):

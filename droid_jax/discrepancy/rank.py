@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from droid_jax.discrepancy.candidates import Candidate
-from droid_jax.discrepancy.screen import Screen
+from droid_jax.discrepancy.screen import ScoreTest
 from droid_jax.model.parameters import Space
 
 COLLINEAR = 0.9  # absolute cosine from which two marks count as one
@@ -32,13 +32,13 @@ class Proposal:
     def start(self, space: Space, values: np.ndarray) -> np.ndarray:
         """`values` [D] with the shapes and amplitudes proposed."""
         out = values.copy()
-        for name, value in {**{k: v for c in self.parts for k, v in c.shapes.items()}, **self.sizes}.items():
+        for name, value in {**{k: v for c in self.parts for k, v in c.shape_parameters.items()}, **self.sizes}.items():
             out[space.index(name)] = value
         return out
 
 
 def proposals(
-    screen: Screen, residuals: np.ndarray, space: Space, number: int = 1, among: Container[str] | None = None
+    screen: ScoreTest, residuals: np.ndarray, space: Space, number: int = 1, among: Container[str] | None = None
 ) -> list[Proposal]:
     """Every candidate (number = 1), or every pair of candidates (2), best shapes only, the best first.
 
@@ -47,9 +47,9 @@ def proposals(
     """
     mean = residuals.mean(axis=0)
     whole = max(float(mean @ mean), 1e-30)
-    scores, gram = screen.marks @ mean, screen.marks @ screen.marks.T
+    scores, gram = screen.sensitivities @ mean, screen.sensitivities @ screen.sensitivities.T
     groups: dict[Any, list[int]] = {}
-    for k, question in enumerate(screen.questions):
+    for k, question in enumerate(screen.directions):
         if among is None or question.candidate.name in among:
             groups.setdefault(question.candidate.key, []).append(k)
     best: dict[tuple[str, ...], Proposal] = {}
@@ -61,23 +61,23 @@ def proposals(
     return sorted(best.values(), key=lambda p: -p.explained)
 
 
-def _combinations(groups: Sequence[list[int]], number: int, screen: Screen) -> list[list[int]]:
+def _combinations(groups: Sequence[list[int]], number: int, screen: ScoreTest) -> list[list[int]]:
     if number == 1:
         return list(groups)
 
     def together(a: Candidate, b: Candidate) -> bool:
         """Not the same candidate; and an effect has one shape at all its places."""
-        return a.name != b.name and (a.effect != b.effect or a.shapes == b.shapes)
+        return a.name != b.name and (a.effect != b.effect or a.shape_parameters == b.shape_parameters)
 
-    of = [screen.questions[rows[0]].candidate for rows in groups]
+    of = [screen.directions[rows[0]].candidate for rows in groups]
     both = ((i, k) for i in range(len(of)) for k in range(i + 1, len(of)) if together(of[i], of[k]))
     return [[*groups[i], *groups[k]] for i, k in both]
 
 
 def _proposal(
-    screen: Screen, rows: Sequence[int], scores: np.ndarray, gram: np.ndarray, whole: float, space: Space
+    screen: ScoreTest, rows: Sequence[int], scores: np.ndarray, gram: np.ndarray, whole: float, space: Space
 ) -> Proposal:
-    names = [screen.questions[k].amplitude for k in rows]
+    names = [screen.directions[k].coefficient for k in rows]
     low = np.array([space[n].low - space[n].mean for n in names])
     high = np.array([space[n].high - space[n].mean for n in names])
     ridge = gram + 1e-9 * max(np.trace(gram), 1e-30) * np.eye(len(gram))
@@ -91,18 +91,18 @@ def _proposal(
     return Proposal(_parts(screen, rows), sizes, explained)
 
 
-def _parts(screen: Screen, rows: Sequence[int]) -> tuple[Candidate, ...]:
+def _parts(screen: ScoreTest, rows: Sequence[int]) -> tuple[Candidate, ...]:
     """The candidates of some questions, once each."""
     found: dict[Any, Candidate] = {}
     for k in rows:
-        candidate = screen.questions[k].candidate
+        candidate = screen.directions[k].candidate
         found.setdefault(candidate.key, candidate)
     return tuple(found.values())
 
 
-def collinear(screen: Screen, names: Container[str]) -> set[str]:
+def collinear(screen: ScoreTest, names: Container[str]) -> set[str]:
     """Names of the candidates with a mark that is nearly one of these candidates'."""
-    rows = np.array([q.candidate.name in names for q in screen.questions])
-    unit = screen.marks / np.maximum(np.linalg.norm(screen.marks, axis=1, keepdims=True), 1e-30)
+    rows = np.array([q.candidate.name in names for q in screen.directions])
+    unit = screen.sensitivities / np.maximum(np.linalg.norm(screen.sensitivities, axis=1, keepdims=True), 1e-30)
     near = np.max(np.abs(unit @ unit[rows].T), axis=1) > COLLINEAR
-    return {screen.questions[k].candidate.name for k in np.flatnonzero(near)}
+    return {screen.directions[k].candidate.name for k in np.flatnonzero(near)}

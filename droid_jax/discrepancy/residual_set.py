@@ -1,6 +1,6 @@
 """One recording against a model: whitened residuals of every repeat, and the gap U that noise does not bias.
 
-`Evidence` is of a recording with repeats, which are what the tests flip.  A recording without repeats is cut
+`A residual set` is of a recording with repeats, which are what the tests flip.  A recording without repeats is cut
 into blocks of time instead: `droid_jax.discrepancy.blocks.Blocks`, which answers the same questions.
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from droid_jax.cost.cost import Cost
 from droid_jax.cost.residuals import Comparison
-from droid_jax.discrepancy.sign_flips import largest_steady_t, one_sided_p, steady, steady_gap_p_values
+from droid_jax.discrepancy.sign_flips import detrended, detrended_discrepancy_p_values, largest_detrended_t, one_sided_p
 from droid_jax.identify.search import NotReplayed
 
 # A parameter off its prior's mean is held back by that prior, and what is left of it all repeats share: with the
@@ -21,25 +21,25 @@ from droid_jax.identify.search import NotReplayed
 # deviations a nuisance is no effect (`case.BEYOND`), so its mark may as well be taken away up to there.
 SLACK = 3.0
 AT_REST = 2  # steps of Gauss and Newton for a recording's own nuisances where joints are at rest along its motion
-TIE = 3.0  # times what the best model leaves above the floor: a rival that leaves no more does as well
+TIE = 3.0  # times what the best model leaves above the floor: a rival that leaves no more is equivalent
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class ResidualSet:
     """A recording's cost and its repeats, in units of one repeat's noise.
 
     cost: of this recording alone.  deviations: [N, M] of the repeats from their mean, data minus mean.
     column, time: [M] compared column and instant [s] of each residual.
-    own: names of nuisances that this recording has for itself; own_columns: [M, len(own)] what one prior
-    deviation of each adds to the common residual.  See `with_own`.
+    nuisances: names of nuisances that this recording has for itself; nuisance_columns: [M, len(own)] what one prior
+    deviation of each adds to the common residual.  See `with_nuisances`.
     """
 
     cost: Cost
     deviations: np.ndarray
     column: np.ndarray
     time: np.ndarray
-    own: tuple[str, ...] = field(default=(), kw_only=True)
-    own_columns: np.ndarray | None = field(default=None, kw_only=True)
+    nuisances: tuple[str, ...] = field(default=(), kw_only=True)
+    nuisance_columns: np.ndarray | None = field(default=None, kw_only=True)
 
     @property
     def repeats(self) -> int:
@@ -67,12 +67,12 @@ class Evidence:
         return self.deviations.size
 
     @property
-    def tie(self) -> float:
+    def equivalence_factor(self) -> float:
         """Times what the best model leaves, up to which a rival's U is as good."""
         return TIE
 
     @property
-    def slack(self) -> float:
+    def prior_slack(self) -> float:
         """Times its prior that a base parameter may move when marks are projected."""
         return SLACK
 
@@ -81,35 +81,35 @@ class Evidence:
 
         NaN throughout where a replay blew up.
         """
-        return self._own_fitted(values)[1]
+        return self._nuisances_fitted(values)[1]
 
-    def with_own_at_best(self, values: np.ndarray) -> np.ndarray:
+    def at_best_nuisances(self, values: np.ndarray) -> np.ndarray:
         """[P, D] -> [P, D] with the recording's own nuisances where `common` has them."""
-        return self._own_fitted(values)[0]
+        return self._nuisances_fitted(values)[0]
 
-    def _own_fitted(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _nuisances_fitted(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rows [P, D] with own nuisances at their best, and their residuals [P, M]."""
         rows = np.array(np.atleast_2d(values), dtype=np.float64)
-        space, own = self.cost.space, [self.cost.space.index(name) for name in self.own]
+        space, own = self.cost.space, [self.cost.space.index(name) for name in self.nuisances]
         rows[:, own] = space.mean[own]
         common = self._common(rows)
-        if self.own_columns is None:
+        if self.nuisance_columns is None:
             return rows, common
         moves = _moves(self.cost)
-        columns = self.own_columns * moves[:, None]
-        normal = columns.T @ columns + np.eye(len(self.own)) / self.repeats
-        best = np.zeros((len(rows), len(self.own)))
+        columns = self.nuisance_columns * moves[:, None]
+        normal = columns.T @ columns + np.eye(len(self.nuisances)) / self.repeats
+        best = np.zeros((len(rows), len(self.nuisances)))
         # Where a joint is at rest its friction takes up an offset as far as it can: there it is replayed again.
         for _ in range(1 if moves.all() else AT_REST):
             best -= np.linalg.solve(normal, (common @ columns + best / self.repeats).T).T
             rows[:, own] = space.mean[own] + space.std[own] * best
-            common = common + best @ self.own_columns.T if moves.all() else self._common(rows)
+            common = common + best @ self.nuisance_columns.T if moves.all() else self._common(rows)
         return rows, common
 
     def _common(self, rows: np.ndarray) -> np.ndarray:
         return -self.cost.whitened(rows).astype(np.float64) / np.sqrt(self.repeats)
 
-    def with_own(self, names: Sequence[str]) -> Evidence:
+    def with_nuisances(self, names: Sequence[str]) -> ResidualSet:
         """The same, with nuisances `names` that are not the fitted recording's but fitted to this one.
 
         They must enter the residual linearly (torque offsets).  Each is fitted with its own prior.
@@ -119,13 +119,13 @@ class Evidence:
         space = self.cost.space
         rows = [space.mean, *(space.values({n: space[n].mean + space[n].std}) for n in names)]
         common = self._common(np.stack(rows))
-        return replace(self, own=tuple(names), own_columns=(common[1:] - common[0]).T)
+        return replace(self, nuisances=tuple(names), nuisance_columns=(common[1:] - common[0]).T)
 
     def residuals(self, common: np.ndarray) -> np.ndarray:
         """[N, M] of every repeat, from the common part [M], which is their mean."""
         return common + self.deviations
 
-    def gap_at(self, values: np.ndarray) -> float:
+    def discrepancy_at(self, values: np.ndarray) -> float:
         """U of the model at `values` [D]; NotReplayed where its replay blows up."""
         common = self.common(values)[0]
         if not np.isfinite(common).all():
@@ -133,25 +133,25 @@ class Evidence:
             raise NotReplayed(
                 f"the simulation of {name!r} blows up with parameters that were fitted to another recording"
             )
-        return self.gap(self.residuals(common))
+        return self.discrepancy(self.residuals(common))
 
-    def gap(self, residuals: np.ndarray) -> float:
+    def discrepancy(self, residuals: np.ndarray) -> float:
         """U of residuals [N, M], without what grows or fades steadily over the repeats."""
-        return gap(steady(residuals))
+        return discrepancy(detrended(residuals))
 
-    def gaps(self, residuals: np.ndarray, cells: np.ndarray) -> np.ndarray:
+    def discrepancies(self, residuals: np.ndarray, cells: np.ndarray) -> np.ndarray:
         """[K] U of each cell; cells: [K, M] bool."""
-        return gaps(steady(residuals), cells)
+        return discrepancies(detrended(residuals), cells)
 
     def cell_p_values(self, residuals: np.ndarray, cells: np.ndarray) -> np.ndarray:
         """[K] p-value of each cell's U being above zero."""
-        return steady_gap_p_values(residuals, cells)
+        return detrended_discrepancy_p_values(residuals, cells)
 
     def gain_p_value(self, gains: np.ndarray) -> float:
         """p-value of gains [N], one of each repeat, being above zero; what grows or fades steadily is no noise."""
-        return one_sided_p(steady(gains))
+        return one_sided_p(detrended(gains))
 
-    def largest(
+    def largest_score(
         self, scores: np.ndarray, marks: np.ndarray, base: np.ndarray, prior: np.ndarray, seed: int = 0
     ) -> tuple[np.ndarray, float]:
         """[K] t of K questions, and the p-value of the largest |t| under flips of whole repeats.
@@ -159,7 +159,7 @@ class Evidence:
         scores: [K, N] of projected marks [K, M], of which what grows or fades steadily over the repeats is left out.
         base: [M, D] columns they were projected on, with prior deviations [D]; repeats need neither.
         """
-        return largest_steady_t(scores, seed)
+        return largest_detrended_t(scores, seed)
 
     def losses(self, commons: np.ndarray, draws: np.ndarray) -> np.ndarray:
         """[R, K] squared mean residual of K models in resamples of the repeats, up to what all models share.
@@ -167,7 +167,7 @@ class Evidence:
         commons: [K, M] common part of each model's residuals; draws: [R, N] weights, each row summing to one.  What
         grows or fades steadily over the repeats is no scatter.
         """
-        return np.sum(commons**2, axis=1) + 2 * draws @ (steady(self.deviations) @ commons.T)
+        return np.sum(commons**2, axis=1) + 2 * draws @ (detrended(self.deviations) @ commons.T)
 
 
 def _moves(cost: Cost) -> np.ndarray:
@@ -175,8 +175,8 @@ def _moves(cost: Cost) -> np.ndarray:
     return np.concatenate([channel.moves.T.ravel() for channel in only_comparison(cost).channels])
 
 
-def evidence(cost: Cost) -> Evidence:
-    """The evidence of a cost over one recording.
+def residual_set(cost: Cost) -> ResidualSet:
+    """The data of a cost over one recording.
 
     Raises ValueError for several recordings at once, and for single repeats: whole repeats are what
     the tests flip.
@@ -185,17 +185,17 @@ def evidence(cost: Cost) -> Evidence:
     if comparison.repeats < 2:
         raise ValueError(f"recording {comparison.name!r} has one repeat; a gap is told from noise by repeats")
     deviations = comparison.deviations() / np.sqrt(comparison.repeats)
-    return Evidence(cost, deviations, *places(comparison))
+    return ResidualSet(cost, deviations, *residual_locations(comparison))
 
 
 def only_comparison(cost: Cost) -> Comparison:
     """The comparison of a cost over one recording; ValueError for several."""
     if len(cost.comparisons) != 1:
-        raise ValueError(f"evidence is of one recording, got {len(cost.comparisons)}")
+        raise ValueError(f"data is of one recording, got {len(cost.comparisons)}")
     return cost.comparisons[0]
 
 
-def places(comparison: Comparison) -> tuple[np.ndarray, np.ndarray]:
+def residual_locations(comparison: Comparison) -> tuple[np.ndarray, np.ndarray]:
     """Column and instant [s] of each residual, both [M]."""
     columns, times, start = [], [], 0
     for channel in comparison.channels:
@@ -206,7 +206,7 @@ def places(comparison: Comparison) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(columns), np.concatenate(times)
 
 
-def gap(residuals: np.ndarray) -> float:
+def discrepancy(residuals: np.ndarray) -> float:
     """U of residuals [N, M]: mean product of different repeats' residuals, per residual.
 
     Noise of the repeats has no part in it; it is the mean square of what all repeats share.
@@ -216,6 +216,6 @@ def gap(residuals: np.ndarray) -> float:
     return float((total @ total - np.sum(residuals**2)) / (count * (count - 1) * size))
 
 
-def gaps(residuals: np.ndarray, cells: np.ndarray) -> np.ndarray:
+def discrepancies(residuals: np.ndarray, cells: np.ndarray) -> np.ndarray:
     """[K] U of each cell; cells: [K, M] bool."""
-    return np.array([gap(residuals[:, cell]) if cell.any() else 0.0 for cell in cells])
+    return np.array([discrepancy(residuals[:, cell]) if cell.any() else 0.0 for cell in cells])

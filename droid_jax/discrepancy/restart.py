@@ -13,34 +13,34 @@ import numpy as np
 
 from droid_jax.discrepancy.candidates import Candidate
 from droid_jax.discrepancy.case import Case
-from droid_jax.discrepancy.refit import Model, refit
+from droid_jax.discrepancy.refit import FittedModel, refit
 from droid_jax.identify.pipeline import Progress, grip_hypotheses, search_cost, starts
 from droid_jax.identify.search import search
 
 
-def base_fit(case: Case, progress: Progress, start: np.ndarray | None = None) -> Model:
+def base_fit(case: Case, progress: Progress, start: np.ndarray | None = None) -> FittedModel:
     """Everything but the effects, fitted to the first demonstration.
 
     start: [F] values of the base parameters out of an earlier fit; without it they are searched for.
     """
     if start is None:
-        return fitted_anew(case, (), progress)
+        return fitted_from_prior(case, (), progress)
     base = case.base
-    return _refined(case, (), case.whole.embed(base, np.clip(start, base.low, base.high)[None]), progress)
+    return _refined(case, (), case.full_space.embed(base, np.clip(start, base.low, base.high)[None]), progress)
 
 
-def fitted_anew(case: Case, parts: Sequence[Candidate], progress: Progress) -> Model:
+def fitted_from_prior(case: Case, parts: Sequence[Candidate], progress: Progress) -> FittedModel:
     """Base parameters and the effects `parts`, searched for from the prior on and refined like the base fit.
 
     The search moves amplitudes and holds shapes at the candidates' values; the refinement frees both.
     Raises NotReplayed where the replay of every start blows up.
     """
-    base, whole = case.base, case.whole
-    at = whole.values({name: value for part in parts for name, value in part.shapes.items()})
-    amplitudes = [a for part in parts for a in part.amplitudes]
+    base, whole = case.base, case.full_space
+    at = whole.values({name: value for part in parts for name, value in part.shape_parameters.items()})
+    amplitudes = [a for part in parts for a in part.coefficients]
     main = whole.select([*(p.name for p in base.parameters if not p.nuisance), *amplitudes])
     found = search(
-        search_cost(case.fit.cost, case.config.compare, whole, main, at),
+        search_cost(case.train.cost, case.config.compare, whole, main, at),
         main,
         case.config.search,
         progress=lambda p: progress("search", p),
@@ -49,10 +49,10 @@ def fitted_anew(case: Case, parts: Sequence[Candidate], progress: Progress) -> M
     return _refined(case, parts, whole.embed(space, starts(space, main, found), at), progress)
 
 
-def _refined(case: Case, parts: Sequence[Candidate], begin: np.ndarray, progress: Progress) -> Model:
+def _refined(case: Case, parts: Sequence[Candidate], begin: np.ndarray, progress: Progress) -> FittedModel:
     """begin: [S, D] over the whole space."""
     return refit(
-        case.fit,
+        case.train,
         case.base,
         parts,
         begin,

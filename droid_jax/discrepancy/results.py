@@ -18,15 +18,15 @@ from droid_jax.discrepancy.candidates import Candidate
 from droid_jax.discrepancy.case import Case
 from droid_jax.discrepancy.doubts import bound_at
 from droid_jax.discrepancy.extended import extended, save_extended
-from droid_jax.discrepancy.final_refit import HandedOn
+from droid_jax.discrepancy.final_refit import FinalModel
 from droid_jax.discrepancy.localise import Localisation
 from droid_jax.discrepancy.refit import intervals
-from droid_jax.discrepancy.residual_set import Evidence
-from droid_jax.discrepancy.screen import Screen
-from droid_jax.discrepancy.select import Trial
+from droid_jax.discrepancy.residual_set import ResidualSet
+from droid_jax.discrepancy.screen import ScoreTest
+from droid_jax.discrepancy.select import ValidationTest
 from droid_jax.discrepancy.verdict import Verdict
 from droid_jax.files import GAP, GAP_TRACES
-from droid_jax.identify.identifiability import told
+from droid_jax.identify.identifiability import posterior_of
 from droid_jax.storage import finite, write_json, write_npz
 
 
@@ -34,7 +34,7 @@ def write_gap(
     folder: Path,
     case: Case,
     verdict: Verdict,
-    handed: HandedOn,
+    handed: FinalModel,
     description: Mapping[str, Any],
     amendments: Mapping[str, str] | None = None,
 ) -> None:
@@ -52,7 +52,7 @@ def write_amended(
     folder: Path,
     case: Case,
     verdict: Verdict,
-    handed: HandedOn,
+    handed: FinalModel,
     description: Mapping[str, Any],
     amendments: Mapping[str, str] | None = None,
 ) -> None:
@@ -68,31 +68,31 @@ def gap_json(case: Case, verdict: Verdict) -> dict[str, Any]:
         "verdict": verdict.kind.value,
         "sentence": verdict.sentence,
         "effects": list(verdict.effects),
-        "tied": [list(rivals) for rivals in verdict.tied],
+        "indistinguishable": [list(rivals) for rivals in verdict.indistinguishable],
         "doubts": list(verdict.doubts),
         "hints": [asdict(hint) for hint in verdict.hints],
-        "thresholds": {"least_closed": case.config.least_closed},
+        "thresholds": {"least_closed": case.config.minimum_closed},
         "about": _about(case, verdict),
-        "p": verdict.screens[0].p if verdict.screens else None,
-        "floor": verdict.floor,
+        "p": verdict.score_tests[0].p if verdict.score_tests else None,
+        "floor": verdict.discretisation_error,
         "converged": verdict.base.refined.converged,
-        "cut": verdict.cut,
+        "cut": verdict.not_tried,
         "remainder": verdict.remainder,
         "explained": verdict.explained if verdict.effects else None,
-        "gaps": {role: _gap(role, case.judged[role], verdict) for role in verdict.gaps},
-        "phases": {role: _phases(case.judged[role]) for role in verdict.gaps},
+        "gaps": {role: _gap(role, case.held_sets[role], verdict) for role in verdict.discrepancies},
+        "phases": {role: _phases(case.held_sets[role]) for role in verdict.discrepancies},
         "screens": [
-            {"p": found.p, "ranking": _ranking(found), "failed": list(found.failed)} for found in verdict.screens
+            {"p": found.p, "ranking": _ranking(found), "failed": list(found.failed)} for found in verdict.score_tests
         ],
         "failed": list(verdict.failed),
-        "trials": [_trial(trial) for trial in verdict.trials],
+        "trials": [_trial(trial) for trial in verdict.validation_tests],
         "cells": {"before": _cells(verdict.before), "after": _cells(verdict.after)},
-        "amplitudes": _sizes(case, verdict, "amplitudes"),
-        "shapes": _sizes(case, verdict, "shapes"),
+        "amplitudes": _sizes(case, verdict, "coefficients"),
+        "shapes": _sizes(case, verdict, "shape_parameters"),
         "shifts": _shifts(case, verdict),
         "experiments": [asdict(experiment) for experiment in verdict.experiments],
-        "trends": [{**asdict(t), "unit": case.whole[t.amplitude].unit} for t in (verdict.trend,) if t is not None],
-        "units": case.fit.cost.scene.torque_unit(_joints(case.fit)),
+        "trends": [{**asdict(t), "unit": case.full_space[t.amplitude].unit} for t in (verdict.trend,) if t is not None],
+        "units": case.train.cost.scene.torque_unit(_joints(case.train)),
     }
 
 
@@ -101,14 +101,14 @@ def gap_arrays(case: Case, verdict: Verdict) -> dict[str, np.ndarray]:
 
     Where one log has several roles, each has the instants of its own blocks.
     """
-    joints = _joints(case.fit)
+    joints = _joints(case.train)
     out = {"joints": np.array(joints)}
-    for role in verdict.gaps:
-        evidence = case.judged[role]
-        order = [_joints(evidence).index(joint) for joint in joints]
-        channel = evidence.cost.comparisons[0].channel("torque")
-        mine = evidence.instants
-        (simulated,) = evidence.cost.smoothed(_before_after(evidence, verdict))
+    for role in verdict.discrepancies:
+        residual_set = case.held_sets[role]
+        order = [_joints(residual_set).index(joint) for joint in joints]
+        channel = residual_set.cost.comparisons[0].channel("torque")
+        mine = residual_set.instants
+        (simulated,) = residual_set.cost.smoothed(_before_after(residual_set, verdict))
         before, after = simulated[:, mine][:, :, order]
         repeats = channel.noise.repeats[:, mine][:, :, order]
         out |= {
@@ -121,60 +121,63 @@ def gap_arrays(case: Case, verdict: Verdict) -> dict[str, np.ndarray]:
     return out
 
 
-def _before_after(evidence: Evidence, verdict: Verdict) -> np.ndarray:
+def _before_after(residual_set: ResidualSet, verdict: Verdict) -> np.ndarray:
     """[2, D] values of the base model and of the extended one, the recording's own nuisances at their best."""
-    return evidence.with_own_at_best(np.stack([verdict.base.values, verdict.model.values]))
+    return residual_set.at_best_nuisances(np.stack([verdict.base.values, verdict.model.values]))
 
 
-def _joints(evidence: Evidence) -> list[str]:
+def _joints(residual_set: ResidualSet) -> list[str]:
     """Measured joints, in the order of the torque channel's columns."""
-    return [evidence.cost.scene.joints[c] for c in evidence.cost.comparisons[0].channel("torque").columns]
+    return [residual_set.cost.scene.joints[c] for c in residual_set.cost.comparisons[0].channel("torque").columns]
 
 
-def _handed_on(case: Case, verdict: Verdict, handed: HandedOn) -> dict[str, Any]:
+def _handed_on(case: Case, verdict: Verdict, handed: FinalModel) -> dict[str, Any]:
     """Which recordings the model that is handed on is fitted to, and U of each role with it; null where it blows up."""
-    commons = {role: case.judged[role].common(handed.model.values)[0] for role in verdict.gaps}
+    commons = {role: case.held_sets[role].common(handed.model.values)[0] for role in verdict.discrepancies}
     return {
-        "fitted_to": [evidence.cost.comparisons[0].name for evidence in handed.of],
-        "gaps": {role: finite(case.judged[role].gap(case.judged[role].residuals(c))) for role, c in commons.items()},
+        "fitted_to": [residual_set.cost.comparisons[0].name for residual_set in handed.fitted_to],
+        "gaps": {
+            role: finite(case.held_sets[role].discrepancy(case.held_sets[role].residuals(c)))
+            for role, c in commons.items()
+        },
     }
 
 
-def _gap(role: str, evidence: Evidence, verdict: Verdict) -> dict[str, Any]:
+def _gap(role: str, residual_set: ResidualSet, verdict: Verdict) -> dict[str, Any]:
     """U and the paper's distance, N m, before and after; closed: None where there was nothing above the floor."""
-    before, after = verdict.gaps[role]
-    both = _before_after(evidence, verdict)
-    distance = (evidence.cost.distances(both) - evidence.cost.penalties(both))[:, 0]
+    before, after = verdict.discrepancies[role]
+    both = _before_after(residual_set, verdict)
+    distance = (residual_set.cost.distances(both) - residual_set.cost.penalties(both))[:, 0]
     return {
-        "recording": evidence.cost.comparisons[0].name,
+        "recording": residual_set.cost.comparisons[0].name,
         "before": before,
         "after": after,
-        "closed": verdict.closed(role) if before > verdict.floor else None,
+        "closed": verdict.closed(role) if before > verdict.discretisation_error else None,
         "torque_before": float(distance[0]),
         "torque_after": float(distance[1]),
     }
 
 
-def _phases(evidence: Evidence) -> list[dict[str, Any]]:
-    return [asdict(phase) for phase in evidence.cost.comparisons[0].phases]
+def _phases(residual_set: ResidualSet) -> list[dict[str, Any]]:
+    return [asdict(phase) for phase in residual_set.cost.comparisons[0].phases]
 
 
-def _ranking(found: Screen) -> list[dict[str, Any]]:
+def _ranking(found: ScoreTest) -> list[dict[str, Any]]:
     """Every candidate with its best shape, by what that explains."""
     best: dict[str, int] = {}
     for k in found.best():
-        best.setdefault(found.questions[k].candidate.name, k)
+        best.setdefault(found.directions[k].candidate.name, k)
     return [
         {"candidate": name, "t": float(found.t[k]), "explained": float(found.explained[k])} for name, k in best.items()
     ]
 
 
-def _trial(trial: Trial) -> dict[str, Any]:
+def _trial(trial: ValidationTest) -> dict[str, Any]:
     return {
         "round": trial.name.count(" + "),
         "name": trial.name,
-        "gap_fit": trial.gap_fit,
-        "gap_confirm": finite(trial.gap_confirm),
+        "discrepancy_train": trial.discrepancy_train,
+        "discrepancy_validation": finite(trial.discrepancy_validation),
         "p": trial.p,
         "chosen": trial.chosen,
         "passed": trial.passed,
@@ -189,32 +192,37 @@ def _cells(found: Localisation) -> list[dict[str, Any]]:
 
 def _about(case: Case, verdict: Verdict) -> dict[str, dict[str, Any]]:
     """Of each effect of the answer, ties and hints with it: what it is, where its mark should appear, and its likes."""
-    groups = [(verdict.effects, verdict.tied), *((hint.effects, hint.tied) for hint in verdict.hints)]
+    groups = [
+        (verdict.effects, verdict.indistinguishable),
+        *((hint.effects, hint.indistinguishable) for hint in verdict.hints),
+    ]
     answers = [a for effects, tied in groups for a in (*effects, *(rival for rivals in tied for rival in rivals))]
     named = {candidate.partition(" at ")[0] for answer in answers for candidate in answer.split(" + ")}
     return {
-        e.name: {"what": e.what, "mark": e.mark, "confused_with": list(e.confused_with)}
+        e.name: {"what": e.description, "mark": e.signature, "confused_with": list(e.confused_with)}
         for e in case.effects
         if e.name in named
     }
 
 
-def _sizes(case: Case, verdict: Verdict, kind: Literal["amplitudes", "shapes"]) -> list[dict[str, Any]]:
-    """Amplitudes or shapes of the final model with intervals, each at the first of the parts that share it."""
-    model, what = verdict.model, {e.name: e.what for e in case.effects}
+def _sizes(case: Case, verdict: Verdict, kind: Literal["coefficients", "shape_parameters"]) -> list[dict[str, Any]]:
+    """Coefficients or shape parameters of the final model with intervals, each at the first of the parts that
+    share it.
+    """
+    model, what = verdict.model, {e.name: e.description for e in case.effects}
     first: dict[str, Candidate] = {}
     for part in model.parts:
         for name in getattr(part, kind):
             first.setdefault(name, part)
-    spans = intervals(case.fit, model, first)
+    spans = intervals(case.train, model, first)
     return [
         {
             "name": name,
-            "unit": case.whole[name].unit,
-            "value": float(model.values[case.whole.index(name)]),
+            "unit": case.full_space[name].unit,
+            "value": float(model.values[case.full_space.index(name)]),
             "low": spans[name][0],
             "high": spans[name][1],
-            "bound": bound_at(case.fit, model, name),
+            "bound": bound_at(case.train, model, name),
             "effect": part.name,
             "what": what[part.effect],
         }
@@ -224,8 +232,8 @@ def _sizes(case: Case, verdict: Verdict, kind: Literal["amplitudes", "shapes"]) 
 
 def _shifts(case: Case, verdict: Verdict) -> list[dict[str, Any]]:
     """How the base parameters moved when the effects came in, against what the base fit thought it knew."""
-    columns = case.whole.columns(case.base)
-    deviation = told(verdict.base.refined, case.fit.cost.comparisons).physical_std
+    columns = case.full_space.columns(case.base)
+    deviation = posterior_of(verdict.base.refined, case.train.cost.comparisons).physical_std
     before, after = verdict.base.values[columns], verdict.model.values[columns]
     return [
         {"name": p.name, "unit": p.unit, "before": b, "after": a, "deviation_before": s}

@@ -18,8 +18,8 @@ import numpy as np
 
 from droid_jax.cost.cost import Cost
 from droid_jax.discrepancy.case import Case
-from droid_jax.discrepancy.refit import Model
-from droid_jax.discrepancy.residual_set import Evidence
+from droid_jax.discrepancy.refit import FittedModel
+from droid_jax.discrepancy.residual_set import ResidualSet
 from droid_jax.identify.checkpoints import Checkpoints, Tree
 from droid_jax.identify.multistart import Refined
 from droid_jax.model.parameters import Space
@@ -27,19 +27,19 @@ from droid_jax.read_npz import read_npz
 from droid_jax.storage import write_npz
 
 
-def remembering(case: Case, folder: Path) -> Case:
+def with_replay_cache(case: Case, folder: Path) -> Case:
     """The case with costs that keep what they computed below `folder`, which belongs to this case alone."""
 
-    def kept(role: str, evidence: Evidence) -> Evidence:
-        cost = evidence.cost
+    def kept(role: str, residual_set: ResidualSet) -> ResidualSet:
+        cost = residual_set.cost
         each = {f.name: getattr(cost, f.name) for f in dataclasses.fields(Cost)}
-        return replace(evidence, cost=Remembered(**each, plain=cost, folder=folder / role))
+        return replace(residual_set, cost=CachedCost(**each, plain=cost, folder=folder / role))
 
-    return replace(case, **{role: kept(role, evidence) for role, evidence in case.judged.items()})
+    return replace(case, **{role: kept(role, residual_set) for role, residual_set in case.held_sets.items()})
 
 
 @dataclass(frozen=True, eq=False)
-class Remembered(Cost):
+class CachedCost(Cost):
     """The cost `plain` over one recording, which looks in its folder before it replays."""
 
     plain: Cost
@@ -84,7 +84,7 @@ def _digest(role: str, what: str, rows: np.ndarray, out: np.ndarray) -> str:
     return sha.hexdigest()
 
 
-def kept_model(folder: Path | None, base: Space, whole: Space, fit: Callable[[], Model]) -> Model:
+def cached_model(folder: Path | None, base: Space, whole: Space, fit: Callable[[], FittedModel]) -> FittedModel:
     """The base model over the space `base`, from its folder or, where that holds none that is whole, fitted now.
 
     None: nothing is kept.  One that is not over the space `whole`, as where other code asked about other effects, is
@@ -97,7 +97,7 @@ def kept_model(folder: Path | None, base: Space, whole: Space, fit: Callable[[],
     return _model(base, _kept(folder, lambda: _tree(fit()), over))
 
 
-def kept_number(folder: Path | None, compute: Callable[[], float]) -> float:
+def cached_number(folder: Path | None, compute: Callable[[], float]) -> float:
     """A number from its folder, computed now where that holds none that is whole; None: nothing is kept."""
     return float(_kept(folder, lambda: {"value": np.array(compute())})["value"])
 
@@ -117,20 +117,20 @@ def _kept(folder: Path | None, make: Callable[[], Tree], fits: Callable[[Tree], 
 
 
 # what a base model holds beside its space, which the caller knows: numbers and arrays, and those of its refinement
-_PLAIN = tuple(f.name for f in dataclasses.fields(Model) if f.name not in ("parts", "space", "refined"))
+_PLAIN = tuple(f.name for f in dataclasses.fields(FittedModel) if f.name not in ("parts", "space", "refined"))
 _REFINED = tuple(f.name for f in dataclasses.fields(Refined) if f.name != "space")
 
 
-def _tree(model: Model) -> Tree:
+def _tree(model: FittedModel) -> Tree:
     """A base model as arrays."""
     refined = {name: np.asarray(getattr(model.refined, name)) for name in _REFINED}
     return {**{name: np.asarray(getattr(model, name)) for name in _PLAIN}, "refined": refined}
 
 
-def _model(base: Space, tree: Tree) -> Model:
+def _model(base: Space, tree: Tree) -> FittedModel:
     """Inverse of `_tree`."""
     refined = Refined(base, **{name: _value(tree["refined"][name]) for name in _REFINED})
-    return Model(parts=(), space=base, refined=refined, **{name: _value(tree[name]) for name in _PLAIN})
+    return FittedModel(parts=(), space=base, refined=refined, **{name: _value(tree[name]) for name in _PLAIN})
 
 
 def _value(array: Any) -> Any:

@@ -8,43 +8,44 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from droid_jax.discrepancy.refit import Model, intervals, zero_words
-from droid_jax.discrepancy.residual_set import Evidence
-from droid_jax.discrepancy.transfer import remainder
+from droid_jax.discrepancy.refit import FittedModel, intervals, zero_warning
+from droid_jax.discrepancy.residual_set import ResidualSet
+from droid_jax.discrepancy.transfer import remaining_discrepancy
 
 SIGNIFICANT = 0.01  # p below which something is missing
 CONFIRMED = 0.05  # and below which one effect's gain on the other demonstration is no chance, among all other gates
-LESS = 0.2  # share of U that the first effect must take away on the confirming demonstration
+LESS = 0.2  # share of U that the first effect must take away on the validation demonstration
 MORE = 0.4  # share of what is left that every further effect must: a wrong form of the first leaves something too
 OF_ALL = 0.05  # and share of the base model's U: what a wrong form of the first effect leaves is no effect of its own
-DOUBT = 0.05  # share of the resamples in which a rival is better, from which it does as well
-CHOSEN = 0.8  # share of the resamples in which an effect, or one that does as well, must win
+DOUBT = 0.05  # share of the resamples in which a rival is better, from which it is equivalent
+CHOSEN = 0.8  # share of the resamples in which an effect, or one that is equivalent, must win
 RESAMPLES = 400
 AS_FITTED = 0.05  # share of the gap on the fitted demonstration that is no difference there
-TOO_SMALL = "too small to be worth a name"
+TOO_SMALL = "below the minimum effect size"
 AT_BOUND = "ran into its bound"
 UNCONFIRMED = "not confirmed by the other demonstration"
 EDGE = 0.02  # share of a parameter's range that counts as its bound
 
 
 @dataclass(frozen=True)
-class Trial:
+class ValidationTest:
     """An effect's case: everything it had to pass, and the reason where it did not.
 
-    gap_fit, gap_confirm: U with it on both demonstrations; p: of the improvement on the confirming one.
-    interval: of each amplitude; chosen: share of resamples.  rivals: names of models that cannot be told from it.
-    reasons: why it lost, empty where it passed.  weak: it lost for nothing but its size or its significance,
+    discrepancy_train, discrepancy_validation: U with it on both demonstrations; p: of the improvement on the
+    validation one.
+    interval: of each amplitude; chosen: share of resamples.  indistinguishable: names of models that cannot be told
+    from it. reasons: why it lost, empty where it passed.  weak: it lost for nothing but its size or its significance,
     and may yet be the truth.
     """
 
     name: str
-    gap_fit: float
-    gap_confirm: float
+    discrepancy_train: float
+    discrepancy_validation: float
     p: float
     interval: dict[str, tuple[float, float]]
     chosen: float
     reasons: tuple[str, ...]
-    rivals: tuple[str, ...] = ()
+    indistinguishable: tuple[str, ...] = ()
     weak: bool = False
 
     @property
@@ -58,41 +59,43 @@ def resamples(count: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), size=RESAMPLES) / count
 
 
-def judge(
-    fit: Evidence,
-    confirm: Evidence,
-    before: Model,
-    models: Sequence[Model],
+def validation_tests(
+    fit: ResidualSet,
+    validation: ResidualSet,
+    before: FittedModel,
+    models: Sequence[FittedModel],
     smallest: Mapping[str, float],
     whole_gap: float,
     floor: float = 0.0,
     seed: int = 0,
     ends: Collection[str] = (),
-) -> list[Trial]:
+) -> list[ValidationTest]:
     """Put extended models on trial against the one without their last effects, and against each other.
 
     before: that model.  smallest: amplitude -> size worth naming.  whole_gap: U of the model without
-    any effect on the confirming demonstration.  ends: amplitudes that may stand at their bound.  One batch of
+    any effect on the validation demonstration.  ends: amplitudes that may stand at their bound.  One batch of
     replays; U of one that blows up is infinite.
     """
-    commons = confirm.common(np.stack([before.values, *(m.values for m in models)]))
-    repeats = [confirm.residuals(c) for c in commons]
-    left = np.nan_to_num([confirm.gap(r) for r in repeats], nan=np.inf)
+    commons = validation.common(np.stack([before.values, *(m.values for m in models)]))
+    repeats = [validation.residuals(c) for c in commons]
+    left = np.nan_to_num([validation.discrepancy(r) for r in repeats], nan=np.inf)
     squares = np.array([np.sum(r**2, axis=1) for r in repeats])
-    losses = np.nan_to_num(confirm.losses(commons[1:], resamples(confirm.units, seed)), nan=np.inf)
-    fitted = np.array([m.gap for m in models])
-    same = alike(left[1:], fitted, losses, floor, confirm.tie, AS_FITTED * before.gap)
+    losses = np.nan_to_num(validation.losses(commons[1:], resamples(validation.units, seed)), nan=np.inf)
+    fitted = np.array([m.discrepancy for m in models])
+    same = indistinguishable(
+        left[1:], fitted, losses, floor, validation.equivalence_factor, AS_FITTED * before.discrepancy
+    )
     winners = np.bincount(np.argmin(losses, axis=1), minlength=len(models)) / len(losses)
-    beside = functools.cache(lambda: remainder(fit, confirm, before))
+    beside = functools.cache(lambda: remaining_discrepancy(fit, validation, before))
     out = []
     for k, model in enumerate(models):
-        p = confirm.gain_p_value(0.5 * (squares[0] - squares[k + 1])) if np.isfinite(left[k + 1]) else 1.0
+        p = validation.gain_p_value(0.5 * (squares[0] - squares[k + 1])) if np.isfinite(left[k + 1]) else 1.0
         chosen = float(winners[same[k]].sum())
-        spans = {a: s for a, s in intervals(fit, model).items() if a not in before.amplitudes}
+        spans = {a: s for a, s in intervals(fit, model).items() if a not in before.coefficients}
         weak = [f"{UNCONFIRMED} (p = {p:.2g})"] if p >= CONFIRMED else []
         weak += _too_small(fit, model, spans, smallest)
         if before.parts:
-            beyond = functools.partial(remainder, fit, confirm, model)
+            beyond = functools.partial(remaining_discrepancy, fit, validation, model)
             taken = much_more(left[0], left[k + 1], beside, beyond, whole_gap)
         else:
             taken = left[k + 1] <= (1 - LESS) * left[0]
@@ -103,20 +106,20 @@ def judge(
             reasons.append(f"wins only {chosen:.0%} of the resamples; {leader} does better")
         rivals = tuple(models[i].name for i in np.flatnonzero(same[k]).tolist() if i != k)
         out.append(
-            Trial(
-                model.name, model.gap, float(left[k + 1]), p, spans, chosen, (*weak, *reasons), rivals,
+            ValidationTest(
+                model.name, model.discrepancy, float(left[k + 1]), p, spans, chosen, (*weak, *reasons), rivals,
                 weak=bool(weak) and not reasons,
             )
         )  # fmt: skip
     return out
 
 
-def alike(
+def indistinguishable(
     left: np.ndarray, fitted: np.ndarray, losses: np.ndarray, floor: float, tie: float, nothing: float
 ) -> np.ndarray:
     """[K, K] bool, which models cannot be told apart.
 
-    left, fitted: [K] U on the confirming and on the fitted demonstration; losses: [R, K] in resamples of the confirming
+    left, fitted: [K] U on the validation and on the training motion; losses: [R, K] in resamples of the validation
     one's repeats.  What two wrong forms leave says little about which is nearer the truth, so a ratio `tie` counts and
     not significance; on the fitted one differences up to `nothing` are none.
     """
@@ -131,7 +134,7 @@ def alike(
 def much_more(
     before: float, after: float, beside: Callable[[], float], beyond: Callable[[], float], whole_gap: float
 ) -> bool:
-    """Whether a further effect takes its share of what is left on the confirming demonstration.
+    """Whether a further effect takes its share of what is left on the validation demonstration.
 
     before, after: U.  beside, beyond: the same less what the uncertainty of each fit leaves there, which no effect can
     take; where U falls by less than the share, that may do, if it is a share of the first gap too.  (They are dear:
@@ -161,7 +164,7 @@ def _gap_reasons(before: float, after: float, whole_gap: float, taken: bool, flo
 
 
 def _too_small(
-    fit: Evidence, model: Model, spans: Mapping[str, tuple[float, float]], smallest: Mapping[str, float]
+    fit: ResidualSet, model: FittedModel, spans: Mapping[str, tuple[float, float]], smallest: Mapping[str, float]
 ) -> list[str]:
     space = fit.cost.space
     small = all(abs(model.values[space.index(a)] - space[a].mean) < smallest[a] for a in spans)
@@ -169,16 +172,16 @@ def _too_small(
 
 
 def _amplitude_reasons(
-    fit: Evidence, model: Model, spans: Mapping[str, tuple[float, float]], ends: Collection[str]
+    fit: ResidualSet, model: FittedModel, spans: Mapping[str, tuple[float, float]], ends: Collection[str]
 ) -> list[str]:
-    new = [c for c in model.parts if set(c.amplitudes) <= set(spans)]
-    reasons = [said for c in new if (said := zero_words(fit, model, c))][:1]
+    new = [c for c in model.parts if set(c.coefficients) <= set(spans)]
+    reasons = [said for c in new if (said := zero_warning(fit, model, c))][:1]
     return reasons + [
         f"{a} {AT_BOUND}: {beyond}" for a in spans if a not in ends and (beyond := past_bound(fit, model, a))
     ]
 
 
-def past_bound(fit: Evidence, model: Model, amplitude: str) -> str:
+def past_bound(fit: ResidualSet, model: FittedModel, amplitude: str) -> str:
     """ "more than 0.5 N m" of an amplitude at a bound that is not neutral; empty of others."""
     p = fit.cost.space[amplitude]
     value, reach = model.values[fit.cost.space.index(amplitude)], EDGE * (p.high - p.low)

@@ -10,14 +10,14 @@ from __future__ import annotations
 import numpy as np
 import scipy.stats
 
-from droid_jax.cost.noise import untrended
+from droid_jax.cost.noise import detrend
 
 EXACT = 12  # up to this many repeats all flips are tried
 DRAWS = 4096
-FEWEST = 8  # repeats; with six the smallest possible p is 0.03
+FEWEST_REPEATS = 8  # repeats; with six the smallest possible p is 0.03
 
 
-def steady(x: np.ndarray) -> np.ndarray:
+def detrended(x: np.ndarray) -> np.ndarray:
     """x [N, ...] of repeats without its trend over their order: the same mean, the scatter of N - 2 degrees of freedom.
 
     What grows or fades steadily over the repeats (a friction or a sensor that warms up) is no noise.
@@ -25,7 +25,7 @@ def steady(x: np.ndarray) -> np.ndarray:
     if len(x) < 3:
         return x
     mean = x.mean(axis=0)
-    return mean + (untrended(x) - mean) * np.sqrt((len(x) - 1) / (len(x) - 2))
+    return mean + (detrend(x) - mean) * np.sqrt((len(x) - 1) / (len(x) - 2))
 
 
 def sign_flips(repeats: int, seed: int = 0, *, one_sided: bool = False) -> np.ndarray:
@@ -57,7 +57,7 @@ def one_sided_p(gains: np.ndarray) -> float:
     return float(np.mean(t >= t[0] - 1e-12))
 
 
-def largest_steady_t(scores: np.ndarray, seed: int = 0) -> tuple[np.ndarray, float]:
+def largest_detrended_t(scores: np.ndarray, seed: int = 0) -> tuple[np.ndarray, float]:
     """[K] t of each of K questions with scores [K, N], and the p-value of the largest |t| among them.
 
     Without what grows or fades steadily over the repeats (`steady`).
@@ -67,13 +67,13 @@ def largest_steady_t(scores: np.ndarray, seed: int = 0) -> tuple[np.ndarray, flo
     forty independent questions; `tests/discrepancy/test_flips.py`).
     """
     count = scores.shape[1]
-    t = t_values(steady(scores.T).T, sign_flips(count, seed))
+    t = t_values(detrended(scores.T).T, sign_flips(count, seed))
     own, flipped = scipy.stats.t(max(count - 2, 1)), scipy.stats.t(count - 1)
     found = flipped.isf(own.sf(np.max(np.abs(t[0]))))
     return t[0], float(np.mean(np.max(np.abs(t), axis=1) >= found * (1 - 1e-12)))
 
 
-def steady_gap_p_values(residuals: np.ndarray, cells: np.ndarray) -> np.ndarray:
+def detrended_discrepancy_p_values(residuals: np.ndarray, cells: np.ndarray) -> np.ndarray:
     """[K] p-value of each cell's U being above zero, without what grows or fades steadily over the repeats (`steady`).
 
     residuals [N, M], cells [K, M] bool.  Where a line was taken out, the products of different repeats have a part of
@@ -81,7 +81,7 @@ def steady_gap_p_values(residuals: np.ndarray, cells: np.ndarray) -> np.ndarray:
     back.  Without that hardly anything is found below U = M^-1/2 (U = 0.02 of 1400 residuals, eight repeats, p < 0.01:
     1 in 50, and now 2 in 3; `tests/discrepancy/test_flips.py`).
     """
-    flips, rows, out = sign_flips(len(residuals)), steady(residuals), []
+    flips, rows, out = sign_flips(len(residuals)), detrended(residuals), []
     for cell in cells:
         gram = rows[:, cell] @ rows[:, cell].T
         gram -= _taken_out(gram)
@@ -97,7 +97,7 @@ def _taken_out(gram: np.ndarray) -> np.ndarray:
     Each repeat has a noise of its own size, told by what the repeats' deviations from their mean hold of it.
     """
     count = len(gram)
-    made = steady(np.eye(count))
+    made = detrended(np.eye(count))
     apart = made - 1.0 / count
     centred = np.eye(count) - 1.0 / count
     squares = np.diag(centred @ gram @ centred)

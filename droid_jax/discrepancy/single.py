@@ -1,13 +1,14 @@
-"""A case out of one recording without repeats: what is fitted, what confirms, what is sealed, and how large noise is.
+"""A case out of one recording without repeats: training, validation and test data, and how large noise is.
 
-The last third of the recording is sealed, or a second recording is.  What comes before is cut into blocks (see
-`discrepancy.blocks`) that fit and confirm in turns.  In turns, because a log holds its motion once or twice: a
+The last third of the recording is test data, or a second recording is.  What comes before is cut into blocks (see
+`discrepancy.blocks`) that train and validate in turns.  In turns, because a log holds its motion once or twice: a
 base model fitted to one half of it misses what only the other half moves, and that would look like an effect.
-So the confirming blocks tell an effect from noise and not from another form of it; other motions are for what
-is sealed.
+So the validation blocks tell an effect from noise and not from another form of it; other motions are for what
+is test data.
 
 Noise.  One recording does not tell its noise.  What is stated, and sets the blocks' length, is the smallest residual
-that an extended model leaves, the base and up to GapConfig.most candidates chosen and fitted linearly, where that is
+that an extended model leaves, the base and up to DiscrepancyConfig.max_effects candidates chosen and fitted linearly,
+where that is
 less than a fifth of what the base leaves (in squares); else what the base leaves.  The fifth is there because
 the best of many candidates takes noise too, of slow noise up to three quarters (40 synthetic door logs), and what it
 leaves is correlated for too short a time.  So with something missing that the library explains in part only,
@@ -27,16 +28,16 @@ import numpy as np
 from droid_jax.cost.cost import Cost, make_cost
 from droid_jax.cost.noise import discrepancy
 from droid_jax.cost.observation import least_noise
-from droid_jax.discrepancy.blocks import OUTSIDE, Blocks, block_length, blocks, interleaved
+from droid_jax.discrepancy.blocks import OUTSIDE, BlockResidualSet, block_length, block_residual_set, interleaved
 from droid_jax.discrepancy.candidates import candidates
-from droid_jax.discrepancy.case import Case, GapConfig, own_nuisances, restrained, unbounded
+from droid_jax.discrepancy.case import Case, DiscrepancyConfig, per_recording_nuisances, restrained, unbounded
 from droid_jax.discrepancy.rank import proposals
-from droid_jax.discrepancy.refit import Model, refit
+from droid_jax.discrepancy.refit import FittedModel, refit
 from droid_jax.discrepancy.residual_set import only_comparison
-from droid_jax.discrepancy.screen import Screen, questions_of
+from droid_jax.discrepancy.screen import ScoreTest, directions_of
 from droid_jax.discrepancy.select import LESS
-from droid_jax.discrepancy.sign_flips import FEWEST
-from droid_jax.discrepancy.workflow import ask
+from droid_jax.discrepancy.sign_flips import FEWEST_REPEATS
+from droid_jax.discrepancy.workflow import score
 from droid_jax.identify.multistart import RefineProgress
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects.registry import joined, ready
@@ -45,7 +46,7 @@ from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording
 from droid_jax.simulate.measured_motion import Motion
 
-FITTED = 2 / 3  # of a recording whose rest is sealed
+FITTED = 2 / 3  # of a recording whose rest is test data
 EXPLAINED = 0.2  # share of the base's residual, in squares, below which what is left counts as noise
 
 
@@ -102,16 +103,16 @@ class Log(Cost):
         """[K, C] bool, instants at which each joint moves: at rest friction takes what is left."""
         return only_comparison(self).channel("torque").moves
 
-    def left(self, values: np.ndarray) -> np.ndarray:
+    def residual_torque(self, values: np.ndarray) -> np.ndarray:
         """[K, C] measured minus simulated torques of one vector [D]."""
         return self.measured - self.simulated(values[None])[0]
 
-    def stated(self, deviation: np.ndarray, instants: np.ndarray) -> Log:
+    def with_noise(self, deviation: np.ndarray, instants: np.ndarray) -> Log:
         """With noise of a deviation [C], in the channel's unit, at some instants [K] bool; the rest does not count."""
         noise = self._noise.stated(np.maximum(deviation, least_noise("torque", self.measured)))
         return self._with(replace(noise, whitener=noise.whitener * instants[:, None]))
 
-    def holding(self, torque: np.ndarray) -> Log:
+    def with_torques(self, torque: np.ndarray) -> Log:
         """With other measured torques [K, C] of the same motion."""
         return self._with(replace(self._noise, mean=torque, repeats=torque[None]))
 
@@ -130,7 +131,7 @@ def make_log(
     base: Space,
     effects: Sequence[Effect],
     recording: Recording,
-    config: GapConfig | None = None,
+    config: DiscrepancyConfig | None = None,
     known: Sequence[Effect] = (),
 ) -> Log:
     """The log of a recording of one repeat without commands, all effects in its replay, at neutral.
@@ -141,7 +142,7 @@ def make_log(
     """
     if recording.repeats > 1:
         raise ValueError(f"recording {recording.name!r} has {recording.repeats} repeats: use make_case")
-    whole, config = joined(restrained(base), effects), config or GapConfig()
+    whole, config = joined(restrained(base), effects), config or DiscrepancyConfig()
     cost = make_cost(ready(scene), whole, [recording], config=config.compare, effects=[*known, *effects], check=False)
     if not isinstance(cost.drives[0], Motion):
         raise ValueError(f"recording {recording.name!r} holds commands; blocks are for logs in inverse mode")
@@ -152,49 +153,49 @@ def single_case(
     log: Log,
     base: Space,
     effects: Sequence[Effect],
-    sealed: Log | None = None,
-    config: GapConfig | None = None,
+    test: Log | None = None,
+    config: DiscrepancyConfig | None = None,
     start: np.ndarray | None = None,
 ) -> Case:
-    """A case from one log, or from two of which the second is sealed, with its own torque offsets.
+    """A case from one log, or from two of which the second is test data, with its own torque offsets.
 
     start: [D] where fits begin, fitted to this motion before; the prior's mean unless given.
     Raises ValueError where the log is too short for its residual's correlation time.
     """
-    config = config or GapConfig()
+    config = config or DiscrepancyConfig()
     clock = log.clock
-    share = 1.0 if sealed is not None else FITTED
-    end = clock[-1] + 1e-6 if sealed is not None else clock[0] + share * (clock[-1] - clock[0])
+    share = 1.0 if test is not None else FITTED
+    end = clock[-1] + 1e-6 if test is not None else clock[0] + share * (clock[-1] - clock[0])
     deviation, length = noise_of(log, base, effects, end, config, start)
     parts = interleaved(clock, clock[0], end, length, 2, share)
     name = only_comparison(log).name
     turns = (f"{name}, every other block", f"{name}, the blocks between")
-    fit, confirm = (_blocks(log.part(n), deviation, part) for n, part in zip(turns, parts, strict=True))
-    own = [] if sealed is None else own_nuisances(base)  # another day's; the rest of the same log has the same
-    rest = log.part(f"{name}, last third") if sealed is None else sealed
+    fit, validation = (_blocks(log.part(n), deviation, part) for n, part in zip(turns, parts, strict=True))
+    own = [] if test is None else per_recording_nuisances(base)  # another day's; the rest of the same log has the same
+    rest = log.part(f"{name}, last third") if test is None else test
     judged = _blocks(
         replace(rest, space=unbounded(rest.space, own)) if own else rest,
         deviation[[log.columns.index(c) for c in rest.columns]],
-        _any_blocks(rest.clock, end if sealed is None else rest.clock[0]),
+        _any_blocks(rest.clock, end if test is None else rest.clock[0]),
     )
     if own:
-        judged = judged.with_own(own)
-    return Case(fit, confirm, judged, restrained(base), tuple(effects), config)
+        judged = judged.with_nuisances(own)
+    return Case(fit, validation, judged, restrained(base), tuple(effects), config)
 
 
 def base_model(
     case: Case, start: np.ndarray | None = None, progress: Callable[[RefineProgress], None] | None = None
-) -> Model:
+) -> FittedModel:
     """The base parameters fitted, from the prior's mean unless a start [D] is given.
 
     Inverse dynamics is smooth in them, so one start and no search will do.
     """
-    start = case.whole.mean if start is None else start
-    return refit(case.fit, case.base, (), start[None], case.config.refine, progress=progress)
+    start = case.full_space.mean if start is None else start
+    return refit(case.train, case.base, (), start[None], case.config.refine, progress=progress)
 
 
 def noise_of(
-    log: Log, base: Space, effects: Sequence[Effect], end: float, config: GapConfig, start: np.ndarray | None
+    log: Log, base: Space, effects: Sequence[Effect], end: float, config: DiscrepancyConfig, start: np.ndarray | None
 ) -> tuple[np.ndarray, float]:
     """Deviation [C] to state as noise, and length [s] of the blocks, from what lies before `end`; see the module."""
     inside = log.clock < end
@@ -203,26 +204,26 @@ def noise_of(
     if start is None:  # what the prior's mean leaves is no noise
         start = _rough_fit(log, base, effects, log.space.mean, block, config)[1].values
     case, model, deviation = _rough_fit(log, base, effects, start, block, config)
-    found = ask(case, model, questions_of(candidates(effects)))
+    found = score(case, model, directions_of(candidates(effects)))
     whole = model.residuals.mean(axis=0)
-    least = _least(found, whole, log.space, config.most)
+    least = _least(found, whole, log.space, config.max_effects)
     noise = least if least @ least < EXPLAINED * (whole @ whole) else whole
     left = (noise.reshape(len(deviation), -1).T * deviation)[inside]
     return discrepancy(left, log.moves[inside]), block_length(left)
 
 
 def _rough_fit(
-    log: Log, base: Space, effects: Sequence[Effect], values: np.ndarray, block: np.ndarray, config: GapConfig
-) -> tuple[Case, Model, np.ndarray]:
+    log: Log, base: Space, effects: Sequence[Effect], values: np.ndarray, block: np.ndarray, config: DiscrepancyConfig
+) -> tuple[Case, FittedModel, np.ndarray]:
     """The base fitted with the noise [C] stated that `values` [D] leave."""
-    left = discrepancy(log.left(values)[block >= 0], log.moves[block >= 0])
+    left = discrepancy(log.residual_torque(values)[block >= 0], log.moves[block >= 0])
     deviation = np.maximum(left, least_noise("torque", log.measured))
-    evidence = _blocks(log, deviation, block)
-    case = Case(evidence, evidence, None, base, tuple(effects), config)
+    residual_set = _blocks(log, deviation, block)
+    case = Case(residual_set, residual_set, None, base, tuple(effects), config)
     return case, base_model(case, values), deviation
 
 
-def _least(found: Screen, left: np.ndarray, space: Space, most: int) -> np.ndarray:
+def _least(found: ScoreTest, left: np.ndarray, space: Space, most: int) -> np.ndarray:
     """[M] what the best `most` candidates leave of residuals `left` [M], one after the other, linearly.
 
     One that takes less than an effect must is left out: it would take noise.
@@ -232,18 +233,18 @@ def _least(found: Screen, left: np.ndarray, space: Space, most: int) -> np.ndarr
         if best.explained < LESS:
             break
         keys = {part.key for part in best.parts}
-        rows = [k for k, q in enumerate(found.questions) if q.candidate.key in keys]
-        taken, _ = np.linalg.qr(found.marks[rows].T)
+        rows = [k for k, q in enumerate(found.directions) if q.candidate.key in keys]
+        taken, _ = np.linalg.qr(found.sensitivities[rows].T)
         left = left - taken @ (taken.T @ left)
-        found = replace(found, marks=found.marks - (found.marks @ taken) @ taken.T)
+        found = replace(found, sensitivities=found.sensitivities - (found.sensitivities @ taken) @ taken.T)
     return left
 
 
 def _any_blocks(clock: np.ndarray, first: float) -> np.ndarray:
     """[K] block of each instant from `first` on, for what is not tested: as few as there may be."""
     end = clock[-1] + 1e-6
-    return interleaved(clock, first, end, (end - first) / (FEWEST + 0.5))[0]
+    return interleaved(clock, first, end, (end - first) / (FEWEST_REPEATS + 0.5))[0]
 
 
-def _blocks(log: Log, deviation: np.ndarray, block: np.ndarray) -> Blocks:
-    return blocks(log.stated(deviation, block >= 0), block)
+def _blocks(log: Log, deviation: np.ndarray, block: np.ndarray) -> BlockResidualSet:
+    return block_residual_set(log.with_noise(deviation, block >= 0), block)

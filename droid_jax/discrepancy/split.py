@@ -1,7 +1,7 @@
-"""How recordings share the work of a search: what is fitted, what confirms, what stays sealed.
+"""How recordings share the work of a search: train, validation and test data.
 
 Two or three recordings have a role each.  One alone is divided, by its repeats or, where it has none, into blocks of
-time (`droid_jax.discrepancy.single`); both confirm on the fitted motion, and `Split.limits` says what that costs.
+time (`droid_jax.discrepancy.single`); both validate on the training motion, and `Split.limits` says what that costs.
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ import enum
 from collections.abc import Sequence
 from dataclasses import replace
 
-from droid_jax.discrepancy.sign_flips import FEWEST
+from droid_jax.discrepancy.sign_flips import FEWEST_REPEATS
 from droid_jax.recordings.recording import Recording
 
-ROLES = ("fit", "confirm", "sealed")
-HALVES = 2 * FEWEST  # repeats of one recording from which each half is enough
+ROLES = ("train", "validation", "test")
+HALVES = 2 * FEWEST_REPEATS  # repeats of one recording from which each half is enough
 ELSE = (
     "What can still be told: `python -m droid_jax.run identify` fits the parameters, and its report shows in which "
     "joint and phase simulation and robot disagree"
@@ -25,7 +25,7 @@ ALONE = "one repeat alone"  # of a log without commands
 
 
 class Split(enum.Enum):
-    """What fitted and confirming part differ in."""
+    """What fitted and validation part differ in."""
 
     RECORDINGS = "recordings"
     REPEATS = "repeats"
@@ -36,11 +36,11 @@ class Split(enum.Enum):
         """What cannot be concluded, in words; empty where nothing is to be said."""
         return {
             Split.RECORDINGS: "",
-            Split.REPEATS: "One recording both fits and confirms: the confirming repeats repeat the fitted motion, so "
+            Split.REPEATS: "One recording both fits and confirms: the validation repeats repeat the fitted motion, so "
             "they tell an effect from noise, but not from another one that acts alike in this motion. Only another "
-            "motion would, and nothing was kept sealed.",
+            "motion would, and nothing was kept as test data.",
             Split.BLOCKS: "There are no repeats: U holds the noise too, and nothing tells a place from noise. The "
-            "confirming blocks are of the same motion as the fitted ones, so they tell an effect from noise, but not "
+            "validation blocks are of the same motion as the fitted ones, so they tell an effect from noise, but not "
             "from another form of it.",
         }[self]
 
@@ -55,7 +55,7 @@ def split_of(recordings: Sequence[Recording]) -> Split:
     first, *others = recordings
     if first.repeats == 1 and not first.command.size and len(others) < 2:
         for other in others:
-            _check_sealed(first, other)
+            _check_test(first, other)
         return Split.BLOCKS
     if not others:
         _check_halves(first)
@@ -66,16 +66,18 @@ def split_of(recordings: Sequence[Recording]) -> Split:
 
 
 def roles_of(split: Split, recordings: Sequence[Recording]) -> dict[str, Recording]:
-    """Role -> recording.  A log that is cut into blocks is "fit" and holds the confirming blocks too."""
+    """Role -> recording.  A log that is cut into blocks is "train" and holds the validation blocks too."""
     if split is Split.BLOCKS:
-        return dict(zip(("fit", "sealed"), recordings, strict=False))
+        return dict(zip(("train", "test"), recordings, strict=False))
     if split is Split.RECORDINGS:
         return dict(zip(ROLES, recordings, strict=False))
     (whole,) = recordings
     half, count = whole.repeats // 2, whole.repeats
     return {
-        "fit": replace(whole.repeats_subset(range(half)), name=f"{whole.name}, first {half} repeats"),
-        "confirm": replace(whole.repeats_subset(range(half, count)), name=f"{whole.name}, last {count - half} repeats"),
+        "train": replace(whole.repeats_subset(range(half)), name=f"{whole.name}, first {half} repeats"),
+        "validation": replace(
+            whole.repeats_subset(range(half, count)), name=f"{whole.name}, last {count - half} repeats"
+        ),
     }
 
 
@@ -94,13 +96,13 @@ def _as_log(recording: Recording) -> str:
     )
 
 
-def _check_sealed(first: Recording, other: Recording) -> None:
+def _check_test(first: Recording, other: Recording) -> None:
     if other.repeats == 1 and not other.command.size:
         return
     what = _repeats(other) if other.repeats > 1 else "commands"
     raise ValueError(
         f"the second recording {other.name!r} has {what}, and the first, {first.name!r}, is a log without repeats and "
-        "commands, beside which only another such log can be sealed. Leave the second out, or give it alone: with "
+        "commands, beside which only another such log can be test data. Leave the second out, or give it alone: with "
         f"{HALVES} repeats or more one half fits and the other confirms"
     )
 
@@ -110,19 +112,20 @@ def _check_halves(recording: Recording) -> None:
         return
     raise ValueError(
         f"recording {recording.name!r} is the only one and has {_repeats(recording)}: one half must fit and the other "
-        f"confirm, and with fewer than {FEWEST} repeats in a half no effect can be told from chance. Record "
-        f"{HALVES} or more, or better another motion, {FEWEST} repeats or more of each: "
-        f"--recording FIT CONFIRM. {ELSE}"
+        f"validation, and with fewer than {FEWEST_REPEATS} repeats in a half no effect can be told from chance. Record "
+        f"{HALVES} or more, or better another motion, {FEWEST_REPEATS} repeats or more of each: "
+        f"--recording TRAIN VALIDATION. {ELSE}"
         + (_as_log(recording) if recording.command.size else f"; and {ALONE} is searched as a log, in blocks of time")
     )
 
 
 def _check_repeats(role: str, recording: Recording) -> None:
-    if recording.repeats >= FEWEST:
+    if recording.repeats >= FEWEST_REPEATS:
         return
     log = not recording.command.size
     raise ValueError(
-        f"the {role} recording {recording.name!r} has {_repeats(recording)}: with fewer than {FEWEST} no effect can be "
+        f"the {role} recording {recording.name!r} has {_repeats(recording)}: with fewer than {FEWEST_REPEATS} no "
+        "effect can be "
         f"told from chance. {ELSE}"
         + (f"; and {ALONE}, or of each of two logs, is searched in blocks of time" if log else _as_log(recording))
     )

@@ -14,7 +14,7 @@ STOP = 2.0  # s
 
 
 @dataclass(frozen=True)
-class Entry:
+class TimeScaling:
     """An experiment of the menu.
 
     what: in words.  seconds: duration of a motion of `duration` s on the new clock; clock: (new instants [K],
@@ -26,11 +26,11 @@ class Entry:
     clock: Callable[[np.ndarray, float], np.ndarray]
 
 
-MENU = (
-    Entry("the same motion three times slower", lambda d: 3 * d, lambda t, d: t / 3),
-    Entry("the same motion twice as fast", lambda d: d / 2, lambda t, d: 2 * t),
-    Entry("the same motion there and back again", lambda d: 2 * d, lambda t, d: np.minimum(t, 2 * d - t)),
-    Entry(
+TIME_SCALINGS = (
+    TimeScaling("the same motion three times slower", lambda d: 3 * d, lambda t, d: t / 3),
+    TimeScaling("the same motion twice as fast", lambda d: d / 2, lambda t, d: 2 * t),
+    TimeScaling("the same motion there and back again", lambda d: 2 * d, lambda t, d: np.minimum(t, 2 * d - t)),
+    TimeScaling(
         f"the same motion with a stop of {STOP:.0f} s half-way",
         lambda d: d + STOP,
         lambda t, d: np.where(t < d / 2, t, np.maximum(d / 2, t - STOP)),
@@ -38,7 +38,7 @@ MENU = (
 )
 
 
-def warped(recording: Recording, entry: Entry) -> Recording:
+def time_scaled(recording: Recording, entry: TimeScaling) -> Recording:
     """A recording as if its motion had been made on another clock; its noise comes along."""
     first, duration = recording.time[0], recording.duration
 

@@ -9,48 +9,48 @@ from __future__ import annotations
 
 import numpy as np
 
-from droid_jax.discrepancy.refit import Model
-from droid_jax.discrepancy.residual_set import Evidence
+from droid_jax.discrepancy.refit import FittedModel
+from droid_jax.discrepancy.residual_set import ResidualSet
 from droid_jax.discrepancy.screen import project
-from droid_jax.identify.identifiability import told
+from droid_jax.identify.identifiability import posterior_of
 from droid_jax.identify.levenberg_marquardt import principal_axes
 
 LEAST = 0.25  # share of a step that bounds must leave for a slope
 LONGEST = 1.0  # search units: what the fit did not tell at all is no further from it than that
 
 
-def left_over(fitted: Evidence, other: Evidence, model: Model) -> np.ndarray:
+def remaining_residuals(fitted: ResidualSet, other: ResidualSet, model: FittedModel) -> np.ndarray:
     """[N, M] `beyond`; of blocks of one log, which are of one motion, what the model leaves as it is."""
     if fitted.repeated:
-        return beyond(fitted, other, model)
+        return beyond_fit_uncertainty(fitted, other, model)
     return other.residuals(other.common(model.values)[0])
 
 
-def remainder(fitted: Evidence, other: Evidence, model: Model) -> float:
+def remaining_discrepancy(fitted: ResidualSet, other: ResidualSet, model: FittedModel) -> float:
     """U of what a model leaves over on another recording than the fitted one."""
-    return other.gap(left_over(fitted, other, model))
+    return other.discrepancy(remaining_residuals(fitted, other, model))
 
 
-def beyond(fitted: Evidence, other: Evidence, model: Model) -> np.ndarray:
+def beyond_fit_uncertainty(fitted: ResidualSet, other: ResidualSet, model: FittedModel) -> np.ndarray:
     """[N, M] residuals of a model on another recording than the fitted one, less what its uncertainty allows.
 
     The parameters move once more, along slopes, to where the other recording wants them; how far is held by what the
     fitted one tells of them (`told`), as if both had been fitted.  The other recording's own nuisances are at their
     best throughout.  Every repeat is projected and not their mean alone, whose noise U tells from their scatter.
     """
-    slopes = spread(fitted, other, model)
+    slopes = transfer_spread(fitted, other, model)
     held = np.full(len(slopes.T), other.repeats**0.5)  # the residual is that of the mean of so many repeats
     return project(other.residuals(other.common(model.values)[0]), slopes, held)
 
 
-def spread(fitted: Evidence, other: Evidence, model: Model) -> np.ndarray:
+def transfer_spread(fitted: ResidualSet, other: ResidualSet, model: FittedModel) -> np.ndarray:
     """[M, D] by how much one deviation of the fit, along each of its principal axes, changes the common residual.
 
     Where a bound cuts a step short, what is left of it tells the slope.  Zero along an axis on which a replay blows up:
     nothing is allowed for there.
     """
     space, whole, x = model.space, other.cost.space, model.refined.x
-    steps = principal_axes(told(model.refined, fitted.cost.comparisons, misfit=False).cov, LONGEST).T
+    steps = principal_axes(posterior_of(model.refined, fitted.cost.comparisons, misfit=False).cov, LONGEST).T
     ends = [np.clip(x + sign * steps, *map(space.to_search, (space.low, space.high))) for sign in (1.0, -1.0)]
     up, down = np.split(other.common(whole.embed(space, space.from_search(np.concatenate(ends)), model.values)), 2)
     left = np.sum((ends[0] - ends[1]) * steps, axis=1) / np.sum(2 * steps**2, axis=1)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from droid_jax.discrepancy.screen import Screen
+from droid_jax.discrepancy.screen import ScoreTest
 
 ORDERS = 4096
 
@@ -30,13 +30,13 @@ class Trend:
     p: float
 
 
-def trend(found: Screen, residuals: np.ndarray, seed: int = 0) -> Trend | None:
+def trend(found: ScoreTest, residuals: np.ndarray, seed: int = 0) -> Trend | None:
     """The strongest trend of residuals [N, M] over their order; None for fewer than three repeats."""
     count = len(residuals)
-    if count < 3 or not found.questions:
+    if count < 3 or not found.directions:
         return None
-    size = np.maximum(np.linalg.norm(found.marks, axis=1), 1e-30)
-    scores = (found.marks @ residuals.T) / size[:, None]  # [K, N], noise of one
+    size = np.maximum(np.linalg.norm(found.sensitivities, axis=1), 1e-30)
+    scores = (found.sensitivities @ residuals.T) / size[:, None]  # [K, N], noise of one
     order = np.arange(count) - 0.5 * (count - 1)
     order /= np.linalg.norm(order)
     others = np.random.default_rng(seed).permuted(np.tile(order, (ORDERS - 1, 1)), axis=1)
@@ -44,8 +44,8 @@ def trend(found: Screen, residuals: np.ndarray, seed: int = 0) -> Trend | None:
     slopes = np.abs(orders @ scores.T)  # [F, K]
     largest = slopes.max(axis=1)
     best = int(np.argmax(slopes[0]))
-    question = found.questions[best]
+    question = found.directions[best]
     steps = float(order @ scores[best]) / size[best] * (order[1] - order[0])
     return Trend(
-        question.candidate.name, question.amplitude, steps, float(np.mean(largest >= largest[0] * (1 - 1e-12)))
+        question.candidate.name, question.coefficient, steps, float(np.mean(largest >= largest[0] * (1 - 1e-12)))
     )

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 from droid_jax.discrepancy.discretisation_error import above
 from droid_jax.discrepancy.localise import Localisation
-from droid_jax.discrepancy.refit import Model
-from droid_jax.discrepancy.screen import Screen
-from droid_jax.discrepancy.select import AT_BOUND, TOO_SMALL, UNCONFIRMED, Trial
+from droid_jax.discrepancy.refit import FittedModel
+from droid_jax.discrepancy.screen import ScoreTest
+from droid_jax.discrepancy.select import AT_BOUND, TOO_SMALL, UNCONFIRMED, ValidationTest
 from droid_jax.discrepancy.trend import Trend
 
 HALF = 0.5  # share of the gap: an effect that explains less may only imitate what is missing
@@ -27,12 +27,12 @@ def _beyond(reasons: Iterable[str]) -> str:
     return f" ({' and '.join(told)})" if told else ""
 
 
-class Kind(enum.Enum):
+class Conclusion(enum.Enum):
     """The answers there are."""
 
     NONE = "none"  # nothing is missing that these recordings could tell
     NAMED = "named"  # these effects are missing
-    TIE = "tie"  # one of these; an experiment that would tell them apart is named
+    INDISTINGUISHABLE = "tie"  # one of these; an experiment that would tell them apart is named
     PARTLY = "partly explained"  # these, and a remainder that nothing in the library explains
     UNEXPLAINED = "unexplained"  # something is missing, and nothing in the library is it
     UNCONVERGED = "fit not converged"  # of the base model or of the extended one; nothing can be concluded
@@ -42,13 +42,13 @@ class Kind(enum.Enum):
 class Experiment:
     """Something to record that would tell tied effects apart.
 
-    what: in words.  apart: standardised difference of the rivals' simulated torques there, after each was
+    what: in words.  distance: standardised difference of the rivals' simulated torques there, after each was
     refitted to what is recorded already; above about 6 ten repeats decide.  None where it could not be made:
     not_made says why.
     """
 
     what: str
-    apart: float | None
+    distance: float | None
     not_made: str = ""
 
 
@@ -56,76 +56,81 @@ class Experiment:
 class Hint:
     """Effects that passed their trials and close too little to be named: they may only imitate what is missing.
 
-    effects, tied: as of a verdict.  closed: share of U beyond the floor by held-out role, "confirm" and "sealed".
+    effects, indistinguishable: as of a verdict.  closed: share of U beyond the floor by held-out role, "validation"
+    and "test".
     """
 
     effects: tuple[str, ...]
-    tied: tuple[tuple[str, ...], ...]
+    indistinguishable: tuple[tuple[str, ...], ...]
     closed: dict[str, float]
 
     @property
     def words(self) -> str:
         """ "a (closes 31 %)", "a or b (closes 31 %)": the least that it closes on a held-out recording."""
-        each = [" or ".join((e, *ties)) for e, ties in zip(self.effects, self.tied, strict=True)]
+        each = [" or ".join((e, *ties)) for e, ties in zip(self.effects, self.indistinguishable, strict=True)]
         return f"{' and '.join(each)} (closes {max(min(self.closed.values()), 0.0):.0%})"
 
 
-LOST = "the fitted model on the sealed recording"  # among what failed
+LOST = "the fitted model on the test recording"  # among what failed
 
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
     """The answer and its grounds.
 
-    kind; effects: names of what is in the model; tied: for each of them the names that do as well.
-    base, model: before and after.  floor: U0, what the simulation's own step leaves.
-    gaps: "fit", "confirm", "sealed" -> (U before, U after).  remainder: U on the confirming demonstration that neither
-    `model` nor the uncertainty of its fit explains (`transfer.beyond`), None where no fit converged.  screens, trials:
+    kind; effects: names of what is in the model; indistinguishable: for each of them the names that do as well.
+    base, model: before and after.  discretisation_error: U0, what the simulation's own step leaves.
+    discrepancies: "train", "validation", "test" -> (U before, U after).  remainder: U on the validation demonstration
+    that neither
+    `model` nor the uncertainty of its fit explains (`transfer.beyond`), None where no fit converged.  score_tests,
+    validation_tests:
     the grounds, in the order they were made.  failed: models whose replay blew up where their refit was to begin, or
-    on the sealed recording, which then is not in gaps.
+    on the test recording, which then is not in gaps.
     before, after: where the gap lives on the fitted recording.  rivals: models that do as well as `model`, refitted;
-    experiments: what would tell them apart, the best first.  cut: in words what the budget left out, empty for nothing.
-    trend: what changes from repeat to repeat, None where nothing was asked.
+    experiments: what would tell them apart, the best first.  not_tried: in words what the budget left out, empty for
+    nothing. trend: what changes from repeat to repeat, None where nothing was asked.
     hints: effects that close too little to be named, see `workflow.unnamed`; the model is without them.
     doubts: what is to be doubted of the effects in the model (`doubts.doubts`).
     """
 
-    kind: Kind
+    kind: Conclusion
     effects: tuple[str, ...]
-    tied: tuple[tuple[str, ...], ...]
-    base: Model
-    model: Model
-    floor: float
-    gaps: dict[str, tuple[float, float]]
-    screens: tuple[Screen, ...]
-    trials: tuple[Trial, ...]
+    indistinguishable: tuple[tuple[str, ...], ...]
+    base: FittedModel
+    model: FittedModel
+    discretisation_error: float
+    discrepancies: dict[str, tuple[float, float]]
+    score_tests: tuple[ScoreTest, ...]
+    validation_tests: tuple[ValidationTest, ...]
     before: Localisation
     after: Localisation
     remainder: float | None = None
     failed: tuple[str, ...] = ()
-    rivals: tuple[Model, ...] = ()
+    indistinguishable_models: tuple[FittedModel, ...] = ()
     experiments: tuple[Experiment, ...] = ()
-    cut: str = ""
+    not_tried: str = ""
     trend: Trend | None = None
     hints: tuple[Hint, ...] = ()
     doubts: tuple[str, ...] = ()
 
     def closed(self, role: str) -> float:
-        """1 - (U_after - U0) / (U_before - U0) on "fit", "confirm" or "sealed"."""
-        before, after = self.gaps[role]
-        return 1.0 - open_share(after, before, self.floor)
+        """1 - (U_after - U0) / (U_before - U0) on "train", "validation" or "test"."""
+        before, after = self.discrepancies[role]
+        return 1.0 - open_share(after, before, self.discretisation_error)
 
     def closed_held_out(self) -> dict[str, float]:
         """`closed` of the held-out roles that show a discrepancy at all."""
-        held_out = {role: before for role, (before, _) in self.gaps.items() if role != "fit"}
-        return {role: self.closed(role) for role, before in held_out.items() if above(before, self.floor)}
+        held_out = {role: before for role, (before, _) in self.discrepancies.items() if role != "train"}
+        return {
+            role: self.closed(role) for role, before in held_out.items() if above(before, self.discretisation_error)
+        }
 
     @property
     def explained(self) -> float:
-        """Share of the gap on the confirming demonstration that the model, or its fit's uncertainty, explains."""
-        before, after = self.gaps["confirm"]
+        """Share of the gap on the validation demonstration that the model, or its fit's uncertainty, explains."""
+        before, after = self.discrepancies["validation"]
         left = after if self.remainder is None else self.remainder
-        return 1.0 - open_share(left, before, self.floor)
+        return 1.0 - open_share(left, before, self.discretisation_error)
 
     @property
     def _unsettled(self) -> str:
@@ -134,7 +139,7 @@ class Verdict:
     @property
     def _lacking(self) -> str:
         """ "a and b", "a, and one of: b or c"."""
-        both = list(zip(self.effects, self.tied, strict=True))
+        both = list(zip(self.effects, self.indistinguishable, strict=True))
         certain = " and ".join(e for e, ties in both if not ties)
         open_ones = [f"one of: {' or '.join((e, *ties))}" for e, ties in both if ties]
         return ", and ".join([certain, *open_ones] if certain else open_ones)
@@ -142,7 +147,7 @@ class Verdict:
     @property
     def _or_lost(self) -> str:
         """Where a candidate lost for its size or its significance alone, it may be all there is."""
-        lost = [t for t in self.trials if t.reasons]
+        lost = [t for t in self.validation_tests if t.reasons]
         small = dict.fromkeys(t.name for t in lost if t.reasons == (TOO_SMALL,))
         large = {t.name: _beyond(t.reasons) for t in lost if all(AT_BOUND in r for r in t.reasons)}
         chance = dict.fromkeys(t.name for t in lost if all(r.startswith(UNCONFIRMED) for r in t.reasons))
@@ -180,10 +185,11 @@ class Verdict:
     @property
     def _answer(self) -> str:
         return {
-            Kind.NONE: "Nothing is missing that these recordings could tell.",
-            Kind.NAMED: f"The model lacks: {self._lacking}.",
-            Kind.TIE: f"The model lacks {self._lacking}.",
-            Kind.PARTLY: self._partly,
-            Kind.UNEXPLAINED: f"The model lacks something that is not in the library{self._or_lost}.{self._hinted}",
-            Kind.UNCONVERGED: f"The fit of {self._unsettled} did not converge; nothing can be concluded.",
+            Conclusion.NONE: "Nothing is missing that these recordings could tell.",
+            Conclusion.NAMED: f"The model lacks: {self._lacking}.",
+            Conclusion.INDISTINGUISHABLE: f"The model lacks {self._lacking}.",
+            Conclusion.PARTLY: self._partly,
+            Conclusion.UNEXPLAINED: "The model lacks something that is not in the library"
+            f"{self._or_lost}.{self._hinted}",
+            Conclusion.UNCONVERGED: f"The fit of {self._unsettled} did not converge; nothing can be concluded.",
         }[self.kind]

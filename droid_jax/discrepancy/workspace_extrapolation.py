@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from droid_jax.discrepancy.time_scaling import Entry, warped
+from droid_jax.discrepancy.time_scaling import TimeScaling, time_scaled
 from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording
@@ -38,12 +38,12 @@ def opened_further(scene: Scene, recording: Recording, replayed: Rollout) -> Rec
     if path is None:
         return None
     at, seconds = float(replayed.time[last]), _seconds(replayed.time[: last + 1], angle[: last + 1])
-    stretched = Entry(
+    stretched = TimeScaling(
         FURTHER,
         lambda d: d + 2 * seconds,
         lambda t, d: np.where(t < at, t, np.maximum(at, t - 2 * seconds)),
     )
-    longer = warped(recording, stretched)
+    longer = time_scaled(recording, stretched)
     since = longer.time - longer.time[0] - at
     share = minimum_jerk(np.minimum(since, 2 * seconds - since) / seconds)
     step = CubicSpline(np.linspace(0.0, 1.0, KNOTS), path - path[0])(share)  # [T, J]

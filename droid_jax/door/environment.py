@@ -36,7 +36,7 @@ from droid_jax.model.step import step as simulate_step
 from droid_jax.policy.control import ACTIONS, OBSERVED, Safety, limited
 from droid_jax.policy.environment import Environment
 from droid_jax.simulate.hand_path import solve_pose
-from droid_jax.simulate.replay import check_stateless, push, rubbing, servo_given, through
+from droid_jax.simulate.replay import apply_forces, apply_friction, check_stateless, compose, servo_input
 
 PAST = 4  # commands remembered: a delay of up to three times Task.control
 FAST = 100.0  # rad/s or m/s: ten times what arm, fingers and door ever do; beyond, the simulation has come apart
@@ -157,10 +157,10 @@ class DoorEnv(Environment):
             ctrl = self._servo(theta, now, world)
             data = self._template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm, ctrl=ctrl)
             after = simulate_step(
-                rubbing(model, theta, now, self.effects),
+                apply_friction(model, theta, now, self.effects),
                 data,
                 servo_damping=self._servo_damping,
-                push=push(theta, now, self.effects, encoder_error(self.scene, model)),
+                push=apply_forces(theta, now, self.effects, encoder_error(self.scene, model)),
             )
             force = finger_forces(self._hand, after)
             return (after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator, force), None
@@ -178,8 +178,8 @@ class DoorEnv(Environment):
 
         for effect in self.effects:
             if effect.command is not None:
-                look = through(effect.command, theta, look)
-        return servo_given(look(now.time), theta, now, self.effects)
+                look = compose(effect.command, theta, look)
+        return servo_input(look(now.time), theta, now, self.effects)
 
     def _look(self, model, world: World, force: jax.Array):
         data = mjx.kinematics(model, self._template.replace(qpos=world.qpos))

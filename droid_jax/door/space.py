@@ -94,7 +94,7 @@ def _joint_dampings(scene: Scene, preset: str) -> tuple[Parameter, ...]:
         std = PAPER_DAMPING_STD[i] if preset == "paper" else 0.1 * mean
         out.append(
             joint_damping(
-                scene, joint, name=JOINT_DAMPING[i], mean=mean, std=std, low=0.01, high=5 * mean, floor=0.0,
+                scene, joint, name=JOINT_DAMPING[i], mean=mean, std=std, low=0.01, high=5 * mean, log_offset=0.0,
                 group="Robot",
             )
         )  # fmt: skip

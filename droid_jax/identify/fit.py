@@ -82,7 +82,7 @@ class Fit:
 
 
 @dataclass(frozen=True)
-class Progress:
+class SearchProgress:
     """What a progress display needs after each generation; costs over all running restarts.
 
     seconds: wall time so far; seconds_left: at most, at the pace of the latest generations.

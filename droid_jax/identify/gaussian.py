@@ -11,12 +11,12 @@ hardly any row falls inside, Gibbs sampling draws from the same distribution (`i
 A log-scaled parameter in search coordinates is clipped by its map instead, so that a bound of
 exactly zero keeps the probability that lies beyond it.
 
-File format (JSON, version 1)::
+File format (JSON, version 2)::
 
-    {"format": "droid_jax.gaussian", "version": 1, "coordinates": "search" | "physical",
+    {"format": "droid_jax.gaussian", "version": 2, "coordinates": "search" | "physical",
      "rule": str, "mean": [D], "cov": [D][D],
      "space": [{"name", "unit", "mean", "std", "low", "high", "nuisance", "group",
-                "scaling": "linear" | "log", "floor", "width": number | null,
+                "scaling": "linear" | "log", "log_offset", "width": number | null,
                 "writes": [{"field", "index": [...], "mode", "gain", "offset", "element"}]}]}
 """
 
@@ -42,7 +42,7 @@ from droid_jax.storage import write_json
 Coordinates = Literal["search", "physical"]
 
 FORMAT = "droid_jax.gaussian"
-VERSION = 1
+VERSION = 2
 MIN_ACCEPTANCE = 1e-3  # below this share of draws inside the bounds, rows are no longer drawn again
 MOMENT_POINTS = 20_001  # equal-probability points behind physical_mean and physical_std
 
@@ -224,7 +224,7 @@ class Gaussian:
         slopes = [
             np.full(values.shape[:-1], -math.log(p.std))
             if p.scaling is Scaling.LINEAR
-            else -np.log((values[..., i] + p.floor) * p.log_width)
+            else -np.log((values[..., i] + p.log_offset) * p.log_width)
             for i, p in enumerate(self.space.parameters)
         ]
         return self.space.to_search(values), np.sum(slopes, axis=0)
@@ -290,7 +290,7 @@ class ParameterEntry(msgspec.Struct, forbid_unknown_fields=True):
     nuisance: bool
     group: str
     scaling: Scaling
-    floor: float
+    log_offset: float
     width: float | None
 
 

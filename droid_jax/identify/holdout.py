@@ -19,12 +19,12 @@ Judged = Literal["repeats", "time", "same"]
 
 
 @dataclass(frozen=True)
-class Gap:
+class TorqueDistance:
     """Disagreement with held-out repeats of one recording, N m, before and after the fit.
 
-    before, after, floor: equation 1 without penalty terms, all compared channels; floor is what a perfect
+    before, after, noise_floor: equation 1 without penalty terms, all compared channels; floor is what a perfect
     model would leave, estimated from the scatter of all repeats, fitted and held out, about their mean.
-    closed: share of the way from before to floor; None where before does not exceed it by WORTH of it.
+    closed: share of the way from before to noise_floor; None where before does not exceed it by WORTH of it.
     Floors and closed are None where there is one repeat only.
     per_joint_*: [J] root mean square of the smoothed torques' difference.
     judged: on what: "repeats" that were held out, the last part in "time" of a log, or the "same" one repeat that was
@@ -33,15 +33,15 @@ class Gap:
 
     before: float
     after: float
-    floor: float | None
+    noise_floor: float | None
     closed: float | None
     per_joint_before: tuple[float, ...]
     per_joint_after: tuple[float, ...]
-    per_joint_floor: tuple[float, ...] | None
+    per_joint_noise_floor: tuple[float, ...] | None
     judged: Judged
 
 
-def split(recording: Recording, share: float) -> tuple[Recording, Recording, tuple[int, ...]]:
+def split_repeats(recording: Recording, share: float) -> tuple[Recording, Recording, tuple[int, ...]]:
     """Fitted and held-out repeats (the last ones), and the latter's indices.
 
     Of one repeat without commands the last part in time is held out; with commands, one serves as both.
@@ -65,9 +65,9 @@ def judged_on(recording: Recording, held: Recording) -> Judged:
     return "time" if recording.repeats == 1 else "repeats"
 
 
-def gaps_of(
+def torque_distances(
     cost: Cost, recordings: Sequence[Recording], held: Sequence[Recording], before: np.ndarray, after: np.ndarray
-) -> list[Gap]:
+) -> list[TorqueDistance]:
     """The gap to what was held out of each recording, of which `cost` is, at two parameter vectors [F]."""
     penalty_free = cost.distances(np.stack([before, after])) - cost.penalties(np.stack([before, after]))
     smoothed = cost.smoothed(np.stack([before, after]))
@@ -79,14 +79,14 @@ def gaps_of(
         floor = None if everything is None else _floor(everything)
         first, last = penalty_free[0, i], penalty_free[1, i]
         out.append(
-            Gap(
+            TorqueDistance(
                 before=float(first),
                 after=float(last),
-                floor=floor,
+                noise_floor=floor,
                 closed=_closed(float(first), float(last), floor),
                 per_joint_before=tuple(rms[0].tolist()),
                 per_joint_after=tuple(rms[1].tolist()),
-                per_joint_floor=None if everything is None else _smooth_floor(everything, one.repeats),
+                per_joint_noise_floor=None if everything is None else _smooth_floor(everything, one.repeats),
                 judged=judged_on(recording, own),
             )
         )

@@ -51,10 +51,10 @@ class Identifiability:
 
 def posterior(refined: Refined, comparisons: Sequence[Comparison]) -> Gaussian:
     """The Gaussian to hand on, in search coordinates over the refined space: `told` with the stated prior."""
-    return with_stated_prior(told(refined, comparisons), refined)
+    return with_stated_prior(posterior_of(refined, comparisons), refined)
 
 
-def told(refined: Refined, comparisons: Sequence[Comparison], *, misfit: bool = True) -> Gaussian:
+def posterior_of(refined: Refined, comparisons: Sequence[Comparison], *, misfit: bool = True) -> Gaussian:
     """What the recordings that were refined on tell by themselves, but for the refinement's wide prior.
 
     For questions to the data alone, as whether an amplitude may be zero.

@@ -24,7 +24,7 @@ Residuals = Callable[[np.ndarray], np.ndarray]
 # A batch of trials for each start: damping factors x lengths x paths, 32 in all, the block of a CPU.
 _DAMPINGS = 10.0 ** np.arange(-3.0, 5.0)
 _LENGTHS = (1.0, 0.5)
-TRIALS = 2 * len(_DAMPINGS) * len(_LENGTHS)
+CANDIDATE_STEPS = 2 * len(_DAMPINGS) * len(_LENGTHS)
 _LONGEST = 2.0  # search units: the longest component of a step
 CHORDS = 3  # batches of trials at most with one Jacobian
 WIDE = 1.5  # posterior deviations: half-width of those differences
@@ -61,7 +61,7 @@ class StepConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class Starts:
     """Live starts: x [S, D], residual [S, M], objective [S], damping [S], difference widths [S, D]."""
 
     x: np.ndarray
@@ -70,9 +70,9 @@ class State:
     damping: np.ndarray
     widths: np.ndarray
 
-    def rows(self, keep: Any) -> State:
+    def rows(self, keep: Any) -> Starts:
         """The starts that `keep` indexes."""
-        return State(*(getattr(self, f)[keep] for f in State.__dataclass_fields__))
+        return Starts(*(getattr(self, f)[keep] for f in Starts.__dataclass_fields__))
 
 
 def curvature(jacobian: np.ndarray, prior: np.ndarray) -> np.ndarray:
@@ -91,13 +91,15 @@ def fall(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     return np.where(np.isinf(after), 0.0, before - np.where(np.isinf(after), 0.0, after))
 
 
-class Problem:
+class DampedProblem:
     """Residuals and prior in search coordinates, with what an iteration does; counts iterations and replays.
 
     before: a problem whose counts are gone on with.
     """
 
-    def __init__(self, residuals: Residuals, space: Space, config: StepConfig, before: Problem | None = None) -> None:
+    def __init__(
+        self, residuals: Residuals, space: Space, config: StepConfig, before: DampedProblem | None = None
+    ) -> None:
         self.residuals, self.space = residuals, space
         self._config = config
         self.prior = np.where(space.nuisance, 1.0, config.main_prior)
@@ -117,7 +119,7 @@ class Problem:
         whole = np.isfinite(residual).all(axis=1, keepdims=True)  # of one recording of several it may not be
         return np.where(whole, residual, np.nan)
 
-    def differences(self, up: np.ndarray, down: np.ndarray, state: State) -> tuple[np.ndarray, np.ndarray]:
+    def differences(self, up: np.ndarray, down: np.ndarray, state: Starts) -> tuple[np.ndarray, np.ndarray]:
         """Spans [S, N, D] and residual differences [S, N, M] between up and down, both [S, N, D].
 
         The start itself takes the place of a replay that failed.
@@ -134,25 +136,25 @@ class Problem:
         value = 0.5 * np.sum(residual**2, axis=-1) + 0.5 * np.sum((x / self.prior) ** 2, axis=-1)
         return np.where(np.isfinite(value), value, np.inf)
 
-    def start(self, x: np.ndarray) -> State:
+    def start(self, x: np.ndarray) -> Starts:
         """The state of fresh starts [S, D]."""
         residual = self.replay(x)
         widths = np.full(x.shape, self._config.step)
-        return State(x, residual, self.objective(x, residual), np.full(len(x), 1e-3), widths)
+        return Starts(x, residual, self.objective(x, residual), np.full(len(x), 1e-3), widths)
 
-    def step(self, state: State, held: np.ndarray | None = None) -> tuple[State, np.ndarray]:
+    def step(self, state: Starts, held: np.ndarray | None = None) -> tuple[Starts, np.ndarray]:
         """One iteration of all starts, and by how much each objective fell. held: [S, D] bool, stay put."""
         jacobian = self.jacobian(state)
         before = state.objective
         self.iterations += 1
-        state = self.trials(state, jacobian, held)
+        state = self.candidate_steps(state, jacobian, held)
         curvature = np.einsum("smd,smd->sd", jacobian, jacobian) + self.prior**-2
         # About one deviation wide, the others given; a start that stood still looks from elsewhere.
         widths = np.where((state.objective < before)[:, None], 1.0, 3.0) / np.sqrt(curvature)
         widths = np.clip(widths, self._config.smallest_step, self._config.step)
         return replace(state, widths=widths), fall(before, state.objective)
 
-    def trials(self, state: State, jacobian: np.ndarray, held: np.ndarray | None = None) -> State:
+    def candidate_steps(self, state: Starts, jacobian: np.ndarray, held: np.ndarray | None = None) -> Starts:
         """Batches of trials with one Jacobian [S, M, D] for as long as they pay."""
         for _ in range(CHORDS):
             last = state.objective
@@ -161,7 +163,7 @@ class Problem:
                 break
         return state
 
-    def jacobian(self, state: State) -> np.ndarray:
+    def jacobian(self, state: Starts) -> np.ndarray:
         """[S, M, D] differences of every start in one batch; one-sided where a bound is in the way."""
         steps = np.eye(state.x.shape[1]) * state.widths[:, None, :]
         up, down = self.inside(state.x[:, None] + steps), self.inside(state.x[:, None] - steps)
@@ -173,7 +175,7 @@ class Problem:
         """[D, D] columns: the posterior's principal axes, one deviation long, no entry beyond `longest`."""
         return principal_axes(np.linalg.inv(curvature(jacobian, self.prior)), longest)
 
-    def wide_jacobian(self, state: State, jacobian: np.ndarray) -> np.ndarray:
+    def wide_jacobian(self, state: Starts, jacobian: np.ndarray) -> np.ndarray:
         """[M, D] slopes of one start over the width of its posterior, from narrow ones, along the posterior's own axes.
 
         Differences of one parameter at a time carry the solver's rounding, which looks like
@@ -191,7 +193,7 @@ class Problem:
             jacobian = np.linalg.lstsq(spans[0], apart[0])[0].T
         return jacobian
 
-    def _try(self, state: State, jacobian: np.ndarray, held: np.ndarray | None) -> State:
+    def _try(self, state: Starts, jacobian: np.ndarray, held: np.ndarray | None) -> Starts:
         """All trials of all starts in one batch; each start takes its best, or stays."""
         starts, dims = state.x.shape
         steps = np.stack([self._steps(state.rows([s]), jacobian[s], held, s) for s in range(starts)])
@@ -202,7 +204,7 @@ class Problem:
         rows, pick = np.arange(starts), np.argmin(objective, axis=1)
         better = objective[rows, pick] < state.objective
         factor = np.tile(np.repeat(_DAMPINGS, len(_LENGTHS)), len(paths))[pick]
-        return State(
+        return Starts(
             x=np.where(better[:, None], trials[rows, pick], state.x),
             residual=np.where(better[:, None], residual[rows, pick], state.residual),
             objective=np.where(better, objective[rows, pick], state.objective),
@@ -210,7 +212,7 @@ class Problem:
             widths=state.widths,
         )
 
-    def _steps(self, state: State, jacobian: np.ndarray, held: np.ndarray | None, row: int) -> np.ndarray:
+    def _steps(self, state: Starts, jacobian: np.ndarray, held: np.ndarray | None, row: int) -> np.ndarray:
         """[dampings * lengths, D] Levenberg-Marquardt steps of one start, along the bounds it sits on.
 
         None from a start that could not be replayed.

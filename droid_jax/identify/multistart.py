@@ -4,8 +4,8 @@ Works in search coordinates x. The objective is |r(x)|^2 / 2 + |(x - x0) / w|^2 
 posterior, with a prior of deviation w: one unit for nuisances (their own prior), `main_prior` units
 for the parameters of interest, so that what the data do not tell stays put instead of drifting.
 
-An iteration is `identify.damped`'s.  What is here decides which starts go on, when to stop, and how to leave a basin
-that is none of the best: hypotheses, initial means, and CMA-ES around where the iterations stood still.
+An iteration is `levenberg_marquardt`'s.  What is here decides which starts go on, when to stop, and how to leave a
+basin that is none of the best: hypotheses, initial means, and CMA-ES around where the iterations stood still.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 
 from droid_jax import arguments
 from droid_jax.arguments import check_fields, several, whole
-from droid_jax.identify.levenberg_marquardt import Problem, Residuals, State, StepConfig, curvature, fall
+from droid_jax.identify.levenberg_marquardt import DampedProblem, Residuals, Starts, StepConfig, curvature, fall
 from droid_jax.identify.search import NotReplayed, SearchConfig, search
 from droid_jax.model.parameters import Parameter, Space
 
@@ -44,26 +44,27 @@ class RefineConfig(StepConfig):
     iterations: Jacobians at most.
     tolerance: stop when an iteration lowers the objective (a log likelihood) by less than this, or by less than a
       share FAR of what it is above that of noise alone: a model that misses something may be far from any fit.
-    rough: while starts and hypotheses are sorted out, already when it lowers it by less than this share.
-    aim: an objective to reach: stop where the last iteration's gain, HOPELESS times over, would not do.
-    keep: after iteration i only starts within keep[i] times the best objective go on (the last
+    coarse_tolerance: while starts and hypotheses are sorted out, already when it lowers it by less than this share.
+    target_objective: an objective to reach: stop where the last iteration's gain, HOPELESS times over, would not do.
+    pruning_ratio: after iteration i only starts within pruning_ratio[i] times the best objective go on (the last
       number holds from there on).
-    doubt: hypotheses are tried where the residuals' mean square stays above this.
-    hold: iterations for which the values of a hypothesis are held while all else settles.
-    hops: searches at most for a better basin around where the iterations stood still; with none of them nothing is
+    misfit_threshold: hypotheses are tried where the residuals' mean square stays above this.
+    hold_iterations: iterations for which the values of a hypothesis are held while all else settles.
+    basin_hops: searches at most for a better basin around where the iterations stood still; with none of them nothing
+    is
       put back to its initial mean either (see `STRAYED`).
-    hop_generations: generations of each.
+    basin_hop_generations: generations of each.
     """
 
     iterations: int = 30
     tolerance: float = 0.5
-    rough: float = 5e-3
-    aim: float = np.inf
-    keep: tuple[float, ...] = (100.0, 20.0, 3.0, 1.3, 1.0)
-    doubt: float = 1.1
-    hold: int = 2
-    hops: int = 4
-    hop_generations: int = 20
+    coarse_tolerance: float = 5e-3
+    target_objective: float = np.inf
+    pruning_ratio: tuple[float, ...] = (100.0, 20.0, 3.0, 1.3, 1.0)
+    misfit_threshold: float = 1.1
+    hold_iterations: int = 2
+    basin_hops: int = 4
+    basin_hop_generations: int = 20
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -71,13 +72,13 @@ class RefineConfig(StepConfig):
             self,
             iterations=partial(whole, least=0),
             tolerance=partial(arguments.number, least=0),
-            rough=partial(arguments.number, least=0),
-            aim=partial(arguments.number, infinite=True),
-            keep=several(partial(arguments.number, least=1)),
-            doubt=partial(arguments.number, least=0),
-            hold=partial(whole, least=0),
-            hops=partial(whole, least=0),
-            hop_generations=partial(whole, least=1),
+            coarse_tolerance=partial(arguments.number, least=0),
+            target_objective=partial(arguments.number, infinite=True),
+            pruning_ratio=several(partial(arguments.number, least=1)),
+            misfit_threshold=partial(arguments.number, least=0),
+            hold_iterations=partial(whole, least=0),
+            basin_hops=partial(whole, least=0),
+            basin_hop_generations=partial(whole, least=1),
         )
 
 
@@ -89,7 +90,7 @@ class Refined:
     objective: |r|^2 / 2 plus the prior's part; residual [M] and jacobian [M, D] there;
     prior [D] deviations, search units; starts: objective each start ended at; evaluations: replays;
     iterations; converged: it ended before its iterations ran out, since they no longer paid; not where it was given
-    up because `aim` was out of reach.
+    up because `target_objective` was out of reach.
     """
 
     space: Space
@@ -150,9 +151,9 @@ def refine(
     ended, alive = begun.objective, np.isfinite(begun.objective)
     if not alive.any():
         raise NotReplayed("none of the starts could be replayed; widen the bounds or start nearer to the truth")
-    state, ended[alive] = rough.descend(begun.rows(alive), config.rough)
-    if hypotheses and np.mean(state.residual**2) > config.doubt:
-        state, _ = rough.descend(rough.explore(state, hypotheses), config.rough)
+    state, ended[alive] = rough.descend(begun.rows(alive), config.coarse_tolerance)
+    if hypotheses and np.mean(state.residual**2) > config.misfit_threshold:
+        state, _ = rough.descend(rough.explore(state, hypotheses), config.coarse_tolerance)
     problem = rough
     if first is not None:
         problem = _Descent(residuals, space, config, progress, rough)
@@ -162,7 +163,7 @@ def refine(
                 "the best start on the first recording could not be replayed on all; start nearer to the truth"
             )
     state, _ = problem.descend(state)
-    if config.hops:
+    if config.basin_hops:
         state = problem.back(state)
     state, slopes, settled = problem.hopped(state)
     return Refined(
@@ -185,14 +186,14 @@ def chord(residuals: Residuals, space: Space, starts: np.ndarray, jacobian: np.n
 
     A few batches of trials and no differences: a first look at what a refinement would find.
     """
-    problem = Problem(residuals, space, StepConfig())
+    problem = DampedProblem(residuals, space, StepConfig())
     state = problem.start(problem.inside(space.to_search(space.check(starts))))
-    state = problem.trials(state, np.repeat(jacobian[None], len(state.x), axis=0))
+    state = problem.candidate_steps(state, np.repeat(jacobian[None], len(state.x), axis=0))
     best = int(np.argmin(state.objective))
     return space.from_search(state.x[best]), float(state.objective[best])
 
 
-class _Descent(Problem):
+class _Descent(DampedProblem):
     """Iterations until they no longer pay, and the ways out of a basin."""
 
     def __init__(
@@ -201,23 +202,23 @@ class _Descent(Problem):
         space: Space,
         config: RefineConfig,
         progress: Callable[[RefineProgress], None] | None = None,
-        before: Problem | None = None,
+        before: DampedProblem | None = None,
     ) -> None:
         super().__init__(residuals, space, config, before)
         self.config, self.progress = config, progress
         self.given_up = False
 
-    def excess(self, state: State) -> np.ndarray:
+    def excess(self, state: Starts) -> np.ndarray:
         """[S] by how much the objectives are above half a unit for each residual, which noise alone leaves."""
         return np.maximum(state.objective - 0.5 * state.residual.shape[1], 0.0)
 
-    def descend(self, state: State, rough: float = 0.0) -> tuple[State, np.ndarray]:
+    def descend(self, state: Starts, rough: float = 0.0) -> tuple[Starts, np.ndarray]:
         """Iterate until the best start stands still; that start, and the objective [S] each one ended at.
 
         rough: a share of the objective that is not worth an iteration either.
         """
         ended, alive, self.given_up = state.objective.copy(), np.arange(len(state.x)), False
-        keep = self.config.keep
+        keep = self.config.pruning_ratio
         for number in range(self.config.iterations - self.iterations):
             state, gain = self.step(state)
             ended[alive] = state.objective
@@ -225,20 +226,20 @@ class _Descent(Problem):
             self._report(state.objective[leader], state.residual.shape[1])
             if gain[leader] <= max(self.least(state), rough * state.objective[leader]):
                 break
-            self.given_up = bool(HOPELESS * gain[leader] < state.objective[leader] - self.config.aim)
+            self.given_up = bool(HOPELESS * gain[leader] < state.objective[leader] - self.config.target_objective)
             if self.given_up:
                 break
             good = state.objective <= keep[min(number, len(keep) - 1)] * state.objective[leader]
             state, alive = state.rows(good), alive[good]
         return state.rows([int(np.argmin(state.objective))]), ended
 
-    def back(self, state: State) -> State:
+    def back(self, state: Starts) -> Starts:
         """Leave a basin that the data hardly chose: put back to its initial mean what strayed, and follow that.
 
         In logarithms a small mass is a plateau, and a finger that sticks is one in its friction: where another
         parameter pushed them there, no slope leads back.  Not with the last iterations: they are for what is there.
         """
-        tried, last = set[str](), self.config.iterations - 2 * (self.config.hold + 1)
+        tried, last = set[str](), self.config.iterations - 2 * (self.config.hold_iterations + 1)
         while self.iterations <= last and (strayed := [n for n in self.strayed(state) if n not in tried]):
             tried.update(strayed)
             means = {name: self.space[name].mean for name in strayed}
@@ -249,25 +250,25 @@ class _Descent(Problem):
             state, _ = self.descend(found)
         return state
 
-    def least(self, state: State) -> float:
+    def least(self, state: Starts) -> float:
         """By how much the best objective must fall for it to be worth an iteration."""
         leader = int(np.argmin(state.objective))
         return max(self.config.tolerance, FAR * float(self.excess(state)[leader]))
 
-    def strayed(self, state: State) -> list[str]:
+    def strayed(self, state: Starts) -> list[str]:
         """Parameters of interest far from their initial means that the data do not tell sharply."""
         slopes = self.jacobian(state)[0]
         deviation = np.sqrt(np.diag(np.linalg.inv(curvature(slopes, self.prior))))
         which = ~self.space.nuisance & (np.abs(state.x[0]) > STRAYED) & (deviation > UNTOLD)
         return [self.space.names[k] for k in np.flatnonzero(which)]
 
-    def hopped(self, state: State) -> tuple[State, np.ndarray | None, bool]:
+    def hopped(self, state: Starts) -> tuple[Starts, np.ndarray | None, bool]:
         """Leave small basins, as often as that pays and no more than `hops` times; one start.
 
         Returns where that ended, its slopes [M, D] where they are known, and whether a hop found nothing more.
         """
-        settled, slopes = self.config.hops == 0, None
-        for number in range(self.config.hops):
+        settled, slopes = self.config.basin_hops == 0, None
+        for number in range(self.config.basin_hops):
             slopes = self.jacobian(state)[0]
             hopped = self.hop(state, slopes, number)
             least = max(HOP_TOLERANCE, HOP_FAR * self.excess(state)[0])
@@ -280,7 +281,7 @@ class _Descent(Problem):
             slopes = None
         return state, slopes, settled
 
-    def hop(self, state: State, jacobian: np.ndarray, seed: int) -> State:
+    def hop(self, state: Starts, jacobian: np.ndarray, seed: int) -> Starts:
         """Leave a small basin: CMA-ES in the metric of the posterior, from a start that stands still.
 
         In x = x0 + L u, L L^T the posterior's covariance, the objective is about |u|^2 / 2 and what
@@ -297,14 +298,18 @@ class _Descent(Problem):
 
         unit = Space(tuple(Parameter(f"u{i}", "-", 0.0, 1.0, -50.0, 50.0) for i in range(len(self.space))))
         settings = SearchConfig(
-            population=HOP_POPULATION, parents=None, generations=self.config.hop_generations, sigma=HOP_SIGMA, seed=seed
+            population=HOP_POPULATION,
+            parents=None,
+            generations=self.config.basin_hop_generations,
+            sigma=HOP_SIGMA,
+            seed=seed,
         )
         try:
             return self.start(around(search(cost, unit, settings).best[None]))
         except NotReplayed:  # nothing around here can be
             return state
 
-    def explore(self, state: State, hypotheses: Hypotheses) -> State:
+    def explore(self, state: Starts, hypotheses: Hypotheses) -> Starts:
         """Follow each hypothesis from a converged start: hold its values while all else settles, then free them.
 
         After one iteration only the best of them go on.  Returns the better of what they found and `state`, one start.
@@ -321,8 +326,8 @@ class _Descent(Problem):
         if not alive.any():
             return state
         branches, held = branches.rows(alive), held[alive]
-        for iteration in range(self.config.hold + 1):
-            branches, _ = self.step(branches, held if iteration < self.config.hold else None)
+        for iteration in range(self.config.hold_iterations + 1):
+            branches, _ = self.step(branches, held if iteration < self.config.hold_iterations else None)
             ahead = np.argsort(branches.objective)[:FOLLOWED]
             branches, held = branches.rows(ahead), held[ahead]
         found = branches.rows([int(np.argmin(branches.objective))])

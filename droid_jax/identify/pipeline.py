@@ -18,7 +18,7 @@ from droid_jax.cost.residuals import CompareConfig
 from droid_jax.identify.divergence import blow_up
 from droid_jax.identify.fit import Fit
 from droid_jax.identify.gaussian import Gaussian, prior, space_to_json
-from droid_jax.identify.holdout import Gap, gaps_of, split
+from droid_jax.identify.holdout import TorqueDistance, split_repeats, torque_distances
 from droid_jax.identify.identifiability import Identifiability, identifiability, not_judged, posterior
 from droid_jax.identify.multistart import RefineConfig, Refined, refine
 from droid_jax.identify.search import SearchConfig, search
@@ -75,8 +75,8 @@ class Identified:
 
     space: what was searched; full: with the nuisances (the same where nothing was refined).
     best: [F] physical values over `full`.  gaussian: over `space`, the one to hand on; full_gaussian
-    over `full`.  search: the CMA-ES part.  refined: or None.  tells: per parameter of `full`.
-    gaps: by recording name.  fit, heldout: costs over `full` on the fitted and the held-out repeats.
+    over `full`.  search: the CMA-ES part.  refined: or None.  identifiability: per parameter of `full`.
+    torque_distances: by recording name.  fit, heldout: costs over `full` on the fitted and the held-out repeats.
     heldout_repeats: by recording name.  seconds: by stage.  checks: by recording name, of those with commands.
     """
 
@@ -88,8 +88,8 @@ class Identified:
     full_gaussian: Gaussian
     search: Fit
     refined: Refined | None
-    tells: tuple[Identifiability, ...]
-    gaps: dict[str, Gap]
+    identifiability: tuple[Identifiability, ...]
+    torque_distances: dict[str, TorqueDistance]
     fit: Cost
     heldout: Cost
     heldout_repeats: dict[str, tuple[int, ...]]
@@ -107,11 +107,11 @@ _FIELDS = tuple(Rollout.__dataclass_fields__)
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class Preparation:
     """What is to be identified, checked: costs over `full`, which is `space` with the nuisances that are fitted.
 
-    held: the repeats of each recording that the fit does not see; heldout_repeats: their numbers.  fit, heldout: costs
-    on the other repeats and on these.  seconds: that this took.
+    heldout_count: the repeats of each recording that the fit does not see; heldout_repeats: their numbers.  fit,
+    heldout: costs on the other repeats and on these.  seconds: that this took.
     """
 
     scene: Scene
@@ -120,7 +120,7 @@ class Problem:
     config: IdentifyConfig
     effects: tuple[Effect, ...]
     recordings: tuple[Recording, ...]
-    held: tuple[Recording, ...]
+    heldout_count: tuple[Recording, ...]
     heldout_repeats: tuple[tuple[int, ...], ...]
     fit: Cost
     heldout: Cost
@@ -128,7 +128,7 @@ class Problem:
     seconds: float
 
 
-def identify(
+def identify_parameters(
     scene: Scene,
     space: Space,
     recordings: Recording | Sequence[Recording],
@@ -149,7 +149,7 @@ def identify(
     without the refinement (the search sees the first alone), and where the initial means cannot be simulated.
     """
     problem = prepare(scene, space, recordings, nuisances=nuisances, config=config, effects=effects)
-    return solve(problem, checkpoints=checkpoints, progress=progress)
+    return run_fit(problem, checkpoints=checkpoints, progress=progress)
 
 
 def prepare(
@@ -160,7 +160,7 @@ def prepare(
     nuisances: Space | None = None,
     config: IdentifyConfig | None = None,
     effects: Sequence[Effect] = (),
-) -> Problem:
+) -> Preparation:
     """The part of `identify` before the search: whatever is wrong with the input is told here, and nothing written."""
     began = time.monotonic()
     config = instance(IdentifyConfig() if config is None else config, "config", IdentifyConfig)
@@ -170,7 +170,7 @@ def prepare(
     if nuisances is not None:
         instance(nuisances, "nuisances", Space)
     recordings = [own_starts(recording) for recording in recordings]
-    fitted, held, numbers = zip(*(split(r, config.heldout) for r in recordings), strict=True)
+    fitted, held, numbers = zip(*(split_repeats(r, config.heldout) for r in recordings), strict=True)
     full = space if nuisances is None or config.refine is None else space + nuisances
     base = make_cost(scene, full, fitted, engine=config.engine, config=config.compare, effects=effects, check=False)
     for recording in recordings:  # whole: copies among its repeats may be fitted and held out
@@ -184,14 +184,14 @@ def prepare(
         else make_cost(scene, full, held, config=plain, effects=effects, check=False)
     )
     _check_start(base, full)
-    return Problem(
+    return Preparation(
         scene=scene,
         space=space,
         full=full,
         config=config,
         effects=tuple(effects),
         recordings=tuple(recordings),
-        held=held,
+        heldout_count=held,
         heldout_repeats=numbers,
         fit=base,
         heldout=heldout,
@@ -215,7 +215,7 @@ def search_cost(
     return searched
 
 
-def solve(problem: Problem, *, checkpoints: Path | None = None, progress: Progress | None = None) -> Identified:
+def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: Progress | None = None) -> Identified:
     """The rest of `identify`: search, refine, calibrate, judge."""
     report = progress or (lambda stage, value: None)
     config, space, full, base = problem.config, problem.space, problem.full, problem.fit
@@ -244,7 +244,7 @@ def solve(problem: Problem, *, checkpoints: Path | None = None, progress: Progre
 
     began = time.monotonic()
     report("judge", None)
-    gaps = gaps_of(problem.heldout, problem.recordings, problem.held, full.mean, best)
+    gaps = torque_distances(problem.heldout, problem.recordings, problem.heldout_count, full.mean, best)
     seconds["judge"] = time.monotonic() - began
 
     began = time.monotonic()
@@ -260,8 +260,8 @@ def solve(problem: Problem, *, checkpoints: Path | None = None, progress: Progre
         full_gaussian=full_gaussian,
         search=found,
         refined=refined,
-        tells=not_judged(full_gaussian) if refined is None else identifiability(full_gaussian, refined.prior),
-        gaps=dict(zip(names, gaps, strict=True)),
+        identifiability=not_judged(full_gaussian) if refined is None else identifiability(full_gaussian, refined.prior),
+        torque_distances=dict(zip(names, gaps, strict=True)),
         fit=base,
         heldout=problem.heldout,
         heldout_repeats=dict(zip(names, problem.heldout_repeats, strict=True)),

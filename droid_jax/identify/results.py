@@ -99,7 +99,7 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
     x, initial_x = (found.full.to_search(v).tolist() for v in (found.best, found.full.mean))
     parameters = []
     for i, p in enumerate(found.full.parameters):
-        tells = found.tells[i]
+        tells = found.identifiability[i]
         parameters.append(
             {
                 "name": p.name,
@@ -124,7 +124,7 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
             }
         )
     costs = found.fit(np.stack([found.start, found.best]))
-    floors: list[Any] = [g.floor for g in found.gaps.values()]
+    floors: list[Any] = [g.noise_floor for g in found.torque_distances.values()]
     comparison = found.fit.comparisons[0]
     whitened = comparison.config.whitened  # the gaps' floors are in the unit of the torque
     unit = found.scene.torque_unit(found.scene.joints[c] for c in comparison.channel("torque").columns)
@@ -134,10 +134,10 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
         "cost": {
             "initial": float(costs[0]),
             "best": float(costs[1]),
-            "floor": None if whitened or None in floors else float(np.mean(floors)),
+            "noise_floor": None if whitened or None in floors else float(np.mean(floors)),
             "unit": "noise units" if whitened else unit,
         },
-        "gap": {name: asdict(gap) for name, gap in found.gaps.items()},
+        "gap": {name: asdict(gap) for name, gap in found.torque_distances.items()},
         "torque_unit": unit,
         "stop": found.search.stop,
         "converged": None if found.refined is None else found.refined.converged,

@@ -23,9 +23,9 @@ import numpy as np
 
 from droid_jax.arguments import check_fields, flag, number, one_of, optional, whole
 from droid_jax.identify.cma import Strategy, recombination
-from droid_jax.identify.fit import Fit, History, Progress, Restart, on_bound
+from droid_jax.identify.fit import Fit, History, Restart, SearchProgress, on_bound
 from droid_jax.identify.gaussian import space_to_json
-from droid_jax.identify.search_state import REASONS, Run
+from droid_jax.identify.search_state import REASONS, SearchState
 from droid_jax.model.parameters import Space
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ def search(
     start: np.ndarray | None = None,
     checkpoint_dir: Path | None = None,
     fingerprint: str = "",
-    progress: Callable[[Progress], None] | None = None,
+    progress: Callable[[SearchProgress], None] | None = None,
 ) -> Fit:
     """Minimise cost over a space.
 
@@ -131,7 +131,9 @@ def search(
     strategy = _strategy(space, config)
     centre = _start(space, config, start)
     with _checkpoints(checkpoint_dir, space, config, centre, fingerprint) as checkpoints:
-        run = _restored(checkpoints, strategy, centre) or Run.fresh(strategy.init(centre), config.restarts, len(space))
+        run = _restored(checkpoints, strategy, centre) or SearchState.fresh(
+            strategy.init(centre), config.restarts, len(space)
+        )
         while _unfinished(run, config):
             _generation(run, cost, strategy, config)
             if checkpoints and (run.generation % config.checkpoint_every == 0 or not _unfinished(run, config)):
@@ -150,7 +152,7 @@ def _strategy(space: Space, config: SearchConfig) -> Strategy:
     return Strategy(space, weights, sigma=config.sigma, seeds=seeds, redraw=config.bounds == "resample")
 
 
-def _generation(run: Run, cost: Cost, strategy: Strategy, config: SearchConfig) -> None:
+def _generation(run: SearchState, cost: Cost, strategy: Strategy, config: SearchConfig) -> None:
     """One generation of every restart: draw, evaluate, update, record, judge."""
     started = time.perf_counter()
     space = strategy.space
@@ -185,7 +187,7 @@ def mirrored(space: Space, x: np.ndarray) -> np.ndarray:
     return np.clip(np.where(x < low, 2 * low - x, np.where(x > high, 2 * high - x, x)), low, high)
 
 
-def _try_bounds(run: Run, cost: Cost, space: Space, config: SearchConfig) -> int:
+def _try_bounds(run: SearchState, cost: Cost, space: Space, config: SearchConfig) -> int:
     """Ask once more for every restart's best, moved onto bounds it lies near; how many rows were asked.
 
     Mirrored draws come near a bound and never lie on it.  A row that costs no more becomes the best.  Nothing of this
@@ -222,7 +224,7 @@ def _evaluate(cost: Cost, values: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(costs), costs, np.inf).reshape(values.shape[:2])
 
 
-def _judge(run: Run, config: SearchConfig) -> None:
+def _judge(run: SearchState, config: SearchConfig) -> None:
     """Mark the restarts that have converged; a marked one stays as it is from then on."""
     widest = np.sqrt(np.linalg.eigvalsh(run.cov)[:, -1])  # [R]
     narrow = widest < config.tol_sigma
@@ -236,13 +238,13 @@ def _judge(run: Run, config: SearchConfig) -> None:
     run.stopped[running & narrow] = REASONS.index("tol_sigma")
 
 
-def _unfinished(run: Run, config: SearchConfig) -> bool:
+def _unfinished(run: SearchState, config: SearchConfig) -> bool:
     """Whether another generation is due."""
     in_time = config.max_seconds is None or run.seconds < config.max_seconds
     return bool((run.stopped == 0).any()) and run.generation < config.generations and in_time
 
 
-def _progress(run: Run, config: SearchConfig) -> Progress:
+def _progress(run: SearchState, config: SearchConfig) -> SearchProgress:
     """Numbers for a display; the pace is the median of ten generations, so that compilation drops out."""
     pace = float(np.median([s[0] for s in run.records["seconds"][-10:]]))
     left = pace * (config.generations - run.generation) if _unfinished(run, config) else 0.0
@@ -251,10 +253,12 @@ def _progress(run: Run, config: SearchConfig) -> Progress:
     leader = int(np.argmin(run.best_cost))
     median = float(np.min(run.records["median_cost"][-1][run.ended == run.generation]))
     sigma = float(run.records["sigma"][-1][leader])
-    return Progress(run.generation, config.generations, float(run.best_cost[leader]), median, sigma, run.seconds, left)
+    return SearchProgress(
+        run.generation, config.generations, float(run.best_cost[leader]), median, sigma, run.seconds, left
+    )
 
 
-def _fit(run: Run, space: Space, config: SearchConfig, asked: int) -> Fit:
+def _fit(run: SearchState, space: Space, config: SearchConfig, asked: int) -> Fit:
     """The result, led by the restart with the lowest cost; `asked` rows came after the generations."""
     overall = "max_seconds" if run.generation < config.generations else "generations"
     covs, means = run.cov, run.records["mean"][-1]
@@ -313,11 +317,11 @@ def _checkpoints(folder: Path | None, space: Space, config: SearchConfig, centre
     return Checkpoints(folder, fingerprint=texts)
 
 
-def _restored(checkpoints: Checkpoints | None, strategy: Strategy, centre: np.ndarray) -> Run | None:
+def _restored(checkpoints: Checkpoints | None, strategy: Strategy, centre: np.ndarray) -> SearchState | None:
     """The search as its newest whole checkpoint left it, or None."""
     found = checkpoints.restore() if checkpoints else None
     if found is None:
         return None
     generation, tree = found
     state = strategy.put_state(strategy.init(centre), tree["state"])
-    return Run.of_tree(generation, tree, state)
+    return SearchState.of_tree(generation, tree, state)

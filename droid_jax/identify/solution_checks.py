@@ -23,7 +23,7 @@ from droid_jax.model.physics import make_c_model, make_physics
 from droid_jax.model.scene import Scene, with_options
 from droid_jax.preflight.creep import creep_note
 from droid_jax.recordings.recording import Recording
-from droid_jax.simulate.c_reference import twin_replay
+from droid_jax.simulate.c_reference import c_replay
 from droid_jax.simulate.replay import Drive, make_drive, servo_replay
 
 LARGE = 0.1  # share of the remaining error from which on a time step is too coarse, or two engines too far apart
@@ -218,7 +218,7 @@ class _Replayed:
         late = 0.0 if self.comparison.config.mj_step else 0.5
         effects = [e for e in with_sensors(scene, self.cost.space, drive, self.effects) if e.name != "torque offset"]
         try:
-            replayed = twin_replay(scene, self.cost.space, drive, effects, late=late)(self.best[None])
+            replayed = c_replay(scene, self.cost.space, drive, effects, late=late)(self.best[None])
         except ValueError as error:
             return f"not compared with plain C MuJoCo: {error}"
         return self._at_own_rows(jax.tree.map(lambda a: a[0], replayed), times, "plain C MuJoCo")

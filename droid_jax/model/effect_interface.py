@@ -79,15 +79,17 @@ class Effect:
                   in MuJoCo's own numbers, for the MJCF; None where this model has none.
 
     For the gap search:
-    what, mark:   a sentence each: what it is, and where its mark should appear.
+    description, signature:   a sentence each: what it is, and where its mark should appear.
     confused_with: names of effects that look alike on some data.
-    holds:        names of those that are special cases of it, or nearly so over the range of a motion: where one of
-                  them does as well, this one is no rival of it.
-    places:       place -> the amplitudes there, e.g. {"joint3": ("joint_coulomb[joint3]",)}; without
+    special_cases:        names of those that are special cases of it, or nearly so over the range of a motion: where
+    one of
+                  them is equivalent, this one is no rival of it.
+    locations:       place -> the amplitudes there, e.g. {"joint3": ("joint_coulomb[joint3]",)}; without
                   them the effect is of no interest to the search.
-    shapes:       parameters that matter only beside an amplitude, and the values to try.
-    smallest:     amplitude below which it is not worth a name, in its own unit.
-    ends:         amplitudes whose bounds are where nature ends (friction that is wholly firm): a fit may stand there.
+    shape_parameters:       parameters that matter only beside an amplitude, and the values to try.
+    minimum_size:     amplitude below which it is not named, in its own unit.
+    natural_bounds:         amplitudes whose bounds are where nature ends (friction that is wholly firm): a fit may
+    stand there.
     """
 
     name: str
@@ -98,14 +100,14 @@ class Effect:
     frictionloss: Callable[[Theta, State, jax.Array], jax.Array] | None = None
     observe: Callable[[Theta, Rollout], Rollout] | None = None
     native: Callable[[Mapping[str, float], mujoco.MjModel], Mapping[tuple[str, int], float] | None] | None = None
-    what: str = ""
-    mark: str = ""
+    description: str = ""
+    signature: str = ""
     confused_with: tuple[str, ...] = ()
-    holds: tuple[str, ...] = ()
-    places: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    shapes: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    smallest: float = 0.0
-    ends: tuple[str, ...] = ()
+    special_cases: tuple[str, ...] = ()
+    locations: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    shape_parameters: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    minimum_size: float = 0.0
+    natural_bounds: tuple[str, ...] = ()
 
 
 def complete(theta: Theta, effects: Sequence[Effect]) -> Theta:

@@ -130,7 +130,7 @@ def model_parameter(
 
     field, element, column: e.g. "dof_damping", "hinge", None or "geom_size", "knob", 0.
     mean: default is the value that leaves the model's own number as it is.
-    options: further fields of `Parameter` (nuisance, group, scaling, floor, width).
+    options: further fields of `Parameter` (nuisance, group, scaling, log_offset, width).
     """
     from droid_jax.model.physics import check_field  # only here: it imports jax, which may have to be tuned first
 
@@ -220,13 +220,13 @@ def _check_frictionloss(scene: Scene, joint: str) -> None:
 
 def joint_damping(scene: Scene, joint: str, *, std: float, high: float, **options: Any) -> Parameter:
     """Viscous damping of a joint, N m s/rad; log-scaled unless told otherwise."""
-    options = {"unit": "N m s/rad", "scaling": Scaling.LOG, "floor": 0.05, **options}
+    options = {"unit": "N m s/rad", "scaling": Scaling.LOG, "log_offset": 0.05, **options}
     return model_parameter(scene, "dof_damping", joint, std=std, high=high, **options)
 
 
 def joint_stiffness(scene: Scene, joint: str, *, std: float, high: float, **options: Any) -> Parameter:
     """Spring stiffness of a joint about its `springref`, N m/rad; log-scaled unless told otherwise."""
-    options = {"unit": "N m/rad", "scaling": Scaling.LOG, "floor": 0.05, **options}
+    options = {"unit": "N m/rad", "scaling": Scaling.LOG, "log_offset": 0.05, **options}
     return model_parameter(scene, "jnt_stiffness", joint, std=std, high=high, **options)
 
 
@@ -236,7 +236,7 @@ def joint_frictionloss(scene: Scene, joint: str, *, std: float, high: float, **o
     Raises ValueError where the model was compiled with friction loss 0: MJX lays the constraint
     row out at compilation, so it could never be raised (see `load_scene(friction_joints=...)`).
     """
-    options = {"unit": "N m", "scaling": Scaling.LOG, "floor": 0.05, **options}
+    options = {"unit": "N m", "scaling": Scaling.LOG, "log_offset": 0.05, **options}
     return model_parameter(scene, "dof_frictionloss", joint, std=std, high=high, **options)
 
 
@@ -260,7 +260,7 @@ def body_mass(
     if nominal <= 0:
         raise ValueError(f"body {body!r} has no mass of its own in this scene")
     mean = nominal if mean is None else mean
-    options = {"name": f"{body}_mass", "unit": "kg", "scaling": Scaling.LOG, "floor": mean, **options}
+    options = {"name": f"{body}_mass", "unit": "kg", "scaling": Scaling.LOG, "log_offset": mean, **options}
     writes = (write(scene, "body_mass", (index,)), *_inertia(scene, index, Mode.SCALE, 1.0 / nominal))
     return Parameter(mean=mean, std=std, low=low, high=high, writes=writes, **options)
 

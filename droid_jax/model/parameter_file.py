@@ -1,11 +1,11 @@
 """Parameters of a user's own scene, from a JSON file.
 
     [{"field": "dof_damping", "element": "elbow", "unit": "N m s/rad", "std": 0.5, "high": 10, "scaling": "log",
-      "floor": 0.05},
+      "log_offset": 0.05},
      {"field": "body_mass", "element": "forearm", "std": 0.2, "high": 5}]
 
 Every entry needs field, element, std and high; optional: column, name, unit, mean, low, mode
-(set, scale, divide, add, negative), scaling (linear, log), floor, width, nuisance, group.
+(set, scale, divide, add, negative), scaling (linear, log), log_offset, width, nuisance, group.
 
     {"sensor": "coulomb", "element": "elbow", "std": 0.5, "high": 5}
 
@@ -40,7 +40,7 @@ from droid_jax.read_json import read_json, typed
 
 _NEEDED = ("element", "std", "high")
 _TIME = "time_offset"
-SMALL = 1e-3  # of its deviation: a mean (and floor) below it is out of reach of a search in the logarithm
+SMALL = 1e-3  # of its deviation: a mean (and log_offset) below it is out of reach of a search in the logarithm
 
 
 class _Entry(msgspec.Struct, forbid_unknown_fields=True):
@@ -57,7 +57,7 @@ class _Entry(msgspec.Struct, forbid_unknown_fields=True):
     high: float | msgspec.UnsetType = msgspec.UNSET
     low: float | msgspec.UnsetType = msgspec.UNSET
     mean: float | msgspec.UnsetType = msgspec.UNSET
-    floor: float | msgspec.UnsetType = msgspec.UNSET
+    log_offset: float | msgspec.UnsetType = msgspec.UNSET
     width: float | msgspec.UnsetType = msgspec.UNSET
     mode: Mode | msgspec.UnsetType = msgspec.UNSET
     scaling: Scaling | msgspec.UnsetType = msgspec.UNSET
@@ -78,10 +78,10 @@ def load_parameters(path: str | Path, scene: Scene) -> Space:
             raise ValueError(f'{path}, entry {i}: {p.name!r} is entry {first[p.name]} already; give it a unique "name"')
     space = Space(tuple(parameters))
     for p in space.parameters:
-        if p.scaling is Scaling.LOG and p.mean + p.floor < SMALL * p.std:
+        if p.scaling is Scaling.LOG and p.mean + p.log_offset < SMALL * p.std:
             warnings.warn(
                 f"{path}: {p.name!r} is searched in the logarithm from {p.mean:g} {p.unit}, where nothing that it does "
-                'is felt yet: give a "mean" of the size that you expect, or a "floor"',
+                'is felt yet: give a "mean" of the size that you expect, or a "log_offset"',
                 stacklevel=2,
             )
     return space

@@ -8,8 +8,8 @@ of physical values in that order.
 
 Search coordinates: the search and the Gaussian move in coordinates x [..., D] in which one
 unit is about one prior deviation.  `Scaling.LINEAR` is x = (v - mean) / std.
-`Scaling.LOG` is x = (log(v + floor) - log(mean + floor)) / width: positive parameters stay
-positive, and with a floor > 0 a value of exactly zero is still reachable (a door without
+`Scaling.LOG` is x = (log(v + log_offset) - log(mean + log_offset)) / width: positive parameters stay
+positive, and with log_offset > 0 a value of exactly zero is still reachable (a door without
 friction loss).
 """
 
@@ -120,8 +120,8 @@ class Parameter:
     writes: model fields it sets; empty for a parameter that lives in theta.
     nuisance: fitted and marginalised, of no interest by itself.
     group:  heading in tables ("Door", "Robot", "Gripper", "Nuisance").
-    scaling, floor: search coordinate.
-    width:  what one unit of the search coordinate is in log(v + floor) when scaling is LOG; None takes
+    scaling, log_offset: search coordinate.
+    width:  what one unit of the search coordinate is in log(v + log_offset) when scaling is LOG; None takes
             it from mean and std.
     """
 
@@ -135,7 +135,7 @@ class Parameter:
     nuisance: bool = False
     group: str = "Model"
     scaling: Scaling = Scaling.LINEAR
-    floor: float = 0.0
+    log_offset: float = 0.0
     width: float | None = None
 
     def __post_init__(self) -> None:
@@ -143,7 +143,7 @@ class Parameter:
         name(self.name, f"{where}: its name")
         name(self.unit, f"{where}: unit", empty=True)
         name(self.group, f"{where}: group", empty=True)
-        for key in ("mean", "std", "low", "high", "floor"):
+        for key in ("mean", "std", "low", "high", "log_offset"):
             set_field(self, key, number(getattr(self, key), f"{where}: {key}"))
         set_field(self, "writes", instances(self.writes, f"{where}: writes", Write))
         set_field(self, "nuisance", flag(self.nuisance, f"{where}: nuisance"))
@@ -159,31 +159,31 @@ class Parameter:
             )
         if self.std <= 0:
             raise ValueError(f"parameter {self.name!r}: std must be positive, got {self.std}")
-        if self.scaling is Scaling.LOG and self.low + self.floor <= 0:
-            raise ValueError(f"parameter {self.name!r}: log scaling needs low + floor > 0")
+        if self.scaling is Scaling.LOG and self.low + self.log_offset <= 0:
+            raise ValueError(f"parameter {self.name!r}: log scaling needs low + log_offset > 0")
         if not (math.isfinite(self.high - self.low) and (self.scaling is Scaling.LINEAR or self._mapped())):
             raise ValueError(f"parameter {self.name!r}: its numbers are too large or too small to search among")
 
     def _mapped(self) -> bool:
         """Whether the logarithmic map is finite and of positive width at the bounds."""
-        if not (self.high + self.floor < math.inf and self.log_width > 0):
+        if not (self.high + self.log_offset < math.inf and self.log_width > 0):
             return False
-        ends = (math.log((end + self.floor) / (self.mean + self.floor)) for end in (self.low, self.high))
+        ends = (math.log((end + self.log_offset) / (self.mean + self.log_offset)) for end in (self.low, self.high))
         return all(math.isfinite(end / self.log_width) for end in ends)
 
     @property
     def log_width(self) -> float:
-        """Deviation of log(v + floor) that counts as one unit of the search coordinate."""
+        """Deviation of log(v + log_offset) that counts as one unit of the search coordinate."""
         if self.width is not None:
             return self.width
-        return math.log1p(self.std / (self.mean + self.floor))
+        return math.log1p(self.std / (self.mean + self.log_offset))
 
     def to_search(self, value: Any) -> Any:
         """Physical value(s) -> search coordinate(s); numpy or jax."""
         if self.scaling is Scaling.LINEAR:
             return (value - self.mean) / self.std
         xp = _namespace(value)
-        return (xp.log(value + self.floor) - math.log(self.mean + self.floor)) / self.log_width
+        return (xp.log(value + self.log_offset) - math.log(self.mean + self.log_offset)) / self.log_width
 
     def from_search(self, x: Any) -> Any:
         """Search coordinate(s) -> physical value(s), clipped to the bounds; numpy or jax."""
@@ -191,7 +191,7 @@ class Parameter:
         if self.scaling is Scaling.LINEAR:
             value = self.mean + self.std * x
         else:
-            value = xp.exp(math.log(self.mean + self.floor) + self.log_width * x) - self.floor
+            value = xp.exp(math.log(self.mean + self.log_offset) + self.log_width * x) - self.log_offset
         return xp.clip(value, self.low, self.high)
 
 

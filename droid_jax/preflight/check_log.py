@@ -28,7 +28,7 @@ def check_log(scene: Scene, recording: Recording) -> tuple[Finding, ...]:
 
     Args:
         scene: with its nominal values: masses right to a factor of three, servo gains as on the robot.
-        recording: a valid one (`measure.checks.validate`).
+        recording: a valid one (`recordings.checks.validate`).
 
     Returns:
         The findings; none where all is as it should be, or where too little was measured to tell.

@@ -43,12 +43,12 @@ def draw(run: Run) -> dict[str, list[Drawing]]:
     for i, (name, gap) in enumerate(fit["gap"].items()):
         of = f" ({name})" if len(fit["gap"]) > 1 else ""
         traces = run.traces[name]
-        bars = (traces["joints"], gap["per_joint_before"], gap["per_joint_after"], gap.get("floor"))
+        bars = (traces["joints"], gap["per_joint_before"], gap["per_joint_after"], gap.get("noise_floor"))
         add(
             "gap", f"gap_{i}", f"Torque difference of each joint{of}",
             f"RMS difference between the smoothed torques of simulation and {robot}, {judged(gap)}, joint by "
             "joint. The torque distance above is taken of torques as they were measured.",
-            torque_figures.gap_per_joint, *bars, gap.get("per_joint_floor"), run.torque_unit,
+            torque_figures.gap_per_joint, *bars, gap.get("per_joint_noise_floor"), run.torque_unit,
         )  # fmt: skip
         add(
             "torque", f"torque_{i}", f"Torque over time{of}",

@@ -42,7 +42,7 @@ def draw_gap(gap: Gap) -> dict[str, list[Drawing]]:
             f"Upper: {gap.parts.lines} Lower: measurement minus simulation.{shaded}",
             gap_torques.torque_overlays, traces, gap.unit, extended,
         )  # fmt: skip
-    fitted = f"On {role_words(gap, 'fit')}. {gap.parts.places}"
+    fitted = f"On {role_words(gap, 'train')}. {gap.parts.places}"
     if gap_maps.joints_and_phases(cells[0])[0]:
         add("place", "cells", "By joint and phase", fitted, gap_maps.cell_maps, *cells)
     if gap_maps.state_bins(cells[0]):
@@ -57,7 +57,8 @@ def draw_gap(gap: Gap) -> dict[str, list[Drawing]]:
     if found["verdict"] in CURVE:
         add(
             "curve", "remainder", "What is left, as a curve",
-            f"Descriptive only, on {role_words(gap, 'fit')}: it shows where the remainder lives and is no name for it. "
+            f"Descriptive only, on {role_words(gap, 'train')}: it shows where the remainder lives and is no name "
+            "for it. "
             f"σ: {gap.parts.sigma}.",
             gap_torques.remainder, gap.sheets[-1][1], found["cells"]["after"], gap.unit,
         )  # fmt: skip
@@ -68,4 +69,4 @@ def _shown(gap: Gap, cells: Sequence[Cell]) -> Sequence[Cell]:
     """Cells to draw; without repeats no test judges them, and all that hold an instant are shown as they are."""
     if gap.parts.repeated:
         return cells
-    return [{**c, "found": True} for c in cells if c["gap"]]
+    return [{**c, "found": True} for c in cells if c["discrepancy"]]

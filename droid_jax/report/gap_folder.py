@@ -14,18 +14,18 @@ from droid_jax.report.gap_parts import PARTS, Parts, parts_of, said_split
 from droid_jax.report.reading import FINDING, Maybe, Reader
 
 VERDICTS = ("none", "named", "tie", "partly explained", "unexplained", "fit not converged")
-ROLES = ("fit", "confirm", "sealed")
+ROLES = ("train", "validation", "test")
 _READ = Reader("gap", "--again")  # gap.json comes last: once it is there, the command takes the run for whole
 _NUMBER = (int, float)
 _MAYBE = (int, float, type(None))
-_CELL = {"variable": str, "where": str, "gap": _MAYBE, "p": _MAYBE, "found": bool}
+_CELL = {"variable": str, "where": str, "discrepancy": _MAYBE, "p": _MAYBE, "found": bool}
 _GAP = {
     "recording": str,
     **dict.fromkeys(("before", "after", "closed", "torque_before", "torque_after"), _MAYBE),
 }
 _TRIAL = {
     **{"round": int, "name": str, "passed": bool, "reasons": [str]},
-    **dict.fromkeys(("gap_fit", "gap_confirm", "p", "chosen"), _MAYBE),
+    **dict.fromkeys(("discrepancy_train", "discrepancy_validation", "p", "chosen"), _MAYBE),
 }
 _SIZE = {
     **dict.fromkeys(("name", "unit", "effect", "what"), str),
@@ -36,10 +36,10 @@ _SHIFT = {"name": str, "unit": str, **dict.fromkeys(("before", "after", "deviati
 _TREND = {**dict.fromkeys(("candidate", "amplitude", "unit"), str), "per_repeat": _MAYBE, "p": _MAYBE}
 _ABOUT = {"what": str, "mark": str, "confused_with": [str]}
 _SETUP = {"robot": Maybe({"hidden": Maybe(str)}), "synthetic_robot": Maybe(bool), "recording": Maybe([str])}
-_EXPERIMENT = {"what": str, "apart": _MAYBE, "not_made": Maybe(str)}
-_HINT = {"effects": [str], "tied": [[str]], "closed": {str: _NUMBER}}
+_EXPERIMENT = {"what": str, "distance": _MAYBE, "not_made": Maybe(str)}
+_HINT = {"effects": [str], "indistinguishable": [[str]], "closed": {str: _NUMBER}}
 _SCHEMA = {
-    **{"verdict": str, "sentence": str, "effects": [str], "tied": [[str]], "p": _MAYBE, "floor": _MAYBE},
+    **{"verdict": str, "sentence": str, "effects": [str], "indistinguishable": [[str]], "p": _MAYBE, "floor": _MAYBE},
     **{"converged": bool, "cut": str, "seconds": {str: _NUMBER}, "gaps": {str: _GAP}},
     "phases": {str: [{"name": str, "start": _NUMBER, "end": _NUMBER}]},
     "screens": [{"p": _MAYBE, "ranking": [{"candidate": str, "t": _MAYBE, "explained": _MAYBE}], "failed": [str]}],
@@ -77,12 +77,12 @@ class Gap:
 
     @property
     def roles(self) -> list[str]:
-        """The recordings there are, by what they were for: "fit", "confirm" and perhaps "sealed"."""
+        """The recordings there are, by what they were for: "train", "validation" and perhaps "test"."""
         return [r for r in ROLES if r in self.found["gaps"]]
 
     @property
     def judge(self) -> str:
-        """The role that says how large the gap is: the sealed one, or the best there is."""
+        """The role that says how large the gap is: the test one, or the best there is."""
         return self.roles[-1]
 
     @property
@@ -92,7 +92,7 @@ class Gap:
 
     @property
     def lost(self) -> bool:
-        """Whether a recording was kept sealed and could not be replayed in the end."""
+        """Whether a recording was kept as test data and could not be replayed in the end."""
         from droid_jax.discrepancy.verdict import LOST  # only here: it imports what computes
 
         return LOST in self.found.get("failed", ())
@@ -131,7 +131,7 @@ class Gap:
     @property
     def fitted_to(self) -> list[str]:
         """Recordings that the model that was handed on is fitted to; an older search fitted it to the first."""
-        return self.found.get("handed_on", {}).get("fitted_to", [self.recording("fit")])
+        return self.found.get("handed_on", {}).get("fitted_to", [self.recording("train")])
 
     @property
     def hints(self) -> list[Mapping[str, Any]]:
@@ -156,7 +156,7 @@ class Gap:
     @property
     def sheets(self) -> list[tuple[tuple[str, ...], Mapping[str, Any]]]:
         """Roles and what is drawn of them over time, the judging role first; parts that take turns are drawn as one."""
-        together = [("fit", "confirm")] if self.parts.in_turns else [("fit",), ("confirm",)]
+        together = [("train", "validation")] if self.parts.in_turns else [("train",), ("validation",)]
         sheets = [*together, *((r,) for r in self.roles[2:])]
         return [(roles, _joined([self.traces[r] for r in roles])) for roles in reversed(sheets)]
 
@@ -208,8 +208,8 @@ def _faults(found: Mapping[str, Any]) -> Iterator[str]:
     absent = [r for r in ROLES[:2] if r not in found["gaps"]]
     if absent:
         yield f"'gaps' lacks {', '.join(map(repr, absent))}"
-    if len(found["tied"]) > len(found["effects"]):
-        yield f"'tied' has {len(found['tied'])} lists for {len(found['effects'])} effects"
+    if len(found["indistinguishable"]) > len(found["effects"]):
+        yield f"'indistinguishable' has {len(found['indistinguishable'])} lists for {len(found['effects'])} effects"
 
 
 def _traces(path: Path, roles: Sequence[str], phases: Mapping[str, Any]) -> dict[str, dict[str, Any]]:

@@ -69,7 +69,7 @@ def joints_and_phases(cells: Sequence[Cell]) -> tuple[list[str], list[tuple[str,
 
 def cell_table(cells: Sequence[Cell], joints: Sequence[str], phases: Sequence[tuple[str, str]]) -> np.ndarray:
     """U [J, F], NaN where the test finds nothing."""
-    found = {joint_phase(c["where"]): c["gap"] for c in cells if c["variable"] == TIME and c["found"]}
+    found = {joint_phase(c["where"]): c["discrepancy"] for c in cells if c["variable"] == TIME and c["found"]}
     return as_floats([[found.get((joint, *phase)) for phase in phases] for joint in joints])
 
 
@@ -122,13 +122,13 @@ def state_bins(cells: Sequence[Cell], joints: Sequence[str] = ()) -> list[Bins]:
 
 def most_at(cells: Sequence[Cell]) -> str:
     """The joint at whose position most is found; empty where there is none."""
-    known = [c for c in cells if c["variable"].startswith(POSITION) and c["gap"] is not None]
-    known.sort(key=lambda c: (c["found"], c["gap"]))
+    known = [c for c in cells if c["variable"].startswith(POSITION) and c["discrepancy"] is not None]
+    known.sort(key=lambda c: (c["found"], c["discrepancy"]))
     return known[-1]["variable"].removeprefix(POSITION) if known else ""
 
 
 def _bins(name: str, cells: Sequence[Cell]) -> Bins:
-    gaps, found = as_floats([c["gap"] for c in cells]), np.array([c["found"] for c in cells])
+    gaps, found = as_floats([c["discrepancy"] for c in cells]), np.array([c["found"] for c in cells])
     if name == DIRECTION:
         signs = {"forward": "+", "back": "−"}
         joints = [label(c["variable"].removeprefix(DIRECTION)).removeprefix("Joint ") for c in cells]

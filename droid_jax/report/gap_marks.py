@@ -13,7 +13,7 @@ def marks(gap: Gap) -> list[tuple[str, bool, str]]:
     What lies at several places is told of once.
     """
     named = gap.found["effects"]
-    tied = [part for rivals in gap.found["tied"] for model in rivals for part in model.split(BETWEEN)]
+    tied = [part for rivals in gap.found["indistinguishable"] for model in rivals for part in model.split(BETWEEN)]
     alike: dict[tuple[bool, str], list[str]] = {}
     for name in dict.fromkeys([*named, *tied]):
         if text := _mark(gap, name, name not in named):

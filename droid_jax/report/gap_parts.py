@@ -1,4 +1,4 @@
-"""What the page of a search says differently by what fitted and confirming part differ in ("split" of gap.json)."""
+"""What the page of a search says differently by what fitted and validation part differ in ("split" of gap.json)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Parts:
     gap: what U is, in a sentence; bars: the same under its figure; sigma: its unit.
     closed: after the share of U that went away.  other: what confirms.  flipped: what the tests turn and draw again.
     lines: what is drawn over time; places: what the maps of U show.  more: what a smaller effect would need.
-    repeated: whether there are repeats, which tell noise.  in_turns: whether fitted and confirming instants
+    repeated: whether there are repeats, which tell noise.  in_turns: whether fitted and validation instants
     take turns in one recording.  halves: whether they are repeats of one recording.
     """
 

@@ -33,14 +33,15 @@ class Group:
     """Models with as many effects.
 
     beside: the model that was screened, empty for the base model; p: of that screening, None where there was
-    none.  gap_fit, gap_confirm: U of that model.  tried: rows with a trial; others: rows that were screened only.
+    none.  discrepancy_train, discrepancy_validation: U of that model.  tried: rows with a trial; others: rows that
+    were screened only.
     """
 
     title: str
     beside: str
     p: float | None
-    gap_fit: float | None
-    gap_confirm: float | None
+    discrepancy_train: float | None
+    discrepancy_validation: float | None
     tried: tuple[Row, ...]
     others: tuple[Row, ...]
 
@@ -68,8 +69,8 @@ def _group(found: Mapping[str, Any], k: int, screen: Mapping[str, Any] | None) -
         title=SIZES[k] if k < len(SIZES) else f"{k + 1} effects",
         beside=model_words(stood),
         p=screen["p"] if screen else None,
-        gap_fit=before.get("gap_fit"),
-        gap_confirm=before.get("gap_confirm"),
+        discrepancy_train=before.get("discrepancy_train"),
+        discrepancy_validation=before.get("discrepancy_validation"),
         tried=tuple(r for r in rows if r.trial is not None),
         others=tuple(r for r in rows if r.trial is None),
     )
@@ -87,14 +88,14 @@ def _stood(found: Mapping[str, Any], k: int) -> str:
     passed = [t for t in _of_size(found, k - 1) if t["passed"]]
     if begins:
         return begins.most_common(1)[0][0]
-    return min(passed, key=lambda t: t["gap_confirm"])["name"] if passed else ""
+    return min(passed, key=lambda t: t["discrepancy_validation"])["name"] if passed else ""
 
 
 def _gaps(found: Mapping[str, Any], k: int, stood: str) -> Mapping[str, Any]:
     """U of the model that stood, where gap.json says it."""
     if not stood:
         gaps = found["gaps"]
-        return {"gap_fit": gaps["fit"]["before"], "gap_confirm": gaps["confirm"]["before"]}
+        return {"discrepancy_train": gaps["train"]["before"], "discrepancy_validation": gaps["validation"]["before"]}
     return next((t for t in _of_size(found, k - 1) if t["name"] == stood), {})
 
 
@@ -104,7 +105,7 @@ def _joined(stood: str, candidate: str) -> str:
 
 def _row(found: Mapping[str, Any], name: str, entry: Any, trial: Mapping[str, Any] | None) -> Row:
     parts, effects = set(name.split(BETWEEN)), found["effects"]
-    rivals = {part for ties in found["tied"] for n in ties for part in n.split(BETWEEN)}
+    rivals = {part for ties in found["indistinguishable"] for n in ties for part in n.split(BETWEEN)}
     kept = trial is not None and trial["passed"] and parts <= set(effects)
     if trial is None:
         fate = "screened only: explains less"
@@ -113,10 +114,10 @@ def _row(found: Mapping[str, Any], name: str, entry: Any, trial: Mapping[str, An
         if parts < set(effects):
             fate = f"without the model's other effects: {fate}"
     elif kept:
-        tied = any(ties for effect, ties in zip(effects, found["tied"], strict=False) if effect in parts)
+        tied = any(ties for effect, ties in zip(effects, found["indistinguishable"], strict=False) if effect in parts)
         fate = "in the model, and others do as well" if tied else "in the model"
     else:
-        fate = "does as well: a tie" if parts <= {*effects, *rivals} else _passed_over(found, trial)
+        fate = "is equivalent: a tie" if parts <= {*effects, *rivals} else _passed_over(found, trial)
     ranked = entry or {"t": None, "explained": None}
     return Row(model_words(name), ranked["t"], ranked["explained"], trial, fate, kept)
 
@@ -127,8 +128,8 @@ def _passed_over(found: Mapping[str, Any], trial: Mapping[str, Any]) -> str:
         return "passed, but closes too little for a name: a hint"
     if found["verdict"] == "fit not converged":
         return "passed, but a fit did not converge"
-    left = [found["gaps"]["confirm"]["after"], *(t["gap_confirm"] for t in found["trials"])]
-    if trial["gap_confirm"] > min(u for u in left if u is not None):
+    left = [found["gaps"]["validation"]["after"], *(t["discrepancy_validation"] for t in found["trials"])]
+    if trial["discrepancy_validation"] > min(u for u in left if u is not None):
         return "passed, but another leaves less"
     if BETWEEN in trial["name"]:
         return "passed, but takes too little more away than fewer effects do"

@@ -110,19 +110,19 @@ def _curve(axes: Axes, name: str, edges: np.ndarray, values: np.ndarray, found: 
 def located(cells: Sequence[Cell], joints: Sequence[str]) -> str:
     """The joint of the largest cell by joint and phase that the test finds, else of the largest at all."""
     known = [c for c in cells if c["variable"] == TIME and joint_phase(c["where"])[0] in joints]
-    known.sort(key=lambda c: (c["found"], float("-inf") if c["gap"] is None else c["gap"]))
+    known.sort(key=lambda c: (c["found"], float("-inf") if c["discrepancy"] is None else c["discrepancy"]))
     return joint_phase(known[-1]["where"])[0] if known else joints[0]
 
 
 def located_bins(cells: Sequence[Cell]) -> tuple[str, np.ndarray, np.ndarray, np.ndarray] | None:
     """The variable with bins that holds the largest found cell: name and unit, edges [B + 1], √U and found [B]."""
-    found = [c for c in cells if c["found"] and c["gap"] is not None and _span(c)]
+    found = [c for c in cells if c["found"] and c["discrepancy"] is not None and _span(c)]
     if not found:
         return None
-    variable = max(found, key=lambda c: c["gap"])["variable"]
+    variable = max(found, key=lambda c: c["discrepancy"])["variable"]
     mine = [(span, c) for c in cells if c["variable"] == variable and (span := _span(c))]
     edges = np.array([float(mine[0][0][1]), *(float(span[2]) for span, _ in mine)])
-    values = np.sqrt(np.maximum(as_floats([c["gap"] for _, c in mine]), 0.0))
+    values = np.sqrt(np.maximum(as_floats([c["discrepancy"] for _, c in mine]), 0.0))
     return f"{variable_words(variable)} [{mine[0][0][3]}]", edges, values, np.array([c["found"] for _, c in mine])
 
 

@@ -14,12 +14,12 @@ from droid_jax.report.words import counted, label, listed, number, percent, was
 
 DECISIVE = 6.0  # standardised difference from which ten repeats decide between rivals
 COARSE = 0.1  # share of U that is the numerical floor, from which that is worth a word
-TOLD = 0.8  # share of what is left on the confirming motion: where more is left beyond the fit's uncertainty, no word
+TOLD = 0.8  # share of what is left on the validation motion: where more is left beyond the fit's uncertainty, no word
 OTHER = "the other demonstration"  # as the search calls what confirms, whatever it is
 OF = " of "  # between what is said of a joint and its name
 TIME = "joint x phase"  # the variable of the cells that have a joint and a phase of the motion
 BETWEEN = " + "  # between the effects in a model's name
-ROLES = {"fit": "fitted", "confirm": "confirming", "sealed": "sealed"}
+ROLES = {"train": "training", "validation": "validation", "test": "test"}
 
 
 def effect_words(name: str) -> str:
@@ -54,7 +54,7 @@ def readable(text: str, found: Mapping[str, Any]) -> str:
     text = text.replace(OTHER, parts_of(found).other)
     names = {r["candidate"] for screen in found["screens"] for r in screen["ranking"]}
     for said in (found, *found.get("hints", [])):
-        names |= {*said["effects"], *(name for rivals in said["tied"] for name in rivals)}
+        names |= {*said["effects"], *(name for rivals in said["indistinguishable"] for name in rivals)}
     for name in sorted(names, key=len, reverse=True):
         text = text.replace(name, model_words(name))
     return re.sub(r"\b\w+_\w+(\[\w+\])?", lambda m: label(m[0]).lower(), text)
@@ -121,16 +121,15 @@ def settings(gap: Gap) -> list[str]:
 
 def _fitted(gap: Gap) -> str:
     found = gap.found
-    text = f"The base model was fitted to “{gap.recording('fit')}”"
+    text = f"The base model was fitted to “{gap.recording('train')}”"
     if not found["screens"]:
         return text + "; no candidate was asked about."
     asked = len({r["candidate"] for s in found["screens"] for r in s["ranking"]})
     text += f", {counted(asked, 'candidate effect')} {was(asked)} screened against what it leaves"
     tried = len({t["name"] for t in found["trials"]})
     if tried:
-        text += (
-            f", and {counted(tried, 'extended model')} {was(tried)} refitted and judged on “{gap.recording('confirm')}”"
-        )
+        text += f", and {counted(tried, 'extended model')} {was(tried)} refitted "
+        text += f"and judged on “{gap.recording('validation')}”"
     blown = [model_words(name) for name in gap.blown_up]
     left_out = f" Left out, because the simulation blew up with it: {listed(blown)}."
     return f"{text}.{left_out if blown else ''}"
@@ -153,11 +152,11 @@ def _significance(gap: Gap) -> str:
 
 def _size(gap: Gap) -> str:
     one = gap.found["gaps"][gap.judge]
-    without = "the sealed one could not be replayed" if gap.lost else "none was kept sealed"
+    without = "the test one could not be replayed" if gap.lost else "none was kept as test data"
     seen = {
-        "sealed": "which was opened once, at the end",
-        "confirm": f"which also chose the effects, since {without}",
-        "fit": "the only one there is",
+        "test": "which was opened once, at the end",
+        "validation": f"which also chose the effects, since {without}",
+        "train": "the only one there is",
     }
     where = f"On “{one['recording']}”" + (f", {seen[gap.judge]}," if gap.extended else "")
     at, size = _floor(gap), gap.parts.gap
@@ -171,15 +170,16 @@ def _size(gap: Gap) -> str:
 
 
 def _allowed(gap: Gap) -> str:
-    """What of the confirming motion's gap is the fit's own uncertainty, where that is worth a word."""
-    left, confirm = gap.found.get("remainder"), gap.found["gaps"].get("confirm")
-    if left is None or confirm is None or not gap.extended:
+    """What of the validation motion's gap is the fit's own uncertainty, where that is worth a word."""
+    left, validation = gap.found.get("remainder"), gap.found["gaps"].get("validation")
+    if left is None or validation is None or not gap.extended:
         return ""
-    if confirm["after"] <= max(gap.floor or 0.0, 0.0) or left > TOLD * confirm["after"]:
+    if validation["after"] <= max(gap.floor or 0.0, 0.0) or left > TOLD * validation["after"]:
         return ""
-    after, share = number(confirm["after"]), percent(1.0 - max(left, 0.0) / confirm["after"])
+    after, share = number(validation["after"]), percent(1.0 - max(left, 0.0) / validation["after"])
     return (
-        f"Of U = {after} that is left on “{confirm['recording']}”, {share} lies within the uncertainty of the fitted "
+        f"Of U = {after} that is left on “{validation['recording']}”, {share} lies within the uncertainty of the "
+        "fitted "
         "parameters: that motion shows some that the fitted one does not tell."
     )
 
@@ -189,7 +189,7 @@ def _floor(gap: Gap) -> str:
         return "there is no numerical floor, since a measured motion is replayed without a time step"
     if gap.floor is None:
         return "the numerical floor is not known"
-    floor, fit = f"the numerical floor is {number(gap.floor)}", gap.found["gaps"]["fit"]
+    floor, fit = f"the numerical floor is {number(gap.floor)}", gap.found["gaps"]["train"]
     if not gap.floor > COARSE * fit["before"] > 0:
         return floor
     share, base = percent(gap.floor / fit["before"]), " of the base model" if gap.extended else ""
@@ -292,7 +292,7 @@ def _longer(gap: Gap) -> str:
     """How to search longer than `gap` itself can; nothing in blocks, whose fit needs no search."""
     if gap.parts.in_turns:
         return ""
-    recording = "the recording" if gap.parts.halves else f"“{gap.recording('fit')}”"
+    recording = "the recording" if gap.parts.halves else f"“{gap.recording('train')}”"
     return (
         f"fit {recording} by python -m droid_jax.run identify --preset standard --restarts 3 and hand its "
         "folder on (gap --fit FOLDER), or "
@@ -323,7 +323,7 @@ def _partly(gap: Gap, named: str) -> str:
 
 def _kept(gap: Gap, named: str) -> str:
     """What to do with a part that was named, or that several effects explain as well."""
-    doubt = ", which need not be the cause: others do as well," if any(gap.found["tied"]) else ""
+    doubt = ", which need not be the cause: others do as well," if any(gap.found["indistinguishable"]) else ""
     return f"keep the {named}{doubt} in the model{_file(gap)}"
 
 
@@ -332,7 +332,7 @@ def _file(gap: Gap) -> str:
 
 
 def _separate(gap: Gap) -> str:
-    known = [e for e in gap.found["experiments"] if e["apart"] is not None]
+    known = [e for e in gap.found["experiments"] if e["distance"] is not None]
     if gap.timeless:
         return (
             "Without commands no other motion can be tried in simulation: record one that is slower, faster or comes "
@@ -340,9 +340,9 @@ def _separate(gap: Gap) -> str:
         )
     if not known:
         return "No experiment on the menu was found that separates them; for torques they act alike"
-    best = max(known, key=lambda e: e["apart"])
-    apart = f"{number(best['apart'])} standard deviations apart"
-    if best["apart"] >= DECISIVE:
+    best = max(known, key=lambda e: e["distance"])
+    apart = f"{number(best['distance'])} standard deviations apart"
+    if best["distance"] >= DECISIVE:
         return f"Record this too and run again: {best['what']}. There the rivals are {apart}, and ten repeats decide"
     bar = number(DECISIVE, 1)
     return (
@@ -353,7 +353,7 @@ def _separate(gap: Gap) -> str:
 
 def _where(gap: Gap) -> str:
     """The largest cell that the test found in what is left; of all, where there are no repeats to test."""
-    cells = [c for c in gap.found["cells"]["after"] if c["gap"] is not None]
+    cells = [c for c in gap.found["cells"]["after"] if c["discrepancy"] is not None]
     found = [c for c in cells if c["found"] or not gap.parts.repeated]
     if not found:
         return "(no single place stands out)"
@@ -361,7 +361,7 @@ def _where(gap: Gap) -> str:
     kinds = [kind for kind in (over_time, _others(found)) if kind] or [found]
     noise = "" if gap.parts.repeated else ", noise included"
     return f"where the most is left{noise}: " + listed(
-        [place_words(max(kind, key=lambda c: c["gap"])) for kind in kinds]
+        [place_words(max(kind, key=lambda c: c["discrepancy"])) for kind in kinds]
     )
 
 

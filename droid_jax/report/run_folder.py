@@ -25,8 +25,8 @@ _PARAMETER = {
 }
 _GAP = {
     **{"before": _NUMBER, "after": _NUMBER, "per_joint_before": [_NUMBER], "per_joint_after": [_NUMBER]},
-    **{"floor": Maybe(_MAYBE), "closed": Maybe(_MAYBE), "judged": Maybe(Literal["repeats", "time", "same"])},
-    "per_joint_floor": Maybe(([_NUMBER], type(None))),
+    **{"noise_floor": Maybe(_MAYBE), "closed": Maybe(_MAYBE), "judged": Maybe(Literal["repeats", "time", "same"])},
+    "per_joint_noise_floor": Maybe(([_NUMBER], type(None))),
 }
 _CHECK = {
     **{"unit": str, "time_step": _NUMBER, "remaining": _NUMBER, "unmeasured": str},
@@ -35,7 +35,7 @@ _CHECK = {
 }
 _FIT = {
     **{"parameters": [_PARAMETER], "gap": {str: _GAP}, "stop": str, "rule": str},
-    "cost": {**dict.fromkeys(("initial", "best", "floor"), _MAYBE), "unit": Maybe(str)},
+    "cost": {**dict.fromkeys(("initial", "best", "noise_floor"), _MAYBE), "unit": Maybe(str)},
     **{"torque_unit": Maybe(str), "converged": Maybe((bool, type(None))), "mean_square": Maybe(_MAYBE)},
     **{"generations": Maybe(int), "evaluations": Maybe(int), "seconds": Maybe({str: _NUMBER})},
     **{"mjcf_lacks": Maybe([str]), "notes": Maybe([str]), "findings": Maybe([FINDING])},

@@ -62,7 +62,7 @@ def parameter_history(
 def cost_history(history: Mapping[str, Any], cost: Mapping[str, Any], width: float = WIDE) -> Figure:
     """Best and median cost per generation [G] in N m; the axis is logarithmic over more than a decade.
 
-    cost: "best" and "floor" (or None) of fit.json, drawn as lines.
+    cost: "best" and "noise_floor" (or None) of fit.json, drawn as lines.
     """
     figure = Figure(figsize=(width, 2.7), layout="constrained")
     axes = figure.add_subplot()
@@ -78,8 +78,8 @@ def cost_history(history: Mapping[str, Any], cost: Mapping[str, Any], width: flo
     axes.plot(generation, series["best_cost"], color=AFTER, label="best of a generation")
     if cost.get("best") is not None:
         axes.axhline(cost["best"], color=INK, linewidth=0.9, linestyle=(0, (1, 1.5)), label="final fit")
-    if cost.get("floor") is not None:
-        axes.axhline(cost["floor"], color=MEASURED, linewidth=1.1, linestyle=(0, (5, 2)), label="floor")
+    if cost.get("noise_floor") is not None:
+        axes.axhline(cost["noise_floor"], color=MEASURED, linewidth=1.1, linestyle=(0, (5, 2)), label="floor")
     both = np.concatenate(list(series.values()))
     both = both[np.isfinite(both)]
     if both.size and both.min() > 0 and both.max() > 10 * both.min():

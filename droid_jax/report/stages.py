@@ -32,7 +32,7 @@ class Setup(TypedDict, total=False):
     recording: list[str]
     scene: str | None
     extended: str | None
-    own_effects: str | None
+    user_effects: str | None
     fit: str | None
     fit_sha256: str | None
     scene_sha256: str

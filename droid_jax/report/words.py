@@ -144,7 +144,7 @@ def _gap(run: Run, name: str) -> str:
         f"{number(gap['before'])} {run.torque_unit} before the fit (norm over the joints, averaged over time) and "
         f"differ by {number(gap['after'])} {run.torque_unit} after it"
     )
-    floor, closed = gap.get("floor"), gap.get("closed")
+    floor, closed = gap.get("noise_floor"), gap.get("closed")
     if gap["after"] > gap["before"]:
         return text + ": the fit made it worse."
     if floor is None:
@@ -236,20 +236,20 @@ def _next(run: Run, searched: bool) -> str:
 
 def needed(repeats: Sequence[int]) -> str:
     """What the search of the gap takes beside recordings of so many repeats, in brackets; empty where they will do."""
-    from droid_jax.discrepancy.sign_flips import FEWEST  # only here: these import distributions of scipy
+    from droid_jax.discrepancy.sign_flips import FEWEST_REPEATS  # only here: these import distributions of scipy
     from droid_jax.discrepancy.split import HALVES
 
     alone = len(repeats) == 1
-    if (alone and (repeats[0] == 1 or repeats[0] >= HALVES)) or (not alone and min(repeats) >= FEWEST):
+    if (alone and (repeats[0] == 1 or repeats[0] >= HALVES)) or (not alone and min(repeats) >= FEWEST_REPEATS):
         return ""
-    if alone and repeats[0] >= FEWEST:
+    if alone and repeats[0] >= FEWEST_REPEATS:
         return f" (it takes a second motion, or {HALVES} repeats of this one)"
-    return f" (it takes {FEWEST} repeats of each of two motions, or {HALVES} of one)"
+    return f" (it takes {FEWEST_REPEATS} repeats of each of two motions, or {HALVES} of one)"
 
 
 def noiseless(fit: Mapping[str, Any]) -> bool:
     """Whether a fit.json is of single repeats, which do not tell noise from what the model lacks."""
-    return any(gap.get("floor") is None for gap in fit["gap"].values())
+    return any(gap.get("noise_floor") is None for gap in fit["gap"].values())
 
 
 def asked_of(fit: Mapping[str, Any]) -> str:
@@ -264,7 +264,7 @@ def lacks_something(fit: Mapping[str, Any]) -> bool:
 
     By the mean square of its whitened residuals (0.6 to 1.4 in fits where nothing is missing), and by equation 1.
     """
-    far = any(g.get("floor") and g["after"] > 1.5 * g["floor"] for g in fit["gap"].values())
+    far = any(g.get("noise_floor") and g["after"] > 1.5 * g["noise_floor"] for g in fit["gap"].values())
     return far or (fit.get("mean_square") or 0.0) > 2.0
 
 
@@ -276,7 +276,7 @@ def far_off(fit: Mapping[str, Any]) -> bool:
     bounds = sum(p["on_bound"] for p in fit["parameters"] if not p["nuisance"])
 
     def far(gap: Mapping[str, Any]) -> bool:
-        floor = gap.get("floor")
+        floor = gap.get("noise_floor")
         most = bounds >= 2 if floor is None else gap["after"] > FAR * floor
         return gap["after"] > gap["before"] or (most and gap["after"] > 0.5 * (gap["before"] + (floor or 0.0)))
 

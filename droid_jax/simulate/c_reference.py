@@ -24,7 +24,7 @@ from droid_jax.simulate.replay import Drive, check_gains, check_stateless
 CHUNK = 64  # samples whose traces of the whole state are held at once
 
 
-def twin_replay(
+def c_replay(
     scene: Scene, space: Space, drive: Drive, effects: Sequence[Effect] = (), *, late: float = 0.5
 ) -> Callable[[np.ndarray], Rollout]:
     """values [P, D] -> Rollout with a leading [P], float64, on all cores.

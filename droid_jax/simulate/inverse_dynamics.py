@@ -23,7 +23,7 @@ from droid_jax.model.unsupported_features import refuse_fluid
 from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.simulate.closed_loops import coupled_to_others
 from droid_jax.simulate.measured_motion import Motion
-from droid_jax.simulate.replay import observed
+from droid_jax.simulate.replay import apply_sensor_model
 
 
 def prescribed(scene: Scene, recording: Recording) -> tuple[str, ...]:
@@ -172,7 +172,7 @@ def path_replay(
             contact=jnp.zeros((len(path.time), 0), bool),
             finite=jnp.array(True),
         )
-        seen = observed(rollout, theta, effects)
+        seen = apply_sensor_model(rollout, theta, effects)
         # The slack is there without friction too: else any friction would pay by taking the noise at rest.
         slack = jnp.hypot(path.torque_slack[:count], inertia * path.acceleration_slack[:count])
         bound = jnp.maximum(loss, 0.0) + slack

@@ -169,14 +169,14 @@ def servo_replay(
         def step(carry, k):
             qpos, qvel, warm, load = carry
             state = State(k * drive.timestep, qpos, qvel, load, model)
-            ctrl = servo_given(_command(table, drive.timestep, k, shift, theta, effects), theta, state, effects)
+            ctrl = servo_input(_command(table, drive.timestep, k, shift, theta, effects), theta, state, effects)
             before = template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm, ctrl=ctrl)
             after = simulate_step(
-                rubbing(model, theta, state, effects),
+                apply_friction(model, theta, state, effects),
                 before,
                 parity=parity,
                 servo_damping=damping,
-                push=push(theta, state, effects, error),
+                push=apply_forces(theta, state, effects, error),
             )
             mean = 0.5 * (qvel + after.qvel)
             servo = servo_force(model, after, mean) if damping and not parity else after.qfrc_actuator
@@ -198,7 +198,7 @@ def servo_replay(
         _, (torque, position, velocity, angle, contact) = jax.lax.scan(step, (start, zero, zero, zero), steps)
         time = jnp.asarray(drive.time, jnp.float32)
         rollout = Rollout(time, torque, position, velocity, angle, contact, jnp.array(True))
-        return observed(rollout, theta, effects)
+        return apply_sensor_model(rollout, theta, effects)
 
     return replay
 
@@ -229,16 +229,16 @@ def _command(
     ctrl = table[high] * (1 - part) + table[low] * part
     laws = [effect.command for effect in effects if effect.command is not None]
     for law in laws:  # each law sees what the one before it made of the command
-        look = through(law, theta, look)
+        look = compose(law, theta, look)
     return look((k - delay) * timestep) if laws else ctrl
 
 
-def through(law: Callable, theta: Theta, look: Callable) -> Callable:
+def compose(law: Callable, theta: Theta, look: Callable) -> Callable:
     """What an effect's law makes of a command, look(t) -> [U]."""
     return lambda time: law(theta, time, look)
 
 
-def servo_given(ctrl: jax.Array, theta: Theta, state: State, effects: Sequence[Effect]) -> jax.Array:
+def servo_input(ctrl: jax.Array, theta: Theta, state: State, effects: Sequence[Effect]) -> jax.Array:
     """[U] what the servos are given in place of the command."""
     for effect in effects:
         if effect.servo is not None:
@@ -246,7 +246,7 @@ def servo_given(ctrl: jax.Array, theta: Theta, state: State, effects: Sequence[E
     return ctrl
 
 
-def rubbing(model, theta: Theta, state: State, effects: Sequence[Effect]):
+def apply_friction(model, theta: Theta, state: State, effects: Sequence[Effect]):
     """The model with the friction losses that effects give it in this state."""
     loss = model.dof_frictionloss
     for effect in effects:
@@ -255,7 +255,7 @@ def rubbing(model, theta: Theta, state: State, effects: Sequence[Effect]):
     return model if loss is model.dof_frictionloss else model.replace(dof_frictionloss=loss)
 
 
-def push(
+def apply_forces(
     theta: Theta, state: State, effects: Sequence[Effect], error: jax.Array | None = None
 ) -> Callable[[Any], jax.Array] | None:
     """The forces of effects in this state, and of a gravity compensation that goes by encoders: of the pose, [nv].
@@ -274,7 +274,7 @@ def push(
     return forces
 
 
-def observed(rollout: Rollout, theta: Theta, effects: Sequence[Effect]) -> Rollout:
+def apply_sensor_model(rollout: Rollout, theta: Theta, effects: Sequence[Effect]) -> Rollout:
     """What the sensors make of a rollout, and the verdict on finiteness."""
     for effect in effects:
         if effect.observe is not None:

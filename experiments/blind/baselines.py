@@ -17,9 +17,9 @@ import optax
 
 from droid_jax.cost.noise import lowpass, smooth
 from droid_jax.discrepancy.case import Case
-from droid_jax.discrepancy.refit import Model
-from droid_jax.discrepancy.residual_set import Evidence
-from droid_jax.discrepancy.screen import Screen, project
+from droid_jax.discrepancy.refit import FittedModel
+from droid_jax.discrepancy.residual_set import ResidualSet
+from droid_jax.discrepancy.screen import ScoreTest, project
 from droid_jax.recordings.recording import Recording
 from experiments.blind.answers import beside, matched
 from experiments.blind.units import torques, whitened
@@ -31,7 +31,9 @@ BLOCK = 0.5  # s, every fifth such block is left aside
 FOLDS = 5
 
 
-def baselines(case: Case, model: Model, screen: Screen | None, recordings: Mapping[str, Recording]) -> dict[str, Any]:
+def baselines(
+    case: Case, model: FittedModel, screen: ScoreTest | None, recordings: Mapping[str, Recording]
+) -> dict[str, Any]:
     """Both, from a fitted base model; screen: its first screening, if it came that far."""
     return {
         "bic": [] if screen is None else stepwise_bic(screen, model.residuals.mean(axis=0)),
@@ -39,61 +41,61 @@ def baselines(case: Case, model: Model, screen: Screen | None, recordings: Mappi
     }
 
 
-def stepwise_bic(screen: Screen, common: np.ndarray) -> list[str]:
+def stepwise_bic(screen: ScoreTest, common: np.ndarray) -> list[str]:
     """Names in the order in which adding them lowers n log(RSS / n) + k log(n) most, until none does.
 
     common: [M] the mean residual.  A candidate counts its amplitudes, and its shapes too.
     """
     groups: dict[Any, list[int]] = {}
-    for k, question in enumerate(screen.questions):
+    for k, question in enumerate(screen.directions):
         groups.setdefault(question.candidate.key, []).append(k)
-    names = {key: screen.questions[rows[0]].candidate for key, rows in groups.items()}
+    names = {key: screen.directions[rows[0]].candidate for key, rows in groups.items()}
     size, chosen, named, cost = len(common), list[int](), list[str](), 0
     best = size * np.log(max(float(common @ common), 1e-30) / size)
     while len(named) < MOST:
         tried = {}
         for key, rows in groups.items():
             if names[key].name not in named:
-                columns = screen.marks[[*chosen, *rows]].T
+                columns = screen.sensitivities[[*chosen, *rows]].T
                 rest = common - columns @ np.linalg.lstsq(columns, common, rcond=1e-8)[0]
-                parameters = cost + len(rows) + len(names[key].shapes)
+                parameters = cost + len(rows) + len(names[key].shape_parameters)
                 tried[key] = size * np.log(max(float(rest @ rest), 1e-30) / size) + parameters * np.log(size)
         winner = min(tried, key=lambda key: tried[key]) if tried else None
         if winner is None or tried[winner] >= best:
             break
         best = tried[winner]
         chosen += groups[winner]
-        cost += len(groups[winner]) + len(names[winner].shapes)
+        cost += len(groups[winner]) + len(names[winner].shape_parameters)
         named.append(names[winner].name)
     return named
 
 
-def black_box(case: Case, model: Model, recordings: Mapping[str, Recording]) -> dict[str, list[float]]:
+def black_box(case: Case, model: FittedModel, recordings: Mapping[str, Recording]) -> dict[str, list[float]]:
     """Role -> U before and after a network, trained on the fitted recording, has added its torque.
 
     A recording on which the base model blows up is left out.
     """
-    inputs = {role: features(e, recordings[role]) for role, e in case.judged.items()}
-    left = _shaped(case.fit, torques(case.fit, case.fit.common(model.values)))
-    centre, scale = inputs["fit"].mean(axis=0), inputs["fit"].std(axis=0) + 1e-9
+    inputs = {role: features(e, recordings[role]) for role, e in case.held_sets.items()}
+    left = _shaped(case.train, torques(case.train, case.train.common(model.values)))
+    centre, scale = inputs["train"].mean(axis=0), inputs["train"].std(axis=0) + 1e-9
     size = left.std(axis=0) + 1e-9
-    time = case.fit.time[: len(left)]
+    time = case.train.time[: len(left)]
     aside = (np.floor((time - time[0]) / BLOCK) % FOLDS) == FOLDS - 1
-    weights = train((inputs["fit"] - centre) / scale, left / size, aside)
+    weights = train((inputs["train"] - centre) / scale, left / size, aside)
     out = {}
-    for role, e in case.judged.items():
+    for role, e in case.held_sets.items():
         common = e.common(model.values)[0]
         torque = np.asarray(_Network(left.shape[1]).apply(weights, (inputs[role] - centre) / scale)) * size
         added = whitened(e, torque.T.reshape(1, -1))[0]
-        if e.own_columns is not None:  # the recording's own offsets are fitted again
-            added = project(added[None], e.own_columns, np.full(len(e.own), np.sqrt(e.repeats)))[0]
-        gaps = [e.gap(e.residuals(common)), e.gap(e.residuals(common - added))]
+        if e.nuisance_columns is not None:  # the recording's own offsets are fitted again
+            added = project(added[None], e.nuisance_columns, np.full(len(e.nuisances), np.sqrt(e.repeats)))[0]
+        gaps = [e.discrepancy(e.residuals(common)), e.discrepancy(e.residuals(common - added))]
         if np.all(np.isfinite(gaps)):
             out[role] = gaps
     return out
 
 
-def features(evidence: Evidence, recording: Recording) -> np.ndarray:
+def features(evidence: ResidualSet, recording: Recording) -> np.ndarray:
     """[K, F] mean position and velocity of the joints, angle and speed of the object, on the coarse clock."""
     clock = evidence.time[: np.sum(evidence.column == 0)]
     columns = []
@@ -153,7 +155,7 @@ def _round(network: _Network, weights: Any, state: Any, x: jax.Array, y: jax.Arr
     return weights, state, error(weights, aside)
 
 
-def _shaped(evidence: Evidence, rows: np.ndarray) -> np.ndarray:
+def _shaped(evidence: ResidualSet, rows: np.ndarray) -> np.ndarray:
     """[1, M] -> [K, C]."""
     columns = int(evidence.column.max()) + 1
     return rows.reshape(columns, -1).T

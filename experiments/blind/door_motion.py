@@ -26,15 +26,15 @@ def _plan(name: str, pose: tuple[float, ...], roll: int, moves: tuple[tuple[str,
 
 
 PLANS = (
-    _plan("fit", POSE_A, -1, (
+    _plan("train", POSE_A, -1, (
         ("opening", 1.2, 8), ("opening", 2.9, 44), ("hold", 0.1, 44), ("closing", 2.3, 16), ("closing", 1.3, 6),
         ("rest", 0.15, 6),
     )),
-    _plan("confirm", POSE_B, 1, (
+    _plan("validation", POSE_B, 1, (
         ("opening", 2.4, 30), ("opening", 1.5, 44), ("hold", 0.1, 44), ("closing", 1.4, 33), ("closing", 2.2, 6),
         ("rest", 0.15, 6),
     )),
-    _plan("sealed", POSE_BETWEEN, -1, (
+    _plan("test", POSE_BETWEEN, -1, (
         ("opening", 3.4, 42), ("hold", 0.1, 42), ("closing", 1.4, 26), ("opening again", 1.0, 34),
         ("closing again", 2.4, 6), ("rest", 0.15, 6),
     )),

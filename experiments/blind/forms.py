@@ -57,14 +57,14 @@ class Forms:
             "name": name,
             "left": self._best(self.where.torques(added[None])[0], self.torques)[name][0],
             "left_after_refit": left,
-            "per_unit": dict(zip(self.candidates[k].amplitudes, sizes.tolist(), strict=True)),
-            "shapes": dict(self.candidates[k].shapes),
+            "per_unit": dict(zip(self.candidates[k].coefficients, sizes.tolist(), strict=True)),
+            "shapes": dict(self.candidates[k].shape_parameters),
         }
 
     def _worth(self, found: Best) -> float:
-        """Amplitude of the hidden effect from which its library form is large enough to be worth a name."""
+        """Amplitude of the hidden effect from which its library form is large enough to be named."""
         _, k, sizes = found
-        smallest = {e.name: e.smallest for e in self.where.setting.effects()}[self.candidates[k].effect]
+        smallest = {e.name: e.minimum_size for e in self.where.setting.effects()}[self.candidates[k].effect]
         return smallest / max(float(np.max(np.abs(sizes))), 1e-30)
 
     def _best(self, wanted: np.ndarray, marks: np.ndarray) -> dict[str, Best]:

@@ -19,9 +19,9 @@ import numpy as np
 from benchmarks.common import CODE
 from benchmarks.sharing import code_name
 from droid_jax.discrepancy.candidates import candidates
-from droid_jax.discrepancy.screen import questions_of
+from droid_jax.discrepancy.screen import directions_of
 from droid_jax.discrepancy.select import SIGNIFICANT
-from droid_jax.discrepancy.sign_flips import largest_steady_t
+from droid_jax.discrepancy.sign_flips import largest_detrended_t
 from droid_jax.storage import write_json
 from droid_jax.synthetic.hidden_effects import HIDDEN, Applied
 from experiments.blind.cases import SAFE, key, keys
@@ -60,7 +60,7 @@ class Power:
         left, free = self.where.left(amplitude * common)
         marks, noise = self._projected(free)
         scores = marks @ (left + amplitude * (added - common)).T
-        p = [largest_steady_t(scores + noise[:, rows])[1] for rows in self.chosen]  # as `Evidence.largest`
+        p = [largest_detrended_t(scores + noise[:, rows])[1] for rows in self.chosen]  # as `ResidualSet.largest_score`
         return float(np.mean(np.array(p) < SIGNIFICANT))
 
     def limit(self, added: np.ndarray, largest: float) -> float | None:
@@ -83,7 +83,7 @@ class Power:
 def power_of(where: Ground, seed: int) -> Power:
     """Marks of all candidates, and draws of repeats."""
     rng = np.random.default_rng(seed)
-    raw = where.added(questions_of(candidates(where.setting.effects())))
+    raw = where.added(directions_of(candidates(where.setting.effects())))
     return Power(where, raw, rng.integers(len(where.noise), size=(DRAWS, REPEATS)), {})
 
 
@@ -127,7 +127,7 @@ def _draw_limits(
     if not left:
         return known
     seed = seed_of(DEVELOPMENT, f"{setting.name}/limits/{number}")
-    where = ground(setting, draw_truths(setting, np.random.default_rng(seed))["fit"], seed)
+    where = ground(setting, draw_truths(setting, np.random.default_rng(seed))["train"], seed)
     power, forms = power_of(where, seed), forms_of(where)
     for effect in left:
         name = key(effect.name, effect.joint)

@@ -16,9 +16,9 @@ import scipy.optimize
 from droid_jax.cost.noise import lowpass, smooth
 from droid_jax.discrepancy.candidates import Candidate, candidates
 from droid_jax.discrepancy.case import make_case
-from droid_jax.discrepancy.refit import Model, refit
-from droid_jax.discrepancy.residual_set import Evidence
-from droid_jax.discrepancy.screen import Question, marks, project, questions_of
+from droid_jax.discrepancy.refit import FittedModel, refit
+from droid_jax.discrepancy.residual_set import ResidualSet
+from droid_jax.discrepancy.screen import ScoreDirection, directions_of, project, sensitivities
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects.registry import effect_space
@@ -48,8 +48,8 @@ class Ground:
     setting: Setting
     truth: Truth
     seed: int
-    evidence: Evidence
-    model: Model
+    evidence: ResidualSet
+    model: FittedModel
     wide: np.ndarray
     noise: np.ndarray
     plain: dict[int, np.ndarray] = field(default_factory=dict)
@@ -75,8 +75,8 @@ class Ground:
         return project(columns, self.slopes[:, chosen], self.prior[chosen])
 
     def asked(self, columns: np.ndarray, free: np.ndarray) -> np.ndarray:
-        """[K, M] marks as the test has them, which lets base parameters move further (`Evidence.slack`)."""
-        return project(columns, self.wide[:, free], self.evidence.slack * self.prior[free])
+        """[K, M] marks as the test has them, which lets base parameters move further (`ResidualSet.prior_slack`)."""
+        return project(columns, self.wide[:, free], self.evidence.prior_slack * self.prior[free])
 
     def left(self, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """[M] what the base model leaves of a column within its bounds, and which parameters [D] stay off them."""
@@ -88,9 +88,9 @@ class Ground:
         step = scipy.optimize.lsq_linear(root, aim, (low - 1e-9, high + 1e-9)).x
         return column - self.slopes @ step, (step > low + 1e-6) & (step < high - 1e-6)
 
-    def added(self, questions: tuple[Question, ...]) -> np.ndarray:
+    def added(self, questions: tuple[ScoreDirection, ...]) -> np.ndarray:
         """[K, M] what the library's amplitudes add, per unit of each; 0 where a replay blows up, as in the search."""
-        return np.nan_to_num(marks(self.evidence, self.model.values, questions))
+        return np.nan_to_num(sensitivities(self.evidence, self.model.values, questions))
 
     def record(self, hidden: tuple[Applied, ...], repeats: int) -> Recording:
         """The same robot and the same noise, with something hidden."""
@@ -125,15 +125,17 @@ def ground(setting: Setting, truth: Truth, seed: int) -> Ground:
     case = make_case(setting.scene, setting.base, setting.effects(), recording, recording)
     base = case.base
     known = {n: float(np.clip(v, base[n].low, base[n].high)) for n, v in truth.items() if n in base.names}
-    at = case.whole.values(known)[None]
-    model, asked = (refit(case.fit, base, (), at, RefineConfig(iterations=0, hops=0, spreads=s)) for s in (0, 2))
-    wide = asked.refined.jacobian / np.sqrt(case.fit.repeats)
-    return Ground(setting, truth, seed, case.fit, model, wide, case.fit.deviations * np.sqrt(NOISY / (NOISY - 1)))
+    at = case.full_space.values(known)[None]
+    model, asked = (
+        refit(case.train, base, (), at, RefineConfig(iterations=0, basin_hops=0, spreads=s)) for s in (0, 2)
+    )
+    wide = asked.refined.jacobian / np.sqrt(case.train.repeats)
+    return Ground(setting, truth, seed, case.train, model, wide, case.train.deviations * np.sqrt(NOISY / (NOISY - 1)))
 
 
 def _recorded(setting: Setting, hidden: tuple[Applied, ...], truth: Truth, seed: int, repeats: int) -> Recording:
-    drawn = Drawn(hidden, {"fit": truth}, {"fit": seed})
-    return record(setting, drawn, ("fit",), SyntheticRobotConfig(repeats=repeats))["fit"]
+    drawn = Drawn(hidden, {"train": truth}, {"train": seed})
+    return record(setting, drawn, ("train",), SyntheticRobotConfig(repeats=repeats))["train"]
 
 
 def dense(effects: tuple[Effect, ...]) -> tuple[Candidate, ...]:
@@ -141,14 +143,14 @@ def dense(effects: tuple[Effect, ...]) -> tuple[Candidate, ...]:
     out = []
     for effect in effects:
         bounds = {p.name: (p.low, p.high) for p in effect_space([effect]).parameters}
-        grid = {n: tuple(np.geomspace(*bounds[n], DENSE).tolist()) for n in effect.shapes}
-        out.append(replace(effect, shapes=grid))
+        grid = {n: tuple(np.geomspace(*bounds[n], DENSE).tolist()) for n in effect.shape_parameters}
+        out.append(replace(effect, shape_parameters=grid))
     return candidates(out)
 
 
-def by_candidate(found: tuple[Candidate, ...]) -> tuple[tuple[Question, ...], list[list[int]]]:
+def by_candidate(found: tuple[Candidate, ...]) -> tuple[tuple[ScoreDirection, ...], list[list[int]]]:
     """All questions, and which of them belong to each candidate."""
-    questions = questions_of(found)
+    questions = directions_of(found)
     rows: dict[tuple, list[int]] = {}
     for k, question in enumerate(questions):
         rows.setdefault(question.candidate.key, []).append(k)

@@ -18,7 +18,7 @@ import numpy as np
 from benchmarks.sharing import claimed
 from droid_jax.discrepancy.candidates import Candidate, candidates
 from droid_jax.discrepancy.case import Case
-from droid_jax.discrepancy.refit import Model, refit
+from droid_jax.discrepancy.refit import FittedModel, refit
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.recordings.formats import load
 from droid_jax.storage import file_sha256, write_json
@@ -29,7 +29,7 @@ from experiments.blind.scenes import ROLES
 from experiments.blind.score import oracle_of
 from experiments.blind.search import FAILED, Bench
 
-FROM_TRUTH = RefineConfig(iterations=12, hops=0, spreads=0)
+FROM_TRUTH = RefineConfig(iterations=12, basin_hops=0, spreads=0)
 SIZES = np.geomspace(3e-3, 0.8, 12)  # of the way from neutral to a bound
 KINDS = ("single", "pair")  # whose effects the library has forms of
 
@@ -42,43 +42,43 @@ def oracle(folder: Path, truth: dict[str, Any], result: dict[str, Any], bench: B
     recordings = {role: load(folder / "recordings" / f"{role}.npz") for role in ROLES}
     case = bench.case(truth["scene"], recordings)
     scene = bench.setting(truth["scene"]).scene
-    model = fitted(case, truth["truths"]["fit"], [right(scene, Applied(**h)) for h in truth["hidden"]])
+    model = fitted(case, truth["truths"]["train"], [right(scene, Applied(**h)) for h in truth["hidden"]])
     return {
         "model": model.name,
-        "gaps": {role: of.gap_at(model.values) for role, of in case.judged.items()},
-        "amplitudes": {name: float(model.values[case.whole.index(name)]) for name in model.amplitudes},
+        "gaps": {role: of.discrepancy_at(model.values) for role, of in case.held_sets.items()},
+        "amplitudes": {name: float(model.values[case.full_space.index(name)]) for name in model.coefficients},
         "converged": model.refined.converged,
         "settled": settled(recordings, truth, result, bench),
     }
 
 
-def fitted(case: Case, truth: dict[str, float], names: Sequence[Sequence[str]]) -> Model:
+def fitted(case: Case, truth: dict[str, float], names: Sequence[Sequence[str]]) -> FittedModel:
     """The best model with one of the right names for each hidden effect, from the truth of all else."""
-    whole = case.whole
+    whole = case.full_space
     known = {name: value for name, value in truth.items() if name in whole.names}
     start, parts = np.clip(whole.values(known), whole.low, whole.high), list[Candidate]()
     for own in names:
         start, part = best_start(case, start, [c for c in candidates(case.effects) if c.name in own])
         parts.append(part)
-    return refit(case.fit, case.base, parts, start[None], FROM_TRUTH)
+    return refit(case.train, case.base, parts, start[None], FROM_TRUTH)
 
 
 def best_start(case: Case, start: np.ndarray, asked: Iterable[Candidate]) -> tuple[np.ndarray, Candidate]:
     """Values [D] with the one amplitude, of all of these candidates over a grid of sizes, that leaves the least."""
-    whole = case.whole
+    whole = case.full_space
     rows, parts = list[np.ndarray](), list[Candidate]()
     for candidate in asked:
-        for amplitude in candidate.amplitudes:
+        for amplitude in candidate.coefficients:
             p = whole[amplitude]
             for reach in {p.high - p.mean, p.low - p.mean} - {0.0}:
                 for size in SIZES:
                     row = start.copy()
-                    for name, value in candidate.shapes.items():
+                    for name, value in candidate.shape_parameters.items():
                         row[whole.index(name)] = value
                     row[whole.index(amplitude)] = p.mean + size * reach
                     rows.append(row)
                     parts.append(candidate)
-    left = np.sum(case.fit.cost.whitened(np.stack(rows)) ** 2, axis=1)
+    left = np.sum(case.train.cost.whitened(np.stack(rows)) ** 2, axis=1)
     best = int(np.nanargmin(left))
     return rows[best], parts[best]
 

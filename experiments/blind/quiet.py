@@ -23,7 +23,7 @@ from droid_jax.synthetic.robot import SyntheticRobotConfig
 from experiments.blind.make import Drawn, record
 from experiments.blind.search import Bench
 
-SETTLE = RefineConfig(iterations=20, hops=0, spreads=0)
+SETTLE = RefineConfig(iterations=20, basin_hops=0, spreads=0)
 QUIET = SyntheticRobotConfig(
     torque_noise=(0.0, 0.0), torque_drift=(0.0, 0.0), position_noise=0.0, angle_noise=0.0,
     start_noise=0.0, pose_noise=0.0,
@@ -42,12 +42,18 @@ def settled(
     where = bench.setting(truth["scene"])
     drawn = Drawn(tuple(Applied(**h) for h in truth["hidden"]), truth["truths"], truth["seeds"])
     try:
-        plain = record(where, drawn, ("fit",), QUIET)["fit"]
+        plain = record(where, drawn, ("train",), QUIET)["train"]
     except ValueError:  # it loses its door where a pose a little different kept it
         return None
-    case = bench.case(truth["scene"], {**recordings, "fit": around(plain, recordings["fit"])}, result["without"])
-    model = refit(case.fit, case.base, _parts(case, result), _start(case, truth["truths"]["fit"], result)[None], SETTLE)
-    return {n: float(model.values[case.whole.index(n)]) for n in model.amplitudes} if model.refined.converged else None
+    case = bench.case(truth["scene"], {**recordings, "train": around(plain, recordings["train"])}, result["without"])
+    model = refit(
+        case.train, case.base, _parts(case, result), _start(case, truth["truths"]["train"], result)[None], SETTLE
+    )
+    return (
+        {n: float(model.values[case.full_space.index(n)]) for n in model.coefficients}
+        if model.refined.converged
+        else None
+    )
 
 
 def around(plain: Recording, noisy: Recording) -> Recording:
@@ -66,7 +72,7 @@ def _parts(case: Case, result: Mapping[str, Any]) -> list[Candidate]:
 
 def _start(case: Case, truth: Mapping[str, float], result: Mapping[str, Any]) -> np.ndarray:
     """[D] the truth of the base model, and what was found of the effects."""
-    whole = case.whole
+    whole = case.full_space
     sizes = {name: found["value"] for name, found in result["amplitudes"].items()}
     known = {**truth, **sizes, **result["shapes"]}
     return np.clip(whole.values({n: v for n, v in known.items() if n in whole.names}), whole.low, whole.high)

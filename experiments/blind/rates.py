@@ -71,9 +71,9 @@ def summarise(judged: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "pair_both_named": rate(pair, lambda c: c["named"]),
         "unexplained_recall": rate(strange, lambda c: c["open"]),
         "unconverged_or_error": rate(judged, lambda c: c["verdict"] not in ANSWERED),
-        "gap_closed_confirm": closing(named, "confirm"),
-        "gap_closed": closing(named, "sealed"),
-        "gap_closed_whatever_was_named": closing([c for c in judged if c["effects"]], "sealed"),
+        "gap_closed_confirm": closing(named, "validation"),
+        "gap_closed": closing(named, "test"),
+        "gap_closed_whatever_was_named": closing([c for c in judged if c["effects"]], "test"),
         "within_floor": rate(named, lambda c: bool(c["within_floor"])),
         **{
             f"amplitude_{key}": rate([inside for c in named for inside in c[key]], bool)
@@ -95,7 +95,7 @@ def summarise_baselines(judged: Sequence[dict[str, Any]]) -> dict[str, Any] | No
         return None
     none, known = ([c for c in done if c["class"] in kinds] for kinds in (("none",), ("single", "pair")))
     shares = [c["baselines"]["closed"] for c in done if c["class"] != "none"]
-    sealed = [c["gaps"]["sealed"][0] for c in done if "sealed" in c["gaps"]]  # not of one that blew up there
+    sealed = [c["gaps"]["test"][0] for c in done if "test" in c["gaps"]]  # not of one that blew up there
     return {
         "base_gap_sealed_median": float(np.median(sealed)) if sealed else None,
         "bic_names_where_nothing": rate(none, lambda c: bool(c["baselines"]["bic"])),
@@ -104,7 +104,7 @@ def summarise_baselines(judged: Sequence[dict[str, Any]]) -> dict[str, Any] | No
         **{
             f"{who}_closed_{role}": closing([{"closed": s[who]} for s in shares], role)
             for who in ("search", "black_box")
-            for role in ("confirm", "sealed")
+            for role in ("validation", "test")
         },
     }
 
@@ -146,7 +146,7 @@ def confusion(judged: Sequence[dict[str, Any]]) -> dict[str, dict[str, int]]:
 
 def _alternatives(named: Sequence[dict[str, Any]]) -> dict[str, float] | None:
     """How many names an answer gives for one effect, itself among them: a tie of everything names nothing."""
-    counts = [1 + len(ties) for c in named for ties in c["tied"]]
+    counts = [1 + len(ties) for c in named for ties in c["indistinguishable"]]
     return {"median": float(np.median(counts)), "mean": float(np.mean(counts)), "most": max(counts)} if counts else None
 
 

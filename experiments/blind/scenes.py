@@ -5,7 +5,7 @@ bench  the same door beside an arm of two links: effects of joints and servos to
 arm    the free Panda, its motors' torques replayed by inverse dynamics, as logs of real arms are.
 door   the built-in scene, where the targets are to be met.
 
-In each the first motion ("fit") opens and closes at two speeds, "confirm" moves differently and "sealed"
+In each the first motion ("train") opens and closes at two speeds, "validation" moves differently and "test"
 differently again.
 """
 
@@ -19,7 +19,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from droid_jax.discrepancy.candidates import steers
+from droid_jax.discrepancy.candidates import acts_on_commands_only
 from droid_jax.door.arm import panda_arm_scene
 from droid_jax.door.builtin import ARM
 from droid_jax.door.scene import door_scene
@@ -43,7 +43,7 @@ from droid_jax.simulate.hand_path import minimum_jerk
 from experiments.blind.door_motion import door_demonstrations
 
 FOLDER = Path(__file__).resolve().parents[1]
-ROLES = ("fit", "confirm", "sealed")
+ROLES = ("train", "validation", "test")
 DOOR = "door"  # the joint that a servo turns in the cheap scenes
 SOME_JOINTS = ("panda_joint2", "panda_joint4", "panda_joint6")  # shoulder, elbow, wrist; the search asks for all
 SECONDS = 8.0
@@ -51,16 +51,16 @@ AJAR = 0.02  # rad: a door that a servo turns here never meets its frame, which 
 SERVO_LAG = 0.07  # s: velocity gain of the free arm's servos over their position gain
 # (seconds, furthest angle in rad) of each opening and closing
 STROKES = {
-    "fit": ((3.0, 0.9), (5.0, 0.9)),
-    "confirm": ((4.6, 0.8), (3.4, 0.95)),
-    "sealed": ((2.6, 0.75), (5.4, 0.85)),
+    "train": ((3.0, 0.9), (5.0, 0.9)),
+    "validation": ((4.6, 0.8), (3.4, 0.95)),
+    "test": ((2.6, 0.75), (5.4, 0.85)),
 }
 RISE = 1.5  # s in which an arm's swings grow from rest
 # (rad, rad/s) of two sines for shoulder and elbow
 SWINGS = {
-    "fit": (((0.6, 1.2), (0.0, 0.0)), ((0.8, 2.0), (0.2, 0.7))),
-    "confirm": (((0.5, 0.9), (0.2, 1.7)), ((0.6, 1.5), (-0.3, 0.5))),
-    "sealed": (((0.4, 1.5), (-0.3, 0.6)), ((0.7, 1.1), (0.25, 2.3))),
+    "train": (((0.6, 1.2), (0.0, 0.0)), ((0.8, 2.0), (0.2, 0.7))),
+    "validation": (((0.5, 0.9), (0.2, 1.7)), ((0.6, 1.5), (-0.3, 0.5))),
+    "test": (((0.4, 1.5), (-0.3, 0.6)), ((0.7, 1.1), (0.25, 2.3))),
 }
 
 
@@ -88,7 +88,7 @@ class Setting:
     def effects(self, without: Iterable[str] = ()) -> tuple[Effect, ...]:
         """The library's effects for this scene, less those named; a prescribed motion has no servo to be wrong."""
         found = (e for e in library(self.scene) if e.name not in {*without})
-        return tuple(e for e in found if not (self.prescribed and steers(e)))
+        return tuple(e for e in found if not (self.prescribed and acts_on_commands_only(e)))
 
 
 def setting(name: str, cache: Path | None = None) -> Setting:

@@ -105,7 +105,7 @@ def answered(case: Case) -> dict[str, Any]:
     named: by right names, own or equivalent, in a tie or not.  own: every hidden effect's own name is among them.
     """
     result, left_out = case["result"], case["truth"]["kind"] == "left_out"
-    verdict, effects, ties = result["verdict"], result.get("effects", ()), result.get("tied", ())
+    verdict, effects, ties = result["verdict"], result.get("effects", ()), result.get("indistinguishable", ())
     right_names = [[] for _ in case["right"]] if left_out else case["right"]
     slots = slots_of(result, right_names)
     met = matched(slots, right_names)
@@ -118,7 +118,7 @@ def answered(case: Case) -> dict[str, Any]:
     return {
         "verdict": verdict,
         "effects": list(effects),
-        "tied": [list(t) for t in ties],
+        "indistinguishable": [list(t) for t in ties],
         "false_names": false,
         "wrong_confident": bool(false) and verdict in CLEAN,
         "said": [saying(*part, right_names, allowed) for part in zip(effects, ties, strict=True)],
@@ -134,10 +134,10 @@ def answered(case: Case) -> dict[str, Any]:
 def slots_of(result: Mapping[str, Any], right_names: Sequence[Sequence[str]]) -> list[set[str]]:
     """The parts of an answer: each effect with its ties.
 
-    A tie of several at once ("a + b" does as well) gives as many answers, where each of them is right.
+    A tie of several at once ("a + b" is equivalent) gives as many answers, where each of them is right.
     """
     known, out = {name for names in right_names for name in names}, list[set[str]]()
-    for effect, ties in zip(result.get("effects", ()), result.get("tied", ()), strict=True):
+    for effect, ties in zip(result.get("effects", ()), result.get("indistinguishable", ()), strict=True):
         slot = {effect, *ties}
         several = [t.split(" + ") for t in ties if " + " in t]
         whole = next((names for names in several if known.issuperset(names)), None)
@@ -218,20 +218,20 @@ def reachable(case: Case) -> float | None:
     named there.
     """
     oracle, result = case["oracle"] or {}, case["result"]
-    if "gaps" not in oracle or "confirm" not in result.get("gaps", {}):
+    if "gaps" not in oracle or "validation" not in result.get("gaps", {}):
         return None
-    before, floor = result["gaps"]["confirm"][0], result["floor"]
+    before, floor = result["gaps"]["validation"][0], result["floor"]
     if before - floor < SEEN:
         return 0.0
-    share = (before - oracle["gaps"]["confirm"]) / (before - floor)
+    share = (before - oracle["gaps"]["validation"]) / (before - floor)
     return share if share >= NAMEABLE or oracle.get("converged") else None
 
 
 def within_floor(result: Mapping[str, Any]) -> bool | None:
     """Whether what is left on the sealed recording is within 2 U0 of the floor."""
-    if "sealed" not in result.get("gaps", {}):
+    if "test" not in result.get("gaps", {}):
         return None
-    return bool(result["gaps"]["sealed"][1] <= 3.0 * result["floor"])
+    return bool(result["gaps"]["test"][1] <= 3.0 * result["floor"])
 
 
 def coverage(case: Case) -> list[bool]:

@@ -16,12 +16,12 @@ from benchmarks.common import CODE
 from benchmarks.sharing import claimed
 from droid_jax.cost.cost import Cost
 from droid_jax.discrepancy.case import Case, make_case
-from droid_jax.discrepancy.discretisation_error import finer, numerical_floor
-from droid_jax.discrepancy.refit import Model, intervals
-from droid_jax.discrepancy.residual_set import Evidence, evidence
+from droid_jax.discrepancy.discretisation_error import discretisation_error, with_finer_step
+from droid_jax.discrepancy.refit import FittedModel, intervals
+from droid_jax.discrepancy.residual_set import ResidualSet, residual_set
 from droid_jax.discrepancy.restart import base_fit
 from droid_jax.discrepancy.verdict import Verdict
-from droid_jax.discrepancy.workflow import find
+from droid_jax.discrepancy.workflow import search_effects
 from droid_jax.recordings.formats import load
 from droid_jax.recordings.recording import Recording
 from droid_jax.storage import write_json
@@ -53,26 +53,26 @@ class Bench:
         Where there is nothing to confirm or to judge on, the fitted recording stands in.
         """
         where = self.setting(scene)
-        given = {role: recordings.get(role, recordings["fit"]) for role in ROLES}
+        given = {role: recordings.get(role, recordings["train"]) for role in ROLES}
         key = ", ".join((scene, *sorted(recordings)))
         if key not in self.compiled:
             self.compiled[key] = make_case(where.scene, where.base, where.effects(), **given)
         known = self.compiled[key]
-        of = {role: _again(known.judged[role], recording) for role, recording in recordings.items()}
+        of = {role: _again(known.held_sets[role], recording) for role, recording in recordings.items()}
         kept = {e.name for e in where.effects(without)}
         return replace(known, **of, effects=tuple(e for e in known.effects if e.name in kept))
 
-    def floor(self, scene: str, case: Case, model: Model, recording: Recording) -> float:
+    def floor(self, scene: str, case: Case, model: FittedModel, recording: Recording) -> float:
         """U0 of a base model; the finer replay is compiled once a scene."""
         if scene not in self.fine:
-            self.fine[scene] = finer(case.fit, model.space, recording)
-        return numerical_floor(case.fit, model, recording, self.fine[scene])
+            self.fine[scene] = with_finer_step(case.train, model.space, recording)
+        return discretisation_error(case.train, model, recording, self.fine[scene])
 
 
-def _again(known: Evidence, recording: Recording) -> Evidence:
+def _again(known: ResidualSet, recording: Recording) -> ResidualSet:
     """The evidence of another recording of the same commands, on the same compiled replay."""
-    fresh = evidence(known.cost.against([recording]))
-    return fresh.with_own(known.own) if known.own else fresh
+    fresh = residual_set(known.cost.against([recording]))
+    return fresh.with_nuisances(known.nuisances) if known.nuisances else fresh
 
 
 @dataclass
@@ -98,8 +98,8 @@ def search_case(folder: Path, bench: Bench) -> dict[str, Any]:
     try:
         case = watch("prepare", lambda: bench.case(told["scene"], recordings, told["without"]))
         model = watch("base", lambda: base_fit(case, silent))
-        floor = watch("floor", lambda: bench.floor(told["scene"], case, model, recordings["fit"]))
-        verdict = watch("find", lambda: find(case, model, floor))
+        floor = watch("floor", lambda: bench.floor(told["scene"], case, model, recordings["train"]))
+        verdict = watch("find", lambda: search_effects(case, model, floor))
     except FAILED as error:
         return {**result, "verdict": "error", "error": str(error), "seconds": watch.seconds}
     result |= describe(case, verdict)
@@ -113,28 +113,30 @@ def search_case(folder: Path, bench: Bench) -> dict[str, Any]:
 
 def describe(case: Case, verdict: Verdict) -> dict[str, Any]:
     """A verdict as plain numbers."""
-    spans = intervals(case.fit, verdict.model) if verdict.model.parts else {}
-    space = case.whole
+    spans = intervals(case.train, verdict.model) if verdict.model.parts else {}
+    space = case.full_space
     return {
         "verdict": verdict.kind.value,
         "sentence": verdict.sentence,
         "effects": list(verdict.effects),
-        "tied": [list(t) for t in verdict.tied],
+        "indistinguishable": [list(t) for t in verdict.indistinguishable],
         "hints": [asdict(hint) for hint in verdict.hints],
         "doubts": list(verdict.doubts),
         "remainder": verdict.remainder,
-        "p": verdict.screens[0].p if verdict.screens else None,
-        "gaps": {role: list(pair) for role, pair in verdict.gaps.items()},
-        "floor": verdict.floor,
+        "p": verdict.score_tests[0].p if verdict.score_tests else None,
+        "gaps": {role: list(pair) for role, pair in verdict.discrepancies.items()},
+        "floor": verdict.discretisation_error,
         "converged": verdict.base.refined.converged,
         "amplitudes": {
             name: {"value": float(verdict.model.values[space.index(name)]), "interval": list(span)}
             for name, span in spans.items()
         },
         "shapes": {
-            name: float(verdict.model.values[space.index(name)]) for part in verdict.model.parts for name in part.shapes
+            name: float(verdict.model.values[space.index(name)])
+            for part in verdict.model.parts
+            for name in part.shape_parameters
         },
-        "trials": [trial_json(trial) for trial in verdict.trials],
+        "trials": [trial_json(trial) for trial in verdict.validation_tests],
     }
 
 

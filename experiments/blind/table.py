@@ -88,7 +88,7 @@ def _rows() -> Iterator[tuple[str, str, Chosen, Chosen]]:
     yield "of these at that multiple: named, alone or in a tie", "", lambda c: above(c) and not c["larger"], _named
     yield "of these at that multiple: named alone", "", lambda c: above(c) and not c["larger"], lambda c: c["alone"]
     yield (
-        "of these larger, to be worth a name: named, alone or in a tie",
+        "of these above the minimum effect size: named, alone or in a tie",
         "",
         lambda c: above(c) and c["larger"],
         _named,
@@ -107,7 +107,7 @@ def _rows() -> Iterator[tuple[str, str, Chosen, Chosen]]:
     yield "anything hidden: stepwise BIC holds a false name", "", _judged_by_bic, lambda c: c["baselines"]["bic_false"]
     yield "any: error, or fit not converged", "", lambda c: True, lambda c: c["verdict"] not in ANSWERED
     closed = f"rightly named: at least {CLOSED:.0%} of the sealed gap closed"
-    yield closed, "", lambda c: _named(c) and "sealed" in c["closed"], lambda c: c["closed"]["sealed"] >= CLOSED
+    yield closed, "", lambda c: _named(c) and "test" in c["closed"], lambda c: c["closed"]["test"] >= CLOSED
     yield "rightly named: sealed gap within two floors of the floor", "all", _named, lambda c: bool(c["within_floor"])
     near = "nothing hidden: sealed gap within two floors of the floor"  # what the base model itself leaves
     yield near, "", _kind("none"), lambda c: bool(c["within_floor"])
@@ -127,7 +127,7 @@ def _share(cases: Sequence[Any], hit: Callable[[Any], bool]) -> str:
 
 
 def _closed(judged: Sequence[Mapping[str, Any]], scene: str, chosen: Chosen) -> str:
-    found = closing([dict(c) for c in judged if c["scene"] == scene and chosen(c)], "sealed")
+    found = closing([dict(c) for c in judged if c["scene"] == scene and chosen(c)], "test")
     if found is None:
         return "-"
     low, high = found["interval_95"]

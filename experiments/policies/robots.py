@@ -14,7 +14,7 @@ from droid_jax.door.space import door_nuisances, door_space
 from droid_jax.files import GAUSSIAN
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.gaussian import load as load_gaussian
-from droid_jax.identify.pipeline import identify
+from droid_jax.identify.pipeline import identify_parameters
 from droid_jax.storage import write_json
 from droid_jax.synthetic.policy_trials import PolicyRobot, TransferConfig, synthetic_robot
 from droid_jax.synthetic.robot import synthetic_truth
@@ -62,7 +62,9 @@ def fitted(setting: Setting, arguments: Options, code: Mapping[str, Any]) -> Gau
             scene, truth = door_scene(timestep=TIMESTEP), truth_of(setting)
             recorded = recordings(scene, truth, "A" if quick else "AC", setting.robot)
             config = settings(quick, setting.robot)
-            found = identify(scene, door_space(scene), recorded, nuisances=door_nuisances(scene), config=config)
+            found = identify_parameters(
+                scene, door_space(scene), recorded, nuisances=door_nuisances(scene), config=config
+            )
             write_json(folder / FIT, {**made_of, "fit": describe(found, truth), "origin": dict(code)})
             found.gaussian.save(path)
     return load_gaussian(path)

@@ -10,11 +10,11 @@ from droid_jax.cost.noise import (
     RATE,
     coarse_clock,
     correlation_time,
+    detrend,
     discrepancy,
     estimate_noise,
     lowpass,
     smooth,
-    untrended,
 )
 
 CLOCK = np.arange(0, 6.0, 0.002)
@@ -252,10 +252,10 @@ def test_a_trend_over_the_order_is_taken_away_and_the_mean_stays():
     rng = np.random.default_rng(5)
     rest, slope = rng.normal(size=(9, 4)), np.array([2.0, 0.0, -1.0, 30.0])
     with_trend = rest + (np.arange(9)[:, None] - 4.0) * slope
-    np.testing.assert_allclose(untrended(with_trend), untrended(rest), atol=1e-12)
-    np.testing.assert_allclose(untrended(with_trend).mean(axis=0), rest.mean(axis=0), atol=1e-12)
+    np.testing.assert_allclose(detrend(with_trend), detrend(rest), atol=1e-12)
+    np.testing.assert_allclose(detrend(with_trend).mean(axis=0), rest.mean(axis=0), atol=1e-12)
     seen = rng.uniform(size=(9, 4)) < 0.7
-    found = untrended(np.where(seen, with_trend, 0.0), seen)
+    found = detrend(np.where(seen, with_trend, 0.0), seen)
     for k in range(4):
         at = np.flatnonzero(seen[:, k])
         line = np.polynomial.Polynomial.fit(at, with_trend[at, k], 1)

@@ -11,7 +11,7 @@ from small_gap import Small, record, small
 
 from droid_jax.discrepancy import amendments as amend
 from droid_jax.discrepancy.amendments import EXPERIMENTS, MADE, NOT_NEEDED, REFIT, amended
-from droid_jax.discrepancy.final_refit import HandedOn
+from droid_jax.discrepancy.final_refit import FinalModel
 from droid_jax.discrepancy.verdict import Experiment
 from droid_jax.files import TO_BE_MADE
 
@@ -31,14 +31,17 @@ def failing(error: BaseException) -> Callable[..., Any]:
 
 
 def test_the_verdict_comes_first_and_then_each_amendment(found: Small, monkeypatch: pytest.MonkeyPatch):
-    tie, both = replace(found.verdict, rivals=(found.base,)), HandedOn(found.base, (found.case.fit,))
+    tie, both = (
+        replace(found.verdict, indistinguishable_models=(found.base,)),
+        FinalModel(found.base, (found.case.train,)),
+    )
     monkeypatch.setattr(amend, "separating", lambda case, models, recording: FASTER)
-    monkeypatch.setattr(amend, "handed_on", lambda *arguments: both)
-    first, second, third = amended(found.case, tie, record("fit"))
+    monkeypatch.setattr(amend, "final_model", lambda *arguments: both)
+    first, second, third = amended(found.case, tie, record("train"))
     assert first.states == {EXPERIMENTS: TO_BE_MADE, REFIT: TO_BE_MADE}
-    assert first.verdict is tie and first.handed.model is tie.model and first.handed.of == (found.case.fit,)
+    assert first.verdict is tie and first.final.model is tie.model and first.final.fitted_to == (found.case.train,)
     assert second.verdict.experiments == FASTER and second.states == {EXPERIMENTS: MADE, REFIT: TO_BE_MADE}
-    assert third.handed is both and third.states == {EXPERIMENTS: MADE, REFIT: MADE}
+    assert third.final is both and third.states == {EXPERIMENTS: MADE, REFIT: MADE}
 
 
 @pytest.mark.parametrize(
@@ -52,43 +55,46 @@ def test_the_verdict_comes_first_and_then_each_amendment(found: Small, monkeypat
 def test_what_fails_is_said_and_what_comes_after_it_is_made(
     found: Small, monkeypatch: pytest.MonkeyPatch, error: Exception, said: str
 ):
-    tie, both = replace(found.verdict, rivals=(found.base,)), HandedOn(found.base, (found.case.fit,))
+    tie, both = (
+        replace(found.verdict, indistinguishable_models=(found.base,)),
+        FinalModel(found.base, (found.case.train,)),
+    )
     monkeypatch.setattr(amend, "separating", failing(error))
-    monkeypatch.setattr(amend, "handed_on", lambda *arguments: both)
-    *_, last = amended(found.case, tie, record("fit"))
+    monkeypatch.setattr(amend, "final_model", lambda *arguments: both)
+    *_, last = amended(found.case, tie, record("train"))
     assert last.states[EXPERIMENTS].startswith(f"not made: {said}") and "\n" not in last.states[EXPERIMENTS]
-    assert last.states[REFIT] == MADE and last.handed is both and last.verdict.experiments == ()
-    monkeypatch.setattr(amend, "handed_on", failing(error))
-    *_, last = amended(found.case, tie, record("fit"))
+    assert last.states[REFIT] == MADE and last.final is both and last.verdict.experiments == ()
+    monkeypatch.setattr(amend, "final_model", failing(error))
+    *_, last = amended(found.case, tie, record("train"))
     assert last.states[REFIT].startswith(f"not made: {said}")
-    assert last.handed.model is tie.model and last.handed.of == (found.case.fit,)
+    assert last.final.model is tie.model and last.final.fitted_to == (found.case.train,)
 
 
 def test_a_refit_that_cannot_be_written_is_not_handed_on(found: Small, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(amend, "handed_on", lambda *arguments: HandedOn(found.base, (found.case.fit,)))
+    monkeypatch.setattr(amend, "final_model", lambda *arguments: FinalModel(found.base, (found.case.train,)))
     monkeypatch.setattr(amend, "extended", failing(ValueError("its covariance is singular")))
-    *_, last = amended(found.case, found.verdict, record("fit"))
-    assert last.states[REFIT] == "not made: its covariance is singular" and last.handed.model is found.verdict.model
+    *_, last = amended(found.case, found.verdict, record("train"))
+    assert last.states[REFIT] == "not made: its covariance is singular" and last.final.model is found.verdict.model
 
 
 def test_a_refit_that_does_not_converge_is_said(found: Small, monkeypatch: pytest.MonkeyPatch):
     short = replace(
         found.case, config=replace(found.case.config, refine=replace(found.case.config.refine, iterations=1))
     )
-    *_, last = amended(short, found.verdict, record("fit"))
+    *_, last = amended(short, found.verdict, record("train"))
     assert last.states == {
         EXPERIMENTS: NOT_NEEDED, REFIT: "not made: the fit to both motions did not converge"
     }  # fmt: skip
 
 
 def test_nothing_is_added_where_nothing_is_due(found: Small):
-    (only,) = amended(found.case, replace(found.verdict, model=found.base), record("fit"))
+    (only,) = amended(found.case, replace(found.verdict, model=found.base), record("train"))
     assert only.states == {EXPERIMENTS: NOT_NEEDED, REFIT: NOT_NEEDED}
 
 
 def test_a_stop_is_no_failure(found: Small, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(amend, "handed_on", failing(KeyboardInterrupt()))
-    steps = amended(found.case, found.verdict, record("fit"))
+    monkeypatch.setattr(amend, "final_model", failing(KeyboardInterrupt()))
+    steps = amended(found.case, found.verdict, record("train"))
     assert next(steps).states[REFIT] == TO_BE_MADE
     with pytest.raises(KeyboardInterrupt):
         next(steps)

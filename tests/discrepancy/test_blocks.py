@@ -14,13 +14,13 @@ from small_log import ASKED, CONFIG, COULOMB, elbow, elbow_log, elbow_space
 from droid_jax.cost.cost import make_cost
 from droid_jax.cost.noise import RATE, coarse_clock
 from droid_jax.discrepancy import single
-from droid_jax.discrepancy.blocks import OUTSIDE, Blocks, block_length, blocks, interleaved
+from droid_jax.discrepancy.blocks import OUTSIDE, BlockResidualSet, block_length, block_residual_set, interleaved
 from droid_jax.discrepancy.case import make_case
 from droid_jax.discrepancy.screen import project
 from droid_jax.discrepancy.select import resamples
 from droid_jax.discrepancy.single import Log, base_model, make_log, single_case
-from droid_jax.discrepancy.verdict import Kind
-from droid_jax.discrepancy.workflow import find
+from droid_jax.discrepancy.verdict import Conclusion
+from droid_jax.discrepancy.workflow import search_effects
 from droid_jax.model.effects.registry import library, ready
 from droid_jax.model.parameters import Space
 from droid_jax.recordings.recording import Recording
@@ -57,12 +57,12 @@ def test_blocks_are_longer_than_the_correlation():
     assert block_length(slow) == pytest.approx(1.5, rel=0.3)
 
 
-def made_blocks(count: int = 8, size: int = 25, columns: int = 2) -> Blocks:
+def made_blocks(count: int = 8, size: int = 25, columns: int = 2) -> BlockResidualSet:
     """Blocks without a recording, with a tail that belongs to no block."""
     block = np.r_[np.repeat(np.arange(count), size), np.full(10, OUTSIDE)]
     whole = np.tile(block, columns)
     column = np.repeat(np.arange(columns), len(block))
-    return Blocks(None, np.zeros((1, len(whole))), column, np.zeros(len(whole)), whole)  # pyright: ignore
+    return BlockResidualSet(None, np.zeros((1, len(whole))), column, np.zeros(len(whole)), whole)  # pyright: ignore
 
 
 def test_rows_are_blocks_and_their_mean_the_residual():
@@ -72,9 +72,9 @@ def test_rows_are_blocks_and_their_mean_the_residual():
     inside = made.block != OUTSIDE
     np.testing.assert_allclose(rows.mean(axis=0), np.where(inside, common, 0.0))
     assert made.repeats == 1 and made.units == len(rows) == 8
-    assert made.gap(rows) == pytest.approx(np.mean(common[inside] ** 2))
+    assert made.discrepancy(rows) == pytest.approx(np.mean(common[inside] ** 2))
     first = made.column == 0
-    np.testing.assert_allclose(made.gaps(rows, first[None]), np.mean(common[inside & first] ** 2))
+    np.testing.assert_allclose(made.discrepancies(rows, first[None]), np.mean(common[inside & first] ** 2))
     np.testing.assert_array_equal(made.cell_p_values(rows, first[None]), [1.0])
     losses = made.losses(np.stack([common, 2 * common]), np.full((1, 8), 1 / 8))
     np.testing.assert_allclose(losses[0], np.sum(common[inside] ** 2) * np.array([1.0, 4.0]))
@@ -130,25 +130,25 @@ def test_a_log_is_whitened_as_its_cost_would(log: Log):
     restated = cost.restated(values)
     deviation = 1 / restated.comparisons[0].channel("torque").noise.whitener[0, 0, 0]
     everywhere = np.ones(len(log.clock), bool)
-    stated = log.stated(np.array([deviation]), everywhere)
+    stated = log.with_noise(np.array([deviation]), everywhere)
     np.testing.assert_allclose(stated.whitened(whole[None]), restated.whitened(values[None]), atol=1e-3)
     some = log.clock < 5.0
-    np.testing.assert_array_equal(log.stated(np.ones(1), some).whitened(whole[None])[0] == 0, ~some)
-    held = log.holding(log.simulated(whole[None])[0])
-    np.testing.assert_allclose(held.left(whole), 0.0, atol=1e-9)
+    np.testing.assert_array_equal(log.with_noise(np.ones(1), some).whitened(whole[None])[0] == 0, ~some)
+    held = log.with_torques(log.simulated(whole[None])[0])
+    np.testing.assert_allclose(held.residual_torque(whole), 0.0, atol=1e-9)
 
 
 def test_dry_friction_is_found_in_one_log(log: Log):
     scene = elbow()
     effects, base = library(scene, ASKED), elbow_space(scene)
     case = single_case(log, base, effects, config=CONFIG)
-    assert case.fit.units == case.confirm.units >= 8
-    assert not np.any((case.fit.block >= 0) & (case.confirm.block >= 0))  # pyright: ignore
-    verdict = find(case, base_model(case), 0.0)
-    assert verdict.kind is Kind.NAMED and verdict.effects == ("joint_coulomb at elbow",)
-    at = case.whole.index("joint_coulomb[elbow]")
+    assert case.train.units == case.validation.units >= 8
+    assert not np.any((case.train.block >= 0) & (case.validation.block >= 0))  # pyright: ignore
+    verdict = search_effects(case, base_model(case), 0.0)
+    assert verdict.kind is Conclusion.NAMED and verdict.effects == ("joint_coulomb at elbow",)
+    at = case.full_space.index("joint_coulomb[elbow]")
     assert verdict.model.values[at] == pytest.approx(COULOMB, rel=0.1)
-    before, after = verdict.gaps["sealed"]
+    before, after = verdict.discrepancies["test"]
     assert after < 0.1 * before
     assert all(cell.p == 1.0 and not cell.found for cell in verdict.before.cells)
 
@@ -156,8 +156,8 @@ def test_dry_friction_is_found_in_one_log(log: Log):
 def test_nothing_is_said_where_nothing_is_missing(log: Log):
     scene = elbow()
     effects, base = library(scene, ASKED), elbow_space(scene)
-    case = single_case(log.holding(elbow_torque(log)), base, effects, config=CONFIG)
-    assert find(case, base_model(case), 0.0).kind is Kind.NONE
+    case = single_case(log.with_torques(elbow_torque(log)), base, effects, config=CONFIG)
+    assert search_effects(case, base_model(case), 0.0).kind is Conclusion.NONE
 
 
 def elbow_torque(log: Log) -> np.ndarray:
@@ -180,11 +180,11 @@ def test_each_joint_of_a_sealed_log_has_its_own_noise(monkeypatch: pytest.Monkey
     monkeypatch.setattr(single, "noise_of", lambda *_: (np.array([1.0, 2.0]), 1.0))
     monkeypatch.setattr(single, "only_comparison", lambda log: log)
     monkeypatch.setattr(single, "_blocks", lambda log, deviation, block: given.update({log.name: deviation}))
-    single_case(synthetic_robot("log", 0, 1), elbow_space(elbow()), (), synthetic_robot("sealed", 1, 0))
+    single_case(synthetic_robot("log", 0, 1), elbow_space(elbow()), (), synthetic_robot("test", 1, 0))
     assert {name: noise.tolist() for name, noise in given.items()} == {
         "log, every other block": [1.0, 2.0],
         "log, the blocks between": [1.0, 2.0],
-        "sealed": [2.0, 1.0],
+        "test": [2.0, 1.0],
     }
 
 
@@ -208,26 +208,28 @@ def test_a_sealed_log_has_torque_offsets_of_its_own(off: float):
     other = offset_by(elbow_log(COULOMB, 30.0), off, "another day")
     logs = [make_log(scene, base, effects, each, CONFIG) for each in (log, other)]
     case = single_case(logs[0], base, effects, logs[1], CONFIG)
-    assert case.sealed is not None and case.sealed.own == ("torque_offset[elbow]",) and case.confirm.own == ()
-    truth = case.whole.values({"elbow_damping": 0.6, "torque_offset[elbow]": 0.1, "joint_coulomb[elbow]": COULOMB})
-    least = case.confirm.gap_at(truth)
-    assert case.sealed.gap_at(truth) == pytest.approx(least, rel=0.3)
-    best = case.sealed.with_own_at_best(truth)[0]
-    assert best[case.whole.index("torque_offset[elbow]")] == pytest.approx(0.1 + off, abs=0.03)
-    assert single_case(logs[0], base, effects, None, CONFIG).sealed.own == ()  # pyright: ignore
+    assert (
+        case.test is not None and case.test.nuisances == ("torque_offset[elbow]",) and case.validation.nuisances == ()
+    )
+    truth = case.full_space.values({"elbow_damping": 0.6, "torque_offset[elbow]": 0.1, "joint_coulomb[elbow]": COULOMB})
+    least = case.validation.discrepancy_at(truth)
+    assert case.test.discrepancy_at(truth) == pytest.approx(least, rel=0.3)
+    best = case.test.at_best_nuisances(truth)[0]
+    assert best[case.full_space.index("torque_offset[elbow]")] == pytest.approx(0.1 + off, abs=0.03)
+    assert single_case(logs[0], base, effects, None, CONFIG).test.nuisances == ()  # pyright: ignore
     if off:
-        assert replace(case.sealed, own=(), own_columns=None).gap_at(truth) > 2.0 * least
+        assert replace(case.test, nuisances=(), nuisance_columns=None).discrepancy_at(truth) > 2.0 * least
 
 
 def test_repeats_need_no_blocks():
     scene = elbow()
     with pytest.raises(ValueError, match="'elbow' has 2 repeats: use make_case"):
         make_log(scene, elbow_space(scene), library(scene, ASKED), elbow_log(COULOMB, 8.0, 2), CONFIG)
-    few = {"fit": elbow_log(COULOMB, 8.0, 5), "confirm": replace(elbow_log(COULOMB, 9.0, 5), name="other")}
+    few = {"train": elbow_log(COULOMB, 8.0, 5), "validation": replace(elbow_log(COULOMB, 9.0, 5), name="other")}
     with pytest.raises(ValueError, match="recordings elbow, other: at least 8 repeats are needed"):
         make_case(scene, elbow_space(scene), library(scene, ASKED), **few, config=CONFIG)
 
 
 def test_too_few_blocks_are_refused(log: Log):
     with pytest.raises(ValueError, match="3 blocks, at least 8"):
-        blocks(log, np.minimum(np.arange(len(log.clock)) // 100, 2))
+        block_residual_set(log, np.minimum(np.arange(len(log.clock)) // 100, 2))

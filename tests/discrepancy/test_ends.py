@@ -9,8 +9,8 @@ from small_gap import EFFECTS, FLOOR, PRELOAD, QUICK, record, small_scene
 
 from droid_jax.discrepancy.case import make_case
 from droid_jax.discrepancy.restart import base_fit
-from droid_jax.discrepancy.verdict import Kind, Verdict
-from droid_jax.discrepancy.workflow import find
+from droid_jax.discrepancy.verdict import Conclusion, Verdict
+from droid_jax.discrepancy.workflow import search_effects
 from droid_jax.model.effects.registry import library
 
 FRICTION = 0.5  # N m
@@ -20,20 +20,20 @@ FRICTION = 0.5  # N m
 def verdict(preload: float, friction: float) -> Verdict:
     """What is said of a robot that hides so much."""
     scene, space = small_scene()
-    recordings = {name: record(name, preload=preload, friction=friction) for name in ("fit", "confirm")}
+    recordings = {name: record(name, preload=preload, friction=friction) for name in ("train", "validation")}
     case = make_case(
-        scene, space, library(scene, (*EFFECTS, "joint_coulomb")), **recordings, config=replace(QUICK, most=2)
+        scene, space, library(scene, (*EFFECTS, "joint_coulomb")), **recordings, config=replace(QUICK, max_effects=2)
     )
-    return find(case, base_fit(case, lambda stage, value: None), FLOOR)
+    return search_effects(case, base_fit(case, lambda stage, value: None), FLOOR)
 
 
 def test_nothing_hidden_is_called_nothing():
     found = verdict(0.0, 0.0)
-    assert found.kind is Kind.NONE and not found.effects
-    assert found.screens[0].p > 0.01
+    assert found.kind is Conclusion.NONE and not found.effects
+    assert found.score_tests[0].p > 0.01
 
 
 def test_two_effects_are_both_named_and_nothing_else():
     found = verdict(PRELOAD, FRICTION)
-    assert found.kind is Kind.NAMED
+    assert found.kind is Conclusion.NAMED
     assert set(found.effects) == {"hinge_preload at door", "joint_coulomb at elbow"}

@@ -17,7 +17,7 @@ import droid_jax as dj
 from droid_jax.cost.cost import make_cost
 from droid_jax.discrepancy.candidates import Candidate
 from droid_jax.discrepancy.extended import Extended, extended, load_extended, save_extended
-from droid_jax.discrepancy.final_refit import HandedOn
+from droid_jax.discrepancy.final_refit import FinalModel
 from droid_jax.identify.gaussian import prior
 from droid_jax.model.effects.registry import effect_space, library, ready
 from droid_jax.model.mjcf import fitted_mjcf
@@ -44,9 +44,9 @@ def with_effects(scene: Scene, base: Space, **values: float) -> Extended:
     """A made-up extended model whose effects have these values, all at the place of their first amplitude."""
     effects = library(scene, sorted({e.name for e in library(scene) for n in values if n in _names(e)}))
     parts = [
-        Candidate(e.name, place, names, {n: values[n] for n in e.shapes if n in values})
+        Candidate(e.name, place, names, {n: values[n] for n in e.shape_parameters if n in values})
         for e in effects
-        for place, names in e.places.items()
+        for place, names in e.locations.items()
         if set(names) & set(values)
     ]
     space = base + effect_space(effects).select(values)
@@ -80,9 +80,9 @@ def test_the_cost_is_the_searchs_own(found: Small, saved: Path):
     model = load_extended(saved, scene)
     assert [e.name for e in model.effects] == ["hinge_preload"]
     assert [p.name for p in model.parts] == list(found.verdict.effects)
-    cost = make_cost(model.scene, model.space, [found.recordings["confirm"]], effects=model.effects)
+    cost = make_cost(model.scene, model.space, [found.recordings["validation"]], effects=model.effects)
     case, whole = found.case, found.verdict.model.values
-    own = case.confirm.cost.distances(whole[None])[0, 0]
+    own = case.validation.cost.distances(whole[None])[0, 0]
     assert cost(model.values[None])[0] == pytest.approx(own, abs=3e-4)
     without = model.space.values({**dict(zip(model.space.names, model.values, strict=True)), "hinge_preload": 0.0})
     assert cost(without[None])[0] > own + 0.3
@@ -92,7 +92,7 @@ def test_the_values_are_the_ones_found_and_the_gaussian_is_around_them(found: Sm
     scene, base = small_scene()
     model = load_extended(saved, scene)
     assert model.space.names == (*base.names, "hinge_preload")
-    whole = found.case.whole
+    whole = found.case.full_space
     np.testing.assert_array_equal(model.values, found.verdict.model.values[whole.columns(model.space)])
     low, high = model.gaussian.interval(0.9)
     assert np.all(low <= model.values + 1e-9) and np.all(model.values <= high + 1e-9)
@@ -111,7 +111,7 @@ def test_effects_join_a_space_from_where_they_were_found(saved: Path):
 
 
 def test_a_model_without_effects_is_the_base_model(found: Small, tmp_path: Path):
-    save_extended(tmp_path, extended(found.case, HandedOn(found.base, (found.case.fit,))))
+    save_extended(tmp_path, extended(found.case, FinalModel(found.base, (found.case.train,))))
     scene, base = small_scene()
     model = load_extended(tmp_path / "extended.json", scene)
     assert (model.parts, model.effects, model.lacking) == ((), (), ())
@@ -125,8 +125,11 @@ def test_shapes_and_places_come_back(tmp_path: Path):
     values = {"latch_torque": 1.2, "latch_width": 0.05, "latch_exponent": 1.5, "torque_gain[elbow]": 0.04}
     save_extended(tmp_path, with_effects(scene, base, **values))
     model = load_extended(tmp_path / "extended.json", scene)
-    assert [(p.effect, p.place) for p in model.parts] == [("latch", "door"), ("torque_gain", "elbow")]
-    assert model.parts[0].shapes == {"latch_width": 0.05, "latch_exponent": 1.5} and model.parts[1].shapes == {}
+    assert [(p.effect, p.location) for p in model.parts] == [("latch", "door"), ("torque_gain", "elbow")]
+    assert (
+        model.parts[0].shape_parameters == {"latch_width": 0.05, "latch_exponent": 1.5}
+        and model.parts[1].shape_parameters == {}
+    )
     assert dict(zip(model.effect_space.names, model.effect_space.mean.tolist(), strict=True)) == values
     assert model.lacking == ("latch at door", "torque_gain at elbow")
 
@@ -224,16 +227,16 @@ def test_a_missing_file(tmp_path: Path):
     ("change", "expected"),
     [
         (lambda c: c.clear(), "expected a JSON object with format"),
-        (lambda c: c.update(version=2), "version 1"),
+        (lambda c: c.update(version=1), "version 2"),
         (lambda c: c.pop("values"), "missing keys: values"),
         (lambda c: c["values"].pop("hinge_preload"), "'values': missing keys: hinge_preload"),
         (lambda c: c["values"].update(hinge_preload=99.0), "not inside its bounds"),
         (lambda c: c["effects"][0].update(effect="gravity_waves"), "unknown effects gravity_waves; valid: .*latch"),
         (lambda c: c["gaussian"].update(cov=[[1.0]]), "cov must have shape"),
         (lambda c: c.update(scene=3), "'scene' must be an object, got 3"),
-        (lambda c: c["effects"][0].update(amplitudes=None), "entry 0, 'amplitudes' must be a list, got None"),
-        (lambda c: c["effects"][0].update(amplitudes=[]), "'hinge_preload' has no amplitudes"),
-        (lambda c: c["effects"][0].update(amplitudes=["x"]), "parameters that the space lacks: x"),
+        (lambda c: c["effects"][0].update(coefficients=None), "entry 0, 'coefficients' must be a list, got None"),
+        (lambda c: c["effects"][0].update(coefficients=[]), "'hinge_preload' has no coefficients"),
+        (lambda c: c["effects"][0].update(coefficients=["x"]), "parameters that the space lacks: x"),
         (lambda c: c["effects"][0].update(colour="red"), "'effects', entry 0: unknown keys: colour"),
         (lambda c: c["space"][-1].update(writes=[{"field": "body_mass", "index": [1], "mode": "set", "gain": 1}]),
          "'hinge_preload' is not in this version's library"),
@@ -274,7 +277,7 @@ def test_the_three_lines_of_the_document_run(found: Small, saved: Path, monkeypa
     (code,) = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     assert "runs/gap/extended.json" in code
     scene, _ = small_scene()
-    names: dict[str, Any] = {"scene": scene, "recording": found.recordings["confirm"]}
+    names: dict[str, Any] = {"scene": scene, "recording": found.recordings["validation"]}
     exec(code.replace("runs/gap/extended.json", str(saved)), names)
-    own = found.case.confirm.cost.distances(found.verdict.model.values[None])[0, 0]
+    own = found.case.validation.cost.distances(found.verdict.model.values[None])[0, 0]
     assert names["costs"][0] == pytest.approx(own, abs=3e-4)

@@ -9,13 +9,13 @@ import pytest
 import scipy.stats
 from plain_flips import largest_t
 
-from droid_jax.discrepancy.residual_set import gap, gaps
+from droid_jax.discrepancy.residual_set import discrepancies, discrepancy
 from droid_jax.discrepancy.sign_flips import (
     benjamini_hochberg,
-    largest_steady_t,
+    detrended,
+    detrended_discrepancy_p_values,
+    largest_detrended_t,
     sign_flips,
-    steady,
-    steady_gap_p_values,
     t_values,
 )
 
@@ -51,13 +51,13 @@ def test_without_a_trend_the_largest_t_keeps_its_level():
     rng = np.random.default_rng(5)
     noise = [rng.normal(size=(40, 10)) for _ in range(3000)]
     p, forgotten = (np.array([of(scores)[1] for scores in noise]) for of in (
-        largest_steady_t, lambda scores: largest_t(steady(scores.T).T)
+        largest_detrended_t, lambda scores: largest_t(detrended(scores.T).T)
     ))  # fmt: skip
     assert np.mean(p < 0.01) < 0.0135 and 0.04 < np.mean(p < 0.05) < 0.058  # two deviations of the counts
     assert np.mean(forgotten < 0.05) > np.mean(p < 0.05) + 0.008
     trend = 5.0 * (np.arange(10) - 4.5)
-    assert largest_steady_t(noise[0] + trend)[1] == pytest.approx(p[0])
-    assert largest_steady_t(np.tile(np.r_[np.ones(7), 1.1], (2, 1)))[1] == pytest.approx(1 / 128)  # eight can reject
+    assert largest_detrended_t(noise[0] + trend)[1] == pytest.approx(p[0])
+    assert largest_detrended_t(np.tile(np.r_[np.ones(7), 1.1], (2, 1)))[1] == pytest.approx(1 / 128)  # eight can reject
 
 
 def test_the_largest_t_finds_what_is_there():
@@ -73,8 +73,8 @@ def test_noise_does_not_bias_the_gap():
     """U of pure noise is zero on average; of a common part it is that part's mean square, whatever the noise."""
     rng = np.random.default_rng(3)
     common = rng.normal(0, 0.4, 200)
-    none = [gap(rng.normal(0, 3.0, (10, 200))) for _ in range(400)]
-    there = [gap(common + rng.normal(0, 3.0, (10, 200))) for _ in range(400)]
+    none = [discrepancy(rng.normal(0, 3.0, (10, 200))) for _ in range(400)]
+    there = [discrepancy(common + rng.normal(0, 3.0, (10, 200))) for _ in range(400)]
     assert np.mean(none) == pytest.approx(0.0, abs=4 * np.std(none) / 20)
     assert np.mean(there) == pytest.approx(np.mean(common**2), abs=4 * np.std(there) / 20)
 
@@ -86,9 +86,9 @@ def test_the_gap_lies_where_it_was_put():
     cells = np.zeros((6, 300), bool)
     for k in range(6):
         cells[k, 50 * k : 50 * (k + 1)] = True
-    p = steady_gap_p_values(residuals, cells)
+    p = detrended_discrepancy_p_values(residuals, cells)
     assert p[2] == pytest.approx(1 / 512)
-    assert np.argmax(gaps(residuals, cells)) == 2
+    assert np.argmax(discrepancies(residuals, cells)) == 2
     np.testing.assert_array_equal(benjamini_hochberg(p, 0.02), np.arange(6) == 2)
 
 
@@ -99,7 +99,7 @@ def test_a_small_gap_everywhere_is_found_and_nothing_keeps_its_level(noisy: np.n
     drift = 3.0 * (np.arange(8) - 3.5)[:, None]
     none, there = (
         np.array([
-            steady_gap_p_values(np.sqrt(u) + noisy[:, None] * rng.normal(size=(8, 1400)) + drift, cell)[0]
+            detrended_discrepancy_p_values(np.sqrt(u) + noisy[:, None] * rng.normal(size=(8, 1400)) + drift, cell)[0]
             for _ in range(400)
         ])
         for u in (0.0, 0.02)

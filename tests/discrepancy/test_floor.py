@@ -10,7 +10,7 @@ import pytest
 from small_gap import Small, small
 
 from droid_jax.discrepancy import discretisation_error as floor
-from droid_jax.discrepancy.discretisation_error import numerical_floor
+from droid_jax.discrepancy.discretisation_error import discretisation_error
 from droid_jax.identify.search import NotReplayed
 
 
@@ -22,14 +22,14 @@ def found() -> Small:
 def of(found: Small, difference: np.ndarray) -> float:
     """U0 where the finer simulation differs by [M] of the noise of the repeats' mean."""
     case, base = found.case, found.base
-    coarse = case.fit.cost.whitened(base.values[None])
+    coarse = case.train.cost.whitened(base.values[None])
     made: Any = SimpleNamespace(whitened=lambda rows: coarse + difference[None])
     fine: Any = SimpleNamespace(against=lambda recordings: made)
-    return numerical_floor(case.fit, base, found.recordings["fit"], fine)
+    return discretisation_error(case.train, base, found.recordings["train"], fine)
 
 
 def test_what_no_base_parameter_can_do_is_the_floor(found: Small):
-    jacobian, count = found.base.refined.jacobian, found.case.fit.repeats
+    jacobian, count = found.base.refined.jacobian, found.case.train.repeats
     off = np.random.default_rng(0).normal(size=len(jacobian))
     off -= jacobian @ np.linalg.lstsq(jacobian, off, rcond=None)[0]
     assert of(found, off) == pytest.approx(np.mean(off**2) / count, rel=0.01)
@@ -39,7 +39,7 @@ def test_what_a_base_parameter_can_do_is_none(found: Small):
     jacobian = found.base.refined.jacobian
     told = int(np.argmax(np.linalg.norm(jacobian, axis=0)))
     off = 0.5 * jacobian[:, told]
-    assert of(found, off) < 0.01 * np.mean(off**2) / found.case.fit.repeats
+    assert of(found, off) < 0.01 * np.mean(off**2) / found.case.train.repeats
 
 
 def test_a_finer_simulation_that_blows_up_is_no_floor(found: Small):
@@ -50,5 +50,5 @@ def test_a_finer_simulation_that_blows_up_is_no_floor(found: Small):
 
 def test_the_finer_simulation_has_a_quarter_of_the_step(found: Small, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(floor, "make_cost", lambda scene, *_, **__: scene)
-    fine: Any = floor.finer(found.case.fit, found.base.space, found.recordings["fit"])
+    fine: Any = floor.with_finer_step(found.case.train, found.base.space, found.recordings["train"])
     assert fine.model.opt.timestep == pytest.approx(found.scene.model.opt.timestep / 4)

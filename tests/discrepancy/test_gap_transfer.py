@@ -11,11 +11,11 @@ import pytest
 from small_gap import FLOOR, Small, record, small
 
 from droid_jax.discrepancy.case import Case, make_case
-from droid_jax.discrepancy.refit import Model, refit
+from droid_jax.discrepancy.refit import FittedModel, refit
 from droid_jax.discrepancy.restart import base_fit
 from droid_jax.discrepancy.screen import project
-from droid_jax.discrepancy.transfer import LONGEST, beyond, left_over, spread
-from droid_jax.identify.identifiability import told
+from droid_jax.discrepancy.transfer import LONGEST, beyond_fit_uncertainty, remaining_residuals, transfer_spread
+from droid_jax.identify.identifiability import posterior_of
 
 
 @pytest.fixture(scope="module")
@@ -24,32 +24,35 @@ def found() -> Small:
 
 
 @pytest.fixture(scope="module")
-def whole(found: Small) -> tuple[Case, Model]:
+def whole(found: Small) -> tuple[Case, FittedModel]:
     """Nothing is hidden."""
     case = make_case(
-        found.scene, found.case.base, found.case.effects, record("fit", preload=0.0), record("confirm", preload=0.0),
+        found.scene, found.case.base, found.case.effects, record("train", preload=0.0),
+        record("validation", preload=0.0),
         config=found.case.config,
     )  # fmt: skip
     return case, base_fit(case, lambda stage, value: None)
 
 
-def kept(case: Case, model: Model, off: np.ndarray) -> float:
+def kept(case: Case, model: FittedModel, off: np.ndarray) -> float:
     """Share that stays of what the other recording does otherwise by `off` [M]."""
-    confirm = case.confirm
+    validation = case.validation
     other: Any = SimpleNamespace(
-        cost=confirm.cost,
-        repeats=confirm.repeats,
-        common=lambda values: confirm.common(values) + off,
-        residuals=confirm.residuals,
+        cost=validation.cost,
+        repeats=validation.repeats,
+        common=lambda values: validation.common(values) + off,
+        residuals=validation.residuals,
     )
-    left = np.mean(beyond(case.fit, other, model) - beyond(case.fit, confirm, model), axis=0)
+    left = np.mean(
+        beyond_fit_uncertainty(case.train, other, model) - beyond_fit_uncertainty(case.train, validation, model), axis=0
+    )
     return float(np.sum(left**2) / np.sum(off**2))
 
 
-def test_what_the_fit_does_not_tell_is_allowed_for_and_nothing_else(whole: tuple[Case, Model]):
+def test_what_the_fit_does_not_tell_is_allowed_for_and_nothing_else(whole: tuple[Case, FittedModel]):
     """Two deviations along the axis that the other recording shows best, and something that no axis does."""
     case, model = whole
-    slopes = spread(case.fit, case.confirm, model)
+    slopes = transfer_spread(case.train, case.validation, model)
     shown = slopes[:, np.argmax(np.linalg.norm(slopes, axis=0))]
     else_ = np.random.default_rng(0).normal(size=len(slopes))
     else_ -= slopes @ np.linalg.lstsq(slopes, else_, rcond=None)[0]
@@ -57,16 +60,16 @@ def test_what_the_fit_does_not_tell_is_allowed_for_and_nothing_else(whole: tuple
     assert kept(case, model, else_) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_the_slopes_are_of_one_deviation(whole: tuple[Case, Model]):
+def test_the_slopes_are_of_one_deviation(whole: tuple[Case, FittedModel]):
     """One for each axis; together they span what any one parameter does."""
     case, model = whole
-    slopes, refined = spread(case.fit, case.confirm, model), model.refined
-    assert slopes.shape == (len(case.confirm.common(model.values)[0]), len(refined.x))
+    slopes, refined = transfer_spread(case.train, case.validation, model), model.refined
+    assert slopes.shape == (len(case.validation.common(model.values)[0]), len(refined.x))
     step = np.zeros(len(refined.x))
     step[0] = 0.01
-    here, there = (case.whole.embed(model.space, model.space.from_search(x)[None], model.values)
+    here, there = (case.full_space.embed(model.space, model.space.from_search(x)[None], model.values)
                    for x in (refined.x, refined.x + step))  # fmt: skip
-    moved = (case.confirm.common(there) - case.confirm.common(here))[0]
+    moved = (case.validation.common(there) - case.validation.common(here))[0]
     # What one parameter does is inside the span of what all axes do, as far as they are told.
     assert np.linalg.norm(project(moved[None], slopes, np.full(len(slopes.T), 1e6))[0]) < 0.1 * np.linalg.norm(moved)
 
@@ -74,35 +77,41 @@ def test_the_slopes_are_of_one_deviation(whole: tuple[Case, Model]):
 def test_what_is_really_missing_stays(found: Small):
     """The hidden preload acts on the other motion in a way that no uncertain parameter does."""
     case, base = found.case, found.base
-    whole_gap, left = case.confirm.gap_at(base.values), left_over(case.fit, case.confirm, base)
-    assert whole_gap > FLOOR and case.confirm.gap(left) > 0.5 * whole_gap
+    whole_gap, left = (
+        case.validation.discrepancy_at(base.values),
+        remaining_residuals(case.train, case.validation, base),
+    )
+    assert whole_gap > FLOOR and case.validation.discrepancy(left) > 0.5 * whole_gap
 
 
 def test_the_verdict_says_what_remains(found: Small):
     case, verdict = found.case, found.verdict
-    assert verdict.remainder == pytest.approx(case.confirm.gap(left_over(case.fit, case.confirm, verdict.model)))
+    assert verdict.remainder == pytest.approx(
+        case.validation.discrepancy(remaining_residuals(case.train, case.validation, verdict.model))
+    )
     # Where little is taken away it may lie above U by noise, of which both are free on average only.
-    assert verdict.remainder is not None and verdict.remainder <= 1.1 * verdict.gaps["confirm"][1]
+    assert verdict.remainder is not None and verdict.remainder <= 1.1 * verdict.discrepancies["validation"][1]
 
 
-def test_of_noise_alone_nothing_remains_on_average(whole: tuple[Case, Model]):
+def test_of_noise_alone_nothing_remains_on_average(whole: tuple[Case, FittedModel]):
     """Noise about the model's own replay: U is zero on average, not less for what the projection takes of the mean."""
     case, model = whole
-    confirm = case.confirm
-    slopes = spread(case.fit, confirm, model)
+    validation = case.validation
+    slopes = transfer_spread(case.train, validation, model)
     rng, gaps, mean_only = np.random.default_rng(0), list[float](), list[float]()
     for _ in range(300):
-        noise = rng.normal(size=confirm.deviations.shape)
-        left = project(noise, slopes, np.full(len(slopes.T), confirm.repeats**0.5))
-        gaps.append(confirm.gap(left))
-        mean_only.append(confirm.gap(noise - noise.mean(axis=0) + left.mean(axis=0)))
+        noise = rng.normal(size=validation.deviations.shape)
+        left = project(noise, slopes, np.full(len(slopes.T), validation.repeats**0.5))
+        gaps.append(validation.discrepancy(left))
+        mean_only.append(validation.discrepancy(noise - noise.mean(axis=0) + left.mean(axis=0)))
     less = np.array(gaps) - mean_only
     assert abs(np.mean(gaps)) < 3 * np.std(gaps) / len(gaps) ** 0.5
     assert np.mean(less) > 10 * np.std(less) / len(less) ** 0.5
-    drawn = replace(confirm, deviations=noise - noise.mean(axis=0))
+    drawn = replace(validation, deviations=noise - noise.mean(axis=0))
     common = drawn.residuals(drawn.common(model.values)[0])
     np.testing.assert_allclose(
-        beyond(case.fit, drawn, model), project(common, slopes, np.full(len(slopes.T), confirm.repeats**0.5))
+        beyond_fit_uncertainty(case.train, drawn, model),
+        project(common, slopes, np.full(len(slopes.T), validation.repeats**0.5)),
     )
 
 
@@ -110,15 +119,15 @@ def test_more_repeats_of_the_fit_allow_less(found: Small):
     """What is told better may be off by less."""
 
     def size(repeats: int) -> float:
-        made = {role: record(role, repeats, preload=0.0) for role in ("fit", "confirm")}
+        made = {role: record(role, repeats, preload=0.0) for role in ("train", "validation")}
         case = make_case(found.scene, found.case.base, found.case.effects, **made, config=found.case.config)
-        model = refit(case.fit, case.base, (), case.whole.mean[None], case.config.refine)
-        return float(np.mean(np.sum(spread(case.fit, case.confirm, model) ** 2, axis=1)))
+        model = refit(case.train, case.base, (), case.full_space.mean[None], case.config.refine)
+        return float(np.mean(np.sum(transfer_spread(case.train, case.validation, model) ** 2, axis=1)))
 
     assert size(32) < 0.6 * size(8)
 
 
-def test_a_bound_does_not_halve_a_slope(whole: tuple[Case, Model]):
+def test_a_bound_does_not_halve_a_slope(whole: tuple[Case, FittedModel]):
     """On a replay that is linear, one of the parameters at its bound, each parameter an axis of its own."""
     case, model = whole
     space, count = model.space, len(model.space)
@@ -130,10 +139,10 @@ def test_a_bound_does_not_halve_a_slope(whole: tuple[Case, Model]):
     refined = replace(model.refined, x=x, jacobian=jacobian)
     matrix = np.random.default_rng(0).normal(size=(count, 30))
     linear: Any = SimpleNamespace(
-        cost=case.confirm.cost, common=lambda rows: space.to_search(rows[:, case.whole.columns(space)]) @ matrix
+        cost=case.validation.cost, common=lambda rows: space.to_search(rows[:, case.full_space.columns(space)]) @ matrix
     )
-    slopes = spread(case.fit, linear, replace(model, refined=refined))
+    slopes = transfer_spread(case.train, linear, replace(model, refined=refined))
     along = np.linalg.lstsq(matrix.T, slopes, rcond=None)[0]  # each column is an axis in search units
     assert np.all(np.count_nonzero(np.abs(along) > 1e-9, axis=0) == 1)
-    deviation = np.sqrt(np.diag(told(refined, case.fit.cost.comparisons, misfit=False).cov))
+    deviation = np.sqrt(np.diag(posterior_of(refined, case.train.cost.comparisons, misfit=False).cov))
     np.testing.assert_allclose(np.abs(along).sum(axis=1), np.minimum(deviation, LONGEST), rtol=1e-6)

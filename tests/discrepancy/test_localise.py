@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from droid_jax.discrepancy.localise import _bins, _cells, _parts
-from droid_jax.discrepancy.residual_set import gap
-from droid_jax.discrepancy.sign_flips import steady_gap_p_values
+from droid_jax.discrepancy.residual_set import discrepancy
+from droid_jax.discrepancy.sign_flips import detrended_discrepancy_p_values
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import compile_scene
 
@@ -29,7 +29,7 @@ def unit() -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def evidence(unit: np.ndarray) -> Any:
+def residual_set(unit: np.ndarray) -> Any:
     size = np.where(np.arange(INSTANTS) < FREE, 0.0, 7.0)
 
     def common(values: np.ndarray) -> np.ndarray:
@@ -37,8 +37,8 @@ def evidence(unit: np.ndarray) -> Any:
 
     return SimpleNamespace(
         cost=SimpleNamespace(space=SPACE, scene=SimpleNamespace(object_joint="hinge", joints=("a", "b", "c"))),
-        repeated=True, column=np.repeat(np.arange(COLUMNS), INSTANTS), common=common, gap=gap,
-        cell_p_values=steady_gap_p_values,
+        repeated=True, column=np.repeat(np.arange(COLUMNS), INSTANTS), common=common, discrepancy=discrepancy,
+        cell_p_values=detrended_discrepancy_p_values,
     )  # fmt: skip
 
 
@@ -51,35 +51,35 @@ def residuals(shared: np.ndarray) -> np.ndarray:
     ("where", "name"),
     [("along", "along the hinge"), ("across", "door held, other directions"), ("free", "door not held")],
 )
-def test_each_part_holds_what_was_put_there(evidence: Any, unit: np.ndarray, where: str, name: str) -> None:
+def test_each_part_holds_what_was_put_there(residual_set: Any, unit: np.ndarray, where: str, name: str) -> None:
     held = np.arange(INSTANTS) >= FREE
     turned = np.stack([-unit[1], unit[0], np.zeros(INSTANTS)])
     across = turned / np.linalg.norm(turned, axis=0)
     shared = {"along": 2.0 * unit * held, "across": 2.0 * across * held, "free": 2.0 * across * ~held}[where]
-    cells = {c.where: c for c in _parts(evidence, SPACE.mean, residuals(shared))}
+    cells = {c.where: c for c in _parts(residual_set, SPACE.mean, residuals(shared))}
     assert list(cells) == ["along the hinge", "door held, other directions", "door not held"]
     degrees = {"along": 1, "across": COLUMNS - 1, "free": COLUMNS}[where]
     for cell in cells.values():
         assert cell.variable == "force"
         assert cell.found == (cell.where == name)
-        assert cell.gap == pytest.approx(4.0 / degrees if cell.where == name else 0.0, abs=0.25)
+        assert cell.discrepancy == pytest.approx(4.0 / degrees if cell.where == name else 0.0, abs=0.25)
 
 
-def test_the_parts_are_told_where_a_preload_stands_near_its_bound(evidence: Any) -> None:
+def test_the_parts_are_told_where_a_preload_stands_near_its_bound(residual_set: Any) -> None:
     """Its push goes the other way there: beyond the bound nothing may be replayed."""
 
     def common(values: np.ndarray) -> np.ndarray:
-        return evidence.common(SPACE.check(values))
+        return residual_set.common(SPACE.check(values))
 
-    checked = SimpleNamespace(**{**vars(evidence), "common": common})
+    checked = SimpleNamespace(**{**vars(residual_set), "common": common})
     shared = residuals(np.zeros((COLUMNS, INSTANTS)))
     for preload in (4.9, -4.9):
         assert len(_parts(checked, SPACE.values({"hinge_preload": preload}), shared)) == 3  # type: ignore[arg-type]
 
 
-def test_a_hinge_with_a_sensor_of_its_own_needs_no_parts(evidence: Any) -> None:
+def test_a_hinge_with_a_sensor_of_its_own_needs_no_parts(residual_set: Any) -> None:
     cost = SimpleNamespace(space=SPACE, scene=SimpleNamespace(object_joint="c", joints=("a", "b", "c")))
-    one = SimpleNamespace(**{**vars(evidence), "cost": cost})
+    one = SimpleNamespace(**{**vars(residual_set), "cost": cost})
     assert _parts(one, SPACE.mean, residuals(np.zeros((COLUMNS, INSTANTS)))) == ()  # type: ignore[arg-type]
 
 
@@ -98,8 +98,8 @@ def test_a_place_has_the_unit_of_its_joints_type():
     channel = SimpleNamespace(columns=np.array([0, 1]), unit="N m")
     comparison = SimpleNamespace(clock=clock, phases=(), channel=lambda name: channel)
     cost = SimpleNamespace(comparisons=(comparison,), scene=scene, rollouts=lambda values: (rollout,))
-    evidence: Any = SimpleNamespace(cost=cost, time=np.tile(clock, 2), column=np.repeat([0, 1], 40))
-    units = {variable: where.split(maxsplit=3)[-1] for (variable, where), _ in _cells(evidence, SPACE.mean)}
+    residual_set: Any = SimpleNamespace(cost=cost, time=np.tile(clock, 2), column=np.repeat([0, 1], 40))
+    units = {variable: where.split(maxsplit=3)[-1] for (variable, where), _ in _cells(residual_set, SPACE.mean)}
     assert (units["position of pan"], units["load of pan"]) == ("rad", "N m")
     assert (units["position of extend"], units["load of extend"]) == ("m", "N")
     assert (units["object angle"], units["object speed"]) == ("m", "m/s")

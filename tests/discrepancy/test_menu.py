@@ -13,8 +13,8 @@ from droid_jax.cost.observation import TooLong
 from droid_jax.discrepancy import candidate_experiments as menu
 from droid_jax.discrepancy.candidate_experiments import CARRIED, IN_THE_AIR, WEIGHT, separating, untouched
 from droid_jax.discrepancy.case import Case
-from droid_jax.discrepancy.refit import Model
-from droid_jax.discrepancy.time_scaling import MENU, STOP, warped
+from droid_jax.discrepancy.refit import FittedModel
+from droid_jax.discrepancy.time_scaling import STOP, TIME_SCALINGS, time_scaled
 from droid_jax.discrepancy.workspace_extrapolation import FURTHER
 from droid_jax.door.demonstration import PLANS, grasp_pose
 from droid_jax.door.scene import door_scene
@@ -25,7 +25,7 @@ from droid_jax.simulate.hand_path import solve_pose
 
 @pytest.fixture(scope="module")
 def demonstration():
-    return record("fit")
+    return record("train")
 
 
 @pytest.mark.parametrize(
@@ -39,7 +39,7 @@ def demonstration():
 )
 def test_a_motion_on_another_clock(demonstration, number, seconds, at):
     """`at`: instants of the new motion and of the demonstration (2.998 s long) that have the same command."""
-    new = warped(demonstration, MENU[number])
+    new = time_scaled(demonstration, TIME_SCALINGS[number])
     assert new.duration == pytest.approx(seconds(demonstration.duration), abs=0.005)
     for later, before in at.items():
         expected = [np.interp(before, demonstration.time, c) for c in demonstration.command.T]
@@ -50,20 +50,20 @@ def test_a_motion_on_another_clock(demonstration, number, seconds, at):
         assert channel.time[-1] <= new.time[-1] + 0.1
 
 
-def model(name: str, value: float) -> Model:
+def model(name: str, value: float) -> FittedModel:
     """The base fit with one effect beside it."""
     found = small()
     values = found.base.values.copy()
-    values[found.case.whole.index(name)] = value
+    values[found.case.full_space.index(name)] = value
     return replace(found.base, values=values)
 
 
 def test_a_drag_is_told_from_a_preload_by_another_speed(demonstration, monkeypatch):
     """Rivals that differ in a speed-dependent torque: three times slower they come closer, twice as fast they part."""
-    monkeypatch.setattr(menu, "MENU", MENU[:2])
+    monkeypatch.setattr(menu, "TIME_SCALINGS", TIME_SCALINGS[:2])
     rivals = (model("drag", 0.0), model("drag", 0.8))
-    found = {e.what: e.apart or 0.0 for e in separating(small().case, rivals, demonstration)}
-    slower, faster = (found[entry.what] for entry in MENU[:2])
+    found = {e.what: e.distance or 0.0 for e in separating(small().case, rivals, demonstration)}
+    slower, faster = (found[entry.what] for entry in TIME_SCALINGS[:2])
     assert faster > 3.0 * slower > 0.0
     weighed = next(apart for what, apart in found.items() if "weighed" in what)
     assert slower < weighed < faster
@@ -78,14 +78,14 @@ def test_an_experiment_that_cannot_be_made_says_why_and_ends_nothing(demonstrati
             raise raised.pop(0)
         return make(scene, space, recordings, **options)
 
-    monkeypatch.setattr(menu, "MENU", MENU[:3])
+    monkeypatch.setattr(menu, "TIME_SCALINGS", TIME_SCALINGS[:3])
     monkeypatch.setattr(menu, "make_cost", short_of_memory)
     found = separating(small().case, (model("drag", 0.0), model("drag", 0.8)), demonstration)
-    said = {e.what: (e.apart is None, e.not_made) for e in found}
-    assert said[MENU[0].what] == (True, "needs 9.0 GB")
-    assert said[MENU[1].what] == (False, "")
-    assert said[MENU[2].what] == (True, "RuntimeError: RESOURCE_EXHAUSTED")
-    assert [e.apart is None for e in found] == sorted(e.apart is None for e in found)
+    said = {e.what: (e.distance is None, e.not_made) for e in found}
+    assert said[TIME_SCALINGS[0].what] == (True, "needs 9.0 GB")
+    assert said[TIME_SCALINGS[1].what] == (False, "")
+    assert said[TIME_SCALINGS[2].what] == (True, "RuntimeError: RESOURCE_EXHAUSTED")
+    assert [e.distance is None for e in found] == sorted(e.distance is None for e in found)
 
 
 def dropped(recording: Recording, seconds: float) -> Recording:
@@ -100,57 +100,57 @@ def test_a_dropout_that_a_slower_motion_makes_too_long_is_said(demonstration):
     """60 ms without torques are filled in; three times slower they are too long."""
     rivals = (model("drag", 0.0), model("drag", 0.8))
     found = {e.what: e for e in separating(small().case, rivals, dropped(demonstration, 0.06))}
-    slower, faster = (found[entry.what] for entry in MENU[:2])
-    assert slower.apart is None and "a stretch that no repeat measured" in slower.not_made
-    assert faster.apart is not None and faster.apart > 0.0
+    slower, faster = (found[entry.what] for entry in TIME_SCALINGS[:2])
+    assert slower.distance is None and "a stretch that no repeat measured" in slower.not_made
+    assert faster.distance is not None and faster.distance > 0.0
 
 
 def test_a_known_weight_tells_only_what_acts_through_it(demonstration, monkeypatch):
     """Two payloads differ by as much with a weight beside them as without; two preloads likewise."""
-    monkeypatch.setattr(menu, "MENU", ())
+    monkeypatch.setattr(menu, "TIME_SCALINGS", ())
     case = small().case
     rivals = (model(CARRIED, 0.0), model(CARRIED, 0.2))
     (found,) = separating(case, rivals, demonstration)
-    plain = case.fit.cost.whitened(np.stack([m.values for m in rivals])).astype(float)
+    plain = case.train.cost.whitened(np.stack([m.values for m in rivals])).astype(float)
     assert f"{WEIGHT:g} kg" in found.what
-    assert found.apart == pytest.approx(np.linalg.norm(plain[0] - plain[1]), rel=0.2)
+    assert found.distance == pytest.approx(np.linalg.norm(plain[0] - plain[1]), rel=0.2)
 
 
 def gripping(case: Case) -> Case:
     """The small scene as if its hand, which holds nothing, gripped by contact."""
-    cost = replace(case.fit.cost, scene=replace(case.fit.cost.scene, grip=Grip(())))
-    return replace(case, fit=replace(case.fit, cost=cost))
+    cost = replace(case.train.cost, scene=replace(case.train.cost.scene, grip=Grip(())))
+    return replace(case, train=replace(case.train, cost=cost))
 
 
 def test_in_the_air_only_the_robot_is_seen(demonstration, monkeypatch):
     """Two payloads part without the held thing, and as in the plain model: the small scene's hand holds nothing."""
-    monkeypatch.setattr(menu, "MENU", ())
+    monkeypatch.setattr(menu, "TIME_SCALINGS", ())
     case = small().case
     rivals = (model(CARRIED, 0.0), model(CARRIED, 0.2))
-    found = {e.what: e.apart or 0.0 for e in separating(gripping(case), rivals, demonstration)}
-    plain = case.fit.cost.whitened(np.stack([m.values for m in rivals])).astype(float)
+    found = {e.what: e.distance or 0.0 for e in separating(gripping(case), rivals, demonstration)}
+    plain = case.train.cost.whitened(np.stack([m.values for m in rivals])).astype(float)
     assert found[IN_THE_AIR] == pytest.approx(np.linalg.norm(plain[0] - plain[1]), rel=0.2)
     assert IN_THE_AIR not in {e.what for e in separating(case, rivals, demonstration)}
 
 
 def test_a_hand_that_gets_no_further_is_said(demonstration, monkeypatch):
-    monkeypatch.setattr(menu, "MENU", ())
+    monkeypatch.setattr(menu, "TIME_SCALINGS", ())
     monkeypatch.setattr(menu, "opened_further", lambda *arguments: None)
     found = {
         e.what: e for e in separating(gripping(small().case), (model("drag", 0.0), model("drag", 0.8)), demonstration)
     }
-    assert found[FURTHER].apart is None and "does not reach further" in found[FURTHER].not_made
+    assert found[FURTHER].distance is None and "does not reach further" in found[FURTHER].not_made
 
 
 def test_a_motion_within_reach_is_on_the_menu(demonstration, monkeypatch):
     """Where the hand could go on, what the rivals do on that motion counts (here the same motion again)."""
-    monkeypatch.setattr(menu, "MENU", ())
+    monkeypatch.setattr(menu, "TIME_SCALINGS", ())
     monkeypatch.setattr(menu, "opened_further", lambda scene, recording, replayed: replace(recording, name=FURTHER))
     case = small().case
     rivals = (model("drag", 0.0), model("drag", 0.8))
-    found = {e.what: e.apart or 0.0 for e in separating(gripping(case), rivals, demonstration)}
+    found = {e.what: e.distance or 0.0 for e in separating(gripping(case), rivals, demonstration)}
     assert FURTHER not in {e.what for e in separating(case, rivals, demonstration)}
-    plain = case.fit.cost.whitened(np.stack([m.values for m in rivals])).astype(float)
+    plain = case.train.cost.whitened(np.stack([m.values for m in rivals])).astype(float)
     assert found[FURTHER] == pytest.approx(np.linalg.norm(plain[0] - plain[1]), rel=1e-3)
 
 
@@ -180,15 +180,15 @@ def test_an_experiment_is_as_good_as_what_it_tells_apart_least():
 
     rivals = np.array([[0.0], [1.0], [2.0]])
     found = menu._experiment("so", Cost(), rivals)  # type: ignore[arg-type]
-    assert (found.what, found.apart) == ("so", 1.0)
+    assert (found.what, found.distance) == ("so", 1.0)
     lost = menu._made("so", lambda: menu._experiment("so", Cost(), -rivals))  # type: ignore[arg-type]
-    assert (lost.what, lost.apart) == ("so", None) and "fails on this motion" in lost.not_made
+    assert (lost.what, lost.distance) == ("so", None) and "fails on this motion" in lost.not_made
 
 
 def test_the_best_experiment_comes_first(demonstration, monkeypatch):
-    monkeypatch.setattr(menu, "MENU", MENU[:2])
+    monkeypatch.setattr(menu, "TIME_SCALINGS", TIME_SCALINGS[:2])
     found = separating(small().case, (model("drag", 0.0), model("drag", 0.8)), demonstration)
-    apart = [e.apart or 0.0 for e in found]
+    apart = [e.distance or 0.0 for e in found]
     assert apart == sorted(apart, reverse=True) and apart[0] > apart[-1]
 
 

@@ -14,9 +14,9 @@ from small_log import CONFIG, COULOMB, MJCF, elbow, elbow_log, elbow_space
 import droid_jax as dj
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.discrepancy import missing
-from droid_jax.discrepancy.candidates import possible, steers
+from droid_jax.discrepancy.candidates import acts_on_commands_only, observable_effects
 from droid_jax.discrepancy.split import Split
-from droid_jax.discrepancy.verdict import Kind
+from droid_jax.discrepancy.verdict import Conclusion
 from droid_jax.identify.search import SearchConfig
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects.registry import joined, library
@@ -24,19 +24,19 @@ from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import compile_scene
 from droid_jax.recordings.recording import Recording
 
-SEARCH = replace(CONFIG, search=SearchConfig(population=8, parents=None, generations=2), most=1)
+SEARCH = replace(CONFIG, search=SearchConfig(population=8, parents=None, generations=2), max_effects=1)
 
 LATE = Effect("late", (Parameter("late", "s", 0.0, 0.01, -0.1, 0.1),), command=lambda theta, time, look: look(time),
-              places={"elbow": ("late",)})  # fmt: skip
+              locations={"elbow": ("late",)})  # fmt: skip
 THREE = [replace(elbow_log(COULOMB, seconds, 8), name=f"{seconds:g} s") for seconds in (7.0, 6.0, 5.0)]
 
 
 @pytest.mark.parametrize(
     ("recordings", "judged", "searched"),
     [
-        (THREE, ["fit", "confirm", "sealed"], True),
-        ([elbow_log(COULOMB, 7.0, repeats=16)], ["fit", "confirm"], True),
-        ([elbow_log(COULOMB)], ["fit", "confirm", "sealed"], False),
+        (THREE, ["train", "validation", "test"], True),
+        ([elbow_log(COULOMB, 7.0, repeats=16)], ["train", "validation"], True),
+        ([elbow_log(COULOMB)], ["train", "validation", "test"], False),
     ],
     ids=["recordings", "repeats", "blocks"],
 )
@@ -44,7 +44,7 @@ def test_hidden_friction_is_named_and_in_the_extended_model(
     recordings: Sequence[Recording], judged: list[str], searched: bool
 ):
     scene, stages = elbow(), []
-    verdict, extended = dj.find_missing(
+    verdict, extended = dj.find_missing_effects(
         scene,
         elbow_space(scene),
         recordings,
@@ -52,8 +52,8 @@ def test_hidden_friction_is_named_and_in_the_extended_model(
         config=SEARCH,
         progress=lambda stage, value: stages.append(stage),
     )
-    assert (verdict.kind, verdict.effects) == (Kind.NAMED, ("joint_coulomb at elbow",))
-    assert list(verdict.gaps) == judged and all(verdict.closed(role) > 0.9 for role in judged)
+    assert (verdict.kind, verdict.effects) == (Conclusion.NAMED, ("joint_coulomb at elbow",))
+    assert list(verdict.discrepancies) == judged and all(verdict.closed(role) > 0.9 for role in judged)
     assert [part.name for part in extended.parts] == ["joint_coulomb at elbow"]
     assert extended.space.names == ("elbow_damping", "torque_offset[elbow]", "joint_coulomb[elbow]")
     np.testing.assert_allclose(extended.values, [0.6, 0.1, COULOMB], rtol=0.1, atol=0.02)
@@ -65,27 +65,35 @@ def test_a_log_without_commands_has_no_servo_to_ask_about():
     servo = '</worldbody><actuator><position name="servo" joint="elbow" kp="10"/></actuator>'
     scene = compile_scene(mujoco.MjSpec.from_string(MJCF.replace("</worldbody>", servo)), "elbow", joints=["elbow"])
     log = elbow_log(COULOMB)
-    commanded = {e.name for e in possible(scene, [replace(log, command=np.zeros((2, 1)))])}
-    assert commanded - {e.name for e in possible(scene, [log])} >= {"servo_gain", "command_delay"}
-    assert {"payload", "joint_coulomb", "sensor_delay", "torque_gain"} <= {e.name for e in possible(scene, [log])}
+    commanded = {e.name for e in observable_effects(scene, [replace(log, command=np.zeros((2, 1)))])}
+    assert commanded - {e.name for e in observable_effects(scene, [log])} >= {"servo_gain", "command_delay"}
+    assert {"payload", "joint_coulomb", "sensor_delay", "torque_gain"} <= {
+        e.name for e in observable_effects(scene, [log])
+    }
     (gain,) = library(scene, ["servo_gain"])
-    assert steers(gain) and not steers(replace(gain, force=lambda theta, state: state.qvel))
-    assert not steers(replace(gain, parameters=(*gain.parameters, *library(scene, ["payload"])[0].parameters)))
+    assert acts_on_commands_only(gain) and not acts_on_commands_only(
+        replace(gain, force=lambda theta, state: state.qvel)
+    )
+    assert not acts_on_commands_only(
+        replace(gain, parameters=(*gain.parameters, *library(scene, ["payload"])[0].parameters))
+    )
 
 
 def test_unless_told_it_asks_about_all_that_could_show(monkeypatch: pytest.MonkeyPatch):
     scene, begin = elbow(), np.array([0.6, 0.1])
 
     def answer(split, case, roles, start, progress):
-        assert split is Split.RECORDINGS and list(roles) == ["fit", "confirm", "sealed"]
-        assert [e.name for e in case.effects] == [e.name for e in possible(scene, THREE)] and len(case.effects) > 5
-        assert case.config == dj.GapConfig()
+        assert split is Split.RECORDINGS and list(roles) == ["train", "validation", "test"]
+        assert [e.name for e in case.effects] == [e.name for e in observable_effects(scene, THREE)] and len(
+            case.effects
+        ) > 5
+        assert case.config == dj.DiscrepancyConfig()
         np.testing.assert_array_equal(start, begin)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(missing, "answer", answer)
+    monkeypatch.setattr(missing, "search", answer)
     with pytest.raises(KeyboardInterrupt):
-        dj.find_missing(scene, elbow_space(scene), THREE, start=begin)
+        dj.find_missing_effects(scene, elbow_space(scene), THREE, start=begin)
 
 
 @pytest.mark.parametrize(
@@ -97,7 +105,7 @@ def test_unless_told_it_asks_about_all_that_could_show(monkeypatch: pytest.Monke
 )
 def test_settings_that_no_search_could_use_are_refused(changes: dict[str, Any], said: str):
     with pytest.raises(ValueError, match=said):
-        dj.GapConfig(**changes)
+        dj.DiscrepancyConfig(**changes)
 
 
 def test_a_name_that_an_effect_has_is_refused_with_what_to_do():
@@ -105,7 +113,9 @@ def test_a_name_that_an_effect_has_is_refused_with_what_to_do():
     scene = elbow()
     space = elbow_space(scene)
     taken = Space((*space.parameters[1:], replace(space.parameters[0], name="payload_mass[elbow]")))
-    twin = Effect("twin", (replace(space.parameters[0], name="payload_mass[elbow]", writes=()),), places={"elbow": ()})
+    twin = Effect(
+        "twin", (replace(space.parameters[0], name="payload_mass[elbow]", writes=()),), locations={"elbow": ()}
+    )
     with pytest.raises(ValueError, match=r"'payload_mass\[elbow\]' \(of the effect twin\); give yours others"):
         joined(taken, (twin,))
     assert joined(space, (twin,)).names == (*space.names, "payload_mass[elbow]")
@@ -117,9 +127,9 @@ def test_a_name_that_an_effect_has_is_refused_with_what_to_do():
         ({"recordings": []}, "no recording to fit: give one, or several"),
         ({"recordings": [elbow_log(0.0, 2.0, 8)] * 4}, "got 4"),
         ({"recordings": [elbow_log(0.0, 2.0, 15)]}, "is the only one and has 15 repeats"),
-        ({"recordings": [elbow_log(0.0, 2.0, 8)] * 2}, "the fit and the confirm recording are the same"),
+        ({"recordings": [elbow_log(0.0, 2.0, 8)] * 2}, "the train and the validation recording are the same"),
         ({"effects": ()}, "effects: there is none to ask about"),
-        ({"effects": [Effect("late")]}, "none of the effects says its places"),
+        ({"effects": [Effect("late")]}, "none of the effects says its locations"),
         ({"effects": [LATE]}, "no commands that an effect could change: late"),
         ({"start": np.zeros(3)}, "expected parameter vectors [..., 2]"),
     ],
@@ -127,5 +137,5 @@ def test_a_name_that_an_effect_has_is_refused_with_what_to_do():
 def test_what_could_not_end_well_is_refused_first(changes: dict[str, Any], said: str):
     scene = elbow()
     with pytest.raises(ValueError) as refused:
-        dj.find_missing(scene, elbow_space(scene), **{"recordings": [elbow_log(0.0, 2.0, 16)], **changes})
+        dj.find_missing_effects(scene, elbow_space(scene), **{"recordings": [elbow_log(0.0, 2.0, 16)], **changes})
     assert said in str(refused.value)

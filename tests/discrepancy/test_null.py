@@ -7,7 +7,7 @@ import pytest
 
 from droid_jax.cost.noise import RATE, estimate_noise
 from droid_jax.discrepancy.screen import project
-from droid_jax.discrepancy.sign_flips import largest_steady_t
+from droid_jax.discrepancy.sign_flips import largest_detrended_t
 
 REPEATS, LENGTH, CASES = 10, 160, 500
 
@@ -47,7 +47,7 @@ def case(seed: int, missing: float, drift: float = 0.0) -> tuple[float, int]:
     common = residuals.mean(axis=0)
     weights = columns.T @ columns + np.diag(prior**-2) / REPEATS
     residuals = residuals - columns @ np.linalg.solve(weights, columns.T @ common)
-    t, p = largest_steady_t(questions @ residuals.T)
+    t, p = largest_detrended_t(questions @ residuals.T)
     return p, int(np.argmax(np.abs(t)))
 
 

@@ -17,7 +17,7 @@ from droid_jax.door.space import door_space
 from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording
-from droid_jax.simulate.c_reference import twin_replay
+from droid_jax.simulate.c_reference import c_replay
 from droid_jax.simulate.replay import make_drive
 
 
@@ -29,7 +29,7 @@ def scene() -> Scene:
 def replayed(recording: Recording) -> Rollout:
     """By the C engine, at the door's mean parameters."""
     space = door_space(scene())
-    rollout = twin_replay(scene(), space, make_drive(scene(), recording))(space.mean[None])
+    rollout = c_replay(scene(), space, make_drive(scene(), recording))(space.mean[None])
     return Rollout(**{name: np.atleast_2d(getattr(rollout, name))[0] for name in rollout.__dataclass_fields__})
 
 
@@ -88,4 +88,4 @@ def test_a_stop_of_the_hinge_is_not_passed():
 def test_a_hand_that_holds_nothing_opens_nothing():
     small, _ = small_scene()
     _, before = plan("A")
-    assert opened_further(small, record("fit"), before) is None
+    assert opened_further(small, record("train"), before) is None

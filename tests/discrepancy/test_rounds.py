@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from droid_jax.discrepancy.blocks import OUTSIDE, Blocks
+from droid_jax.discrepancy.blocks import OUTSIDE, BlockResidualSet
 from droid_jax.discrepancy.candidates import Candidate
-from droid_jax.discrepancy.residual_set import Evidence
-from droid_jax.discrepancy.search_state import Budget, Hunt
+from droid_jax.discrepancy.residual_set import ResidualSet
+from droid_jax.discrepancy.search_state import Budget, SearchState
 from droid_jax.discrepancy.selection_step import pruned, without
 from droid_jax.identify.search import NotReplayed
 from droid_jax.model.parameters import Parameter, Space
@@ -39,10 +39,10 @@ def test_a_part_that_the_replay_cannot_do_without_stays() -> None:
         return SimpleNamespace(parts=parts, values=start, left=1.01)
 
     whole = Space(tuple(Parameter(name, "N m", 0.0, 1.0, -5.0, 5.0) for name in ("closer", "drag")))
-    case = SimpleNamespace(whole=whole, config=SimpleNamespace(refit=None))
-    hunt: Any = SimpleNamespace(case=case, refit=refit, gap=lambda model: model.left, whole_gap=10.0)
+    case = SimpleNamespace(full_space=whole, config=SimpleNamespace(refit=None))
+    state: Any = SimpleNamespace(case=case, refit=refit, discrepancy=lambda model: model.left, base_discrepancy=10.0)
     model: Any = SimpleNamespace(parts=(damper, drag), values=np.array([2.0, 1.0]), left=1.0)
-    assert pruned(hunt, model).parts == (damper,)
+    assert pruned(state, model).parts == (damper,)
 
 
 def test_a_budget_says_what_it_left_out() -> None:
@@ -60,8 +60,8 @@ def test_the_aim_is_the_objective_of_half_the_share_that_an_effect_must_take(blo
     cost, nothing, none = SimpleNamespace(), np.zeros((1, 30)), np.zeros(30)
     block = np.array([0] * 6 + [1] * 6 + [OUTSIDE] * 18)
     known: Any = (cost, nothing, none, none)
-    evidence = Blocks(*known, block) if blocks else Evidence(*known)
+    residual_set = BlockResidualSet(*known, block) if blocks else ResidualSet(*known)
     count = 12 if blocks else 30
-    fitted: Any = SimpleNamespace(parts=(), gap=4.0, refined=SimpleNamespace(objective=0.5 * count * 4.0))
-    hunt: Any = SimpleNamespace(case=SimpleNamespace(fit=evidence))
-    assert Hunt.aim(hunt, fitted) == pytest.approx(0.9 * fitted.refined.objective)
+    fitted: Any = SimpleNamespace(parts=(), discrepancy=4.0, refined=SimpleNamespace(objective=0.5 * count * 4.0))
+    state: Any = SimpleNamespace(case=SimpleNamespace(train=residual_set))
+    assert SearchState.target_objective(state, fitted) == pytest.approx(0.9 * fitted.refined.objective)

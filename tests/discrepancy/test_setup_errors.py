@@ -17,7 +17,7 @@ import droid_jax as dj
 from droid_jax.cost.cost import make_cost
 from droid_jax.discrepancy.missing import case_of
 from droid_jax.discrepancy.split import Split
-from droid_jax.discrepancy.verdict import Kind, Verdict
+from droid_jax.discrepancy.verdict import Conclusion, Verdict
 from droid_jax.identify.multistart import RefineConfig, refine
 from droid_jax.identify.search import SearchConfig
 from droid_jax.model.effects.registry import effect_space, library
@@ -48,11 +48,11 @@ PARAMETERS = [
 ]
 # rad, rad/s, rad: two sines a joint and a phase, by role
 WAVES = {
-    "fit": ((0.9, 1.1, 0.0), (0.5, 1.7, 0.3), (0.6, 2.3, 1.0)),
-    "confirm": ((0.7, 1.6, 1.2), (0.6, 1.2, 2.0), (0.5, 1.9, 0.1)),
-    "sealed": ((0.8, 0.9, 2.1), (0.4, 2.0, 0.9), (0.7, 1.4, 1.7)),
+    "train": ((0.9, 1.1, 0.0), (0.5, 1.7, 0.3), (0.6, 2.3, 1.0)),
+    "validation": ((0.7, 1.6, 1.2), (0.6, 1.2, 2.0), (0.5, 1.9, 0.1)),
+    "test": ((0.8, 0.9, 2.1), (0.4, 2.0, 0.9), (0.7, 1.4, 1.7)),
 }
-SEARCH = replace(CONFIG, search=SearchConfig(population=8, parents=None, generations=2), most=1)
+SEARCH = replace(CONFIG, search=SearchConfig(population=8, parents=None, generations=2), max_effects=1)
 
 
 @functools.cache
@@ -89,11 +89,11 @@ def found_in(compensated: bool, folder: Path, **hidden: float) -> tuple[Verdict,
     scene = arm(compensated)
     named = tuple((f"{name}[elbow]" if name == "encoder_zero" else name, size) for name, size in hidden.items())
     recordings = list(recorded(compensated, named).values())
-    verdict, model = dj.find_missing(
+    verdict, model = dj.find_missing_effects(
         scene, space_of(scene, folder), recordings, effects=library(scene, ASKED), config=SEARCH
     )
     spans = {}
-    for name in (n for part in model.parts for n in part.amplitudes):
+    for name in (n for part in model.parts for n in part.coefficients):
         k = model.space.index(name)
         wide = 1.645 * np.sqrt(model.gaussian.cov[k, k]) * model.space[name].std
         spans[name] = (model.values[k], model.values[k] - wide, model.values[k] + wide)
@@ -112,7 +112,7 @@ def test_the_effects_are_what_the_robot_hides(compensated: bool, tmp_path: Path)
         "tilted_base": {"gravity_about_x": 0.03 * np.cos(0.6), "gravity_about_y": 0.03 * np.sin(0.6)},
     }
     for name, truth in hidden.items():
-        recording = recorded(compensated, ((name, 0.03),) if name else ())["fit"]
+        recording = recorded(compensated, ((name, 0.03),) if name else ())["train"]
         if cost is None:
             cost = make_cost(scene, space, [recording], effects=effects, config=SEARCH.compare)
         rows = np.array([space.mean, space.values(truth)])
@@ -127,21 +127,21 @@ def test_the_effects_are_what_the_robot_hides(compensated: bool, tmp_path: Path)
 @pytest.mark.parametrize("compensated", [False, True], ids=["weight", "compensated"])
 def test_an_encoders_zero_is_named_and_measured(compensated: bool, tmp_path: Path):
     verdict, spans = found_in(compensated, tmp_path, encoder_zero=0.03)
-    assert (verdict.kind, verdict.effects) == (Kind.NAMED, ("encoder_offset at elbow",)), verdict
+    assert (verdict.kind, verdict.effects) == (Conclusion.NAMED, ("encoder_offset at elbow",)), verdict
     value, low, high = spans["encoder_offset[elbow]"]
     assert value == pytest.approx(0.03, abs=0.003) and low < 0.03 < high, spans
-    assert all(verdict.closed(role) > 0.9 for role in ("fit", "confirm", "sealed"))
+    assert all(verdict.closed(role) > 0.9 for role in ("train", "validation", "test"))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("compensated", [False, True], ids=["weight", "compensated"])
 def test_a_base_that_leans_is_named_and_measured(compensated: bool, tmp_path: Path):
     verdict, spans = found_in(compensated, tmp_path, tilted_base=0.03)
-    assert (verdict.kind, verdict.effects) == (Kind.NAMED, ("gravity_direction at base",)), verdict
+    assert (verdict.kind, verdict.effects) == (Conclusion.NAMED, ("gravity_direction at base",)), verdict
     for axis, size in (("x", np.cos(0.6)), ("y", np.sin(0.6))):
         value, low, high = spans[f"gravity_about_{axis}"]
         assert value == pytest.approx(0.03 * size, abs=0.003) and low < 0.03 * size < high, spans
-    assert all(verdict.closed(role) > 0.9 for role in ("fit", "confirm", "sealed"))
+    assert all(verdict.closed(role) > 0.9 for role in ("train", "validation", "test"))
 
 
 def test_sensors_gains_and_zeros_are_parameters_of_a_file(tmp_path: Path):
@@ -157,17 +157,17 @@ def test_sensors_gains_and_zeros_are_parameters_of_a_file(tmp_path: Path):
         ("-", 0.0),
     ]
     recordings = recorded(False, (("encoder_zero[elbow]", 0.03),))
-    seen = recordings["fit"].channel("torque")
+    seen = recordings["train"].channel("torque")
     gained = replace(seen, values=seen.values * np.array([1.0, 1.1, 1.0], np.float32))
-    fitted = replace(recordings["fit"], channels={**recordings["fit"].channels, "torque": gained})
+    fitted = replace(recordings["train"], channels={**recordings["train"].channels, "torque": gained})
     cost = make_cost(scene, space, [fitted])
-    found = refine(cost.whitened, space, space.mean[None], RefineConfig(iterations=15, hops=0))
+    found = refine(cost.whitened, space, space.mean[None], RefineConfig(iterations=15, basin_hops=0))
     deviation = np.sqrt(np.diag(np.linalg.inv(found.hessian))) * space.std
     for name, truth in (("encoder_offset[elbow]", 0.03), ("torque_gain[shoulder]", 0.1)):
         k = space.index(name)
         assert abs(found.best[k] - truth) < 5 * deviation[k] < 0.1 * truth + 5e-3, (name, found.best[k], deviation[k])
     effects = library(scene, ["encoder_offset", "torque_gain", "payload"])
     case = case_of(Split.RECORDINGS, scene, space, effects, recordings, SEARCH)
-    asked = {e.name: [*e.places] for e in case.effects}
+    asked = {e.name: [*e.locations] for e in case.effects}
     assert asked == {"encoder_offset": ["shoulder"], "torque_gain": ["yaw", "elbow"], "payload": ["elbow"]}
-    assert len({*case.whole.names}) == len(case.whole.names)
+    assert len({*case.full_space.names}) == len(case.full_space.names)

@@ -7,17 +7,17 @@ import pytest
 import scipy.stats
 
 from droid_jax.discrepancy.candidates import Candidate
-from droid_jax.discrepancy.screen import Question, Screen
+from droid_jax.discrepancy.screen import ScoreDirection, ScoreTest
 from droid_jax.discrepancy.trend import trend
 
 REPEATS, SIZE = 10, 400
 
 
-def screen(marks: np.ndarray) -> Screen:
+def screen(marks: np.ndarray) -> ScoreTest:
     names = [f"effect{k}" for k in range(len(marks))]
-    questions = tuple(Question(Candidate(n, "hinge", (f"{n}_size",), {}), f"{n}_size") for n in names)
+    questions = tuple(ScoreDirection(Candidate(n, "hinge", (f"{n}_size",), {}), f"{n}_size") for n in names)
     none = np.zeros(len(marks))
-    return Screen(questions, marks, marks, none, none, none, 1.0)
+    return ScoreTest(questions, marks, marks, none, none, none, 1.0)
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from droid_jax.door.space import door_space
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.formats import load
 from droid_jax.recordings.recording import Recording
-from droid_jax.simulate.c_reference import twin_replay
+from droid_jax.simulate.c_reference import c_replay
 from droid_jax.simulate.hand_path import minimum_jerk, solve_pose
 from droid_jax.simulate.replay import make_drive
 
@@ -147,7 +147,7 @@ def test_phases_tile_the_motion_and_the_fingers_close_in_the_grasp(shipped: Reco
 def test_the_command_leads_so_that_the_servo_stays_on_the_path(scene: Scene):
     """In free motion a servo with damping D and stiffness K trails by D/K v unless the command leads by it."""
     recording = load(demonstration_path("A"))
-    rollout = twin_replay(scene, door_space(scene), make_drive(scene, recording))(door_space(scene).mean[None])
+    rollout = c_replay(scene, door_space(scene), make_drive(scene, recording))(door_space(scene).mean[None])
     free = recording.time < 1.5
     path = path_of(recording)
     lag = np.abs(rollout.position[0] - path)[free].max()

@@ -102,11 +102,11 @@ def test_seeds_and_folders_come_from_the_commit():
 def test_truths_are_the_robots_own_in_all_recordings_but_for_the_sensors():
     bench = setting("bench")
     truths = draw_truths(bench, np.random.default_rng(3))
-    assert set(truths) == set(ROLES) and set(truths["fit"]) == set(bench.base.names)
-    apart = {n for n in bench.base.names if truths["fit"][n] != truths["confirm"][n]}
+    assert set(truths) == set(ROLES) and set(truths["train"]) == set(bench.base.names)
+    apart = {n for n in bench.base.names if truths["train"][n] != truths["validation"][n]}
     assert apart == {n for n in bench.base.names if n.startswith("torque_offset[")}
     for seed in range(40):  # none so far out that the search would have to call it an effect
-        truth = draw_truths(bench, np.random.default_rng(seed))["fit"]
+        truth = draw_truths(bench, np.random.default_rng(seed))["train"]
         nuisances = [p for p in bench.base.parameters if p.nuisance]
         assert all(abs(truth[p.name] - p.mean) <= 2.5001 * p.std for p in nuisances)
 
@@ -118,7 +118,7 @@ def test_motions_differ_and_begin_at_rest(name: str):
     for motion in motions.values():
         assert np.all(np.abs(motion.command[1] - motion.command[0]) < 1e-4)
         assert motion.command[0].tolist() == list(motion.qpos0.values())
-    assert not np.allclose(motions["fit"].command, motions["confirm"].command, atol=0.05)
+    assert not np.allclose(motions["train"].command, motions["validation"].command, atol=0.05)
 
 
 # ----- what is right
@@ -137,7 +137,7 @@ def test_every_hidden_effect_has_an_answer():
 @pytest.mark.parametrize("name", CHEAP)
 def test_targets_can_be_hidden_and_named(name: str):
     where = setting(name)
-    offered = {f"{e.name} at {place}" for e in where.effects() for place in e.places}
+    offered = {f"{e.name} at {place}" for e in where.effects() for place in e.locations}
     for hidden in keys(where):
         assert hidden.name in possible(where.scene)
         names = right(where.scene, hidden)
@@ -221,7 +221,7 @@ def test_limits_scale_with_the_effect():
 
 def test_a_form_that_blows_up_hides_no_limit(monkeypatch: pytest.MonkeyPatch):
     """Its mark is NaN, with which every p would be zero and every limit the smallest."""
-    monkeypatch.setattr(marks, "marks", lambda *_: np.array([[1.0, 2.0], [np.nan, np.nan]]))
+    monkeypatch.setattr(marks, "sensitivities", lambda *_: np.array([[1.0, 2.0], [np.nan, np.nan]]))
     seen: Any = SimpleNamespace(evidence=None, model=SimpleNamespace(values=None))
     np.testing.assert_array_equal(Ground.added(seen, ()), [[1.0, 2.0], [0.0, 0.0]])
     stage: Any = Stage()
@@ -264,7 +264,7 @@ def test_bounds_hold_what_the_base_model_absorbs():
 
 def test_what_an_effect_adds_is_taken_on_the_same_robot_with_the_same_noise(hinge: Setting):
     """Of an offset twice as large twice as much, per unit of it the same; a drift differs by repeat."""
-    where = ground(hinge, draw_truths(hinge, np.random.default_rng(3))["fit"], 7)
+    where = ground(hinge, draw_truths(hinge, np.random.default_rng(3))["train"], 7)
     one, two = (where.hidden(Applied("torque_bias", size)) for size in (0.1, 0.2))
     assert one.shape[0] == 10 and np.abs(one).max() > 1.0
     np.testing.assert_allclose(two, one, atol=0.02 * np.abs(one).max())
@@ -288,17 +288,18 @@ def case(
 ) -> Any:
     hidden = [{"name": f"h{k}", "joint": "", "amplitude": 2.0} for k in range(len(right_names))]
     truth = {"name": f"{kind}", "scene": "s", "kind": kind, "factor": 3.0, "hidden": hidden, "commit": COMMIT}
-    gaps = {"confirm": [11.0, 2.0], "sealed": [11.0, 1.5]}
+    gaps = {"validation": [11.0, 2.0], "test": [11.0, 1.5]}
     result = {
-        "verdict": verdict, "effects": effects, "tied": tied or [[] for _ in effects], "p": 0.002, "gaps": gaps,
+        "verdict": verdict, "effects": effects, "indistinguishable": tied or [[] for _ in effects],
+        "p": 0.002, "gaps": gaps,
         "floor": 1.0, "seconds": {"base": 2.0, "find": 3.0}, **more,
     }  # fmt: skip
     return {"truth": truth, "result": result, "right": right_names, "parts": [], "oracle": None}
 
 
-def reached(confirm: float, converged: bool = True) -> Any:
+def reached(validation: float, converged: bool = True) -> Any:
     """An oracle."""
-    return {"gaps": {"confirm": confirm}, "settled": None, "converged": converged}
+    return {"gaps": {"validation": validation}, "settled": None, "converged": converged}
 
 
 def rates(*cases: Any, known: Any = None) -> dict[str, Any]:
@@ -340,7 +341,7 @@ def test_rates_of_what_is_named():
 def test_cases_are_nameable_where_right_names_close_half_of_the_gap():
     latch = "latch at door"
     good, poor = ({"oracle": reached(u)} for u in (5.0, 7.0))  # of 10 above the floor they close 6 and 4
-    shut = case("single", "none", [], [[latch]], gaps={"confirm": [1.01, 1.01], "sealed": [1.0, 1.0]})
+    shut = case("single", "none", [], [[latch]], gaps={"validation": [1.01, 1.01], "test": [1.0, 1.0]})
     found = rates(
         {**case("single", "named", [latch], [[latch]]), **good},
         {**case("single", "named", [latch], [[latch]]), **poor},  # named or not: the oracle alone counts
@@ -390,7 +391,7 @@ def test_a_part_of_what_was_hidden_is_no_false_name_beside_it_but_alone():
 def test_without_noise_a_recording_keeps_its_scatter_and_gets_another_mean(hinge: Setting):
     truths = draw_truths(hinge, np.random.default_rng(3))
     drawn = Drawn((Applied("hinge_preload", 0.5),), truths, dict.fromkeys(ROLES, 7))
-    (noisy,), (plain,) = (record(hinge, drawn, ("fit",), *config).values() for config in ((), (QUIET,)))
+    (noisy,), (plain,) = (record(hinge, drawn, ("train",), *config).values() for config in ((), (QUIET,)))
     moved = around(plain, noisy)
     for name, channel in moved.channels.items():
         quiet, rough = plain.channels[name].values, noisy.channels[name].values
@@ -422,15 +423,15 @@ def test_intervals_are_compared_with_what_the_library_form_should_take():
 
 
 def test_where_there_is_no_gap_no_share_of_it_is_closed():
-    gaps = {"confirm": [11.0, 2.0], "sealed": [1.01, 0.99]}
+    gaps = {"validation": [11.0, 2.0], "test": [1.01, 0.99]}
     judged = score.judge(case("single", "named", ["latch at door"], [["latch at door"]], gaps=gaps), {})
-    assert judged["closed"] == {"confirm": pytest.approx(0.9)}
+    assert judged["closed"] == {"validation": pytest.approx(0.9)}
 
 
 def test_search_and_black_box_are_compared_on_the_same_gaps():
-    box = {"bic": [], "black_box": {"confirm": [11.0, 6.0], "sealed": [11.0, 1.0]}}
+    box = {"bic": [], "black_box": {"validation": [11.0, 6.0], "test": [11.0, 1.0]}}
     named = case("single", "named", ["latch at door"], [["latch at door"]], baselines=box)
-    gaps = {"confirm": [11.0, 11.0], "sealed": [1.0, 1.0]}  # the sealed motion shows none
+    gaps = {"validation": [11.0, 11.0], "test": [1.0, 1.0]}  # the test motion shows none
     silent = case("single", "unexplained", [], [["latch at door"]], baselines=box, gaps=gaps)
     found = rates(named, silent)["baselines"]
     assert found["search_closed_confirm"]["median"] == pytest.approx(0.45)  # 0.9 and 0
@@ -684,7 +685,7 @@ def test_an_oracle_is_of_the_result_that_is_there(tmp_path: Path, monkeypatch: p
         asked.append(result["n"])
         if result["n"] == 3:
             raise FloatingPointError("no replay")
-        return {"model": "latch", "gaps": {"fit": 1.0}}
+        return {"model": "latch", "gaps": {"train": 1.0}}
 
     monkeypatch.setattr(oracle, "oracle", one)
     for folder in ("sealed", "results"):

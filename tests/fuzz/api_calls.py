@@ -202,28 +202,28 @@ def _of_studies(folder: Path) -> tuple[Call, ...]:
         droid_jax.make_cost(**given, config=CompareConfig(**settings))
 
     def fit(**settings: Any) -> None:
-        droid_jax.identify(**given, config=droid_jax.IdentifyConfig(**settings))
+        droid_jax.identify_parameters(**given, config=droid_jax.IdentifyConfig(**settings))
 
     def missing(**settings: Any) -> None:
-        droid_jax.find_missing(bench, own, many, config=droid_jax.GapConfig(**settings))
+        droid_jax.find_missing_effects(bench, own, many, config=droid_jax.DiscrepancyConfig(**settings))
 
     identify = {
         **given, "nuisances": None, "config": droid_jax.IdentifyConfig(), "effects": (), "progress": None,
         "checkpoints": folder / "checkpoints",
     }  # fmt: skip
     find = {
-        **given, "recordings": many, "effects": None, "start": own.mean, "config": droid_jax.GapConfig(),
+        **given, "recordings": many, "effects": None, "start": own.mean, "config": droid_jax.DiscrepancyConfig(),
         "progress": None,
     }  # fmt: skip
     calls = (
         Call("make_cost", droid_jax.make_cost, {**given, "engine": "mjx", "config": CompareConfig(), "effects": ()}),
         Call("CompareConfig", cost, _fields(CompareConfig())),
-        Call("identify", droid_jax.identify, identify),
+        Call("identify", droid_jax.identify_parameters, identify),
         Call("IdentifyConfig", fit, _fields(droid_jax.IdentifyConfig())),
         Call("SearchConfig", lambda **settings: fit(search=SearchConfig(**settings)), _fields(SearchConfig())),
         Call("RefineConfig", lambda **settings: fit(refine=RefineConfig(**settings)), _fields(RefineConfig())),
-        Call("find_missing", droid_jax.find_missing, find),
-        Call("GapConfig", missing, _fields(droid_jax.GapConfig())),
+        Call("find_missing_effects", droid_jax.find_missing_effects, find),
+        Call("DiscrepancyConfig", missing, _fields(droid_jax.DiscrepancyConfig())),
     )
     return tuple(replace(call, run=_cut_short(call.run)) for call in calls)
 

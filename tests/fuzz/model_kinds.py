@@ -36,7 +36,7 @@ def make_parameters(folder: Path) -> None:
     entries = [
         {"field": "body_mass", "element": "forearm", "std": 0.2, "high": 3.0, "unit": "kg"},
         {"field": "dof_damping", "element": "door", "unit": "N m s/rad", "std": 0.3, "high": 10.0, "scaling": "log",
-         "floor": 0.05, "low": 0.0, "mean": 0.5, "width": 1.0, "group": "Door"},
+         "log_offset": 0.05, "low": 0.0, "mean": 0.5, "width": 1.0, "group": "Door"},
         {"field": "body_ipos", "element": "forearm", "column": 2, "std": 0.01, "high": 0.1, "low": -0.3, "mode": "set"},
         {"field": "dof_frictionloss", "element": "elbow", "std": 0.1, "high": 2.0, "mean": 0.1},
         {"sensor": "torque_offset", "element": "elbow", "std": 0.1, "high": 2.0, "nuisance": True},

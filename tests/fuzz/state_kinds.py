@@ -10,7 +10,7 @@ import numpy as np
 from kinds import Kind
 
 from droid_jax.cost.cost import Cost
-from droid_jax.discrepancy.resume import Remembered
+from droid_jax.discrepancy.resume import CachedCost
 from droid_jax.files import POLICY
 from droid_jax.identify.checkpoints import Checkpoints
 from droid_jax.policy.control import ACTIONS, FORMAT, LAYOUT, OBSERVED, SHAPES
@@ -64,7 +64,7 @@ class _Plain:
 
 def remembered(folder: Path) -> Any:
     of: dict[str, Any] = {f.name: () for f in fields(Cost)}
-    return Remembered(**of, plain=_Plain(), folder=folder)  # type: ignore[arg-type]
+    return CachedCost(**of, plain=_Plain(), folder=folder)  # type: ignore[arg-type]
 
 
 _ROWS = np.array([[1.0, 2.0], [3.0, 4.0]])

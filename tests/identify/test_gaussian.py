@@ -20,7 +20,7 @@ def wide(name, mean=0.0, std=1.0, **kw):
 
 
 def log_parameter(name="stiffness", low=0.0, high=100.0, floor=0.01, **kw):
-    return Parameter(name, "N m/rad", 1.0, 0.5, low, high, scaling=Scaling.LOG, floor=floor, **kw)
+    return Parameter(name, "N m/rad", 1.0, 0.5, low, high, scaling=Scaling.LOG, log_offset=floor, **kw)
 
 
 COV = np.array([[1.0, 0.6, 0.0], [0.6, 2.0, -0.5], [0.0, -0.5, 0.7]])
@@ -246,7 +246,7 @@ def test_the_space_survives_json_text():
     ("change", "message"),
     [
         (lambda c: c.pop("cov"), "missing keys: cov"),
-        (lambda c: c.update(version=2), "version 1, got 2"),
+        (lambda c: c.update(version=1), "version 2, got 1"),
         (lambda c: c.update(format="other"), "format"),
         (lambda c: c.update(mean=[0.0]), "mean must have shape"),
         (lambda c: c.update(mean=["x", 0.0]), "'mean', entry 0 must be a number, got 'x'"),

@@ -10,8 +10,8 @@ import pytest
 
 from droid_jax.cost.cost import Along, make_cost
 from droid_jax.cost.residuals import CompareConfig
-from droid_jax.identify.holdout import split
-from droid_jax.identify.pipeline import Identified, IdentifyConfig, identify
+from droid_jax.identify.holdout import split_repeats
+from droid_jax.identify.pipeline import Identified, IdentifyConfig, identify_parameters
 from droid_jax.identify.search import SearchConfig
 from droid_jax.model.fields import body_mass, joint_damping
 from droid_jax.model.joint_friction import joint_friction_space, sensor_parameter
@@ -67,7 +67,7 @@ def space(scene: Scene) -> Space:
 @pytest.fixture(scope="module")
 def found(scene: Scene, space: Space) -> Identified:
     config = IdentifyConfig(search=SearchConfig(population=16, parents=None, generations=10), samples=4)
-    return identify(scene, space, [log(1)], config=config)
+    return identify_parameters(scene, space, [log(1)], config=config)
 
 
 def test_mass_and_friction_come_back(found: Identified):
@@ -77,14 +77,14 @@ def test_mass_and_friction_come_back(found: Identified):
     # A replay's torques are read off along lines between rows of 8 ms: of a motion of 0.83 Hz that takes 1.6e-4.
     assert np.all((low < 1.0002 * truth) & (0.9998 * truth < high)), (low / truth - 1, high / truth - 1)
     assert np.all(high - low < 0.2 * truth)
-    assert all(t.identifiable for t in found.tells)
+    assert all(t.identifiable for t in found.identifiability)
 
 
 def test_the_last_third_in_time_is_held_out(found: Identified):
     (fitted,), (held,) = found.fit.comparisons, found.heldout.comparisons
     assert fitted.channel("torque").span[1] < 8.0 < held.channel("torque").span[0]
-    gap = found.gaps["log"]
-    assert gap.floor is None and gap.closed is None
+    gap = found.torque_distances["log"]
+    assert gap.noise_floor is None and gap.closed is None
     assert gap.after < 0.1 * gap.before
     assert found.fit.comparisons[0].channel("torque").unit == "N"
 
@@ -97,7 +97,7 @@ def test_the_noise_of_one_repeat_is_what_the_fit_leaves(found: Identified):
 
 def test_repeats_are_split_by_number(scene: Scene, space: Space):
     recording = log(4)
-    fitted, held, rows = split(recording, 0.3)
+    fitted, held, rows = split_repeats(recording, 0.3)
     assert (fitted.repeats, held.repeats, rows) == (3, 1, (3,))
     cost = make_cost(scene, space, [fitted])
     truth = space.values({"carriage_mass": MASS, "slide_damping": DAMPING, "coulomb[slide]": COULOMB})
@@ -121,17 +121,17 @@ def test_a_cost_of_two_recordings_is_that_of_each(scene: Scene, space: Space):
 
 def test_every_recordings_gap_is_its_own(scene: Scene, space: Space):
     config = IdentifyConfig(search=SearchConfig(population=8, parents=None, generations=2), samples=4)
-    found = identify(scene, space, [log(3), another()], config=config)
+    found = identify_parameters(scene, space, [log(3), another()], config=config)
     assert found.refined is not None and len(found.refined.residual) == found.fit.whitened(space.mean[None]).shape[1]
     for recording in (log(3), another()):
-        held = make_cost(scene, space, [split(recording, config.heldout)[1]])
+        held = make_cost(scene, space, [split_repeats(recording, config.heldout)[1]])
         before, after = held.distances(np.stack([space.mean, found.best]))[:, 0]
-        gap = found.gaps[recording.name]
+        gap = found.torque_distances[recording.name]
         assert (gap.before, gap.after) == (pytest.approx(before, rel=1e-5), pytest.approx(after, rel=1e-3))
 
 
 def test_another_motion_on_the_same_clock_compiles_no_replay(scene: Scene, space: Space):
-    fitted, held, _ = split(log(4), 0.3)
+    fitted, held, _ = split_repeats(log(4), 0.3)
     cost = make_cost(scene, space, [fitted])
     rows = np.stack([space.mean, space.values({"carriage_mass": MASS})])
     first = cost.whitened(rows)

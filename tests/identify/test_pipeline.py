@@ -21,9 +21,16 @@ from droid_jax.door.space import door_space
 from droid_jax.identify import pipeline, results
 from droid_jax.identify.fit import on_bound
 from droid_jax.identify.gaussian import prior
-from droid_jax.identify.holdout import WORTH, _closed, _floor, _scatter, judged_on, split
+from droid_jax.identify.holdout import WORTH, _closed, _floor, _scatter, judged_on, split_repeats
 from droid_jax.identify.multistart import RefineConfig, refine
-from droid_jax.identify.pipeline import Identified, IdentifyConfig, cost_samples, grip_hypotheses, identify, starts
+from droid_jax.identify.pipeline import (
+    Identified,
+    IdentifyConfig,
+    cost_samples,
+    grip_hypotheses,
+    identify_parameters,
+    starts,
+)
 from droid_jax.identify.results import traces, write_run
 from droid_jax.identify.search import SearchConfig
 from droid_jax.model.effect_interface import Rollout
@@ -42,9 +49,9 @@ def repeats(count: int, seed: int = 0, noise: float = 0.3) -> np.ndarray:
 def test_what_is_no_recording_is_refused():
     scene = elbow()
     with pytest.raises(ValueError, match="no recording to fit"):
-        identify(scene, elbow_space(scene), [])
+        identify_parameters(scene, elbow_space(scene), [])
     with pytest.raises(ValueError, match=r"expected a Recording, got 'log\.npz'; load_recording reads one"):
-        identify(scene, elbow_space(scene), ["log.npz"])  # pyright: ignore[reportArgumentType]
+        identify_parameters(scene, elbow_space(scene), ["log.npz"])  # pyright: ignore[reportArgumentType]
 
 
 NORM = 0.3 * np.sqrt(np.pi / 2)  # mean norm of two normal numbers of deviation 0.3
@@ -98,15 +105,17 @@ def found(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Identified:
     """Two repeats, of which one is fitted and one held out; whitened."""
     config = dataclasses.replace(QUICK, compare=CompareConfig(whitened=True))
     folder = tmp_path_factory.mktemp("checkpoints")
-    return identify(scene, elbow_space(scene), [elbow_log(COULOMB, 10.0, 2)], config=config, checkpoints=folder)
+    return identify_parameters(
+        scene, elbow_space(scene), [elbow_log(COULOMB, 10.0, 2)], config=config, checkpoints=folder
+    )
 
 
 def test_two_repeats_know_their_floor(found: Identified):
-    gap = found.gaps["elbow"]
+    gap = found.torque_distances["elbow"]
     recording = elbow_log(COULOMB, 10.0, 2)
     torque = recording.channels["torque"].values[:, :, 0]
-    assert gap.floor == pytest.approx(np.mean(np.abs(torque[0] - torque[1])) / np.sqrt(2), rel=0.05)
-    assert gap.per_joint_floor is not None and gap.before > gap.floor
+    assert gap.noise_floor == pytest.approx(np.mean(np.abs(torque[0] - torque[1])) / np.sqrt(2), rel=0.05)
+    assert gap.per_joint_noise_floor is not None and gap.before > gap.noise_floor
 
 
 def test_traces_and_joints_are_of_the_held_out_repeat(found: Identified):
@@ -116,21 +125,21 @@ def test_traces_and_joints_are_of_the_held_out_repeat(found: Identified):
     np.testing.assert_allclose(kept["elbow/before"], before)
     np.testing.assert_allclose(kept["elbow/after"], after)
     np.testing.assert_allclose(kept["elbow/measured_mean"], held.noise.mean)
-    gap = found.gaps["elbow"]
+    gap = found.torque_distances["elbow"]
     for curve, size in ((before, gap.per_joint_before), (after, gap.per_joint_after)):
         assert size == pytest.approx(np.sqrt(np.mean((curve - held.noise.mean) ** 2, axis=0)), rel=1e-5)
     assert gap.per_joint_before[0] > 1.1 * gap.per_joint_after[0]
     everything = make_comparison(elbow(), elbow_log(COULOMB, 10.0, 2), held.clock, CompareConfig(whitened=True))
     apart = np.diff(everything.channel("torque").noise.repeats[..., 0], axis=0)  # of two, one of which is held out
-    assert gap.per_joint_floor == pytest.approx([np.sqrt(np.mean(apart**2) / 2)], rel=0.02)
+    assert gap.per_joint_noise_floor == pytest.approx([np.sqrt(np.mean(apart**2) / 2)], rel=0.02)
 
 
 def test_the_command_says_how_it_went_and_what_to_do(found: Identified, tmp_path: Path, capsys):
     write_run(tmp_path, found, {"recordings": []})
     fit = json.loads((tmp_path / "fit.json").read_text())
     (name,) = fit["gap"]
-    fit["gap"][name]["after"] = fit["gap"][name]["floor"]
-    alone = {name: {**fit["gap"][name], "floor": None, "judged": "time"}}
+    fit["gap"][name]["after"] = fit["gap"][name]["noise_floor"]
+    alone = {name: {**fit["gap"][name], "noise_floor": None, "judged": "time"}}
     for changes, repeats, said in (
         ({"mean_square": 90.0}, [8], "gap` looks for what the model lacks (it takes a second motion, or 16 repeats"),
         ({"mean_square": 90.0}, [16], "gap` looks for what the model lacks\n"),
@@ -207,8 +216,8 @@ def test_a_fit_that_makes_no_mjcf_keeps_everything_else(
 def test_a_floor_in_newton_metres_stands_beside_no_cost_in_noise_units(found: Identified, tmp_path: Path):
     write_run(tmp_path, found, {})
     fit = json.loads((tmp_path / "fit.json").read_text())
-    assert fit["cost"]["unit"] == "noise units" and fit["cost"]["floor"] is None
-    assert fit["gap"]["elbow"]["floor"] == found.gaps["elbow"].floor
+    assert fit["cost"]["unit"] == "noise units" and fit["cost"]["noise_floor"] is None
+    assert fit["gap"]["elbow"]["noise_floor"] == found.torque_distances["elbow"].noise_floor
 
 
 def test_a_search_of_another_cost_is_not_gone_on_with(scene: Scene, tmp_path: Path):
@@ -218,7 +227,9 @@ def test_a_search_of_another_cost_is_not_gone_on_with(scene: Scene, tmp_path: Pa
 
     def run(config: IdentifyConfig = QUICK, **changes) -> None:
         given = {"scene": scene, "nuisances": None, **changes}
-        identify(given["scene"], main, [recording], nuisances=given["nuisances"], config=config, checkpoints=tmp_path)
+        identify_parameters(
+            given["scene"], main, [recording], nuisances=given["nuisances"], config=config, checkpoints=tmp_path
+        )
 
     run()
     heavier = elbow()
@@ -238,13 +249,13 @@ def test_a_search_of_another_cost_is_not_gone_on_with(scene: Scene, tmp_path: Pa
 def test_a_fit_without_torques_is_refused_at_once(scene: Scene):
     config = dataclasses.replace(QUICK, compare=CompareConfig(channels={"position": 1.0}))
     with pytest.raises(ValueError, match="compares torques, got the channels position"):
-        identify(scene, elbow_space(scene), [elbow_log(0.0, 10.0, 2)], config=config)
+        identify_parameters(scene, elbow_space(scene), [elbow_log(0.0, 10.0, 2)], config=config)
 
 
 def test_faults_of_what_is_held_out_are_told_before_the_search(scene: Scene, monkeypatch: pytest.MonkeyPatch):
     recording = elbow_log(0.0, 10.0, 2)
     torque = recording.channels["torque"]
-    (held,) = split(recording, QUICK.heldout)[2]
+    (held,) = split_repeats(recording, QUICK.heldout)[2]
     mask = torque.mask.copy()
     mask[held, 300:900] = False
     faulty = dataclasses.replace(
@@ -252,7 +263,7 @@ def test_faults_of_what_is_held_out_are_told_before_the_search(scene: Scene, mon
     )
     monkeypatch.setattr(pipeline, "search", lambda *a, **k: pytest.fail("the search began"))
     with pytest.raises(ValueError, match="'elbow' has a stretch that no repeat measured"):
-        identify(scene, elbow_space(scene), [faulty], config=QUICK)
+        identify_parameters(scene, elbow_space(scene), [faulty], config=QUICK)
 
 
 def test_a_replay_that_blows_up_is_no_parent_whatever_the_others_cost(scene: Scene, monkeypatch: pytest.MonkeyPatch):
@@ -270,7 +281,7 @@ def test_a_replay_that_blows_up_is_no_parent_whatever_the_others_cost(scene: Sce
     monkeypatch.setattr(pipeline, "search", search)
     monkeypatch.setattr(pipeline, "make_cost", cost_of)
     with pytest.raises(KeyboardInterrupt):
-        identify(scene, elbow_space(scene), [elbow_log(0.0, 10.0, 2)], config=QUICK)
+        identify_parameters(scene, elbow_space(scene), [elbow_log(0.0, 10.0, 2)], config=QUICK)
     np.testing.assert_array_equal(asked[0], [5000.0, np.inf])
 
 
@@ -289,13 +300,13 @@ def test_means_that_cannot_be_simulated_are_refused_before_the_search(scene: Sce
     monkeypatch.setattr(pipeline, "make_cost", lambda *_, **__: cost)
     monkeypatch.setattr(pipeline, "search", lambda *a, **k: pytest.fail("the search began"))
     with pytest.raises(ValueError, match=r"'elbow' blows up .* means \(elbow leaves its range at step 20 \(0\.2 s\)"):
-        identify(scene, elbow_space(scene), [elbow_log(0.0, 10.0, 2)], config=QUICK)
+        identify_parameters(scene, elbow_space(scene), [elbow_log(0.0, 10.0, 2)], config=QUICK)
 
 
 def test_without_the_refinement_one_recording_is_fitted(scene: Scene):
     both = [elbow_log(0.0, 10.0, 2), dataclasses.replace(elbow_log(0.0, 12.0, 2), name="other")]
     with pytest.raises(ValueError, match="one recording is fitted, got 2: elbow, other"):
-        identify(scene, elbow_space(scene), both, config=dataclasses.replace(QUICK, refine=None))
+        identify_parameters(scene, elbow_space(scene), both, config=dataclasses.replace(QUICK, refine=None))
 
 
 @pytest.mark.parametrize(("repeats", "runs"), [(1, 2), (3, 1)])
@@ -310,8 +321,8 @@ def test_every_replay_of_the_refinement_is_counted(
         return counted[-1]
 
     monkeypatch.setattr(pipeline, "refine", counting)
-    config = dataclasses.replace(QUICK, refine=RefineConfig(iterations=3, hops=0))
-    found = identify(scene, elbow_space(scene), [elbow_log(COULOMB, 10.0, repeats)], config=config)
+    config = dataclasses.replace(QUICK, refine=RefineConfig(iterations=3, basin_hops=0))
+    found = identify_parameters(scene, elbow_space(scene), [elbow_log(COULOMB, 10.0, repeats)], config=config)
     assert len(counted) == runs and found.refined is not None
     assert found.refined.evaluations == sum(one.evaluations for one in counted)
 
@@ -319,9 +330,9 @@ def test_every_replay_of_the_refinement_is_counted(
 @pytest.mark.parametrize(("repeats", "judged"), [(1, "time"), (3, "repeats")])
 def test_a_fit_says_what_it_is_judged_on(scene: Scene, repeats: int, judged: str):
     log = elbow_log(0.0, 9.0, repeats)
-    assert judged_on(log, split(log, 0.3)[1]) == judged
+    assert judged_on(log, split_repeats(log, 0.3)[1]) == judged
     commanded = dataclasses.replace(log, time=np.arange(3.0), command=np.zeros((3, 1)), command_names=("elbow",))
-    assert judged_on(commanded, split(commanded, 0.3)[1]) == ("repeats" if repeats > 1 else "same")
+    assert judged_on(commanded, split_repeats(commanded, 0.3)[1]) == ("repeats" if repeats > 1 else "same")
 
 
 def test_a_search_imports_nothing_that_it_may_not_need():

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from droid_jax.identify.levenberg_marquardt import Problem
+from droid_jax.identify.levenberg_marquardt import DampedProblem
 from droid_jax.identify.multistart import HOP_POPULATION, RefineConfig, chord, refine
 from droid_jax.model.parameters import Parameter, Scaling, Space
 
@@ -40,7 +40,7 @@ def linear(matrix, target):
 
 
 # No hops, and gains far below a log likelihood still count: the end is a minimum to many digits.
-EXACT = RefineConfig(hops=0, tolerance=1e-9, rough=0.0)
+EXACT = RefineConfig(basin_hops=0, tolerance=1e-9, coarse_tolerance=0.0)
 FLAT = dataclasses.replace(EXACT, main_prior=1e6)  # and the prior does not show
 
 
@@ -119,7 +119,7 @@ def test_differences_at_a_bound_are_divided_by_what_is_left_of_their_span(a):
     space = Space((line("a", low=0.0, mean=1.0, high=9.0), line("b")))
     matrix = np.array([[3.0, 2.5], [2.5, 3.0], [1.0, -1.0]])
     recorder = Recorder(linear(matrix, [1.0, 2.0, 3.0]))
-    problem = Problem(recorder, space, EXACT)
+    problem = DampedProblem(recorder, space, EXACT)
     state = problem.start(space.to_search(np.array([[a, 0.0]])))
     np.testing.assert_allclose(problem.jacobian(state)[0], matrix, atol=1e-9)
     np.testing.assert_allclose(problem.wide_jacobian(state, problem.jacobian(state)[0]), matrix, atol=1e-9)
@@ -161,7 +161,7 @@ def test_a_hypothesis_finds_the_lower_basin_that_descent_misses():
 
 def test_a_hypothesis_that_is_worse_changes_nothing():
     plain = refine(two_basins, BASINS, [-3.1, -12.0], FLAT)
-    tried = dataclasses.replace(FLAT, doubt=0.0)
+    tried = dataclasses.replace(FLAT, misfit_threshold=0.0)
     fit = refine(two_basins, BASINS, [-3.1, -12.0], tried, hypotheses=[{"s": 3.0}])
     assert fit.evaluations > plain.evaluations
     np.testing.assert_allclose(fit.best, plain.best, atol=1e-6)
@@ -172,12 +172,12 @@ def test_hypotheses_are_tried_only_where_the_residuals_leave_doubt():
     plain = refine(two_basins, BASINS, [3.2, 12.0], FLAT)
     mean_square = np.mean(plain.residual**2)
     for doubt, end in ((1.01 * mean_square, plain.best), (0.99 * mean_square, [-3.0, -12.0])):
-        config = dataclasses.replace(FLAT, doubt=doubt)
+        config = dataclasses.replace(FLAT, misfit_threshold=doubt)
         fit = refine(two_basins, BASINS, [3.2, 12.0], config, hypotheses=[{"s": -2.8}])
         np.testing.assert_allclose(fit.best, end, atol=1e-4)
 
 
-HOPPING = dataclasses.replace(FLAT, hops=1, hop_generations=1)
+HOPPING = dataclasses.replace(FLAT, basin_hops=1, basin_hop_generations=1)
 
 
 def two_untold(values):
@@ -211,7 +211,7 @@ def test_nothing_else_is_put_back(space, sharper):
 
 
 def test_the_best_of_several_starts_wins_and_each_says_where_it_ended():
-    fit = refine(two_basins, BASINS, [[3.2, 12.0], [-3.3, -10.0]], dataclasses.replace(FLAT, keep=(1e9,)))
+    fit = refine(two_basins, BASINS, [[3.2, 12.0], [-3.3, -10.0]], dataclasses.replace(FLAT, pruning_ratio=(1e9,)))
     np.testing.assert_allclose(fit.best, [-3.0, -12.0], atol=1e-4)
     upper = refine(two_basins, BASINS, [3.2, 12.0], FLAT).objective
     np.testing.assert_allclose(fit.starts, [upper, 0.0], atol=1e-3)
@@ -225,7 +225,7 @@ def test_starts_far_worse_than_the_best_are_dropped():
 
     def iterations_of_the_second(keep):
         recorder = Recorder(two_basins)
-        refine(recorder, BASINS, starts, dataclasses.replace(FLAT, keep=keep))
+        refine(recorder, BASINS, starts, dataclasses.replace(FLAT, pruning_ratio=keep))
         differences = [rows for rows in recorder.asked if len(rows) == 8]  # of two starts; four rows for one
         return len(differences)
 
@@ -246,7 +246,7 @@ def test_hops_get_past_steps_beside_the_optimum_that_no_derivative_sees():
     stuck = refine(stepped, space, [-1.0, 1.0], config)
     np.testing.assert_allclose(stuck.best, [0.7, -0.4], atol=1e-3)
     assert stuck.objective == pytest.approx(14.0, abs=1e-3)
-    hopped = refine(stepped, space, [-1.0, 1.0], dataclasses.replace(config, hops=4))
+    hopped = refine(stepped, space, [-1.0, 1.0], dataclasses.replace(config, basin_hops=4))
     assert 1.44 <= hopped.objective < 1.44 + 0.2
     np.testing.assert_allclose(hopped.best, [1.9, -1.6], atol=0.1)
     assert hopped.converged
@@ -257,7 +257,7 @@ def test_a_hop_that_finds_nothing_is_the_last():
     space = Space((line("a"), line("b")))
 
     def fit(hops):
-        config = dataclasses.replace(FLAT, hops=hops, hop_generations=3)
+        config = dataclasses.replace(FLAT, basin_hops=hops, basin_hop_generations=3)
         return refine(linear(matrix, target), space, [5.0, 5.0], config)
 
     none, one, four = fit(0), fit(1), fit(4)
@@ -293,7 +293,7 @@ def test_slopes_over_the_posterior_s_width_do_not_take_rounding_for_information(
     truth = np.stack([APART + TOGETHER, TOGETHER - APART], axis=1)
     true = deviation_of_the_sum(truth, fit.prior)
 
-    problem = Problem(rounded, space, config)
+    problem = DampedProblem(rounded, space, config)
     state = problem.start(fit.x[None])
     narrow = dataclasses.replace(state, widths=np.full((1, 2), config.smallest_step))
     assert deviation_of_the_sum(problem.jacobian(narrow)[0], fit.prior) < 0.5 * true
@@ -410,7 +410,7 @@ def test_a_start_outside_the_bounds_is_refused():
 def test_progress_rises_and_every_replay_is_counted():
     """Through all stages: a cheap part, a hypothesis, all data, hops."""
     cheap, full, seen = Recorder(two_basins), Recorder(two_basins), []
-    config = RefineConfig(main_prior=1e6, hop_generations=3)
+    config = RefineConfig(main_prior=1e6, basin_hop_generations=3)
     fit = refine(full, BASINS, [3.9, 9.0], config, first=cheap, hypotheses=[{"s": -2.8}], progress=seen.append)
     assert fit.evaluations == len(cheap.rows) + len(full.rows)
     numbers = [p.iteration for p in seen]
@@ -446,7 +446,7 @@ def test_a_fit_that_nothing_around_it_can_be_replayed_beside_is_kept():
     """A hop draws far from where the iterations stood still, and finds no number there."""
     inside = linear(np.eye(2), [0.0, 1.0])
     near = Recorder(lambda v: np.where(np.linalg.norm(v - [0.0, 1.0], axis=1, keepdims=True) > 0.02, np.nan, inside(v)))
-    fit = refine(near, BASINS, [0.01, 1.0], dataclasses.replace(FLAT, hops=2, step=1e-3))
+    fit = refine(near, BASINS, [0.01, 1.0], dataclasses.replace(FLAT, basin_hops=2, step=1e-3))
     np.testing.assert_allclose(fit.best, [0.0, 1.0], atol=1e-3)
     assert fit.converged and np.any(np.linalg.norm(near.rows - [0.0, 1.0], axis=1) > 0.1)
 
@@ -495,15 +495,15 @@ def test_an_aim_that_is_out_of_reach_is_given_up_and_one_within_reach_is_pursued
     def quartic(values):
         return (values - 50.0) ** 2 * 0.2
 
-    plain = RefineConfig(hops=0, tolerance=1e-3, rough=0.0, main_prior=1e6)
+    plain = RefineConfig(basin_hops=0, tolerance=1e-3, coarse_tolerance=0.0, main_prior=1e6)
     whole = refine(quartic, space, [0.0], plain)
-    reachable = refine(quartic, space, [0.0], dataclasses.replace(plain, aim=0.0))
-    hopeless = refine(quartic, space, [0.0], dataclasses.replace(plain, aim=-5e5))
+    reachable = refine(quartic, space, [0.0], dataclasses.replace(plain, target_objective=0.0))
+    hopeless = refine(quartic, space, [0.0], dataclasses.replace(plain, target_objective=-5e5))
     assert reachable.objective == whole.objective and reachable.evaluations == whole.evaluations
     assert hopeless.evaluations < whole.evaluations
     assert hopeless.objective > whole.objective
     assert whole.converged and reachable.converged and not hopeless.converged
-    still = refine(quartic, space, [50.0], dataclasses.replace(plain, aim=-5e5))
+    still = refine(quartic, space, [50.0], dataclasses.replace(plain, target_objective=-5e5))
     assert still.converged
 
 
@@ -517,5 +517,5 @@ def test_a_period_is_found_though_the_first_differences_span_a_whole_one():
         return 30.0 * (sine * np.sin(periods * times) + cosine * np.cos(periods * times) - 0.5 * np.sin(17.7 * times))
 
     start = np.array([[0.25, -0.3, 20.0]])
-    fit = refine(residuals, space, start, RefineConfig(iterations=8, hops=0, spreads=0, aim=100.0))
+    fit = refine(residuals, space, start, RefineConfig(iterations=8, basin_hops=0, spreads=0, target_objective=100.0))
     np.testing.assert_allclose(fit.best, [0.5, 0.0, 17.7], atol=0.02)

@@ -81,8 +81,8 @@ def test_rosenbrock_inside_bounds():
 
 def test_two_hundred_prior_deviations_away():
     """A spring of 1.06 N m/rad from a prior of 0.01 with deviation 0.005, thanks to the logarithm."""
-    spring = Parameter("k", "N m/rad", 0.01, 0.005, 0.0, 10.0, scaling=Scaling.LOG, floor=1e-3)
-    space = Space((spring, Parameter("d", "N m s/rad", 0.1, 0.05, 0.0, 5.0, scaling=Scaling.LOG, floor=1e-3)))
+    spring = Parameter("k", "N m/rad", 0.01, 0.005, 0.0, 10.0, scaling=Scaling.LOG, log_offset=1e-3)
+    space = Space((spring, Parameter("d", "N m s/rad", 0.1, 0.05, 0.0, 5.0, scaling=Scaling.LOG, log_offset=1e-3)))
     truth = np.array([1.06, 0.3])
     assert (truth[0] - spring.mean) / spring.std > 200
 
@@ -105,7 +105,7 @@ def test_minimum_on_a_bound_is_named():
 
 def test_minimum_on_the_bound_of_a_logarithm_is_reached():
     """Mirrored draws never lie on the bound; the best is tried on it when the generations are over."""
-    friction = Parameter("f", "N m", 0.1, 0.05, 0.0, 5.0, scaling=Scaling.LOG, floor=1e-3)
+    friction = Parameter("f", "N m", 0.1, 0.05, 0.0, 5.0, scaling=Scaling.LOG, log_offset=1e-3)
     fit = search(sphere([0.0, 1.0]), Space((friction, *box(1).parameters)), endless(generations=40))
     assert fit.best[0] == 0.0
     assert fit.on_bound == ("f",)
@@ -125,7 +125,7 @@ def test_optima_beyond_bounds_do_not_spoil_the_search(count: int, beyond: float)
     A bowl in search coordinates whose bottom lies beyond the lower bound in `count` of 16 logarithms: clipped, all rows
     beyond it looked alike, and the step size grew until the search stopped near its first generations.
     """
-    logs = tuple(Parameter(f"p{i}", "u", 1.0, 0.5, 0.1, 10.0, scaling=Scaling.LOG, floor=0.05) for i in range(16))
+    logs = tuple(Parameter(f"p{i}", "u", 1.0, 0.5, 0.1, 10.0, scaling=Scaling.LOG, log_offset=0.05) for i in range(16))
     space = Space(logs)
     low = space.to_search(space.low)
     bottom = np.where(np.arange(16) < count, low - beyond, 0.3)
@@ -141,7 +141,7 @@ def test_optima_beyond_bounds_do_not_spoil_the_search(count: int, beyond: float)
 
 def test_a_restart_that_could_not_be_replayed_keeps_no_other_off_its_bound():
     """Its rows all blow up; the best of the other one is asked for on its bound all the same."""
-    mass = Parameter("mass", "kg", 1.0, 0.5, 0.0, 10.0, scaling=Scaling.LOG, floor=1.0)
+    mass = Parameter("mass", "kg", 1.0, 0.5, 0.0, 10.0, scaling=Scaling.LOG, log_offset=1.0)
     space = Space((mass, Parameter("x", "u", 0.0, 1.0, -5.0, 5.0)))
 
     def cost(values):

@@ -393,7 +393,7 @@ def test_the_gaussian_to_hand_on_holds_the_stated_prior_and_the_blocks_of_a_seco
     comparison: Any = SimpleNamespace(channels=(channel,), deviations=lambda: exactly(1.0, 60, count))
     scores = per_second * np.array([1.0, -1.0, 2.0, -2.0, 3.0, -3.0])
     expected = np.sqrt(np.sum(scores**2)) / count
-    np.testing.assert_allclose(deviations(uncertainty.told(fit, [comparison])), [expected, 4.0], rtol=0.01)
+    np.testing.assert_allclose(deviations(uncertainty.posterior_of(fit, [comparison])), [expected, 4.0], rtol=0.01)
     with_prior = 1 / np.sqrt(expected**-2 + 1)
     np.testing.assert_allclose(deviations(posterior(fit, [comparison])), [with_prior, 1.0], rtol=0.01)
     assert deviations(posterior(fit, [comparison]))[1] <= 1.0

@@ -43,8 +43,8 @@ def test_a_balls_number_is_one_for_all_its_degrees_of_freedom():
     """As MJCF states it, so that what is fitted can be written."""
     arm = scene()
     damping = joint_damping(arm, "wrist", std=0.5, high=5.0)
-    rubbing = joint_frictionloss(arm, "wrist", std=0.5, high=5.0)
-    space = Space((damping, rubbing, joint_damping(arm, "swing", std=0.5, high=5.0)))
+    dry = joint_frictionloss(arm, "wrist", std=0.5, high=5.0)
+    space = Space((damping, dry, joint_damping(arm, "swing", std=0.5, high=5.0)))
     values = np.array([2.0, 0.7, 0.3])
     model = make_c_model(arm, space, values)
     np.testing.assert_allclose(model.dof_damping, [0.3, 2.0, 2.0, 2.0])

@@ -87,7 +87,7 @@ def test_a_logarithm_that_starts_where_nothing_is_felt_is_said(scene: Scene, tmp
     file.write_text(json.dumps([entry]))
     with pytest.warns(UserWarning, match="'j_frictionloss' is searched in the logarithm from 1e-06"):
         load_parameters(file, scene)
-    file.write_text(json.dumps([{**entry, "floor": 0.05}]))
+    file.write_text(json.dumps([{**entry, "log_offset": 0.05}]))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         load_parameters(file, scene)

@@ -41,7 +41,7 @@ def test_a_file_is_utf_8_whatever_wrote_it(tmp_path: Path, scene: Scene):
 
 
 def test_an_entry_is_read_as_it_says(tmp_path: Path, scene: Scene):
-    more = {"mode": "scale", "scaling": "log", "floor": 0.1, "width": 0.5, "nuisance": True, "low": 0, "mean": 2}
+    more = {"mode": "scale", "scaling": "log", "log_offset": 0.1, "width": 0.5, "nuisance": True, "low": 0, "mean": 2}
     parameter = loaded(tmp_path, scene, {**GOOD, **more, "name": "oil", "unit": "-", "group": "Arm"})["oil"]
     assert parameter.writes[0].mode is Mode.SCALE and parameter.scaling is Scaling.LOG
     assert (parameter.width, parameter.nuisance, parameter.group) == (0.5, True, "Arm")
@@ -98,8 +98,8 @@ def test_a_servos_gain_and_the_commands_delay_have_no_element(tmp_path: Path, sc
         ({"field": "geom_size", "element": "bone", "column": "1"}, "'column' must be a whole number, got '1'"),
         ({"std": "a"}, "'std' must be a number, got 'a'"),
         ({"std": True}, "'std' must be a number, got True"),
-        ({"width": "x", "scaling": "log", "floor": 0.1}, "'width' must be a number, got 'x'"),
-        ({"width": 0, "scaling": "log", "floor": 0.1}, "width must be above 0, got 0"),
+        ({"width": "x", "scaling": "log", "log_offset": 0.1}, "'width' must be a number, got 'x'"),
+        ({"width": 0, "scaling": "log", "log_offset": 0.1}, "width must be above 0, got 0"),
         ({"nuisance": "false"}, "'nuisance' must be true or false, got 'false'"),
         ({"name": 5}, "'name' must be text, got 5"),
         ({"element": 3}, "'element' must be text, got 3"),
@@ -122,7 +122,7 @@ def test_a_mistake_is_named(tmp_path: Path, scene: Scene, changes: dict[str, Any
 
 def test_numbers_that_are_none_are_refused_with_the_file(tmp_path: Path, scene: Scene):
     with pytest.raises(ValueError, match=r"parameters\.json: NaN is no number of JSON"):
-        loaded(tmp_path, scene, {**GOOD, "floor": float("nan")})
+        loaded(tmp_path, scene, {**GOOD, "log_offset": float("nan")})
     with pytest.raises(ValueError, match=r"parameters\.json: entry 0, 'std': a whole number beyond 2\^63"):
         loaded(tmp_path, scene, {**GOOD, "std": 10**400})
 

@@ -17,7 +17,7 @@ def linear(name: str = "offset", **changes) -> Parameter:
 
 
 def log(name: str = "damping", **changes) -> Parameter:
-    start = dict(name=name, unit="N m s/rad", mean=2.0, std=1.0, low=0.0, high=20.0, floor=0.05)
+    start = dict(name=name, unit="N m s/rad", mean=2.0, std=1.0, low=0.0, high=20.0, log_offset=0.05)
     return Parameter(**{**start, **changes}, scaling=Scaling.LOG)
 
 
@@ -92,8 +92,8 @@ def test_a_bad_parameter_is_refused(changes: dict, says: str):
 
 
 def test_log_scaling_needs_a_positive_range():
-    with pytest.raises(ValueError, match=r"low \+ floor > 0"):
-        log(floor=0.0)
+    with pytest.raises(ValueError, match=r"low \+ log_offset > 0"):
+        log(log_offset=0.0)
 
 
 def test_a_prior_outside_the_bounds_is_refused_by_name():

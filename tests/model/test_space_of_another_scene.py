@@ -51,7 +51,7 @@ def test_rows_that_are_not_there(one: Scene, two: Scene) -> None:
     with pytest.raises(ValueError, match=r"'elbow_damping' writes dof_damping\[1\] of 'elbow', but in .j. "):
         dj.make_cost(one, space, log("j"))
     with pytest.raises(ValueError, match=r"'elbow_damping'.*belongs to another scene"):
-        dj.identify(one, space, log("j"))
+        dj.identify_parameters(one, space, log("j"))
 
 
 @pytest.mark.parametrize("make", [joint_damping, servo_scale])

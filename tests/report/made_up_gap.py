@@ -33,7 +33,7 @@ SHIFTS = [
 def make_gap(folder: Path, verdict: str = "named", sealed: bool = True, **changes: Any) -> Path:
     """A folder with gap.json, gap.npz and setup.json; `changes` replace entries of gap.json."""
     folder.mkdir(parents=True, exist_ok=True)
-    roles = ("fit", "confirm", "sealed")[: 3 if sealed else 2]
+    roles = ("train", "validation", "test")[: 3 if sealed else 2]
     found = gap_json(verdict, roles) | changes
     (folder / "gap.json").write_text(json.dumps(found))
     (folder / "setup.json").write_text(json.dumps(found["setup"]))
@@ -57,7 +57,8 @@ def gap_json(verdict: str, roles: tuple[str, ...]) -> dict[str, Any]:
     }
     return {
         "verdict": verdict, "sentence": words[verdict], "effects": effects,
-        "tied": [[STRIBECK] if verdict == "tie" else []][: len(effects)], "about": _about(verdict) if effects else {},
+        "indistinguishable": [[STRIBECK] if verdict == "tie" else []][: len(effects)],
+        "about": _about(verdict) if effects else {},
         "p": None if not asked else 0.412 if verdict == "none" else 0.00195, "floor": 0.0123, "converged": asked,
         "cut": "", "seconds": {"compile": 41.2, "base_fit": 312.0, "screen": 18.5, "refit": 640.1},
         "gaps": {r: _gap(name, k, first, left) for k, (r, name) in enumerate(zip(roles, "ABC", strict=False))},
@@ -70,7 +71,7 @@ def gap_json(verdict: str, roles: tuple[str, ...]) -> dict[str, Any]:
         "shifts": [dict(zip(("name", "unit", "before", "after", "deviation_before"), s, strict=True)) for s in SHIFTS],
         "experiments": _experiments() if verdict == "tie" else [], "trends": _trends(verdict), "units": "N m",
         "versions": {"mujoco": "3.17.0", "jax": "0.9.2"}, "device": "2 CPU cores",
-        "setup": {"preset": "quick", "fit": "a.npz", "confirm": "b.npz", "recording": ["a.npz"], "scene": None},
+        "setup": {"preset": "quick", "fit": "a.npz", "validation": "b.npz", "recording": ["a.npz"], "scene": None},
     }  # fmt: skip
 
 
@@ -100,13 +101,19 @@ def _trials(verdict: str, first: float, left: float | None) -> list[dict[str, An
         u = (left or 0.0) * (1 + 0.04 * k) if passed else first * 0.97
         out.append(
             {
-                "round": 0, "name": name, "gap_fit": u, "gap_confirm": 1.1 * u, "p": 0.00098 if passed else 0.12,
+                "round": 0, "name": name, "discrepancy_train": u, "discrepancy_validation": 1.1 * u,
+                "p": 0.00098 if passed else 0.12,
                 "chosen": 0.97 if passed else 0.02, "passed": passed, "reasons": [] if passed else list(FAR),
                 "interval": {name.split(" at ")[0]: [0.41, 0.93]},
             }
         )  # fmt: skip
     if verdict == "partly explained":
-        more = out[1] | {"round": 1, "name": f"{LATCH} + {CLOSER}", "gap_fit": 1.87, "gap_confirm": 2.4}
+        more = out[1] | {
+            "round": 1,
+            "name": f"{LATCH} + {CLOSER}",
+            "discrepancy_train": 1.87,
+            "discrepancy_validation": 2.4,
+        }
         out.append(more)
     return out
 
@@ -117,7 +124,9 @@ def _cells(size: float) -> list[dict[str, Any]]:
 
     def add(variable: str, where: str, gap: float) -> None:
         found = gap > 0.05
-        out.append({"variable": variable, "where": where, "gap": gap, "p": 0.002 if found else 0.4, "found": found})
+        out.append(
+            {"variable": variable, "where": where, "discrepancy": gap, "p": 0.002 if found else 0.4, "found": found}
+        )
 
     for j, joint in enumerate(JOINTS):
         for f, (name, start, _) in enumerate(PHASES):
@@ -169,7 +178,7 @@ def _trends(verdict: str) -> list[dict[str, Any]]:
 
 def _experiments() -> list[dict[str, Any]]:
     menu = (("the same motion at 0.3 of the speed", 14.31), ("closing as well as opening", 5.22))
-    return [{"what": what, "apart": apart} for what, apart in menu]
+    return [{"what": what, "distance": apart} for what, apart in menu]
 
 
 def _traces(roles: tuple[str, ...], extended: bool) -> dict[str, np.ndarray]:

@@ -19,7 +19,7 @@ def named(tmp_path_factory: pytest.TempPathFactory) -> Gap:
 
 
 def test_overlays_draw_the_given_torques(named: Gap) -> None:
-    traces = named.traces["sealed"]
+    traces = named.traces["test"]
     figure = gap_torques.torque_overlays(traces, named.unit)
     panels = [a for a in figure.axes if a.get_visible() and a.get_title("left")]
     assert [a.get_title("left") for a in panels] == [f"Joint {i}" for i in range(1, 8)]
@@ -37,7 +37,7 @@ def test_the_maps_share_one_scale_and_leave_out_what_is_not_found(named: Gap) ->
     assert before.get_clim() == after.get_clim()
     found = [c["found"] for c in cells["after"] if c["variable"] == gap_words.TIME]
     np.testing.assert_array_equal(~np.ma.getmaskarray(np.ma.asarray(after.get_array())).ravel(), found)
-    largest = max(c["gap"] for c in cells["before"] if c["variable"] == gap_words.TIME)
+    largest = max(c["discrepancy"] for c in cells["before"] if c["variable"] == gap_words.TIME)
     assert np.max(np.asarray(before.get_array())) == largest
     assert number(largest, 2) in {t.get_text() for t in first.texts}
 
@@ -47,10 +47,10 @@ def test_figures_survive_odd_numbers(named: Gap) -> None:
     gaps = [{**g, "after": -0.001, "torque_after": None} for g in found["gaps"].values()]
     gap_figures.gap_bars(["A", "B", "C"], gaps, 0.0, "N m")
     gap_figures.gap_bars(["A"], [{k: None for k in gaps[0]}], None, "N m")
-    silent = [{**c, "found": False, "gap": -0.01} for c in found["cells"]["before"]]
+    silent = [{**c, "found": False, "discrepancy": -0.01} for c in found["cells"]["before"]]
     gap_maps.cell_maps(silent, silent)
     gap_maps.state_bars(silent, None)
-    traces = named.traces["fit"]
+    traces = named.traces["train"]
     assert len(gap_torques.remainder(traces, silent, "N m").axes) == 1  # no variable is located, time alone is drawn
     gap_torques.remainder(traces, [], "N m")
 
@@ -66,12 +66,14 @@ def test_position_and_load_are_shown_of_the_joint_with_the_most(named: Gap) -> N
     """Of the base model, in both models alike; a curve over a joint's load says that it is that joint's."""
     cells = named.found["cells"]
     joint = gap_maps.most_at(cells["before"])
-    loudest = max((c for c in cells["before"] if c["variable"].startswith("position of ")), key=lambda c: c["gap"])
+    loudest = max(
+        (c for c in cells["before"] if c["variable"].startswith("position of ")), key=lambda c: c["discrepancy"]
+    )
     assert loudest["variable"] == f"position of {joint}"
     shown = [a.get_xlabel() for a in gap_maps.state_bars(cells["before"], cells["after"]).axes if a.get_visible()]
     assert [name for name in shown if " of " in name] == ["Position of joint 1 [rad]", "Load of joint 1 [N m]"]
     some = [c for c in cells["before"] if c["variable"] in (gap_words.TIME, f"load of {joint}")]
-    curve = gap_torques.remainder(named.traces["fit"], some, "N m").axes[-1]
+    curve = gap_torques.remainder(named.traces["train"], some, "N m").axes[-1]
     assert (curve.get_title("left"), curve.get_xlabel()) == ("That joint alone", "Load of joint 1 [N m]")
 
 

@@ -72,17 +72,17 @@ def test_every_verdict_has_its_words(tmp_path: Path, quick: None, verdict: str) 
     assert ("joint coulomb at joint 2 changes by about" in text) == (verdict == "named")
     assert ("U after" in text) == bool(gap.found["effects"])
     assert ("Descriptive only" in text) == (verdict in ("unexplained", "partly explained"))
-    assert ("No recording was kept sealed" in text) == (not sealed)
-    assert f"Torque over time, {gap.recording(gap.judge)} ({'sealed' if sealed else 'confirming'})" in text
+    assert ("No recording was kept as test data" in text) == (not sealed)
+    assert f"Torque over time, {gap.recording(gap.judge)} ({'test' if sealed else 'validation'})" in text
 
 
 def test_the_page_says_what_to_look_for(tmp_path: Path, quick: None) -> None:
-    """Beside every effect of the answer its mark and what looks like it; of what does as well also what it is."""
+    """Beside every effect of the answer its mark and what looks like it; of what is equivalent also what it is."""
     folder = make_gap(tmp_path / "run", "tie")
     told = [
         "Latch at door hinge Its mark: the first degrees of opening, and the last of closing. Can look like: hinge "
         "stribeck, over centre spring.",
-        "Hinge stribeck at door hinge does as well Dry friction of the hinge that falls with speed. Its mark: "
+        "Hinge stribeck at door hinge is equivalent Dry friction of the hinge that falls with speed. Its mark: "
         "breakaway and reversals of the door. Can look like: latch, joint stribeck.",
     ]
     text = " ".join(read_page(page.write_report(folder)).text.split())
@@ -98,7 +98,9 @@ def test_a_mark_at_several_places_is_told_once_and_none_where_nothing_is_known(t
     coulomb, own = ["joint_coulomb at panda_joint2", "joint_coulomb at panda_joint3"], "squeak at door_hinge"
     step = {"what": "dry friction", "mark": "a step at every reversal.", "confused_with": []}
     about = {"joint_coulomb": step, "squeak": {"what": "", "mark": "", "confused_with": []}}
-    gap = read_gap(make_gap(tmp_path, effects=[*coulomb, own], tied=[["drag at door_hinge"], [], []], about=about))
+    gap = read_gap(
+        make_gap(tmp_path, effects=[*coulomb, own], indistinguishable=[["drag at door_hinge"], [], []], about=about)
+    )
     told = "Joint coulomb at joint 2 and joint coulomb at joint 3"
     assert gap_marks.marks(gap) == [(told, False, "Its mark: a step at every reversal.")]
 
@@ -110,7 +112,7 @@ def test_the_page_loads_nothing_and_every_link_is_there(tmp_path: Path, verdict:
     written = read_page(page.write_report(folder))
     assert all(source.startswith("data:") for source in written.loads)
     assert not [link for link in written.links if not (folder / link).is_file()]
-    stems = {"gap", "cells", "state", "torque_fit", "torque_confirm", "torque_sealed"}
+    stems = {"gap", "cells", "state", "torque_train", "torque_validation", "torque_test"}
     stems |= {"shifts", "remainder"} if verdict == "partly explained" else set()
     names = {f"missing_{s}.{kind}" for s in stems for kind in ("png", "pdf")}
     assert {p.name for p in (folder / "figures").iterdir()} == names
@@ -132,7 +134,9 @@ def test_the_tables_hold_the_numbers_of_the_file(named: Path) -> None:
             assert _shown(cells[f"shift:{s['name']}", field], s[key])
     for t in found["trials"]:
         row = f"candidate:{t['round']}:{gap_words.model_words(t['name'])}"
-        assert _shown(cells[row, "gap_fit"], t["gap_fit"]) and _shown(cells[row, "gap_confirm"], t["gap_confirm"])
+        assert _shown(cells[row, "discrepancy_train"], t["discrepancy_train"]) and _shown(
+            cells[row, "discrepancy_validation"], t["discrepancy_validation"]
+        )
         assert _shown(cells[row, "share"], t["chosen"], percent)
         assert _shown(cells[row, "p"], t["p"], lambda v: number(v, 2))
         assert all(gap_words.readable(r, found) in cells[row, "fate"]["text"] for r in t["reasons"])
@@ -143,13 +147,13 @@ def test_the_tables_hold_the_numbers_of_the_file(named: Path) -> None:
 
 def test_the_summary_says_how_large_and_how_sure(named: Path) -> None:
     found, text = read_gap(named).found, read_page(named / "report.html").text.replace("\u00a0", " ")
-    sealed = found["gaps"]["sealed"]
+    sealed = found["gaps"]["test"]
     assert f"was {number(sealed['before'])} before and is {number(sealed['after'])} after" in text
     assert f"numerical floor is {number(found['floor'])}" in text and f"p = {number(found['p'], 2)}" in text
     assert "11 candidate effects were screened" in text and "4 extended models" in text
     for stage, seconds in found["seconds"].items():
         assert f"{stage.replace('_', ' ')} {number(seconds)} s" in text
-    assert "Settings preset quick; fit a.npz; confirm b.npz; recording a.npz" in re.sub(r"\s+", " ", text)
+    assert "Settings preset quick; fit a.npz; validation b.npz; recording a.npz" in re.sub(r"\s+", " ", text)
 
 
 def test_a_floor_that_is_much_of_the_gap_is_said(tmp_path: Path, quick: None) -> None:
@@ -157,7 +161,7 @@ def test_a_floor_that_is_much_of_the_gap_is_said(tmp_path: Path, quick: None) ->
     for share, said in ((0.3, True), (0.01, False)):
         folder = make_gap(tmp_path / str(said), floor=0.0)
         content = json.loads((folder / "gap.json").read_text())
-        content["floor"] = share * content["gaps"]["fit"]["before"]
+        content["floor"] = share * content["gaps"]["train"]["before"]
         (folder / "gap.json").write_text(json.dumps(content))
         text = read_page(page.write_report(folder)).text.replace("\u00a0", " ")
         assert ("a finer timestep would tell more" in text) is said
@@ -172,7 +176,7 @@ def test_what_was_cut_and_an_unknown_floor_are_said(tmp_path: Path, quick: None)
 
 
 def test_a_tie_that_nothing_on_the_menu_separates(tmp_path: Path) -> None:
-    near = read_gap(make_gap(tmp_path / "near", "tie", experiments=[{"what": "another pose", "apart": 2.5}]))
+    near = read_gap(make_gap(tmp_path / "near", "tie", experiments=[{"what": "another pose", "distance": 2.5}]))
     assert "another pose. There the rivals are only 2.50 standard deviations apart" in gap_words.gap_summary(near)[-1]
     none = read_gap(make_gap(tmp_path / "none", "tie", experiments=[]))
     assert "No experiment on the menu" in gap_words.gap_summary(none)[-1]
@@ -184,7 +188,7 @@ def test_significant_but_below_the_floor_is_said(tmp_path: Path) -> None:
 
 
 def test_what_the_fit_does_not_tell_is_said_where_it_is_much(tmp_path: Path) -> None:
-    after = gap_json("named", ("fit", "confirm", "sealed"))["gaps"]["confirm"]["after"]
+    after = gap_json("named", ("train", "validation", "test"))["gaps"]["validation"]["after"]
 
     def said(name: str, **changes: Any) -> str:
         return " ".join(gap_words.gap_summary(read_gap(make_gap(tmp_path / name, "named", **changes))))
@@ -192,9 +196,9 @@ def test_what_the_fit_does_not_tell_is_said_where_it_is_much(tmp_path: Path) -> 
     assert "75 % lies within the uncertainty" in said("much", remainder=0.25 * after).replace("\u00a0", " ")
     for name, remainder in (("little", 0.9 * after), ("unknown", None)):
         assert "lies within the uncertainty" not in said(name, remainder=remainder)
-    gaps = gap_json("named", ("fit", "confirm", "sealed"))["gaps"]
+    gaps = gap_json("named", ("train", "validation", "test"))["gaps"]
     for name, u in (("nothing", 0.0), ("below", -0.006)):  # nothing is left, so that no share of it is anything
-        found = gaps | {"confirm": gaps["confirm"] | {"after": u}}
+        found = gaps | {"validation": gaps["validation"] | {"after": u}}
         assert "lies within the uncertainty" not in said(name, gaps=found, remainder=-0.01)
 
 
@@ -207,13 +211,13 @@ def test_what_leaves_most_of_the_gap_open_is_kept_by_nobody(tmp_path: Path) -> N
         assert NEXT["partly explained"] in said
 
 
-BLOCKS = {"by": "blocks", "limits": "The confirming blocks are of the same motion."}
-HALVES = {"by": "repeats", "limits": "The confirming repeats repeat the fitted motion."}
+BLOCKS = {"by": "blocks", "limits": "The validation blocks are of the same motion."}
+HALVES = {"by": "repeats", "limits": "The validation repeats repeat the fitted motion."}
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)
 def test_a_log_in_blocks_claims_nothing_that_takes_repeats(tmp_path: Path, quick: None, verdict: str) -> None:
-    found = gap_json(verdict, ("fit", "confirm", "sealed"))
+    found = gap_json(verdict, ("train", "validation", "test"))
     cells = {when: [{**c, "found": False} for c in found["cells"][when]] for when in ("before", "after")}
     changes = {"split": BLOCKS, "floor": 0.0, "cells": cells, "experiments": [], "trends": []}
     folder = make_gap(tmp_path / "run", verdict, **changes)
@@ -236,25 +240,27 @@ def test_a_log_is_drawn_in_order_of_time(tmp_path: Path) -> None:
     folder = make_gap(tmp_path / "run", "unexplained", split=BLOCKS)
     arrays = dict(np.load(folder / "gap.npz"))
     whole = {key: arrays[f"fit.{key}"] for key in ("time", "measured", "before")}
-    for role, turn in (("fit", 0), ("confirm", 1)):
+    for role, turn in (("train", 0), ("validation", 1)):
         arrays |= {key: arrays[key][turn::2] for key in arrays if key.startswith(f"{role}.")}
         arrays |= {f"{role}.{key}": values[turn::2] for key, values in whole.items()}
     np.savez(folder / "gap.npz", **arrays)
     sealed, (roles, drawn) = read_gap(folder).sheets
-    assert (sealed[0], roles) == (("sealed",), ("fit", "confirm"))
+    assert (sealed[0], roles) == (("test",), ("train", "validation"))
     for key, values in whole.items():
         np.testing.assert_array_equal(drawn[key], values)
     gap = read_gap(folder)
-    empty = {"variable": gap_words.TIME, "where": "elbow, later 9.0 s", "gap": 0.0, "p": 1.0, "found": False}
-    assert gap_drawings._shown(gap, [empty, {**empty, "gap": 2.0}]) == [{**empty, "gap": 2.0, "found": True}]
+    empty = {"variable": gap_words.TIME, "where": "elbow, later 9.0 s", "discrepancy": 0.0, "p": 1.0, "found": False}
+    assert gap_drawings._shown(gap, [empty, {**empty, "discrepancy": 2.0}]) == [
+        {**empty, "discrepancy": 2.0, "found": True}
+    ]
 
 
 def test_halves_of_the_repeats_say_what_they_cannot_tell(tmp_path: Path, quick: None) -> None:
     folder = make_gap(tmp_path / "run", "partly explained", sealed=False, split=HALVES)
     text = read_page(page.write_report(folder)).text.replace("\u00a0", " ")
-    assert HALVES["limits"] in text and "No recording was kept sealed" in text and "Hatched" in text
+    assert HALVES["limits"] in text and "No recording was kept as test data" in text and "Hatched" in text
     assert "not confirmed by the other repeats (p = 0.12)" in text and "other demonstration" not in text
-    assert [r for r, _ in read_gap(folder).sheets] == [("confirm",), ("fit",)]
+    assert [r for r, _ in read_gap(folder).sheets] == [("validation",), ("train",)]
 
 
 def test_an_inverse_replay_has_no_floor(tmp_path: Path, quick: None) -> None:
@@ -265,12 +271,12 @@ def test_an_inverse_replay_has_no_floor(tmp_path: Path, quick: None) -> None:
 
 def test_a_sealed_recording_that_blew_up_was_kept_all_the_same(tmp_path: Path, quick: None) -> None:
     folder = make_gap(
-        tmp_path / "run", "named", sealed=False, failed=["drag", "the fitted model on the sealed recording"]
+        tmp_path / "run", "named", sealed=False, failed=["drag", "the fitted model on the test recording"]
     )
     text = read_page(page.write_report(folder)).text
-    assert "since the sealed one could not be replayed" in text and "The sealed recording could not be replayed" in text
-    assert "blew up with it: " in text and "the fitted model on the sealed recording" not in text
-    assert "kept sealed" not in text
+    assert "since the test one could not be replayed" in text and "The test recording could not be replayed" in text
+    assert "blew up with it: " in text and "the fitted model on the test recording" not in text
+    assert "kept as test data" not in text
 
 
 def test_what_is_left_at_some_position_alone_is_a_place_too(tmp_path: Path) -> None:
@@ -279,7 +285,7 @@ def test_what_is_left_at_some_position_alone_is_a_place_too(tmp_path: Path) -> N
     (cell,) = [c for c in found["after"] if c["variable"] == "position of panda_joint2"][:1] or [
         {**found["after"][-1], "variable": "position of panda_joint2", "where": "0.10 to 0.20 rad"}
     ]
-    cells = [{**c, "found": False} for c in found["after"]] + [{**cell, "gap": 3.0, "found": True}]
+    cells = [{**c, "found": False} for c in found["after"]] + [{**cell, "discrepancy": 3.0, "found": True}]
     folder = make_gap(tmp_path / "run", "unexplained", cells={**found, "after": cells})
     text = gap_words.gap_summary(read_gap(folder))[-1]
     assert f"where the most is left: position of joint 2 {gap_words.span_words(cell['where'])}." in text
@@ -302,13 +308,19 @@ def test_candidates_say_what_became_of_them(tmp_path: Path) -> None:
     assert [r.name for r in one.tried][:2] == ["latch at door hinge", "hinge stribeck at door hinge"]
     assert one.tried[0].kept and one.tried[0].fate == "in the model"
     assert not any(r.kept for r in (*one.tried[1:], *two.tried))
-    assert (one.gap_fit, one.gap_confirm) == tuple(found["gaps"][r]["before"] for r in ("fit", "confirm"))
+    assert (one.discrepancy_train, one.discrepancy_validation) == tuple(
+        found["gaps"][r]["before"] for r in ("train", "validation")
+    )
     assert two.beside == "latch at door hinge"
     assert [r.name for r in two.tried] == ["latch at door hinge + door closer at door hinge"]
-    assert (two.tried[0].t, two.gap_fit, two.p) == (2.4 * 0.8**2, found["trials"][0]["gap_fit"], 0.412)
+    assert (two.tried[0].t, two.discrepancy_train, two.p) == (
+        2.4 * 0.8**2,
+        found["trials"][0]["discrepancy_train"],
+        0.412,
+    )
     assert (len(one.others), len(two.others)) == (7, 9)
     ties = groups(read_gap(make_gap(tmp_path / "tie", "tie")).found)[0].tried
-    assert [r.fate for r in ties[:2]] == ["in the model, and others do as well", "does as well: a tie"]
+    assert [r.fate for r in ties[:2]] == ["in the model, and others do as well", "is equivalent: a tie"]
 
 
 @pytest.mark.parametrize(
@@ -321,8 +333,8 @@ def test_candidates_say_what_became_of_them(tmp_path: Path) -> None:
     ],
 )
 def test_what_passed_and_was_not_named_says_why(tmp_path: Path, verdict: str, name: str, gap: float, fate: str) -> None:
-    found = gap_json("unexplained", ("fit", "confirm")) | {"verdict": verdict}
-    passed = {**found["trials"][0], "name": name, "gap_confirm": gap, "passed": True, "reasons": []}
+    found = gap_json("unexplained", ("train", "validation")) | {"verdict": verdict}
+    passed = {**found["trials"][0], "name": name, "discrepancy_validation": gap, "passed": True, "reasons": []}
     found["trials"] = [*found["trials"][1:], {**passed, "round": name.count(" + ")}]
     read = read_gap(make_gap(tmp_path / "run", **found))
     assert [r.fate for g in groups(read.found) for r in g.tried if r.trial and r.trial["passed"]] == [fate]
@@ -331,20 +343,20 @@ def test_what_passed_and_was_not_named_says_why(tmp_path: Path, verdict: str, na
 
 
 def test_pairs_tried_from_scratch_stand_beside_those_that_grew(tmp_path: Path) -> None:
-    found = gap_json("partly explained", ("fit", "confirm"))
+    found = gap_json("partly explained", ("train", "validation"))
     grown = next(t for t in found["trials"] if t["round"] == 1)
     other = {**grown, "name": f"{STRIBECK} + {CLOSER}", "passed": True, "reasons": []}
-    found["trials"] += [{**grown, "passed": True, "reasons": [], "gap_confirm": 0.5}, other]
+    found["trials"] += [{**grown, "passed": True, "reasons": [], "discrepancy_validation": 0.5}, other]
     found["screens"].append(found["screens"][0])
-    found |= {"effects": [LATCH, CLOSER], "tied": [[STRIBECK], []]}
+    found |= {"effects": [LATCH, CLOSER], "indistinguishable": [[STRIBECK], []]}
     one, two = groups(read_gap(make_gap(tmp_path / "run", **found)).found)
-    assert [(r.fate, r.trial["gap_confirm"]) for r in two.tried if r.trial] == [
+    assert [(r.fate, r.trial["discrepancy_validation"]) for r in two.tried if r.trial] == [
         ("in the model, and others do as well", 0.5),
-        ("does as well: a tie", 2.4),
+        ("is equivalent: a tie", 2.4),
     ]
     assert two.tried[1].name == "hinge stribeck at door hinge + door closer at door hinge" and two.tried[1].t is None
     assert one.tried[0].kept and two.tried[0].kept and not two.tried[1].kept
-    whole = {**found, "tied": [[f"{STRIBECK} + {CLOSER}"], []]}
+    whole = {**found, "indistinguishable": [[f"{STRIBECK} + {CLOSER}"], []]}
     text = gap_words.readable(f"one of: {LATCH} or {STRIBECK} + {CLOSER}", whole)
     assert text == "one of: latch at door hinge or hinge stribeck at door hinge + door closer at door hinge"
 
@@ -354,7 +366,7 @@ def test_one_page_for_a_folder_with_both(tmp_path: Path) -> None:
     folder = make_gap(make_run(tmp_path / "run"), "named")
     html = page.write_report(folder).read_text(encoding="utf-8")
     written = read_page(folder / "report.html")
-    assert ("hinge_stiffness", "mean") in written.cells and ("gap:sealed", "after") in written.cells
+    assert ("hinge_stiffness", "mean") in written.cells and ("gap:test", "after") in written.cells
     ids = re.findall(r'\bid="([^"]+)"', html)
     assert len(ids) == len(set(ids))
     used = set(re.findall(r'(?:url\(#|href="#)([^")]+)', html))
@@ -367,15 +379,18 @@ def test_one_page_for_a_folder_with_both(tmp_path: Path) -> None:
     [
         (lambda f: f.pop("floor"), r"gap.json lacks 'floor'"),
         (lambda f: f["trials"][2].pop("p"), r"gap.json: 'trials', entry 2 lacks 'p'"),
-        (lambda f: f["gaps"].pop("confirm"), r"'gaps' lacks 'confirm'"),
-        (lambda f: f["gaps"]["fit"].update(before="4"), r"'gaps', 'fit', 'before' must be a number or null, got '4'"),
+        (lambda f: f["gaps"].pop("validation"), r"'gaps' lacks 'validation'"),
+        (
+            lambda f: f["gaps"]["train"].update(before="4"),
+            r"'gaps', 'train', 'before' must be a number or null, got '4'",
+        ),
         (lambda f: f["cells"].update(after={}), r"'cells', 'after' must be a list, got {}"),
         (lambda f: f.update(verdict="maybe"), r"'verdict' must be one of none, named.*got 'maybe'"),
         (lambda f: f.update(remainder="much"), r"'remainder' must be a number or null, got 'much'"),
         (lambda f: f.update(split={"by": "halves", "limits": ""}), r"'by' must be one of recordings.*got 'halves'"),
         (lambda f: f["about"]["latch"].pop("mark"), r"'about', 'latch' lacks 'mark'"),
         (lambda f: f.update(split={"by": "blocks"}), r"'split' lacks 'limits'"),
-        (lambda f: f.update(tied=[[], []]), r"'tied' has 2 lists for 1 effects"),
+        (lambda f: f.update(indistinguishable=[[], []]), r"'indistinguishable' has 2 lists for 1 effects"),
     ],
 )
 def test_a_damaged_file_is_named(tmp_path: Path, break_it: Callable[[dict[str, Any]], Any], message: str) -> None:
@@ -408,18 +423,18 @@ def test_a_missing_or_broken_file_is_named(tmp_path: Path, name: str, content: b
 def test_a_wrong_shape_is_named(tmp_path: Path) -> None:
     folder = make_gap(tmp_path / "run")
     arrays = dict(np.load(folder / "gap.npz"))
-    arrays["confirm.after"] = arrays["confirm.after"][:-1]
+    arrays["validation.after"] = arrays["validation.after"][:-1]
     np.savez(folder / "gap.npz", **arrays)
-    with pytest.raises(ValueError, match=r"confirm\.after must be .*\(204, 7\).*\(203, 7\)"):
+    with pytest.raises(ValueError, match=r"validation\.after must be .*\(204, 7\).*\(203, 7\)"):
         read_gap(folder)
 
 
 def test_words_agree_with_the_search() -> None:
     from droid_jax.discrepancy import select
     from droid_jax.discrepancy.split import Split
-    from droid_jax.discrepancy.verdict import Kind
+    from droid_jax.discrepancy.verdict import Conclusion
 
-    assert {k.value for k in Kind} == set(VERDICTS)
+    assert {k.value for k in Conclusion} == set(VERDICTS)
     assert {s.value for s in Split} == set(PARTS)
     assert gap_words.OTHER in Path(select.__file__).read_text(encoding="utf-8")
 
@@ -464,7 +479,7 @@ def test_a_form_that_does_not_fit_is_said_with_the_answer(tmp_path: Path, quick:
     doubt = "the form of latch at door_hinge does not fit: latch_width at its lower bound, 0.01 rad"
     sentence = f"The model lacks: {LATCH}. But {doubt}."
     shapes = [
-        {**gap_json("named", ("fit",))["shapes"][0], "value": 0.01, "low": 0.01, "high": 0.0143, "bound": "lower"}
+        {**gap_json("named", ("train",))["shapes"][0], "value": 0.01, "low": 0.01, "high": 0.0143, "bound": "lower"}
     ]
     text = page.write_report(make_gap(tmp_path, sentence=sentence, doubts=[doubt], shapes=shapes)).read_text()
     assert "the form of latch at door hinge does not fit: latch width at its lower bound, 0.01 rad" in text
@@ -473,7 +488,7 @@ def test_a_form_that_does_not_fit_is_said_with_the_answer(tmp_path: Path, quick:
 
 def test_what_failed_by_itself_and_is_in_the_model_beside_others_is_no_contradiction(tmp_path: Path) -> None:
     """Its interval in the final model leaves zero out, and in the model without the others it did not."""
-    found = gap_json("named", ("fit", "confirm")) | {"effects": [LATCH, CLOSER], "tied": [[], []]}
+    found = gap_json("named", ("train", "validation")) | {"effects": [LATCH, CLOSER], "indistinguishable": [[], []]}
     alone = {
         **found["trials"][0],
         "passed": False,
@@ -495,8 +510,8 @@ def test_settings_are_those_that_a_person_reads(tmp_path: Path) -> None:
 def test_a_hint_is_no_name(tmp_path: Path, quick: None) -> None:
     """What closes a third and leaves the rest is told as a hint, on the page and of its trial."""
     said = f"The model lacks something that is not in the library. Hints, not names: {LATCH} (closes 31%)."
-    hints = [{"effects": [LATCH], "tied": [[]], "closed": {"confirm": 0.31}}]
-    trials = gap_json("partly explained", ("fit", "confirm"))["trials"]
+    hints = [{"effects": [LATCH], "indistinguishable": [[]], "closed": {"validation": 0.31}}]
+    trials = gap_json("partly explained", ("train", "validation"))["trials"]
     folder = make_gap(
         tmp_path, "unexplained", sentence=said, hints=hints, thresholds={"least_closed": 0.4}, trials=trials
     )
@@ -509,8 +524,12 @@ def test_a_hint_is_no_name(tmp_path: Path, quick: None) -> None:
 
 def test_an_amendment_that_is_not_there_is_said(tmp_path: Path, quick: None) -> None:
     experiments = [
-        {"what": "the same motion twice as fast", "apart": 7.1, "not_made": ""},
-        {"what": "the same motion three times slower", "apart": None, "not_made": "a stretch that no repeat measured"},
+        {"what": "the same motion twice as fast", "distance": 7.1, "not_made": ""},
+        {
+            "what": "the same motion three times slower",
+            "distance": None,
+            "not_made": "a stretch that no repeat measured",
+        },
     ]
     states = {"experiments": "made", "final_refit": "not made: the fit to both motions did not converge"}
     folder = make_gap(tmp_path, "tie", experiments=experiments, amendments=states)

@@ -27,7 +27,7 @@ def run(whole: Path, stage: str, last: bool = True, files: dict[str, str] | None
 
 def whole_run(place: Path, robot: str = "one") -> Path:
     run(place, "identify", recordings_sha256=[robot], files={GAUSSIAN: robot})
-    gap = run(place, "gap", recordings_sha256=[robot, "sealed"], files={EXTENDED: robot})
+    gap = run(place, "gap", recordings_sha256=[robot, "test"], files={EXTENDED: robot})
     run(place, "train", fit=str(gap), fit_sha256=fingerprint(gap))
     return place
 
@@ -40,7 +40,7 @@ def test_what_was_made_together_belongs_together(tmp_path: Path):
 def test_stages_of_an_earlier_robot_are_left_over(tmp_path: Path):
     run(whole_run(tmp_path), "identify", recordings_sha256=["two"])
     assert left_over(tmp_path) == {"gap", "train"}
-    run(tmp_path, "gap", recordings_sha256=["two", "sealed"], files={EXTENDED: "two"})
+    run(tmp_path, "gap", recordings_sha256=["two", "test"], files={EXTENDED: "two"})
     assert left_over(tmp_path) == {"train"}  # of another model now
 
 

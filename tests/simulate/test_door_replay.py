@@ -22,7 +22,7 @@ from droid_jax.recordings.recording import Channel, Recording
 from droid_jax.simulate import c_reference as twin
 from droid_jax.simulate.batching import over_population
 from droid_jax.simulate.c_engine import Trace, instrument, simulate
-from droid_jax.simulate.c_reference import twin_replay
+from droid_jax.simulate.c_reference import c_replay
 from droid_jax.simulate.replay import Drive, make_drive, servo_replay, torque_offset_effect
 
 
@@ -66,7 +66,7 @@ def in_mjx(scene: Scene, space: Space, drive: Drive, rows: np.ndarray) -> Rollou
 
 @pytest.fixture(scope="module")
 def in_c(scene: Scene, space: Space, drive: Drive, rows: np.ndarray) -> Rollout:
-    return twin_replay(scene, space, drive)(rows)
+    return c_replay(scene, space, drive)(rows)
 
 
 def rms(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -123,7 +123,7 @@ def test_half_a_step_of_delay_serves_the_c_engine_in_free_motion(
 ):
     """Up to the grasp its error falls by more than half; after it, the contact's own error is larger."""
     monkeypatch.setattr(twin, "control_of", lambda drive, offset, late: drive.command)
-    plain = twin_replay(scene, space, drive)(rows[:1])
+    plain = c_replay(scene, space, drive)(rows[:1])
     free = slice(0, 700)
     with_delay = rms(in_c.torque[:1, free], fine.torque[:1, free])
     without = rms(plain.torque[:, free], fine.torque[:1, free])

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from droid_jax.cost.cost import make_cost
-from droid_jax.identify.pipeline import IdentifyConfig, identify
+from droid_jax.identify.pipeline import IdentifyConfig, identify_parameters
 from droid_jax.identify.search import SearchConfig
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.fields import joint_damping, joint_frictionloss
@@ -139,7 +139,7 @@ def test_friction_and_damping_of_a_hinge_that_holds(seed: int):
     scene, space = studied()
     recording, truth = recorded(seed, "a")
     assert truth == drawn(np.random.default_rng([seed, 0]))
-    found = identify(
+    found = identify_parameters(
         scene, space, [recording], config=IdentifyConfig(search=SearchConfig(population=16, generations=8))
     )
     deviations = found.full_gaussian.interval(0.9)

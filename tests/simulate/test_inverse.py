@@ -17,7 +17,7 @@ from droid_jax.cost.cost import make_cost
 from droid_jax.door.builtin import ARM
 from droid_jax.door.scene import door_scene
 from droid_jax.door.space import torque_offsets
-from droid_jax.identify.holdout import split
+from droid_jax.identify.holdout import split_repeats
 from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.fields import body_mass, joint_damping
 from droid_jax.model.parameters import Space
@@ -265,7 +265,7 @@ def test_a_part_of_a_log_keeps_what_stands_still():
     whole = standing({"torso": 0.7, "arm": 0.0})
     part = whole.window(2.0, 3.0)
     assert part.qpos0["torso"] == 0.7 and part.qpos0["arm"] == pytest.approx(0.3 * np.sin(4.0), abs=1e-3)
-    fitted, held, _ = split(whole, 0.3)
+    fitted, held, _ = split_repeats(whole, 0.3)
     assert fitted.qpos0["torso"] == held.qpos0["torso"] == 0.7
 
 

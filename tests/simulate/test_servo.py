@@ -24,8 +24,15 @@ from droid_jax.model.physics import make_physics
 from droid_jax.model.scene import Scene, compile_scene, with_options
 from droid_jax.recordings.recording import Channel, ServoGains, TorqueConvention, TorqueSide
 from droid_jax.simulate.batching import over_population
-from droid_jax.simulate.c_reference import twin_replay
-from droid_jax.simulate.replay import Drive, check_gains, make_drive, observed, servo_replay, torque_offset_effect
+from droid_jax.simulate.c_reference import c_replay
+from droid_jax.simulate.replay import (
+    Drive,
+    apply_sensor_model,
+    check_gains,
+    make_drive,
+    servo_replay,
+    torque_offset_effect,
+)
 
 SPACE = Space(
     (time_offset(), *torque_offsets(JOINTS), joint_damping(arm(), "elbow", name="elbow_damping", std=0.1, high=50.0))
@@ -153,7 +160,7 @@ def test_parity_replay_is_mj_step(scene: Scene, drive: Drive):
 
 
 def test_the_twin_is_mj_step(scene: Scene, drive: Drive):
-    got = twin_replay(scene, SPACE, drive)(SPACE.mean[None])
+    got = c_replay(scene, SPACE, drive)(SPACE.mean[None])
     position, velocity, torque = c_rollout(scene, drive, delay=0.001)
     np.testing.assert_allclose(got.torque[0], torque, atol=1e-12)
     np.testing.assert_allclose(got.position[0], position + 0.001 * velocity, atol=1e-12)
@@ -162,14 +169,14 @@ def test_the_twin_is_mj_step(scene: Scene, drive: Drive):
 
 
 def test_the_twin_tells_what_the_parity_replay_tells(scene: Scene, drive: Drive):
-    twin, parity = twin_replay(scene, SPACE, drive)(SPACE.mean[None]), run(scene, drive, [{}], parity=True)
+    twin, parity = c_replay(scene, SPACE, drive)(SPACE.mean[None]), run(scene, drive, [{}], parity=True)
     for channel in ("torque", "position", "velocity"):
         np.testing.assert_allclose(getattr(twin, channel)[0, :-1], getattr(parity, channel)[0, :-1], atol=5e-5)
 
 
 def test_without_delay_both_tell_what_mj_step_logs(scene: Scene, drive: Drive):
     logged = c_rollout(scene, drive, delay=0.0)
-    twin = twin_replay(scene, SPACE, drive, late=0.0)(SPACE.mean[None])
+    twin = c_replay(scene, SPACE, drive, late=0.0)(SPACE.mean[None])
     mjx = run(scene, drive, [{}], parity=True, late=0.0)
     for rollout, atol in ((twin, (1e-12, 1e-12, 1e-12)), (mjx, (2e-6, 1e-4, 5e-5))):
         told = (rollout.position[0], rollout.velocity[0], rollout.torque[0])
@@ -217,15 +224,15 @@ def test_the_replay_is_closer_to_the_continuous_arm_than_the_c_engine(scene: Sce
 
 def test_a_files_own_sensors_do_not_disturb_the_twin(scene: Scene, drive: Drive):
     busy = arm(sensor='<jointpos joint="elbow"/><actuatorfrc actuator="s"/>')
-    expected = twin_replay(scene, SPACE, drive)(SPACE.mean[None])
-    got = twin_replay(busy, SPACE, drive)(SPACE.mean[None])
+    expected = c_replay(scene, SPACE, drive)(SPACE.mean[None])
+    got = c_replay(busy, SPACE, drive)(SPACE.mean[None])
     np.testing.assert_array_equal(got.torque, expected.torque)
     np.testing.assert_array_equal(got.position, expected.position)
 
 
 def test_the_twin_keeps_every_option(drive: Drive):
     light = with_options(arm(gravcomp=False), gravity=[0.0, 0.0, -1.6])
-    got = twin_replay(light, SPACE, drive)(SPACE.mean[None])
+    got = c_replay(light, SPACE, drive)(SPACE.mean[None])
     np.testing.assert_allclose(got.torque[0], c_rollout(light, drive, delay=0.001)[2], atol=1e-12)
 
 
@@ -419,10 +426,10 @@ def test_command_effects_act_one_after_the_other(scene: Scene, drive: Drive):
 def test_the_twin_refuses_what_it_cannot_run(scene: Scene, drive: Drive):
     kick = Effect("kick", force=lambda theta, state: state.qvel)
     with pytest.raises(ValueError, match="cannot run effects that depend on the state: kick"):
-        twin_replay(scene, SPACE, drive, [kick])
+        c_replay(scene, SPACE, drive, [kick])
     for convention in (TorqueConvention(TorqueSide.LINK, False), TorqueConvention(TorqueSide.MOTOR, True)):
         with pytest.raises(ValueError, match="the actuators' torque alone: motor-side"):
-            twin_replay(scene, SPACE, replace(drive, torque=convention))
+            c_replay(scene, SPACE, replace(drive, torque=convention))
 
 
 # ----- a cost over such replays
@@ -465,7 +472,7 @@ def test_gains_must_match(scene: Scene):
         with pytest.raises(ValueError, match="servo gain of 30 for elbow, the scene has 25"):
             check(scene, wrong)
     with pytest.raises(ValueError, match="servo gain of 30 for elbow"):
-        twin_replay(scene, SPACE, wrong)
+        c_replay(scene, SPACE, wrong)
     check_gains(scene, make_drive(scene, recording(gains=None)))
 
 
@@ -544,10 +551,10 @@ def test_a_replay_that_blows_up_costs_the_penalty_and_harms_no_other(engine: str
 @pytest.mark.parametrize("trace", ["torque", "position", "velocity", "object_angle"])
 def test_a_rollout_with_a_number_that_is_none_is_not_finite(trace: str):
     still = Rollout(*np.zeros((7, 5, 2)))
-    assert observed(still, {}, ()).finite
+    assert apply_sensor_model(still, {}, ()).finite
     broken = getattr(still, trace).copy()
     broken[3, 1] = np.inf
-    assert not observed(replace(still, **{trace: broken}), {}, ()).finite
+    assert not apply_sensor_model(replace(still, **{trace: broken}), {}, ()).finite
 
 
 def test_actuators_with_a_state_of_their_own_are_refused(tmp_path: Path):

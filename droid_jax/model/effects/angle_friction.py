@@ -25,9 +25,9 @@ def angle_friction(scene: Scene) -> Effect | None:
         "angle_friction",
         (a.amplitude(SLOPE, "N m/rad", 0.5, 5.0), a.amplitude(CURVE, "N m/rad^2", 0.5, 5.0)),
         frictionloss=frictionloss,
-        what="dry friction of the hinge that changes with the door's angle",
-        mark="hysteresis over the angle: opening and closing differ more at some angles",
+        description="dry friction of the hinge that changes with the door's angle",
+        signature="hysteresis over the angle: opening and closing differ more at some angles",
         confused_with=("hardening_spring", "hinge_directional"),
-        places={joint: (SLOPE, CURVE)},
-        smallest=0.1,
+        locations={joint: (SLOPE, CURVE)},
+        minimum_size=0.1,
     )

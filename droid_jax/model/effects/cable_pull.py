@@ -27,10 +27,10 @@ def cable_pull(scene: Scene) -> Effect | None:
         "cable_pull",
         (*a.of_joints(STIFFNESS, joints, "N m/rad", 0.5, 10.0), *a.of_joints(PULL, joints, "N m", 0.3, 5.0)),
         force=force,
-        what="a cable or hose that pulls on a joint of the arm",
-        mark="smooth in the position of one joint, the same at every speed",
+        description="a cable or hose that pulls on a joint of the arm",
+        signature="smooth in the position of one joint, the same at every speed",
         confused_with=("payload", "torque_bias"),
-        holds=("torque_bias",),  # a pull that does not change with the angle
-        places=a.places(joints, STIFFNESS, PULL),
-        smallest=0.1,
+        special_cases=("torque_bias",),  # a pull that does not change with the angle
+        locations=a.places(joints, STIFFNESS, PULL),
+        minimum_size=0.1,
     )

@@ -20,9 +20,9 @@ def contact_compliance(scene: Scene) -> Effect | None:
     return Effect(
         "contact_compliance",
         (Parameter(SOFTNESS, "-", 0.0, 0.5, -0.5, 12.0, writes=writes, group=a.GROUP),),
-        what="fingertips or a knob that give way more than the model's",
-        mark="grasp and breakaway, the peaks of the load",
+        description="fingertips or a knob that give way more than the model's",
+        signature="grasp and breakaway, the peaks of the load",
         confused_with=("hinge_stribeck", "joint_compliance"),
-        places={"grip": (SOFTNESS,)},
-        smallest=0.2,
+        locations={"grip": (SOFTNESS,)},
+        minimum_size=0.2,
     )

@@ -22,11 +22,11 @@ def command_delay(scene: Scene) -> Effect | None:
         COMMAND,
         (a.amplitude(COMMAND, "s", 0.005, 0.05, low=-0.01),),
         command=lambda theta, time, look: look(time - a.value(theta, COMMAND)),
-        what="commands that reach the servo late",
-        mark="all joints, in proportion to the commanded speed; torques and positions shift together",
+        description="commands that reach the servo late",
+        signature="all joints, in proportion to the commanded speed; torques and positions shift together",
         confused_with=(SENSOR, "servo_gain"),
-        places={"commands": (COMMAND,)},
-        smallest=0.001,
+        locations={"commands": (COMMAND,)},
+        minimum_size=0.001,
     )
 
 
@@ -48,9 +48,9 @@ def sensor_delay(scene: Scene) -> Effect | None:
         SENSOR,
         (a.amplitude(SENSOR, "s", 0.005, 0.05, low=-0.01),),
         observe=observe,
-        what="torques that are recorded late",
-        mark="all joints, where torques change fast; positions stay",
+        description="torques that are recorded late",
+        signature="all joints, where torques change fast; positions stay",
         confused_with=(COMMAND,),
-        places={"sensors": (SENSOR,)},
-        smallest=0.001,
+        locations={"sensors": (SENSOR,)},
+        minimum_size=0.001,
     )

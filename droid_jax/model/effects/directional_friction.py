@@ -24,11 +24,11 @@ def joint_directional(scene: Scene) -> Effect | None:
         JOINT,
         a.of_joints(JOINT, joints, "N m", 0.2, 2.0),
         frictionloss=frictionloss,
-        what="dry friction of a joint of the arm that differs between its two directions",
-        mark="an offset that comes and goes with the direction of that joint",
+        description="dry friction of a joint of the arm that differs between its two directions",
+        signature="an offset that comes and goes with the direction of that joint",
         confused_with=("joint_coulomb", "torque_bias"),
-        places=a.places(joints, JOINT),
-        smallest=0.03,
+        locations=a.places(joints, JOINT),
+        minimum_size=0.03,
     )
 
 
@@ -48,9 +48,9 @@ def hinge_directional(scene: Scene) -> Effect | None:
         HINGE,
         (a.amplitude(HINGE, "N m", 0.3, 3.0),),
         frictionloss=frictionloss,
-        what="dry friction of the hinge that differs between opening and closing",
-        mark="a step at the door's reversals",
+        description="dry friction of the hinge that differs between opening and closing",
+        signature="a step at the door's reversals",
         confused_with=("hinge_preload", "angle_friction"),
-        places={joint: (HINGE,)},
-        smallest=0.05,
+        locations={joint: (HINGE,)},
+        minimum_size=0.05,
     )

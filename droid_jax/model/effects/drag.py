@@ -23,9 +23,9 @@ def drag(scene: Scene) -> Effect | None:
         DRAG,
         (a.amplitude(DRAG, "N m s^2/rad^2", 0.5, 20.0, low=0.0),),
         force=force,
-        what="drag of the door that grows with the square of its speed",
-        mark="the contrast between fast and slow stretches",
+        description="drag of the door that grows with the square of its speed",
+        signature="the contrast between fast and slow stretches",
         confused_with=("door_closer", "opening_check"),
-        places={joint: (DRAG,)},
-        smallest=0.1,
+        locations={joint: (DRAG,)},
+        minimum_size=0.1,
     )

@@ -13,17 +13,17 @@ LENGTHS = (("(N m)", "N"), (TORQUE, "N"), ("rad", "m"), ("turn", "(2 pi m)"))  #
 
 
 def sized(effect: Effect, scene: Scene, scale: float) -> Effect:
-    """An effect whose forces and torques are `scale` times the library's: priors, bounds and the size worth a name.
+    """An effect whose forces and torques are `scale` times the library's: priors, bounds and the minimum effect size.
 
     Amplitudes that are no torques (masses, gains, delays) stay as they are.  At slides a torque is a force, in N, and
     an angle a way, in m; shapes are in these units where all places of the effect are slides.
     """
-    of = {name: place for place, names in effect.places.items() for name in names}
+    of = {name: place for place, names in effect.locations.items() for name in names}
     slides = {name: _is_slide(scene, place) for name, place in of.items()}
     shapes = bool(slides) and all(slides.values())
     torques = {p.name for p in effect.parameters if p.name in of and p.unit.startswith(TORQUE)}
     parameters = (_sized(p, scale if p.name in torques else 1.0, slides.get(p.name, shapes)) for p in effect.parameters)
-    return replace(effect, parameters=tuple(parameters), smallest=effect.smallest * (scale if torques else 1.0))
+    return replace(effect, parameters=tuple(parameters), minimum_size=effect.minimum_size * (scale if torques else 1.0))
 
 
 def _sized(p: Parameter, scale: float, slide: bool) -> Parameter:

@@ -32,11 +32,11 @@ def encoder_offset(scene: Scene) -> Effect | None:
     return Effect(
         ENCODER,
         tuple(parameter(j) for j in joints),
-        what="an encoder whose zero is not the model's",
-        mark="weight that goes by another angle of one joint, and inertia with it",
+        description="an encoder whose zero is not the model's",
+        signature="weight that goes by another angle of one joint, and inertia with it",
         confused_with=("gravity_direction", "payload", "cable_pull", "torque_bias"),
-        places=a.places(joints, ENCODER),
-        smallest=2e-3,
+        locations=a.places(joints, ENCODER),
+        minimum_size=2e-3,
     )
 
 

@@ -42,11 +42,11 @@ def gravity_direction(scene: Scene) -> Effect | None:
         "gravity_direction",
         tuple(a.amplitude(name, "rad", 0.01, 0.1) for name in names),
         force=force,
-        what="a base that is not level, which the gravity compensation takes for upright",
-        mark="all joints that carry weight, smooth in their angles, the same at every speed",
+        description="a base that is not level, which the gravity compensation takes for upright",
+        signature="all joints that carry weight, smooth in their angles, the same at every speed",
         confused_with=("encoder_offset", "payload", "cable_pull", "torque_bias"),
-        places={"base": tuple(names)},
-        smallest=2e-3,
+        locations={"base": tuple(names)},
+        minimum_size=2e-3,
     )
 
 

@@ -24,9 +24,9 @@ def hardening_spring(scene: Scene) -> Effect | None:
         "hardening_spring",
         (a.amplitude(SQUARE, "N m/rad^2", 0.5, 5.0), a.amplitude(CUBE, "N m/rad^3", 0.5, 5.0)),
         force=force,
-        what="a hinge spring that gets stiffer the further the door opens",
-        mark="late in the opening, the same at every speed and in both directions",
+        description="a hinge spring that gets stiffer the further the door opens",
+        signature="late in the opening, the same at every speed and in both directions",
         confused_with=("tilted_frame", "opening_check", "angle_friction"),
-        places={joint: (SQUARE, CUBE)},
-        smallest=0.1,
+        locations={joint: (SQUARE, CUBE)},
+        minimum_size=0.1,
     )

@@ -25,9 +25,9 @@ def hinge_preload(scene: Scene) -> Effect | None:
         (a.amplitude(NAME, "N m", 0.5, 5.0),),
         force=lambda theta, state: a.at_dof(scene, joint, -a.value(theta, NAME)),
         native=native,
-        what="a constant torque that closes (or opens) the door",
-        mark="the whole opening, the same at every angle and speed",
+        description="a constant torque that closes (or opens) the door",
+        signature="the whole opening, the same at every angle and speed",
         confused_with=("tilted_frame", "over_centre_spring"),
-        places={joint: (NAME,)},
-        smallest=0.05,
+        locations={joint: (NAME,)},
+        minimum_size=0.05,
     )

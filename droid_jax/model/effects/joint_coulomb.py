@@ -26,9 +26,9 @@ def joint_coulomb(scene: Scene) -> Effect | None:
         a.of_joints(LOSS, joints, "N m", 0.3, 5.0, low=0.0),
         frictionloss=frictionloss,
         native=native,
-        what="dry friction in a joint of the arm",
-        mark="a step at every reversal of that joint, in all phases",
+        description="dry friction in a joint of the arm",
+        signature="a step at every reversal of that joint, in all phases",
         confused_with=("joint_stribeck", "joint_directional", "load_friction"),
-        places=a.places(joints, LOSS),
-        smallest=0.03,
+        locations=a.places(joints, LOSS),
+        minimum_size=0.03,
     )

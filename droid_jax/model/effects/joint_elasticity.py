@@ -108,11 +108,11 @@ def joint_compliance(scene: Scene) -> Effect | None:
         COMPLIANCE,
         tuple(parameter(j, float(k)) for j, k in zip(servos.joints, servos.stiffness, strict=True)),
         servo=servo,
-        what="an elastic gear between motor and link",
-        mark="tracking error in proportion to load",
+        description="an elastic gear between motor and link",
+        signature="tracking error in proportion to load",
         confused_with=("servo_gain", "torque_gain"),
-        places=a.places(servos.joints, COMPLIANCE),
-        smallest=2e-5,
+        locations=a.places(servos.joints, COMPLIANCE),
+        minimum_size=2e-5,
     )
 
 
@@ -133,9 +133,9 @@ def joint_backlash(scene: Scene) -> Effect | None:
         BACKLASH,
         a.of_joints(BACKLASH, servos.joints, "rad", 2e-3, 2e-2, low=-2e-3),
         servo=servo,
-        what="backlash in a joint's gear",
-        mark="a step where the load of that joint changes sign",
+        description="backlash in a joint's gear",
+        signature="a step where the load of that joint changes sign",
         confused_with=("joint_coulomb", "joint_compliance"),
-        places=a.places(servos.joints, BACKLASH),
-        smallest=3e-4,
+        locations=a.places(servos.joints, BACKLASH),
+        minimum_size=3e-4,
     )

@@ -24,9 +24,9 @@ def load_friction(scene: Scene) -> Effect | None:
         SHARE,
         a.of_joints(SHARE, joints, "-", 0.05, 1.0, low=0.0),
         frictionloss=frictionloss,
-        what="friction of a joint of the arm that grows with its load",
-        mark="steps at that joint's reversals that grow with its torque",
+        description="friction of a joint of the arm that grows with its load",
+        signature="steps at that joint's reversals that grow with its torque",
         confused_with=("joint_coulomb", "torque_gain"),
-        places=a.places(joints, SHARE),
-        smallest=0.01,
+        locations=a.places(joints, SHARE),
+        minimum_size=0.01,
     )

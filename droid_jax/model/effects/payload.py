@@ -45,11 +45,11 @@ def payload(scene: Scene) -> Effect | None:
         "payload",
         parameters,
         force=weighs,
-        what="a tool or load that the arm's controller does not know of",
-        mark="free motion: all joints in proportion to their lever",
+        description="a tool or load that the arm's controller does not know of",
+        signature="free motion: all joints in proportion to their lever",
         confused_with=("torque_bias", "cable_pull"),
-        places={last: tuple(p.name for p in parameters)},
-        smallest=0.02,
+        locations={last: tuple(p.name for p in parameters)},
+        minimum_size=0.02,
         native=lambda values, model: None if values.get(MOMENT) else {},  # a mass alone is written as such
     )
 

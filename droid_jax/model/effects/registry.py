@@ -45,7 +45,7 @@ def registered() -> tuple[str, ...]:
 def library(scene: Scene, names: Iterable[str] | None = None, scale: float = 1.0) -> tuple[Effect, ...]:
     """The effects that a scene can have, in the order of their names; `names` chooses some.
 
-    scale: forces and torques of the built-in effects relative to a light arm's, see `sized`; those of one's own have
+    scale: forces and torques of the built-in effects relative to a light arm's, see `sized`; those of your own have
     the size they were given.
 
     Raises ValueError for unknown names, listing the valid ones, for an effect that is not well made, and for a scale
@@ -87,13 +87,13 @@ def checked(effect: Effect) -> Effect:
     to try lie within their bounds.
     """
     own = {p.name: p for p in effect.parameters}
-    amplitudes = [name for place in effect.places.values() for name in place]
-    for name in (*amplitudes, *effect.shapes):
+    amplitudes = [name for place in effect.locations.values() for name in place]
+    for name in (*amplitudes, *effect.shape_parameters):
         if name not in own:
             raise ValueError(
                 f"effect {effect.name!r} speaks of a parameter {name!r} that it does not have; it has: {', '.join(own)}"
             )
-    for p, values in ((own[name], values) for name, values in effect.shapes.items()):
+    for p, values in ((own[name], values) for name, values in effect.shape_parameters.items()):
         if strange := [v for v in values if not p.low <= v <= p.high]:
             raise ValueError(
                 f"effect {effect.name!r}: values to try of its shape {p.name!r} lie outside its bounds "
@@ -148,10 +148,10 @@ def beside(base: Space, effects: Iterable[Effect]) -> tuple[Effect, ...]:
         if not taken & {p.name for p in effect.parameters}:
             found.append(effect)
             continue
-        places = {at: names for at, names in effect.places.items() if not taken & {*names}}
+        places = {at: names for at, names in effect.locations.items() if not taken & {*names}}
         if places:
             left = tuple(p for p in effect.parameters if p.name not in taken)
-            found.append(replace(effect, places=places, parameters=left))
+            found.append(replace(effect, locations=places, parameters=left))
     return tuple(found)
 
 

@@ -26,9 +26,9 @@ def servo_gain(scene: Scene) -> Effect | None:
     return Effect(
         GAIN,
         tuple(parameter(j) for j in joints),
-        what="a servo whose position gain is not the stated one",
-        mark="tracking error of one joint",
+        description="a servo whose position gain is not the stated one",
+        signature="tracking error of one joint",
         confused_with=("joint_compliance", "command_delay", "torque_gain"),
-        places=a.places(joints, GAIN),
-        smallest=0.02,
+        locations=a.places(joints, GAIN),
+        minimum_size=0.02,
     )

@@ -31,10 +31,10 @@ def soft_friction(scene: Scene) -> Effect | None:
     return Effect(
         "soft_friction",
         tuple(Parameter(names[j], "-", 0.0, 0.5, 0.0, 1.0, writes=w, group=a.GROUP) for j, w in writes.items()),
-        what="dry friction that holds a joint where the model's lets it creep",
-        mark="a joint that rests under load, or turns back",
+        description="dry friction that holds a joint where the model's lets it creep",
+        signature="a joint that rests under load, or turns back",
         confused_with=("joint_coulomb", "joint_stribeck", "servo_gain"),
-        places=a.places(tuple(writes), FIRMNESS),
-        smallest=0.1,
-        ends=tuple(names.values()),
+        locations=a.places(tuple(writes), FIRMNESS),
+        minimum_size=0.1,
+        natural_bounds=tuple(names.values()),
     )

@@ -40,13 +40,13 @@ def joint_stribeck(scene: Scene) -> Effect | None:
             a.shape(JOINT_EXPONENT, "-", a.EXPONENTS, 1.0, 2.5),
         ),
         frictionloss=frictionloss,
-        what="friction of a joint of the arm that is higher at rest than in motion",
-        mark="breakaway and reversals of that joint",
+        description="friction of a joint of the arm that is higher at rest than in motion",
+        signature="breakaway and reversals of that joint",
         confused_with=("joint_coulomb",),
-        holds=("joint_coulomb",),  # a speed beyond all that the joint has
-        places=a.places(joints, JOINT),
-        shapes={JOINT_SPEED: SPEEDS, JOINT_EXPONENT: a.EXPONENTS},
-        smallest=0.05,
+        special_cases=("joint_coulomb",),  # a speed beyond all that the joint has
+        locations=a.places(joints, JOINT),
+        shape_parameters={JOINT_SPEED: SPEEDS, JOINT_EXPONENT: a.EXPONENTS},
+        minimum_size=0.05,
     )
 
 
@@ -69,10 +69,10 @@ def hinge_stribeck(scene: Scene) -> Effect | None:
             a.shape(HINGE_EXPONENT, "-", a.EXPONENTS, 1.0, 2.5),
         ),
         frictionloss=frictionloss,
-        what="friction of the hinge that is higher at rest than in motion",
-        mark="breakaway and reversals of the door",
+        description="friction of the hinge that is higher at rest than in motion",
+        signature="breakaway and reversals of the door",
         confused_with=("latch", "joint_stribeck"),
-        places={joint: (HINGE,)},
-        shapes={HINGE_SPEED: SPEEDS, HINGE_EXPONENT: a.EXPONENTS},
-        smallest=0.1,
+        locations={joint: (HINGE,)},
+        shape_parameters={HINGE_SPEED: SPEEDS, HINGE_EXPONENT: a.EXPONENTS},
+        minimum_size=0.1,
     )

@@ -25,10 +25,10 @@ def tilted_frame(scene: Scene) -> Effect | None:
         "tilted_frame",
         (a.amplitude(SINE, "N m", 0.3, 3.0), a.amplitude(COSINE, "N m", 0.3, 3.0)),
         force=force,
-        what="a frame out of plumb, so that gravity moves the door",
-        mark="smooth over the angle, the same at every speed and in both directions",
+        description="a frame out of plumb, so that gravity moves the door",
+        signature="smooth over the angle, the same at every speed and in both directions",
         confused_with=("hinge_preload", "hardening_spring"),
-        holds=("hinge_preload",),  # its cosine, over a small angle
-        places={joint: (SINE, COSINE)},
-        smallest=0.05,
+        special_cases=("hinge_preload",),  # its cosine, over a small angle
+        locations={joint: (SINE, COSINE)},
+        minimum_size=0.05,
     )

@@ -22,11 +22,11 @@ def torque_bias(scene: Scene) -> Effect | None:
         BIAS,
         a.of_joints(BIAS, scene.joints, "N m", 0.3, 10.0),
         observe=observe,
-        what="a constant error of a joint's torque sensor",
-        mark="one joint, the same throughout, also at rest",
+        description="a constant error of a joint's torque sensor",
+        signature="one joint, the same throughout, also at rest",
         confused_with=("payload", "cable_pull"),
-        places=a.places(scene.joints, BIAS),
-        smallest=0.05,
+        locations=a.places(scene.joints, BIAS),
+        minimum_size=0.05,
     )
 
 
@@ -37,11 +37,11 @@ def torque_gain(scene: Scene) -> Effect | None:
         GAIN,
         a.of_joints(GAIN, scene.joints, "-", 0.03, 0.3),
         observe=torque_gain_effect(scene.joints).observe,
-        what="a wrong gain of a joint's torque sensor",
-        mark="one joint, in proportion to its torque",
+        description="a wrong gain of a joint's torque sensor",
+        signature="one joint, in proportion to its torque",
         confused_with=("servo_gain", "load_friction"),
-        places=a.places(scene.joints, GAIN),
-        smallest=0.01,
+        locations=a.places(scene.joints, GAIN),
+        minimum_size=0.01,
     )
 
 
@@ -57,9 +57,9 @@ def torque_drift(scene: Scene) -> Effect | None:
         DRIFT,
         a.of_joints(DRIFT, scene.joints, "N m/s", 0.02, 0.3),
         observe=observe,
-        what="a torque sensor that drifts during a recording",
-        mark="one joint, growing steadily with time whatever moves",
+        description="a torque sensor that drifts during a recording",
+        signature="one joint, growing steadily with time whatever moves",
         confused_with=("torque_bias", "cable_pull"),
-        places=a.places(scene.joints, DRIFT),
-        smallest=0.005,
+        locations=a.places(scene.joints, DRIFT),
+        minimum_size=0.005,
     )

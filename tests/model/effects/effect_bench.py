@@ -89,7 +89,7 @@ def typical(parameter: Parameter) -> float:
 
 def amplitudes(effect: Effect) -> list[Parameter]:
     """Of all places."""
-    names = {n for place in effect.places.values() for n in place}
+    names = {n for place in effect.locations.values() for n in place}
     return [p for p in effect.parameters if p.name in names]
 
 

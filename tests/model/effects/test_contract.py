@@ -46,7 +46,7 @@ def effect(request: pytest.FixtureRequest, scene: Scene) -> Effect:
 
 
 def having(part: str) -> list[str]:
-    """Names of the effects of the small scene that have shapes, or a friction loss."""
+    """Names of the effects of the small scene that have shape parameters, or a friction loss."""
     return [effect.name for effect in library(mechanism()) if getattr(effect, part)]
 
 
@@ -65,19 +65,19 @@ def test_the_name_is_the_registered_one(effect: Effect, request: pytest.FixtureR
 
 def test_parameters_are_amplitudes_and_shapes(effect: Effect):
     """Each is one of the two, amplitudes of one place alone and zero at neutral."""
-    named = [n for place in effect.places.values() for n in place]
-    assert named and all(effect.places.values())
-    assert sorted([*named, *effect.shapes]) == sorted(p.name for p in effect.parameters)
+    named = [n for place in effect.locations.values() for n in place]
+    assert named and all(effect.locations.values())
+    assert sorted([*named, *effect.shape_parameters]) == sorted(p.name for p in effect.parameters)
     for parameter in amplitudes(effect):
         assert parameter.mean == 0.0
-        assert 0 < effect.smallest < parameter.high
+        assert 0 < effect.minimum_size < parameter.high
         assert parameter.mean + parameter.std <= parameter.high
         assert not parameter.nuisance and parameter.unit
 
 
 def test_shapes_start_at_one_of_the_values_to_try(effect: Effect):
     space = Space(effect.parameters)
-    for name, values in effect.shapes.items():
+    for name, values in effect.shape_parameters.items():
         assert len(values) > 1 and list(values) == sorted(set(values))
         assert space[name].mean in values
         assert space[name].low <= values[0] and values[-1] <= space[name].high
@@ -85,7 +85,7 @@ def test_shapes_start_at_one_of_the_values_to_try(effect: Effect):
 
 
 def test_words_are_there(effect: Effect):
-    for words in (effect.what, effect.mark):
+    for words in (effect.description, effect.signature):
         assert len(words.split()) >= 3 and words == words.strip() and not words.endswith(".")
 
 
@@ -96,7 +96,7 @@ def test_what_it_may_be_confused_with_exists(effect: Effect):
 
 
 def test_what_it_holds_is_among_what_it_may_be_confused_with(effect: Effect):
-    assert set(effect.holds) <= set(effect.confused_with)
+    assert set(effect.special_cases) <= set(effect.confused_with)
 
 
 def test_it_does_something(effect: Effect):
@@ -148,10 +148,10 @@ def test_each_function_changes_nothing_at_neutral(effect: Effect, scene: Scene, 
         jax.tree.map(np.testing.assert_array_equal, effect.observe(theta, rollout), rollout)
 
 
-@pytest.mark.parametrize("effect", having("shapes"), indirect=True)
+@pytest.mark.parametrize("effect", having("shape_parameters"), indirect=True)
 def test_a_shape_that_is_absent_is_at_its_mean(effect: Effect, scene: Scene):
     loud = {p.name: jnp.float32(typical(p)) for p in amplitudes(effect)}
-    stated = loud | {name: jnp.float32(Space(effect.parameters)[name].mean) for name in effect.shapes}
+    stated = loud | {name: jnp.float32(Space(effect.parameters)[name].mean) for name in effect.shape_parameters}
     base = jnp.asarray(scene.model.dof_frictionloss, jnp.float32)
     for state in moments(scene):
         if effect.force:
@@ -252,7 +252,7 @@ def check_amplitudes(bench: Bench, effect: Effect) -> None:
 
 def check_shapes(bench: Bench, effect: Effect) -> None:
     """They do nothing by themselves, and every value of them is another effect beside an amplitude."""
-    for name, values in effect.shapes.items():
+    for name, values in effect.shape_parameters.items():
         shape = bench.space[name]
         tried = [{name: v} for v in sorted({*values, shape.low, shape.high})]
         # Row by row: a batch's last rows may be rounded another way than its first.

@@ -96,7 +96,7 @@ def test_the_effect_is_what_c_does(exact: Bench, torques: dict[str, np.ndarray],
     expected = in_c(exact.drive, oracle, late=0.5)[:, columns(oracle)]
     tolerance = PARITY_RUBBING if oracle.loss else PARITY
     np.testing.assert_allclose(torques[name][:, columns(oracle)], expected, atol=tolerance)
-    places = [j for j in exact.effect(name).places if j in oracle.joints] or oracle.joints
+    places = [j for j in exact.effect(name).locations if j in oracle.joints] or oracle.joints
     apart = np.abs(torques[name] - torques[""]).max(axis=0)
     assert (apart[[JOINTS.index(j) for j in places]] > FAINT.get(name, 20) * tolerance).all()
 

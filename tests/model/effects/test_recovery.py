@@ -22,8 +22,8 @@ LEFT_OVER = 1.05  # mean square of the residuals in units of the noise, which is
 
 def starts(effect: Effect, free: Space) -> np.ndarray:
     """[S, D] neutral, with every combination of shapes to try."""
-    combinations = itertools.product(*effect.shapes.values())
-    return np.array([free.values(dict(zip(effect.shapes, c, strict=True))) for c in combinations])
+    combinations = itertools.product(*effect.shape_parameters.values())
+    return np.array([free.values(dict(zip(effect.shape_parameters, c, strict=True))) for c in combinations])
 
 
 def check_recovery(bench: Bench, name: str, truth: Mapping[str, float]) -> None:
@@ -41,7 +41,7 @@ def check_recovery(bench: Bench, name: str, truth: Mapping[str, float]) -> None:
     start = starts(bench.effect(name), free)
     true = np.array(list(truth.values()))
     assert (start != true).all() and (np.mean(residuals(start) ** 2, axis=1) > 2.0).all()
-    fit = refine(residuals, free, start, RefineConfig(hops=0))
+    fit = refine(residuals, free, start, RefineConfig(basin_hops=0))
     deviation = np.sqrt(np.diag(np.linalg.inv(fit.hessian))) * free.std
     assert np.mean(fit.residual**2) < LEFT_OVER
     assert (np.abs(fit.best - true) < FAR * deviation).all(), (fit.best, true, deviation)

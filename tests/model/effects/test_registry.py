@@ -1,4 +1,4 @@
-"""The list of effects: what a scene can have, names, and effects of one's own."""
+"""The list of effects: what a scene can have, names, and effects of your own."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def edited(old: str, new: str, **options) -> Scene:
     return compile_scene(mujoco.MjSpec.from_string(MECHANISM.replace(old, new)), "edited", **options)
 
 
-# ----- effects of one's own
+# ----- effects of your own
 
 
 def grease_at(*joints: str, name: str = "grease", high: float = 9.0) -> Effect:
@@ -63,7 +63,12 @@ def grease_at(*joints: str, name: str = "grease", high: float = 9.0) -> Effect:
         return {("qpos_spring", k): 0.1 * values[f"grease[{j}]"] for k, j in enumerate(joints)}
 
     return Effect(
-        name, (*amplitudes, shape), force=force, native=native, places=places, shapes={"thickness": (1.0, high)}
+        name,
+        (*amplitudes, shape),
+        force=force,
+        native=native,
+        locations=places,
+        shape_parameters={"thickness": (1.0, high)},
     )
 
 
@@ -124,15 +129,15 @@ def test_motors_feel_no_soft_gears():
     """Their torque is what is commanded, wherever they stand."""
     motors = edited('"s" joint="shoulder" kp="80"', '"s" joint="shoulder" kp="0"')
     compliant = library(motors, sorted(OF_SERVOS))
-    assert [list(e.places) for e in compliant] == [["elbow"], ["elbow"]]
+    assert [list(e.locations) for e in compliant] == [["elbow"], ["elbow"]]
     for effect in compliant:
         assert [p.name for p in effect.parameters] == [f"{effect.name}[elbow]"]
 
 
 def test_joints_without_servos_have_none_of_theirs():
     passive = edited('<position name="s" joint="shoulder" kp="80"/>', "")
-    assert list(library(passive, ["servo_gain"])[0].places) == ["elbow"]
-    assert list(library(passive, ["joint_coulomb"])[0].places) == list(ARM)
+    assert list(library(passive, ["servo_gain"])[0].locations) == ["elbow"]
+    assert list(library(passive, ["joint_coulomb"])[0].locations) == list(ARM)
 
 
 def test_the_payload_hangs_on_the_end_of_the_chain():
@@ -140,7 +145,7 @@ def test_the_payload_hangs_on_the_end_of_the_chain():
     scene = edited("", "", joints=None)
     assert scene.joints == ("elbow", "door", "shoulder")
     (payload,) = library(scene, ["payload"])
-    assert list(payload.places) == ["elbow"]
+    assert list(payload.locations) == ["elbow"]
     assert {w.index for p in payload.parameters for w in p.writes} == {(scene.id("body", "hand"),)}
 
 
@@ -181,7 +186,7 @@ def test_sizes_are_those_of_another_machine():
     np.testing.assert_array_equal(large.mean, usual.mean)
     for before, after in zip(library(mechanism()), library(mechanism(), scale=30.0), strict=True):
         grows = any(p.unit.startswith("N m") for p in before.parameters)
-        assert after.smallest == pytest.approx((30.0 if grows else 1.0) * before.smallest)
+        assert after.minimum_size == pytest.approx((30.0 if grows else 1.0) * before.minimum_size)
 
 
 def test_slides_are_driven_by_forces():
@@ -211,7 +216,7 @@ def test_a_scale_is_a_positive_number(scale: float):
         library(mechanism(), scale=scale)
 
 
-# ----- effects of one's own
+# ----- effects of your own
 
 
 def test_a_taken_name_is_refused(own_list: None):
@@ -242,8 +247,8 @@ def test_an_effect_of_ones_own_is_part_of_the_library(own_list: None, small: Ben
             "wind",
             (a.amplitude("wind", "N m", 0.5, 5.0),),
             force=lambda theta, state: jnp.zeros_like(state.qvel).at[scene.dof(joint)].set(theta["wind"]),
-            places={joint: ("wind",)},
-            smallest=0.1,
+            locations={joint: ("wind",)},
+            minimum_size=0.1,
         )
 
     assert "wind" in registered()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from effect_bench import Bench, make_bench
 
-from droid_jax.discrepancy.candidates import possible, steers
+from droid_jax.discrepancy.candidates import acts_on_commands_only, observable_effects
 from droid_jax.model.effects.registry import effect_space, library, ready
 from droid_jax.model.mjcf import fitted_mjcf, unwritten
 from droid_jax.model.scene import Scene, compile_scene
@@ -106,13 +106,15 @@ def test_its_places_are_joints_with_friction_that_is_not_firm_already():
     none = scene_of(plain.replace('frictionloss="0.3"', ""))
     firm = scene_of(plain.replace('frictionloss="0.3"', 'frictionloss="0.3" solimpfriction="0.9999 0.9999"'))
     asked = scene_of(plain.replace('frictionloss="0.3"', 'frictionloss="1e-6"'))  # to be fitted
-    has = [[*e.places] for s in (none, ready(none), firm, asked) for e in library(s, ["soft_friction"]) or (None,) if e]
+    has = [
+        [*e.locations] for s in (none, ready(none), firm, asked) for e in library(s, ["soft_friction"]) or (None,) if e
+    ]
     assert has == [["j"]]
 
 
 def test_a_prescribed_motion_does_not_have_it():
     scene = held(0.03).scene
     (effect,) = library(scene, ["soft_friction"])
-    assert steers(effect)
+    assert acts_on_commands_only(effect)
     log = Recording("log", np.zeros(0), np.zeros((0, 0)), (), {}, MOTOR)
-    assert "soft_friction" not in {e.name for e in possible(scene, [log])}
+    assert "soft_friction" not in {e.name for e in observable_effects(scene, [log])}

@@ -1,0 +1,54 @@
+"""Words of this project's past that the field has a word for: none comes back."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+# What a name or a phrase was -> what it is now.
+RENAMED = {
+    r"stand[-_]ins?\b|\bStandIn\b|\bSurrogateConfig\b|\bTrialRobot\b": "synthetic robot",
+    r"\bdroid_jax[./](measure|compare|gap)\b": "recordings, simulate, preflight, cost, discrepancy",
+    r"\bGapConfig\b": "DiscrepancyConfig",
+    r"\bfind_missing\b": "find_missing_effects",
+    r"\btwin_replay\b": "c_replay",
+    r"\brubbing\b|\bservo_given\b": "apply_friction, servo_input",
+    r"\buntrended\b|\bsteady_": "detrend",
+    r"\bHunt\b(?! and Crossley)|\bhunt\b": "SearchState",
+    r"\bEvidence\b": "ResidualSet",
+    r"[\"'](confirm|sealed)[\"'](?=[:\]])": "validation, test",
+    r"\bgap_(fit|confirm)\b": "discrepancy_train, discrepancy_validation",
+    r"\bown[-_]effects\b": "user effects",
+    r"\bhanded_on\(|\bHandedOn\b": "final_model",
+    r"\bwith_own\b|\bown_columns\b|\bown_nuisances\b": "per-recording nuisances",
+    r"\bgone_on_with\b|\bplainest\b|\bwithout_idle\b|\bfitted_anew\b": "polished, simplest, without_dominated, ...",
+    r"\bhops=|\bhop_generations=(?<!basin_hop_generations=)|\brough=(?!rough)|\bdoubt=": "basin_hops, misfit_threshold",
+    r"of one's own|worth a name\b|does as well\b": "your own, minimum effect size, equivalent",
+}
+ENDINGS = (".py", ".md", ".j2", ".ipynb", ".toml", ".css")
+HISTORY = ("docs/history/", "benchmarks/results/", "CHANGELOG.md", "tests/test_vocabulary.py")
+
+
+def texts() -> list[Path]:
+    tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split()
+    return [ROOT / name for name in tracked if name.endswith(ENDINGS) and not name.startswith(HISTORY)]
+
+
+@pytest.mark.parametrize("old", RENAMED)
+def test_no_old_word_comes_back(old: str) -> None:
+    found = [
+        f"{path.relative_to(ROOT)}:{number}: {line.strip()[:80]}"
+        for path in texts()
+        if path.exists()
+        for number, line in enumerate(path.read_text().splitlines(), 1)
+        if re.search(old, line)
+    ]
+    assert not found, f"say {RENAMED[old]}: {found}"
+
+
+def test_the_search_for_old_words_finds_one() -> None:
+    assert len(texts()) > 300 and any(re.search(old, "a stand-in for Evidence") for old in RENAMED)
