@@ -113,7 +113,7 @@ def by_joint(found: Mapping[str, Any], published: Mapping[str, Sequence[float]])
                 "named_here": entry is not None and entry["value"] > NINETY * entry["deviation"],
                 "published_OSI_Nm": published["fc_OSI"][j],
                 "published_CLS_Nm": published["fc_CLS"][j],
-                "sealed_rms_left": round(ratio, 3),
+                "test_rms_left": round(ratio, 3),
             }
         )
     return out
@@ -165,8 +165,8 @@ def main(config: GapPanda) -> None:
         "targets": {
             "dry_friction_named": f"{FOUND} at {EVERYWHERE}" in found["rigid"]["effects"],
             "in_joints": [row["joint"] for row in joints if row["named_here"]],
-            "sealed_third_better_in_joints": int(np.sum(np.less(sealed["after"], sealed["before"]))),
-            "sealed_rms_ratio": rounded(np.divide(sealed["after"], sealed["before"]), 3),
+            "test_third_better_in_joints": int(np.sum(np.less(sealed["after"], sealed["before"]))),
+            "test_rms_ratio": rounded(np.divide(sealed["after"], sealed["before"]), 3),
             "joint_2_left_open": found["rigid"]["verdict"] == "partly explained" and most_left == "panda_joint2",
             "dry_friction_not_named_again": silent_about(
                 found["dry"], ("joint_coulomb", "joint_stribeck", "joint_directional", "load_friction")

@@ -52,3 +52,8 @@ def test_no_old_word_comes_back(old: str) -> None:
 
 def test_the_search_for_old_words_finds_one() -> None:
     assert len(texts()) > 300 and any(re.search(old, "a stand-in for Evidence") for old in RENAMED)
+
+
+def test_the_files_that_contributing_names_are_there() -> None:
+    named = re.findall(r"`([\w./]+\.(?:py|md))`", (ROOT / "CONTRIBUTING.md").read_text())
+    assert len(named) > 30 and [name for name in named if not (ROOT / name).is_file()] == []

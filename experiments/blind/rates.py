@@ -71,7 +71,7 @@ def summarise(judged: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "pair_both_named": rate(pair, lambda c: c["named"]),
         "unexplained_recall": rate(strange, lambda c: c["open"]),
         "unconverged_or_error": rate(judged, lambda c: c["verdict"] not in ANSWERED),
-        "gap_closed_confirm": closing(named, "validation"),
+        "gap_closed_validation": closing(named, "validation"),
         "gap_closed": closing(named, "test"),
         "gap_closed_whatever_was_named": closing([c for c in judged if c["effects"]], "test"),
         "within_floor": rate(named, lambda c: bool(c["within_floor"])),
@@ -97,7 +97,7 @@ def summarise_baselines(judged: Sequence[dict[str, Any]]) -> dict[str, Any] | No
     shares = [c["baselines"]["closed"] for c in done if c["class"] != "none"]
     sealed = [c["gaps"]["test"][0] for c in done if "test" in c["gaps"]]  # not of one that blew up there
     return {
-        "base_gap_sealed_median": float(np.median(sealed)) if sealed else None,
+        "base_gap_test_median": float(np.median(sealed)) if sealed else None,
         "bic_names_where_nothing": rate(none, lambda c: bool(c["baselines"]["bic"])),
         "bic_names_all_hidden": rate(known, lambda c: c["baselines"]["bic_all"]),
         "bic_false_names": rate(done, lambda c: c["baselines"]["bic_false"]),

@@ -103,7 +103,7 @@ def search_case(folder: Path, bench: Bench) -> dict[str, Any]:
     except FAILED as error:
         return {**result, "verdict": "error", "error": str(error), "seconds": watch.seconds}
     result |= describe(case, verdict)
-    first = verdict.screens[0] if verdict.screens else None
+    first = verdict.score_tests[0] if verdict.score_tests else None
     try:
         result["baselines"] = watch("baselines", lambda: baselines(case, model, first, recordings))
     except FAILED as error:  # what they are compared with stands

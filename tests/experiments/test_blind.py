@@ -333,7 +333,7 @@ def test_rates_of_what_is_named():
         assert (found[name]["hits"], found[name]["of"]) == (hits, of), name
         low, high = found[name]["interval_95"]
         assert 0 <= low <= hits / of <= high <= 1
-    assert found["gap_closed_confirm"]["median"] == pytest.approx(0.9)
+    assert found["gap_closed_validation"]["median"] == pytest.approx(0.9)
     assert found["gap_closed"]["median"] == pytest.approx(0.95)
     assert found["within_floor"]["rate"] == 1.0 and found["seconds"]["whole"] == 5.0
 
@@ -434,9 +434,9 @@ def test_search_and_black_box_are_compared_on_the_same_gaps():
     gaps = {"validation": [11.0, 11.0], "test": [1.0, 1.0]}  # the test motion shows none
     silent = case("single", "unexplained", [], [["latch at door"]], baselines=box, gaps=gaps)
     found = rates(named, silent)["baselines"]
-    assert found["search_closed_confirm"]["median"] == pytest.approx(0.45)  # 0.9 and 0
-    assert found["black_box_closed_confirm"]["median"] == pytest.approx(0.5)
-    assert found["search_closed_sealed"]["at_least"]["of"] == found["black_box_closed_sealed"]["at_least"]["of"] == 1
+    assert found["search_closed_validation"]["median"] == pytest.approx(0.45)  # 0.9 and 0
+    assert found["black_box_closed_validation"]["median"] == pytest.approx(0.5)
+    assert found["search_closed_test"]["at_least"]["of"] == found["black_box_closed_test"]["at_least"]["of"] == 1
 
 
 def test_confusion_tells_ties_from_swaps_and_right_effects_in_wrong_places():

@@ -239,7 +239,7 @@ def test_a_log_is_drawn_in_order_of_time(tmp_path: Path) -> None:
     """Its turns are one trace, and a place that holds no instant is none."""
     folder = make_gap(tmp_path / "run", "unexplained", split=BLOCKS)
     arrays = dict(np.load(folder / "gap.npz"))
-    whole = {key: arrays[f"fit.{key}"] for key in ("time", "measured", "before")}
+    whole = {key: arrays[f"train.{key}"] for key in ("time", "measured", "before")}
     for role, turn in (("train", 0), ("validation", 1)):
         arrays |= {key: arrays[key][turn::2] for key in arrays if key.startswith(f"{role}.")}
         arrays |= {f"{role}.{key}": values[turn::2] for key, values in whole.items()}
