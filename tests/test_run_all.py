@@ -438,7 +438,7 @@ def test_a_sealed_recording_is_not_fitted(
 def test_recordings_are_checked_before_any_stage(called, capsys):
     motions("a.npz", "b.npz", repeats=5)
     assert main(["all", "--recording", "a.npz", "b.npz"]) == 2
-    assert "the fit recording 'a' has 5 repeats" in capsys.readouterr().err and called == []
+    assert "the train recording 'a' has 5 repeats" in capsys.readouterr().err and called == []
     assert main(["all", "--recording", "a.npz", "b.npz", "--stages", "identify"]) == 0
     assert len(called[0].recording) == 2
 

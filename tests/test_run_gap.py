@@ -36,7 +36,7 @@ pytestmark = pytest.mark.usefixtures("tuned")
 
 @pytest.fixture
 def place(tmp_path: Path) -> Path:
-    """A folder with parameters.json, fit.npz and validation.npz."""
+    """A folder with parameters.json, train.npz and validation.npz."""
     write_parameters(tmp_path)
     for name in ("train", "validation"):
         save(record(name), tmp_path / f"{name}.npz")
@@ -83,7 +83,7 @@ def test_two_recordings_of_one_name(place: Path, refused):
     other = place / "day2"
     other.mkdir()
     save(replace(record("validation"), name="train"), other / "train.npz")
-    said = refused(*arguments(place, recordings=("train.npz", "day2/fit.npz")))
+    said = refused(*arguments(place, recordings=("train.npz", "day2/train.npz")))
     assert "the train and the validation recording have one name, 'train'" in said
 
 

@@ -78,11 +78,11 @@ LOST = ("Lost are effects of commands, servos and contacts", "U then holds the n
         ([with_repeats(1)], ["is the only one and has 1 repeat:", "another motion, 8 repeats or more of each"]),
         ([with_repeats(1)], ["without its commands it can be searched as a log", *LOST]),
         ([with_repeats(3)], ["has 3 repeats:", "one repeat of it, without its commands, it can be searched", *LOST]),
-        ([with_repeats(3)] * 2, ["the fit recording 'servo' has 3 repeats:", "searched as a log", *LOST]),
+        ([with_repeats(3)] * 2, ["the train recording 'servo' has 3 repeats:", "searched as a log", *LOST]),
         ([elbow_log(0.0, 2.0, repeats=2)], ["has 2 repeats", "one repeat alone is searched as a log"]),
         ([LOG, elbow_log(0.0, 2.0, repeats=3)], ["the second recording 'elbow' has 3 repeats", "Leave the second out"]),
         ([LOG, with_repeats(1)], ["the second recording 'servo' has commands", "log without repeats and commands"]),
-        ([LOG] * 3, ["the fit recording 'elbow' has 1 repeat:", "fewer than 8", "droid_jax.run identify"]),
+        ([LOG] * 3, ["the train recording 'elbow' has 1 repeat:", "fewer than 8", "droid_jax.run identify"]),
         ([with_repeats(8), LOG], ["the validation recording 'elbow' has 1 repeat:"]),
     ],
 )  # fmt: skip
