@@ -100,7 +100,7 @@ def run_case(plan: Plan, commit: str, bench: Bench, watch: Stopwatch) -> Iterato
     case = watch("prepare", lambda: bench.case(scene, {"train": recordings["train"]}))
     model = watch("base", lambda: base_fit(case, silent))
     screen = watch("screen", lambda: score(case, model, directions_of(candidates(case.effects))))
-    best = screen.questions[int(np.argmax(np.abs(screen.t)))].candidate.name
+    best = screen.directions[int(np.argmax(np.abs(screen.t)))].candidate.name
     yield {"p": screen.p, "gap": model.discrepancy, "converged": bool(model.refined.converged), "best": best}
     if screen.p < SIGNIFICANT:
         floor = watch("floor", lambda: bench.floor(scene, case, model, recordings["train"]))

@@ -105,7 +105,7 @@ def test_what_is_offered_instead_can_be_done():
 
 def test_a_second_log_is_another_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert main(command(tmp_path, [LOG, LOG])) == 2
-    assert "the fit and the test recording are the same ('elbow')" in capsys.readouterr().err
+    assert "the train and the test recording are the same ('elbow')" in capsys.readouterr().err
 
 
 def test_a_log_that_is_too_short_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -97,7 +97,7 @@ def p_values(count: int, present: float) -> np.ndarray:
         noise = (present * marks[0] + rng.normal(size=len(inside))) * inside
         left, projected = project(noise[None], base, prior)[0], project(marks, base, prior)
         scores = projected @ made.residuals(left).T
-        out.append((made.largest(scores, projected, base, prior)[1], largest_t(scores)[1]))
+        out.append((made.largest_score(scores, projected, base, prior)[1], largest_t(scores)[1]))
     return np.array(out)
 
 

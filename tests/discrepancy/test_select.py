@@ -134,7 +134,7 @@ def test_what_the_repeats_do_not_agree_on_is_not_confirmed(found: Small):
 def test_a_further_effect_must_take_more_than_the_first(found: Small, monkeypatch: pytest.MonkeyPatch):
     """Half-way to what it would take: enough for the first effect of a model, too little for a second."""
     monkeypatch.setattr(
-        select, "remaining_discrepancy", lambda fit, other, model: other.gap_at(model.values)
+        select, "remaining_discrepancy", lambda fit, other, model: other.discrepancy_at(model.values)
     )  # a certain fit
     case, model = found.case, extended(found, "hinge_preload at door")
     share = 1 - np.sqrt(0.7)  # the gap is square in what is left
