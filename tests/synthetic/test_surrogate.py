@@ -29,7 +29,7 @@ def test_a_hidden_delay_and_offset_come_back_with_their_signs():
     scene, known = small_scene()
     space = known + Space((time_offset(),))
     hidden = {**TRUTH, "time_offset": 0.01, "torque_offset[elbow]": 0.2}
-    recording = record_hidden(scene, demonstration("fit"), hidden, {}, seed=1, config=QUIET, space=space)
+    recording = record_hidden(scene, demonstration("train"), hidden, {}, seed=1, config=QUIET, space=space)
     wrong = (
         {"time_offset": -0.01},
         {"time_offset": 0.0},
@@ -56,7 +56,7 @@ def test_noise_and_drift_are_as_large_as_they_say_at_arm_and_wrist():
 def test_every_repeat_begins_and_measures_a_little_otherwise():
     scene, space = small_scene()
     config = replace(QUIET, start_noise=1e-3, repeats=40)
-    shown = demonstration("fit")
+    shown = demonstration("train")
     robot = set_up(scene, shown, TRUTH, seed=3, config=config, space=space)
     apart = robot.qpos0[:, scene.joint_qpos] - robot.qpos0[:, scene.joint_qpos].mean(axis=0)
     assert np.std(apart) == pytest.approx(1e-3, rel=0.3)
@@ -84,7 +84,7 @@ def test_without_a_truth_the_synthetic_robot_is_the_scene():
             servo_scale(scene, elbow, std=0.1),
         )
     )
-    robot = set_up(scene, demonstration("fit"), {}, seed=3, config=QUIET, space=space)
+    robot = set_up(scene, demonstration("train"), {}, seed=3, config=QUIET, space=space)
     for field in ("dof_damping", "body_mass", "body_inertia", "body_pos", "actuator_gainprm", "actuator_biasprm"):
         for model in robot.models:
             np.testing.assert_allclose(getattr(model, field), getattr(robot.scene.model, field), rtol=1e-12)
@@ -96,10 +96,10 @@ def test_the_link_side_of_dry_friction_in_the_model_is_not_known():
     rubs.dof_frictionloss[scene.dof("elbow")] = 0.5
     with pytest.raises(ValueError, match=r"link side of joints with a frictionloss of their own \(elbow"):
         config = replace(QUIET, side=TorqueSide.LINK)
-        set_up(replace(scene, model=rubs), demonstration("fit"), TRUTH, seed=3, config=config, space=space)
+        set_up(replace(scene, model=rubs), demonstration("train"), TRUTH, seed=3, config=config, space=space)
 
 
 def test_a_rate_above_the_time_steps_is_refused():
     scene, space = small_scene()
     with pytest.raises(ValueError, match="at most once per time step, at 4000 Hz, got a rate of 9000 Hz"):
-        set_up(scene, demonstration("fit"), {}, seed=3, config=replace(QUIET, rate=9000.0), space=space)
+        set_up(scene, demonstration("train"), {}, seed=3, config=replace(QUIET, rate=9000.0), space=space)
