@@ -99,7 +99,7 @@ def test_unless_told_it_asks_about_all_that_could_show(monkeypatch: pytest.Monke
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"most": 0}, "most must be at least 1, got 0"),
+        ({"max_effects": 0}, "max_effects must be at least 1, got 0"),
         ({"compare": CompareConfig(channels={"torque": 1.0, "position": 1.0})}, "got the channels torque, position"),
     ],
 )

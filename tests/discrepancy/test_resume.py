@@ -36,7 +36,7 @@ def counted(case, counts: list[int]):
 
         return dataclasses.replace(residual_set, cost=dataclasses.replace(residual_set.cost, _replays=(count,)))
 
-    return dataclasses.replace(case, train=of(case.fit), validation=of(case.validation))
+    return dataclasses.replace(case, train=of(case.train), validation=of(case.validation))
 
 
 def test_a_remembered_cost_replays_nothing_twice(found: Small, tmp_path: Path):
