@@ -59,7 +59,7 @@ def test_the_cones_are_compared_on_the_robot_that_is_searched(monkeypatch: pytes
     module, seen = importlib.import_module("experiments.cone_mismatch"), list[Any]()
 
     def of(value: float) -> dict[str, Any]:
-        return {"fit": SimpleNamespace(channels={"torque": SimpleNamespace(values=np.full((2, 4, 1), value))})}
+        return {"train": SimpleNamespace(channels={"torque": SimpleNamespace(values=np.full((2, 4, 1), value))})}
 
     monkeypatch.setattr(module, "elliptic", lambda where: f"{where}, elliptic")
     monkeypatch.setattr(module, "recorded", lambda where, *_: seen.append(where) or (3, "the fourth", of(1.5)))
