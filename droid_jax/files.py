@@ -14,7 +14,7 @@ POLICY, TRAINING, TRANSFER, FILMS = "policy.npz", "training.json", "transfer.jso
 SYNTHETIC_ROBOT = (
     "synthetic_robot.json"  # beside the synthetic robot's recordings: its springs, seed and hidden effects
 )
-STAND_IN_SOURCE = "synthetic robot (plain C MuJoCo), not a real one"  # in the metadata of what it recorded
+SYNTHETIC_SOURCE = "synthetic robot (plain C MuJoCo), not a real one"  # in the metadata of what it recorded
 # Folders in one of `all`, and what is written last in each: its presence says that the run is whole.
 LAST_FILES = {"identify": CONFIG, "gap": GAP, "train": TRAINING}
 # What else is in them that would be taken for the next run's.

@@ -472,7 +472,7 @@ def test_what_record_wrote_says_which_robot_it_was(tmp_path: Path):
     """A fit of it knows its truth, and a policy is tried on this robot and no other."""
     recording = replace(load(demonstration_path("A")), meta={"springs": "2", "robot": "7"})
     save(recording, tmp_path / "c.npz")
-    assert known_robot([tmp_path / "c.npz"]) == {"springs": 2, "seed": 7, "hide": [], "hidden": ""}
+    assert known_robot([tmp_path / "c.npz"]) == {"springs": 2, "seed": 7, "hide": []}
     save(replace(recording, meta={"springs": "1", "robot": "7"}), tmp_path / "d.npz")
     assert known_robot([tmp_path / "c.npz", tmp_path / "d.npz"]) == {}
     save(replace(recording, meta={}), tmp_path / "d.npz")

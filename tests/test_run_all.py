@@ -80,7 +80,7 @@ def found(folder: Path, effects: list[str], synthetic_robot: bool = True) -> Non
                 "gaps": gaps,
                 "setup": {
                     "synthetic_robot": synthetic_robot,
-                    "robot": {"hidden": "magnetic catch (1.5 N m; in the library: latch)"},
+                    "hidden": "magnetic catch (1.5 N m; in the library: latch)",
                 },
             }
         )
@@ -93,8 +93,7 @@ def test_without_arguments_every_stage_runs_on_one_recording(called, tmp_path: P
     files = tuple(Path("runs/all/recordings") / f"{name}.npz" for name in "CBA")
     assert fit.recording == files[:2] and search.recording == files
     assert policy.fit == fit.out and policy.out == trials.run == Path("runs/all/train")
-    assert known_robot(files) == {"springs": 1, "seed": 0, "hide": ["magnetic_catch=1.5"],
-                                     "hidden": "magnetic catch (1.5 N m; in the library: latch)"}  # fmt: skip
+    assert known_robot(files) == {"springs": 1, "seed": 0, "hide": ["magnetic_catch=1.5"]}
     lines = capsys.readouterr().out.splitlines()
     stages = {"record": 19, "identify": 19, "gap": 15, "train": 7, "evaluate": 1}
     assert [line for line in lines if line.startswith("[")] == [

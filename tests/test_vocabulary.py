@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 # What a name or a phrase was -> what it is now.
 RENAMED = {
-    r"stand[-_]ins?\b|\bStandIn\b|\bSurrogateConfig\b|\bTrialRobot\b": "synthetic robot",
+    r"(?i:stand[-_]ins?)(?=\b|_)|\bStandIn\b|\bSurrogateConfig\b|\bTrialRobot\b": "synthetic robot",
     r"\bdroid_jax[./](measure|compare|gap)\b": "recordings, simulate, preflight, cost, discrepancy",
     r"\bGapConfig\b": "DiscrepancyConfig",
     r"\bfind_missing\b": "find_missing_effects",
@@ -20,7 +20,7 @@ RENAMED = {
     r"\buntrended\b|\bsteady_": "detrend",
     r"\bHunt\b(?! and Crossley)|\bhunt\b": "SearchState",
     r"\bEvidence\b": "ResidualSet",
-    r"[\"'](confirm|sealed)[\"'](?=[:\]])": "validation, test",
+    r"[\"'](confirm|sealed)[\"'](?=[:\]])|\[SEALED\]": "validation, test",
     r"\bgap_(fit|confirm)\b": "discrepancy_train, discrepancy_validation",
     r"\bown[-_]effects\b": "user effects",
     r"\bhanded_on\(|\bHandedOn\b": "final_model",

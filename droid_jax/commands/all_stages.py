@@ -56,7 +56,7 @@ class All:
     standard (100 generations; not identify's paper, whose servo no policy can be trained on), train with paper; hours.
     gpu: all with gpu."""
     recording: tuple[Path, ...] = ()
-    """TRAIN VALIDATION [TEST], ONE or LOG [SEALED], as in gap; with fewer repeats: --stages identify."""
+    """TRAIN VALIDATION [TEST], ONE or LOG [TEST], as in gap; with fewer repeats: --stages identify."""
     scene: Path | None = None
     """Your own MJCF instead of the built-in door: identify and gap, policies are trained at the built-in one."""
     parameters: Path | None = None

@@ -106,6 +106,7 @@ def run(command: Gap) -> None:
     from droid_jax.discrepancy.split import Split
     from droid_jax.identify.results import prepare_folder
     from droid_jax.preflight.check_log import check_log
+    from droid_jax.synthetic.hidden_effects import in_words
     from droid_jax.synthetic.robot import is_synthetic
 
     out = command.out
@@ -143,7 +144,12 @@ def run(command: Gap) -> None:
         "split": {"by": split.value, "limits": split.limits},
         "versions": runtime.versions(),
         "device": runtime.device(),
-        "setup": {**setup, "synthetic_robot": synthetic_robot, "robot": robot},
+        "setup": {
+            **setup,
+            "synthetic_robot": synthetic_robot,
+            "robot": robot,
+            "hidden": in_words(robot.get("hide", ())),
+        },
     }
     written = list[str]()
 
@@ -250,7 +256,7 @@ def given_to(command: Gap) -> list[Recording]:
     needs_recording(command)
     if len(command.recording) > 3:
         raise ValueError(
-            f"--recording takes TRAIN VALIDATION [TEST], or ONE with repeats, or LOG [SEALED] without, got "
+            f"--recording takes TRAIN VALIDATION [TEST], or ONE with repeats, or LOG [TEST] without, got "
             f"{len(command.recording)} recordings; `python -m droid_jax.run identify` fits any number"
         )
     return [recording_at(path) for path in command.recording]

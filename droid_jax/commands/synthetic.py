@@ -18,11 +18,8 @@ if TYPE_CHECKING:
 
 DEMONSTRATIONS = {"train": "C", "validation": "B", "test": "A"}
 HIDE = ("magnetic_catch=1.5",)  # N m
-OPTIONS = {
-    "hide": None,
-    "springs": 1,
-    "demonstrations": ("A", "C"),
-}  # of a synthetic robot, as they are where not given
+# Options of a synthetic robot, as they are where not given.
+OPTIONS = {"hide": None, "springs": 1, "demonstrations": ("A", "C")}
 
 T = TypeVar("T")
 
@@ -97,9 +94,8 @@ def record_synthetic(
     if again or known_robot(files) != this:
         for path in paths.values():
             path.unlink(missing_ok=True)
-    write_json(
-        out / "recordings" / SYNTHETIC_ROBOT, this
-    )  # before the first: a stop leaves no recordings of an unknown robot
+    # Before the first: a stop leaves no recordings of an unknown robot.
+    write_json(out / "recordings" / SYNTHETIC_ROBOT, this)
     found = kept_recordings(paths, False, recorded)
     return {role: found[name] for role, name in DEMONSTRATIONS.items()}
 
@@ -111,10 +107,7 @@ def kept_at(out: Path) -> tuple[Path, ...]:
 
 def robot_json(hidden: Mapping[str, float], springs: int, seed: int) -> dict[str, Any]:
     """What is known of the synthetic robot that made some recordings."""
-    from droid_jax.synthetic.hidden_effects import in_words
-
-    hide = [f"{name}={amplitude:g}" for name, amplitude in hidden.items()]
-    return {"springs": springs, "seed": seed, "hide": hide, "hidden": in_words(hidden)}
+    return {"springs": springs, "seed": seed, "hide": [f"{name}={amplitude:g}" for name, amplitude in hidden.items()]}
 
 
 def known_robot(recordings: Sequence[str | Path]) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from droid_jax import console
-from droid_jax.files import ASKED, CONFIG, FIT, GAP, LOCK, SETUP, STAND_IN_SOURCE, SYNTHETIC_ROBOT, TRAINING, WRITTEN
+from droid_jax.files import ASKED, CONFIG, FIT, GAP, LOCK, SETUP, SYNTHETIC_ROBOT, SYNTHETIC_SOURCE, TRAINING, WRITTEN
 from droid_jax.read_json import read_json
 from droid_jax.storage import kind_of
 
@@ -152,7 +152,7 @@ _SIGNS = {
     GAP: ("verdict", "gaps"),
     TRAINING: ("setup", "history"),
 }
-_STAND_INS = re.compile(r"[A-Z](_springs\d_seed\d+(_paper)?)?\.npz")  # recordings of the synthetic robot
+_SYNTHETIC = re.compile(r"[A-Z](_springs\d_seed\d+(_paper)?)?\.npz")  # recordings of the synthetic robot
 
 
 def check_own(folder: Path, stage: str) -> None:
@@ -187,8 +187,8 @@ def _strange_recordings(folder: Path) -> list[Path]:
 
     def strange(path: Path) -> bool:
         try:
-            return load(path).meta.get("source") != STAND_IN_SOURCE
+            return load(path).meta.get("source") != SYNTHETIC_SOURCE
         except (OSError, ValueError):
             return True
 
-    return [path for path in sorted(folder.iterdir()) if _STAND_INS.fullmatch(path.name) and strange(path)]
+    return [path for path in sorted(folder.iterdir()) if _SYNTHETIC.fullmatch(path.name) and strange(path)]

@@ -55,8 +55,8 @@ def find_missing_effects(
 
     The verdict's gaps are in squared noise units of one repeat.  Only another motion tells effects apart that act
     alike in this one (`Split.limits`).
-    The model is handed on as `handed_on` says: with effects in it, it is fitted to both motions; where that fails it is
-    the search's own, of the first motion.
+    The model is handed on as `final_model` says: with effects in it, it is fitted to both motions; where that fails it
+    is the search's own, of the first motion.
     Raises ValueError for recordings in which a search could not end well, and for effects that are none or that a
     recording without commands cannot have.
     """
@@ -87,7 +87,7 @@ def search(
 ) -> tuple[Case, Verdict]:
     """The verdict on a case of recordings by role (see `case_of`), and the case, which now remembers its replays.
 
-    Without experiments for a tie: `amend.amended` adds them.
+    Without experiments for a tie: `amendments.amended` adds them.
     start: [F] values of the base parameters from which their fit begins, instead of a search.
     checkpoints: folder of this search alone, from which it goes on after a stop; None keeps nothing.
     """
@@ -120,7 +120,7 @@ def case_of(
     roles: Mapping[str, Recording],
     config: DiscrepancyConfig,
 ) -> Case:
-    """Of recordings by role (see `shared_out`), which are one or two logs where the split is by blocks.
+    """Of recordings by role (see `assigned_roles`), which are one or two logs where the split is by blocks.
 
     Sensors' gains and encoders' offsets that the base has as parameters are not asked about there.
     Raises ValueError for what is wrong with them, or does not fit the scene.

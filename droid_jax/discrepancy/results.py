@@ -42,7 +42,7 @@ def write_gap(
 
     handed: the model to hand on, the search's own while the final refit is to be made.
     description: what else gap.json shall hold: "seconds", "versions", "device", "setup", ...
-    amendments: their states (`amend.Amended.states`); None where all that is due has been made.
+    amendments: their states (`Amended.states`); None where all that is due has been made.
     """
     write_npz(folder / GAP_TRACES, gap_arrays(case, verdict))
     write_amended(folder, case, verdict, handed, description, amendments)

@@ -20,7 +20,9 @@ LONGEST = 1.0  # search units: what the fit did not tell at all is no further fr
 
 
 def remaining_residuals(fitted: ResidualSet, other: ResidualSet, model: FittedModel) -> np.ndarray:
-    """[N, M] `beyond`; of blocks of one log, which are of one motion, what the model leaves as it is."""
+    """[N, M] `beyond_fit_uncertainty`; of blocks of one log, which are of one motion, what the model leaves as it
+    is.
+    """
     if fitted.repeated:
         return beyond_fit_uncertainty(fitted, other, model)
     return other.residuals(other.common(model.values)[0])
@@ -35,8 +37,8 @@ def beyond_fit_uncertainty(fitted: ResidualSet, other: ResidualSet, model: Fitte
     """[N, M] residuals of a model on another recording than the fitted one, less what its uncertainty allows.
 
     The parameters move once more, along slopes, to where the other recording wants them; how far is held by what the
-    fitted one tells of them (`told`), as if both had been fitted.  The other recording's own nuisances are at their
-    best throughout.  Every repeat is projected and not their mean alone, whose noise U tells from their scatter.
+    fitted one tells of them (`posterior_of`), as if both had been fitted.  The other recording's own nuisances are at
+    their best throughout.  Every repeat is projected and not their mean alone, whose noise U tells from their scatter.
     """
     slopes = transfer_spread(fitted, other, model)
     held = np.full(len(slopes.T), other.repeats**0.5)  # the residual is that of the mean of so many repeats

@@ -82,8 +82,8 @@ class Verdict:
     base, model: before and after.  discretisation_error: U0, what the simulation's own step leaves.
     discrepancies: "train", "validation", "test" -> (U before, U after).  remainder: U on the validation demonstration
     that neither
-    `model` nor the uncertainty of its fit explains (`transfer.beyond`), None where no fit converged.  score_tests,
-    validation_tests:
+    `model` nor the uncertainty of its fit explains (`transfer.beyond_fit_uncertainty`), None where no fit converged.
+    score_tests, validation_tests:
     the grounds, in the order they were made.  failed: models whose replay blew up where their refit was to begin, or
     on the test recording, which then is not in gaps.
     before, after: where the gap lives on the fitted recording.  rivals: models that do as well as `model`, refitted;

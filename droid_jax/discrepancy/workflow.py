@@ -60,7 +60,7 @@ def score(case: Case, model: FittedModel, asked: tuple[ScoreDirection, ...]) -> 
 def search_effects(
     case: Case, base: FittedModel, floor: float, progress: Progress = lambda stage, value: None
 ) -> Verdict:
-    """From a base fit to a verdict.  floor: U0, see `numerical_floor`.
+    """From a base fit to a verdict.  floor: U0, see `discretisation_error`.
 
     Raises ValueError where the case's effects have no place that could be asked about.
     """

@@ -50,7 +50,7 @@ class Identifiability:
 
 
 def posterior(refined: Refined, comparisons: Sequence[Comparison]) -> Gaussian:
-    """The Gaussian to hand on, in search coordinates over the refined space: `told` with the stated prior."""
+    """The Gaussian to hand on, in search coordinates over the refined space: `posterior_of` with the stated prior."""
     return with_stated_prior(posterior_of(refined, comparisons), refined)
 
 

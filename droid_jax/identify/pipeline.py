@@ -161,7 +161,9 @@ def prepare(
     config: IdentifyConfig | None = None,
     effects: Sequence[Effect] = (),
 ) -> Preparation:
-    """The part of `identify` before the search: whatever is wrong with the input is told here, and nothing written."""
+    """The part of `identify_parameters` before the search: whatever is wrong with the input is told here, and
+    nothing written.
+    """
     began = time.monotonic()
     config = instance(IdentifyConfig() if config is None else config, "config", IdentifyConfig)
     recordings = recordings_of(recordings)
@@ -216,7 +218,7 @@ def search_cost(
 
 
 def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: Progress | None = None) -> Identified:
-    """The rest of `identify`: search, refine, calibrate, judge."""
+    """The rest of `identify_parameters`: search, refine, calibrate, judge."""
     report = progress or (lambda stage, value: None)
     config, space, full, base = problem.config, problem.space, problem.full, problem.fit
     seconds: dict[str, float] = {}

@@ -35,7 +35,7 @@ _SIZE = {
 _SHIFT = {"name": str, "unit": str, **dict.fromkeys(("before", "after", "deviation_before"), _MAYBE)}
 _TREND = {**dict.fromkeys(("candidate", "amplitude", "unit"), str), "per_repeat": _MAYBE, "p": _MAYBE}
 _ABOUT = {"what": str, "mark": str, "confused_with": [str]}
-_SETUP = {"robot": Maybe({"hidden": Maybe(str)}), "synthetic_robot": Maybe(bool), "recording": Maybe([str])}
+_SETUP = {"hidden": Maybe(str), "synthetic_robot": Maybe(bool), "recording": Maybe([str])}
 _EXPERIMENT = {"what": str, "distance": _MAYBE, "not_made": Maybe(str)}
 _HINT = {"effects": [str], "indistinguishable": [[str]], "closed": {str: _NUMBER}}
 _SCHEMA = {
@@ -178,7 +178,7 @@ class Gap:
 def hidden_in(found: Mapping[str, Any]) -> str:
     """What the synthetic robot hid that was searched, of gap.json, in words; empty where nothing is known."""
     setup = found["setup"]
-    return setup.get("robot", {}).get("hidden", "") if setup.get("synthetic_robot") else ""
+    return setup.get("hidden", "") if setup.get("synthetic_robot") else ""
 
 
 def has_gap(folder: Path) -> bool:

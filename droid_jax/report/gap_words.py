@@ -111,7 +111,7 @@ def deviations(shift: Mapping[str, Any]) -> float:
 
 def settings(gap: Gap) -> list[str]:
     """What was asked for, one text per setting; what only tells a run that goes on from another stays in its file."""
-    out, untold = [], ("command", "start", "synthetic_robot", "robot")
+    out, untold = [], ("command", "start", "synthetic_robot", "robot", "hidden")
     for name, value in gap.found["setup"].items():
         if value not in (None, [], "") and name not in untold and not name.endswith("_sha256"):
             words = ", ".join(map(str, value)) if isinstance(value, list) else str(value)

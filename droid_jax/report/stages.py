@@ -16,12 +16,11 @@ _MEND = "start the run of this folder over with --again"
 
 
 class Robot(TypedDict, total=False):
-    """What is known of a synthetic robot that was recorded; hidden: what `hide` means, in words."""
+    """What is known of a synthetic robot that was recorded."""
 
     springs: int
     seed: int
     hide: list[str]
-    hidden: str
 
 
 class Setup(TypedDict, total=False):

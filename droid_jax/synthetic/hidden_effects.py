@@ -132,14 +132,15 @@ def listed(effects: Mapping[str, float] | Sequence[Applied]) -> list[Applied]:
     return found
 
 
-def in_words(effects: Mapping[str, float]) -> str:
-    """{"magnetic_catch": 1.5} -> "magnetic catch (1.5 N m; in the library: latch)"; empty for nothing."""
+def in_words(hide: Sequence[str]) -> str:
+    """["magnetic_catch=1.5"] -> "magnetic catch (1.5 N m; in the library: latch)"; empty for nothing."""
     said = []
-    for one in listed(effects):
-        effect, called = HIDDEN.get(one.name), LIBRARY.get(one.name, "")
-        called = ON_HINGE.get(called, called) if one.joint == HINGE else called
-        name = f"{one.name}[{one.joint}]" if one.joint else one.name
-        size = f"{one.amplitude:g} {effect.unit}".removesuffix(" -") if effect else f"{one.amplitude:g}"
+    for entry in hide:
+        name, _, amplitude = entry.partition("=")
+        kind, _, joint = name.rstrip("]").partition("[")
+        effect, called = HIDDEN.get(kind), LIBRARY.get(kind, "")
+        called = ON_HINGE.get(called, called) if joint == HINGE else called
+        size = f"{amplitude} {effect.unit}".removesuffix(" -") if effect else amplitude
         library = f"in the library: {label(called).lower()}" if called else "the library has no form of it"
         said.append(f"{label(name).lower()} ({size}; {library})")
     return enumerated(said)

@@ -21,7 +21,7 @@ from droid_jax.arguments import check_fields, choice, number, several, whole
 from droid_jax.door.builtin import HINGE
 from droid_jax.door.space import JOINT_DAMPING, door_nuisances, door_space, torque_offsets
 from droid_jax.door.space import truth as table_i
-from droid_jax.files import STAND_IN_SOURCE as SOURCE
+from droid_jax.files import SYNTHETIC_SOURCE as SOURCE
 from droid_jax.model.fields import time_offset
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model

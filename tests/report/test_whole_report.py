@@ -60,7 +60,7 @@ def test_what_the_synthetic_robot_hid_is_said_in_the_librarys_words_too(tmp_path
     searched = json.loads(path.read_text())
     searched["setup"] |= {
         "synthetic_robot": True,
-        "robot": {"hidden": in_words({"magnetic_catch": 1.5, "detent": 0.5})},
+        "hidden": in_words(["magnetic_catch=1.5", "detent=0.5"]),
     }
     path.write_text(json.dumps(searched))
     assert (
@@ -161,12 +161,12 @@ def test_a_stage_alone_has_no_lead(tmp_path: Path):
 @pytest.mark.parametrize(
     ("hidden", "called"),
     [
-        ("stribeck_friction[hinge]", "hinge stribeck"),
-        ("directional_friction[hinge]", "hinge directional"),
-        ("stribeck_friction[panda_joint2]", "joint stribeck"),
-        ("stribeck_friction", "joint stribeck"),
-        ("dry_friction[hinge]", "joint coulomb"),
+        ("stribeck_friction[hinge]=1", "hinge stribeck"),
+        ("directional_friction[hinge]=1", "hinge directional"),
+        ("stribeck_friction[panda_joint2]=1", "joint stribeck"),
+        ("stribeck_friction=1", "joint stribeck"),
+        ("dry_friction[hinge]=1", "joint coulomb"),
     ],
 )
 def test_what_was_hidden_is_called_as_the_library_does_there(hidden: str, called: str):
-    assert f"in the library: {called})" in in_words({hidden: 1.0})
+    assert f"in the library: {called})" in in_words([hidden])
