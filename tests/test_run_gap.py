@@ -19,12 +19,12 @@ from small_gap import EFFECTS, FLOOR, JOINTS, PRELOAD, QUICK, SCENE, record, sma
 from droid_jax.commands import gap, report
 from droid_jax.commands.synthetic import hidden_effects, record_synthetic
 from droid_jax.discrepancy import amendments, missing, restart
-from droid_jax.discrepancy.inputs import check_recordings, lags
 from droid_jax.discrepancy.verdict import Experiment
 from droid_jax.door.scene import door_scene
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects import registry
 from droid_jax.model.parameters import Parameter, Scaling
+from droid_jax.preflight.search_inputs import check_recordings, lags
 from droid_jax.recordings.formats import save
 from droid_jax.recordings.recording import Channel, Recording
 from droid_jax.report.gap_folder import read_gap

@@ -16,13 +16,13 @@ from small_log import ASKED, CONFIG, COULOMB, elbow, elbow_log, write_elbow
 from droid_jax import runtime
 from droid_jax.commands import gap
 from droid_jax.commands.gap_search import IN_BLOCKS
+from droid_jax.cost.lone_log import LoneLog
 from droid_jax.discrepancy import missing
-from droid_jax.discrepancy.extended import load_extended
-from droid_jax.discrepancy.single import Log
-from droid_jax.discrepancy.split import Split, roles_of, split_of
+from droid_jax.identify.extended_model import load_extended
 from droid_jax.identify.search import SearchConfig
 from droid_jax.recordings.formats import save
 from droid_jax.recordings.recording import Recording
+from droid_jax.recordings.split import Split, roles_of, split_of
 from droid_jax.report.gap_folder import Gap, read_gap
 from droid_jax.run import main
 
@@ -130,7 +130,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
     def remembered(*arguments):
         with pytest.MonkeyPatch.context() as inside:
-            inside.setattr(Log, "whitened", lambda *a: pytest.fail("this replay was kept"))
+            inside.setattr(LoneLog, "whitened", lambda *a: pytest.fail("this replay was kept"))
             return find(*arguments)
 
     with pytest.MonkeyPatch.context() as patch:

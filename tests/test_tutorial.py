@@ -12,7 +12,7 @@ from typing import Any
 import matplotlib
 import pytest
 
-from droid_jax.discrepancy.extended import Extended
+from droid_jax.identify.extended_model import Extended
 from droid_jax.identify.gaussian import prior
 from droid_jax.model.effects.registry import effect_space, library, ready
 from droid_jax.model.parameter_file import load_parameters

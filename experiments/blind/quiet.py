@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.discrepancy.candidates import Candidate, candidates
 from droid_jax.discrepancy.case import Case
-from droid_jax.discrepancy.refit import refit
+from droid_jax.discrepancy.fitting import refit
 from droid_jax.identify.multistart import RefineConfig
+from droid_jax.model.effects.candidate import Candidate, candidates
 from droid_jax.recordings.recording import Recording
 from droid_jax.synthetic.hidden_effects import Applied
 from droid_jax.synthetic.robot import SyntheticRobotConfig
@@ -66,7 +66,7 @@ def around(plain: Recording, noisy: Recording) -> Recording:
 
 
 def _parts(case: Case, result: Mapping[str, Any]) -> list[Candidate]:
-    known = {c.name: c for c in candidates(case.effects)}
+    known = {str(c.key): c for c in candidates(case.effects)}
     return [known[name] for name in result["effects"]]
 
 

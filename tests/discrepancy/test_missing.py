@@ -15,7 +15,6 @@ import droid_jax as dj
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.discrepancy import missing
 from droid_jax.discrepancy.candidates import acts_on_commands_only, observable_effects
-from droid_jax.discrepancy.split import Split
 from droid_jax.discrepancy.verdict import Conclusion
 from droid_jax.identify.search import SearchConfig
 from droid_jax.model.effect_interface import Effect
@@ -23,6 +22,7 @@ from droid_jax.model.effects.registry import joined, library
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import compile_scene
 from droid_jax.recordings.recording import Recording
+from droid_jax.recordings.split import Split
 
 SEARCH = replace(CONFIG, search=SearchConfig(population=8, parents=None, generations=2), max_effects=1)
 
