@@ -8,8 +8,8 @@ repeat, its score.  Source of the projection: Plumlee, Bayesian calibration of i
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -139,13 +139,36 @@ def score_test(
     blown_up = np.isnan(raw).any(axis=1)
     raw[blown_up] = 0.0
     projected = project(raw, base, prior)
-    scores = projected @ model.residuals.T  # [K, N]
-    t, p = residual_set.resampling.largest_score(scores, projected, base, prior, seed)
-    size = scores.mean(axis=1) / np.maximum(np.einsum("km,km->k", projected, projected), 1e-30)
-    shared = model.residuals.mean(axis=0)
-    explained = size * scores.mean(axis=1) / max(float(shared @ shared), 1e-30)
+    rows = residual_set.resampling
+    found = scored(
+        model.residuals, directions, raw, projected, lambda s: rows.largest_score(s, projected, base, prior, seed)
+    )
     failed = tuple(dict.fromkeys(directions[k].candidate.key for k in np.flatnonzero(blown_up).tolist()))
-    return ScoreTest(tuple(directions), raw, projected, t, explained, size, p, failed)
+    return replace(found, failed=failed)
+
+
+def scored(
+    residuals: np.ndarray,
+    directions: Sequence[ScoreDirection],
+    raw: np.ndarray,
+    projected: np.ndarray,
+    largest: Callable[[np.ndarray], tuple[np.ndarray, float]],
+) -> ScoreTest:
+    """Score projected sensitivities against residuals.
+
+    Args:
+        residuals: [N, M] of the model.
+        directions: K of them.
+        raw: [K, M] their sensitivities before projection.
+        projected: [K, M] after it.
+        largest: scores [K, N] -> statistic [K] and the p-value of the largest (see `Resampling.largest_score`).
+    """
+    scores = projected @ residuals.T  # [K, N]
+    t, p = largest(scores)
+    size = scores.mean(axis=1) / np.maximum(np.einsum("km,km->k", projected, projected), 1e-30)
+    shared = residuals.mean(axis=0)
+    explained = size * scores.mean(axis=1) / max(float(shared @ shared), 1e-30)
+    return ScoreTest(tuple(directions), raw, projected, t, explained, size, p)
 
 
 @dataclass(frozen=True)
