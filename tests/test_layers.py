@@ -79,6 +79,36 @@ def test_imports_point_only_to_layers_further_up():
     assert faults(PACKAGE) == []
 
 
+def names_of_mjx_internals(source: str) -> set[str]:
+    """What of mjx's private parts a module names: `mujoco.mjx._src` in an import, `_impl` as an attribute or a path."""
+    found = {name for name in imports(source, ("droid_jax",), False) if name.startswith("mujoco.") and "._" in name}
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Attribute) and node.attr in ("_impl", "_src"):
+            found.add(node.attr)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.split(".")[0] == "_impl":
+            found.add(node.value)
+    return found
+
+
+def test_mjx_internals_are_named_in_one_module():
+    """Another MuJoCo is one file's work."""
+    found = {f.relative_to(PACKAGE).as_posix(): names_of_mjx_internals(f.read_text()) for f in PACKAGE.rglob("*.py")}
+    assert [path for path, names in found.items() if names] == ["model/mjx_internals.py"]
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "rows = data._impl",
+        "import mujoco.mjx._src.math as math",
+        "from mujoco.mjx._src import constraint",
+        'data = data.tree_replace({"_impl.efc_force": force})',
+    ],
+)
+def test_a_name_of_mjx_internals_is_found(source):
+    assert names_of_mjx_internals(source)
+
+
 def test_every_folder_and_file_of_the_package_is_a_layer():
     names = {p.stem for p in PACKAGE.iterdir() if p.suffix == ".py" or (p.is_dir() and any(p.glob("*.py")))}
     assert names <= {*ORDER, *FOR_ALL, "__init__", "__main__"}

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from droid_jax.door.task import Seen
+from droid_jax.model.mjx_internals import constraint_rows, contacts
 from droid_jax.model.scene import Scene
 from droid_jax.simulate.replay import finger_geoms, of_fingers
 
@@ -70,11 +71,10 @@ def looked(hand: Hand, data: Any, force: Any, last: Any, seconds: float, numbers
 
 def finger_forces(hand: Hand, data: Any) -> jax.Array:
     """[2] N, normal force on each finger, from mjx.Data after a step."""
-    contact, rows = data._impl.contact, data._impl
-    force: Any = rows.efc_force
-    edges: Any = force[contact.efc_address[:, None] + np.arange(EDGES)]
-    normal = jnp.sum(edges, axis=1) * (contact.dist < 0)
-    return jnp.stack([jnp.sum(normal * mine) for mine in of_fingers(contact, hand.pairs)])
+    found = contacts(data)
+    edges = constraint_rows(data).force[found.first_row[:, None] + np.arange(EDGES)]
+    normal = jnp.sum(edges, axis=1) * (found.distance < 0)
+    return jnp.stack([jnp.sum(normal * mine) for mine in of_fingers(found, hand.pairs)])
 
 
 def finger_forces_c(hand: Hand, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:

@@ -19,6 +19,7 @@ from droid_jax.arguments import instance
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.model.fields import check_space, element_name
 from droid_jax.model.inertia import possible_draws
+from droid_jax.model.mjx_internals import friction_dofs
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import POSE, UNIT, Physics, joined_bodies, make_physics, model_writes, written_fields
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
@@ -106,7 +107,7 @@ def _geoms_among(scene: Scene, model: Any, fields: Sequence[str]) -> dict[str, n
 
 def _check_friction_rows(scene: Scene, model: Any, written: Iterable[tuple[int, ...]]) -> None:
     """ValueError for a friction loss that was zero when the model was compiled: MJX laid out no row for it."""
-    rows = getattr(model._impl, "dof_hasfrictionloss", None)  # of the implementation in JAX; others lay out all rows
+    rows = friction_dofs(model)
     without = [i for (i, *_) in written if rows is not None and not rows[i]]
     if without:
         names = ", ".join(element_name(scene.model, "dof_frictionloss", (i,)) or f"dof {i}" for i in without)

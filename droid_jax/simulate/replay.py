@@ -19,6 +19,7 @@ import numpy as np
 from droid_jax.model.actuators import has_servo_damping
 from droid_jax.model.effect_interface import Effect, Rollout, State, Theta, column, complete
 from droid_jax.model.encoders import encoder_error, misplaced_compensation
+from droid_jax.model.mjx_internals import Contacts, constraint_rows, contacts
 from droid_jax.model.physics import Physics
 from droid_jax.model.quiet_mjx import mjx
 from droid_jax.model.scene import Scene
@@ -306,9 +307,9 @@ def _joint_torque(model, before, after, servo: jax.Array, joints: np.ndarray, dr
         gain = (after.qvel - before.qvel)[joints]
         velocity = after.qvel[joints] - (0.0 if parity else 0.5) * gain
         torque = torque - model.dof_armature[joints] * gain / drive.timestep - model.dof_damping[joints] * velocity
-        rows = after._impl
-        dry = slice(rows.ne, rows.ne + rows.nf)
-        torque = torque + (rows.efc_J[dry].T @ rows.efc_force[dry])[joints]
+        rows = constraint_rows(after)
+        dry = slice(rows.equalities, rows.equalities + rows.frictions)
+        torque = torque + (rows.jacobian[dry].T @ rows.force[dry])[joints]
     share = weight_share(model, joints, drive.torque.gravity)
     return torque + share * after.qfrc_gravcomp[joints] if share.any() else torque
 
@@ -319,9 +320,9 @@ def finger_geoms(scene: Scene) -> tuple[np.ndarray, ...]:
     return tuple(both[pairs] for pairs in scene.finger_pairs)
 
 
-def of_fingers(contact: Any, fingers: Sequence[np.ndarray]) -> list[jax.Array]:
+def of_fingers(found: Contacts, fingers: Sequence[np.ndarray]) -> list[jax.Array]:
     """For each finger, [contacts] bool: which of MJX's contacts are of its pairs, as `finger_geoms` has them."""
-    geoms = jnp.sort(contact.geom, axis=1)  # [contacts, 2]
+    geoms = jnp.sort(found.geoms, axis=1)  # [contacts, 2]
     return [jnp.any(jnp.all(geoms[:, None] == pairs[None], axis=-1), axis=1) for pairs in fingers]
 
 
@@ -329,5 +330,5 @@ def _touching(data, fingers: Sequence[np.ndarray]) -> jax.Array:
     """[F] bool: does any contact of a finger's pairs penetrate?"""
     if not fingers:
         return jnp.zeros((0,), bool)
-    contact = data._impl.contact
-    return jnp.stack([jnp.any(mine & (contact.dist < 0)) for mine in of_fingers(contact, fingers)])
+    found = contacts(data)
+    return jnp.stack([jnp.any(mine & (found.distance < 0)) for mine in of_fingers(found, fingers)])
