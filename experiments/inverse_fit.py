@@ -178,7 +178,7 @@ def estimate(cost: Cost, space: Space, start: np.ndarray, block: float) -> Estim
         raise ValueError(f"block: residuals stay correlated for {longest:.2f} s, got {block} s")
     refined = refine(cost.restated(start).whitened, space, start)
     samples, columns = left.shape
-    blocks = time_blocks([(columns, samples)], [samples / noise.RATE], block)
+    blocks = time_blocks([(columns, samples)], [samples / noise.DEFAULT_NOISE.rate], block)
     return Estimate(space, refined.best, calibrated(refined, (), blocks), refined)  # one repeat: no scatter
 
 

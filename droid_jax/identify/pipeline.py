@@ -12,14 +12,20 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.arguments import check_fields, instance, number, one_of, optional, whole
+from droid_jax.arguments import check_fields, flag, instance, number, one_of, optional, whole
 from droid_jax.cost.cost import ENGINES, Cost, make_cost
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.identify.divergence import blow_up
 from droid_jax.identify.fit import Fit
 from droid_jax.identify.gaussian import Gaussian, prior, space_to_json
-from droid_jax.identify.holdout import TorqueDistance, split_repeats, torque_distances
-from droid_jax.identify.identifiability import Identifiability, identifiability, not_judged, posterior
+from droid_jax.identify.holdout import WORTH, TorqueDistance, split_repeats, torque_distances
+from droid_jax.identify.identifiability import (
+    Identifiability,
+    IdentifiabilityConfig,
+    identifiability,
+    not_judged,
+    posterior,
+)
 from droid_jax.identify.multistart import RefineConfig, Refined, refine
 from droid_jax.identify.search import SearchConfig, search
 from droid_jax.identify.solution_checks import SolutionCheck, check_solution
@@ -43,6 +49,9 @@ class IdentifyConfig:
     samples: replays drawn from the initial and from the fitted Gaussian to compare their costs.
     seed: of those samples (the search has its own).
     compare: how simulation and measurement are compared.
+    identifiability: what decides the calibrated width, and when a parameter counts as identifiable.
+    worth: share of the noise floor by which the distance before the fit must exceed it, else there was nothing to close
+      and `TorqueDistance.closed` is None.
     checks: measure what the time step and the engine leave at the fitted values (`solution_checks`), which takes one
       more compilation.
     """
@@ -54,6 +63,8 @@ class IdentifyConfig:
     samples: int = 200
     seed: int = 0
     compare: CompareConfig = field(default_factory=CompareConfig)
+    identifiability: IdentifiabilityConfig = field(default_factory=IdentifiabilityConfig)
+    worth: float = WORTH
     checks: bool = True
 
     def __post_init__(self) -> None:
@@ -66,6 +77,9 @@ class IdentifyConfig:
             samples=partial(whole, least=0),
             seed=partial(whole, least=0),
             compare=partial(instance, kind=CompareConfig),
+            identifiability=partial(instance, kind=IdentifiabilityConfig),
+            worth=partial(number, least=0),
+            checks=flag,
         )
 
 
@@ -78,6 +92,7 @@ class Identified:
     over `full`.  search: the CMA-ES part.  refined: or None.  identifiability: per parameter of `full`.
     torque_distances: by recording name.  fit, heldout: costs over `full` on the fitted and the held-out repeats.
     heldout_repeats: by recording name.  seconds: by stage.  checks: by recording name, of those with commands.
+    config: the settings it was found with.
     """
 
     scene: Scene
@@ -95,6 +110,7 @@ class Identified:
     heldout_repeats: dict[str, tuple[int, ...]]
     seconds: dict[str, float]
     checks: dict[str, SolutionCheck] = field(default_factory=dict)
+    config: IdentifyConfig = field(default_factory=IdentifyConfig)
 
     @property
     def start(self) -> np.ndarray:
@@ -241,12 +257,13 @@ def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: 
     if config.refine is not None:
         base, refined = _refined(base, starts(full, space, found), config.refine, lambda p: report("refine", p))
     best = found.best if refined is None else refined.best
-    full_gaussian = found.gaussian() if refined is None else posterior(refined, base.comparisons)
+    judging = config.identifiability
+    full_gaussian = found.gaussian() if refined is None else posterior(refined, base.comparisons, judging)
     seconds["refine"] = time.monotonic() - began
 
     began = time.monotonic()
     report("judge", None)
-    gaps = torque_distances(problem.heldout, problem.recordings, problem.heldout_count, full.mean, best)
+    gaps = torque_distances(problem.heldout, problem.recordings, problem.heldout_count, full.mean, best, config.worth)
     seconds["judge"] = time.monotonic() - began
 
     began = time.monotonic()
@@ -262,13 +279,16 @@ def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: 
         full_gaussian=full_gaussian,
         search=found,
         refined=refined,
-        identifiability=not_judged(full_gaussian) if refined is None else identifiability(full_gaussian, refined.prior),
+        identifiability=(
+            not_judged(full_gaussian) if refined is None else identifiability(full_gaussian, refined.prior, judging)
+        ),
         torque_distances=dict(zip(names, gaps, strict=True)),
         fit=base,
         heldout=problem.heldout,
         heldout_repeats=dict(zip(names, problem.heldout_repeats, strict=True)),
         seconds=seconds,
         checks=checks,
+        config=config,
     )
 
 

@@ -33,8 +33,6 @@ if TYPE_CHECKING:
 
 Cost = Callable[[np.ndarray], Any]  # [rows, D] float64 physical values -> [rows]; +inf is a failed row
 
-_NEAR = 1.0  # search coordinates, one prior deviation: so near to a bound the best is tried on it
-
 
 class NotReplayed(ValueError):
     """No replay gave numbers where a search or a refinement needed some."""
@@ -51,9 +49,11 @@ class SearchConfig:
                 draws what a single search with seed + r would draw.
     sigma:      initial step in search coordinates; 1 starts from the prior.
     bounds:     "resample" redraws rows in which a linearly scaled parameter is out of bounds and clips
-                what is still outside after cma.REDRAWS draws, and mirrors log-scaled ones at their bounds; at the
-                end the best is asked for once more with what lies near a bound on it;
+                what is still outside after `redraws` draws, and mirrors log-scaled ones at their bounds; at the
+                end the best is asked for once more with what lies near a bound (`near_bound`) on it;
                 "clip" clips both, which leads nowhere where several optima lie beyond their bounds.
+    redraws:    draws per row among which one inside the bounds is looked for.
+    near_bound: search coordinates, one prior deviation: so near to a bound the best is tried on it.
     active:     negative weights for the worst rows; None: only when `parents` is None.
     tol_cost:   a restart stops when its best cost fell by less than this share over `patience`
                 generations; 0 never.
@@ -71,6 +71,8 @@ class SearchConfig:
     restarts: int = 1
     sigma: float = 1.0
     bounds: Literal["resample", "clip"] = "resample"
+    redraws: int = 64
+    near_bound: float = 1.0
     active: bool | None = None
     tol_cost: float = 1e-4
     patience: int = 20
@@ -82,8 +84,10 @@ class SearchConfig:
     def __post_init__(self) -> None:
         check_fields(
             self,
-            **dict.fromkeys(("generations", "restarts", "patience", "checkpoint_every"), partial(whole, least=1)),
-            **dict.fromkeys(("tol_cost", "tol_sigma"), partial(number, least=0)),
+            **dict.fromkeys(
+                ("generations", "restarts", "patience", "checkpoint_every", "redraws"), partial(whole, least=1)
+            ),
+            **dict.fromkeys(("tol_cost", "tol_sigma", "near_bound"), partial(number, least=0)),
             population=partial(whole, least=2),
             parents=optional(whole),
             sigma=partial(number, above=0),
@@ -149,7 +153,8 @@ def _strategy(space: Space, config: SearchConfig) -> Strategy:
     active = config.parents is None if config.active is None else config.active
     weights = recombination(config.population, config.elite, len(space), active)
     seeds = range(config.seed, config.seed + config.restarts)
-    return Strategy(space, weights, sigma=config.sigma, seeds=seeds, redraw=config.bounds == "resample")
+    redraws = config.redraws if config.bounds == "resample" else 0
+    return Strategy(space, weights, sigma=config.sigma, seeds=seeds, redraws=redraws)
 
 
 def _generation(run: SearchState, cost: Cost, strategy: Strategy, config: SearchConfig) -> None:
@@ -197,19 +202,21 @@ def _try_bounds(run: SearchState, cost: Cost, space: Space, config: SearchConfig
         return 0
     known = np.isfinite(run.best_cost)  # a restart whose every row blew up has no best
     bests = np.where(known[:, None], run.best, space.mean)
-    values = np.stack([_moved_onto_bounds(space, best, config.population) for best in bests])  # [R, P, D]
+    values = np.stack(
+        [_moved_onto_bounds(space, best, config.population, config.near_bound) for best in bests]
+    )  # [R, P, D]
     if (values == bests[:, None])[known].all():
         return 0
     run.keep_best(values, _evaluate(cost, values), known, ties=True)
     return values.shape[0] * values.shape[1]
 
 
-def _moved_onto_bounds(space: Space, best: np.ndarray, rows: int) -> np.ndarray:
+def _moved_onto_bounds(space: Space, best: np.ndarray, rows: int, near: float) -> np.ndarray:
     """Values [rows, D]: the best [D] with all its near coordinates on their bounds, then with ever fewer."""
     x, low, high = (space.to_search(values) for values in (best, space.low, space.high))
     gap = np.minimum(x - low, high - x)
     values = np.tile(best, (rows, 1))
-    farthest = [i for i in np.argsort(-gap) if gap[i] <= _NEAR]
+    farthest = [i for i in np.argsort(-gap) if gap[i] <= near]
     for k, i in enumerate(farthest[-rows:], start=1):
         values[:k, i] = (space.low if x[i] - low[i] == gap[i] else space.high)[i]
     return values

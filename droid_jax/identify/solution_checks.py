@@ -15,7 +15,6 @@ import numpy as np
 
 from droid_jax import runtime
 from droid_jax.cost.cost import Cost, with_sensors
-from droid_jax.cost.observation import MINIMUM_NOISE
 from droid_jax.cost.residuals import Comparison
 from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.parameters import Space
@@ -148,7 +147,9 @@ class _Replayed:
         """The checks, and whether they took a compilation."""
         mj_step, torque = self.comparison.config.mj_step, self.comparison.channel("torque")
         left = _rms(self._torque(self.rollout) - torque.noise.mean)
-        check = SolutionCheck(torque.unit, self.drive.timestep, max(left, MINIMUM_NOISE["torque"]))
+        check = SolutionCheck(
+            torque.unit, self.drive.timestep, max(left, self.comparison.config.noise.minimum["torque"])
+        )
         if engine == "mujoco":
             if not mj_step:
                 check = self._with_step(check, self._in_c(2))

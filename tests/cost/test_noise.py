@@ -7,7 +7,8 @@ import pytest
 import scipy.signal
 
 from droid_jax.cost.noise import (
-    RATE,
+    DEFAULT_NOISE,
+    NoiseConfig,
     coarse_clock,
     correlation_time,
     detrend,
@@ -24,7 +25,7 @@ INSIDE = (COARSE > 0.5) & (COARSE < 5.5)
 
 def test_the_coarse_clock_keeps_its_ends_and_its_rate():
     assert COARSE[0] == 0.0 and COARSE[-1] == CLOCK[-1]
-    assert 1 / np.diff(COARSE).mean() == pytest.approx(RATE, rel=0.01)
+    assert 1 / np.diff(COARSE).mean() == pytest.approx(DEFAULT_NOISE.rate, rel=0.01)
     assert len(coarse_clock(1.0, 1.001)) == 2
 
 
@@ -234,8 +235,8 @@ def test_correlation_time_of_a_moving_average():
     white = np.random.default_rng(1).normal(size=(4000, 1))
     averaged = np.convolve(white[:, 0], np.ones(10) / 10, "valid")[:, None]
     # a box of n samples has the triangular autocorrelation, whose two-sided sum is n
-    assert correlation_time(averaged)[0] == pytest.approx(10 / RATE, rel=0.3)
-    assert correlation_time(white)[0] == pytest.approx(1 / RATE, rel=0.4)
+    assert correlation_time(averaged)[0] == pytest.approx(10 / DEFAULT_NOISE.rate, rel=0.3)
+    assert correlation_time(white)[0] == pytest.approx(1 / DEFAULT_NOISE.rate, rel=0.4)
 
 
 def test_the_stated_deviation_makes_correlated_residuals_count_once():
@@ -271,6 +272,28 @@ def test_what_warms_up_from_repeat_to_repeat_is_no_noise(repeats: int, forgiven:
     warming = calm + 0.5 * (np.arange(repeats) - (repeats - 1) / 2)[:, None, None]
     still, moving = (estimate_noise(r, minimum=1e-3).whitener[0] @ np.ones(200) for r in (calm, warming))
     assert bool(np.linalg.norm(moving) > 0.95 * np.linalg.norm(still)) is forgiven
+
+
+def test_the_settings_reach_the_noise():
+    """Each one changes what it says it does, and nothing else decides it."""
+    rng = np.random.default_rng(7)
+    white = rng.normal(0, 0.1, (6, 200, 1))
+    one_lag = estimate_noise(white, minimum=1e-3, config=NoiseConfig(longest_lag=0.0, shrinkage=1.0))
+    off = one_lag.whitener[0] - np.diag(np.diag(one_lag.whitener[0]))
+    constant = estimate_noise(white, minimum=1e-3).whitener[0]
+    assert np.abs(off).max() < 0.05 * np.abs(constant - np.diag(np.diag(constant))).max()
+    slow = lowpass(CLOCK, COARSE, NoiseConfig(cutoff=2.0)) @ np.sin(2 * np.pi * 4.0 * CLOCK)
+    fast = lowpass(CLOCK, COARSE) @ np.sin(2 * np.pi * 4.0 * CLOCK)
+    assert np.abs(slow[INSIDE]).max() < 0.1 < 0.9 < np.abs(fast[INSIDE]).max()
+    assert len(coarse_clock(0.0, 2.0, 50.0)) == 101
+    warming = white + 0.5 * np.arange(6)[:, None, None]
+    told = estimate_noise(warming, minimum=1e-3, config=NoiseConfig(trend_repeats=7)).whitener[0] @ np.ones(200)
+    assert np.linalg.norm(told) < 0.5 * np.linalg.norm(estimate_noise(warming, minimum=1e-3).whitener[0] @ np.ones(200))
+    mask = np.ones((1, len(CLOCK), 1), bool)
+    mask[:, : len(CLOCK) // 2] = False
+    kernel = lowpass(CLOCK, COARSE)
+    strict, lax = (np.isnan(smooth(np.ones(mask.shape), mask, kernel, least)).sum() for least in (0.9, 0.1))
+    assert strict > lax
 
 
 @pytest.mark.parametrize("gap", [0.05, 0.08, 0.12, 0.14, 0.16, 0.18, 0.5])

@@ -36,6 +36,7 @@ from droid_jax.identify.search import SearchConfig
 from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Channel
+from droid_jax.storage import config_json
 
 QUICK = IdentifyConfig(search=SearchConfig(population=8, parents=None, generations=2), refine=None, samples=2)
 
@@ -132,6 +133,13 @@ def test_traces_and_joints_are_of_the_held_out_repeat(found: Identified):
     everything = make_comparison(elbow(), elbow_log(COULOMB, 10.0, 2), held.clock, CompareConfig(whitened=True))
     apart = np.diff(everything.channel("torque").noise.repeats[..., 0], axis=0)  # of two, one of which is held out
     assert gap.per_joint_noise_floor == pytest.approx([np.sqrt(np.mean(apart**2) / 2)], rel=0.02)
+
+
+def test_the_settings_that_decided_are_in_the_result(found: Identified, tmp_path: Path):
+    write_run(tmp_path, found, {"recordings": []})
+    config = json.loads((tmp_path / "fit.json").read_text())["config"]
+    assert config == config_json(found.config) and config["search"]["population"] == 8
+    assert config["compare"]["noise"]["cutoff"] == 8.0 and config["identifiability"]["identifiable"] == 0.25
 
 
 def test_the_command_says_how_it_went_and_what_to_do(found: Identified, tmp_path: Path, capsys):
