@@ -8,6 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from droid_jax.door.scene import door_scene
+from droid_jax.door.space import door_nuisances, door_space
+from droid_jax.model.effects.registry import library
+from droid_jax.model.parameters import OF_A_JOINT
+
 PACKAGE = Path(__file__).resolve().parents[1] / "droid_jax"
 ORDER = (
     *("model", "recordings", "simulate", "preflight", "cost", "identify", "discrepancy", "policy", "report"),
@@ -107,6 +112,47 @@ def test_mjx_internals_are_named_in_one_module():
 )
 def test_a_name_of_mjx_internals_is_found(source):
     assert names_of_mjx_internals(source)
+
+
+GENERIC = ("model", "recordings", "simulate", "preflight", "cost", "identify", "discrepancy", "policy", "report")
+NAMES_DEFINED = ("model/parameters.py", "model/effects/")  # where parameters that a replay or an effect reads get names
+NAMES_LOOKED_UP = {"discrepancy/case.py", "discrepancy/localise.py", "discrepancy/candidate_experiments.py"}
+
+
+def parameter_names() -> set[str]:
+    """Names of the parameters of the door, of all effects in its scene, and of what a replay reads; no joints."""
+    scene = door_scene(springs=1)
+    spaces = (*door_space(scene).parameters, *door_nuisances(scene).parameters)
+    effects = (p for e in library(scene) for p in e.parameters)
+    return {p.name.partition("[")[0] for p in (*spaces, *effects)} | {role.value for role in OF_A_JOINT}
+
+
+def looked_up(source: str, names: set[str]) -> set[str]:
+    """Texts in a module, docstrings aside, that are a parameter's name, or begin as one of a joint does."""
+    tree = ast.parse(source)
+    nodes = [n for n in ast.walk(tree) if isinstance(n, (ast.Module, ast.ClassDef, ast.FunctionDef))]
+    documented = {ast.get_docstring(n, clean=False) for n in nodes}
+    texts = {n.value for n in ast.walk(tree) if isinstance(n, ast.Constant) and isinstance(n.value, str)} - documented
+    return {t for t in texts if t.partition("[")[0] in names}
+
+
+def test_generic_layers_know_parameters_by_role():
+    """What a parameter is, `Parameter.role` says; its name is for people."""
+    names = parameter_names()
+    assert {"hinge_preload", "payload_mass", "sliding_friction_left", "time_offset", "torque_offset"} <= names
+    found = {
+        path: hits
+        for file in PACKAGE.rglob("*.py")
+        if (path := file.relative_to(PACKAGE).as_posix()).split("/")[0] in GENERIC
+        and not path.startswith(NAMES_DEFINED)
+        and (hits := looked_up(file.read_text(), names))
+    }
+    assert {path: hits for path, hits in found.items() if path not in NAMES_LOOKED_UP} == {}
+
+
+@pytest.mark.parametrize("source", ['space["hinge_preload"]', 'n.startswith("torque_offset[")', 'f"viscous[{joint}]"'])
+def test_a_looked_up_name_is_found(source):
+    assert looked_up(source, {"hinge_preload", "torque_offset", "viscous"})
 
 
 def test_every_folder_and_file_of_the_package_is_a_layer():

@@ -24,8 +24,8 @@ from droid_jax.cost.residuals import CompareConfig, Comparison, make_comparison
 from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.fields import check_space
 from droid_jax.model.inertia import check_inertia, free_inertias, inertia_possible
-from droid_jax.model.joint_friction import FRICTION, GAIN, TERMS, direction, joint_friction_effect, torque_gain_effect
-from droid_jax.model.parameters import Space
+from droid_jax.model.joint_friction import direction, joint_friction_effect, torque_gain_effect
+from droid_jax.model.parameters import OF_A_JOINT, Role, Space
 from droid_jax.model.physics import make_physics
 from droid_jax.model.scene import Scene
 from droid_jax.preflight.check_log import warn_of_log
@@ -38,7 +38,15 @@ from droid_jax.simulate.initial_state import AJAR, following
 from droid_jax.simulate.inverse_dynamics import Path, path_of, path_replay, prescribed
 from droid_jax.simulate.measured_motion import Motion, measured_motion
 from droid_jax.simulate.repeat_starts import from_one_start, own_starts
-from droid_jax.simulate.replay import Drive, Replay, check_gains, make_drive, servo_replay, torque_offset_effect
+from droid_jax.simulate.replay import (
+    TORQUE_OFFSETS,
+    Drive,
+    Replay,
+    check_gains,
+    make_drive,
+    servo_replay,
+    torque_offset_effect,
+)
 
 ENGINES = ("mjx", "mujoco")
 ALIKE = 2e-3  # rad or m: measured starts that are closer differ by the noise of a sensor
@@ -191,13 +199,14 @@ def check_read(scene: Scene, space: Space, effects: Sequence[Effect]) -> None:
 
     An effect that states no parameters may read any of them.
     """
-    sensed = [f"{what}[{joint}]" for what in TERMS for joint in scene.joints]
-    read = {"time_offset", *sensed, *(p.name for e in effects for p in e.parameters)}
+    late = Role.TIME_OFFSET.in_theta()
+    sensed = [role.in_theta(joint) for role in OF_A_JOINT for joint in scene.joints]
+    read = {late, *sensed, *(p.name for e in effects for p in e.parameters)}
     unread = [p.name for p in space.parameters if not p.writes and p.name not in read]
     if unread and all(e.parameters for e in effects):
         raise ValueError(
             f"parameters {', '.join(unread)} write no field of the model, and nothing in the replay reads them; names "
-            f"that it reads: time_offset, {', '.join(sensed)}, and those of the effects that it is given"
+            f"that it reads: {late}, {', '.join(sensed)}, and those of the effects that it is given"
         )
 
 
@@ -206,7 +215,8 @@ def _warn_of_commanded(space: Space) -> None:
     idle = [
         p.name
         for p in space.parameters
-        if p.name == "time_offset" or (p.writes and all(w.field.startswith(("actuator_", "dof_sol")) for w in p.writes))
+        if p.role is Role.TIME_OFFSET
+        or (p.writes and all(w.field.startswith(("actuator_", "dof_sol")) for w in p.writes))
     ]
     if idle:
         warnings.warn(
@@ -397,12 +407,9 @@ def with_sensors(scene: Scene, space: Space, drive: Drive | Motion, effects: Seq
 def _sensor_effects(scene: Scene, space: Space, drive: Drive | Motion) -> tuple[Effect, ...]:
     """What the torque sensors add: always the offsets, all else where the space asks for it."""
 
-    def asked(*terms: str) -> bool:
-        return any(name.startswith(tuple(f"{term}[" for term in terms)) for name in space.names)
-
     sign = jnp.sign if isinstance(drive, Motion) else direction
-    found = [joint_friction_effect(scene.joints, sign)] if asked(*FRICTION) else []
-    found += [torque_gain_effect(scene.joints)] if asked(GAIN) else []
+    found = [joint_friction_effect(scene.joints, sign)] if space.of_role(Role.VISCOUS, Role.COULOMB) else []
+    found += [torque_gain_effect(scene.joints)] if space.of_role(Role.TORQUE_GAIN) else []
     return (*found, torque_offset_effect(scene.joints))
 
 
@@ -434,7 +441,7 @@ def _engine(
             return lambda values: compiled(values, *of_drive)
 
         return Driven(driven, drive)
-    known = [e for e in effects if e.name != "torque offset"]
+    known = [e for e in effects if e.name != TORQUE_OFFSETS]
 
     def twin(drive: Drive) -> Callable[[np.ndarray], Rollout]:
         checked = _of_bodies(scene, space, c_replay(scene, space, drive, known, late=late))

@@ -154,9 +154,9 @@ def estimate_noise(
     are a constant of each repeat and a stationary rest.
     The rest's autocovariance (biased, hence positive semi-definite) is tapered to `longest_lag` by a Parzen
     window, shrunk by `shrinkage` towards white noise of the same variance, and never less than `minimum` (a deviation
-    in the channel's unit: what one repeat alone would have); the constants' variance is added to it.  With one repeat only
-    `minimum` is used, as white noise.  Source of the window: Parzen, Mathematical considerations in the estimation of
-    spectra, Technometrics 1961.
+    in the channel's unit: what one repeat alone would have); the constants' variance is added to it.  With one repeat
+    only `minimum` is used, as white noise.  Source of the window: Parzen, Mathematical considerations in the estimation
+    of spectra, Technometrics 1961.
     """
     _, length, columns = repeats.shape
     mean = repeats.mean(axis=0)

@@ -144,9 +144,9 @@ def _needs_memory(channel: Channel, steps: int, coarse: np.ndarray) -> None:
     there = float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
     if 2.0 * needed > there:  # what computes with them needs as much again
         raise TooLong(
-            f"channel {channel.name!r} of {coarse[-1] - coarse[0]:.0f} s needs {needed / 1e9:.1f} GB for its filter and "
-            f"the covariance of its noise, and half of this machine's memory is {there / 2e9:.1f} GB: cut the recording "
-            "(`python -m droid_jax.run convert --start S --end S`), or fit its parts as several"
+            f"channel {channel.name!r} of {coarse[-1] - coarse[0]:.0f} s needs {needed / 1e9:.1f} GB for its filter "
+            f"and the covariance of its noise, and half of this machine's memory is {there / 2e9:.1f} GB: cut the "
+            "recording (`python -m droid_jax.run convert --start S --end S`), or fit its parts as several"
         )
 
 

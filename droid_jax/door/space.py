@@ -25,7 +25,7 @@ from droid_jax.model.fields import (
     servo_scale,
     time_offset,
 )
-from droid_jax.model.parameters import Parameter, Space
+from droid_jax.model.parameters import Parameter, Role, Space
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
 
 PAPER_DAMPING_STD = (2.0, 2.0, 2.0, 2.0, 2.0, 1.0, 0.2)  # Table I, N m s/rad
@@ -70,7 +70,9 @@ def door_space(scene: Scene, *, preset: str = "impedance") -> Space:
         raise ValueError(f"scene {scene.name!r} has no grip, whose fingers' friction is part of Table I")
     left, right = scene.grip.fingers
     door = dict(group="Door")
-    grip = dict(group="Gripper", width=0.5)
+    slides, turns = (
+        dict(group="Gripper", width=0.5, role=role) for role in (Role.SLIDING_FRICTION, Role.TORSIONAL_FRICTION)
+    )
     parameters = (
         body_mass(scene, "door", mean=1.144, std=0.5, low=0.05, high=10.0, **door),
         body_mass(scene, "knob", mean=0.199, std=0.1, low=0.01, high=8.0, width=0.7, **door),
@@ -78,10 +80,10 @@ def door_space(scene: Scene, *, preset: str = "impedance") -> Space:
         joint_stiffness(scene, HINGE, mean=0.01, std=0.005, high=10.0, width=1.0, **door),
         joint_damping(scene, HINGE, mean=2.0, std=1.0, high=20.0, width=0.7, **door),
         *_joint_dampings(scene, preset),
-        pair_friction(scene, left, (0, 1), name="sliding_friction_left", unit="-", std=0.25, **grip),
-        pair_friction(scene, right, (0, 1), name="sliding_friction_right", unit="-", std=0.25, **grip),
-        pair_friction(scene, left, (2,), name="torsional_friction_left", unit="m", std=0.25, **grip),
-        pair_friction(scene, right, (2,), name="torsional_friction_right", unit="m", std=0.25, **grip),
+        pair_friction(scene, left, (0, 1), name="sliding_friction_left", unit="-", std=0.25, **slides),
+        pair_friction(scene, right, (0, 1), name="sliding_friction_right", unit="-", std=0.25, **slides),
+        pair_friction(scene, left, (2,), name="torsional_friction_left", unit="m", std=0.25, **turns),
+        pair_friction(scene, right, (2,), name="torsional_friction_right", unit="m", std=0.25, **turns),
     )
     space = Space(parameters)
     return space.linear() if preset == "paper" else space
@@ -124,7 +126,7 @@ def door_nuisances(scene: Scene) -> Space:
 def torque_offsets(joints: tuple[str, ...], std: float = 0.1) -> tuple[Parameter, ...]:
     """Constant error of each joint's torque sensor, N m."""
     return tuple(
-        Parameter(f"torque_offset[{j}]", "N m", 0.0, std if i < 4 else 0.3 * std, -2.0, 2.0, nuisance=True,
+        Parameter(Role.TORQUE_OFFSET.in_theta(j), "N m", 0.0, std if i < 4 else 0.3 * std, -2.0, 2.0, nuisance=True,
                   group="Nuisance")
         for i, j in enumerate(joints)
     )  # fmt: skip

@@ -35,7 +35,7 @@ from scipy import special
 
 from droid_jax.arguments import instance, name, note, number, numeric, one_of, path_of, several, shown, whole
 from droid_jax.identify.truncated_normal import gibbs, quantiles
-from droid_jax.model.parameters import Mode, Parameter, Scaling, Space, Write
+from droid_jax.model.parameters import Mode, Parameter, Role, Scaling, Space, Write, role_in_theta
 from droid_jax.read_json import read_json, typed
 from droid_jax.storage import write_json
 
@@ -260,7 +260,9 @@ def space_to_json(space: Space) -> list[dict[str, Any]]:
     """A space as JSON values: one object per parameter, writes included."""
     out = []
     for p in space.parameters:
-        entry = asdict(p) | {"scaling": p.scaling.value}
+        entry = asdict(p) | {"scaling": p.scaling.value, "role": p.role.value}
+        if p.role is (Role.OTHER if p.writes else role_in_theta(p.name)):
+            del entry["role"]  # as in files of earlier versions
         entry["writes"] = [asdict(w) | {"mode": w.mode.value, "index": list(w.index)} for w in p.writes]
         out.append(entry)
     return out
@@ -278,7 +280,7 @@ class WriteEntry(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class ParameterEntry(msgspec.Struct, forbid_unknown_fields=True):
-    """A parameter in a file."""
+    """A parameter in a file; one whose role follows from its name states none."""
 
     name: str
     unit: str
@@ -292,6 +294,7 @@ class ParameterEntry(msgspec.Struct, forbid_unknown_fields=True):
     scaling: Scaling
     log_offset: float
     width: float | None
+    role: Role = Role.OTHER
 
 
 class _File(msgspec.Struct, forbid_unknown_fields=True):

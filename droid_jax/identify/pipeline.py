@@ -31,7 +31,7 @@ from droid_jax.identify.search import SearchConfig, search
 from droid_jax.identify.solution_checks import SolutionCheck, check_solution
 from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.inertia import possible_draws
-from droid_jax.model.parameters import Space
+from droid_jax.model.parameters import Role, Space
 from droid_jax.model.scene import Scene
 from droid_jax.preflight.check_log import warn_of_log
 from droid_jax.recordings.recording import Recording, recordings_of
@@ -119,6 +119,7 @@ class Identified:
 
 
 Progress = Callable[[str, Any], None]
+FIRM = 4.0  # times its initial mean: the friction of a pad that does not slip
 _FIELDS = tuple(Rollout.__dataclass_fields__)
 
 
@@ -348,8 +349,8 @@ def starts(full: Space, space: Space, found: Fit) -> np.ndarray:
     A grip that slips and one that never does are different basins, and neither start finds the other's.
     """
     searched = full.embed(space, found.best[None])[0]
-    pads = ("sliding_friction", "torsional_friction")
-    firm = {p.name: min(p.high, 4.0 * p.mean) for p in space.parameters if p.name.startswith(pads)}
+    pads = space.of_role(Role.SLIDING_FRICTION, Role.TORSIONAL_FRICTION)
+    firm = {p.name: min(p.high, FIRM * p.mean) for p in pads}
     return np.stack([searched, full.mean, *([full.values(firm)] if firm else [])])
 
 
@@ -358,7 +359,7 @@ def grip_hypotheses(space: Space) -> list[dict[str, float]]:
 
     Slip is a basin of its own: from a sticking finger no derivative sees it.
     """
-    sliding = {p.name: p.mean for p in space.parameters if p.name.startswith("sliding_friction")}
+    sliding = {p.name: p.mean for p in space.of_role(Role.SLIDING_FRICTION)}
     alone = [{name: mean} for name, mean in sliding.items()]
     return [*alone, sliding] if len(sliding) > 1 else alone
 

@@ -23,7 +23,7 @@ from droid_jax.model.scene import Scene, with_options
 from droid_jax.preflight.creep import creep_note
 from droid_jax.recordings.recording import Recording
 from droid_jax.simulate.c_reference import c_replay
-from droid_jax.simulate.replay import Drive, make_drive, servo_replay
+from droid_jax.simulate.replay import TORQUE_OFFSETS, Drive, make_drive, servo_replay
 
 LARGE = 0.1  # share of the remaining error from which on a time step is too coarse, or two engines too far apart
 EXPLAINED = 2.0  # times what half a time step changes: of an error of first order all of it
@@ -217,7 +217,7 @@ class _Replayed:
         """The replay in plain C with a finer time step, at the rows of the own one; or why there is none."""
         scene, drive = self._finer(times)
         late = 0.0 if self.comparison.config.mj_step else 0.5
-        effects = [e for e in with_sensors(scene, self.cost.space, drive, self.effects) if e.name != "torque offset"]
+        effects = [e for e in with_sensors(scene, self.cost.space, drive, self.effects) if e.name != TORQUE_OFFSETS]
         try:
             replayed = c_replay(scene, self.cost.space, drive, effects, late=late)(self.best[None])
         except ValueError as error:

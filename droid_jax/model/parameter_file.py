@@ -34,12 +34,12 @@ from droid_jax.arguments import instance, path_of
 from droid_jax.errors import faults
 from droid_jax.model.fields import ENCODER, body_mass, encoder_offset, model_parameter, servo_scale, time_offset
 from droid_jax.model.joint_friction import TERMS, sensor_parameter
-from droid_jax.model.parameters import Mode, Parameter, Scaling, Space
+from droid_jax.model.parameters import Mode, Parameter, Role, Scaling, Space
 from droid_jax.model.scene import Scene
 from droid_jax.read_json import read_json, typed
 
 _NEEDED = ("element", "std", "high")
-_TIME = "time_offset"
+_TIME = Role.TIME_OFFSET.value
 SMALL = 1e-3  # of its deviation: a mean (and log_offset) below it is out of reach of a search in the logarithm
 
 

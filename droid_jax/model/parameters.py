@@ -109,6 +109,42 @@ class Scaling(enum.Enum):
     LOG = "log"
 
 
+class Role(enum.Enum):
+    """What a parameter is, for code that treats parameters of its kind in a way of their own.
+
+    The roles of the first block are what a replay reads from theta beside effects: their values are its names there,
+    of a joint with the joint in brackets (`in_theta`).
+    """
+
+    TIME_OFFSET = "time_offset"  # s, delay of the command
+    TORQUE_OFFSET = "torque_offset"  # N m, constant error of a joint's torque sensor
+    TORQUE_GAIN = "torque_gain"  # relative error of a joint's torque sensor
+    VISCOUS = "viscous"  # N m s/rad, friction that a joint's torque sensor sees
+    COULOMB = "coulomb"  # N m, likewise
+
+    SLIDING_FRICTION = "sliding_friction"  # of a finger's contact
+    TORSIONAL_FRICTION = "torsional_friction"  # likewise, m
+    PAYLOAD_MASS = "payload_mass"  # kg that the arm carries at its hand beside what the model says
+    OBJECT_TORQUE = "object_torque"  # N m (N of a slide), constant on the object's joint
+    OTHER = "other"
+
+    def in_theta(self, joint: str = "") -> str:
+        """Name in theta of what a replay reads, of a joint where it is one's."""
+        return f"{self.value}[{joint}]" if joint else self.value
+
+
+OF_A_JOINT = (Role.VISCOUS, Role.COULOMB, Role.TORQUE_OFFSET, Role.TORQUE_GAIN)
+
+
+def role_in_theta(name: str) -> Role:
+    """What a replay reads by this name from theta; OTHER where it reads nothing by it, or an effect does."""
+    if name == Role.TIME_OFFSET.value:
+        return Role.TIME_OFFSET
+    term, bracket, joint = name.partition("[")
+    found = {role.value: role for role in OF_A_JOINT}.get(term, Role.OTHER)
+    return found if bracket and joint.endswith("]") else Role.OTHER
+
+
 @dataclass(frozen=True)
 class Parameter:
     """One physics parameter.
@@ -123,6 +159,8 @@ class Parameter:
     scaling, log_offset: search coordinate.
     width:  what one unit of the search coordinate is in log(v + log_offset) when scaling is LOG; None takes
             it from mean and std.
+    role:   what it is, where code treats its kind in a way of its own; of a parameter that writes nothing it follows
+            from the name that a replay reads it by.
     """
 
     name: str
@@ -137,6 +175,7 @@ class Parameter:
     scaling: Scaling = Scaling.LINEAR
     log_offset: float = 0.0
     width: float | None = None
+    role: Role = field(default=Role.OTHER, compare=False)
 
     def __post_init__(self) -> None:
         where = f"parameter {shown(self.name)}"
@@ -148,6 +187,9 @@ class Parameter:
         set_field(self, "writes", instances(self.writes, f"{where}: writes", Write))
         set_field(self, "nuisance", flag(self.nuisance, f"{where}: nuisance"))
         set_field(self, "scaling", choice(self.scaling, f"{where}: scaling", Scaling))
+        set_field(self, "role", choice(self.role, f"{where}: role", Role))
+        if self.role is Role.OTHER and not self.writes:
+            set_field(self, "role", role_in_theta(self.name))
         if self.width is not None:
             set_field(self, "width", number(self.width, f"{where}: width", above=0))
         if not self.low < self.high:
@@ -266,6 +308,10 @@ class Space:
     def select(self, names: Iterable[str]) -> Space:
         """The sub-space of these names, in the order given."""
         return Space(tuple(self[n] for n in several(name)(names, "names")))
+
+    def of_role(self, *roles: Role) -> tuple[Parameter, ...]:
+        """The parameters that are one of these, in the space's order; none where there are none."""
+        return tuple(p for p in self.parameters if p.role in roles)
 
     def with_prior(self, **prior: tuple[float, float]) -> Space:
         """A copy in which some parameters start from another (mean, std)."""

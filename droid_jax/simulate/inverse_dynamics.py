@@ -16,6 +16,7 @@ import numpy as np
 
 from droid_jax.model.effect_interface import Effect, Rollout, State, Theta, column, complete
 from droid_jax.model.encoders import encoder_error, misplaced_weight
+from droid_jax.model.parameters import Role
 from droid_jax.model.physics import Physics
 from droid_jax.model.quiet_mjx import mjx
 from droid_jax.model.scene import Scene
@@ -190,7 +191,7 @@ def _may_rub(scene: Scene, theta: Theta, effects: Sequence[Effect], motor: bool)
     """
     if any(effect.frictionloss is not None for effect in effects):
         return np.ones(len(scene.joints), bool)
-    behind = np.array([f"coulomb[{joint}]" in theta for joint in scene.joints])
+    behind = np.array([Role.COULOMB.in_theta(joint) in theta for joint in scene.joints])
     return behind | (motor & (scene.model.dof_frictionloss[scene.joint_dofs] > 0.0))
 
 

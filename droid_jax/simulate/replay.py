@@ -20,6 +20,7 @@ from droid_jax.model.actuators import has_servo_damping
 from droid_jax.model.effect_interface import Effect, Rollout, State, Theta, column, complete
 from droid_jax.model.encoders import encoder_error, misplaced_compensation
 from droid_jax.model.mjx_internals import Contacts, constraint_rows, contacts
+from droid_jax.model.parameters import Role
 from droid_jax.model.physics import Physics
 from droid_jax.model.quiet_mjx import mjx
 from droid_jax.model.scene import Scene
@@ -33,6 +34,7 @@ from droid_jax.simulate.floating_base import refuse_floating
 from droid_jax.simulate.initial_state import check_weight, holding, start_pose, weight_share
 
 Replay = Callable[[Physics], Rollout]
+TORQUE_OFFSETS = "torque offset"  # the effect that adds them, which every replay in MJX has
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,7 +224,7 @@ def _command(
         return table[low] * (1 - part) + table[low + 1] * part
 
     # In steps first: seconds that are added up in float32 lose a fifth of a step in ten seconds.
-    delay = late + jnp.asarray(theta.get("time_offset", 0.0), jnp.float32) / timestep
+    delay = late + jnp.asarray(theta.get(Role.TIME_OFFSET.value, 0.0), jnp.float32) / timestep
     whole = jnp.floor(delay)
     low = jnp.clip(k - whole.astype(jnp.int32) - 1, 0, last)
     high = jnp.clip(k - whole.astype(jnp.int32), 0, last)
@@ -289,9 +291,9 @@ def torque_offset_effect(joints: Sequence[str]) -> Effect:
     """Constant torque-sensor errors: reads `torque_offset[joint]` from theta, N m; absent means zero."""
 
     def observe(theta: Theta, rollout: Rollout) -> Rollout:
-        return replace(rollout, torque=rollout.torque + column(theta, "torque_offset", joints))
+        return replace(rollout, torque=rollout.torque + column(theta, Role.TORQUE_OFFSET.value, joints))
 
-    return Effect("torque offset", observe=observe)
+    return Effect(TORQUE_OFFSETS, observe=observe)
 
 
 def _joint_torque(model, before, after, servo: jax.Array, joints: np.ndarray, drive: Drive, parity: bool) -> jax.Array:

@@ -12,7 +12,7 @@ from scipy import integrate, stats
 
 from droid_jax.identify.gaussian import Gaussian, load, prior, space_from_json, space_to_json
 from droid_jax.identify.truncated_normal import gibbs, quantiles
-from droid_jax.model.parameters import Mode, Parameter, Scaling, Space, Write
+from droid_jax.model.parameters import Mode, Parameter, Role, Scaling, Space, Write
 
 
 def wide(name, mean=0.0, std=1.0, **kw):
@@ -235,6 +235,16 @@ def test_save_and_load_give_the_same_gaussian(saved):
     np.testing.assert_array_equal(back.cov, g.cov)
     np.testing.assert_array_equal(back.sample(5, 20), g.sample(5, 20))
     assert os.listdir(path.parent) == [path.name]
+
+
+def test_roles_survive_json_text_and_older_files_state_none():
+    one = Parameter("a", "kg", 0.0, 1.0, -5.0, 5.0, role=Role.PAYLOAD_MASS)
+    other = Parameter("torque_offset[b]", "N m", 0.0, 1.0, -5.0, 5.0)
+    entries = json.loads(json.dumps(space_to_json(Space((one, other)))))
+    assert ["role" in entry for entry in entries] == [True, False]
+    assert [p.role for p in space_from_json(entries).parameters] == [Role.PAYLOAD_MASS, Role.TORQUE_OFFSET]
+    del entries[0]["role"]
+    assert space_from_json(entries)["a"].role is Role.OTHER
 
 
 def test_the_space_survives_json_text():
