@@ -161,16 +161,26 @@ def make_cost(
     effects: Sequence[Effect] = (),
     check: bool = True,
 ) -> Cost:
-    """The cost of a scene over one or more recordings.
+    """The cost of a scene over one or more recordings: equation 1 of the paper.
 
-    A recording with commands is replayed by its servo, one without by inverse dynamics of its
-    measured motion.
-    engine: "mjx" (compiled, all devices) or "mujoco" (plain C, all cores; the parity oracle).
-    effects: extra physics or observation models whose parameters are part of the space; torque
-      offsets, and joint friction behind the sensor where the space holds any, are there already.
-    check: warn of units, signs and clocks in the recordings that can hardly be right (`log_checks.check_log`).
-    Raises ValueError for a space of another scene, unknown engines, joints, channels, parameters that nothing reads,
-      or gains that do not match.
+    A recording with commands is replayed by its servo, one without by inverse dynamics of its measured motion.
+
+    Args:
+        scene: what is simulated.
+        space: meaning of the vectors [D].
+        recordings: R recordings of the same robot and object.
+        engine: "mjx" (compiled, all devices) or "mujoco" (plain C, all cores; the parity oracle).
+        config: how simulation and measurement are compared; None for the defaults.
+        effects: extra physics or observation models whose parameters are part of the space. Torque offsets, and joint
+            friction behind the sensor where the space holds any, are there already.
+        check: warn of units, signs and clocks in the recordings that can hardly be right (`preflight.check_log`).
+
+    Returns:
+        A cost to be called with [P, D] physical values, which gives [P] N m.
+
+    Raises:
+        ValueError: a space of another scene, unknown engines, joints or channels, parameters that nothing reads, or gains
+            that do not match.
     """
     config = instance(CompareConfig() if config is None else config, "config", CompareConfig)
     check_space(instance(scene, "scene", Scene), instance(space, "space", Space))

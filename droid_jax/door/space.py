@@ -57,12 +57,18 @@ def truth(springs: int) -> dict[str, float]:
 def door_space(scene: Scene, *, preset: str = "impedance") -> Space:
     """The 16 parameters of Table I.
 
-    preset "paper": Table I's own means and deviations, joint damping around 100 N m s/rad,
-      linear coordinates, negative samples redrawn.
-    preset "impedance": the same door and gripper; joint damping around the scene's own servo
-      damping with a deviation of 10 %; log coordinates, wide enough that a sprung door, 200 of
-      Table I's deviations away, is still found.
-    Raises ValueError for other presets and for a scene without a grip.
+    Args:
+        scene: of `door_scene`.
+        preset: "paper" has Table I's own means and deviations, joint damping around 100 N m s/rad and linear coordinates;
+            negative samples are redrawn. "impedance" has the same door and gripper, joint damping around the scene's own
+            servo damping with a deviation of 10 %, and log coordinates, wide enough that a sprung door, 200 of Table I's
+            deviations away, is still found.
+
+    Returns:
+        A space of D = 16.
+
+    Raises:
+        ValueError: another preset, or a scene without a grip.
     """
     one_of(preset, "preset", ("impedance", "paper"))
     instance(scene, "scene", Scene)
@@ -104,9 +110,19 @@ def _joint_dampings(scene: Scene, preset: str) -> tuple[Parameter, ...]:
 
 
 def door_nuisances(scene: Scene) -> Space:
-    """What is uncertain and of no interest, each with a prior: pose, grasp, link masses, servo
-    gains, timing and torque offsets.  Deviations: 2 mm and 0.5 degree of door pose, 1 mm at the
-    knob, 3 % of link masses and servo gains, 1 ms, 0.1 N m (0.03 at the wrist).
+    """What is uncertain and of no interest: pose, grasp, link masses, servo gains, timing and torque offsets.
+
+    Deviations of the priors: 2 mm and 0.5 degree of door pose, 1 mm at the knob, 3 % of link masses and servo gains, 1 ms,
+    0.1 N m (0.03 at the wrist).
+
+    Args:
+        scene: of `door_scene`.
+
+    Returns:
+        A space of nuisances, to be given beside `door_space`.
+
+    Raises:
+        ValueError: the scene lacks an element of the door's.
     """
     instance(scene, "scene", Scene)
     note: dict[str, Any] = dict(nuisance=True, group="Nuisance")

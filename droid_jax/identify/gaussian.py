@@ -51,13 +51,15 @@ MOMENT_POINTS = 20_001  # equal-probability points behind physical_mean and phys
 class Gaussian:
     """A normal distribution over the parameters of a space.
 
-    space:       meaning of the entries.
-    mean:        [D] in `coordinates`.
-    cov:         [D, D] in `coordinates`, symmetric and positive semi-definite.
-    rule:        how the width was set, e.g. "prior", "cma-es covariance".
-    coordinates: "search" (unitless) or "physical" (each entry in its parameter's unit).
+    Attributes:
+        space: meaning of the entries.
+        mean: [D] in `coordinates`.
+        cov: [D, D] in `coordinates`, symmetric and positive semi-definite.
+        rule: how the width was set, e.g. "prior", "cma-es covariance".
+        coordinates: "search" (unitless) or "physical" (each entry in its parameter's unit).
 
-    Raises ValueError on a wrong shape, a number that is not finite, or a cov that is no covariance.
+    Raises:
+        ValueError: a wrong shape, a number that is not finite, or a cov that is no covariance.
     """
 
     space: Space

@@ -42,18 +42,22 @@ from droid_jax.simulate.repeat_starts import own_starts
 class IdentifyConfig:
     """Settings of an identification.
 
-    engine: "mjx" or "mujoco" (plain C, all cores).
-    heldout: share of each recording's repeats that the fit does not see (at least one where there are two).
-    search: CMA-ES settings; it sees the first recording alone, the refinement sees all of them.
-    refine: refinement settings, or None: the search's own covariance is the distribution, as in the paper.
-    samples: replays drawn from the initial and from the fitted Gaussian to compare their costs.
-    seed: of those samples (the search has its own).
-    compare: how simulation and measurement are compared.
-    identifiability: what decides the calibrated width, and when a parameter counts as identifiable.
-    worth: share of the noise floor by which the distance before the fit must exceed it, else there was nothing to close
-      and `TorqueDistance.closed` is None.
-    checks: measure what the time step and the engine leave at the fitted values (`solution_checks`), which takes one
-      more compilation.
+    Attributes:
+        engine: "mjx" or "mujoco" (plain C, all cores).
+        heldout: share of each recording's repeats that the fit does not see (at least one where there are two).
+        search: CMA-ES settings; it sees the first recording alone, the refinement sees all of them.
+        refine: refinement settings, or None: the search's own covariance is the distribution, as in the paper.
+        samples: replays drawn from the initial and from the fitted Gaussian to compare their costs.
+        seed: of those samples (the search has its own).
+        compare: how simulation and measurement are compared.
+        identifiability: what decides the calibrated width, and when a parameter counts as identifiable.
+        worth: share of the noise floor by which the distance before the fit must exceed it, else there was nothing to
+            close and `TorqueDistance.closed` is None.
+        checks: measure what the time step and the engine leave at the fitted values (`solution_checks`), which takes one
+            more compilation.
+
+    Raises:
+        ValueError: a setting is of the wrong type or out of its range.
     """
 
     engine: str = "mjx"
@@ -158,12 +162,22 @@ def identify_parameters(
 ) -> Identified:
     """Fit `space` to one or several recordings of the same robot and object.
 
-    nuisances: fitted and marginalised beside it in the refinement; None for none.
-    effects: in the model beside what the scene has; their parameters are in `space` or stay at neutral.
-    checkpoints: folder where the search saves itself and from which it resumes.
-    progress: called with a stage's name and its progress value.
-    Raises ValueError for recordings of one name, where no torque is compared, where several recordings are to be fitted
-    without the refinement (the search sees the first alone), and where the initial means cannot be simulated.
+    Args:
+        scene: what is simulated.
+        space: the D parameters that the search moves.
+        recordings: to fit and, of their last repeats, to judge the fit.
+        nuisances: fitted and marginalised beside it in the refinement; None for none.
+        config: settings; None for the defaults.
+        effects: in the model beside what the scene has; their parameters are in `space` or stay at neutral.
+        checkpoints: folder where the search saves itself and from which it resumes.
+        progress: called with a stage's name and its progress value.
+
+    Returns:
+        Everything found; its `gaussian` is the distribution to hand on.
+
+    Raises:
+        ValueError: recordings of one name, no torque compared, several recordings without the refinement (the search sees
+            the first alone), or initial means that cannot be simulated.
     """
     problem = prepare(scene, space, recordings, nuisances=nuisances, config=config, effects=effects)
     return run_fit(problem, checkpoints=checkpoints, progress=progress)

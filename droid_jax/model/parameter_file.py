@@ -69,7 +69,19 @@ _KNOWN = _Entry.__struct_fields__
 
 
 def load_parameters(path: str | Path, scene: Scene) -> Space:
-    """The space described in a JSON file; ValueError names the file, the entry and what is wrong with it."""
+    """The space described in a JSON file (its format: the module's text).
+
+    Args:
+        path: of the file.
+        scene: whose elements the entries name.
+
+    Returns:
+        A space of one parameter for each entry, in the file's order.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: an entry is wrong; the message names the file, the entry and what is wrong with it.
+    """
     entries, first = _entries(path_of(path, "the path of a parameter file")), dict[str, int]()
     instance(scene, "scene", Scene)
     parameters = [_parameter(scene, entry, f"{path}, entry {i}") for i, entry in enumerate(entries, 1)]

@@ -103,7 +103,7 @@ class Write:
 
 
 class Scaling(enum.Enum):
-    """Search coordinate of a parameter, see the module's text."""
+    """Search coordinate of a parameter: the value itself, or its logarithm (see the module's text)."""
 
     LINEAR = "linear"
     LOG = "log"
@@ -149,18 +149,23 @@ def role_in_theta(name: str) -> Role:
 class Parameter:
     """One physics parameter.
 
-    name:   unique within a space, e.g. "hinge_stiffness".
-    unit:   for tables and axes, e.g. "N m/rad".
-    mean, std: initial Gaussian, in `unit` (Table I of the paper for the door).
-    low, high: bounds, in `unit`; low <= mean <= high and low < high.
-    writes: model fields it sets; empty for a parameter that lives in theta.
-    nuisance: fitted and marginalised, of no interest by itself.
-    group:  heading in tables ("Door", "Robot", "Gripper", "Nuisance").
-    scaling, log_offset: search coordinate.
-    width:  what one unit of the search coordinate is in log(v + log_offset) when scaling is LOG; None takes
-            it from mean and std.
-    role:   what it is, where code treats its kind in a way of its own; of a parameter that writes nothing it follows
+    Attributes:
+        name: unique within a space, e.g. "hinge_stiffness".
+        unit: for tables and axes, e.g. "N m/rad".
+        mean, std: initial Gaussian, in `unit` (Table I of the paper for the door).
+        low, high: bounds, in `unit`; low <= mean <= high and low < high.
+        writes: model fields it sets; empty for a parameter that lives in theta.
+        nuisance: fitted and marginalised, of no interest by itself.
+        group: heading in tables ("Door", "Robot", "Gripper", "Nuisance").
+        scaling, log_offset: search coordinate, see the module's text.
+        width: what one unit of the search coordinate is in log(v + log_offset) when scaling is LOG; None takes it from
+            mean and std.
+        role: what it is, where code treats its kind in a way of its own. Of a parameter that writes nothing it follows
             from the name that a replay reads it by.
+
+    Raises:
+        ValueError: an attribute is of the wrong type, the bounds do not hold the mean, or the numbers are too large or
+            too small to search among.
     """
 
     name: str
@@ -241,7 +246,11 @@ class Parameter:
 class Space:
     """An ordered set of parameters: the meaning of a vector's entries.
 
-    Raises ValueError when two parameters share a name or none is given.
+    Attributes:
+        parameters: [D] of unique names.
+
+    Raises:
+        ValueError: two parameters share a name, or none is given.
     """
 
     parameters: tuple[Parameter, ...]

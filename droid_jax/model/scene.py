@@ -43,14 +43,15 @@ class Grip:
 class Scene:
     """A compiled scene.
 
-    name:   for messages and reports.
-    spec:   the MjSpec, looks included; never changed after construction.
-    model:  compiled without looks; what is replayed.
-    joints: servo-driven joints whose torque and position are measured, in channel order [J].
-    command_names: joints of the actuators, in actuator order [U]; of one that drives a tendon, or drives a joint beside
-      the joint's position servo, its own name.
-    object_joint: joint of the thing that is moved (the door's hinge), or None.
-    grip:   how a lost grasp is seen, or None where there is nothing to grip.
+    Attributes:
+        name: for messages and reports.
+        spec: the MjSpec, visual geoms included; never changed after construction.
+        model: compiled without visual geoms; what is replayed.
+        joints: servo-driven joints whose torque and position are measured, in channel order [J].
+        command_names: joints of the actuators, in actuator order [U]; of one that drives a tendon, or drives a joint
+            beside the joint's position servo, its own name.
+        object_joint: joint of the thing that is moved (the door's hinge), or None.
+        grip: how a lost grasp is seen, or None where there is nothing to grip.
     """
 
     name: str
@@ -320,11 +321,21 @@ def load_scene(
 ) -> Scene:
     """A user's own MJCF as a Scene.
 
-    assets: contents of files that it names, by name, where they do not lie beside it: `env.model_assets` of
-      mujoco_playground.  An MJCF that is written of the scene later names them as this one does.
-    friction_joints: joints whose friction loss will be a parameter though the file gives none.
-    engine, mj_step: as in `compile_scene`.
-    Raises FileNotFoundError or ValueError (the file does not compile, unknown names, ...).
+    Args:
+        path: of the MJCF.
+        joints: measured joints, in channel order; None for all driven ones.
+        object_joint: joint of the thing that is moved, or None.
+        friction_joints: joints whose friction loss will be a parameter though the file gives none.
+        assets: contents of files that it names, by name, where they do not lie beside it: `env.model_assets` of
+            mujoco_playground. An MJCF that is written of the scene later names them as this one does.
+        engine, mj_step: as in `compile_scene`.
+
+    Returns:
+        The compiled scene.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file does not compile, names are unknown, or MJX would ignore something in it.
     """
     path = arguments.path_of(path, "the path of an MJCF")
     friction_joints = arguments.names(friction_joints, "friction_joints")

@@ -30,7 +30,15 @@ Randomise = Callable[[Any, jax.Array], tuple[Any, Any]]
 def randomised(scene: Scene, gaussian: Gaussian) -> Randomise:
     """A randomization_fn for environments whose `sys` is `Physics`: one draw of the Gaussian for each key.
 
-    Raises ValueError for a Gaussian of another scene.
+    Args:
+        scene: that the Gaussian is of.
+        gaussian: over any part of the scene's parameters, effects included.
+
+    Returns:
+        brax's randomization_fn, (sys, rng [N, 2]) -> (sys_v, in_axes).
+
+    Raises:
+        ValueError: a Gaussian of another scene.
     """
     check_space(instance(scene, "scene", Scene), instance(gaussian, "gaussian", Gaussian).space)
 
@@ -48,13 +56,21 @@ def of_method(method: str, scene: Scene, gaussian: Gaussian) -> Randomise:
 
 
 def randomised_model(scene: Scene, gaussian: Gaussian) -> Randomise:
-    """The same for environments that know an mjx.Model only (mujoco_playground's): the model fields alone.
+    """A randomization_fn for environments that know an mjx.Model only (mujoco_playground's): the model fields alone.
 
-    scene: of the same MJCF, whose geoms that are for the eye alone the environment may have.  Numbers that no parameter
-    writes stay the environment's own, those apart that follow from masses and places: they are the scene's.
-    Warns of parameters that live outside the model: they have no place there and stay at neutral.
-    Raises ValueError for a Gaussian of another scene, and when called with a model of another scene or with one in
-    which a friction loss that varies has no row.
+    Numbers that no parameter writes stay the environment's own, those apart that follow from masses and places: they are
+    the scene's. Warns of parameters that live outside the model: they have no place there and stay at neutral.
+
+    Args:
+        scene: of the same MJCF, whose visual geoms the environment may have.
+        gaussian: over any part of the scene's parameters.
+
+    Returns:
+        (mjx.Model, rng [N, 2]) -> (batched mjx.Model, in_axes). It raises ValueError when called with a model of another
+        scene, or with one in which a friction loss that varies has no row.
+
+    Raises:
+        ValueError: a Gaussian of another scene.
     """
     both, fields = randomised(scene, gaussian), _batched(scene, gaussian.space)
     outside = [p.name for p in gaussian.space.parameters if not p.writes]

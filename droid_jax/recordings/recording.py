@@ -107,17 +107,18 @@ class ObjectPose:
 class Recording:
     """One demonstration and its N repeats.
 
-    name:          for tables and file names; not part of the content hash.
-    time:          [T] s, the command clock, strictly increasing.
-    command:       [T, U] position command, rad or m; T = U = 0 for a log without commands.
-    command_names: U joint names.
-    channels:      name -> Channel; all share N.
-    torque:        what the torque channel holds.
-    qpos0:         joint name -> position at the start, rad or m; joints not named start where the scene has them.
-    gains:         servo gains, when known.
-    phases:        named parts of the motion.
-    object_pose:   pose of the manipulated object, when known.
-    meta:          free notes; not part of the content hash.
+    Attributes:
+        name: for tables and file names; not part of the content hash.
+        time: [T] s, the command clock, strictly increasing.
+        command: [T, U] position command, rad or m; T = U = 0 for a log without commands.
+        command_names: U joint names.
+        channels: name -> Channel; all share N.
+        torque: what the torque channel holds.
+        qpos0: joint name -> position at the start, rad or m; joints not named start where the scene has them.
+        gains: servo gains, when known.
+        phases: named parts of the motion.
+        object_pose: pose of the manipulated object, when known.
+        meta: free notes; not part of the content hash.
     """
 
     name: str
