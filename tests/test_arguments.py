@@ -173,8 +173,8 @@ def test_what_is_shown_of_a_value_is_one_short_line() -> None:
 
 def test_arrays_without_axes_are_no_lists() -> None:
     for value in (np.array(1.0), np.array("j"), Path("j"), "j", b"j", 3):
-        assert not arguments.listed(value)
-    assert all(map(arguments.listed, ([], (), {"a"}, np.zeros(2), (x for x in "ab"))))
+        assert not arguments.is_list(value)
+    assert all(map(arguments.is_list, ([], (), {"a"}, np.zeros(2), (x for x in "ab"))))
     with pytest.raises(ValueError, match="joints must be a list of names"):
         arguments.names(np.array("j"), "joints")
 

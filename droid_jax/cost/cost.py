@@ -35,7 +35,7 @@ from droid_jax.recordings.recording import Recording, recordings_of
 from droid_jax.simulate.batching import in_blocks, over_block
 from droid_jax.simulate.c_reference import c_replay
 from droid_jax.simulate.initial_state import AJAR, following
-from droid_jax.simulate.inverse_dynamics import Path, path_of, path_replay, prescribed
+from droid_jax.simulate.inverse_dynamics import Path, motion_path, path_replay, prescribed
 from droid_jax.simulate.measured_motion import Motion, measured_motion
 from droid_jax.simulate.repeat_starts import from_one_start, own_starts
 from droid_jax.simulate.replay import (
@@ -179,8 +179,8 @@ def make_cost(
         A cost to be called with [P, D] physical values, which gives [P] N m.
 
     Raises:
-        ValueError: a space of another scene, unknown engines, joints or channels, parameters that nothing reads, or gains
-            that do not match.
+        ValueError: a space of another scene, unknown engines, joints or channels, parameters that nothing reads, or
+            gains that do not match.
     """
     config = instance(CompareConfig() if config is None else config, "config", CompareConfig)
     check_space(instance(scene, "scene", Scene), instance(space, "space", Space))
@@ -304,7 +304,7 @@ class Along:
     torques: Callable[[Path], jax.Array]
 
     def __call__(self, values: np.ndarray) -> Rollout:
-        return self.compiled(values, path_of(self.scene, self.motion))
+        return self.compiled(values, motion_path(self.scene, self.motion))
 
 
 @dataclass(frozen=True, eq=False)
@@ -370,7 +370,7 @@ def _apart(along: Along, scene: Scene, recording: Recording, config: CompareConf
         )
         for n in range(recording.repeats)
     ]
-    paths = [path_of(scene, motion) for motion in motions]
+    paths = [motion_path(scene, motion) for motion in motions]
     torques = np.asarray(along.torques(jax.tree.map(lambda *a: jnp.stack(a), *paths)), np.float64)
     return torques - torques.mean(axis=0)
 

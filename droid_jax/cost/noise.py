@@ -221,7 +221,7 @@ def correlation_time(residuals: np.ndarray, rate: float = DEFAULT_NOISE.rate) ->
     return np.array(times)
 
 
-def discrepancy(
+def stated_deviation(
     residuals: np.ndarray, counts: np.ndarray | None = None, rate: float = DEFAULT_NOISE.rate
 ) -> np.ndarray:
     """[C] deviation to state as noise so that correlated residuals [K, C] count as often as they are independent.

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from droid_jax.arguments import check_fields, flag, instance, number, weights
-from droid_jax.cost.noise import NoiseConfig, discrepancy
+from droid_jax.cost.noise import NoiseConfig, stated_deviation
 from droid_jax.cost.observation import Measured, least_noise, prepared
 from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.scene import Scene
@@ -140,7 +140,7 @@ class Comparison:
 
         def stated(channel: Measured) -> Measured:
             left = channel.noise.mean - np.asarray(_smooth(channel, _trace(rollout, channel)))
-            left = discrepancy(left, channel.moves, self.config.noise.rate)
+            left = stated_deviation(left, channel.moves, self.config.noise.rate)
             least = least_noise(channel.name, channel.noise.mean, self.config.noise)
             return replace(channel, noise=channel.noise.stated(np.maximum(left, least)))
 

@@ -15,7 +15,7 @@ from droid_jax.discrepancy.candidates import Candidate
 from droid_jax.discrepancy.case import Case
 from droid_jax.discrepancy.refit import FittedModel, refit
 from droid_jax.identify.pipeline import Progress, grip_hypotheses, search_cost, starts
-from droid_jax.identify.search import search
+from droid_jax.identify.search import cma_search as search
 
 
 def base_fit(case: Case, progress: Progress, start: np.ndarray | None = None) -> FittedModel:

@@ -26,7 +26,7 @@ import jax
 import numpy as np
 
 from droid_jax.cost.cost import Cost, make_cost
-from droid_jax.cost.noise import discrepancy
+from droid_jax.cost.noise import stated_deviation as discrepancy
 from droid_jax.cost.observation import least_noise
 from droid_jax.discrepancy.blocks import OUTSIDE, BlockResidualSet, block_length, block_residual_set, interleaved
 from droid_jax.discrepancy.candidates import candidates

@@ -59,10 +59,10 @@ def door_space(scene: Scene, *, preset: str = "impedance") -> Space:
 
     Args:
         scene: of `door_scene`.
-        preset: "paper" has Table I's own means and deviations, joint damping around 100 N m s/rad and linear coordinates;
-            negative samples are redrawn. "impedance" has the same door and gripper, joint damping around the scene's own
-            servo damping with a deviation of 10 %, and log coordinates, wide enough that a sprung door, 200 of Table I's
-            deviations away, is still found.
+        preset: "paper" has Table I's own means and deviations, joint damping around 100 N m s/rad and linear
+            coordinates; negative samples are redrawn. "impedance" has the same door and gripper, joint damping around
+            the scene's own servo damping with a deviation of 10 %, and log coordinates, wide enough that a sprung door,
+            200 of Table I's deviations away, is still found.
 
     Returns:
         A space of D = 16.
@@ -112,8 +112,8 @@ def _joint_dampings(scene: Scene, preset: str) -> tuple[Parameter, ...]:
 def door_nuisances(scene: Scene) -> Space:
     """What is uncertain and of no interest: pose, grasp, link masses, servo gains, timing and torque offsets.
 
-    Deviations of the priors: 2 mm and 0.5 degree of door pose, 1 mm at the knob, 3 % of link masses and servo gains, 1 ms,
-    0.1 N m (0.03 at the wrist).
+    Deviations of the priors: 2 mm and 0.5 degree of door pose, 1 mm at the knob, 3 % of link masses and servo gains,
+    1 ms, 0.1 N m (0.03 at the wrist).
 
     Args:
         scene: of `door_scene`.

@@ -237,8 +237,18 @@ def prior(space: Space) -> Gaussian:
     return Gaussian(space, space.to_search(space.mean), np.eye(len(space)), rule="prior")
 
 
-def load(path: str | Path) -> Gaussian:
-    """Read a file written by `Gaussian.save`; ValueError names the file and what is wrong in it."""
+def load_gaussian(path: str | Path) -> Gaussian:
+    """Read a file written by `Gaussian.save`.
+
+    Args:
+        path: of the file, as gaussian.json of a run's folder.
+
+    Returns:
+        The distribution.
+
+    Raises:
+        ValueError: there is no such file, or something in it is wrong; the message names both.
+    """
     path = path_of(path, "the path of a Gaussian")
     if path.is_dir():
         raise ValueError(f"{path} is a folder; a run keeps its Gaussian in gaussian.json there")

@@ -27,7 +27,7 @@ from droid_jax.identify.levenberg_marquardt import (
     curvature,
     fall,
 )
-from droid_jax.identify.search import NotReplayed, SearchConfig, search
+from droid_jax.identify.search import NotReplayed, SearchConfig, cma_search
 from droid_jax.model.parameters import Parameter, Space
 
 Hypotheses = Sequence[Mapping[str, float]]
@@ -333,7 +333,7 @@ class _Descent(DampedProblem):
             seed=seed,
         )
         try:
-            return self.start(around(search(cost, unit, settings).best[None]))
+            return self.start(around(cma_search(cost, unit, settings).best[None]))
         except NotReplayed:  # nothing around here can be
             return state
 

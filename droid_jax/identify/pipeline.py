@@ -27,7 +27,7 @@ from droid_jax.identify.identifiability import (
     posterior,
 )
 from droid_jax.identify.multistart import RefineConfig, Refined, refine
-from droid_jax.identify.search import SearchConfig, search
+from droid_jax.identify.search import SearchConfig, cma_search
 from droid_jax.identify.solution_checks import SolutionCheck, check_solution
 from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.inertia import possible_draws
@@ -53,8 +53,8 @@ class IdentifyConfig:
         identifiability: what decides the calibrated width, and when a parameter counts as identifiable.
         worth: share of the noise floor by which the distance before the fit must exceed it, else there was nothing to
             close and `TorqueDistance.closed` is None.
-        checks: measure what the time step and the engine leave at the fitted values (`solution_checks`), which takes one
-            more compilation.
+        checks: measure what the time step and the engine leave at the fitted values (`solution_checks`), which takes
+            one more compilation.
 
     Raises:
         ValueError: a setting is of the wrong type or out of its range.
@@ -176,8 +176,8 @@ def identify_parameters(
         Everything found; its `gaussian` is the distribution to hand on.
 
     Raises:
-        ValueError: recordings of one name, no torque compared, several recordings without the refinement (the search sees
-            the first alone), or initial means that cannot be simulated.
+        ValueError: recordings of one name, no torque compared, several recordings without the refinement (the search
+            sees the first alone), or initial means that cannot be simulated.
     """
     problem = prepare(scene, space, recordings, nuisances=nuisances, config=config, effects=effects)
     return run_fit(problem, checkpoints=checkpoints, progress=progress)
@@ -257,7 +257,7 @@ def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: 
     began = time.monotonic() - problem.seconds
     first = base.first()
 
-    found = search(
+    found = cma_search(
         search_cost(first, config.compare, full, space),
         space,
         config.search,

@@ -25,7 +25,7 @@ from droid_jax.arguments import check_fields, flag, number, one_of, optional, wh
 from droid_jax.identify.cma import Strategy, recombination
 from droid_jax.identify.fit import Fit, History, Restart, SearchProgress, on_bound
 from droid_jax.identify.gaussian import space_to_json
-from droid_jax.identify.search_state import REASONS, SearchState
+from droid_jax.identify.search_state import REASONS, CmaState
 from droid_jax.model.parameters import Space
 
 if TYPE_CHECKING:
@@ -109,7 +109,7 @@ class SearchConfig:
         return self.population // 2 if self.parents is None else self.parents
 
 
-def search(
+def cma_search(
     cost: Cost,
     space: Space,
     config: SearchConfig,
@@ -135,7 +135,7 @@ def search(
     strategy = _strategy(space, config)
     centre = _start(space, config, start)
     with _checkpoints(checkpoint_dir, space, config, centre, fingerprint) as checkpoints:
-        run = _restored(checkpoints, strategy, centre) or SearchState.fresh(
+        run = _restored(checkpoints, strategy, centre) or CmaState.fresh(
             strategy.init(centre), config.restarts, len(space)
         )
         while _unfinished(run, config):
@@ -157,7 +157,7 @@ def _strategy(space: Space, config: SearchConfig) -> Strategy:
     return Strategy(space, weights, sigma=config.sigma, seeds=seeds, redraws=redraws)
 
 
-def _generation(run: SearchState, cost: Cost, strategy: Strategy, config: SearchConfig) -> None:
+def _generation(run: CmaState, cost: Cost, strategy: Strategy, config: SearchConfig) -> None:
     """One generation of every restart: draw, evaluate, update, record, judge."""
     started = time.perf_counter()
     space = strategy.space
@@ -192,7 +192,7 @@ def mirrored(space: Space, x: np.ndarray) -> np.ndarray:
     return np.clip(np.where(x < low, 2 * low - x, np.where(x > high, 2 * high - x, x)), low, high)
 
 
-def _try_bounds(run: SearchState, cost: Cost, space: Space, config: SearchConfig) -> int:
+def _try_bounds(run: CmaState, cost: Cost, space: Space, config: SearchConfig) -> int:
     """Ask once more for every restart's best, moved onto bounds it lies near; how many rows were asked.
 
     Mirrored draws come near a bound and never lie on it.  A row that costs no more becomes the best.  Nothing of this
@@ -231,7 +231,7 @@ def _evaluate(cost: Cost, values: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(costs), costs, np.inf).reshape(values.shape[:2])
 
 
-def _judge(run: SearchState, config: SearchConfig) -> None:
+def _judge(run: CmaState, config: SearchConfig) -> None:
     """Mark the restarts that have converged; a marked one stays as it is from then on."""
     widest = np.sqrt(np.linalg.eigvalsh(run.cov)[:, -1])  # [R]
     narrow = widest < config.tol_sigma
@@ -245,13 +245,13 @@ def _judge(run: SearchState, config: SearchConfig) -> None:
     run.stopped[running & narrow] = REASONS.index("tol_sigma")
 
 
-def _unfinished(run: SearchState, config: SearchConfig) -> bool:
+def _unfinished(run: CmaState, config: SearchConfig) -> bool:
     """Whether another generation is due."""
     in_time = config.max_seconds is None or run.seconds < config.max_seconds
     return bool((run.stopped == 0).any()) and run.generation < config.generations and in_time
 
 
-def _progress(run: SearchState, config: SearchConfig) -> SearchProgress:
+def _progress(run: CmaState, config: SearchConfig) -> SearchProgress:
     """Numbers for a display; the pace is the median of ten generations, so that compilation drops out."""
     pace = float(np.median([s[0] for s in run.records["seconds"][-10:]]))
     left = pace * (config.generations - run.generation) if _unfinished(run, config) else 0.0
@@ -265,7 +265,7 @@ def _progress(run: SearchState, config: SearchConfig) -> SearchProgress:
     )
 
 
-def _fit(run: SearchState, space: Space, config: SearchConfig, asked: int) -> Fit:
+def _fit(run: CmaState, space: Space, config: SearchConfig, asked: int) -> Fit:
     """The result, led by the restart with the lowest cost; `asked` rows came after the generations."""
     overall = "max_seconds" if run.generation < config.generations else "generations"
     covs, means = run.cov, run.records["mean"][-1]
@@ -324,11 +324,11 @@ def _checkpoints(folder: Path | None, space: Space, config: SearchConfig, centre
     return Checkpoints(folder, fingerprint=texts)
 
 
-def _restored(checkpoints: Checkpoints | None, strategy: Strategy, centre: np.ndarray) -> SearchState | None:
+def _restored(checkpoints: Checkpoints | None, strategy: Strategy, centre: np.ndarray) -> CmaState | None:
     """The search as its newest whole checkpoint left it, or None."""
     found = checkpoints.restore() if checkpoints else None
     if found is None:
         return None
     generation, tree = found
     state = strategy.put_state(strategy.init(centre), tree["state"])
-    return SearchState.of_tree(generation, tree, state)
+    return CmaState.of_tree(generation, tree, state)

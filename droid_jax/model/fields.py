@@ -292,7 +292,7 @@ def servo_scale(scene: Scene, joint: str, *, std: float = 0.03, **options: Any) 
     return Parameter(std=std, writes=writes, **options)
 
 
-def encoder_offset(scene: Scene, joint: str, *, std: float, high: float, **options: Any) -> Parameter:
+def joint_encoder_offset(scene: Scene, joint: str, *, std: float, high: float, **options: Any) -> Parameter:
     """How much further a joint stands than its encoder says, rad (m for slides); 0 at nominal (`model.encoders`).
 
     Reference, spring and range of a joint are told in what its encoder reads: all go down by the offset.

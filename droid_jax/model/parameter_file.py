@@ -32,7 +32,7 @@ import msgspec
 
 from droid_jax.arguments import instance, path_of
 from droid_jax.errors import faults
-from droid_jax.model.fields import ENCODER, body_mass, encoder_offset, model_parameter, servo_scale, time_offset
+from droid_jax.model.fields import ENCODER, body_mass, joint_encoder_offset, model_parameter, servo_scale, time_offset
 from droid_jax.model.joint_friction import TERMS, sensor_parameter
 from droid_jax.model.parameters import Mode, Parameter, Role, Scaling, Space
 from droid_jax.model.scene import Scene
@@ -140,7 +140,7 @@ def _parameter(scene: Scene, entry: Any, where: str) -> Parameter:
             raise ValueError(f"unknown sensor term {sensor!r}; valid: {', '.join((*TERMS, ENCODER))}")
         if sensor == ENCODER:
             _check_measured(scene, element)
-            return encoder_offset(scene, element, **options)
+            return joint_encoder_offset(scene, element, **options)
         if sensor is not None:
             return sensor_parameter(scene.joints, sensor, element, **options)
         if field == "body_mass" and options.get("mode", Mode.SET) is Mode.SET:

@@ -58,16 +58,16 @@ def of_method(method: str, scene: Scene, gaussian: Gaussian) -> Randomise:
 def randomised_model(scene: Scene, gaussian: Gaussian) -> Randomise:
     """A randomization_fn for environments that know an mjx.Model only (mujoco_playground's): the model fields alone.
 
-    Numbers that no parameter writes stay the environment's own, those apart that follow from masses and places: they are
-    the scene's. Warns of parameters that live outside the model: they have no place there and stay at neutral.
+    Numbers that no parameter writes stay the environment's own, those apart that follow from masses and places: they
+    are the scene's. Warns of parameters that live outside the model: they have no place there and stay at neutral.
 
     Args:
         scene: of the same MJCF, whose visual geoms the environment may have.
         gaussian: over any part of the scene's parameters.
 
     Returns:
-        (mjx.Model, rng [N, 2]) -> (batched mjx.Model, in_axes). It raises ValueError when called with a model of another
-        scene, or with one in which a friction loss that varies has no row.
+        (mjx.Model, rng [N, 2]) -> (batched mjx.Model, in_axes). It raises ValueError when called with a model of
+        another scene, or with one in which a friction loss that varies has no row.
 
     Raises:
         ValueError: a Gaussian of another scene.

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.arguments import check_fields, choice, flag, instance, listed, number, shown, whole
+from droid_jax.arguments import check_fields, choice, flag, instance, is_list, number, shown, whole
 from droid_jax.recordings.clocks import SLACK
 
 START = 0.1  # s: a channel that begins no later than this after the command still tells where the motion started
@@ -192,7 +192,7 @@ class Recording:
 
         Raises ValueError when no index is given or one lies outside 0 .. N - 1.
         """
-        if not listed(indices):
+        if not is_list(indices):
             raise ValueError(f"repeats must be a list of whole numbers, got {shown(indices)}")
         chosen = [whole(i, "a repeat") for i in indices]
         bad = [i for i in chosen if not 0 <= i < self.repeats]
@@ -243,7 +243,7 @@ def recordings_of(given: Any) -> tuple[Recording, ...]:
     """One recording or several as a tuple; ValueError where there is none, or a file's name stands for its content."""
     if isinstance(given, Recording):
         return (given,)
-    if not listed(given):
+    if not is_list(given):
         given = [given]
     out = tuple(given)
     if not out:

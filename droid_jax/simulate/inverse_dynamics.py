@@ -88,7 +88,7 @@ class Path(NamedTuple):
     still: jax.Array
 
 
-def path_of(scene: Scene, motion: Motion) -> Path:
+def motion_path(scene: Scene, motion: Motion) -> Path:
     """What a compiled replay is given of a motion; ValueError where it states a joint that the scene has not."""
     rest = motion.velocity == 0.0 if motion.rest is None else motion.rest
     measured = np.full(motion.velocity.shape, np.nan) if motion.measured is None else motion.measured

@@ -12,10 +12,10 @@ from droid_jax.cost.noise import (
     coarse_clock,
     correlation_time,
     detrend,
-    discrepancy,
     estimate_noise,
     lowpass,
     smooth,
+    stated_deviation,
 )
 
 CLOCK = np.arange(0, 6.0, 0.002)
@@ -242,9 +242,9 @@ def test_correlation_time_of_a_moving_average():
 def test_the_stated_deviation_makes_correlated_residuals_count_once():
     """The mean of K samples correlated over n varies like that of K white ones of sqrt(n) times the deviation."""
     white = np.random.default_rng(2).normal(size=(4000, 2)) * [0.3, 3.0]
-    np.testing.assert_allclose(discrepancy(white), [0.3, 3.0], rtol=0.25)
+    np.testing.assert_allclose(stated_deviation(white), [0.3, 3.0], rtol=0.25)
     averaged = np.stack([np.convolve(c, np.ones(10) / 10, "valid") for c in white.T], axis=1)
-    np.testing.assert_allclose(discrepancy(averaged), [0.3, 3.0], rtol=0.25)
+    np.testing.assert_allclose(stated_deviation(averaged), [0.3, 3.0], rtol=0.25)
     noise = estimate_noise(averaged[None, :30], minimum=0.01).stated(np.array([0.3, 3.0]))
     np.testing.assert_allclose(noise.whitener, np.eye(30) / np.array([0.3, 3.0])[:, None, None])
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from droid_jax.identify.gaussian import Gaussian, load, prior, space_from_json, space_to_json
+from droid_jax.identify.gaussian import Gaussian, load_gaussian, prior, space_from_json, space_to_json
 from droid_jax.identify.truncated_normal import gibbs, quantiles
 from droid_jax.model.parameters import Mode, Parameter, Role, Scaling, Space, Write
 
@@ -228,7 +228,7 @@ def saved(tmp_path):
 
 def test_save_and_load_give_the_same_gaussian(saved):
     g, path = saved
-    back = load(path)
+    back = load_gaussian(path)
     assert back.space == g.space and back.space["stiffness"].writes == WRITES
     assert (back.rule, back.coordinates) == (g.rule, g.coordinates)
     np.testing.assert_array_equal(back.mean, g.mean)
@@ -285,7 +285,7 @@ def test_bad_files_are_named(saved, change, message):
     change(content)
     path.write_text(json.dumps(content))
     with pytest.raises(ValueError, match=message) as error:
-        load(path)
+        load_gaussian(path)
     assert str(path) in str(error.value)
 
 
@@ -293,11 +293,11 @@ def test_missing_and_truncated_files_are_named(saved):
     _, path = saved
     path.write_text(path.read_text()[:-20])
     with pytest.raises(ValueError, match=r"gaussian\.json"):
-        load(path)
+        load_gaussian(path)
     with pytest.raises(ValueError, match=r"nowhere\.json: there is no such file"):
-        load(path.parent / "nowhere.json")
+        load_gaussian(path.parent / "nowhere.json")
     with pytest.raises(ValueError, match=r"is a folder; a run keeps its Gaussian in gaussian\.json there"):
-        load(path.parent)
+        load_gaussian(path.parent)
 
 
 @pytest.mark.parametrize("mean", [-0.4, 0.0, 0.3, 1.0, 4.0])

@@ -269,7 +269,7 @@ def test_faults_of_what_is_held_out_are_told_before_the_search(scene: Scene, mon
     faulty = dataclasses.replace(
         recording, channels={**recording.channels, "torque": dataclasses.replace(torque, mask=mask)}
     )
-    monkeypatch.setattr(pipeline, "search", lambda *a, **k: pytest.fail("the search began"))
+    monkeypatch.setattr(pipeline, "cma_search", lambda *a, **k: pytest.fail("the search began"))
     with pytest.raises(ValueError, match="'elbow' has a stretch that no repeat measured"):
         identify_parameters(scene, elbow_space(scene), [faulty], config=QUICK)
 
@@ -286,7 +286,7 @@ def test_a_replay_that_blows_up_is_no_parent_whatever_the_others_cost(scene: Sce
         costs = SimpleNamespace(first=lambda: lambda rows: np.array([5000.0, 1000.0]), against=lambda *a: None)
         return SimpleNamespace(**vars(costs), comparisons=(), rollouts=lambda rows: ())
 
-    monkeypatch.setattr(pipeline, "search", search)
+    monkeypatch.setattr(pipeline, "cma_search", search)
     monkeypatch.setattr(pipeline, "make_cost", cost_of)
     with pytest.raises(KeyboardInterrupt):
         identify_parameters(scene, elbow_space(scene), [elbow_log(0.0, 10.0, 2)], config=QUICK)
@@ -306,7 +306,7 @@ def test_means_that_cannot_be_simulated_are_refused_before_the_search(scene: Sce
         rollouts=lambda rows: (blown,),
     )
     monkeypatch.setattr(pipeline, "make_cost", lambda *_, **__: cost)
-    monkeypatch.setattr(pipeline, "search", lambda *a, **k: pytest.fail("the search began"))
+    monkeypatch.setattr(pipeline, "cma_search", lambda *a, **k: pytest.fail("the search began"))
     with pytest.raises(ValueError, match=r"'elbow' blows up .* means \(elbow leaves its range at step 20 \(0\.2 s\)"):
         identify_parameters(scene, elbow_space(scene), [elbow_log(0.0, 10.0, 2)], config=QUICK)
 
