@@ -115,16 +115,21 @@ def test_a_name_of_mjx_internals_is_found(source):
 
 
 GENERIC = ("model", "recordings", "simulate", "preflight", "cost", "identify", "discrepancy", "policy", "report")
-NAMES_DEFINED = ("model/parameters.py", "model/effects/")  # where parameters that a replay or an effect reads get names
+# Where parameters that a replay or an effect reads, or an encoder has, get their names.
+NAMES_DEFINED = ("model/parameters.py", "model/fields.py", "model/effects/")
 NAMES_LOOKED_UP = {"discrepancy/case.py", "discrepancy/localise.py", "discrepancy/candidate_experiments.py"}
 
 
 def parameter_names() -> set[str]:
-    """Names of the parameters of the door, of all effects in its scene, and of what a replay reads; no joints."""
+    """Names of the parameters of the door, of all effects in its scene, and of what a replay reads; no joints.
+
+    Those that are fields of MuJoCo's model too (sensor_delay) are left out.
+    """
     scene = door_scene(springs=1)
     spaces = (*door_space(scene).parameters, *door_nuisances(scene).parameters)
     effects = (p for e in library(scene) for p in e.parameters)
-    return {p.name.partition("[")[0] for p in (*spaces, *effects)} | {role.value for role in OF_A_JOINT}
+    found = {p.name.partition("[")[0] for p in (*spaces, *effects)} | {role.value for role in OF_A_JOINT}
+    return {name for name in found if not hasattr(scene.model, name)}
 
 
 def looked_up(source: str, names: set[str]) -> set[str]:

@@ -217,5 +217,5 @@ def _resistance(theta: Theta, state: State, own: jax.Array, effects: Sequence[Ef
 
 def _behind_the_sensor(scene: Scene, theta: Theta) -> jax.Array:
     """[nv] the dry friction that `joint_friction_effect` adds to a link-side torque."""
-    coulomb = column(theta, "coulomb", scene.joints)
+    coulomb = column(theta, Role.COULOMB.value, scene.joints)
     return jnp.zeros(scene.model.nv, jnp.float32).at[scene.joint_dofs].set(coulomb)
