@@ -211,6 +211,11 @@ def instance(value: Any, what: str, kind: type[Kind]) -> Kind:
     return value
 
 
+def mapping(value: Any, what: str) -> Mapping[Any, Any]:
+    """A dictionary or another mapping; what its keys and values are is for others to check."""
+    return instance(value, what, Mapping)
+
+
 def instances(value: Any, what: str, kind: type[Kind], *, empty: bool = True) -> tuple[Kind, ...]:
     """A list of objects of a class."""
     if isinstance(value, dict) or not is_list(value):

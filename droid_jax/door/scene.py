@@ -81,7 +81,10 @@ def _attach(spec: mujoco.MjSpec, file: Path, site: str) -> None:
 
     MuJoCo warns of an empty prefix twice, through Python and on stderr with a log file; both are silenced.
     """
-    mujoco.set_mju_user_warning(lambda message: None)
+
+    def nothing(message: str) -> None: ...
+
+    mujoco.set_mju_user_warning(nothing)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
@@ -126,9 +129,9 @@ def _add_grip(spec: mujoco.MjSpec) -> Grip:
     moves to the next time step: the cost then has cliffs 20 log-likelihood units high all around
     the best fit, which no search survives.
     """
-    fingers = []
+    fingers: list[tuple[str, str]] = []
     for side in ("left", "right"):
-        pairs = tuple(f"{side}_{rail}" for rail in ("near", "far"))
+        pairs = (f"{side}_near", f"{side}_far")
         for pair, rail in zip(pairs, ("near", "far"), strict=True):
             spec.add_pair(
                 name=pair,

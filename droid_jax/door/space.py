@@ -96,7 +96,7 @@ def door_space(scene: Scene, *, preset: str = "impedance") -> Space:
 
 
 def _joint_dampings(scene: Scene, preset: str) -> tuple[Parameter, ...]:
-    out = []
+    out: list[Parameter] = []
     for i, joint in enumerate(ARM):
         mean = PAPER_DAMPING[i] if preset == "paper" else float(scene.model.dof_damping[scene.dof(joint)])
         std = PAPER_DAMPING_STD[i] if preset == "paper" else 0.1 * mean

@@ -27,11 +27,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, cast, get_args
 
 import msgspec
 import numpy as np
-from scipy import special
+from scipy import special  # pyright: ignore[reportMissingTypeStubs]
 
 from droid_jax.arguments import instance, name, note, number, numeric, one_of, path_of, several, shown, whole
 from droid_jax.identify.truncated_normal import gibbs, quantiles
@@ -253,10 +253,11 @@ def load_gaussian(path: str | Path) -> Gaussian:
     if path.is_dir():
         raise ValueError(f"{path} is a folder; a run keeps its Gaussian in gaussian.json there")
     try:
-        content = read_json(path)
+        given = read_json(path)
     except FileNotFoundError:
         raise ValueError(f"{path}: there is no such file") from None
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
+    content: dict[str, Any] = cast(dict[str, Any], given) if isinstance(given, dict) else {}
+    if content.get("format") != FORMAT:
         raise ValueError(f"{path}: expected a JSON object with format {FORMAT!r}")
     if content.get("version") != VERSION:
         raise ValueError(f"{path}: expected version {VERSION}, got {shown(content.get('version'))}")
@@ -270,7 +271,7 @@ def load_gaussian(path: str | Path) -> Gaussian:
 
 def space_to_json(space: Space) -> list[dict[str, Any]]:
     """A space as JSON values: one object per parameter, writes included."""
-    out = []
+    out: list[dict[str, Any]] = []
     for p in space.parameters:
         entry = asdict(p) | {"scaling": p.scaling.value, "role": p.role.value}
         if p.role is (Role.OTHER if p.writes else role_in_theta(p.name)):
@@ -334,7 +335,8 @@ def space_of(entries: Iterable[ParameterEntry]) -> Space:
 def _parameter(entry: ParameterEntry) -> Parameter:
     fields = msgspec.structs.asdict(entry)
     try:
-        fields["writes"] = tuple(Write(**{**msgspec.structs.asdict(w), "index": tuple(w.index)}) for w in entry.writes)
+        writes: list[dict[str, Any]] = [msgspec.structs.asdict(w) | {"index": tuple(w.index)} for w in entry.writes]
+        fields["writes"] = tuple(Write(**w) for w in writes)
     except ValueError as error:
         raise ValueError(f"parameter {shown(entry.name)}: {error}") from None
     return Parameter(**fields)
@@ -342,7 +344,7 @@ def _parameter(entry: ParameterEntry) -> Parameter:
 
 def matrix(name: str, rows: list[Any]) -> np.ndarray:
     """Rows of a file as an array, where they are of one length."""
-    if len({len(row) for row in rows if isinstance(row, list)}) > 1:
+    if len({len(cast(list[Any], row)) for row in rows if isinstance(row, list)}) > 1:
         raise ValueError(f"{name} must have rows of one length")
     return np.array(rows, dtype=np.float64)
 

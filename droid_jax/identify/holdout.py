@@ -78,7 +78,7 @@ def torque_distances(
     """
     penalty_free = cost.distances(np.stack([before, after])) - cost.penalties(np.stack([before, after]))
     smoothed = cost.smoothed(np.stack([before, after]))
-    out = []
+    out: list[TorqueDistance] = []
     for i, (one, recording, own) in enumerate(zip(cost.comparisons, recordings, held, strict=True)):
         rms = np.sqrt(np.mean((smoothed[i] - one.channel("torque").noise.mean) ** 2, axis=1))
         alike = cost.from_one_start(i, recording)  # as the held-out repeats that `cost` compares
@@ -125,11 +125,11 @@ def _scatter(values: np.ndarray, mask: np.ndarray) -> float | None:
     mean = filled.sum(axis=0) / np.maximum(count, 1)
     seen = mask & (count > 1)
     error = np.where(seen, (filled - mean) / np.sqrt(1 - 1 / np.maximum(count, 2)), 0.0)
-    rows = seen.any(axis=-1)  # [N, T]
-    repeats = rows.any(axis=1)
+    rows = np.any(seen, axis=-1)  # [N, T]
+    repeats = np.any(rows, axis=1)
     if not repeats.any():
         return None
-    distance = np.linalg.norm(error, axis=-1).sum(axis=1)[repeats] / rows.sum(axis=1)[repeats]
+    distance: np.ndarray = np.linalg.norm(error, axis=-1).sum(axis=1)[repeats] / rows.sum(axis=1)[repeats]
     return float(np.mean(distance))
 
 

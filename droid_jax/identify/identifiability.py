@@ -184,7 +184,8 @@ def time_blocks(
     shapes: (columns C, coarse samples K) of each compared channel, in the order of the residuals
     (column by column); seconds: its duration.
     """
-    ids, start = [], 0
+    ids: list[np.ndarray] = []
+    start = 0
     for (columns, samples), duration in zip(shapes, seconds, strict=True):
         per_column = max(1, round(duration / block))
         within = np.minimum((np.arange(samples) * per_column) // samples, per_column - 1)
@@ -212,10 +213,11 @@ def identifiability(
     correlation = gaussian.cov / np.outer(deviation, deviation)
     space = gaussian.space
     away = gaussian.mean if gaussian.coordinates == "search" else space.to_search(gaussian.mean)
-    out = []
+    out: list[Identifiability] = []
     for i, name in enumerate(space.names):
         shrinkage = float(deviation[i] / min(prior[i], STATED))
-        others = [(space.names[j], float(correlation[i, j])) for j in np.argsort(-np.abs(correlation[i])) if j != i]
+        nearest: list[int] = np.argsort(-np.abs(correlation[i])).tolist()
+        others = [(space.names[j], float(correlation[i, j])) for j in nearest if j != i]
         partners = tuple((n, c) for n, c in others if abs(c) > config.partner)[:3]
         known = shrinkage < config.identifiable
         out.append(Identifiability(name, known, shrinkage, partners, _reason(known, shrinkage), float(away[i])))

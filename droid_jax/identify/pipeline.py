@@ -113,7 +113,7 @@ class Identified:
     heldout: Cost
     heldout_repeats: dict[str, tuple[int, ...]]
     seconds: dict[str, float]
-    checks: dict[str, SolutionCheck] = field(default_factory=dict)
+    checks: dict[str, SolutionCheck] = field(default_factory=dict[str, SolutionCheck])
     config: IdentifyConfig = field(default_factory=IdentifyConfig)
 
     @property
@@ -250,7 +250,7 @@ def search_cost(
 
 def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: Progress | None = None) -> Identified:
     """The rest of `identify_parameters`: search, refine, calibrate, judge."""
-    report = progress or (lambda stage, value: None)
+    report = progress or _silent
     config, space, full, base = problem.config, problem.space, problem.full, problem.fit
     seconds: dict[str, float] = {}
 
@@ -305,6 +305,10 @@ def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: 
         checks=checks,
         config=config,
     )
+
+
+def _silent(stage: str, value: Any) -> None:
+    """No progress is shown."""
 
 
 def _check_names(names: Sequence[str], config: IdentifyConfig) -> None:

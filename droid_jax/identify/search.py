@@ -265,6 +265,15 @@ def _progress(run: CmaState, config: SearchConfig) -> SearchProgress:
     )
 
 
+def _history(run: CmaState, restart: int) -> History:
+    """One restart's own rows of the records, as long as it ran."""
+    ended = int(run.ended[restart])
+    records: dict[str, np.ndarray] = {
+        name: np.stack([each[restart] for each in rows[:ended]]) for name, rows in run.records.items()
+    }
+    return History(**records)
+
+
 def _fit(run: CmaState, space: Space, config: SearchConfig, asked: int) -> Fit:
     """The result, led by the restart with the lowest cost; `asked` rows came after the generations."""
     overall = "max_seconds" if run.generation < config.generations else "generations"
@@ -276,8 +285,8 @@ def _fit(run: CmaState, space: Space, config: SearchConfig, asked: int) -> Fit:
             best_cost=float(run.best_cost[r]),
             mean=means[r],
             cov=covs[r],
-            stop=REASONS[run.stopped[r]] or overall,
-            history=History(**{k: np.stack([e[r] for e in v[: run.ended[r]]]) for k, v in run.records.items()}),
+            stop=REASONS[int(run.stopped[r])] or overall,
+            history=_history(run, r),
         )
         for r in range(config.restarts)
     )

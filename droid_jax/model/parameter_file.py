@@ -26,7 +26,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 
@@ -101,23 +101,24 @@ def load_parameters(path: str | Path, scene: Scene) -> Space:
 
 def friction_joints(path: str | Path) -> tuple[str, ...]:
     """Joints whose friction loss the file asks for: the scene must be compiled with a row for them."""
-    entries = [e for e in _entries(Path(path)) if isinstance(e, dict)]
+    entries: list[dict[str, Any]] = [e for e in _entries(Path(path)) if isinstance(e, dict)]
     return tuple(str(e["element"]) for e in entries if e.get("field") == "dof_frictionloss" and "element" in e)
 
 
 def _entries(path: Path) -> list[Any]:
     if not path.is_file():
         raise FileNotFoundError(f"no parameter file at {path}")
-    entries = read_json(path)
-    if not isinstance(entries, list) or not entries:
-        got = "an empty one" if entries == [] else type(entries).__name__
+    content = read_json(path)
+    if not isinstance(content, list) or not content:
+        got = "an empty one" if content == [] else type(cast(Any, content)).__name__
         raise ValueError(f"{path}: expected a list of parameters, got {got}")
-    return entries
+    return cast(list[Any], content)
 
 
-def _parameter(scene: Scene, entry: Any, where: str) -> Parameter:
-    if not isinstance(entry, dict):
-        raise ValueError(f"{where}: expected an object, got {type(entry).__name__}")
+def _parameter(scene: Scene, given: Any, where: str) -> Parameter:
+    if not isinstance(given, dict):
+        raise ValueError(f"{where}: expected an object, got {type(given).__name__}")
+    entry = cast(dict[str, Any], given)
     needed = ("std",) if "servo" in entry else ("std", "high") if entry.get("sensor") == _TIME else _NEEDED
     missing = [k for k in needed if k not in entry]
     if sum(kind in entry for kind in ("field", "sensor", "servo")) != 1:
@@ -128,7 +129,7 @@ def _parameter(scene: Scene, entry: Any, where: str) -> Parameter:
     if extra := [k for k in _useless(entry) if k in entry]:
         raise ValueError(f"{where}: leave {', '.join(extra)} out, which an entry of its kind has no use for")
     read = msgspec.structs.asdict(typed(entry, _Entry, where))
-    options = {key: value for key, value in read.items() if value is not msgspec.UNSET}
+    options: dict[str, Any] = {key: value for key, value in read.items() if value is not msgspec.UNSET}
     try:
         field, sensor, servo = (options.pop(kind, None) for kind in ("field", "sensor", "servo"))
         if servo is not None:
@@ -146,7 +147,8 @@ def _parameter(scene: Scene, entry: Any, where: str) -> Parameter:
         if field == "body_mass" and options.get("mode", Mode.SET) is Mode.SET:
             options.pop("mode", None)
             return body_mass(scene, element, **options)
-        return model_parameter(scene, field, element, options.pop("column", None), **{"unit": "", **options})
+        options = {"unit": "", **options}
+        return model_parameter(scene, field, element, options.pop("column", None), **options)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{where}: {error}") from None
 

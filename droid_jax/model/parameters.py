@@ -18,17 +18,17 @@ from __future__ import annotations
 import dataclasses
 import enum
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from droid_jax.arguments import (
     choice,
     flag,
-    instance,
     instances,
+    mapping,
     name,
     number,
     numeric,
@@ -75,9 +75,11 @@ class Write:
     def __post_init__(self) -> None:
         where = f"a write of {shown(self.field)}"
         set_field(self, "field", name(self.field, f"{where}: field"))
-        if not isinstance(self.index, (tuple, list)) or not self.index:
-            raise ValueError(f"{where}: index must be a tuple of whole numbers, got {shown(self.index)}")
-        set_field(self, "index", tuple(whole(i, f"{where}: index", least=0, most=MOST_ROWS) for i in self.index))
+        index: Any = self.index
+        if not isinstance(index, (tuple, list)) or not index:
+            raise ValueError(f"{where}: index must be a tuple of whole numbers, got {shown(index)}")
+        entries: list[Any] = list(index)  # pyright: ignore[reportUnknownArgumentType, reportUnknownVariableType]
+        set_field(self, "index", tuple(whole(i, f"{where}: index", least=0, most=MOST_ROWS) for i in entries))
         set_field(self, "mode", choice(self.mode, f"{where}: mode", Mode))
         set_field(self, "gain", number(self.gain, f"{where}: gain"))
         set_field(self, "offset", number(self.offset, f"{where}: offset"))
@@ -254,7 +256,7 @@ class Space:
     """
 
     parameters: tuple[Parameter, ...]
-    _index: dict[str, int] = field(init=False, repr=False, compare=False, hash=False, default_factory=dict)
+    _index: dict[str, int] = field(init=False, repr=False, compare=False, hash=False, default_factory=dict[str, int])
 
     def __post_init__(self) -> None:
         set_field(self, "parameters", instances(self.parameters, "the parameters of a space", Parameter))
@@ -326,9 +328,9 @@ class Space:
         """A copy in which some parameters start from another (mean, std)."""
         changed = list(self.parameters)
         for of, pair in prior.items():
-            i = self.index(of)
-            if not isinstance(pair, (tuple, list)) or len(pair) != 2:
-                raise ValueError(f"the prior of {of!r} must be its mean and deviation, got {shown(pair)}")
+            i, given = self.index(of), cast(Any, pair)
+            if not isinstance(given, (tuple, list)) or len(pair) != 2:
+                raise ValueError(f"the prior of {of!r} must be its mean and deviation, got {shown(given)}")
             changed[i] = replace(changed[i], mean=pair[0], std=pair[1])
         return Space(tuple(changed))
 
@@ -339,7 +341,7 @@ class Space:
     def values(self, values: dict[str, float] | None = None) -> np.ndarray:
         """[D] the means, with some entries replaced by name."""
         out = self.mean
-        for of, value in instance({} if values is None else values, "values", Mapping).items():
+        for of, value in mapping({} if values is None else values, "values").items():
             out[self.index(of)] = number(value, f"the value of {of!r}")
         return out
 

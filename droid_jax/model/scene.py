@@ -9,10 +9,10 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import mujoco
 import numpy as np
@@ -169,7 +169,8 @@ class Scene:
 
         try:
             with jax.ensure_compile_time_eval():  # else a first use inside jit would keep that trace's values
-                return mjx.put_model(self.model)
+                put = cast(Callable[[mujoco.MjModel], Any], mjx.put_model)  # pyright: ignore[reportUnknownMemberType]
+                return put(self.model)
         except NotImplementedError as error:
             raise ValueError(
                 f"scene {self.name!r} uses something that MJX has not: {error}; change it in the MJCF "
@@ -233,7 +234,8 @@ class Scene:
 def name_to_id(model: mujoco.MjModel, kind: str, name: str) -> int:
     """Id of a named joint, body, geom, pair, actuator or site; an unknown name lists the valid ones."""
     obj = getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
-    plain = isinstance(name, str) and bool(name) and name.isprintable()
+    given: Any = name
+    plain = isinstance(given, str) and bool(given) and given.isprintable()
     found = mujoco.mj_name2id(model, obj, name) if plain else -1
     if found < 0:
         valid = [v for v in (mujoco.mj_id2name(model, obj, i) for i in range(_count(model, kind))) if v]
@@ -339,8 +341,9 @@ def load_scene(
     """
     path = arguments.path_of(path, "the path of an MJCF")
     friction_joints = arguments.names(friction_joints, "friction_joints")
-    assets = {} if assets is None else arguments.instance(assets, "assets", Mapping)
-    for key, content in assets.items():
+    assets = {} if assets is None else arguments.mapping(assets, "assets")
+    given: Mapping[Any, Any] = assets
+    for key, content in given.items():
         if not isinstance(key, str) or not isinstance(content, bytes):
             raise ValueError(f"assets must map file names to bytes, got {arguments.shown(key)}")
     if path.is_dir():

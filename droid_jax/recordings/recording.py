@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.arguments import check_fields, choice, flag, instance, is_list, number, shown, whole
+from droid_jax.arguments import check_fields, choice, flag, is_list, mapping, number, shown, whole
 from droid_jax.recordings.clocks import SLACK
 
 START = 0.1  # s: a channel that begins no later than this after the command still tells where the motion started
@@ -127,11 +127,11 @@ class Recording:
     command_names: tuple[str, ...]
     channels: Mapping[str, Channel]
     torque: TorqueConvention
-    qpos0: Mapping[str, float] = field(default_factory=dict)
+    qpos0: Mapping[str, float] = field(default_factory=dict[str, float])
     gains: ServoGains | None = None
     phases: tuple[Phase, ...] = ()
     object_pose: ObjectPose | None = None
-    meta: Mapping[str, str] = field(default_factory=dict)
+    meta: Mapping[str, str] = field(default_factory=dict[str, str])
 
     @property
     def repeats(self) -> int:
@@ -211,7 +211,7 @@ class Recording:
         """
         start, end = number(start, "start of a window"), number(end, "end of a window")
         if qpos0 is not None:
-            given = instance(qpos0, "qpos0", Mapping).items()
+            given = mapping(qpos0, "qpos0").items()
             qpos0 = {str(joint): number(q, f"qpos0, joint {shown(joint)}") for joint, q in given}
         if not start < end:
             raise ValueError(f"a window needs start < end, got {start} and {end} s")
@@ -301,10 +301,11 @@ def _measured_at(recording: Recording, instant: float, slack: float = SLACK) -> 
 def _interpolate(channel: Channel, repeat: int, column: int, at: float, slack: float) -> float | None:
     """One column's value at an instant, or None more than `slack` s outside what was measured."""
     seen = channel.mask[repeat, :, column]
-    time = channel.time[seen]
+    time: np.ndarray = channel.time[seen]
     if not len(time) or not time[0] - slack <= at <= time[-1] + slack:
         return None
-    return float(np.interp(at, time, channel.values[repeat, seen, column]))
+    values: np.ndarray = channel.values[repeat, seen, column]
+    return float(np.interp(at, time, values))
 
 
 def _content(recording: Recording) -> tuple[dict[str, Any], Iterator[np.ndarray]]:
