@@ -16,7 +16,7 @@ from droid_jax import arguments
 from droid_jax.arguments import check_fields, number, whole
 from droid_jax.cost.noise import NoiseConfig
 from droid_jax.cost.residuals import CompareConfig
-from droid_jax.discrepancy.case import DiscrepancyConfig
+from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.identify.identifiability import IdentifiabilityConfig
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.identify.pipeline import IdentifyConfig
