@@ -24,8 +24,7 @@ from droid_jax.model.parameters import Role
 from droid_jax.model.physics import Physics
 from droid_jax.model.quiet_mjx import mjx
 from droid_jax.model.scene import Scene
-from droid_jax.model.step import servo_force
-from droid_jax.model.step import step as simulate_step
+from droid_jax.model.step import servo_force, simulate_step
 from droid_jax.model.unsupported_features import check_options
 from droid_jax.recordings.checks import check_joints
 from droid_jax.recordings.clocks import interpolate
