@@ -85,6 +85,10 @@ def record(name: str, repeats: int = 8, preload: float = PRELOAD, friction: floa
     return record_hidden(scene, demonstration(name), TRUTH, hidden, seed=seed, config=config, name=name, space=space)
 
 
+def quiet(stage: str, value: object) -> None:
+    """Progress that nobody sees."""
+
+
 @dataclass(frozen=True, eq=False)
 class Small:
     """A finished search."""
@@ -107,5 +111,5 @@ def small() -> Small:
     recordings = {name: record(name) for name in ("train", "validation")}
     scene, space = small_scene()
     case = make_case(scene, space, library(scene, EFFECTS), **recordings, config=QUICK)
-    base = base_fit(case, lambda stage, value: None)
+    base = base_fit(case.train, case.base, case.config, quiet)
     return Small(scene, recordings, case, base, search_effects(case, base, FLOOR))
