@@ -1,4 +1,4 @@
-"""The model that is handed on: of both motions where there are two and an effect, else the search's own."""
+"""The final model: fitted to both motions where there are two and an effect, else the search's own."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from small_gap import PRELOAD, Small, small
 
-from droid_jax.discrepancy.fitting import FinalModel, final_refit
+from droid_jax.discrepancy.case import Case
+from droid_jax.discrepancy.fitting import FinalModel, FittedModel, final_refit, final_refit_due
 from droid_jax.discrepancy.results import extended, write_gap
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.report.gap_folder import read_gap
@@ -26,9 +27,13 @@ def found() -> Small:
     return small()
 
 
+def refitted(case: Case, model: FittedModel) -> FinalModel:
+    return final_refit(case.train, case.validation, model, case.config.refine)
+
+
 @pytest.fixture(scope="module")
 def both(found: Small) -> FinalModel:
-    return final_refit(found.case, found.verdict.model)
+    return refitted(found.case, found.verdict.model)
 
 
 def test_it_is_the_best_of_both_motions(found: Small, both: FinalModel):
@@ -55,7 +60,7 @@ def test_it_is_the_best_of_both_motions(found: Small, both: FinalModel):
             assert objective(moved) > both.model.refined.objective - RefineConfig().tolerance, name
 
 
-def test_two_motions_tell_more_than_one(found: Small, both: FinalModel):
+def test_two_motions_constrain_more_than_one(found: Small, both: FinalModel):
     alone = found.verdict.model
     one, two = (np.diag(np.linalg.inv(m.refined.hessian)) for m in (alone, both.model))
     assert np.all(two < 1.02 * one) and np.min(two / one) < 0.8
@@ -66,14 +71,17 @@ def test_two_motions_tell_more_than_one(found: Small, both: FinalModel):
     assert low[at] < PRELOAD < high[at]
 
 
-def test_without_an_effect_in_blocks_or_unsettled_it_is_the_searchs_own(found: Small):
+def test_without_an_effect_in_blocks_or_unconverged_it_is_the_searchs_own(found: Small):
     case, model = found.case, found.verdict.model
-    assert final_refit(case, found.base).model is found.base
-    blocks: Any = SimpleNamespace(train=SimpleNamespace(repeated=False))
-    assert final_refit(blocks, model).model is model
+    assert final_refit_due(case.train, model) and not final_refit_due(case.train, found.base)
+    base = refitted(case, found.base)
+    assert base.model is found.base and base.fitted_to == (case.train,) and not base.not_made
+    blocks: Any = replace(case.train, resampling=SimpleNamespace(repeated=False))
+    assert not final_refit_due(blocks, model)
+    assert final_refit(blocks, case.validation, model, case.config.refine).model is model
     short = replace(case, config=replace(case.config, refine=RefineConfig(iterations=1, basin_hops=0)))
-    kept = final_refit(short, model)
-    assert kept.model is model and kept.fitted_to == (case.train,)
+    kept = refitted(short, model)
+    assert kept.model is model and kept.fitted_to == (case.train,) and kept.not_made
 
 
 def test_file_and_page_say_what_it_is_fitted_to(found: Small, both: FinalModel, tmp_path):
