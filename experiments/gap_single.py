@@ -45,7 +45,7 @@ from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.policy.trials import wilson
 from droid_jax.recordings.recording import Recording
-from experiments.trials import answer_json, trial_json
+from experiments.trials import answer_json, validation_json
 
 ORDER = 20  # of the noise's autoregression, at 20 Hz: one second
 BURN = 400  # samples before the noise is stationary
@@ -235,7 +235,7 @@ def report(case: Case, verdict: Verdict) -> dict[str, Any]:
             for p in verdict.model.space.parameters
         },
         "p": [s.p for s in verdict.score_tests],
-        "gaps": {
+        "discrepancies": {
             role: {"before": b, "after": a, "closed": 1 - a / b} for role, (b, a) in verdict.discrepancies.items()
         },
         "rms": {role: _rms_of(case, verdict, role) for role in ("train", "validation", "test")},
@@ -245,7 +245,7 @@ def report(case: Case, verdict: Verdict) -> dict[str, Any]:
             {**asdict(b.key), "axis": b.key.axis.value, "before": b.discrepancy, "after": a.discrepancy}
             for b, a in zip(verdict.before, verdict.after, strict=True)
         ],
-        "trials": [trial_json(trial) for trial in verdict.validation_tests],
+        "validation_tests": [validation_json(trial) for trial in verdict.validation_tests],
     }
 
 

@@ -101,12 +101,21 @@ def run_case(plan: Plan, commit: str, bench: Bench, watch: Stopwatch) -> Iterato
     model = watch("base", lambda: base_fit(case.train, case.base, case.config, silent))
     screen = watch("screen", lambda: score_test(case.train, model, directions_of(candidates(case.effects))))
     best = screen.directions[int(np.argmax(np.abs(screen.t)))].candidate.key
-    yield {"p": screen.p, "gap": model.discrepancy, "converged": bool(model.refined.converged), "best": str(best)}
+    yield {
+        "p": screen.p,
+        "discrepancy": model.discrepancy,
+        "converged": bool(model.refined.converged),
+        "best": str(best),
+    }
     if screen.p < case.config.selection.significance:
-        floor = watch("floor", lambda: bench.floor(scene, case, model, recordings["train"]))
+        floor = watch("discretisation_error", lambda: bench.floor(scene, case, model, recordings["train"]))
         whole = watch("prepare", lambda: bench.case(scene, recordings))
         verdict = watch("find", lambda: search_effects(whole, model, floor))
-        yield {"floor": floor, "verdict": verdict.conclusion.value, "effects": list(map(str, verdict.effects))}
+        yield {
+            "discretisation_error": floor,
+            "verdict": verdict.conclusion.value,
+            "effects": list(map(str, verdict.effects)),
+        }
 
 
 def summarise(cases: list[dict[str, Any]]) -> dict[str, Any]:
@@ -131,7 +140,7 @@ def summarise(cases: list[dict[str, Any]]) -> dict[str, Any]:
         "p_below": {f"{level:g}": float(np.mean(p < level)) for level in LEVELS},
         "uniform_p": float(scipy.stats.kstest(p, "uniform").pvalue),
         "p_histogram": np.histogram(p, np.linspace(0, 1, 11))[0].tolist(),
-        "gap_median": float(np.median([c["gap"] for c in cases])),
+        "discrepancy_median": float(np.median([c["discrepancy"] for c in cases])),
         "seconds_median": float(np.median([sum(c["seconds"].values()) for c in cases])),
     }
 

@@ -19,7 +19,7 @@ def answer_json(verdict: Verdict) -> dict[str, Any]:
     }
 
 
-def trial_json(trial: ValidationTest) -> dict[str, Any]:
+def validation_json(trial: ValidationTest) -> dict[str, Any]:
     """Name, figures and what spoke against it; discrepancy_validation is None where the model blew up there."""
     return {
         "name": names_of(trial.keys),
@@ -28,6 +28,6 @@ def trial_json(trial: ValidationTest) -> dict[str, Any]:
         "discrepancy_train": trial.discrepancy_train,
         "discrepancy_validation": finite(trial.discrepancy_validation),
         "chosen": trial.chosen,
-        "rivals": list(map(names_of, trial.indistinguishable)),
+        "indistinguishable": list(map(names_of, trial.indistinguishable)),
         "reasons": [r.text for r in trial.reasons],
     }

@@ -458,8 +458,8 @@ def test_a_run_goes_on_after_a_stop_and_is_whole(
     assert files == {"checkpoints", "setup.json", "tensorboard", *written}
     assert not (out / "checkpoints" / "replays").exists()
     answer = read_gap(out).found
-    assert answer["amplitudes"][0]["value"] == pytest.approx(PRELOAD, rel=0.05)
-    assert {"search", "refine", "floor", "screen", "refit"} <= set(answer["seconds"])
+    assert answer["coefficients"][0]["value"] == pytest.approx(PRELOAD, rel=0.05)
+    assert {"search", "refine", "discretisation_error", "score_test", "refit"} <= set(answer["seconds"])
     assert answer["setup"]["synthetic_robot"] is True and answer["setup"]["command"] == "gap"
     places = {when: [(c["variable"], c["where"]) for c in answer["cells"][when]] for when in ("before", "after")}
     assert places["before"] == places["after"]

@@ -20,8 +20,24 @@ if TYPE_CHECKING:
     from droid_jax.recordings.recording import Recording
     from droid_jax.recordings.split import Split
 
-BARS = ("search", "refine", "floor", "screen", "look", "refit", "anew", "judge", "both")
-IN_BLOCKS = ("refine", "screen", "look", "refit", "judge")  # of a log: no search, and no time step to refine
+BARS = (
+    "search",
+    "refine",
+    "discretisation_error",
+    "score_test",
+    "one_step_fit",
+    "refit",
+    "restart",
+    "verdict",
+    "final_refit",
+)
+IN_BLOCKS = (
+    "refine",
+    "score_test",
+    "one_step_fit",
+    "refit",
+    "verdict",
+)  # of a log: no search, and no time step to refine
 
 
 def searched(
@@ -46,7 +62,7 @@ def searched(
 
     names = IN_BLOCKS if split is Split.BLOCKS else BARS if start is None else BARS[1:]
     with (
-        stages(names, {"look": case.config.one_step_fits, "refit": case.config.full_refits}) as show,
+        stages(names, {"one_step_fit": case.config.one_step_fits, "refit": case.config.full_refits}) as show,
         scalars(board) as write,
     ):
         clock = Clock(names, (show, write), checkpoints / "seconds.json")

@@ -73,7 +73,7 @@ def _check_door(path: Path, gaussian: Gaussian, scene: Scene) -> None:
 class _Verdict(TypedDict):
     """What training reads of a gap.json."""
 
-    effects: list[str]
+    effects: list[dict[str, str]]
 
 
 def model_folder(whole: Path) -> Path:

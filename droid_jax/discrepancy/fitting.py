@@ -240,8 +240,8 @@ def final_refit(
         return np.concatenate([-e.common(values) * e.repeats**0.5 for e in (train, validation)], axis=1)
 
     begin = model.values[whole.columns(space)]
-    progress("both", None)
-    refined = refine(residuals, space, begin, config, progress=lambda now: progress("both", now))
+    progress("final_refit", None)
+    refined = refine(residuals, space, begin, config, progress=lambda now: progress("final_refit", now))
     if not refined.converged:
         return FinalModel(model, (train,), "the fit to both motions did not converge")
     values = whole.embed(space, refined.best[None], model.values)[0]

@@ -127,10 +127,10 @@ def search(
         step_error = 0.0
     else:
         model = base_fit(case.train, case.base, case.config, report, start)
-        report("floor", None)
+        report("discretisation_error", None)
         step_error = discretisation_error(case.train, model, roles["train"])
     verdict = search_effects(case, model, step_error, report)
-    report("judge", None)
+    report("verdict", None)
     return verdict
 
 

@@ -150,7 +150,7 @@ def step(state: SearchState, problem: Problem) -> tuple[SearchState, SelectionSt
     asked = open_directions(problem.directions, model)
     if not asked:
         return replace(state, finished=True, exhausted=True), None
-    problem.progress("screen", model.name)
+    problem.progress("score_test", model.name)
     found = score_test(case.train, model, asked, case.config.seed)
     thresholds = case.config.selection
     exhausted = found.p >= thresholds.significance
@@ -215,7 +215,7 @@ def _one_step_fits(
         if number and problem.late:
             return out, _late(len(ranked) - number, len(ranked), "candidates not looked at")
         (part,), start = proposal.parts, proposal.start(problem.case.full_space, model.values)
-        problem.progress("look", names_of((*model.keys, part.key)))
+        problem.progress("one_step_fit", names_of((*model.keys, part.key)))
         rows = {d.coefficient: k for k, d in enumerate(found.directions) if d.candidate.shaped_key == part.shaped_key}
         raw = {a: found.raw[k] for a, k in rows.items()}
         out.append((*one_step_fit(problem.case.train, model, part, raw, start), proposal))
@@ -286,7 +286,7 @@ def _better_from_prior(problem: Problem, model: FittedModel) -> FittedModel:
     case = problem.case
 
     def progress(stage: str, value: object) -> None:
-        problem.progress("anew", value)
+        problem.progress("restart", value)
 
     try:
         fresh = fitted_from_prior(case.train, case.base, model.parts, case.config, progress)

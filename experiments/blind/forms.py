@@ -58,7 +58,7 @@ class Forms:
             "left": self._best(self.where.torques(added[None])[0], self.torques)[name][0],
             "left_after_refit": left,
             "per_unit": dict(zip(self.candidates[k].coefficients, sizes.tolist(), strict=True)),
-            "shapes": dict(self.candidates[k].shape_parameters),
+            "shape_parameters": dict(self.candidates[k].shape_parameters),
         }
 
     def _worth(self, found: Best) -> float:

@@ -45,8 +45,8 @@ def oracle(folder: Path, truth: dict[str, Any], result: dict[str, Any], bench: B
     model = fitted(case, truth["truths"]["train"], [right(scene, Applied(**h)) for h in truth["hidden"]])
     return {
         "model": model.name,
-        "gaps": {role: of.discrepancy_at(model.values) for role, of in case.residual_sets.items()},
-        "amplitudes": {name: float(model.values[case.full_space.index(name)]) for name in model.coefficients},
+        "discrepancies": {role: of.discrepancy_at(model.values) for role, of in case.residual_sets.items()},
+        "coefficients": {name: float(model.values[case.full_space.index(name)]) for name in model.coefficients},
         "converged": model.refined.converged,
         "settled": settled(recordings, truth, result, bench),
     }
@@ -103,6 +103,6 @@ def oracle_all(runs: Path, chosen: Iterable[str], bench: Bench, tell: Callable[[
                 found = {"error": str(error)}
             write_json(path, {"of": file_sha256(known), **found})
         count += 1
-        left = ", ".join(f"U {role} {u:.3g}" for role, u in found.get("gaps", {}).items())
+        left = ", ".join(f"U {role} {u:.3g}" for role, u in found.get("discrepancies", {}).items())
         tell(f"{name}: {found.get('error', found.get('model'))} {left}")
     return count

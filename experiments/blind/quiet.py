@@ -73,6 +73,6 @@ def _parts(case: Case, result: Mapping[str, Any]) -> list[Candidate]:
 def _start(case: Case, truth: Mapping[str, float], result: Mapping[str, Any]) -> np.ndarray:
     """[D] the truth of the base model, and what was found of the effects."""
     whole = case.full_space
-    sizes = {name: found["value"] for name, found in result["amplitudes"].items()}
-    known = {**truth, **sizes, **result["shapes"]}
+    sizes = {name: found["value"] for name, found in result["coefficients"].items()}
+    known = {**truth, **sizes, **result["shape_parameters"]}
     return np.clip(whole.values({n: v for n, v in known.items() if n in whole.names}), whole.low, whole.high)

@@ -26,7 +26,7 @@ from droid_jax.recordings.recording import Recording
 from droid_jax.storage import write_json
 from experiments.blind.baselines import baselines
 from experiments.blind.scenes import ROLES, Setting, setting
-from experiments.trials import answer_json, trial_json
+from experiments.trials import answer_json, validation_json
 
 # What is kept as the result of a case that fails; running out of memory is none, and a later start tries it again.
 FAILED = (ValueError, ArithmeticError)
@@ -97,7 +97,7 @@ def search_case(folder: Path, bench: Bench) -> dict[str, Any]:
     try:
         case = watch("prepare", lambda: bench.case(told["scene"], recordings, told["without"]))
         model = watch("base", lambda: base_fit(case.train, case.base, case.config, silent))
-        floor = watch("floor", lambda: bench.floor(told["scene"], case, model, recordings["train"]))
+        floor = watch("discretisation_error", lambda: bench.floor(told["scene"], case, model, recordings["train"]))
         verdict = watch("find", lambda: search_effects(case, model, floor))
     except FAILED as error:
         return {**result, "verdict": "error", "error": str(error), "seconds": watch.seconds}
@@ -128,19 +128,19 @@ def describe(case: Case, verdict: Verdict) -> dict[str, Any]:
         "doubts": list(verdict.doubts),
         "remainder": verdict.remainder,
         "p": verdict.score_tests[0].p if verdict.score_tests else None,
-        "gaps": {role: list(pair) for role, pair in verdict.discrepancies.items()},
-        "floor": verdict.discretisation_error,
+        "discrepancies": {role: list(pair) for role, pair in verdict.discrepancies.items()},
+        "discretisation_error": verdict.discretisation_error,
         "converged": verdict.base.refined.converged,
-        "amplitudes": {
+        "coefficients": {
             name: {"value": float(verdict.model.values[space.index(name)]), "interval": list(span)}
             for name, span in spans.items()
         },
-        "shapes": {
+        "shape_parameters": {
             name: float(verdict.model.values[space.index(name)])
             for part in verdict.model.parts
             for name in part.shape_parameters
         },
-        "trials": [trial_json(trial) for trial in verdict.validation_tests],
+        "validation_tests": [validation_json(trial) for trial in verdict.validation_tests],
     }
 
 

@@ -57,7 +57,7 @@ def test_hidden_friction_is_named_and_in_the_extended_model(
     assert [part.name for part in extended.parts] == ["joint_coulomb at elbow"]
     assert extended.space.names == ("elbow_damping", "torque_offset[elbow]", "joint_coulomb[elbow]")
     np.testing.assert_allclose(extended.values, [0.6, 0.1, COULOMB], rtol=0.1, atol=0.02)
-    assert ("search" in stages) is searched and {"screen", "refit", "judge"} <= set(stages)
+    assert ("search" in stages) is searched and {"score_test", "refit", "verdict"} <= set(stages)
 
 
 def test_a_log_without_commands_has_no_servo_to_ask_about():
