@@ -79,7 +79,7 @@ def test_a_step_without_a_winner_has_its_best_model_fitted_from_the_prior_on(fou
     again, notes = restart_from_prior(problem, lost)
     assert again.selected is not None and again.selected.keys == (PRELOAD_KEY,) and notes == Notes()
     assert {m.keys for m in again.tried} >= {m.keys for m in lost.tried}
-    values = [value for stage, value in reported if stage == "anew"]
+    values = [value for stage, value in reported if stage == "restart"]
     assert any(hasattr(v, "generation") for v in values) and any(hasattr(v, "iteration") for v in values)
 
 

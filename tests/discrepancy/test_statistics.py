@@ -54,7 +54,7 @@ def test_the_largest_t_keeps_its_level():
 
 
 def test_without_a_trend_the_largest_t_keeps_its_level():
-    """3,000 times nothing, 40 independent directions each; with the degree of freedom forgotten 6.5 % lie below 0.05."""
+    """3,000 times nothing, 40 independent directions each; with the degree of freedom forgotten 6.5 % lie below."""
     rng = np.random.default_rng(5)
     noise = [rng.normal(size=(40, 10)) for _ in range(3000)]
     p, forgotten = (np.array([of(scores)[1] for scores in noise]) for of in (
