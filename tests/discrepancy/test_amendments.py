@@ -78,7 +78,7 @@ def test_what_fails_is_said_and_what_comes_after_it_is_made(
     assert last.final.model is open_verdict.model and last.final.fitted_to == (found.case.train,)
 
 
-def test_a_refit_that_cannot_be_written_is_not_handed_on(found: Small, monkeypatch: pytest.MonkeyPatch):
+def test_a_refit_that_cannot_be_written_is_no_final_model(found: Small, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(missing, "final_refit", lambda *arguments: of_both(found))
     monkeypatch.setattr(missing, "extended", failing(ValueError("its covariance is singular")))
     *_, last = amended(found.case, found.verdict, record("train"))

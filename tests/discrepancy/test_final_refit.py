@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,9 +15,9 @@ from small_gap import PRELOAD, Small, small
 
 from droid_jax.discrepancy.case import Case
 from droid_jax.discrepancy.fitting import FinalModel, FittedModel, final_refit, final_refit_due
-from droid_jax.discrepancy.results import extended, write_gap
+from droid_jax.discrepancy.results import extended, write_amended, write_gap
+from droid_jax.files import GAP
 from droid_jax.identify.multistart import RefineConfig
-from droid_jax.report.gap_folder import read_gap
 from droid_jax.report.page import write_report
 
 MORE = {"seconds": {"search": 1.0}, "versions": {}, "device": "test", "setup": {"recording": []}}
@@ -84,16 +85,34 @@ def test_without_an_effect_in_blocks_or_unconverged_it_is_the_searchs_own(found:
     assert kept.model is model and kept.fitted_to == (case.train,) and kept.not_made
 
 
-def test_file_and_page_say_what_it_is_fitted_to(found: Small, both: FinalModel, tmp_path):
+def test_the_file_says_what_it_is_fitted_to(found: Small, both: FinalModel, tmp_path: Path):
     write_gap(tmp_path, found.case, found.verdict, both, MORE)
-    told: Any = read_gap(tmp_path)
-    assert told.fitted_to == ["train", "validation"]
-    for role, residual_set in (("train", found.case.train), ("validation", found.case.validation)):
-        assert told.found["handed_on"]["gaps"][role] == pytest.approx(residual_set.discrepancy_at(both.model.values))
+    final = json.loads((tmp_path / GAP).read_text())["final_model"]
+    assert final["fitted_to"] == ["train", "validation"]
+    for role, residual_set in found.case.residual_sets.items():
+        assert final["discrepancies"][role] == pytest.approx(residual_set.discrepancy_at(both.model.values))
+    write_gap(tmp_path, found.case, found.verdict, found.own, MORE)
+    assert json.loads((tmp_path / GAP).read_text())["final_model"] == {
+        "fitted_to": ["train"],
+        "discrepancies": {role: after for role, (_, after) in found.verdict.discrepancies.items()},
+    }
+
+
+def test_a_final_model_that_blows_up_has_no_discrepancy_in_the_file(found: Small, both: FinalModel, tmp_path: Path):
+    lost = replace(found.case.validation, whitened=lambda rows: np.nan * found.case.validation.whitened(rows))
+    case = replace(found.case, validation=lost)
+    write_amended(tmp_path, case, found.verdict, both, MORE)
+    final = json.loads((tmp_path / GAP).read_text())["final_model"]
+    assert final["discrepancies"]["validation"] is None and final["discrepancies"]["train"] > 0
+
+
+def test_the_page_says_what_it_is_fitted_to(found: Small, both: FinalModel, tmp_path: Path):
+    write_gap(tmp_path, found.case, found.verdict, both, MORE)
     page = write_report(tmp_path).read_text()
     assert re.search("was fitted to “train” and “validation” together; on “validation” it leaves U = [0-9.e-]+", page)
-    told.found["handed_on"]["gaps"]["validation"] = None  # its replay blew up
-    (tmp_path / "gap.json").write_text(json.dumps(told.found))
+    written = json.loads((tmp_path / GAP).read_text())
+    written["final_model"]["discrepancies"]["validation"] = None  # its replay blew up
+    (tmp_path / GAP).write_text(json.dumps(written))
     assert "was fitted to “train” and “validation” together.</p>" in write_report(tmp_path).read_text()
     write_gap(tmp_path, found.case, found.verdict, found.own, MORE)
-    assert "handed-on" not in write_report(tmp_path).read_text()
+    assert "together" not in write_report(tmp_path).read_text()

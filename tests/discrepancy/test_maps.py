@@ -146,7 +146,8 @@ def test_ranges_cover_a_joint_and_nothing_else() -> None:
     made, rows = moving(np.linspace(-1.0, 2.0, 60))
     found = [k for k in keys(made, rows) if (k.axis, k.joint) == (Axis.POSITION, "pan")]
     assert len(found) == 6 and found[0].low == -1.0
-    assert found[-1].high == pytest.approx(2.0) and found[-1].high > 2.0  # the largest value is inside
+    most = found[-1].high
+    assert most == pytest.approx(2.0) and most is not None and most > 2.0  # the largest value is inside
     assert all(a.high == b.low for a, b in itertools.pairwise(found))
     widths = [k.high - k.low for k in found if k.high is not None and k.low is not None]
     assert widths == pytest.approx([0.5] * 6)

@@ -1,7 +1,8 @@
-"""The search as a whole, where something is wrong: an effect that blows up, a fit that did not settle."""
+"""The search, step by step and as a whole: what is tried, what is left out, what is taken out again."""
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -9,29 +10,204 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from droid_jax.discrepancy.search_state import Budget
-from droid_jax.discrepancy.select import AT_BOUND, TOO_SMALL, UNCONFIRMED
-from droid_jax.discrepancy.selection_step import forward_step
-from small_gap import EFFECTS, FLOOR, QUICK, Small, record, small, small_scene
+from small_gap import EFFECTS, FLOOR, QUICK, Small, problem_of, quiet, record, small, small_scene
 
-from droid_jax.discrepancy import workflow
-from droid_jax.discrepancy.candidates import ScoreTest, directions_of, proposals, score_test
-from droid_jax.discrepancy.case import make_case
-from droid_jax.discrepancy.fitting import FittedModel, base_fit, remaining_residuals
-from droid_jax.discrepancy.search import SearchState, search_effects
+from droid_jax.discrepancy import search
+from droid_jax.discrepancy.candidates import directions_of, proposals, score_test
+from droid_jax.discrepancy.case import Case, make_case
+from droid_jax.discrepancy.config import DiscrepancyConfig
+from droid_jax.discrepancy.fitting import FittedModel, base_fit
+from droid_jax.discrepancy.search import (
+    Notes,
+    Problem,
+    SearchState,
+    converged_model,
+    open_directions,
+    pair_step,
+    polished,
+    pruned,
+    search_effects,
+    staged_refit,
+    step,
+    target_objective,
+    without,
+)
 from droid_jax.discrepancy.selection import SelectionStep
+from droid_jax.discrepancy.statistics import OUTSIDE, Blocks, Repeats
 from droid_jax.discrepancy.verdict import Conclusion
 from droid_jax.identify.search import NotReplayed
 from droid_jax.model.effect_interface import Effect
-from droid_jax.model.effects.candidate import Candidate, candidates
+from droid_jax.model.effects.candidate import Candidate, EffectKey, candidates
 from droid_jax.model.effects.registry import library
-from droid_jax.model.parameters import Parameter
+from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import Scene
+
+PRELOAD = EffectKey("hinge_preload", "door")
 
 
 @pytest.fixture(scope="module")
 def found() -> Small:
     return small()
+
+
+@pytest.fixture(scope="module")
+def first(found: Small) -> tuple[SearchState, SelectionStep]:
+    """After one step."""
+    state, info = step(SearchState(found.base), problem_of(found))
+    assert info is not None
+    return state, info
+
+
+def case_of(scene: Scene, space: Space, effects: tuple[Effect, ...], config: DiscrepancyConfig = QUICK) -> Case:
+    return make_case(scene, space, effects, record("train"), record("validation"), config=config)
+
+
+def searched(case: Case) -> Any:
+    return search_effects(case, base_fit(case.train, case.base, case.config, quiet), FLOOR)
+
+
+# From state to state -----------------------------------------------------------------------
+
+
+def test_a_step_selects_and_leaves_the_state_it_was_given_unchanged(
+    found: Small, first: tuple[SearchState, SelectionStep]
+):
+    begin = SearchState(found.base)
+    before, values = copy.copy(vars(begin)), found.base.values.copy()
+    state, info = step(begin, problem_of(found))
+    assert vars(begin) == before and begin.model is found.base and begin.steps == ()
+    np.testing.assert_array_equal(found.base.values, values)
+    assert info is not None and info.selected is not None and state.model.keys == (PRELOAD,) == info.selected.keys
+    assert state.steps == (info,) and not state.finished and not state.exhausted and state.notes == Notes()
+    again, same = step(begin, problem_of(found))  # the same state, the same step
+    assert same is not None and again.model.keys == state.model.keys
+    np.testing.assert_array_equal(again.model.values, state.model.values)
+    assert same.tests == info.tests == first[1].tests
+
+
+def test_a_step_beyond_the_most_effects_is_none(found: Small, first: tuple[SearchState, SelectionStep]):
+    state, _ = first
+    assert found.case.config.max_effects == 1
+    ended, info = step(state, problem_of(found))
+    assert info is None and ended.finished and not ended.exhausted and ended.model is state.model
+
+
+def test_a_step_with_nothing_left_to_ask_has_exhausted_the_candidates(found: Small):
+    ended, info = step(SearchState(found.base), replace(problem_of(found), directions=()))
+    assert info is None and ended.finished and ended.exhausted and ended.model is found.base
+
+
+def test_a_step_that_finds_nothing_significant_tries_nothing(found: Small):
+    """The test rejects, yet the time step alone would leave as much."""
+    problem = replace(problem_of(found), discretisation_error=2.0 * found.base.discrepancy)
+    ended, info = step(SearchState(found.base), problem)
+    assert info is not None and (info.tried, info.tests, info.selected) == ((), (), None)
+    assert info.score_test.p < found.case.config.selection.significance
+    assert ended.finished and ended.exhausted and ended.steps == (info,)
+
+
+def test_the_significance_is_configured(found: Small):
+    """A p-value of 1/128, the smallest that eight repeats allow."""
+    strict = replace(found.case.config, selection=replace(found.case.config.selection, significance=0.001))
+    problem = replace(problem_of(found), case=replace(found.case, config=strict))
+    ended, info = step(SearchState(found.base), problem)
+    assert info is not None and info.score_test.p == pytest.approx(1 / 128) and info.tried == () and ended.exhausted
+
+
+def test_a_search_without_time_tries_one_candidate_and_says_what_it_left_out(found: Small):
+    state, info = step(SearchState(found.base), problem_of(found, deadline=0.0))
+    assert info is not None and [m.keys for m in info.tried] == [(PRELOAD,)]
+    assert state.notes.not_tried[0] == "2 of 3 candidates not looked at" and state.notes.failed == ()
+    case = replace(found.case, config=replace(found.case.config, budget_minutes=0.0))
+    verdict = search_effects(case, found.base, FLOOR)
+    assert verdict.not_tried == state.notes.not_tried and verdict.effects == (PRELOAD,)
+
+
+def test_refits_stop_when_time_is_up_but_for_the_first(found: Small, monkeypatch: pytest.MonkeyPatch):
+    def refit(train: Any, base: Any, parts: Any, *rest: Any) -> Any:
+        if parts[0].effect == "payload":
+            raise NotReplayed("none of the starts could be replayed")
+        return SimpleNamespace(keys=(parts[0].key,), refined=SimpleNamespace(objective=1.0))
+
+    monkeypatch.setattr(search, "refit", refit)
+    starters = [((part,), found.base.values) for part in candidates(found.case.effects)]
+    names = [str(part.key) for (part,), _ in starters]
+    models, notes = staged_refit(problem_of(found), starters, np.inf, "candidates not refitted")
+    assert notes == Notes(failed=tuple(n for n in names if n.startswith("payload")))
+    assert len(models) == len(starters) - len(notes.failed) == 2
+    hinge = [s for s in starters if s[0][0].effect != "payload"]
+    models, notes = staged_refit(problem_of(found, deadline=0.0), hinge, np.inf, "candidates not refitted")
+    assert len(models) == 1 and notes == Notes(not_tried=("1 of 2 candidates not refitted",))
+    assert notes + Notes(("a",), ("b",)) == Notes(("a",), ("1 of 2 candidates not refitted", "b"))
+
+
+def test_a_refit_aims_at_the_best_so_far(found: Small, monkeypatch: pytest.MonkeyPatch):
+    aims, objectives = list[float](), iter([7.0, 3.0, 5.0])
+
+    def refit(train: Any, base: Any, parts: Any, start: Any, config: Any) -> Any:
+        aims.append(config.target_objective)
+        return SimpleNamespace(refined=SimpleNamespace(objective=next(objectives)))
+
+    monkeypatch.setattr(search, "refit", refit)
+    starters = [((part,), found.base.values) for part in candidates(found.case.effects)][:3]
+    staged_refit(problem_of(found), starters, 6.0, "candidates not refitted")
+    assert aims == [6.0, 6.0, 3.0]
+
+
+@pytest.mark.parametrize("blocks", [False, True])
+def test_the_aim_is_the_objective_of_half_the_share_that_an_effect_must_take(found: Small, blocks: bool):
+    """U of 4, a fifth of which an effect must take away: the objective falls by a tenth of it."""
+    rows = Blocks(np.array([0] * 6 + [1] * 6 + [OUTSIDE] * 18)) if blocks else Repeats(np.zeros((1, 30)))
+    count = 12 if blocks else 30
+    problem = problem_of(found)
+    case = replace(found.case, train=replace(found.case.train, resampling=rows))
+    problem, objective = replace(problem, case=case), 0.5 * count * 4.0
+    fitted: Any = SimpleNamespace(parts=(), discrepancy=4.0, refined=SimpleNamespace(objective=objective))
+    assert target_objective(problem, fitted) == pytest.approx(0.9 * objective)
+    further: Any = SimpleNamespace(**{**vars(fitted), "parts": ("one",)})
+    assert target_objective(problem, further) == pytest.approx(0.8 * objective)
+    selection = replace(found.case.config.selection, least_gain=0.5)
+    strict = replace(problem, case=replace(case, config=replace(case.config, selection=selection)))
+    assert target_objective(strict, fitted) == pytest.approx(0.75 * objective)
+
+
+# Pairs -------------------------------------------------------------------------------------
+
+
+def two_effects(found: Small, **changes: Any) -> Problem:
+    case = replace(found.case, config=replace(found.case.config, max_effects=2))
+    return replace(problem_of(found, **changes), case=case)
+
+
+def test_pairs_are_tried_where_nothing_is_named_and_their_score_test_is_reported_once(
+    found: Small, first: tuple[SearchState, SelectionStep]
+):
+    _, info = first
+    unnamed = SearchState(found.base, (replace(info, selected=None, chosen=None),), finished=True)
+    state = pair_step(unnamed, two_effects(found))
+    assert len(state.steps) == 2 and state.steps[1].score_test is info.score_test
+    assert len(state.steps[1].tried) == 3 and all(len(m.parts) == 2 for m in state.steps[1].tried)
+    assert unnamed.steps == state.steps[:1]
+    for test in state.steps[1].tests:
+        assert test.before == 0 and len(test.keys) == 2
+
+
+def test_no_pairs_where_they_are_not_asked_for_or_not_needed(found: Small, first: tuple[SearchState, SelectionStep]):
+    state, info = first
+    unnamed = SearchState(found.base, (replace(info, selected=None, chosen=None),), finished=True)
+    assert pair_step(unnamed, problem_of(found)) is unnamed  # one effect at most
+    assert pair_step(state, two_effects(found)) is state  # one effect that leaves little
+    for done in (
+        replace(unnamed, exhausted=True),
+        replace(unnamed, steps=()),
+        replace(unnamed, steps=(replace(info, tried=(), tests=(), selected=None, chosen=None),)),
+    ):
+        assert pair_step(done, two_effects(found)) is done
+    late = pair_step(unnamed, two_effects(found, deadline=0.0))
+    assert late.notes == Notes(not_tried=("pairs of effects not tried",)) and late.steps == unnamed.steps
+
+
+# What goes wrong ---------------------------------------------------------------------------
 
 
 def bomb(scene: Scene) -> Effect:
@@ -54,13 +230,12 @@ def bomb(scene: Scene) -> Effect:
 def test_an_effect_that_blows_up_is_left_out_and_named():
     """What is really missing is found all the same."""
     scene, space = small_scene()
-    effects = (*library(scene, EFFECTS), bomb(scene))
-    case = make_case(scene, space, effects, record("train"), record("validation"), config=QUICK)
-    verdict = search_effects(case, base_fit(case, lambda stage, value: None), FLOOR)
-    assert verdict.score_tests[0].failed == ("bomb at door",)
-    assert verdict.effects == ("hinge_preload at door",)
-    assert not any("bomb" in trial.name for trial in verdict.validation_tests if trial.passed)
-    row = next(k for k, q in enumerate(verdict.score_tests[0].directions) if q.coefficient == "bomb")
+    verdict = searched(case_of(scene, space, (*library(scene, EFFECTS), bomb(scene))))
+    explosive = EffectKey("bomb", "door")
+    assert verdict.score_tests[0].failed == (explosive,)
+    assert verdict.effects == (PRELOAD,)
+    assert not any(explosive in test.keys for test in verdict.validation_tests if test.passed)
+    row = next(k for k, d in enumerate(verdict.score_tests[0].directions) if d.coefficient == "bomb")
     assert verdict.score_tests[0].t[row] == verdict.score_tests[0].explained[row] == 0.0
 
 
@@ -83,318 +258,139 @@ def late_bomb(scene: Scene) -> Effect:
 
 
 def test_a_refit_that_blows_up_where_it_begins_is_left_out_and_named(monkeypatch: pytest.MonkeyPatch):
-    """The screening's small step is replayed, the proposal is not."""
-    monkeypatch.setattr(
-        SearchState, "one_step_fit", lambda state, model, part, found: (_proposed(state, model, part, found), -np.inf)
-    )
+    """The score test's small step is replayed, the proposal is not."""
+    monkeypatch.setattr(search, "one_step_fit", lambda train, model, part, raw, proposed: (proposed, -np.inf))
     scene, space = small_scene()
-    case = make_case(scene, space, (late_bomb(scene),), record("train"), record("validation"), config=QUICK)
-    verdict = search_effects(case, base_fit(case, lambda stage, value: None), FLOOR)
+    verdict = searched(case_of(scene, space, (late_bomb(scene),)))
     assert verdict.score_tests[0].failed == () and verdict.score_tests[0].explained[0] > 0.5
-    assert verdict.failed == ("late_bomb at door",) and verdict.validation_tests == ()
-    assert verdict.kind is Conclusion.UNEXPLAINED
-
-
-def _proposed(state: SearchState, model: FittedModel, part: Candidate, found: ScoreTest) -> np.ndarray:
-    (proposal,) = proposals(found, model.residuals, state.case.full_space)
-    return proposal.start(state.case.full_space, model.values)
+    assert verdict.failed == (str(EffectKey("late_bomb", "door")),) and verdict.validation_tests == ()
+    assert verdict.conclusion is Conclusion.UNEXPLAINED
 
 
 def test_a_search_ends_where_all_that_was_asked_about_is_in_the_model():
     scene, space = small_scene()
-    effects, config = library(scene, ["hinge_preload"]), replace(QUICK, max_effects=2)
-    case = make_case(scene, space, effects, record("train"), record("validation"), config=config)
-    verdict = search_effects(case, base_fit(case, lambda stage, value: None), FLOOR)
-    assert verdict.effects == ("hinge_preload at door",) and len(verdict.score_tests) == 1
+    verdict = searched(case_of(scene, space, library(scene, ["hinge_preload"]), replace(QUICK, max_effects=2)))
+    assert verdict.effects == (PRELOAD,) and len(verdict.score_tests) == 1
 
 
-def test_no_more_effects_are_tried_together_than_are_asked_for(found: Small, monkeypatch: pytest.MonkeyPatch):
-    """Where two might explain more, pairs are tried, and the screening that they come from is told once."""
-    tried = list[str]()
+@pytest.mark.parametrize("fitted_further", [converged_model, polished])
+def test_what_blows_up_on_the_validation_motion_while_it_is_fitted_further_stays_unchanged(
+    found: Small, monkeypatch: pytest.MonkeyPatch, fitted_further: Any
+):
+    def common(values: np.ndarray) -> np.ndarray:
+        return values[None] * np.where(values[0] > 1.0, np.nan, 1.0)
 
-    def pairs(state, base, model, first):
-        tried.append(model.name)
-        return SelectionStep(first.screen)
-
-    monkeypatch.setattr(workflow, "pair_step", pairs)
-    monkeypatch.setattr(workflow, "_unsettled", lambda state, model: True)
-    monkeypatch.setattr(workflow, "open_directions", lambda asked, model: () if model.parts else asked)
-    assert found.case.config.max_effects == 1
-    assert len(search_effects(found.case, found.base, FLOOR).score_tests) == 1 and not tried
-    monkeypatch.setattr(
-        workflow,
-        "forward_step",
-        lambda state, model, screen: replace(forward_step(state, model, screen), selected=None),
-    )
-    monkeypatch.setattr(workflow, "restart_from_prior", lambda state, base, done: done)
-    two = replace(found.case, config=replace(found.case.config, max_effects=2))
-    assert len(search_effects(two, found.base, FLOOR).score_tests) == 1 and tried == [found.base.name]
+    validation: Any = SimpleNamespace(common=common)
+    problem = replace(problem_of(found), case=replace(found.case, validation=validation))
+    refined = replace(found.base.refined, converged=False)
+    model = replace(found.verdict.model, values=np.array([0.5]), refined=refined)
+    whole, lost = (replace(model, values=np.array([x])) for x in (0.7, 1.5))
+    monkeypatch.setattr(search, "refit", lambda *arguments: whole)
+    assert fitted_further(problem, model) == (whole, Notes())
+    monkeypatch.setattr(search, "refit", lambda *arguments: lost)
+    kept, notes = fitted_further(problem, model)
+    assert kept is model and len(notes.failed) == 1 and notes.failed[0].startswith(model.name)
 
 
-def test_what_blows_up_on_the_other_motion_while_it_settles_stays_as_it_was(monkeypatch: pytest.MonkeyPatch):
-    class Judge:
-        def common(self, values):
-            return values[None] * np.where(values[0] > 1.0, np.nan, 1.0)
-
-    state: Any = SearchState(SimpleNamespace(validation=Judge()), 1.0, 0.0, Budget(None), lambda stage, value: None)  # type: ignore
-    model: Any = SimpleNamespace(parts=(), values=np.array([0.5]))
-    ends: Any = [SimpleNamespace(parts=(), values=np.array([x])) for x in (0.7, 1.5)]
-    monkeypatch.setattr(SearchState, "refit", lambda self, parts, start, config, note: ends[0])
-    assert state.polished(model, None, "") is ends[0]
-    monkeypatch.setattr(SearchState, "refit", lambda self, parts, start, config, note: ends[1])
-    assert state.polished(model, None, "") is model
+def test_what_has_converged_is_fitted_no_further(found: Small, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(search, "refit", lambda *arguments: pytest.fail("it has converged"))
+    assert converged_model(problem_of(found), found.verdict.model) == (found.verdict.model, Notes())
+    assert polished(problem_of(found), found.base) == (found.base, Notes())  # no intervals to report
 
 
-def test_effects_without_places_cannot_be_asked_about(found: Small):
-    placeless = tuple(replace(e, locations={}) for e in found.case.effects)
+def test_effects_without_locations_cannot_be_asked_about(found: Small):
+    nowhere = tuple(replace(e, locations={}) for e in found.case.effects)
     with pytest.raises(ValueError, match="none of the effects says its locations"):
-        search_effects(replace(found.case, effects=placeless), found.base, FLOOR)
+        search_effects(replace(found.case, effects=nowhere), found.base, FLOOR)
 
 
 def test_where_nothing_blows_up_nothing_is_left_out(found: Small):
-    assert score_test(found.case, found.base, directions_of(candidates(found.case.effects))).failed == ()
+    asked = directions_of(candidates(found.case.effects))
+    assert score_test(found.case.train, found.base, asked).failed == ()
 
 
 def test_a_nuisance_goes_no_further_than_its_prior_says(found: Small):
     p = found.case.base["torque_offset[elbow]"]
     assert (p.low, p.high) == (pytest.approx(-0.3), pytest.approx(0.3))  # of bounds of 2 and a deviation of 0.1
+    scene, space = small_scene()
+    wider = replace(QUICK, selection=replace(QUICK.selection, nuisance_bound=5.0))
+    p = case_of(scene, space, (), wider).base["torque_offset[elbow]"]
+    assert (p.low, p.high) == (pytest.approx(-0.5), pytest.approx(0.5))
 
 
 def test_a_parameter_at_its_bound_absorbs_nothing_more(found: Small):
-    asked, refined = directions_of(candidates(found.case.effects)), found.base.refined
+    asked, refined, train = directions_of(candidates(found.case.effects)), found.base.refined, found.case.train
     assert refined.free.all()
     at = refined.space.index("door_stiffness")
     x = refined.x.copy()
     x[at] = refined.space.to_search(refined.space.high)[at]
     stuck = replace(found.base, refined=replace(refined, x=x))
     assert np.flatnonzero(~stuck.refined.free).tolist() == [at]
-    before, after = (
-        np.linalg.norm(score_test(found.case, m, asked).sensitivities, axis=1) for m in (found.base, stuck)
-    )
+    before, after = (np.linalg.norm(score_test(train, m, asked).sensitivities, axis=1) for m in (found.base, stuck))
     assert np.all(after >= before - 1e-9)
-    preload = [q.coefficient for q in asked].index("hinge_preload")
+    preload = [d.coefficient for d in asked].index("hinge_preload")
     assert after[preload] > 1.1 * before[preload]  # a spring looks like a preload
 
 
-def test_no_verdict_from_a_base_fit_that_did_not_converge(found: Small):
-    base = replace(found.base, refined=replace(found.base.refined, converged=False))
-    verdict = search_effects(found.case, base, FLOOR)
-    assert verdict.kind is Conclusion.UNCONVERGED
-    assert (verdict.effects, verdict.validation_tests, verdict.score_tests, verdict.trend) == ((), (), (), None)
-    assert verdict.sentence == "The fit of the base model did not converge; nothing can be concluded."
+# Parts ------------------------------------------------------------------------------------
 
 
-def test_no_name_from_an_extended_fit_that_did_not_converge(found: Small, monkeypatch: pytest.MonkeyPatch):
-    def unsettled(state, model):
-        return replace(model, refined=replace(model.refined, converged=False))
-
-    monkeypatch.setattr(workflow, "polished", unsettled)
-    verdict = search_effects(found.case, found.base, FLOOR)
-    assert verdict.kind is Conclusion.UNCONVERGED
-    assert "the model with the effects" in verdict.sentence
-    assert (verdict.effects, verdict.indistinguishable, verdict.indistinguishable_models) == (
-        (),
-        (),
-        (),
-    ) and verdict.model is found.base
-    assert any(trial.passed for trial in verdict.validation_tests)  # the grounds are told
-
-
-def of_gap(residual_set: Any, gap: float) -> Any:
-    """A residual set whose every U is this."""
-    return SimpleNamespace(discrepancy=lambda residuals: gap, cell_p_values=residual_set.cell_p_values)
-
-
-def test_what_is_left_counts_where_chance_would_not_leave_it(found: Small):
-    """A remainder that no candidate looks like is one: half of what was there, or half of noise."""
-    case = found.case
-    left = remaining_residuals(case.train, case.validation, found.base)
-    state: Any = SimpleNamespace(
-        case=case, discretisation_error=FLOOR, base_discrepancy=2.0 * case.validation.discrepancy(left)
-    )
-    assert workflow._remains(state, left, quiet=True)
-    vast: Any = SimpleNamespace(case=case, discretisation_error=FLOOR, base_discrepancy=1e3)
-    assert not workflow._remains(vast, left, quiet=False)
-    signs = np.where(np.arange(case.validation.repeats) % 2, 1.0, -1.0)[:, None]
-    by_chance = signs * np.ones((case.validation.repeats, 6))
-    state.case = SimpleNamespace(validation=of_gap(case.validation, found.base.discrepancy))
-    assert not workflow._remains(state, by_chance, quiet=True) and workflow._remains(state, by_chance, quiet=False)
-
-
-LITTLE = {"train": (4.0, 2.0), "validation": (4.0, 2.8), "test": (3.0, 2.07)}  # closes 30 and 31 % of held-out data
-
-
-@pytest.mark.parametrize(
-    ("kind", "gaps", "least", "little"),
-    [
-        (Conclusion.PARTLY, LITTLE, 0.4, True),
-        (Conclusion.PARTLY, LITTLE, 0.25, False),
-        (Conclusion.PARTLY, {**LITTLE, "validation": (4.0, 0.8)}, 0.4, True),  # the test motion alone says so
-        (Conclusion.PARTLY, {**LITTLE, "test": (3.0, 0.3)}, 0.4, True),
-        (
-            Conclusion.PARTLY,
-            {"train": (4.0, 3.6), "validation": (4.0, 0.8)},
-            0.4,
-            False,
-        ),  # what was fitted decides nothing
-        (
-            Conclusion.PARTLY,
-            {"train": (4.0, 2.0), "validation": (4.0, 0.8), "test": (0.011, 0.0105)},
-            0.4,
-            False,
-        ),  # no gap there
-        (Conclusion.NAMED, LITTLE, 0.4, False),  # nothing significant is left
-        (Conclusion.INDISTINGUISHABLE, LITTLE, 0.4, False),
-    ],
-)
-def test_beside_a_remainder_a_name_needs_its_share_of_held_out_data(
-    found: Small, kind: Conclusion, gaps: dict[str, tuple[float, float]], least: float, little: bool
-):
-    verdict = replace(found.verdict, kind=kind, discrepancies=gaps)
-    assert workflow.too_little(verdict, least) is little
-
-
-def test_a_name_for_a_third_of_a_discrepancy_is_a_hint(found: Small, monkeypatch: pytest.MonkeyPatch):
-    """An effect that passed, a significant remainder, and 31 % closed on one held-out motion: unexplained."""
-    monkeypatch.setattr(workflow, "_remains", lambda *arguments: True)
-    monkeypatch.setattr(workflow, "_gaps", lambda state, base, model: {"train": (4.0, 2.0), "validation": (4.01, 2.77)})
-    verdict = search_effects(found.case, found.base, FLOOR)
-    assert verdict.kind is Conclusion.UNEXPLAINED and (
-        verdict.effects,
-        verdict.indistinguishable,
-        verdict.indistinguishable_models,
-    ) == ((), (), ())
-    assert verdict.model is found.base and verdict.discrepancies["validation"] == (4.01, 4.01)
-    (hint,) = verdict.hints
-    assert hint.effects == ("hinge_preload at door",) and hint.closed == {"validation": pytest.approx(0.31)}
-    assert verdict.sentence == (
-        "The model lacks something that is not in the library. Hints, not names, since they may only imitate it: "
-        "hinge_preload at door (closes 31%)."
-    )
-    assert any(trial.passed for trial in verdict.validation_tests)  # the grounds are told
-    weaker = replace(found.case, config=replace(found.case.config, minimum_closed=0.3))
-    verdict = search_effects(weaker, found.base, FLOOR)
-    assert verdict.kind is Conclusion.PARTLY and verdict.effects == ("hinge_preload at door",) and verdict.hints == ()
-
-
-def candidate(name: str, place: str = "door", **shapes: float) -> Candidate:
-    return Candidate(name, place, (f"{name}[{place}]",), shapes)
-
-
-def chosen(stood: list[str], winner: list[str], *rivals: list[str]) -> Any:
-    """A round: names of effects that stood, that won, that did as well."""
-
-    def model(names: list[str]) -> Any:
-        return SimpleNamespace(parts=[candidate(n) for n in names])
-
-    places = [f"{name} at door" for name in stood]
-    return SimpleNamespace(before=places, selected=model(winner), indistinguishable=[model(names) for names in rivals])
-
-
-def ties(names: str, *rounds: Any) -> dict[str, tuple[str, ...]]:
-    """Of a model with these effects, one letter each."""
-    model: Any = SimpleNamespace(parts=[candidate(n) for n in names])
-    return {n: workflow._tied(f"{n} at door", model, rounds) for n in names}
-
-
-def test_ties_are_those_of_the_last_round_that_chose_an_effect():
-    first, pair = chosen([], ["a"], ["x"]), chosen([], ["a", "b"], ["y", "b"])
-    assert ties("a", first) == {"a": ("x at door",)}
-    assert ties("ab", first, pair) == {"a": ("y at door",), "b": ()}
-    lost: Any = SimpleNamespace(before=[], selected=None, indistinguishable=[])
-    assert ties("a", first, lost) == {"a": ("x at door",)}
-
-
-def test_an_effect_of_the_model_is_no_rival_of_another():
-    first, second = chosen([], ["a"], ["b"], ["x"]), chosen(["a"], ["a", "b"])
-    assert ties("ab", first, second) == {"a": ("x at door",), "b": ()}
-
-
-def test_a_rival_without_any_of_the_models_effects_is_named_whole():
-    assert ties("ab", chosen([], ["a", "b"], ["c", "e"])) == {n: ("c at door + e at door",) for n in "ab"}
-    assert ties("ab", chosen([], ["a", "b"], ["c"])) == {n: ("c at door",) for n in "ab"}
+def candidate(name: str, location: str = "door", **shapes: float) -> Candidate:
+    return Candidate(name, location, (f"{name}[{location}]",), shapes)
 
 
 def test_an_effect_is_asked_about_elsewhere_with_the_shape_it_has():
     speeds = [candidate("ripple", place, periods=periods) for place in ("one", "two") for periods in (10.0, 20.0)]
     asked = directions_of([*speeds, candidate("latch", width=0.1)])
     model: Any = SimpleNamespace(parts=speeds[:1], coefficients=("ripple[one]",))
-    left = [q.candidate for q in workflow.open_directions(asked, model)]
+    left = [d.candidate for d in open_directions(asked, model)]
     assert left == [candidate("ripple", "two"), candidate("latch", width=0.1)]
 
 
-@pytest.mark.parametrize(
-    ("tied", "said"),
-    [
-        (((), ()), "The model lacks: a and b."),
-        ((("x",), ()), "The model lacks b, and one of: a or x."),
-        ((("x",), ("y", "z")), "The model lacks one of: a or x, and one of: b or y or z."),
-    ],
-)
-def test_the_sentence_keeps_what_is_certain(found: Small, tied: Any, said: str):
-    verdict = search_effects(found.case, found.base, 2.0 * found.base.discrepancy)
-    kind = Conclusion.INDISTINGUISHABLE if any(tied) else Conclusion.NAMED
-    assert replace(verdict, kind=kind, effects=("a", "b"), indistinguishable=tied).sentence == said
-    before = verdict.discrepancies["validation"][0]
-    partly = replace(
-        verdict,
-        kind=Conclusion.PARTLY,
-        effects=("a", "b"),
-        indistinguishable=tied,
-        discretisation_error=0.0,
-        remainder=0.4 * before,
+def test_a_shape_stays_where_its_effect_does():
+    """A ripple asked about elsewhere has the count of the one in the model, and keeps it when that one goes."""
+    first = Candidate("ripple", "elbow", ("ripple_elbow",), {"periods": 48.0})
+    second, drag = Candidate("ripple", "wrist", ("ripple_wrist",)), Candidate("drag", "hinge", ("drag",))
+    assert without(first, (first, drag, second)) == (
+        drag,
+        Candidate("ripple", "wrist", ("ripple_wrist",), {"periods": 48.0}),
     )
-    assert partly.explained == pytest.approx(0.6)
-    assert partly.sentence == said.replace("lacks: ", "lacks ")[:-1] + "; a remainder is unexplained."
-    little = replace(partly, remainder=0.77 * before).sentence
-    assert little.startswith(
-        "Most of what the model lacks is not in the library; what there is explains or imitates 23%"
-    )
-    assert little.endswith(said.removeprefix("The model lacks").removeprefix(":")[1:])
+    assert without(second, (first, drag, second)) == (first, drag)
+    assert without(drag, (first, drag)) == (first,)
 
 
-def test_a_gap_below_the_floor_is_none(found: Small):
-    """The test rejects, yet the time step alone would leave as much."""
-    verdict = search_effects(found.case, found.base, 2.0 * found.base.discrepancy)
-    assert verdict.kind is Conclusion.NONE
-    assert verdict.score_tests[0].p < 0.01
-    assert not verdict.effects and np.isfinite(verdict.closed("validation"))
+def test_a_part_that_the_replay_cannot_do_without_stays(found: Small, monkeypatch: pytest.MonkeyPatch):
+    """A damper keeps the simulation whole; drag takes next to nothing away and goes."""
+    damper, drag = Candidate("closer", "hinge", ("closer",)), Candidate("drag", "hinge", ("drag",))
+
+    def refit(train: Any, base: Any, parts: Any, starts: Any, config: Any) -> Any:
+        if damper not in parts:
+            raise NotReplayed("none of the starts could be replayed")
+        assert starts[0].tolist() == [2.0, 0.0]  # the drag at neutral
+        return SimpleNamespace(parts=parts, keys=(damper.key,), values=starts[0], left=1.01)
+
+    monkeypatch.setattr(search, "refit", refit)
+    monkeypatch.setattr(Problem, "discrepancy", lambda problem, model: model.left)
+    whole = Space(tuple(Parameter(name, "N m", 0.0, 1.0, -5.0, 5.0) for name in ("closer", "drag")))
+    case: Any = SimpleNamespace(full_space=whole, config=found.case.config, train=None, base=None)
+    problem = replace(problem_of(found), case=case, base_discrepancy=10.0)
+    model: Any = SimpleNamespace(parts=(damper, drag), values=np.array([2.0, 1.0]), left=1.0)
+    assert pruned(problem, model)[0].parts == (damper,)
+    selection = replace(found.case.config.selection, least_share=0.0005)
+    case.config = replace(found.case.config, selection=selection)
+    assert pruned(problem, model)[0] is model  # it takes 0.1 % of the base model's U
 
 
-def test_a_gap_that_an_error_of_first_order_could_leave_is_none(found: Small):
-    """A quarter of the step leaves a quarter of such an error: U0 shows nine sixteenths of its U."""
-    assert search_effects(found.case, found.base, 0.6 * found.base.discrepancy).kind is Conclusion.NONE
-    assert search_effects(found.case, found.base, 0.5 * found.base.discrepancy).kind is not Conclusion.NONE
+def test_proposals_of_a_step_begin_at_the_model(found: Small, first: tuple[SearchState, SelectionStep]):
+    _, info = first
+    ranked = proposals(info.score_test, found.base.residuals, found.case.full_space)
+    assert [p.keys for p in ranked] == [p.keys for p in info.ranked]
+    start = ranked[0].start(found.case.full_space, found.base.values)
+    moved = np.flatnonzero(start != found.base.values)
+    assert [found.case.full_space.names[k] for k in moved] == list(ranked[0].sizes)
 
 
-def test_what_lost_for_its_size_alone_is_said(found: Small):
-    verdict = replace(found.verdict, kind=Conclusion.UNEXPLAINED, effects=(), indistinguishable=())
-    assert verdict.sentence == "The model lacks something that is not in the library."
-    tiny, both = (
-        replace(verdict.validation_tests[0], reasons=r) for r in ((TOO_SMALL,), (TOO_SMALL, "another reason"))
-    )
-    assert replace(verdict, validation_tests=(both,)).sentence == verdict.sentence
-    said = replace(verdict, validation_tests=(tiny, tiny)).sentence
-    assert said.endswith(f"not in the library, or {tiny.name}, below the minimum effect size.")
-    large = replace(tiny, reasons=(f"its_torque {AT_BOUND}",))
-    said = replace(
-        verdict, validation_tests=(large, replace(large, reasons=(*large.reasons, "another reason")))
-    ).sentence
-    assert said.endswith(f"not in the library, or {large.name}, larger than its bounds allow.")
-    chance = replace(tiny, reasons=(f"{UNCONFIRMED} (p = 0.014)",))
-    said = replace(
-        verdict, validation_tests=(chance, replace(chance, reasons=(*chance.reasons, "another reason")))
-    ).sentence
-    assert said.endswith(f"not in the library, or {chance.name}, {UNCONFIRMED}.")
-
-
-def test_a_sealed_motion_that_blows_up_is_left_out_and_said_so(found: Small) -> None:
-    """It is opened when hours of search are over, which must not be lost."""
-
-    def gap_at(values: np.ndarray) -> float:
-        raise NotReplayed("the simulation of 'test' blows up")
-
-    sealed: Any = SimpleNamespace(discrepancy_at=gap_at)
-    state = SearchState(replace(found.case, test=sealed), 1.0, FLOOR, Budget(None), lambda stage, value: None)
-    gaps = workflow._gaps(state, found.base, found.verdict.model)
-    assert gaps == found.verdict.discrepancies and state.failed == ["the fitted model on the test recording"]
+def test_a_model_that_was_selected_has_converged(found: Small, first: tuple[SearchState, SelectionStep]):
+    state, _ = first
+    model: FittedModel = state.model
+    assert model.refined.converged
