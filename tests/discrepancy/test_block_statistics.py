@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from plain_t import largest_t
 
-from droid_jax.cost.noise import RATE, coarse_clock
+from droid_jax.cost.noise import DEFAULT_NOISE, coarse_clock
 from droid_jax.discrepancy.candidates import project
 from droid_jax.discrepancy.config import BlocksConfig
 from droid_jax.discrepancy.statistics import (
@@ -31,7 +31,7 @@ def test_parts_take_turns():
     for part in parts:
         for block in range(10):
             at = np.flatnonzero(part == block)
-            assert np.all(np.diff(at) == 1) and len(at) >= 1.0 * RATE - 1
+            assert np.all(np.diff(at) == 1) and len(at) >= 1.0 * DEFAULT_NOISE.rate - 1
 
 
 @pytest.mark.parametrize(("share", "needed"), [(1.0, 32.0), (2 / 3, 48.0)])

@@ -16,7 +16,7 @@ from droid_jax.cost.observation import TooLong
 from droid_jax.discrepancy import missing
 from droid_jax.discrepancy.case import Case
 from droid_jax.discrepancy.fitting import FittedModel
-from droid_jax.discrepancy.missing import CARRIED, IN_THE_AIR, WEIGHT, separating_experiments, untouched
+from droid_jax.discrepancy.missing import IN_THE_AIR, WEIGHT, separating_experiments, untouched
 from droid_jax.door.demonstration import PLANS, grasp_pose
 from droid_jax.door.scene import door_scene
 from droid_jax.model.scene import Grip
@@ -90,7 +90,7 @@ def test_a_known_weight_distinguishes_only_what_acts_through_it(demonstration, m
     """Two payloads differ by as much with a weight beside them as without; two preloads likewise."""
     monkeypatch.setattr(missing, "TIME_SCALINGS", ())
     case = small().case
-    models = (model(CARRIED, 0.0), model(CARRIED, 0.2))
+    models = (model("payload_mass", 0.0), model("payload_mass", 0.2))
     (found,) = separating_experiments(case, models, demonstration)
     plain = case.train.cost.whitened(np.stack([m.values for m in models])).astype(float)
     assert f"{WEIGHT:g} kg" in found.what
@@ -107,7 +107,7 @@ def test_in_the_air_only_the_robot_counts(demonstration, monkeypatch):
     """Two payloads part without the held thing, and as in the plain model: the small scene's hand holds nothing."""
     monkeypatch.setattr(missing, "TIME_SCALINGS", ())
     case = small().case
-    models = (model(CARRIED, 0.0), model(CARRIED, 0.2))
+    models = (model("payload_mass", 0.0), model("payload_mass", 0.2))
     found = {e.what: e.distance or 0.0 for e in separating_experiments(gripping(case), models, demonstration)}
     plain = case.train.cost.whitened(np.stack([m.values for m in models])).astype(float)
     assert found[IN_THE_AIR] == pytest.approx(np.linalg.norm(plain[0] - plain[1]), rel=0.2)

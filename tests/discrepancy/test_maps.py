@@ -15,12 +15,15 @@ from small_gap import Small, small
 from droid_jax.discrepancy.config import SelectionConfig
 from droid_jax.discrepancy.maps import Axis, CellKey, Localisation, localise
 from droid_jax.discrepancy.statistics import Repeats, benjamini_hochberg
-from droid_jax.model.parameters import Parameter, Space
+from droid_jax.model.parameters import Parameter, Role, Space
 from droid_jax.model.scene import compile_scene
 
 REPEATS, COLUMNS, INSTANTS, FREE = 10, 3, 80, 30
 SPACE = Space(
-    (Parameter("mass", "kg", 1.0, 0.1, 0.0, 9.0), Parameter("hinge_preload", "N m", 0.0, 1.0, -5.0, 5.0)),
+    (
+        Parameter("mass", "kg", 1.0, 0.1, 0.0, 9.0),
+        Parameter("hinge_preload", "N m", 0.0, 1.0, -5.0, 5.0, role=Role.OBJECT_TORQUE),
+    ),
 )
 CLOCK = np.linspace(0.0, 1.0, INSTANTS)
 

@@ -12,7 +12,7 @@ from small_gap import PRELOAD, TRUTH, Small, problem_of, quiet, small
 
 from droid_jax.discrepancy import fitting, search
 from droid_jax.discrepancy.fitting import FittedModel, base_fit, fitted_from_prior
-from droid_jax.discrepancy.search import Notes, Problem, SearchState, restart_from_prior, step
+from droid_jax.discrepancy.search import Notes, Problem, SearchState, restart_from_prior, selection_step
 from droid_jax.discrepancy.selection import SelectionStep
 from droid_jax.identify.search import NotReplayed
 from droid_jax.model.effects.candidate import EffectKey, candidates
@@ -28,7 +28,7 @@ def found() -> Small:
 @pytest.fixture(scope="module")
 def lost(found: Small) -> SelectionStep:
     """The first step, as if none of its models had passed."""
-    _, info = step(SearchState(found.base), problem_of(found))
+    _, info = selection_step(SearchState(found.base), problem_of(found))
     assert info is not None and info.selected is not None
     return replace(info, selected=None, chosen=None)
 
@@ -55,7 +55,7 @@ def test_shapes_are_held_while_the_search_goes_and_free_in_the_refinement(
         seen.update(space=space)
         return SimpleNamespace(best=space.values({"drag": 0.5}))
 
-    monkeypatch.setattr(fitting, "search", searched)
+    monkeypatch.setattr(fitting, "cma_search", searched)
     monkeypatch.setattr(fitting, "refit", lambda *a, **k: seen.update(parts=a[2], begin=a[3]))
     fitted_from_prior(case.train, case.base, (shaped,), case.config, quiet)
     assert "drag" in seen["space"].names and "hinge_preload" not in seen["space"].names
@@ -66,7 +66,7 @@ def test_shapes_are_held_while_the_search_goes_and_free_in_the_refinement(
 
 
 def test_a_base_fit_may_begin_at_an_earlier_one(found: Small, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fitting, "search", lambda *a, **k: pytest.fail("there is a start"))
+    monkeypatch.setattr(fitting, "cma_search", lambda *a, **k: pytest.fail("there is a start"))
     case = found.case
     start = found.base.values[case.full_space.columns(case.base)]
     again = base_fit(case.train, case.base, case.config, quiet, start)

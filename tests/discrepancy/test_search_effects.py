@@ -27,8 +27,8 @@ from droid_jax.discrepancy.search import (
     polished,
     pruned,
     search_effects,
+    selection_step,
     staged_refit,
-    step,
     target_objective,
     without,
 )
@@ -53,7 +53,7 @@ def found() -> Small:
 @pytest.fixture(scope="module")
 def first(found: Small) -> tuple[SearchState, SelectionStep]:
     """After one step."""
-    state, info = step(SearchState(found.base), problem_of(found))
+    state, info = selection_step(SearchState(found.base), problem_of(found))
     assert info is not None
     return state, info
 
@@ -74,12 +74,12 @@ def test_a_step_selects_and_leaves_the_state_it_was_given_unchanged(
 ):
     begin = SearchState(found.base)
     before, values = copy.copy(vars(begin)), found.base.values.copy()
-    state, info = step(begin, problem_of(found))
+    state, info = selection_step(begin, problem_of(found))
     assert vars(begin) == before and begin.model is found.base and begin.steps == ()
     np.testing.assert_array_equal(found.base.values, values)
     assert info is not None and info.selected is not None and state.model.keys == (PRELOAD,) == info.selected.keys
     assert state.steps == (info,) and not state.finished and not state.exhausted and state.notes == Notes()
-    again, same = step(begin, problem_of(found))  # the same state, the same step
+    again, same = selection_step(begin, problem_of(found))  # the same state, the same step
     assert same is not None and again.model.keys == state.model.keys
     np.testing.assert_array_equal(again.model.values, state.model.values)
     assert same.tests == info.tests == first[1].tests
@@ -88,19 +88,19 @@ def test_a_step_selects_and_leaves_the_state_it_was_given_unchanged(
 def test_a_step_beyond_the_most_effects_is_none(found: Small, first: tuple[SearchState, SelectionStep]):
     state, _ = first
     assert found.case.config.max_effects == 1
-    ended, info = step(state, problem_of(found))
+    ended, info = selection_step(state, problem_of(found))
     assert info is None and ended.finished and not ended.exhausted and ended.model is state.model
 
 
 def test_a_step_with_nothing_left_to_ask_has_exhausted_the_candidates(found: Small):
-    ended, info = step(SearchState(found.base), replace(problem_of(found), directions=()))
+    ended, info = selection_step(SearchState(found.base), replace(problem_of(found), directions=()))
     assert info is None and ended.finished and ended.exhausted and ended.model is found.base
 
 
 def test_a_step_that_finds_nothing_significant_tries_nothing(found: Small):
     """The test rejects, yet the time step alone would leave as much."""
     problem = replace(problem_of(found), discretisation_error=2.0 * found.base.discrepancy)
-    ended, info = step(SearchState(found.base), problem)
+    ended, info = selection_step(SearchState(found.base), problem)
     assert info is not None and (info.tried, info.tests, info.selected) == ((), (), None)
     assert info.score_test.p < found.case.config.selection.significance
     assert ended.finished and ended.exhausted and ended.steps == (info,)
@@ -110,12 +110,12 @@ def test_the_significance_is_configured(found: Small):
     """A p-value of 1/128, the smallest that eight repeats allow."""
     strict = replace(found.case.config, selection=replace(found.case.config.selection, significance=0.001))
     problem = replace(problem_of(found), case=replace(found.case, config=strict))
-    ended, info = step(SearchState(found.base), problem)
+    ended, info = selection_step(SearchState(found.base), problem)
     assert info is not None and info.score_test.p == pytest.approx(1 / 128) and info.tried == () and ended.exhausted
 
 
 def test_a_search_without_time_tries_one_candidate_and_says_what_it_left_out(found: Small):
-    state, info = step(SearchState(found.base), problem_of(found, deadline=0.0))
+    state, info = selection_step(SearchState(found.base), problem_of(found, deadline=0.0))
     assert info is not None and [m.keys for m in info.tried] == [(PRELOAD,)]
     assert state.notes.not_tried[0] == "2 of 3 candidates not looked at" and state.notes.failed == ()
     case = replace(found.case, config=replace(found.case.config, budget_minutes=0.0))

@@ -14,7 +14,7 @@ from droid_jax.discrepancy import search
 from droid_jax.discrepancy.case import Case
 from droid_jax.discrepancy.fitting import FittedModel, remaining_discrepancy
 from droid_jax.discrepancy.results import gap_json
-from droid_jax.discrepancy.search import Notes, SearchState, search_effects, step
+from droid_jax.discrepancy.search import Notes, SearchState, search_effects, selection_step
 from droid_jax.discrepancy.selection import Reason, Rejection, SelectionStep, ValidationTest
 from droid_jax.discrepancy.statistics import Repeats
 from droid_jax.discrepancy.verdict import LOST, Conclusion, Verdict, closes_too_little, conclude
@@ -31,7 +31,7 @@ def found() -> Small:
 
 @pytest.fixture(scope="module")
 def steps(found: Small) -> tuple[SelectionStep, ...]:
-    state, _ = step(SearchState(found.base), problem_of(found))
+    state, _ = selection_step(SearchState(found.base), problem_of(found))
     return state.steps
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from droid_jax.model.effects.registry import registered
 from droid_jax.model.parameters import Parameter, Space
-from droid_jax.recordings.formats import load
+from droid_jax.recordings.formats import load_recording
 from droid_jax.synthetic.hidden_effects import HIDDEN, LIBRARY, ON_HINGE, Applied, possible
 from experiments import hidden_effects, null_calibration
 from experiments.blind import limits, marks, oracle, score
@@ -67,7 +67,7 @@ def test_a_recording_holds_nothing_of_the_truth(hinge: Setting, tmp_path: Path):
     assert json.loads((folder / "case.json").read_text()) == {"scene": "hinge", "without": []}
     words = {"closer", "single", "3x", str(truth["seed"]), *(str(s) for s in truth["seeds"].values())}
     for role in ROLES:
-        recording = load(folder / "recordings" / f"{role}.npz")
+        recording = load_recording(folder / "recordings" / f"{role}.npz")
         assert recording.name == role and not recording.meta and recording.repeats == 10
         with np.load(folder / "recordings" / f"{role}.npz") as file:
             assert not any(word in str(file["metadata"]) for word in words)

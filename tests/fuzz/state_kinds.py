@@ -11,8 +11,7 @@ from kinds import Kind
 from droid_jax.cost.replay_cache import cached
 from droid_jax.files import POLICY
 from droid_jax.identify.checkpoints import Checkpoints
-from droid_jax.policy.control import ACTIONS, FORMAT, LAYOUT, OBSERVED, SHAPES
-from droid_jax.policy.control import load as load_policy
+from droid_jax.policy.control import ACTIONS, FORMAT, LAYOUT, OBSERVED, SHAPES, load_policy
 from droid_jax.storage import write_npz
 
 
