@@ -177,7 +177,7 @@ def test_cells_are_found_at_the_configured_rate() -> None:
     rows = rows + 0.08
     for rate in (0.01, 0.1, 0.9):
         made.config = SelectionConfig(false_discovery_rate=rate)
-        cells = localise(made, SPACE.mean[:1], rows, SPACE.mean[:1])
+        cells = [c for c in localise(made, SPACE.mean[:1], rows, SPACE.mean[:1]) if c.p < 1.0]  # those tested
         expected = benjamini_hochberg(np.array([c.p for c in cells]), rate)
         assert [c.found for c in cells] == expected.tolist()
 

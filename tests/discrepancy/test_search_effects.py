@@ -14,7 +14,7 @@ from small_gap import EFFECTS, FLOOR, QUICK, Small, problem_of, quiet, record, s
 
 from droid_jax.discrepancy import search
 from droid_jax.discrepancy.candidates import directions_of, proposals, score_test
-from droid_jax.discrepancy.case import Case, make_case
+from droid_jax.discrepancy.case import Case, make_case, restrained
 from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.discrepancy.fitting import FittedModel, base_fit
 from droid_jax.discrepancy.search import (
@@ -132,11 +132,11 @@ def test_refits_stop_when_time_is_up_but_for_the_first(found: Small, monkeypatch
     monkeypatch.setattr(search, "refit", refit)
     starters = [((part,), found.base.values) for part in candidates(found.case.effects)]
     names = [str(part.key) for (part,), _ in starters]
-    models, notes = staged_refit(problem_of(found), starters, np.inf, "candidates not refitted")
+    models, notes = staged_refit(problem_of(found), starters, 1e9, "candidates not refitted")
     assert notes == Notes(failed=tuple(n for n in names if n.startswith("payload")))
     assert len(models) == len(starters) - len(notes.failed) == 2
     hinge = [s for s in starters if s[0][0].effect != "payload"]
-    models, notes = staged_refit(problem_of(found, deadline=0.0), hinge, np.inf, "candidates not refitted")
+    models, notes = staged_refit(problem_of(found, deadline=0.0), hinge, 1e9, "candidates not refitted")
     assert len(models) == 1 and notes == Notes(not_tried=("1 of 2 candidates not refitted",))
     assert notes + Notes(("a",), ("b",)) == Notes(("a",), ("1 of 2 candidates not refitted", "b"))
 
@@ -312,10 +312,9 @@ def test_where_nothing_blows_up_nothing_is_left_out(found: Small):
 def test_a_nuisance_goes_no_further_than_its_prior_says(found: Small):
     p = found.case.base["torque_offset[elbow]"]
     assert (p.low, p.high) == (pytest.approx(-0.3), pytest.approx(0.3))  # of bounds of 2 and a deviation of 0.1
-    scene, space = small_scene()
-    wider = replace(QUICK, selection=replace(QUICK.selection, nuisance_bound=5.0))
-    p = case_of(scene, space, (), wider).base["torque_offset[elbow]"]
-    assert (p.low, p.high) == (pytest.approx(-0.5), pytest.approx(0.5))
+    assert found.case.config.selection.nuisance_bound == 3.0
+    wider = restrained(small_scene()[1], 5.0)["torque_offset[elbow]"]
+    assert (wider.low, wider.high) == (pytest.approx(-0.5), pytest.approx(0.5))
 
 
 def test_a_parameter_at_its_bound_absorbs_nothing_more(found: Small):
