@@ -1,4 +1,4 @@
-"""What a fit leaves on another motion: only what its own uncertainty cannot be is something missing."""
+"""What a fit leaves on another motion, beyond what its own uncertainty explains: only that is something missing."""
 
 from __future__ import annotations
 
@@ -8,12 +8,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-from droid_jax.discrepancy.transfer import LONGEST
-from small_gap import FLOOR, Small, record, small
+from small_gap import FLOOR, Small, quiet, record, small
 
 from droid_jax.discrepancy.candidates import project
 from droid_jax.discrepancy.case import Case, make_case
-from droid_jax.discrepancy.fitting import FittedModel, base_fit, refit, remaining_residuals, transfer_spread
+from droid_jax.discrepancy.fitting import (
+    LONGEST_STEP,
+    FittedModel,
+    base_fit,
+    refit,
+    remaining_discrepancy,
+    remaining_residuals,
+    transfer_spread,
+)
+from droid_jax.discrepancy.statistics import Repeats
 from droid_jax.identify.identifiability import posterior_of
 
 
@@ -30,25 +38,23 @@ def whole(found: Small) -> tuple[Case, FittedModel]:
         record("validation", preload=0.0),
         config=found.case.config,
     )  # fmt: skip
-    return case, base_fit(case, lambda stage, value: None)
+    return case, base_fit(case.train, case.base, case.config, quiet)
 
 
 def kept(case: Case, model: FittedModel, off: np.ndarray) -> float:
     """Share that stays of what the other recording does otherwise by `off` [M]."""
     validation = case.validation
-    other: Any = SimpleNamespace(
-        cost=validation.cost,
-        repeats=validation.repeats,
-        common=lambda values: validation.common(values) + off,
-        residuals=validation.residuals,
-    )
+    # Less in the simulation is more in the residual, measured minus simulated.
+    whitened = lambda rows: validation.whitened(rows) - off * validation.repeats**0.5  # noqa: E731
+    other = replace(validation, whitened=whitened, nuisances=(), nuisance_columns=None)
+    alone = replace(validation, nuisances=(), nuisance_columns=None)
     left = np.mean(
-        remaining_residuals(case.train, other, model) - remaining_residuals(case.train, validation, model), axis=0
+        remaining_residuals(case.train, other, model) - remaining_residuals(case.train, alone, model), axis=0
     )
     return float(np.sum(left**2) / np.sum(off**2))
 
 
-def test_what_the_fit_does_not_tell_is_allowed_for_and_nothing_else(whole: tuple[Case, FittedModel]):
+def test_what_the_fit_does_not_constrain_is_allowed_for_and_nothing_else(whole: tuple[Case, FittedModel]):
     """Two deviations along the axis that the other recording shows best, and something that no axis does."""
     case, model = whole
     slopes = transfer_spread(case.train, case.validation, model)
@@ -69,25 +75,20 @@ def test_the_slopes_are_of_one_deviation(whole: tuple[Case, FittedModel]):
     here, there = (case.full_space.embed(model.space, model.space.from_search(x)[None], model.values)
                    for x in (refined.x, refined.x + step))  # fmt: skip
     moved = (case.validation.common(there) - case.validation.common(here))[0]
-    # What one parameter does is inside the span of what all axes do, as far as they are told.
+    # What one parameter does is inside the span of what all axes do, as far as they are constrained.
     assert np.linalg.norm(project(moved[None], slopes, np.full(len(slopes.T), 1e6))[0]) < 0.1 * np.linalg.norm(moved)
 
 
 def test_what_is_really_missing_stays(found: Small):
     """The hidden preload acts on the other motion in a way that no uncertain parameter does."""
     case, base = found.case, found.base
-    whole_gap, left = (
-        case.validation.discrepancy_at(base.values),
-        remaining_residuals(case.train, case.validation, base),
-    )
-    assert whole_gap > FLOOR and case.validation.discrepancy(left) > 0.5 * whole_gap
+    before = case.validation.discrepancy_at(base.values)
+    assert before > FLOOR and remaining_discrepancy(case.train, case.validation, base) > 0.5 * before
 
 
 def test_the_verdict_says_what_remains(found: Small):
     case, verdict = found.case, found.verdict
-    assert verdict.remainder == pytest.approx(
-        case.validation.discrepancy(remaining_residuals(case.train, case.validation, verdict.model))
-    )
+    assert verdict.remainder == pytest.approx(remaining_discrepancy(case.train, case.validation, verdict.model))
     # Where little is taken away it may lie above U by noise, of which both are free on average only.
     assert verdict.remainder is not None and verdict.remainder <= 1.1 * verdict.discrepancies["validation"][1]
 
@@ -96,18 +97,19 @@ def test_of_noise_alone_nothing_remains_on_average(whole: tuple[Case, FittedMode
     """Noise about the model's own replay: U is zero on average, not less for what the projection takes of the mean."""
     case, model = whole
     validation = case.validation
-    slopes = transfer_spread(case.train, validation, model)
-    rng, gaps, mean_only = np.random.default_rng(0), list[float](), list[float]()
+    assert isinstance(validation.resampling, Repeats)
+    slopes, rows = transfer_spread(case.train, validation, model), validation.resampling
+    rng, left_over, mean_only = np.random.default_rng(0), list[float](), list[float]()
     for _ in range(300):
-        noise = rng.normal(size=validation.deviations.shape)
+        noise = rng.normal(size=rows.deviations.shape)
         left = project(noise, slopes, np.full(len(slopes.T), validation.repeats**0.5))
-        gaps.append(validation.discrepancy(left))
-        mean_only.append(validation.discrepancy(noise - noise.mean(axis=0) + left.mean(axis=0)))
-    less = np.array(gaps) - mean_only
-    assert abs(np.mean(gaps)) < 3 * np.std(gaps) / len(gaps) ** 0.5
+        left_over.append(rows.discrepancy(left))
+        mean_only.append(rows.discrepancy(noise - noise.mean(axis=0) + left.mean(axis=0)))
+    less = np.array(left_over) - mean_only
+    assert abs(np.mean(left_over)) < 3 * np.std(left_over) / len(left_over) ** 0.5
     assert np.mean(less) > 10 * np.std(less) / len(less) ** 0.5
-    drawn = replace(validation, deviations=noise - noise.mean(axis=0))
-    common = drawn.residuals(drawn.common(model.values)[0])
+    drawn = replace(validation, resampling=Repeats(noise - noise.mean(axis=0)))
+    common = drawn.residuals(model.values)
     np.testing.assert_allclose(
         remaining_residuals(case.train, drawn, model),
         project(common, slopes, np.full(len(slopes.T), validation.repeats**0.5)),
@@ -115,7 +117,7 @@ def test_of_noise_alone_nothing_remains_on_average(whole: tuple[Case, FittedMode
 
 
 def test_more_repeats_of_the_fit_allow_less(found: Small):
-    """What is told better may be off by less."""
+    """What is constrained better may be off by less."""
 
     def size(repeats: int) -> float:
         made = {role: record(role, repeats, preload=0.0) for role in ("train", "validation")}
@@ -144,4 +146,12 @@ def test_a_bound_does_not_halve_a_slope(whole: tuple[Case, FittedModel]):
     along = np.linalg.lstsq(matrix.T, slopes, rcond=None)[0]  # each column is an axis in search units
     assert np.all(np.count_nonzero(np.abs(along) > 1e-9, axis=0) == 1)
     deviation = np.sqrt(np.diag(posterior_of(refined, case.train.cost.comparisons, misfit=False).cov))
-    np.testing.assert_allclose(np.abs(along).sum(axis=1), np.minimum(deviation, LONGEST), rtol=1e-6)
+    np.testing.assert_allclose(np.abs(along).sum(axis=1), np.minimum(deviation, LONGEST_STEP), rtol=1e-6)
+
+
+def test_blocks_of_one_motion_allow_nothing(whole: tuple[Case, FittedModel]):
+    case, model = whole
+    blocks: Any = SimpleNamespace(resampling=SimpleNamespace(repeated=False))
+    left = remaining_residuals(blocks, case.validation, model)
+    np.testing.assert_array_equal(left, case.validation.residuals(model.values))
+    assert not np.array_equal(left, remaining_residuals(case.train, case.validation, model))

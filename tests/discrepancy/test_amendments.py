@@ -1,4 +1,4 @@
-"""What is added to a verdict: one after the other, and what fails takes nothing along."""
+"""What is added to a verdict: one amendment after the other, and one that fails takes nothing along."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 from small_gap import Small, record, small
 
-from droid_jax.discrepancy import amendments as amend
+from droid_jax.discrepancy import missing
 from droid_jax.discrepancy.fitting import FinalModel
 from droid_jax.discrepancy.missing import EXPERIMENTS, MADE, NOT_NEEDED, REFIT, amended
-from droid_jax.discrepancy.verdict import Experiment
-from droid_jax.files import TO_BE_MADE
+from droid_jax.discrepancy.verdict import Experiment, Verdict
+from droid_jax.files import NOT_MADE, TO_BE_MADE
 
 FASTER = (Experiment("twice as fast", 8.5),)
 
@@ -21,6 +21,16 @@ FASTER = (Experiment("twice as fast", 8.5),)
 @pytest.fixture(scope="module")
 def found() -> Small:
     return small()
+
+
+def with_an_alternative(found: Small) -> Verdict:
+    """The verdict as if the base model were indistinguishable from its own."""
+    return replace(found.verdict, indistinguishable_models=(found.base,))
+
+
+def of_both(found: Small) -> FinalModel:
+    """A final model that is not the search's own."""
+    return FinalModel(found.base, (found.case.train, found.case.validation))
 
 
 def failing(error: BaseException) -> Callable[..., Any]:
@@ -31,15 +41,16 @@ def failing(error: BaseException) -> Callable[..., Any]:
 
 
 def test_the_verdict_comes_first_and_then_each_amendment(found: Small, monkeypatch: pytest.MonkeyPatch):
-    tie, both = (
-        replace(found.verdict, indistinguishable_models=(found.base,)),
-        FinalModel(found.base, (found.case.train,)),
-    )
-    monkeypatch.setattr(amend, "separating", lambda case, models, recording: FASTER)
-    monkeypatch.setattr(amend, "final_model", lambda *arguments: both)
-    first, second, third = amended(found.case, tie, record("train"))
+    open_verdict, both = with_an_alternative(found), of_both(found)
+    monkeypatch.setattr(missing, "separating_experiments", lambda case, models, recording: FASTER)
+    monkeypatch.setattr(missing, "final_refit", lambda *arguments: both)
+    first, second, third = amended(found.case, open_verdict, record("train"))
     assert first.states == {EXPERIMENTS: TO_BE_MADE, REFIT: TO_BE_MADE}
-    assert first.verdict is tie and first.final.model is tie.model and first.final.fitted_to == (found.case.train,)
+    assert (
+        first.verdict is open_verdict
+        and first.final.model is open_verdict.model
+        and first.final.fitted_to == (found.case.train,)
+    )
     assert second.verdict.experiments == FASTER and second.states == {EXPERIMENTS: MADE, REFIT: TO_BE_MADE}
     assert third.final is both and third.states == {EXPERIMENTS: MADE, REFIT: MADE}
 
@@ -55,26 +66,23 @@ def test_the_verdict_comes_first_and_then_each_amendment(found: Small, monkeypat
 def test_what_fails_is_said_and_what_comes_after_it_is_made(
     found: Small, monkeypatch: pytest.MonkeyPatch, error: Exception, said: str
 ):
-    tie, both = (
-        replace(found.verdict, indistinguishable_models=(found.base,)),
-        FinalModel(found.base, (found.case.train,)),
-    )
-    monkeypatch.setattr(amend, "separating", failing(error))
-    monkeypatch.setattr(amend, "final_model", lambda *arguments: both)
-    *_, last = amended(found.case, tie, record("train"))
-    assert last.states[EXPERIMENTS].startswith(f"not made: {said}") and "\n" not in last.states[EXPERIMENTS]
+    open_verdict, both = with_an_alternative(found), of_both(found)
+    monkeypatch.setattr(missing, "separating_experiments", failing(error))
+    monkeypatch.setattr(missing, "final_refit", lambda *arguments: both)
+    *_, last = amended(found.case, open_verdict, record("train"))
+    assert last.states[EXPERIMENTS].startswith(f"{NOT_MADE}: {said}") and "\n" not in last.states[EXPERIMENTS]
     assert last.states[REFIT] == MADE and last.final is both and last.verdict.experiments == ()
-    monkeypatch.setattr(amend, "final_model", failing(error))
-    *_, last = amended(found.case, tie, record("train"))
-    assert last.states[REFIT].startswith(f"not made: {said}")
-    assert last.final.model is tie.model and last.final.fitted_to == (found.case.train,)
+    monkeypatch.setattr(missing, "final_refit", failing(error))
+    *_, last = amended(found.case, open_verdict, record("train"))
+    assert last.states[REFIT].startswith(f"{NOT_MADE}: {said}")
+    assert last.final.model is open_verdict.model and last.final.fitted_to == (found.case.train,)
 
 
-def test_a_refit_that_cannot_be_written_is_not_handed_on(found: Small, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(amend, "final_model", lambda *arguments: FinalModel(found.base, (found.case.train,)))
-    monkeypatch.setattr(amend, "extended", failing(ValueError("its covariance is singular")))
+def test_a_refit_that_cannot_be_written_is_no_final_model(found: Small, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(missing, "final_refit", lambda *arguments: of_both(found))
+    monkeypatch.setattr(missing, "extended", failing(ValueError("its covariance is singular")))
     *_, last = amended(found.case, found.verdict, record("train"))
-    assert last.states[REFIT] == "not made: its covariance is singular" and last.final.model is found.verdict.model
+    assert last.states[REFIT] == f"{NOT_MADE}: its covariance is singular" and last.final.model is found.verdict.model
 
 
 def test_a_refit_that_does_not_converge_is_said(found: Small, monkeypatch: pytest.MonkeyPatch):
@@ -83,7 +91,7 @@ def test_a_refit_that_does_not_converge_is_said(found: Small, monkeypatch: pytes
     )
     *_, last = amended(short, found.verdict, record("train"))
     assert last.states == {
-        EXPERIMENTS: NOT_NEEDED, REFIT: "not made: the fit to both motions did not converge"
+        EXPERIMENTS: NOT_NEEDED, REFIT: f"{NOT_MADE}: the fit to both motions did not converge"
     }  # fmt: skip
 
 
@@ -93,7 +101,7 @@ def test_nothing_is_added_where_nothing_is_due(found: Small):
 
 
 def test_a_stop_is_no_failure(found: Small, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(amend, "final_model", failing(KeyboardInterrupt()))
+    monkeypatch.setattr(missing, "final_refit", failing(KeyboardInterrupt()))
     steps = amended(found.case, found.verdict, record("train"))
     assert next(steps).states[REFIT] == TO_BE_MADE
     with pytest.raises(KeyboardInterrupt):

@@ -5,12 +5,13 @@ from __future__ import annotations
 import functools
 from dataclasses import replace
 
-from small_gap import EFFECTS, FLOOR, PRELOAD, QUICK, record, small_scene
+from small_gap import EFFECTS, FLOOR, PRELOAD, QUICK, quiet, record, small_scene
 
 from droid_jax.discrepancy.case import make_case
 from droid_jax.discrepancy.fitting import base_fit
 from droid_jax.discrepancy.search import search_effects
 from droid_jax.discrepancy.verdict import Conclusion, Verdict
+from droid_jax.model.effects.candidate import EffectKey
 from droid_jax.model.effects.registry import library
 
 FRICTION = 0.5  # N m
@@ -24,16 +25,16 @@ def verdict(preload: float, friction: float) -> Verdict:
     case = make_case(
         scene, space, library(scene, (*EFFECTS, "joint_coulomb")), **recordings, config=replace(QUICK, max_effects=2)
     )
-    return search_effects(case, base_fit(case, lambda stage, value: None), FLOOR)
+    return search_effects(case, base_fit(case.train, case.base, case.config, quiet), FLOOR)
 
 
-def test_nothing_hidden_is_called_nothing():
+def test_where_nothing_is_hidden_nothing_is_missing():
     found = verdict(0.0, 0.0)
-    assert found.kind is Conclusion.NONE and not found.effects
+    assert found.conclusion is Conclusion.NONE and not found.effects
     assert found.score_tests[0].p > 0.01
 
 
 def test_two_effects_are_both_named_and_nothing_else():
     found = verdict(PRELOAD, FRICTION)
-    assert found.kind is Conclusion.NAMED
-    assert set(found.effects) == {"hinge_preload at door", "joint_coulomb at elbow"}
+    assert found.conclusion is Conclusion.NAMED
+    assert set(found.effects) == {EffectKey("hinge_preload", "door"), EffectKey("joint_coulomb", "elbow")}

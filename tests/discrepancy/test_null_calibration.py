@@ -1,4 +1,4 @@
-"""Nothing missing in a model that is linear by construction: the screening's p-values are what p-values should be."""
+"""Nothing missing in a model that is linear by construction: the score test's p-values are what p-values should be."""
 
 from __future__ import annotations
 
@@ -29,25 +29,25 @@ def sensor_noise(rng: np.random.Generator) -> np.ndarray:
 
 
 def case(seed: int, missing: float, drift: float = 0.0) -> tuple[float, int]:
-    """The screening's p, and which of twelve questions it answers with; the third is there, `missing` of it.
+    """The score test's p, and the largest of twelve directions; the third is there, `missing` of it.
 
     drift: by which every repeat lies above the one before it.
     """
     rng = np.random.default_rng(seed)
-    base, marks = smooth_curves(rng, 5), smooth_curves(rng, 12)
-    prior = np.full(5, 10.0)  # far wider than what the data tell
-    marks = marks - base @ np.linalg.lstsq(base, marks, rcond=None)[0]
-    repeats = sensor_noise(rng) + missing * marks[:, 2]
+    base, raw = smooth_curves(rng, 5), smooth_curves(rng, 12)
+    prior = np.full(5, 10.0)  # far wider than what the data leave
+    raw = raw - base @ np.linalg.lstsq(base, raw, rcond=None)[0]
+    repeats = sensor_noise(rng) + missing * raw[:, 2]
     if drift:
         repeats += drift * (np.arange(REPEATS)[:, None] - (REPEATS - 1) / 2)
     noise = estimate_noise(repeats[:, :, None], minimum=1e-3)
     of_repeat = noise.whitener[0] / np.sqrt(REPEATS)
-    columns, questions = of_repeat @ base, project((of_repeat @ marks).T, of_repeat @ base, prior)
+    columns, projected = of_repeat @ base, project((of_repeat @ raw).T, of_repeat @ base, prior)
     residuals = noise.repeats[:, :, 0] @ of_repeat.T
     common = residuals.mean(axis=0)
     weights = columns.T @ columns + np.diag(prior**-2) / REPEATS
     residuals = residuals - columns @ np.linalg.solve(weights, columns.T @ common)
-    t, p = largest_detrended_t(questions @ residuals.T)
+    t, p = largest_detrended_t(projected @ residuals.T)
     return p, int(np.argmax(np.abs(t)))
 
 

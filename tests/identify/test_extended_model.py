@@ -19,7 +19,7 @@ from droid_jax.discrepancy.fitting import FinalModel
 from droid_jax.discrepancy.results import extended
 from droid_jax.identify.extended_model import Extended, load_extended, save_extended
 from droid_jax.identify.gaussian import prior
-from droid_jax.model.effects.candidate import Candidate
+from droid_jax.model.effects.candidate import Candidate, EffectKey
 from droid_jax.model.effects.registry import effect_space, library, ready
 from droid_jax.model.mjcf import fitted_mjcf
 from droid_jax.model.parameters import Parameter, Space, Write
@@ -42,12 +42,12 @@ def saved(found: Small, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def with_effects(scene: Scene, base: Space, **values: float) -> Extended:
-    """A made-up extended model whose effects have these values, all at the place of their first amplitude."""
+    """A made-up extended model whose effects have these values, each at the location of its first coefficient."""
     effects = library(scene, sorted({e.name for e in library(scene) for n in values if n in _names(e)}))
     parts = [
-        Candidate(e.name, place, names, {n: values[n] for n in e.shape_parameters if n in values})
+        Candidate(e.name, location, names, {n: values[n] for n in e.shape_parameters if n in values})
         for e in effects
-        for place, names in e.locations.items()
+        for location, names in e.locations.items()
         if set(names) & set(values)
     ]
     space = base + effect_space(effects).select(values)
@@ -75,12 +75,12 @@ def test_a_model_that_makes_no_mjcf_is_saved_all_the_same(tmp_path: Path):
     assert dict(zip(again.space.names, again.values, strict=True)) == {"inertia": 50.0, "hinge_preload": 0.7}
 
 
-def test_the_cost_is_the_searchs_own(found: Small, saved: Path):
+def test_the_cost_is_that_of_the_search(found: Small, saved: Path):
     """Compiled with the one effect alone instead of the whole library: 3e-4 N m is what that may change."""
     scene, _ = small_scene()
     model = load_extended(saved, scene)
     assert [e.name for e in model.effects] == ["hinge_preload"]
-    assert [p.name for p in model.parts] == list(found.verdict.effects)
+    assert tuple(p.key for p in model.parts) == found.verdict.effects
     cost = make_cost(model.scene, model.space, [found.recordings["validation"]], effects=model.effects)
     case, whole = found.case, found.verdict.model.values
     own = case.validation.cost.distances(whole[None])[0, 0]
@@ -121,7 +121,7 @@ def test_a_model_without_effects_is_the_base_model(found: Small, tmp_path: Path)
         _ = model.effect_space
 
 
-def test_shapes_and_places_come_back(tmp_path: Path):
+def test_shapes_and_locations_come_back(tmp_path: Path):
     scene, base = small_scene()
     values = {"latch_torque": 1.2, "latch_width": 0.05, "latch_exponent": 1.5, "torque_gain[elbow]": 0.04}
     save_extended(tmp_path, with_effects(scene, base, **values))
@@ -132,13 +132,13 @@ def test_shapes_and_places_come_back(tmp_path: Path):
         and model.parts[1].shape_parameters == {}
     )
     assert dict(zip(model.effect_space.names, model.effect_space.mean.tolist(), strict=True)) == values
-    assert model.lacking == ("latch at door", "torque_gain at elbow")
+    assert model.lacking == (EffectKey("latch", "door"), EffectKey("torque_gain", "elbow"))
 
 
 # ----- MJCF
 
 
-def test_what_mjcf_has_no_words_for_is_said(tmp_path: Path):
+def test_what_mjcf_has_no_words_for_is_listed(tmp_path: Path):
     """The base part as MJCF, nothing but JSON beside it."""
     scene, base = small_scene()
     save_extended(tmp_path, with_effects(scene, base, latch_torque=1.2, hinge_preload=0.5))
@@ -172,7 +172,7 @@ def test_laws_that_mujoco_has_numbers_for_are_in_the_mjcf(degrees: bool):
         assert passive[1] - passive[0] == pytest.approx(-0.5, abs=1e-5)
 
 
-def test_a_preload_without_a_spring_has_no_place_in_the_mjcf():
+def test_a_preload_without_a_spring_is_not_in_the_mjcf():
     scene, base = small_scene()
     stiff = base.select([n for n in base.names if n != "door_stiffness"])
     spec = scene.spec.copy()
@@ -180,7 +180,7 @@ def test_a_preload_without_a_spring_has_no_place_in_the_mjcf():
         joint.stiffness = np.zeros_like(joint.stiffness)
     scene = compile_scene(spec, "slack", joints=scene.joints, object_joint="door")
     model = with_effects(scene, stiff, hinge_preload=0.5)
-    assert model.lacking == ("hinge_preload at door",)
+    assert model.lacking == (EffectKey("hinge_preload", "door"),)
     fitted_mjcf(model.scene, model.space, model.values, model.effects)
 
 
@@ -208,7 +208,7 @@ def test_softer_contacts_are_in_the_mjcf():
     expected = make_c_model(scene, model.space, model.values)
     np.testing.assert_allclose(written.pair_solref, expected.pair_solref, rtol=1e-4)
     assert np.allclose(expected.pair_solref[:, 0], 1.7 * scene.model.pair_solref[:, 0])
-    assert written.ngeom > scene.model.ngeom  # its looks too
+    assert written.ngeom > scene.model.ngeom  # its visual geoms too
     for kind, names in (("body", ("door", "knob", "hand")), ("joint", ("hinge",))):
         for name in names:
             for field in {"body": ("mass", "inertia"), "joint": ("damping", "stiffness")}[kind]:
