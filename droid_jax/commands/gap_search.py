@@ -42,8 +42,7 @@ def searched(
     from droid_jax.discrepancy.amendments import amended
     from droid_jax.discrepancy.missing import search
     from droid_jax.discrepancy.split import Split
-    from droid_jax.report.progress import stages
-    from droid_jax.report.scalars import scalars
+    from droid_jax.report.progress import scalars, stages
 
     names = IN_BLOCKS if split is Split.BLOCKS else BARS if start is None else BARS[1:]
     with (
