@@ -12,6 +12,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from droid_jax.recordings.split import FEWEST_REPEATS, HALVES
 from droid_jax.report import identify_figures, style, torque_figures
 from droid_jax.report.identify_folder import Fit, Parameter, Run, TorqueDistance
 from droid_jax.report.style import Drawing, data_uri
@@ -125,9 +126,6 @@ def needed(repeats: Sequence[int]) -> tuple[int, int, bool] | None:
     """What `gap` takes beside recordings of so many repeats: repeats of each of two motions, or of one, and whether a
     second motion alone will do; None where these are enough.
     """
-    from droid_jax.discrepancy.sign_flips import FEWEST_REPEATS  # only here: these import distributions of scipy
-    from droid_jax.discrepancy.split import HALVES
-
     alone = len(repeats) == 1
     if (alone and (repeats[0] == 1 or repeats[0] >= HALVES)) or (not alone and min(repeats) >= FEWEST_REPEATS):
         return None

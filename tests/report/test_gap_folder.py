@@ -79,7 +79,8 @@ def test_keys_that_are_not_known_are_ignored(tmp_path: Path) -> None:
 
 
 def test_what_is_said_agrees_with_the_search() -> None:
-    from droid_jax.discrepancy import split, verdict
+    from droid_jax.discrepancy import verdict
+    from droid_jax.recordings import split
 
     assert {s.value for s in split.Split} == set(get_args(Split.__annotations__["by"])) or {
         s.value for s in split.Split
