@@ -35,12 +35,11 @@ ROLES: dict[Role, str] = {"train": "training", "validation": "validation", "test
 UNREAD = ("command", "start", "synthetic_robot", "robot", "hidden")  # options that only the program reads
 
 
-def gap_view(gap: Gap, setup_first: bool = False) -> dict[str, Any]:
+def gap_view(gap: Gap) -> dict[str, Any]:
     """What the templates show of a search.
 
     Args:
         gap: its folder.
-        setup_first: whether the fit is so far from the data that its set-up is to be checked first.
 
     Returns:
         The context of gap.html.jinja.
@@ -56,7 +55,6 @@ def gap_view(gap: Gap, setup_first: bool = False) -> dict[str, Any]:
         "within_fit": within_uncertainty(gap),
         "trends": trends(gap),
         "next": next_step(gap),
-        "setup_first": setup_first,
         "where": where(gap),
         "best": best_experiment(gap),
         "groups": groups(gap.found),

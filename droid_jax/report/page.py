@@ -16,48 +16,32 @@ from typing import Any
 
 from markupsafe import Markup
 
-from droid_jax.files import (
-    CONFIG,
-    EXTENDED,
-    EXTENDED_MJCF,
-    FIT,
-    FITTED,
-    GAP,
-    GAP_TRACES,
-    GAUSSIAN,
-    HISTORY_TABLE,
-    LAST_FILES,
-    POLICY,
-    SAMPLES,
-    TRACES,
-    TRAINING,
-    TRANSFER,
-)
+from droid_jax import files
 from droid_jax.report.gap_folder import Gap, has_gap, read_gap
-from droid_jax.report.gap_page import ROLES, gap_view
+from droid_jax.report.gap_page import gap_view
 from droid_jax.report.identify_folder import Run, has_run, read_run
 from droid_jax.report.identify_page import far_off, identify_view
 from droid_jax.report.policy_folder import Trained, has_policy, read_policy
 from droid_jax.report.policy_page import policy_view
 from droid_jax.report.stages import left_over, needs_whole
-from droid_jax.report.text import counted, html
+from droid_jax.report.text import html
 from droid_jax.storage import refuse_foreign, write_text
 
 _DOWNLOADS = (
-    (GAUSSIAN, "the Gaussian of the model's parameters, for training"),
-    (EXTENDED, "the extended model: effects, values and Gaussian, for fits and training"),
-    (EXTENDED_MJCF, "the extended model as MJCF, as far as MJCF can express it"),
-    (FITTED, "the scene with the fitted values"),
-    (FIT, "every number of this page"),
-    (SAMPLES, "parameter sets drawn from the fitted Gaussian"),
-    (HISTORY_TABLE, "the search, generation by generation"),
-    (TRACES, "torques over time"),
-    (CONFIG, "how the run was set up"),
-    (POLICY, "the policy: python -m droid_jax.run export makes it ready for a robot"),
-    (TRAINING, "how the policy was trained"),
-    (TRANSFER, "every trial of the policy"),
-    (GAP, "the search for a missing effect: every number"),
-    (GAP_TRACES, "the search for a missing effect: torques over time"),
+    (files.GAUSSIAN, "the Gaussian of the model's parameters, for training"),
+    (files.EXTENDED, "the extended model: effects, values and Gaussian, for fits and training"),
+    (files.EXTENDED_MJCF, "the extended model as MJCF, as far as MJCF can express it"),
+    (files.FITTED, "the scene with the fitted values"),
+    (files.FIT, "every number of this page"),
+    (files.SAMPLES, "parameter sets drawn from the fitted Gaussian"),
+    (files.HISTORY_TABLE, "the search, generation by generation"),
+    (files.TRACES, "torques over time"),
+    (files.CONFIG, "how the run was set up"),
+    (files.POLICY, "the policy: python -m droid_jax.run export makes it ready for a robot"),
+    (files.TRAINING, "how the policy was trained"),
+    (files.TRANSFER, "every trial of the policy"),
+    (files.GAP, "the search for a missing effect: every number"),
+    (files.GAP_TRACES, "the search for a missing effect: torques over time"),
 )
 
 
@@ -76,7 +60,7 @@ def write_report(run: Path) -> Path:
     folder = Path(run)
     path = folder / "report.html"
     old = left_over(folder)
-    places = [folder, *(folder / stage for stage in LAST_FILES if stage not in old)]
+    places = [folder, *(folder / stage for stage in files.LAST_FILES if stage not in old)]
     gap = read_gap(at) if (at := _part(places, has_gap)) else None
     policy = read_policy(at) if (at := _part(places, has_policy)) else None
     at = _part(places, has_run)
@@ -90,65 +74,18 @@ def write_report(run: Path) -> Path:
 
 
 def _context(folder: Path, run: Run | None, gap: Gap | None, policy: Trained | None) -> dict[str, Any]:
-    """What page.html.jinja shows: the parts of the page, and the paragraph above them where there are several."""
+    """What page.html.jinja shows: the parts of the page, and what it says above them."""
     views = {
         "identify": identify_view(run, gap is not None) if run else None,
-        "gap": gap_view(gap, setup_first=False) if gap else None,
+        "gap": gap_view(gap) if gap else None,
         "policy": policy_view(policy, run, gap) if policy else None,
     }
-    names = {
-        "identify": ("identification", "Identification"),
-        "gap": ("missing", "Search for a missing effect"),
-        "policy": ("policy", "Policy"),
+    parts = {  # each escaped by its template
+        name: Markup(html(f"{name}.html.jinja", folder=folder, **view)) for name, view in views.items() if view
     }
-    parts = [
-        (*names[name], Markup(html(f"{name}.html.jinja", folder=folder, **view)))  # escaped by its template
-        for name, view in views.items()
-        if view
-    ]
-    if gap and run and views["gap"]:
-        views["gap"] = {**views["gap"], "setup_first": far_off(run.fit)}
-    at = [part.folder for part in (run, gap, policy) if part]
-    several = {"lead": True, **_heading(folder, run, policy)} if len(parts) > 1 else {"lead": False}
-    head = _head(run, gap, policy)
-    return {"folder": folder, "parts": parts, "downloads": list(_downloads(at)), **views, **head, **several}
-
-
-def _heading(folder: Path, run: Run | None, policy: Trained | None) -> dict[str, Any]:
-    """Title and heading of a page with several parts."""
-    name = folder.resolve().name
-    scene = run.config.scene if run else policy.training.scene if policy else ""
-    return {"title": f"Report: {name}", "heading": f"Report: {scene or name}"}
-
-
-def _head(run: Run | None, gap: Gap | None, policy: Trained | None) -> dict[str, Any]:
-    """Title, heading and the line below it, of the first part that the page holds."""
-    if run:
-        config = run.config
-        meta = [f"Preset {config.preset}", counted(len(config.recordings), "recording")]
-        meta += [f"{config.started[:16].replace('T', ' ')} UTC"] if config.started else []
-        return {
-            "title": f"Identification of {config.scene}",
-            "heading": f"Identification report: {config.scene}",
-            "meta": [*meta, run.folder.resolve().name],
-            "synthetic_robot": config.synthetic_robot,
-        }
-    if gap:
-        name = gap.folder.resolve().name
-        return {
-            "title": f"Search for a missing effect: {name}",
-            "heading": "Search for a missing effect",
-            "meta": [*(f"{gap.recording(role)} ({ROLES[role]})" for role in gap.roles), name],
-            "synthetic_robot": gap.synthetic_robot,
-        }
-    assert policy is not None
-    setup, name = policy.training.setup, policy.folder.resolve().name
-    return {
-        "title": f"Policy: {name}",
-        "heading": f"Policy for {policy.training.scene}",
-        "meta": [f"Method {setup.method}", f"preset {setup.preset}", f"seed {setup.seed}", name],
-        "synthetic_robot": bool(policy.trials),
-    }
+    downloads = list(_downloads([part.folder for part in (run, gap, policy) if part]))
+    setup_first = run is not None and gap is not None and far_off(run.fit)
+    return {"folder": folder, "parts": parts, "downloads": downloads, "setup_first": setup_first, **views}
 
 
 def _is_page(path: Path) -> bool:
