@@ -37,10 +37,10 @@ from droid_jax.identify.search import SearchConfig
 from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Channel
+from droid_jax.report.identify_folder import Fit
 from droid_jax.storage import config_json
 
-QUICK = IdentifyConfig(search=SearchConfig(population=8, parents=None, generations=2), refine=None, samples=2)from droid_jax.report.identify_folder import Fit
-
+QUICK = IdentifyConfig(search=SearchConfig(population=8, parents=None, generations=2), refine=None, samples=2)
 
 
 def repeats(count: int, seed: int = 0, noise: float = 0.3) -> np.ndarray:
