@@ -36,15 +36,22 @@ from droid_jax.door.scene import door_scene  # noqa: E402
 from droid_jax.door.space import door_nuisances, door_space  # noqa: E402
 from droid_jax.door.task import Task  # noqa: E402
 from droid_jax.files import GAUSSIAN  # noqa: E402
-from droid_jax.identify.gaussian import Gaussian, prior  # noqa: E402
-from droid_jax.identify.gaussian import load as load_gaussian  # noqa: E402
-from droid_jax.policy.control import Policy, load  # noqa: E402
+from droid_jax.identify.gaussian import (  # noqa: E402
+    Gaussian,
+    load_gaussian,
+    prior,
+)
+from droid_jax.policy.control import Policy, load_policy  # noqa: E402
 from droid_jax.policy.evaluate import simulated  # noqa: E402
 from droid_jax.policy.randomise import axes, physics_of, randomised  # noqa: E402
 from droid_jax.policy.train import train  # noqa: E402
 from droid_jax.policy.trials import Trials  # noqa: E402
-from droid_jax.report.export import png_bytes  # noqa: E402
-from droid_jax.report.style import AFTER, INK, styled  # noqa: E402
+from droid_jax.report.style import (  # noqa: E402
+    AFTER,
+    INK,
+    png_bytes,
+    styled,
+)
 from droid_jax.storage import file_sha256, write_bytes, write_json  # noqa: E402
 from droid_jax.synthetic.policy_trials import TransferConfig, synthetic_robot, transfer  # noqa: E402
 from experiments.policies.cases import QUICK_STEPS, RESULTS, TIMESTEP, Options  # noqa: E402
@@ -76,7 +83,7 @@ def trained(policy: Path, gaussian: Path) -> tuple[Policy, DoorEnv, Gaussian]:
     strange = [n for n in drawn.space.names if n not in known.names]
     if strange:
         raise SystemExit(f"error: {gaussian} has effects that plain C MuJoCo does not have: {', '.join(strange)}")
-    return load(policy), DoorEnv(scene, Task(spread=0.0)), drawn
+    return load_policy(policy), DoorEnv(scene, Task(spread=0.0)), drawn
 
 
 def untrained() -> tuple[Policy, DoorEnv, Gaussian]:

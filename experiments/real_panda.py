@@ -65,7 +65,7 @@ from inverse_fit import (
 )
 
 from droid_jax.cost.cost import Cost
-from droid_jax.cost.noise import CUTOFF, correlation_time
+from droid_jax.cost.noise import DEFAULT_NOISE, correlation_time
 from droid_jax.door.arm import panda_arm_scene
 from droid_jax.door.builtin import ARM
 from droid_jax.identify.search import SearchConfig
@@ -76,7 +76,7 @@ from droid_jax.model.parameters import Mode, Parameter, Space
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.report import style
-from droid_jax.report.words import label
+from droid_jax.report.text import label
 from droid_jax.simulate.measured_motion import OVERSAMPLING
 from droid_jax.simulate.rest import RestConfig
 
@@ -344,7 +344,7 @@ def main(config: RealPanda) -> None:
         "recording": recording.sha256,
         "filter": {
             "position": f"zero-phase Butterworth, order 4, {MOTION_CUTOFF:g} Hz, then central differences at 1 kHz",
-            "torque": f"windowed sinc, {CUTOFF:g} Hz, measured and simulated alike",
+            "torque": f"windowed sinc, {DEFAULT_NOISE.cutoff:g} Hz, measured and simulated alike",
             "simulated_at_hz": OVERSAMPLING * MOTION_CUTOFF,
             "sign_smoothed_over_rad_s": SMOOTHING,
         },

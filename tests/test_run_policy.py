@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -21,8 +22,9 @@ from droid_jax.door.scene import door_scene
 from droid_jax.door.space import door_nuisances, door_space
 from droid_jax.door.task import Task
 from droid_jax.identify.gaussian import prior
-from droid_jax.policy.control import load
+from droid_jax.policy.control import load_policy
 from droid_jax.policy.trials import BLOWN_UP, Trials
+from droid_jax.report.policy_folder import Trained, Training, Transfer
 from droid_jax.report.render import NoOpenGL
 from droid_jax.report.stages import extended_of
 from droid_jax.run import main
@@ -179,7 +181,7 @@ def test_a_page_without_a_path_is_that_of_the_run_that_was_finished_last(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     """A folder without a finished run, as a refused command may leave one, does not count."""
-    monkeypatch.setattr(report, "write", lambda folder: folder)
+    monkeypatch.setattr(report, "write_page", lambda folder: folder)
     (tmp_path / "runs" / "identify").mkdir(parents=True)
     for age, (file, found) in enumerate((
         ("all/gap/gap.json", "all"), ("gap/gap.json", "gap"), ("train/training.json", "train"),
@@ -247,7 +249,7 @@ def test_a_killed_training_goes_on_where_it_was(tmp_path: Path, monkeypatch: pyt
     assert asked == [(4_000_000, False), (3_000_000, True)]
     history = json.loads((tmp_path / "run" / "training.json").read_text())["history"]
     assert [now["step"] for now in history] == [0, 1_000_000, 2_000_000, 3_000_000]
-    load(tmp_path / "run" / "policy.npz")
+    load_policy(tmp_path / "run" / "policy.npz")
     assert main(command) == 0 and len(asked) == 2  # it is done
 
 
@@ -276,7 +278,7 @@ def test_films_are_of_the_trials_of_median_angle(tmp_path: Path, monkeypatch: py
             raise NoOpenGL("no OpenGL here")
         made[path.name] = states[0]
 
-    monkeypatch.setattr("droid_jax.report.film.film", film)
+    monkeypatch.setattr("droid_jax.report.render.film", film)
     monkeypatch.setattr("droid_jax.synthetic.policy_trials.filmed", lambda policy, robot, number: number)
     robot: Any = SimpleNamespace(scene=SimpleNamespace(visual_model=lambda: None), task=Task())
     why = _film(tmp_path, None, robot, trials)  # type: ignore[arg-type]
@@ -292,8 +294,13 @@ def test_trials_on_another_robot_than_the_fitted_one_say_so(fit: str | None, rob
     """With recordings of your own the synthetic robot is another robot; without a fit there is none that it
     could be.
     """
-    trials = {"success_rate": 1.0, "interval_95": [0.9, 1.0], "angle_deg": {"mean": 40.0, "std": 1.0}}
-    _tell({"simulation": trials, "synthetic_robot": trials}, {"setup": {"fit": fit}, "synthetic_robot": robot})
+    trials = {"success_rate": 1.0, "interval_95": [0.9, 1.0], "angle_deg": {"mean": 40.0, "std": 1.0, "all": []}}
+    trials |= {"trials": 0, "success": [], "stopped": {}, "grip": {"mean": 0.5}, "steps": trials["angle_deg"]}
+    tried = {"simulation": trials, "synthetic_robot": trials, "robot": {"hidden": []}}
+    task = {"opened": 0.7, "held": 1.0, "control": 0.02, "steps": 512}
+    training = {"setup": {"method": "fitted", "preset": "quick", "knob": 0, "seed": 0, "fit": fit}, "task": task}
+    training |= {"synthetic_robot": robot, "scene": "door", "effects": [], "versions": {}, "device": "", "history": []}
+    _tell(Trained(Path(), msgspec.convert(training, Training), msgspec.convert(tried, Transfer), {}))
     said = capsys.readouterr().out
     assert "synthetic robot: 100 % success" in said
     assert ("The fit is of your own recordings: the synthetic robot is another one" in said) == another
@@ -323,7 +330,7 @@ def test_train_evaluate_export(scene, tmp_path: Path, capsys: pytest.CaptureFixt
     assert "synthetic robot: 0 % success" in said and "ONNX and JAX differ by at most" in said
     transfer = json.loads((tmp_path / "run" / "transfer.json").read_text())
     assert transfer["simulation"]["trials"] == transfer["synthetic_robot"]["trials"] == 4
-    assert np.isfinite(load(tmp_path / "run" / "export" / "policy.npz").act(np.zeros(23))).all()
+    assert np.isfinite(load_policy(tmp_path / "run" / "export" / "policy.npz").act(np.zeros(23))).all()
     assert "Learning" in (tmp_path / "run" / "report.html").read_text()
     assert main(["train", "--fit", "fit", "--steps", "20000", "--out", "run"]) == 0
     assert "holds this run already" in capsys.readouterr().out

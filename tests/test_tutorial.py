@@ -12,11 +12,11 @@ from typing import Any
 import matplotlib
 import pytest
 
-from droid_jax.discrepancy.extended import Extended
+from droid_jax.identify.extended_model import Extended
 from droid_jax.identify.gaussian import prior
 from droid_jax.model.effects.registry import effect_space, library, ready
 from droid_jax.model.parameter_file import load_parameters
-from droid_jax.recordings.formats import load
+from droid_jax.recordings.formats import load_recording
 from droid_jax.run import main
 
 HERE = Path(__file__).resolve().parents[1] / "docs" / "tutorial"
@@ -42,7 +42,7 @@ def converted() -> list[str]:
 def test_its_bags_become_a_recording(copy: Path, capsys: pytest.CaptureFixture[str]):
     assert main(converted()) == 0
     assert "10 repeats of 4.0 s, channels torque (2 x 400), position (2 x 400)" in capsys.readouterr().out
-    assert load("runs/train.npz").name == "train"  # as the page of the search calls the motion
+    assert load_recording("runs/train.npz").name == "train"  # as the page of the search calls the motion
 
 
 def test_the_notebook_is_stored_without_outputs():
@@ -83,7 +83,7 @@ def test_the_notebook_runs_and_finds_the_friction(copy: Path, monkeypatch: pytes
             exec(compile("".join(cell["source"]), "your_robot.ipynb", "exec"), names)
     found = json.loads((copy / "runs" / "gap" / "gap.json").read_text())
     assert found["verdict"] == "named" and found["effects"] == ["joint_coulomb at shoulder"]
-    assert found["gaps"]["test"]["closed"] > 0.95
+    assert found["discrepancies"]["test"]["closed"] > 0.95
     at = dict(zip(names["extended"].space.names, names["extended"].values, strict=True))
     assert all(at[name] == pytest.approx(value, rel=0.1) for name, value in names["truth"].items())
     assert names["angles"].shape == (16, 200, 2)

@@ -14,7 +14,7 @@ from droid_jax.commands import evaluate, gap, identify, report, train
 from droid_jax.commands.folder import OtherRun, changed, forget, setup_of
 from droid_jax.commands.scenes import needs_log, needs_recording, needs_scene
 from droid_jax.commands.source import model_folder, needs_brax
-from droid_jax.commands.synthetic import DEMONSTRATIONS, hidden_effects, kept_at, record_synthetic, settled
+from droid_jax.commands.synthetic import DEMONSTRATIONS, hidden_effects, kept_at, record_synthetic, with_robot_options
 from droid_jax.commands.user_effects import load_effects
 from droid_jax.commands.writer import writes
 from droid_jax.files import ASKED, FIT, GAP, LAST_FILES, TRANSFER
@@ -94,10 +94,10 @@ def run(command: All) -> None:
     """Every stage in a folder of its own below OUT, then the page of all of them; where one fails, of those before."""
     started = time.monotonic()
     from droid_jax import runtime
-    from droid_jax.report.scalars import needs_writer
+    from droid_jax.report.progress import needs_writer
 
     _needs_stages(command)
-    command = settled(command)
+    command = with_robot_options(command)
     needs_scene(command)
     needs_recording(command)
     needs_writer(command.tensorboard)
@@ -121,7 +121,7 @@ def run(command: All) -> None:
         for stage in [stage for stage in command.stages if stage in LAST_FILES][1:]:
             forget(out / stage, stage)
     _run_stages(command, out, roles)
-    page = report.write(out)
+    page = report.write_page(out)
     print(f"\n{command.out}: {(time.monotonic() - started) / 60:.0f} minutes")
     for line in told(out):
         print(line)
@@ -184,7 +184,7 @@ def _run_stages(command: All, out: Path, roles: tuple[str, ...]) -> None:
         except Exception:
             if number > 1:
                 with contextlib.suppress(ValueError):  # the recording alone makes no page
-                    print(f"report of what is done: {report.write(out)}")
+                    print(f"report of what is done: {report.write_page(out)}")
             raise
         print(f"[{number}/{len(plan)}] {stage}: {(time.monotonic() - began) / 60:.1f} minutes", flush=True)
 
@@ -210,11 +210,11 @@ def _needs_robot(command: All) -> None:
     scene = door_scene()
     hidden = hidden_effects(command.hide, scene)
     if "evaluate" in command.stages:
-        from droid_jax.synthetic.hidden_effects import listed
+        from droid_jax.synthetic.hidden_effects import as_applied
         from droid_jax.synthetic.policy_trials import check_playable
 
         try:
-            check_playable(scene, listed(hidden))
+            check_playable(scene, as_applied(hidden))
         except ValueError as error:
             raise ValueError(f"{error}; or leave the trials away: --stages identify gap train") from None
 
@@ -228,11 +228,11 @@ def _roles(command: All) -> tuple[str, ...]:
     if not command.recording:
         needs_log(command.motion_cutoff, ())
         return tuple(DEMONSTRATIONS)
-    from droid_jax.discrepancy.inputs import assigned_roles
     from droid_jax.model.effects.registry import joined
+    from droid_jax.preflight.search_inputs import assigned_roles
 
-    own = gap.Gap(command.recording, preset=PRESETS[command.preset].identify, **_own(command))
-    scene, base = gap.model_of(own)
+    own = gap.GapCommand(command.recording, preset=PRESETS[command.preset].identify, **_own(command))
+    scene, base = gap.gap_model(own)
     given = gap.given_to(own)
     try:
         _, roles = assigned_roles(scene, given)
@@ -268,7 +268,10 @@ def _plan(
         # A log in blocks of time has no validation recording, and its base fit needs no start.
         fit = out / "identify" if "validation" in roles and _fitted(out / "identify", command, recordings) else None
         scale = command.effect_scale
-        _stage(gap.run, gap.Gap(recordings, fit, presets.identify, effect_scale=scale, out=out / "gap", **board, **own))
+        _stage(
+            gap.run,
+            gap.GapCommand(recordings, fit, presets.identify, effect_scale=scale, out=out / "gap", **board, **own),
+        )
 
     def learn() -> None:
         _stage(train.run, train.Train(model_folder(out), preset=presets.train, out=out / "train", **board, **common))
@@ -290,41 +293,30 @@ def _fitted(folder: Path, command: All, recordings: Sequence[Path]) -> bool:
         return True
     made = setup(folder)
     hashes = made.get("recordings_sha256", [])
-    scene, _ = gap.model_of(gap.Gap(command.recording, preset=PRESETS[command.preset].identify, **_own(command)))
+    scene, _ = gap.gap_model(
+        gap.GapCommand(command.recording, preset=PRESETS[command.preset].identify, **_own(command))
+    )
     same_scene = made.get("scene_sha256") == scene.sha256
     return bool(hashes) and same_scene and [recording_at(p).sha256 for p in recordings[: len(hashes)]] == hashes
 
 
 def told(out: Path) -> list[str]:
     """One line for each stage that has a result."""
-    from droid_jax.report.gap_folder import hidden_in
-    from droid_jax.report.gap_words import amendment_words, readable
-    from droid_jax.report.policy_folder import read_training
-    from droid_jax.report.policy_words import another_robot
-    from droid_jax.report.words import judged, percent
+    from droid_jax.report.gap_folder import read_answer
+    from droid_jax.report.identify_folder import read_fit
+    from droid_jax.report.policy_folder import read_rates, read_training
+    from droid_jax.report.text import lines
 
-    lines, old = [], left_over(out)
-    if old:
-        lines.append(f"not on the page: {' and '.join(sorted(old))}, of an earlier run in this folder")
-    if fit := _json(out / "identify" / FIT):
-        unit = fit.get("torque_unit", "N m")
-        gaps = [f"{name} {g['before']:.3f} -> {g['after']:.3f} {unit} {judged(g)}" for name, g in fit["gap"].items()]
-        lines.append(f"identify: torque distance {', '.join(gaps)}")
-    if found := None if "gap" in old else _json(out / "gap" / GAP):
-        role, size = list(found["gaps"].items())[-1]
-        closed = size["closed"] if found["effects"] else None
-        share = "" if closed is None else f"; {percent(closed)} of the gap U closed on the {role} motion"
-        lines.append(f"gap: {readable(found['sentence'], found).rstrip('.')}{share}")
-        lines += amendment_words(found)
-        if hidden := hidden_in(found):
-            lines.append(f"hidden in the synthetic robot: {hidden}")
-    if tried := None if "train" in old else _json(out / "train" / TRANSFER):
-        for name, where in (("simulation", "in simulation"), ("synthetic_robot", "on the synthetic robot")):
-            rate, (low, high) = tried[name]["success_rate"], tried[name]["interval_95"]
-            lines.append(f"policy: {percent(rate)} success {where} ({percent(low)} to {percent(high)})")
-        if other := another_robot(read_training(out / "train")):
-            lines.append(other)
-    return lines
+    old, at = left_over(out), {stage: out / stage for stage in LAST_FILES}
+    tried = "train" not in old and (at["train"] / TRANSFER).is_file()
+    return lines(
+        "all.txt.jinja",
+        old=sorted(old),
+        fit=read_fit(at["identify"]) if (at["identify"] / FIT).is_file() else None,
+        answer=read_answer(at["gap"]) if "gap" not in old and (at["gap"] / GAP).is_file() else None,
+        trials=read_rates(at["train"]) if tried else None,
+        another_robot=tried and read_training(at["train"]).another_robot,
+    )
 
 
 def _record(command: All) -> None:

@@ -14,7 +14,7 @@ from droid_jax.commands.folder import begin, fingerprints, finished, setup_of, s
 from droid_jax.commands.gap_search import searched
 from droid_jax.commands.presets import TIMESTEP, refine_config, search_config, warn_of_cpu
 from droid_jax.commands.scenes import compared, needs_log, needs_recording, needs_scene, own_scene, recording_at
-from droid_jax.commands.synthetic import hidden_effects, kept_at, known_robot, record_synthetic, settled
+from droid_jax.commands.synthetic import hidden_effects, kept_at, known_robot, record_synthetic, with_robot_options
 from droid_jax.commands.user_effects import load_effects
 from droid_jax.commands.writer import writes
 from droid_jax.files import FIT, GAP
@@ -24,17 +24,17 @@ from droid_jax.report.stages import needs_whole, to_be_amended
 if TYPE_CHECKING:
     import numpy as np
 
-    from droid_jax.discrepancy.amendments import Amended
-    from droid_jax.discrepancy.case import Case, DiscrepancyConfig
+    from droid_jax.discrepancy.case import Case
+    from droid_jax.discrepancy.config import DiscrepancyConfig
+    from droid_jax.discrepancy.missing import Amended
     from droid_jax.model.effect_interface import Effect
     from droid_jax.model.parameters import Space
     from droid_jax.model.scene import Scene
     from droid_jax.recordings.recording import Recording
-    from droid_jax.report.gap_folder import Gap as Found
 
 
 @dataclass(frozen=True)
-class Gap:
+class GapCommand:
     """Find the physical effect that the model lacks: fit, ask a library of effects, validate on what was not fitted.
 
     Without --recording a synthetic robot with a hidden effect is recorded first.
@@ -90,29 +90,29 @@ class Gap:
 
 
 @writes("gap")
-def run(command: Gap) -> None:
+def run(command: GapCommand) -> None:
     """Record or load, fit, search, write the run's folder and its page."""
     from droid_jax import runtime
-    from droid_jax.report.scalars import FOLDER, needs_writer
+    from droid_jax.report.progress import FOLDER, needs_writer
 
-    command = settled(command)
+    command = with_robot_options(command)
     needs_scene(command)
     needs_writer(command.tensorboard)
     runtime.start()
     warn_of_cpu(command.preset)
-    from droid_jax.discrepancy.inputs import assigned_roles
-    from droid_jax.discrepancy.missing import case_of
+    from droid_jax.discrepancy.case import case_of
     from droid_jax.discrepancy.results import write_amended, write_gap
-    from droid_jax.discrepancy.split import Split
     from droid_jax.identify.results import prepare_folder
     from droid_jax.preflight.check_log import check_log
+    from droid_jax.preflight.search_inputs import assigned_roles
+    from droid_jax.recordings.split import Split
     from droid_jax.synthetic.hidden_effects import in_words
     from droid_jax.synthetic.robot import is_synthetic
 
     out = command.out
     fit = None if command.fit is None else stage_folder(command.fit, "identify", FIT)
     load_effects(command.user_effects, fit)
-    scene, base = model_of(command)
+    scene, base = gap_model(command)
     given = given_to(command)
     needs_log(command.motion_cutoff, given)
     hidden = {} if given else hidden_effects(command.hide, scene)
@@ -128,7 +128,7 @@ def run(command: Gap) -> None:
     split, roles = assigned_roles(scene, given) if given else (Split.RECORDINGS, {})
     if split is Split.BLOCKS and start is not None:
         print("a log without repeats is fitted without a search: --fit is not needed")
-    config = config_of(command)
+    config = gap_config(command)
     prepare_folder(out)  # only now, with all input read
     if not given:
         assert command.springs is not None  # settled
@@ -169,7 +169,7 @@ def run(command: Gap) -> None:
     _done(out)
 
 
-def model_of(command: Gap) -> tuple[Scene, Space]:
+def gap_model(command: GapCommand) -> tuple[Scene, Space]:
     """The scene and all that is fitted without any effect, nuisances among it."""
     from droid_jax.door.scene import door_scene
     from droid_jax.door.space import door_nuisances, door_space
@@ -208,7 +208,7 @@ def values_of(folder: Path, base: Space) -> np.ndarray:
     return base.values({n: v for n, v in known.items() if n in base.names})
 
 
-def chosen_effects(command: Gap, scene: Scene, recordings: list[Recording]) -> tuple[Effect, ...]:
+def chosen_effects(command: GapCommand, scene: Scene, recordings: list[Recording]) -> tuple[Effect, ...]:
     """The library's effects for this scene, --effects and --without applied.
 
     Raises ValueError for unknown names, for effects that this scene cannot have, and where none is left.
@@ -234,9 +234,9 @@ def chosen_effects(command: Gap, scene: Scene, recordings: list[Recording]) -> t
     return left
 
 
-def config_of(command: Gap) -> DiscrepancyConfig:
+def gap_config(command: GapCommand) -> DiscrepancyConfig:
     """The preset with the command's own numbers."""
-    from droid_jax.discrepancy.case import SETTLED, DiscrepancyConfig
+    from droid_jax.discrepancy.config import CONVERGE_ITERATIONS, DiscrepancyConfig
     from droid_jax.identify.multistart import RefineConfig
 
     if command.budget is not None and not command.budget > 0:
@@ -244,14 +244,14 @@ def config_of(command: Gap) -> DiscrepancyConfig:
     asked: dict[str, Any] = {} if command.budget is None else {"budget_minutes": command.budget}
     return DiscrepancyConfig(
         search=search_config(command.preset, command.seed),
-        refine=replace(refine_config(command.preset) or RefineConfig(), iterations=SETTLED),
+        refine=replace(refine_config(command.preset) or RefineConfig(), iterations=CONVERGE_ITERATIONS),
         compare=compared(command.motion_cutoff),
         seed=command.seed,
         **asked,
     )
 
 
-def given_to(command: Gap) -> list[Recording]:
+def given_to(command: GapCommand) -> list[Recording]:
     """The recordings, none where the synthetic robot shall record."""
     needs_recording(command)
     if len(command.recording) > 3:
@@ -264,40 +264,12 @@ def given_to(command: Gap) -> list[Recording]:
 
 def _done(out: Path) -> None:
     """Build the page, and say in a few lines what was found."""
-    from droid_jax.report.gap_folder import read_gap
-    from droid_jax.report.gap_words import amendment_words, size_words
-    from droid_jax.report.words import percent
+    from droid_jax.report.gap_folder import largest_shifts, read_gap
+    from droid_jax.report.text import lines
 
     gap = read_gap(out)
-    found = gap.found
-    page = report.write(out)
-    print(found["sentence"])
-    for size in gap.sizes:
-        print(f"{size['effect']}: {size_words(size)} (90 % interval)")
-    p = "nothing was asked" if found["p"] is None else f"p = {found['p']:.2g} if nothing were missing"
-    print(f"{p}; base fit converged: {'yes' if found['converged'] else 'no'}")
-    gaps = []
-    for role, one in found["gaps"].items():
-        closed = "" if one["closed"] is None else f" ({percent(one['closed'])} closed)"
-        gaps.append(f"{role} {one['before']:.3g} -> {one['after']:.3g}{closed}")
-    print(f"gap, noise units squared: {', '.join(gaps)}")
-    if found["cut"]:
-        print(f"left out for lack of time (--budget): {found['cut']}")
-    for line in amendment_words(found):
+    page = report.write_page(out)
+    shifted = next(iter(largest_shifts(gap.found.shifts)), None)
+    for line in lines("gap.txt.jinja", gap=gap, found=gap.found, shifted=shifted):
         print(line)
-    if gap.limits:
-        print(gap.limits)
-    print(f"shifted most: {_shifted_most(gap)}")
     print(f"report: {page}")
-
-
-def _shifted_most(gap: Found) -> str:
-    """Which base parameter the effects moved most, by how many of its deviations."""
-    from droid_jax.report.gap_words import deviations, largest_shifts
-
-    if not gap.extended:
-        return "nothing, no effect came in"
-    for most in largest_shifts(gap.found["shifts"])[:1]:
-        by = abs(deviations(most))
-        return f"{most['name']} {most['before']:.3g} -> {most['after']:.3g} {most['unit']} ({by:.1f} deviations)"
-    return "nothing whose deviation is known"

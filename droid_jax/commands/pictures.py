@@ -45,14 +45,13 @@ def keep_replay(out: Path, found: Identified, recording: Recording) -> None:
     write_npz(out / REPLAY, {"time": time, "before": before, "after": after})
 
 
-def draw(out: Path, scene: Scene) -> None:
+def draw_replay(out: Path, scene: Scene) -> None:
     """Draw what replay.npz holds, as film and frames, where there is one that was not drawn yet.
 
     Where that cannot be done (no OpenGL, a replay that blew up) it is said, and the page has no pictures.
     """
-    from droid_jax.report.film import film
     from droid_jax.report.reading import Reader, read_replay
-    from droid_jax.report.render import NoOpenGL, frames, save_frames
+    from droid_jax.report.render import NoOpenGL, film, frames, save_frames
     from droid_jax.storage import new_folder
 
     if not (out / REPLAY).is_file() or (out / FRAMES).is_dir():

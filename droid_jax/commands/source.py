@@ -10,7 +10,7 @@ from droid_jax.commands.synthetic import known_robot
 from droid_jax.errors import needs
 from droid_jax.files import CONFIG, GAP, GAUSSIAN
 from droid_jax.read_json import read_json, typed
-from droid_jax.report.stages import extended_of, left_over, needs_whole, setup, told_in, unfinished
+from droid_jax.report.stages import described_in, extended_of, left_over, needs_whole, setup, unfinished
 
 if TYPE_CHECKING:
     from droid_jax.identify.gaussian import Gaussian
@@ -26,10 +26,10 @@ def source(folder: Path | None, knob: int) -> tuple[Scene, Gaussian, tuple[Effec
     folder: None for the prior of the built-in door.
     Raises ValueError where the folder holds no Gaussian, one of another scene or servo, or a run that is not whole.
     """
-    from droid_jax.discrepancy.extended import load_extended
     from droid_jax.door.scene import door_scene
     from droid_jax.door.space import door_nuisances, door_space
-    from droid_jax.identify.gaussian import load, prior
+    from droid_jax.identify.extended_model import load_extended
+    from droid_jax.identify.gaussian import load_gaussian, prior
 
     scene = door_scene(timestep=TIMESTEP, limits=True, knob=knob)
     if folder is None:  # over what a fit is over, so that what a policy meets differs in nothing but the ranges
@@ -44,11 +44,11 @@ def source(folder: Path | None, knob: int) -> tuple[Scene, Gaussian, tuple[Effec
     if model is None:
         if not at.is_file():
             raise ValueError(f"{folder} holds no {GAUSSIAN}: it is no folder of `identify`, `gap` or `train`")
-        own = load(at)
+        own = load_gaussian(at)
         _check_door(at, own, scene)
         return scene, own, ()
     extended = load_extended(model, scene)
-    own = load(at) if at.is_file() else extended.gaussian
+    own = load_gaussian(at) if at.is_file() else extended.gaussian
     lacking = {name for part in extended.parts for name in part.free} - set(own.space.names)
     if lacking:
         raise ValueError(f"{at} lacks {', '.join(sorted(lacking))} of {model}, which is of another search by now")
@@ -73,7 +73,7 @@ def _check_door(path: Path, gaussian: Gaussian, scene: Scene) -> None:
 class _Verdict(TypedDict):
     """What training reads of a gap.json."""
 
-    effects: list[str]
+    effects: list[dict[str, str]]
 
 
 def model_folder(whole: Path) -> Path:
@@ -116,7 +116,7 @@ def _robot(folder: Path | None) -> dict[str, Any]:
     """The same as a finished run of `identify` or `gap` keeps it; empty where it does not."""
     if folder is None:
         return {}
-    told = (told_in(folder / CONFIG), told_in(folder / GAP).get("setup", {}))
+    told = (described_in(folder / CONFIG), described_in(folder / GAP).get("setup", {}))
     return next((of["robot"] for of in told if of.get("synthetic_robot") and of.get("robot")), {})
 
 
@@ -124,11 +124,11 @@ def _hold(paths: Sequence[str | Path], hashes: Sequence[str]) -> bool:
     """Whether these files are there and hold a synthetic robot's recordings of these hashes: others may have
     their names.
     """
-    from droid_jax.recordings.formats import load
+    from droid_jax.recordings.formats import load_recording
     from droid_jax.synthetic.robot import is_synthetic
 
     try:
-        recordings = [load(path) for path in paths]
+        recordings = [load_recording(path) for path in paths]
     except (OSError, ValueError):
         return False
     return [r.sha256 for r in recordings] == list(hashes) and all(map(is_synthetic, recordings))

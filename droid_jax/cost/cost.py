@@ -24,8 +24,8 @@ from droid_jax.cost.residuals import CompareConfig, Comparison, make_comparison
 from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.fields import check_space
 from droid_jax.model.inertia import check_inertia, free_inertias, inertia_possible
-from droid_jax.model.joint_friction import FRICTION, GAIN, TERMS, direction, joint_friction_effect, torque_gain_effect
-from droid_jax.model.parameters import Space
+from droid_jax.model.joint_friction import direction, joint_friction_effect, torque_gain_effect
+from droid_jax.model.parameters import OF_A_JOINT, Role, Space
 from droid_jax.model.physics import make_physics
 from droid_jax.model.scene import Scene
 from droid_jax.preflight.check_log import warn_of_log
@@ -34,14 +34,21 @@ from droid_jax.recordings.checks import validate
 from droid_jax.recordings.recording import Recording, recordings_of
 from droid_jax.simulate.batching import in_blocks, over_block
 from droid_jax.simulate.c_reference import c_replay
-from droid_jax.simulate.initial_state import AJAR, following
-from droid_jax.simulate.inverse_dynamics import Path, path_of, path_replay, prescribed
+from droid_jax.simulate.initial_state import StartConfig, following
+from droid_jax.simulate.inverse_dynamics import Path, motion_path, path_replay, prescribed
 from droid_jax.simulate.measured_motion import Motion, measured_motion
 from droid_jax.simulate.repeat_starts import from_one_start, own_starts
-from droid_jax.simulate.replay import Drive, Replay, check_gains, make_drive, servo_replay, torque_offset_effect
+from droid_jax.simulate.replay import (
+    TORQUE_OFFSETS,
+    Drive,
+    Replay,
+    check_gains,
+    make_drive,
+    servo_replay,
+    torque_offset_effect,
+)
 
 ENGINES = ("mjx", "mujoco")
-ALIKE = 2e-3  # rad or m: measured starts that are closer differ by the noise of a sensor
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -117,7 +124,7 @@ class Cost:
             raise ValueError(f"expected repeats of {len(self.drives)} replayed recordings, got {len(recordings)}")
         made, drives, replays = [], [], []
         for given, old, drive, replay in zip(recordings, self.comparisons, self.drives, self._replays, strict=True):
-            recording = own_starts(given)
+            recording = own_starts(given, (config or old.config).start)
             new = followed(self.scene, recording, config or old.config)
             if isinstance(new, Drive):
                 check_gains(self.scene, new)
@@ -127,14 +134,16 @@ class Cost:
                     "(side, gravity) or, without commands, has another clock or other joints whose positions were "
                     "measured throughout"
                 )
-            drives.append(drive if _start_alike(self.scene, new, drive) else new)
+            drives.append(drive if _start_alike(self.scene, new, drive, (config or old.config).start) else new)
             replays.append(_along(replay, drives[-1]))
             made.append(_compared(self.scene, self.space, recording, drives[-1], replays[-1], config or old.config))
         return assemble(self.scene, self.space, made, replays, drives)
 
     def from_one_start(self, index: int, recording: Recording) -> Recording:
         """Repeats of a recording as if all had started where its replay does (`own_starts.from_one_start`)."""
-        return _from_one_start(self.scene, self.space, own_starts(recording), self.drives[index], self._replays[index])
+        config = self.comparisons[index].config.start
+        own = own_starts(recording, config)
+        return _from_one_start(self.scene, self.space, own, self.drives[index], self._replays[index], config)
 
     def _blockwise(self, values: Any, functions: Sequence[Callable], join: Callable) -> Any:
         def block(rows: np.ndarray) -> Any:
@@ -153,22 +162,32 @@ def make_cost(
     effects: Sequence[Effect] = (),
     check: bool = True,
 ) -> Cost:
-    """The cost of a scene over one or more recordings.
+    """The cost of a scene over one or more recordings: equation 1 of the paper.
 
-    A recording with commands is replayed by its servo, one without by inverse dynamics of its
-    measured motion.
-    engine: "mjx" (compiled, all devices) or "mujoco" (plain C, all cores; the parity oracle).
-    effects: extra physics or observation models whose parameters are part of the space; torque
-      offsets, and joint friction behind the sensor where the space holds any, are there already.
-    check: warn of units, signs and clocks in the recordings that can hardly be right (`log_checks.check_log`).
-    Raises ValueError for a space of another scene, unknown engines, joints, channels, parameters that nothing reads,
-      or gains that do not match.
+    A recording with commands is replayed by its servo, one without by inverse dynamics of its measured motion.
+
+    Args:
+        scene: what is simulated.
+        space: meaning of the vectors [D].
+        recordings: R recordings of the same robot and object.
+        engine: "mjx" (compiled, all devices) or "mujoco" (plain C, all cores; the parity oracle).
+        config: how simulation and measurement are compared; None for the defaults.
+        effects: extra physics or observation models whose parameters are part of the space. Torque offsets, and joint
+            friction behind the sensor where the space holds any, are there already.
+        check: warn of units, signs and clocks in the recordings that can hardly be right (`preflight.check_log`).
+
+    Returns:
+        A cost to be called with [P, D] physical values, which gives [P] N m.
+
+    Raises:
+        ValueError: a space of another scene, unknown engines, joints or channels, parameters that nothing reads, or
+            gains that do not match.
     """
     config = instance(CompareConfig() if config is None else config, "config", CompareConfig)
     check_space(instance(scene, "scene", Scene), instance(space, "space", Space))
     recordings, effects = recordings_of(recordings), instances(effects, "effects", Effect)
     one_of(engine, "engine", ENGINES)
-    recordings = [own_starts(recording) for recording in recordings]
+    recordings = [own_starts(recording, config.start) for recording in recordings]
     drives = [followed(scene, r, config) for r in recordings]
     for recording in recordings if check else ():
         warn_of_log(scene, recording)
@@ -191,13 +210,14 @@ def check_read(scene: Scene, space: Space, effects: Sequence[Effect]) -> None:
 
     An effect that states no parameters may read any of them.
     """
-    sensed = [f"{what}[{joint}]" for what in TERMS for joint in scene.joints]
-    read = {"time_offset", *sensed, *(p.name for e in effects for p in e.parameters)}
+    late = Role.TIME_OFFSET.in_theta()
+    sensed = [role.in_theta(joint) for role in OF_A_JOINT for joint in scene.joints]
+    read = {late, *sensed, *(p.name for e in effects for p in e.parameters)}
     unread = [p.name for p in space.parameters if not p.writes and p.name not in read]
     if unread and all(e.parameters for e in effects):
         raise ValueError(
             f"parameters {', '.join(unread)} write no field of the model, and nothing in the replay reads them; names "
-            f"that it reads: time_offset, {', '.join(sensed)}, and those of the effects that it is given"
+            f"that it reads: {late}, {', '.join(sensed)}, and those of the effects that it is given"
         )
 
 
@@ -206,7 +226,8 @@ def _warn_of_commanded(space: Space) -> None:
     idle = [
         p.name
         for p in space.parameters
-        if p.name == "time_offset" or (p.writes and all(w.field.startswith(("actuator_", "dof_sol")) for w in p.writes))
+        if p.role is Role.TIME_OFFSET
+        or (p.writes and all(w.field.startswith(("actuator_", "dof_sol")) for w in p.writes))
     ]
     if idle:
         warnings.warn(
@@ -259,7 +280,7 @@ def followed(scene: Scene, recording: Recording, config: CompareConfig) -> Drive
     validate(recording, allow_jitter=True)  # one made in Python may not have been
     check_range(scene, recording)
     if recording.command.size:
-        drive = make_drive(scene, recording, weigh="torque" in config.channels)
+        drive = make_drive(scene, recording, weigh="torque" in config.channels, config=config.start)
         warn_of_commands(scene, recording)
         warn_if_moving(recording)
         return drive
@@ -284,7 +305,7 @@ class Along:
     torques: Callable[[Path], jax.Array]
 
     def __call__(self, values: np.ndarray) -> Rollout:
-        return self.compiled(values, path_of(self.scene, self.motion))
+        return self.compiled(values, motion_path(self.scene, self.motion))
 
 
 @dataclass(frozen=True, eq=False)
@@ -315,7 +336,12 @@ def _along(replay: Callable[[np.ndarray], Rollout], follows: Drive | Motion) -> 
 
 
 def _from_one_start(
-    scene: Scene, space: Space, recording: Recording, follows: Drive | Motion, replay: Callable
+    scene: Scene,
+    space: Space,
+    recording: Recording,
+    follows: Drive | Motion,
+    replay: Callable,
+    config: StartConfig,
 ) -> Recording:
     if not isinstance(follows, Drive) or not isinstance(replay, Driven):
         return recording
@@ -323,7 +349,7 @@ def _from_one_start(
     def alone(drive: Drive) -> Rollout:
         return jax.tree.map(lambda a: a[0], in_blocks(replace(replay, drive=drive), space.mean[None]))
 
-    return from_one_start(scene, recording, follows, alone)
+    return from_one_start(scene, recording, follows, alone, config)
 
 
 def _compared(
@@ -331,7 +357,7 @@ def _compared(
 ) -> Comparison:
     """What a recording is compared with its replay by."""
     apart = _apart(replay, scene, recording, config) if isinstance(replay, Along) else None
-    recording = _from_one_start(scene, space, recording, follows, replay)
+    recording = _from_one_start(scene, space, recording, follows, replay, config.start)
     rest = follows.rest if isinstance(follows, Motion) else None
     return make_comparison(scene, recording, _clock(recording, follows), config, apart, rest)
 
@@ -350,7 +376,7 @@ def _apart(along: Along, scene: Scene, recording: Recording, config: CompareConf
         )
         for n in range(recording.repeats)
     ]
-    paths = [path_of(scene, motion) for motion in motions]
+    paths = [motion_path(scene, motion) for motion in motions]
     torques = np.asarray(along.torques(jax.tree.map(lambda *a: jnp.stack(a), *paths)), np.float64)
     return torques - torques.mean(axis=0)
 
@@ -367,18 +393,18 @@ def _same(scene: Scene, new: Drive | Motion, old: Drive | Motion) -> bool:
     return np.array_equal(sent, before) and np.array_equal(new.command[:, sent], old.command[:, sent])
 
 
-def _start_alike(scene: Scene, new: Drive | Motion, old: Drive | Motion) -> bool:
-    """Whether two drives start at one place, but for ALIKE; motions, which are followed as they are, never do.
+def _start_alike(scene: Scene, new: Drive | Motion, old: Drive | Motion, config: StartConfig) -> bool:
+    """Whether two drives start at one place, but for `alike`; motions, which are followed as they are, never do.
 
-    An object that stands ajar by about AJAR is put back for some repeats and not for others.
+    An object that stands ajar by about `ajar` is put back for some repeats and not for others.
     """
     if isinstance(new, Motion) or isinstance(old, Motion):
         return False
-    apart = np.full(scene.model.nq, ALIKE)
+    apart = np.full(scene.model.nq, config.alike)
     if scene.object_joint and scene.object_joint not in scene.joints:
         hinge = scene.qpos(scene.object_joint)
         if scene.model.qpos0[hinge] in (new.qpos0[hinge], old.qpos0[hinge]):
-            apart[hinge] += AJAR
+            apart[hinge] += config.ajar
     apart[list(following(scene, new.qpos0) & following(scene, old.qpos0))] = np.inf  # by as much as what has them there
     return bool(np.all(np.abs(new.qpos0 - old.qpos0) <= apart))
 
@@ -397,12 +423,9 @@ def with_sensors(scene: Scene, space: Space, drive: Drive | Motion, effects: Seq
 def _sensor_effects(scene: Scene, space: Space, drive: Drive | Motion) -> tuple[Effect, ...]:
     """What the torque sensors add: always the offsets, all else where the space asks for it."""
 
-    def asked(*terms: str) -> bool:
-        return any(name.startswith(tuple(f"{term}[" for term in terms)) for name in space.names)
-
     sign = jnp.sign if isinstance(drive, Motion) else direction
-    found = [joint_friction_effect(scene.joints, sign)] if asked(*FRICTION) else []
-    found += [torque_gain_effect(scene.joints)] if asked(GAIN) else []
+    found = [joint_friction_effect(scene.joints, sign)] if space.of_role(Role.VISCOUS, Role.COULOMB) else []
+    found += [torque_gain_effect(scene.joints)] if space.of_role(Role.TORQUE_GAIN) else []
     return (*found, torque_offset_effect(scene.joints))
 
 
@@ -434,7 +457,7 @@ def _engine(
             return lambda values: compiled(values, *of_drive)
 
         return Driven(driven, drive)
-    known = [e for e in effects if e.name != "torque offset"]
+    known = [e for e in effects if e.name != TORQUE_OFFSETS]
 
     def twin(drive: Drive) -> Callable[[np.ndarray], Rollout]:
         checked = _of_bodies(scene, space, c_replay(scene, space, drive, known, late=late))

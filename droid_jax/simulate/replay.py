@@ -19,19 +19,28 @@ import numpy as np
 from droid_jax.model.actuators import has_servo_damping
 from droid_jax.model.effect_interface import Effect, Rollout, State, Theta, column, complete
 from droid_jax.model.encoders import encoder_error, misplaced_compensation
+from droid_jax.model.mjx_internals import Contacts, constraint_rows, contacts
+from droid_jax.model.parameters import Role
 from droid_jax.model.physics import Physics
 from droid_jax.model.quiet_mjx import mjx
 from droid_jax.model.scene import Scene
-from droid_jax.model.step import servo_force
-from droid_jax.model.step import step as simulate_step
+from droid_jax.model.step import servo_force, simulate_step
 from droid_jax.model.unsupported_features import check_options
 from droid_jax.recordings.checks import check_joints
 from droid_jax.recordings.clocks import interpolate
 from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.simulate.floating_base import refuse_floating
-from droid_jax.simulate.initial_state import check_weight, holding, start_pose, weight_share
+from droid_jax.simulate.initial_state import (
+    DEFAULT_START,
+    StartConfig,
+    check_weight,
+    holding,
+    start_pose,
+    weight_share,
+)
 
 Replay = Callable[[Physics], Rollout]
+TORQUE_OFFSETS = "torque offset"  # the effect that adds them, which every replay in MJX has
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,12 +68,13 @@ class Drive:
         return np.arange(len(self.command)) * self.timestep
 
 
-def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True) -> Drive:
+def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True, config: StartConfig = DEFAULT_START) -> Drive:
     """Resample a recording's command onto the simulation's clock and order its columns.
 
     weigh: False where no torque is compared, so that it does not matter whether it contains the arm's weight.
+    config: what decides where the motion starts.
     Raises ValueError where the recording has no commands, its joints or the weight in its torque do not fit the
-    scene, or nothing tells where a joint starts (see `compare.start`).
+    scene, or nothing tells where a joint starts (see `start_pose`).
     """
     if recording.command.size == 0:
         raise ValueError(
@@ -78,7 +88,7 @@ def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True) -> Dri
     steps = int(np.floor((end - start) / timestep + 1e-6)) + 1
     clock = start + np.arange(steps) * timestep
     gains = recording.gains
-    qpos0 = start_pose(scene, recording)
+    qpos0 = start_pose(scene, recording, config)
     held = holding(scene, qpos0)
     refuse_floating(scene, recording, qpos0, held)
     command = np.tile(held, (steps, 1))
@@ -221,7 +231,7 @@ def _command(
         return table[low] * (1 - part) + table[low + 1] * part
 
     # In steps first: seconds that are added up in float32 lose a fifth of a step in ten seconds.
-    delay = late + jnp.asarray(theta.get("time_offset", 0.0), jnp.float32) / timestep
+    delay = late + jnp.asarray(theta.get(Role.TIME_OFFSET.value, 0.0), jnp.float32) / timestep
     whole = jnp.floor(delay)
     low = jnp.clip(k - whole.astype(jnp.int32) - 1, 0, last)
     high = jnp.clip(k - whole.astype(jnp.int32), 0, last)
@@ -288,9 +298,9 @@ def torque_offset_effect(joints: Sequence[str]) -> Effect:
     """Constant torque-sensor errors: reads `torque_offset[joint]` from theta, N m; absent means zero."""
 
     def observe(theta: Theta, rollout: Rollout) -> Rollout:
-        return replace(rollout, torque=rollout.torque + column(theta, "torque_offset", joints))
+        return replace(rollout, torque=rollout.torque + column(theta, Role.TORQUE_OFFSET.value, joints))
 
-    return Effect("torque offset", observe=observe)
+    return Effect(TORQUE_OFFSETS, observe=observe)
 
 
 def _joint_torque(model, before, after, servo: jax.Array, joints: np.ndarray, drive: Drive, parity: bool) -> jax.Array:
@@ -306,9 +316,9 @@ def _joint_torque(model, before, after, servo: jax.Array, joints: np.ndarray, dr
         gain = (after.qvel - before.qvel)[joints]
         velocity = after.qvel[joints] - (0.0 if parity else 0.5) * gain
         torque = torque - model.dof_armature[joints] * gain / drive.timestep - model.dof_damping[joints] * velocity
-        rows = after._impl
-        dry = slice(rows.ne, rows.ne + rows.nf)
-        torque = torque + (rows.efc_J[dry].T @ rows.efc_force[dry])[joints]
+        rows = constraint_rows(after)
+        dry = slice(rows.equalities, rows.equalities + rows.frictions)
+        torque = torque + (rows.jacobian[dry].T @ rows.force[dry])[joints]
     share = weight_share(model, joints, drive.torque.gravity)
     return torque + share * after.qfrc_gravcomp[joints] if share.any() else torque
 
@@ -319,9 +329,9 @@ def finger_geoms(scene: Scene) -> tuple[np.ndarray, ...]:
     return tuple(both[pairs] for pairs in scene.finger_pairs)
 
 
-def of_fingers(contact: Any, fingers: Sequence[np.ndarray]) -> list[jax.Array]:
+def of_fingers(found: Contacts, fingers: Sequence[np.ndarray]) -> list[jax.Array]:
     """For each finger, [contacts] bool: which of MJX's contacts are of its pairs, as `finger_geoms` has them."""
-    geoms = jnp.sort(contact.geom, axis=1)  # [contacts, 2]
+    geoms = jnp.sort(found.geoms, axis=1)  # [contacts, 2]
     return [jnp.any(jnp.all(geoms[:, None] == pairs[None], axis=-1), axis=1) for pairs in fingers]
 
 
@@ -329,5 +339,5 @@ def _touching(data, fingers: Sequence[np.ndarray]) -> jax.Array:
     """[F] bool: does any contact of a finger's pairs penetrate?"""
     if not fingers:
         return jnp.zeros((0,), bool)
-    contact = data._impl.contact
-    return jnp.stack([jnp.any(mine & (contact.dist < 0)) for mine in of_fingers(contact, fingers)])
+    found = contacts(data)
+    return jnp.stack([jnp.any(mine & (found.distance < 0)) for mine in of_fingers(found, fingers)])

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from small_log import COULOMB, elbow, elbow_log, elbow_space
@@ -36,6 +37,8 @@ from droid_jax.identify.search import SearchConfig
 from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Channel
+from droid_jax.report.identify_folder import Fit
+from droid_jax.storage import config_json
 
 QUICK = IdentifyConfig(search=SearchConfig(population=8, parents=None, generations=2), refine=None, samples=2)
 
@@ -134,6 +137,13 @@ def test_traces_and_joints_are_of_the_held_out_repeat(found: Identified):
     assert gap.per_joint_noise_floor == pytest.approx([np.sqrt(np.mean(apart**2) / 2)], rel=0.02)
 
 
+def test_the_settings_that_decided_are_in_the_result(found: Identified, tmp_path: Path):
+    write_run(tmp_path, found, {"recordings": []})
+    config = json.loads((tmp_path / "fit.json").read_text())["config"]
+    assert config == config_json(found.config) and config["search"]["population"] == 8
+    assert config["compare"]["noise"]["cutoff"] == 8.0 and config["identifiability"]["identifiable"] == 0.25
+
+
 def test_the_command_says_how_it_went_and_what_to_do(found: Identified, tmp_path: Path, capsys):
     write_run(tmp_path, found, {"recordings": []})
     fit = json.loads((tmp_path / "fit.json").read_text())
@@ -141,13 +151,13 @@ def test_the_command_says_how_it_went_and_what_to_do(found: Identified, tmp_path
     fit["gap"][name]["after"] = fit["gap"][name]["noise_floor"]
     alone = {name: {**fit["gap"][name], "noise_floor": None, "judged": "time"}}
     for changes, repeats, said in (
-        ({"mean_square": 90.0}, [8], "gap` looks for what the model lacks (it takes a second motion, or 16 repeats"),
-        ({"mean_square": 90.0}, [16], "gap` looks for what the model lacks\n"),
-        ({"mean_square": 1.0, "gap": alone}, [1], "one repeat does not tell noise from what the model lacks: let"),
+        ({"mean_square": 90.0}, [8], "gap` searches for what the model lacks (it takes a second motion, or 16 repeats"),
+        ({"mean_square": 90.0}, [16], "gap` searches for what the model lacks\n"),
+        ({"mean_square": 1.0, "gap": alone}, [1], "one repeat does not separate noise from what the model lacks: let"),
     ):
-        _summary(found, {**fit, **changes}, repeats)
+        _summary(found, msgspec.convert({**fit, **changes}, Fit), repeats)
         assert said in capsys.readouterr().out
-        _summary(found, {**fit, "mean_square": 1.0}, repeats)
+        _summary(found, msgspec.convert({**fit, "mean_square": 1.0}, Fit), repeats)
         assert said not in capsys.readouterr().out
 
 
@@ -261,7 +271,7 @@ def test_faults_of_what_is_held_out_are_told_before_the_search(scene: Scene, mon
     faulty = dataclasses.replace(
         recording, channels={**recording.channels, "torque": dataclasses.replace(torque, mask=mask)}
     )
-    monkeypatch.setattr(pipeline, "search", lambda *a, **k: pytest.fail("the search began"))
+    monkeypatch.setattr(pipeline, "cma_search", lambda *a, **k: pytest.fail("the search began"))
     with pytest.raises(ValueError, match="'elbow' has a stretch that no repeat measured"):
         identify_parameters(scene, elbow_space(scene), [faulty], config=QUICK)
 
@@ -278,7 +288,7 @@ def test_a_replay_that_blows_up_is_no_parent_whatever_the_others_cost(scene: Sce
         costs = SimpleNamespace(first=lambda: lambda rows: np.array([5000.0, 1000.0]), against=lambda *a: None)
         return SimpleNamespace(**vars(costs), comparisons=(), rollouts=lambda rows: ())
 
-    monkeypatch.setattr(pipeline, "search", search)
+    monkeypatch.setattr(pipeline, "cma_search", search)
     monkeypatch.setattr(pipeline, "make_cost", cost_of)
     with pytest.raises(KeyboardInterrupt):
         identify_parameters(scene, elbow_space(scene), [elbow_log(0.0, 10.0, 2)], config=QUICK)
@@ -298,7 +308,7 @@ def test_means_that_cannot_be_simulated_are_refused_before_the_search(scene: Sce
         rollouts=lambda rows: (blown,),
     )
     monkeypatch.setattr(pipeline, "make_cost", lambda *_, **__: cost)
-    monkeypatch.setattr(pipeline, "search", lambda *a, **k: pytest.fail("the search began"))
+    monkeypatch.setattr(pipeline, "cma_search", lambda *a, **k: pytest.fail("the search began"))
     with pytest.raises(ValueError, match=r"'elbow' blows up .* means \(elbow leaves its range at step 20 \(0\.2 s\)"):
         identify_parameters(scene, elbow_space(scene), [elbow_log(0.0, 10.0, 2)], config=QUICK)
 

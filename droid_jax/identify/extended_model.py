@@ -1,0 +1,206 @@
+"""The extended model: base parameters and the effects that a search named, as one thing to hand on.
+
+    extended = load_extended("runs/gap/extended.json", scene)
+    cost = make_cost(extended.scene, extended.space, [recording], effects=extended.effects)
+
+extended.json always holds all of it.  extended.xml is the scene as MJCF with the fitted values; effects
+that MJCF has no words for are missing in it, and extended.json says which.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from droid_jax.arguments import instance, path_of, shown
+from droid_jax.files import EXTENDED, EXTENDED_MJCF
+from droid_jax.identify.gaussian import Coordinates, Gaussian, ParameterEntry, matrix, space_of, space_to_json
+from droid_jax.model.effect_interface import Effect
+from droid_jax.model.effects.candidate import Candidate, Keys
+from droid_jax.model.effects.registry import effect_space, library, ready
+from droid_jax.model.fields import check_space
+from droid_jax.model.mjcf import WORDS, fitted_mjcf, native
+from droid_jax.model.parameters import Space
+from droid_jax.model.physics import make_c_model
+from droid_jax.model.scene import Scene
+from droid_jax.read_json import read_json, typed
+from droid_jax.storage import write_json, write_text
+
+FORMAT, VERSION = "droid_jax extended model", 2
+
+
+@dataclass(frozen=True, eq=False)
+class Extended:
+    """A fitted model with the effects that are in it.
+
+    scene: with all that the effects need of it.  parts: the effects with their places.  effects: for
+    `make_cost(..., effects=...)`.  values: [D] physical, over `space`.  gaussian: over `space`, base
+    parameters first.
+    """
+
+    scene: Scene
+    parts: tuple[Candidate, ...]
+    effects: tuple[Effect, ...]
+    values: np.ndarray
+    gaussian: Gaussian
+
+    @property
+    def space(self) -> Space:
+        """Base parameters, then those of the effects at their places."""
+        return self.gaussian.space
+
+    @property
+    def effect_space(self) -> Space:
+        """The effects' parameters alone, starting from the fitted values, each as wide as it ever was.
+
+        Raises ValueError where no effect is in the model.
+        """
+        if not self.parts:
+            raise ValueError("the extended model names no effect: it is the base model")
+        names = dict.fromkeys(name for part in self.parts for name in part.free)
+        at = dict(zip(self.space.names, self.values.tolist(), strict=True))
+        return Space(tuple(replace(self.space[name], mean=at[name]) for name in names))
+
+    @property
+    def lacking(self) -> Keys:
+        """The parts that an MJCF cannot hold in full: of a payload it holds the mass, and not the moment."""
+        effects = {e.name: e for e in self.effects}
+        model = make_c_model(self.scene, self.space, self.values)
+        said = {n for n, e in effects.items() if native(e, self.space, self.values, model) is not None}
+        parts = (p for p in self.parts if p.effect not in said)
+        return tuple(p.key for p in parts if not _in_mjcf(effects[p.effect], self.space.select(p.free)))
+
+
+def save_extended(folder: Path, model: Extended) -> None:
+    """Write extended.json and extended.xml into `folder`; extended.json says why where there is no MJCF."""
+    mjcf: dict[str, Any] = {"file": EXTENDED_MJCF, "lacks": list(map(str, model.lacking))}
+    try:
+        write_text(folder / EXTENDED_MJCF, fitted_mjcf(model.scene, model.space, model.values, model.effects))
+    except ValueError as error:
+        mjcf |= {"file": None, "error": str(error)}
+        (folder / EXTENDED_MJCF).unlink(missing_ok=True)  # of another run, started over in this folder
+    write_json(folder / EXTENDED, _to_json(model) | {"mjcf": mjcf})
+
+
+def load_extended(path: str | Path, scene: Scene) -> Extended:
+    """What `save_extended` wrote, for the scene that it was fitted with (another time step is fine).
+
+    Raises ValueError that names the file where it is missing or damaged, or belongs to another scene.
+    """
+    path, scene = path_of(path, "the path of an extended model"), instance(scene, "scene", Scene)
+    try:
+        content = read_json(path)
+    except FileNotFoundError:
+        raise ValueError(f"{path}: there is no such file; `python -m droid_jax.run gap` writes one") from None
+    if not isinstance(content, dict) or (content.get("format"), content.get("version")) != (FORMAT, VERSION):
+        raise ValueError(f"{path}: expected a JSON object with format {FORMAT!r}, version {VERSION}")
+    file = typed(content, _File, str(path))
+    try:
+        return _of_file(file, scene)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def _in_mjcf(effect: Effect, free: Space) -> bool:
+    """Whether an effect is nothing but numbers of the model that MJCF has words for; free: its parameters in use."""
+    laws = (effect.command, effect.servo, effect.force, effect.frictionloss, effect.observe)
+    fields = [{w.field for w in p.writes} for p in free.parameters]
+    return not any(laws) and all(written and written <= WORDS for written in fields)
+
+
+class _Effect(msgspec.Struct, forbid_unknown_fields=True):
+    effect: str
+    location: str
+    description: str
+    coefficients: list[str]
+    shape_parameters: list[str]
+
+
+class _Normal(msgspec.Struct, forbid_unknown_fields=True):
+    coordinates: Coordinates
+    rule: str
+    mean: list[float]
+    cov: list[list[float]]
+
+
+class _File(msgspec.Struct, forbid_unknown_fields=True):
+    """The content of an extended.json."""
+
+    format: str
+    version: int
+    scene: dict[str, str | int | list[str] | None]
+    effects: list[_Effect]
+    values: dict[str, float]
+    gaussian: _Normal
+    space: list[ParameterEntry]
+    mjcf: dict[str, str | list[str] | None] = {}
+
+
+def _to_json(model: Extended) -> dict[str, Any]:
+    what = {e.name: e.description for e in model.effects}
+    gaussian = model.gaussian
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "scene": _scene_to_json(model.scene),
+        "effects": [
+            {
+                "effect": part.effect,
+                "location": part.location,
+                "description": what[part.effect],
+                "coefficients": list(part.coefficients),
+                "shape_parameters": list(part.shape_parameters),
+            }
+            for part in model.parts
+        ],
+        "values": dict(zip(model.space.names, model.values.tolist(), strict=True)),
+        "gaussian": {
+            "coordinates": gaussian.coordinates,
+            "rule": gaussian.rule,
+            "mean": gaussian.mean.tolist(),
+            "cov": gaussian.cov.tolist(),
+        },
+        "space": space_to_json(model.space),
+    }
+
+
+def _of_file(file: _File, scene: Scene) -> Extended:
+    if (own := _scene_to_json(scene)) | {"name": ""} != file.scene | {"name": ""}:
+        raise ValueError(f"it was fitted with another scene, {file.scene}; this one is {own}")
+    space = space_of(file.space)
+    free = [name for effect in file.effects for name in (*effect.coefficients, *effect.shape_parameters)]
+    if without := [effect.effect for effect in file.effects if not effect.coefficients]:
+        raise ValueError(f"'effects': {shown(without[0])} has no coefficients")
+    if absent := [name for name in free if name not in space.names]:
+        raise ValueError(f"the effects have parameters that the space lacks: {', '.join(absent)}")
+    if absent := [name for name in space.names if name not in file.values]:
+        raise ValueError(f"'values': missing keys: {', '.join(absent)}")
+    parts = tuple(
+        Candidate(e.effect, e.location, tuple(e.coefficients), {name: file.values[name] for name in e.shape_parameters})
+        for e in file.effects
+    )
+    effects = library(scene, dict.fromkeys(p.effect for p in parts))
+    _check_known(parts, effects, space)
+    check_space(made := ready(scene), space)
+    g = file.gaussian
+    gaussian = Gaussian(space, matrix("mean", g.mean), matrix("cov", g.cov), g.rule, g.coordinates)
+    values = space.check(np.array([file.values[name] for name in space.names]))
+    return Extended(made, parts, effects, values, gaussian)
+
+
+def _check_known(parts: tuple[Candidate, ...], effects: tuple[Effect, ...], space: Space) -> None:
+    """ValueError unless the library still makes these effects, and of the same numbers of the model."""
+    own = {p.name: p for p in (effect_space(effects).parameters if effects else ())}
+    for name in (name for part in parts for name in part.free):
+        if name not in own or own[name].writes != space[name].writes:
+            raise ValueError(f"the effect parameter {name!r} is not in this version's library, or another one there")
+
+
+def _scene_to_json(scene: Scene) -> dict[str, Any]:
+    """What a scene must have in common with the one that a model was fitted with: the indices that parameters write."""
+    sizes = {size: int(getattr(scene.model, size)) for size in ("nbody", "nv", "nu", "npair")}
+    return {"name": scene.name, "joints": list(scene.joints), "object_joint": scene.object_joint, **sizes}
