@@ -423,7 +423,7 @@ def test_effects_enter_where_they_say(scene: Scene, drive: Drive, rollout: Rollo
     torque, position = np.asarray(got.torque) / 2.0, np.asarray(got.position)
     assert seen["shapes"] == ((2,), (2,), (2,))
     np.testing.assert_allclose(torque, 0.5 * (servo_torque(position, 0.02) + servo_torque(position, 0.03)), atol=2e-4)
-    # at rest the servo gives way until kp dq = 6 N m; the laws' delays change the torque by less than 0.5 N m
+    # at rest the servo gives way until kp dq = 6 N m
     assert torque[-1, 1] - rollout.torque[0, -1, 1] < -1.0
 
 
