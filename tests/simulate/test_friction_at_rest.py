@@ -93,7 +93,7 @@ def test_friction_behind_the_sensor_is_bounded_too():
 def test_a_joint_without_friction_is_compared_with_its_weight():
     scene = hinge(0.0)
     path = motion_path(scene, held(WEIGHT + 0.2))
-    replay = path_replay(scene, TorqueConvention(MOTOR, True), (), ("j",))
+    replay = replay_of(scene, TorqueConvention(MOTOR, True), ())
     space = Space((joint_damping(scene, "j", std=0.1, high=1.0),))
     physics = make_physics(scene, space, np.asarray(space.mean, np.float32))
     assert float(replay(physics, path).torque[0, 0]) == pytest.approx(WEIGHT, abs=1e-5)
