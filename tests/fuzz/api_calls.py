@@ -225,8 +225,11 @@ def _of_studies(folder: Path) -> tuple[Call, ...]:
         Call("RefineConfig", lambda **settings: fit(refine=RefineConfig(**settings)), _fields(RefineConfig())),
         Call("find_missing_effects", droid_jax.find_missing_effects, find),
         Call("DiscrepancyConfig", missing, _fields(droid_jax.DiscrepancyConfig())),
-        Call("SelectionConfig", lambda **settings: missing(selection=SelectionConfig(**settings)),
-             _fields(SelectionConfig())),
+        Call(
+            "SelectionConfig",
+            lambda **settings: missing(selection=SelectionConfig(**settings)),
+            _fields(SelectionConfig()),
+        ),
         Call("BlocksConfig", lambda **settings: missing(blocks=BlocksConfig(**settings)), _fields(BlocksConfig())),
     )
     return tuple(replace(call, run=_cut_short(call.run)) for call in calls)
