@@ -35,7 +35,7 @@ class DiscrepancyConfig:
     a selection step is always tried.
     minimum_closed: share of U beyond the floor that a model must close on every held-out recording for its effects to
     be named beside an unexplained remainder; with less they are hints.  0.4 turned 9 false names and one right one of
-    the blind run d1a4e04 into hints (docs/method-gap.md).
+    the blind run d1a4e04 into hints (docs/discrepancy-search.md).
     compare: how simulation and measurement are compared.  seed: of flips and resamples.
     """
 

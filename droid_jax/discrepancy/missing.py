@@ -43,7 +43,7 @@ def find_missing_effects(
     config: DiscrepancyConfig | None = None,
     progress: Progress | None = None,
 ) -> tuple[Verdict, Extended]:
-    """Which physical effect the model lacks, and the model with it (docs/method-gap.md).
+    """Which physical effect the model lacks, and the model with it (docs/discrepancy-search.md).
 
     space: all that is fitted without any effect, nuisances among it: `found.full` of an identification.
     recordings: train, validation and perhaps test, eight repeats or more of each; or one, sixteen repeats or more,

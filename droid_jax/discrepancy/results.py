@@ -2,7 +2,7 @@
 
 The verdict is written when it is known; what is added to it later (`discrepancy.amendments`) is written again.
 
-docs/gap-command.md lists every entry; `report.gap_folder` reads them, for a page and for a user.  No pickle.
+docs/results-folder.md lists every entry; `report.gap_folder` reads them, for a page and for a user.  No pickle.
 """
 
 from __future__ import annotations
