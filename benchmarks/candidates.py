@@ -24,13 +24,13 @@ import tyro  # noqa: E402
 
 from benchmarks.common import interleave, publish  # noqa: E402
 from droid_jax.cost.cost import Cost, make_cost  # noqa: E402
-from droid_jax.discrepancy.candidates import candidates  # noqa: E402
-from droid_jax.discrepancy.case import DiscrepancyConfig  # noqa: E402
-from droid_jax.discrepancy.screen import directions_of  # noqa: E402
+from droid_jax.discrepancy.candidates import directions_of  # noqa: E402
+from droid_jax.discrepancy.config import DiscrepancyConfig  # noqa: E402
 from droid_jax.door.demonstration import demonstration_path  # noqa: E402
 from droid_jax.door.scene import door_scene  # noqa: E402
 from droid_jax.door.space import door_nuisances, door_space  # noqa: E402
 from droid_jax.identify.levenberg_marquardt import CANDIDATE_STEPS, CHORDS  # noqa: E402
+from droid_jax.model.effects.candidate import candidates  # noqa: E402
 from droid_jax.model.effects.registry import effect_space, library, ready  # noqa: E402
 from droid_jax.recordings.formats import load  # noqa: E402
 from droid_jax.recordings.recording import Recording  # noqa: E402

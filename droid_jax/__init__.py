@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from droid_jax.cost.cost import make_cost as make_cost
-    from droid_jax.discrepancy.case import DiscrepancyConfig as DiscrepancyConfig
-    from droid_jax.discrepancy.extended import load_extended as load_extended
+    from droid_jax.discrepancy.config import DiscrepancyConfig as DiscrepancyConfig
     from droid_jax.discrepancy.missing import find_missing_effects as find_missing_effects
     from droid_jax.door.scene import door_scene as door_scene
     from droid_jax.door.space import door_nuisances as door_nuisances
     from droid_jax.door.space import door_space as door_space
+    from droid_jax.identify.extended_model import load_extended as load_extended
     from droid_jax.identify.gaussian import Gaussian as Gaussian
     from droid_jax.identify.gaussian import load as load_gaussian
     from droid_jax.identify.pipeline import IdentifyConfig as IdentifyConfig

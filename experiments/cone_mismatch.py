@@ -111,7 +111,7 @@ def main() -> None:
     for number in range(0 if arguments.quick else arguments.cases):
         found.append(case(where, number, commit, arguments.out, bench))
         print(f"door {number}: {found[-1].get('sentence', found[-1].get('error'))}", flush=True)
-    keys = ("verdict", "sentence", "effects", "p", "gaps", "floor", "seconds", "code")
+    keys = ("verdict", "sentence", "effects", "p", "discrepancies", "discretisation_error", "seconds", "code")
     result["cases"] = [{k: c.get(k) for k in keys} for c in found]
     line = {"torque_difference": [round(d, 3) for d in difference], "said": [c["verdict"] for c in found]}
     publish(arguments.out, "cone_mismatch", arguments.quick, 0, result, line)

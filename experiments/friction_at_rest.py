@@ -40,6 +40,7 @@ from droid_jax.model.scene import Scene, compile_scene  # noqa: E402
 from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 from experiments.blind.rates import rate  # noqa: E402
+from experiments.trials import answer_json  # noqa: E402
 
 MASS, LENGTH = 0.5, 0.1  # kg, m: a weight of 0.49 N m at the horizontal
 STIFFNESS, SERVO_DAMPING = 8.0, 0.3  # N m/rad, N m s/rad, of the servo that makes the motion
@@ -187,9 +188,7 @@ def one(seed: int, scene: Scene, space: Space) -> dict[str, Any]:
             name: {"truth": t, "best": float(b), "interval": [float(a), float(z)], "inside": bool(a <= t <= z)}
             for name, t, b, a, z in zip(TRUTHS, truths, found.best, low, high, strict=True)
         },
-        "verdict": verdict.kind.value,
-        "effects": list(verdict.effects),
-        "indistinguishable": [list(names) for names in verdict.indistinguishable],
+        **answer_json(verdict),
         "p": float(verdict.score_tests[0].p) if verdict.score_tests else None,
     }
 

@@ -179,7 +179,7 @@ def main(config: GapDoor) -> None:
         "false_alarms": alarms,
         "targets": {
             "held_out_30_percent_better": tangential[JUDGE]["less"] >= 0.3,
-            "tie_with_a_spring": found["verdict"] == "tie" and any(n in SPRINGS for n in named),
+            "tie_with_a_spring": found["verdict"] == "indistinguishable" and any(n in SPRINGS for n in named),
             "not_named_again": None if again is None else silent_about(again, [e.name for e in springs]),
             "added_found": {effect: names_one_of(a, [effect]) for effect, a in added.items()},
         },

@@ -41,7 +41,7 @@ from inverse_fit import RESULTS, rms, rounded, run
 from real_emps import FIT, JUDGE, MOTION_CUTOFF, SLIDE, SOURCE, emps_space, load_emps
 
 from benchmarks.common import publish, stem
-from droid_jax.discrepancy.single import make_log
+from droid_jax.discrepancy.case import make_log
 from droid_jax.discrepancy.verdict import Verdict
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects.registry import library

@@ -121,7 +121,7 @@ def by_joint(found: Mapping[str, Any], published: Mapping[str, Sequence[float]])
 
 def of_joints(found: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     """The gap by joint, before and after."""
-    return [cell for cell in found["where"] if cell["variable"] == "joint x phase"]
+    return [cell for cell in found["where"] if cell["axis"] == "phase"]
 
 
 def main(config: GapPanda) -> None:
@@ -151,7 +151,7 @@ def main(config: GapPanda) -> None:
     for row in joints:
         print(f"  {row}")
     sealed = found["rigid"]["rms"]["test"]
-    most_left = max(of_joints(found["rigid"]), key=lambda cell: cell["after"])["where"].split(",")[0]
+    most_left = max(of_joints(found["rigid"]), key=lambda cell: cell["after"])["joint"]
     result = {
         "experiment": "gap_panda",
         "quick": config.quick,

@@ -13,7 +13,7 @@ Every experiment answers four questions about its log:
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,15 +29,15 @@ from inverse_fit import rms, rounded
 
 from benchmarks.common import CODE
 from benchmarks.sharing import code_name, kept
+from droid_jax.cost.lone_log import LoneLog
 from droid_jax.cost.residuals import CompareConfig
-from droid_jax.discrepancy.blocks import BlockResidualSet
-from droid_jax.discrepancy.case import Case, DiscrepancyConfig
-from droid_jax.discrepancy.refit import deviations, intervals
+from droid_jax.discrepancy.case import Case, base_model, make_log, single_case
+from droid_jax.discrepancy.config import DiscrepancyConfig, SelectionConfig
+from droid_jax.discrepancy.fitting import deviations, intervals
 from droid_jax.discrepancy.residual_set import only_comparison
-from droid_jax.discrepancy.select import SIGNIFICANT
-from droid_jax.discrepancy.single import Log, base_model, make_log, single_case
+from droid_jax.discrepancy.search import search_effects
+from droid_jax.discrepancy.statistics import Blocks
 from droid_jax.discrepancy.verdict import Verdict
-from droid_jax.discrepancy.workflow import search_effects
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.model.effect_interface import Effect, Theta
 from droid_jax.model.effects.registry import effect_space
@@ -45,7 +45,7 @@ from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.policy.trials import wilson
 from droid_jax.recordings.recording import Recording
-from experiments.trials import trial_json
+from experiments.trials import answer_json, validation_json
 
 ORDER = 20  # of the noise's autoregression, at 20 Hz: one second
 BURN = 400  # samples before the noise is stationary
@@ -61,14 +61,14 @@ class Search:
     sealed: another log, or None.  base: with the parameters of `known`, the effects that the base has.
     """
 
-    log: Log
-    sealed: Log | None
+    log: LoneLog
+    sealed: LoneLog | None
     base: Space
     effects: tuple[Effect, ...]
     config: DiscrepancyConfig
     known: tuple[Effect, ...] = ()
 
-    def case(self, log: Log | None = None, start: np.ndarray | None = None) -> Case:
+    def case(self, log: LoneLog | None = None, start: np.ndarray | None = None) -> Case:
         """Of this log, or of another with the same motion."""
         return single_case(log or self.log, self.base, self.effects, self.sealed, self.config, start)
 
@@ -99,13 +99,13 @@ def make_search(
     return Search(logs[0], logs[1] if len(logs) > 1 else None, base, tuple(effects), config, tuple(known))
 
 
-def run_search(search: Search, log: Log | None = None, start: np.ndarray | None = None) -> tuple[Case, Verdict]:
+def run_search(search: Search, log: LoneLog | None = None, start: np.ndarray | None = None) -> tuple[Case, Verdict]:
     """Its case and the verdict."""
     case = search.case(log, start)
     return case, search_effects(case, base_model(case, start), 0.0)
 
 
-def answer(search: Search, log: Log | None = None) -> dict[str, Any]:
+def answer(search: Search, log: LoneLog | None = None) -> dict[str, Any]:
     """The report of a search, or why none was possible: nothing is said then."""
     try:
         return report(*run_search(search, log))
@@ -132,13 +132,13 @@ def as_known(effect: Effect) -> Effect:
     )
 
 
-def adding(log: Log, values: np.ndarray, added: Mapping[str, float]) -> Log:
+def adding(log: LoneLog, values: np.ndarray, added: Mapping[str, float]) -> LoneLog:
     """The log with what parameters `added` change in the simulation at `values` [D] added to its measurement."""
     without, with_it = log.simulated(np.stack([values, _changed(log, values, added)]))
     return log.with_torques(log.measured + with_it - without)
 
 
-def _changed(log: Log, values: np.ndarray, added: Mapping[str, float]) -> np.ndarray:
+def _changed(log: LoneLog, values: np.ndarray, added: Mapping[str, float]) -> np.ndarray:
     out = values.copy()
     for name, value in added.items():
         out[log.space.index(name)] = value
@@ -179,7 +179,7 @@ def false_alarms(search: Search, verdict: Verdict, count: int, seed: int, folder
         print(f"  {number + 1:4d}: {said}", flush=True)
         if "refused" in said:
             continue
-        missing.append(said["p"] < SIGNIFICANT)
+        missing.append(said["p"] < SelectionConfig().significance)
         named.extend([{"case": number, "effects": said["effects"]}] if said["effects"] else [])
     return {
         "cases": count,
@@ -188,21 +188,22 @@ def false_alarms(search: Search, verdict: Verdict, count: int, seed: int, folder
         "named": share(len(named), len(missing)),
         "names": named,
         "noise": f"autoregression of order {ORDER} of the residual that the extended model leaves, column by column",
-        "level": SIGNIFICANT,
+        "level": SelectionConfig().significance,
     }
 
 
-def _said_of(search: Search, log: Log, start: np.ndarray) -> dict[str, Any]:
+def _said_of(search: Search, log: LoneLog, start: np.ndarray) -> dict[str, Any]:
     """What a search says of a log: p, verdict, effects, blocks; or why it says nothing."""
     try:
         case, found = run_search(search, log, start)
     except ValueError as error:  # too short for the residual's correlation time
         return {"refused": str(error)}
-    said = {"p": found.score_tests[0].p, "verdict": found.kind.value, "effects": list(found.effects)}
-    return {**said, "blocks": case.train.units}
+    answer = answer_json(found)
+    said = {"p": found.score_tests[0].p, "verdict": answer["verdict"], "effects": answer["effects"]}
+    return {**said, "blocks": case.train.resampling.units}
 
 
-def _key(log: Log, code: str) -> str:
+def _key(log: LoneLog, code: str) -> str:
     """Of a log's torques and the program's commit: what is kept under it was said of this log by this program."""
     return hashlib.sha256(np.ascontiguousarray(log.measured).tobytes() + code.encode()).hexdigest()[:12]
 
@@ -222,10 +223,8 @@ def report(case: Case, verdict: Verdict) -> dict[str, Any]:
     spans, widths = intervals(case.train, verdict.model), deviations(case.train, verdict.model)
     torque = only_comparison(case.train.cost).channel("torque")
     return {
-        "verdict": verdict.kind.value,
+        **answer_json(verdict),
         "sentence": verdict.sentence,
-        "effects": list(verdict.effects),
-        "indistinguishable": [list(t) for t in verdict.indistinguishable],
         "values": {
             p.name: {
                 "unit": p.unit,
@@ -236,32 +235,33 @@ def report(case: Case, verdict: Verdict) -> dict[str, Any]:
             for p in verdict.model.space.parameters
         },
         "p": [s.p for s in verdict.score_tests],
-        "gaps": {
+        "discrepancies": {
             role: {"before": b, "after": a, "closed": 1 - a / b} for role, (b, a) in verdict.discrepancies.items()
         },
         "rms": {role: _rms_of(case, verdict, role) for role in ("train", "validation", "test")},
         "noise_stated": rounded(1 / np.einsum("ckk->kc", torque.noise.whitener).max(axis=0)),
-        "blocks": {"each": case.train.units, "seconds": round(_block_seconds(case), 3)},
+        "blocks": {"each": case.train.resampling.units, "seconds": round(_block_seconds(case), 3)},
         "where": [
-            {"variable": b.variable, "where": b.where, "before": b.discrepancy, "after": a.discrepancy}
-            for b, a in zip(verdict.before.cells, verdict.after.cells, strict=True)
+            {**asdict(b.key), "axis": b.key.axis.value, "before": b.discrepancy, "after": a.discrepancy}
+            for b, a in zip(verdict.before, verdict.after, strict=True)
         ],
-        "trials": [trial_json(trial) for trial in verdict.validation_tests],
+        "validation_tests": [validation_json(trial) for trial in verdict.validation_tests],
     }
 
 
 def _block_seconds(case: Case) -> float:
     """Shortest of the blocks."""
-    assert isinstance(case.train, BlockResidualSet)
-    block, time = case.train.block[case.train.column == 0], case.train.time
-    return min(float(np.sum(block == b)) for b in range(case.train.units)) * float(time[1] - time[0])
+    rows, time = case.train.resampling, case.train.time
+    assert isinstance(rows, Blocks)
+    block = rows.block[case.train.column == 0]
+    return min(float(np.sum(block == b)) for b in range(rows.units)) * float(time[1] - time[0])
 
 
 def _rms_of(case: Case, verdict: Verdict, role: str) -> dict[str, list[float]]:
     """RMS of each column before and after, in its unit, over the instants of a role."""
-    evidence = case.held_sets[role]
+    evidence = case.residual_sets[role]
     inside, log = evidence.instants, evidence.cost
-    assert isinstance(log, Log)
+    assert isinstance(log, LoneLog)
     return {
         when: rounded(rms(log.residual_torque(model.values)[inside]))
         for when, model in (("before", verdict.base), ("after", verdict.model))

@@ -33,22 +33,23 @@ from benchmarks.common import origin  # noqa: E402
 from benchmarks.sharing import claimed, code_name  # noqa: E402
 from droid_jax.commands.gap_search import searched  # noqa: E402
 from droid_jax.commands.synthetic import hidden_effects, record_synthetic  # noqa: E402
-from droid_jax.discrepancy.case import DiscrepancyConfig  # noqa: E402
-from droid_jax.discrepancy.extended import extended, load_extended, save_extended  # noqa: E402
-from droid_jax.discrepancy.missing import case_of  # noqa: E402
-from droid_jax.discrepancy.split import Split  # noqa: E402
+from droid_jax.discrepancy.case import case_of  # noqa: E402
+from droid_jax.discrepancy.config import DiscrepancyConfig  # noqa: E402
+from droid_jax.discrepancy.results import extended  # noqa: E402
 from droid_jax.discrepancy.verdict import Conclusion  # noqa: E402
 from droid_jax.door.environment import DoorEnv  # noqa: E402
 from droid_jax.door.scene import door_scene  # noqa: E402
 from droid_jax.door.space import door_nuisances, door_space  # noqa: E402
 from droid_jax.door.task import Task  # noqa: E402
 from droid_jax.files import EXTENDED  # noqa: E402
+from droid_jax.identify.extended_model import load_extended, save_extended  # noqa: E402
 from droid_jax.identify.gaussian import load as load_gaussian  # noqa: E402
 from droid_jax.identify.gaussian import prior  # noqa: E402
 from droid_jax.identify.identifiability import posterior  # noqa: E402
 from droid_jax.identify.multistart import RefineConfig  # noqa: E402
 from droid_jax.identify.search import SearchConfig  # noqa: E402
 from droid_jax.model.effects.registry import library  # noqa: E402
+from droid_jax.recordings.split import Split  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 from droid_jax.synthetic.hidden_effects import listed  # noqa: E402
 from droid_jax.synthetic.policy_trials import TransferConfig, check_playable, synthetic_robot  # noqa: E402
@@ -109,19 +110,26 @@ def _searched(arguments: Arguments, folder: Path, code: Mapping[str, Any]) -> di
     config = DiscrepancyConfig()
     if arguments.quick:
         small = RefineConfig(iterations=1, basin_hops=0, spreads=0)
-        config = DiscrepancyConfig(SearchConfig(population=8, parents=None, generations=1), small, small, 1, 1, 1)
+        config = DiscrepancyConfig(
+            search=SearchConfig(population=8, parents=None, generations=1),
+            refine=small,
+            refit=small,
+            one_step_fits=1,
+            full_refits=1,
+            max_effects=1,
+        )
     checkpoints = folder / "checkpoints" / code_name(code["commit"])
     case = case_of(Split.RECORDINGS, scene, base, library(scene), roles, config)
     case, verdict, handed, _ = searched(Split.RECORDINGS, case, roles, checkpoints)
     posterior(verdict.base.refined, case.train.cost.comparisons).save(folder / BASE)
     save_extended(folder, extended(case, handed))
-    if verdict.kind is Conclusion.UNCONVERGED and not arguments.quick:  # no verdict: nothing is kept of it
+    if verdict.conclusion is Conclusion.UNCONVERGED and not arguments.quick:  # no verdict: nothing is kept of it
         raise SystemExit(f"error: {verdict.sentence}")
     found = {
         "hidden": list(arguments.hide),
-        "verdict": verdict.kind.value,
+        "verdict": verdict.conclusion.value,
         "sentence": verdict.sentence,
-        "effects": list(verdict.effects),
+        "effects": list(map(str, verdict.effects)),
         "searched_by": dict(code),
     }
     write_json(folder / "verdict.json", found)

@@ -31,11 +31,11 @@ import tyro  # noqa: E402
 
 from benchmarks.common import CODE, origin, stem  # noqa: E402
 from benchmarks.sharing import claimed  # noqa: E402
-from droid_jax.discrepancy.candidates import candidates  # noqa: E402
-from droid_jax.discrepancy.restart import base_fit  # noqa: E402
-from droid_jax.discrepancy.screen import directions_of  # noqa: E402
-from droid_jax.discrepancy.select import SIGNIFICANT  # noqa: E402
-from droid_jax.discrepancy.workflow import score, search_effects  # noqa: E402
+from droid_jax.discrepancy.candidates import directions_of, score_test  # noqa: E402
+from droid_jax.discrepancy.config import SelectionConfig  # noqa: E402
+from droid_jax.discrepancy.fitting import base_fit  # noqa: E402
+from droid_jax.discrepancy.search import search_effects  # noqa: E402
+from droid_jax.model.effects.candidate import candidates  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 from experiments.blind.cases import Plan  # noqa: E402
 from experiments.blind.draws import commit_of, seed_of  # noqa: E402
@@ -98,15 +98,24 @@ def run_case(plan: Plan, commit: str, bench: Bench, watch: Stopwatch) -> Iterato
         raise ValueError(f"case {plan.name}: {found}")
     recordings = found[2]
     case = watch("prepare", lambda: bench.case(scene, {"train": recordings["train"]}))
-    model = watch("base", lambda: base_fit(case, silent))
-    screen = watch("screen", lambda: score(case, model, directions_of(candidates(case.effects))))
-    best = screen.directions[int(np.argmax(np.abs(screen.t)))].candidate.name
-    yield {"p": screen.p, "gap": model.discrepancy, "converged": bool(model.refined.converged), "best": best}
-    if screen.p < SIGNIFICANT:
-        floor = watch("floor", lambda: bench.floor(scene, case, model, recordings["train"]))
+    model = watch("base", lambda: base_fit(case.train, case.base, case.config, silent))
+    screen = watch("screen", lambda: score_test(case.train, model, directions_of(candidates(case.effects))))
+    best = screen.directions[int(np.argmax(np.abs(screen.t)))].candidate.key
+    yield {
+        "p": screen.p,
+        "discrepancy": model.discrepancy,
+        "converged": bool(model.refined.converged),
+        "best": str(best),
+    }
+    if screen.p < case.config.selection.significance:
+        floor = watch("discretisation_error", lambda: bench.floor(scene, case, model, recordings["train"]))
         whole = watch("prepare", lambda: bench.case(scene, recordings))
         verdict = watch("find", lambda: search_effects(whole, model, floor))
-        yield {"floor": floor, "verdict": verdict.kind.value, "effects": list(verdict.effects)}
+        yield {
+            "discretisation_error": floor,
+            "verdict": verdict.conclusion.value,
+            "effects": list(map(str, verdict.effects)),
+        }
 
 
 def summarise(cases: list[dict[str, Any]]) -> dict[str, Any]:
@@ -123,7 +132,7 @@ def summarise(cases: list[dict[str, Any]]) -> dict[str, Any]:
         "cases": len(cases),
         "errors": failed,
         "codes": sorted({str(c.get("code")) for c in cases}),
-        "screening_rejects": rate(cases, lambda c: c["p"] < SIGNIFICANT),
+        "screening_rejects": rate(cases, lambda c: c["p"] < SelectionConfig().significance),
         "alarms": rate(cases, lambda c: c.get("verdict", "none") not in ("none", "fit not converged", "error")),
         "rejected_then_failed": sum("error" in c for c in cases),
         "names": rate(cases, lambda c: bool(c.get("effects"))),
@@ -131,7 +140,7 @@ def summarise(cases: list[dict[str, Any]]) -> dict[str, Any]:
         "p_below": {f"{level:g}": float(np.mean(p < level)) for level in LEVELS},
         "uniform_p": float(scipy.stats.kstest(p, "uniform").pvalue),
         "p_histogram": np.histogram(p, np.linspace(0, 1, 11))[0].tolist(),
-        "gap_median": float(np.median([c["gap"] for c in cases])),
+        "discrepancy_median": float(np.median([c["discrepancy"] for c in cases])),
         "seconds_median": float(np.median([sum(c["seconds"].values()) for c in cases])),
     }
 

@@ -13,12 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from droid_jax.discrepancy.case import Case, DiscrepancyConfig, make_case
-from droid_jax.discrepancy.final_refit import FinalModel
-from droid_jax.discrepancy.refit import FittedModel
-from droid_jax.discrepancy.restart import base_fit
+from droid_jax.discrepancy.case import Case, make_case
+from droid_jax.discrepancy.config import DiscrepancyConfig
+from droid_jax.discrepancy.fitting import FinalModel, FittedModel, base_fit
+from droid_jax.discrepancy.search import search_effects
 from droid_jax.discrepancy.verdict import Verdict
-from droid_jax.discrepancy.workflow import search_effects
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.identify.search import SearchConfig
 from droid_jax.model.effects.registry import library

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from droid_jax.cost.residuals import CompareConfig
-from droid_jax.discrepancy.case import DiscrepancyConfig
+from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.model.fields import joint_damping
 from droid_jax.model.joint_friction import SMOOTHING

@@ -15,7 +15,7 @@ import droid_jax as dj
 from droid_jax import arguments
 from droid_jax.arguments import check_fields, number, whole
 from droid_jax.cost.residuals import CompareConfig
-from droid_jax.discrepancy.case import DiscrepancyConfig
+from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.identify.pipeline import IdentifyConfig
 from droid_jax.identify.search import SearchConfig

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import json
 import re
@@ -10,6 +11,10 @@ import sys
 from pathlib import Path
 
 import pytest
+
+from droid_jax.discrepancy.config import BlocksConfig, DiscrepancyConfig, SelectionConfig
+from droid_jax.identify.multistart import RefineConfig
+from droid_jax.identify.search import SearchConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 WRITTEN = ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "experiments/README.md", "benchmarks/README.md")
@@ -126,3 +131,30 @@ def test_the_tree_of_the_architecture_is_the_packages():
     tree = text.split("```")[1]
     files = {p.name for p in (ROOT / "droid_jax").rglob("*.py")} - {"__init__.py"}
     assert sorted(files - set(re.findall(r"[\w]+\.py", tree))) == []
+
+
+def documented() -> dict[tuple[str, str], str]:
+    """(config, field) -> value of docs/discrepancy-search.md's table of thresholds."""
+    text = (ROOT / "docs" / "discrepancy-search.md").read_text()
+    config, out = "", dict[tuple[str, str], str]()
+    for first, value in re.findall(r"^\| ([^|]+) \| ([^|]*)\|", text[text.index("## Thresholds") :], re.MULTILINE):
+        if first.startswith("**"):
+            config = first.strip("*`")
+        elif re.fullmatch(r"`\w+`", first):
+            out[config, first.strip("`")] = value.strip()
+    return out
+
+
+@pytest.mark.parametrize("config", [SelectionConfig, BlocksConfig], ids=lambda config: config.__name__)
+def test_every_threshold_is_documented(config: type):
+    fields = {f.name: f.default for f in dataclasses.fields(config)}
+    rows = {name: value for (of, name), value in documented().items() if of == config.__name__}
+    assert {name: float(value) for name, value in rows.items()} == pytest.approx(fields, rel=1e-3)
+
+
+@pytest.mark.parametrize("config", [DiscrepancyConfig, RefineConfig, SearchConfig], ids=lambda config: config.__name__)
+def test_documented_settings_are_the_defaults(config: type):
+    rows = {name: value for (of, name), value in documented().items() if of == config.__name__}
+    numbers = {name: float(value) for name, value in rows.items() if "," not in value}
+    assert len(numbers) > 3
+    assert numbers == pytest.approx({name: getattr(config(), name) for name in numbers})

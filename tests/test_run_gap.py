@@ -19,12 +19,12 @@ from small_gap import EFFECTS, FLOOR, JOINTS, PRELOAD, QUICK, SCENE, record, sma
 from droid_jax.commands import gap, report
 from droid_jax.commands.synthetic import hidden_effects, record_synthetic
 from droid_jax.discrepancy import amendments, missing, restart
-from droid_jax.discrepancy.inputs import check_recordings, lags
 from droid_jax.discrepancy.verdict import Experiment
 from droid_jax.door.scene import door_scene
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects import registry
 from droid_jax.model.parameters import Parameter, Scaling
+from droid_jax.preflight.search_inputs import check_recordings, lags
 from droid_jax.recordings.formats import save
 from droid_jax.recordings.recording import Channel, Recording
 from droid_jax.report.gap_folder import read_gap
@@ -458,8 +458,8 @@ def test_a_run_goes_on_after_a_stop_and_is_whole(
     assert files == {"checkpoints", "setup.json", "tensorboard", *written}
     assert not (out / "checkpoints" / "replays").exists()
     answer = read_gap(out).found
-    assert answer["amplitudes"][0]["value"] == pytest.approx(PRELOAD, rel=0.05)
-    assert {"search", "refine", "floor", "screen", "refit"} <= set(answer["seconds"])
+    assert answer["coefficients"][0]["value"] == pytest.approx(PRELOAD, rel=0.05)
+    assert {"search", "refine", "discretisation_error", "score_test", "refit"} <= set(answer["seconds"])
     assert answer["setup"]["synthetic_robot"] is True and answer["setup"]["command"] == "gap"
     places = {when: [(c["variable"], c["where"]) for c in answer["cells"][when]] for when in ("before", "after")}
     assert places["before"] == places["after"]

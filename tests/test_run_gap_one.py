@@ -16,13 +16,13 @@ from small_log import ASKED, CONFIG, COULOMB, elbow, elbow_log, write_elbow
 from droid_jax import runtime
 from droid_jax.commands import gap
 from droid_jax.commands.gap_search import IN_BLOCKS
+from droid_jax.cost.lone_log import LoneLog
 from droid_jax.discrepancy import missing
-from droid_jax.discrepancy.extended import load_extended
-from droid_jax.discrepancy.single import Log
-from droid_jax.discrepancy.split import Split, roles_of, split_of
+from droid_jax.identify.extended_model import load_extended
 from droid_jax.identify.search import SearchConfig
 from droid_jax.recordings.formats import save
 from droid_jax.recordings.recording import Recording
+from droid_jax.recordings.split import Split, roles_of, split_of
 from droid_jax.report.gap_folder import Gap, read_gap
 from droid_jax.run import main
 
@@ -130,7 +130,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
     def remembered(*arguments):
         with pytest.MonkeyPatch.context() as inside:
-            inside.setattr(Log, "whitened", lambda *a: pytest.fail("this replay was kept"))
+            inside.setattr(LoneLog, "whitened", lambda *a: pytest.fail("this replay was kept"))
             return find(*arguments)
 
     with pytest.MonkeyPatch.context() as patch:
@@ -153,9 +153,9 @@ def test_a_log_is_searched_and_its_limits_are_said(run: tuple[Path, str], found:
     assert lines[0] == "The model lacks: joint_coulomb at elbow."
     assert "closed), test " in lines[3] and lines[4] == Split.BLOCKS.limits == found.found["split"]["limits"]
     assert found.found["split"]["by"] == "blocks" and "nothing tells a place from noise" in lines[4]
-    (amplitude,) = found.found["amplitudes"]
+    (amplitude,) = found.found["coefficients"]
     assert amplitude["low"] < COULOMB < amplitude["high"] and amplitude["value"] == pytest.approx(COULOMB, rel=0.1)
-    assert found.found["floor"] == 0.0 and set(found.found["seconds"]) == set(IN_BLOCKS)
+    assert found.found["discretisation_error"] == 0.0 and set(found.found["seconds"]) == set(IN_BLOCKS)
     assert found.found["trends"] == [] and found.found["experiments"] == []
     assert not any(cell["found"] for cell in found.found["cells"]["before"])
     places = {when: [(c["variable"], c["where"]) for c in found.found["cells"][when]] for when in ("before", "after")}
@@ -168,9 +168,9 @@ def test_each_role_has_its_own_instants(found: Gap):
     assert len(np.unique(together)) == len(together)
     assert np.ptp(np.diff(together)) < 1e-6  # nothing is left out
     assert clocks[2].min() > max(clocks[0].max(), clocks[1].max())
-    names = [g["recording"] for g in found.found["gaps"].values()]
+    names = [g["recording"] for g in found.found["discrepancies"].values()]
     assert names == ["elbow, every other block", "elbow, the blocks between", "elbow, last third"]
-    for role, gap_of_role in found.found["gaps"].items():
+    for role, gap_of_role in found.found["discrepancies"].items():
         traces = found.traces[role]
         np.testing.assert_array_equal(traces["scatter"], 0.0)
         for when in ("before", "after"):  # equation 1 holds the noise that the filter takes out of the traces
@@ -198,7 +198,7 @@ def test_the_page_of_a_log_claims_no_repeats(run: tuple[Path, str]):
 def test_another_log_is_sealed(tmp_path: Path):
     other = replace(elbow_log(COULOMB, seconds=12.0), name="other")
     assert main(command(tmp_path, [LOG.window(0.0, 24.0), other], "--effects", "joint_coulomb", "cable_pull")) == 0
-    gaps = read_gap(tmp_path / "run").found["gaps"]
+    gaps = read_gap(tmp_path / "run").found["discrepancies"]
     assert [g["recording"] for g in gaps.values()] == ["elbow, every other block", "elbow, the blocks between", "other"]
     assert gaps["test"]["after"] < 0.1 * gaps["test"]["before"]
 
@@ -216,9 +216,9 @@ def test_the_second_half_of_the_repeats_confirms(
     assert lines[0] == "The model lacks: joint_coulomb at elbow." and lines[4] == Split.REPEATS.limits
     answer = json.loads((tmp_path / "run" / "gap.json").read_text())
     assert answer["split"] == {"by": "repeats", "limits": Split.REPEATS.limits}
-    names = {role: g["recording"] for role, g in answer["gaps"].items()}
+    names = {role: g["recording"] for role, g in answer["discrepancies"].items()}
     assert names == {"train": "elbow, first 8 repeats", "validation": "elbow, last 8 repeats"}
-    assert answer["amplitudes"][0]["value"] == pytest.approx(COULOMB, rel=0.05)
+    assert answer["coefficients"][0]["value"] == pytest.approx(COULOMB, rel=0.05)
     page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
     assert "acts alike in this motion" in page and "No recording was kept as test data" in page
     assert "there is no numerical floor" in page and "Numerical floor" not in page

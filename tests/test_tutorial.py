@@ -12,7 +12,7 @@ from typing import Any
 import matplotlib
 import pytest
 
-from droid_jax.discrepancy.extended import Extended
+from droid_jax.identify.extended_model import Extended
 from droid_jax.identify.gaussian import prior
 from droid_jax.model.effects.registry import effect_space, library, ready
 from droid_jax.model.parameter_file import load_parameters
@@ -83,7 +83,7 @@ def test_the_notebook_runs_and_finds_the_friction(copy: Path, monkeypatch: pytes
             exec(compile("".join(cell["source"]), "your_robot.ipynb", "exec"), names)
     found = json.loads((copy / "runs" / "gap" / "gap.json").read_text())
     assert found["verdict"] == "named" and found["effects"] == ["joint_coulomb at shoulder"]
-    assert found["gaps"]["test"]["closed"] > 0.95
+    assert found["discrepancies"]["test"]["closed"] > 0.95
     at = dict(zip(names["extended"].space.names, names["extended"].values, strict=True))
     assert all(at[name] == pytest.approx(value, rel=0.1) for name, value in names["truth"].items())
     assert names["angles"].shape == (16, 200, 2)

@@ -35,6 +35,8 @@ def run_gap(recordings: Sequence[Recording], folder: Path, arguments: Sequence[s
         raise RuntimeError(f"gap ended with {done.returncode}: {' '.join(done.stderr.strip().splitlines()[-1:])}")
     found = json.loads((out / GAP).read_text())
     return {
-        **{k: found[k] for k in ("verdict", "sentence", "effects", "indistinguishable", "p", "gaps", "shifts")},
+        **{
+            k: found[k] for k in ("verdict", "sentence", "effects", "indistinguishable", "p", "discrepancies", "shifts")
+        },
         "seconds": seconds,
     }

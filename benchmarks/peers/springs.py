@@ -19,8 +19,8 @@ from benchmarks.peers import sysid as peer
 from benchmarks.peers.gap import run_gap
 from droid_jax.cost.cost import ENGINES, make_cost
 from droid_jax.cost.residuals import CompareConfig
-from droid_jax.discrepancy.extended import load_extended
 from droid_jax.files import EXTENDED
+from droid_jax.identify.extended_model import load_extended
 from droid_jax.identify.multistart import RefineConfig, refine
 from droid_jax.model.fields import model_parameter
 from droid_jax.model.parameter_file import load_parameters

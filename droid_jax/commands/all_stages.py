@@ -228,8 +228,8 @@ def _roles(command: All) -> tuple[str, ...]:
     if not command.recording:
         needs_log(command.motion_cutoff, ())
         return tuple(DEMONSTRATIONS)
-    from droid_jax.discrepancy.inputs import assigned_roles
     from droid_jax.model.effects.registry import joined
+    from droid_jax.preflight.search_inputs import assigned_roles
 
     own = gap.Gap(command.recording, preset=PRESETS[command.preset].identify, **_own(command))
     scene, base = gap.model_of(own)

@@ -24,8 +24,9 @@ from droid_jax.report.stages import needs_whole, to_be_amended
 if TYPE_CHECKING:
     import numpy as np
 
-    from droid_jax.discrepancy.amendments import Amended
-    from droid_jax.discrepancy.case import Case, DiscrepancyConfig
+    from droid_jax.discrepancy.case import Case
+    from droid_jax.discrepancy.config import DiscrepancyConfig
+    from droid_jax.discrepancy.missing import Amended
     from droid_jax.model.effect_interface import Effect
     from droid_jax.model.parameters import Space
     from droid_jax.model.scene import Scene
@@ -100,12 +101,12 @@ def run(command: Gap) -> None:
     needs_writer(command.tensorboard)
     runtime.start()
     warn_of_cpu(command.preset)
-    from droid_jax.discrepancy.inputs import assigned_roles
-    from droid_jax.discrepancy.missing import case_of
+    from droid_jax.discrepancy.case import case_of
     from droid_jax.discrepancy.results import write_amended, write_gap
-    from droid_jax.discrepancy.split import Split
     from droid_jax.identify.results import prepare_folder
     from droid_jax.preflight.check_log import check_log
+    from droid_jax.preflight.search_inputs import assigned_roles
+    from droid_jax.recordings.split import Split
     from droid_jax.synthetic.hidden_effects import in_words
     from droid_jax.synthetic.robot import is_synthetic
 
@@ -236,7 +237,7 @@ def chosen_effects(command: Gap, scene: Scene, recordings: list[Recording]) -> t
 
 def config_of(command: Gap) -> DiscrepancyConfig:
     """The preset with the command's own numbers."""
-    from droid_jax.discrepancy.case import SETTLED, DiscrepancyConfig
+    from droid_jax.discrepancy.config import CONVERGE_ITERATIONS, DiscrepancyConfig
     from droid_jax.identify.multistart import RefineConfig
 
     if command.budget is not None and not command.budget > 0:
@@ -244,7 +245,7 @@ def config_of(command: Gap) -> DiscrepancyConfig:
     asked: dict[str, Any] = {} if command.budget is None else {"budget_minutes": command.budget}
     return DiscrepancyConfig(
         search=search_config(command.preset, command.seed),
-        refine=replace(refine_config(command.preset) or RefineConfig(), iterations=SETTLED),
+        refine=replace(refine_config(command.preset) or RefineConfig(), iterations=CONVERGE_ITERATIONS),
         compare=compared(command.motion_cutoff),
         seed=command.seed,
         **asked,

@@ -13,15 +13,31 @@ from droid_jax.storage import write_json
 if TYPE_CHECKING:
     import numpy as np
 
-    from droid_jax.discrepancy.amendments import Amended
     from droid_jax.discrepancy.case import Case
-    from droid_jax.discrepancy.final_refit import FinalModel
-    from droid_jax.discrepancy.split import Split
+    from droid_jax.discrepancy.fitting import FinalModel
+    from droid_jax.discrepancy.missing import Amended
     from droid_jax.discrepancy.verdict import Verdict
     from droid_jax.recordings.recording import Recording
+    from droid_jax.recordings.split import Split
 
-BARS = ("search", "refine", "floor", "screen", "look", "refit", "anew", "judge", "both")
-IN_BLOCKS = ("refine", "screen", "look", "refit", "judge")  # of a log: no search, and no time step to refine
+BARS = (
+    "search",
+    "refine",
+    "discretisation_error",
+    "score_test",
+    "one_step_fit",
+    "refit",
+    "restart",
+    "verdict",
+    "final_refit",
+)
+IN_BLOCKS = (
+    "refine",
+    "score_test",
+    "one_step_fit",
+    "refit",
+    "verdict",
+)  # of a log: no search, and no time step to refine
 
 
 def searched(
@@ -39,20 +55,20 @@ def searched(
     board: folder for scalars of the base fit, and of the others that report iterations.
     keep: called with what there is and the seconds so far once the verdict is known, and after each amendment to it.
     """
-    from droid_jax.discrepancy.amendments import amended
-    from droid_jax.discrepancy.missing import search
-    from droid_jax.discrepancy.split import Split
+    from droid_jax.discrepancy.missing import amended, search
+    from droid_jax.recordings.split import Split
     from droid_jax.report.progress import stages
     from droid_jax.report.scalars import scalars
 
     names = IN_BLOCKS if split is Split.BLOCKS else BARS if start is None else BARS[1:]
     with (
-        stages(names, {"look": case.config.one_step_fits, "refit": case.config.full_refits}) as show,
+        stages(names, {"one_step_fit": case.config.one_step_fits, "refit": case.config.full_refits}) as show,
         scalars(board) as write,
     ):
         clock = Clock(names, (show, write), checkpoints / "seconds.json")
         clock(names[0], None)
-        case, verdict = search(split, case, roles, start, clock, checkpoints)
+        case = case.with_replay_cache(checkpoints / "replays")
+        verdict = search(split, case, roles, start, clock)
         for now in amended(case, verdict, roles["train"], clock):
             clock.stop()
             keep(case, now, clock.seconds)

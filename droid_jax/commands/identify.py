@@ -223,7 +223,7 @@ def _extended(command: Identify, scene: Scene, space: Space) -> tuple[Scene, Spa
     """Scene and space with the effects of --extended in them, and what `identify` has to be told of these."""
     if command.extended is None:
         return scene, space, {}
-    from droid_jax.discrepancy.extended import load_extended
+    from droid_jax.identify.extended_model import load_extended
 
     model = load_extended(command.extended, scene)
     return model.scene, space + model.effect_space, {"effects": model.effects}

@@ -26,9 +26,9 @@ def source(folder: Path | None, knob: int) -> tuple[Scene, Gaussian, tuple[Effec
     folder: None for the prior of the built-in door.
     Raises ValueError where the folder holds no Gaussian, one of another scene or servo, or a run that is not whole.
     """
-    from droid_jax.discrepancy.extended import load_extended
     from droid_jax.door.scene import door_scene
     from droid_jax.door.space import door_nuisances, door_space
+    from droid_jax.identify.extended_model import load_extended
     from droid_jax.identify.gaussian import load, prior
 
     scene = door_scene(timestep=TIMESTEP, limits=True, knob=knob)
@@ -73,7 +73,7 @@ def _check_door(path: Path, gaussian: Gaussian, scene: Scene) -> None:
 class _Verdict(TypedDict):
     """What training reads of a gap.json."""
 
-    effects: list[str]
+    effects: list[dict[str, str]]
 
 
 def model_folder(whole: Path) -> Path:

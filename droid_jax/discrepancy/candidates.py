@@ -1,57 +1,45 @@
-"""What the search for a missing effect asks about: an effect, at a place, with a shape."""
+"""Is anything missing, and what looks like it: the score test of every candidate, and what each could explain.
+
+A candidate is simulated once with a small coefficient.  The whitened difference, less its projection on the base
+parameters' columns (their priors included), is its sensitivity; the product of sensitivity and residual, repeat by
+repeat, its score.  Source of the projection: Plumlee, Bayesian calibration of inexact computer models, JASA 2017.
+"""
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+import math
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from droid_jax.discrepancy.residual_set import ResidualSet
+from droid_jax.discrepancy.statistics import largest_trend
 from droid_jax.model.effect_interface import Effect
+from droid_jax.model.effects.candidate import Candidate, EffectKey, Keys, keys_of
 from droid_jax.model.effects.registry import library
+from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording
 
-STEERED = ("actuator_", "dof_sol", "pair_")  # how model fields begin that inverse dynamics does not read
+if TYPE_CHECKING:
+    from droid_jax.discrepancy.fitting import FittedModel
 
-
-@dataclass(frozen=True)
-class Candidate:
-    """An effect at a place.
-
-    coefficients: names of the parameters that make it; shape_parameters: name -> value tried.
-    """
-
-    effect: str
-    location: str
-    coefficients: tuple[str, ...]
-    shape_parameters: Mapping[str, float] = field(default_factory=dict)
-
-    @property
-    def name(self) -> str:
-        """ "latch at door_hinge"."""
-        return f"{self.effect} at {self.location}"
-
-    @property
-    def key(self) -> tuple[Any, ...]:
-        """Tells candidates apart, shapes included."""
-        return self.effect, self.location, *sorted(self.shape_parameters.items())
-
-    @property
-    def free(self) -> tuple[str, ...]:
-        """Names of the parameters that a refit frees."""
-        return (*self.coefficients, *self.shape_parameters)
-
-
-def joined_names(parts: Iterable[Candidate]) -> str:
-    """ "latch at door_hinge + drag at door_hinge"."""
-    return " + ".join(part.name for part in parts)
+ACT_ON_COMMANDS = ("actuator_", "dof_sol", "pair_")  # how model fields begin that inverse dynamics does not read
+SMALL = 0.3  # prior deviations of a coefficient: large against solver noise, small enough to be linear
 
 
 def observable_effects(scene: Scene, recordings: Iterable[Recording], scale: float = 1.0) -> tuple[Effect, ...]:
-    """The library's effects that could show in these recordings: in one without commands all but `steers`.
+    """The library's effects that could show in these recordings.
 
-    scale: of their forces and torques, see `library`.
+    In a recording without commands these are all but the ones that act on commands only.
+
+    Args:
+        scene: which has the effects' joints and bodies.
+        recordings: to be searched.
+        scale: of the effects' forces and torques, see `library`.
     """
     commanded = all(r.command.size for r in recordings)
     return tuple(e for e in library(scene, scale=scale) if commanded or not acts_on_commands_only(e))
@@ -67,24 +55,235 @@ def acts_on_commands_only(effect: Effect) -> bool:
     fields = [w.field for p in effect.parameters for w in p.writes]
     laws = (effect.force, effect.frictionloss, effect.observe)
     acts = any(laws) or not all(p.writes for p in effect.parameters)
-    return bool(fields) and not acts and all(field.startswith(STEERED) for field in fields)
+    return bool(fields) and not acts and all(field.startswith(ACT_ON_COMMANDS) for field in fields)
 
 
-def candidates(effects: Iterable[Effect]) -> tuple[Candidate, ...]:
-    """Every effect at every place with every combination of its shapes' values.
+@dataclass(frozen=True, eq=False)
+class ScoreDirection:
+    """One coefficient of one candidate (a tilted frame has two)."""
 
-    Raises ValueError where that is none at all.
+    candidate: Candidate
+    coefficient: str
+
+
+def directions_of(candidates: Sequence[Candidate]) -> tuple[ScoreDirection, ...]:
+    """One direction for each coefficient of each candidate."""
+    return tuple(ScoreDirection(c, a) for c in candidates for a in c.coefficients)
+
+
+@dataclass(frozen=True, eq=False)
+class ScoreTest:
+    """What the score test of a model found.
+
+    directions: K of them.
+    raw: [K, M] what a unit of each coefficient adds; sensitivities: [K, M] the same, projected.
+    t: [K] statistic.
+    explained: [K] share of the squared residual that the best coefficient would take away, linearly.
+    size: [K] that coefficient.
+    p: of the largest |t|.
+    failed: candidates that made the replay blow up; their sensitivities are zero.
     """
-    out = []
-    for effect in effects:
-        grid = [
-            dict(zip(effect.shape_parameters, values, strict=True))
-            for values in itertools.product(*effect.shape_parameters.values())
-        ]
-        for (place, amplitudes), shapes in itertools.product(effect.locations.items(), grid):
-            out.append(Candidate(effect.name, place, amplitudes, shapes))
-    if not out:
-        raise ValueError(
-            "effects: there is nothing to ask about, none of the effects says its locations (`Effect.locations`)"
-        )
-    return tuple(out)
+
+    directions: tuple[ScoreDirection, ...]
+    raw: np.ndarray
+    sensitivities: np.ndarray
+    t: np.ndarray
+    explained: np.ndarray
+    size: np.ndarray
+    p: float
+    failed: Keys = ()
+
+    def ranking(self) -> list[int]:
+        """Directions by what they explain, the best first."""
+        return np.argsort(-self.explained).tolist()
+
+
+def sensitivities(residual_set: ResidualSet, values: np.ndarray, directions: Sequence[ScoreDirection]) -> np.ndarray:
+    """[K, M] what each coefficient adds to the simulation, per unit of it, in units of one repeat's noise.
+
+    values: [D] the fitted model.  One batch for all.  NaN where the replay blew up.
+    """
+    space = residual_set.cost.space
+    rows, sizes = [values], []
+    for direction in directions:
+        row = values.copy()
+        for name, value in direction.candidate.shape_parameters.items():
+            row[space.index(name)] = value
+        p = space[direction.coefficient]
+        room = p.high - p.mean or p.low - p.mean  # downwards where neutral is the upper bound
+        size = math.copysign(min(SMALL * p.std, 0.5 * abs(room)), room)
+        row[space.index(direction.coefficient)] = p.mean + size
+        rows.append(row)
+        sizes.append(size)
+    simulated = -residual_set.common(np.stack(rows))
+    found = (simulated[1:] - simulated[0]) / np.array(sizes)[:, None]
+    return np.where(np.isfinite(found).all(axis=1, keepdims=True), found, np.nan)
+
+
+def project(columns: np.ndarray, base: np.ndarray, prior: np.ndarray) -> np.ndarray:
+    """Columns [K, M] without what base columns [M, D] with prior deviations [D] would absorb of them."""
+    normal = base.T @ base + np.diag(prior**-2)
+    return columns - np.linalg.solve(normal, base.T @ columns.T).T @ base.T
+
+
+def score_test(
+    residual_set: ResidualSet, model: FittedModel, directions: Sequence[ScoreDirection], seed: int = 0
+) -> ScoreTest:
+    """Score directions against a model's residuals on the recording it was fitted to.
+
+    A base parameter at a bound absorbs nothing more: sensitivities keep what it would have taken.
+    """
+    root, free = residual_set.repeats**0.5, model.refined.free
+    base, prior = model.refined.jacobian[:, free] / root, model.refined.prior[free] * root * residual_set.prior_slack
+    raw = sensitivities(residual_set, model.values, directions)
+    blown_up = np.isnan(raw).any(axis=1)
+    raw[blown_up] = 0.0
+    projected = project(raw, base, prior)
+    rows = residual_set.resampling
+    found = scored(
+        model.residuals, directions, raw, projected, lambda s: rows.largest_score(s, projected, base, prior, seed)
+    )
+    failed = tuple(dict.fromkeys(directions[k].candidate.key for k in np.flatnonzero(blown_up).tolist()))
+    return replace(found, failed=failed)
+
+
+def scored(
+    residuals: np.ndarray,
+    directions: Sequence[ScoreDirection],
+    raw: np.ndarray,
+    projected: np.ndarray,
+    largest: Callable[[np.ndarray], tuple[np.ndarray, float]],
+) -> ScoreTest:
+    """Score projected sensitivities against residuals.
+
+    Args:
+        residuals: [N, M] of the model.
+        directions: K of them.
+        raw: [K, M] their sensitivities before projection.
+        projected: [K, M] after it.
+        largest: scores [K, N] -> statistic [K] and the p-value of the largest (see `Resampling.largest_score`).
+    """
+    scores = projected @ residuals.T  # [K, N]
+    t, p = largest(scores)
+    size = scores.mean(axis=1) / np.maximum(np.einsum("km,km->k", projected, projected), 1e-30)
+    shared = residuals.mean(axis=0)
+    explained = size * scores.mean(axis=1) / max(float(shared @ shared), 1e-30)
+    return ScoreTest(tuple(directions), raw, projected, t, explained, size, p)
+
+
+@dataclass(frozen=True)
+class Trend:
+    """What changes most steadily from repeat to repeat: a gear that warms up, a sensor that drifts.
+
+    Repeats are taken for draws of the same thing, so what changes between them counts as noise and is in no U.
+
+    key, coefficient: whose sensitivity it follows.
+    per_repeat: by how much the coefficient changes from one repeat to the next, in its unit.
+    p: of a trend as strong in any candidate where the order of the repeats says nothing.
+    """
+
+    key: EffectKey
+    coefficient: str
+    per_repeat: float
+    p: float
+
+
+def trend(found: ScoreTest, residuals: np.ndarray, seed: int = 0) -> Trend | None:
+    """The strongest trend of residuals [N, M] over their order; None for fewer than three repeats."""
+    if len(residuals) < 3 or not found.directions:
+        return None
+    size = np.maximum(np.linalg.norm(found.sensitivities, axis=1), 1e-30)
+    scores = (found.sensitivities @ residuals.T) / size[:, None]  # [K, N], noise of one
+    best, slope, p = largest_trend(scores, seed)
+    direction = found.directions[best]
+    return Trend(direction.candidate.key, direction.coefficient, slope / float(size[best]), p)
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """One or several candidates together, their coefficients, and the share of the squared residual they would take."""
+
+    parts: tuple[Candidate, ...]
+    sizes: Mapping[str, float]
+    explained: float
+
+    @property
+    def keys(self) -> Keys:
+        """Of the candidates."""
+        return keys_of(self.parts)
+
+    def start(self, space: Space, values: np.ndarray) -> np.ndarray:
+        """`values` [D] with the shape parameters and coefficients proposed."""
+        out = values.copy()
+        for name, value in {**{k: v for c in self.parts for k, v in c.shape_parameters.items()}, **self.sizes}.items():
+            out[space.index(name)] = value
+        return out
+
+
+def proposals(
+    found: ScoreTest, residuals: np.ndarray, space: Space, number: int = 1, among: Container[EffectKey] | None = None
+) -> list[Proposal]:
+    """Every candidate (number = 1), or every pair of candidates (2), best shapes only, the best first.
+
+    Coefficients stay inside their bounds: a friction that would have to be negative explains nothing.
+
+    Args:
+        found: the score test.
+        residuals: [N, M] of the model that was tested.
+        space: of all parameters.
+        number: of candidates together.
+        among: the candidates to take, None for all.
+    """
+    mean = residuals.mean(axis=0)
+    whole = max(float(mean @ mean), 1e-30)
+    scores, gram = found.sensitivities @ mean, found.sensitivities @ found.sensitivities.T
+    groups: dict[EffectKey, list[int]] = {}
+    for k, direction in enumerate(found.directions):
+        if among is None or direction.candidate.key in among:
+            groups.setdefault(direction.candidate.shaped_key, []).append(k)
+    best: dict[Keys, Proposal] = {}
+    for rows in _combinations(list(groups.values()), number, found):
+        proposal = _proposal(found, rows, scores[rows], gram[np.ix_(rows, rows)], whole, space)
+        known = best.get(proposal.keys)
+        if known is None or proposal.explained > known.explained:
+            best[proposal.keys] = proposal
+    return sorted(best.values(), key=lambda p: -p.explained)
+
+
+def _combinations(groups: Sequence[list[int]], number: int, found: ScoreTest) -> list[list[int]]:
+    if number == 1:
+        return list(groups)
+
+    def together(a: Candidate, b: Candidate) -> bool:
+        """Not the same candidate; and an effect has one shape at all its locations."""
+        return a.key != b.key and (a.effect != b.effect or a.shape_parameters == b.shape_parameters)
+
+    of = [found.directions[rows[0]].candidate for rows in groups]
+    both = ((i, k) for i in range(len(of)) for k in range(i + 1, len(of)) if together(of[i], of[k]))
+    return [[*groups[i], *groups[k]] for i, k in both]
+
+
+def _proposal(
+    found: ScoreTest, rows: Sequence[int], scores: np.ndarray, gram: np.ndarray, whole: float, space: Space
+) -> Proposal:
+    names = [found.directions[k].coefficient for k in rows]
+    low = np.array([space[n].low - space[n].mean for n in names])
+    high = np.array([space[n].high - space[n].mean for n in names])
+    ridge = gram + 1e-9 * max(np.trace(gram), 1e-30) * np.eye(len(gram))
+    if len(rows) == 1:
+        size = np.clip(scores / ridge[0], low, high)
+    else:
+        factor = np.linalg.cholesky(ridge)
+        size = lsq_linear(factor.T, np.linalg.solve(factor, scores), bounds=(low, high)).x
+    explained = float(2 * size @ scores - size @ gram @ size) / whole
+    sizes = {n: float(space[n].mean + s) for n, s in zip(names, size, strict=True)}
+    parts = {found.directions[k].candidate.shaped_key: found.directions[k].candidate for k in rows}
+    return Proposal(tuple(parts.values()), sizes, explained)
+
+
+def collinear(found: ScoreTest, keys: Container[EffectKey], cosine: float) -> set[EffectKey]:
+    """The candidates whose sensitivity is nearly one of these candidates', by absolute cosine."""
+    rows = np.array([d.candidate.key in keys for d in found.directions])
+    unit = found.sensitivities / np.maximum(np.linalg.norm(found.sensitivities, axis=1, keepdims=True), 1e-30)
+    near = np.max(np.abs(unit @ unit[rows].T), axis=1) > cosine
+    return {found.directions[k].candidate.key for k in np.flatnonzero(near)}

@@ -1,80 +1,62 @@
-"""One recording against a model: whitened residuals of every repeat, and the gap U that noise does not bias.
-
-`A residual set` is of a recording with repeats, which are what the tests flip.  A recording without repeats is cut
-into blocks of time instead: `droid_jax.discrepancy.blocks.Blocks`, which answers the same questions.
-"""
+"""One recording against a model: its residuals in units of one repeat's noise."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from droid_jax.cost.cost import Cost
 from droid_jax.cost.residuals import Comparison
-from droid_jax.discrepancy.sign_flips import detrended, detrended_discrepancy_p_values, largest_detrended_t, one_sided_p
+from droid_jax.discrepancy.config import DiscrepancyConfig, SelectionConfig
+from droid_jax.discrepancy.statistics import Blocks, Repeats, Resampling
 from droid_jax.identify.search import NotReplayed
+from droid_jax.recordings.split import FEWEST_REPEATS
 
-# A parameter off its prior's mean is held back by that prior, and what is left of it all repeats share: with the
-# priors as they are, 6 of 200 recordings of a lone hinge with nothing missing fell below p = 0.01.  Within three
-# deviations a nuisance is no effect (`case.BEYOND`), so its mark may as well be taken away up to there.
-SLACK = 3.0
 AT_REST = 2  # steps of Gauss and Newton for a recording's own nuisances where joints are at rest along its motion
-TIE = 3.0  # times what the best model leaves above the floor: a rival that leaves no more is equivalent
 
 
 @dataclass(frozen=True, eq=False)
 class ResidualSet:
-    """A recording's cost and its repeats, in units of one repeat's noise.
+    """A recording's cost, what is resampled and tested of it, and its own nuisances.
 
-    cost: of this recording alone.  deviations: [N, M] of the repeats from their mean, data minus mean.
+    cost: of this recording alone.
+    whitened: [P, D] -> [P, M], distances: [P, D] -> [P, 1]: the cost's own, or ones that remember their replays.
+    resampling: whole repeats, or blocks of time.
     column, time: [M] compared column and instant [s] of each residual.
-    nuisances: names of nuisances that this recording has for itself; nuisance_columns: [M, len(own)] what one prior
-    deviation of each adds to the common residual.  See `with_nuisances`.
+    config: thresholds of the search.
+    equivalence_factor, prior_slack: those of the config that go with the resampling.
+    nuisances: names of nuisances that this recording has for itself; nuisance_columns: [M, len(nuisances)] what one
+    prior deviation of each adds to the common residual.  See `with_nuisances`.
     """
 
     cost: Cost
-    deviations: np.ndarray
+    whitened: Callable[[np.ndarray], np.ndarray]
+    distances: Callable[[np.ndarray], np.ndarray]
+    resampling: Resampling
     column: np.ndarray
     time: np.ndarray
+    config: SelectionConfig
+    equivalence_factor: float
+    prior_slack: float
     nuisances: tuple[str, ...] = field(default=(), kw_only=True)
     nuisance_columns: np.ndarray | None = field(default=None, kw_only=True)
 
     @property
+    def comparison(self) -> Comparison:
+        """Of the recording."""
+        return only_comparison(self.cost)
+
+    @property
     def repeats(self) -> int:
-        """N."""
-        return len(self.deviations)
-
-    @property
-    def units(self) -> int:
-        """How many rows the residuals have: what is flipped and resampled."""
-        return self.repeats
-
-    @property
-    def repeated(self) -> bool:
-        """Whether rows are repeats, which tell noise from what they share; blocks of one motion do not."""
-        return True
+        """Of the recording."""
+        return self.comparison.repeats
 
     @property
     def instants(self) -> np.ndarray:
         """[K] bool of the coarse clock, those that count."""
-        return np.ones(int(np.sum(self.column == 0)), bool)
-
-    @property
-    def size(self) -> int:
-        """How many residuals the log likelihood holds: U of one is half of this."""
-        return self.deviations.size
-
-    @property
-    def equivalence_factor(self) -> float:
-        """Times what the best model leaves, up to which a rival's U is as good."""
-        return TIE
-
-    @property
-    def prior_slack(self) -> float:
-        """Times its prior that a base parameter may move when marks are projected."""
-        return SLACK
+        return self.resampling.counted[self.column == 0]
 
     def common(self, values: np.ndarray) -> np.ndarray:
         """[P, D] -> [P, M] mean of the repeats minus simulation, the recording's own nuisances at their best.
@@ -83,31 +65,23 @@ class ResidualSet:
         """
         return self._nuisances_fitted(values)[1]
 
+    def residuals(self, values: np.ndarray) -> np.ndarray:
+        """[D] -> [N, M] of every repeat or block."""
+        return self.resampling.residuals(self.common(values)[0])
+
     def at_best_nuisances(self, values: np.ndarray) -> np.ndarray:
         """[P, D] -> [P, D] with the recording's own nuisances where `common` has them."""
         return self._nuisances_fitted(values)[0]
 
-    def _nuisances_fitted(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rows [P, D] with own nuisances at their best, and their residuals [P, M]."""
-        rows = np.array(np.atleast_2d(values), dtype=np.float64)
-        space, own = self.cost.space, [self.cost.space.index(name) for name in self.nuisances]
-        rows[:, own] = space.mean[own]
-        common = self._common(rows)
-        if self.nuisance_columns is None:
-            return rows, common
-        moves = _moves(self.cost)
-        columns = self.nuisance_columns * moves[:, None]
-        normal = columns.T @ columns + np.eye(len(self.nuisances)) / self.repeats
-        best = np.zeros((len(rows), len(self.nuisances)))
-        # Where a joint is at rest its friction takes up an offset as far as it can: there it is replayed again.
-        for _ in range(1 if moves.all() else AT_REST):
-            best -= np.linalg.solve(normal, (common @ columns + best / self.repeats).T).T
-            rows[:, own] = space.mean[own] + space.std[own] * best
-            common = common + best @ self.nuisance_columns.T if moves.all() else self._common(rows)
-        return rows, common
-
-    def _common(self, rows: np.ndarray) -> np.ndarray:
-        return -self.cost.whitened(rows).astype(np.float64) / np.sqrt(self.repeats)
+    def discrepancy_at(self, values: np.ndarray) -> float:
+        """U of the model at `values` [D]; NotReplayed where its replay blows up."""
+        common = self.common(values)[0]
+        if not np.isfinite(common).all():
+            raise NotReplayed(
+                f"the simulation of {self.comparison.name!r} blows up with parameters that were fitted to another "
+                "recording"
+            )
+        return self.resampling.discrepancy(self.resampling.residuals(common))
 
     def with_nuisances(self, names: Sequence[str]) -> ResidualSet:
         """The same, with nuisances `names` that are not the fitted recording's but fitted to this one.
@@ -121,77 +95,79 @@ class ResidualSet:
         common = self._common(np.stack(rows))
         return replace(self, nuisances=tuple(names), nuisance_columns=(common[1:] - common[0]).T)
 
-    def residuals(self, common: np.ndarray) -> np.ndarray:
-        """[N, M] of every repeat, from the common part [M], which is their mean."""
-        return common + self.deviations
+    def _nuisances_fitted(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows [P, D] with own nuisances at their best, and their residuals [P, M]."""
+        rows = np.array(np.atleast_2d(values), dtype=np.float64)
+        space, own = self.cost.space, [self.cost.space.index(name) for name in self.nuisances]
+        rows[:, own] = space.mean[own]
+        common = self._common(rows)
+        if self.nuisance_columns is None:
+            return rows, common
+        moves = self._moves()
+        columns = self.nuisance_columns * moves[:, None]
+        normal = columns.T @ columns + np.eye(len(self.nuisances)) / self.repeats
+        best = np.zeros((len(rows), len(self.nuisances)))
+        # Where a joint is at rest its friction takes up an offset as far as it can: there it is replayed again.
+        for _ in range(1 if moves.all() else AT_REST):
+            best -= np.linalg.solve(normal, (common @ columns + best / self.repeats).T).T
+            rows[:, own] = space.mean[own] + space.std[own] * best
+            common = common + best @ self.nuisance_columns.T if moves.all() else self._common(rows)
+        return rows, common
 
-    def discrepancy_at(self, values: np.ndarray) -> float:
-        """U of the model at `values` [D]; NotReplayed where its replay blows up."""
-        common = self.common(values)[0]
-        if not np.isfinite(common).all():
-            name = only_comparison(self.cost).name
-            raise NotReplayed(
-                f"the simulation of {name!r} blows up with parameters that were fitted to another recording"
-            )
-        return self.discrepancy(self.residuals(common))
+    def _common(self, rows: np.ndarray) -> np.ndarray:
+        return -self.whitened(rows).astype(np.float64) / np.sqrt(self.repeats)
 
-    def discrepancy(self, residuals: np.ndarray) -> float:
-        """U of residuals [N, M], without what grows or fades steadily over the repeats."""
-        return discrepancy(detrended(residuals))
-
-    def discrepancies(self, residuals: np.ndarray, cells: np.ndarray) -> np.ndarray:
-        """[K] U of each cell; cells: [K, M] bool."""
-        return discrepancies(detrended(residuals), cells)
-
-    def cell_p_values(self, residuals: np.ndarray, cells: np.ndarray) -> np.ndarray:
-        """[K] p-value of each cell's U being above zero."""
-        return detrended_discrepancy_p_values(residuals, cells)
-
-    def gain_p_value(self, gains: np.ndarray) -> float:
-        """p-value of gains [N], one of each repeat, being above zero; what grows or fades steadily is no noise."""
-        return one_sided_p(detrended(gains))
-
-    def largest_score(
-        self, scores: np.ndarray, marks: np.ndarray, base: np.ndarray, prior: np.ndarray, seed: int = 0
-    ) -> tuple[np.ndarray, float]:
-        """[K] t of K questions, and the p-value of the largest |t| under flips of whole repeats.
-
-        scores: [K, N] of projected marks [K, M], of which what grows or fades steadily over the repeats is left out.
-        base: [M, D] columns they were projected on, with prior deviations [D]; repeats need neither.
-        """
-        return largest_detrended_t(scores, seed)
-
-    def losses(self, commons: np.ndarray, draws: np.ndarray) -> np.ndarray:
-        """[R, K] squared mean residual of K models in resamples of the repeats, up to what all models share.
-
-        commons: [K, M] common part of each model's residuals; draws: [R, N] weights, each row summing to one.  What
-        grows or fades steadily over the repeats is no scatter.
-        """
-        return np.sum(commons**2, axis=1) + 2 * draws @ (detrended(self.deviations) @ commons.T)
+    def _moves(self) -> np.ndarray:
+        """[M] bool, residuals at which their joint moves; all of them where motions are not prescribed."""
+        return np.concatenate([channel.moves.T.ravel() for channel in self.comparison.channels])
 
 
-def _moves(cost: Cost) -> np.ndarray:
-    """[M] bool, residuals at which their joint moves; all of them where motions are not prescribed."""
-    return np.concatenate([channel.moves.T.ravel() for channel in only_comparison(cost).channels])
+def residual_set(cost: Cost, config: DiscrepancyConfig | None = None) -> ResidualSet:
+    """The residual set of a cost over one recording with repeats.
 
-
-def residual_set(cost: Cost) -> ResidualSet:
-    """The data of a cost over one recording.
-
-    Raises ValueError for several recordings at once, and for single repeats: whole repeats are what
-    the tests flip.
+    Raises:
+        ValueError: several recordings at once, or a single repeat: whole repeats are what the tests flip.
     """
-    comparison = only_comparison(cost)
+    comparison, selection = only_comparison(cost), (config or DiscrepancyConfig()).selection
     if comparison.repeats < 2:
-        raise ValueError(f"recording {comparison.name!r} has one repeat; a gap is told from noise by repeats")
-    deviations = comparison.deviations() / np.sqrt(comparison.repeats)
-    return ResidualSet(cost, deviations, *residual_locations(comparison))
+        raise ValueError(f"recording {comparison.name!r} has one repeat; a discrepancy needs repeats, or blocks")
+    rows = Repeats(comparison.deviations() / np.sqrt(comparison.repeats))
+    where = residual_locations(comparison)
+    return ResidualSet(
+        cost,
+        cost.whitened,
+        cost.distances,
+        rows,
+        *where,
+        selection,
+        selection.equivalence_factor,
+        selection.prior_slack,
+    )
+
+
+def block_residual_set(cost: Cost, block: np.ndarray, config: DiscrepancyConfig | None = None) -> ResidualSet:
+    """The residual set of a cost over one recording of one repeat; block: [K] of each instant of the coarse clock.
+
+    Raises:
+        ValueError: repeats, which need no blocks, or fewer blocks than flips can use.
+    """
+    config, comparison = config or DiscrepancyConfig(), only_comparison(cost)
+    if comparison.repeats > 1:
+        raise ValueError(f"recording {comparison.name!r} has {comparison.repeats} repeats: flip these, not blocks")
+    if block.max() + 1 < FEWEST_REPEATS:
+        raise ValueError(
+            f"recording {comparison.name!r}: {block.max() + 1} blocks, at least {FEWEST_REPEATS} are needed"
+        )
+    column, time = residual_locations(comparison)
+    rows, blocks = Blocks(np.tile(block, int(column.max()) + 1)), config.blocks
+    factor, slack = blocks.equivalence_factor, blocks.prior_slack
+    return ResidualSet(cost, cost.whitened, cost.distances, rows, column, time, config.selection, factor, slack)
 
 
 def only_comparison(cost: Cost) -> Comparison:
     """The comparison of a cost over one recording; ValueError for several."""
     if len(cost.comparisons) != 1:
-        raise ValueError(f"data is of one recording, got {len(cost.comparisons)}")
+        raise ValueError(f"a residual set is of one recording, got {len(cost.comparisons)}")
     return cost.comparisons[0]
 
 
@@ -204,18 +180,3 @@ def residual_locations(comparison: Comparison) -> tuple[np.ndarray, np.ndarray]:
         times.append(np.tile(clock, len(channel.columns)))
         start += len(channel.columns)
     return np.concatenate(columns), np.concatenate(times)
-
-
-def discrepancy(residuals: np.ndarray) -> float:
-    """U of residuals [N, M]: mean product of different repeats' residuals, per residual.
-
-    Noise of the repeats has no part in it; it is the mean square of what all repeats share.
-    """
-    count, size = residuals.shape
-    total = residuals.sum(axis=0)
-    return float((total @ total - np.sum(residuals**2)) / (count * (count - 1) * size))
-
-
-def discrepancies(residuals: np.ndarray, cells: np.ndarray) -> np.ndarray:
-    """[K] U of each cell; cells: [K, M] bool."""
-    return np.array([discrepancy(residuals[:, cell]) if cell.any() else 0.0 for cell in cells])

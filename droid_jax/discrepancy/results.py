@@ -1,8 +1,7 @@
-"""What a search for a missing effect leaves in its folder: gap.json and gap.npz, the extended model beside them.
+"""What a search for missing effects leaves in its folder: gap.json and gap.npz, the extended model beside them.
 
-The verdict is written when it is known; what is added to it later (`discrepancy.amendments`) is written again.
-
-docs/results-folder.md lists every entry; `report.gap_folder` reads them, for a page and for a user.  No pickle.
+The verdict is written when it is known; what is added to it later (`missing.amended`) is written again.
+docs/results-folder.md lists every entry.  No pickle.
 """
 
 from __future__ import annotations
@@ -14,84 +13,122 @@ from typing import Any, Literal
 
 import numpy as np
 
-from droid_jax.discrepancy.candidates import Candidate
+from droid_jax.discrepancy.candidates import ScoreTest
 from droid_jax.discrepancy.case import Case
-from droid_jax.discrepancy.doubts import bound_at
-from droid_jax.discrepancy.extended import extended, save_extended
-from droid_jax.discrepancy.final_refit import FinalModel
-from droid_jax.discrepancy.localise import Localisation
-from droid_jax.discrepancy.refit import intervals
+from droid_jax.discrepancy.fitting import FinalModel, intervals
+from droid_jax.discrepancy.maps import Localisation
 from droid_jax.discrepancy.residual_set import ResidualSet
-from droid_jax.discrepancy.screen import ScoreTest
-from droid_jax.discrepancy.select import ValidationTest
-from droid_jax.discrepancy.verdict import Verdict
+from droid_jax.discrepancy.selection import ValidationTest, bound_at
+from droid_jax.discrepancy.verdict import Alternatives, Verdict
 from droid_jax.files import GAP, GAP_TRACES
-from droid_jax.identify.identifiability import posterior_of
+from droid_jax.identify.extended_model import Extended, save_extended
+from droid_jax.identify.identifiability import posterior, posterior_of
+from droid_jax.model.effects.candidate import Candidate, EffectKey, Keys
 from droid_jax.storage import finite, write_json, write_npz
+
+FORMAT, VERSION = "droid_jax gap", 2
+
+
+def extended(case: Case, final: FinalModel) -> Extended:
+    """The extended model that a search hands on, as something to save."""
+    model = final.model
+    values = model.values[case.full_space.columns(model.space)]
+    gaussian = posterior(model.refined, [c for fitted in final.fitted_to for c in fitted.cost.comparisons])
+    named = {part.effect for part in model.parts}
+    effects = tuple(e for e in case.effects if e.name in named)
+    return Extended(case.train.cost.scene, model.parts, effects, values, gaussian)
 
 
 def write_gap(
     folder: Path,
     case: Case,
     verdict: Verdict,
-    handed: FinalModel,
+    final: FinalModel,
     description: Mapping[str, Any],
     amendments: Mapping[str, str] | None = None,
 ) -> None:
     """Write all files of a search as soon as its verdict is known; gap.json last.
 
-    handed: the model to hand on, the search's own while the final refit is to be made.
-    description: what else gap.json shall hold: "seconds", "versions", "device", "setup", ...
-    amendments: their states (`Amended.states`); None where all that is due has been made.
+    Args:
+        folder: of the run.
+        case: the recordings.
+        verdict: the answer.
+        final: the model to hand on, the search's own while the final refit is to be made.
+        description: what else gap.json shall hold: "seconds", "versions", "device", "setup", ...
+        amendments: their states (`missing.Amended.states`); None where all that is due has been made.
     """
     write_npz(folder / GAP_TRACES, gap_arrays(case, verdict))
-    write_amended(folder, case, verdict, handed, description, amendments)
+    write_amended(folder, case, verdict, final, description, amendments)
 
 
 def write_amended(
     folder: Path,
     case: Case,
     verdict: Verdict,
-    handed: FinalModel,
+    final: FinalModel,
     description: Mapping[str, Any],
     amendments: Mapping[str, str] | None = None,
 ) -> None:
     """Write what an amendment changes of `write_gap`'s files: the extended model, then gap.json."""
-    save_extended(folder, extended(case, handed))
-    more = {"handed_on": _handed_on(case, verdict, handed), "amendments": dict(amendments or {})}
+    save_extended(folder, extended(case, final))
+    more = {"final_model": _final_json(case, verdict, final), "amendments": dict(amendments or {})}
     write_json(folder / GAP, {**gap_json(case, verdict), **more, **description})
 
 
 def gap_json(case: Case, verdict: Verdict) -> dict[str, Any]:
     """The answer and its grounds as plain data."""
     return {
-        "verdict": verdict.kind.value,
+        "format": FORMAT,
+        "version": VERSION,
+        "verdict": verdict.conclusion.value,
         "sentence": verdict.sentence,
-        "effects": list(verdict.effects),
-        "indistinguishable": [list(rivals) for rivals in verdict.indistinguishable],
+        "effects": _keys(verdict.effects),
+        "indistinguishable": _alternatives(verdict.indistinguishable),
         "doubts": list(verdict.doubts),
-        "hints": [asdict(hint) for hint in verdict.hints],
-        "thresholds": {"least_closed": case.config.minimum_closed},
+        "hints": [
+            {
+                "effects": _keys(hint.effects),
+                "indistinguishable": _alternatives(hint.indistinguishable),
+                "closed": hint.closed,
+            }
+            for hint in verdict.hints
+        ],
+        "config": asdict(case.config),
         "about": _about(case, verdict),
         "p": verdict.score_tests[0].p if verdict.score_tests else None,
-        "floor": verdict.discretisation_error,
+        "discretisation_error": verdict.discretisation_error,
         "converged": verdict.base.refined.converged,
-        "cut": verdict.not_tried,
+        "not_tried": "; ".join(verdict.not_tried),
         "remainder": verdict.remainder,
         "explained": verdict.explained if verdict.effects else None,
-        "gaps": {role: _gap(role, case.held_sets[role], verdict) for role in verdict.discrepancies},
-        "phases": {role: _phases(case.held_sets[role]) for role in verdict.discrepancies},
-        "screens": [
-            {"p": found.p, "ranking": _ranking(found), "failed": list(found.failed)} for found in verdict.score_tests
+        "discrepancies": {
+            role: _discrepancy(role, case.residual_sets[role], verdict) for role in verdict.discrepancies
+        },
+        "phases": {
+            role: [asdict(phase) for phase in case.residual_sets[role].comparison.phases]
+            for role in verdict.discrepancies
+        },
+        "score_tests": [
+            {"p": found.p, "ranking": _ranking(found), "failed": _keys(found.failed)} for found in verdict.score_tests
         ],
         "failed": list(verdict.failed),
-        "trials": [_trial(trial) for trial in verdict.validation_tests],
+        "validation_tests": [_test(test) for test in verdict.validation_tests],
         "cells": {"before": _cells(verdict.before), "after": _cells(verdict.after)},
-        "amplitudes": _sizes(case, verdict, "coefficients"),
-        "shapes": _sizes(case, verdict, "shape_parameters"),
+        "coefficients": _parameters(case, verdict, "coefficients"),
+        "shape_parameters": _parameters(case, verdict, "shape_parameters"),
         "shifts": _shifts(case, verdict),
         "experiments": [asdict(experiment) for experiment in verdict.experiments],
-        "trends": [{**asdict(t), "unit": case.full_space[t.amplitude].unit} for t in (verdict.trend,) if t is not None],
+        "trends": [
+            {
+                **_key(t.key),
+                "coefficient": t.coefficient,
+                "per_repeat": t.per_repeat,
+                "p": t.p,
+                "unit": case.full_space[t.coefficient].unit,
+            }
+            for t in (verdict.trend,)
+            if t is not None
+        ],
         "units": case.train.cost.scene.torque_unit(_joints(case.train)),
     }
 
@@ -104,9 +141,9 @@ def gap_arrays(case: Case, verdict: Verdict) -> dict[str, np.ndarray]:
     joints = _joints(case.train)
     out = {"joints": np.array(joints)}
     for role in verdict.discrepancies:
-        residual_set = case.held_sets[role]
+        residual_set = case.residual_sets[role]
         order = [_joints(residual_set).index(joint) for joint in joints]
-        channel = residual_set.cost.comparisons[0].channel("torque")
+        channel = residual_set.comparison.channel("torque")
         mine = residual_set.instants
         (simulated,) = residual_set.cost.smoothed(_before_after(residual_set, verdict))
         before, after = simulated[:, mine][:, :, order]
@@ -128,28 +165,41 @@ def _before_after(residual_set: ResidualSet, verdict: Verdict) -> np.ndarray:
 
 def _joints(residual_set: ResidualSet) -> list[str]:
     """Measured joints, in the order of the torque channel's columns."""
-    return [residual_set.cost.scene.joints[c] for c in residual_set.cost.comparisons[0].channel("torque").columns]
+    return [residual_set.cost.scene.joints[c] for c in residual_set.comparison.channel("torque").columns]
 
 
-def _handed_on(case: Case, verdict: Verdict, handed: FinalModel) -> dict[str, Any]:
-    """Which recordings the model that is handed on is fitted to, and U of each role with it; null where it blows up."""
-    commons = {role: case.held_sets[role].common(handed.model.values)[0] for role in verdict.discrepancies}
+def _key(key: EffectKey) -> dict[str, str]:
+    return {"effect": key.effect, "location": key.location}
+
+
+def _keys(keys: Keys) -> list[dict[str, str]]:
+    return [_key(key) for key in keys]
+
+
+def _alternatives(each: tuple[Alternatives, ...]) -> list[list[list[dict[str, str]]]]:
+    return [[_keys(keys) for keys in alternatives] for alternatives in each]
+
+
+def _final_json(case: Case, verdict: Verdict, final: FinalModel) -> dict[str, Any]:
+    """Which recordings the final model is fitted to, and U of each role with it; null where it blows up."""
+
+    def of(residual_set: ResidualSet) -> float | None:
+        rows = residual_set.resampling
+        return finite(rows.discrepancy(rows.residuals(residual_set.common(final.model.values)[0])))
+
     return {
-        "fitted_to": [residual_set.cost.comparisons[0].name for residual_set in handed.fitted_to],
-        "gaps": {
-            role: finite(case.held_sets[role].discrepancy(case.held_sets[role].residuals(c)))
-            for role, c in commons.items()
-        },
+        "fitted_to": [fitted.comparison.name for fitted in final.fitted_to],
+        "discrepancies": {role: of(case.residual_sets[role]) for role in verdict.discrepancies},
     }
 
 
-def _gap(role: str, residual_set: ResidualSet, verdict: Verdict) -> dict[str, Any]:
-    """U and the paper's distance, N m, before and after; closed: None where there was nothing above the floor."""
+def _discrepancy(role: str, residual_set: ResidualSet, verdict: Verdict) -> dict[str, Any]:
+    """U and the paper's distance, N m, before and after; closed: None where there was nothing beyond U0."""
     before, after = verdict.discrepancies[role]
     both = _before_after(residual_set, verdict)
-    distance = (residual_set.cost.distances(both) - residual_set.cost.penalties(both))[:, 0]
+    distance = (residual_set.distances(both) - residual_set.cost.penalties(both))[:, 0]
     return {
-        "recording": residual_set.cost.comparisons[0].name,
+        "recording": residual_set.comparison.name,
         "before": before,
         "after": after,
         "closed": verdict.closed(role) if before > verdict.discretisation_error else None,
@@ -158,57 +208,57 @@ def _gap(role: str, residual_set: ResidualSet, verdict: Verdict) -> dict[str, An
     }
 
 
-def _phases(residual_set: ResidualSet) -> list[dict[str, Any]]:
-    return [asdict(phase) for phase in residual_set.cost.comparisons[0].phases]
-
-
 def _ranking(found: ScoreTest) -> list[dict[str, Any]]:
     """Every candidate with its best shape, by what that explains."""
-    best: dict[str, int] = {}
-    for k in found.best():
-        best.setdefault(found.directions[k].candidate.name, k)
-    return [
-        {"candidate": name, "t": float(found.t[k]), "explained": float(found.explained[k])} for name, k in best.items()
-    ]
+    best: dict[EffectKey, int] = {}
+    for k in found.ranking():
+        best.setdefault(found.directions[k].candidate.key, k)
+    return [{**_key(key), "t": float(found.t[k]), "explained": float(found.explained[k])} for key, k in best.items()]
 
 
-def _trial(trial: ValidationTest) -> dict[str, Any]:
+def _test(test: ValidationTest) -> dict[str, Any]:
     return {
-        "round": trial.name.count(" + "),
-        "name": trial.name,
-        "discrepancy_train": trial.discrepancy_train,
-        "discrepancy_validation": finite(trial.discrepancy_validation),
-        "p": trial.p,
-        "chosen": trial.chosen,
-        "passed": trial.passed,
-        "reasons": list(trial.reasons),
-        "interval": {name: list(span) for name, span in trial.interval.items()},
+        "parts": _keys(test.keys),
+        "parts_before": test.before,
+        "discrepancy_train": test.discrepancy_train,
+        "discrepancy_validation": finite(test.discrepancy_validation),
+        "p": test.p,
+        "chosen": test.chosen,
+        "passed": test.passed,
+        "reasons": [{"reason": r.reason.value, "text": r.text} for r in test.reasons],
+        "interval": {name: list(span) for name, span in test.interval.items()},
     }
 
 
 def _cells(found: Localisation) -> list[dict[str, Any]]:
-    return [asdict(cell) for cell in found.cells]
+    return [
+        {
+            **asdict(cell.key),
+            "axis": cell.key.axis.value,
+            "discrepancy": cell.discrepancy,
+            "p": cell.p,
+            "found": cell.found,
+        }
+        for cell in found
+    ]
 
 
 def _about(case: Case, verdict: Verdict) -> dict[str, dict[str, Any]]:
-    """Of each effect of the answer, ties and hints with it: what it is, where its mark should appear, and its likes."""
-    groups = [
-        (verdict.effects, verdict.indistinguishable),
-        *((hint.effects, hint.indistinguishable) for hint in verdict.hints),
-    ]
-    answers = [a for effects, tied in groups for a in (*effects, *(rival for rivals in tied for rival in rivals))]
-    named = {candidate.partition(" at ")[0] for answer in answers for candidate in answer.split(" + ")}
+    """Of each effect of the answer, alternatives and hints with it: what it is, its signature, and its likes."""
+    answers = [(verdict.effects, verdict.indistinguishable), *((h.effects, h.indistinguishable) for h in verdict.hints)]
+    named = {key.effect for effects, _ in answers for key in effects}
+    named |= {key.effect for _, each in answers for alternatives in each for keys in alternatives for key in keys}
     return {
-        e.name: {"what": e.description, "mark": e.signature, "confused_with": list(e.confused_with)}
+        e.name: {"what": e.description, "signature": e.signature, "confused_with": list(e.confused_with)}
         for e in case.effects
         if e.name in named
     }
 
 
-def _sizes(case: Case, verdict: Verdict, kind: Literal["coefficients", "shape_parameters"]) -> list[dict[str, Any]]:
-    """Coefficients or shape parameters of the final model with intervals, each at the first of the parts that
-    share it.
-    """
+def _parameters(
+    case: Case, verdict: Verdict, kind: Literal["coefficients", "shape_parameters"]
+) -> list[dict[str, Any]]:
+    """Coefficients or shape parameters of the model with intervals, each at the first of the parts that share it."""
     model, what = verdict.model, {e.name: e.description for e in case.effects}
     first: dict[str, Candidate] = {}
     for part in model.parts:
@@ -223,7 +273,7 @@ def _sizes(case: Case, verdict: Verdict, kind: Literal["coefficients", "shape_pa
             "low": spans[name][0],
             "high": spans[name][1],
             "bound": bound_at(case.train, model, name),
-            "effect": part.name,
+            **_key(part.key),
             "what": what[part.effect],
         }
         for name, part in first.items()
@@ -231,7 +281,7 @@ def _sizes(case: Case, verdict: Verdict, kind: Literal["coefficients", "shape_pa
 
 
 def _shifts(case: Case, verdict: Verdict) -> list[dict[str, Any]]:
-    """How the base parameters moved when the effects came in, against what the base fit thought it knew."""
+    """How the base parameters moved when the effects came in, beside their deviation in the base fit."""
     columns = case.full_space.columns(case.base)
     deviation = posterior_of(verdict.base.refined, case.train.cost.comparisons).physical_std
     before, after = verdict.base.values[columns], verdict.model.values[columns]

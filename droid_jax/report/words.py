@@ -236,8 +236,10 @@ def _next(run: Run, searched: bool) -> str:
 
 def needed(repeats: Sequence[int]) -> str:
     """What the search of the gap takes beside recordings of so many repeats, in brackets; empty where they will do."""
-    from droid_jax.discrepancy.sign_flips import FEWEST_REPEATS  # only here: these import distributions of scipy
-    from droid_jax.discrepancy.split import HALVES
+    from droid_jax.recordings.split import (
+        FEWEST_REPEATS,  # only here: these import distributions of scipy
+        HALVES,
+    )
 
     alone = len(repeats) == 1
     if (alone and (repeats[0] == 1 or repeats[0] >= HALVES)) or (not alone and min(repeats) >= FEWEST_REPEATS):

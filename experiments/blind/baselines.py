@@ -16,10 +16,10 @@ import numpy as np
 import optax
 
 from droid_jax.cost.noise import lowpass, smooth
+from droid_jax.discrepancy.candidates import ScoreTest, project
 from droid_jax.discrepancy.case import Case
-from droid_jax.discrepancy.refit import FittedModel
+from droid_jax.discrepancy.fitting import FittedModel
 from droid_jax.discrepancy.residual_set import ResidualSet
-from droid_jax.discrepancy.screen import ScoreTest, project
 from droid_jax.recordings.recording import Recording
 from experiments.blind.answers import beside, matched
 from experiments.blind.units import torques, whitened
@@ -48,14 +48,14 @@ def stepwise_bic(screen: ScoreTest, common: np.ndarray) -> list[str]:
     """
     groups: dict[Any, list[int]] = {}
     for k, question in enumerate(screen.directions):
-        groups.setdefault(question.candidate.key, []).append(k)
+        groups.setdefault(question.candidate.shaped_key, []).append(k)
     names = {key: screen.directions[rows[0]].candidate for key, rows in groups.items()}
     size, chosen, named, cost = len(common), list[int](), list[str](), 0
     best = size * np.log(max(float(common @ common), 1e-30) / size)
     while len(named) < MOST:
         tried = {}
         for key, rows in groups.items():
-            if names[key].name not in named:
+            if str(names[key].key) not in named:
                 columns = screen.sensitivities[[*chosen, *rows]].T
                 rest = common - columns @ np.linalg.lstsq(columns, common, rcond=1e-8)[0]
                 parameters = cost + len(rows) + len(names[key].shape_parameters)
@@ -66,7 +66,7 @@ def stepwise_bic(screen: ScoreTest, common: np.ndarray) -> list[str]:
         best = tried[winner]
         chosen += groups[winner]
         cost += len(groups[winner]) + len(names[winner].shape_parameters)
-        named.append(names[winner].name)
+        named.append(str(names[winner].key))
     return named
 
 
@@ -75,7 +75,7 @@ def black_box(case: Case, model: FittedModel, recordings: Mapping[str, Recording
 
     A recording on which the base model blows up is left out.
     """
-    inputs = {role: features(e, recordings[role]) for role, e in case.held_sets.items()}
+    inputs = {role: features(e, recordings[role]) for role, e in case.residual_sets.items()}
     left = _shaped(case.train, torques(case.train, case.train.common(model.values)))
     centre, scale = inputs["train"].mean(axis=0), inputs["train"].std(axis=0) + 1e-9
     size = left.std(axis=0) + 1e-9
@@ -83,13 +83,13 @@ def black_box(case: Case, model: FittedModel, recordings: Mapping[str, Recording
     aside = (np.floor((time - time[0]) / BLOCK) % FOLDS) == FOLDS - 1
     weights = train((inputs["train"] - centre) / scale, left / size, aside)
     out = {}
-    for role, e in case.held_sets.items():
+    for role, e in case.residual_sets.items():
         common = e.common(model.values)[0]
         torque = np.asarray(_Network(left.shape[1]).apply(weights, (inputs[role] - centre) / scale)) * size
         added = whitened(e, torque.T.reshape(1, -1))[0]
         if e.nuisance_columns is not None:  # the recording's own offsets are fitted again
             added = project(added[None], e.nuisance_columns, np.full(len(e.nuisances), np.sqrt(e.repeats)))[0]
-        gaps = [e.discrepancy(e.residuals(common)), e.discrepancy(e.residuals(common - added))]
+        gaps = [e.resampling.discrepancy(e.resampling.residuals(c)) for c in (common, common - added)]
         if np.all(np.isfinite(gaps)):
             out[role] = gaps
     return out

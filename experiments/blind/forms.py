@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.discrepancy.candidates import Candidate
+from droid_jax.model.effects.candidate import Candidate
 from droid_jax.synthetic.hidden_effects import Applied
 from experiments.blind.answers import right
 from experiments.blind.cases import NAMELESS
@@ -58,7 +58,7 @@ class Forms:
             "left": self._best(self.where.torques(added[None])[0], self.torques)[name][0],
             "left_after_refit": left,
             "per_unit": dict(zip(self.candidates[k].coefficients, sizes.tolist(), strict=True)),
-            "shapes": dict(self.candidates[k].shape_parameters),
+            "shape_parameters": dict(self.candidates[k].shape_parameters),
         }
 
     def _worth(self, found: Best) -> float:
@@ -74,8 +74,8 @@ class Forms:
         for k, (candidate, rows) in enumerate(zip(self.candidates, self.rows, strict=True)):
             sizes = np.linalg.lstsq(marks[rows].T, wanted, rcond=1e-6)[0]
             left = float(np.linalg.norm(wanted - sizes @ marks[rows])) / size
-            if left < best.get(candidate.name, (np.inf,))[0]:
-                best[candidate.name] = (left, k, sizes)
+            if left < best.get(str(candidate.key), (np.inf,))[0]:
+                best[str(candidate.key)] = (left, k, sizes)
         return best
 
 

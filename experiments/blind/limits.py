@@ -18,10 +18,10 @@ import numpy as np
 
 from benchmarks.common import CODE
 from benchmarks.sharing import code_name
-from droid_jax.discrepancy.candidates import candidates
-from droid_jax.discrepancy.screen import directions_of
-from droid_jax.discrepancy.select import SIGNIFICANT
-from droid_jax.discrepancy.sign_flips import largest_detrended_t
+from droid_jax.discrepancy.candidates import directions_of
+from droid_jax.discrepancy.config import SelectionConfig
+from droid_jax.discrepancy.statistics import largest_detrended_t
+from droid_jax.model.effects.candidate import candidates
 from droid_jax.storage import write_json
 from droid_jax.synthetic.hidden_effects import HIDDEN, Applied
 from experiments.blind.cases import SAFE, key, keys
@@ -61,7 +61,7 @@ class Power:
         marks, noise = self._projected(free)
         scores = marks @ (left + amplitude * (added - common)).T
         p = [largest_detrended_t(scores + noise[:, rows])[1] for rows in self.chosen]  # as `ResidualSet.largest_score`
-        return float(np.mean(np.array(p) < SIGNIFICANT))
+        return float(np.mean(np.array(p) < SelectionConfig().significance))
 
     def limit(self, added: np.ndarray, largest: float) -> float | None:
         """Amplitude with `POWER`, by bisection in its logarithm; None where the largest has less."""

@@ -14,13 +14,13 @@ import scipy.linalg
 import scipy.optimize
 
 from droid_jax.cost.noise import lowpass, smooth
-from droid_jax.discrepancy.candidates import Candidate, candidates
+from droid_jax.discrepancy.candidates import ScoreDirection, directions_of, project, sensitivities
 from droid_jax.discrepancy.case import make_case
-from droid_jax.discrepancy.refit import FittedModel, refit
+from droid_jax.discrepancy.fitting import FittedModel, refit
 from droid_jax.discrepancy.residual_set import ResidualSet
-from droid_jax.discrepancy.screen import ScoreDirection, directions_of, project, sensitivities
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.model.effect_interface import Effect
+from droid_jax.model.effects.candidate import Candidate, EffectKey, candidates
 from droid_jax.model.effects.registry import effect_space
 from droid_jax.recordings.recording import Recording
 from droid_jax.synthetic.hidden_effects import Applied
@@ -130,7 +130,8 @@ def ground(setting: Setting, truth: Truth, seed: int) -> Ground:
         refit(case.train, base, (), at, RefineConfig(iterations=0, basin_hops=0, spreads=s)) for s in (0, 2)
     )
     wide = asked.refined.jacobian / np.sqrt(case.train.repeats)
-    return Ground(setting, truth, seed, case.train, model, wide, case.train.deviations * np.sqrt(NOISY / (NOISY - 1)))
+    noise = case.train.resampling.residuals(np.zeros(len(case.train.time))) * np.sqrt(NOISY / (NOISY - 1))
+    return Ground(setting, truth, seed, case.train, model, wide, noise)
 
 
 def _recorded(setting: Setting, hidden: tuple[Applied, ...], truth: Truth, seed: int, repeats: int) -> Recording:
@@ -151,7 +152,7 @@ def dense(effects: tuple[Effect, ...]) -> tuple[Candidate, ...]:
 def by_candidate(found: tuple[Candidate, ...]) -> tuple[tuple[ScoreDirection, ...], list[list[int]]]:
     """All questions, and which of them belong to each candidate."""
     questions = directions_of(found)
-    rows: dict[tuple, list[int]] = {}
+    rows: dict[EffectKey, list[int]] = {}
     for k, question in enumerate(questions):
-        rows.setdefault(question.candidate.key, []).append(k)
-    return questions, [rows[c.key] for c in found]
+        rows.setdefault(question.candidate.shaped_key, []).append(k)
+    return questions, [rows[c.shaped_key] for c in found]

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks.sharing import claimed
-from droid_jax.discrepancy.candidates import Candidate, candidates
 from droid_jax.discrepancy.case import Case
-from droid_jax.discrepancy.refit import FittedModel, refit
+from droid_jax.discrepancy.fitting import FittedModel, refit
 from droid_jax.identify.multistart import RefineConfig
+from droid_jax.model.effects.candidate import Candidate, candidates
 from droid_jax.recordings.formats import load
 from droid_jax.storage import file_sha256, write_json
 from droid_jax.synthetic.hidden_effects import Applied
@@ -45,8 +45,8 @@ def oracle(folder: Path, truth: dict[str, Any], result: dict[str, Any], bench: B
     model = fitted(case, truth["truths"]["train"], [right(scene, Applied(**h)) for h in truth["hidden"]])
     return {
         "model": model.name,
-        "gaps": {role: of.discrepancy_at(model.values) for role, of in case.held_sets.items()},
-        "amplitudes": {name: float(model.values[case.full_space.index(name)]) for name in model.coefficients},
+        "discrepancies": {role: of.discrepancy_at(model.values) for role, of in case.residual_sets.items()},
+        "coefficients": {name: float(model.values[case.full_space.index(name)]) for name in model.coefficients},
         "converged": model.refined.converged,
         "settled": settled(recordings, truth, result, bench),
     }
@@ -58,7 +58,7 @@ def fitted(case: Case, truth: dict[str, float], names: Sequence[Sequence[str]]) 
     known = {name: value for name, value in truth.items() if name in whole.names}
     start, parts = np.clip(whole.values(known), whole.low, whole.high), list[Candidate]()
     for own in names:
-        start, part = best_start(case, start, [c for c in candidates(case.effects) if c.name in own])
+        start, part = best_start(case, start, [c for c in candidates(case.effects) if str(c.key) in own])
         parts.append(part)
     return refit(case.train, case.base, parts, start[None], FROM_TRUTH)
 
@@ -78,7 +78,7 @@ def best_start(case: Case, start: np.ndarray, asked: Iterable[Candidate]) -> tup
                     row[whole.index(amplitude)] = p.mean + size * reach
                     rows.append(row)
                     parts.append(candidate)
-    left = np.sum(case.train.cost.whitened(np.stack(rows)) ** 2, axis=1)
+    left = np.sum(case.train.whitened(np.stack(rows)) ** 2, axis=1)
     best = int(np.nanargmin(left))
     return rows[best], parts[best]
 
@@ -103,6 +103,6 @@ def oracle_all(runs: Path, chosen: Iterable[str], bench: Bench, tell: Callable[[
                 found = {"error": str(error)}
             write_json(path, {"of": file_sha256(known), **found})
         count += 1
-        left = ", ".join(f"U {role} {u:.3g}" for role, u in found.get("gaps", {}).items())
+        left = ", ".join(f"U {role} {u:.3g}" for role, u in found.get("discrepancies", {}).items())
         tell(f"{name}: {found.get('error', found.get('model'))} {left}")
     return count

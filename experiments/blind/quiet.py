@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.discrepancy.candidates import Candidate, candidates
 from droid_jax.discrepancy.case import Case
-from droid_jax.discrepancy.refit import refit
+from droid_jax.discrepancy.fitting import refit
 from droid_jax.identify.multistart import RefineConfig
+from droid_jax.model.effects.candidate import Candidate, candidates
 from droid_jax.recordings.recording import Recording
 from droid_jax.synthetic.hidden_effects import Applied
 from droid_jax.synthetic.robot import SyntheticRobotConfig
@@ -66,13 +66,13 @@ def around(plain: Recording, noisy: Recording) -> Recording:
 
 
 def _parts(case: Case, result: Mapping[str, Any]) -> list[Candidate]:
-    known = {c.name: c for c in candidates(case.effects)}
+    known = {str(c.key): c for c in candidates(case.effects)}
     return [known[name] for name in result["effects"]]
 
 
 def _start(case: Case, truth: Mapping[str, float], result: Mapping[str, Any]) -> np.ndarray:
     """[D] the truth of the base model, and what was found of the effects."""
     whole = case.full_space
-    sizes = {name: found["value"] for name, found in result["amplitudes"].items()}
-    known = {**truth, **sizes, **result["shapes"]}
+    sizes = {name: found["value"] for name, found in result["coefficients"].items()}
+    known = {**truth, **sizes, **result["shape_parameters"]}
     return np.clip(whole.values({n: v for n, v in known.items() if n in whole.names}), whole.low, whole.high)

@@ -10,7 +10,7 @@ import numpy as np
 
 from droid_jax.policy.trials import wilson
 
-NAMING = ("named", "tie", "partly explained")  # verdicts that give a name
+NAMING = ("named", "indistinguishable", "partly explained")  # verdicts that give a name
 ANSWERED = ("none", *NAMING, "unexplained")  # verdicts that say something; an error or an unconverged fit does not
 CLOSED = 0.8  # share of a gap that a named effect has to close
 NAMEABLE = 0.5  # share of the gap that the right names have to close from the truth: less explains nothing
@@ -95,7 +95,9 @@ def summarise_baselines(judged: Sequence[dict[str, Any]]) -> dict[str, Any] | No
         return None
     none, known = ([c for c in done if c["class"] in kinds] for kinds in (("none",), ("single", "pair")))
     shares = [c["baselines"]["closed"] for c in done if c["class"] != "none"]
-    sealed = [c["gaps"]["test"][0] for c in done if "test" in c["gaps"]]  # not of one that blew up there
+    sealed = [
+        c["discrepancies"]["test"][0] for c in done if "test" in c["discrepancies"]
+    ]  # not of one that blew up there
     return {
         "base_gap_test_median": float(np.median(sealed)) if sealed else None,
         "bic_names_where_nothing": rate(none, lambda c: bool(c["baselines"]["bic"])),

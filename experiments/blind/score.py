@@ -17,7 +17,7 @@ from experiments.blind.cases import amplitude, key
 from experiments.blind.rates import NAMEABLE, NAMING, confusion, grouped, rate, summarise
 from experiments.blind.scenes import setting
 
-CLEAN = ("named", "tie")  # and say that this is all
+CLEAN = ("named", "indistinguishable")  # and say that this is all
 OPEN = ("unexplained", "partly explained")
 ROUNDED = 1.05  # beyond this times the stated multiple of its limit an effect is larger than that says
 SEEN = 0.02  # U above the floor below which a recording shows no gap
@@ -89,7 +89,7 @@ def judge(case: Case, limits: Mapping[str, Any]) -> dict[str, Any]:
         "p": result.get("p"),
         **answered(case),
         "reachable": reachable(case),
-        "gaps": result.get("gaps", {}),
+        "discrepancies": result.get("discrepancies", {}),
         "closed": _shares(result) if result.get("effects") else {},
         "within_floor": within_floor(result),
         "coverage": coverage(case),
@@ -197,15 +197,15 @@ def oracle_of(result: Path, oracle: Path) -> dict[str, Any] | None:
 
 def closed(result: Mapping[str, Any], role: str) -> float | None:
     """1 - (U after - U0) / (U before - U0); None where there was hardly a gap to close."""
-    before, after = result["gaps"][role]
-    if before - result["floor"] < SEEN:
+    before, after = result["discrepancies"][role]
+    if before - result["discretisation_error"] < SEEN:
         return None
-    return 1.0 - (after - result["floor"]) / (before - result["floor"])
+    return 1.0 - (after - result["discretisation_error"]) / (before - result["discretisation_error"])
 
 
 def _shares(result: Mapping[str, Any]) -> dict[str, float]:
     """Role -> share of its gap that was closed, of the recordings that show one."""
-    shares = {role: closed(result, role) for role in result.get("gaps", {})}
+    shares = {role: closed(result, role) for role in result.get("discrepancies", {})}
     return {role: share for role, share in shares.items() if share is not None}
 
 
@@ -218,26 +218,26 @@ def reachable(case: Case) -> float | None:
     named there.
     """
     oracle, result = case["oracle"] or {}, case["result"]
-    if "gaps" not in oracle or "validation" not in result.get("gaps", {}):
+    if "discrepancies" not in oracle or "validation" not in result.get("discrepancies", {}):
         return None
-    before, floor = result["gaps"]["validation"][0], result["floor"]
+    before, floor = result["discrepancies"]["validation"][0], result["discretisation_error"]
     if before - floor < SEEN:
         return 0.0
-    share = (before - oracle["gaps"]["validation"]) / (before - floor)
+    share = (before - oracle["discrepancies"]["validation"]) / (before - floor)
     return share if share >= NAMEABLE or oracle.get("converged") else None
 
 
 def within_floor(result: Mapping[str, Any]) -> bool | None:
     """Whether what is left on the sealed recording is within 2 U0 of the floor."""
-    if "test" not in result.get("gaps", {}):
+    if "test" not in result.get("discrepancies", {}):
         return None
-    return bool(result["gaps"]["test"][1] <= 3.0 * result["floor"])
+    return bool(result["discrepancies"]["test"][1] <= 3.0 * result["discretisation_error"])
 
 
 def coverage(case: Case) -> list[bool]:
     """For each amplitude of the answer: whether its interval holds what the same model settles at without noise."""
     settled = (case["oracle"] or {}).get("settled") or {}
-    found = case["result"].get("amplitudes", {})
+    found = case["result"].get("coefficients", {})
     return [bool(found[n]["interval"][0] <= at <= found[n]["interval"][1]) for n, at in settled.items() if n in found]
 
 
@@ -254,7 +254,7 @@ def counterpart_coverage(case: Case, limits: Mapping[str, Any]) -> list[bool]:
         if len(form.get("per_unit", ())) != 1 or form["left_after_refit"] > COMPARABLE:
             continue
         ((name, per_unit),) = form["per_unit"].items()
-        span = case["result"].get("amplitudes", {}).get(name)
+        span = case["result"].get("coefficients", {}).get(name)
         if span is not None:
             low, high = span["interval"]
             out.append(bool(low <= per_unit * hidden["amplitude"] <= high))
@@ -268,7 +268,7 @@ def against_baselines(case: Case) -> dict[str, Any] | None:
         return None
     left_out = case["truth"]["kind"] == "left_out"
     names = [[] for _ in case["right"]] if left_out else case["right"]
-    box = _shares({"gaps": found["black_box"], "floor": case["result"]["floor"]})
+    box = _shares({"discrepancies": found["black_box"], "discretisation_error": case["result"]["discretisation_error"]})
     search = _shares(case["result"])  # 0 where nothing was named
     return {
         "bic": found["bic"],

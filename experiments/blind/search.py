@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,18 +16,17 @@ from benchmarks.common import CODE
 from benchmarks.sharing import claimed
 from droid_jax.cost.cost import Cost
 from droid_jax.discrepancy.case import Case, make_case
-from droid_jax.discrepancy.discretisation_error import discretisation_error, with_finer_step
-from droid_jax.discrepancy.refit import FittedModel, intervals
+from droid_jax.discrepancy.fitting import FittedModel, base_fit, discretisation_error, intervals, with_finer_step
 from droid_jax.discrepancy.residual_set import ResidualSet, residual_set
-from droid_jax.discrepancy.restart import base_fit
+from droid_jax.discrepancy.search import search_effects
 from droid_jax.discrepancy.verdict import Verdict
-from droid_jax.discrepancy.workflow import search_effects
+from droid_jax.model.effects.candidate import names_of
 from droid_jax.recordings.formats import load
 from droid_jax.recordings.recording import Recording
 from droid_jax.storage import write_json
 from experiments.blind.baselines import baselines
 from experiments.blind.scenes import ROLES, Setting, setting
-from experiments.trials import trial_json
+from experiments.trials import answer_json, validation_json
 
 # What is kept as the result of a case that fails; running out of memory is none, and a later start tries it again.
 FAILED = (ValueError, ArithmeticError)
@@ -58,7 +57,7 @@ class Bench:
         if key not in self.compiled:
             self.compiled[key] = make_case(where.scene, where.base, where.effects(), **given)
         known = self.compiled[key]
-        of = {role: _again(known.held_sets[role], recording) for role, recording in recordings.items()}
+        of = {role: _again(known.residual_sets[role], recording) for role, recording in recordings.items()}
         kept = {e.name for e in where.effects(without)}
         return replace(known, **of, effects=tuple(e for e in known.effects if e.name in kept))
 
@@ -97,8 +96,8 @@ def search_case(folder: Path, bench: Bench) -> dict[str, Any]:
     result: dict[str, Any] = {"scene": told["scene"], "without": told["without"], "code": CODE.get("git")}
     try:
         case = watch("prepare", lambda: bench.case(told["scene"], recordings, told["without"]))
-        model = watch("base", lambda: base_fit(case, silent))
-        floor = watch("floor", lambda: bench.floor(told["scene"], case, model, recordings["train"]))
+        model = watch("base", lambda: base_fit(case.train, case.base, case.config, silent))
+        floor = watch("discretisation_error", lambda: bench.floor(told["scene"], case, model, recordings["train"]))
         verdict = watch("find", lambda: search_effects(case, model, floor))
     except FAILED as error:
         return {**result, "verdict": "error", "error": str(error), "seconds": watch.seconds}
@@ -116,27 +115,32 @@ def describe(case: Case, verdict: Verdict) -> dict[str, Any]:
     spans = intervals(case.train, verdict.model) if verdict.model.parts else {}
     space = case.full_space
     return {
-        "verdict": verdict.kind.value,
+        **answer_json(verdict),
         "sentence": verdict.sentence,
-        "effects": list(verdict.effects),
-        "indistinguishable": [list(t) for t in verdict.indistinguishable],
-        "hints": [asdict(hint) for hint in verdict.hints],
+        "hints": [
+            {
+                "effects": list(map(str, hint.effects)),
+                "indistinguishable": [list(map(names_of, each)) for each in hint.indistinguishable],
+                "closed": hint.closed,
+            }
+            for hint in verdict.hints
+        ],
         "doubts": list(verdict.doubts),
         "remainder": verdict.remainder,
         "p": verdict.score_tests[0].p if verdict.score_tests else None,
-        "gaps": {role: list(pair) for role, pair in verdict.discrepancies.items()},
-        "floor": verdict.discretisation_error,
+        "discrepancies": {role: list(pair) for role, pair in verdict.discrepancies.items()},
+        "discretisation_error": verdict.discretisation_error,
         "converged": verdict.base.refined.converged,
-        "amplitudes": {
+        "coefficients": {
             name: {"value": float(verdict.model.values[space.index(name)]), "interval": list(span)}
             for name, span in spans.items()
         },
-        "shapes": {
+        "shape_parameters": {
             name: float(verdict.model.values[space.index(name)])
             for part in verdict.model.parts
             for name in part.shape_parameters
         },
-        "trials": [trial_json(trial) for trial in verdict.validation_tests],
+        "validation_tests": [validation_json(trial) for trial in verdict.validation_tests],
     }
 
 

@@ -136,7 +136,7 @@ def _closed(judged: Sequence[Mapping[str, Any]], scene: str, chosen: Chosen) -> 
 
 def _minutes(judged: Sequence[Mapping[str, Any]], scene: str) -> str:
     """Base fit, floor and search, on whatever the machine had free; the baselines' time is not a search's."""
-    stages = ("prepare", "base", "floor", "find")
+    stages = ("prepare", "base", "discretisation_error", "find")
     taken = [sum(c["seconds"].get(s, 0.0) for s in stages) / 60 for c in judged if c["scene"] == scene]
     return f"{np.median(taken):.1f} ({min(taken):.1f} to {max(taken):.1f})"
 

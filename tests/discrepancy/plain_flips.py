@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from droid_jax.discrepancy.sign_flips import sign_flips, t_values
+from droid_jax.discrepancy.statistics import sign_flips, t_values
 
 
 def largest_t(scores: np.ndarray) -> tuple[np.ndarray, float]:

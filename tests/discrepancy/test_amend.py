@@ -10,8 +10,8 @@ import pytest
 from small_gap import Small, record, small
 
 from droid_jax.discrepancy import amendments as amend
-from droid_jax.discrepancy.amendments import EXPERIMENTS, MADE, NOT_NEEDED, REFIT, amended
-from droid_jax.discrepancy.final_refit import FinalModel
+from droid_jax.discrepancy.fitting import FinalModel
+from droid_jax.discrepancy.missing import EXPERIMENTS, MADE, NOT_NEEDED, REFIT, amended
 from droid_jax.discrepancy.verdict import Experiment
 from droid_jax.files import TO_BE_MADE
 

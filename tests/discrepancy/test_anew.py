@@ -8,17 +8,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from droid_jax.discrepancy.search_state import Budget
+from droid_jax.discrepancy.selection_step import forward_step
 from small_gap import FLOOR, PRELOAD, TRUTH, Small, small
 
 from droid_jax.discrepancy import search_state as search_states
-from droid_jax.discrepancy.candidates import candidates
-from droid_jax.discrepancy.refit import FittedModel
-from droid_jax.discrepancy.restart import base_fit, fitted_from_prior
-from droid_jax.discrepancy.screen import directions_of
-from droid_jax.discrepancy.search_state import Budget, SearchState
-from droid_jax.discrepancy.selection_step import SelectionStep, forward_step, restart_from_prior
-from droid_jax.discrepancy.workflow import score
+from droid_jax.discrepancy.candidates import directions_of, score_test
+from droid_jax.discrepancy.fitting import FittedModel, base_fit, fitted_from_prior
+from droid_jax.discrepancy.search import SearchState, restart_from_prior
+from droid_jax.discrepancy.selection import SelectionStep
 from droid_jax.identify.search import NotReplayed
+from droid_jax.model.effects.candidate import candidates
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def found() -> Small:
 def lost(found: Small) -> SelectionStep:
     """The first round, as if none of its models had passed."""
     done = forward_step(
-        state_of(found), found.base, score(found.case, found.base, directions_of(candidates(found.case.effects)))
+        state_of(found), found.base, score_test(found.case, found.base, directions_of(candidates(found.case.effects)))
     )
     return replace(done, selected=None, chosen=None)
 

@@ -12,15 +12,15 @@ from plain_flips import largest_t
 from small_log import ASKED, CONFIG, COULOMB, elbow, elbow_log, elbow_space
 
 from droid_jax.cost.cost import make_cost
+from droid_jax.cost.lone_log import LoneLog
 from droid_jax.cost.noise import RATE, coarse_clock
 from droid_jax.discrepancy import single
-from droid_jax.discrepancy.blocks import OUTSIDE, BlockResidualSet, block_length, block_residual_set, interleaved
-from droid_jax.discrepancy.case import make_case
-from droid_jax.discrepancy.screen import project
-from droid_jax.discrepancy.select import resamples
-from droid_jax.discrepancy.single import Log, base_model, make_log, single_case
+from droid_jax.discrepancy.candidates import project
+from droid_jax.discrepancy.case import base_model, make_case, make_log, single_case
+from droid_jax.discrepancy.residual_set import block_residual_set
+from droid_jax.discrepancy.search import search_effects
+from droid_jax.discrepancy.statistics import OUTSIDE, Blocks, block_length, interleaved, resample_weights
 from droid_jax.discrepancy.verdict import Conclusion
-from droid_jax.discrepancy.workflow import search_effects
 from droid_jax.model.effects.registry import library, ready
 from droid_jax.model.parameters import Space
 from droid_jax.recordings.recording import Recording
@@ -57,12 +57,12 @@ def test_blocks_are_longer_than_the_correlation():
     assert block_length(slow) == pytest.approx(1.5, rel=0.3)
 
 
-def made_blocks(count: int = 8, size: int = 25, columns: int = 2) -> BlockResidualSet:
+def made_blocks(count: int = 8, size: int = 25, columns: int = 2) -> Blocks:
     """Blocks without a recording, with a tail that belongs to no block."""
     block = np.r_[np.repeat(np.arange(count), size), np.full(10, OUTSIDE)]
     whole = np.tile(block, columns)
     column = np.repeat(np.arange(columns), len(block))
-    return BlockResidualSet(None, np.zeros((1, len(whole))), column, np.zeros(len(whole)), whole)  # pyright: ignore
+    return Blocks(None, np.zeros((1, len(whole))), column, np.zeros(len(whole)), whole)  # pyright: ignore
 
 
 def test_rows_are_blocks_and_their_mean_the_residual():
@@ -78,7 +78,7 @@ def test_rows_are_blocks_and_their_mean_the_residual():
     np.testing.assert_array_equal(made.cell_p_values(rows, first[None]), [1.0])
     losses = made.losses(np.stack([common, 2 * common]), np.full((1, 8), 1 / 8))
     np.testing.assert_allclose(losses[0], np.sum(common[inside] ** 2) * np.array([1.0, 4.0]))
-    draws = resamples(8, seed=0)
+    draws = resample_weights(8, seed=0)
     by_hand = draws @ [8 * np.sum(common[made.block == b] ** 2) for b in range(8)]
     np.testing.assert_allclose(made.losses(common[None], draws)[:, 0], by_hand)
 
@@ -117,12 +117,12 @@ def test_an_effect_that_lives_in_few_blocks_is_found():
 
 
 @pytest.fixture(scope="module")
-def log() -> Log:
+def log() -> LoneLog:
     scene = elbow()
     return make_log(scene, elbow_space(scene), library(scene, ASKED), elbow_log(COULOMB), CONFIG)
 
 
-def test_a_log_is_whitened_as_its_cost_would(log: Log):
+def test_a_log_is_whitened_as_its_cost_would(log: LoneLog):
     scene = elbow()
     cost = make_cost(ready(scene), elbow_space(scene), [elbow_log(COULOMB)], config=CONFIG.compare)
     values = elbow_space(scene).mean
@@ -138,7 +138,7 @@ def test_a_log_is_whitened_as_its_cost_would(log: Log):
     np.testing.assert_allclose(held.residual_torque(whole), 0.0, atol=1e-9)
 
 
-def test_dry_friction_is_found_in_one_log(log: Log):
+def test_dry_friction_is_found_in_one_log(log: LoneLog):
     scene = elbow()
     effects, base = library(scene, ASKED), elbow_space(scene)
     case = single_case(log, base, effects, config=CONFIG)
@@ -153,14 +153,14 @@ def test_dry_friction_is_found_in_one_log(log: Log):
     assert all(cell.p == 1.0 and not cell.found for cell in verdict.before.cells)
 
 
-def test_nothing_is_said_where_nothing_is_missing(log: Log):
+def test_nothing_is_said_where_nothing_is_missing(log: LoneLog):
     scene = elbow()
     effects, base = library(scene, ASKED), elbow_space(scene)
     case = single_case(log.with_torques(elbow_torque(log)), base, effects, config=CONFIG)
     assert search_effects(case, base_model(case), 0.0).kind is Conclusion.NONE
 
 
-def elbow_torque(log: Log) -> np.ndarray:
+def elbow_torque(log: LoneLog) -> np.ndarray:
     """[K, 1] what the log would hold without its dry friction."""
     values = np.stack([log.space.mean, log.space.values({"joint_coulomb[elbow]": COULOMB})])
     without, with_it = log.simulated(values)
@@ -230,6 +230,6 @@ def test_repeats_need_no_blocks():
         make_case(scene, elbow_space(scene), library(scene, ASKED), **few, config=CONFIG)
 
 
-def test_too_few_blocks_are_refused(log: Log):
+def test_too_few_blocks_are_refused(log: LoneLog):
     with pytest.raises(ValueError, match="3 blocks, at least 8"):
         block_residual_set(log, np.minimum(np.arange(len(log.clock)) // 100, 2))

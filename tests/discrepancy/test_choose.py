@@ -5,9 +5,8 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
-from droid_jax.discrepancy.candidates import Candidate
-from droid_jax.discrepancy.choose import selected, simplest, special_cases_of, without_dominated
-from droid_jax.discrepancy.select import ValidationTest
+from droid_jax.discrepancy.selection import ValidationTest, more_general, selected, simplest, without_dominated
+from droid_jax.model.effects.candidate import Candidate
 
 FLOOR, WHOLE = 0.1, 1.0
 
@@ -44,12 +43,12 @@ def test_one_that_holds_the_leader_as_a_special_case_is_told_from_other_rivals()
 
     plain = of(("coulomb", "elbow"))
     others = [plain, of(("stribeck", "elbow")), of(("stribeck", "wrist")), of(("bias", "elbow"))]
-    assert special_cases_of(effects, plain, [*others, of(("stribeck", "elbow"), ("bias", "elbow"))]) == [
+    assert more_general(effects, plain, [*others, of(("stribeck", "elbow"), ("bias", "elbow"))]) == [
         False, True, False, False, False
     ]  # fmt: skip
     both = of(("bias", "hinge"), ("coulomb", "elbow"))
-    assert special_cases_of(effects, both, [of(("bias", "hinge"), ("stribeck", "elbow")), others[1]]) == [True, False]
-    assert special_cases_of(effects, others[1], [plain]) == [False]  # not the other way round
+    assert more_general(effects, both, [of(("bias", "hinge"), ("stribeck", "elbow")), others[1]]) == [True, False]
+    assert more_general(effects, others[1], [plain]) == [False]  # not the other way round
 
 
 def test_which_of_two_at_one_joint_holds_which_does_not_depend_on_their_order() -> None:
@@ -61,8 +60,8 @@ def test_which_of_two_at_one_joint_holds_which_does_not_depend_on_their_order() 
         return SimpleNamespace(parts=[Candidate(name, "elbow", ()) for name in names])
 
     for first, second in (("AB", "ab"), ("BA", "ab"), ("AB", "ba"), ("BA", "ba")):
-        assert special_cases_of(effects, of(*second), [of(*first)]) == [True]
-    assert special_cases_of(effects, of(*"ab"), [of(*"AA")]) == [False]
+        assert more_general(effects, of(*second), [of(*first)]) == [True]
+    assert more_general(effects, of(*"ab"), [of(*"AA")]) == [False]
 
 
 def test_the_one_that_leaves_least_wins_and_a_plainer_one_that_does_as_well_before_it() -> None:

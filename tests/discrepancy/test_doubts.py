@@ -10,9 +10,9 @@ from small_gap import FLOOR, Small, small
 
 from droid_jax.discrepancy import doubts as doubts_module
 from droid_jax.discrepancy import workflow
-from droid_jax.discrepancy.doubts import bound_at, doubts
-from droid_jax.discrepancy.refit import FittedModel, intervals
+from droid_jax.discrepancy.fitting import FittedModel, intervals
 from droid_jax.discrepancy.results import gap_json
+from droid_jax.discrepancy.selection import bound_at, doubts
 
 SHAPE = "torque_offset[elbow]"  # -0.3 to 0.3 N m
 

@@ -8,9 +8,9 @@ from dataclasses import replace
 from small_gap import EFFECTS, FLOOR, PRELOAD, QUICK, record, small_scene
 
 from droid_jax.discrepancy.case import make_case
-from droid_jax.discrepancy.restart import base_fit
+from droid_jax.discrepancy.fitting import base_fit
+from droid_jax.discrepancy.search import search_effects
 from droid_jax.discrepancy.verdict import Conclusion, Verdict
-from droid_jax.discrepancy.workflow import search_effects
 from droid_jax.model.effects.registry import library
 
 FRICTION = 0.5  # N m

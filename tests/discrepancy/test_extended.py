@@ -15,10 +15,11 @@ from small_gap import JOINTS, SCENE, Small, small, small_scene
 
 import droid_jax as dj
 from droid_jax.cost.cost import make_cost
-from droid_jax.discrepancy.candidates import Candidate
-from droid_jax.discrepancy.extended import Extended, extended, load_extended, save_extended
-from droid_jax.discrepancy.final_refit import FinalModel
+from droid_jax.discrepancy.fitting import FinalModel
+from droid_jax.discrepancy.results import extended
+from droid_jax.identify.extended_model import Extended, load_extended, save_extended
 from droid_jax.identify.gaussian import prior
+from droid_jax.model.effects.candidate import Candidate
 from droid_jax.model.effects.registry import effect_space, library, ready
 from droid_jax.model.mjcf import fitted_mjcf
 from droid_jax.model.parameters import Parameter, Space, Write

@@ -9,11 +9,12 @@ import pytest
 import scipy.stats
 from plain_flips import largest_t
 
-from droid_jax.discrepancy.residual_set import discrepancies, discrepancy
-from droid_jax.discrepancy.sign_flips import (
+from droid_jax.discrepancy.statistics import (
     benjamini_hochberg,
     detrended,
     detrended_discrepancy_p_values,
+    discrepancies,
+    discrepancy,
     largest_detrended_t,
     sign_flips,
     t_values,

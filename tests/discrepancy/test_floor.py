@@ -10,7 +10,7 @@ import pytest
 from small_gap import Small, small
 
 from droid_jax.discrepancy import discretisation_error as floor
-from droid_jax.discrepancy.discretisation_error import discretisation_error
+from droid_jax.discrepancy.fitting import discretisation_error
 from droid_jax.identify.search import NotReplayed
 
 

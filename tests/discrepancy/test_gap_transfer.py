@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from droid_jax.discrepancy.transfer import LONGEST
 from small_gap import FLOOR, Small, record, small
 
+from droid_jax.discrepancy.candidates import project
 from droid_jax.discrepancy.case import Case, make_case
-from droid_jax.discrepancy.refit import FittedModel, refit
-from droid_jax.discrepancy.restart import base_fit
-from droid_jax.discrepancy.screen import project
-from droid_jax.discrepancy.transfer import LONGEST, beyond_fit_uncertainty, remaining_residuals, transfer_spread
+from droid_jax.discrepancy.fitting import FittedModel, base_fit, refit, remaining_residuals, transfer_spread
 from droid_jax.identify.identifiability import posterior_of
 
 
@@ -44,7 +43,7 @@ def kept(case: Case, model: FittedModel, off: np.ndarray) -> float:
         residuals=validation.residuals,
     )
     left = np.mean(
-        beyond_fit_uncertainty(case.train, other, model) - beyond_fit_uncertainty(case.train, validation, model), axis=0
+        remaining_residuals(case.train, other, model) - remaining_residuals(case.train, validation, model), axis=0
     )
     return float(np.sum(left**2) / np.sum(off**2))
 
@@ -110,7 +109,7 @@ def test_of_noise_alone_nothing_remains_on_average(whole: tuple[Case, FittedMode
     drawn = replace(validation, deviations=noise - noise.mean(axis=0))
     common = drawn.residuals(drawn.common(model.values)[0])
     np.testing.assert_allclose(
-        beyond_fit_uncertainty(case.train, drawn, model),
+        remaining_residuals(case.train, drawn, model),
         project(common, slopes, np.full(len(slopes.T), validation.repeats**0.5)),
     )
 

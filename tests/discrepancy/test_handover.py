@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 from small_gap import PRELOAD, Small, small
 
-from droid_jax.discrepancy.extended import extended
-from droid_jax.discrepancy.final_refit import FinalModel, final_model
-from droid_jax.discrepancy.results import write_gap
+from droid_jax.discrepancy.fitting import FinalModel, final_refit
+from droid_jax.discrepancy.results import extended, write_gap
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.report.gap_folder import read_gap
 from droid_jax.report.page import write_report
@@ -29,7 +28,7 @@ def found() -> Small:
 
 @pytest.fixture(scope="module")
 def both(found: Small) -> FinalModel:
-    return final_model(found.case, found.verdict.model)
+    return final_refit(found.case, found.verdict.model)
 
 
 def test_it_is_the_best_of_both_motions(found: Small, both: FinalModel):
@@ -69,11 +68,11 @@ def test_two_motions_tell_more_than_one(found: Small, both: FinalModel):
 
 def test_without_an_effect_in_blocks_or_unsettled_it_is_the_searchs_own(found: Small):
     case, model = found.case, found.verdict.model
-    assert final_model(case, found.base).model is found.base
+    assert final_refit(case, found.base).model is found.base
     blocks: Any = SimpleNamespace(train=SimpleNamespace(repeated=False))
-    assert final_model(blocks, model).model is model
+    assert final_refit(blocks, model).model is model
     short = replace(case, config=replace(case.config, refine=RefineConfig(iterations=1, basin_hops=0)))
-    kept = final_model(short, model)
+    kept = final_refit(short, model)
     assert kept.model is model and kept.fitted_to == (case.train,)
 
 

@@ -8,10 +8,9 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-
 from droid_jax.discrepancy.localise import _bins, _cells, _parts
-from droid_jax.discrepancy.residual_set import discrepancy
-from droid_jax.discrepancy.sign_flips import detrended_discrepancy_p_values
+
+from droid_jax.discrepancy.statistics import detrended_discrepancy_p_values, discrepancy
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import compile_scene
 

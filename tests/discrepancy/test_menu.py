@@ -11,16 +11,16 @@ from small_gap import record, small
 
 from droid_jax.cost.observation import TooLong
 from droid_jax.discrepancy import candidate_experiments as menu
-from droid_jax.discrepancy.candidate_experiments import CARRIED, IN_THE_AIR, WEIGHT, separating, untouched
 from droid_jax.discrepancy.case import Case
-from droid_jax.discrepancy.refit import FittedModel
-from droid_jax.discrepancy.time_scaling import STOP, TIME_SCALINGS, time_scaled
-from droid_jax.discrepancy.workspace_extrapolation import FURTHER
+from droid_jax.discrepancy.fitting import FittedModel
+from droid_jax.discrepancy.missing import CARRIED, IN_THE_AIR, WEIGHT, separating_experiments, untouched
 from droid_jax.door.demonstration import PLANS, grasp_pose
 from droid_jax.door.scene import door_scene
 from droid_jax.model.scene import Grip
 from droid_jax.recordings.recording import Recording
+from droid_jax.recordings.time_scaling import STOP, TIME_SCALINGS, time_scaled
 from droid_jax.simulate.hand_path import solve_pose
+from droid_jax.simulate.workspace_extrapolation import FURTHER
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,7 @@ def test_a_drag_is_told_from_a_preload_by_another_speed(demonstration, monkeypat
     """Rivals that differ in a speed-dependent torque: three times slower they come closer, twice as fast they part."""
     monkeypatch.setattr(menu, "TIME_SCALINGS", TIME_SCALINGS[:2])
     rivals = (model("drag", 0.0), model("drag", 0.8))
-    found = {e.what: e.distance or 0.0 for e in separating(small().case, rivals, demonstration)}
+    found = {e.what: e.distance or 0.0 for e in separating_experiments(small().case, rivals, demonstration)}
     slower, faster = (found[entry.what] for entry in TIME_SCALINGS[:2])
     assert faster > 3.0 * slower > 0.0
     weighed = next(apart for what, apart in found.items() if "weighed" in what)
@@ -80,7 +80,7 @@ def test_an_experiment_that_cannot_be_made_says_why_and_ends_nothing(demonstrati
 
     monkeypatch.setattr(menu, "TIME_SCALINGS", TIME_SCALINGS[:3])
     monkeypatch.setattr(menu, "make_cost", short_of_memory)
-    found = separating(small().case, (model("drag", 0.0), model("drag", 0.8)), demonstration)
+    found = separating_experiments(small().case, (model("drag", 0.0), model("drag", 0.8)), demonstration)
     said = {e.what: (e.distance is None, e.not_made) for e in found}
     assert said[TIME_SCALINGS[0].what] == (True, "needs 9.0 GB")
     assert said[TIME_SCALINGS[1].what] == (False, "")
@@ -99,7 +99,7 @@ def dropped(recording: Recording, seconds: float) -> Recording:
 def test_a_dropout_that_a_slower_motion_makes_too_long_is_said(demonstration):
     """60 ms without torques are filled in; three times slower they are too long."""
     rivals = (model("drag", 0.0), model("drag", 0.8))
-    found = {e.what: e for e in separating(small().case, rivals, dropped(demonstration, 0.06))}
+    found = {e.what: e for e in separating_experiments(small().case, rivals, dropped(demonstration, 0.06))}
     slower, faster = (found[entry.what] for entry in TIME_SCALINGS[:2])
     assert slower.distance is None and "a stretch that no repeat measured" in slower.not_made
     assert faster.distance is not None and faster.distance > 0.0
@@ -110,7 +110,7 @@ def test_a_known_weight_tells_only_what_acts_through_it(demonstration, monkeypat
     monkeypatch.setattr(menu, "TIME_SCALINGS", ())
     case = small().case
     rivals = (model(CARRIED, 0.0), model(CARRIED, 0.2))
-    (found,) = separating(case, rivals, demonstration)
+    (found,) = separating_experiments(case, rivals, demonstration)
     plain = case.train.cost.whitened(np.stack([m.values for m in rivals])).astype(float)
     assert f"{WEIGHT:g} kg" in found.what
     assert found.distance == pytest.approx(np.linalg.norm(plain[0] - plain[1]), rel=0.2)
@@ -127,17 +127,18 @@ def test_in_the_air_only_the_robot_is_seen(demonstration, monkeypatch):
     monkeypatch.setattr(menu, "TIME_SCALINGS", ())
     case = small().case
     rivals = (model(CARRIED, 0.0), model(CARRIED, 0.2))
-    found = {e.what: e.distance or 0.0 for e in separating(gripping(case), rivals, demonstration)}
+    found = {e.what: e.distance or 0.0 for e in separating_experiments(gripping(case), rivals, demonstration)}
     plain = case.train.cost.whitened(np.stack([m.values for m in rivals])).astype(float)
     assert found[IN_THE_AIR] == pytest.approx(np.linalg.norm(plain[0] - plain[1]), rel=0.2)
-    assert IN_THE_AIR not in {e.what for e in separating(case, rivals, demonstration)}
+    assert IN_THE_AIR not in {e.what for e in separating_experiments(case, rivals, demonstration)}
 
 
 def test_a_hand_that_gets_no_further_is_said(demonstration, monkeypatch):
     monkeypatch.setattr(menu, "TIME_SCALINGS", ())
     monkeypatch.setattr(menu, "opened_further", lambda *arguments: None)
     found = {
-        e.what: e for e in separating(gripping(small().case), (model("drag", 0.0), model("drag", 0.8)), demonstration)
+        e.what: e
+        for e in separating_experiments(gripping(small().case), (model("drag", 0.0), model("drag", 0.8)), demonstration)
     }
     assert found[FURTHER].distance is None and "does not reach further" in found[FURTHER].not_made
 
@@ -148,8 +149,8 @@ def test_a_motion_within_reach_is_on_the_menu(demonstration, monkeypatch):
     monkeypatch.setattr(menu, "opened_further", lambda scene, recording, replayed: replace(recording, name=FURTHER))
     case = small().case
     rivals = (model("drag", 0.0), model("drag", 0.8))
-    found = {e.what: e.distance or 0.0 for e in separating(gripping(case), rivals, demonstration)}
-    assert FURTHER not in {e.what for e in separating(case, rivals, demonstration)}
+    found = {e.what: e.distance or 0.0 for e in separating_experiments(gripping(case), rivals, demonstration)}
+    assert FURTHER not in {e.what for e in separating_experiments(case, rivals, demonstration)}
     plain = case.train.cost.whitened(np.stack([m.values for m in rivals])).astype(float)
     assert found[FURTHER] == pytest.approx(np.linalg.norm(plain[0] - plain[1]), rel=1e-3)
 
@@ -187,10 +188,10 @@ def test_an_experiment_is_as_good_as_what_it_tells_apart_least():
 
 def test_the_best_experiment_comes_first(demonstration, monkeypatch):
     monkeypatch.setattr(menu, "TIME_SCALINGS", TIME_SCALINGS[:2])
-    found = separating(small().case, (model("drag", 0.0), model("drag", 0.8)), demonstration)
+    found = separating_experiments(small().case, (model("drag", 0.0), model("drag", 0.8)), demonstration)
     apart = [e.distance or 0.0 for e in found]
     assert apart == sorted(apart, reverse=True) and apart[0] > apart[-1]
 
 
 def test_one_model_needs_no_experiment(demonstration):
-    assert separating(small().case, (model("drag", 0.0),), demonstration) == ()
+    assert separating_experiments(small().case, (model("drag", 0.0),), demonstration) == ()

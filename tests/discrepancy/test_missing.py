@@ -15,7 +15,6 @@ import droid_jax as dj
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.discrepancy import missing
 from droid_jax.discrepancy.candidates import acts_on_commands_only, observable_effects
-from droid_jax.discrepancy.split import Split
 from droid_jax.discrepancy.verdict import Conclusion
 from droid_jax.identify.search import SearchConfig
 from droid_jax.model.effect_interface import Effect
@@ -23,6 +22,7 @@ from droid_jax.model.effects.registry import joined, library
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import compile_scene
 from droid_jax.recordings.recording import Recording
+from droid_jax.recordings.split import Split
 
 SEARCH = replace(CONFIG, search=SearchConfig(population=8, parents=None, generations=2), max_effects=1)
 
@@ -57,7 +57,7 @@ def test_hidden_friction_is_named_and_in_the_extended_model(
     assert [part.name for part in extended.parts] == ["joint_coulomb at elbow"]
     assert extended.space.names == ("elbow_damping", "torque_offset[elbow]", "joint_coulomb[elbow]")
     np.testing.assert_allclose(extended.values, [0.6, 0.1, COULOMB], rtol=0.1, atol=0.02)
-    assert ("search" in stages) is searched and {"screen", "refit", "judge"} <= set(stages)
+    assert ("search" in stages) is searched and {"score_test", "refit", "verdict"} <= set(stages)
 
 
 def test_a_log_without_commands_has_no_servo_to_ask_about():

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from droid_jax.cost.noise import RATE, estimate_noise
-from droid_jax.discrepancy.screen import project
-from droid_jax.discrepancy.sign_flips import largest_detrended_t
+from droid_jax.discrepancy.candidates import project
+from droid_jax.discrepancy.statistics import largest_detrended_t
 
 REPEATS, LENGTH, CASES = 10, 160, 500
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from small_gap import record, small_scene
 
-from droid_jax.discrepancy.workspace_extrapolation import opened_further
 from droid_jax.door.demonstration import PLANS, demonstrate
 from droid_jax.door.scene import door_scene
 from droid_jax.door.space import door_space
@@ -19,6 +18,7 @@ from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording
 from droid_jax.simulate.c_reference import c_replay
 from droid_jax.simulate.replay import make_drive
+from droid_jax.simulate.workspace_extrapolation import opened_further
 
 
 @functools.cache

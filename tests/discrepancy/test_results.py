@@ -11,9 +11,8 @@ import pytest
 from small_gap import FLOOR, JOINTS, PRELOAD, Small, small
 
 from droid_jax.discrepancy.results import gap_arrays, gap_json, write_gap
-from droid_jax.discrepancy.split import ROLES
-from droid_jax.discrepancy.verdict import Conclusion, Experiment
-from droid_jax.discrepancy.workflow import unnamed
+from droid_jax.discrepancy.verdict import Conclusion, Experiment, unnamed
+from droid_jax.recordings.split import ROLES
 from droid_jax.report.gap_folder import read_gap
 from droid_jax.report.gap_words import deviations, largest_shifts
 

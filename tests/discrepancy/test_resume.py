@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from droid_jax.discrepancy.resume import CachedCost, cached_model, cached_number, with_replay_cache
 from small_gap import FLOOR, Small, small
 
-from droid_jax.discrepancy.resume import CachedCost, cached_model, cached_number, with_replay_cache
-from droid_jax.discrepancy.workflow import search_effects
+from droid_jax.discrepancy.search import search_effects
 
 
 @pytest.fixture(scope="module")

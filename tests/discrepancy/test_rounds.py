@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from droid_jax.discrepancy.search_state import Budget
 
-from droid_jax.discrepancy.blocks import OUTSIDE, BlockResidualSet
-from droid_jax.discrepancy.candidates import Candidate
 from droid_jax.discrepancy.residual_set import ResidualSet
-from droid_jax.discrepancy.search_state import Budget, SearchState
-from droid_jax.discrepancy.selection_step import pruned, without
+from droid_jax.discrepancy.search import SearchState, pruned, without
+from droid_jax.discrepancy.statistics import OUTSIDE, Blocks
 from droid_jax.identify.search import NotReplayed
+from droid_jax.model.effects.candidate import Candidate
 from droid_jax.model.parameters import Parameter, Space
 
 
@@ -60,7 +60,7 @@ def test_the_aim_is_the_objective_of_half_the_share_that_an_effect_must_take(blo
     cost, nothing, none = SimpleNamespace(), np.zeros((1, 30)), np.zeros(30)
     block = np.array([0] * 6 + [1] * 6 + [OUTSIDE] * 18)
     known: Any = (cost, nothing, none, none)
-    residual_set = BlockResidualSet(*known, block) if blocks else ResidualSet(*known)
+    residual_set = Blocks(*known, block) if blocks else ResidualSet(*known)
     count = 12 if blocks else 30
     fitted: Any = SimpleNamespace(parts=(), discrepancy=4.0, refined=SimpleNamespace(objective=0.5 * count * 4.0))
     state: Any = SimpleNamespace(case=SimpleNamespace(train=residual_set))

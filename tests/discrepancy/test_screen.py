@@ -9,13 +9,12 @@ import pytest
 from plain_flips import largest_t
 
 from droid_jax.cost.cost import Cost
-from droid_jax.discrepancy.candidates import Candidate, candidates
-from droid_jax.discrepancy.rank import proposals
+from droid_jax.discrepancy.candidates import ScoreDirection, project, proposals, score_test
 from droid_jax.discrepancy.residual_set import ResidualSet
-from droid_jax.discrepancy.screen import ScoreDirection, project, score_test
-from droid_jax.discrepancy.select import indistinguishable, resamples
-from droid_jax.discrepancy.sign_flips import detrended, one_sided_p
+from droid_jax.discrepancy.selection import indistinguishable
+from droid_jax.discrepancy.statistics import detrended, one_sided_p, resample_weights
 from droid_jax.model.effect_interface import Effect
+from droid_jax.model.effects.candidate import Candidate, candidates
 from droid_jax.model.parameters import Parameter, Space
 
 REPEATS, SIZE = 10, 400
@@ -137,7 +136,7 @@ def test_models_that_noise_cannot_separate_are_ties():
     commons[1] = commons[0] + 0.005 * rng.normal(size=SIZE)
     commons[2] += 1.0
     deviations = rng.normal(size=(REPEATS, SIZE))
-    losses = measured(deviations - deviations.mean(axis=0)).losses(commons, resamples(REPEATS))
+    losses = measured(deviations - deviations.mean(axis=0)).losses(commons, resample_weights(REPEATS))
     same = indistinguishable(np.array([1e-4, 1e-3, 1.0]), np.zeros(3), losses, 0.0, 3.0, 0.1)
     assert same[0].tolist() == [True, True, False]
 
@@ -147,7 +146,7 @@ def test_resampled_losses_are_the_squared_means_of_resamples():
     rng = np.random.default_rng(7)
     commons, deviations = rng.normal(size=(2, 30)), rng.normal(size=(REPEATS, 30))
     deviations -= deviations.mean(axis=0)
-    draws = resamples(REPEATS, seed=8)
+    draws = resample_weights(REPEATS, seed=8)
     losses = measured(deviations).losses(commons, draws)
     expected = np.sum((commons[:, None] + draws @ detrended(deviations)) ** 2, axis=2).T
     np.testing.assert_allclose(losses[:, 0] - losses[:, 1], expected[:, 0] - expected[:, 1])

@@ -7,16 +7,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from droid_jax.discrepancy.select import UNCONFIRMED, _gap_reasons
 from small_gap import FLOOR, Small, small
 
 from droid_jax.discrepancy import refit as refit_module
 from droid_jax.discrepancy import select
-from droid_jax.discrepancy.candidates import candidates
-from droid_jax.discrepancy.refit import consistent_with_zero, deviations, intervals, refit, zero_warning
-from droid_jax.discrepancy.select import UNCONFIRMED, _gap_reasons, much_more, validation_tests
-from droid_jax.discrepancy.sign_flips import detrended
+from droid_jax.discrepancy.fitting import consistent_with_zero, deviations, intervals, refit
+from droid_jax.discrepancy.selection import much_more, validation_tests, zero_warning
+from droid_jax.discrepancy.statistics import detrended
 from droid_jax.identify.identifiability import posterior_of
 from droid_jax.identify.search import NotReplayed
+from droid_jax.model.effects.candidate import candidates
 
 
 @pytest.fixture(scope="module")

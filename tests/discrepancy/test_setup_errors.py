@@ -15,8 +15,7 @@ from small_log import CONFIG
 
 import droid_jax as dj
 from droid_jax.cost.cost import make_cost
-from droid_jax.discrepancy.missing import case_of
-from droid_jax.discrepancy.split import Split
+from droid_jax.discrepancy.case import case_of
 from droid_jax.discrepancy.verdict import Conclusion, Verdict
 from droid_jax.identify.multistart import RefineConfig, refine
 from droid_jax.identify.search import SearchConfig
@@ -25,6 +24,7 @@ from droid_jax.model.parameter_file import load_parameters
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSide
+from droid_jax.recordings.split import Split
 from droid_jax.simulate.hand_path import minimum_jerk
 from droid_jax.synthetic.hidden_effects import record_hidden
 from droid_jax.synthetic.robot import SyntheticRobotConfig

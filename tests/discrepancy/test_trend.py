@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from droid_jax.discrepancy.candidates import Candidate
-from droid_jax.discrepancy.screen import ScoreDirection, ScoreTest
-from droid_jax.discrepancy.trend import trend
+from droid_jax.discrepancy.candidates import ScoreDirection, ScoreTest, trend
+from droid_jax.model.effects.candidate import Candidate
 
 REPEATS, SIZE = 10, 400
 

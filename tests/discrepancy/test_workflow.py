@@ -9,23 +9,21 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from droid_jax.discrepancy.search_state import Budget
+from droid_jax.discrepancy.select import AT_BOUND, TOO_SMALL, UNCONFIRMED
+from droid_jax.discrepancy.selection_step import forward_step
 from small_gap import EFFECTS, FLOOR, QUICK, Small, record, small, small_scene
 
 from droid_jax.discrepancy import workflow
-from droid_jax.discrepancy.candidates import Candidate, candidates
+from droid_jax.discrepancy.candidates import ScoreTest, directions_of, proposals, score_test
 from droid_jax.discrepancy.case import make_case
-from droid_jax.discrepancy.rank import proposals
-from droid_jax.discrepancy.refit import FittedModel
-from droid_jax.discrepancy.restart import base_fit
-from droid_jax.discrepancy.screen import ScoreTest, directions_of
-from droid_jax.discrepancy.search_state import Budget, SearchState
-from droid_jax.discrepancy.select import AT_BOUND, TOO_SMALL, UNCONFIRMED
-from droid_jax.discrepancy.selection_step import SelectionStep, forward_step
-from droid_jax.discrepancy.transfer import remaining_residuals
+from droid_jax.discrepancy.fitting import FittedModel, base_fit, remaining_residuals
+from droid_jax.discrepancy.search import SearchState, search_effects
+from droid_jax.discrepancy.selection import SelectionStep
 from droid_jax.discrepancy.verdict import Conclusion
-from droid_jax.discrepancy.workflow import score, search_effects
 from droid_jax.identify.search import NotReplayed
 from droid_jax.model.effect_interface import Effect
+from droid_jax.model.effects.candidate import Candidate, candidates
 from droid_jax.model.effects.registry import library
 from droid_jax.model.parameters import Parameter
 from droid_jax.model.scene import Scene
@@ -154,7 +152,7 @@ def test_effects_without_places_cannot_be_asked_about(found: Small):
 
 
 def test_where_nothing_blows_up_nothing_is_left_out(found: Small):
-    assert score(found.case, found.base, directions_of(candidates(found.case.effects))).failed == ()
+    assert score_test(found.case, found.base, directions_of(candidates(found.case.effects))).failed == ()
 
 
 def test_a_nuisance_goes_no_further_than_its_prior_says(found: Small):
@@ -170,7 +168,9 @@ def test_a_parameter_at_its_bound_absorbs_nothing_more(found: Small):
     x[at] = refined.space.to_search(refined.space.high)[at]
     stuck = replace(found.base, refined=replace(refined, x=x))
     assert np.flatnonzero(~stuck.refined.free).tolist() == [at]
-    before, after = (np.linalg.norm(score(found.case, m, asked).sensitivities, axis=1) for m in (found.base, stuck))
+    before, after = (
+        np.linalg.norm(score_test(found.case, m, asked).sensitivities, axis=1) for m in (found.base, stuck)
+    )
     assert np.all(after >= before - 1e-9)
     preload = [q.coefficient for q in asked].index("hinge_preload")
     assert after[preload] > 1.1 * before[preload]  # a spring looks like a preload

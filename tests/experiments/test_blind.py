@@ -291,15 +291,15 @@ def case(
     gaps = {"validation": [11.0, 2.0], "test": [11.0, 1.5]}
     result = {
         "verdict": verdict, "effects": effects, "indistinguishable": tied or [[] for _ in effects],
-        "p": 0.002, "gaps": gaps,
-        "floor": 1.0, "seconds": {"base": 2.0, "find": 3.0}, **more,
+        "p": 0.002, "discrepancies": gaps,
+        "discretisation_error": 1.0, "seconds": {"base": 2.0, "find": 3.0}, **more,
     }  # fmt: skip
     return {"truth": truth, "result": result, "right": right_names, "parts": [], "oracle": None}
 
 
 def reached(validation: float, converged: bool = True) -> Any:
     """An oracle."""
-    return {"gaps": {"validation": validation}, "settled": None, "converged": converged}
+    return {"discrepancies": {"validation": validation}, "settled": None, "converged": converged}
 
 
 def rates(*cases: Any, known: Any = None) -> dict[str, Any]:
@@ -310,7 +310,7 @@ def test_rates_of_what_is_named():
     latch, closer = "latch at door", "door_closer at door"
     found = rates(
         case("single", "named", [latch], [[latch]]),
-        case("single", "tie", [closer], [[latch]], tied=[[latch]]),
+        case("single", "indistinguishable", [closer], [[latch]], tied=[[latch]]),
         case("single", "partly explained", [latch], [[latch]]),
         case("single", "named", [closer], [[latch]]),
         case("single", "unexplained", [], [[latch]]),
@@ -341,7 +341,7 @@ def test_rates_of_what_is_named():
 def test_cases_are_nameable_where_right_names_close_half_of_the_gap():
     latch = "latch at door"
     good, poor = ({"oracle": reached(u)} for u in (5.0, 7.0))  # of 10 above the floor they close 6 and 4
-    shut = case("single", "none", [], [[latch]], gaps={"validation": [1.01, 1.01], "test": [1.0, 1.0]})
+    shut = case("single", "none", [], [[latch]], discrepancies={"validation": [1.01, 1.01], "test": [1.0, 1.0]})
     found = rates(
         {**case("single", "named", [latch], [[latch]]), **good},
         {**case("single", "named", [latch], [[latch]]), **poor},  # named or not: the oracle alone counts
@@ -424,7 +424,7 @@ def test_intervals_are_compared_with_what_the_library_form_should_take():
 
 def test_where_there_is_no_gap_no_share_of_it_is_closed():
     gaps = {"validation": [11.0, 2.0], "test": [1.01, 0.99]}
-    judged = score.judge(case("single", "named", ["latch at door"], [["latch at door"]], gaps=gaps), {})
+    judged = score.judge(case("single", "named", ["latch at door"], [["latch at door"]], discrepancies=gaps), {})
     assert judged["closed"] == {"validation": pytest.approx(0.9)}
 
 
@@ -432,7 +432,7 @@ def test_search_and_black_box_are_compared_on_the_same_gaps():
     box = {"bic": [], "black_box": {"validation": [11.0, 6.0], "test": [11.0, 1.0]}}
     named = case("single", "named", ["latch at door"], [["latch at door"]], baselines=box)
     gaps = {"validation": [11.0, 11.0], "test": [1.0, 1.0]}  # the test motion shows none
-    silent = case("single", "unexplained", [], [["latch at door"]], baselines=box, gaps=gaps)
+    silent = case("single", "unexplained", [], [["latch at door"]], baselines=box, discrepancies=gaps)
     found = rates(named, silent)["baselines"]
     assert found["search_closed_validation"]["median"] == pytest.approx(0.45)  # 0.9 and 0
     assert found["black_box_closed_validation"]["median"] == pytest.approx(0.5)
@@ -443,10 +443,12 @@ def test_confusion_tells_ties_from_swaps_and_right_effects_in_wrong_places():
     right_names = [["latch at door", "preload at door"]]
     answers = (["preload at door"], ["latch at elbow"], ["closer at door"])
     judged = [score.judge(case("single", "named", names, right_names), {}) for names in answers]
-    judged.append(score.judge(case("single", "tie", ["closer at door"], right_names, tied=[["latch at door"]]), {}))
+    judged.append(
+        score.judge(case("single", "indistinguishable", ["closer at door"], right_names, tied=[["latch at door"]]), {})
+    )
     assert summing.confusion(judged) == {"h0": {"latch": 2, "latch (elsewhere)": 1, "closer": 1}}
     pair, ties = [["tilt at door"], ["delay at door"]], [["delay at door + tilt at door"], ["tilt at door"]]
-    both = score.judge(case("pair", "tie", ["drag at door", "delay at door"], pair, tied=ties), {})
+    both = score.judge(case("pair", "indistinguishable", ["drag at door", "delay at door"], pair, tied=ties), {})
     assert both["said"] == ["drag", "delay"]
 
 
@@ -478,18 +480,18 @@ def test_bic_is_judged_by_the_same_answers():
 
 def test_one_tie_does_not_name_both_effects_of_a_pair():
     right_names = [["check", "preload"], ["tilt", "preload"]]
-    one = score.judge(case("pair", "tie", ["preload"], right_names, tied=[["check", "tilt"]]), {})
-    two = score.judge(case("pair", "tie", ["preload", "check"], right_names, tied=[["tilt"], []]), {})
+    one = score.judge(case("pair", "indistinguishable", ["preload"], right_names, tied=[["check", "tilt"]]), {})
+    two = score.judge(case("pair", "indistinguishable", ["preload", "check"], right_names, tied=[["tilt"], []]), {})
     assert sum(one["met"]) == 1 and not one["named"] and not one["false_names"]
     assert two["met"] == [True, True] and two["named"]
 
 
 def test_a_tie_of_two_effects_at_once_names_both():
     """ "a, or b and c together": the hidden pair b and c is named, and where only b is hidden c is a false name."""
-    found = case("pair", "tie", ["a"], [["b"], ["c"]], tied=[["b + c"]])
+    found = case("pair", "indistinguishable", ["a"], [["b"], ["c"]], tied=[["b + c"]])
     judged = score.judge(found, {})
     assert judged["met"] == [True, True] and judged["named"] and not judged["wrong_confident"] and not judged["alone"]
-    other = score.judge(case("single", "tie", ["a"], [["b"]], tied=[["b + c"]]), {})
+    other = score.judge(case("single", "indistinguishable", ["a"], [["b"]], tied=[["b + c"]]), {})
     assert other["met"] == [False] and other["false_names"]
 
 
@@ -504,7 +506,7 @@ def test_an_effects_own_name_is_told_from_an_equivalents():
     names = [["latch", "preload"]]
     one = [
         case("single", "named", ["latch"], names),
-        case("single", "tie", ["drag"], names, tied=[["latch"]]),
+        case("single", "indistinguishable", ["drag"], names, tied=[["latch"]]),
         case("single", "named", ["preload"], names),
         case("single", "named", ["latch", "drag"], names),  # with a false name it is not named
         case("left_out", "named", ["latch"], names),
@@ -519,7 +521,7 @@ def test_an_effects_own_name_is_told_from_an_equivalents():
     two = [
         case("pair", "named", ["tilt", "preload"], pair),
         case("pair", "named", ["tilt", "latch"], pair),
-        case("pair", "tie", ["drag"], pair, tied=[["preload + tilt", "latch + tilt"]]),
+        case("pair", "indistinguishable", ["drag"], pair, tied=[["preload + tilt", "latch + tilt"]]),
     ]
     judged = [score.judge(c, {}) for c in two]
     assert [(j["named"], j["own"]) for j in judged] == [(True, False), (True, True), (True, True)]
@@ -584,7 +586,14 @@ def test_a_null_that_was_made_in_pieces_is_summed_up_whole(
 
     def case_of(plan: Any, commit: str, bench: Any) -> dict[str, Any]:
         made.append(plan.name)
-        return {"scene": plan.scene, "p": 0.5, "gap": 0.0, "converged": True, "seconds": {"base": 1.0}, "code": commit}
+        return {
+            "scene": plan.scene,
+            "p": 0.5,
+            "discrepancy": 0.0,
+            "converged": True,
+            "seconds": {"base": 1.0},
+            "code": commit,
+        }
 
     def run(*words: str) -> dict[str, Any]:
         monkeypatch.setattr("sys.argv", ["null_calibration.py", "--out", str(tmp_path), *words])
@@ -612,12 +621,12 @@ def test_a_null_that_fails_after_its_screening_keeps_its_p(monkeypatch: pytest.M
 
     def run_case(plan: Any, commit: str, bench: Any, watch: Any) -> Any:
         watch.seconds["base"] = 1.0
-        yield {"p": 0.001, "gap": 0.1, "converged": True}
+        yield {"p": 0.001, "discrepancy": 0.1, "converged": True}
         raise ValueError("no replay")
 
     monkeypatch.setattr(null_calibration, "run_case", run_case)
     case = null_calibration.case_of(Plan("hinge/null/0", "hinge", "none"), COMMIT, Bench())
-    other = {"p": 0.5, "gap": 0.0, "converged": True, "seconds": {"base": 1.0}}
+    other = {"p": 0.5, "discrepancy": 0.0, "converged": True, "seconds": {"base": 1.0}}
     found = null_calibration.summarise([case, other])
     assert case["p"] == 0.001 and case["error"] == "no replay" and case["verdict"] == "error"
     assert (found["screening_rejects"]["hits"], found["screening_rejects"]["of"]) == (1, 2)
@@ -685,7 +694,7 @@ def test_an_oracle_is_of_the_result_that_is_there(tmp_path: Path, monkeypatch: p
         asked.append(result["n"])
         if result["n"] == 3:
             raise FloatingPointError("no replay")
-        return {"model": "latch", "gaps": {"train": 1.0}}
+        return {"model": "latch", "discrepancies": {"train": 1.0}}
 
     monkeypatch.setattr(oracle, "oracle", one)
     for folder in ("sealed", "results"):

@@ -431,8 +431,8 @@ def test_a_wrong_shape_is_named(tmp_path: Path) -> None:
 
 def test_words_agree_with_the_search() -> None:
     from droid_jax.discrepancy import select
-    from droid_jax.discrepancy.split import Split
     from droid_jax.discrepancy.verdict import Conclusion
+    from droid_jax.recordings.split import Split
 
     assert {k.value for k in Conclusion} == set(VERDICTS)
     assert {s.value for s in Split} == set(PARTS)

@@ -1,7 +1,7 @@
-"""How recordings share the work of a search: train, validation and test data.
+"""Which recordings train, validate and test.
 
 Two or three recordings have a role each.  One alone is divided, by its repeats or, where it has none, into blocks of
-time (`droid_jax.discrepancy.single`); both validate on the training motion, and `Split.limits` says what that costs.
+time (`discrepancy.case.single_case`).  Both validate on the training motion; `Split.limits` says what that costs.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ import enum
 from collections.abc import Sequence
 from dataclasses import replace
 
-from droid_jax.discrepancy.sign_flips import FEWEST_REPEATS
 from droid_jax.recordings.recording import Recording
 
+FEWEST_REPEATS = 8  # for sign flips: with six the smallest possible p is 0.03
 ROLES = ("train", "validation", "test")
 HALVES = 2 * FEWEST_REPEATS  # repeats of one recording from which each half is enough
 ELSE = (

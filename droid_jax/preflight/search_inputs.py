@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from droid_jax.discrepancy.split import Split, roles_of, split_of
 from droid_jax.model.scene import Scene
 from droid_jax.preflight.check_log import warn_of_log
 from droid_jax.recordings.checks import validate
 from droid_jax.recordings.recording import Channel, Recording
+from droid_jax.recordings.split import Split, roles_of, split_of
 
 STILL = 0.01  # rad or m: a robot whose joints all move less stood still
 BACKWARDS = 0.25  # share of the way down that a hinge may also go up and still open downwards
@@ -38,7 +38,7 @@ def check_recordings(scene: Scene, roles: Mapping[str, Recording]) -> None:
     """ValueError where a search in these recordings ("train", "validation", perhaps "test") could not end well.
 
     Each must hold repeats, cut alike, of a motion that moves the robot and the object; all must measure the same
-    joints, and none may be another one once more.  How many repeats are enough: `droid_jax.discrepancy.split`.
+    joints, and none may be another one once more.  How many repeats are enough: `droid_jax.recordings.split`.
     """
     for role, recording in roles.items():
         where = f"the {role} recording {recording.name!r}"

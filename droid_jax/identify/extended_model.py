@@ -17,13 +17,10 @@ import msgspec
 import numpy as np
 
 from droid_jax.arguments import instance, path_of, shown
-from droid_jax.discrepancy.candidates import Candidate
-from droid_jax.discrepancy.case import Case
-from droid_jax.discrepancy.final_refit import FinalModel
 from droid_jax.files import EXTENDED, EXTENDED_MJCF
 from droid_jax.identify.gaussian import Coordinates, Gaussian, ParameterEntry, matrix, space_of, space_to_json
-from droid_jax.identify.identifiability import posterior
 from droid_jax.model.effect_interface import Effect
+from droid_jax.model.effects.candidate import Candidate, Keys
 from droid_jax.model.effects.registry import effect_space, library, ready
 from droid_jax.model.fields import check_space
 from droid_jax.model.mjcf import WORDS, fitted_mjcf, native
@@ -69,28 +66,18 @@ class Extended:
         return Space(tuple(replace(self.space[name], mean=at[name]) for name in names))
 
     @property
-    def lacking(self) -> tuple[str, ...]:
-        """Names of the parts that an MJCF cannot hold in full: of a payload it holds the mass, and not the moment."""
+    def lacking(self) -> Keys:
+        """The parts that an MJCF cannot hold in full: of a payload it holds the mass, and not the moment."""
         effects = {e.name: e for e in self.effects}
         model = make_c_model(self.scene, self.space, self.values)
         said = {n for n, e in effects.items() if native(e, self.space, self.values, model) is not None}
         parts = (p for p in self.parts if p.effect not in said)
-        return tuple(p.name for p in parts if not _in_mjcf(effects[p.effect], self.space.select(p.free)))
-
-
-def extended(case: Case, handed: FinalModel) -> Extended:
-    """The extended model that a search hands on, as something to save."""
-    model = handed.model
-    values = model.values[case.full_space.columns(model.space)]
-    gaussian = posterior(model.refined, [c for residual_set in handed.fitted_to for c in residual_set.cost.comparisons])
-    named = {part.effect for part in model.parts}
-    effects = tuple(e for e in case.effects if e.name in named)
-    return Extended(case.train.cost.scene, model.parts, effects, values, gaussian)
+        return tuple(p.key for p in parts if not _in_mjcf(effects[p.effect], self.space.select(p.free)))
 
 
 def save_extended(folder: Path, model: Extended) -> None:
     """Write extended.json and extended.xml into `folder`; extended.json says why where there is no MJCF."""
-    mjcf: dict[str, Any] = {"file": EXTENDED_MJCF, "lacks": list(model.lacking)}
+    mjcf: dict[str, Any] = {"file": EXTENDED_MJCF, "lacks": list(map(str, model.lacking))}
     try:
         write_text(folder / EXTENDED_MJCF, fitted_mjcf(model.scene, model.space, model.values, model.effects))
     except ValueError as error:

@@ -8,10 +8,10 @@ import mujoco
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from droid_jax.discrepancy.time_scaling import TimeScaling, time_scaled
 from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording
+from droid_jax.recordings.time_scaling import TimeScaling, time_scaled
 from droid_jax.simulate.hand_path import minimum_jerk, solve_pose
 
 FURTHER = "the same motion, opened a third further"
