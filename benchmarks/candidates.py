@@ -32,7 +32,7 @@ from droid_jax.door.space import door_nuisances, door_space  # noqa: E402
 from droid_jax.identify.levenberg_marquardt import CANDIDATE_STEPS, CHORDS  # noqa: E402
 from droid_jax.model.effects.candidate import candidates  # noqa: E402
 from droid_jax.model.effects.registry import effect_space, library, ready  # noqa: E402
-from droid_jax.recordings.formats import load  # noqa: E402
+from droid_jax.recordings.formats import load_recording  # noqa: E402
 from droid_jax.recordings.recording import Recording  # noqa: E402
 from droid_jax.synthetic.robot import SyntheticRobotConfig, record, synthetic_truth  # noqa: E402
 
@@ -56,7 +56,7 @@ class Arguments:
 
 def recording(quick: bool) -> Recording:
     """Two repeats of the synthetic robot: what they hold does not matter here."""
-    scene, demonstration = door_scene(), load(demonstration_path("A"))
+    scene, demonstration = door_scene(), load_recording(demonstration_path("A"))
     if quick:
         first = float(demonstration.time[0])
         demonstration = demonstration.window(first, first + SHORT)

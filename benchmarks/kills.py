@@ -130,7 +130,7 @@ def write_inputs(place: Path) -> None:
     """Scene, parameters and a log of 24 s with dry friction that the scene lacks."""
     if (place / "log.npz").exists():
         return
-    from droid_jax.recordings.formats import save
+    from droid_jax.recordings.formats import save_recording
     from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
 
     time_, size, rate = np.arange(0.0, 24.0, 0.01), np.array([[0.5], [0.15]]), 2 * np.pi * np.array([[0.23], [0.51]])
@@ -149,7 +149,9 @@ def write_inputs(place: Path) -> None:
     convention = TorqueConvention(TorqueSide.MOTOR, gravity=True)
     (place / "hinge.xml").write_text(HINGE)
     write_json(place / "parameters.json", PARAMETERS)
-    save(Recording("hinge", np.zeros(0), np.zeros((0, 0)), (), channels, convention, qpos0={}), place / "log.npz")
+    save_recording(
+        Recording("hinge", np.zeros(0), np.zeros((0, 0)), (), channels, convention, qpos0={}), place / "log.npz"
+    )
 
 
 def reference(place: Path, command: str) -> float:

@@ -23,7 +23,7 @@ from droid_jax.door.space import door_space
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_c_model, make_physics
 from droid_jax.model.scene import Scene
-from droid_jax.recordings.formats import load
+from droid_jax.recordings.formats import load_recording
 from droid_jax.simulate.batching import over_block, over_population
 from droid_jax.simulate.c_engine import instrument, simulate
 from droid_jax.simulate.c_reference import control_of
@@ -56,7 +56,7 @@ class Case:
 def make_case(seed: int, steps: int | None = None) -> Case:
     """Demonstration A in the door scene, whole or its first `steps` steps."""
     scene = door_scene()
-    drive = make_drive(scene, load(demonstration_path("A")))
+    drive = make_drive(scene, load_recording(demonstration_path("A")))
     if steps is not None:
         drive = replace(drive, command=drive.command[:steps])
     return Case(scene, door_space(scene), drive, seed)

@@ -29,14 +29,14 @@ from droid_jax.door.scene import door_scene  # noqa: E402
 from droid_jax.door.space import door_space, truth  # noqa: E402
 from droid_jax.model.physics import make_c_model, make_physics  # noqa: E402
 from droid_jax.model.scene import with_options  # noqa: E402
-from droid_jax.recordings.formats import load  # noqa: E402
+from droid_jax.recordings.formats import load_recording  # noqa: E402
 from droid_jax.simulate.batching import over_population  # noqa: E402
 from droid_jax.simulate.c_engine import instrument, simulate  # noqa: E402
 from droid_jax.simulate.c_reference import c_replay  # noqa: E402
 from droid_jax.simulate.replay import make_drive, servo_replay  # noqa: E402
 
 FINE = 1e-4  # s
-DEMONSTRATION = load(demonstration_path("A"))
+DEMONSTRATION = load_recording(demonstration_path("A"))
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from droid_jax.door.space import door_space as door_space
     from droid_jax.identify.extended_model import load_extended as load_extended
     from droid_jax.identify.gaussian import Gaussian as Gaussian
-    from droid_jax.identify.gaussian import load as load_gaussian
+    from droid_jax.identify.gaussian import load_gaussian as load_gaussian
     from droid_jax.identify.pipeline import IdentifyConfig as IdentifyConfig
     from droid_jax.identify.pipeline import identify_parameters as identify_parameters
     from droid_jax.model.mjcf import fitted_mjcf as fitted_mjcf
@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from droid_jax.model.scene import load_scene as load_scene
     from droid_jax.policy.randomise import randomised as randomised
     from droid_jax.policy.randomise import randomised_model as randomised_model
-    from droid_jax.recordings.formats import load as load_recording
-    from droid_jax.recordings.formats import save as save_recording
+    from droid_jax.recordings.formats import load_recording as load_recording
+    from droid_jax.recordings.formats import save_recording as save_recording
     from droid_jax.recordings.recording import Recording as Recording
     from droid_jax.report.tables import frames as frames
     from droid_jax.runtime import tune as tune
@@ -83,13 +83,13 @@ _HOMES = {
     "door_space": ("door.space", "door_space"),
     "door_nuisances": ("door.space", "door_nuisances"),
     "Recording": ("recordings.recording", "Recording"),
-    "load_recording": ("recordings.formats", "load"),
-    "save_recording": ("recordings.formats", "save"),
+    "load_recording": ("recordings.formats", "load_recording"),
+    "save_recording": ("recordings.formats", "save_recording"),
     "make_cost": ("cost.cost", "make_cost"),
     "identify_parameters": ("identify.pipeline", "identify_parameters"),
     "IdentifyConfig": ("identify.pipeline", "IdentifyConfig"),
     "Gaussian": ("identify.gaussian", "Gaussian"),
-    "load_gaussian": ("identify.gaussian", "load"),
+    "load_gaussian": ("identify.gaussian", "load_gaussian"),
     "fitted_mjcf": ("model.mjcf", "fitted_mjcf"),
     "find_missing_effects": ("discrepancy.missing", "find_missing_effects"),
     "DiscrepancyConfig": ("discrepancy.case", "DiscrepancyConfig"),

@@ -73,7 +73,7 @@ def name(value: Any, what: str, *, file: bool = False, empty: bool = False) -> s
 
 def names(value: Any, what: str, *, empty: bool = True) -> tuple[str, ...]:
     """Several names, none of them twice; one text is no list of its letters."""
-    if not listed(value):
+    if not is_list(value):
         raise ValueError(f"{what} must be a list of names, got {shown(value)}")
     out = tuple(name(one, f"{what}, entry {i}") for i, one in enumerate(value, 1))
     if not out and not empty:
@@ -83,7 +83,7 @@ def names(value: Any, what: str, *, empty: bool = True) -> tuple[str, ...]:
     return out
 
 
-def listed(value: Any) -> bool:
+def is_list(value: Any) -> bool:
     """Whether a value has entries: texts and arrays without axes have none."""
     return (
         isinstance(value, Iterable) and not isinstance(value, (str, bytes, PathLike)) and getattr(value, "ndim", 1) > 0
@@ -211,9 +211,14 @@ def instance(value: Any, what: str, kind: type[Kind]) -> Kind:
     return value
 
 
+def mapping(value: Any, what: str) -> Mapping[Any, Any]:
+    """A dictionary or another mapping; what its keys and values are is for others to check."""
+    return instance(value, what, Mapping)
+
+
 def instances(value: Any, what: str, kind: type[Kind], *, empty: bool = True) -> tuple[Kind, ...]:
     """A list of objects of a class."""
-    if isinstance(value, dict) or not listed(value):
+    if isinstance(value, dict) or not is_list(value):
         raise ValueError(f"{what} must be a list of {kind.__name__} objects, got {_got(value)}")
     out = tuple(instance(one, f"{what}, entry {i}", kind) for i, one in enumerate(value))
     if not out and not empty:
@@ -238,7 +243,7 @@ def several(check: Callable[[Any, str], Any], count: int | None = None) -> Calla
     """A check of every entry of a list; count: how many there must be, None for one or more."""
 
     def each(value: Any, what: str) -> tuple[Any, ...]:
-        if not listed(value):
+        if not is_list(value):
             raise ValueError(f"{what} must be a list, got {_got(value)}")
         out = tuple(check(one, f"{what}, entry {i}") for i, one in enumerate(value))
         if not out or len(out) != (count or len(out)):

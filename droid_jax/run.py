@@ -34,7 +34,7 @@ from droid_jax.commands.folder import BEGUN
 Command = (
     Annotated[all_stages.All, tyro.conf.subcommand("all")]
     | identify.Identify
-    | gap.Gap
+    | Annotated[gap.GapCommand, tyro.conf.subcommand("gap")]
     | train.Train
     | evaluate.Evaluate
     | export.Export
@@ -46,7 +46,7 @@ Command = (
 _ACTIONS: dict[type, Callable[[Any], None]] = {
     all_stages.All: all_stages.run,
     identify.Identify: identify.run,
-    gap.Gap: gap.run,
+    gap.GapCommand: gap.run,
     train.Train: train.run,
     evaluate.Evaluate: evaluate.run,
     export.Export: export.run,
@@ -61,7 +61,12 @@ SCRIPT = "droid-jax"  # as pyproject.toml installs it
 WHOLE = ("-h", "--help", "--tyro-")  # options of the program itself: help, shell completion
 # Errors of the machine, not of what it was given: no room, a quota, a file larger than allowed, a broken disk.
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
-RESUMED = (all_stages.All, identify.Identify, gap.Gap, train.Train)  # commands that go on where they were stopped
+RESUMED = (
+    all_stages.All,
+    identify.Identify,
+    gap.GapCommand,
+    train.Train,
+)  # commands that go on where they were stopped
 WHAT = """From recordings of a robot to a fitted simulation, to what that simulation lacks, and to a policy.
 
 Without a command: `all`, on a synthetic robot.  --version says which version this is."""

@@ -25,7 +25,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from droid_jax.quiet import before_jax, import_mjx, quiet_cache
-from droid_jax.quiet import quiet as quiet
 from droid_jax.storage import write_json
 
 if TYPE_CHECKING:
@@ -55,14 +54,21 @@ class Runtime:
 def tune(devices: int | None = None, cache_dir: str | Path | None = None) -> Runtime:
     """Prepare jax for many replays on this machine; call it before jax computes anything.
 
-    devices: virtual CPU devices; None keeps a number set by JAX_NUM_CPU_DEVICES or XLA_FLAGS, else
-        takes one per core that this process may use.  On a GPU they only concern CPU work.
-    cache_dir: folder for compiled programs and the flag probe's answer; None takes DROID_JAX_CACHE,
-        else droid_jax in the user's cache folder.
     Calling it again with the same settings is harmless.
 
-    Raises ValueError for devices < 1, RuntimeError when jax is already running on the CPU with
-    other settings, and OSError for a chosen cache folder that cannot be written.
+    Args:
+        devices: virtual CPU devices. None keeps a number set by JAX_NUM_CPU_DEVICES or XLA_FLAGS, else takes one per
+            core that this process may use. On a GPU they only concern CPU work.
+        cache_dir: folder for compiled programs and the flag probe's answer. None takes DROID_JAX_CACHE, else droid_jax
+            in the user's cache folder.
+
+    Returns:
+        What was set.
+
+    Raises:
+        ValueError: devices is below 1.
+        RuntimeError: jax is already running on the CPU with other settings.
+        OSError: the chosen cache folder cannot be written.
     """
     if devices is not None and devices < 1:
         raise ValueError(f"devices: expected at least 1 virtual CPU device, got {devices}")

@@ -15,6 +15,8 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import dataclasses
+import enum
 import hashlib
 import io
 import json
@@ -176,6 +178,33 @@ def file_sha256(path: Path) -> str:
 def finite(number: float) -> float | None:
     """The number, or None for NaN and infinities: what `write_json` takes."""
     return float(number) if math.isfinite(number) else None
+
+
+def config_json(config: Any) -> dict[str, Any]:
+    """Settings as plain data, so that a result can be reproduced from its own file.
+
+    Args:
+        config: a dataclass; its fields may be dataclasses, enumerations, mappings, sequences, numbers, texts or None.
+
+    Returns:
+        field -> value, nested as the dataclasses are; numbers that JSON has not as text ("inf").
+    """
+    return {f.name: _plain(getattr(config, f.name)) for f in dataclasses.fields(config)}
+
+
+def _plain(value: Any) -> Any:
+    """A setting's value as JSON has it."""
+    if dataclasses.is_dataclass(value):
+        return config_json(value)
+    if isinstance(value, enum.Enum):
+        return _plain(value.value)
+    if isinstance(value, Mapping):
+        return {str(key): _plain(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(each) for each in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    return value
 
 
 def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:

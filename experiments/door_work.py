@@ -30,8 +30,8 @@ from benchmarks.common import publish  # noqa: E402
 from droid_jax.door.demonstration import demonstration_path  # noqa: E402
 from droid_jax.door.scene import door_scene  # noqa: E402
 from droid_jax.files import POLICY  # noqa: E402
-from droid_jax.policy.control import load  # noqa: E402
-from droid_jax.recordings.formats import load as load_recording  # noqa: E402
+from droid_jax.policy.control import load_policy  # noqa: E402
+from droid_jax.recordings.formats import load_recording  # noqa: E402
 from droid_jax.simulate.c_engine import simulate  # noqa: E402
 from droid_jax.synthetic.policy_trials import watched  # noqa: E402
 from droid_jax.synthetic.robot import SyntheticRobotConfig, set_up  # noqa: E402
@@ -74,7 +74,7 @@ def of_policies(setting: Setting, arguments: Arguments) -> Iterator[tuple[str, d
     options = PadArguments(setting=setting.name, frictions=(), policies=arguments.policies, quick=arguments.quick)
     robot = robots(setting, options)["own"]
     for case in made(options):
-        policy = load(arguments.policies / "trained_cases" / case["trained"] / POLICY)
+        policy = load_policy(arguments.policies / "trained_cases" / case["trained"] / POLICY)
         each = [Opening(robot) for _ in range(1 if arguments.quick else WATCHED)]
         for number, opening in enumerate(each):
             watched(policy, robot, number, opening)

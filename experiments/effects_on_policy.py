@@ -40,10 +40,10 @@ from droid_jax.door.scene import door_scene  # noqa: E402
 from droid_jax.door.task import Task  # noqa: E402
 from droid_jax.files import POLICY  # noqa: E402
 from droid_jax.model.scene import Scene  # noqa: E402
-from droid_jax.policy.control import Policy, load  # noqa: E402
-from droid_jax.recordings.formats import load as load_recording  # noqa: E402
+from droid_jax.policy.control import Policy, load_policy  # noqa: E402
+from droid_jax.recordings.formats import load_recording  # noqa: E402
 from droid_jax.storage import file_sha256, write_json  # noqa: E402
-from droid_jax.synthetic.hidden_effects import HIDDEN, LONGEST_STEP, Applied, listed, possible, record_hidden  # noqa: E402
+from droid_jax.synthetic.hidden_effects import HIDDEN, LONGEST_STEP, Applied, as_applied, possible, record_hidden  # noqa: E402
 from droid_jax.synthetic.policy_trials import TransferConfig, check_playable, synthetic_robot, transfer  # noqa: E402
 from droid_jax.synthetic.robot import SyntheticRobotConfig  # noqa: E402
 from experiments.policies.cases import RESULTS, TIMESTEP, Case, Options, finish, run_all  # noqa: E402
@@ -77,7 +77,7 @@ class Arguments(Options):
 def applicable(scene: Scene, arguments: Arguments) -> list[Applied]:
     """What is asked for, or every effect that a policy can be tried with, on the hinge too where it can act there."""
     if arguments.hide:
-        return [one for entry in arguments.hide for one in listed(hidden_effects([entry], scene))]
+        return [one for entry in arguments.hide for one in as_applied(hidden_effects([entry], scene))]
     found = []
     for name in possible(scene):
         try:
@@ -152,7 +152,7 @@ def main() -> None:
     needs_out(arguments)
     setting = replace(setting_of("paper", arguments.robot), springs=arguments.springs)
     path = arguments.policy or trained(arguments, setting, code)
-    policy = load(path)
+    policy = load_policy(path)
     of = {
         "springs": arguments.springs,
         "policy": arguments.policy.parent.name if arguments.policy else "prior",

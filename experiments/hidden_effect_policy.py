@@ -43,15 +43,14 @@ from droid_jax.door.space import door_nuisances, door_space  # noqa: E402
 from droid_jax.door.task import Task  # noqa: E402
 from droid_jax.files import EXTENDED  # noqa: E402
 from droid_jax.identify.extended_model import load_extended, save_extended  # noqa: E402
-from droid_jax.identify.gaussian import load as load_gaussian  # noqa: E402
-from droid_jax.identify.gaussian import prior  # noqa: E402
+from droid_jax.identify.gaussian import load_gaussian, prior  # noqa: E402
 from droid_jax.identify.identifiability import posterior  # noqa: E402
 from droid_jax.identify.multistart import RefineConfig  # noqa: E402
 from droid_jax.identify.search import SearchConfig  # noqa: E402
 from droid_jax.model.effects.registry import library  # noqa: E402
 from droid_jax.recordings.split import Split  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
-from droid_jax.synthetic.hidden_effects import listed  # noqa: E402
+from droid_jax.synthetic.hidden_effects import as_applied  # noqa: E402
 from droid_jax.synthetic.policy_trials import TransferConfig, check_playable, synthetic_robot  # noqa: E402
 from droid_jax.synthetic.robot import synthetic_truth  # noqa: E402
 from experiments.policies.cases import TIMESTEP, Case, Options, finish, found_of, made_by, run_all, tried  # noqa: E402
@@ -140,7 +139,7 @@ def playable(arguments: Arguments) -> None:
     """Ends the program where no policy can be tried with what is hidden: before the search, which takes hours."""
     scene = door_scene()
     try:
-        check_playable(scene, listed(hidden_effects(arguments.hide, scene)))
+        check_playable(scene, as_applied(hidden_effects(arguments.hide, scene)))
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
 
@@ -159,7 +158,7 @@ def case(model: str, seed: int, folder: Path, arguments: Arguments, code: Mappin
     else:
         known = load_extended(folder / EXTENDED, scene)
         env, gaussian = DoorEnv(known.scene, task, known.effects), known.gaussian
-    hidden, config = listed(hidden_effects(arguments.hide, scene)), TransferConfig(trials=budget.trials, seed=robot)
+    hidden, config = as_applied(hidden_effects(arguments.hide, scene)), TransferConfig(trials=budget.trials, seed=robot)
     truth = synthetic_truth(door_scene(), SPRINGS, robot)
     robots = {"synthetic_robot": synthetic_robot(door_scene(limits=True), env.start, truth, hidden, task, config)}
     return tried(arguments, env, Doors(gaussian), robots, seed, code)

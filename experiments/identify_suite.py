@@ -39,7 +39,7 @@ from droid_jax.identify.multistart import RefineConfig  # noqa: E402
 from droid_jax.identify.pipeline import Identified, IdentifyConfig, cost_samples, identify_parameters  # noqa: E402
 from droid_jax.identify.search import SearchConfig  # noqa: E402
 from droid_jax.model.scene import Scene  # noqa: E402
-from droid_jax.recordings.formats import load  # noqa: E402
+from droid_jax.recordings.formats import load_recording  # noqa: E402
 from droid_jax.recordings.recording import Recording  # noqa: E402
 from droid_jax.synthetic.robot import draw_nuisances, record, synthetic_truth  # noqa: E402
 
@@ -71,7 +71,10 @@ def settings(quick: bool, seed: int) -> IdentifyConfig:
 
 def recordings(scene: Scene, truth: dict[str, float], names: str, seed: int) -> list[Recording]:
     """Ten repeats of each demonstration on the synthetic robot."""
-    return [record(scene, load(demonstration_path(n)), truth, seed=100 * seed + i, name=n) for i, n in enumerate(names)]
+    return [
+        record(scene, load_recording(demonstration_path(n)), truth, seed=100 * seed + i, name=n)
+        for i, n in enumerate(names)
+    ]
 
 
 def describe(found: Identified, truth: dict[str, float]) -> dict[str, Any]:

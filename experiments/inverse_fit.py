@@ -31,7 +31,7 @@ from droid_jax.identify.fit import Fit
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.identifiability import calibrated, identifiability, time_blocks
 from droid_jax.identify.multistart import Refined, refine
-from droid_jax.identify.search import SearchConfig, search
+from droid_jax.identify.search import SearchConfig, cma_search
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
@@ -161,7 +161,7 @@ class Estimate:
 
 def find(cost: Cost, space: Space, config: SearchConfig) -> Fit:
     """CMA-ES from the prior, the noise stated from what the prior's mean leaves unexplained."""
-    fit = search(cost.restated(space.mean), space, config)
+    fit = cma_search(cost.restated(space.mean), space, config)
     print(f"  CMA-ES: cost {fit.best_cost:.4f} after {len(fit.history.sigma)} generations ({fit.stop})", flush=True)
     return fit
 
@@ -178,7 +178,7 @@ def estimate(cost: Cost, space: Space, start: np.ndarray, block: float) -> Estim
         raise ValueError(f"block: residuals stay correlated for {longest:.2f} s, got {block} s")
     refined = refine(cost.restated(start).whitened, space, start)
     samples, columns = left.shape
-    blocks = time_blocks([(columns, samples)], [samples / noise.RATE], block)
+    blocks = time_blocks([(columns, samples)], [samples / noise.DEFAULT_NOISE.rate], block)
     return Estimate(space, refined.best, calibrated(refined, (), blocks), refined)  # one repeat: no scatter
 
 

@@ -44,7 +44,7 @@ from droid_jax.door.hand import finger_forces_c, hand_of, looked  # noqa: E402
 from droid_jax.door.scene import door_scene  # noqa: E402
 from droid_jax.door.task import Task, gripped  # noqa: E402
 from droid_jax.files import POLICY  # noqa: E402
-from droid_jax.policy.control import Policy, load  # noqa: E402
+from droid_jax.policy.control import Policy, load_policy  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 from droid_jax.synthetic.policy_trials import PolicyRobot, TransferConfig, synthetic_robot, transfer, watched  # noqa: E402
 from experiments.policies.cases import QUICK_STEPS, RESULTS, TIMESTEP, made_by  # noqa: E402
@@ -178,7 +178,7 @@ def rows(cases: Sequence[dict[str, Any]], arguments: Arguments) -> Iterator[dict
     """Each policy, by pads."""
     by_pads, few = robots(SETTINGS[arguments.setting], arguments), 1 if arguments.quick else WATCHED
     for case in track(cases, "policies", console=Console(stderr=True)):
-        policy = load(arguments.policies / "trained_cases" / case["trained"] / POLICY)
+        policy = load_policy(arguments.policies / "trained_cases" / case["trained"] / POLICY)
         row = {"policy": f"{case['method']} {case['seed']}", "trained": case["trained"], "pads": {}}
         for name, robot in by_pads.items():
             tried = case["synthetic_robot"] if name == "own" else transfer(policy, robot).to_json()

@@ -36,9 +36,12 @@ from droid_jax.door.scene import door_scene  # noqa: E402
 from droid_jax.door.space import door_nuisances, door_space  # noqa: E402
 from droid_jax.door.task import Task  # noqa: E402
 from droid_jax.files import GAUSSIAN  # noqa: E402
-from droid_jax.identify.gaussian import Gaussian, prior  # noqa: E402
-from droid_jax.identify.gaussian import load as load_gaussian  # noqa: E402
-from droid_jax.policy.control import Policy, load  # noqa: E402
+from droid_jax.identify.gaussian import (  # noqa: E402
+    Gaussian,
+    load_gaussian,
+    prior,
+)
+from droid_jax.policy.control import Policy, load_policy  # noqa: E402
 from droid_jax.policy.evaluate import simulated  # noqa: E402
 from droid_jax.policy.randomise import axes, physics_of, randomised  # noqa: E402
 from droid_jax.policy.train import train  # noqa: E402
@@ -76,7 +79,7 @@ def trained(policy: Path, gaussian: Path) -> tuple[Policy, DoorEnv, Gaussian]:
     strange = [n for n in drawn.space.names if n not in known.names]
     if strange:
         raise SystemExit(f"error: {gaussian} has effects that plain C MuJoCo does not have: {', '.join(strange)}")
-    return load(policy), DoorEnv(scene, Task(spread=0.0)), drawn
+    return load_policy(policy), DoorEnv(scene, Task(spread=0.0)), drawn
 
 
 def untrained() -> tuple[Policy, DoorEnv, Gaussian]:

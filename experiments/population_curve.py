@@ -34,8 +34,8 @@ from droid_jax.door.demonstration import demonstration_path  # noqa: E402
 from droid_jax.door.scene import door_scene  # noqa: E402
 from droid_jax.door.space import door_space  # noqa: E402
 from droid_jax.identify.holdout import split_repeats  # noqa: E402
-from droid_jax.identify.search import SearchConfig, search  # noqa: E402
-from droid_jax.recordings.formats import load  # noqa: E402
+from droid_jax.identify.search import SearchConfig, cma_search  # noqa: E402
+from droid_jax.recordings.formats import load_recording  # noqa: E402
 from droid_jax.storage import write_bytes  # noqa: E402
 from droid_jax.synthetic.robot import record, synthetic_truth  # noqa: E402
 
@@ -62,7 +62,7 @@ def prepare() -> tuple[Cost, Cost]:
     """Cost of the fitted repeats, and of the held-out ones."""
     scene = door_scene(timestep=0.004)
     truth = synthetic_truth(scene, 1, 1)
-    recording = record(scene, load(demonstration_path("A")), truth, seed=100, name="A")
+    recording = record(scene, load_recording(demonstration_path("A")), truth, seed=100, name="A")
     fitted, held, _ = split_repeats(recording, 0.3)
     cost = make_cost(scene, door_space(scene), [fitted])
     return cost, cost.against([held])
@@ -77,8 +77,8 @@ def curve(cost: Cost, held: Cost, population: int, seconds: float, seed: int) ->
         population=population, parents=None, generations=100_000, tol_cost=0, tol_sigma=1e-5,
         max_seconds=seconds, seed=seed,
     )  # fmt: skip
-    search(cost, cost.space, replace(config, generations=1))
-    found = search(cost, cost.space, config)
+    cma_search(cost, cost.space, replace(config, generations=1))
+    found = cma_search(cost, cost.space, config)
     history = found.history
     rows = _rows(len(history.mean))
     return {

@@ -51,7 +51,7 @@ from inverse_fit import (
 )
 
 from droid_jax.cost.cost import Cost
-from droid_jax.cost.noise import CUTOFF, correlation_time
+from droid_jax.cost.noise import DEFAULT_NOISE, correlation_time
 from droid_jax.identify.search import SearchConfig
 from droid_jax.model.fields import body_mass, joint_damping, joint_frictionloss
 from droid_jax.model.parameters import Parameter, Space
@@ -163,7 +163,8 @@ def trace_figure(cost: Cost, before: np.ndarray, after: np.ndarray) -> Any:
         "before the fit": (measured - residual(cost, before), style.BEFORE),
         "after the fit": (measured - residual(cost, after), style.AFTER),
     }
-    return draw_fit(clock_of(cost), [f"{JUDGE} (not fitted)"], measured, lines, f"Force below {CUTOFF:g} Hz [N]")
+    label = f"Force below {DEFAULT_NOISE.cutoff:g} Hz [N]"
+    return draw_fit(clock_of(cost), [f"{JUDGE} (not fitted)"], measured, lines, label)
 
 
 def main(config: RealEmps) -> None:
@@ -186,7 +187,7 @@ def main(config: RealEmps) -> None:
         "recordings": {name: load_emps(config.data, name).sha256 for name in (FIT, JUDGE)},
         "filter": {
             "position": f"zero-phase Butterworth, order 4, {MOTION_CUTOFF:g} Hz, then central differences at 1 kHz",
-            "force": f"windowed sinc, {CUTOFF:g} Hz, measured and simulated alike",
+            "force": f"windowed sinc, {DEFAULT_NOISE.cutoff:g} Hz, measured and simulated alike",
             "simulated_at_hz": OVERSAMPLING * MOTION_CUTOFF,
         },
         "search": {"generations": len(search.history.sigma), "stop": search.stop, "best": rounded(search.best)},

@@ -65,7 +65,7 @@ from inverse_fit import (
 )
 
 from droid_jax.cost.cost import Cost
-from droid_jax.cost.noise import CUTOFF, correlation_time
+from droid_jax.cost.noise import DEFAULT_NOISE, correlation_time
 from droid_jax.door.arm import panda_arm_scene
 from droid_jax.door.builtin import ARM
 from droid_jax.identify.search import SearchConfig
@@ -344,7 +344,7 @@ def main(config: RealPanda) -> None:
         "recording": recording.sha256,
         "filter": {
             "position": f"zero-phase Butterworth, order 4, {MOTION_CUTOFF:g} Hz, then central differences at 1 kHz",
-            "torque": f"windowed sinc, {CUTOFF:g} Hz, measured and simulated alike",
+            "torque": f"windowed sinc, {DEFAULT_NOISE.cutoff:g} Hz, measured and simulated alike",
             "simulated_at_hz": OVERSAMPLING * MOTION_CUTOFF,
             "sign_smoothed_over_rad_s": SMOOTHING,
         },

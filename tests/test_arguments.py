@@ -14,8 +14,10 @@ import pytest
 import droid_jax as dj
 from droid_jax import arguments
 from droid_jax.arguments import check_fields, number, whole
+from droid_jax.cost.noise import NoiseConfig
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.discrepancy.config import DiscrepancyConfig
+from droid_jax.identify.identifiability import IdentifiabilityConfig
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.identify.pipeline import IdentifyConfig
 from droid_jax.identify.search import SearchConfig
@@ -47,12 +49,21 @@ GOOD = {"name": "a", "unit": "kg", "mean": 1.0, "std": 0.5, "low": 0.1, "high": 
         (lambda: CompareConfig(channels=["torque"]), "channels must map names to weights"),  # pyright: ignore
         (lambda: CompareConfig(whitened="yes"), "whitened must be True or False, got 'yes'"),  # pyright: ignore
         (lambda: CompareConfig(grip_share=1.5), "grip_share must be at most 1, got 1.5"),
+        (lambda: NoiseConfig(cutoff=0.0), "cutoff must be above 0, got 0.0"),
+        (lambda: NoiseConfig(trend_repeats=2), "trend_repeats must be at least 3, got 2"),
+        (lambda: NoiseConfig(minimum={"torque": 0.1}), "minimum must give each of torque, position, velocity"),
+        (lambda: CompareConfig(noise=8.0), "noise must be a NoiseConfig, got 8.0"),  # pyright: ignore
+        (lambda: IdentifiabilityConfig(partner=1.5), "partner must be at most 1, got 1.5"),
+        (lambda: IdentifyConfig(checks="yes"), "checks must be True or False, got 'yes'"),  # pyright: ignore
+        (lambda: SearchConfig(redraws=0), "redraws must be at least 1, got 0"),
         (lambda: SearchConfig(population=2.5), "population must be a whole number, got 2.5"),  # pyright: ignore
         (lambda: SearchConfig(sigma=math.nan), "sigma must be finite, got nan"),
         (lambda: SearchConfig(tol_cost=-1.0), "tol_cost must be at least 0, got -1.0"),
         (lambda: SearchConfig(max_seconds=math.inf), "max_seconds must be finite, got inf"),
         (lambda: SearchConfig(bounds="bounce"), "bounds must be one of resample, clip"),  # pyright: ignore
         (lambda: RefineConfig(iterations=-1), "iterations must be at least 0, got -1"),
+        (lambda: RefineConfig(give_up=0.0), "give_up must be above 0, got 0.0"),
+        (lambda: RefineConfig(chords=0), "chords must be at least 1, got 0"),
         (lambda: RefineConfig(step=0.0), "step must be above 0, got 0.0"),
         (lambda: RefineConfig(pruning_ratio=3.0), "pruning_ratio must be a list, got 3.0"),  # pyright: ignore
         (lambda: RefineConfig(pruning_ratio=()), "pruning_ratio must have one or more entries, got 0"),
@@ -162,8 +173,8 @@ def test_what_is_shown_of_a_value_is_one_short_line() -> None:
 
 def test_arrays_without_axes_are_no_lists() -> None:
     for value in (np.array(1.0), np.array("j"), Path("j"), "j", b"j", 3):
-        assert not arguments.listed(value)
-    assert all(map(arguments.listed, ([], (), {"a"}, np.zeros(2), (x for x in "ab"))))
+        assert not arguments.is_list(value)
+    assert all(map(arguments.is_list, ([], (), {"a"}, np.zeros(2), (x for x in "ab"))))
     with pytest.raises(ValueError, match="joints must be a list of names"):
         arguments.names(np.array("j"), "joints")
 

@@ -23,16 +23,16 @@ from droid_jax import run
 from droid_jax.commands import convert, folder, presets
 from droid_jax.commands.all_stages import All
 from droid_jax.commands.folder import OtherRun, changed, finished, setup_of
-from droid_jax.commands.gap import Gap
+from droid_jax.commands.gap import GapCommand
 from droid_jax.commands.identify import Identify
-from droid_jax.commands.synthetic import known_robot, settled
+from droid_jax.commands.synthetic import known_robot, with_robot_options
 from droid_jax.commands.train import Train
 from droid_jax.commands.user_effects import load_effects
 from droid_jax.door.demonstration import demonstration_path
 from droid_jax.identify import pipeline
 from droid_jax.model.effects import registry
 from droid_jax.read_json import typed
-from droid_jax.recordings.formats import load, save
+from droid_jax.recordings.formats import load_recording, save_recording
 from droid_jax.report.stages import Setup
 from droid_jax.run import main
 
@@ -144,7 +144,7 @@ def test_two_recordings_of_one_name(refused, tmp_path: Path):
     """Said before the folder is begun."""
     first, second = tmp_path / "first.npz", tmp_path / "second.npz"
     for path in (first, second):
-        save(load(small_recording(tmp_path), name="repeat_00"), path)
+        save_recording(load_recording(small_recording(tmp_path), name="repeat_00"), path)
     said = refused("identify", "--recording", first, second, "--out", tmp_path / "run")
     assert f"{first} and {second} are both named 'repeat_00'" in said and f"convert {second} --name" in said
     assert not (tmp_path / "run").exists()
@@ -231,7 +231,15 @@ def test_a_file_above_the_results_folder(refused, tmp_path: Path):
 
 @pytest.mark.parametrize(
     "command",
-    [Identify(), Gap(), Gap((Path("log.npz"),)), Identify(scene=Path("own.xml")), Train(), Train(Path("fit")), All()],
+    [
+        Identify(),
+        GapCommand(),
+        GapCommand((Path("log.npz"),)),
+        Identify(scene=Path("own.xml")),
+        Train(),
+        Train(Path("fit")),
+        All(),
+    ],
     ids=lambda command: type(command).__name__,
 )
 def test_what_a_run_was_asked_for_can_be_read_back(command: object):
@@ -279,7 +287,7 @@ def test_a_recording_that_the_scene_does_not_know_leaves_the_folder_as_it_was(re
     """Of an earlier run with --again, and of none: the same command with a better log finds nothing in its way."""
     recording = elbow_log(0.0, 36.0)
     channels = {name: replace(c, columns=("elbwo",)) for name, c in recording.channels.items()}
-    save(replace(recording, channels=channels), run_folder.parent / "log.npz")
+    save_recording(replace(recording, channels=channels), run_folder.parent / "log.npz")
     (run_folder / "config.json").write_text("{}")
     before = content(run_folder)
     given = (command, *write_elbow(run_folder.parent), "--recording", run_folder.parent / "log.npz")
@@ -423,10 +431,10 @@ def test_an_option_of_the_synthetic_robot_beside_recordings(
 
 def test_options_of_the_synthetic_robot_are_filled_in_where_it_records():
     """A page lists what was asked for: of a robot's own recordings it would say a number of springs that is none's."""
-    assert settled(Identify()) == Identify(springs=1, demonstrations=("A", "C"))
-    assert settled(Identify(springs=2)).springs == 2
+    assert with_robot_options(Identify()) == Identify(springs=1, demonstrations=("A", "C"))
+    assert with_robot_options(Identify(springs=2)).springs == 2
     own = Identify(recording=(Path("log.npz"),))
-    assert settled(own) == own
+    assert with_robot_options(own) == own
 
 
 @pytest.mark.parametrize("command", ["all", "identify", "gap", "train"])
@@ -470,12 +478,12 @@ def test_a_demonstration_that_does_not_exist(refused, tmp_path: Path):
 
 def test_what_record_wrote_says_which_robot_it_was(tmp_path: Path):
     """A fit of it knows its truth, and a policy is tried on this robot and no other."""
-    recording = replace(load(demonstration_path("A")), meta={"springs": "2", "robot": "7"})
-    save(recording, tmp_path / "c.npz")
+    recording = replace(load_recording(demonstration_path("A")), meta={"springs": "2", "robot": "7"})
+    save_recording(recording, tmp_path / "c.npz")
     assert known_robot([tmp_path / "c.npz"]) == {"springs": 2, "seed": 7, "hide": []}
-    save(replace(recording, meta={"springs": "1", "robot": "7"}), tmp_path / "d.npz")
+    save_recording(replace(recording, meta={"springs": "1", "robot": "7"}), tmp_path / "d.npz")
     assert known_robot([tmp_path / "c.npz", tmp_path / "d.npz"]) == {}
-    save(replace(recording, meta={}), tmp_path / "d.npz")
+    save_recording(replace(recording, meta={}), tmp_path / "d.npz")
     assert known_robot([tmp_path / "d.npz"]) == {}
 
 
@@ -580,7 +588,8 @@ def test_the_page_of_the_command_line_is_current():
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     assert module.PAGE.read_text(encoding="utf-8") == module.page()
-    assert re.findall(r"^## (\w+)$", module.page(), re.MULTILINE) == [c.__name__.lower() for c in run._ACTIONS]
+    assert re.findall(r"^## (\w+)$", module.page(), re.MULTILINE) == [module.name_of(c) for c in run._ACTIONS]
+    assert "## gap\n" in module.page()
 
 
 def test_a_warning_is_one_line_without_a_place_in_the_code(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):

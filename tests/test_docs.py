@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from droid_jax.cost.noise import NoiseConfig
 from droid_jax.discrepancy.config import BlocksConfig, DiscrepancyConfig, SelectionConfig
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.identify.search import SearchConfig
@@ -152,9 +153,11 @@ def test_every_threshold_is_documented(config: type):
     assert {name: float(value) for name, value in rows.items()} == pytest.approx(fields, rel=1e-3)
 
 
-@pytest.mark.parametrize("config", [DiscrepancyConfig, RefineConfig, SearchConfig], ids=lambda config: config.__name__)
+@pytest.mark.parametrize(
+    "config", [NoiseConfig, DiscrepancyConfig, RefineConfig, SearchConfig], ids=lambda config: config.__name__
+)
 def test_documented_settings_are_the_defaults(config: type):
     rows = {name: value for (of, name), value in documented().items() if of == config.__name__}
-    numbers = {name: float(value) for name, value in rows.items() if "," not in value}
+    numbers = {name: float(value) for name, value in rows.items() if re.fullmatch(r"[\d.e-]+", value)}
     assert len(numbers) > 3
     assert numbers == pytest.approx({name: getattr(config(), name) for name in numbers})

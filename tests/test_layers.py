@@ -8,6 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from droid_jax.door.scene import door_scene
+from droid_jax.door.space import door_nuisances, door_space
+from droid_jax.model.effects.registry import library
+from droid_jax.model.parameters import OF_A_JOINT
+
 PACKAGE = Path(__file__).resolve().parents[1] / "droid_jax"
 ORDER = (
     *("model", "recordings", "simulate", "preflight", "cost", "identify", "discrepancy", "policy", "report"),
@@ -77,6 +82,82 @@ def faults(folder: Path) -> list[str]:
 
 def test_imports_point_only_to_layers_further_up():
     assert faults(PACKAGE) == []
+
+
+def names_of_mjx_internals(source: str) -> set[str]:
+    """What of mjx's private parts a module names: `mujoco.mjx._src` in an import, `_impl` as an attribute or a path."""
+    found = {name for name in imports(source, ("droid_jax",), False) if name.startswith("mujoco.") and "._" in name}
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Attribute) and node.attr in ("_impl", "_src"):
+            found.add(node.attr)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.split(".")[0] == "_impl":
+            found.add(node.value)
+    return found
+
+
+def test_mjx_internals_are_named_in_one_module():
+    """Another MuJoCo is one file's work."""
+    found = {f.relative_to(PACKAGE).as_posix(): names_of_mjx_internals(f.read_text()) for f in PACKAGE.rglob("*.py")}
+    assert [path for path, names in found.items() if names] == ["model/mjx_internals.py"]
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "rows = data._impl",
+        "import mujoco.mjx._src.math as math",
+        "from mujoco.mjx._src import constraint",
+        'data = data.tree_replace({"_impl.efc_force": force})',
+    ],
+)
+def test_a_name_of_mjx_internals_is_found(source):
+    assert names_of_mjx_internals(source)
+
+
+GENERIC = ("model", "recordings", "simulate", "preflight", "cost", "identify", "discrepancy", "policy", "report")
+# Where parameters that a replay or an effect reads, or an encoder has, get their names.
+NAMES_DEFINED = ("model/parameters.py", "model/fields.py", "model/effects/")
+NAMES_LOOKED_UP = {"discrepancy/case.py", "discrepancy/localise.py", "discrepancy/candidate_experiments.py"}
+
+
+def parameter_names() -> set[str]:
+    """Names of the parameters of the door, of all effects in its scene, and of what a replay reads; no joints.
+
+    Those that are fields of MuJoCo's model too (sensor_delay) are left out.
+    """
+    scene = door_scene(springs=1)
+    spaces = (*door_space(scene).parameters, *door_nuisances(scene).parameters)
+    effects = (p for e in library(scene) for p in e.parameters)
+    found = {p.name.partition("[")[0] for p in (*spaces, *effects)} | {role.value for role in OF_A_JOINT}
+    return {name for name in found if not hasattr(scene.model, name)}
+
+
+def looked_up(source: str, names: set[str]) -> set[str]:
+    """Texts in a module, docstrings aside, that are a parameter's name, or begin as one of a joint does."""
+    tree = ast.parse(source)
+    nodes = [n for n in ast.walk(tree) if isinstance(n, (ast.Module, ast.ClassDef, ast.FunctionDef))]
+    documented = {ast.get_docstring(n, clean=False) for n in nodes}
+    texts = {n.value for n in ast.walk(tree) if isinstance(n, ast.Constant) and isinstance(n.value, str)} - documented
+    return {t for t in texts if t.partition("[")[0] in names}
+
+
+def test_generic_layers_know_parameters_by_role():
+    """What a parameter is, `Parameter.role` says; its name is for people."""
+    names = parameter_names()
+    assert {"hinge_preload", "payload_mass", "sliding_friction_left", "time_offset", "torque_offset"} <= names
+    found = {
+        path: hits
+        for file in PACKAGE.rglob("*.py")
+        if (path := file.relative_to(PACKAGE).as_posix()).split("/")[0] in GENERIC
+        and not path.startswith(NAMES_DEFINED)
+        and (hits := looked_up(file.read_text(), names))
+    }
+    assert {path: hits for path, hits in found.items() if path not in NAMES_LOOKED_UP} == {}
+
+
+@pytest.mark.parametrize("source", ['space["hinge_preload"]', 'n.startswith("torque_offset[")', 'f"viscous[{joint}]"'])
+def test_a_looked_up_name_is_found(source):
+    assert looked_up(source, {"hinge_preload", "torque_offset", "viscous"})
 
 
 def test_every_folder_and_file_of_the_package_is_a_layer():

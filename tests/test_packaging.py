@@ -39,7 +39,7 @@ def test_wheel_holds_every_module_and_mjcf_file(built):
     modules = {p.relative_to(ROOT).as_posix() for p in (ROOT / "droid_jax").rglob("*.py")}
     scenes = {f"droid_jax/{p.relative_to(ROOT).as_posix()}" for p in (ROOT / "mjcf").rglob("*") if p.is_file()}
     assert modules and "droid_jax/mjcf/panda.xml" in scenes
-    assert modules | scenes <= names
+    assert modules | scenes | {"droid_jax/py.typed"} <= names
     tops = {name.split("/")[0] for name in names}
     assert {t for t in tops if not t.endswith(".dist-info")} == {"droid_jax"}
 
@@ -74,4 +74,4 @@ def test_the_api_reference_is_built(tmp_path: Path):
     (modules,) = re.findall(r"^python -m pdoc (.*)$", (ROOT / "docs" / "api.md").read_text(), re.MULTILINE)
     run("-m", "pdoc", *modules.split(), "-o", str(tmp_path))
     assert "make_cost" in (tmp_path / "droid_jax.html").read_text()
-    assert (tmp_path / "droid_jax" / "discrepancy" / "workflow.html").is_file()
+    assert (tmp_path / "droid_jax" / "identify" / "pipeline.html").is_file()

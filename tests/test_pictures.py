@@ -9,7 +9,7 @@ import pytest
 
 from droid_jax.commands import identify
 from droid_jax.commands.identify import Identify
-from droid_jax.commands.pictures import draw, keep_replay
+from droid_jax.commands.pictures import draw_replay, keep_replay
 from droid_jax.model.scene import Scene, load_scene
 from droid_jax.recordings.recording import Recording
 from droid_jax.report import film, render
@@ -48,19 +48,19 @@ def test_what_could_not_be_drawn_is_drawn_later_and_once(
 
     monkeypatch.setattr(render, "frames", drawn)
     monkeypatch.setattr(film, "film", lambda path, model, sides, period, camera: asked.append(period))
-    draw(tmp_path, scene)  # nothing to draw
+    draw_replay(tmp_path, scene)  # nothing to draw
     replay(tmp_path, np.zeros((5, scene.model.nq)))
-    draw(tmp_path, scene)
+    draw_replay(tmp_path, scene)
     assert "no pictures: no OpenGL here" in capsys.readouterr().err and not (tmp_path / "frames").exists()
     asked.append(0.0)
     for _ in range(2):
-        draw(tmp_path, scene)
+        draw_replay(tmp_path, scene)
     assert asked[1:] == [pytest.approx(0.04)] and len(list((tmp_path / "frames").glob("after_*.png"))) == 4
 
 
 def test_a_replay_that_cannot_be_shown_ends_no_run(scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     replay(tmp_path, np.full((5, scene.model.nq), np.nan))
-    draw(tmp_path, scene)
+    draw_replay(tmp_path, scene)
     assert "no pictures: frames: qpos row 0 is not finite" in capsys.readouterr().err
     assert not (tmp_path / "frames").exists()
 
@@ -69,7 +69,7 @@ def test_a_finished_run_is_asked_for_its_pictures(tuned: None, tmp_path: Path, m
     """Before its page is built: OpenGL may be there by now."""
     did = list[str]()
     monkeypatch.setattr(identify, "finished", lambda *_: True)
-    monkeypatch.setattr(identify, "draw", lambda out, scene: did.append(f"draw {scene.name}"))
+    monkeypatch.setattr(identify, "draw_replay", lambda out, scene: did.append(f"draw {scene.name}"))
     monkeypatch.setattr(identify.report, "run", lambda command: did.append("report"))
     identify.run(Identify(out=tmp_path))
     assert len(did) == 2 and did[0].startswith("draw door") and did[1] == "report"

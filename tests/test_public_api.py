@@ -19,7 +19,7 @@ import pytest
 
 import droid_jax as dj
 from droid_jax import runtime
-from droid_jax.commands.identify import Identify, config_of, model_of
+from droid_jax.commands.identify import Identify, identify_config, identify_model
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.door.scene import door_scene
 from droid_jax.identify.multistart import RefineConfig
@@ -85,7 +85,7 @@ def test_every_public_name_is_there_and_kept():
     for name in dj.__all__:
         assert getattr(dj, name) is getattr(dj, name)
         assert name in dir(dj)
-    assert dj.load_recording is importlib.import_module("droid_jax.recordings.formats").load
+    assert dj.load_recording is importlib.import_module("droid_jax.recordings.formats").load_recording
     assert dj.tune is runtime.tune
 
 
@@ -276,9 +276,9 @@ def test_the_presets_are_those_of_the_command_line():
     assert [r[0] for r in rows] == ["quick", "standard", "paper", "gpu"]
     for preset, *numbers, step, refined in rows:
         command = Identify(preset=preset)
-        config, search = config_of(command), config_of(command).search
+        config, search = identify_config(command), identify_config(command).search
         assert [search.population, search.elite, search.generations, search.restarts] == [int(n) for n in numbers]
         assert (config.refine is not None) == (refined == "yes")
-        scene, _, nuisances = model_of(command)
+        scene, _, nuisances = identify_model(command)
         assert scene.model.opt.timestep == pytest.approx(int(step) / 1000)
         assert (nuisances is not None) == (preset != "paper")

@@ -19,7 +19,7 @@ from droid_jax.commands.presets import TIMESTEP
 from droid_jax.commands.source import synthetic_robot_of
 from droid_jax.commands.synthetic import known_robot
 from droid_jax.door.scene import door_scene
-from droid_jax.recordings.formats import load, save
+from droid_jax.recordings.formats import load_recording, save_recording
 from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
 from droid_jax.run import main
 from droid_jax.synthetic.robot import SOURCE
@@ -35,7 +35,7 @@ def called(tuned: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list
     for module in (identify, gap, train, evaluate):
         monkeypatch.setattr(module, "run", commands.append)
     monkeypatch.setattr(synthetic, "kept_recordings", lambda paths, again, record: dict.fromkeys(paths))
-    monkeypatch.setattr(report, "write", lambda folder: folder / "report.html")
+    monkeypatch.setattr(report, "write_page", lambda folder: folder / "report.html")
     return commands
 
 
@@ -62,7 +62,7 @@ def motions(*files: str, repeats: int = 8, commands: bool = True, **meta: str) -
             qpos0={},
             meta=meta,
         )
-        save(recording, file)
+        save_recording(recording, file)
     return files
 
 
@@ -137,12 +137,12 @@ def test_what_a_later_stage_would_refuse_is_refused_at_once(called, capsys, opti
 
 
 def test_the_cutoff_of_a_log_reaches_fit_and_search(called, tmp_path: Path):
-    save(elbow_log(0.0), tmp_path / "log.npz")
+    save_recording(elbow_log(0.0), tmp_path / "log.npz")
     options = ["--recording", str(tmp_path / "log.npz"), *write_elbow(tmp_path), "--motion-cutoff", "12"]
     assert main(["all", *options]) == 0
     assert [c.motion_cutoff for c in called] == [12.0, 12.0]
     fit, search = called
-    assert identify.config_of(fit).compare.motion_cutoff == gap.config_of(search).compare.motion_cutoff == 12.0
+    assert identify.identify_config(fit).compare.motion_cutoff == gap.gap_config(search).compare.motion_cutoff == 12.0
 
 
 def test_trials_count_where_they_are_made(called):
@@ -238,7 +238,7 @@ def test_a_search_begins_at_a_fit_of_its_own_recordings_alone(called, tmp_path: 
     fit.mkdir(parents=True)
     for name in ("fit.json", "config.json"):
         (fit / name).write_text("{}")
-    hashes = [load(Path(f"{name}.npz")).sha256 for name in "abc"]
+    hashes = [load_recording(Path(f"{name}.npz")).sha256 for name in "abc"]
     scene = door_scene(timestep=TIMESTEP["quick"]).sha256
     for made, of in ((hashes[:2], scene), (hashes[1:], scene), ([], scene), (hashes[:2], "another")):
         (fit / "setup.json").write_text(json.dumps({"recordings_sha256": made, "scene_sha256": of}))
@@ -253,7 +253,7 @@ def test_a_parameter_with_an_effects_name_is_told_before_the_fit(called, tmp_pat
     file = tmp_path / "parameters.json"
     entries = json.loads(file.read_text())
     file.write_text(json.dumps([{**entries[0], "name": "joint_coulomb[elbow]"}, *entries[1:]]))
-    save(elbow_log(0.0, 2.0, 16), "log.npz")
+    save_recording(elbow_log(0.0, 2.0, 16), "log.npz")
     assert main(["all", "--stages", "identify", "gap", "--recording", "log.npz", *own]) == 2
     assert "'joint_coulomb[elbow]' (of the effect joint_coulomb); give yours others" in capsys.readouterr().err
     assert called == []
@@ -356,7 +356,7 @@ def test_a_synthetic_robot_left_over_in_the_folder_is_not_the_robot_of_your_reco
 
     for meta, known in (({}, {}), ({"source": SOURCE}, {"springs": 1, "seed": 0, "hide": []})):
         motions("a.npz", "b.npz", **meta)
-        told([load(Path(name)).sha256 for name in ("a.npz", "b.npz")])
+        told([load_recording(Path(name)).sha256 for name in ("a.npz", "b.npz")])
         assert synthetic_robot_of(stage) == {}
         for name in ("a.npz", "b.npz"):
             (tmp_path / name).rename(made / name)
@@ -399,7 +399,7 @@ def test_a_robots_own_recording_beside_a_synthetic_robots_has_no_known_truth(
     motions(str(own), **meta)
     (tmp_path / "synthetic_robot.json").write_text(json.dumps({"springs": 1, "seed": 0, "hide": []}))
     command = identify.Identify(recording=(own,))
-    _, truth, _ = identify._recordings(command, door_scene(), tmp_path, [load(own)])
+    _, truth, _ = identify._recordings(command, door_scene(), tmp_path, [load_recording(own)])
     assert (truth is not None) == known
 
 
@@ -443,7 +443,7 @@ def test_recordings_are_checked_before_any_stage(called, capsys):
 
 
 def test_where_a_stage_fails_the_page_shows_those_before(called, monkeypatch: pytest.MonkeyPatch, capsys):
-    def failing(command: gap.Gap) -> None:
+    def failing(command: gap.GapCommand) -> None:
         raise ValueError("nothing can be searched here")
 
     monkeypatch.setattr(gap, "run", failing)

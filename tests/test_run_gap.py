@@ -25,7 +25,7 @@ from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects import registry
 from droid_jax.model.parameters import Parameter, Scaling
 from droid_jax.preflight.search_inputs import check_recordings, lags
-from droid_jax.recordings.formats import save
+from droid_jax.recordings.formats import save_recording
 from droid_jax.recordings.recording import Channel, Recording
 from droid_jax.report.gap_folder import read_gap
 from droid_jax.run import main
@@ -39,7 +39,7 @@ def place(tmp_path: Path) -> Path:
     """A folder with parameters.json, train.npz and validation.npz."""
     write_parameters(tmp_path)
     for name in ("train", "validation"):
-        save(record(name), tmp_path / f"{name}.npz")
+        save_recording(record(name), tmp_path / f"{name}.npz")
     return tmp_path
 
 
@@ -68,7 +68,7 @@ def test_four_recordings_are_too_many(place: Path, refused):
 
 
 def test_too_few_repeats_say_what_can_still_be_concluded(place: Path, refused):
-    save(record("train").repeats_subset(range(5)), place / "train.npz")
+    save_recording(record("train").repeats_subset(range(5)), place / "train.npz")
     said = refused(*arguments(place))
     assert "the train recording 'train' has 5 repeats" in said and "fewer than 8" in said
     assert "droid_jax.run identify" in said and "in which joint and phase" in said
@@ -82,7 +82,7 @@ def test_the_same_recording_twice(place: Path, refused):
 def test_two_recordings_of_one_name(place: Path, refused):
     other = place / "day2"
     other.mkdir()
-    save(replace(record("validation"), name="train"), other / "train.npz")
+    save_recording(replace(record("validation"), name="train"), other / "train.npz")
     said = refused(*arguments(place, recordings=("train.npz", "day2/train.npz")))
     assert "the train and the validation recording have one name, 'train'" in said
 
@@ -98,13 +98,13 @@ def test_a_repeat_that_runs_late(place: Path, refused):
         values[3, :75] = values[3, 75]
         return values
 
-    save(changed(record("validation"), "position", late), place / "validation.npz")
+    save_recording(changed(record("validation"), "position", late), place / "validation.npz")
     said = refused(*arguments(place))
     assert "the validation recording 'validation': repeat 3 runs 0.1" in said and "behind the others" in said
 
 
 def test_repeats_with_clocks_of_their_own(place: Path, refused):
-    save(record("validation"), place / "csv")
+    save_recording(record("validation"), place / "csv")
     path = place / "csv" / "torque_02.csv"
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:-20]))
     said = refused(*arguments(place, recordings=("train.npz", "csv")))
@@ -112,14 +112,14 @@ def test_repeats_with_clocks_of_their_own(place: Path, refused):
 
 
 def test_a_robot_that_never_moves(place: Path, refused):
-    save(changed(record("train"), "position", lambda v: v[:, :1] + 1e-4 * np.sin(np.arange(v.shape[1]))[:, None]),
-         place / "train.npz")  # fmt: skip
+    still = changed(record("train"), "position", lambda v: v[:, :1] + 1e-4 * np.sin(np.arange(v.shape[1]))[:, None])
+    save_recording(still, place / "train.npz")
     said = refused(*arguments(place))
     assert "the train recording 'train' never moves" in said and "0.0002" in said
 
 
 def test_a_door_that_never_opens(place: Path, refused):
-    save(changed(record("validation"), "object_angle", lambda v: 0.02 * v), place / "validation.npz")
+    save_recording(changed(record("validation"), "object_angle", lambda v: 0.02 * v), place / "validation.npz")
     said = refused(*arguments(place))
     assert "the object joint 'door' moves by 0.0" in said and "record a motion that opens it" in said
 
@@ -129,7 +129,7 @@ def test_one_repeat_that_missed_its_grasp(place: Path, refused):
         values[4] *= 0.1
         return values
 
-    save(changed(record("validation"), "object_angle", missed), place / "validation.npz")
+    save_recording(changed(record("validation"), "object_angle", missed), place / "validation.npz")
     said = refused(*arguments(place))
     assert "in repeat 4 the object joint 'door' moves by 0.0" in said and "leave that repeat away" in said
 
@@ -146,7 +146,7 @@ def test_an_angle_that_one_repeat_did_not_measure_hides_no_other_fault(place: Pa
     values[..., position.columns.index("door")] = turned(values[..., position.columns.index("door")])
     values[4, :, position.columns.index("door")] *= 0.1
     channels = {"torque": recording.channels["torque"], "position": replace(position, values=values, mask=mask)}
-    save(replace(recording, channels=channels), place / "validation.npz")
+    save_recording(replace(recording, channels=channels), place / "validation.npz")
     assert said in refused(*arguments(place))
 
 
@@ -155,7 +155,7 @@ def test_a_sensor_that_is_dead_in_one_repeat(place: Path, refused):
         values[2, :, 1] = 0.25
         return values
 
-    save(changed(record("train"), "torque", dead), place / "train.npz")
+    save_recording(changed(record("train"), "torque", dead), place / "train.npz")
     said = refused(*arguments(place))
     assert "never changes in repeat 2 (0.25 N m)" in said and "leave that repeat away" in said
 
@@ -165,7 +165,7 @@ def test_a_dead_sensor(place: Path, refused):
         values[..., 1] = 1.5
         return values
 
-    save(changed(record("train"), "torque", dead), place / "train.npz")
+    save_recording(changed(record("train"), "torque", dead), place / "train.npz")
     said = refused(*arguments(place, "--effects", "hinge_preload"))
     assert "channel 'torque', column 'elbow' never changes (1.5 N m)" in said
 
@@ -174,7 +174,7 @@ def test_recordings_of_different_joints(place: Path, refused):
     recording = record("validation")
     torque = recording.channels["torque"]
     fewer = replace(torque, columns=JOINTS[:2], values=torque.values[..., :2], mask=torque.mask[..., :2])
-    save(replace(recording, channels={**recording.channels, "torque": fewer}), place / "validation.npz")
+    save_recording(replace(recording, channels={**recording.channels, "torque": fewer}), place / "validation.npz")
     said = refused(*arguments(place))
     assert "different joints" in said and "train shoulder, elbow, door; validation shoulder, elbow" in said
 
@@ -231,30 +231,31 @@ def test_no_effect_left(place: Path, refused):
 
 def test_effects_are_restricted_and_left_out():
     scene = door_scene()
-    everything = gap.chosen_effects(gap.Gap(), scene, [])
+    everything = gap.chosen_effects(gap.GapCommand(), scene, [])
     assert {e.name for e in everything} == {e.name for e in registry.library(scene)}
-    fewer = gap.chosen_effects(gap.Gap(without=("latch", "payload")), scene, [])
+    fewer = gap.chosen_effects(gap.GapCommand(without=("latch", "payload")), scene, [])
     assert {e.name for e in everything} - {e.name for e in fewer} == {"latch", "payload"}
-    chosen = gap.chosen_effects(gap.Gap(effects=("latch", "drag"), without=("drag",)), scene, [])
+    chosen = gap.chosen_effects(gap.GapCommand(effects=("latch", "drag"), without=("drag",)), scene, [])
     assert [e.name for e in chosen] == ["latch"]
 
 
 def test_effects_of_a_larger_machine():
     (usual,), (large,) = (
-        gap.chosen_effects(gap.Gap(effects=("joint_coulomb",), effect_scale=k), door_scene(), []) for k in (1.0, 20.0)
+        gap.chosen_effects(gap.GapCommand(effects=("joint_coulomb",), effect_scale=k), door_scene(), [])
+        for k in (1.0, 20.0)
     )
     assert [p.high for p in large.parameters] == [20.0 * p.high for p in usual.parameters]
     with pytest.raises(ValueError, match="the scale of the effects must be above 0, got -1"):
-        gap.chosen_effects(gap.Gap(effect_scale=-1.0), door_scene(), [])
+        gap.chosen_effects(gap.GapCommand(effect_scale=-1.0), door_scene(), [])
 
 
 def test_a_log_without_commands_has_no_servo_to_suspect():
     scene = door_scene()
     log = replace(record("train"), time=np.zeros(0), command=np.zeros((0, 0)), command_names=())
-    names = {e.name for e in gap.chosen_effects(gap.Gap(), scene, [log])}
+    names = {e.name for e in gap.chosen_effects(gap.GapCommand(), scene, [log])}
     assert "torque_bias" in names and not names & {"command_delay", "joint_backlash", "joint_compliance"}
     with pytest.raises(ValueError, match="cannot have command_delay"):
-        gap.chosen_effects(gap.Gap(effects=("command_delay",)), scene, [log])
+        gap.chosen_effects(gap.GapCommand(effects=("command_delay",)), scene, [log])
 
 
 @pytest.mark.parametrize(
@@ -314,7 +315,7 @@ def test_effects_of_ones_own_are_asked_about_like_the_others(place: Path, refuse
     (place / "gasket.py").write_text(code)
     options = ("--user-effects", place / "gasket.py", "--effects", "gasket", "nothing")
     assert "unknown effects nothing; valid:" in (said := refused(*arguments(place, *options))) and "gasket" in said
-    chosen = gap.chosen_effects(gap.Gap(effects=("gasket",)), small_scene()[0], [])
+    chosen = gap.chosen_effects(gap.GapCommand(effects=("gasket",)), small_scene()[0], [])
     assert [e.name for e in chosen] == ["gasket"] and "door" in chosen[0].locations
 
 
@@ -328,9 +329,9 @@ def test_an_effect_that_forgot_its_places_is_not_left_out_in_silence(monkeypatch
 
     scene = small_scene()[0]
     with pytest.raises(ValueError, match="effects lost state no locations"):
-        gap.chosen_effects(gap.Gap(effects=("lost", "latch")), scene, [])
+        gap.chosen_effects(gap.GapCommand(effects=("lost", "latch")), scene, [])
     with pytest.warns(UserWarning, match="effects lost state no locations .*: they are left out"):
-        assert len(gap.chosen_effects(gap.Gap(), scene, [])) > 5
+        assert len(gap.chosen_effects(gap.GapCommand(), scene, [])) > 5
 
 
 def test_a_scene_of_ones_own_needs_recordings(tmp_path: Path, refused):
@@ -373,10 +374,10 @@ def test_the_synthetic_robot_records_each_demonstration_once(tmp_path: Path, mon
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """A case compiled already, of small budgets; no replays at a quarter of the time step, and no page."""
-    monkeypatch.setattr(gap, "config_of", lambda command: QUICK)
+    monkeypatch.setattr(gap, "gap_config", lambda command: QUICK)
     monkeypatch.setattr(missing, "make_case", lambda *arguments, **roles: small().case)
     monkeypatch.setattr(missing, "discretisation_error", lambda *arguments: FLOOR)
-    monkeypatch.setattr(report, "write", lambda folder: folder / "report.html")
+    monkeypatch.setattr(report, "write_page", lambda folder: folder / "report.html")
 
 
 def fit_json(folder: Path, **values: float) -> Path:
@@ -472,7 +473,7 @@ def test_a_run_goes_on_after_a_stop_and_is_whole(
 
     before = (out / "gap.json").read_bytes()
     assert "other settings (seed)" in refused(*command, "--seed", "1")
-    save(record("test"), place / "validation.npz")
+    save_recording(record("test"), place / "validation.npz")
     assert "other settings (recordings)" in refused(*command)
     assert (out / "gap.json").read_bytes() == before
 

@@ -20,7 +20,7 @@ from droid_jax.cost.lone_log import LoneLog
 from droid_jax.discrepancy import missing
 from droid_jax.identify.extended_model import load_extended
 from droid_jax.identify.search import SearchConfig
-from droid_jax.recordings.formats import save
+from droid_jax.recordings.formats import save_recording
 from droid_jax.recordings.recording import Recording
 from droid_jax.recordings.split import Split, roles_of, split_of
 from droid_jax.report.gap_folder import Gap, read_gap
@@ -34,7 +34,7 @@ pytestmark = pytest.mark.usefixtures("tuned")
 def command(place: Path, recordings: Sequence[Recording], *options: str) -> list[str]:
     """A whole command line about the elbow."""
     for k, recording in enumerate(recordings):
-        save(recording, place / f"{k}.npz")
+        save_recording(recording, place / f"{k}.npz")
     files = [str(place / f"{k}.npz") for k in range(len(recordings))]
     return ["gap", "--recording", *files, *write_elbow(place), "--out", str(place / "run"), *options]
 
@@ -209,7 +209,7 @@ def test_another_log_is_sealed(tmp_path: Path):
 def test_the_second_half_of_the_repeats_confirms(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    monkeypatch.setattr(gap, "config_of", lambda command: SEARCH)
+    monkeypatch.setattr(gap, "gap_config", lambda command: SEARCH)
     whole = elbow_log(COULOMB, seconds=12.0, repeats=16)
     assert main(command(tmp_path, [whole], "--effects", "joint_coulomb", "cable_pull")) == 0
     lines = capsys.readouterr().out.splitlines()[-7:]

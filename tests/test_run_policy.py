@@ -21,7 +21,7 @@ from droid_jax.door.scene import door_scene
 from droid_jax.door.space import door_nuisances, door_space
 from droid_jax.door.task import Task
 from droid_jax.identify.gaussian import prior
-from droid_jax.policy.control import load
+from droid_jax.policy.control import load_policy
 from droid_jax.policy.trials import BLOWN_UP, Trials
 from droid_jax.report.render import NoOpenGL
 from droid_jax.report.stages import extended_of
@@ -179,7 +179,7 @@ def test_a_page_without_a_path_is_that_of_the_run_that_was_finished_last(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     """A folder without a finished run, as a refused command may leave one, does not count."""
-    monkeypatch.setattr(report, "write", lambda folder: folder)
+    monkeypatch.setattr(report, "write_page", lambda folder: folder)
     (tmp_path / "runs" / "identify").mkdir(parents=True)
     for age, (file, found) in enumerate((
         ("all/gap/gap.json", "all"), ("gap/gap.json", "gap"), ("train/training.json", "train"),
@@ -247,7 +247,7 @@ def test_a_killed_training_goes_on_where_it_was(tmp_path: Path, monkeypatch: pyt
     assert asked == [(4_000_000, False), (3_000_000, True)]
     history = json.loads((tmp_path / "run" / "training.json").read_text())["history"]
     assert [now["step"] for now in history] == [0, 1_000_000, 2_000_000, 3_000_000]
-    load(tmp_path / "run" / "policy.npz")
+    load_policy(tmp_path / "run" / "policy.npz")
     assert main(command) == 0 and len(asked) == 2  # it is done
 
 
@@ -323,7 +323,7 @@ def test_train_evaluate_export(scene, tmp_path: Path, capsys: pytest.CaptureFixt
     assert "synthetic robot: 0 % success" in said and "ONNX and JAX differ by at most" in said
     transfer = json.loads((tmp_path / "run" / "transfer.json").read_text())
     assert transfer["simulation"]["trials"] == transfer["synthetic_robot"]["trials"] == 4
-    assert np.isfinite(load(tmp_path / "run" / "export" / "policy.npz").act(np.zeros(23))).all()
+    assert np.isfinite(load_policy(tmp_path / "run" / "export" / "policy.npz").act(np.zeros(23))).all()
     assert "Learning" in (tmp_path / "run" / "report.html").read_text()
     assert main(["train", "--fit", "fit", "--steps", "20000", "--out", "run"]) == 0
     assert "holds this run already" in capsys.readouterr().out

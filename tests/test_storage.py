@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+import enum
 import json
 import os
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -128,3 +130,32 @@ def test_a_files_hash_is_of_its_bytes(tmp_path: Path):
     (tmp_path / "file").write_bytes(b"abc")
     expected = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
     assert storage.file_sha256(tmp_path / "file") == expected
+
+
+class Colour(enum.Enum):
+    RED = "red"
+
+
+@dataclass(frozen=True)
+class Inner:
+    colour: Colour = Colour.RED
+    bound: float = float("inf")
+
+
+@dataclass(frozen=True)
+class Outer:
+    inner: Inner = field(default_factory=Inner)
+    none: Inner | None = None
+    ratios: tuple[float, ...] = (3.0, 1.5)
+    weights: dict[str, float] = field(default_factory=lambda: {"torque": 1.0})
+
+
+def test_settings_become_plain_data():
+    plain = storage.config_json(Outer())
+    expected = {
+        "inner": {"colour": "red", "bound": "inf"},
+        "none": None,
+        "ratios": [3.0, 1.5],
+        "weights": {"torque": 1.0},
+    }
+    assert plain == expected == json.loads(json.dumps(plain, allow_nan=False))

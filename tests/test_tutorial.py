@@ -16,7 +16,7 @@ from droid_jax.identify.extended_model import Extended
 from droid_jax.identify.gaussian import prior
 from droid_jax.model.effects.registry import effect_space, library, ready
 from droid_jax.model.parameter_file import load_parameters
-from droid_jax.recordings.formats import load
+from droid_jax.recordings.formats import load_recording
 from droid_jax.run import main
 
 HERE = Path(__file__).resolve().parents[1] / "docs" / "tutorial"
@@ -42,7 +42,7 @@ def converted() -> list[str]:
 def test_its_bags_become_a_recording(copy: Path, capsys: pytest.CaptureFixture[str]):
     assert main(converted()) == 0
     assert "10 repeats of 4.0 s, channels torque (2 x 400), position (2 x 400)" in capsys.readouterr().out
-    assert load("runs/train.npz").name == "train"  # as the page of the search calls the motion
+    assert load_recording("runs/train.npz").name == "train"  # as the page of the search calls the motion
 
 
 def test_the_notebook_is_stored_without_outputs():

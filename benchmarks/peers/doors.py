@@ -26,7 +26,7 @@ from droid_jax.door.space import JOINT_DAMPING, door_nuisances, door_space
 from droid_jax.identify.holdout import split_repeats
 from droid_jax.identify.pipeline import identify_parameters
 from droid_jax.model.parameters import Space
-from droid_jax.recordings.formats import load
+from droid_jax.recordings.formats import load_recording
 from droid_jax.recordings.recording import Recording
 from droid_jax.storage import finite
 from droid_jax.synthetic.hidden_effects import record_hidden
@@ -119,7 +119,7 @@ def hidden(effect: str, amplitude: float, quick: bool) -> dict[str, Any]:
     scene = door_scene(timestep=OURS)
     truth = synthetic_truth(scene, 1, 1)
     data = {
-        n: record_hidden(scene, load(demonstration_path(n)), truth, {effect: amplitude}, seed=i, name=n)
+        n: record_hidden(scene, load_recording(demonstration_path(n)), truth, {effect: amplitude}, seed=i, name=n)
         for i, n in enumerate("CBA")
     }
     full = door_space(scene) + door_nuisances(scene)

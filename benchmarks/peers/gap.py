@@ -13,7 +13,7 @@ from typing import Any
 
 from benchmarks.common import ROOT
 from droid_jax.files import GAP
-from droid_jax.recordings.formats import save
+from droid_jax.recordings.formats import save_recording
 from droid_jax.recordings.recording import Recording
 
 
@@ -24,7 +24,7 @@ def run_gap(recordings: Sequence[Recording], folder: Path, arguments: Sequence[s
     """
     paths = [str(folder / f"{r.name}.npz") for r in recordings]
     for recording, path in zip(recordings, paths, strict=True):
-        save(recording, path)
+        save_recording(recording, path)
     out = folder / "run"
     command = [sys.executable, "-m", "droid_jax.run", "gap", *arguments, "--recording", *paths, "--out", str(out)]
     began = time.perf_counter()

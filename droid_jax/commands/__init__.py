@@ -1,0 +1,1 @@
+"""Commands of the program: each parses its options, calls the layers above, and writes a folder."""

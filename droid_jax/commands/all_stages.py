@@ -14,7 +14,7 @@ from droid_jax.commands import evaluate, gap, identify, report, train
 from droid_jax.commands.folder import OtherRun, changed, forget, setup_of
 from droid_jax.commands.scenes import needs_log, needs_recording, needs_scene
 from droid_jax.commands.source import model_folder, needs_brax
-from droid_jax.commands.synthetic import DEMONSTRATIONS, hidden_effects, kept_at, record_synthetic, settled
+from droid_jax.commands.synthetic import DEMONSTRATIONS, hidden_effects, kept_at, record_synthetic, with_robot_options
 from droid_jax.commands.user_effects import load_effects
 from droid_jax.commands.writer import writes
 from droid_jax.files import ASKED, FIT, GAP, LAST_FILES, TRANSFER
@@ -97,7 +97,7 @@ def run(command: All) -> None:
     from droid_jax.report.scalars import needs_writer
 
     _needs_stages(command)
-    command = settled(command)
+    command = with_robot_options(command)
     needs_scene(command)
     needs_recording(command)
     needs_writer(command.tensorboard)
@@ -121,7 +121,7 @@ def run(command: All) -> None:
         for stage in [stage for stage in command.stages if stage in LAST_FILES][1:]:
             forget(out / stage, stage)
     _run_stages(command, out, roles)
-    page = report.write(out)
+    page = report.write_page(out)
     print(f"\n{command.out}: {(time.monotonic() - started) / 60:.0f} minutes")
     for line in told(out):
         print(line)
@@ -184,7 +184,7 @@ def _run_stages(command: All, out: Path, roles: tuple[str, ...]) -> None:
         except Exception:
             if number > 1:
                 with contextlib.suppress(ValueError):  # the recording alone makes no page
-                    print(f"report of what is done: {report.write(out)}")
+                    print(f"report of what is done: {report.write_page(out)}")
             raise
         print(f"[{number}/{len(plan)}] {stage}: {(time.monotonic() - began) / 60:.1f} minutes", flush=True)
 
@@ -210,11 +210,11 @@ def _needs_robot(command: All) -> None:
     scene = door_scene()
     hidden = hidden_effects(command.hide, scene)
     if "evaluate" in command.stages:
-        from droid_jax.synthetic.hidden_effects import listed
+        from droid_jax.synthetic.hidden_effects import as_applied
         from droid_jax.synthetic.policy_trials import check_playable
 
         try:
-            check_playable(scene, listed(hidden))
+            check_playable(scene, as_applied(hidden))
         except ValueError as error:
             raise ValueError(f"{error}; or leave the trials away: --stages identify gap train") from None
 
@@ -231,8 +231,8 @@ def _roles(command: All) -> tuple[str, ...]:
     from droid_jax.model.effects.registry import joined
     from droid_jax.preflight.search_inputs import assigned_roles
 
-    own = gap.Gap(command.recording, preset=PRESETS[command.preset].identify, **_own(command))
-    scene, base = gap.model_of(own)
+    own = gap.GapCommand(command.recording, preset=PRESETS[command.preset].identify, **_own(command))
+    scene, base = gap.gap_model(own)
     given = gap.given_to(own)
     try:
         _, roles = assigned_roles(scene, given)
@@ -268,7 +268,10 @@ def _plan(
         # A log in blocks of time has no validation recording, and its base fit needs no start.
         fit = out / "identify" if "validation" in roles and _fitted(out / "identify", command, recordings) else None
         scale = command.effect_scale
-        _stage(gap.run, gap.Gap(recordings, fit, presets.identify, effect_scale=scale, out=out / "gap", **board, **own))
+        _stage(
+            gap.run,
+            gap.GapCommand(recordings, fit, presets.identify, effect_scale=scale, out=out / "gap", **board, **own),
+        )
 
     def learn() -> None:
         _stage(train.run, train.Train(model_folder(out), preset=presets.train, out=out / "train", **board, **common))
@@ -290,7 +293,9 @@ def _fitted(folder: Path, command: All, recordings: Sequence[Path]) -> bool:
         return True
     made = setup(folder)
     hashes = made.get("recordings_sha256", [])
-    scene, _ = gap.model_of(gap.Gap(command.recording, preset=PRESETS[command.preset].identify, **_own(command)))
+    scene, _ = gap.gap_model(
+        gap.GapCommand(command.recording, preset=PRESETS[command.preset].identify, **_own(command))
+    )
     same_scene = made.get("scene_sha256") == scene.sha256
     return bool(hashes) and same_scene and [recording_at(p).sha256 for p in recordings[: len(hashes)]] == hashes
 

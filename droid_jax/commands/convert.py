@@ -73,7 +73,7 @@ class Convert:
 
 def run(command: Convert) -> None:
     """Load whatever it is, validate, cut, and save."""
-    from droid_jax.recordings.formats import bags_at, check_target, load, rosbag_reader, save
+    from droid_jax.recordings.formats import bags_at, check_target, load_recording, rosbag_reader, save_recording
     from droid_jax.recordings.torque_constants import with_torque_constants
 
     check_target(command.out)  # before bags are read, which may take long
@@ -93,14 +93,14 @@ def run(command: Convert) -> None:
     else:
         usual = {"name": command.name, "allow_jitter": command.allow_jitter}
         options = usual if strange else _bag_options(command)
-        recording = load(path, resample=command.resample, **options)
+        recording = load_recording(path, resample=command.resample, **options)
     if command.torque_constant:
         recording = with_torque_constants(recording, command.torque_constant)
     if command.start is not None or command.end is not None:
         first, last = recording.span
         start, end = command.start, command.end
         recording = recording.window(first if start is None else start, last if end is None else end)
-    path = save(recording, command.out)
+    path = save_recording(recording, command.out)
     channels = ", ".join(f"{n} ({len(c.columns)} x {len(c.time)})" for n, c in recording.channels.items())
     print(f"{recording.repeats} repeats of {recording.duration:.1f} s, channels {channels}: {path}")
 

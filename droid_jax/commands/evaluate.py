@@ -61,7 +61,7 @@ def run(command: Evaluate) -> None:
 
     runtime.start()
     from droid_jax.door.environment import DoorEnv
-    from droid_jax.policy.control import load
+    from droid_jax.policy.control import load_policy
     from droid_jax.policy.evaluate import simulated
     from droid_jax.policy.randomise import of_method
     from droid_jax.report.policy_folder import read_training
@@ -73,7 +73,7 @@ def run(command: Evaluate) -> None:
     folder = stage_folder(command.run, "train", TRAINING)
     load_effects(command.user_effects, folder)
     trained = read_training(folder)
-    setup, policy = trained["setup"], load(folder / POLICY)
+    setup, policy = trained["setup"], load_policy(folder / POLICY)
     setup_now = {**setup_of(command), "run": str(folder), "policy_sha256": file_sha256(folder / POLICY)}
     if not command.again and (done := _done(folder, setup_now)):
         print(f"{folder} holds these trials already (start over with --again)")
@@ -154,7 +154,7 @@ def _tell(found: Mapping[str, Any], trained: Mapping[str, Any]) -> None:
 def _robot(command: Evaluate, trained: Mapping[str, Any], env: DoorEnv) -> tuple[PolicyRobot, dict[str, float]]:
     """The synthetic robot, the one that was fitted unless asked for another; and its hidden values."""
     from droid_jax.door.scene import door_scene
-    from droid_jax.synthetic.hidden_effects import listed
+    from droid_jax.synthetic.hidden_effects import as_applied
     from droid_jax.synthetic.policy_trials import TransferConfig, synthetic_robot
     from droid_jax.synthetic.robot import synthetic_truth
 
@@ -164,7 +164,9 @@ def _robot(command: Evaluate, trained: Mapping[str, Any], env: DoorEnv) -> tuple
     scene = door_scene(limits=True, knob=trained["setup"]["knob"])
     truth = synthetic_truth(scene, own["springs"], own["seed"])
     config = TransferConfig(trials=command.trials, seed=command.seed)
-    return synthetic_robot(scene, env.start, truth, listed(hidden_effects(own["hide"], scene)), env.task, config), truth
+    return synthetic_robot(
+        scene, env.start, truth, as_applied(hidden_effects(own["hide"], scene)), env.task, config
+    ), truth
 
 
 def _film(folder: Path, policy: Policy, robot: PolicyRobot, found: Trials) -> str | None:

@@ -27,12 +27,12 @@ class Export:
 @writes(None, lambda command: command.out or _policy_folder(command) / "export")
 def run(command: Export) -> None:
     """Write policy.npz, policy.onnx and control.py."""
-    from droid_jax.policy.control import load
+    from droid_jax.policy.control import load_policy
     from droid_jax.policy.export import export
 
     folder = _policy_folder(command)
     out = command.out or folder / "export"
-    apart = export(out, load(folder / POLICY))
+    apart = export(out, load_policy(folder / POLICY))
     print(f"policy.npz, policy.onnx and control.py: {out}; ONNX and JAX differ by at most {apart:.1e} in an action")
 
 

@@ -155,7 +155,7 @@ def kept_recordings(paths: Mapping[str, Path], again: bool, record: Callable[[st
 
     paths: by name.  record: of a recording's name.
     """
-    from droid_jax.recordings.formats import load, save
+    from droid_jax.recordings.formats import load_recording, save_recording
     from droid_jax.report.progress import counting
 
     absent = [name for name, path in paths.items() if again or not path.is_file()]
@@ -163,6 +163,6 @@ def kept_recordings(paths: Mapping[str, Path], again: bool, record: Callable[[st
         with counting("recording the synthetic robot", len(absent)) as count:
             for done, name in enumerate(absent, 1):
                 paths[name].parent.mkdir(parents=True, exist_ok=True)
-                save(record(name), paths[name])
+                save_recording(record(name), paths[name])
                 count(done)
-    return {name: load(path, name=name) for name, path in paths.items()}
+    return {name: load_recording(path, name=name) for name, path in paths.items()}

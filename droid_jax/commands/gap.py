@@ -14,7 +14,7 @@ from droid_jax.commands.folder import begin, fingerprints, finished, setup_of, s
 from droid_jax.commands.gap_search import searched
 from droid_jax.commands.presets import TIMESTEP, refine_config, search_config, warn_of_cpu
 from droid_jax.commands.scenes import compared, needs_log, needs_recording, needs_scene, own_scene, recording_at
-from droid_jax.commands.synthetic import hidden_effects, kept_at, known_robot, record_synthetic, settled
+from droid_jax.commands.synthetic import hidden_effects, kept_at, known_robot, record_synthetic, with_robot_options
 from droid_jax.commands.user_effects import load_effects
 from droid_jax.commands.writer import writes
 from droid_jax.files import FIT, GAP
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Gap:
+class GapCommand:
     """Find the physical effect that the model lacks: fit, ask a library of effects, validate on what was not fitted.
 
     Without --recording a synthetic robot with a hidden effect is recorded first.
@@ -91,12 +91,12 @@ class Gap:
 
 
 @writes("gap")
-def run(command: Gap) -> None:
+def run(command: GapCommand) -> None:
     """Record or load, fit, search, write the run's folder and its page."""
     from droid_jax import runtime
     from droid_jax.report.scalars import FOLDER, needs_writer
 
-    command = settled(command)
+    command = with_robot_options(command)
     needs_scene(command)
     needs_writer(command.tensorboard)
     runtime.start()
@@ -113,7 +113,7 @@ def run(command: Gap) -> None:
     out = command.out
     fit = None if command.fit is None else stage_folder(command.fit, "identify", FIT)
     load_effects(command.user_effects, fit)
-    scene, base = model_of(command)
+    scene, base = gap_model(command)
     given = given_to(command)
     needs_log(command.motion_cutoff, given)
     hidden = {} if given else hidden_effects(command.hide, scene)
@@ -129,7 +129,7 @@ def run(command: Gap) -> None:
     split, roles = assigned_roles(scene, given) if given else (Split.RECORDINGS, {})
     if split is Split.BLOCKS and start is not None:
         print("a log without repeats is fitted without a search: --fit is not needed")
-    config = config_of(command)
+    config = gap_config(command)
     prepare_folder(out)  # only now, with all input read
     if not given:
         assert command.springs is not None  # settled
@@ -170,7 +170,7 @@ def run(command: Gap) -> None:
     _done(out)
 
 
-def model_of(command: Gap) -> tuple[Scene, Space]:
+def gap_model(command: GapCommand) -> tuple[Scene, Space]:
     """The scene and all that is fitted without any effect, nuisances among it."""
     from droid_jax.door.scene import door_scene
     from droid_jax.door.space import door_nuisances, door_space
@@ -209,7 +209,7 @@ def values_of(folder: Path, base: Space) -> np.ndarray:
     return base.values({n: v for n, v in known.items() if n in base.names})
 
 
-def chosen_effects(command: Gap, scene: Scene, recordings: list[Recording]) -> tuple[Effect, ...]:
+def chosen_effects(command: GapCommand, scene: Scene, recordings: list[Recording]) -> tuple[Effect, ...]:
     """The library's effects for this scene, --effects and --without applied.
 
     Raises ValueError for unknown names, for effects that this scene cannot have, and where none is left.
@@ -235,7 +235,7 @@ def chosen_effects(command: Gap, scene: Scene, recordings: list[Recording]) -> t
     return left
 
 
-def config_of(command: Gap) -> DiscrepancyConfig:
+def gap_config(command: GapCommand) -> DiscrepancyConfig:
     """The preset with the command's own numbers."""
     from droid_jax.discrepancy.config import CONVERGE_ITERATIONS, DiscrepancyConfig
     from droid_jax.identify.multistart import RefineConfig
@@ -252,7 +252,7 @@ def config_of(command: Gap) -> DiscrepancyConfig:
     )
 
 
-def given_to(command: Gap) -> list[Recording]:
+def given_to(command: GapCommand) -> list[Recording]:
     """The recordings, none where the synthetic robot shall record."""
     needs_recording(command)
     if len(command.recording) > 3:
@@ -271,7 +271,7 @@ def _done(out: Path) -> None:
 
     gap = read_gap(out)
     found = gap.found
-    page = report.write(out)
+    page = report.write_page(out)
     print(found["sentence"])
     for size in gap.sizes:
         print(f"{size['effect']}: {size_words(size)} (90 % interval)")

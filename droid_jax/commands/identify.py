@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from droid_jax.commands import report
 from droid_jax.commands.folder import begin, fingerprints, finished, kept_recordings, setup_of
-from droid_jax.commands.pictures import draw, keep_replay
+from droid_jax.commands.pictures import draw_replay, keep_replay
 from droid_jax.commands.presets import TIMESTEP, Preset, refine_config, search_config, warn_of_cpu
 from droid_jax.commands.scenes import compared, needs_log, needs_recording, needs_scene, own_scene, recording_at
-from droid_jax.commands.synthetic import known_robot, settled
+from droid_jax.commands.synthetic import known_robot, with_robot_options
 from droid_jax.commands.user_effects import load_effects
 from droid_jax.commands.writer import writes
 from droid_jax.files import EXTENDED, FIT
@@ -92,7 +92,7 @@ def run(command: Identify) -> None:
     from droid_jax import runtime
     from droid_jax.report.scalars import needs_writer
 
-    command = settled(command)
+    command = with_robot_options(command)
     needs_scene(command)
     needs_writer(command.tensorboard)
     runtime.start()
@@ -108,16 +108,16 @@ def run(command: Identify) -> None:
 
     load_effects(command.user_effects, None if command.extended is None else command.extended.parent)
     out = command.out
-    scene, space, nuisances = model_of(command)
+    scene, space, nuisances = identify_model(command)
     scene, space, effects = _extended(command, scene, space)
     given = _given(command)
     needs_log(command.motion_cutoff, given)
     setup = {**setup_of(command), **fingerprints(scene, space if nuisances is None else space + nuisances, given)}
     if finished(out, setup, command.again):
-        draw(out, scene)  # where OpenGL was missing, or drawing was stopped
+        draw_replay(out, scene)  # where OpenGL was missing, or drawing was stopped
         report.run(report.Report(out))
         return
-    config = config_of(command)
+    config = identify_config(command)
     _needs_demonstrations(command, given)
     prepare_folder(out)  # only now, with all input read
     recordings, truth, known = _recordings(command, scene, out, given)
@@ -153,7 +153,7 @@ def run(command: Identify) -> None:
             ],
             findings=[finding for recording in recordings for finding in check_log(scene, recording)],
         )  # fmt: skip
-    draw(out, scene)
+    draw_replay(out, scene)
     report.run(report.Report(out))
     _summary(found, read_json(out / FIT), [r.repeats for r in recordings])
 
@@ -185,7 +185,7 @@ def _description(command: Identify, found: Identified, recordings: Sequence[Reco
     }
 
 
-def model_of(command: Identify) -> tuple[Scene, Space, Space | None]:
+def identify_model(command: Identify) -> tuple[Scene, Space, Space | None]:
     """The scene, what is fitted, and the nuisances beside it."""
     from droid_jax.door.scene import door_scene
     from droid_jax.door.space import door_nuisances, door_space
@@ -205,7 +205,7 @@ def model_of(command: Identify) -> tuple[Scene, Space, Space | None]:
     return scene, door_space(scene), door_nuisances(scene) if command.nuisances else None
 
 
-def config_of(command: Identify) -> IdentifyConfig:
+def identify_config(command: Identify) -> IdentifyConfig:
     """The preset with the command's own numbers."""
     from droid_jax.identify.pipeline import IdentifyConfig
 
@@ -257,7 +257,7 @@ def _recordings(
 ) -> tuple[list[Recording], dict[str, float] | None, dict[str, Any]]:
     """The given recordings, or the synthetic robot's (kept in the run's folder); with its hidden truth and, of given
     ones, springs, seed and hidden effects where these are known."""
-    from droid_jax.recordings.formats import load
+    from droid_jax.recordings.formats import load_recording
     from droid_jax.synthetic.robot import is_synthetic, synthetic_truth
 
     if given:  # a robot's own may lie beside what is known of a synthetic robot
@@ -272,7 +272,7 @@ def _recordings(
     truth = synthetic_truth(scene, command.springs, command.seed, nuisances=command.preset != "paper")
 
     def recorded(name: str) -> Recording:  # as `record` does, whatever stands beside it
-        demonstration = load(demonstration_path(name, gains=gains))
+        demonstration = load_recording(demonstration_path(name, gains=gains))
         return record(scene, demonstration, truth, seed=1000 * command.seed + sorted(PLANS).index(name))
 
     tag = f"springs{command.springs}_seed{command.seed}" + ("_paper" if gains == "paper" else "")

@@ -45,7 +45,7 @@ def keep_replay(out: Path, found: Identified, recording: Recording) -> None:
     write_npz(out / REPLAY, {"time": time, "before": before, "after": after})
 
 
-def draw(out: Path, scene: Scene) -> None:
+def draw_replay(out: Path, scene: Scene) -> None:
     """Draw what replay.npz holds, as film and frames, where there is one that was not drawn yet.
 
     Where that cannot be done (no OpenGL, a replay that blew up) it is said, and the page has no pictures.

@@ -29,17 +29,17 @@ def run(command: Record) -> None:
     """Record the synthetic robot and save what it measured."""
     from droid_jax.door.demonstration import PLANS, demonstration_path
     from droid_jax.door.scene import door_scene
-    from droid_jax.recordings.formats import check_target, load, save
+    from droid_jax.recordings.formats import check_target, load_recording, save_recording
     from droid_jax.synthetic.robot import SyntheticRobotConfig, record, synthetic_truth
 
     check_target(command.out)
     scene = door_scene(springs=command.springs, gains=command.gains)
-    demonstration = load(demonstration_path(command.demonstration, gains=command.gains))
+    demonstration = load_recording(demonstration_path(command.demonstration, gains=command.gains))
     truth = synthetic_truth(scene, command.springs, command.seed)
     # one robot, whose demonstrations have noise and errors of grasp of their own
     seed = 1000 * command.seed + sorted(PLANS).index(command.demonstration)
     recording = record(scene, demonstration, truth, seed=seed, config=SyntheticRobotConfig(repeats=command.repeats))
     of = {"springs": str(command.springs), "robot": str(command.seed)}
     recording = replace(recording, meta={**recording.meta, **of})
-    path = save(recording, command.out)
+    path = save_recording(recording, command.out)
     print(f"synthetic robot recorded {recording.repeats} repeats of {recording.duration:.1f} s: {path}")

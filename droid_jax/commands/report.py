@@ -22,7 +22,7 @@ class Report:
 
 def run(command: Report) -> None:
     """Write RUN/report.html."""
-    print(f"report: {write(command.run or _latest())}")
+    print(f"report: {write_page(command.run or _latest())}")
 
 
 def _latest() -> Path:
@@ -36,7 +36,7 @@ def _latest() -> Path:
     return files[max(whole, key=lambda file: file.stat().st_mtime)]
 
 
-def write(folder: Path) -> Path:
+def write_page(folder: Path) -> Path:
     """Write the page of a run's folder; its path."""
     from droid_jax.report.page import write_report
 

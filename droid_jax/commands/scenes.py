@@ -83,11 +83,11 @@ def own_scene(options: OwnScene, *, engine: str = "mjx", mj_step: bool = False) 
 
 def recording_at(path: Path) -> Recording:
     """A recording; ValueError for ROS bags, which do not say what a fit must know of them."""
-    from droid_jax.recordings.formats import bags_at, load
+    from droid_jax.recordings.formats import bags_at, load_recording
 
     if bags_at(path):
         raise ValueError(
             f"{path}: a ROS bag does not say which joints to read or what its efforts are; "
             "`python -m droid_jax.run convert BAGS --joints ... --torque ...` makes a recording of it"
         )
-    return load(path)
+    return load_recording(path)

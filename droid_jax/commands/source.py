@@ -29,7 +29,7 @@ def source(folder: Path | None, knob: int) -> tuple[Scene, Gaussian, tuple[Effec
     from droid_jax.door.scene import door_scene
     from droid_jax.door.space import door_nuisances, door_space
     from droid_jax.identify.extended_model import load_extended
-    from droid_jax.identify.gaussian import load, prior
+    from droid_jax.identify.gaussian import load_gaussian, prior
 
     scene = door_scene(timestep=TIMESTEP, limits=True, knob=knob)
     if folder is None:  # over what a fit is over, so that what a policy meets differs in nothing but the ranges
@@ -44,11 +44,11 @@ def source(folder: Path | None, knob: int) -> tuple[Scene, Gaussian, tuple[Effec
     if model is None:
         if not at.is_file():
             raise ValueError(f"{folder} holds no {GAUSSIAN}: it is no folder of `identify`, `gap` or `train`")
-        own = load(at)
+        own = load_gaussian(at)
         _check_door(at, own, scene)
         return scene, own, ()
     extended = load_extended(model, scene)
-    own = load(at) if at.is_file() else extended.gaussian
+    own = load_gaussian(at) if at.is_file() else extended.gaussian
     lacking = {name for part in extended.parts for name in part.free} - set(own.space.names)
     if lacking:
         raise ValueError(f"{at} lacks {', '.join(sorted(lacking))} of {model}, which is of another search by now")
@@ -124,11 +124,11 @@ def _hold(paths: Sequence[str | Path], hashes: Sequence[str]) -> bool:
     """Whether these files are there and hold a synthetic robot's recordings of these hashes: others may have
     their names.
     """
-    from droid_jax.recordings.formats import load
+    from droid_jax.recordings.formats import load_recording
     from droid_jax.synthetic.robot import is_synthetic
 
     try:
-        recordings = [load(path) for path in paths]
+        recordings = [load_recording(path) for path in paths]
     except (OSError, ValueError):
         return False
     return [r.sha256 for r in recordings] == list(hashes) and all(map(is_synthetic, recordings))

@@ -24,7 +24,7 @@ OPTIONS = {"hide": None, "springs": 1, "demonstrations": ("A", "C")}
 T = TypeVar("T")
 
 
-def settled(command: T) -> T:
+def with_robot_options(command: T) -> T:
     """A command with the options of its synthetic robot filled in, where it records one.
 
     Raises ValueError where some were given beside recordings, which come from another robot.
@@ -46,7 +46,7 @@ def hidden_effects(entries: Sequence[str] | None, scene: Scene) -> dict[str, flo
     entries: "name=amplitude" each, or "none" alone; None: one effect of this program's choice.
     Raises ValueError for what they cannot mean, listing the valid names, and for what the scene cannot have.
     """
-    from droid_jax.synthetic.hidden_effects import check, hidden_effect, listed, possible
+    from droid_jax.synthetic.hidden_effects import as_applied, check, hidden_effect, possible
 
     entries = HIDE if entries is None else tuple(entries)
     if entries in ((), ("none",)):
@@ -62,7 +62,7 @@ def hidden_effects(entries: Sequence[str] | None, scene: Scene) -> dict[str, flo
                 f"There are: {', '.join(possible(scene))}"
             ) from None
         hidden_effect(name.partition("[")[0])
-    for one in listed(found):
+    for one in as_applied(found):
         check(one, scene)
     return found
 
@@ -75,7 +75,7 @@ def record_synthetic(
     Recorded anew where `again` asks for it, and where the folder is not known to hold recordings of this very robot.
     """
     from droid_jax.door.demonstration import demonstration_path
-    from droid_jax.recordings.formats import load
+    from droid_jax.recordings.formats import load_recording
     from droid_jax.storage import write_json
     from droid_jax.synthetic.hidden_effects import record_hidden
     from droid_jax.synthetic.robot import synthetic_truth
@@ -85,7 +85,7 @@ def record_synthetic(
     names = list(DEMONSTRATIONS.values())
 
     def recorded(name: str) -> Recording:
-        demonstration = load(demonstration_path(name))
+        demonstration = load_recording(demonstration_path(name))
         return record_hidden(scene, demonstration, truth, hidden, seed=1000 * seed + names.index(name), name=name)
 
     files = kept_at(out)
@@ -122,10 +122,10 @@ def known_robot(recordings: Sequence[str | Path]) -> dict[str, Any]:
 
 def _of_meta(recordings: Sequence[str | Path]) -> dict[str, Any]:
     """The same from what `record` wrote into the files themselves, where they all say the same."""
-    from droid_jax.recordings.formats import load
+    from droid_jax.recordings.formats import load_recording
 
     try:
-        metas = [load(path).meta for path in recordings]
+        metas = [load_recording(path).meta for path in recordings]
         said = {(int(meta["springs"]), int(meta["robot"])) for meta in metas}
     except (OSError, ValueError, KeyError):
         return {}

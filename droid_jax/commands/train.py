@@ -19,7 +19,7 @@ from droid_jax.report.stages import extended_of, fingerprint
 if TYPE_CHECKING:
     from droid_jax.door.environment import DoorEnv
     from droid_jax.identify.gaussian import Gaussian
-    from droid_jax.policy.train import TrainConfig, Trained, TrainProgress
+    from droid_jax.policy.train import TrainConfig, TrainedPolicy, TrainProgress
 
 Method = Literal["fitted", "mean", "prior"]
 
@@ -85,7 +85,7 @@ def run(command: Train) -> None:
     if finished(out, setup, command.again, TRAINING):
         report.run(report.Report(out))
         return
-    config = config_of(command)
+    config = train_config(command)
     env, randomise = DoorEnv(scene, effects=effects), of_method(command.method, scene, gaussian)
     prepare_folder(out)  # only now, with all input read
     begin(out, setup, command.again, "train")
@@ -112,7 +112,7 @@ def run(command: Train) -> None:
     report.run(report.Report(out))
 
 
-def _description(setup: dict[str, Any], config: TrainConfig, env: DoorEnv, found: Trained) -> dict[str, Any]:
+def _description(setup: dict[str, Any], config: TrainConfig, env: DoorEnv, found: TrainedPolicy) -> dict[str, Any]:
     """What training.json says."""
     from droid_jax import runtime
 
@@ -129,7 +129,7 @@ def _description(setup: dict[str, Any], config: TrainConfig, env: DoorEnv, found
     }
 
 
-def config_of(command: Train) -> TrainConfig:
+def train_config(command: Train) -> TrainConfig:
     """The preset with the command's own numbers."""
     from droid_jax.policy.train import PRESETS
 

@@ -183,11 +183,11 @@ def _strange_recordings(folder: Path) -> list[Path]:
     """Files of others in a folder of recordings under names of the synthetic robot's."""
     if not folder.is_dir() or (folder / SYNTHETIC_ROBOT).is_file():
         return []
-    from droid_jax.recordings.formats import load
+    from droid_jax.recordings.formats import load_recording
 
     def strange(path: Path) -> bool:
         try:
-            return load(path).meta.get("source") != SYNTHETIC_SOURCE
+            return load_recording(path).meta.get("source") != SYNTHETIC_SOURCE
         except (OSError, ValueError):
             return True
 

@@ -24,8 +24,8 @@ from droid_jax.cost.residuals import CompareConfig, Comparison, make_comparison
 from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.fields import check_space
 from droid_jax.model.inertia import check_inertia, free_inertias, inertia_possible
-from droid_jax.model.joint_friction import FRICTION, GAIN, TERMS, direction, joint_friction_effect, torque_gain_effect
-from droid_jax.model.parameters import Space
+from droid_jax.model.joint_friction import direction, joint_friction_effect, torque_gain_effect
+from droid_jax.model.parameters import OF_A_JOINT, Role, Space
 from droid_jax.model.physics import make_physics
 from droid_jax.model.scene import Scene
 from droid_jax.preflight.check_log import warn_of_log
@@ -35,10 +35,18 @@ from droid_jax.recordings.recording import Recording, recordings_of
 from droid_jax.simulate.batching import in_blocks, over_block
 from droid_jax.simulate.c_reference import c_replay
 from droid_jax.simulate.initial_state import AJAR, following
-from droid_jax.simulate.inverse_dynamics import Path, path_of, path_replay, prescribed
+from droid_jax.simulate.inverse_dynamics import Path, motion_path, path_replay, prescribed
 from droid_jax.simulate.measured_motion import Motion, measured_motion
 from droid_jax.simulate.repeat_starts import from_one_start, own_starts
-from droid_jax.simulate.replay import Drive, Replay, check_gains, make_drive, servo_replay, torque_offset_effect
+from droid_jax.simulate.replay import (
+    TORQUE_OFFSETS,
+    Drive,
+    Replay,
+    check_gains,
+    make_drive,
+    servo_replay,
+    torque_offset_effect,
+)
 
 ENGINES = ("mjx", "mujoco")
 ALIKE = 2e-3  # rad or m: measured starts that are closer differ by the noise of a sensor
@@ -153,16 +161,26 @@ def make_cost(
     effects: Sequence[Effect] = (),
     check: bool = True,
 ) -> Cost:
-    """The cost of a scene over one or more recordings.
+    """The cost of a scene over one or more recordings: equation 1 of the paper.
 
-    A recording with commands is replayed by its servo, one without by inverse dynamics of its
-    measured motion.
-    engine: "mjx" (compiled, all devices) or "mujoco" (plain C, all cores; the parity oracle).
-    effects: extra physics or observation models whose parameters are part of the space; torque
-      offsets, and joint friction behind the sensor where the space holds any, are there already.
-    check: warn of units, signs and clocks in the recordings that can hardly be right (`log_checks.check_log`).
-    Raises ValueError for a space of another scene, unknown engines, joints, channels, parameters that nothing reads,
-      or gains that do not match.
+    A recording with commands is replayed by its servo, one without by inverse dynamics of its measured motion.
+
+    Args:
+        scene: what is simulated.
+        space: meaning of the vectors [D].
+        recordings: R recordings of the same robot and object.
+        engine: "mjx" (compiled, all devices) or "mujoco" (plain C, all cores; the parity oracle).
+        config: how simulation and measurement are compared; None for the defaults.
+        effects: extra physics or observation models whose parameters are part of the space. Torque offsets, and joint
+            friction behind the sensor where the space holds any, are there already.
+        check: warn of units, signs and clocks in the recordings that can hardly be right (`preflight.check_log`).
+
+    Returns:
+        A cost to be called with [P, D] physical values, which gives [P] N m.
+
+    Raises:
+        ValueError: a space of another scene, unknown engines, joints or channels, parameters that nothing reads, or
+            gains that do not match.
     """
     config = instance(CompareConfig() if config is None else config, "config", CompareConfig)
     check_space(instance(scene, "scene", Scene), instance(space, "space", Space))
@@ -191,13 +209,14 @@ def check_read(scene: Scene, space: Space, effects: Sequence[Effect]) -> None:
 
     An effect that states no parameters may read any of them.
     """
-    sensed = [f"{what}[{joint}]" for what in TERMS for joint in scene.joints]
-    read = {"time_offset", *sensed, *(p.name for e in effects for p in e.parameters)}
+    late = Role.TIME_OFFSET.in_theta()
+    sensed = [role.in_theta(joint) for role in OF_A_JOINT for joint in scene.joints]
+    read = {late, *sensed, *(p.name for e in effects for p in e.parameters)}
     unread = [p.name for p in space.parameters if not p.writes and p.name not in read]
     if unread and all(e.parameters for e in effects):
         raise ValueError(
             f"parameters {', '.join(unread)} write no field of the model, and nothing in the replay reads them; names "
-            f"that it reads: time_offset, {', '.join(sensed)}, and those of the effects that it is given"
+            f"that it reads: {late}, {', '.join(sensed)}, and those of the effects that it is given"
         )
 
 
@@ -206,7 +225,8 @@ def _warn_of_commanded(space: Space) -> None:
     idle = [
         p.name
         for p in space.parameters
-        if p.name == "time_offset" or (p.writes and all(w.field.startswith(("actuator_", "dof_sol")) for w in p.writes))
+        if p.role is Role.TIME_OFFSET
+        or (p.writes and all(w.field.startswith(("actuator_", "dof_sol")) for w in p.writes))
     ]
     if idle:
         warnings.warn(
@@ -284,7 +304,7 @@ class Along:
     torques: Callable[[Path], jax.Array]
 
     def __call__(self, values: np.ndarray) -> Rollout:
-        return self.compiled(values, path_of(self.scene, self.motion))
+        return self.compiled(values, motion_path(self.scene, self.motion))
 
 
 @dataclass(frozen=True, eq=False)
@@ -350,7 +370,7 @@ def _apart(along: Along, scene: Scene, recording: Recording, config: CompareConf
         )
         for n in range(recording.repeats)
     ]
-    paths = [path_of(scene, motion) for motion in motions]
+    paths = [motion_path(scene, motion) for motion in motions]
     torques = np.asarray(along.torques(jax.tree.map(lambda *a: jnp.stack(a), *paths)), np.float64)
     return torques - torques.mean(axis=0)
 
@@ -397,12 +417,9 @@ def with_sensors(scene: Scene, space: Space, drive: Drive | Motion, effects: Seq
 def _sensor_effects(scene: Scene, space: Space, drive: Drive | Motion) -> tuple[Effect, ...]:
     """What the torque sensors add: always the offsets, all else where the space asks for it."""
 
-    def asked(*terms: str) -> bool:
-        return any(name.startswith(tuple(f"{term}[" for term in terms)) for name in space.names)
-
     sign = jnp.sign if isinstance(drive, Motion) else direction
-    found = [joint_friction_effect(scene.joints, sign)] if asked(*FRICTION) else []
-    found += [torque_gain_effect(scene.joints)] if asked(GAIN) else []
+    found = [joint_friction_effect(scene.joints, sign)] if space.of_role(Role.VISCOUS, Role.COULOMB) else []
+    found += [torque_gain_effect(scene.joints)] if space.of_role(Role.TORQUE_GAIN) else []
     return (*found, torque_offset_effect(scene.joints))
 
 
@@ -434,7 +451,7 @@ def _engine(
             return lambda values: compiled(values, *of_drive)
 
         return Driven(driven, drive)
-    known = [e for e in effects if e.name != "torque offset"]
+    known = [e for e in effects if e.name != TORQUE_OFFSETS]
 
     def twin(drive: Drive) -> Callable[[np.ndarray], Rollout]:
         checked = _of_bodies(scene, space, c_replay(scene, space, drive, known, late=late))

@@ -14,16 +14,9 @@ import mujoco
 import numpy as np
 from scipy import sparse
 
-from droid_jax.cost.noise import RATE, Noise, coarse_clock, estimate_noise, lowpass, smooth
+from droid_jax.cost.noise import DEFAULT_NOISE, Noise, NoiseConfig, coarse_clock, estimate_noise, lowpass, smooth
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Channel
-
-MOVES = 0.5  # share of the filter's window at least in which a joint moves, where what is left tells of noise
-ENOUGH = 0.1  # share of the time that two repeats must have measured
-# Deviation below which a channel's noise is never believed, in the channel's unit.
-# Of a channel that one repeat measured: no larger than this share of what moves in it, where its motor is small.
-LEAST_SHARE = 1e-3
-MINIMUM_NOISE = {"torque": 0.01, "position": 2e-5, "velocity": 5e-4, "object_angle": 2e-4}
 
 
 class TooLong(ValueError):
@@ -55,16 +48,16 @@ class Measured:
     @property
     def clock(self) -> np.ndarray:
         """[K] s, the coarse clock: the times of what is smoothed and whitened."""
-        return coarse_clock(*self.span)
+        return np.linspace(*self.span, len(self.noise.mean))
 
 
-def least_noise(name: str, mean: np.ndarray) -> np.ndarray:
+def least_noise(name: str, mean: np.ndarray, config: NoiseConfig = DEFAULT_NOISE) -> np.ndarray:
     """[C] deviation below which the noise of a channel that one repeat measured is never believed, in its unit.
 
     mean: [K, C] what was measured, smoothed.  Noise is told from what a fit leaves, which a model with too many
     parameters takes away.
     """
-    return np.minimum(MINIMUM_NOISE[name], LEAST_SHARE * np.maximum(np.std(mean, axis=0), 1e-9))
+    return np.minimum(config.minimum[name], config.minimum_share * np.maximum(np.std(mean, axis=0), 1e-9))
 
 
 def prepared(
@@ -74,14 +67,15 @@ def prepared(
     weight: float,
     apart: np.ndarray | None = None,
     rest: np.ndarray | None = None,
+    config: NoiseConfig = DEFAULT_NOISE,
 ) -> Measured:
     """A channel made ready for a replay whose rows have the times `clock` [T] s; apart, rest: as in `make_comparison`.
 
     Raises ValueError for a channel that no replay produces, unknown columns, a constant one, one outside the motion,
     one with a stretch that nothing measured, and one too long for the memory.
     """
-    if channel.name not in MINIMUM_NOISE:
-        raise ValueError(f"channel {channel.name!r} has no simulated counterpart; known: {', '.join(MINIMUM_NOISE)}")
+    if channel.name not in config.minimum:
+        raise ValueError(f"channel {channel.name!r} has no simulated counterpart; known: {', '.join(config.minimum)}")
     if channel.name == "object_angle":
         if scene.object_joint is None or len(channel.columns) != 1:
             raise ValueError(
@@ -100,15 +94,15 @@ def prepared(
             f"outside the motion that is replayed, {clock[0]:g} .. {clock[-1]:g} s"
         )
     time, values, mask = channel.time[inside], channel.values[:, inside], channel.mask[:, inside]
-    coarse = coarse_clock(float(time[0]), float(time[-1]))
-    _needs_memory(channel, len(clock), len(coarse))
-    kernel = lowpass(time, coarse)
+    coarse = coarse_clock(float(time[0]), float(time[-1]), config.rate)
+    _needs_memory(channel, len(clock), coarse)
+    kernel = lowpass(time, coarse, config)
     resampling = _resampling(clock, time)
     off = 0.0 if apart is None else np.stack([resampling @ a[:, columns] for a in apart])
-    repeats = smooth(values - off, mask, kernel)
+    repeats = smooth(values - off, mask, kernel, config.least_window)
     seen = _same_filter(kernel, mask, ~np.isnan(repeats), resampling)
-    repeats, measured = _fill(repeats, channel, coarse)
-    noise = estimate_noise(repeats, minimum=MINIMUM_NOISE[channel.name], measured=measured)
+    repeats, measured = _fill(repeats, channel, coarse, config.least_overlap)
+    noise = estimate_noise(repeats, minimum=config.minimum[channel.name], measured=measured, config=config)
     step = clock[1] - clock[0]
     still = np.zeros((len(clock), len(scene.joints)), bool) if rest is None else rest[:, : len(scene.joints)]
     return Measured(
@@ -122,7 +116,7 @@ def prepared(
         noise=noise,
         span=(float(coarse[0]), float(coarse[-1])),
         weight=weight,
-        moves=kernel @ (resampling @ (~still[:, columns]).astype(float)) > MOVES,
+        moves=kernel @ (resampling @ (~still[:, columns]).astype(float)) > config.moving_share,
     )
 
 
@@ -140,18 +134,19 @@ def _of_joints(scene: Scene, channel: Channel) -> Channel:
     return replace(channel, columns=columns, values=channel.values[..., kept], mask=channel.mask[..., kept])
 
 
-def _needs_memory(channel: Channel, steps: int, instants: int) -> None:
+def _needs_memory(channel: Channel, steps: int, coarse: np.ndarray) -> None:
     """Raise TooLong where filter and covariance, which grow with the square of the duration, fill the memory."""
     filters = 1 if channel.mask.all() or np.all(channel.mask == channel.mask[..., :1]) else len(channel.columns)
+    instants = len(coarse)
     needed = 8.0 * instants * (filters * steps + len(channel.columns) * instants)
     if not hasattr(os, "sysconf"):  # elsewhere than on Linux and macOS
         return
     there = float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
     if 2.0 * needed > there:  # what computes with them needs as much again
         raise TooLong(
-            f"channel {channel.name!r} of {instants / RATE:.0f} s needs {needed / 1e9:.1f} GB for its filter and the "
-            f"covariance of its noise, and half of this machine's memory is {there / 2e9:.1f} GB: cut the recording "
-            "(`python -m droid_jax.run convert --start S --end S`), or fit its parts as several"
+            f"channel {channel.name!r} of {coarse[-1] - coarse[0]:.0f} s needs {needed / 1e9:.1f} GB for its filter "
+            f"and the covariance of its noise, and half of this machine's memory is {there / 2e9:.1f} GB: cut the "
+            "recording (`python -m droid_jax.run convert --start S --end S`), or fit its parts as several"
         )
 
 
@@ -209,7 +204,7 @@ def _refuse_constant(channel: Channel) -> None:
             )
 
 
-def _fill(repeats: np.ndarray, channel: Channel, clock: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _fill(repeats: np.ndarray, channel: Channel, clock: np.ndarray, overlap: float) -> tuple[np.ndarray, np.ndarray]:
     """Repeats [N, K, C] whose gaps take the other repeats' mean there, and what was measured.
 
     Raises ValueError for a gap in all repeats, and for a column that hardly two of several measured: nothing says then
@@ -224,7 +219,7 @@ def _fill(repeats: np.ndarray, channel: Channel, clock: np.ndarray) -> tuple[np.
             f"channel {channel.name!r}, column {channel.columns[column]!r} has a stretch that no repeat measured, at "
             f"{clock[instant]:.3g} s: cut the recording there (window), or leave the column away"
         )
-    alone = np.flatnonzero((count - 1).sum(axis=0) < ENOUGH * len(clock))
+    alone = np.flatnonzero((count - 1).sum(axis=0) < overlap * len(clock))
     if len(repeats) > 1 and len(alone):
         raise ValueError(
             f"channel {channel.name!r}, column {channel.columns[alone[0]]!r} was measured by one repeat only for most "

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from droid_jax.arguments import check_fields, flag, instance, number, weights
-from droid_jax.cost.noise import discrepancy
+from droid_jax.cost.noise import NoiseConfig, stated_deviation
 from droid_jax.cost.observation import Measured, least_noise, prepared
 from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.scene import Scene
@@ -38,6 +38,7 @@ class CompareConfig:
     whitened: the cost is the root mean square of the whitened residuals instead of N m.
     motion_cutoff: Hz, filter of the measured positions of a recording without commands.
     rest: below which speed a joint of such a recording counts as at rest, where its friction is only bounded.
+    noise: what decides the noise of the channels.
     mj_step: replay as a MuJoCo program logs itself: mj_step's own steps of first order, each row the state before a
       step and the command of that step.  For recordings that MuJoCo made with the scene's own time step; of a real
       robot, or of a finer simulation, the default is the better one by far.
@@ -51,6 +52,7 @@ class CompareConfig:
     whitened: bool = False
     motion_cutoff: float = CUTOFF
     rest: RestConfig = field(default_factory=RestConfig)
+    noise: NoiseConfig = field(default_factory=NoiseConfig)
     mj_step: bool = False
 
     def __post_init__(self) -> None:
@@ -64,6 +66,7 @@ class CompareConfig:
             whitened=flag,
             motion_cutoff=partial(number, above=0),
             rest=partial(instance, kind=RestConfig),
+            noise=partial(instance, kind=NoiseConfig),
             mj_step=flag,
         )
 
@@ -137,10 +140,9 @@ class Comparison:
 
         def stated(channel: Measured) -> Measured:
             left = channel.noise.mean - np.asarray(_smooth(channel, _trace(rollout, channel)))
-            left = discrepancy(left, channel.moves)
-            return replace(
-                channel, noise=channel.noise.stated(np.maximum(left, least_noise(channel.name, channel.noise.mean)))
-            )
+            left = stated_deviation(left, channel.moves, self.config.noise.rate)
+            least = least_noise(channel.name, channel.noise.mean, self.config.noise)
+            return replace(channel, noise=channel.noise.stated(np.maximum(left, least)))
 
         return replace(self, channels=tuple(stated(c) for c in self.channels))
 
@@ -203,7 +205,14 @@ def make_comparison(
     constant (dead) channel.
     """
     channels = tuple(
-        prepared(scene, recording.channel(name), clock, weight, *((apart, rest) if name == "torque" else (None, None)))
+        prepared(
+            scene,
+            recording.channel(name),
+            clock,
+            weight,
+            *((apart, rest) if name == "torque" else (None, None)),
+            config=config.noise,
+        )
         for name, weight in config.channels.items()
     )
     acts = scene.grip is not None and recording.command.size > 0  # along a prescribed motion nothing is gripped

@@ -1,0 +1,1 @@
+"""The paper's door: scene, arm, parameter space, demonstrations and task."""

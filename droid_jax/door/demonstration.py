@@ -206,9 +206,9 @@ def demonstration_path(name: str, gains: str = "impedance") -> Path:
     return path
 
 
-def main() -> None:
+def write_demonstrations() -> None:
     """Write the shipped demonstrations."""
-    from droid_jax.recordings.formats import save
+    from droid_jax.recordings.formats import save_recording
 
     folder = mjcf_dir() / "demonstrations"
     folder.mkdir(exist_ok=True)
@@ -216,9 +216,9 @@ def main() -> None:
         scene = door_scene(gains=gains)
         for name, plan in plans.items():
             recording = demonstrate(scene, plan)
-            save(recording, folder / f"{name}_{gains}_knob0.npz")
+            save_recording(recording, folder / f"{name}_{gains}_knob0.npz")
             print(f"{name}, {gains} gains: {recording.time[-1]:.1f} s, {len(recording.time)} commands")
 
 
 if __name__ == "__main__":
-    main()
+    write_demonstrations()

@@ -19,7 +19,7 @@ from droid_jax.door.policy_interface import PLAN, interface_of
 from droid_jax.door.task import (
     Task,
     gripped,
-    holding,
+    held_open,
     observation,
     reward,
     substeps_of,
@@ -78,7 +78,7 @@ class DoorEnv(Environment):
             )
         self.scene, self.task, self.effects = ready(scene) if effects else scene, task or Task(), tuple(effects)
         self.sys = Physics(self.scene.mjx, {})
-        self.start = start_pose(self.scene, self.task)
+        self.start = waiting_pose(self.scene, self.task)
         self.interface = interface_of(self.scene, self.task, self.start)
         self._hand, self._template = hand_of(self.scene), mjx.make_data(self.scene.mjx)
         self._timestep = float(self.scene.model.opt.timestep)
@@ -129,7 +129,7 @@ class DoorEnv(Environment):
         world = jax.tree.map(lambda new, old: jnp.where(finite, new, old), world, before)
         force = jnp.where(finite, force, 0.0)
         seen = self._look(self.sys.model, world, force)
-        held = holding(self.task, seen, before.held)
+        held = held_open(self.task, seen, before.held)
         world = world._replace(pads=seen.pads, held=held, longest=jnp.maximum(before.longest, held))
         success = succeeded(self.task, world.longest) & ~succeeded(self.task, before.longest)
         metrics = {
@@ -189,7 +189,7 @@ class DoorEnv(Environment):
         return observation(world.qpos[self.scene.joint_qpos], world.qvel[self.scene.joint_dofs], seen)
 
 
-def start_pose(scene: Scene, task: Task) -> np.ndarray:
+def waiting_pose(scene: Scene, task: Task) -> np.ndarray:
     """[nq] the arm in front of the closed door's knob, fingers open.  ValueError where the knob is out of reach."""
     q = solve_pose(scene, np.array(PLAN.pose), *grasp_pose(scene, 0.0, 0.0, PLAN.roll))
     for standoff in np.linspace(0.0, task.standoff, 10):

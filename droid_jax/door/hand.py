@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from droid_jax.door.task import Seen
+from droid_jax.door.task import HandState
+from droid_jax.model.mjx_internals import constraint_rows, contacts
 from droid_jax.model.scene import Scene
 from droid_jax.simulate.replay import finger_geoms, of_fingers
 
@@ -48,7 +49,7 @@ def pads_at(hand: Hand, data: Any, origin: Any, axes: Any, numbers: Any = np) ->
     return (data.xpos[hand.fingers] + data.xmat[hand.fingers].reshape(-1, 3, 3) @ pad - origin) @ axes
 
 
-def looked(hand: Hand, data: Any, force: Any, last: Any, seconds: float, numbers: Any = jnp) -> Seen:
+def looked(hand: Hand, data: Any, force: Any, last: Any, seconds: float, numbers: Any = jnp) -> HandState:
     """From mjx.Data, or MjData with numbers=numpy, with fresh kinematics.
 
     force: [2] N.  last: [2, 3] pads a while ago, `seconds` before, in the knob's frame.
@@ -57,7 +58,7 @@ def looked(hand: Hand, data: Any, force: Any, last: Any, seconds: float, numbers
     pads = pads_at(hand, data, knob, turned, numbers)
     axis, inward = data.site_xmat[hand.pinch].reshape(3, 3)[:, 2], turned[:, 0]
     across, along = inward[0] * axis[1] - inward[1] * axis[0], inward[:2] @ axis[:2]
-    return Seen(
+    return HandState(
         angle=data.qpos[hand.hinge],
         pinch=(data.site_xpos[hand.pinch] - knob) @ turned,
         pads=pads,
@@ -70,11 +71,10 @@ def looked(hand: Hand, data: Any, force: Any, last: Any, seconds: float, numbers
 
 def finger_forces(hand: Hand, data: Any) -> jax.Array:
     """[2] N, normal force on each finger, from mjx.Data after a step."""
-    contact, rows = data._impl.contact, data._impl
-    force: Any = rows.efc_force
-    edges: Any = force[contact.efc_address[:, None] + np.arange(EDGES)]
-    normal = jnp.sum(edges, axis=1) * (contact.dist < 0)
-    return jnp.stack([jnp.sum(normal * mine) for mine in of_fingers(contact, hand.pairs)])
+    found = contacts(data)
+    edges = constraint_rows(data).force[found.first_row[:, None] + np.arange(EDGES)]
+    normal = jnp.sum(edges, axis=1) * (found.distance < 0)
+    return jnp.stack([jnp.sum(normal * mine) for mine in of_fingers(found, hand.pairs)])
 
 
 def finger_forces_c(hand: Hand, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:

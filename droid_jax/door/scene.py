@@ -35,12 +35,18 @@ def door_scene(
 ) -> Scene:
     """The built-in scene: a Panda in front of a cabinet door.
 
-    springs: 0, 1 or 2 springs on the hinge (the paper's three doors).
-    knob:    0..3, the knob's location along the lever arm, 5 cm apart (0 is the outermost, 0.30 m).
-    gains:   "impedance": what a Panda's joint impedance runs at; "paper": Table I's stiff servo.
-    timestep: s.
-    limits:  enforce the arm's joint ranges (needed when a policy drives the arm; a replay keeps inside).
-    Raises ValueError for other springs, knobs or gains.
+    Args:
+        springs: 0, 1 or 2 springs on the hinge (the paper's three doors).
+        knob: 0..3, the knob's location along the lever arm, 5 cm apart (0 is the outermost, 0.30 m).
+        gains: "impedance", what a Panda's joint impedance runs at, or "paper", Table I's stiff servo.
+        timestep: s.
+        limits: enforce the arm's joint ranges (needed when a policy drives the arm; a replay keeps inside).
+
+    Returns:
+        The scene, with the hinge as its object and a grip of two fingers.
+
+    Raises:
+        ValueError: other springs, knobs or gains, or a time step that is not above 0.
     """
     whole(springs, "springs", least=0, most=max(SPRINGS))
     whole(knob, "knob", least=0, most=len(LEVERS) - 1)
@@ -75,7 +81,10 @@ def _attach(spec: mujoco.MjSpec, file: Path, site: str) -> None:
 
     MuJoCo warns of an empty prefix twice, through Python and on stderr with a log file; both are silenced.
     """
-    mujoco.set_mju_user_warning(lambda message: None)
+
+    def nothing(message: str) -> None: ...
+
+    mujoco.set_mju_user_warning(nothing)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
@@ -120,9 +129,9 @@ def _add_grip(spec: mujoco.MjSpec) -> Grip:
     moves to the next time step: the cost then has cliffs 20 log-likelihood units high all around
     the best fit, which no search survives.
     """
-    fingers = []
+    fingers: list[tuple[str, str]] = []
     for side in ("left", "right"):
-        pairs = tuple(f"{side}_{rail}" for rail in ("near", "far"))
+        pairs = (f"{side}_near", f"{side}_far")
         for pair, rail in zip(pairs, ("near", "far"), strict=True):
             spec.add_pair(
                 name=pair,

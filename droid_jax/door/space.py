@@ -25,7 +25,7 @@ from droid_jax.model.fields import (
     servo_scale,
     time_offset,
 )
-from droid_jax.model.parameters import Parameter, Space
+from droid_jax.model.parameters import Parameter, Role, Space
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
 
 PAPER_DAMPING_STD = (2.0, 2.0, 2.0, 2.0, 2.0, 1.0, 0.2)  # Table I, N m s/rad
@@ -57,12 +57,18 @@ def truth(springs: int) -> dict[str, float]:
 def door_space(scene: Scene, *, preset: str = "impedance") -> Space:
     """The 16 parameters of Table I.
 
-    preset "paper": Table I's own means and deviations, joint damping around 100 N m s/rad,
-      linear coordinates, negative samples redrawn.
-    preset "impedance": the same door and gripper; joint damping around the scene's own servo
-      damping with a deviation of 10 %; log coordinates, wide enough that a sprung door, 200 of
-      Table I's deviations away, is still found.
-    Raises ValueError for other presets and for a scene without a grip.
+    Args:
+        scene: of `door_scene`.
+        preset: "paper" has Table I's own means and deviations, joint damping around 100 N m s/rad and linear
+            coordinates; negative samples are redrawn. "impedance" has the same door and gripper, joint damping around
+            the scene's own servo damping with a deviation of 10 %, and log coordinates, wide enough that a sprung door,
+            200 of Table I's deviations away, is still found.
+
+    Returns:
+        A space of D = 16.
+
+    Raises:
+        ValueError: another preset, or a scene without a grip.
     """
     one_of(preset, "preset", ("impedance", "paper"))
     instance(scene, "scene", Scene)
@@ -70,7 +76,9 @@ def door_space(scene: Scene, *, preset: str = "impedance") -> Space:
         raise ValueError(f"scene {scene.name!r} has no grip, whose fingers' friction is part of Table I")
     left, right = scene.grip.fingers
     door = dict(group="Door")
-    grip = dict(group="Gripper", width=0.5)
+    slides, turns = (
+        dict(group="Gripper", width=0.5, role=role) for role in (Role.SLIDING_FRICTION, Role.TORSIONAL_FRICTION)
+    )
     parameters = (
         body_mass(scene, "door", mean=1.144, std=0.5, low=0.05, high=10.0, **door),
         body_mass(scene, "knob", mean=0.199, std=0.1, low=0.01, high=8.0, width=0.7, **door),
@@ -78,17 +86,17 @@ def door_space(scene: Scene, *, preset: str = "impedance") -> Space:
         joint_stiffness(scene, HINGE, mean=0.01, std=0.005, high=10.0, width=1.0, **door),
         joint_damping(scene, HINGE, mean=2.0, std=1.0, high=20.0, width=0.7, **door),
         *_joint_dampings(scene, preset),
-        pair_friction(scene, left, (0, 1), name="sliding_friction_left", unit="-", std=0.25, **grip),
-        pair_friction(scene, right, (0, 1), name="sliding_friction_right", unit="-", std=0.25, **grip),
-        pair_friction(scene, left, (2,), name="torsional_friction_left", unit="m", std=0.25, **grip),
-        pair_friction(scene, right, (2,), name="torsional_friction_right", unit="m", std=0.25, **grip),
+        pair_friction(scene, left, (0, 1), name="sliding_friction_left", unit="-", std=0.25, **slides),
+        pair_friction(scene, right, (0, 1), name="sliding_friction_right", unit="-", std=0.25, **slides),
+        pair_friction(scene, left, (2,), name="torsional_friction_left", unit="m", std=0.25, **turns),
+        pair_friction(scene, right, (2,), name="torsional_friction_right", unit="m", std=0.25, **turns),
     )
     space = Space(parameters)
     return space.linear() if preset == "paper" else space
 
 
 def _joint_dampings(scene: Scene, preset: str) -> tuple[Parameter, ...]:
-    out = []
+    out: list[Parameter] = []
     for i, joint in enumerate(ARM):
         mean = PAPER_DAMPING[i] if preset == "paper" else float(scene.model.dof_damping[scene.dof(joint)])
         std = PAPER_DAMPING_STD[i] if preset == "paper" else 0.1 * mean
@@ -102,9 +110,19 @@ def _joint_dampings(scene: Scene, preset: str) -> tuple[Parameter, ...]:
 
 
 def door_nuisances(scene: Scene) -> Space:
-    """What is uncertain and of no interest, each with a prior: pose, grasp, link masses, servo
-    gains, timing and torque offsets.  Deviations: 2 mm and 0.5 degree of door pose, 1 mm at the
-    knob, 3 % of link masses and servo gains, 1 ms, 0.1 N m (0.03 at the wrist).
+    """What is uncertain and of no interest: pose, grasp, link masses, servo gains, timing and torque offsets.
+
+    Deviations of the priors: 2 mm and 0.5 degree of door pose, 1 mm at the knob, 3 % of link masses and servo gains,
+    1 ms, 0.1 N m (0.03 at the wrist).
+
+    Args:
+        scene: of `door_scene`.
+
+    Returns:
+        A space of nuisances, to be given beside `door_space`.
+
+    Raises:
+        ValueError: the scene lacks an element of the door's.
     """
     instance(scene, "scene", Scene)
     note: dict[str, Any] = dict(nuisance=True, group="Nuisance")
@@ -124,7 +142,7 @@ def door_nuisances(scene: Scene) -> Space:
 def torque_offsets(joints: tuple[str, ...], std: float = 0.1) -> tuple[Parameter, ...]:
     """Constant error of each joint's torque sensor, N m."""
     return tuple(
-        Parameter(f"torque_offset[{j}]", "N m", 0.0, std if i < 4 else 0.3 * std, -2.0, 2.0, nuisance=True,
+        Parameter(Role.TORQUE_OFFSET.in_theta(j), "N m", 0.0, std if i < 4 else 0.3 * std, -2.0, 2.0, nuisance=True,
                   group="Nuisance")
         for i, j in enumerate(joints)
     )  # fmt: skip

@@ -60,7 +60,7 @@ def substeps_of(control: float, timestep: float, whose: str) -> int:
     return steps
 
 
-class Seen(NamedTuple):
+class HandState(NamedTuple):
     """Hand and knob at one instant.
 
     angle: [] rad of the hinge.  pinch: [3] and pads: [2, 3] m from the knob, in its frame (x the door's inward
@@ -78,7 +78,7 @@ class Seen(NamedTuple):
     sliding: Any
 
 
-def gripped(task: Task, seen: Seen) -> Any:
+def gripped(task: Task, seen: HandState) -> Any:
     """[] bool: both fingers press from the sides, and the hand faces the door.
 
     A finger that hooks the knob from the side presses alone, or needs the hand turned; two that close behind its
@@ -87,12 +87,12 @@ def gripped(task: Task, seen: Seen) -> Any:
     return (pressing(task, seen)).all() & (abs(seen.yaw) <= task.yaw)
 
 
-def pressing(task: Task, seen: Seen) -> Any:
+def pressing(task: Task, seen: HandState) -> Any:
     """[2] bool: each finger presses the knob, and not from behind."""
     return (seen.force >= task.force) & (seen.pads[:, 0] <= task.behind)
 
 
-def terms(task: Task, seen: Seen) -> dict[str, Any]:
+def terms(task: Task, seen: HandState) -> dict[str, Any]:
     """The five terms of equation 4, unweighted: door, orientation, distance, log_distance, slip.
 
     Distances count below `opened` only.  The door's opening counts while the knob is gripped.  Each finger that presses
@@ -116,17 +116,17 @@ def terms(task: Task, seen: Seen) -> dict[str, Any]:
     }
 
 
-def reward(task: Task, seen: Seen) -> Any:
+def reward(task: Task, seen: HandState) -> Any:
     """[] equation 4."""
     return sum(getattr(task, name) * value for name, value in terms(task, seen).items())
 
 
-def observation(position: Any, velocity: Any, seen: Seen) -> Any:
+def observation(position: Any, velocity: Any, seen: HandState) -> Any:
     """[23] as `control.LAYOUT` says, from joint positions and velocities [7]."""
     return jnp.concatenate([position, velocity, seen.pinch, seen.pads.reshape(-1)])
 
 
-def holding(task: Task, seen: Seen, before: Any) -> Any:
+def held_open(task: Task, seen: HandState, before: Any) -> Any:
     """[] s for which the door has been open with the grip on, without a break; before: the same an action ago."""
     return (before + task.control) * (gripped(task, seen) & (seen.angle >= task.opened))
 

@@ -1,0 +1,1 @@
+"""From the cost to a distribution: search, refinement, calibrated Gaussian, identifiability."""

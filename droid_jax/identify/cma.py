@@ -21,8 +21,6 @@ from evosax.algorithms import CMA_ES
 from droid_jax.identify.gaussian import redraw_box
 from droid_jax.model.parameters import Space
 
-REDRAWS = 64  # draws per row among which one inside the bounds is looked for
-
 
 class Recombination(NamedTuple):
     """Weights of the ranked rows, and the learning rates that follow from them (Tutorial, Table 1)."""
@@ -65,16 +63,16 @@ class Strategy:
 
     sigma:  initial step in search coordinates.
     seeds:  [R], one per restart.
-    redraw: draw rows again in which a linearly scaled parameter is out of bounds, and clip what is
-            still outside after REDRAWS draws; False leaves the clipping to the space.
+    redraws: draw rows again in which a linearly scaled parameter is out of bounds, and clip what is
+            still outside after so many draws; 0 leaves the clipping to the space.
     """
 
-    def __init__(self, space: Space, weights: Recombination, *, sigma: float, seeds: Sequence[int], redraw: bool):
+    def __init__(self, space: Space, weights: Recombination, *, sigma: float, seeds: Sequence[int], redraws: int):
         self.space, dims = space, len(space)
         self._device = _one_device()
-        box = redraw_box(space) if redraw else (np.full(dims, -np.inf), np.full(dims, np.inf))
+        box = redraw_box(space) if redraws else (np.full(dims, -np.inf), np.full(dims, np.inf))
         with jax.default_device(self._device):
-            self._kernels = _kernels(len(weights.weights), dims, REDRAWS if np.isfinite(box).any() else 1)
+            self._kernels = _kernels(len(weights.weights), dims, redraws if np.isfinite(box).any() else 1)
         params = self._kernels.params.replace(std_init=sigma, **weights._asdict())
         self._params = self._put(jax.tree.map(lambda a: np.asarray(a, np.float32), params))
         self._box = self._put(np.asarray(box, np.float32))

@@ -27,15 +27,15 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, cast, get_args
 
 import msgspec
 import numpy as np
-from scipy import special
+from scipy import special  # pyright: ignore[reportMissingTypeStubs]
 
 from droid_jax.arguments import instance, name, note, number, numeric, one_of, path_of, several, shown, whole
 from droid_jax.identify.truncated_normal import gibbs, quantiles
-from droid_jax.model.parameters import Mode, Parameter, Scaling, Space, Write
+from droid_jax.model.parameters import Mode, Parameter, Role, Scaling, Space, Write, role_in_theta
 from droid_jax.read_json import read_json, typed
 from droid_jax.storage import write_json
 
@@ -51,13 +51,15 @@ MOMENT_POINTS = 20_001  # equal-probability points behind physical_mean and phys
 class Gaussian:
     """A normal distribution over the parameters of a space.
 
-    space:       meaning of the entries.
-    mean:        [D] in `coordinates`.
-    cov:         [D, D] in `coordinates`, symmetric and positive semi-definite.
-    rule:        how the width was set, e.g. "prior", "cma-es covariance".
-    coordinates: "search" (unitless) or "physical" (each entry in its parameter's unit).
+    Attributes:
+        space: meaning of the entries.
+        mean: [D] in `coordinates`.
+        cov: [D, D] in `coordinates`, symmetric and positive semi-definite.
+        rule: how the width was set, e.g. "prior", "cma-es covariance".
+        coordinates: "search" (unitless) or "physical" (each entry in its parameter's unit).
 
-    Raises ValueError on a wrong shape, a number that is not finite, or a cov that is no covariance.
+    Raises:
+        ValueError: a wrong shape, a number that is not finite, or a cov that is no covariance.
     """
 
     space: Space
@@ -235,16 +237,27 @@ def prior(space: Space) -> Gaussian:
     return Gaussian(space, space.to_search(space.mean), np.eye(len(space)), rule="prior")
 
 
-def load(path: str | Path) -> Gaussian:
-    """Read a file written by `Gaussian.save`; ValueError names the file and what is wrong in it."""
+def load_gaussian(path: str | Path) -> Gaussian:
+    """Read a file written by `Gaussian.save`.
+
+    Args:
+        path: of the file, as gaussian.json of a run's folder.
+
+    Returns:
+        The distribution.
+
+    Raises:
+        ValueError: there is no such file, or something in it is wrong; the message names both.
+    """
     path = path_of(path, "the path of a Gaussian")
     if path.is_dir():
         raise ValueError(f"{path} is a folder; a run keeps its Gaussian in gaussian.json there")
     try:
-        content = read_json(path)
+        given = read_json(path)
     except FileNotFoundError:
         raise ValueError(f"{path}: there is no such file") from None
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
+    content: dict[str, Any] = cast(dict[str, Any], given) if isinstance(given, dict) else {}
+    if content.get("format") != FORMAT:
         raise ValueError(f"{path}: expected a JSON object with format {FORMAT!r}")
     if content.get("version") != VERSION:
         raise ValueError(f"{path}: expected version {VERSION}, got {shown(content.get('version'))}")
@@ -258,9 +271,11 @@ def load(path: str | Path) -> Gaussian:
 
 def space_to_json(space: Space) -> list[dict[str, Any]]:
     """A space as JSON values: one object per parameter, writes included."""
-    out = []
+    out: list[dict[str, Any]] = []
     for p in space.parameters:
-        entry = asdict(p) | {"scaling": p.scaling.value}
+        entry = asdict(p) | {"scaling": p.scaling.value, "role": p.role.value}
+        if p.role is (Role.OTHER if p.writes else role_in_theta(p.name)):
+            del entry["role"]  # as in files of earlier versions
         entry["writes"] = [asdict(w) | {"mode": w.mode.value, "index": list(w.index)} for w in p.writes]
         out.append(entry)
     return out
@@ -278,7 +293,7 @@ class WriteEntry(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class ParameterEntry(msgspec.Struct, forbid_unknown_fields=True):
-    """A parameter in a file."""
+    """A parameter in a file; one whose role follows from its name states none."""
 
     name: str
     unit: str
@@ -292,6 +307,7 @@ class ParameterEntry(msgspec.Struct, forbid_unknown_fields=True):
     scaling: Scaling
     log_offset: float
     width: float | None
+    role: Role = Role.OTHER
 
 
 class _File(msgspec.Struct, forbid_unknown_fields=True):
@@ -319,7 +335,8 @@ def space_of(entries: Iterable[ParameterEntry]) -> Space:
 def _parameter(entry: ParameterEntry) -> Parameter:
     fields = msgspec.structs.asdict(entry)
     try:
-        fields["writes"] = tuple(Write(**{**msgspec.structs.asdict(w), "index": tuple(w.index)}) for w in entry.writes)
+        writes: list[dict[str, Any]] = [msgspec.structs.asdict(w) | {"index": tuple(w.index)} for w in entry.writes]
+        fields["writes"] = tuple(Write(**w) for w in writes)
     except ValueError as error:
         raise ValueError(f"parameter {shown(entry.name)}: {error}") from None
     return Parameter(**fields)
@@ -327,7 +344,7 @@ def _parameter(entry: ParameterEntry) -> Parameter:
 
 def matrix(name: str, rows: list[Any]) -> np.ndarray:
     """Rows of a file as an array, where they are of one length."""
-    if len({len(row) for row in rows if isinstance(row, list)}) > 1:
+    if len({len(cast(list[Any], row)) for row in rows if isinstance(row, list)}) > 1:
         raise ValueError(f"{name} must have rows of one length")
     return np.array(rows, dtype=np.float64)
 

@@ -12,9 +12,7 @@ from droid_jax.cost.cost import Cost
 from droid_jax.cost.residuals import Comparison, make_comparison
 from droid_jax.recordings.recording import Recording
 
-WORTH = 0.1  # share of the floor by which the start must exceed it, else there was no gap to close
-
-
+WORTH = 0.1  # share of the noise floor by which the distance before a fit must exceed it, unless a config says else
 Judged = Literal["repeats", "time", "same"]
 
 
@@ -24,7 +22,8 @@ class TorqueDistance:
 
     before, after, noise_floor: equation 1 without penalty terms, all compared channels; floor is what a perfect
     model would leave, estimated from the scatter of all repeats, fitted and held out, about their mean.
-    closed: share of the way from before to noise_floor; None where before does not exceed it by WORTH of it.
+    closed: share of the way from before to noise_floor; None where before does not exceed it by the share
+    `worth` of it.
     Floors and closed are None where there is one repeat only.
     per_joint_*: [J] root mean square of the smoothed torques' difference.
     judged: on what: "repeats" that were held out, the last part in "time" of a log, or the "same" one repeat that was
@@ -66,12 +65,20 @@ def judged_on(recording: Recording, held: Recording) -> Judged:
 
 
 def torque_distances(
-    cost: Cost, recordings: Sequence[Recording], held: Sequence[Recording], before: np.ndarray, after: np.ndarray
+    cost: Cost,
+    recordings: Sequence[Recording],
+    held: Sequence[Recording],
+    before: np.ndarray,
+    after: np.ndarray,
+    worth: float = WORTH,
 ) -> list[TorqueDistance]:
-    """The gap to what was held out of each recording, of which `cost` is, at two parameter vectors [F]."""
+    """The distance to what was held out of each recording, of which `cost` is, at two parameter vectors [F].
+
+    worth: share of the noise floor by which the start must exceed it, else there was nothing to close.
+    """
     penalty_free = cost.distances(np.stack([before, after])) - cost.penalties(np.stack([before, after]))
     smoothed = cost.smoothed(np.stack([before, after]))
-    out = []
+    out: list[TorqueDistance] = []
     for i, (one, recording, own) in enumerate(zip(cost.comparisons, recordings, held, strict=True)):
         rms = np.sqrt(np.mean((smoothed[i] - one.channel("torque").noise.mean) ** 2, axis=1))
         alike = cost.from_one_start(i, recording)  # as the held-out repeats that `cost` compares
@@ -83,7 +90,7 @@ def torque_distances(
                 before=float(first),
                 after=float(last),
                 noise_floor=floor,
-                closed=_closed(float(first), float(last), floor),
+                closed=_closed(float(first), float(last), floor, worth),
                 per_joint_before=tuple(rms[0].tolist()),
                 per_joint_after=tuple(rms[1].tolist()),
                 per_joint_noise_floor=None if everything is None else _smooth_floor(everything, one.repeats),
@@ -93,9 +100,9 @@ def torque_distances(
     return out
 
 
-def _closed(before: float, after: float, floor: float | None) -> float | None:
-    """Share of the way from before to the floor that was gone; None where there was hardly any (WORTH)."""
-    if floor is None or before - floor <= WORTH * floor:
+def _closed(before: float, after: float, floor: float | None, worth: float = WORTH) -> float | None:
+    """Share of the way from before to the floor that was gone; None where there was hardly any."""
+    if floor is None or before - floor <= worth * floor:
         return None
     return 1 - (after - floor) / (before - floor)
 
@@ -118,11 +125,11 @@ def _scatter(values: np.ndarray, mask: np.ndarray) -> float | None:
     mean = filled.sum(axis=0) / np.maximum(count, 1)
     seen = mask & (count > 1)
     error = np.where(seen, (filled - mean) / np.sqrt(1 - 1 / np.maximum(count, 2)), 0.0)
-    rows = seen.any(axis=-1)  # [N, T]
-    repeats = rows.any(axis=1)
+    rows = np.any(seen, axis=-1)  # [N, T]
+    repeats = np.any(rows, axis=1)
     if not repeats.any():
         return None
-    distance = np.linalg.norm(error, axis=-1).sum(axis=1)[repeats] / rows.sum(axis=1)[repeats]
+    distance: np.ndarray = np.linalg.norm(error, axis=-1).sum(axis=1)[repeats] / rows.sum(axis=1)[repeats]
     return float(np.mean(distance))
 
 

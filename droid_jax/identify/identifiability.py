@@ -21,17 +21,45 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
+from droid_jax.arguments import check_fields, number
 from droid_jax.cost.residuals import Comparison
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.multistart import Refined
 
-IDENTIFIABLE = 0.25  # posterior deviation over prior deviation below which the data have spoken
 STATED = 1.0  # search units: the deviation of a parameter's stated prior
-POOL = 12  # degrees of freedom with which the ratio over all parameters counts in each one's own
-PARTNER = 0.7  # absolute correlation from which two parameters are called partners
+
+
+@dataclass(frozen=True)
+class IdentifiabilityConfig:
+    """What decides the calibrated width, and when a parameter counts as identifiable.
+
+    identifiable: posterior deviation over prior deviation, below which the data constrain a parameter.
+    pooling: degrees of freedom with which the widening over all parameters counts in each one's own; ten repeats alone
+      say little about one parameter.
+    block: s, length of the contiguous blocks of time over which the residual's scores are summed (Kuensch 1989).
+    partner: absolute correlation from which two parameters are called partners.
+    """
+
+    identifiable: float = 0.25
+    pooling: float = 12
+    block: float = 1.0
+    partner: float = 0.7
+
+    def __post_init__(self) -> None:
+        check_fields(
+            self,
+            identifiable=partial(number, above=0),
+            pooling=partial(number, above=0),
+            block=partial(number, above=0),
+            partner=partial(number, least=0, most=1),
+        )
+
+
+DEFAULT_IDENTIFIABILITY = IdentifiabilityConfig()
 
 
 @dataclass(frozen=True)
@@ -49,12 +77,20 @@ class Identifiability:
     moved: float = math.nan
 
 
-def posterior(refined: Refined, comparisons: Sequence[Comparison]) -> Gaussian:
+def posterior(
+    refined: Refined, comparisons: Sequence[Comparison], config: IdentifiabilityConfig = DEFAULT_IDENTIFIABILITY
+) -> Gaussian:
     """The Gaussian to hand on, in search coordinates over the refined space: `posterior_of` with the stated prior."""
-    return with_stated_prior(posterior_of(refined, comparisons), refined)
+    return with_stated_prior(posterior_of(refined, comparisons, config), refined)
 
 
-def posterior_of(refined: Refined, comparisons: Sequence[Comparison], *, misfit: bool = True) -> Gaussian:
+def posterior_of(
+    refined: Refined,
+    comparisons: Sequence[Comparison],
+    config: IdentifiabilityConfig = DEFAULT_IDENTIFIABILITY,
+    *,
+    misfit: bool = True,
+) -> Gaussian:
     """What the recordings that were refined on tell by themselves, but for the refinement's wide prior.
 
     For questions to the data alone, as whether an amplitude may be zero.
@@ -63,8 +99,8 @@ def posterior_of(refined: Refined, comparisons: Sequence[Comparison], *, misfit:
     channels = [c for comparison in comparisons for c in comparison.channels]
     shapes = [(len(c.columns), c.noise.mean.shape[0]) for c in channels]
     durations = [c.span[1] - c.span[0] for c in channels]
-    blocks = time_blocks(shapes, durations) if misfit else None
-    return calibrated(refined, [c.deviations() for c in comparisons], blocks)
+    blocks = time_blocks(shapes, durations, config.block) if misfit else None
+    return calibrated(refined, [c.deviations() for c in comparisons], blocks, config.pooling)
 
 
 def with_stated_prior(gaussian: Gaussian, refined: Refined) -> Gaussian:
@@ -81,16 +117,21 @@ def with_stated_prior(gaussian: Gaussian, refined: Refined) -> Gaussian:
     return replace(gaussian, cov=0.5 * (cov + cov.T))
 
 
-def calibrated(refined: Refined, deviations: Sequence[np.ndarray], block_ids: np.ndarray | None) -> Gaussian:
+def calibrated(
+    refined: Refined,
+    deviations: Sequence[np.ndarray],
+    block_ids: np.ndarray | None,
+    pooling: float = DEFAULT_IDENTIFIABILITY.pooling,
+) -> Gaussian:
     """The rule of the width on plain arrays.
 
     deviations: per recording [N, M_i] whitened deviations of its repeats from their mean (see
       `Comparison.deviations`); block_ids: [M] integer block of each residual (see `time_blocks`), or None: what the
-      model leaves over widens nothing.
+      model leaves over widens nothing; pooling: see `IdentifiabilityConfig`.
     """
     plain = np.linalg.inv(refined.hessian)
     variance = np.diag(plain)
-    repeats = variance * np.maximum(1.0, _repeat_ratio(refined, plain, deviations))
+    repeats = variance * np.maximum(1.0, _repeat_ratio(refined, plain, deviations, pooling))
     blocks = variance if block_ids is None else np.diag(_sandwich(refined, plain, block_ids))
     factor = np.sqrt(np.maximum(repeats, blocks) / variance)
     cov = plain * np.outer(factor, factor)
@@ -103,7 +144,9 @@ def calibrated(refined: Refined, deviations: Sequence[np.ndarray], block_ids: np
     return Gaussian(refined.space, refined.x, 0.5 * (cov + cov.T), rule, "search")
 
 
-def _repeat_ratio(refined: Refined, inverse: np.ndarray, deviations: Sequence[np.ndarray]) -> np.ndarray:
+def _repeat_ratio(
+    refined: Refined, inverse: np.ndarray, deviations: Sequence[np.ndarray], pooling: float
+) -> np.ndarray:
     """[D] variance that the repeats' scatter gives each parameter, over the one that whitened noise would give.
 
     Both hold the prior's share, so that what the data do not see stays at ratio 1.
@@ -122,8 +165,8 @@ def _repeat_ratio(refined: Refined, inverse: np.ndarray, deviations: Sequence[np
         freedom += count - 1
     seen = refined.jacobian.T @ refined.jacobian
     pooled = np.trace(inverse @ scatter) / max(np.trace(inverse @ seen), 1e-12)
-    shared = freedom * scatter + POOL * pooled * seen
-    return np.diag(inverse @ (shared / (freedom + POOL) + prior) @ inverse) / np.diag(inverse)
+    shared = freedom * scatter + pooling * pooled * seen
+    return np.diag(inverse @ (shared / (freedom + pooling) + prior) @ inverse) / np.diag(inverse)
 
 
 def _sandwich(refined: Refined, inverse: np.ndarray, block_ids: np.ndarray) -> np.ndarray:
@@ -133,13 +176,16 @@ def _sandwich(refined: Refined, inverse: np.ndarray, block_ids: np.ndarray) -> n
     return inverse @ (scores.T @ scores + prior) @ inverse
 
 
-def time_blocks(shapes: Sequence[tuple[int, int]], seconds: Sequence[float], block: float = 1.0) -> np.ndarray:
+def time_blocks(
+    shapes: Sequence[tuple[int, int]], seconds: Sequence[float], block: float = DEFAULT_IDENTIFIABILITY.block
+) -> np.ndarray:
     """[M] block of each whitened residual: per recording and column, contiguous stretches of `block` s.
 
     shapes: (columns C, coarse samples K) of each compared channel, in the order of the residuals
     (column by column); seconds: its duration.
     """
-    ids, start = [], 0
+    ids: list[np.ndarray] = []
+    start = 0
     for (columns, samples), duration in zip(shapes, seconds, strict=True):
         per_column = max(1, round(duration / block))
         within = np.minimum((np.arange(samples) * per_column) // samples, per_column - 1)
@@ -155,7 +201,9 @@ def not_judged(gaussian: Gaussian) -> tuple[Identifiability, ...]:
     return tuple(Identifiability(name, False, 1.0, (), reason) for name in gaussian.space.names)
 
 
-def identifiability(gaussian: Gaussian, prior: np.ndarray) -> tuple[Identifiability, ...]:
+def identifiability(
+    gaussian: Gaussian, prior: np.ndarray, config: IdentifiabilityConfig = DEFAULT_IDENTIFIABILITY
+) -> tuple[Identifiability, ...]:
     """What the demonstration tells about each parameter of a calibrated Gaussian.
 
     It is judged against the stated prior, or the refinement's where that is narrower.
@@ -165,12 +213,13 @@ def identifiability(gaussian: Gaussian, prior: np.ndarray) -> tuple[Identifiabil
     correlation = gaussian.cov / np.outer(deviation, deviation)
     space = gaussian.space
     away = gaussian.mean if gaussian.coordinates == "search" else space.to_search(gaussian.mean)
-    out = []
+    out: list[Identifiability] = []
     for i, name in enumerate(space.names):
         shrinkage = float(deviation[i] / min(prior[i], STATED))
-        others = [(space.names[j], float(correlation[i, j])) for j in np.argsort(-np.abs(correlation[i])) if j != i]
-        partners = tuple((n, c) for n, c in others if abs(c) > PARTNER)[:3]
-        known = shrinkage < IDENTIFIABLE
+        nearest: list[int] = np.argsort(-np.abs(correlation[i])).tolist()
+        others = [(space.names[j], float(correlation[i, j])) for j in nearest if j != i]
+        partners = tuple((n, c) for n, c in others if abs(c) > config.partner)[:3]
+        known = shrinkage < config.identifiable
         out.append(Identifiability(name, known, shrinkage, partners, _reason(known, shrinkage), float(away[i])))
     return tuple(out)
 

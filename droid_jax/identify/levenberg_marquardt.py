@@ -25,37 +25,43 @@ Residuals = Callable[[np.ndarray], np.ndarray]
 _DAMPINGS = 10.0 ** np.arange(-3.0, 5.0)
 _LENGTHS = (1.0, 0.5)
 CANDIDATE_STEPS = 2 * len(_DAMPINGS) * len(_LENGTHS)
-_LONGEST = 2.0  # search units: the longest component of a step
-CHORDS = 3  # batches of trials at most with one Jacobian
-WIDE = 1.5  # posterior deviations: half-width of those differences
-SPREAD_LONGEST = 1.0  # search units
-_SHORTEST = 0.05  # a straight path in physical units never takes a parameter below this share of itself
 
 
 @dataclass(frozen=True)
-class StepConfig:
+class LevenbergMarquardtConfig:
     """Settings of an iteration.
 
     step: half-width of the first central differences, search units.
     smallest_step: and of later ones at least, search units (below it solver noise would show).
+    longest_step: largest component of a candidate step, search units: further off the slopes no longer hold.
+    least_ratio: a path that is straight in physical units takes a parameter to no less than this share of itself.
     main_prior: prior deviation of parameters of interest, search units.
     chord: a Jacobian serves another batch of trials while the last lowered the objective by this share.
+    chords: batches of trials at most with one Jacobian.
     spreads: times that the slopes are taken over the width of the posterior at the end; 0 leaves the narrow ones.
+    spread_width: half-width of those differences, posterior deviations.
+    spread_longest: and their largest component, search units: what the data do not tell is not followed far.
     """
 
     step: float = 0.3
     smallest_step: float = 0.03
+    longest_step: float = 2.0
+    least_ratio: float = 0.05
     main_prior: float = 4.0
     chord: float = 0.03
+    chords: int = 3
     spreads: int = 2
+    spread_width: float = 1.5
+    spread_longest: float = 1.0
 
     def __post_init__(self) -> None:
         check_fields(
             self,
-            step=partial(number, above=0),
-            smallest_step=partial(number, above=0),
-            main_prior=partial(number, above=0),
+            **dict.fromkeys(("step", "smallest_step", "longest_step", "main_prior"), partial(number, above=0)),
+            **dict.fromkeys(("spread_width", "spread_longest"), partial(number, above=0)),
+            least_ratio=partial(number, above=0, most=1),
             chord=partial(number, least=0),
+            chords=partial(whole, least=1),
             spreads=partial(whole, least=0),
         )
 
@@ -98,7 +104,7 @@ class DampedProblem:
     """
 
     def __init__(
-        self, residuals: Residuals, space: Space, config: StepConfig, before: DampedProblem | None = None
+        self, residuals: Residuals, space: Space, config: LevenbergMarquardtConfig, before: DampedProblem | None = None
     ) -> None:
         self.residuals, self.space = residuals, space
         self._config = config
@@ -156,7 +162,7 @@ class DampedProblem:
 
     def candidate_steps(self, state: Starts, jacobian: np.ndarray, held: np.ndarray | None = None) -> Starts:
         """Batches of trials with one Jacobian [S, M, D] for as long as they pay."""
-        for _ in range(CHORDS):
+        for _ in range(self._config.chords):
             last = state.objective
             state = self._try(state, jacobian, held)
             if np.all(fall(last, state.objective) <= self._config.chord * state.objective):
@@ -180,11 +186,11 @@ class DampedProblem:
 
         Differences of one parameter at a time carry the solver's rounding, which looks like
         information where two parameters trade with each other: their slopes cancel, its does not.
-        Along the axes each difference is WIDE deviations of the result; as the first axes suffer from
+        Along the axes each difference is `spread_width` deviations of the result; as the first axes suffer from
         that rounding themselves, they are improved `spreads` times.
         """
         for _ in range(self._config.spreads):
-            steps = WIDE * self.axes(jacobian, SPREAD_LONGEST).T
+            steps = self._config.spread_width * self.axes(jacobian, self._config.spread_longest).T
             spans, apart = self.differences(
                 self.inside(state.x[:, None] + steps), self.inside(state.x[:, None] - steps), state
             )
@@ -228,12 +234,12 @@ class DampedProblem:
         for k, factor in enumerate(_DAMPINGS):
             damped = hessian + state.damping[0] * factor * np.diag(np.diag(hessian))
             step = -np.linalg.solve(damped[np.ix_(free, free)], slope[free])
-            step *= min(1.0, _LONGEST / max(np.max(np.abs(step), initial=0.0), 1e-12))
+            step *= min(1.0, self._config.longest_step / max(np.max(np.abs(step), initial=0.0), 1e-12))
             out[k][:, free] = np.outer(_LENGTHS, step)
         return out.reshape(-1, len(x))
 
     def _straight(self, x: np.ndarray, step: np.ndarray) -> np.ndarray:
         """x moved by `step` along straight lines in physical units instead of search coordinates."""
         width = np.where(self.log_width > 0, self.log_width, 1.0)
-        path = np.log(np.maximum(1.0 + width * step, _SHORTEST)) / width
+        path = np.log(np.maximum(1.0 + width * step, self._config.least_ratio)) / width
         return x + np.where(self.log_width > 0, path, step)

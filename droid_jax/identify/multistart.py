@@ -19,66 +19,90 @@ import numpy as np
 
 from droid_jax import arguments
 from droid_jax.arguments import check_fields, several, whole
-from droid_jax.identify.levenberg_marquardt import DampedProblem, Residuals, Starts, StepConfig, curvature, fall
-from droid_jax.identify.search import NotReplayed, SearchConfig, search
+from droid_jax.identify.levenberg_marquardt import (
+    DampedProblem,
+    LevenbergMarquardtConfig,
+    Residuals,
+    Starts,
+    curvature,
+    fall,
+)
+from droid_jax.identify.search import NotReplayed, SearchConfig, cma_search
 from droid_jax.model.parameters import Parameter, Space
 
 Hypotheses = Sequence[Mapping[str, float]]
 
-HOPELESS = 30.0  # iterations like the last: an aim farther off than that is given up
-HOP_POPULATION = 32
-HOP_SIGMA = 1.5  # posterior deviations
-HOP_TOLERANCE = 2.0  # of the objective: a hop that finds less ends the refinement
-FAR, HOP_FAR = 5e-4, 4e-3  # the same as shares of what the objective is above noise alone
-# Search units: what strayed further from its initial mean, and is not told to much less than that, is put back once.
-STRAYED, UNTOLD = 1.0, 0.05
-FOLLOWED = 2  # hypotheses: once all else has settled a little, the best go on
 AT_BOUND = 1e-4  # search units: no further from it a parameter counts as stuck there
-HOP_LONGEST = 1.0  # search units: what the data do not tell is not searched far
 
 
 @dataclass(frozen=True)
-class RefineConfig(StepConfig):
-    """Settings of the refinement, beside those of an iteration (`StepConfig`).
+class RefineConfig(LevenbergMarquardtConfig):
+    """Settings of the refinement, beside those of an iteration.
 
     iterations: Jacobians at most.
-    tolerance: stop when an iteration lowers the objective (a log likelihood) by less than this, or by less than a
-      share FAR of what it is above that of noise alone: a model that misses something may be far from any fit.
+    tolerance: stop when an iteration lowers the objective (a log likelihood) by less than this,
+    excess_tolerance: or by less than this share of what it is above that of noise alone: a model that misses something
+      may be far from any fit.
     coarse_tolerance: while starts and hypotheses are sorted out, already when it lowers it by less than this share.
-    target_objective: an objective to reach: stop where the last iteration's gain, HOPELESS times over, would not do.
+    target_objective: an objective to reach: stop where it is further off than
+    give_up: iterations like the last.
     pruning_ratio: after iteration i only starts within pruning_ratio[i] times the best objective go on (the last
       number holds from there on).
     misfit_threshold: hypotheses are tried where the residuals' mean square stays above this.
     hold_iterations: iterations for which the values of a hypothesis are held while all else settles.
+    followed: hypotheses that go on once all else has settled a little, the best ones.
     basin_hops: searches at most for a better basin around where the iterations stood still; with none of them nothing
-    is
-      put back to its initial mean either (see `STRAYED`).
-    basin_hop_generations: generations of each.
+      is put back to its initial mean either.
+    basin_hop_generations, basin_hop_population: of each.
+    basin_hop_sigma: initial step of each, posterior deviations.
+    basin_hop_longest: largest component of that step, search units: what the data do not tell is not searched far.
+    basin_hop_tolerance: a hop that lowers the objective by less than this ends the refinement,
+    basin_hop_excess_tolerance: or by less than this share of what it is above that of noise alone.
+    reset_distance: search units; a parameter of interest that strayed further from its initial mean is put back once,
+    reset_deviation: where its posterior deviation is above this, search units.
     """
 
     iterations: int = 30
     tolerance: float = 0.5
+    excess_tolerance: float = 5e-4
     coarse_tolerance: float = 5e-3
     target_objective: float = np.inf
+    give_up: float = 30.0
     pruning_ratio: tuple[float, ...] = (100.0, 20.0, 3.0, 1.3, 1.0)
     misfit_threshold: float = 1.1
     hold_iterations: int = 2
+    followed: int = 2
     basin_hops: int = 4
     basin_hop_generations: int = 20
+    basin_hop_population: int = 32
+    basin_hop_sigma: float = 1.5
+    basin_hop_longest: float = 1.0
+    basin_hop_tolerance: float = 2.0
+    basin_hop_excess_tolerance: float = 4e-3
+    reset_distance: float = 1.0
+    reset_deviation: float = 0.05
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_fields(
             self,
             iterations=partial(whole, least=0),
-            tolerance=partial(arguments.number, least=0),
-            coarse_tolerance=partial(arguments.number, least=0),
+            **dict.fromkeys(
+                (
+                    *("tolerance", "excess_tolerance", "coarse_tolerance", "basin_hop_tolerance"),
+                    *("basin_hop_excess_tolerance", "reset_distance", "reset_deviation"),
+                ),
+                partial(arguments.number, least=0),
+            ),
+            **dict.fromkeys(("give_up", "basin_hop_sigma", "basin_hop_longest"), partial(arguments.number, above=0)),
             target_objective=partial(arguments.number, infinite=True),
             pruning_ratio=several(partial(arguments.number, least=1)),
             misfit_threshold=partial(arguments.number, least=0),
             hold_iterations=partial(whole, least=0),
             basin_hops=partial(whole, least=0),
+            followed=partial(whole, least=1),
             basin_hop_generations=partial(whole, least=1),
+            basin_hop_population=partial(whole, least=2),
         )
 
 
@@ -186,7 +210,7 @@ def chord(residuals: Residuals, space: Space, starts: np.ndarray, jacobian: np.n
 
     A few batches of trials and no differences: a first look at what a refinement would find.
     """
-    problem = DampedProblem(residuals, space, StepConfig())
+    problem = DampedProblem(residuals, space, LevenbergMarquardtConfig())
     state = problem.start(problem.inside(space.to_search(space.check(starts))))
     state = problem.candidate_steps(state, np.repeat(jacobian[None], len(state.x), axis=0))
     best = int(np.argmin(state.objective))
@@ -226,7 +250,9 @@ class _Descent(DampedProblem):
             self._report(state.objective[leader], state.residual.shape[1])
             if gain[leader] <= max(self.least(state), rough * state.objective[leader]):
                 break
-            self.given_up = bool(HOPELESS * gain[leader] < state.objective[leader] - self.config.target_objective)
+            self.given_up = bool(
+                self.config.give_up * gain[leader] < state.objective[leader] - self.config.target_objective
+            )
             if self.given_up:
                 break
             good = state.objective <= keep[min(number, len(keep) - 1)] * state.objective[leader]
@@ -253,13 +279,14 @@ class _Descent(DampedProblem):
     def least(self, state: Starts) -> float:
         """By how much the best objective must fall for it to be worth an iteration."""
         leader = int(np.argmin(state.objective))
-        return max(self.config.tolerance, FAR * float(self.excess(state)[leader]))
+        return max(self.config.tolerance, self.config.excess_tolerance * float(self.excess(state)[leader]))
 
     def strayed(self, state: Starts) -> list[str]:
         """Parameters of interest far from their initial means that the data do not tell sharply."""
         slopes = self.jacobian(state)[0]
         deviation = np.sqrt(np.diag(np.linalg.inv(curvature(slopes, self.prior))))
-        which = ~self.space.nuisance & (np.abs(state.x[0]) > STRAYED) & (deviation > UNTOLD)
+        far, open_ = np.abs(state.x[0]) > self.config.reset_distance, deviation > self.config.reset_deviation
+        which = ~self.space.nuisance & far & open_
         return [self.space.names[k] for k in np.flatnonzero(which)]
 
     def hopped(self, state: Starts) -> tuple[Starts, np.ndarray | None, bool]:
@@ -271,7 +298,8 @@ class _Descent(DampedProblem):
         for number in range(self.config.basin_hops):
             slopes = self.jacobian(state)[0]
             hopped = self.hop(state, slopes, number)
-            least = max(HOP_TOLERANCE, HOP_FAR * self.excess(state)[0])
+            excess = self.config.basin_hop_excess_tolerance * self.excess(state)[0]
+            least = max(self.config.basin_hop_tolerance, excess)
             settled = bool(state.objective[0] - hopped.objective[0] <= least)
             if hopped.objective[0] < state.objective[0]:
                 state, slopes = hopped, None
@@ -287,7 +315,7 @@ class _Descent(DampedProblem):
         In x = x0 + L u, L L^T the posterior's covariance, the objective is about |u|^2 / 2 and what
         remains are the steps where a finger begins to stick or to slip, which no derivative sees.
         """
-        factor = self.axes(jacobian, HOP_LONGEST)
+        factor = self.axes(jacobian, self.config.basin_hop_longest)
 
         def around(u: np.ndarray) -> np.ndarray:
             return self.inside(state.x + u @ factor.T)
@@ -298,14 +326,14 @@ class _Descent(DampedProblem):
 
         unit = Space(tuple(Parameter(f"u{i}", "-", 0.0, 1.0, -50.0, 50.0) for i in range(len(self.space))))
         settings = SearchConfig(
-            population=HOP_POPULATION,
+            population=self.config.basin_hop_population,
             parents=None,
             generations=self.config.basin_hop_generations,
-            sigma=HOP_SIGMA,
+            sigma=self.config.basin_hop_sigma,
             seed=seed,
         )
         try:
-            return self.start(around(search(cost, unit, settings).best[None]))
+            return self.start(around(cma_search(cost, unit, settings).best[None]))
         except NotReplayed:  # nothing around here can be
             return state
 
@@ -328,7 +356,7 @@ class _Descent(DampedProblem):
         branches, held = branches.rows(alive), held[alive]
         for iteration in range(self.config.hold_iterations + 1):
             branches, _ = self.step(branches, held if iteration < self.config.hold_iterations else None)
-            ahead = np.argsort(branches.objective)[:FOLLOWED]
+            ahead = np.argsort(branches.objective)[: self.config.followed]
             branches, held = branches.rows(ahead), held[ahead]
         found = branches.rows([int(np.argmin(branches.objective))])
         best = found if found.objective[0] < state.objective[0] else state

@@ -12,20 +12,26 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.arguments import check_fields, instance, number, one_of, optional, whole
+from droid_jax.arguments import check_fields, flag, instance, number, one_of, optional, whole
 from droid_jax.cost.cost import ENGINES, Cost, make_cost
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.identify.divergence import blow_up
 from droid_jax.identify.fit import Fit
 from droid_jax.identify.gaussian import Gaussian, prior, space_to_json
-from droid_jax.identify.holdout import TorqueDistance, split_repeats, torque_distances
-from droid_jax.identify.identifiability import Identifiability, identifiability, not_judged, posterior
+from droid_jax.identify.holdout import WORTH, TorqueDistance, split_repeats, torque_distances
+from droid_jax.identify.identifiability import (
+    Identifiability,
+    IdentifiabilityConfig,
+    identifiability,
+    not_judged,
+    posterior,
+)
 from droid_jax.identify.multistart import RefineConfig, Refined, refine
-from droid_jax.identify.search import SearchConfig, search
+from droid_jax.identify.search import SearchConfig, cma_search
 from droid_jax.identify.solution_checks import SolutionCheck, check_solution
 from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.inertia import possible_draws
-from droid_jax.model.parameters import Space
+from droid_jax.model.parameters import Role, Space
 from droid_jax.model.scene import Scene
 from droid_jax.preflight.check_log import warn_of_log
 from droid_jax.recordings.recording import Recording, recordings_of
@@ -36,15 +42,22 @@ from droid_jax.simulate.repeat_starts import own_starts
 class IdentifyConfig:
     """Settings of an identification.
 
-    engine: "mjx" or "mujoco" (plain C, all cores).
-    heldout: share of each recording's repeats that the fit does not see (at least one where there are two).
-    search: CMA-ES settings; it sees the first recording alone, the refinement sees all of them.
-    refine: refinement settings, or None: the search's own covariance is the distribution, as in the paper.
-    samples: replays drawn from the initial and from the fitted Gaussian to compare their costs.
-    seed: of those samples (the search has its own).
-    compare: how simulation and measurement are compared.
-    checks: measure what the time step and the engine leave at the fitted values (`solution_checks`), which takes one
-      more compilation.
+    Attributes:
+        engine: "mjx" or "mujoco" (plain C, all cores).
+        heldout: share of each recording's repeats that the fit does not see (at least one where there are two).
+        search: CMA-ES settings; it sees the first recording alone, the refinement sees all of them.
+        refine: refinement settings, or None: the search's own covariance is the distribution, as in the paper.
+        samples: replays drawn from the initial and from the fitted Gaussian to compare their costs.
+        seed: of those samples (the search has its own).
+        compare: how simulation and measurement are compared.
+        identifiability: what decides the calibrated width, and when a parameter counts as identifiable.
+        worth: share of the noise floor by which the distance before the fit must exceed it, else there was nothing to
+            close and `TorqueDistance.closed` is None.
+        checks: measure what the time step and the engine leave at the fitted values (`solution_checks`), which takes
+            one more compilation.
+
+    Raises:
+        ValueError: a setting is of the wrong type or out of its range.
     """
 
     engine: str = "mjx"
@@ -54,6 +67,8 @@ class IdentifyConfig:
     samples: int = 200
     seed: int = 0
     compare: CompareConfig = field(default_factory=CompareConfig)
+    identifiability: IdentifiabilityConfig = field(default_factory=IdentifiabilityConfig)
+    worth: float = WORTH
     checks: bool = True
 
     def __post_init__(self) -> None:
@@ -66,6 +81,9 @@ class IdentifyConfig:
             samples=partial(whole, least=0),
             seed=partial(whole, least=0),
             compare=partial(instance, kind=CompareConfig),
+            identifiability=partial(instance, kind=IdentifiabilityConfig),
+            worth=partial(number, least=0),
+            checks=flag,
         )
 
 
@@ -78,6 +96,7 @@ class Identified:
     over `full`.  search: the CMA-ES part.  refined: or None.  identifiability: per parameter of `full`.
     torque_distances: by recording name.  fit, heldout: costs over `full` on the fitted and the held-out repeats.
     heldout_repeats: by recording name.  seconds: by stage.  checks: by recording name, of those with commands.
+    config: the settings it was found with.
     """
 
     scene: Scene
@@ -94,7 +113,8 @@ class Identified:
     heldout: Cost
     heldout_repeats: dict[str, tuple[int, ...]]
     seconds: dict[str, float]
-    checks: dict[str, SolutionCheck] = field(default_factory=dict)
+    checks: dict[str, SolutionCheck] = field(default_factory=dict[str, SolutionCheck])
+    config: IdentifyConfig = field(default_factory=IdentifyConfig)
 
     @property
     def start(self) -> np.ndarray:
@@ -103,6 +123,7 @@ class Identified:
 
 
 Progress = Callable[[str, Any], None]
+FIRM = 4.0  # times its initial mean: the friction of a pad that does not slip
 _FIELDS = tuple(Rollout.__dataclass_fields__)
 
 
@@ -141,12 +162,22 @@ def identify_parameters(
 ) -> Identified:
     """Fit `space` to one or several recordings of the same robot and object.
 
-    nuisances: fitted and marginalised beside it in the refinement; None for none.
-    effects: in the model beside what the scene has; their parameters are in `space` or stay at neutral.
-    checkpoints: folder where the search saves itself and from which it resumes.
-    progress: called with a stage's name and its progress value.
-    Raises ValueError for recordings of one name, where no torque is compared, where several recordings are to be fitted
-    without the refinement (the search sees the first alone), and where the initial means cannot be simulated.
+    Args:
+        scene: what is simulated.
+        space: the D parameters that the search moves.
+        recordings: to fit and, of their last repeats, to judge the fit.
+        nuisances: fitted and marginalised beside it in the refinement; None for none.
+        config: settings; None for the defaults.
+        effects: in the model beside what the scene has; their parameters are in `space` or stay at neutral.
+        checkpoints: folder where the search saves itself and from which it resumes.
+        progress: called with a stage's name and its progress value.
+
+    Returns:
+        Everything found; its `gaussian` is the distribution to hand on.
+
+    Raises:
+        ValueError: recordings of one name, no torque compared, several recordings without the refinement (the search
+            sees the first alone), or initial means that cannot be simulated.
     """
     problem = prepare(scene, space, recordings, nuisances=nuisances, config=config, effects=effects)
     return run_fit(problem, checkpoints=checkpoints, progress=progress)
@@ -219,14 +250,14 @@ def search_cost(
 
 def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: Progress | None = None) -> Identified:
     """The rest of `identify_parameters`: search, refine, calibrate, judge."""
-    report = progress or (lambda stage, value: None)
+    report = progress or _silent
     config, space, full, base = problem.config, problem.space, problem.full, problem.fit
     seconds: dict[str, float] = {}
 
     began = time.monotonic() - problem.seconds
     first = base.first()
 
-    found = search(
+    found = cma_search(
         search_cost(first, config.compare, full, space),
         space,
         config.search,
@@ -241,12 +272,13 @@ def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: 
     if config.refine is not None:
         base, refined = _refined(base, starts(full, space, found), config.refine, lambda p: report("refine", p))
     best = found.best if refined is None else refined.best
-    full_gaussian = found.gaussian() if refined is None else posterior(refined, base.comparisons)
+    judging = config.identifiability
+    full_gaussian = found.gaussian() if refined is None else posterior(refined, base.comparisons, judging)
     seconds["refine"] = time.monotonic() - began
 
     began = time.monotonic()
     report("judge", None)
-    gaps = torque_distances(problem.heldout, problem.recordings, problem.heldout_count, full.mean, best)
+    gaps = torque_distances(problem.heldout, problem.recordings, problem.heldout_count, full.mean, best, config.worth)
     seconds["judge"] = time.monotonic() - began
 
     began = time.monotonic()
@@ -262,14 +294,21 @@ def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: 
         full_gaussian=full_gaussian,
         search=found,
         refined=refined,
-        identifiability=not_judged(full_gaussian) if refined is None else identifiability(full_gaussian, refined.prior),
+        identifiability=(
+            not_judged(full_gaussian) if refined is None else identifiability(full_gaussian, refined.prior, judging)
+        ),
         torque_distances=dict(zip(names, gaps, strict=True)),
         fit=base,
         heldout=problem.heldout,
         heldout_repeats=dict(zip(names, problem.heldout_repeats, strict=True)),
         seconds=seconds,
         checks=checks,
+        config=config,
     )
+
+
+def _silent(stage: str, value: Any) -> None:
+    """No progress is shown."""
 
 
 def _check_names(names: Sequence[str], config: IdentifyConfig) -> None:
@@ -328,8 +367,8 @@ def starts(full: Space, space: Space, found: Fit) -> np.ndarray:
     A grip that slips and one that never does are different basins, and neither start finds the other's.
     """
     searched = full.embed(space, found.best[None])[0]
-    pads = ("sliding_friction", "torsional_friction")
-    firm = {p.name: min(p.high, 4.0 * p.mean) for p in space.parameters if p.name.startswith(pads)}
+    pads = space.of_role(Role.SLIDING_FRICTION, Role.TORSIONAL_FRICTION)
+    firm = {p.name: min(p.high, FIRM * p.mean) for p in pads}
     return np.stack([searched, full.mean, *([full.values(firm)] if firm else [])])
 
 
@@ -338,7 +377,7 @@ def grip_hypotheses(space: Space) -> list[dict[str, float]]:
 
     Slip is a basin of its own: from a sticking finger no derivative sees it.
     """
-    sliding = {p.name: p.mean for p in space.parameters if p.name.startswith("sliding_friction")}
+    sliding = {p.name: p.mean for p in space.of_role(Role.SLIDING_FRICTION)}
     alone = [{name: mean} for name, mean in sliding.items()]
     return [*alone, sliding] if len(sliding) > 1 else alone
 

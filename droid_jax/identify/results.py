@@ -35,7 +35,7 @@ from droid_jax.identify.solution_checks import solution_notes
 from droid_jax.model.mjcf import fitted_mjcf, unwritten
 from droid_jax.model.parameters import Space
 from droid_jax.preflight.findings import Finding
-from droid_jax.storage import finite, write_csv, write_json, write_npz, write_text
+from droid_jax.storage import config_json, finite, write_csv, write_json, write_npz, write_text
 
 
 def prepare_folder(folder: Path) -> Path:
@@ -148,6 +148,7 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
         "rule": found.gaussian.rule,
         "mjcf_lacks": list(unwritten(found.scene, found.full)),
         "notes": notes,
+        "config": config_json(found.config),
         "checks": {
             name: {**asdict(check), "too_coarse": check.too_coarse, "engines_differ": check.engines_differ}
             for name, check in found.checks.items()

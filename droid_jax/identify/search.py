@@ -25,15 +25,13 @@ from droid_jax.arguments import check_fields, flag, number, one_of, optional, wh
 from droid_jax.identify.cma import Strategy, recombination
 from droid_jax.identify.fit import Fit, History, Restart, SearchProgress, on_bound
 from droid_jax.identify.gaussian import space_to_json
-from droid_jax.identify.search_state import REASONS, SearchState
+from droid_jax.identify.search_state import REASONS, CmaState
 from droid_jax.model.parameters import Space
 
 if TYPE_CHECKING:
     from droid_jax.identify.checkpoints import Checkpoints
 
 Cost = Callable[[np.ndarray], Any]  # [rows, D] float64 physical values -> [rows]; +inf is a failed row
-
-_NEAR = 1.0  # search coordinates, one prior deviation: so near to a bound the best is tried on it
 
 
 class NotReplayed(ValueError):
@@ -51,9 +49,11 @@ class SearchConfig:
                 draws what a single search with seed + r would draw.
     sigma:      initial step in search coordinates; 1 starts from the prior.
     bounds:     "resample" redraws rows in which a linearly scaled parameter is out of bounds and clips
-                what is still outside after cma.REDRAWS draws, and mirrors log-scaled ones at their bounds; at the
-                end the best is asked for once more with what lies near a bound on it;
+                what is still outside after `redraws` draws, and mirrors log-scaled ones at their bounds; at the
+                end the best is asked for once more with what lies near a bound (`near_bound`) on it;
                 "clip" clips both, which leads nowhere where several optima lie beyond their bounds.
+    redraws:    draws per row among which one inside the bounds is looked for.
+    near_bound: search coordinates, one prior deviation: so near to a bound the best is tried on it.
     active:     negative weights for the worst rows; None: only when `parents` is None.
     tol_cost:   a restart stops when its best cost fell by less than this share over `patience`
                 generations; 0 never.
@@ -71,6 +71,8 @@ class SearchConfig:
     restarts: int = 1
     sigma: float = 1.0
     bounds: Literal["resample", "clip"] = "resample"
+    redraws: int = 64
+    near_bound: float = 1.0
     active: bool | None = None
     tol_cost: float = 1e-4
     patience: int = 20
@@ -82,8 +84,10 @@ class SearchConfig:
     def __post_init__(self) -> None:
         check_fields(
             self,
-            **dict.fromkeys(("generations", "restarts", "patience", "checkpoint_every"), partial(whole, least=1)),
-            **dict.fromkeys(("tol_cost", "tol_sigma"), partial(number, least=0)),
+            **dict.fromkeys(
+                ("generations", "restarts", "patience", "checkpoint_every", "redraws"), partial(whole, least=1)
+            ),
+            **dict.fromkeys(("tol_cost", "tol_sigma", "near_bound"), partial(number, least=0)),
             population=partial(whole, least=2),
             parents=optional(whole),
             sigma=partial(number, above=0),
@@ -105,7 +109,7 @@ class SearchConfig:
         return self.population // 2 if self.parents is None else self.parents
 
 
-def search(
+def cma_search(
     cost: Cost,
     space: Space,
     config: SearchConfig,
@@ -131,7 +135,7 @@ def search(
     strategy = _strategy(space, config)
     centre = _start(space, config, start)
     with _checkpoints(checkpoint_dir, space, config, centre, fingerprint) as checkpoints:
-        run = _restored(checkpoints, strategy, centre) or SearchState.fresh(
+        run = _restored(checkpoints, strategy, centre) or CmaState.fresh(
             strategy.init(centre), config.restarts, len(space)
         )
         while _unfinished(run, config):
@@ -149,10 +153,11 @@ def _strategy(space: Space, config: SearchConfig) -> Strategy:
     active = config.parents is None if config.active is None else config.active
     weights = recombination(config.population, config.elite, len(space), active)
     seeds = range(config.seed, config.seed + config.restarts)
-    return Strategy(space, weights, sigma=config.sigma, seeds=seeds, redraw=config.bounds == "resample")
+    redraws = config.redraws if config.bounds == "resample" else 0
+    return Strategy(space, weights, sigma=config.sigma, seeds=seeds, redraws=redraws)
 
 
-def _generation(run: SearchState, cost: Cost, strategy: Strategy, config: SearchConfig) -> None:
+def _generation(run: CmaState, cost: Cost, strategy: Strategy, config: SearchConfig) -> None:
     """One generation of every restart: draw, evaluate, update, record, judge."""
     started = time.perf_counter()
     space = strategy.space
@@ -187,7 +192,7 @@ def mirrored(space: Space, x: np.ndarray) -> np.ndarray:
     return np.clip(np.where(x < low, 2 * low - x, np.where(x > high, 2 * high - x, x)), low, high)
 
 
-def _try_bounds(run: SearchState, cost: Cost, space: Space, config: SearchConfig) -> int:
+def _try_bounds(run: CmaState, cost: Cost, space: Space, config: SearchConfig) -> int:
     """Ask once more for every restart's best, moved onto bounds it lies near; how many rows were asked.
 
     Mirrored draws come near a bound and never lie on it.  A row that costs no more becomes the best.  Nothing of this
@@ -197,19 +202,21 @@ def _try_bounds(run: SearchState, cost: Cost, space: Space, config: SearchConfig
         return 0
     known = np.isfinite(run.best_cost)  # a restart whose every row blew up has no best
     bests = np.where(known[:, None], run.best, space.mean)
-    values = np.stack([_moved_onto_bounds(space, best, config.population) for best in bests])  # [R, P, D]
+    values = np.stack(
+        [_moved_onto_bounds(space, best, config.population, config.near_bound) for best in bests]
+    )  # [R, P, D]
     if (values == bests[:, None])[known].all():
         return 0
     run.keep_best(values, _evaluate(cost, values), known, ties=True)
     return values.shape[0] * values.shape[1]
 
 
-def _moved_onto_bounds(space: Space, best: np.ndarray, rows: int) -> np.ndarray:
+def _moved_onto_bounds(space: Space, best: np.ndarray, rows: int, near: float) -> np.ndarray:
     """Values [rows, D]: the best [D] with all its near coordinates on their bounds, then with ever fewer."""
     x, low, high = (space.to_search(values) for values in (best, space.low, space.high))
     gap = np.minimum(x - low, high - x)
     values = np.tile(best, (rows, 1))
-    farthest = [i for i in np.argsort(-gap) if gap[i] <= _NEAR]
+    farthest = [i for i in np.argsort(-gap) if gap[i] <= near]
     for k, i in enumerate(farthest[-rows:], start=1):
         values[:k, i] = (space.low if x[i] - low[i] == gap[i] else space.high)[i]
     return values
@@ -224,7 +231,7 @@ def _evaluate(cost: Cost, values: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(costs), costs, np.inf).reshape(values.shape[:2])
 
 
-def _judge(run: SearchState, config: SearchConfig) -> None:
+def _judge(run: CmaState, config: SearchConfig) -> None:
     """Mark the restarts that have converged; a marked one stays as it is from then on."""
     widest = np.sqrt(np.linalg.eigvalsh(run.cov)[:, -1])  # [R]
     narrow = widest < config.tol_sigma
@@ -238,13 +245,13 @@ def _judge(run: SearchState, config: SearchConfig) -> None:
     run.stopped[running & narrow] = REASONS.index("tol_sigma")
 
 
-def _unfinished(run: SearchState, config: SearchConfig) -> bool:
+def _unfinished(run: CmaState, config: SearchConfig) -> bool:
     """Whether another generation is due."""
     in_time = config.max_seconds is None or run.seconds < config.max_seconds
     return bool((run.stopped == 0).any()) and run.generation < config.generations and in_time
 
 
-def _progress(run: SearchState, config: SearchConfig) -> SearchProgress:
+def _progress(run: CmaState, config: SearchConfig) -> SearchProgress:
     """Numbers for a display; the pace is the median of ten generations, so that compilation drops out."""
     pace = float(np.median([s[0] for s in run.records["seconds"][-10:]]))
     left = pace * (config.generations - run.generation) if _unfinished(run, config) else 0.0
@@ -258,7 +265,16 @@ def _progress(run: SearchState, config: SearchConfig) -> SearchProgress:
     )
 
 
-def _fit(run: SearchState, space: Space, config: SearchConfig, asked: int) -> Fit:
+def _history(run: CmaState, restart: int) -> History:
+    """One restart's own rows of the records, as long as it ran."""
+    ended = int(run.ended[restart])
+    records: dict[str, np.ndarray] = {
+        name: np.stack([each[restart] for each in rows[:ended]]) for name, rows in run.records.items()
+    }
+    return History(**records)
+
+
+def _fit(run: CmaState, space: Space, config: SearchConfig, asked: int) -> Fit:
     """The result, led by the restart with the lowest cost; `asked` rows came after the generations."""
     overall = "max_seconds" if run.generation < config.generations else "generations"
     covs, means = run.cov, run.records["mean"][-1]
@@ -269,8 +285,8 @@ def _fit(run: SearchState, space: Space, config: SearchConfig, asked: int) -> Fi
             best_cost=float(run.best_cost[r]),
             mean=means[r],
             cov=covs[r],
-            stop=REASONS[run.stopped[r]] or overall,
-            history=History(**{k: np.stack([e[r] for e in v[: run.ended[r]]]) for k, v in run.records.items()}),
+            stop=REASONS[int(run.stopped[r])] or overall,
+            history=_history(run, r),
         )
         for r in range(config.restarts)
     )
@@ -317,11 +333,11 @@ def _checkpoints(folder: Path | None, space: Space, config: SearchConfig, centre
     return Checkpoints(folder, fingerprint=texts)
 
 
-def _restored(checkpoints: Checkpoints | None, strategy: Strategy, centre: np.ndarray) -> SearchState | None:
+def _restored(checkpoints: Checkpoints | None, strategy: Strategy, centre: np.ndarray) -> CmaState | None:
     """The search as its newest whole checkpoint left it, or None."""
     found = checkpoints.restore() if checkpoints else None
     if found is None:
         return None
     generation, tree = found
     state = strategy.put_state(strategy.init(centre), tree["state"])
-    return SearchState.of_tree(generation, tree, state)
+    return CmaState.of_tree(generation, tree, state)

@@ -14,7 +14,7 @@ REASONS = ("", "tol_cost", "tol_sigma")  # why a restart stopped, by the code ke
 
 
 @dataclass(eq=False)
-class SearchState:
+class CmaState:
     """Everything that changes while a search runs; what a checkpoint holds."""
 
     state: Any  # evosax's, leading axis [R]
@@ -27,10 +27,10 @@ class SearchState:
     records: dict[str, list[np.ndarray]] = field(default_factory=dict)  # per generation [R, ...]
 
     @staticmethod
-    def fresh(state: Any, restarts: int, dims: int) -> SearchState:
+    def fresh(state: Any, restarts: int, dims: int) -> CmaState:
         """Of a search that has not begun."""
         none = np.zeros(restarts, np.int64)
-        return SearchState(state, 0, np.full((restarts, dims), np.nan), np.full(restarts, np.inf), none, none.copy(), 0)
+        return CmaState(state, 0, np.full((restarts, dims), np.nan), np.full(restarts, np.inf), none, none.copy(), 0)
 
     @property
     def cov(self) -> np.ndarray:
@@ -57,11 +57,11 @@ class SearchState:
         }
 
     @staticmethod
-    def of_tree(generation: int, tree: Tree, state: Any) -> SearchState:
+    def of_tree(generation: int, tree: Tree, state: Any) -> CmaState:
         """Inverse of tree(), with the state already on its device."""
         records = {name: list(rows) for name, rows in tree["records"].items()}
         best, best_cost, stopped, ended = (np.array(tree[k]) for k in ("best", "best_cost", "stopped", "ended"))
-        return SearchState(state, generation, best, best_cost, stopped, ended, int(tree["failed"]), records)
+        return CmaState(state, generation, best, best_cost, stopped, ended, int(tree["failed"]), records)
 
     def keep_best(self, values: np.ndarray, costs: np.ndarray, running: np.ndarray, *, ties: bool = False) -> None:
         """Bring every running restart's best row up to date, with `ties` also by a row that costs the same."""

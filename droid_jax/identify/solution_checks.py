@@ -15,7 +15,6 @@ import numpy as np
 
 from droid_jax import runtime
 from droid_jax.cost.cost import Cost, with_sensors
-from droid_jax.cost.observation import MINIMUM_NOISE
 from droid_jax.cost.residuals import Comparison
 from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.parameters import Space
@@ -24,7 +23,7 @@ from droid_jax.model.scene import Scene, with_options
 from droid_jax.preflight.creep import creep_note
 from droid_jax.recordings.recording import Recording
 from droid_jax.simulate.c_reference import c_replay
-from droid_jax.simulate.replay import Drive, make_drive, servo_replay
+from droid_jax.simulate.replay import TORQUE_OFFSETS, Drive, make_drive, servo_replay
 
 LARGE = 0.1  # share of the remaining error from which on a time step is too coarse, or two engines too far apart
 EXPLAINED = 2.0  # times what half a time step changes: of an error of first order all of it
@@ -148,7 +147,9 @@ class _Replayed:
         """The checks, and whether they took a compilation."""
         mj_step, torque = self.comparison.config.mj_step, self.comparison.channel("torque")
         left = _rms(self._torque(self.rollout) - torque.noise.mean)
-        check = SolutionCheck(torque.unit, self.drive.timestep, max(left, MINIMUM_NOISE["torque"]))
+        check = SolutionCheck(
+            torque.unit, self.drive.timestep, max(left, self.comparison.config.noise.minimum["torque"])
+        )
         if engine == "mujoco":
             if not mj_step:
                 check = self._with_step(check, self._in_c(2))
@@ -216,7 +217,7 @@ class _Replayed:
         """The replay in plain C with a finer time step, at the rows of the own one; or why there is none."""
         scene, drive = self._finer(times)
         late = 0.0 if self.comparison.config.mj_step else 0.5
-        effects = [e for e in with_sensors(scene, self.cost.space, drive, self.effects) if e.name != "torque offset"]
+        effects = [e for e in with_sensors(scene, self.cost.space, drive, self.effects) if e.name != TORQUE_OFFSETS]
         try:
             replayed = c_replay(scene, self.cost.space, drive, effects, late=late)(self.best[None])
         except ValueError as error:

@@ -1,0 +1,1 @@
+"""What is simulated: scene, parameters, physics, effects and the simulation step."""

@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 
 from droid_jax.model.actuators import drives_joint, has_servo_damping
-from droid_jax.model.parameters import Mode, Parameter, Scaling, Space, Write
+from droid_jax.model.parameters import Mode, Parameter, Role, Scaling, Space, Write
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
 
 _KIND = {
@@ -292,7 +292,7 @@ def servo_scale(scene: Scene, joint: str, *, std: float = 0.03, **options: Any) 
     return Parameter(std=std, writes=writes, **options)
 
 
-def encoder_offset(scene: Scene, joint: str, *, std: float, high: float, **options: Any) -> Parameter:
+def joint_encoder_offset(scene: Scene, joint: str, *, std: float, high: float, **options: Any) -> Parameter:
     """How much further a joint stands than its encoder says, rad (m for slides); 0 at nominal (`model.encoders`).
 
     Reference, spring and range of a joint are told in what its encoder reads: all go down by the offset.
@@ -365,4 +365,4 @@ def _inertia(scene: Scene, body: int, mode: Mode, gain: float) -> tuple[Write, .
 
 def time_offset(std: float = 0.001, limit: float = 0.05) -> Parameter:
     """Delay of the command against the measurement's clock, s (read by the replay, not by the model)."""
-    return Parameter("time_offset", "s", 0.0, std, -limit, limit, nuisance=True, group="Nuisance")
+    return Parameter(Role.TIME_OFFSET.value, "s", 0.0, std, -limit, limit, nuisance=True, group="Nuisance")

@@ -20,15 +20,14 @@ import jax
 import jax.numpy as jnp
 
 from droid_jax.model.effect_interface import Effect, Rollout, Theta, column
-from droid_jax.model.parameters import Parameter, Space
+from droid_jax.model.parameters import OF_A_JOINT, Parameter, Role, Space
 
 SMOOTHING = 0.01  # rad/s: `direction` reaches 0.96 at twice this speed
-FRICTION = ("viscous", "coulomb")
-GAIN = "torque_gain"
-TERMS = (*FRICTION, "torque_offset", GAIN)
-_UNITS = {"viscous": "N m s/rad", "coulomb": "N m", "torque_offset": "N m", GAIN: "-"}
-_GROUPS = {GAIN: "Sensors"}
-_DEVIATIONS = {"viscous": 0.3, "coulomb": 0.5, "torque_offset": 0.3}  # of the prior
+GAIN = Role.TORQUE_GAIN.value
+TERMS = tuple(role.value for role in OF_A_JOINT)
+_UNITS = {Role.VISCOUS: "N m s/rad", Role.COULOMB: "N m", Role.TORQUE_OFFSET: "N m", Role.TORQUE_GAIN: "-"}
+_GROUPS = {Role.TORQUE_GAIN: "Sensors"}
+_DEVIATIONS = {Role.VISCOUS: 0.3, Role.COULOMB: 0.5, Role.TORQUE_OFFSET: 0.3}  # of the prior
 
 
 def direction(velocity: jax.Array) -> jax.Array:
@@ -49,10 +48,11 @@ def joint_friction_effect(joints: Sequence[str], direction: Callable[[jax.Array]
 
     def observe(theta: Theta, rollout: Rollout) -> Rollout:
         speed = rollout.velocity  # [T, J]
-        friction = column(theta, "viscous", joints) * speed + column(theta, "coulomb", joints) * direction(speed)
+        viscous, coulomb = (column(theta, role.value, joints) for role in (Role.VISCOUS, Role.COULOMB))
+        friction = viscous * speed + coulomb * direction(speed)
         return replace(rollout, torque=rollout.torque + friction)
 
-    parameters = tuple(p for p in joint_friction_space(joints).parameters if not p.name.startswith("torque_offset"))
+    parameters = joint_friction_space(joints).of_role(Role.VISCOUS, Role.COULOMB)
     return Effect("joint friction", parameters=parameters, observe=observe)
 
 
@@ -73,8 +73,8 @@ def joint_friction_space(joints: Sequence[str]) -> Space:
     """
     return Space(
         tuple(
-            Parameter(f"{term}[{joint}]", _UNITS[term], 0.0, std, -10 * std, 10 * std, group="Joint friction")
-            for term, std in _DEVIATIONS.items()
+            Parameter(role.in_theta(joint), _UNITS[role], 0.0, std, -10 * std, 10 * std, group="Joint friction")
+            for role, std in _DEVIATIONS.items()
             for joint in joints
         )
     )
@@ -91,5 +91,6 @@ def sensor_parameter(
         raise ValueError(f"unknown sensor term {term!r}; valid: {', '.join(TERMS)}")
     if joint not in joints:
         raise ValueError(f"unknown joint {joint!r}; measured joints: {', '.join(joints)}")
-    options = {"unit": _UNITS[term], "mean": 0.0, "group": _GROUPS.get(term, "Joint friction"), **options}
-    return Parameter(f"{term}[{joint}]", std=std, low=-high if low is None else low, high=high, **options)
+    role = Role(term)
+    options = {"unit": _UNITS[role], "mean": 0.0, "group": _GROUPS.get(role, "Joint friction"), **options}
+    return Parameter(role.in_theta(joint), std=std, low=-high if low is None else low, high=high, **options)

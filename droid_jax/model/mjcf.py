@@ -49,14 +49,22 @@ _OF_FILES = (int(mujoco.mjtGeom.mjGEOM_MESH), int(mujoco.mjtGeom.mjGEOM_HFIELD))
 
 
 def fitted_mjcf(scene: Scene, space: Space, values: np.ndarray, effects: Sequence[Effect] = ()) -> str:
-    """The scene with the values [D] of `space` written in; `unwritten` says which have no place in it.
-
-    effects: in the model; of those that are laws, what MuJoCo says in numbers of its own (`Effect.native`).
+    """The scene as MJCF text with fitted values written in; `unwritten` says which have no place in it.
 
     Files of meshes and textures are named by their absolute paths, wherever the text is saved.
 
-    Raises ValueError for values of another shape, and where MuJoCo compiles no model of them: a replay takes an inertia
-    that no body can have (fitted about one axis alone, say), the compiler does not.
+    Args:
+        scene: whose MJCF it is.
+        space: meaning of the values.
+        values: [D] physical values.
+        effects: in the model; of those that are laws, what MuJoCo says in numbers of its own (`Effect.native`).
+
+    Returns:
+        The text of the MJCF.
+
+    Raises:
+        ValueError: values of another shape, or MuJoCo compiles no model of them: a replay takes an inertia that no body
+            can have (fitted about one axis alone, say), the compiler does not.
     """
     check_space(instance(scene, "scene", Scene), instance(space, "space", Space))
     values, effects = numeric(values, "values"), instances(effects, "effects", Effect)

@@ -26,20 +26,20 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 
 from droid_jax.arguments import instance, path_of
 from droid_jax.errors import faults
-from droid_jax.model.fields import ENCODER, body_mass, encoder_offset, model_parameter, servo_scale, time_offset
+from droid_jax.model.fields import ENCODER, body_mass, joint_encoder_offset, model_parameter, servo_scale, time_offset
 from droid_jax.model.joint_friction import TERMS, sensor_parameter
-from droid_jax.model.parameters import Mode, Parameter, Scaling, Space
+from droid_jax.model.parameters import Mode, Parameter, Role, Scaling, Space
 from droid_jax.model.scene import Scene
 from droid_jax.read_json import read_json, typed
 
 _NEEDED = ("element", "std", "high")
-_TIME = "time_offset"
+_TIME = Role.TIME_OFFSET.value
 SMALL = 1e-3  # of its deviation: a mean (and log_offset) below it is out of reach of a search in the logarithm
 
 
@@ -69,7 +69,19 @@ _KNOWN = _Entry.__struct_fields__
 
 
 def load_parameters(path: str | Path, scene: Scene) -> Space:
-    """The space described in a JSON file; ValueError names the file, the entry and what is wrong with it."""
+    """The space described in a JSON file (its format: the module's text).
+
+    Args:
+        path: of the file.
+        scene: whose elements the entries name.
+
+    Returns:
+        A space of one parameter for each entry, in the file's order.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: an entry is wrong; the message names the file, the entry and what is wrong with it.
+    """
     entries, first = _entries(path_of(path, "the path of a parameter file")), dict[str, int]()
     instance(scene, "scene", Scene)
     parameters = [_parameter(scene, entry, f"{path}, entry {i}") for i, entry in enumerate(entries, 1)]
@@ -89,23 +101,24 @@ def load_parameters(path: str | Path, scene: Scene) -> Space:
 
 def friction_joints(path: str | Path) -> tuple[str, ...]:
     """Joints whose friction loss the file asks for: the scene must be compiled with a row for them."""
-    entries = [e for e in _entries(Path(path)) if isinstance(e, dict)]
+    entries: list[dict[str, Any]] = [e for e in _entries(Path(path)) if isinstance(e, dict)]
     return tuple(str(e["element"]) for e in entries if e.get("field") == "dof_frictionloss" and "element" in e)
 
 
 def _entries(path: Path) -> list[Any]:
     if not path.is_file():
         raise FileNotFoundError(f"no parameter file at {path}")
-    entries = read_json(path)
-    if not isinstance(entries, list) or not entries:
-        got = "an empty one" if entries == [] else type(entries).__name__
+    content = read_json(path)
+    if not isinstance(content, list) or not content:
+        got = "an empty one" if content == [] else type(cast(Any, content)).__name__
         raise ValueError(f"{path}: expected a list of parameters, got {got}")
-    return entries
+    return cast(list[Any], content)
 
 
-def _parameter(scene: Scene, entry: Any, where: str) -> Parameter:
-    if not isinstance(entry, dict):
-        raise ValueError(f"{where}: expected an object, got {type(entry).__name__}")
+def _parameter(scene: Scene, given: Any, where: str) -> Parameter:
+    if not isinstance(given, dict):
+        raise ValueError(f"{where}: expected an object, got {type(given).__name__}")
+    entry = cast(dict[str, Any], given)
     needed = ("std",) if "servo" in entry else ("std", "high") if entry.get("sensor") == _TIME else _NEEDED
     missing = [k for k in needed if k not in entry]
     if sum(kind in entry for kind in ("field", "sensor", "servo")) != 1:
@@ -116,7 +129,7 @@ def _parameter(scene: Scene, entry: Any, where: str) -> Parameter:
     if extra := [k for k in _useless(entry) if k in entry]:
         raise ValueError(f"{where}: leave {', '.join(extra)} out, which an entry of its kind has no use for")
     read = msgspec.structs.asdict(typed(entry, _Entry, where))
-    options = {key: value for key, value in read.items() if value is not msgspec.UNSET}
+    options: dict[str, Any] = {key: value for key, value in read.items() if value is not msgspec.UNSET}
     try:
         field, sensor, servo = (options.pop(kind, None) for kind in ("field", "sensor", "servo"))
         if servo is not None:
@@ -128,13 +141,14 @@ def _parameter(scene: Scene, entry: Any, where: str) -> Parameter:
             raise ValueError(f"unknown sensor term {sensor!r}; valid: {', '.join((*TERMS, ENCODER))}")
         if sensor == ENCODER:
             _check_measured(scene, element)
-            return encoder_offset(scene, element, **options)
+            return joint_encoder_offset(scene, element, **options)
         if sensor is not None:
             return sensor_parameter(scene.joints, sensor, element, **options)
         if field == "body_mass" and options.get("mode", Mode.SET) is Mode.SET:
             options.pop("mode", None)
             return body_mass(scene, element, **options)
-        return model_parameter(scene, field, element, options.pop("column", None), **{"unit": "", **options})
+        options = {"unit": "", **options}
+        return model_parameter(scene, field, element, options.pop("column", None), **options)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{where}: {error}") from None
 

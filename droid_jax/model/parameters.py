@@ -18,17 +18,17 @@ from __future__ import annotations
 import dataclasses
 import enum
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from droid_jax.arguments import (
     choice,
     flag,
-    instance,
     instances,
+    mapping,
     name,
     number,
     numeric,
@@ -75,9 +75,11 @@ class Write:
     def __post_init__(self) -> None:
         where = f"a write of {shown(self.field)}"
         set_field(self, "field", name(self.field, f"{where}: field"))
-        if not isinstance(self.index, (tuple, list)) or not self.index:
-            raise ValueError(f"{where}: index must be a tuple of whole numbers, got {shown(self.index)}")
-        set_field(self, "index", tuple(whole(i, f"{where}: index", least=0, most=MOST_ROWS) for i in self.index))
+        index: Any = self.index
+        if not isinstance(index, (tuple, list)) or not index:
+            raise ValueError(f"{where}: index must be a tuple of whole numbers, got {shown(index)}")
+        entries: list[Any] = list(index)  # pyright: ignore[reportUnknownArgumentType, reportUnknownVariableType]
+        set_field(self, "index", tuple(whole(i, f"{where}: index", least=0, most=MOST_ROWS) for i in entries))
         set_field(self, "mode", choice(self.mode, f"{where}: mode", Mode))
         set_field(self, "gain", number(self.gain, f"{where}: gain"))
         set_field(self, "offset", number(self.offset, f"{where}: offset"))
@@ -103,26 +105,69 @@ class Write:
 
 
 class Scaling(enum.Enum):
-    """Search coordinate of a parameter, see the module's text."""
+    """Search coordinate of a parameter: the value itself, or its logarithm (see the module's text)."""
 
     LINEAR = "linear"
     LOG = "log"
+
+
+class Role(enum.Enum):
+    """What a parameter is, for code that treats parameters of its kind in a way of their own.
+
+    The roles of the first block are what a replay reads from theta beside effects: their values are its names there,
+    of a joint with the joint in brackets (`in_theta`).
+    """
+
+    TIME_OFFSET = "time_offset"  # s, delay of the command
+    TORQUE_OFFSET = "torque_offset"  # N m, constant error of a joint's torque sensor
+    TORQUE_GAIN = "torque_gain"  # relative error of a joint's torque sensor
+    VISCOUS = "viscous"  # N m s/rad, friction that a joint's torque sensor sees
+    COULOMB = "coulomb"  # N m, likewise
+
+    SLIDING_FRICTION = "sliding_friction"  # of a finger's contact
+    TORSIONAL_FRICTION = "torsional_friction"  # likewise, m
+    PAYLOAD_MASS = "payload_mass"  # kg that the arm carries at its hand beside what the model says
+    OBJECT_TORQUE = "object_torque"  # N m (N of a slide), constant on the object's joint
+    OTHER = "other"
+
+    def in_theta(self, joint: str = "") -> str:
+        """Name in theta of what a replay reads, of a joint where it is one's."""
+        return f"{self.value}[{joint}]" if joint else self.value
+
+
+OF_A_JOINT = (Role.VISCOUS, Role.COULOMB, Role.TORQUE_OFFSET, Role.TORQUE_GAIN)
+
+
+def role_in_theta(name: str) -> Role:
+    """What a replay reads by this name from theta; OTHER where it reads nothing by it, or an effect does."""
+    if name == Role.TIME_OFFSET.value:
+        return Role.TIME_OFFSET
+    term, bracket, joint = name.partition("[")
+    found = {role.value: role for role in OF_A_JOINT}.get(term, Role.OTHER)
+    return found if bracket and joint.endswith("]") else Role.OTHER
 
 
 @dataclass(frozen=True)
 class Parameter:
     """One physics parameter.
 
-    name:   unique within a space, e.g. "hinge_stiffness".
-    unit:   for tables and axes, e.g. "N m/rad".
-    mean, std: initial Gaussian, in `unit` (Table I of the paper for the door).
-    low, high: bounds, in `unit`; low <= mean <= high and low < high.
-    writes: model fields it sets; empty for a parameter that lives in theta.
-    nuisance: fitted and marginalised, of no interest by itself.
-    group:  heading in tables ("Door", "Robot", "Gripper", "Nuisance").
-    scaling, log_offset: search coordinate.
-    width:  what one unit of the search coordinate is in log(v + log_offset) when scaling is LOG; None takes
-            it from mean and std.
+    Attributes:
+        name: unique within a space, e.g. "hinge_stiffness".
+        unit: for tables and axes, e.g. "N m/rad".
+        mean, std: initial Gaussian, in `unit` (Table I of the paper for the door).
+        low, high: bounds, in `unit`; low <= mean <= high and low < high.
+        writes: model fields it sets; empty for a parameter that lives in theta.
+        nuisance: fitted and marginalised, of no interest by itself.
+        group: heading in tables ("Door", "Robot", "Gripper", "Nuisance").
+        scaling, log_offset: search coordinate, see the module's text.
+        width: what one unit of the search coordinate is in log(v + log_offset) when scaling is LOG; None takes it from
+            mean and std.
+        role: what it is, where code treats its kind in a way of its own. Of a parameter that writes nothing it follows
+            from the name that a replay reads it by.
+
+    Raises:
+        ValueError: an attribute is of the wrong type, the bounds do not hold the mean, or the numbers are too large or
+            too small to search among.
     """
 
     name: str
@@ -137,6 +182,7 @@ class Parameter:
     scaling: Scaling = Scaling.LINEAR
     log_offset: float = 0.0
     width: float | None = None
+    role: Role = field(default=Role.OTHER, compare=False)
 
     def __post_init__(self) -> None:
         where = f"parameter {shown(self.name)}"
@@ -148,6 +194,9 @@ class Parameter:
         set_field(self, "writes", instances(self.writes, f"{where}: writes", Write))
         set_field(self, "nuisance", flag(self.nuisance, f"{where}: nuisance"))
         set_field(self, "scaling", choice(self.scaling, f"{where}: scaling", Scaling))
+        set_field(self, "role", choice(self.role, f"{where}: role", Role))
+        if self.role is Role.OTHER and not self.writes:
+            set_field(self, "role", role_in_theta(self.name))
         if self.width is not None:
             set_field(self, "width", number(self.width, f"{where}: width", above=0))
         if not self.low < self.high:
@@ -199,11 +248,15 @@ class Parameter:
 class Space:
     """An ordered set of parameters: the meaning of a vector's entries.
 
-    Raises ValueError when two parameters share a name or none is given.
+    Attributes:
+        parameters: [D] of unique names.
+
+    Raises:
+        ValueError: two parameters share a name, or none is given.
     """
 
     parameters: tuple[Parameter, ...]
-    _index: dict[str, int] = field(init=False, repr=False, compare=False, hash=False, default_factory=dict)
+    _index: dict[str, int] = field(init=False, repr=False, compare=False, hash=False, default_factory=dict[str, int])
 
     def __post_init__(self) -> None:
         set_field(self, "parameters", instances(self.parameters, "the parameters of a space", Parameter))
@@ -267,13 +320,17 @@ class Space:
         """The sub-space of these names, in the order given."""
         return Space(tuple(self[n] for n in several(name)(names, "names")))
 
+    def of_role(self, *roles: Role) -> tuple[Parameter, ...]:
+        """The parameters that are one of these, in the space's order; none where there are none."""
+        return tuple(p for p in self.parameters if p.role in roles)
+
     def with_prior(self, **prior: tuple[float, float]) -> Space:
         """A copy in which some parameters start from another (mean, std)."""
         changed = list(self.parameters)
         for of, pair in prior.items():
-            i = self.index(of)
-            if not isinstance(pair, (tuple, list)) or len(pair) != 2:
-                raise ValueError(f"the prior of {of!r} must be its mean and deviation, got {shown(pair)}")
+            i, given = self.index(of), cast(Any, pair)
+            if not isinstance(given, (tuple, list)) or len(pair) != 2:
+                raise ValueError(f"the prior of {of!r} must be its mean and deviation, got {shown(given)}")
             changed[i] = replace(changed[i], mean=pair[0], std=pair[1])
         return Space(tuple(changed))
 
@@ -284,7 +341,7 @@ class Space:
     def values(self, values: dict[str, float] | None = None) -> np.ndarray:
         """[D] the means, with some entries replaced by name."""
         out = self.mean
-        for of, value in instance({} if values is None else values, "values", Mapping).items():
+        for of, value in mapping({} if values is None else values, "values").items():
             out[self.index(of)] = number(value, f"the value of {of!r}")
         return out
 

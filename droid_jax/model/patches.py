@@ -25,8 +25,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from droid_jax.model.quiet_mjx import constraint as mjx_constraint
-from droid_jax.model.quiet_mjx import math as mjx_math
+from droid_jax.model.mjx_internals import CONSTRAINT_LAW, SEGMENT_POINT, Place
 
 _TINY = 1e-12  # m^2: keeps a segment of no length finite
 
@@ -54,11 +53,12 @@ def midpoint_law(original: Callable) -> Callable:
     return law
 
 
-def _switched(module: Any, name: str, new: Callable[[Callable], Callable]) -> ContextVar[bool]:
-    """Exchange a function of a module for one with two ways to act; the switch between them, off at first.
+def _switched(place: Place, new: Callable[[Callable], Callable]) -> ContextVar[bool]:
+    """Exchange a function of mjx for one with two ways to act; the switch between them, off at first.
 
-    new: of the module's own function, what acts while the switch is on.
+    new: of mjx's own function, what acts while the switch is on.
     """
+    module, name = place
     original = getattr(module, name)
     if (before := getattr(original, "switch", None)) is not None:  # this module was loaded a second time
         return before
@@ -74,8 +74,8 @@ def _switched(module: Any, name: str, new: Callable[[Callable], Callable]) -> Co
     return switch
 
 
-_SEGMENTS = _switched(mjx_math, "closest_segment_point", lambda original: closest_segment_point)
-_MIDPOINT = _switched(mjx_constraint, "_kbi", midpoint_law)
+_SEGMENTS = _switched(SEGMENT_POINT, lambda original: closest_segment_point)
+_MIDPOINT = _switched(CONSTRAINT_LAW, midpoint_law)
 
 
 @contextlib.contextmanager

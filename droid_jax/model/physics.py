@@ -8,19 +8,18 @@ values equals compiling an MJCF that has them.
 from __future__ import annotations
 
 import copy
-import dataclasses
 import functools
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from droid_jax.model.mjx_internals import array_fields, quat_multiply, tendon_jacobian
 from droid_jax.model.parameters import Space, Write
-from droid_jax.model.quiet_mjx import math as mjx_math
 from droid_jax.model.quiet_mjx import mjx
 from droid_jax.model.scene import Scene
 from droid_jax.model.unsupported_features import IGNORED
@@ -86,8 +85,7 @@ def check_field(scene: Scene, field: str) -> None:
 @functools.cache
 def _varied_fields() -> frozenset[str]:
     """Fields of mjx.Model that are arrays of its program's input, not constants of the program, and are read."""
-    arrays = {f.name for f in dataclasses.fields(cast(Any, mjx.Model)) if "jax.Array" in str(f.type)}
-    return frozenset(arrays - {field for field, _ in IGNORED})
+    return array_fields() - {field for field, _ in IGNORED}
 
 
 def make_physics(scene: Scene, space: Space, values: jax.Array) -> Physics:
@@ -151,7 +149,7 @@ def derive(model: Any) -> Any:
         stat=stat,
     )
     if model.ntendon:
-        pull = data._impl.ten_J
+        pull = tendon_jacobian(data)
         derived.update(tendon_length0=data.ten_length, tendon_invweight0=jnp.einsum("ti,ij,tj->t", pull, inverse, pull))
     return model.replace(**derived)
 
@@ -173,7 +171,7 @@ def _equality_data(model: Any, data: Any) -> jax.Array:
         world = at[two] + jnp.einsum("eij,ej->ei", turned[two], anchor)
         place = jnp.einsum("eji,ej->ei", turned[one], world - at[one])
         back = data.xquat[one] * jnp.array([1.0, -1.0, -1.0, -1.0])
-        pose = jnp.concatenate([place, jax.vmap(mjx_math.quat_mul)(back, data.xquat[two])], axis=1)
+        pose = jnp.concatenate([place, jax.vmap(quat_multiply)(back, data.xquat[two])], axis=1)
         own = numbers[rows, _AUTOMATIC, None] > 0
         numbers = numbers.at[rows, POSE].set(jnp.where(own, pose, numbers[rows, POSE]))
     return numbers

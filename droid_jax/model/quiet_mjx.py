@@ -5,7 +5,5 @@ from droid_jax.quiet import import_mjx
 import_mjx()
 # isort: split
 import mujoco.mjx as mjx  # noqa: E402
-import mujoco.mjx._src.constraint as constraint  # noqa: E402
-import mujoco.mjx._src.math as math  # noqa: E402
 
-__all__ = ["constraint", "math", "mjx"]
+__all__ = ["mjx"]

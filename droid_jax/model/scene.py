@@ -9,10 +9,10 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import mujoco
 import numpy as np
@@ -43,14 +43,15 @@ class Grip:
 class Scene:
     """A compiled scene.
 
-    name:   for messages and reports.
-    spec:   the MjSpec, looks included; never changed after construction.
-    model:  compiled without looks; what is replayed.
-    joints: servo-driven joints whose torque and position are measured, in channel order [J].
-    command_names: joints of the actuators, in actuator order [U]; of one that drives a tendon, or drives a joint beside
-      the joint's position servo, its own name.
-    object_joint: joint of the thing that is moved (the door's hinge), or None.
-    grip:   how a lost grasp is seen, or None where there is nothing to grip.
+    Attributes:
+        name: for messages and reports.
+        spec: the MjSpec, visual geoms included; never changed after construction.
+        model: compiled without visual geoms; what is replayed.
+        joints: servo-driven joints whose torque and position are measured, in channel order [J].
+        command_names: joints of the actuators, in actuator order [U]; of one that drives a tendon, or drives a joint
+            beside the joint's position servo, its own name.
+        object_joint: joint of the thing that is moved (the door's hinge), or None.
+        grip: how a lost grasp is seen, or None where there is nothing to grip.
     """
 
     name: str
@@ -168,7 +169,8 @@ class Scene:
 
         try:
             with jax.ensure_compile_time_eval():  # else a first use inside jit would keep that trace's values
-                return mjx.put_model(self.model)
+                put = cast(Callable[[mujoco.MjModel], Any], mjx.put_model)  # pyright: ignore[reportUnknownMemberType]
+                return put(self.model)
         except NotImplementedError as error:
             raise ValueError(
                 f"scene {self.name!r} uses something that MJX has not: {error}; change it in the MJCF "
@@ -232,7 +234,8 @@ class Scene:
 def name_to_id(model: mujoco.MjModel, kind: str, name: str) -> int:
     """Id of a named joint, body, geom, pair, actuator or site; an unknown name lists the valid ones."""
     obj = getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
-    plain = isinstance(name, str) and bool(name) and name.isprintable()
+    given: Any = name
+    plain = isinstance(given, str) and bool(given) and given.isprintable()
     found = mujoco.mj_name2id(model, obj, name) if plain else -1
     if found < 0:
         valid = [v for v in (mujoco.mj_id2name(model, obj, i) for i in range(_count(model, kind))) if v]
@@ -320,16 +323,27 @@ def load_scene(
 ) -> Scene:
     """A user's own MJCF as a Scene.
 
-    assets: contents of files that it names, by name, where they do not lie beside it: `env.model_assets` of
-      mujoco_playground.  An MJCF that is written of the scene later names them as this one does.
-    friction_joints: joints whose friction loss will be a parameter though the file gives none.
-    engine, mj_step: as in `compile_scene`.
-    Raises FileNotFoundError or ValueError (the file does not compile, unknown names, ...).
+    Args:
+        path: of the MJCF.
+        joints: measured joints, in channel order; None for all driven ones.
+        object_joint: joint of the thing that is moved, or None.
+        friction_joints: joints whose friction loss will be a parameter though the file gives none.
+        assets: contents of files that it names, by name, where they do not lie beside it: `env.model_assets` of
+            mujoco_playground. An MJCF that is written of the scene later names them as this one does.
+        engine, mj_step: as in `compile_scene`.
+
+    Returns:
+        The compiled scene.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file does not compile, names are unknown, or MJX would ignore something in it.
     """
     path = arguments.path_of(path, "the path of an MJCF")
     friction_joints = arguments.names(friction_joints, "friction_joints")
-    assets = {} if assets is None else arguments.instance(assets, "assets", Mapping)
-    for key, content in assets.items():
+    assets = {} if assets is None else arguments.mapping(assets, "assets")
+    given: Mapping[Any, Any] = assets
+    for key, content in given.items():
         if not isinstance(key, str) or not isinstance(content, bytes):
             raise ValueError(f"assets must map file names to bytes, got {arguments.shown(key)}")
     if path.is_dir():

@@ -23,6 +23,13 @@ import numpy as np
 from jax.core import Tracer
 
 from droid_jax.model.actuators import drives_joint
+from droid_jax.model.mjx_internals import (
+    ConstraintRows,
+    at_velocity,
+    constraint_rows,
+    friction_dofs,
+    with_constraint_force,
+)
 from droid_jax.model.patches import exact_segments, midpoint_constraints
 from droid_jax.model.quiet_mjx import mjx
 from droid_jax.model.unsupported_features import check_options
@@ -69,7 +76,7 @@ def step(
     if not parity:
         slope = mjx.deriv_smooth_vel(model, data)
         inertia = inertia if slope is None else inertia - 0.5 * model.opt.timestep * slope
-    if data._impl.efc_J.size == 0:
+    if constraint_rows(data).jacobian.size == 0:
         data = data.replace(qacc=jax.scipy.linalg.solve(inertia, data.qfrc_smooth, assume_a="pos"))
     elif model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
         data = mjx.solve(model, data)
@@ -88,8 +95,7 @@ def servo_force(model: Any, data: Any, velocity: jax.Array) -> jax.Array:
 
     A step integrates velocity gains at its mean velocity, data.qfrc_actuator is at the one before it.
     """
-    moving = data.tree_replace({"_impl.actuator_velocity": data._impl.actuator_moment @ velocity})
-    return mjx.fwd_actuation(model, moving).qfrc_actuator
+    return mjx.fwd_actuation(model, at_velocity(data, velocity)).qfrc_actuator
 
 
 def _within_range(model: Any, data: Any) -> Any:
@@ -137,7 +143,7 @@ def _may_be_firm(model: Any) -> bool:
     """Whether a joint's friction is firm, or may be because its impedance is a parameter."""
     if isinstance(model.dof_solimp, Tracer):
         return True
-    return bool(np.any(np.asarray(model.dof_solimp)[np.asarray(model._impl.dof_hasfrictionloss), 0] > FIRM))
+    return bool(np.any(np.asarray(model.dof_solimp)[np.asarray(friction_dofs(model)), 0] > FIRM))
 
 
 def solve(inertia: jax.Array, data: Any, corners: int = LINE_SEARCH) -> Any:
@@ -148,9 +154,8 @@ def solve(inertia: jax.Array, data: Any, corners: int = LINE_SEARCH) -> Any:
     while negative).  inertia: [nv, nv] M, or what the integrator will use in its place.  corners: followed in a step.
     Source: MuJoCo documentation, "Computation", section "Solver" (primal problem).
     """
-    rows = data._impl
-    jacobian: jax.Array = rows.efc_J
-    weight: jax.Array = rows.efc_D
+    rows = constraint_rows(data)
+    jacobian, weight = rows.jacobian, rows.weight
     low, high = _force_bounds(rows)
     products = jnp.concatenate([jacobian[:, i:] * jacobian[:, i : i + 1] for i in range(inertia.shape[0])], axis=1)
     entry = _packed_index(inertia.shape[0])
@@ -183,11 +188,11 @@ def solve(inertia: jax.Array, data: Any, corners: int = LINE_SEARCH) -> Any:
     def unfinished(carry):
         return carry[5] & (carry[4] < ITERATIONS)
 
-    residual = _times(jacobian, data.qacc_warmstart) - rows.efc_aref
+    residual = _times(jacobian, data.qacc_warmstart) - rows.reference
     start = (data.qacc_warmstart, residual, *forces(residual), jnp.zeros((), jnp.int32), jnp.array(True))
     qacc, _, force, _, _, _ = jax.lax.while_loop(unfinished, iterate, start)
     data = data.replace(qacc=qacc, qfrc_constraint=_times(jacobian.T, force))
-    return data.tree_replace({"_impl.efc_force": force})
+    return with_constraint_force(data, force)
 
 
 # Sums of products in place of small matrix products: XLA fuses them with what stands beside them,
@@ -200,11 +205,12 @@ def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
     return jnp.sum(a * b)
 
 
-def _force_bounds(rows: Any) -> tuple[jax.Array, jax.Array]:
+def _force_bounds(rows: ConstraintRows) -> tuple[jax.Array, jax.Array]:
     """[rows] the range of each row's force: any (equality), +- friction loss, or pushing only."""
-    kind = np.arange(rows.efc_D.shape[0])
-    equality, dry = kind < rows.ne, (kind >= rows.ne) & (kind < rows.ne + rows.nf)
-    loss: jax.Array = rows.efc_frictionloss
+    kind = np.arange(rows.weight.shape[0])
+    after = rows.equalities + rows.frictions
+    equality, dry = kind < rows.equalities, (kind >= rows.equalities) & (kind < after)
+    loss = rows.friction
     low = jnp.where(equality, -jnp.inf, jnp.where(dry, -loss, 0.0))
     return low, jnp.where(dry, loss, jnp.inf)
 

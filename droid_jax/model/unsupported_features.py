@@ -160,7 +160,9 @@ def refuse_fluid(model: Any, what: str) -> None:
     if isinstance(model, mujoco.MjModel):
         fluid = model.opt.density > 0 or model.opt.viscosity > 0 or np.any(model.opt.wind)
     else:
-        fluid = model.opt._impl.has_fluid_params
+        from droid_jax.model.mjx_internals import has_fluid  # only here: it starts jax
+
+        fluid = has_fluid(model)
     if fluid:
         raise ValueError(
             f"{what} has no air or water: take density, viscosity and wind out of <option>; the effect `drag` is for "

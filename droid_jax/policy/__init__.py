@@ -1,0 +1,1 @@
+"""From the distribution to a policy: randomisation, PPO, evaluation, control, export."""

@@ -4,7 +4,7 @@
 
     import control
 
-    loop = control.Controller(control.load("policy.npz"))
+    loop = control.Controller(control.load_policy("policy.npz"))
     while not loop.stopped:
         command = loop.act(control.Reading(time, position, velocity, torque, fingers, knob))
         ...  # send command.arm and command.fingers, wait for the next period
@@ -107,7 +107,7 @@ def arrays(policy: Policy) -> dict[str, Any]:
     return {**own, **layers, **interface}
 
 
-def load(path: str | Path) -> Policy:
+def load_policy(path: str | Path) -> Policy:
     """ValueError names what is wrong with a file: missing, damaged, no numbers, of another layout of observations."""
     try:
         found = _arrays(Path(path))
@@ -395,7 +395,7 @@ def _beyond(values: np.ndarray, limits: np.ndarray, unit: str) -> str | None:
     return f"joint {joint + 1} at {values[joint]:.3g} {unit}, limit {limits[joint]:.3g}"
 
 
-class Robot(Protocol):
+class ControlledRobot(Protocol):
     """What `drive` asks of a robot."""
 
     def read(self) -> Reading:
@@ -411,7 +411,7 @@ class Robot(Protocol):
         ...
 
 
-def drive(controller: Controller, robot: Robot, seconds: float) -> str | None:
+def drive(controller: Controller, robot: ControlledRobot, seconds: float) -> str | None:
     """Let the policy drive a robot for so long, or until it stops; why it stopped, or None.
 
     In the end, and where the robot's own functions raise, the robot is told to hold its last pose, once: one that wants

@@ -33,5 +33,5 @@ def policy_of(normaliser: Any, actor: Any, sizes: tuple[int, ...], interface: In
 
 
 def save_policy(path: Path, policy: Policy) -> None:
-    """One npz file, which `control.load` reads."""
+    """One npz file, which `control.load_policy` reads."""
     write_npz(path, arrays(policy))

@@ -68,7 +68,7 @@ class Doors(Wrapper):
 
     def _own(self) -> Any:
         """The physics of this device's environments."""
-        first = device() * self.count
+        first = device_index() * self.count
 
         def rows(axis: int | None, leaf: Any) -> Any:
             return leaf if axis is None else jax.lax.dynamic_slice_in_dim(leaf, first, self.count)
@@ -85,7 +85,7 @@ class Doors(Wrapper):
             env.sys = before
 
 
-def device() -> jax.Array:
+def device_index() -> jax.Array:
     """Number of the device that brax runs this on; 0 where it uses one alone, as in its evaluations."""
     try:
         return jax.lax.axis_index(AXIS)

@@ -19,6 +19,7 @@ from droid_jax.arguments import instance
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.model.fields import check_space, element_name
 from droid_jax.model.inertia import possible_draws
+from droid_jax.model.mjx_internals import friction_dofs
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import POSE, UNIT, Physics, joined_bodies, make_physics, model_writes, written_fields
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
@@ -29,7 +30,15 @@ Randomise = Callable[[Any, jax.Array], tuple[Any, Any]]
 def randomised(scene: Scene, gaussian: Gaussian) -> Randomise:
     """A randomization_fn for environments whose `sys` is `Physics`: one draw of the Gaussian for each key.
 
-    Raises ValueError for a Gaussian of another scene.
+    Args:
+        scene: that the Gaussian is of.
+        gaussian: over any part of the scene's parameters, effects included.
+
+    Returns:
+        brax's randomization_fn, (sys, rng [N, 2]) -> (sys_v, in_axes).
+
+    Raises:
+        ValueError: a Gaussian of another scene.
     """
     check_space(instance(scene, "scene", Scene), instance(gaussian, "gaussian", Gaussian).space)
 
@@ -47,13 +56,21 @@ def of_method(method: str, scene: Scene, gaussian: Gaussian) -> Randomise:
 
 
 def randomised_model(scene: Scene, gaussian: Gaussian) -> Randomise:
-    """The same for environments that know an mjx.Model only (mujoco_playground's): the model fields alone.
+    """A randomization_fn for environments that know an mjx.Model only (mujoco_playground's): the model fields alone.
 
-    scene: of the same MJCF, whose geoms that are for the eye alone the environment may have.  Numbers that no parameter
-    writes stay the environment's own, those apart that follow from masses and places: they are the scene's.
-    Warns of parameters that live outside the model: they have no place there and stay at neutral.
-    Raises ValueError for a Gaussian of another scene, and when called with a model of another scene or with one in
-    which a friction loss that varies has no row.
+    Numbers that no parameter writes stay the environment's own, those apart that follow from masses and places: they
+    are the scene's. Warns of parameters that live outside the model: they have no place there and stay at neutral.
+
+    Args:
+        scene: of the same MJCF, whose visual geoms the environment may have.
+        gaussian: over any part of the scene's parameters.
+
+    Returns:
+        (mjx.Model, rng [N, 2]) -> (batched mjx.Model, in_axes). It raises ValueError when called with a model of
+        another scene, or with one in which a friction loss that varies has no row.
+
+    Raises:
+        ValueError: a Gaussian of another scene.
     """
     both, fields = randomised(scene, gaussian), _batched(scene, gaussian.space)
     outside = [p.name for p in gaussian.space.parameters if not p.writes]
@@ -106,7 +123,7 @@ def _geoms_among(scene: Scene, model: Any, fields: Sequence[str]) -> dict[str, n
 
 def _check_friction_rows(scene: Scene, model: Any, written: Iterable[tuple[int, ...]]) -> None:
     """ValueError for a friction loss that was zero when the model was compiled: MJX laid out no row for it."""
-    rows = getattr(model._impl, "dof_hasfrictionloss", None)  # of the implementation in JAX; others lay out all rows
+    rows = friction_dofs(model)
     without = [i for (i, *_) in written if rows is not None and not rows[i]]
     if without:
         names = ", ".join(element_name(scene.model, "dof_frictionloss", (i,)) or f"dof {i}" for i in without)

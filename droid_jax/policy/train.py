@@ -118,7 +118,7 @@ class TrainProgress:
 
 
 @dataclass(frozen=True, eq=False)
-class Trained:
+class TrainedPolicy:
     """A policy and how it came to be.
 
     policy: of all that were tried while it trained, the one that succeeded most, and among those the one of largest
@@ -137,7 +137,7 @@ def train(
     checkpoints: Path | None = None,
     fingerprint: dict[str, str] | None = None,
     progress: Callable[[TrainProgress], None] = lambda now: None,
-) -> Trained:
+) -> TrainedPolicy:
     """Train a policy on environments that `randomise` makes, all alike where it is None.
 
     checkpoints: folder where the networks are kept after every evaluation, and from which an interrupted run goes on
@@ -181,7 +181,7 @@ def _brax(
     done: int,
     progress: Callable[[TrainProgress], None],
     save: Callable[[int, dict[str, Any]], None],
-) -> Trained:
+) -> TrainedPolicy:
     """brax's PPO from `done` actions on, with the networks of `tree` where there are any."""
     history = [TrainProgress(int(row[0]), *row[1:]) for row in tree["history"].tolist()] if tree else []
     began = time.monotonic() - (history[-1].seconds if history else 0.0)
@@ -230,7 +230,7 @@ def _brax(
             "(in Python, a smaller TrainConfig.learning_rate too)"
         )
     normaliser, actor, _ = best
-    return Trained(policy_of(normaliser, actor, layer_sizes(config.hidden), env.interface), tuple(history))
+    return TrainedPolicy(policy_of(normaliser, actor, layer_sizes(config.hidden), env.interface), tuple(history))
 
 
 def _ppo(

@@ -1,0 +1,1 @@
+"""Checks of a recording before a replay: units, signs, order, clocks, limits."""

@@ -201,7 +201,7 @@ def servo_torque(scene: Scene, motion: LogMotion, joint: str, late: float) -> np
     return gear * force
 
 
-def simulated(scene: Scene, recording: Recording, motion: LogMotion) -> dict[str, np.ndarray]:
+def simulated_torques(scene: Scene, recording: Recording, motion: LogMotion) -> dict[str, np.ndarray]:
     """Joint -> [K] N m (N) of the actuators in a replay of the commands at nominal values; NaN where it blows up.
 
     The first SECONDS are replayed.  What the scene compensates of the weight is added where the torque contains it.

@@ -24,7 +24,7 @@ from droid_jax.preflight.signals import (
     compensated,
     rigid_body,
     servo_torque,
-    simulated,
+    simulated_torques,
 )
 from droid_jax.recordings.recording import Recording, TorqueSide
 from droid_jax.simulate.initial_state import weight_share
@@ -230,7 +230,7 @@ def _of_replay(scene: Scene, recording: Recording, motion: LogMotion) -> list[Fi
     """By a replay of the commands, of a recording without positions."""
     if not motion.command:
         return []
-    replays, by = simulated(scene, recording, motion), "the torque of its replay"
+    replays, by = simulated_torques(scene, recording, motion), "the torque of its replay"
     torques = {j: motion.torque[j] for j in replays}
     stated = {j: _least(torques[j], [x]) for j, x in replays.items()}
     bad = [j for j, share in stated.items() if share > BAD]
@@ -238,7 +238,7 @@ def _of_replay(scene: Scene, recording: Recording, motion: LogMotion) -> list[Fi
         return []
     if found := _compared(recording, torques, {j: [x] for j, x in replays.items()}, by, ()):
         return found
-    small = simulated(scene, recording, motion.scaled(DEGREE))
+    small = simulated_torques(scene, recording, motion.scaled(DEGREE))
     left = {j: _least(torques[j], [x]) for j, x in small.items()}
     if _explains(left, stated, bad):
         joint = max(bad, key=lambda j: stated[j])

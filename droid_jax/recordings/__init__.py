@@ -1,0 +1,1 @@
+"""What was measured: recordings, their checks, and their files."""

@@ -32,7 +32,7 @@ SUPPORTED = (
 _BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 
 
-def load(
+def load_recording(
     path: str | os.PathLike[str],
     *,
     name: str | None = None,
@@ -40,17 +40,23 @@ def load(
     allow_jitter: bool = False,
     **bag_options: Any,
 ) -> Recording:
-    """Reads a recording from an npz file, a CSV folder or ROS bags, and validates it.
+    """Read a recording from an npz file, a CSV folder or ROS bags, and validate it.
 
-    name:         replaces the stored name.
-    resample:     repeats with clocks of their own are interpolated onto the first's; those of bags always are, those
-                  of an npz file share one.
-    allow_jitter: accept irregular clocks, see `validate`; a recording that was accepted says so in its `meta`, and is
-                  read without being asked again once it is saved.
-    bag_options:  passed to `rosbag.read_bags`; `joints` and `torque` are required for bags.
+    Args:
+        path: of the file, or of the folder.
+        name: replaces the stored name.
+        resample: repeats with clocks of their own are interpolated onto the first's; those of bags always are, those
+            of an npz file share one.
+        allow_jitter: accept irregular clocks, see `validate`. A recording that was accepted says so in its `meta`, and
+            is read without being asked again once it is saved.
+        bag_options: passed to `rosbag.read_bags`; `joints` and `torque` are required for bags.
 
-    Raises FileNotFoundError when there is no such path, ValueError for everything in the
-    file that is not as it should be.
+    Returns:
+        The recording, valid.
+
+    Raises:
+        FileNotFoundError: there is no such path.
+        ValueError: something in the file is not as it should be (docs/file-formats.md).
     """
     path = path_of(path, "the path of a recording")
     resample, allow_jitter = flag(resample, "resample"), flag(allow_jitter, "allow_jitter")
@@ -92,11 +98,21 @@ def check_target(path: Path) -> None:
         check_folder(path)
 
 
-def save(recording: Recording, path: str | os.PathLike[str]) -> Path:
-    """Writes an npz file (suffix .npz) or a CSV folder (no suffix), atomically; returns its path.
+def save_recording(recording: Recording, path: str | os.PathLike[str]) -> Path:
+    """Write an npz file (suffix .npz) or a CSV folder (no suffix), atomically.
 
-    An existing recording of that name is replaced.  Raises ValueError when the recording is
-    not valid, the suffix is another one, or something else stands there.
+    An existing recording of that name is replaced.
+
+    Args:
+        recording: what is written, validated first.
+        path: of the file, or of the folder.
+
+    Returns:
+        The path that was written.
+
+    Raises:
+        ValueError: the recording is not valid, the suffix is another one, or something else stands there.
+        OSError: the place cannot be written.
     """
     path = path_of(path, "the path of a recording")
     check_target(path)

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.arguments import check_fields, choice, flag, instance, listed, number, shown, whole
+from droid_jax.arguments import check_fields, choice, flag, is_list, mapping, number, shown, whole
 from droid_jax.recordings.clocks import SLACK
 
 START = 0.1  # s: a channel that begins no later than this after the command still tells where the motion started
@@ -107,17 +107,18 @@ class ObjectPose:
 class Recording:
     """One demonstration and its N repeats.
 
-    name:          for tables and file names; not part of the content hash.
-    time:          [T] s, the command clock, strictly increasing.
-    command:       [T, U] position command, rad or m; T = U = 0 for a log without commands.
-    command_names: U joint names.
-    channels:      name -> Channel; all share N.
-    torque:        what the torque channel holds.
-    qpos0:         joint name -> position at the start, rad or m; joints not named start where the scene has them.
-    gains:         servo gains, when known.
-    phases:        named parts of the motion.
-    object_pose:   pose of the manipulated object, when known.
-    meta:          free notes; not part of the content hash.
+    Attributes:
+        name: for tables and file names; not part of the content hash.
+        time: [T] s, the command clock, strictly increasing.
+        command: [T, U] position command, rad or m; T = U = 0 for a log without commands.
+        command_names: U joint names.
+        channels: name -> Channel; all share N.
+        torque: what the torque channel holds.
+        qpos0: joint name -> position at the start, rad or m; joints not named start where the scene has them.
+        gains: servo gains, when known.
+        phases: named parts of the motion.
+        object_pose: pose of the manipulated object, when known.
+        meta: free notes; not part of the content hash.
     """
 
     name: str
@@ -126,11 +127,11 @@ class Recording:
     command_names: tuple[str, ...]
     channels: Mapping[str, Channel]
     torque: TorqueConvention
-    qpos0: Mapping[str, float] = field(default_factory=dict)
+    qpos0: Mapping[str, float] = field(default_factory=dict[str, float])
     gains: ServoGains | None = None
     phases: tuple[Phase, ...] = ()
     object_pose: ObjectPose | None = None
-    meta: Mapping[str, str] = field(default_factory=dict)
+    meta: Mapping[str, str] = field(default_factory=dict[str, str])
 
     @property
     def repeats(self) -> int:
@@ -191,7 +192,7 @@ class Recording:
 
         Raises ValueError when no index is given or one lies outside 0 .. N - 1.
         """
-        if not listed(indices):
+        if not is_list(indices):
             raise ValueError(f"repeats must be a list of whole numbers, got {shown(indices)}")
         chosen = [whole(i, "a repeat") for i in indices]
         bad = [i for i in chosen if not 0 <= i < self.repeats]
@@ -210,7 +211,7 @@ class Recording:
         """
         start, end = number(start, "start of a window"), number(end, "end of a window")
         if qpos0 is not None:
-            given = instance(qpos0, "qpos0", Mapping).items()
+            given = mapping(qpos0, "qpos0").items()
             qpos0 = {str(joint): number(q, f"qpos0, joint {shown(joint)}") for joint, q in given}
         if not start < end:
             raise ValueError(f"a window needs start < end, got {start} and {end} s")
@@ -242,7 +243,7 @@ def recordings_of(given: Any) -> tuple[Recording, ...]:
     """One recording or several as a tuple; ValueError where there is none, or a file's name stands for its content."""
     if isinstance(given, Recording):
         return (given,)
-    if not listed(given):
+    if not is_list(given):
         given = [given]
     out = tuple(given)
     if not out:
@@ -300,10 +301,11 @@ def _measured_at(recording: Recording, instant: float, slack: float = SLACK) -> 
 def _interpolate(channel: Channel, repeat: int, column: int, at: float, slack: float) -> float | None:
     """One column's value at an instant, or None more than `slack` s outside what was measured."""
     seen = channel.mask[repeat, :, column]
-    time = channel.time[seen]
+    time: np.ndarray = channel.time[seen]
     if not len(time) or not time[0] - slack <= at <= time[-1] + slack:
         return None
-    return float(np.interp(at, time, channel.values[repeat, seen, column]))
+    values: np.ndarray = channel.values[repeat, seen, column]
+    return float(np.interp(at, time, values))
 
 
 def _content(recording: Recording) -> tuple[dict[str, Any], Iterator[np.ndarray]]:

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from droid_jax.model.effect_interface import Effect, Rollout
-from droid_jax.model.parameters import Space
+from droid_jax.model.parameters import Role, Space
 from droid_jax.model.physics import make_c_model, theta_of
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.clocks import interpolate
@@ -54,7 +54,7 @@ def c_replay(
     def piece(values: np.ndarray) -> Rollout:
         models = [make_c_model(plain, space, row) for row in values]
         thetas = [theta_of(space, row) for row in values]
-        control = np.stack([control_of(drive, t.get("time_offset", 0.0), late) for t in thetas])
+        control = np.stack([control_of(drive, t.get(Role.TIME_OFFSET.value, 0.0), late) for t in thetas])
         trace = simulate(plain, models, drive.qpos0[None], control)
         traces = (trace.torque, trace.position, trace.velocity, trace.object_angle[..., None])
         ahead = late * drive.timestep
@@ -91,4 +91,4 @@ def control_of(drive: Drive, time_offset: float = 0.0, late: float = 0.5) -> np.
 
 def _offsets(scene: Scene, thetas: Sequence[dict[str, float]]) -> np.ndarray:
     """[P, J] N m constant torque-sensor errors."""
-    return np.array([[t.get(f"torque_offset[{j}]", 0.0) for j in scene.joints] for t in thetas])
+    return np.array([[t.get(Role.TORQUE_OFFSET.in_theta(j), 0.0) for j in scene.joints] for t in thetas])

@@ -16,6 +16,7 @@ import numpy as np
 
 from droid_jax.model.effect_interface import Effect, Rollout, State, Theta, column, complete
 from droid_jax.model.encoders import encoder_error, misplaced_weight
+from droid_jax.model.parameters import Role
 from droid_jax.model.physics import Physics
 from droid_jax.model.quiet_mjx import mjx
 from droid_jax.model.scene import Scene
@@ -87,7 +88,7 @@ class Path(NamedTuple):
     still: jax.Array
 
 
-def path_of(scene: Scene, motion: Motion) -> Path:
+def motion_path(scene: Scene, motion: Motion) -> Path:
     """What a compiled replay is given of a motion; ValueError where it states a joint that the scene has not."""
     rest = motion.velocity == 0.0 if motion.rest is None else motion.rest
     measured = np.full(motion.velocity.shape, np.nan) if motion.measured is None else motion.measured
@@ -190,7 +191,7 @@ def _may_rub(scene: Scene, theta: Theta, effects: Sequence[Effect], motor: bool)
     """
     if any(effect.frictionloss is not None for effect in effects):
         return np.ones(len(scene.joints), bool)
-    behind = np.array([f"coulomb[{joint}]" in theta for joint in scene.joints])
+    behind = np.array([Role.COULOMB.in_theta(joint) in theta for joint in scene.joints])
     return behind | (motor & (scene.model.dof_frictionloss[scene.joint_dofs] > 0.0))
 
 
@@ -216,5 +217,5 @@ def _resistance(theta: Theta, state: State, own: jax.Array, effects: Sequence[Ef
 
 def _behind_the_sensor(scene: Scene, theta: Theta) -> jax.Array:
     """[nv] the dry friction that `joint_friction_effect` adds to a link-side torque."""
-    coulomb = column(theta, "coulomb", scene.joints)
+    coulomb = column(theta, Role.COULOMB.value, scene.joints)
     return jnp.zeros(scene.model.nv, jnp.float32).at[scene.joint_dofs].set(coulomb)

@@ -19,6 +19,8 @@ import numpy as np
 from droid_jax.model.actuators import has_servo_damping
 from droid_jax.model.effect_interface import Effect, Rollout, State, Theta, column, complete
 from droid_jax.model.encoders import encoder_error, misplaced_compensation
+from droid_jax.model.mjx_internals import Contacts, constraint_rows, contacts
+from droid_jax.model.parameters import Role
 from droid_jax.model.physics import Physics
 from droid_jax.model.quiet_mjx import mjx
 from droid_jax.model.scene import Scene
@@ -32,6 +34,7 @@ from droid_jax.simulate.floating_base import refuse_floating
 from droid_jax.simulate.initial_state import check_weight, holding, start_pose, weight_share
 
 Replay = Callable[[Physics], Rollout]
+TORQUE_OFFSETS = "torque offset"  # the effect that adds them, which every replay in MJX has
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,7 +224,7 @@ def _command(
         return table[low] * (1 - part) + table[low + 1] * part
 
     # In steps first: seconds that are added up in float32 lose a fifth of a step in ten seconds.
-    delay = late + jnp.asarray(theta.get("time_offset", 0.0), jnp.float32) / timestep
+    delay = late + jnp.asarray(theta.get(Role.TIME_OFFSET.value, 0.0), jnp.float32) / timestep
     whole = jnp.floor(delay)
     low = jnp.clip(k - whole.astype(jnp.int32) - 1, 0, last)
     high = jnp.clip(k - whole.astype(jnp.int32), 0, last)
@@ -288,9 +291,9 @@ def torque_offset_effect(joints: Sequence[str]) -> Effect:
     """Constant torque-sensor errors: reads `torque_offset[joint]` from theta, N m; absent means zero."""
 
     def observe(theta: Theta, rollout: Rollout) -> Rollout:
-        return replace(rollout, torque=rollout.torque + column(theta, "torque_offset", joints))
+        return replace(rollout, torque=rollout.torque + column(theta, Role.TORQUE_OFFSET.value, joints))
 
-    return Effect("torque offset", observe=observe)
+    return Effect(TORQUE_OFFSETS, observe=observe)
 
 
 def _joint_torque(model, before, after, servo: jax.Array, joints: np.ndarray, drive: Drive, parity: bool) -> jax.Array:
@@ -306,9 +309,9 @@ def _joint_torque(model, before, after, servo: jax.Array, joints: np.ndarray, dr
         gain = (after.qvel - before.qvel)[joints]
         velocity = after.qvel[joints] - (0.0 if parity else 0.5) * gain
         torque = torque - model.dof_armature[joints] * gain / drive.timestep - model.dof_damping[joints] * velocity
-        rows = after._impl
-        dry = slice(rows.ne, rows.ne + rows.nf)
-        torque = torque + (rows.efc_J[dry].T @ rows.efc_force[dry])[joints]
+        rows = constraint_rows(after)
+        dry = slice(rows.equalities, rows.equalities + rows.frictions)
+        torque = torque + (rows.jacobian[dry].T @ rows.force[dry])[joints]
     share = weight_share(model, joints, drive.torque.gravity)
     return torque + share * after.qfrc_gravcomp[joints] if share.any() else torque
 
@@ -319,9 +322,9 @@ def finger_geoms(scene: Scene) -> tuple[np.ndarray, ...]:
     return tuple(both[pairs] for pairs in scene.finger_pairs)
 
 
-def of_fingers(contact: Any, fingers: Sequence[np.ndarray]) -> list[jax.Array]:
+def of_fingers(found: Contacts, fingers: Sequence[np.ndarray]) -> list[jax.Array]:
     """For each finger, [contacts] bool: which of MJX's contacts are of its pairs, as `finger_geoms` has them."""
-    geoms = jnp.sort(contact.geom, axis=1)  # [contacts, 2]
+    geoms = jnp.sort(found.geoms, axis=1)  # [contacts, 2]
     return [jnp.any(jnp.all(geoms[:, None] == pairs[None], axis=-1), axis=1) for pairs in fingers]
 
 
@@ -329,5 +332,5 @@ def _touching(data, fingers: Sequence[np.ndarray]) -> jax.Array:
     """[F] bool: does any contact of a finger's pairs penetrate?"""
     if not fingers:
         return jnp.zeros((0,), bool)
-    contact = data._impl.contact
-    return jnp.stack([jnp.any(mine & (contact.dist < 0)) for mine in of_fingers(contact, fingers)])
+    found = contacts(data)
+    return jnp.stack([jnp.any(mine & (found.distance < 0)) for mine in of_fingers(found, fingers)])

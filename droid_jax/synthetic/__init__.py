@@ -1,0 +1,1 @@
+"""The synthetic robot, in plain C MuJoCo, and the effects hidden in it."""

@@ -12,7 +12,7 @@ PAYLOAD_GYRATION = 0.03  # m, radius of gyration: a tool, not a point
 TWIST_KNEE = 15.0  # N m, where a harmonic drive's flexspline begins to stiffen
 
 
-def payload(place: Place, a: float) -> Influence:
+def hide_payload(place: Place, a: float) -> Influence:
     """a kg at `PAYLOAD_AT` on the hand: inertia and gravity, which the robot does not compensate.
 
     The hand's body gets mass, centre and inertia of both (parallel axes); the compensation of the
@@ -66,7 +66,7 @@ def _steiner(offset: np.ndarray) -> np.ndarray:
     return offset @ offset * np.eye(3) - np.outer(offset, offset)
 
 
-def cable_pull(place: Place, a: float) -> Influence:
+def hide_cable_pull(place: Place, a: float) -> Influence:
     """-a sinh(2 (q - q_rest)) / sinh(2): a dress pack that hangs slack, then pulls; a in N m at 1 rad.
 
     It hangs slack in the middle of the joint's range, wherever a motion begins, and rubs in its clamps with a
@@ -87,7 +87,7 @@ def cable(a: float, turned: np.ndarray, v: np.ndarray) -> np.ndarray:
     return -pull - 0.1 * np.abs(pull) * np.tanh(v / 0.01)
 
 
-def torque_ripple(place: Place, a: float) -> Influence:
+def hide_torque_ripple(place: Place, a: float) -> Influence:
     """a (sin(18 q + 0.4) + 0.35 sin(44 q + 1.9)) on the joint: two harmonics of a gear; a in N m."""
 
     def step(live: Live) -> None:
@@ -108,7 +108,7 @@ def twist(a: float, torque: np.ndarray) -> np.ndarray:
     return a * TWIST_KNEE * np.arcsinh(torque / TWIST_KNEE)
 
 
-def joint_elasticity(place: Place, a: float) -> Influence:
+def hide_joint_elasticity(place: Place, a: float) -> Influence:
     """Quasi-static: the motor stands `twist` ahead of the link, and the servo and its encoder see the motor.
 
     The servo's command loses the twist of its torque behind a lag of 3 ms (the motor's inertia in the
@@ -138,7 +138,7 @@ def play(values: np.ndarray, width: float) -> np.ndarray:
     return out
 
 
-def backlash(place: Place, a: float) -> Influence:
+def hide_backlash(place: Place, a: float) -> Influence:
     """A gap of a rad between motor and link: the link is led by the command behind a play of that width."""
 
     def command(clock: np.ndarray, control: np.ndarray) -> np.ndarray:
@@ -149,7 +149,7 @@ def backlash(place: Place, a: float) -> Influence:
     return Influence(command=command)
 
 
-def servo_gains(place: Place, a: float) -> Influence:
+def hide_servo_gains(place: Place, a: float) -> Influence:
     """Stiffness times 1 + a and damping times sqrt(1 + a): another gain set of the same damping ratio; a > -1."""
     if a <= -1.0:
         raise ValueError(f"wrong servo gains need an amplitude above -1, got {a}")
@@ -163,7 +163,7 @@ def servo_gains(place: Place, a: float) -> Influence:
     return Influence(edit=edit)
 
 
-def grip_compliance(place: Place, a: float) -> Influence:
+def hide_grip_compliance(place: Place, a: float) -> Influence:
     """Softer pads: the contact's force sets in over a m more, with a time constant 1 + 400 a times as long."""
     pairs = np.concatenate(place.scene.finger_pairs)
 
@@ -175,11 +175,11 @@ def grip_compliance(place: Place, a: float) -> Influence:
 
 
 ARM_EFFECTS = (
-    Hidden("payload", "kg", (0.05, 0.6), "hand", payload, "a tool on the hand that the robot does not know"),
-    Hidden("cable_pull", "N m", (0.1, 1.0), "arm", cable_pull, "a cable that pulls the joint back"),
-    Hidden("torque_ripple", "N m", (0.1, 1.0), "arm", torque_ripple, "two harmonics of a gear"),
-    Hidden("joint_elasticity", "rad/(N m)", (5e-5, 1e-3), "arm", joint_elasticity, "gears that twist"),
-    Hidden("backlash", "rad", (0.0005, 0.005), "arm", backlash, "a gap in the gears"),
-    Hidden("servo_gains", "-", (0.05, 0.3), "arm", servo_gains, "another gain set than stated", signed=True),
-    Hidden("grip_compliance", "m", (0.0005, 0.003), "grip", grip_compliance, "softer finger pads"),
+    Hidden("payload", "kg", (0.05, 0.6), "hand", hide_payload, "a tool on the hand that the robot does not know"),
+    Hidden("cable_pull", "N m", (0.1, 1.0), "arm", hide_cable_pull, "a cable that pulls the joint back"),
+    Hidden("torque_ripple", "N m", (0.1, 1.0), "arm", hide_torque_ripple, "two harmonics of a gear"),
+    Hidden("joint_elasticity", "rad/(N m)", (5e-5, 1e-3), "arm", hide_joint_elasticity, "gears that twist"),
+    Hidden("backlash", "rad", (0.0005, 0.005), "arm", hide_backlash, "a gap in the gears"),
+    Hidden("servo_gains", "-", (0.05, 0.3), "arm", hide_servo_gains, "another gain set than stated", signed=True),
+    Hidden("grip_compliance", "m", (0.0005, 0.003), "grip", hide_grip_compliance, "softer finger pads"),
 )

@@ -15,7 +15,7 @@ from droid_jax.synthetic.hooks import Hidden, Influence, Live, Place, Seen
 AZIMUTH = 0.6  # rad from the world's x axis, of the horizontal line about which the base leans
 
 
-def tilted_base(place: Place, a: float) -> Influence:
+def hide_tilted_base(place: Place, a: float) -> Influence:
     """Gravity turned by a rad about a horizontal line at `AZIMUTH`, in the frame of the arm's base.
 
     The compensation, a force at each body's centre of mass, stays upright.  What the object hangs from does not lean.
@@ -45,7 +45,7 @@ def tilted_base(place: Place, a: float) -> Influence:
     return Influence(edit=edit, begin=begin, step=step)
 
 
-def encoder_zero(place: Place, a: float) -> Influence:
+def hide_encoder_zero(place: Place, a: float) -> Influence:
     """Joints stand a rad further than their encoders say: at the start, wherever a servo holds them, in the recording.
 
     Gravity is compensated as if they stood where they are read.
@@ -102,6 +102,6 @@ def _behind(model: mujoco.MjModel, joint: str | None) -> list[int]:
 
 
 BASE = (
-    Hidden("tilted_base", "rad", (0.005, 0.05), "base", tilted_base, "a base that is not level", signed=True),
-    Hidden("encoder_zero", "rad", (0.005, 0.05), "arm", encoder_zero, "encoders whose zeros are off", signed=True),
+    Hidden("tilted_base", "rad", (0.005, 0.05), "base", hide_tilted_base, "a base that is not level", signed=True),
+    Hidden("encoder_zero", "rad", (0.005, 0.05), "arm", hide_encoder_zero, "encoders whose zeros are off", signed=True),
 )

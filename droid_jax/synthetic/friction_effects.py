@@ -61,28 +61,28 @@ def _friction(place: Place, formula: Callable[[Live], np.ndarray | float]) -> In
     return Influence(step=step)
 
 
-def dry_friction(place: Place, a: float) -> Influence:
+def hide_dry_friction(place: Place, a: float) -> Influence:
     """Friction loss of `dry_loss`."""
     return _friction(place, lambda live: dry_loss(a, live.position[place.qpos]))
 
 
-def stribeck_friction(place: Place, a: float) -> Influence:
+def hide_stribeck_friction(place: Place, a: float) -> Influence:
     """Friction loss of `stribeck_loss`."""
     return _friction(place, lambda live: stribeck_loss(a, live.position[place.qpos], live.velocity[place.dofs]))
 
 
-def directional_friction(place: Place, a: float) -> Influence:
+def hide_directional_friction(place: Place, a: float) -> Influence:
     """Friction loss of `directional_loss`."""
     return _friction(place, lambda live: directional_loss(a, live.velocity[place.dofs]))
 
 
-def warm_up_friction(place: Place, a: float) -> Influence:
+def hide_warm_up_friction(place: Place, a: float) -> Influence:
     """Friction loss of `warm_up_loss`, its clock running on from repeat to repeat."""
     before = place.repeat * place.period
     return _friction(place, lambda live: warm_up_loss(a, before + live.data.time))
 
 
-def load_friction(place: Place, a: float) -> Influence:
+def hide_load_friction(place: Place, a: float) -> Influence:
     """Friction loss of `load_loss`, of the motor's torque behind a first-order lag of 20 ms (the oil film's)."""
     filtered = np.zeros(len(place.dofs))
 
@@ -93,7 +93,7 @@ def load_friction(place: Place, a: float) -> Influence:
     return Influence(step=step)
 
 
-def bristle_friction(place: Place, a: float) -> Influence:
+def hide_bristle_friction(place: Place, a: float) -> Influence:
     """Torque of `bristle`, applied to the joint."""
     force = np.zeros(len(place.dofs))
 
@@ -105,7 +105,7 @@ def bristle_friction(place: Place, a: float) -> Influence:
     return Influence(step=step)
 
 
-def firm_friction(place: Place, a: float) -> Influence:
+def hide_firm_friction(place: Place, a: float) -> Influence:
     """A share a of each joint's own friction loss acts as bristles that hold, in place of a constraint that creeps.
 
     The bristles are Dahl's, as of `bristle`, and a sixth as long: they bend by half a milliradian and stand.  A damper
@@ -129,11 +129,11 @@ def firm_friction(place: Place, a: float) -> Influence:
 
 
 FRICTION = (
-    Hidden("dry_friction", "N m", (0.2, 1.5), "joint", dry_friction, "dry friction that varies with angle"),
-    Hidden("stribeck_friction", "N m", (0.3, 2.0), "joint", stribeck_friction, "more friction when slow"),
-    Hidden("directional_friction", "N m", (0.3, 2.0), "joint", directional_friction, "friction one way"),
-    Hidden("load_friction", "-", (0.03, 0.2), "arm", load_friction, "friction that grows with the load"),
-    Hidden("bristle_friction", "N m", (0.2, 1.0), "joint", bristle_friction, "friction that bends first"),
-    Hidden("firm_friction", "-", (0.5, 1.0), "joint", firm_friction, "friction that holds and does not creep"),
-    Hidden("warm_up_friction", "N m", (0.2, 1.5), "joint", warm_up_friction, "friction fading by repeats"),
+    Hidden("dry_friction", "N m", (0.2, 1.5), "joint", hide_dry_friction, "dry friction that varies with angle"),
+    Hidden("stribeck_friction", "N m", (0.3, 2.0), "joint", hide_stribeck_friction, "more friction when slow"),
+    Hidden("directional_friction", "N m", (0.3, 2.0), "joint", hide_directional_friction, "friction one way"),
+    Hidden("load_friction", "-", (0.03, 0.2), "arm", hide_load_friction, "friction that grows with the load"),
+    Hidden("bristle_friction", "N m", (0.2, 1.0), "joint", hide_bristle_friction, "friction that bends first"),
+    Hidden("firm_friction", "-", (0.5, 1.0), "joint", hide_firm_friction, "friction that holds and does not creep"),
+    Hidden("warm_up_friction", "N m", (0.2, 1.5), "joint", hide_warm_up_friction, "friction fading by repeats"),
 )

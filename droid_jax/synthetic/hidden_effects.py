@@ -108,7 +108,7 @@ def record_hidden(
     config = config or SyntheticRobotConfig()
     if config.timestep > LONGEST_STEP * (1 + 1e-9):
         raise ValueError(f"hidden effects need time steps of at most {LONGEST_STEP} s, got {config.timestep}")
-    applied = listed(effects)
+    applied = as_applied(effects)
     for one in applied:
         check(one, scene)
     synthetic_robot = set_up(scene, demonstration, truth, seed=seed, config=config, space=space)
@@ -121,7 +121,7 @@ def record_hidden(
     return as_recording(synthetic_robot, trace, torque, position, name=name)
 
 
-def listed(effects: Mapping[str, float] | Sequence[Applied]) -> list[Applied]:
+def as_applied(effects: Mapping[str, float] | Sequence[Applied]) -> list[Applied]:
     """Amplitudes by name or by "name[joint]" as effects at work; a list of these as it is."""
     if not isinstance(effects, Mapping):
         return list(effects)

@@ -64,7 +64,7 @@ def closer(a: float, q: float, v: float) -> float:
     return a * (0.35 + 0.65 * _logistic((q - 0.15) / 0.02)) * (-v / 0.3) ** 1.6
 
 
-def opening_check(a: float, q: float, v: float) -> float:
+def check_at_end(a: float, q: float, v: float) -> float:
     """-a r(q) (v / 0.3)² while opening, r rising linearly from 0 at 0.35 rad to 1 at 0.70 rad; a in N m."""
     if v <= 0.0:
         return 0.0
@@ -111,7 +111,7 @@ def pin_wobble(a: float, q: float) -> float:
     return a * math.cos(5.5 * q + 0.35) ** 4
 
 
-def tilted_frame(place: Place, a: float) -> Influence:
+def hide_tilted_frame(place: Place, a: float) -> Influence:
     """The frame leans by a rad: axis · (c x M (R g - g)), the door's gravity torque as it turns, on bent hinges.
 
     Its two hinges are not quite in line, so 0.25 of the torque's size comes and goes with the sine of three times
@@ -149,7 +149,7 @@ def lean_torque(model: mujoco.MjModel, data: mujoco.MjData, joint: int, lean: fl
     return [float(axis @ np.cross(arm, weight)), float(axis @ np.cross(np.cross(axis, arm), weight))]
 
 
-def gasket(place: Place, a: float) -> Influence:
+def hide_gasket(place: Place, a: float) -> Influence:
     """-a s: a seal that holds the door by suction, s in 0..1 with a memory; a in N m.
 
     s' = max(v, 0) / 0.015 (1 - s) - s / T: opening stretches the gap under the seal, air leaks in with
@@ -186,12 +186,12 @@ DOOR = (
     Hidden("over_centre", "N m", (0.2, 1.5), "hinge", hinge_torque(over_centre), "a self-closing hinge"),
     Hidden("magnetic_catch", "N m", (0.3, 2.5), "hinge", hinge_torque(magnetic_catch), "a magnet at the frame"),
     Hidden("closer", "N m", (0.3, 2.0), "hinge", hinge_torque(closer), "an oil damper that slows closing"),
-    Hidden("opening_check", "N m", (0.3, 2.0), "hinge", hinge_torque(opening_check), "a check near the end of opening"),
+    Hidden("opening_check", "N m", (0.3, 2.0), "hinge", hinge_torque(check_at_end), "a check near the end of opening"),
     Hidden("air_drag", "N m s²/rad²", (1.0, 6.0), "hinge", hinge_torque(air_drag), "drag with the square of speed"),
     Hidden("floor_friction", "N m", (0.3, 2.0), "hinge", hinge_loss(floor_friction), "the door drags on the floor"),
-    Hidden("tilted_frame", "rad", (0.02, 0.15), "hinge", tilted_frame, "the frame is out of plumb", signed=True),
+    Hidden("tilted_frame", "rad", (0.02, 0.15), "hinge", hide_tilted_frame, "the frame is out of plumb", signed=True),
     Hidden("detent", "N m", (0.3, 1.5), "hinge", hinge_torque(detent), "a ball detent half-way; in no library"),
     Hidden("pin_wobble", "N m", (0.2, 1.5), "hinge", hinge_loss(pin_wobble), "a bent hinge pin; in no library"),
-    Hidden("gasket", "N m", (0.3, 2.0), "hinge", gasket, "a seal that sucks; in no library"),
+    Hidden("gasket", "N m", (0.3, 2.0), "hinge", hide_gasket, "a seal that sucks; in no library"),
     Hidden("neighbour_door", "N m", (0.1, 0.5), "hinge", hinge_torque(neighbour_door), "another door; in no library"),
 )

@@ -19,7 +19,7 @@ from droid_jax import runtime
 from droid_jax.arguments import check_fields, number, whole
 from droid_jax.door.hand import finger_forces_c, hand_of, looked
 from droid_jax.door.space import door_nuisances, door_space
-from droid_jax.door.task import Task, gripped, holding, substeps_of, succeeded
+from droid_jax.door.task import Task, gripped, held_open, substeps_of, succeeded
 from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene
 from droid_jax.policy.control import Controller, Policy, Reading
@@ -176,7 +176,7 @@ def _trial(
         mujoco.mj_kinematics(model, data)  # mj_step leaves places as they were before its last step
         seen = looked(hand, data, finger_forces_c(hand, model, data), seen.pads, task.control, np)
         grips += bool(gripped(task, seen))
-        angle, held = max(angle, float(seen.angle)), float(holding(task, seen, held))
+        angle, held = max(angle, float(seen.angle)), float(held_open(task, seen, held))
         steps += not succeeded(task, longest)
         longest = max(longest, held)
     return bool(succeeded(task, longest)), angle, steps, grips / max(made, 1), stopped

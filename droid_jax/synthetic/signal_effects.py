@@ -14,7 +14,7 @@ CREEP_TIME = 0.5  # s, a torque sensor's body
 SETTLING_TIME = 2.0  # s, a sensor that has just been loaded
 
 
-def command_delay(place: Place, a: float) -> Influence:
+def hide_command_delay(place: Place, a: float) -> Influence:
     """The command arrives a s late: 0.7 a of dead time, then a first-order lag of 0.3 a."""
 
     def command(clock: np.ndarray, control: np.ndarray) -> np.ndarray:
@@ -25,7 +25,7 @@ def command_delay(place: Place, a: float) -> Influence:
     return Influence(command=command)
 
 
-def sensor_delay(place: Place, a: float) -> Influence:
+def hide_sensor_delay(place: Place, a: float) -> Influence:
     """The torque arrives a s late: 0.6 a of dead time, then a first-order lag of 0.4 a; positions do not.
 
     The joints are asked one after the other: a is the mean, the first one's is 0.8 of it and the last one's 1.2.
@@ -39,7 +39,7 @@ def sensor_delay(place: Place, a: float) -> Influence:
     return _on_torque(place, late)
 
 
-def torque_bias(place: Place, a: float) -> Influence:
+def hide_torque_bias(place: Place, a: float) -> Influence:
     """torque + a (1 + 0.2 sin q + 0.3 exp(-t / 2 s)): a zero that moves a little as the joint turns, and settles.
 
     a in N m, t from the start of each repeat.
@@ -51,7 +51,7 @@ def torque_bias(place: Place, a: float) -> Influence:
     return _on_torque(place, biased)
 
 
-def torque_gain(place: Place, a: float) -> Influence:
+def hide_torque_gain(place: Place, a: float) -> Influence:
     """torque + a (0.7 x + 0.3 y), x = t tanh(torque / t), t = 20 N m: a wrong gain that levels off.
 
     y is x behind a first-order lag of 0.5 s, what the sensor's body creeps; a without unit.
@@ -64,7 +64,7 @@ def torque_gain(place: Place, a: float) -> Influence:
     return _on_torque(place, gained)
 
 
-def torque_drift(place: Place, a: float) -> Influence:
+def hide_torque_drift(place: Place, a: float) -> Influence:
     """torque + a (1 - exp(-t / 60 s)): a sensor that warms up, t from the start of the first repeat; a in N m."""
     before = place.repeat * place.period
     return _on_torque(
@@ -84,9 +84,9 @@ def _on_torque(place: Place, formula: Callable[[Seen, np.ndarray, np.ndarray], n
 
 
 SIGNALS = (
-    Hidden("command_delay", "s", (0.002, 0.02), "arm", command_delay, "commands that arrive late"),
-    Hidden("sensor_delay", "s", (0.002, 0.02), "arm", sensor_delay, "torques that arrive late"),
-    Hidden("torque_bias", "N m", (0.1, 1.0), "arm", torque_bias, "a torque sensor off zero", signed=True),
-    Hidden("torque_gain", "-", (0.03, 0.2), "arm", torque_gain, "a torque sensor of wrong gain", signed=True),
-    Hidden("torque_drift", "N m", (0.2, 1.5), "arm", torque_drift, "a torque sensor that warms up", signed=True),
+    Hidden("command_delay", "s", (0.002, 0.02), "arm", hide_command_delay, "commands that arrive late"),
+    Hidden("sensor_delay", "s", (0.002, 0.02), "arm", hide_sensor_delay, "torques that arrive late"),
+    Hidden("torque_bias", "N m", (0.1, 1.0), "arm", hide_torque_bias, "a torque sensor off zero", signed=True),
+    Hidden("torque_gain", "-", (0.03, 0.2), "arm", hide_torque_gain, "a torque sensor of wrong gain", signed=True),
+    Hidden("torque_drift", "N m", (0.2, 1.5), "arm", hide_torque_drift, "a torque sensor that warms up", signed=True),
 )

@@ -12,7 +12,7 @@ import numpy as np
 
 from droid_jax.door.demonstration import CLOSED, OPEN, POSE_A, POSE_B, Plan, Segment, demonstrate
 from droid_jax.door.scene import door_scene
-from droid_jax.recordings.formats import load, save
+from droid_jax.recordings.formats import load_recording, save_recording
 from droid_jax.recordings.recording import Recording
 
 _DEG = np.pi / 180
@@ -46,8 +46,8 @@ def door_demonstrations(cache: Path | None = None) -> dict[str, Recording]:
     made = {}
     for plan in PLANS:
         path = cache / f"{plan.name}.npz" if cache else None
-        found = load(path) if path and path.is_file() else demonstrate(door_scene(), plan)
+        found = load_recording(path) if path and path.is_file() else demonstrate(door_scene(), plan)
         if path and not path.is_file():
-            save(found, path)
+            save_recording(found, path)
         made[plan.name] = found
     return made

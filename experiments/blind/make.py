@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from droid_jax.recordings.formats import save
+from droid_jax.recordings.formats import save_recording
 from droid_jax.recordings.recording import Recording
 from droid_jax.storage import new_folder, write_json
 from droid_jax.synthetic.hidden_effects import Applied, record_hidden
@@ -97,7 +97,7 @@ def write_case(folder: Path, scene: str, left_out: tuple[str, ...], recordings: 
     with new_folder(folder) as new:
         write_json(new / "case.json", {"scene": scene, "without": list(left_out)})
         for role, recording in recordings.items():
-            save(replace(recording, meta={}), new / "recordings" / f"{role}.npz")
+            save_recording(replace(recording, meta={}), new / "recordings" / f"{role}.npz")
 
 
 def _without_commands(recording: Recording) -> Recording:

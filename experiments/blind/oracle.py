@@ -20,7 +20,7 @@ from droid_jax.discrepancy.case import Case
 from droid_jax.discrepancy.fitting import FittedModel, refit
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.model.effects.candidate import Candidate, candidates
-from droid_jax.recordings.formats import load
+from droid_jax.recordings.formats import load_recording
 from droid_jax.storage import file_sha256, write_json
 from droid_jax.synthetic.hidden_effects import Applied
 from experiments.blind.answers import right
@@ -39,7 +39,7 @@ def oracle(folder: Path, truth: dict[str, Any], result: dict[str, Any], bench: B
 
     result: what the search found, whose amplitudes are then told without noise as well (`quiet.py`).
     """
-    recordings = {role: load(folder / "recordings" / f"{role}.npz") for role in ROLES}
+    recordings = {role: load_recording(folder / "recordings" / f"{role}.npz") for role in ROLES}
     case = bench.case(truth["scene"], recordings)
     scene = bench.setting(truth["scene"]).scene
     model = fitted(case, truth["truths"]["train"], [right(scene, Applied(**h)) for h in truth["hidden"]])

@@ -21,7 +21,7 @@ from droid_jax.discrepancy.residual_set import ResidualSet, residual_set
 from droid_jax.discrepancy.search import search_effects
 from droid_jax.discrepancy.verdict import Verdict
 from droid_jax.model.effects.candidate import names_of
-from droid_jax.recordings.formats import load
+from droid_jax.recordings.formats import load_recording
 from droid_jax.recordings.recording import Recording
 from droid_jax.storage import write_json
 from experiments.blind.baselines import baselines
@@ -91,7 +91,7 @@ class Stopwatch:
 def search_case(folder: Path, bench: Bench) -> dict[str, Any]:
     """The result of one case folder; an error of the search is a result too."""
     told = json.loads((folder / "case.json").read_text())
-    recordings = {role: load(folder / "recordings" / f"{role}.npz") for role in ROLES}
+    recordings = {role: load_recording(folder / "recordings" / f"{role}.npz") for role in ROLES}
     watch = Stopwatch()
     result: dict[str, Any] = {"scene": told["scene"], "without": told["without"], "code": CODE.get("git")}
     try:

@@ -15,11 +15,10 @@ from matplotlib.figure import Figure
 
 from benchmarks.common import commits, stem
 from benchmarks.sharing import claimed
-from droid_jax.commands.source import TIMESTEP as TIMESTEP
 from droid_jax.door.environment import DoorEnv
 from droid_jax.door.task import Task
 from droid_jax.files import POLICY
-from droid_jax.policy.control import load
+from droid_jax.policy.control import load_policy
 from droid_jax.policy.evaluate import simulated
 from droid_jax.policy.randomise import of_method
 from droid_jax.policy.train import PRESETS, TrainConfig
@@ -135,7 +134,7 @@ def tried(
     """Train (where no experiment has done so), and try in simulation and on robots by name: a policy's figures."""
     budget = arguments.budget
     place, made = learned(budget, seed, lambda config: trained(arguments.trained, env, doors, config, code))
-    policy, drawn = load(place / POLICY), of_method(doors.method, env.scene, doors.gaussian)
+    policy, drawn = load_policy(place / POLICY), of_method(doors.method, env.scene, doors.gaussian)
     return {
         "doors_sha256": sha256(json.dumps(doors.gaussian.to_json())),
         "simulation": simulated(policy, env, drawn, budget.trials, seed).to_json(),

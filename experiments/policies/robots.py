@@ -12,8 +12,7 @@ from droid_jax.door.environment import DoorEnv
 from droid_jax.door.scene import door_scene
 from droid_jax.door.space import door_nuisances, door_space
 from droid_jax.files import GAUSSIAN
-from droid_jax.identify.gaussian import Gaussian
-from droid_jax.identify.gaussian import load as load_gaussian
+from droid_jax.identify.gaussian import Gaussian, load_gaussian
 from droid_jax.identify.pipeline import identify_parameters
 from droid_jax.storage import write_json
 from droid_jax.synthetic.policy_trials import PolicyRobot, TransferConfig, synthetic_robot

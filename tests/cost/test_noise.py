@@ -7,14 +7,15 @@ import pytest
 import scipy.signal
 
 from droid_jax.cost.noise import (
-    RATE,
+    DEFAULT_NOISE,
+    NoiseConfig,
     coarse_clock,
     correlation_time,
     detrend,
-    discrepancy,
     estimate_noise,
     lowpass,
     smooth,
+    stated_deviation,
 )
 
 CLOCK = np.arange(0, 6.0, 0.002)
@@ -24,7 +25,7 @@ INSIDE = (COARSE > 0.5) & (COARSE < 5.5)
 
 def test_the_coarse_clock_keeps_its_ends_and_its_rate():
     assert COARSE[0] == 0.0 and COARSE[-1] == CLOCK[-1]
-    assert 1 / np.diff(COARSE).mean() == pytest.approx(RATE, rel=0.01)
+    assert 1 / np.diff(COARSE).mean() == pytest.approx(DEFAULT_NOISE.rate, rel=0.01)
     assert len(coarse_clock(1.0, 1.001)) == 2
 
 
@@ -234,16 +235,16 @@ def test_correlation_time_of_a_moving_average():
     white = np.random.default_rng(1).normal(size=(4000, 1))
     averaged = np.convolve(white[:, 0], np.ones(10) / 10, "valid")[:, None]
     # a box of n samples has the triangular autocorrelation, whose two-sided sum is n
-    assert correlation_time(averaged)[0] == pytest.approx(10 / RATE, rel=0.3)
-    assert correlation_time(white)[0] == pytest.approx(1 / RATE, rel=0.4)
+    assert correlation_time(averaged)[0] == pytest.approx(10 / DEFAULT_NOISE.rate, rel=0.3)
+    assert correlation_time(white)[0] == pytest.approx(1 / DEFAULT_NOISE.rate, rel=0.4)
 
 
 def test_the_stated_deviation_makes_correlated_residuals_count_once():
     """The mean of K samples correlated over n varies like that of K white ones of sqrt(n) times the deviation."""
     white = np.random.default_rng(2).normal(size=(4000, 2)) * [0.3, 3.0]
-    np.testing.assert_allclose(discrepancy(white), [0.3, 3.0], rtol=0.25)
+    np.testing.assert_allclose(stated_deviation(white), [0.3, 3.0], rtol=0.25)
     averaged = np.stack([np.convolve(c, np.ones(10) / 10, "valid") for c in white.T], axis=1)
-    np.testing.assert_allclose(discrepancy(averaged), [0.3, 3.0], rtol=0.25)
+    np.testing.assert_allclose(stated_deviation(averaged), [0.3, 3.0], rtol=0.25)
     noise = estimate_noise(averaged[None, :30], minimum=0.01).stated(np.array([0.3, 3.0]))
     np.testing.assert_allclose(noise.whitener, np.eye(30) / np.array([0.3, 3.0])[:, None, None])
 
@@ -271,6 +272,33 @@ def test_what_warms_up_from_repeat_to_repeat_is_no_noise(repeats: int, forgiven:
     warming = calm + 0.5 * (np.arange(repeats) - (repeats - 1) / 2)[:, None, None]
     still, moving = (estimate_noise(r, minimum=1e-3).whitener[0] @ np.ones(200) for r in (calm, warming))
     assert bool(np.linalg.norm(moving) > 0.95 * np.linalg.norm(still)) is forgiven
+
+
+def test_the_settings_reach_the_noise():
+    """Each one changes what it says it does, and nothing else decides it."""
+    rng = np.random.default_rng(7)
+    white = rng.normal(0, 0.1, (6, 200, 1))
+    averaged = white + np.roll(white, 1, axis=1)  # neighbours share half of their variance
+    beside, none = (
+        abs(w[1, 0] / w[1, 1])
+        for config in (NoiseConfig(), NoiseConfig(longest_lag=0.0))
+        for w in [estimate_noise(averaged, minimum=1e-3, config=config).whitener[0]]
+    )
+    assert none < 0.1 < 0.4 < beside
+    flat = estimate_noise(averaged, minimum=1e-3, config=NoiseConfig(shrinkage=1.0)).whitener[0]
+    assert abs(flat[1, 0] / flat[1, 1]) == pytest.approx(none)
+    slow = lowpass(CLOCK, COARSE, NoiseConfig(cutoff=2.0)) @ np.sin(2 * np.pi * 4.0 * CLOCK)
+    fast = lowpass(CLOCK, COARSE) @ np.sin(2 * np.pi * 4.0 * CLOCK)
+    assert np.abs(slow[INSIDE]).max() < 0.1 < 0.9 < np.abs(fast[INSIDE]).max()
+    assert len(coarse_clock(0.0, 2.0, 50.0)) == 101
+    warming = white + 0.5 * np.arange(6)[:, None, None]
+    told = estimate_noise(warming, minimum=1e-3, config=NoiseConfig(trend_repeats=7)).whitener[0] @ np.ones(200)
+    assert np.linalg.norm(told) < 0.5 * np.linalg.norm(estimate_noise(warming, minimum=1e-3).whitener[0] @ np.ones(200))
+    mask = np.ones((1, len(CLOCK), 1), bool)
+    mask[:, : len(CLOCK) // 2] = False
+    kernel = lowpass(CLOCK, COARSE)
+    strict, lax = (np.isnan(smooth(np.ones(mask.shape), mask, kernel, least)).sum() for least in (0.9, 0.1))
+    assert strict > lax
 
 
 @pytest.mark.parametrize("gap", [0.05, 0.08, 0.12, 0.14, 0.16, 0.18, 0.5])

@@ -13,7 +13,7 @@ from small_log import ASKED, CONFIG, COULOMB, elbow, elbow_log, elbow_space
 
 from droid_jax.cost.cost import make_cost
 from droid_jax.cost.lone_log import LoneLog
-from droid_jax.cost.noise import RATE, coarse_clock
+from droid_jax.cost.noise import DEFAULT_NOISE, coarse_clock
 from droid_jax.discrepancy import single
 from droid_jax.discrepancy.candidates import project
 from droid_jax.discrepancy.case import base_model, make_case, make_log, single_case
@@ -37,7 +37,7 @@ def test_parts_take_turns():
     for part in parts:
         for block in range(10):
             at = np.flatnonzero(part == block)
-            assert np.all(np.diff(at) == 1) and len(at) >= 1.0 * RATE - 1
+            assert np.all(np.diff(at) == 1) and len(at) >= 1.0 * DEFAULT_NOISE.rate - 1
 
 
 @pytest.mark.parametrize(("share", "needed"), [(1.0, 32.0), (2 / 3, 48.0)])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from droid_jax.cost.noise import RATE, estimate_noise
+from droid_jax.cost.noise import DEFAULT_NOISE, estimate_noise
 from droid_jax.discrepancy.candidates import project
 from droid_jax.discrepancy.statistics import largest_detrended_t
 
@@ -14,14 +14,14 @@ REPEATS, LENGTH, CASES = 10, 160, 500
 
 def smooth_curves(rng: np.random.Generator, count: int) -> np.ndarray:
     """[LENGTH, count] of slow random waves, as parameters change a torque."""
-    time = np.arange(LENGTH) / RATE
+    time = np.arange(LENGTH) / DEFAULT_NOISE.rate
     rates, starts = rng.uniform(0.05, 1.5, (6, count)), rng.uniform(0, 2 * np.pi, (6, count))
     return np.sin(2 * np.pi * rates * time[:, None, None] + starts).sum(axis=1)
 
 
 def sensor_noise(rng: np.random.Generator) -> np.ndarray:
     """[REPEATS, LENGTH]: white, and of first order with 0.15 s, alike in size."""
-    keep = np.exp(-1 / RATE / 0.15)
+    keep = np.exp(-1 / DEFAULT_NOISE.rate / 0.15)
     slow = rng.normal(size=(REPEATS, LENGTH))
     for k in range(1, LENGTH):
         slow[:, k] = keep * slow[:, k - 1] + np.sqrt(1 - keep**2) * slow[:, k]

@@ -13,7 +13,7 @@ from droid_jax.door.demonstration import CLOSED, OPEN, PLANS, demonstrate, demon
 from droid_jax.door.scene import door_scene
 from droid_jax.door.space import door_space
 from droid_jax.model.scene import Scene
-from droid_jax.recordings.formats import load
+from droid_jax.recordings.formats import load_recording
 from droid_jax.recordings.recording import Recording
 from droid_jax.simulate.c_reference import c_replay
 from droid_jax.simulate.hand_path import minimum_jerk, solve_pose
@@ -27,7 +27,7 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="module", params=sorted(PLANS))
 def shipped(request) -> Recording:
-    return load(demonstration_path(request.param))
+    return load_recording(demonstration_path(request.param))
 
 
 def path_of(recording: Recording) -> np.ndarray:
@@ -103,7 +103,7 @@ def test_the_hand_stays_on_the_knob_from_grasp_to_end(scene: Scene, shipped: Rec
 
 
 def test_shipped_demonstrations_are_what_the_plans_make(scene: Scene):
-    made, file = demonstrate(scene, PLANS["A"]), load(demonstration_path("A"))
+    made, file = demonstrate(scene, PLANS["A"]), load_recording(demonstration_path("A"))
     np.testing.assert_allclose(made.command, file.command, atol=1e-6)
     assert made.phases == file.phases and made.command_names == file.command_names
     np.testing.assert_allclose(made.gains.stiffness, file.gains.stiffness)
@@ -146,7 +146,7 @@ def test_phases_tile_the_motion_and_the_fingers_close_in_the_grasp(shipped: Reco
 
 def test_the_command_leads_so_that_the_servo_stays_on_the_path(scene: Scene):
     """In free motion a servo with damping D and stiffness K trails by D/K v unless the command leads by it."""
-    recording = load(demonstration_path("A"))
+    recording = load_recording(demonstration_path("A"))
     rollout = c_replay(scene, door_space(scene), make_drive(scene, recording))(door_space(scene).mean[None])
     free = recording.time < 1.5
     path = path_of(recording)

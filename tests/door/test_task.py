@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from droid_jax.door.task import (
-    Seen,
+    HandState,
     Task,
     gripped,
-    holding,
+    held_open,
     observation,
     reward,
     succeeded,
@@ -20,7 +20,7 @@ from droid_jax.door.task import (
 from droid_jax.policy.control import LAYOUT, OBSERVED
 
 TASK = Task()
-HELD = Seen(
+HELD = HandState(
     angle=0.2, pinch=np.array([0.003, 0.0, 0.004]), pads=np.zeros((2, 3)), normal=1.0, yaw=0.0,
     force=np.array([5.0, 6.0]), sliding=0.0,
 )  # fmt: skip
@@ -103,7 +103,7 @@ def test_a_success_is_held_for_half_a_second_without_a_break():
     opened, lost = HELD._replace(angle=0.55), HELD._replace(angle=0.9, force=np.zeros(2))
     held = longest = 0.0
     for k in range(60):
-        held = float(holding(TASK, lost if k in (0, 24) else opened, held))
+        held = float(held_open(TASK, lost if k in (0, 24) else opened, held))
         longest = max(longest, held)
         assert bool(succeeded(TASK, longest)) == (k >= 49)
     assert longest == pytest.approx(35 * TASK.control)

@@ -13,7 +13,7 @@ import pytest
 
 from droid_jax.model.effects.registry import registered
 from droid_jax.model.parameters import Parameter, Space
-from droid_jax.recordings.formats import load
+from droid_jax.recordings.formats import load_recording
 from droid_jax.synthetic.hidden_effects import HIDDEN, LIBRARY, ON_HINGE, Applied, possible
 from experiments import hidden_effects, null_calibration
 from experiments.blind import limits, marks, oracle, score
@@ -67,7 +67,7 @@ def test_a_recording_holds_nothing_of_the_truth(hinge: Setting, tmp_path: Path):
     assert json.loads((folder / "case.json").read_text()) == {"scene": "hinge", "without": []}
     words = {"closer", "single", "3x", str(truth["seed"]), *(str(s) for s in truth["seeds"].values())}
     for role in ROLES:
-        recording = load(folder / "recordings" / f"{role}.npz")
+        recording = load_recording(folder / "recordings" / f"{role}.npz")
         assert recording.name == role and not recording.meta and recording.repeats == 10
         with np.load(folder / "recordings" / f"{role}.npz") as file:
             assert not any(word in str(file["metadata"]) for word in words)
@@ -402,7 +402,7 @@ def test_without_noise_a_recording_keeps_its_scatter_and_gets_another_mean(hinge
 
 def measured(low: float, high: float) -> Any:
     span = {"latch_torque": {"value": 3.0, "interval": [low, high]}}
-    return case("single", "named", ["latch at door"], [["latch at door"]], amplitudes=span)
+    return case("single", "named", ["latch at door"], [["latch at door"]], coefficients=span)
 
 
 def test_intervals_are_compared_with_where_the_model_settles_without_noise():

@@ -27,9 +27,8 @@ from droid_jax.door.scene import door_scene
 from droid_jax.door.space import door_nuisances, door_space
 from droid_jax.door.task import Task
 from droid_jax.files import GAUSSIAN, POLICY
-from droid_jax.identify.gaussian import load as load_gaussian
-from droid_jax.identify.gaussian import prior
-from droid_jax.policy.control import load
+from droid_jax.identify.gaussian import load_gaussian, prior
+from droid_jax.policy.control import load_policy
 from droid_jax.policy.train import TrainConfig
 from droid_jax.policy.trials import Trials
 from droid_jax.synthetic.hidden_effects import Applied, possible
@@ -285,7 +284,7 @@ def test_a_trained_policy_opens_by_its_grip(door: str, archived: Callable[[str],
     """A reported policy of each door, tried again: with slippery pads a hook or a push would still open it."""
     results = archived("policies")
     kept = json.loads((results / "table2_cases" / door / "prior_0.json").read_text())
-    policy = load(results / "trained_cases" / kept["trained"] / POLICY)
+    policy = load_policy(results / "trained_cases" / kept["trained"] / POLICY)
     env = DoorEnv(door_scene(timestep=TIMESTEP, limits=True), Task())
     rates = {name: transfer(policy, robot).rate for name, robot in robots_of(SETTINGS[door], env, 10).items()}
     assert rates["synthetic_robot"] >= 0.8 and rates["slippery"] < 0.2

@@ -13,8 +13,7 @@ from kinds import ROOT, Kind, use
 
 from droid_jax.files import EXTENDED, GAUSSIAN
 from droid_jax.identify.extended_model import Extended, load_extended, save_extended
-from droid_jax.identify.gaussian import Gaussian, prior
-from droid_jax.identify.gaussian import load as load_gaussian
+from droid_jax.identify.gaussian import Gaussian, load_gaussian, prior
 from droid_jax.model.effects.candidate import Candidate
 from droid_jax.model.effects.registry import effect_space, library, ready
 from droid_jax.model.mjcf import fitted_mjcf

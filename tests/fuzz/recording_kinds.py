@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from kinds import Kind, use
 
-from droid_jax.recordings.formats import load, save
+from droid_jax.recordings.formats import load_recording, save_recording
 from droid_jax.recordings.recording import (
     Channel,
     ObjectPose,
@@ -50,23 +50,23 @@ def recording(*, commands: bool = True) -> Recording:
 
 def use_recording(path: Path, **options: Any) -> None:
     """Load, look into it, write it as npz and read it back as the same."""
-    found = load(path, **options)
+    found = load_recording(path, **options)
     use(found.repeats, found.duration, found.grip_window, found.span, found.measured_start(), found.repeats_subset([0]))
-    again = save(found, path.parent / "again.npz")
-    if load(again).sha256 != found.sha256:
+    again = save_recording(found, path.parent / "again.npz")
+    if load_recording(again).sha256 != found.sha256:
         raise RuntimeError("a recording changed by being saved")
 
 
 def make_npz(folder: Path) -> None:
-    save(recording(), folder / "wave.npz")
+    save_recording(recording(), folder / "wave.npz")
 
 
 def make_log(folder: Path) -> None:
-    save(recording(commands=False), folder / "log.npz")
+    save_recording(recording(commands=False), folder / "log.npz")
 
 
 def make_csv(folder: Path) -> None:
-    save(recording(), folder / "wave")
+    save_recording(recording(), folder / "wave")
 
 
 _MCAP, _SQLITE, _ROS1 = "mcap", "sqlite3", "ros1"

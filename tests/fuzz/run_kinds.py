@@ -50,7 +50,7 @@ from droid_jax.files import (
     TRANSFER,
 )
 from droid_jax.model.parameters import Parameter, Space
-from droid_jax.recordings.formats import save
+from droid_jax.recordings.formats import save_recording
 from droid_jax.report import drawings, gap_drawings, page, policy_drawings, stages
 from droid_jax.report.tables import frames
 
@@ -187,7 +187,7 @@ def use_tables(folder: Path) -> None:
 def make_synthetic(folder: Path) -> None:
     """What is kept of the synthetic robot beside its recording."""
     (folder / SYNTHETIC_ROBOT).write_text(json.dumps({"springs": 1, "seed": 3, "hide": ["magnetic_catch=1.5"]}))
-    save(replace(recording(), meta={}), folder / "a.npz")
+    save_recording(replace(recording(), meta={}), folder / "a.npz")
 
 
 def use_synthetic(folder: Path) -> None:

@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from droid_jax.discrepancy.resume import CachedCost
 from kinds import Kind
 
 from droid_jax.cost.cost import Cost
-from droid_jax.discrepancy.resume import CachedCost
 from droid_jax.files import POLICY
 from droid_jax.identify.checkpoints import Checkpoints
-from droid_jax.policy.control import ACTIONS, FORMAT, LAYOUT, OBSERVED, SHAPES
-from droid_jax.policy.control import load as load_policy
+from droid_jax.policy.control import ACTIONS, FORMAT, LAYOUT, OBSERVED, SHAPES, load_policy
 from droid_jax.storage import write_npz
 
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from droid_jax.identify.gaussian import Gaussian, load, prior, space_from_json, space_to_json
+from droid_jax.identify.gaussian import Gaussian, load_gaussian, prior, space_from_json, space_to_json
 from droid_jax.identify.truncated_normal import gibbs, quantiles
-from droid_jax.model.parameters import Mode, Parameter, Scaling, Space, Write
+from droid_jax.model.parameters import Mode, Parameter, Role, Scaling, Space, Write
 
 
 def wide(name, mean=0.0, std=1.0, **kw):
@@ -228,13 +228,23 @@ def saved(tmp_path):
 
 def test_save_and_load_give_the_same_gaussian(saved):
     g, path = saved
-    back = load(path)
+    back = load_gaussian(path)
     assert back.space == g.space and back.space["stiffness"].writes == WRITES
     assert (back.rule, back.coordinates) == (g.rule, g.coordinates)
     np.testing.assert_array_equal(back.mean, g.mean)
     np.testing.assert_array_equal(back.cov, g.cov)
     np.testing.assert_array_equal(back.sample(5, 20), g.sample(5, 20))
     assert os.listdir(path.parent) == [path.name]
+
+
+def test_roles_survive_json_text_and_older_files_state_none():
+    one = Parameter("a", "kg", 0.0, 1.0, -5.0, 5.0, role=Role.PAYLOAD_MASS)
+    other = Parameter("torque_offset[b]", "N m", 0.0, 1.0, -5.0, 5.0)
+    entries = json.loads(json.dumps(space_to_json(Space((one, other)))))
+    assert ["role" in entry for entry in entries] == [True, False]
+    assert [p.role for p in space_from_json(entries).parameters] == [Role.PAYLOAD_MASS, Role.TORQUE_OFFSET]
+    del entries[0]["role"]
+    assert space_from_json(entries)["a"].role is Role.OTHER
 
 
 def test_the_space_survives_json_text():
@@ -275,7 +285,7 @@ def test_bad_files_are_named(saved, change, message):
     change(content)
     path.write_text(json.dumps(content))
     with pytest.raises(ValueError, match=message) as error:
-        load(path)
+        load_gaussian(path)
     assert str(path) in str(error.value)
 
 
@@ -283,11 +293,11 @@ def test_missing_and_truncated_files_are_named(saved):
     _, path = saved
     path.write_text(path.read_text()[:-20])
     with pytest.raises(ValueError, match=r"gaussian\.json"):
-        load(path)
+        load_gaussian(path)
     with pytest.raises(ValueError, match=r"nowhere\.json: there is no such file"):
-        load(path.parent / "nowhere.json")
+        load_gaussian(path.parent / "nowhere.json")
     with pytest.raises(ValueError, match=r"is a folder; a run keeps its Gaussian in gaussian\.json there"):
-        load(path.parent)
+        load_gaussian(path.parent)
 
 
 @pytest.mark.parametrize("mean", [-0.4, 0.0, 0.3, 1.0, 4.0])

@@ -36,6 +36,7 @@ from droid_jax.identify.search import SearchConfig
 from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Channel
+from droid_jax.storage import config_json
 
 QUICK = IdentifyConfig(search=SearchConfig(population=8, parents=None, generations=2), refine=None, samples=2)
 
@@ -132,6 +133,13 @@ def test_traces_and_joints_are_of_the_held_out_repeat(found: Identified):
     everything = make_comparison(elbow(), elbow_log(COULOMB, 10.0, 2), held.clock, CompareConfig(whitened=True))
     apart = np.diff(everything.channel("torque").noise.repeats[..., 0], axis=0)  # of two, one of which is held out
     assert gap.per_joint_noise_floor == pytest.approx([np.sqrt(np.mean(apart**2) / 2)], rel=0.02)
+
+
+def test_the_settings_that_decided_are_in_the_result(found: Identified, tmp_path: Path):
+    write_run(tmp_path, found, {"recordings": []})
+    config = json.loads((tmp_path / "fit.json").read_text())["config"]
+    assert config == config_json(found.config) and config["search"]["population"] == 8
+    assert config["compare"]["noise"]["cutoff"] == 8.0 and config["identifiability"]["identifiable"] == 0.25
 
 
 def test_the_command_says_how_it_went_and_what_to_do(found: Identified, tmp_path: Path, capsys):
@@ -261,7 +269,7 @@ def test_faults_of_what_is_held_out_are_told_before_the_search(scene: Scene, mon
     faulty = dataclasses.replace(
         recording, channels={**recording.channels, "torque": dataclasses.replace(torque, mask=mask)}
     )
-    monkeypatch.setattr(pipeline, "search", lambda *a, **k: pytest.fail("the search began"))
+    monkeypatch.setattr(pipeline, "cma_search", lambda *a, **k: pytest.fail("the search began"))
     with pytest.raises(ValueError, match="'elbow' has a stretch that no repeat measured"):
         identify_parameters(scene, elbow_space(scene), [faulty], config=QUICK)
 
@@ -278,7 +286,7 @@ def test_a_replay_that_blows_up_is_no_parent_whatever_the_others_cost(scene: Sce
         costs = SimpleNamespace(first=lambda: lambda rows: np.array([5000.0, 1000.0]), against=lambda *a: None)
         return SimpleNamespace(**vars(costs), comparisons=(), rollouts=lambda rows: ())
 
-    monkeypatch.setattr(pipeline, "search", search)
+    monkeypatch.setattr(pipeline, "cma_search", search)
     monkeypatch.setattr(pipeline, "make_cost", cost_of)
     with pytest.raises(KeyboardInterrupt):
         identify_parameters(scene, elbow_space(scene), [elbow_log(0.0, 10.0, 2)], config=QUICK)
@@ -298,7 +306,7 @@ def test_means_that_cannot_be_simulated_are_refused_before_the_search(scene: Sce
         rollouts=lambda rows: (blown,),
     )
     monkeypatch.setattr(pipeline, "make_cost", lambda *_, **__: cost)
-    monkeypatch.setattr(pipeline, "search", lambda *a, **k: pytest.fail("the search began"))
+    monkeypatch.setattr(pipeline, "cma_search", lambda *a, **k: pytest.fail("the search began"))
     with pytest.raises(ValueError, match=r"'elbow' blows up .* means \(elbow leaves its range at step 20 \(0\.2 s\)"):
         identify_parameters(scene, elbow_space(scene), [elbow_log(0.0, 10.0, 2)], config=QUICK)
 

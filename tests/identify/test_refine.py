@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from droid_jax.identify.levenberg_marquardt import DampedProblem
-from droid_jax.identify.multistart import HOP_POPULATION, RefineConfig, chord, refine
+from droid_jax.identify.multistart import RefineConfig, chord, refine
 from droid_jax.model.parameters import Parameter, Scaling, Space
 
 
@@ -261,7 +261,7 @@ def test_a_hop_that_finds_nothing_is_the_last():
         return refine(linear(matrix, target), space, [5.0, 5.0], config)
 
     none, one, four = fit(0), fit(1), fit(4)
-    assert four.evaluations == one.evaluations > none.evaluations + 3 * HOP_POPULATION
+    assert four.evaluations == one.evaluations > none.evaluations + 3 * EXACT.basin_hop_population
     np.testing.assert_allclose(four.best, np.linalg.lstsq(matrix, target)[0], atol=1e-6)
     assert four.converged
 

@@ -12,8 +12,8 @@ from evosax.algorithms import CMA_ES
 
 from droid_jax.identify.checkpoints import Checkpoints
 from droid_jax.identify.cma import recombination
-from droid_jax.identify.gaussian import load
-from droid_jax.identify.search import SearchConfig, search
+from droid_jax.identify.gaussian import load_gaussian
+from droid_jax.identify.search import SearchConfig, cma_search
 from droid_jax.model.parameters import Parameter, Scaling, Space
 
 
@@ -57,7 +57,7 @@ def test_rotated_quadratic(parents):
     def cost(values):  # a device array, as the replay returns
         return jnp.sum(scales * ((values - target) @ rotation) ** 2, axis=-1)
 
-    fit = search(cost, box(5), endless(parents=parents, generations=250, tol_sigma=1e-4))
+    fit = cma_search(cost, box(5), endless(parents=parents, generations=250, tol_sigma=1e-4))
     assert fit.stop == "tol_sigma"
     np.testing.assert_allclose(fit.best, target, atol=2e-3)
     np.testing.assert_allclose(fit.mean, target, atol=2e-3)
@@ -73,7 +73,7 @@ def test_rosenbrock_inside_bounds():
 
     space = box(3, low=-2.0, high=1.5)
     recorder = Recorder(cost)
-    fit = search(recorder, space, endless(generations=200, tol_sigma=1e-4))
+    fit = cma_search(recorder, space, endless(generations=200, tol_sigma=1e-4))
     np.testing.assert_allclose(fit.best, 1.0, atol=1e-3)
     for values in recorder.asked:
         space.check(values)
@@ -89,16 +89,16 @@ def test_two_hundred_prior_deviations_away():
     def cost(v):
         return np.abs((v - truth) / truth).sum(axis=-1)
 
-    fit = search(cost, space, endless(generations=40))
+    fit = cma_search(cost, space, endless(generations=40))
     np.testing.assert_allclose(fit.best, truth, rtol=0.02)
-    linear = search(cost, space.linear(), endless(generations=10))
-    logged = search(cost, space, endless(generations=10))
+    linear = cma_search(cost, space.linear(), endless(generations=10))
+    logged = cma_search(cost, space, endless(generations=10))
     assert logged.best_cost < 0.5 * linear.best_cost
 
 
 def test_minimum_on_a_bound_is_named():
     space = Space(tuple(dataclasses.replace(p, low=0.0, mean=1.0) for p in box(3).parameters))
-    fit = search(sphere([-2.0, 2.0, 5.0]), space, endless(generations=40))
+    fit = cma_search(sphere([-2.0, 2.0, 5.0]), space, endless(generations=40))
     assert fit.on_bound == ("p0", "p2")
     np.testing.assert_allclose(fit.best, [0.0, 2.0, 5.0], atol=0.05)
 
@@ -106,7 +106,7 @@ def test_minimum_on_a_bound_is_named():
 def test_minimum_on_the_bound_of_a_logarithm_is_reached():
     """Mirrored draws never lie on the bound; the best is tried on it when the generations are over."""
     friction = Parameter("f", "N m", 0.1, 0.05, 0.0, 5.0, scaling=Scaling.LOG, log_offset=1e-3)
-    fit = search(sphere([0.0, 1.0]), Space((friction, *box(1).parameters)), endless(generations=40))
+    fit = cma_search(sphere([0.0, 1.0]), Space((friction, *box(1).parameters)), endless(generations=40))
     assert fit.best[0] == 0.0
     assert fit.on_bound == ("f",)
     assert fit.mean[0] < 1e-3  # the mean has not wandered off
@@ -134,7 +134,7 @@ def test_optima_beyond_bounds_do_not_spoil_the_search(count: int, beyond: float)
     def bowl(values):
         return 0.5 * np.sum((space.to_search(np.asarray(values)) - bottom) ** 2, axis=1)
 
-    fit = search(bowl, space, endless(population=30, parents=None, generations=150))
+    fit = cma_search(bowl, space, endless(population=30, parents=None, generations=150))
     assert fit.best_cost - least < 3e-3
     assert set(fit.on_bound) == {f"p{i}" for i in range(count)}
 
@@ -148,7 +148,7 @@ def test_a_restart_that_could_not_be_replayed_keeps_no_other_off_its_bound():
         return np.where(values[:, 1] > 2.5, np.nan, values[:, 0] ** 2 + 0.01 * values[:, 1] ** 2)
 
     config = endless(population=16, parents=None, generations=25, restarts=2, sigma=0.02)
-    fit = search(cost, space, config, start=np.array([[1.0, 0.0], [1.0, 4.9]]))
+    fit = cma_search(cost, space, config, start=np.array([[1.0, 0.0], [1.0, 4.9]]))
     assert np.isinf(fit.restarts[1].best_cost)
     assert fit.best[0] == 0.0 and fit.on_bound == ("mass",)
 
@@ -157,8 +157,8 @@ def test_resample_redraws_and_clip_clips():
     """One generation from the paper's kind of prior: damping 0.10 with deviation 0.19, never negative."""
     space = Space((Parameter("d", "N m s/rad", 0.10, 0.19, 0.0, 5.0), Parameter("e", "u", 0, 1, -9, 9)))
     drawn, clipped = Recorder(sphere([1, 1])), Recorder(sphere([1, 1]))
-    search(drawn, space, endless(population=400, generations=1))
-    search(clipped, space, endless(population=400, generations=1, bounds="clip"))
+    cma_search(drawn, space, endless(population=400, generations=1))
+    cma_search(clipped, space, endless(population=400, generations=1, bounds="clip"))
     assert drawn.asked[0][:, 0].min() > 0
     share = (clipped.asked[0][:, 0] == 0).mean()
     assert 0.2 < share < 0.4  # normal.cdf(-0.10 / 0.19) = 0.30
@@ -186,7 +186,7 @@ def test_half_as_parents_are_cma_es_s_own_weights(population):
 def first_update(change):
     """mean [D], cov [D, D] after one generation in which costs went through `change`, and the rows."""
     recorder = Recorder(lambda v: change(sphere([1, 2, 3])(v)))
-    fit = search(recorder, box(3), endless(generations=1))
+    fit = cma_search(recorder, box(3), endless(generations=1))
     return fit.mean, fit.cov, recorder.asked[0]
 
 
@@ -258,7 +258,7 @@ def test_updates_agree_with_the_equations_in_numpy(parents, active):
     cost = sphere([1.0, -2.0, 0.5, 3.0])
     recorder = Recorder(cost)
     space = box(4, low=-1e3, high=1e3)
-    fit = search(recorder, space, endless(parents=parents, active=active, generations=6))
+    fit = cma_search(recorder, space, endless(parents=parents, active=active, generations=6))
     generations = [(rows, cost(rows)) for rows in recorder.asked]
     oracle = numpy_cma(generations, 4, 30, parents or 15, active is not False)
     for g, (mean, sigma, cov) in enumerate(oracle):
@@ -280,7 +280,7 @@ def test_failed_rows_do_not_poison():
         return out
 
     recorder = Recorder(cost)
-    fit = search(recorder, box(2), endless(generations=60))
+    fit = cma_search(recorder, box(2), endless(generations=60))
     np.testing.assert_allclose(fit.best, [1.0, 2.0], atol=1e-3)
     assert fit.failed == sum((~np.isfinite(cost(rows))).sum() for rows in recorder.asked) > 10
     for name in ("mean", "std", "sigma", "mean_cost", "median_cost"):
@@ -305,7 +305,7 @@ def test_fewer_good_rows_than_parents():
 
 def test_a_generation_without_a_good_row_raises_with_advice():
     with pytest.raises(ValueError, match=r"generation 0: all 30 rows .* smaller sigma"):
-        search(lambda v: np.full(len(v), np.nan), box(2), ENDLESS)
+        cma_search(lambda v: np.full(len(v), np.nan), box(2), ENDLESS)
 
 
 def test_a_restart_without_a_good_row_waits_for_the_next_draw():
@@ -319,7 +319,7 @@ def test_a_restart_without_a_good_row_waits_for_the_next_draw():
         calls.append(1)
         return out
 
-    fit = search(cost, box(2), endless(restarts=2, generations=40))
+    fit = cma_search(cost, box(2), endless(restarts=2, generations=40))
     waited = fit.restarts[1]
     np.testing.assert_array_equal(waited.history.mean[0], [0.0, 0.0])
     assert waited.history.sigma[0] == 1.0 and np.isinf(waited.history.median_cost[0])
@@ -331,11 +331,11 @@ def test_a_restart_without_a_good_row_waits_for_the_next_draw():
 
 def test_restarts_in_one_batch_equal_separate_searches():
     cost = Recorder(sphere([1.0, 2.0, -1.0]))
-    together = search(cost, box(3), endless(restarts=3, generations=12, seed=7))
+    together = cma_search(cost, box(3), endless(restarts=3, generations=12, seed=7))
     assert {rows.shape for rows in cost.asked} == {(90, 3)}
     assert together.evaluations == 12 * 90
     for r, restart in enumerate(together.restarts):
-        alone = search(sphere([1.0, 2.0, -1.0]), box(3), endless(generations=12, seed=7 + r))
+        alone = cma_search(sphere([1.0, 2.0, -1.0]), box(3), endless(generations=12, seed=7 + r))
         assert restart.seed == 7 + r
         np.testing.assert_allclose(restart.history.costs, alone.history.costs, rtol=1e-3, atol=1e-5)
         np.testing.assert_allclose(restart.best, alone.best, atol=1e-4)
@@ -348,23 +348,23 @@ def test_a_converged_restart_stays_while_others_go_on():
     """Restart 0 starts at its minimum, restart 1 far off: each stops for itself."""
     start = np.array([[1.0, 2.0], [-4.0, -4.0]])
     config = endless(restarts=2, generations=200, tol_sigma=1e-2, sigma=0.1)
-    fit = search(sphere([1.0, 2.0]), box(2), config, start=start)
+    fit = cma_search(sphere([1.0, 2.0]), box(2), config, start=start)
     lengths = [len(r.history.sigma) for r in fit.restarts]
     assert lengths[0] < lengths[1] and {r.stop for r in fit.restarts} == {"tol_sigma"}
-    alone = search(sphere([1.0, 2.0]), box(2), dataclasses.replace(config, restarts=1), start=start[0])
+    alone = cma_search(sphere([1.0, 2.0]), box(2), dataclasses.replace(config, restarts=1), start=start[0])
     assert len(alone.history.sigma) == lengths[0]
     np.testing.assert_allclose(fit.restarts[0].mean, alone.mean, atol=1e-5)
 
 
 def test_stop_reasons():
     bowl = sphere([1.0, 2.0])
-    assert search(bowl, box(2), endless(generations=3)).stop == "generations"
-    narrow = search(bowl, box(2), endless(tol_sigma=0.05))
+    assert cma_search(bowl, box(2), endless(generations=3)).stop == "generations"
+    narrow = cma_search(bowl, box(2), endless(tol_sigma=0.05))
     assert narrow.stop == "tol_sigma" and np.sqrt(np.linalg.eigvalsh(narrow.cov)[-1]) < 0.05
     assert len(narrow.history.sigma) < 100
-    flat = search(lambda v: 1.0 + 0 * v[:, 0], box(2), endless(tol_cost=1e-6, patience=7))
+    flat = cma_search(lambda v: 1.0 + 0 * v[:, 0], box(2), endless(tol_cost=1e-6, patience=7))
     assert flat.stop == "tol_cost" and len(flat.history.sigma) == 8
-    hurried = search(bowl, box(2), endless(max_seconds=1e-6))
+    hurried = cma_search(bowl, box(2), endless(max_seconds=1e-6))
     assert hurried.stop == "max_seconds" and len(hurried.history.sigma) == 1
 
 
@@ -377,14 +377,14 @@ def test_a_search_stalls_by_shares_of_its_cost(size: float):
         return lambda values: np.full(len(values), size * (1 - share) ** next(generation))
 
     config = endless(tol_cost=1e-3, patience=5, generations=12)
-    assert search(falling(0.01), box(2), config).stop == "generations"
-    assert search(falling(1e-5), box(2), config).stop == "tol_cost"
+    assert cma_search(falling(0.01), box(2), config).stop == "generations"
+    assert cma_search(falling(1e-5), box(2), config).stop == "tol_cost"
 
 
 def test_history_says_what_the_cost_said():
     recorder = Recorder(sphere([1.0, 2.0]))
     seen = []
-    fit = search(recorder, box(2), endless(generations=5), progress=seen.append)
+    fit = cma_search(recorder, box(2), endless(generations=5), progress=seen.append)
     costs = np.array([recorder.cost(rows) for rows in recorder.asked])
     np.testing.assert_array_equal(fit.history.costs, costs)
     np.testing.assert_array_equal(fit.history.best_cost, np.minimum.accumulate(costs.min(axis=1)))
@@ -399,7 +399,7 @@ def test_history_says_what_the_cost_said():
 def test_every_generation_and_seed_draws_anew():
     def lengths(seed):  # Mahalanobis length per row: the same normal draws give it whatever the axes are
         recorder = Recorder(sphere([0.1, 0.1]))
-        search(recorder, box(2, -99, 99), endless(population=300, generations=2, seed=seed))
+        cma_search(recorder, box(2, -99, 99), endless(population=300, generations=2, seed=seed))
         centred = [asked - asked.mean(axis=0) for asked in recorder.asked]
         return [np.einsum("pi,ij,pj->p", c, np.linalg.inv(np.cov(c.T)), c) for c in centred]
 
@@ -409,14 +409,14 @@ def test_every_generation_and_seed_draws_anew():
 
 
 def test_the_fit_s_gaussian_is_the_search_distribution(tmp_path):
-    fit = search(sphere([1.0, 2.0]), box(2, mean=0.5, std=2.0), endless(generations=8))
+    fit = cma_search(sphere([1.0, 2.0]), box(2, mean=0.5, std=2.0), endless(generations=8))
     g = fit.gaussian()
     assert g.rule == "cma-es covariance" and g.coordinates == "search"
     np.testing.assert_allclose(g.quantiles([0.5])[0], fit.mean, atol=1e-3)
     draws = g.sample(0, 20_000)
     np.testing.assert_allclose(np.cov(draws.T), 4.0 * fit.cov, rtol=0.1, atol=1e-3)
     g.save(tmp_path / "g.json")
-    np.testing.assert_array_equal(load(tmp_path / "g.json").cov, g.cov)
+    np.testing.assert_array_equal(load_gaussian(tmp_path / "g.json").cov, g.cov)
 
 
 @pytest.mark.parametrize(
@@ -439,11 +439,11 @@ def test_impossible_settings_are_refused(change, message):
 
 def test_wrong_shapes_are_refused():
     with pytest.raises(ValueError, match=r"cost must return shape \(30,\)"):
-        search(lambda v: v, box(2), ENDLESS)
+        cma_search(lambda v: v, box(2), ENDLESS)
     with pytest.raises(ValueError, match="start must have shape"):
-        search(sphere([0, 0]), box(2), ENDLESS, start=np.zeros((2, 2)))
+        cma_search(sphere([0, 0]), box(2), ENDLESS, start=np.zeros((2, 2)))
     with pytest.raises(ValueError, match=r"'p1'.*not inside its bounds"):
-        search(sphere([0, 0]), box(2), ENDLESS, start=np.array([0.0, 9.0]))
+        cma_search(sphere([0, 0]), box(2), ENDLESS, start=np.array([0.0, 9.0]))
 
 
 # ---------------------------------------------------------------- checkpoints
@@ -465,28 +465,28 @@ def assert_same(a, b):
 
 def interrupted(folder, at=11):
     with pytest.raises(KeyboardInterrupt):
-        search(Recorder(BOWL, die_at=at), box(2), RESUMED, checkpoint_dir=folder)
+        cma_search(Recorder(BOWL, die_at=at), box(2), RESUMED, checkpoint_dir=folder)
 
 
 @pytest.fixture(scope="module")
 def whole():
-    return search(BOWL, box(2), RESUMED)
+    return cma_search(BOWL, box(2), RESUMED)
 
 
 def test_a_killed_search_resumes_bit_for_bit(tmp_path, whole):
     interrupted(tmp_path)
     again = Recorder(BOWL)
-    assert_same(search(again, box(2), RESUMED, checkpoint_dir=tmp_path), whole)
+    assert_same(cma_search(again, box(2), RESUMED, checkpoint_dir=tmp_path), whole)
     assert len(again.asked) == 14 - 9  # from the checkpoint of generation 9
     idle = Recorder(BOWL)
-    assert_same(search(idle, box(2), RESUMED, checkpoint_dir=tmp_path), whole)
+    assert_same(cma_search(idle, box(2), RESUMED, checkpoint_dir=tmp_path), whole)
     assert not idle.asked
 
 
 def test_a_finished_search_continues_with_more_generations(tmp_path, whole):
     short = dataclasses.replace(RESUMED, generations=5)
-    assert search(BOWL, box(2), short, checkpoint_dir=tmp_path).stop == "generations"
-    assert_same(search(BOWL, box(2), RESUMED, checkpoint_dir=tmp_path), whole)
+    assert cma_search(BOWL, box(2), short, checkpoint_dir=tmp_path).stop == "generations"
+    assert_same(cma_search(BOWL, box(2), RESUMED, checkpoint_dir=tmp_path), whole)
 
 
 def truncate(folder):
@@ -520,27 +520,27 @@ def test_a_damaged_checkpoint_is_reported_and_the_one_before_used(tmp_path, whol
     damage(tmp_path / "9")
     again = Recorder(BOWL)
     with pytest.warns(UserWarning, match="is damaged and was passed over") as caught:
-        fit = search(again, box(2), RESUMED, checkpoint_dir=tmp_path)
+        fit = cma_search(again, box(2), RESUMED, checkpoint_dir=tmp_path)
     assert str(tmp_path / "9") in str(caught[0].message)
     assert len(again.asked) == 14 - 6
     assert_same(fit, whole)
     with warnings.catch_warnings():  # the damaged one has been replaced
         warnings.simplefilter("error")
-        assert_same(search(BOWL, box(2), RESUMED, checkpoint_dir=tmp_path), whole)
+        assert_same(cma_search(BOWL, box(2), RESUMED, checkpoint_dir=tmp_path), whole)
 
 
 def test_somebody_else_s_checkpoint_is_refused(tmp_path):
     config = endless(generations=2)
-    search(BOWL, box(2), config, checkpoint_dir=tmp_path, fingerprint="door 1")
+    cma_search(BOWL, box(2), config, checkpoint_dir=tmp_path, fingerprint="door 1")
     with pytest.raises(ValueError, match="differs in fingerprint;"):
-        search(BOWL, box(2), config, checkpoint_dir=tmp_path, fingerprint="door 2")
+        cma_search(BOWL, box(2), config, checkpoint_dir=tmp_path, fingerprint="door 2")
     with pytest.raises(ValueError, match="differs in config;"):
         other = dataclasses.replace(config, seed=1)
-        search(BOWL, box(2), other, checkpoint_dir=tmp_path, fingerprint="door 1")
+        cma_search(BOWL, box(2), other, checkpoint_dir=tmp_path, fingerprint="door 1")
     with pytest.raises(ValueError, match="differs in space;"):
-        search(BOWL, box(2, high=6.0), config, checkpoint_dir=tmp_path, fingerprint="door 1")
+        cma_search(BOWL, box(2, high=6.0), config, checkpoint_dir=tmp_path, fingerprint="door 1")
     with pytest.raises(ValueError, match="differs in start;"):
-        search(BOWL, box(2), config, checkpoint_dir=tmp_path, fingerprint="door 1", start=np.ones(2))
+        cma_search(BOWL, box(2), config, checkpoint_dir=tmp_path, fingerprint="door 1", start=np.ones(2))
 
 
 def test_what_a_killed_run_left_half_written_is_replaced_without_a_word(tmp_path, caplog):

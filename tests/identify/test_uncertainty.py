@@ -10,7 +10,7 @@ import pytest
 from droid_jax.identify import identifiability as uncertainty
 from droid_jax.identify.gaussian import Gaussian, prior
 from droid_jax.identify.identifiability import (
-    POOL,
+    DEFAULT_IDENTIFIABILITY,
     calibrated,
     identifiability,
     not_judged,
@@ -114,7 +114,7 @@ def test_a_pattern_shared_by_all_residuals_widens_the_parameter_that_it_looks_li
     slopes = 8 * 25.0  # |column|^2; the mean of the c_n scatters by shifts @ shifts / (N (N - 1))
     plain, assumed = 1 / (slopes + 1 / 16), 1 / slopes
     own = (shifts @ shifts) / (count * (count - 1)) / assumed
-    weight = (count - 1) / (count - 1 + POOL)
+    weight = (count - 1) / (count - 1 + DEFAULT_IDENTIFIABILITY.pooling)
     ratio = np.array([weight * own, 0.0]) + (1 - weight) * own / 2  # the pool: half of the two parameters' spread
     np.testing.assert_allclose(np.diag(gaussian.cov), plain * ratio, rtol=2e-3)
 
@@ -139,7 +139,7 @@ def test_each_recording_s_repeats_speak_for_its_own_residuals():
     count = 101
     recordings = [np.zeros((1, 8)), exactly(3.0, count, 8)]
     gaussian = calibrated(fitted(SQUARE), recordings, one_block(SQUARE))
-    weight = (count - 1) / (count - 1 + POOL)
+    weight = (count - 1) / (count - 1 + DEFAULT_IDENTIFIABILITY.pooling)
     ratio = weight * np.array([1.0, 9.0]) + (1 - weight) * 5.0  # the pool: the mean of 1 and 9
     np.testing.assert_allclose(np.diag(gaussian.cov) * (200.0 + 1 / 16), ratio, rtol=2e-3)
 

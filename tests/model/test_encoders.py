@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from droid_jax.cost.cost import make_cost
-from droid_jax.model.fields import encoder_offset
+from droid_jax.model.fields import joint_encoder_offset
 from droid_jax.model.mjcf import fitted_mjcf, unwritten
 from droid_jax.model.parameter_file import load_parameters
 from droid_jax.model.parameters import Space
@@ -51,7 +51,7 @@ def forces(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("reading", [-0.4, 0.8])  # the second beyond its limit of 40 degrees
 def test_the_robot_is_the_same_at_readings_lower_by_the_offset(reading: float):
     scene = scene_of()
-    space = Space((encoder_offset(scene, "elbow", std=0.02, high=0.1),))
+    space = Space((joint_encoder_offset(scene, "elbow", std=0.02, high=0.1),))
     model = make_c_model(scene, space, np.array([OFF]))
     read = np.array([0.3, reading, 0.05])
     expected = forces(scene.model, np.add(read, [0.0, OFF, 0.0]))
@@ -91,6 +91,6 @@ def test_c_compensates_by_the_joint_and_says_so():
     recording = Recording(
         "still", clock, np.zeros((len(clock), 2)), scene.joints, {"torque": torque}, convention, start
     )
-    space = Space((encoder_offset(scene, "elbow", std=0.02, high=0.1),))
+    space = Space((joint_encoder_offset(scene, "elbow", std=0.02, high=0.1),))
     with pytest.raises(ValueError, match="compensates gravity where joints are, not where encoders say: use MJX"):
         make_cost(scene, space, [recording], engine="mujoco").distances(space.mean[None])

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from droid_jax.model.parameters import Mode, Parameter, Scaling, Space, Write
+from droid_jax.model.parameters import Mode, Parameter, Role, Scaling, Space, Write
 
 
 def linear(name: str = "offset", **changes) -> Parameter:
@@ -167,3 +167,32 @@ def test_values_replaces_by_name():
 def test_write_modes(mode: Mode, expected: float):
     """nominal 4, value 2, gain 3."""
     assert Write("dof_damping", (0,), mode, gain=3.0).new(4.0, 2.0) == pytest.approx(expected)
+
+
+def of_name(name: str, **options) -> Parameter:
+    return Parameter(name, "N m", 0.0, 1.0, -5.0, 5.0, **options)
+
+
+@pytest.mark.parametrize(
+    ("name", "role"),
+    [
+        ("time_offset", Role.TIME_OFFSET),
+        ("torque_offset[elbow]", Role.TORQUE_OFFSET),
+        ("viscous[a[0]]", Role.VISCOUS),
+        ("torque_offset", Role.OTHER),
+        ("time_offset[elbow]", Role.OTHER),
+        ("torque_offset_of_the_elbow", Role.OTHER),
+        ("payload_mass", Role.OTHER),  # an effect's, which says so itself
+    ],
+)
+def test_what_a_replay_reads_has_its_role_by_name(name: str, role: Role):
+    assert of_name(name).role is role
+    assert of_name(name, writes=(Write("dof_damping", (0,)),)).role is Role.OTHER  # a model's field is read there
+
+
+def test_parameters_are_found_by_role():
+    space = Space((of_name("a", role=Role.PAYLOAD_MASS), of_name("torque_offset[b]"), of_name("c")))
+    assert [p.name for p in space.of_role(Role.TORQUE_OFFSET, Role.PAYLOAD_MASS)] == ["a", "torque_offset[b]"]
+    assert space.of_role(Role.SLIDING_FRICTION) == () and space.linear()["a"].role is Role.PAYLOAD_MASS
+    with pytest.raises(ValueError, match="role must be one of time_offset, "):
+        of_name("a", role="grip")

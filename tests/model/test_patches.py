@@ -8,10 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from mujoco.mjx._src import constraint as mjx_constraint
-from mujoco.mjx._src import math as mjx_math
 
+from droid_jax.model.mjx_internals import CONSTRAINT_LAW, SEGMENT_POINT
 from droid_jax.model.patches import closest_segment_point, exact_segments, midpoint_constraints
+
+
+def mjx_point(a, b, p):
+    """What mjx itself calls, whatever stands there now."""
+    return getattr(*SEGMENT_POINT)(a, b, p)
 
 
 def brute_point(a: np.ndarray, b: np.ndarray, p: np.ndarray) -> np.ndarray:
@@ -68,7 +72,7 @@ def test_segments_of_no_length_and_ends():
 
 def distances(cases: np.ndarray) -> np.ndarray:
     def one(s):
-        on_a, on_b = mjx_math.closest_segment_to_segment_points(s[0], s[1], s[2], s[3])
+        on_a, on_b = SEGMENT_POINT[0].closest_segment_to_segment_points(s[0], s[1], s[2], s[3])
         return jnp.linalg.norm(on_a - on_b)
 
     return np.asarray(jax.jit(jax.vmap(one))(jnp.asarray(cases, jnp.float32)))
@@ -88,28 +92,28 @@ def test_capsule_distances_are_exact_inside_the_context():
 def test_the_bias_it_removes_is_real():
     """On a rail of 18 mm MJX's own function is off by 28 micrometres at its end."""
     a, b = np.zeros(3), np.array([0.018, 0.0, 0.0])
-    off = mjx_math.closest_segment_point(jnp.asarray(a), jnp.asarray(b), jnp.asarray(b)) - b
+    off = mjx_point(jnp.asarray(a), jnp.asarray(b), jnp.asarray(b)) - b
     assert 2.5e-5 < float(np.abs(off).max()) < 6e-5
     np.testing.assert_allclose(closest_segment_point(jnp.asarray(a), jnp.asarray(b), jnp.asarray(b)), b, atol=1e-9)
 
 
 def test_the_original_comes_back_even_after_an_error():
     a, b = jnp.zeros(3), jnp.array([0.018, 0.0, 0.0])
-    biased = mjx_math.closest_segment_point(a, b, b)
+    biased = mjx_point(a, b, b)
     with pytest.raises(RuntimeError), exact_segments():
-        np.testing.assert_array_equal(mjx_math.closest_segment_point(a, b, b), b)
+        np.testing.assert_array_equal(mjx_point(a, b, b), b)
         raise RuntimeError
-    np.testing.assert_array_equal(mjx_math.closest_segment_point(a, b, b), biased)
+    np.testing.assert_array_equal(mjx_point(a, b, b), biased)
     with exact_segments(), exact_segments():
         pass
-    np.testing.assert_array_equal(mjx_math.closest_segment_point(a, b, b), biased)
+    np.testing.assert_array_equal(mjx_point(a, b, b), biased)
 
 
 def test_two_threads_that_trace_at_once_leave_mjx_as_it_was():
     """One enters while the other is inside, and leaves after it."""
-    functions = mjx_math.closest_segment_point, mjx_constraint._kbi
+    functions = getattr(*SEGMENT_POINT), getattr(*CONSTRAINT_LAW)
     a, b = jnp.zeros(3), jnp.array([0.018, 0.0, 0.0])
-    biased = mjx_math.closest_segment_point(a, b, b)
+    biased = mjx_point(a, b, b)
     first_is_in, second_is_in, first_is_out = (threading.Event() for _ in range(3))
     seen = {}
 
@@ -121,12 +125,12 @@ def test_two_threads_that_trace_at_once_leave_mjx_as_it_was():
 
     def second() -> None:
         assert first_is_in.wait(60)
-        seen["before"] = mjx_math.closest_segment_point(a, b, b)
+        seen["before"] = mjx_point(a, b, b)
         with exact_segments(), midpoint_constraints():
             second_is_in.set()
             assert first_is_out.wait(60)
-            seen["inside"] = mjx_math.closest_segment_point(a, b, b)
-        seen["after"] = mjx_math.closest_segment_point(a, b, b)
+            seen["inside"] = mjx_point(a, b, b)
+        seen["after"] = mjx_point(a, b, b)
 
     threads = [threading.Thread(target=run) for run in (first, second)]
     for thread in threads:
@@ -136,5 +140,5 @@ def test_two_threads_that_trace_at_once_leave_mjx_as_it_was():
     np.testing.assert_array_equal(seen["before"], biased)  # whatever another thread traces meanwhile
     np.testing.assert_array_equal(seen["inside"], b)
     np.testing.assert_array_equal(seen["after"], biased)
-    assert (mjx_math.closest_segment_point, mjx_constraint._kbi) == functions
-    np.testing.assert_array_equal(mjx_math.closest_segment_point(a, b, b), biased)
+    assert (getattr(*SEGMENT_POINT), getattr(*CONSTRAINT_LAW)) == functions
+    np.testing.assert_array_equal(mjx_point(a, b, b), biased)

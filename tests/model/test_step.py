@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
+from droid_jax.model.mjx_internals import CONSTRAINT_LAW, constraint_rows
 from droid_jax.model.patches import exact_segments, midpoint_law
 from droid_jax.model.step import solve, step
 from droid_jax.model.unsupported_features import check_options
@@ -69,10 +70,10 @@ def solver(model: mujoco.MjModel) -> Callable[..., tuple[Any, dict[str, jax.Arra
 
     def one(qpos, qvel, warm):
         data = smooth(on_device, template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm))
-        inertia, rows = mjx.full_m(on_device, data), data._impl
+        inertia, rows = mjx.full_m(on_device, data), constraint_rows(data)
         solved = solve(inertia, data)
-        problem = dict(M=inertia, f=data.qfrc_smooth, J=rows.efc_J, D=rows.efc_D, aref=rows.efc_aref,
-                       dry=rows.efc_frictionloss)  # fmt: skip
+        problem = dict(M=inertia, f=data.qfrc_smooth, J=rows.jacobian, D=rows.weight, aref=rows.reference,
+                       dry=rows.friction)  # fmt: skip
         return (solved.qacc, solved.qfrc_constraint), problem
 
     return jax.jit(jax.vmap(one))
@@ -180,10 +181,13 @@ def test_accelerations_are_those_of_the_c_engine(case):
 def test_the_minimum_is_that_of_a_float64_newton(case):
     """On MJX's own rows, so that nothing but the solver is tested: float32 keeps five digits."""
     _, model, qpos, qvel, run, (qacc, _, _) = case
-    rows = mjx.make_data(mjx.put_model(model))._impl
+    rows = constraint_rows(mjx.make_data(mjx.put_model(model)))
     (got, _), problems = run(qpos, qvel, np.zeros_like(qvel))
     exact = np.array(
-        [minimum({k: v[i] for k, v in problems.items()}, rows.ne, rows.nf, qacc[i]) for i in range(len(qpos))]
+        [
+            minimum({k: v[i] for k, v in problems.items()}, rows.equalities, rows.frictions, qacc[i])
+            for i in range(len(qpos))
+        ]
     )
     assert error(np.asarray(got), exact).max() < 1e-5
 
@@ -319,12 +323,10 @@ def _half_back(model: mujoco.MjModel, h: float) -> np.ndarray:
 
 def test_midpoint_law_is_its_own_derivation():
     """J a = (-b v - k d r - R f) / (1 + b h / 2): the damping, stiffness x impedance and R it says."""
-    model = mjx.put_model(arm())
-    from mujoco.mjx._src import constraint
-
+    model, own_law = mjx.put_model(arm()), getattr(*CONSTRAINT_LAW)
     solref, solimp, position = jnp.array([0.02, 1.0]), jnp.array([0.9, 0.95, 0.001, 0.5, 2.0]), jnp.array(-4e-4)
-    k, b, d = constraint._kbi(model, solref, solimp, position)
-    new_k, new_b, new_d = midpoint_law(constraint._kbi)(model, solref, solimp, position)
+    k, b, d = own_law(model, solref, solimp, position)
+    new_k, new_b, new_d = midpoint_law(own_law)(model, solref, solimp, position)
     share = 1.0 / (1.0 + 0.5 * 0.002 * b)
     assert float(new_b) == pytest.approx(float(share * b), rel=1e-5)
     assert float(new_k * new_d) == pytest.approx(float(share * k * d), rel=1e-5)

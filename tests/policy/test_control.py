@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from droid_jax.door.environment import start_pose
+from droid_jax.door.environment import waiting_pose
 from droid_jax.door.hand import hand_of, looked
 from droid_jax.door.policy_interface import interface_of
 from droid_jax.door.scene import door_scene
@@ -33,7 +33,7 @@ def scene():
 
 @pytest.fixture(scope="module")
 def start(scene) -> np.ndarray:
-    return start_pose(scene, TASK)
+    return waiting_pose(scene, TASK)
 
 
 @pytest.fixture(scope="module")
@@ -186,9 +186,9 @@ def test_a_knob_that_is_turned_is_no_beginning(policy, still, turned, begins):
 
 def test_a_policy_for_the_next_place_of_the_knob_does_not_begin(policy, scene):
     next_place = door_scene(limits=True, knob=1)
-    own = interface_of(next_place, TASK, start_pose(next_place, TASK))
+    own = interface_of(next_place, TASK, waiting_pose(next_place, TASK))
     data = mujoco.MjData(scene.model)
-    data.qpos[:] = start_pose(scene, TASK)
+    data.qpos[:] = waiting_pose(scene, TASK)
     mujoco.mj_forward(scene.model, data)
     at_the_limit = replace(reading(scene, data), position=own.start[:7], fingers=own.start[7:])
     with pytest.raises(ValueError, match=r"cannot begin: the knob is elsewhere: 0\.05 m"):
@@ -257,7 +257,7 @@ def test_readings_that_come_too_fast_stop_it(policy, still):
 def test_a_damaged_file_is_refused(policy, tmp_path: Path, changes, said: str):
     np.savez(tmp_path / "policy.npz", **{**control.arrays(policy), **changes})
     with pytest.raises(ValueError, match=said):
-        control.load(tmp_path / "policy.npz")
+        control.load_policy(tmp_path / "policy.npz")
 
 
 def test_a_robot_without_torque_sensors_is_fine(policy, still):
@@ -317,7 +317,7 @@ class Refuse:
 sys.meta_path.insert(0, Refuse())
 import numpy as np, control
 r = np.load("reading.npz")
-loop = control.Controller(control.load("policy.npz"))
+loop = control.Controller(control.load_policy("policy.npz"))
 out = loop.act(control.Reading(0.0, r["position"], np.zeros(7), None, r["fingers"], r["knob"]))
 print(",".join(repr(float(x)) for x in (*out.arm, *out.fingers)))
 """

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from droid_jax.policy import control
-from droid_jax.policy.control import ACTIONS, LAYOUT, OBSERVED, SHAPES, Interface, Policy, load
+from droid_jax.policy.control import ACTIONS, LAYOUT, OBSERVED, SHAPES, Interface, Policy, load_policy
 from droid_jax.policy.export import CLOSE, difference, export, to_onnx
 from droid_jax.storage import WRITTEN
 
@@ -61,7 +61,9 @@ def test_the_folder_holds_all_a_robot_needs(policy, tmp_path: Path):
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"policy.npz", "policy.onnx", "control.py", WRITTEN}
     assert (tmp_path / "out" / "control.py").read_text() == Path(control.__file__).read_text()
     observation = np.linspace(-1, 1, OBSERVED)
-    np.testing.assert_array_equal(load(tmp_path / "out" / "policy.npz").act(observation), policy.act(observation))
+    np.testing.assert_array_equal(
+        load_policy(tmp_path / "out" / "policy.npz").act(observation), policy.act(observation)
+    )
 
 
 def test_without_onnx_it_says_what_to_install(policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

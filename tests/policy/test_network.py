@@ -13,11 +13,11 @@ import pytest
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks as ppo_networks
 
-from droid_jax.door.environment import start_pose
+from droid_jax.door.environment import waiting_pose
 from droid_jax.door.policy_interface import interface_of
 from droid_jax.door.scene import door_scene
 from droid_jax.door.task import Task
-from droid_jax.policy.control import ACTIONS, FORMAT, LAYOUT, OBSERVED, Interface, Policy, load
+from droid_jax.policy.control import ACTIONS, FORMAT, LAYOUT, OBSERVED, Interface, Policy, load_policy
 from droid_jax.policy.network import layer_sizes, policy_of, save_policy
 
 HIDDEN = (64, 64)
@@ -46,7 +46,7 @@ def parameters(networks):
 @pytest.fixture(scope="module")
 def interface() -> Interface:
     scene, task = door_scene(limits=True), Task()
-    return interface_of(scene, task, start_pose(scene, task))
+    return interface_of(scene, task, waiting_pose(scene, task))
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def test_it_acts_as_braxs_deterministic_policy(networks, parameters, policy):
 
 def test_a_file_brings_it_back(policy, tmp_path: Path):
     save_policy(tmp_path / "policy.npz", policy)
-    found = load(tmp_path / "policy.npz")
+    found = load_policy(tmp_path / "policy.npz")
     observation = np.linspace(-1, 1, OBSERVED, dtype=np.float32)
     np.testing.assert_array_equal(found.act(observation), policy.act(observation))
     assert found.interface.period == 0.02 and isinstance(found.interface.period, float)
@@ -128,7 +128,7 @@ def test_files_that_are_not_as_they_should_be(policy, tmp_path: Path, spoil, exp
     save_policy(path, policy)
     spoil(path)
     with pytest.raises(ValueError, match=expected):
-        load(path)
+        load_policy(path)
 
 
 def test_another_layout_of_observations_is_refused(policy, tmp_path: Path):
@@ -137,7 +137,7 @@ def test_another_layout_of_observations_is_refused(policy, tmp_path: Path):
     other = np.array([*LAYOUT[:-1], "temperature of the knob, K"])
     rewritten(path, lambda found: found.update(layout=other))
     with pytest.raises(ValueError, match="trained on another observation: temperature of the knob, K"):
-        load(path)
+        load_policy(path)
 
 
 @pytest.mark.parametrize("other", [[LAYOUT], ["y" * 100_000], [f"\x1b{LAYOUT[0]}", *LAYOUT[1:]]])
@@ -146,5 +146,5 @@ def test_a_layout_that_is_no_list_of_short_names_is_told_in_one_short_line(polic
     save_policy(path, policy)
     rewritten(path, lambda found: found.update(layout=np.array(other)))
     with pytest.raises(ValueError, match="trained on another observation") as refused:
-        load(path)
+        load_policy(path)
     assert str(refused.value).isprintable() and len(str(refused.value)) < 500

@@ -17,7 +17,7 @@ from mujoco import mjx
 from droid_jax.commands import train
 from droid_jax.door.scene import door_scene
 from droid_jax.door.space import door_space
-from droid_jax.identify.gaussian import Gaussian, load, prior
+from droid_jax.identify.gaussian import Gaussian, load_gaussian, prior
 from droid_jax.model.effects.registry import effect_space, library
 from droid_jax.model.fields import (
     body_mass,
@@ -240,7 +240,7 @@ def test_a_gaussian_of_a_scene_of_the_same_shapes_is_refused_by_its_names(tmp_pa
         scenes[name] = load_scene(path)
     fitted = prior(Space((joint_damping(scenes["elbow"], "elbow", std=0.1, high=5.0),)))
     fitted.save(tmp_path / "gaussian.json")
-    kept = load(tmp_path / "gaussian.json")
+    kept = load_gaussian(tmp_path / "gaussian.json")
     randomised(scenes["elbow"], kept)
     with pytest.raises(ValueError, match=r"of 'elbow', but in 'wrist' that entry is of 'wrist'.*another scene"):
         randomised(scenes["wrist"], kept)

@@ -16,7 +16,7 @@ import pytest
 from droid_jax.commands import convert
 from droid_jax.recordings import csv_folder
 from droid_jax.recordings.clocks import resample
-from droid_jax.recordings.formats import load, save
+from droid_jax.recordings.formats import load_recording, save_recording
 from droid_jax.recordings.recording import (
     Channel,
     ObjectPose,
@@ -68,7 +68,7 @@ def bare(recording: Recording) -> Recording:
 def fails(path: Path, *parts: str, **options) -> None:
     """load refuses the path in one sentence that holds all these parts."""
     with pytest.raises(ValueError) as caught:
-        load(path, **options)
+        load_recording(path, **options)
     text = str(caught.value)
     assert str(path) in text
     assert "\n" not in text
@@ -80,7 +80,7 @@ def fails(path: Path, *parts: str, **options) -> None:
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_round_trip(tmp_path: Path, where: str, dtype: type) -> None:
     before = make(dtype)
-    after = load(save(before, tmp_path / where))
+    after = load_recording(save_recording(before, tmp_path / where))
     assert after.sha256 == before.sha256
     assert (after.name, dict(after.meta), after.phases) == (before.name, before.meta, before.phases)
     assert (after.torque, after.command_names, dict(after.qpos0)) == (before.torque, JOINTS, before.qpos0)
@@ -97,34 +97,34 @@ def test_round_trip(tmp_path: Path, where: str, dtype: type) -> None:
 @pytest.mark.parametrize("where", ["log.npz", "log"])
 def test_round_trip_without_commands(tmp_path: Path, where: str) -> None:
     before = bare(make())
-    after = load(save(before, tmp_path / where))
+    after = load_recording(save_recording(before, tmp_path / where))
     assert after.sha256 == before.sha256
     assert after.command.shape == (0, 0)
 
 
 def test_formats_agree_and_name_can_be_given(tmp_path: Path) -> None:
-    npz, folder = save(make(), tmp_path / "a.npz"), save(make(), tmp_path / "b")
-    assert load(npz).sha256 == load(folder).sha256
-    assert load(npz, name="mine").name == load(folder, name="mine").name == "mine"
+    npz, folder = save_recording(make(), tmp_path / "a.npz"), save_recording(make(), tmp_path / "b")
+    assert load_recording(npz).sha256 == load_recording(folder).sha256
+    assert load_recording(npz, name="mine").name == load_recording(folder, name="mine").name == "mine"
 
 
 @pytest.mark.parametrize("where", ["pull.npz", "pull"])
 def test_saving_again_replaces_and_leaves_nothing_behind(tmp_path: Path, where: str) -> None:
-    save(make(), tmp_path / where)
+    save_recording(make(), tmp_path / where)
     second = make().repeats_subset([1])
-    assert load(save(second, tmp_path / where)).sha256 == second.sha256
+    assert load_recording(save_recording(second, tmp_path / where)).sha256 == second.sha256
     assert os.listdir(tmp_path) == [where]
 
 
 def test_what_lies_beside_a_recording_is_never_lost(tmp_path: Path) -> None:
-    folder = save(make(), tmp_path / "wave")
+    folder = save_recording(make(), tmp_path / "wave")
     for name in ("raw.bag", "notes_1.csv"):
         (folder / name).write_bytes(b"the only one")
         with pytest.raises(ValueError, match=rf"wave: holds {re.escape(name)} beside a recording, which would be lost"):
-            save(make(), folder)
+            save_recording(make(), folder)
         assert (folder / name).read_bytes() == b"the only one"
         (folder / name).unlink()
-    save(make(), folder)
+    save_recording(make(), folder)
 
 
 @pytest.mark.parametrize("where", ["door", "door.npz"])
@@ -137,19 +137,19 @@ def test_an_irregular_clock_is_accepted_once(tmp_path: Path, where: str) -> None
         name: replace(c, time=time) if len(c.time) == len(time) else c for name, c in recording.channels.items()
     }
     rough = replace(recording, time=time, channels=channels)
-    path = save(rough, tmp_path / where)
+    path = save_recording(rough, tmp_path / where)
     with pytest.raises(ValueError, match="irregular rate"):
-        load(path)
-    accepted = load(path, allow_jitter=True)
-    assert load(save(accepted, tmp_path / f"again_{where}")).sha256 == rough.sha256
+        load_recording(path)
+    accepted = load_recording(path, allow_jitter=True)
+    assert load_recording(save_recording(accepted, tmp_path / f"again_{where}")).sha256 == rough.sha256
     assert (
-        "allow_jitter" not in load(save(make(), tmp_path / where), allow_jitter=True).meta
+        "allow_jitter" not in load_recording(save_recording(make(), tmp_path / where), allow_jitter=True).meta
     )  # there was nothing to accept
 
 
 @pytest.mark.parametrize("where", ["pull.npz", "pull"])
 def test_a_failed_save_keeps_the_old_file(tmp_path: Path, where: str, monkeypatch) -> None:
-    save(make(), tmp_path / where)
+    save_recording(make(), tmp_path / where)
 
     def broken(*_args, **_kwargs):
         raise OSError("disk full")
@@ -157,35 +157,35 @@ def test_a_failed_save_keeps_the_old_file(tmp_path: Path, where: str, monkeypatc
     monkeypatch.setattr(np, "savez_compressed", broken)
     monkeypatch.setattr(csv_folder, "_write_table", broken)
     with pytest.raises(OSError, match="disk full"):
-        save(make().repeats_subset([1]), tmp_path / where)
+        save_recording(make().repeats_subset([1]), tmp_path / where)
     monkeypatch.undo()
-    assert load(tmp_path / where).sha256 == make().sha256
+    assert load_recording(tmp_path / where).sha256 == make().sha256
     assert os.listdir(tmp_path) == [where]
 
 
 def test_save_refuses(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"expected the suffix \.npz or none.*'\.csv'"):
-        save(make(), tmp_path / "a.csv")
+        save_recording(make(), tmp_path / "a.csv")
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "thesis.txt").write_text("dear")
     with pytest.raises(ValueError, match="is not a recording's folder"):
-        save(make(), tmp_path / "notes")
+        save_recording(make(), tmp_path / "notes")
     assert (tmp_path / "notes" / "thesis.txt").exists()
     with pytest.raises(ValueError, match="at least one measured channel"):
-        save(replace(make(), channels={}), tmp_path / "b.npz")
+        save_recording(replace(make(), channels={}), tmp_path / "b.npz")
     assert sorted(os.listdir(tmp_path)) == ["notes"]
 
 
 def test_paths_that_are_no_recording(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"no recording at .*gone\.npz"):
-        load(tmp_path / "gone.npz")
+        load_recording(tmp_path / "gone.npz")
     (tmp_path / "log.mat").write_text("x")
     fails(tmp_path / "log.mat", "unknown suffix '.mat'", ".npz", "recording.json", ".bag", ".mcap", ".db3")
     (tmp_path / "empty").mkdir()
     fails(tmp_path / "empty", "no recording.json", ".npz")
     (tmp_path / "a.bag").write_text("x")
     fails(tmp_path / "a.bag", "pass joints and torque as well")
-    save(make(), tmp_path / "a.npz")
+    save_recording(make(), tmp_path / "a.npz")
     fails(tmp_path / "a.npz", "takes no option jonts", jonts=["j1"])
 
 
@@ -196,7 +196,7 @@ def test_bags_without_the_package_say_what_to_install(tmp_path: Path, monkeypatc
         monkeypatch.setitem(sys.modules, name, None)
     (tmp_path / "a.bag").write_text("x")
     with pytest.raises(ValueError, match=r"ROS bags need rosbags: in the checkout, pip install .* '\.\[ros\]'"):
-        load(tmp_path / "a.bag", joints=JOINTS, torque=make().torque)
+        load_recording(tmp_path / "a.bag", joints=JOINTS, torque=make().torque)
     with pytest.raises(ValueError, match="ROS bags need rosbags"):  # several, which convert reads by itself
         convert.run(convert.Convert(source=(tmp_path / "a.bag", tmp_path / "a.bag"), joints=JOINTS, torque="link"))
 
@@ -211,7 +211,7 @@ def test_damaged_npz(tmp_path: Path) -> None:
     path.write_text("hello, this is text")
     fails(path, "not an npz file")
     path.unlink()  # no recording: `save` would not replace it
-    whole = save(make(), path).read_bytes()
+    whole = save_recording(make(), path).read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     fails(path, "cut off")
     middle = len(whole) // 2
@@ -220,7 +220,7 @@ def test_damaged_npz(tmp_path: Path) -> None:
 
 
 def parts_of(path: Path) -> dict[str, np.ndarray]:
-    with np.load(save(make(), path)) as file:
+    with np.load(save_recording(make(), path)) as file:
         return dict(file)
 
 
@@ -260,7 +260,7 @@ def test_npz_keys(tmp_path: Path) -> None:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    return save(make(), tmp_path / "pull")
+    return save_recording(make(), tmp_path / "pull")
 
 
 def edit(path: Path, line: int, text: str | None) -> None:
@@ -318,7 +318,7 @@ def test_blank_lines_count_as_an_editor_counts_them(folder: Path) -> None:
     path = folder / "torque_00.csv"
     lines = path.read_text().splitlines()
     path.write_text("\n".join([lines[0], "", *lines[1:]]) + "\n\n")
-    assert load(folder).sha256 == make().sha256
+    assert load_recording(folder).sha256 == make().sha256
     edit(path, 9, "0.06,x,1.0")
     fails(folder, "torque_00.csv, line 9, column 'j1': 'x'")
 
@@ -327,7 +327,7 @@ def test_columns_are_found_by_name_and_excel_files_are_read(folder: Path) -> Non
     path = folder / "torque_01.csv"
     rows = [line.split(",") for line in path.read_text().splitlines()]
     path.write_bytes("\ufeff".encode() + "\r\n".join(",".join([r[0], r[2], r[1]]) for r in rows).encode())
-    assert load(folder).sha256 == make().sha256
+    assert load_recording(folder).sha256 == make().sha256
 
 
 def test_files_missing_or_empty(folder: Path) -> None:
@@ -386,7 +386,7 @@ def test_a_minimal_folder_written_by_hand(tmp_path: Path) -> None:
     )
     (tmp_path / "command.csv").write_text("time,j1\n0,0.5\n0.01,0.6\n0.02,0.7\n")
     (tmp_path / "torque_00.csv").write_text("time,j1\n0,1\n0.01,\n0.02,3\n")
-    recording = load(tmp_path)
+    recording = load_recording(tmp_path)
     np.testing.assert_array_equal(recording.command, [[0.5], [0.6], [0.7]])
     np.testing.assert_array_equal(recording.channel("torque").mask, [[[True], [False], [True]]])
     assert recording.torque == TorqueConvention(TorqueSide.MOTOR, False)
@@ -407,11 +407,11 @@ def test_the_documented_folder_loads(tmp_path: Path) -> None:
         header = "time,joint1,joint2" if columns == 2 else "time,door_hinge"
         rows = [",".join([repr(t)] + [repr(t)] * columns) for t in times]
         (tmp_path / f"{name}.csv").write_text("\n".join([header, *rows]))
-    recording = load(tmp_path)
+    recording = load_recording(tmp_path)
     assert recording.name == "door pull"
     assert [p.name for p in recording.phases] == ["approach", "opening"]
     assert recording.object_pose is not None and recording.object_pose.covariance[3, 3] == 1e-5
-    assert load(save(recording, tmp_path / "a.npz")).sha256 == recording.sha256
+    assert load_recording(save_recording(recording, tmp_path / "a.npz")).sha256 == recording.sha256
 
 
 def test_the_documented_npz_loads(tmp_path: Path, monkeypatch) -> None:
@@ -420,7 +420,7 @@ def test_the_documented_npz_loads(tmp_path: Path, monkeypatch) -> None:
     time = np.arange(10) * 0.01
     torques = np.random.default_rng(0).normal(size=(3, 10, 2))
     exec(code, {"time": time, "command": np.ones((10, 2)), "torques": torques})
-    recording = load(tmp_path / "door.npz")
+    recording = load_recording(tmp_path / "door.npz")
     np.testing.assert_array_equal(recording.channel("torque").values, torques)
     assert recording.torque == TorqueConvention(TorqueSide.LINK, gravity=True)
 
@@ -463,7 +463,7 @@ def test_load_resamples_only_when_asked(folder: Path) -> None:
         rows = "\n".join(f"{a},{3 * a},{1 - a}" for a in clock)
         (folder / f"torque_{r:02d}.csv").write_text("time,j1,j2\n" + rows + "\n")
     fails(folder, "torque_01.csv", "repeat 1", "0.004 s", "resample=True")
-    torque = load(folder, resample=True).channel("torque")
+    torque = load_recording(folder, resample=True).channel("torque")
     np.testing.assert_allclose(torque.time, t[1:])
     np.testing.assert_allclose(torque.values[1], np.stack([3 * t[1:], 1 - t[1:]], axis=-1))
 
@@ -471,7 +471,7 @@ def test_load_resamples_only_when_asked(folder: Path) -> None:
 def test_jitter_must_be_allowed(folder: Path) -> None:
     edit(folder / "command.csv", 7, None)
     fails(folder, "command.csv, line 7: irregular rate", "allow_jitter=True")
-    assert len(load(folder, allow_jitter=True).time) == 19
+    assert len(load_recording(folder, allow_jitter=True).time) == 19
 
 
 @pytest.mark.parametrize(
@@ -538,14 +538,14 @@ def test_a_pipe_and_a_huge_table_are_not_waited_for(folder: Path) -> None:
 
 
 def test_resampling_is_refused_where_nothing_is_resampled(tmp_path: Path) -> None:
-    fails(save(make(), tmp_path / "a.npz"), "resample is for CSV folders", resample=True)
+    fails(save_recording(make(), tmp_path / "a.npz"), "resample is for CSV folders", resample=True)
 
 
 def test_only_the_members_of_a_recording_are_read(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
     np.savez_compressed(path, **parts_of(tmp_path / "b.npz"), more=np.zeros(30 * 2**20))
     before = peak()
-    assert load(path).sha256 == make().sha256
+    assert load_recording(path).sha256 == make().sha256
     assert peak() - before < 60 * 2**20
 
 

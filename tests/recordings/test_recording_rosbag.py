@@ -20,7 +20,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from droid_jax.commands.scenes import recording_at
 from droid_jax.recordings import rosbag
-from droid_jax.recordings.formats import load, save
+from droid_jax.recordings.formats import load_recording, save_recording
 from droid_jax.recordings.recording import TorqueConvention, TorqueSide
 from droid_jax.recordings.rosbag import Stamps, read_bags
 from droid_jax.run import main
@@ -215,7 +215,7 @@ def test_units_follow_the_slides(tmp_path: Path, slides: tuple[str, ...], units:
     out, option = tmp_path / "axis.npz", ["--slides", *slides] if slides else []
     said = ["--joints", *JOINTS, "--torque", "motor", "--command-topic", "/command", *option]
     assert convert(pulled(tmp_path, "sqlite3"), *said, "--out", out) == 0
-    assert tuple(load(out).channel(name).unit for name in ("torque", "position", "velocity")) == units
+    assert tuple(load_recording(out).channel(name).unit for name in ("torque", "position", "velocity")) == units
 
 
 def test_phases_are_stated_in_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -223,7 +223,10 @@ def test_phases_are_stated_in_words(tmp_path: Path, capsys: pytest.CaptureFixtur
     said = ["--joints", *JOINTS, "--torque", "motor", "--command-topic", "/command", "--out", out]
     bag = pulled(tmp_path, "sqlite3")
     assert convert(bag, *said, "--phases", "approach=0:0.5", "grasp=0.5:1") == 0
-    assert [(p.name, p.start, p.end) for p in load(out).phases] == [("approach", 0.0, 0.5), ("grasp", 0.5, 1.0)]
+    assert [(p.name, p.start, p.end) for p in load_recording(out).phases] == [
+        ("approach", 0.0, 0.5),
+        ("grasp", 0.5, 1.0),
+    ]
     assert convert(bag, *said, "--phases", "grasp=0.5") == 2
     assert "--phases takes NAME=START:END in seconds, e.g. grasp=1.5:2, got 'grasp=0.5'" in capsys.readouterr().err
 
@@ -306,7 +309,7 @@ def test_bags_that_overlap_keep_their_order(tmp_path: Path) -> None:
     expected = 0.001 * (11 - np.arange(1, 11))
     for recording in (
         read_bags(paths, joints=JOINTS, torque=TORQUE),
-        load(tmp_path, joints=JOINTS, torque=TORQUE),  # a folder: run_2 before run_10
+        load_recording(tmp_path, joints=JOINTS, torque=TORQUE),  # a folder: run_2 before run_10
     ):
         np.testing.assert_array_equal(recording.channel("torque").values[:, 0, 0], expected)
 
@@ -512,14 +515,14 @@ def test_load_finds_bags(tmp_path: Path, kind: str) -> None:
     paths = [pulled(tmp_path / "runs", kind, f"run{i}") for i in range(2)]
     options = {"joints": JOINTS, "torque": TORQUE, "command_topic": "/command"}
     expected = read_bags(paths, **options)
-    both = load(tmp_path / "runs", name="door", **options)
+    both = load_recording(tmp_path / "runs", name="door", **options)
     assert both.repeats == 2
     assert both.name == "door"
     assert both.sha256 == expected.sha256
-    assert load(paths[0], **options).repeats == 1
+    assert load_recording(paths[0], **options).repeats == 1
     file = paths[0] if kind == "ros1" else next(p for p in paths[0].iterdir() if p.suffix != ".yaml")
-    assert load(file, **options).repeats == 1
-    assert load(save(both, tmp_path / "door.npz")).sha256 == both.sha256
+    assert load_recording(file, **options).repeats == 1
+    assert load_recording(save_recording(both, tmp_path / "door.npz")).sha256 == both.sha256
 
 
 # ----- on the command line
@@ -535,14 +538,14 @@ def test_convert_turns_bags_into_a_recording(tmp_path: Path, capsys: pytest.Capt
     out = tmp_path / "door.npz"
     assert convert(*paths, *said, "--stiffness", "80", "40", "--damping", "2", "1", "--out", out) == 0
     assert "3 repeats of" in capsys.readouterr().out
-    recording = load(out)
+    recording = load_recording(out)
     assert recording.torque == TorqueConvention(TorqueSide.LINK, gravity=True)
     assert recording.gains is not None
     np.testing.assert_array_equal(recording.gains.stiffness, [80.0, 40.0])
     expected = read_bags(paths, joints=JOINTS, torque=recording.torque, command_topic="/command", gains=recording.gains)
     assert recording.sha256 == expected.sha256
     assert convert(out, "--start", "0.2", "--end", "0.6", "--out", tmp_path / "part") == 0
-    part = load(tmp_path / "part")
+    part = load_recording(tmp_path / "part")
     assert (part.span, part.repeats) == (pytest.approx((0.2, 0.6)), 3)
 
 
@@ -577,12 +580,12 @@ def test_efforts_that_are_amperes(tmp_path: Path, refused: Callable[..., str]) -
     said = ["--joints", *JOINTS, "--torque", "motor"]
     assert convert(*paths, *said, "--out", tmp_path / "plain.npz") == 0
     assert convert(*paths, *said, "--torque-constant", "8", "-12", "--out", tmp_path / "scaled.npz") == 0
-    plain, scaled = (load(tmp_path / f"{name}.npz") for name in ("plain", "scaled"))
+    plain, scaled = (load_recording(tmp_path / f"{name}.npz") for name in ("plain", "scaled"))
     torque = plain.channels["torque"].values
     np.testing.assert_allclose(scaled.channels["torque"].values, torque * [8.0, -12.0])
     assert scaled.meta["torque_constants"] == "8 -12"
     assert convert(tmp_path / "plain.npz", "--torque-constant", "2", "--out", tmp_path / "one") == 0
-    np.testing.assert_allclose(load(tmp_path / "one").channels["torque"].values, 2.0 * torque)
+    np.testing.assert_allclose(load_recording(tmp_path / "one").channels["torque"].values, 2.0 * torque)
     for wrong, what in ((("1", "2", "3"), "got 3 torque constants"), (("0",), "other than 0, got 0")):
         assert what in refused("convert", tmp_path / "plain.npz", "--torque-constant", *wrong, "--out", tmp_path / "no")
 
@@ -594,7 +597,7 @@ def test_convert_takes_several_folders_of_bags(tmp_path: Path) -> None:
             pulled(tmp_path / day, "ros1", f"run{i}")
     said = ["--joints", *JOINTS, "--torque", "link", "--out", tmp_path / "door.npz"]
     assert convert(tmp_path / "day1", tmp_path / "day2", *said) == 0
-    assert load(tmp_path / "door.npz").repeats == 4
+    assert load_recording(tmp_path / "door.npz").repeats == 4
 
 
 def test_a_converted_motion_is_called_as_its_file_unless_told_otherwise(tmp_path: Path) -> None:
@@ -603,11 +606,11 @@ def test_a_converted_motion_is_called_as_its_file_unless_told_otherwise(tmp_path
     said = ["--joints", *JOINTS, "--torque", "link"]
     for bags in (paths, paths[:1]):
         assert convert(*bags, *said, "--out", tmp_path / "door.npz") == 0
-        assert load(tmp_path / "door.npz").name == "door"
+        assert load_recording(tmp_path / "door.npz").name == "door"
     assert convert(*paths, *said, "--name", "slow", "--out", tmp_path / "door.npz") == 0
-    assert load(tmp_path / "door.npz").name == "slow"
+    assert load_recording(tmp_path / "door.npz").name == "slow"
     assert convert(tmp_path / "door.npz", "--out", tmp_path / "csv") == 0  # a name that it has stays
-    assert load(tmp_path / "csv").name == "slow"
+    assert load_recording(tmp_path / "csv").name == "slow"
 
 
 @pytest.mark.parametrize("field", ["velocity", "position"])
@@ -664,7 +667,7 @@ def test_convert_hands_on_what_the_reader_takes(tmp_path: Path, monkeypatch: pyt
     said = ["--joints", *JOINTS, "--torque", "link", "--command-topic", "/command", "--rate", "50", "--stamps", "bag"]
     more = ["--command-joints", *JOINTS, "--command-tolerance", "0.5", "--allow-jitter"]
     assert convert(*paths, *said, *more, "--out", tmp_path / "door.npz") == 0
-    found = load(tmp_path / "door.npz")
+    found = load_recording(tmp_path / "door.npz")
     assert np.diff(found.time) == pytest.approx(0.02) and found.meta["stamps"] == "bag"
     given = {}
     monkeypatch.setattr(rosbag, "read_bags", lambda paths, **options: given.update(options) or found)
@@ -679,7 +682,7 @@ def test_convert_resamples_tables_with_clocks_of_their_own(tmp_path: Path) -> No
     table.write_text("".join(table.read_text().splitlines(keepends=True)[:-3]))
     assert convert(tmp_path / "csv", "--out", tmp_path / "door.npz") == 2
     assert convert(tmp_path / "csv", "--resample", "--out", tmp_path / "door.npz") == 0
-    assert load(tmp_path / "door.npz").repeats == 2
+    assert load_recording(tmp_path / "door.npz").repeats == 2
 
 
 def test_convert_says_what_a_bag_lacks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

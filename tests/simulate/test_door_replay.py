@@ -17,7 +17,7 @@ from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_c_model, make_physics
 from droid_jax.model.scene import Scene, with_options
-from droid_jax.recordings.formats import load
+from droid_jax.recordings.formats import load_recording
 from droid_jax.recordings.recording import Channel, Recording
 from droid_jax.simulate import c_reference as twin
 from droid_jax.simulate.batching import over_population
@@ -33,7 +33,7 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def demonstration() -> Recording:
-    return load(demonstration_path("A"))
+    return load_recording(demonstration_path("A"))
 
 
 @pytest.fixture(scope="module")

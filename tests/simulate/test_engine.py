@@ -11,7 +11,7 @@ from droid_jax.door.scene import door_scene
 from droid_jax.door.space import door_space, truth
 from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene, compile_scene, with_options
-from droid_jax.recordings.formats import load
+from droid_jax.recordings.formats import load_recording
 from droid_jax.simulate import c_engine as engine
 from droid_jax.simulate.c_engine import Trace, instrument, simulate
 from droid_jax.synthetic.robot import _carries_weight
@@ -34,13 +34,13 @@ def models(scene: Scene) -> list[mujoco.MjModel]:
 @pytest.fixture(scope="module")
 def control(scene: Scene) -> np.ndarray:
     """[1, T, 9]: the demonstration up to the first centimetres of the opening."""
-    recording = load(demonstration_path("A"))
+    recording = load_recording(demonstration_path("A"))
     return recording.command[None, :1700, scene.command_index(recording.command_names)]
 
 
 @pytest.fixture(scope="module")
 def start(scene: Scene) -> np.ndarray:
-    return scene.initial_qpos(dict(load(demonstration_path("A")).qpos0))[None]
+    return scene.initial_qpos(dict(load_recording(demonstration_path("A")).qpos0))[None]
 
 
 @pytest.fixture(scope="module")

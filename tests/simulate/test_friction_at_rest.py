@@ -20,7 +20,7 @@ from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_physics
 from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.recordings.recording import TorqueConvention, TorqueSide
-from droid_jax.simulate.inverse_dynamics import path_of, path_replay
+from droid_jax.simulate.inverse_dynamics import motion_path, path_replay
 from droid_jax.simulate.measured_motion import Motion
 from droid_jax.simulate.rest import RestConfig, at_rest, derivative_noise, white_noise
 from experiments.friction_at_rest import Truth, drawn, exact, recorded, studied
@@ -54,7 +54,7 @@ def torque(scene: Scene, motion: Motion, effects: tuple[Effect, ...] = (), **the
     if not theta:
         physics = replace(physics, theta={k: v for k, v in physics.theta.items() if "coulomb" not in k})
     replay = path_replay(scene, motion.torque, effects, motion.joints)
-    return float(jax.jit(replay)(physics, path_of(scene, motion)).torque[0, 0])
+    return float(jax.jit(replay)(physics, motion_path(scene, motion)).torque[0, 0])
 
 
 @pytest.mark.parametrize(
@@ -84,7 +84,7 @@ def test_friction_behind_the_sensor_is_bounded_too():
 
 def test_a_joint_without_friction_is_compared_with_its_weight():
     scene = hinge(0.0)
-    path = path_of(scene, held(WEIGHT + 0.2))
+    path = motion_path(scene, held(WEIGHT + 0.2))
     replay = path_replay(scene, TorqueConvention(MOTOR, True), (), ("j",))
     space = Space((joint_damping(scene, "j", std=0.1, high=1.0),))
     physics = make_physics(scene, space, np.asarray(space.mean, np.float32))

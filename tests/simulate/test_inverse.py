@@ -24,7 +24,7 @@ from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_c_model, make_physics
 from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
-from droid_jax.simulate.inverse_dynamics import path_of, path_replay, prescribed
+from droid_jax.simulate.inverse_dynamics import motion_path, path_replay, prescribed
 from droid_jax.simulate.measured_motion import Motion
 from droid_jax.simulate.replay import Replay, torque_offset_effect
 
@@ -56,7 +56,7 @@ def motion(scene: Scene, side: TorqueSide, gravity: bool, count: int = 40) -> Mo
 
 def inverse_replay(scene: Scene, motion: Motion, effects: Sequence[Effect] = ()) -> Replay:
     """Torques of one prescribed motion."""
-    replay, path = path_replay(scene, motion.torque, effects, motion.joints), path_of(scene, motion)
+    replay, path = path_replay(scene, motion.torque, effects, motion.joints), motion_path(scene, motion)
     return lambda physics: replay(physics, path)
 
 

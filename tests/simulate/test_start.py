@@ -19,7 +19,7 @@ from droid_jax.model.fields import joint_damping
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.preflight.preflight import check_range, geared, open_loop
-from droid_jax.recordings.formats import load
+from droid_jax.recordings.formats import load_recording
 from droid_jax.recordings.recording import Channel, Recording, ServoGains
 from droid_jax.simulate.initial_state import AJAR
 from droid_jax.simulate.replay import Drive, check_gains, make_drive
@@ -183,7 +183,7 @@ def test_an_object_starts_where_it_was_seen_unless_a_cameras_noise_is_all(scene:
 
 def test_repeats_serve_a_door_that_is_seen_just_ajar():
     """About AJAR the mean of some repeats is put back to the scene's pose, and that of others is not."""
-    door, demonstration = door_scene(), load(demonstration_path("A"))
+    door, demonstration = door_scene(), load_recording(demonstration_path("A"))
     time = demonstration.time[::30]
 
     def seen(angle: float) -> Drive:

@@ -17,7 +17,7 @@ from droid_jax.door.demonstration import demonstration_path
 from droid_jax.door.scene import door_scene
 from droid_jax.model.scene import Grip, Scene, compile_scene
 from droid_jax.recordings.checks import validate
-from droid_jax.recordings.formats import load
+from droid_jax.recordings.formats import load_recording
 from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
 from droid_jax.simulate.c_engine import instrument
 from droid_jax.synthetic import arm_effects, friction_effects, hinge_effects, hooks
@@ -656,7 +656,7 @@ def test_a_command_delay_moves_its_own_column(scene: Scene):
 @pytest.fixture(scope="module")
 def door() -> tuple[Scene, Recording, dict[str, float]]:
     scene = door_scene()
-    return scene, load(demonstration_path("C")), synthetic_truth(scene, 1, 5)
+    return scene, load_recording(demonstration_path("C")), synthetic_truth(scene, 1, 5)
 
 
 @pytest.fixture(scope="module")

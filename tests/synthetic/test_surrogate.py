@@ -15,7 +15,7 @@ from droid_jax.door.scene import door_scene
 from droid_jax.door.space import door_nuisances
 from droid_jax.model.fields import body_mass_scale, body_position, joint_damping, servo_scale, time_offset
 from droid_jax.model.parameters import Space
-from droid_jax.recordings.formats import load
+from droid_jax.recordings.formats import load_recording
 from droid_jax.recordings.recording import TorqueSide
 from droid_jax.synthetic.hidden_effects import record_hidden
 from droid_jax.synthetic.robot import DRIFT_TIME, SyntheticRobotConfig, _torque_noise, set_up
@@ -64,7 +64,7 @@ def test_every_repeat_begins_and_measures_a_little_otherwise():
 
 def test_the_door_stands_a_little_otherwise_in_every_repeat():
     scene, config = door_scene(), replace(QUIET, pose_noise=2e-3, repeats=40)
-    robot = set_up(scene, load(demonstration_path("A")), {}, seed=3, config=config)
+    robot = set_up(scene, load_recording(demonstration_path("A")), {}, seed=3, config=config)
     nuisances = door_nuisances(robot.scene)
     for axis in ("door_x", "door_y"):
         (write,) = nuisances[axis].writes

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scripted import Script, opening
 
-from droid_jax.door.environment import start_pose
+from droid_jax.door.environment import waiting_pose
 from droid_jax.door.hand import looked
 from droid_jax.door.policy_interface import interface_of
 from droid_jax.door.scene import door_scene
@@ -31,7 +31,7 @@ def scene():
 
 @pytest.fixture(scope="module")
 def start(scene) -> np.ndarray:
-    return start_pose(scene, TASK)
+    return waiting_pose(scene, TASK)
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from droid_jax.model.effect_interface import State, Theta
-from droid_jax.model.parameters import Parameter
+from droid_jax.model.parameters import Parameter, Role
 from droid_jax.model.scene import Scene
 
 GROUP = "Effect"
@@ -19,9 +19,11 @@ RELIEF = 1.5
 EXPONENTS = (1.0, 2.0)  # of a damper, of Stribeck's excess
 
 
-def amplitude(name: str, unit: str, typical: float, high: float, *, low: float | None = None) -> Parameter:
+def amplitude(
+    name: str, unit: str, typical: float, high: float, *, low: float | None = None, role: Role = Role.OTHER
+) -> Parameter:
     """A size that is zero at neutral; typical: its prior deviation; low: -high unless given."""
-    return Parameter(name, unit, 0.0, typical, -high if low is None else low, high, group=GROUP)
+    return Parameter(name, unit, 0.0, typical, -high if low is None else low, high, group=GROUP, role=role)
 
 
 def shape(name: str, unit: str, values: Sequence[float], low: float, high: float) -> Parameter:

@@ -7,7 +7,7 @@ from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects import coefficients as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.fields import ENCODER
-from droid_jax.model.fields import encoder_offset as encoder_parameter
+from droid_jax.model.fields import joint_encoder_offset as encoder_parameter
 from droid_jax.model.scene import Scene
 
 WIDTH = {False: (0.0175, 0.09), True: (0.002, 0.02)}  # prior deviation and bound: a degree of hinges, 2 mm of slides

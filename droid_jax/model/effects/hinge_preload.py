@@ -3,6 +3,7 @@
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects import coefficients as a
 from droid_jax.model.effects.registry import register
+from droid_jax.model.parameters import Role
 from droid_jax.model.scene import Scene
 
 NAME = "hinge_preload"
@@ -22,7 +23,7 @@ def hinge_preload(scene: Scene) -> Effect | None:
 
     return Effect(
         NAME,
-        (a.amplitude(NAME, "N m", 0.5, 5.0),),
+        (a.amplitude(NAME, "N m", 0.5, 5.0, role=Role.OBJECT_TORQUE),),
         force=lambda theta, state: a.at_dof(scene, joint, -a.value(theta, NAME)),
         native=native,
         description="a constant torque that closes (or opens) the door",

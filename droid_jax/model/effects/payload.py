@@ -1,6 +1,7 @@
 """A tool or load that the arm's controller does not know of."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ from droid_jax.model.effects import coefficients as a
 from droid_jax.model.effects.kinematics import turned
 from droid_jax.model.effects.registry import register
 from droid_jax.model.fields import write
-from droid_jax.model.parameters import Mode, Parameter
+from droid_jax.model.parameters import Mode, Parameter, Role
 from droid_jax.model.scene import Scene
 
 MASS, MOMENT = "payload_mass", "payload_moment"
@@ -38,7 +39,8 @@ def payload(scene: Scene) -> Effect | None:
     writes = [write(scene, "body_mass", (body,), Mode.SCALE, **share)]
     if scene.model.body_gravcomp[body] != 0:
         writes.append(write(scene, "body_gravcomp", (body,), Mode.DIVIDE, **share))
-    more = Parameter(MASS, "kg", 0.0, 0.2, -0.9 * min(mass, 1.0), 2.0, writes=tuple(writes), group=a.GROUP)
+    of_it: dict[str, Any] = dict(group=a.GROUP, role=Role.PAYLOAD_MASS)
+    more = Parameter(MASS, "kg", 0.0, 0.2, -0.9 * min(mass, 1.0), 2.0, writes=tuple(writes), **of_it)
     weighs = _weighs(scene, last, body)
     parameters = (more,) if weighs is None else (more, a.amplitude(MOMENT, "kg m", 0.02, 0.3))
     return Effect(

@@ -16,7 +16,7 @@ from droid_jax.model.effects.registry import effect_space, library, ready
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_physics
 from droid_jax.model.scene import Scene, compile_scene, with_options
-from droid_jax.recordings.formats import load
+from droid_jax.recordings.formats import load_recording
 from droid_jax.recordings.recording import TorqueConvention, TorqueSide
 from droid_jax.simulate.batching import over_population
 from droid_jax.simulate.replay import Drive, make_drive, servo_replay
@@ -130,5 +130,5 @@ def door(gains: str = "impedance") -> Scene:
 def door_bench(gains: str = "impedance", names: Sequence[str] | None = None, motion: str = "A") -> Bench:
     """The built-in scene, one of its demonstrations, and its library or some of it; for slow tests."""
     scene = door(gains)
-    drive = make_drive(scene, load(demonstration_path(motion, gains=gains)))
+    drive = make_drive(scene, load_recording(demonstration_path(motion, gains=gains)))
     return make_bench(scene, drive, library(scene, names))

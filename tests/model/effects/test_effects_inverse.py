@@ -19,7 +19,7 @@ from droid_jax.model.physics import make_physics
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import TorqueConvention, TorqueSide
 from droid_jax.simulate.batching import over_population
-from droid_jax.simulate.inverse_dynamics import path_of, path_replay
+from droid_jax.simulate.inverse_dynamics import motion_path, path_replay
 from droid_jax.simulate.measured_motion import Motion
 from droid_jax.simulate.replay import Replay
 
@@ -52,7 +52,7 @@ def scene() -> Scene:
 
 def inverse_replay(scene: Scene, motion: Motion, effects: Sequence[Effect] = ()) -> Replay:
     """Torques of one prescribed motion."""
-    replay, path = path_replay(scene, motion.torque, effects, motion.joints), path_of(scene, motion)
+    replay, path = path_replay(scene, motion.torque, effects, motion.joints), motion_path(scene, motion)
     return lambda physics: replay(physics, path)
 
 
