@@ -15,8 +15,8 @@ PACKAGE = Path(dj.__file__).parent
 # Name that several modules define -> why.
 SHARED = {
     "run": "every command has one, of one interface: the parsed command, nothing back (`droid_jax.run`)",
-    "deviations": "discrepancy/refit.py and report/gap_words.py, which are being rewritten",
-    "intervals": "discrepancy/refit.py and report/parameter_figures.py, which are being rewritten",
+    "deviations": "discrepancy/fitting.py and report/gap_words.py, which are being rewritten",
+    "intervals": "discrepancy/fitting.py and report/parameter_figures.py, which are being rewritten",
     "frames": "report/render.py and the public one of report/tables.py, which are being rewritten",
     "number": "a checked argument; in report/words.py, which is being rewritten, a number as it is read",
 }

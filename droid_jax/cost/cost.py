@@ -34,7 +34,7 @@ from droid_jax.recordings.checks import validate
 from droid_jax.recordings.recording import Recording, recordings_of
 from droid_jax.simulate.batching import in_blocks, over_block
 from droid_jax.simulate.c_reference import c_replay
-from droid_jax.simulate.initial_state import AJAR, following
+from droid_jax.simulate.initial_state import StartConfig, following
 from droid_jax.simulate.inverse_dynamics import Path, motion_path, path_replay, prescribed
 from droid_jax.simulate.measured_motion import Motion, measured_motion
 from droid_jax.simulate.repeat_starts import from_one_start, own_starts
@@ -49,7 +49,6 @@ from droid_jax.simulate.replay import (
 )
 
 ENGINES = ("mjx", "mujoco")
-ALIKE = 2e-3  # rad or m: measured starts that are closer differ by the noise of a sensor
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -125,7 +124,7 @@ class Cost:
             raise ValueError(f"expected repeats of {len(self.drives)} replayed recordings, got {len(recordings)}")
         made, drives, replays = [], [], []
         for given, old, drive, replay in zip(recordings, self.comparisons, self.drives, self._replays, strict=True):
-            recording = own_starts(given)
+            recording = own_starts(given, (config or old.config).start)
             new = followed(self.scene, recording, config or old.config)
             if isinstance(new, Drive):
                 check_gains(self.scene, new)
@@ -135,14 +134,16 @@ class Cost:
                     "(side, gravity) or, without commands, has another clock or other joints whose positions were "
                     "measured throughout"
                 )
-            drives.append(drive if _start_alike(self.scene, new, drive) else new)
+            drives.append(drive if _start_alike(self.scene, new, drive, (config or old.config).start) else new)
             replays.append(_along(replay, drives[-1]))
             made.append(_compared(self.scene, self.space, recording, drives[-1], replays[-1], config or old.config))
         return assemble(self.scene, self.space, made, replays, drives)
 
     def from_one_start(self, index: int, recording: Recording) -> Recording:
         """Repeats of a recording as if all had started where its replay does (`own_starts.from_one_start`)."""
-        return _from_one_start(self.scene, self.space, own_starts(recording), self.drives[index], self._replays[index])
+        config = self.comparisons[index].config.start
+        own = own_starts(recording, config)
+        return _from_one_start(self.scene, self.space, own, self.drives[index], self._replays[index], config)
 
     def _blockwise(self, values: Any, functions: Sequence[Callable], join: Callable) -> Any:
         def block(rows: np.ndarray) -> Any:
@@ -186,7 +187,7 @@ def make_cost(
     check_space(instance(scene, "scene", Scene), instance(space, "space", Space))
     recordings, effects = recordings_of(recordings), instances(effects, "effects", Effect)
     one_of(engine, "engine", ENGINES)
-    recordings = [own_starts(recording) for recording in recordings]
+    recordings = [own_starts(recording, config.start) for recording in recordings]
     drives = [followed(scene, r, config) for r in recordings]
     for recording in recordings if check else ():
         warn_of_log(scene, recording)
@@ -279,7 +280,7 @@ def followed(scene: Scene, recording: Recording, config: CompareConfig) -> Drive
     validate(recording, allow_jitter=True)  # one made in Python may not have been
     check_range(scene, recording)
     if recording.command.size:
-        drive = make_drive(scene, recording, weigh="torque" in config.channels)
+        drive = make_drive(scene, recording, weigh="torque" in config.channels, config=config.start)
         warn_of_commands(scene, recording)
         warn_if_moving(recording)
         return drive
@@ -335,7 +336,12 @@ def _along(replay: Callable[[np.ndarray], Rollout], follows: Drive | Motion) -> 
 
 
 def _from_one_start(
-    scene: Scene, space: Space, recording: Recording, follows: Drive | Motion, replay: Callable
+    scene: Scene,
+    space: Space,
+    recording: Recording,
+    follows: Drive | Motion,
+    replay: Callable,
+    config: StartConfig,
 ) -> Recording:
     if not isinstance(follows, Drive) or not isinstance(replay, Driven):
         return recording
@@ -343,7 +349,7 @@ def _from_one_start(
     def alone(drive: Drive) -> Rollout:
         return jax.tree.map(lambda a: a[0], in_blocks(replace(replay, drive=drive), space.mean[None]))
 
-    return from_one_start(scene, recording, follows, alone)
+    return from_one_start(scene, recording, follows, alone, config)
 
 
 def _compared(
@@ -351,7 +357,7 @@ def _compared(
 ) -> Comparison:
     """What a recording is compared with its replay by."""
     apart = _apart(replay, scene, recording, config) if isinstance(replay, Along) else None
-    recording = _from_one_start(scene, space, recording, follows, replay)
+    recording = _from_one_start(scene, space, recording, follows, replay, config.start)
     rest = follows.rest if isinstance(follows, Motion) else None
     return make_comparison(scene, recording, _clock(recording, follows), config, apart, rest)
 
@@ -387,18 +393,18 @@ def _same(scene: Scene, new: Drive | Motion, old: Drive | Motion) -> bool:
     return np.array_equal(sent, before) and np.array_equal(new.command[:, sent], old.command[:, sent])
 
 
-def _start_alike(scene: Scene, new: Drive | Motion, old: Drive | Motion) -> bool:
-    """Whether two drives start at one place, but for ALIKE; motions, which are followed as they are, never do.
+def _start_alike(scene: Scene, new: Drive | Motion, old: Drive | Motion, config: StartConfig) -> bool:
+    """Whether two drives start at one place, but for `alike`; motions, which are followed as they are, never do.
 
-    An object that stands ajar by about AJAR is put back for some repeats and not for others.
+    An object that stands ajar by about `ajar` is put back for some repeats and not for others.
     """
     if isinstance(new, Motion) or isinstance(old, Motion):
         return False
-    apart = np.full(scene.model.nq, ALIKE)
+    apart = np.full(scene.model.nq, config.alike)
     if scene.object_joint and scene.object_joint not in scene.joints:
         hinge = scene.qpos(scene.object_joint)
         if scene.model.qpos0[hinge] in (new.qpos0[hinge], old.qpos0[hinge]):
-            apart[hinge] += AJAR
+            apart[hinge] += config.ajar
     apart[list(following(scene, new.qpos0) & following(scene, old.qpos0))] = np.inf  # by as much as what has them there
     return bool(np.all(np.abs(new.qpos0 - old.qpos0) <= apart))
 

@@ -82,7 +82,9 @@ class LoneLog(Cost):
 
     def with_noise(self, deviation: np.ndarray, instants: np.ndarray) -> LoneLog:
         """With noise of a deviation [C], in the channel's unit, at some instants [K] bool; the rest does not count."""
-        noise = self._noise.stated(np.maximum(deviation, least_noise("torque", self.measured)))
+        noise = self._noise.stated(
+            np.maximum(deviation, least_noise("torque", self.measured, self.comparisons[0].config.noise))
+        )
         return self._with(replace(noise, whitener=noise.whitener * instants[:, None]))
 
     def with_torques(self, torque: np.ndarray) -> LoneLog:

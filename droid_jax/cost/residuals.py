@@ -21,6 +21,7 @@ from droid_jax.cost.observation import Measured, least_noise, prepared
 from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Phase, Recording
+from droid_jax.simulate.initial_state import StartConfig
 from droid_jax.simulate.measured_motion import CUTOFF
 from droid_jax.simulate.rest import RestConfig
 
@@ -38,6 +39,7 @@ class CompareConfig:
     whitened: the cost is the root mean square of the whitened residuals instead of N m.
     motion_cutoff: Hz, filter of the measured positions of a recording without commands.
     rest: below which speed a joint of such a recording counts as at rest, where its friction is only bounded.
+    start: what decides where a motion starts, and whether repeats start at one place.
     noise: what decides the noise of the channels.
     mj_step: replay as a MuJoCo program logs itself: mj_step's own steps of first order, each row the state before a
       step and the command of that step.  For recordings that MuJoCo made with the scene's own time step; of a real
@@ -52,6 +54,7 @@ class CompareConfig:
     whitened: bool = False
     motion_cutoff: float = CUTOFF
     rest: RestConfig = field(default_factory=RestConfig)
+    start: StartConfig = field(default_factory=StartConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     mj_step: bool = False
 
@@ -66,6 +69,7 @@ class CompareConfig:
             whitened=flag,
             motion_cutoff=partial(number, above=0),
             rest=partial(instance, kind=RestConfig),
+            start=partial(instance, kind=StartConfig),
             noise=partial(instance, kind=NoiseConfig),
             mj_step=flag,
         )

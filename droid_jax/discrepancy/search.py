@@ -1,7 +1,7 @@
 """From a base fit to a verdict: one selection step after the other, then pairs, then pruning.
 
-A step scores all candidates, refits the promising ones, tests them on the validation recording and selects.  `selection_step` is
-a function from a state to the next one; nothing in a state is ever changed.
+A step scores all candidates, refits the promising ones, tests them on the validation recording and selects.
+`selection_step` is a function from a state to the next one; nothing in a state is ever changed.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ from droid_jax.model.effects.registry import ready
 from droid_jax.model.encoders import encoder_error
 from droid_jax.model.physics import Physics
 from droid_jax.model.scene import Scene
-from droid_jax.model.step import step as simulate_step
+from droid_jax.model.step import simulate_step
 from droid_jax.policy.control import ACTIONS, OBSERVED, Safety, limited
 from droid_jax.policy.environment import Environment
 from droid_jax.simulate.hand_path import solve_pose

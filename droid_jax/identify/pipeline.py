@@ -202,7 +202,7 @@ def prepare(
     instance(space, "space", Space)
     if nuisances is not None:
         instance(nuisances, "nuisances", Space)
-    recordings = [own_starts(recording) for recording in recordings]
+    recordings = [own_starts(recording, config.compare.start) for recording in recordings]
     fitted, held, numbers = zip(*(split_repeats(r, config.heldout) for r in recordings), strict=True)
     full = space if nuisances is None or config.refine is None else space + nuisances
     base = make_cost(scene, full, fitted, engine=config.engine, config=config.compare, effects=effects, check=False)

@@ -42,7 +42,7 @@ _TOLERANCE = 3e-6  # of the acceleration's scale: what float32 can still tell ap
 _ROUNDING = 1e-5  # of a Newton step: how exactly float32 solves for it
 
 
-def step(
+def simulate_step(
     model: Any,
     data: Any,
     *,

@@ -11,7 +11,7 @@ import numpy as np
 
 from droid_jax.model.scene import Scene
 
-OPEN = 0.01  # rad or m that joints must move to close a loop: as far apart as repeats may begin (own_starts.SCATTER)
+OPEN = 0.01  # rad or m that joints must move to close a loop: as far apart as repeats may begin (`StartConfig.scatter`)
 EXACT = 1e-6  # m or rad: a loop open by less is closed
 STAGES = 20  # from the scene's pose to where the motion starts, so that a linkage stays on its branch
 ITERATIONS = 30  # of Gauss-Newton at each stage

@@ -3,22 +3,48 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import mujoco
 import numpy as np
 
+from droid_jax.arguments import check_fields, number
 from droid_jax.model.actuators import has_feedback
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording
 from droid_jax.simulate.closed_loops import OPEN, closed, moved_by_loops, open_loops
 
-AJAR = 0.02  # rad or m: an object seen no further than this from the scene's pose stands there, as cameras are noisy
 WEIGHT = 0.01  # N m or N: a joint that feels less uncompensated weight feels none (noise below it is never believed)
 POSES = 50  # of a motion, at which the weight is looked at
 
 
-def start_pose(scene: Scene, recording: Recording) -> np.ndarray:
+@dataclass(frozen=True)
+class StartConfig:
+    """What decides where a motion starts, and whether repeats start at one place.
+
+    ajar: rad or m; an object seen no further than this from the scene's pose stands there, as cameras are noisy.
+    scatter: rad or m; repeats whose measured starts are closer are taken to start at one place.
+    noise: deviations of a position's noise that starts must be apart too.
+    early: s at the beginning, in which that noise is looked at.
+    alike: rad or m; measured starts that are closer differ by the noise of a sensor, and share one replay.
+    """
+
+    ajar: float = 0.02
+    scatter: float = 0.01
+    noise: float = 6.0
+    early: float = 0.2
+    alike: float = 2e-3
+
+    def __post_init__(self) -> None:
+        check_fields(self, **dict.fromkeys(("ajar", "scatter", "noise", "early", "alike"), partial(number, least=0)))
+
+
+DEFAULT_START = StartConfig()
+
+
+def start_pose(scene: Scene, recording: Recording, config: StartConfig = DEFAULT_START) -> np.ndarray:
     """[nq] where the motion starts: as stated (qpos0), else as measured, else where its servos were sent first.
 
     Of joints that nobody commanded or measured one that an equality couples to another starts where that has it, those
@@ -31,7 +57,7 @@ def start_pose(scene: Scene, recording: Recording) -> np.ndarray:
             scene.qpos(joint)
         except ValueError as error:
             raise ValueError(f"recording {recording.name!r}, qpos0: {error}") from None
-    told = _told(scene, recording)
+    told = _told(scene, recording, config)
     asked = {*scene.needs_command, *recording.command_names}
     guessed = [j for j in scene.driven_joints if j in asked and j not in told]
     if guessed:
@@ -49,15 +75,15 @@ def start_pose(scene: Scene, recording: Recording) -> np.ndarray:
     return qpos
 
 
-def told_start(scene: Scene, recording: Recording) -> np.ndarray:
+def told_start(scene: Scene, recording: Recording, config: StartConfig = DEFAULT_START) -> np.ndarray:
     """[nq] where the motion starts, before the joints of closed loops are moved to close them."""
-    return _coupled(scene, _told(scene, recording))
+    return _coupled(scene, _told(scene, recording, config))
 
 
-def _told(scene: Scene, recording: Recording) -> dict[str, float]:
+def _told(scene: Scene, recording: Recording, config: StartConfig) -> dict[str, float]:
     """Joint -> where it starts, rad or m, of those of which the recording says it."""
     sent = {joint: path[0] for joint, path in sent_to(scene, recording).items()}
-    return {**sent, **_measured(scene, recording), **recording.qpos0}
+    return {**sent, **_measured(scene, recording, config.ajar), **recording.qpos0}
 
 
 def _coupled(scene: Scene, told: Mapping[str, float]) -> np.ndarray:
@@ -179,12 +205,12 @@ def sent_to(scene: Scene, recording: Recording) -> dict[str, np.ndarray]:
     return {scene.command_names[u]: recording.command[:, columns[u]] / gear[u] for u in sent}
 
 
-def _measured(scene: Scene, recording: Recording) -> dict[str, float]:
+def _measured(scene: Scene, recording: Recording, ajar: float) -> dict[str, float]:
     """Joint -> measured position at the start, rad or m, of the scene's joints of one degree."""
     start = recording.measured_start()
     hinge, channel = scene.object_joint, recording.channels.get("object_angle")
     if hinge and hinge not in scene.joints and channel is not None:
         seen, own = start.pop(channel.columns[0], None), scene.model.qpos0[scene.qpos(hinge)]
-        if seen is not None and abs(seen - own) > AJAR:
+        if seen is not None and abs(seen - own) > ajar:
             start[hinge] = seen
     return {joint: q for joint, q in start.items() if joint in scene.single_joints}

@@ -24,14 +24,20 @@ from droid_jax.model.parameters import Role
 from droid_jax.model.physics import Physics
 from droid_jax.model.quiet_mjx import mjx
 from droid_jax.model.scene import Scene
-from droid_jax.model.step import servo_force
-from droid_jax.model.step import step as simulate_step
+from droid_jax.model.step import servo_force, simulate_step
 from droid_jax.model.unsupported_features import check_options
 from droid_jax.recordings.checks import check_joints
 from droid_jax.recordings.clocks import interpolate
 from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.simulate.floating_base import refuse_floating
-from droid_jax.simulate.initial_state import check_weight, holding, start_pose, weight_share
+from droid_jax.simulate.initial_state import (
+    DEFAULT_START,
+    StartConfig,
+    check_weight,
+    holding,
+    start_pose,
+    weight_share,
+)
 
 Replay = Callable[[Physics], Rollout]
 TORQUE_OFFSETS = "torque offset"  # the effect that adds them, which every replay in MJX has
@@ -62,12 +68,13 @@ class Drive:
         return np.arange(len(self.command)) * self.timestep
 
 
-def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True) -> Drive:
+def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True, config: StartConfig = DEFAULT_START) -> Drive:
     """Resample a recording's command onto the simulation's clock and order its columns.
 
     weigh: False where no torque is compared, so that it does not matter whether it contains the arm's weight.
+    config: what decides where the motion starts.
     Raises ValueError where the recording has no commands, its joints or the weight in its torque do not fit the
-    scene, or nothing tells where a joint starts (see `compare.start`).
+    scene, or nothing tells where a joint starts (see `start_pose`).
     """
     if recording.command.size == 0:
         raise ValueError(
@@ -81,7 +88,7 @@ def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True) -> Dri
     steps = int(np.floor((end - start) / timestep + 1e-6)) + 1
     clock = start + np.arange(steps) * timestep
     gains = recording.gains
-    qpos0 = start_pose(scene, recording)
+    qpos0 = start_pose(scene, recording, config)
     held = holding(scene, qpos0)
     refuse_floating(scene, recording, qpos0, held)
     command = np.tile(held, (steps, 1))

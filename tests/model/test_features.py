@@ -12,7 +12,7 @@ from mujoco import mjx
 from mujoco.mjx._src import types
 
 from droid_jax.model.scene import compile_scene, load_scene
-from droid_jax.model.step import step
+from droid_jax.model.step import simulate_step
 from droid_jax.model.unsupported_features import IGNORED, refuse_ignored
 
 ARM = """<mujoco><option integrator="implicitfast" {option}><flag {flag}/></option><extension>{extension}</extension>
@@ -214,7 +214,7 @@ def test_what_is_kept_does_in_a_step_what_it_does_in_c(kept: str):
     model.opt.iterations, model.opt.tolerance = 100, 1e-12
     before = data.qvel.copy()
     mujoco.mj_step(model, data)
-    after = np.asarray(step(taken, state, parity=True).qvel, np.float64)
+    after = np.asarray(simulate_step(taken, state, parity=True).qvel, np.float64)
     accelerations = [(velocity - before) / model.opt.timestep for velocity in (data.qvel, after)]
     largest = 1.0 + np.abs(accelerations[0]).max()
     np.testing.assert_allclose(accelerations[1], accelerations[0], rtol=2e-3, atol=2e-4 * largest)

@@ -14,7 +14,7 @@ from mujoco import mjx
 
 from droid_jax.model.mjx_internals import CONSTRAINT_LAW, constraint_rows
 from droid_jax.model.patches import exact_segments, midpoint_law
-from droid_jax.model.step import solve, step
+from droid_jax.model.step import simulate_step, solve
 from droid_jax.model.unsupported_features import check_options
 
 # A three-link arm over a floor: contacts, limits, dry friction, a coupled and a pinned joint.
@@ -223,7 +223,7 @@ def run_spinner(
     data = mjx.make_data(on_device).replace(ctrl=jnp.array([torque]), qvel=jnp.array([speed]))
 
     def advance(data, _):
-        data = step(on_device, data, parity=parity)
+        data = simulate_step(on_device, data, parity=parity)
         return data, (data.qpos[0], data.qvel[0])
 
     _, (position, velocity) = jax.jit(lambda d: jax.lax.scan(advance, d, None, length=steps))(data)
@@ -274,7 +274,7 @@ def rollout_mjx(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, steps
     data = mjx.make_data(on_device).replace(qpos=jnp.asarray(qpos), qvel=jnp.asarray(qvel))
 
     def advance(data, _):
-        data = step(on_device, data, parity=parity)
+        data = simulate_step(on_device, data, parity=parity)
         return data, data.qpos
 
     return np.asarray(jax.jit(lambda d: jax.lax.scan(advance, d, None, length=steps)[1])(data))
@@ -345,6 +345,9 @@ def test_midpoint_law_is_its_own_derivation():
 def test_other_options_are_refused(option: str, parity: bool, says: str):
     given = mujoco.MjModel.from_xml_string(f"<mujoco><option {option}/></mujoco>")
     model = mjx.put_model(given)
-    for refuse in (lambda: step(model, mjx.make_data(model), parity=parity), lambda: check_options(given, parity)):
+    for refuse in (
+        lambda: simulate_step(model, mjx.make_data(model), parity=parity),
+        lambda: check_options(given, parity),
+    ):
         with pytest.raises(ValueError, match=says):
             refuse()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
+from functools import partial
 
 import mujoco
 import numpy as np
@@ -21,10 +22,12 @@ from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.preflight.preflight import check_range, geared, open_loop
 from droid_jax.recordings.formats import load_recording
 from droid_jax.recordings.recording import Channel, Recording, ServoGains
-from droid_jax.simulate.initial_state import AJAR
+from droid_jax.simulate.initial_state import DEFAULT_START
 from droid_jax.simulate.replay import Drive, check_gains, make_drive
 
 SPACE = Space((joint_damping(arm(), "elbow", name="elbow_damping", std=0.1, high=50.0),))
+
+AJAR = DEFAULT_START.ajar
 
 
 @pytest.fixture(scope="module")
@@ -182,7 +185,7 @@ def test_an_object_starts_where_it_was_seen_unless_a_cameras_noise_is_all(scene:
 
 
 def test_repeats_serve_a_door_that_is_seen_just_ajar():
-    """About AJAR the mean of some repeats is put back to the scene's pose, and that of others is not."""
+    """About `ajar` the mean of some repeats is put back to the scene's pose, and that of others is not."""
     door, demonstration = door_scene(), load_recording(demonstration_path("A"))
     time = demonstration.time[::30]
 
@@ -193,8 +196,9 @@ def test_repeats_serve_a_door_that_is_seen_just_ajar():
 
     shut, ajar, open_ = (seen(angle) for angle in (AJAR - 1e-3, AJAR + 1e-3, 2 * AJAR))
     assert shut.qpos0[door.qpos("hinge")] == 0.0 and ajar.qpos0[door.qpos("hinge")] > AJAR
-    assert _start_alike(door, shut, ajar) and _start_alike(door, ajar, shut) and not _start_alike(door, shut, open_)
-    assert not _start_alike(door, open_, seen(2 * AJAR + 0.015))  # neither is put back: these are two motions
+    one_motion = partial(_start_alike, door, config=DEFAULT_START)
+    assert one_motion(shut, ajar) and one_motion(ajar, shut) and not one_motion(shut, open_)
+    assert not one_motion(open_, seen(2 * AJAR + 0.015))  # neither is put back: these are two motions
 
 
 COUPLED = """<mujoco><worldbody><body><joint name="shoulder" axis="0 1 0"/><geom size=".1" pos="0 0 .2"/>
@@ -250,6 +254,6 @@ def test_coupled_joints_follow_the_scatter_of_what_has_them():
     heavy = {"torque": replace(recording().torque, gravity=True), "gains": None}
     one, other = (make_drive(scene, recording(qpos0={"shoulder": 0.2, "elbow": q}, **heavy)) for q in (0.4, 0.401))
     assert np.abs(one.qpos0 - other.qpos0).max() == pytest.approx(0.05)
-    assert _start_alike(scene, one, other)
+    assert _start_alike(scene, one, other, DEFAULT_START)
     stated = {"shoulder": 0.2, "elbow": 0.401, "mimic": float(other.qpos0[scene.qpos("mimic")]) + 0.2}
     assert not _start_alike(scene, one, make_drive(scene, recording(qpos0=stated, **heavy)))
