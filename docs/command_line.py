@@ -47,7 +47,13 @@ def _command(command: type) -> str:
     rows = [_row(field, hints[field.name], told[field.name]) for field in dataclasses.fields(command)]
     what = "\n\n".join(" ".join(part.split()) for part in (command.__doc__ or "").split("\n\n"))
     return "\n".join(
-        [f"## {command.__name__.lower()}\n\n{what}\n", "| option | default | meaning |", "|---|---|---|", *rows, ""]
+        [
+            f"## {command.__name__.lower().removesuffix('command')}\n\n{what}\n",
+            "| option | default | meaning |",
+            "|---|---|---|",
+            *rows,
+            "",
+        ]
     )
 
 
