@@ -29,7 +29,7 @@ import tyro  # noqa: E402
 
 from benchmarks.common import empty_cache, origin, stem  # noqa: E402
 from droid_jax.files import TRANSFER  # noqa: E402
-from droid_jax.report.gap_folder import hidden_in  # noqa: E402
+from droid_jax.report.gap_folder import read_answer  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 
 STAGE = re.compile(r"\[\d+/\d+\] (?P<stage>\w+): (?P<minutes>[\d.]+) minutes")  # as the command says that one ended
@@ -107,7 +107,7 @@ def results(out: Path) -> dict[str, Any]:
         json.loads((out / name).read_text()) for name in ("identify/fit.json", "gap/gap.json", f"train/{TRANSFER}")
     )
     return {
-        "hidden": hidden_in(gap),
+        "hidden": read_answer(out / "gap").hidden,
         "torque_gap": fit["gap"],
         "verdict": gap["verdict"],
         "effects": gap["effects"],

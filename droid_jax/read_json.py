@@ -157,11 +157,11 @@ def _sentence(value: Any, kind: Any, said: str) -> str:
 
 
 def _keys(found: dict[str, Any], options: tuple[Any, ...]) -> str:
-    """Which keys of an object are unknown and which are missing."""
-    fields = next(o.fields for o in options if isinstance(o, (inspect.StructType, inspect.TypedDictType)))
-    names = {f.encode_name: f.required for f in fields}
+    """Which keys of an object are missing, and which are unknown where its type allows no others."""
+    node = next(o for o in options if isinstance(o, (inspect.StructType, inspect.TypedDictType)))
+    names = {f.encode_name: f.required for f in node.fields}
     missing = [key for key, required in names.items() if required and key not in found]
-    if any(isinstance(o, inspect.TypedDictType) for o in options):  # which may hold more, and in a later version does
+    if isinstance(node, inspect.TypedDictType) or not node.cls.__struct_config__.forbid_unknown_fields:
         return f" lacks {', '.join(map(repr, missing))}"
     unknown = sorted(map(str, found.keys() - names.keys()))
     return f": {faults({'unknown keys:': unknown, 'missing keys:': missing})}; valid keys: {', '.join(names)}"

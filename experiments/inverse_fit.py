@@ -39,7 +39,7 @@ from droid_jax.recordings.checks import validate
 from droid_jax.recordings.clocks import interpolate
 from droid_jax.recordings.recording import Channel, Recording, TorqueConvention
 from droid_jax.report import style
-from droid_jax.report.export import png_bytes
+from droid_jax.report.style import png_bytes
 from droid_jax.simulate.measured_motion import Motion
 from droid_jax.simulate.rest import RestConfig
 from droid_jax.storage import write_bytes

@@ -46,8 +46,12 @@ from droid_jax.policy.evaluate import simulated  # noqa: E402
 from droid_jax.policy.randomise import axes, physics_of, randomised  # noqa: E402
 from droid_jax.policy.train import train  # noqa: E402
 from droid_jax.policy.trials import Trials  # noqa: E402
-from droid_jax.report.export import png_bytes  # noqa: E402
-from droid_jax.report.style import AFTER, INK, styled  # noqa: E402
+from droid_jax.report.style import (  # noqa: E402
+    AFTER,
+    INK,
+    png_bytes,
+    styled,
+)
 from droid_jax.storage import file_sha256, write_bytes, write_json  # noqa: E402
 from droid_jax.synthetic.policy_trials import TransferConfig, synthetic_robot, transfer  # noqa: E402
 from experiments.policies.cases import QUICK_STEPS, RESULTS, TIMESTEP, Options  # noqa: E402

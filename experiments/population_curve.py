@@ -128,7 +128,7 @@ def figure(runs: list[dict[str, Any]]) -> Figure:
 
 
 def main() -> None:
-    from droid_jax.report.export import png_bytes
+    from droid_jax.report.style import png_bytes
 
     arguments = tyro.cli(Arguments, description=__doc__)
     seconds = 3.0 if arguments.quick else 60.0 * arguments.minutes

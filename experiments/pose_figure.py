@@ -25,9 +25,15 @@ from scipy import stats  # noqa: E402
 from benchmarks.common import stem  # noqa: E402
 from droid_jax.door.scene import door_scene  # noqa: E402
 from droid_jax.door.space import door_space  # noqa: E402
-from droid_jax.report.export import save  # noqa: E402
-from droid_jax.report.style import AFTER, BEFORE, TRUTH, WIDE, styled  # noqa: E402
-from droid_jax.report.words import label  # noqa: E402
+from droid_jax.report.style import (  # noqa: E402
+    AFTER,
+    BEFORE,
+    TRUTH,
+    WIDE,
+    save,
+    styled,
+)
+from droid_jax.report.text import label  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 
 

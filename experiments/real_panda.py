@@ -76,7 +76,7 @@ from droid_jax.model.parameters import Mode, Parameter, Space
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.report import style
-from droid_jax.report.words import label
+from droid_jax.report.text import label
 from droid_jax.simulate.measured_motion import OVERSAMPLING
 from droid_jax.simulate.rest import RestConfig
 

@@ -25,14 +25,15 @@ import tuned  # noqa: E402, F401  (before jax starts)
 # isort: split
 import json  # noqa: E402
 
+import msgspec  # noqa: E402
 import tyro  # noqa: E402
 from table1 import PAPER  # noqa: E402
 
 from benchmarks.common import stem  # noqa: E402
 from droid_jax.commands.identify import Identify, run  # noqa: E402
-from droid_jax.report import search_figures, torque_figures  # noqa: E402
-from droid_jax.report.export import save  # noqa: E402
-from droid_jax.report.run_folder import Run, read_run  # noqa: E402
+from droid_jax.report import identify_figures, torque_figures  # noqa: E402
+from droid_jax.report.identify_folder import Run, read_run  # noqa: E402
+from droid_jax.report.style import save  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 
 SHOWN = ("hinge_damping", "hinge_frictionloss", "knob_mass")
@@ -53,17 +54,17 @@ def figures(found: Run) -> dict[str, Any]:
     trace = next(iter(found.traces.values()))
     return {
         "search_torques": torque_figures.torque_traces(trace, trace["phases"]),
-        "search_parameters": search_figures.parameter_history(found.history, found.fit["parameters"], SHOWN),
-        "search_cost": search_figures.cost_history(found.history, found.fit["cost"]),
+        "search_parameters": identify_figures.parameter_history(found.history, found.fit.parameters, SHOWN),
+        "search_cost": identify_figures.cost_history(found.history, found.fit.cost),
     }
 
 
 def made_by(found: Run) -> dict[str, Any]:
     """Where the run comes from, in the words of `origin`: one that is drawn again stays of the code that made it."""
     told = found.config
-    versions = {name: version for name, version in told["versions"].items() if name != "git"}
-    of = {"commit": told["versions"].get("git"), "versions": versions, "device": told["device"], "seed": told["seed"]}
-    return {**of, "date": told["started"]}
+    versions = {name: version for name, version in told.versions.items() if name != "git"}
+    of = {"commit": told.versions.get("git"), "versions": versions, "device": told.device, "seed": told.seed}
+    return {**of, "date": told.started}
 
 
 def main() -> None:
@@ -74,17 +75,18 @@ def main() -> None:
     for name, figure in figures(found).items():
         save(figure, arguments.out, stem(name, arguments.quick))
     shown = {
-        p["name"]: {k: p[k] for k in ("truth", "initial_mean", "mean", "std")}
-        | {"paper": PAPER[p["name"]][1]}  # mean and deviation, of the door without a spring
-        for p in found.parameters
+        p.name: {k: getattr(p, k) for k in ("truth", "initial_mean", "mean", "std")}
+        | {"paper": PAPER[p.name][1]}  # mean and deviation, of the door without a spring
+        for p in found.fit.of_interest
     }
     result = {
-        "cost": found.fit["cost"],
+        "cost": msgspec.structs.asdict(found.fit.cost),
         "gap": {
-            n: {k: g[k] for k in ("before", "after", "noise_floor", "closed")} for n, g in found.fit["gap"].items()
+            n: {k: getattr(g, k) for k in ("before", "after", "noise_floor", "closed")}
+            for n, g in found.fit.gap.items()
         },
-        "generations": found.fit["generations"],
-        "seconds": found.fit["seconds"],
+        "generations": found.fit.generations,
+        "seconds": found.fit.seconds,
         "parameters": shown,
     }
     write_json(arguments.out / f"{stem('search_figure', arguments.quick)}.json", {**made_by(found), **result}, indent=2)

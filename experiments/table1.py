@@ -27,7 +27,7 @@ from identify_suite import kept_cases  # noqa: E402
 from benchmarks.common import commits, stem  # noqa: E402
 from droid_jax.door.scene import door_scene  # noqa: E402
 from droid_jax.door.space import door_space  # noqa: E402
-from droid_jax.report.words import label, like, number  # noqa: E402
+from droid_jax.report.text import label, like, number  # noqa: E402
 from droid_jax.storage import write_json, write_text  # noqa: E402
 
 # Table I of the paper: mean and diag(Sigma), initial and for the doors with 0, 1 and 2 springs.

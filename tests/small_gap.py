@@ -13,13 +13,16 @@ from pathlib import Path
 
 import numpy as np
 
+from droid_jax.discrepancy.candidates import directions_of
 from droid_jax.discrepancy.case import Case, make_case
 from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.discrepancy.fitting import FinalModel, FittedModel, base_fit
-from droid_jax.discrepancy.search import search_effects
+from droid_jax.discrepancy.search import Problem, search_effects
 from droid_jax.discrepancy.verdict import Verdict
 from droid_jax.identify.multistart import RefineConfig
+from droid_jax.identify.pipeline import Progress
 from droid_jax.identify.search import SearchConfig
+from droid_jax.model.effects.candidate import candidates
 from droid_jax.model.effects.registry import library
 from droid_jax.model.parameter_file import load_parameters
 from droid_jax.model.parameters import Space
@@ -85,6 +88,10 @@ def record(name: str, repeats: int = 8, preload: float = PRELOAD, friction: floa
     return record_hidden(scene, demonstration(name), TRUTH, hidden, seed=seed, config=config, name=name, space=space)
 
 
+def quiet(stage: str, value: object) -> None:
+    """Progress that nobody sees."""
+
+
 @dataclass(frozen=True, eq=False)
 class Small:
     """A finished search."""
@@ -107,5 +114,12 @@ def small() -> Small:
     recordings = {name: record(name) for name in ("train", "validation")}
     scene, space = small_scene()
     case = make_case(scene, space, library(scene, EFFECTS), **recordings, config=QUICK)
-    base = base_fit(case, lambda stage, value: None)
+    base = base_fit(case.train, case.base, case.config, quiet)
     return Small(scene, recordings, case, base, search_effects(case, base, FLOOR))
+
+
+def problem_of(found: Small, deadline: float | None = None, progress: Progress = quiet) -> Problem:
+    """What every step of the search is given."""
+    before = found.case.validation.discrepancy_at(found.base.values)
+    asked = directions_of(candidates(found.case.effects))
+    return Problem(found.case, found.base, before, FLOOR, asked, deadline, progress)

@@ -12,7 +12,7 @@ from droid_jax.commands.identify import Identify
 from droid_jax.commands.pictures import draw_replay, keep_replay
 from droid_jax.model.scene import Scene, load_scene
 from droid_jax.recordings.recording import Recording
-from droid_jax.report import film, render
+from droid_jax.report import render
 from droid_jax.storage import write_npz
 
 OLD = ("frames/after_00_0.0s.png", "films/replay.webp", "replay.npz")
@@ -47,7 +47,7 @@ def test_what_could_not_be_drawn_is_drawn_later_and_once(
         return [np.zeros((4, 4, 3), np.uint8) for _ in rows]
 
     monkeypatch.setattr(render, "frames", drawn)
-    monkeypatch.setattr(film, "film", lambda path, model, sides, period, camera: asked.append(period))
+    monkeypatch.setattr(render, "film", lambda path, model, sides, period, camera: asked.append(period))
     draw_replay(tmp_path, scene)  # nothing to draw
     replay(tmp_path, np.zeros((5, scene.model.nq)))
     draw_replay(tmp_path, scene)

@@ -69,15 +69,16 @@ def motions(*files: str, repeats: int = 8, commands: bool = True, **meta: str) -
 def found(folder: Path, effects: list[str], synthetic_robot: bool = True) -> None:
     """A folder with the results of a search."""
     folder.mkdir(parents=True)
-    gaps = {role: {"closed": 0.5 + 0.1 * k} for k, role in enumerate(("train", "validation", "test"))}
+    size = {"recording": "a", **dict.fromkeys(("before", "after", "torque_before", "torque_after"), 1.0)}
+    sizes = {role: {**size, "closed": 0.5 + 0.1 * k} for k, role in enumerate(("train", "validation", "test"))}
     (folder / "gap.json").write_text(
         json.dumps(
             {
-                "effects": effects,
-                "indistinguishable": [],
-                "screens": [],
+                "version": 2,
+                "effects": [{"effect": effect, "location": "door_hinge"} for effect in effects],
+                "amendments": {},
                 "sentence": "The model lacks: latch.",
-                "gaps": gaps,
+                "discrepancies": sizes,
                 "setup": {
                     "synthetic_robot": synthetic_robot,
                     "hidden": "magnetic catch (1.5 N m; in the library: latch)",
@@ -150,16 +151,18 @@ def test_trials_count_where_they_are_made(called):
 
 
 def test_a_policy_is_trained_on_the_extended_model_where_there_is_one(called, tmp_path: Path, capsys):
-    found(tmp_path / "runs" / "all" / "gap", ["latch at door_hinge"])
+    found(tmp_path / "runs" / "all" / "gap", ["latch"])
     assert main(["all", "--stages", "train"]) == 0
     assert called[0].fit == Path("runs/all/gap")
-    assert "gap: The model lacks: latch; 70 % of the gap U closed on the test motion" in capsys.readouterr().out
+    assert (
+        "gap: The model lacks: latch; 70 % of the discrepancy U closed on the test recording" in capsys.readouterr().out
+    )
 
 
 @pytest.mark.parametrize("synthetic_robot", [True, False])
 def test_the_last_lines_say_what_was_hidden_in_what_was_searched(called, tmp_path: Path, capsys, synthetic_robot: bool):
     """Recordings of a synthetic robot may lie beside a search in a robot's own."""
-    found(tmp_path / "runs" / "all" / "gap", ["latch at door_hinge"], synthetic_robot)
+    found(tmp_path / "runs" / "all" / "gap", ["latch"], synthetic_robot)
     assert main([]) == 0
     said = capsys.readouterr().out
     assert ("hidden in the synthetic robot: magnetic catch (1.5 N m; in the library: latch)" in said) == synthetic_robot

@@ -451,7 +451,7 @@ def test_a_run_goes_on_after_a_stop_and_is_whole(
     assert lines[0] == "The model lacks: hinge_preload at door."
     assert re.fullmatch(r"hinge_preload at door: hinge preload \S+ N m, \S+ to \S+ N m \(90 % interval\)", lines[1])
     assert lines[2] == "p = 0.0078 if nothing were missing; base fit converged: yes"
-    assert lines[3].startswith("gap, noise units squared: train ") and " % closed), validation " in lines[3]
+    assert lines[3].startswith("discrepancy U: train ") and " % closed), validation " in lines[3]
     assert lines[4].startswith("shifted most: door_stiffness ") and lines[4].endswith(" deviations)")
     assert lines[5] == f"report: {out / 'report.html'}"
     files = {p.name for p in out.iterdir()}
@@ -459,12 +459,15 @@ def test_a_run_goes_on_after_a_stop_and_is_whole(
     assert files == {"checkpoints", "setup.json", "tensorboard", *written}
     assert not (out / "checkpoints" / "replays").exists()
     answer = read_gap(out).found
-    assert answer["coefficients"][0]["value"] == pytest.approx(PRELOAD, rel=0.05)
-    assert {"search", "refine", "discretisation_error", "score_test", "refit"} <= set(answer["seconds"])
-    assert answer["setup"]["synthetic_robot"] is True and answer["setup"]["command"] == "gap"
-    places = {when: [(c["variable"], c["where"]) for c in answer["cells"][when]] for when in ("before", "after")}
-    assert places["before"] == places["after"]
-    assert answer["versions"]["jax"] and answer["device"]
+    assert answer.coefficients[0].value == pytest.approx(PRELOAD, rel=0.05)
+    assert {"search", "refine", "discretisation_error", "score_test", "refit"} <= set(answer.seconds)
+    assert answer.setup.synthetic_robot is True and read_gap(out).options["command"] == "gap"
+    before, after = (
+        [(c.axis, c.joint, c.label, c.low, c.high) for c in cells]
+        for cells in (answer.cells.before, answer.cells.after)
+    )
+    assert before == after
+    assert answer.versions["jax"] and answer.device
 
     monkeypatch.setattr(missing, "search_effects", lambda *a: pytest.fail("this run is whole"))
     assert main(command) == 0
@@ -500,11 +503,11 @@ def test_ties_come_with_an_experiment(place: Path, quick: None, monkeypatch: pyt
     assert main(arguments(place, "--effects", *EFFECTS)) == 0
     assert asked == [(["hinge_preload at door", "base"], "train")]
     found = read_gap(place / "run").found
-    assert found["experiments"] == [
-        {"what": "the same motion twice as fast", "distance": 8.5, "not_made": ""},
-        {"what": "slower", "distance": None, "not_made": "too long"},
+    assert [(e.what, e.distance, e.not_made) for e in found.experiments] == [
+        ("the same motion twice as fast", 8.5, ""),
+        ("slower", None, "too long"),
     ]
-    assert found["amendments"] == {"experiments": "made", "final_refit": "made"}
+    assert found.amendments == {"experiments": "made", "final_refit": "made"}
 
 
 def test_the_verdict_is_there_whatever_becomes_of_what_is_added_to_it(
@@ -518,7 +521,7 @@ def test_the_verdict_is_there_whatever_becomes_of_what_is_added_to_it(
         raise KeyboardInterrupt
 
     def failing(*arguments: Any) -> Any:
-        assert read_gap(out).found["verdict"] == "named"  # it stayed there while the run went on
+        assert read_gap(out).found.verdict == "named"  # it stayed there while the run went on
         raise ValueError("no motion can be asked for")
 
     monkeypatch.setattr(amendments, "separating", stopped)
@@ -526,18 +529,20 @@ def test_the_verdict_is_there_whatever_becomes_of_what_is_added_to_it(
     said = capsys.readouterr()
     assert f"the verdict is in {out / 'gap.json'}: The model lacks: hinge_preload at door." in said.out
     first = read_gap(out)
-    assert first.amendments == {"experiments": "to be made", "final_refit": "to be made"}
-    assert first.found["verdict"] == "named" and first.fitted_to == ["train"]
+    assert first.found.amendments == {"experiments": "to be made", "final_refit": "to be made"}
+    assert first.found.verdict == "named" and first.found.final_model.fitted_to == ["train"]
     assert {"gap.npz", "extended.json", "checkpoints"} <= {p.name for p in out.iterdir()}
 
     monkeypatch.setattr(amendments, "separating", failing)
     assert main(command) == 0
     said = capsys.readouterr().out
     assert "holds this run unfinished; going on" in said
-    assert "would tell the tied effects apart were not made: no motion can be asked for; the tie stands" in said
+    assert (
+        "would distinguish the alternatives were not made: no motion can be asked for; the alternatives stand" in said
+    )
     last = read_gap(out)
-    assert last.amendments == {"experiments": "not made: no motion can be asked for", "final_refit": "made"}
-    assert last.fitted_to == ["train", "validation"] and last.found["effects"] == first.found["effects"]
+    assert last.found.amendments == {"experiments": "not made: no motion can be asked for", "final_refit": "made"}
+    assert last.found.final_model.fitted_to == ["train", "validation"] and last.found.effects == first.found.effects
 
     monkeypatch.setattr(missing, "search_effects", lambda *a: pytest.fail("this run is whole"))
     assert main(command) == 0

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -23,6 +24,7 @@ from droid_jax.door.task import Task
 from droid_jax.identify.gaussian import prior
 from droid_jax.policy.control import load_policy
 from droid_jax.policy.trials import BLOWN_UP, Trials
+from droid_jax.report.policy_folder import Trained, Training, Transfer
 from droid_jax.report.render import NoOpenGL
 from droid_jax.report.stages import extended_of
 from droid_jax.run import main
@@ -276,7 +278,7 @@ def test_films_are_of_the_trials_of_median_angle(tmp_path: Path, monkeypatch: py
             raise NoOpenGL("no OpenGL here")
         made[path.name] = states[0]
 
-    monkeypatch.setattr("droid_jax.report.film.film", film)
+    monkeypatch.setattr("droid_jax.report.render.film", film)
     monkeypatch.setattr("droid_jax.synthetic.policy_trials.filmed", lambda policy, robot, number: number)
     robot: Any = SimpleNamespace(scene=SimpleNamespace(visual_model=lambda: None), task=Task())
     why = _film(tmp_path, None, robot, trials)  # type: ignore[arg-type]
@@ -292,8 +294,13 @@ def test_trials_on_another_robot_than_the_fitted_one_say_so(fit: str | None, rob
     """With recordings of your own the synthetic robot is another robot; without a fit there is none that it
     could be.
     """
-    trials = {"success_rate": 1.0, "interval_95": [0.9, 1.0], "angle_deg": {"mean": 40.0, "std": 1.0}}
-    _tell({"simulation": trials, "synthetic_robot": trials}, {"setup": {"fit": fit}, "synthetic_robot": robot})
+    trials = {"success_rate": 1.0, "interval_95": [0.9, 1.0], "angle_deg": {"mean": 40.0, "std": 1.0, "all": []}}
+    trials |= {"trials": 0, "success": [], "stopped": {}, "grip": {"mean": 0.5}, "steps": trials["angle_deg"]}
+    tried = {"simulation": trials, "synthetic_robot": trials, "robot": {"hidden": []}}
+    task = {"opened": 0.7, "held": 1.0, "control": 0.02, "steps": 512}
+    training = {"setup": {"method": "fitted", "preset": "quick", "knob": 0, "seed": 0, "fit": fit}, "task": task}
+    training |= {"synthetic_robot": robot, "scene": "door", "effects": [], "versions": {}, "device": "", "history": []}
+    _tell(Trained(Path(), msgspec.convert(training, Training), msgspec.convert(tried, Transfer), {}))
     said = capsys.readouterr().out
     assert "synthetic robot: 100 % success" in said
     assert ("The fit is of your own recordings: the synthetic robot is another one" in said) == another

@@ -29,7 +29,7 @@ RENAMED = {
     r"\bhops=|\bhop_generations=(?<!basin_hop_generations=)|\brough=(?!rough)|\bdoubt=": "basin_hops, misfit_threshold",
     r"of one's own|worth a name\b|does as well\b": "your own, minimum effect size, equivalent",
 }
-ENDINGS = (".py", ".md", ".j2", ".ipynb", ".toml", ".css")
+ENDINGS = (".py", ".md", ".jinja", ".ipynb", ".toml", ".css")
 HISTORY = ("docs/history/", "benchmarks/results/", "CHANGELOG.md", "tests/test_vocabulary.py")
 
 

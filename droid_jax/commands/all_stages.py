@@ -94,7 +94,7 @@ def run(command: All) -> None:
     """Every stage in a folder of its own below OUT, then the page of all of them; where one fails, of those before."""
     started = time.monotonic()
     from droid_jax import runtime
-    from droid_jax.report.scalars import needs_writer
+    from droid_jax.report.progress import needs_writer
 
     _needs_stages(command)
     command = with_robot_options(command)
@@ -302,34 +302,21 @@ def _fitted(folder: Path, command: All, recordings: Sequence[Path]) -> bool:
 
 def told(out: Path) -> list[str]:
     """One line for each stage that has a result."""
-    from droid_jax.report.gap_folder import hidden_in
-    from droid_jax.report.gap_words import amendment_words, readable
-    from droid_jax.report.policy_folder import read_training
-    from droid_jax.report.policy_words import another_robot
-    from droid_jax.report.words import judged, percent
+    from droid_jax.report.gap_folder import read_answer
+    from droid_jax.report.identify_folder import read_fit
+    from droid_jax.report.policy_folder import read_rates, read_training
+    from droid_jax.report.text import lines
 
-    lines, old = [], left_over(out)
-    if old:
-        lines.append(f"not on the page: {' and '.join(sorted(old))}, of an earlier run in this folder")
-    if fit := _json(out / "identify" / FIT):
-        unit = fit.get("torque_unit", "N m")
-        gaps = [f"{name} {g['before']:.3f} -> {g['after']:.3f} {unit} {judged(g)}" for name, g in fit["gap"].items()]
-        lines.append(f"identify: torque distance {', '.join(gaps)}")
-    if found := None if "gap" in old else _json(out / "gap" / GAP):
-        role, size = list(found["gaps"].items())[-1]
-        closed = size["closed"] if found["effects"] else None
-        share = "" if closed is None else f"; {percent(closed)} of the gap U closed on the {role} motion"
-        lines.append(f"gap: {readable(found['sentence'], found).rstrip('.')}{share}")
-        lines += amendment_words(found)
-        if hidden := hidden_in(found):
-            lines.append(f"hidden in the synthetic robot: {hidden}")
-    if tried := None if "train" in old else _json(out / "train" / TRANSFER):
-        for name, where in (("simulation", "in simulation"), ("synthetic_robot", "on the synthetic robot")):
-            rate, (low, high) = tried[name]["success_rate"], tried[name]["interval_95"]
-            lines.append(f"policy: {percent(rate)} success {where} ({percent(low)} to {percent(high)})")
-        if other := another_robot(read_training(out / "train")):
-            lines.append(other)
-    return lines
+    old, at = left_over(out), {stage: out / stage for stage in LAST_FILES}
+    tried = "train" not in old and (at["train"] / TRANSFER).is_file()
+    return lines(
+        "all.txt.jinja",
+        old=sorted(old),
+        fit=read_fit(at["identify"]) if (at["identify"] / FIT).is_file() else None,
+        answer=read_answer(at["gap"]) if "gap" not in old and (at["gap"] / GAP).is_file() else None,
+        trials=read_rates(at["train"]) if tried else None,
+        another_robot=tried and read_training(at["train"]).another_robot,
+    )
 
 
 def _record(command: All) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -18,12 +17,14 @@ from droid_jax.commands.synthetic import hidden_effects
 from droid_jax.commands.user_effects import load_effects
 from droid_jax.commands.writer import writes
 from droid_jax.files import FILMS, POLICY, TRAINING, TRANSFER
+from droid_jax.read_json import read_json
 
 if TYPE_CHECKING:
     from droid_jax.door.environment import DoorEnv
     from droid_jax.door.task import Task
     from droid_jax.policy.control import Policy
     from droid_jax.policy.trials import Trials
+    from droid_jax.report.policy_folder import Trained, Training
     from droid_jax.synthetic.policy_trials import PolicyRobot
 
 
@@ -64,7 +65,7 @@ def run(command: Evaluate) -> None:
     from droid_jax.policy.control import load_policy
     from droid_jax.policy.evaluate import simulated
     from droid_jax.policy.randomise import of_method
-    from droid_jax.report.policy_folder import read_training
+    from droid_jax.report.policy_folder import read_policy, read_training
     from droid_jax.report.progress import counting
     from droid_jax.storage import file_sha256, new_folder, write_json
     from droid_jax.synthetic.hidden_effects import HIDDEN
@@ -72,20 +73,19 @@ def run(command: Evaluate) -> None:
 
     folder = stage_folder(command.run, "train", TRAINING)
     load_effects(command.user_effects, folder)
-    trained = read_training(folder)
-    setup, policy = trained["setup"], load_policy(folder / POLICY)
+    trained, policy = read_training(folder), load_policy(folder / POLICY)
     setup_now = {**setup_of(command), "run": str(folder), "policy_sha256": file_sha256(folder / POLICY)}
-    if not command.again and (done := _done(folder, setup_now)):
+    if not command.again and _done(folder, setup_now):
         print(f"{folder} holds these trials already (start over with --again)")
-        _tell(done, trained)
+        _tell(read_policy(folder))
         report.run(report.Report(folder))
         return
-    scene, gaussian, effects = source(folder, setup["knob"])
-    env = DoorEnv(scene, _task(folder, trained["task"]), effects)
+    scene, gaussian, effects = source(folder, trained.setup.knob)
+    env = DoorEnv(scene, _task(folder), effects)
     robot, truth = _robot(command, trained, env)
     # All of them are one compiled program, which does not say how far it is.
     with counting("episodes in simulation, a minute of compiling first", command.trials) as count:
-        inside = simulated(policy, env, of_method(setup["method"], scene, gaussian), command.trials, command.seed)
+        inside = simulated(policy, env, of_method(trained.setup.method, scene, gaussian), command.trials, command.seed)
         count(command.trials)
     with counting("trials on the synthetic robot", command.trials) as count:
         outside = transfer(policy, robot, count)
@@ -106,7 +106,7 @@ def run(command: Evaluate) -> None:
         "device": runtime.device(),
     }
     write_json(folder / TRANSFER, content)  # last: its presence says that the trials are whole
-    _tell(content, trained)
+    _tell(read_policy(folder))
     report.run(report.Report(folder))
 
 
@@ -116,42 +116,37 @@ def needs_trials(trials: int) -> None:
         raise ValueError(f"--trials must be 1 or more, got {trials}")
 
 
-def _done(folder: Path, setup: dict[str, Any]) -> Mapping[str, Any] | None:
-    """transfer.json of these very trials, where the folder holds it whole."""
+def _done(folder: Path, setup: dict[str, Any]) -> bool:
+    """Whether the folder holds the transfer.json of these very trials, whole."""
     from droid_jax.report.policy_folder import read_policy
 
     try:
         found = read_policy(folder).transfer
     except ValueError:  # broken: it is made again
-        return None
-    return found if found is not None and not changed(found.get("setup", {}), setup) else None
+        return False
+    return found is not None and not changed(found.setup, setup)
 
 
-def _task(folder: Path, known: Mapping[str, Any]) -> Task:
-    """The task that a policy was trained for; ValueError where this program knows another one."""
+def _task(folder: Path) -> Task:
+    """The task that a folder's policy was trained for; ValueError where this program knows another one."""
     from droid_jax.door.task import Task
 
+    known = read_json(folder / TRAINING)["task"]
     strange = sorted(set(known) - {f.name for f in dataclasses.fields(Task)})
     if strange:
         raise ValueError(f"{folder}: the policy was trained for a task with {', '.join(strange)}; train it again")
     return Task(**known)
 
 
-def _tell(found: Mapping[str, Any], trained: Mapping[str, Any]) -> None:
-    """Two lines of transfer.json, and what they do not tell of a policy whose training.json is `trained`."""
-    from droid_jax.report.policy_words import another_robot
-    from droid_jax.report.words import percent
+def _tell(trained: Trained) -> None:
+    """Two lines of the trials, and what they do not say."""
+    from droid_jax.report.text import lines
 
-    for name, where in (("simulation", "simulation"), ("synthetic_robot", "synthetic robot")):
-        of = found[name]
-        low, high = of["interval_95"]
-        angle = f"opened to {of['angle_deg']['mean']:.1f} ± {of['angle_deg']['std']:.1f} degrees"
-        print(f"{where}: {percent(of['success_rate'])} success ({percent(low)} to {percent(high)}), {angle}")
-    if other := another_robot(trained):
-        print(other)
+    for line in lines("evaluate.txt.jinja", trials=trained.trials, another_robot=trained.training.another_robot):
+        print(line)
 
 
-def _robot(command: Evaluate, trained: Mapping[str, Any], env: DoorEnv) -> tuple[PolicyRobot, dict[str, float]]:
+def _robot(command: Evaluate, trained: Training, env: DoorEnv) -> tuple[PolicyRobot, dict[str, float]]:
     """The synthetic robot, the one that was fitted unless asked for another; and its hidden values."""
     from droid_jax.door.scene import door_scene
     from droid_jax.synthetic.hidden_effects import as_applied
@@ -160,8 +155,8 @@ def _robot(command: Evaluate, trained: Mapping[str, Any], env: DoorEnv) -> tuple
 
     asked = {"springs": command.springs, "seed": command.robot, "hide": command.hide}
     usual = {"springs": 1, "seed": 0, "hide": ()}
-    own = usual | trained["synthetic_robot"] | {name: value for name, value in asked.items() if value is not None}
-    scene = door_scene(limits=True, knob=trained["setup"]["knob"])
+    own = usual | trained.synthetic_robot.known | {name: value for name, value in asked.items() if value is not None}
+    scene = door_scene(limits=True, knob=trained.setup.knob)
     truth = synthetic_truth(scene, own["springs"], own["seed"])
     config = TransferConfig(trials=command.trials, seed=command.seed)
     return synthetic_robot(
@@ -176,8 +171,7 @@ def _film(folder: Path, policy: Policy, robot: PolicyRobot, found: Trials) -> st
     """
     import numpy as np
 
-    from droid_jax.report.film import film
-    from droid_jax.report.render import NoOpenGL
+    from droid_jax.report.render import NoOpenGL, film
     from droid_jax.synthetic.policy_trials import filmed
 
     chosen = {"good": np.flatnonzero(found.success), "bad": np.flatnonzero(~found.success & found.counted)}

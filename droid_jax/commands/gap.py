@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from droid_jax.model.parameters import Space
     from droid_jax.model.scene import Scene
     from droid_jax.recordings.recording import Recording
-    from droid_jax.report.gap_folder import Gap as Found
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,7 @@ class GapCommand:
 def run(command: GapCommand) -> None:
     """Record or load, fit, search, write the run's folder and its page."""
     from droid_jax import runtime
-    from droid_jax.report.scalars import FOLDER, needs_writer
+    from droid_jax.report.progress import FOLDER, needs_writer
 
     command = with_robot_options(command)
     needs_scene(command)
@@ -265,40 +264,12 @@ def given_to(command: GapCommand) -> list[Recording]:
 
 def _done(out: Path) -> None:
     """Build the page, and say in a few lines what was found."""
-    from droid_jax.report.gap_folder import read_gap
-    from droid_jax.report.gap_words import amendment_words, size_words
-    from droid_jax.report.words import percent
+    from droid_jax.report.gap_folder import largest_shifts, read_gap
+    from droid_jax.report.text import lines
 
     gap = read_gap(out)
-    found = gap.found
     page = report.write_page(out)
-    print(found["sentence"])
-    for size in gap.sizes:
-        print(f"{size['effect']}: {size_words(size)} (90 % interval)")
-    p = "nothing was asked" if found["p"] is None else f"p = {found['p']:.2g} if nothing were missing"
-    print(f"{p}; base fit converged: {'yes' if found['converged'] else 'no'}")
-    gaps = []
-    for role, one in found["gaps"].items():
-        closed = "" if one["closed"] is None else f" ({percent(one['closed'])} closed)"
-        gaps.append(f"{role} {one['before']:.3g} -> {one['after']:.3g}{closed}")
-    print(f"gap, noise units squared: {', '.join(gaps)}")
-    if found["cut"]:
-        print(f"left out for lack of time (--budget): {found['cut']}")
-    for line in amendment_words(found):
+    shifted = next(iter(largest_shifts(gap.found.shifts)), None)
+    for line in lines("gap.txt.jinja", gap=gap, found=gap.found, shifted=shifted):
         print(line)
-    if gap.limits:
-        print(gap.limits)
-    print(f"shifted most: {_shifted_most(gap)}")
     print(f"report: {page}")
-
-
-def _shifted_most(gap: Found) -> str:
-    """Which base parameter the effects moved most, by how many of its deviations."""
-    from droid_jax.report.gap_words import deviations, largest_shifts
-
-    if not gap.extended:
-        return "nothing, no effect came in"
-    for most in largest_shifts(gap.found["shifts"])[:1]:
-        by = abs(deviations(most))
-        return f"{most['name']} {most['before']:.3g} -> {most['after']:.3g} {most['unit']} ({by:.1f} deviations)"
-    return "nothing whose deviation is known"

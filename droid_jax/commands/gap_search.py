@@ -57,8 +57,7 @@ def searched(
     """
     from droid_jax.discrepancy.missing import amended, search
     from droid_jax.recordings.split import Split
-    from droid_jax.report.progress import stages
-    from droid_jax.report.scalars import scalars
+    from droid_jax.report.progress import scalars, stages
 
     names = IN_BLOCKS if split is Split.BLOCKS else BARS if start is None else BARS[1:]
     with (

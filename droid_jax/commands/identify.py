@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -17,8 +17,7 @@ from droid_jax.commands.scenes import compared, needs_log, needs_recording, need
 from droid_jax.commands.synthetic import known_robot, with_robot_options
 from droid_jax.commands.user_effects import load_effects
 from droid_jax.commands.writer import writes
-from droid_jax.files import EXTENDED, FIT
-from droid_jax.read_json import read_json
+from droid_jax.files import EXTENDED
 
 if TYPE_CHECKING:
     from droid_jax.identify.pipeline import Identified, IdentifyConfig
@@ -26,6 +25,7 @@ if TYPE_CHECKING:
     from droid_jax.model.parameters import Space
     from droid_jax.model.scene import Scene
     from droid_jax.recordings.recording import Recording
+    from droid_jax.report.identify_folder import Fit
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class Identify:
 def run(command: Identify) -> None:
     """Record or load, fit, write the run's folder and its page."""
     from droid_jax import runtime
-    from droid_jax.report.scalars import needs_writer
+    from droid_jax.report.progress import needs_writer
 
     command = with_robot_options(command)
     needs_scene(command)
@@ -102,8 +102,8 @@ def run(command: Identify) -> None:
     from droid_jax.identify.solution_checks import creep_of_fit
     from droid_jax.preflight.check_log import check_log
     from droid_jax.preflight.preflight import command_notes
-    from droid_jax.report.progress import stages
-    from droid_jax.report.scalars import FOLDER, scalars
+    from droid_jax.report.identify_folder import read_fit
+    from droid_jax.report.progress import FOLDER, scalars, stages
     from droid_jax.storage import write_bytes
 
     load_effects(command.user_effects, None if command.extended is None else command.extended.parent)
@@ -155,7 +155,7 @@ def run(command: Identify) -> None:
         )  # fmt: skip
     draw_replay(out, scene)
     report.run(report.Report(out))
-    _summary(found, read_json(out / FIT), [r.repeats for r in recordings])
+    _summary(found, read_fit(out), [r.repeats for r in recordings])
 
 
 def _description(command: Identify, found: Identified, recordings: Sequence[Recording]) -> dict[str, Any]:
@@ -280,36 +280,15 @@ def _recordings(
     return list(kept_recordings(paths, command.again, recorded).values()), truth, {}
 
 
-def _summary(found: Identified, fit: Mapping[str, Any], repeats: Sequence[int]) -> None:
-    """A few lines that say how it went; fit: of fit.json; repeats: of each recording."""
+def _summary(found: Identified, fit: Fit, repeats: Sequence[int]) -> None:
+    """A few lines that say how it went; fit: fit.json; repeats: of each recording."""
     from droid_jax.identify.solution_checks import solution_notes
-    from droid_jax.report.told import moved_words, unsure_words, went_far
-    from droid_jax.report.words import DOUBT, asked_of, far_off, judged, lacks_something, needed, noiseless, percent
+    from droid_jax.report.identify_page import asked_of, far_off, lacks_something, needed, noiseless
+    from droid_jax.report.text import lines
 
-    for name, gap in found.torque_distances.items():
-        way = "one repeat: what noise alone would leave is not known"
-        if gap.noise_floor is not None:
-            closed = "there was none to close" if gap.closed is None else f"{percent(gap.closed)} of the gap closed"
-            way = f"a perfect model: {gap.noise_floor:.3f}; {closed}"
-        on = judged(fit["gap"][name])
-        print(f"{name}: torque distance {gap.before:.3f} -> {gap.after:.3f} {fit['torque_unit']} {on} ({way})")
-    silent = [p for p in fit["parameters"] if not p["identifiable"] and not p["nuisance"]]
-    if silent and found.refined is not None:
-        if still := [p["name"] for p in silent if not went_far(p)]:
-            print(f"this demonstration tells little about: {', '.join(still)}")
-        for p in filter(went_far, silent):
-            print(f"{p['name']} {moved_words(p)}, but its value is not sure: {unsure_words(p)}")
-    if found.refined is not None and not found.refined.converged:
-        print("the refinement did not converge: take values and intervals with care")
     for text in solution_notes(found.checks, found.scene.name):
         warnings.warn(text, stacklevel=2)
-    print(f"search stopped: {found.search.stop}; {sum(found.seconds.values()):.0f} s")
-    if far_off(fit):
-        print(f"the fit stays far from the data: {DOUBT}")
-    if lacks_something(fit):
-        print(
-            "what is left is well above noise: `python -m droid_jax.run gap` looks for what the model lacks"
-            + needed(repeats)
-        )
-    elif noiseless(fit):
-        print(f"one repeat does not tell noise from what the model lacks: {asked_of(fit)}")
+    said = {"far_off": far_off(fit), "lacks_something": lacks_something(fit), "needs": needed(repeats)}
+    asked, seconds = asked_of(fit) if noiseless(fit) else "", sum(found.seconds.values())
+    for line in lines("identify.txt.jinja", fit=fit, seconds=seconds, asked=asked, **said):
+        print(line)

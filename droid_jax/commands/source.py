@@ -10,7 +10,7 @@ from droid_jax.commands.synthetic import known_robot
 from droid_jax.errors import needs
 from droid_jax.files import CONFIG, GAP, GAUSSIAN
 from droid_jax.read_json import read_json, typed
-from droid_jax.report.stages import extended_of, left_over, needs_whole, setup, told_in, unfinished
+from droid_jax.report.stages import described_in, extended_of, left_over, needs_whole, setup, unfinished
 
 if TYPE_CHECKING:
     from droid_jax.identify.gaussian import Gaussian
@@ -116,7 +116,7 @@ def _robot(folder: Path | None) -> dict[str, Any]:
     """The same as a finished run of `identify` or `gap` keeps it; empty where it does not."""
     if folder is None:
         return {}
-    told = (told_in(folder / CONFIG), told_in(folder / GAP).get("setup", {}))
+    told = (described_in(folder / CONFIG), described_in(folder / GAP).get("setup", {}))
     return next((of["robot"] for of in told if of.get("synthetic_robot") and of.get("robot")), {})
 
 

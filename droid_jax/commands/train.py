@@ -59,7 +59,7 @@ def run(command: Train) -> None:
     """Train, and write the run's folder and its page."""
     needs_brax()
     from droid_jax import runtime
-    from droid_jax.report.scalars import FOLDER, needs_writer, scalars
+    from droid_jax.report.progress import FOLDER, needs_writer, scalars, training
 
     needs_writer(command.tensorboard)
     runtime.start()
@@ -69,7 +69,6 @@ def run(command: Train) -> None:
     from droid_jax.policy.network import save_policy
     from droid_jax.policy.randomise import of_method
     from droid_jax.policy.train import train
-    from droid_jax.report.progress import training
     from droid_jax.storage import write_bytes, write_json
 
     out, fit = command.out, _fit_folder(command)

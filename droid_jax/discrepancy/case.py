@@ -11,7 +11,7 @@ import numpy as np
 from droid_jax.arguments import instance
 from droid_jax.cost.cost import Cost, make_cost
 from droid_jax.cost.lone_log import LoneLog, lone_log
-from droid_jax.cost.noise import stated_deviation as noise_of_residual
+from droid_jax.cost.noise import stated_deviation
 from droid_jax.cost.observation import least_noise
 from droid_jax.cost.replay_cache import cached
 from droid_jax.discrepancy.candidates import ScoreTest, directions_of, proposals, score_test
@@ -23,7 +23,7 @@ from droid_jax.identify.multistart import RefineProgress
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects.candidate import candidates
 from droid_jax.model.effects.registry import beside, joined, ready
-from droid_jax.model.parameters import Parameter, Space
+from droid_jax.model.parameters import Parameter, Role, Space
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording
 from droid_jax.recordings.split import FEWEST_REPEATS, Split
@@ -156,7 +156,7 @@ def _of_costs(costs: Sequence[Cost], base: Space, effects: tuple[Effect, ...], c
 
 def per_recording_nuisances(base: Space) -> list[str]:
     """Nuisances that every recording has for itself: what a sensor shows at rest changes from day to day."""
-    return [p.name for p in base.parameters if p.nuisance and p.name.startswith("torque_offset[")]
+    return [p.name for p in base.of_role(Role.TORQUE_OFFSET) if p.nuisance]
 
 
 def unbounded(whole: Space, names: Sequence[str]) -> Space:
@@ -284,7 +284,7 @@ def noise_of(
     least = _least(found, whole, log.space, config)
     noise = least if least @ least < config.blocks.noise_share * (whole @ whole) else whole
     left = (noise.reshape(len(deviation), -1).T * deviation)[inside]
-    return noise_of_residual(left, log.moves[inside]), block_length(left, config.blocks)
+    return stated_deviation(left, log.moves[inside]), block_length(left, config.blocks)
 
 
 def _rough_fit(
@@ -296,7 +296,7 @@ def _rough_fit(
     config: DiscrepancyConfig,
 ) -> tuple[Case, FittedModel, np.ndarray]:
     """The base fitted with the noise [C] stated that `values` [D] leave."""
-    left = noise_of_residual(log.residual_torque(values)[block >= 0], log.moves[block >= 0])
+    left = stated_deviation(log.residual_torque(values)[block >= 0], log.moves[block >= 0])
     deviation = np.maximum(left, least_noise("torque", log.measured))
     rows = _blocks(log, deviation, block, config)
     case = Case(rows, rows, None, base, tuple(effects), config)

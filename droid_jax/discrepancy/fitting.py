@@ -20,8 +20,7 @@ from droid_jax.identify.identifiability import posterior_of
 from droid_jax.identify.levenberg_marquardt import principal_axes
 from droid_jax.identify.multistart import Hypotheses, RefineConfig, Refined, RefineProgress, chord, refine
 from droid_jax.identify.pipeline import Progress, grip_hypotheses, search_cost, starts
-from droid_jax.identify.search import NotReplayed
-from droid_jax.identify.search import cma_search as search
+from droid_jax.identify.search import NotReplayed, cma_search
 from droid_jax.model.effects.candidate import Candidate, Keys, keys_of, names_of
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import with_options
@@ -171,7 +170,7 @@ def fitted_from_prior(
     at = whole.values({name: value for part in parts for name, value in part.shape_parameters.items()})
     coefficients = [a for part in parts for a in part.coefficients]
     main = whole.select([*(p.name for p in base.parameters if not p.nuisance), *coefficients])
-    found = search(
+    found = cma_search(
         search_cost(lambda rows: np.mean(train.distances(rows), axis=1), config.compare, whole, main, at),
         main,
         config.search,

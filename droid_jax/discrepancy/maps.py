@@ -11,6 +11,7 @@ import numpy as np
 
 from droid_jax.discrepancy.residual_set import ResidualSet
 from droid_jax.discrepancy.statistics import benjamini_hochberg
+from droid_jax.model.parameters import Role
 from droid_jax.model.scene import Scene
 
 BINS = 6
@@ -18,8 +19,7 @@ STILL = 0.01  # rad/s or m/s
 STILL_JOINT = 0.005  # rad/s or m/s
 LEAST = 1e-3  # of its size, by which a variable must change to be divided
 FEWEST = 5  # residuals of a cell that is tested
-ALONG = "hinge_preload"  # the coefficient whose sensitivity says how a torque of the hinge shows in the measured joints
-HELD = 0.2  # of that sensitivity's size where it is large: with less the door is not held
+HELD = 0.2  # of the size, where it is large, of what a torque of the hinge does: with less the door is not held
 
 
 class Axis(enum.Enum):
@@ -97,10 +97,11 @@ def _hinge_parts(residual_set: ResidualSet, values: np.ndarray, residuals: np.nd
     Empty where nothing tells the first: no hinge, a sensor on the hinge itself, or blocks instead of repeats.
     """
     space, scene, rows = residual_set.cost.space, residual_set.cost.scene, residual_set.resampling
-    if ALONG not in space.names or scene.object_joint in scene.joints or not rows.repeated:
+    torques = space.of_role(Role.OBJECT_TORQUE)  # how they show in the measured joints
+    if not torques or scene.object_joint in scene.joints or not rows.repeated:
         return ()
-    pushed, at, step = values.copy(), space.index(ALONG), 0.5 * space[ALONG].std
-    pushed[at] += step if values[at] + step <= space[ALONG].high else -step
+    pushed, at, step = values.copy(), space.index(torques[0].name), 0.5 * torques[0].std
+    pushed[at] += step if values[at] + step <= torques[0].high else -step
     without, with_it = -residual_set.common(np.stack([values, pushed]))
     columns = int(residual_set.column.max()) + 1
     sensitivity = (with_it - without).reshape(columns, -1)

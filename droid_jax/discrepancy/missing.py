@@ -40,7 +40,7 @@ from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects.candidate import candidates
 from droid_jax.model.effects.registry import checked
 from droid_jax.model.fields import check_space
-from droid_jax.model.parameters import Space
+from droid_jax.model.parameters import Role, Space
 from droid_jax.model.scene import Scene
 from droid_jax.preflight.search_inputs import assigned_roles
 from droid_jax.recordings.recording import Recording, recordings_of
@@ -51,7 +51,7 @@ from droid_jax.simulate.workspace_extrapolation import FURTHER, opened_further
 EXPERIMENTS, REFIT = "experiments", "final_refit"  # names of the amendments in gap.json
 MADE, NOT_NEEDED = "made", "not needed"
 IN_THE_AIR = "the same motion in the air, away from what the hand held"
-WEIGHT, CARRIED = 0.5, "payload_mass"  # kg, and the library's parameter that stands for it
+WEIGHT = 0.5  # kg
 
 
 def find_missing_effects(
@@ -239,7 +239,7 @@ def _possible(case: Case, values: np.ndarray, recording: Recording) -> Iterator[
             return _experiment(IN_THE_AIR, cost, values)
 
         yield IN_THE_AIR, in_the_air
-    if CARRIED in case.full_space.names:
+    if case.full_space.of_role(Role.PAYLOAD_MASS):
         what = f"the same motion with {WEIGHT:g} kg more, weighed, at the hand"
         yield what, lambda: _experiment(what, known, _carrying(case, values))
 
@@ -280,6 +280,7 @@ def _experiment(what: str, cost: Cost, values: np.ndarray) -> Experiment:
 
 def _carrying(case: Case, values: np.ndarray) -> np.ndarray:
     """Models [K, D] with a known weight at the hand."""
-    out, column = values.copy(), case.full_space.index(CARRIED)
-    out[:, column] = np.minimum(out[:, column] + WEIGHT, case.full_space[CARRIED].high)
+    carried = case.full_space.of_role(Role.PAYLOAD_MASS)[0]
+    out, column = values.copy(), case.full_space.index(carried.name)
+    out[:, column] = np.minimum(out[:, column] + WEIGHT, carried.high)
     return out

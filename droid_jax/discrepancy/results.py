@@ -24,7 +24,7 @@ from droid_jax.files import GAP, GAP_TRACES
 from droid_jax.identify.extended_model import Extended, save_extended
 from droid_jax.identify.identifiability import posterior, posterior_of
 from droid_jax.model.effects.candidate import Candidate, EffectKey, Keys
-from droid_jax.storage import finite, write_json, write_npz
+from droid_jax.storage import config_json, finite, write_json, write_npz
 
 FORMAT, VERSION = "droid_jax gap", 2
 
@@ -93,7 +93,7 @@ def gap_json(case: Case, verdict: Verdict) -> dict[str, Any]:
             }
             for hint in verdict.hints
         ],
-        "config": asdict(case.config),
+        "config": config_json(case.config),
         "about": _about(case, verdict),
         "p": verdict.score_tests[0].p if verdict.score_tests else None,
         "discretisation_error": verdict.discretisation_error,

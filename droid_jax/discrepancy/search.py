@@ -1,7 +1,7 @@
 """From a base fit to a verdict: one selection step after the other, then pairs, then pruning.
 
-A step scores all candidates, refits the promising ones, tests them on the validation recording and selects.  `step` is
-a function from a state to the next one; nothing in a state is ever changed.
+A step scores all candidates, refits the promising ones, tests them on the validation recording and selects.
+`selection_step` is a function from a state to the next one; nothing in a state is ever changed.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ def search_effects(
     problem = Problem(case, base, before, discretisation_error, asked, deadline, progress)
     state = SearchState(base)
     while not state.finished:
-        state, _ = step(state, problem)
+        state, _ = selection_step(state, problem)
     state = pair_step(state, problem)
     model, pruning = pruned(problem, state.model)
     model, converging = converged_model(problem, model)
@@ -142,7 +142,7 @@ def search_effects(
     )
 
 
-def step(state: SearchState, problem: Problem) -> tuple[SearchState, SelectionStep | None]:
+def selection_step(state: SearchState, problem: Problem) -> tuple[SearchState, SelectionStep | None]:
     """One selection step: the next state, and what was asked and tried; None where nothing was left to ask."""
     model, case = state.model, problem.case
     if len(model.parts) >= case.config.max_effects:

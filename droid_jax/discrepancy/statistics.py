@@ -98,7 +98,7 @@ def largest_detrended_t(scores: np.ndarray, seed: int = 0) -> tuple[np.ndarray, 
 
     A line taken out costs a degree of freedom, but not where rows were flipped after it: the unflipped t is compared as
     the quantile of theirs that it is of its own.  Without that 1.6 % of noise alone fell below p = 0.01 (ten repeats,
-    forty independent directions; `tests/discrepancy/test_flips.py`).
+    forty independent directions; `tests/discrepancy/test_statistics.py`).
     """
     count = scores.shape[1]
     t = t_values(detrended(scores.T).T, sign_flips(count, seed))
@@ -113,7 +113,7 @@ def detrended_discrepancy_p_values(residuals: np.ndarray, cells: np.ndarray) -> 
     residuals [N, M], cells [K, M] bool.  Where a line was taken out, the products of different repeats have a part of
     their own (`_taken_out`), which adds up to next to nothing unflipped and to something under most flips: it is put
     back.  Without that hardly anything is found below U = M^-1/2 (U = 0.02 of 1400 residuals, eight repeats, p < 0.01:
-    1 in 50, and now 2 in 3; `tests/discrepancy/test_flips.py`).
+    1 in 50, and now 2 in 3; `tests/discrepancy/test_statistics.py`).
     """
     flips, rows, out = sign_flips(len(residuals)), detrended(residuals), []
     for cell in cells:

@@ -1,184 +1,377 @@
-"""What a search for a missing effect leaves in its folder, as the report reads it: gap.json and gap.npz, checked."""
+"""The folder of a search for a missing effect as typed values: gap.json and gap.npz, checked.
+
+The one module that knows the keys of gap.json; docs/gap-command.md describes them.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from msgspec import Struct, field
 
-from droid_jax.files import GAP, GAP_TRACES
-from droid_jax.report.gap_parts import PARTS, Parts, parts_of, said_split
-from droid_jax.report.reading import FINDING, Maybe, Reader
+from droid_jax.files import EXTENDED, GAP, GAP_TRACES, NOT_MADE, TO_BE_MADE
+from droid_jax.report.reading import Finding, Phase, Reader
+from droid_jax.report.text import label
 
-VERDICTS = ("none", "named", "tie", "partly explained", "unexplained", "fit not converged")
-ROLES = ("train", "validation", "test")
+Role = Literal["train", "validation", "test"]
+ROLES: tuple[Role, ...] = ("train", "validation", "test")
 _READ = Reader("gap", "--again")  # gap.json comes last: once it is there, the command takes the run for whole
-_NUMBER = (int, float)
-_MAYBE = (int, float, type(None))
-_CELL = {"variable": str, "where": str, "discrepancy": _MAYBE, "p": _MAYBE, "found": bool}
-_GAP = {
-    "recording": str,
-    **dict.fromkeys(("before", "after", "closed", "torque_before", "torque_after"), _MAYBE),
-}
-_TRIAL = {
-    **{"round": int, "name": str, "passed": bool, "reasons": [str]},
-    **dict.fromkeys(("discrepancy_train", "discrepancy_validation", "p", "chosen"), _MAYBE),
-}
-_SIZE = {
-    **dict.fromkeys(("name", "unit", "effect", "what"), str),
-    **dict.fromkeys(("value", "low", "high"), _MAYBE),
-    "bound": Maybe(str),
-}
-_SHIFT = {"name": str, "unit": str, **dict.fromkeys(("before", "after", "deviation_before"), _MAYBE)}
-_TREND = {**dict.fromkeys(("candidate", "amplitude", "unit"), str), "per_repeat": _MAYBE, "p": _MAYBE}
-_ABOUT = {"what": str, "mark": str, "confused_with": [str]}
-_SETUP = {"hidden": Maybe(str), "synthetic_robot": Maybe(bool), "recording": Maybe([str])}
-_EXPERIMENT = {"what": str, "distance": _MAYBE, "not_made": Maybe(str)}
-_HINT = {"effects": [str], "indistinguishable": [[str]], "closed": {str: _NUMBER}}
-_SCHEMA = {
-    **{"verdict": str, "sentence": str, "effects": [str], "indistinguishable": [[str]], "p": _MAYBE, "floor": _MAYBE},
-    **{"converged": bool, "cut": str, "seconds": {str: _NUMBER}, "gaps": {str: _GAP}},
-    "phases": {str: [{"name": str, "start": _NUMBER, "end": _NUMBER}]},
-    "screens": [{"p": _MAYBE, "ranking": [{"candidate": str, "t": _MAYBE, "explained": _MAYBE}], "failed": [str]}],
-    "trials": [_TRIAL],
-    "cells": {"before": [_CELL], "after": [_CELL]},
-    **{"amplitudes": [_SIZE], "shifts": [_SHIFT], "experiments": [_EXPERIMENT]},
-    "trends": [_TREND],
-    **{"units": str, "versions": {str: str}, "device": str, "setup": _SETUP},
-    # what older files lack
-    **{"split": Maybe({"by": str, "limits": str}), "shapes": Maybe([_SIZE]), "about": Maybe({str: _ABOUT})},
-    **{"handed_on": Maybe({"fitted_to": [str], "gaps": {str: _MAYBE}}), "amendments": Maybe({str: str})},
-    **{"remainder": Maybe(_MAYBE), "explained": Maybe(_MAYBE), "failed": Maybe([str])},
-    **{"hints": Maybe([_HINT]), "doubts": Maybe([str]), "thresholds": Maybe({str: _NUMBER})},
-    "findings": Maybe([FINDING]),
-}
 _LINES = ("measured", "scatter", "before", "after")
+VERSION = 2
+THRESHOLDS = ("significance", "minimum_closed", "mostly_explained")  # of "config", "selection", that are read
+LOST = "the fitted model on the test recording"  # among what failed: that recording then has no discrepancy
+
+
+class Place(Struct, frozen=True):
+    """An effect at a place."""
+
+    effect: str
+    location: str = ""
+
+    @property
+    def text(self) -> str:
+        """ "latch at door_hinge"."""
+        return f"{self.effect} at {self.location}" if self.location else self.effect
+
+
+class Placed(Struct, frozen=True):
+    """What belongs to an effect at a place."""
+
+    effect: str
+    location: str = ""
+
+    @property
+    def place(self) -> Place:
+        """The effect and its place."""
+        return Place(effect=self.effect, location=self.location)
+
+
+class Discrepancy(Struct, frozen=True):
+    """Of one recording: U [sigma^2], the share of it that is closed, and the torque distance (equation 1)."""
+
+    recording: str
+    before: float | None
+    after: float | None
+    closed: float | None
+    torque_before: float | None
+    torque_after: float | None
+
+
+class Hint(Struct, frozen=True):
+    """Effects that passed validation and close too little to be named; closed: by held-out role."""
+
+    effects: list[Place]
+    indistinguishable: list[list[list[Place]]]
+    closed: dict[str, float]
+
+
+class About(Struct, frozen=True):
+    """What the library says of an effect."""
+
+    what: str
+    signature: str
+    confused_with: list[str]
+
+
+class Ranked(Placed, frozen=True, kw_only=True):
+    """A candidate in a score test: its statistic and the share of U that it explains linearly."""
+
+    t: float | None
+    explained: float | None
+
+
+class ScoreTest(Struct, frozen=True):
+    """All candidates against what a model leaves."""
+
+    p: float | None
+    ranking: list[Ranked]
+    failed: list[Place]
+
+
+class Reason(Struct, frozen=True):
+    """Why a model failed its validation test."""
+
+    reason: str
+    text: str
+
+
+class ValidationTest(Struct, frozen=True):
+    """A model with effects, refitted on the train recording and judged on the validation recording.
+
+    parts_before: how many effects the model had before.  chosen: share of resamples in which it, or one that looks
+    like it, wins.
+    """
+
+    parts: list[Place]
+    parts_before: int
+    discrepancy_train: float | None
+    discrepancy_validation: float | None
+    p: float | None
+    chosen: float | None
+    passed: bool
+    reasons: list[Reason]
+
+
+Axis = Literal[
+    "phase", "object_angle", "object_direction", "object_speed", "direction", "position", "load", "hinge_force"
+]
+
+
+class Cell(Struct, frozen=True, kw_only=True):
+    """U of some instants and joints; what does not apply is None.
+
+    axis: what the instants are sorted by.  found: by the sign-flip test, false discoveries 10 %.
+    """
+
+    axis: Axis
+    joint: str | None = None
+    label: str | None = None
+    low: float | None = None
+    high: float | None = None
+    unit: str | None = None
+    discrepancy: float | None
+    p: float | None
+    found: bool
+
+    @property
+    def name(self) -> str:
+        """Its axis: "Object angle", "Position of joint 2"; an object that slides has a position and no angle."""
+        axis = "Object position" if self.axis == "object_angle" and self.unit == "m" else label(self.axis)
+        return f"{axis} of {label(self.joint).lower()}" if self.joint else axis
+
+    @property
+    def phase(self) -> tuple[str, float]:
+        """Name of its phase, and where that starts, s."""
+        return self.label or "", self.low or 0.0
+
+
+class Cells(Struct, frozen=True):
+    """Where the discrepancy is, with the base model and with the final one."""
+
+    before: list[Cell]
+    after: list[Cell]
+
+
+class Coefficient(Placed, frozen=True, kw_only=True):
+    """A coefficient or shape parameter of an effect in the model, with its 90 % interval."""
+
+    name: str
+    unit: str
+    value: float | None
+    low: float | None
+    high: float | None
+    bound: str = ""  # "lower", "upper" where the value lies on one
+    what: str
+
+
+class Shift(Struct, frozen=True):
+    """A base parameter before and after the effects entered; the deviation is the base fit's own."""
+
+    name: str
+    unit: str
+    before: float | None
+    after: float | None
+    deviation_before: float | None
+
+    @property
+    def deviations(self) -> float:
+        """The shift in deviations; NaN where one of its numbers is not known."""
+        if self.before is None or self.after is None or not (self.deviation_before or 0.0) > 0:
+            return math.nan
+        return (self.after - self.before) / self.deviation_before  # type: ignore[operator]  # known one line above
+
+
+def largest_shifts(shifts: Sequence[Shift]) -> list[Shift]:
+    """Those with a known shift, the largest first."""
+    return sorted((s for s in shifts if math.isfinite(s.deviations)), key=lambda s: -abs(s.deviations))
+
+
+class Experiment(Struct, frozen=True):
+    """A motion to record: distance in standard deviations between indistinguishable models."""
+
+    what: str
+    distance: float | None
+    not_made: str | None = ""
+
+
+class Trend(Placed, frozen=True, kw_only=True):
+    """How a coefficient changes from repeat to repeat."""
+
+    coefficient: str
+    per_repeat: float | None
+    p: float | None
+    unit: str
+
+
+class FinalModel(Struct, frozen=True):
+    """The model that is written to extended.json."""
+
+    fitted_to: list[str]
+    discrepancies: dict[str, float | None]
+
+
+class Split(Struct, frozen=True):
+    """How the recordings were divided, and what cannot be concluded from that."""
+
+    by: Literal["recordings", "repeats", "blocks"] = "recordings"
+    limits: str = ""
+
+
+class Setup(Struct, frozen=True):
+    """Options of the command; its other entries are kept in `Gap.options`."""
+
+    hidden: str = ""
+    synthetic_robot: bool | None = None
+    recording: list[str] | None = None
+
+
+class Answer(Struct, frozen=True, kw_only=True):
+    """The part of gap.json that answers the question."""
+
+    sentence: str
+    effects: list[Place]
+    discrepancies: dict[Role, Discrepancy]
+    amendments: dict[str, str]
+    setup: Setup
+
+    @property
+    def hidden(self) -> str:
+        """What was hidden in the synthetic robot that was searched, in words; empty where nothing is known."""
+        return self.setup.hidden if self.setup.synthetic_robot else ""
+
+    @property
+    def missing_amendments(self) -> dict[str, str]:
+        """Additions to the verdict that are not there -> why; empty for one that the same command will make."""
+        states = {n: s for n, s in self.amendments.items() if s == TO_BE_MADE or s.startswith(NOT_MADE)}
+        return {n: s.removeprefix(TO_BE_MADE).removeprefix(NOT_MADE).strip(": .") for n, s in states.items()}
+
+
+Verdict = Literal["none", "named", "indistinguishable", "partly explained", "unexplained", "fit not converged"]
+
+
+class Found(Answer, frozen=True, kw_only=True):
+    """gap.json."""
+
+    verdict: Verdict
+    indistinguishable: list[list[list[Place]]]  # for each effect its alternatives, each a list of effects
+    hints: list[Hint]
+    doubts: list[str]
+    config: dict[str, Any]
+    about: dict[str, About]
+    p: float | None
+    discretisation_error: float | None
+    converged: bool
+    not_tried: str
+    remainder: float | None
+    explained: float | None
+    phases: dict[Role, list[Phase]]
+    score_tests: list[ScoreTest]
+    failed: list[str]
+    validation_tests: list[ValidationTest]
+    cells: Cells
+    coefficients: list[Coefficient]
+    shape_parameters: list[Coefficient]
+    shifts: list[Shift]
+    experiments: list[Experiment]
+    trends: list[Trend]
+    units: str
+    final_model: FinalModel
+    findings: list[Finding] = field(default_factory=list)
+    split: Split = Split()
+    seconds: dict[str, float]
+    versions: dict[str, str]
+    device: str
+
+    def threshold(self, name: str) -> float:
+        """A threshold of the selection, of its "config"."""
+        return float(self.config["selection"][name])
 
 
 @dataclass(frozen=True)
 class Gap:
-    """What a search for a missing effect found.
+    """The folder of a search for a missing effect.
 
-    found: gap.json.  traces: role -> joints [J], time [K] s, and measured, scatter, before, after [K, J]
-    in `unit`, and the role's phases.
+    found: gap.json.  options: its "setup", all of it.  traces: role -> joints [J], time [K] s, and measured,
+    scatter, before, after [K, J] in `found.units`, and the role's phases.
     """
 
     folder: Path
-    found: Mapping[str, Any]
-    traces: Mapping[str, Mapping[str, Any]]
+    found: Found
+    options: Mapping[str, Any]
+    traces: Mapping[Role, Mapping[str, Any]]
 
     @property
-    def unit(self) -> str:
-        """Of torques: N m, N where slides are measured, "N m or N" for both."""
-        return self.found["units"]
+    def roles(self) -> list[Role]:
+        """The recordings there are: "train", "validation" and perhaps "test"."""
+        return [r for r in ROLES if r in self.found.discrepancies]
 
     @property
-    def roles(self) -> list[str]:
-        """The recordings there are, by what they were for: "train", "validation" and perhaps "test"."""
-        return [r for r in ROLES if r in self.found["gaps"]]
-
-    @property
-    def judge(self) -> str:
-        """The role that says how large the gap is: the test one, or the best there is."""
+    def judge(self) -> Role:
+        """The role that says how large the discrepancy is: test, or validation where there is none."""
         return self.roles[-1]
 
     @property
     def extended(self) -> bool:
         """Whether an effect entered the model: only then is there an "after"."""
-        return bool(self.found["effects"])
+        return bool(self.found.effects)
+
+    @property
+    def extended_file(self) -> bool:
+        """Whether the folder holds the extended model."""
+        return (self.folder / EXTENDED).is_file()
 
     @property
     def lost(self) -> bool:
         """Whether a recording was kept as test data and could not be replayed in the end."""
-        from droid_jax.discrepancy.verdict import LOST  # only here: it imports what computes
-
-        return LOST in self.found.get("failed", ())
+        return LOST in self.found.failed
 
     @property
     def blown_up(self) -> list[str]:
         """Candidates and models that were left out since their replay blew up, each once."""
-        from droid_jax.discrepancy.verdict import LOST  # as above
-
-        names = [
-            *(name for screen in self.found["screens"] for name in screen["failed"]),
-            *self.found.get("failed", ()),
-        ]
+        names = [p.text for test in self.found.score_tests for p in test.failed] + self.found.failed
         return [name for name in dict.fromkeys(names) if name != LOST]
 
     @property
-    def floor(self) -> float | None:
+    def discretisation_error(self) -> float | None:
         """U0; None where it is not known and where there is none, see `timeless`."""
-        return self.found["floor"] or None
+        return self.found.discretisation_error or None
 
     @property
     def timeless(self) -> bool:
-        """Whether a measured motion was replayed, which has no time step and whose floor is exactly zero."""
-        return self.found["floor"] == 0
+        """Whether a measured motion was replayed, which has no time step and whose discretisation error is zero."""
+        return self.found.discretisation_error == 0
 
     @property
-    def sizes(self) -> list[Mapping[str, Any]]:
-        """Amplitudes of the effects in the model, then their shapes; an older search does not tell these."""
-        return [*self.found["amplitudes"], *self.found.get("shapes", [])]
+    def coefficients(self) -> list[Coefficient]:
+        """Coefficients of the effects in the model, then their shape parameters."""
+        return [*self.found.coefficients, *self.found.shape_parameters]
 
     @property
-    def about(self) -> Mapping[str, Mapping[str, Any]]:
-        """What the library says of the effects of the answer, by their names there; an older search does not tell."""
-        return self.found.get("about", {})
+    def repeated(self) -> bool:
+        """Whether there are repeats, from which the noise is known; without them blocks of one log take turns."""
+        return self.found.split.by != "blocks"
 
     @property
-    def fitted_to(self) -> list[str]:
-        """Recordings that the model that was handed on is fitted to; an older search fitted it to the first."""
-        return self.found.get("handed_on", {}).get("fitted_to", [self.recording("train")])
-
-    @property
-    def hints(self) -> list[Mapping[str, Any]]:
-        """Effects that close too little to be named; an older search named them."""
-        return self.found.get("hints", [])
-
-    @property
-    def amendments(self) -> Mapping[str, str]:
-        """What was added to the verdict after it was written, and whether: name -> state; an older search added all."""
-        return self.found.get("amendments", {})
-
-    @property
-    def parts(self) -> Parts:
-        """What is said of how the recordings were divided."""
-        return parts_of(self.found)
-
-    @property
-    def limits(self) -> str:
-        """What cannot be concluded, in words; empty where nothing is to be said."""
-        return said_split(self.found)["limits"]
-
-    @property
-    def sheets(self) -> list[tuple[tuple[str, ...], Mapping[str, Any]]]:
-        """Roles and what is drawn of them over time, the judging role first; parts that take turns are drawn as one."""
-        together = [("train", "validation")] if self.parts.in_turns else [("train",), ("validation",)]
-        sheets = [*together, *((r,) for r in self.roles[2:])]
+    def sheets(self) -> list[tuple[tuple[Role, ...], Mapping[str, Any]]]:
+        """Roles and what is drawn of them over time, the judging role first; blocks that take turns are one sheet."""
+        first: list[tuple[Role, ...]] = [("train",), ("validation",)] if self.repeated else [("train", "validation")]
+        sheets = [*first, *((r,) for r in self.roles[2:])]
         return [(roles, _joined([self.traces[r] for r in roles])) for roles in reversed(sheets)]
 
     @property
     def synthetic_robot(self) -> bool:
-        """Whether the run says that its torques come from a synthetic robot: no recording was given to it."""
-        return self.found["setup"].get("synthetic_robot", self.found["setup"].get("recording") == [])
+        """Whether the torques come from a synthetic robot: no recording was given."""
+        said = self.found.setup.synthetic_robot
+        return self.found.setup.recording == [] if said is None else said
 
-    @property
-    def hidden(self) -> str:
-        """See `hidden_in`."""
-        return hidden_in(self.found)
-
-    def recording(self, role: str) -> str:
+    def recording(self, role: Role) -> str:
         """Name of the recording in a role."""
-        return self.found["gaps"][role]["recording"]
-
-
-def hidden_in(found: Mapping[str, Any]) -> str:
-    """What the synthetic robot hid that was searched, of gap.json, in words; empty where nothing is known."""
-    setup = found["setup"]
-    return setup.get("hidden", "") if setup.get("synthetic_robot") else ""
+        return self.found.discrepancies[role].recording
 
 
 def has_gap(folder: Path) -> bool:
@@ -186,39 +379,52 @@ def has_gap(folder: Path) -> bool:
     return any((folder / name).exists() for name in (GAP, GAP_TRACES))
 
 
+def read_answer(folder: Path) -> Answer:
+    """The answer in a folder's gap.json; ValueError where it is missing or broken."""
+    return _READ.typed(_content(folder / GAP), Answer, str(folder / GAP))
+
+
 def read_gap(folder: str | Path) -> Gap:
     """Load and check; ValueError names what is missing or broken."""
     folder = Path(folder)
     path = folder / GAP
-    found = (_READ if path.exists() else Reader("gap")).json(path)
-    _READ.check(found, _SCHEMA, GAP)
+    content = _content(path)
+    found = _READ.typed(content, Found, str(path))
     for fault in _faults(found):
-        raise _READ.fault(f"gap.json, {fault}")
-    roles = [r for r in ROLES if r in found["gaps"]]
-    return Gap(folder, found, _traces(folder / GAP_TRACES, roles, found["phases"]))
+        raise _READ.fault(f"{path}, {fault}")
+    roles: list[Role] = [r for r in ROLES if r in found.discrepancies]
+    return Gap(folder, found, content["setup"], _traces(folder / GAP_TRACES, roles, found.phases))
 
 
-def _faults(found: Mapping[str, Any]) -> Iterator[str]:
-    """What the schema cannot say."""
-    if found["verdict"] not in VERDICTS:
-        yield f"'verdict' must be one of {', '.join(VERDICTS)}, got {found['verdict']!r}"
-    by = said_split(found)["by"]
-    if by not in PARTS:
-        yield f"'split', 'by' must be one of {', '.join(PARTS)}, got {by!r}"
-    absent = [r for r in ROLES[:2] if r not in found["gaps"]]
+def _content(path: Path) -> dict[str, Any]:
+    """gap.json as plain values, of the version that this program reads."""
+    content = (_READ if path.exists() else Reader("gap")).json(path)
+    if content.get("version") != VERSION:
+        raise _READ.fault(f"{path} has version {content.get('version', 1)!r}, this program reads version {VERSION}")
+    return content
+
+
+def _faults(found: Found) -> Iterator[str]:
+    """What the types cannot say."""
+    absent = [r for r in ROLES[:2] if r not in found.discrepancies]
     if absent:
-        yield f"'gaps' lacks {', '.join(map(repr, absent))}"
-    if len(found["indistinguishable"]) > len(found["effects"]):
-        yield f"'indistinguishable' has {len(found['indistinguishable'])} lists for {len(found['effects'])} effects"
+        yield f"'discrepancies' lacks {', '.join(map(repr, absent))}"
+    selection = found.config.get("selection")
+    for name in THRESHOLDS:
+        if not isinstance(selection, dict) or not isinstance(selection.get(name), (int, float)):
+            yield f"'config', 'selection' has no number {name!r}"
+    for said in (found, *found.hints):
+        if len(said.indistinguishable) != len(said.effects):
+            yield f"'indistinguishable' has {len(said.indistinguishable)} lists for {len(said.effects)} effects"
 
 
-def _traces(path: Path, roles: Sequence[str], phases: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def _traces(path: Path, roles: Sequence[Role], phases: Mapping[Role, Any]) -> dict[Role, dict[str, Any]]:
     """Arrays by role, their shapes checked against time [K] and joints [J]."""
     keys = ["joints", *(f"{r}.{key}" for r in roles for key in ("time", *_LINES))]
     arrays = _READ.arrays(path, keys, texts=["joints"])
     for key in ("joints", *(f"{r}.time" for r in roles)):
         _READ.shaped(arrays[key], (None,), f"{path}, {key}")
-    traces: dict[str, dict[str, Any]] = {}
+    traces: dict[Role, dict[str, Any]] = {}
     for role in roles:
         shape = (len(arrays[f"{role}.time"]), len(arrays["joints"]))
         for key in _LINES:

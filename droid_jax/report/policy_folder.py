@@ -1,4 +1,4 @@
-"""What training and trials leave in a folder, as the report reads it: training.json, transfer.json, films; checked."""
+"""The folder of a trained policy as typed values: training.json, transfer.json and films, checked."""
 
 from __future__ import annotations
 
@@ -7,80 +7,175 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from msgspec import Struct, field, structs
+
 from droid_jax.files import FILMS, TRAINING, TRANSFER
 from droid_jax.policy.trials import BLOWN_UP
-from droid_jax.report.reading import Maybe, Reader
+from droid_jax.report.reading import Reader
 
-_READ = Reader("train")
-_NUMBER = (int, float)
-_TRAINING = {
-    "setup": {
-        **{"method": Literal["fitted", "mean", "prior"], "preset": str, "knob": int, "seed": int},
-        "fit": (str, type(None)),
-    },
-    "synthetic_robot": {"springs": Maybe(int), "seed": Maybe(int), "hide": Maybe([str])},
-    **{"task": {"opened": _NUMBER, "held": _NUMBER, "control": _NUMBER, "steps": int}, "scene": str},
-    **{"effects": [str], "versions": dict, "device": str},
-    "history": [
-        {"step": int, **dict.fromkeys(("seconds", "rate", "reward", "success"), _NUMBER), "of": Maybe(_NUMBER)}
-    ],
-}
-_MAYBE = (int, float, type(None))
-_SPREAD = {"mean": _MAYBE, "std": _MAYBE, "all": [_NUMBER]}
-_TRIALS = {
-    **{"trials": int, "success_rate": _NUMBER, "interval_95": [_NUMBER], "success": [bool], "stopped": {str: int}},
-    **{"angle_deg": _SPREAD, "steps": _SPREAD, "grip": {"mean": _NUMBER}, "stopped_each": Maybe([str])},
-}
-_HIDDEN = {"name": str, "amplitude": _NUMBER, "joint": Maybe((str, type(None))), "unit": Maybe(str)}
-_TRANSFER = {
-    **{"simulation": _TRIALS, "synthetic_robot": _TRIALS, "robot": {"hidden": [_HIDDEN]}},
-    **{"no_films": Maybe(str), "setup": Maybe(dict)},
-}
+
+class TrainingSetup(Struct, frozen=True):
+    """Options of a training."""
+
+    method: Literal["fitted", "mean", "prior"]
+    preset: str
+    knob: int
+    seed: int
+    fit: str | None  # None: no fit, the prior
+
+
+class TrainingRobot(Struct, frozen=True):
+    """What is known of the synthetic robot that was fitted; nothing where your own recordings were."""
+
+    springs: int | None = None
+    seed: int | None = None
+    hide: list[str] | None = None
+
+    @property
+    def known(self) -> dict[str, Any]:
+        """The entries that are known."""
+        return {name: value for name, value in structs.asdict(self).items() if value is not None}
+
+
+class TrainedTask(Struct, frozen=True):
+    """opened: rad; held, control: s; steps: actions of an episode."""
+
+    opened: float
+    held: float
+    control: float
+    steps: int
+
+
+class Progress(Struct, frozen=True):
+    """An evaluation during training; seconds since its start, rate in actions/s, of: actions asked for."""
+
+    step: int
+    seconds: float
+    rate: float
+    reward: float
+    success: float
+    of: float = 0.0
+
+
+class Training(Struct, frozen=True, kw_only=True):
+    """training.json."""
+
+    setup: TrainingSetup
+    synthetic_robot: TrainingRobot
+    task: TrainedTask
+    scene: str
+    effects: list[str]
+    versions: dict[str, Any]
+    device: str
+    history: list[Progress]
+
+    @property
+    def another_robot(self) -> bool:
+        """Whether your own recordings were fitted: the synthetic robot is then another robot."""
+        return self.setup.fit is not None and not self.synthetic_robot.known
+
+
+class Spread(Struct, frozen=True):
+    """Mean and deviation, None where nothing is left to count; each trial."""
+
+    mean: float | None
+    std: float | None
+    all: list[float]
+
+
+class Grip(Struct, frozen=True):
+    """Mean share of actions with the knob gripped."""
+
+    mean: float
+
+
+class Rate(Struct, frozen=True):
+    """Share of the trials in one place that succeeded, and its interval."""
+
+    success_rate: float
+    interval_95: tuple[float, float]
+
+
+class Trials(Rate, frozen=True):
+    """What came of the trials in one place (`policy.trials.Trials.to_json`)."""
+
+    trials: int
+    success: list[bool]
+    stopped: dict[str, int]
+    angle_deg: Spread
+    steps: Spread
+    grip: Grip
+    stopped_each: list[str] | None = None
+
+    @property
+    def counted(self) -> int:
+        """Trials, those that blew up left out."""
+        return self.trials - self.stopped.get(BLOWN_UP, 0)
+
+    @property
+    def angles(self) -> list[float]:
+        """Largest angle of each of them, degrees."""
+        each = self.stopped_each or [""] * self.trials
+        return [a for a, why in zip(self.angle_deg.all, each, strict=True) if why != BLOWN_UP]
+
+    def faults(self) -> Iterator[str]:
+        """What the types cannot say."""
+        each = self.stopped_each
+        for key, of in (("angle_deg", self.angle_deg.all), ("success", self.success), ("stopped_each", each)):
+            if of is not None and len(of) != self.trials:
+                yield f"{key!r} has {len(of)} trials, 'trials' says {self.trials}"
+
+
+class HiddenEffect(Struct, frozen=True):
+    """An effect hidden in the synthetic robot."""
+
+    name: str
+    amplitude: float
+    joint: str | None = None
+    unit: str = "-"
+
+
+class TransferRobot(Struct, frozen=True):
+    """The synthetic robot of the trials."""
+
+    hidden: list[HiddenEffect]
+
+
+class Rates(Struct, frozen=True):
+    """The success rates of transfer.json."""
+
+    simulation: Rate
+    synthetic_robot: Rate
+
+
+class Transfer(Struct, frozen=True):
+    """transfer.json."""
+
+    simulation: Trials
+    synthetic_robot: Trials
+    robot: TransferRobot
+    no_films: str | None = None
+    setup: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Trained:
-    """What a folder of `train` holds.
+    """The folder of `train`.
 
-    training: training.json.  transfer: transfer.json, None before `evaluate`.  films: by name, "good" and "bad".
+    transfer: None before `evaluate`.  films: by name, "good" and "bad".
     """
 
     folder: Path
-    training: Mapping[str, Any]
-    transfer: Mapping[str, Any] | None
+    training: Training
+    transfer: Transfer | None
     films: Mapping[str, Path]
 
     @property
-    def trials(self) -> dict[str, Mapping[str, Any]]:
-        """Where the policy was tried -> what came of it; `counted` and `angles` without trials that blew up."""
+    def trials(self) -> dict[str, Trials]:
+        """Where the policy was tried -> what came of it."""
         if self.transfer is None:
             return {}
-        places = {"simulation": "simulation", "synthetic robot": "synthetic_robot"}
-        return {where: _without_blown_up(self.transfer[name]) for where, name in places.items()}
-
-    @property
-    def no_films(self) -> str:
-        """Why there are no films of the trials."""
-        why = (self.transfer or {}).get("no_films") or "none are there"
-        return f"No films: {why}."
-
-
-def _without_blown_up(found: Mapping[str, Any]) -> dict[str, Any]:
-    each = found.get("stopped_each", [""] * found["trials"])
-    angles = [a for a, why in zip(found["angle_deg"]["all"], each, strict=True) if why != BLOWN_UP]
-    return {**found, "counted": found["trials"] - found["stopped"].get(BLOWN_UP, 0), "angles": angles}
-
-
-def _faults(trials: Mapping[str, Any]) -> Iterator[str]:
-    """What the schema cannot say."""
-    count = trials["trials"]
-    for key, of in (("angle_deg", trials["angle_deg"]["all"]), ("success", trials["success"])):
-        if len(of) != count:
-            yield f"{key!r} tells of {len(of)} trials, 'trials' says {count}"
-    if len(trials.get("stopped_each", [""] * count)) != count:
-        yield f"'stopped_each' tells of {len(trials['stopped_each'])} trials, 'trials' says {count}"
-    if len(trials["interval_95"]) != 2:
-        yield f"'interval_95' must be two numbers, got {len(trials['interval_95'])}"
+        return {"simulation": self.transfer.simulation, "synthetic robot": self.transfer.synthetic_robot}
 
 
 def has_policy(folder: Path) -> bool:
@@ -88,23 +183,25 @@ def has_policy(folder: Path) -> bool:
     return (folder / TRAINING).exists()
 
 
-def read_training(folder: Path) -> Mapping[str, Any]:
+def read_training(folder: Path) -> Training:
     """training.json, checked; ValueError where it is missing or broken."""
-    training = _READ.json(folder / TRAINING)
-    _READ.check(training, _TRAINING, TRAINING)
-    return training
+    return Reader("train").json(folder / TRAINING, Training)
+
+
+def read_rates(folder: Path) -> dict[str, Rate]:
+    """Success by place, of transfer.json; ValueError where it is broken."""
+    rates = Reader("evaluate").json(folder / TRANSFER, Rates)
+    return {"in simulation": rates.simulation, "on the synthetic robot": rates.synthetic_robot}
 
 
 def read_policy(folder: Path) -> Trained:
     """Load and check; ValueError names the file that is missing or broken."""
-    training = read_training(folder)
-    transfer = None
+    training, transfer = read_training(folder), None
     if (folder / TRANSFER).is_file():
         read = Reader("evaluate")
-        transfer = read.json(folder / TRANSFER)
-        read.check(transfer, _TRANSFER, TRANSFER)
-        for where in ("simulation", "synthetic_robot"):
-            for fault in _faults(transfer[where]):
-                raise read.fault(f"{TRANSFER}, {where!r}, {fault}")
+        transfer = read.json(folder / TRANSFER, Transfer)
+        for where, trials in (("simulation", transfer.simulation), ("synthetic_robot", transfer.synthetic_robot)):
+            for fault in trials.faults():
+                raise read.fault(f"{folder / TRANSFER}, {where!r}, {fault}")
     films = {path.stem: path for path in sorted((folder / FILMS).glob("*.webp"))}
     return Trained(folder, training, transfer, films)

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-import functools
-import operator
 from collections.abc import Container, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NotRequired, TypedDict
+from typing import Any, TypeVar
 
 import numpy as np
+from msgspec import Struct
 
 from droid_jax.arguments import LONGEST_NAME
 from droid_jax.read_json import read_json, typed
 from droid_jax.read_npz import NUMBERS, TEXT, NpzFile
 
-FINDING = dict.fromkeys(("kind", "column", "severity", "sentence"), str)  # of what a check of a recording found
+Content = TypeVar("Content")
+
+
+class Fault(ValueError):
+    """What is wrong with a run's file, and what to do about it."""
 
 
 @dataclass(frozen=True)
@@ -36,16 +39,22 @@ class Reader:
             f"{what}; run `python -m droid_jax.run {self.command}` again{how}, or pass the folder that it wrote"
         )
 
-    def json(self, path: Path, schema: Any = dict) -> dict[str, Any]:
-        """A JSON object as its schema says, see `check`."""
+    def json(self, path: Path, kind: type[Content] = dict[str, Any]) -> Content:
+        """A JSON file as a msgspec.Struct or other type; keys that a Struct does not name are ignored."""
         try:
             value = read_json(path)
         except FileNotFoundError:
             raise self.fault(f"{path} is missing") from None
         except (OSError, ValueError) as error:
             raise self.fault(f"{path} cannot be read ({_reason(path, error)})") from None
-        self.check(value, schema, str(path))
-        return value
+        return self.typed(value, kind, str(path))
+
+    def typed(self, value: Any, kind: type[Content], where: str) -> Content:
+        """A parsed JSON value as a type; fault at the first place where it is something else."""
+        try:
+            return typed(value, kind, where)
+        except ValueError as error:
+            raise self.fault(str(error)) from None
 
     def arrays(
         self, path: Path, keys: Iterable[str], optional: Iterable[str] = (), texts: Iterable[str] = ()
@@ -83,17 +92,10 @@ class Reader:
         if absent:
             raise self.fault(f"{where} lacks {', '.join(map(repr, absent))}")
 
-    def check(self, value: Any, schema: Any, where: str) -> None:
-        """Fault at the first place where a value read from JSON is not as its schema says.
 
-        schema: a type or tuple of types; {"key": schema} for an object with these keys (more may be
-        there), of which those with a Maybe may be absent; {str: schema} for one with keys of any name;
-        [schema] for a list.
-        """
-        try:
-            typed(value, _kind(schema), where)
-        except ValueError as error:
-            raise self.fault(str(error)) from None
+def _reason(path: Path, error: Exception) -> str:
+    """The message of an error without the path in front."""
+    return str(error).removeprefix(f"{path}: ")
 
 
 def read_replay(path: Path, read: Reader) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -108,33 +110,18 @@ def read_replay(path: Path, read: Reader) -> tuple[np.ndarray, np.ndarray, np.nd
     return time, before, after
 
 
-@dataclass(frozen=True)
-class Maybe:
-    """The schema of a key that need not be there."""
+class Finding(Struct, frozen=True):
+    """What a check of a recording found (`preflight.findings`)."""
 
-    schema: Any
-
-
-class Fault(ValueError):
-    """What is wrong with a run's file, and what to do about it."""
+    kind: str
+    column: str
+    severity: str
+    sentence: str
 
 
-def _reason(path: Path, error: Exception) -> str:
-    """The message of an error without the path in front."""
-    return str(error).removeprefix(f"{path}: ")
+class Phase(Struct, frozen=True):
+    """A part of the motion, s."""
 
-
-def _kind(schema: Any) -> Any:
-    """A schema of `Reader.check` as a type; int and float together are a number."""
-    if isinstance(schema, list):
-        return list[_kind(schema[0])]
-    if isinstance(schema, dict):
-        if str in schema:
-            return dict[str, _kind(schema[str])]
-        return TypedDict("Object", {key: _kind(inner) for key, inner in schema.items()})  # pyright: ignore
-    if isinstance(schema, Maybe):
-        return NotRequired[_kind(schema.schema)]
-    if isinstance(schema, tuple):
-        kinds = [_kind(kind) for kind in schema if not (kind is int and float in schema)]
-        return functools.reduce(operator.or_, kinds)
-    return schema
+    name: str
+    start: float
+    end: float

@@ -1,4 +1,4 @@
-"""Pictures of a scene, drawn by MuJoCo with software OpenGL: no display, no graphics card.
+"""Pictures and films of a scene, drawn by MuJoCo with software OpenGL: no display, no graphics card.
 
 MuJoCo chooses its OpenGL library once, when it is first imported, from the environment
 variable MUJOCO_GL, and a broken library can end the process instead of raising.  So the
@@ -10,6 +10,7 @@ then OSMesa.
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import subprocess
@@ -18,13 +19,19 @@ import tempfile
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 if TYPE_CHECKING:
     import mujoco
 
+RATE = 12.5  # pictures per second
+LONGEST = 150  # pictures
+SIZE = (270, 360)  # height, width
+QUALITY = 60  # of WebP
+LAST = 1.5  # s for which the last picture stays
+LOOPS = 3  # then it rests on the last picture: a page without scripts has no button that stops it (WCAG 2.2.2)
 _OFF = ("disable", "disabled", "off", "false", "0")
 _PROBE_SECONDS = 60.0
 
@@ -81,8 +88,6 @@ def save_frames(
 
 def save_image(path: Path, image: np.ndarray) -> None:
     """Write one image [H, W, 3] uint8 as PNG, in one step."""
-    import io
-
     from PIL import Image
 
     from droid_jax.storage import write_bytes
@@ -90,6 +95,37 @@ def save_image(path: Path, image: np.ndarray) -> None:
     with io.BytesIO() as buffer:
         Image.fromarray(image).save(buffer, format="PNG", optimize=True)
         write_bytes(path, buffer.getvalue())
+
+
+def film(
+    path: Path, model: mujoco.MjModel, sides: Sequence[np.ndarray], period: float, camera: str | None = "front"
+) -> None:
+    """Write states [T, nq], `period` s apart, as PATH (webp), in the time they took; several side by side.
+
+    sides: each [T, nq].  camera: see `frames`.
+    Raises NoOpenGL where nothing can draw, ValueError for states that do not fit the model or each other.
+    """
+    from PIL import Image
+
+    from droid_jax.storage import write_bytes
+
+    length = len(sides[0])
+    if any(len(states) != length for states in sides):
+        raise ValueError(f"film: all sides must be as long as each other, got {[len(s) for s in sides]} states")
+    every = max(1, round(1.0 / (RATE * period)), -(-length // LONGEST))
+    drawn = frames(model, np.concatenate(sides), _rows(length, every, len(sides)), camera, SIZE)
+    images = np.concatenate(np.array_split(np.array(drawn), len(sides)), axis=2)
+    pictures = [Image.fromarray(image) for image in images]
+    shown = [round(1e3 * every * period)] * (len(pictures) - 1) + [round(1e3 * LAST)]
+    with io.BytesIO() as buffer:
+        timing: dict[str, Any] = {"duration": shown, "loop": LOOPS}
+        pictures[0].save(buffer, format="WEBP", save_all=True, append_images=pictures[1:], quality=QUALITY, **timing)
+        write_bytes(path, buffer.getvalue())
+
+
+def _rows(length: int, every: int, sides: int) -> list[int]:
+    """Rows to draw of all sides one after the other."""
+    return [side * length + row for side in range(sides) for row in range(0, length, every)]
 
 
 def working_backend() -> str:

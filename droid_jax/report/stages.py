@@ -1,4 +1,4 @@
-"""Runs' folders to one another: what a run was told, whether it is whole, what a policy's doors came from.
+"""Runs' folders to one another: options of a run, whether it is whole, what a policy was trained on.
 
 Light: commands ask before anything is imported that takes time.
 """
@@ -45,7 +45,7 @@ class Setup(TypedDict, total=False):
     versions: dict[str, str]
 
 
-class Told(TypedDict, total=False):
+class Description(TypedDict, total=False):
     """What other commands read of a config.json or gap.json."""
 
     synthetic_robot: bool
@@ -59,9 +59,9 @@ def setup(folder: Path) -> dict[str, Any]:
     return _read(folder / SETUP, Setup)
 
 
-def told_in(path: Path) -> dict[str, Any]:
+def described_in(path: Path) -> dict[str, Any]:
     """What a config.json or gap.json says, empty where there is none; ValueError for one that is damaged."""
-    return _read(path, Told)
+    return _read(path, Description)
 
 
 def _read(path: Path, kind: type) -> dict[str, Any]:
@@ -85,7 +85,7 @@ def unfinished(folder: Path) -> bool:
 
 def to_be_amended(folder: Path) -> bool:
     """Whether a search was stopped after its verdict was written: the same command makes what is to be added to it."""
-    states = told_in(folder / GAP).get("amendments")
+    states = described_in(folder / GAP).get("amendments")
     return isinstance(states, dict) and TO_BE_MADE in states.values()
 
 
@@ -96,9 +96,9 @@ def needs_whole(folder: Path) -> None:
 
 
 def extended_of(folder: Path) -> Path | None:
-    """The extended model that a run's Gaussian belongs to: its own file, or the one that it was told to fit."""
-    told = setup(folder).get("extended")
-    return folder / EXTENDED if (folder / EXTENDED).is_file() else Path(told) if told else None
+    """The extended model that a run's Gaussian belongs to: its own file, or the one that it was to fit."""
+    given = setup(folder).get("extended")
+    return folder / EXTENDED if (folder / EXTENDED).is_file() else Path(given) if given else None
 
 
 def fingerprint(folder: Path | None) -> str | None:

@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from droid_jax.report.reading import Phase
 from droid_jax.report.style import (
     AFTER,
     BEFORE,
@@ -24,13 +25,13 @@ from droid_jax.report.style import (
     panel_columns,
     styled,
 )
-from droid_jax.report.words import label
+from droid_jax.report.text import label
 
 BUCKETS = 140  # pieces of a drawn line, and points of a band
-SHORT = 0.1  # of the motion; the name of a last phase below that would be cut by the panel's edge
 RESIDUAL_BUCKETS = 60  # of a line of residuals: the figure must fit into the page as SVG
-_TRACES = ("measured_mean", "measured_low", "measured_high", "before", "after")
-_FITS: dict[str, dict[str, Any]] = {
+SHORT = 0.1  # of the motion; the name of a last phase below that would be cut by the panel's edge
+FITS = {"before": "before the fit", "after": "after the fit"}
+_STYLES: dict[str, dict[str, Any]] = {
     "before": {"color": BEFORE, "linestyle": (0, (4, 1.5))},
     "after": {"color": AFTER, "linewidth": 1.0},
 }
@@ -38,22 +39,38 @@ _FITS: dict[str, dict[str, Any]] = {
 
 @styled
 def torque_traces(
-    traces: Mapping[str, Any], phases: Sequence[Mapping[str, Any]] = (), unit: str = "N m", width: float = WIDE
+    traces: Mapping[str, Any],
+    phases: Sequence[Phase] = (),
+    unit: str = "N m",
+    models: Mapping[str, str] = FITS,
+    repeats: str = "5 to 95 % of repeats",
+    buckets: int = BUCKETS,
+    width: float = WIDE,
 ) -> Figure:
     """Every joint's torque over time with, below it, measurement minus simulation.
 
     Over a motion that the fit follows well the three lines of a torque are one; the lower panel shows what is left.
 
-    traces: time [T] s; measured_mean, measured_low (5 % of the repeats), measured_high (95 %), before, after (the
-    fit) [T, J] in `unit`; joints [J] names.  phases: parts of the motion, each with name, start and end in s.
+    Args:
+        traces: time [T] s; measured_mean, measured_low, measured_high and the simulations [T, J] in `unit`; joints [J]
+            names.
+        phases: parts of the motion.
+        unit: of the torques.
+        models: which of the simulations "before" and "after" are drawn, and their labels.
+        repeats: what lies between measured_low and measured_high.
+        buckets: pieces of a drawn line.
+        width: inches.
+
+    Returns:
+        The figure.
     """
     time, joints = np.asarray(traces["time"]), [str(j) for j in traces["joints"]]
     columns = panel_columns(width)
     figure, upper, lower = torque_grid(len(joints), width)
     for j, joint in enumerate(joints):
-        line = {k: np.asarray(traces[k])[:, j] for k in _TRACES}
-        _torques(upper[j], time, line)
-        _residuals(lower[j], time, line)
+        line = {k: np.asarray(traces[k])[:, j] for k in ("measured_mean", "measured_low", "measured_high", *models)}
+        _torques(upper[j], time, line, models, repeats, buckets)
+        residuals(lower[j], time, line, models)
         for axes in (upper[j], lower[j]):
             shade(axes, phases, named=j < columns and axes is upper[j])
         upper[j].set(title=label(joint), xlim=(time[0], time[-1]))
@@ -77,25 +94,30 @@ def torque_grid(joints: int, width: float) -> tuple[Figure, list[Axes], list[Axe
     return figure, list(upper[:joints]), list(lower[:joints])
 
 
-def _torques(axes: Axes, time: np.ndarray, line: Mapping[str, np.ndarray]) -> None:
-    repeated = fill(axes, time, line["measured_low"], line["measured_high"], "measured, 5 to 95 % of repeats")
+def _torques(
+    axes: Axes, time: np.ndarray, line: Mapping[str, np.ndarray], models: Mapping[str, str], repeats: str, buckets: int
+) -> None:
+    repeated = fill(axes, time, line["measured_low"], line["measured_high"], f"measured, {repeats}", buckets)
     mean = "measured, mean" if repeated else "measured"
-    axes.plot(*thin(time, line["measured_mean"]), color=MEASURED, linewidth=2.4, label=mean)
-    for name, look in _FITS.items():
-        axes.plot(*thin(time, line[name]), label=f"{name} the fit", **look)
+    axes.plot(*thin(time, line["measured_mean"], buckets), color=MEASURED, linewidth=2.4, label=mean)
+    for key, name in models.items():
+        axes.plot(*thin(time, line[key], buckets), label=name, **_STYLES[key])
     axes.set_ylim(_torque_limits(line))
 
 
-def _residuals(axes: Axes, time: np.ndarray, line: Mapping[str, np.ndarray]) -> None:
+def residuals(
+    axes: Axes, time: np.ndarray, line: Mapping[str, np.ndarray], models: Mapping[str, str], band_name: str = ""
+) -> None:
+    """Measurement minus simulation over time, and the band of the repeats around zero."""
     mean = line["measured_mean"]
-    fill(axes, time, line["measured_low"] - mean, line["measured_high"] - mean, buckets=RESIDUAL_BUCKETS)
+    fill(axes, time, line["measured_low"] - mean, line["measured_high"] - mean, band_name, RESIDUAL_BUCKETS)
     axes.axhline(0.0, color=LINE, linewidth=0.8)
-    for name, look in _FITS.items():
-        axes.plot(*thin(time, mean - line[name], RESIDUAL_BUCKETS), label=f"{name} the fit", **look)
+    for key, name in models.items():
+        axes.plot(*thin(time, mean - line[key], RESIDUAL_BUCKETS), label=name, **_STYLES[key])
 
 
 @styled
-def gap_per_joint(
+def distance_per_joint(
     joints: Sequence[str],
     before: Sequence[float],
     after: Sequence[float],
@@ -115,9 +137,11 @@ def gap_per_joint(
     axes.bar(x - 0.2, before, 0.36, color=BEFORE, label="before the fit")
     axes.bar(x + 0.2, after, 0.36, color=AFTER, label="after the fit")
     if floors is not None:
-        axes.hlines(floors, x - 0.42, x + 0.42, color=MEASURED, linewidth=1.6, label="floor (repeats)")
+        axes.hlines(floors, x - 0.42, x + 0.42, color=MEASURED, linewidth=1.6, label="noise floor (repeats)")
     elif floor is not None:
-        axes.axhline(floor, color=MEASURED, linestyle=(0, (3, 2)), linewidth=1.1, label="floor (repeats), all joints")
+        axes.axhline(
+            floor, color=MEASURED, linestyle=(0, (3, 2)), linewidth=1.1, label="noise floor (repeats), all joints"
+        )
     names = [label(j) for j in joints]
     numbered = width <= 6 and all(re.fullmatch(r"Joint \d+", name) for name in names)
     axes.set_xticks(x, [name.removeprefix("Joint ") for name in names] if numbered else names)
@@ -138,18 +162,18 @@ def fill(
     return True
 
 
-def shade(axes: Axes, phases: Sequence[Mapping[str, Any]], named: bool) -> None:
+def shade(axes: Axes, phases: Sequence[Phase], named: bool) -> None:
     """Every other phase of the motion shaded; names at the top where asked for."""
     for i, phase in enumerate(phases):
-        start, end = phase["start"], phase["end"]
+        start, end = phase.start, phase.end
         if i % 2 == 0:
             axes.axvspan(start, end, color=MUTED, alpha=0.10, linewidth=0)
         if named:
-            cut = phase is phases[-1] and end - start < SHORT * (end - phases[0]["start"])
+            cut = phase is phases[-1] and end - start < SHORT * (end - phases[0].start)
             axes.text(
                 end if cut else (start + end) / 2,
                 0.98,
-                phase["name"],
+                phase.name,
                 transform=axes.get_xaxis_transform(),
                 ha="right" if cut else "center",
                 va="top",
@@ -185,7 +209,7 @@ def band(
 
 def _torque_limits(line: Mapping[str, np.ndarray]) -> tuple[float, float]:
     """Limits that show measurement and fit whole, and all but the extreme 2 % of the start."""
-    whole = np.concatenate([line[k] for k in _TRACES if k != "before"])
+    whole = np.concatenate([values for key, values in line.items() if key != "before"])
     whole = whole[np.isfinite(whole)]
     start = line["before"][np.isfinite(line["before"])]
     marks = [*np.percentile(start, [1, 99])] if start.size else []

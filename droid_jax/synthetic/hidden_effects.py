@@ -20,8 +20,8 @@ from droid_jax.door.builtin import HINGE
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording, TorqueSide
-from droid_jax.report.words import label
-from droid_jax.report.words import listed as enumerated
+from droid_jax.report.text import label
+from droid_jax.report.text import listed as enumerated
 from droid_jax.simulate.c_engine import split
 from droid_jax.synthetic.arm_effects import ARM_EFFECTS
 from droid_jax.synthetic.base_effects import BASE

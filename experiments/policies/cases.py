@@ -23,7 +23,7 @@ from droid_jax.policy.evaluate import simulated
 from droid_jax.policy.randomise import of_method
 from droid_jax.policy.train import PRESETS, TrainConfig
 from droid_jax.policy.trials import LEARNED
-from droid_jax.report.export import save
+from droid_jax.report.style import save
 from droid_jax.storage import write_json
 from droid_jax.synthetic.policy_trials import PolicyRobot, transfer
 from experiments.policies.store import Doors, sha256, trained

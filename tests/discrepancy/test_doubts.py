@@ -1,4 +1,4 @@
-"""What is to be doubted of effects in a final model; a nuisance of the small scene plays a shape here."""
+"""What is to be doubted of effects in a final model; a nuisance of the small scene serves as a shape parameter here."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from small_gap import FLOOR, Small, small
 
-from droid_jax.discrepancy import doubts as doubts_module
-from droid_jax.discrepancy import workflow
 from droid_jax.discrepancy.fitting import FittedModel, intervals
 from droid_jax.discrepancy.results import gap_json
 from droid_jax.discrepancy.selection import bound_at, doubts
+from droid_jax.discrepancy.verdict import conclude
 
 SHAPE = "torque_offset[elbow]"  # -0.3 to 0.3 N m
 
@@ -42,27 +41,40 @@ def test_a_shape_at_its_bound_says_that_the_form_does_not_fit(found: Small, valu
     assert bound_at(found.case.train, model, SHAPE) == side
     verdict = replace(found.verdict, model=model, doubts=said)
     answer = gap_json(found.case, verdict)
-    (shape,) = answer["shapes"]
+    (shape,) = answer["shape_parameters"]
     assert shape["bound"] == side and shape["low"] <= shape["value"] <= shape["high"]
     assert answer["doubts"] == list(said)
     assert answer["sentence"] == found.verdict.sentence + (f" But {form}." if side else "")
 
 
-def test_a_shape_that_is_hardly_told_says_nothing_of_the_form(found: Small, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(doubts_module, "intervals", lambda residual_set, model, names: {SHAPE: (-0.3, 0.1)})
-    assert doubts(found.case.train, shaped(found, -1.0)) == ()
+def test_a_shape_that_is_poorly_constrained_says_nothing_of_the_form(found: Small):
+    train, model, p = found.case.train, shaped(found, -1.0), found.case.full_space[SHAPE]
+    share = np.ptp(intervals(train, model, [SHAPE])[SHAPE]) / (p.high - p.low)
+    assert share < train.config.shape_told
+    for told, said in ((0.9 * share, 0), (1.1 * share, 1)):
+        assert len(doubts(replace(train, config=replace(train.config, shape_told=told)), model)) == said
 
 
-def test_an_amplitude_past_its_bound_is_larger_than_its_bounds_allow(found: Small):
+def test_a_coefficient_past_its_bound_is_larger_than_its_bounds_allow(found: Small):
     model, whole = found.verdict.model, found.case.full_space
     values = model.values.copy()
     values[whole.index("hinge_preload")] = whole["hinge_preload"].high
     (said,) = doubts(found.case.train, replace(model, values=values))
     most = f"{whole['hinge_preload'].high:g} N m"
     assert said == f"hinge_preload at door is larger than its bounds allow: hinge_preload more than {most}"
+    assert doubts(found.case.train, replace(model, values=values), natural_bounds=("hinge_preload",)) == ()
 
 
-def test_the_verdict_carries_its_doubts(found: Small, monkeypatch: pytest.MonkeyPatch):
+def test_a_coefficient_that_may_be_zero_is_said(found: Small):
+    model, whole = found.verdict.model, found.case.full_space
+    values = model.values.copy()
+    values[whole.index("hinge_preload")] = 0.0
+    (said,) = doubts(found.case.train, replace(model, values=values))
+    assert said.startswith("of hinge_preload at door, its coefficient may be zero")
+
+
+def test_the_verdict_carries_its_doubts(found: Small):
     assert found.verdict.doubts == ()
-    monkeypatch.setattr(workflow, "doubts", lambda residual_set, model, ends: ("the form of it does not fit",))
-    assert workflow.search_effects(found.case, found.base, FLOOR).doubts == ("the form of it does not fit",)
+    model = shaped(found, -1.0)
+    again = conclude(found.case, found.base, model, (), FLOOR)
+    assert again.doubts == doubts(found.case.train, model) != ()

@@ -5,18 +5,24 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from small_gap import FLOOR, JOINTS, PRELOAD, Small, small
 
-from droid_jax.discrepancy.results import gap_arrays, gap_json, write_gap
+from droid_jax.discrepancy.config import DiscrepancyConfig
+from droid_jax.discrepancy.residual_set import ResidualSet
+from droid_jax.discrepancy.results import FORMAT, VERSION, gap_arrays, gap_json, write_gap
 from droid_jax.discrepancy.verdict import Conclusion, Experiment, unnamed
+from droid_jax.files import GAP, GAP_TRACES
+from droid_jax.model.effects.candidate import EffectKey
 from droid_jax.recordings.split import ROLES
-from droid_jax.report.gap_folder import read_gap
-from droid_jax.report.gap_words import deviations, largest_shifts
 
 MORE = {"seconds": {"search": 1.0}, "versions": {}, "device": "test", "setup": {"recording": []}}
+PRELOAD_ENTRY = {"effect": "hinge_preload", "location": "door"}
+DRAG_ENTRY = {"effect": "drag", "location": "door"}
+DRAG = EffectKey("drag", "door")
 
 
 @pytest.fixture(scope="module")
@@ -31,47 +37,57 @@ def folder(found: Small, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_what_was_hidden_is_in_the_file(found: Small, folder: Path):
-    answer = read_gap(folder).found
-    assert (
-        answer["verdict"] == "named"
-        and answer["effects"] == ["hinge_preload at door"]
-        and answer["indistinguishable"] == [[]]
-    )
-    (amplitude,) = answer["amplitudes"]
-    assert amplitude["low"] < PRELOAD < amplitude["high"]
-    assert amplitude["value"] == pytest.approx(PRELOAD, rel=0.05)
-    assert (amplitude["unit"], amplitude["effect"]) == ("N m", "hinge_preload at door")
-    assert "constant torque" in amplitude["what"]
+@pytest.fixture(scope="module")
+def answer(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / GAP).read_text())
+
+
+@pytest.fixture(scope="module")
+def arrays(folder: Path) -> dict[str, np.ndarray]:
+    with np.load(folder / GAP_TRACES) as file:
+        return dict(file)
+
+
+def test_what_was_hidden_is_in_the_file(found: Small, answer: dict[str, Any]):
+    assert (answer["format"], answer["version"]) == (FORMAT, VERSION)
+    assert answer["verdict"] == Conclusion.NAMED.value
+    assert answer["effects"] == [PRELOAD_ENTRY] and answer["indistinguishable"] == [[]]
+    (coefficient,) = answer["coefficients"]
+    assert coefficient["low"] < PRELOAD < coefficient["high"]
+    assert coefficient["value"] == pytest.approx(PRELOAD, rel=0.05)
+    assert PRELOAD_ENTRY.items() <= coefficient.items() and coefficient["unit"] == "N m"
     (preload,) = (e for e in found.case.effects if e.name == "hinge_preload")
-    told = {"what": preload.description, "mark": preload.signature, "confused_with": list(preload.confused_with)}
-    assert answer["about"] == {"hinge_preload": told} and told["mark"] and told["confused_with"]
+    assert coefficient["what"] == preload.description
+    about = {
+        "what": preload.description, "signature": preload.signature, "confused_with": list(preload.confused_with)
+    }  # fmt: skip
+    assert answer["about"] == {"hinge_preload": about} and about["signature"] and about["confused_with"]
     assert answer["p"] == pytest.approx(1 / 128)  # the smallest that eight repeats allow
-    assert answer["converged"] is True and answer["floor"] == FLOOR and answer["units"] == "N m"
+    assert answer["converged"] is True and answer["discretisation_error"] == FLOOR and answer["units"] == "N m"
+    assert MORE.items() <= answer.items()
 
 
-def test_gaps_are_the_verdicts_and_distances_those_of_the_traces(found: Small, folder: Path):
-    loaded = read_gap(folder)
-    assert list(loaded.found["gaps"]) == ["train", "validation"]
-    for role, gap in loaded.found["gaps"].items():
-        assert (gap["before"], gap["after"]) == found.verdict.discrepancies[role]
-        assert gap["recording"] == role and 0.95 < gap["closed"] <= 1.01
-        traces = loaded.traces[role]
+def test_discrepancies_are_the_verdicts_and_distances_those_of_the_traces(
+    found: Small, answer: dict[str, Any], arrays: dict[str, np.ndarray]
+):
+    assert list(answer["discrepancies"]) == ["train", "validation"]
+    for role, entry in answer["discrepancies"].items():
+        assert (entry["before"], entry["after"]) == found.verdict.discrepancies[role]
+        assert entry["recording"] == role and 0.95 < entry["closed"] <= 1.01
         for when in ("before", "after"):
             torque = found.recordings[role].channel("torque")
             noise = np.linalg.norm(torque.values - torque.values.mean(axis=0), axis=-1).mean()
-            left = np.linalg.norm(traces[when] - traces["measured"], axis=-1).mean()
-            assert gap[f"torque_{when}"] == pytest.approx(np.hypot(left, noise), rel=0.25)
-        assert gap["torque_after"] < gap["torque_before"]
+            left = np.linalg.norm(arrays[f"{role}.{when}"] - arrays[f"{role}.measured"], axis=-1).mean()
+            assert entry[f"torque_{when}"] == pytest.approx(np.hypot(left, noise), rel=0.25)
+        assert entry["torque_after"] < entry["torque_before"]
 
 
-def test_traces_have_one_shape_and_their_clock(found: Small, folder: Path):
-    loaded = read_gap(folder)
-    for role, traces in loaded.traces.items():
-        assert traces["joints"] == list(JOINTS)
+def test_traces_have_one_shape_and_their_clock(found: Small, arrays: dict[str, np.ndarray]):
+    assert arrays["joints"].tolist() == list(JOINTS)
+    for role, recording in found.recordings.items():
+        traces = {name: arrays[f"{role}.{name}"] for name in ("time", "measured", "scatter", "before", "after")}
         shape = (len(traces["time"]), len(JOINTS))
         assert all(traces[name].shape == shape for name in ("measured", "scatter", "before", "after"))
-        recording = found.recordings[role]
         torque = recording.channel("torque")
         assert recording.time[0] <= traces["time"][0] < traces["time"][-1] <= recording.time[-1]
         at = np.searchsorted(torque.time, traces["time"])
@@ -81,13 +97,13 @@ def test_traces_have_one_shape_and_their_clock(found: Small, folder: Path):
         assert 0.001 < np.median(traces["scatter"]) < 0.1
 
 
-def replace_own(residual_set):
+def without_nuisances(residual_set: ResidualSet) -> ResidualSet:
     """Without nuisances of the recording's own."""
     return dataclasses.replace(residual_set, nuisances=(), nuisance_columns=None)
 
 
 @pytest.mark.parametrize("off", [0.15, 0.8])
-def test_a_recordings_own_offset_is_no_gap_of_the_traces(found: Small, off: float):
+def test_a_recordings_own_offset_is_no_discrepancy_of_the_traces(found: Small, off: float):
     """A sensor that was off on the second day, in units of its prior by 1.5 and by 8: U fits that, and so do traces."""
     recording = found.recordings["validation"]
     torque = recording.channel("torque")
@@ -101,15 +117,17 @@ def test_a_recordings_own_offset_is_no_gap_of_the_traces(found: Small, off: floa
     assert case.validation.discrepancy_at(values) == pytest.approx(
         found.case.validation.discrepancy_at(values), abs=0.05
     )
-    assert replace_own(case.validation).discrepancy_at(values) > 1.0  # the offset is no small thing
-    before = gap_json(found.case, found.verdict)["gaps"]["validation"]["torque_after"]
-    assert gap_json(case, found.verdict)["gaps"]["validation"]["torque_after"] == pytest.approx(before, rel=0.05)
+    assert without_nuisances(case.validation).discrepancy_at(values) > 1.0  # the offset is no small thing
+    before = gap_json(found.case, found.verdict)["discrepancies"]["validation"]["torque_after"]
+    assert gap_json(case, found.verdict)["discrepancies"]["validation"]["torque_after"] == pytest.approx(
+        before, rel=0.05
+    )
 
 
 def test_joints_keep_one_order_whatever_the_recordings_have(found: Small):
     """A recording whose channels come in another order ends up in the order of the first."""
     case = found.case
-    channel = case.validation.cost.comparisons[0].channels[0]
+    channel = case.validation.comparison.channels[0]
     order = [2, 0, 1]
     turned = dataclasses.replace(
         channel,
@@ -118,17 +136,17 @@ def test_joints_keep_one_order_whatever_the_recordings_have(found: Small):
             channel.noise, mean=channel.noise.mean[:, order], repeats=channel.noise.repeats[:, :, order]
         ),
     )
-    comparison = dataclasses.replace(case.validation.cost.comparisons[0], channels=(turned,))
+    comparison = dataclasses.replace(case.validation.comparison, channels=(turned,))
 
     class Turned:
         comparisons = (comparison,)
         scene, space = case.validation.cost.scene, case.validation.cost.space
-        whitened = staticmethod(case.validation.cost.whitened)
 
         def smoothed(self, values):
             return tuple(s[:, :, order] for s in case.validation.cost.smoothed(values))
 
-    other = dataclasses.replace(case, validation=dataclasses.replace(case.validation, cost=Turned()))
+    cost: Any = Turned()
+    other = dataclasses.replace(case, validation=dataclasses.replace(case.validation, cost=cost))
     plain, again = gap_arrays(case, found.verdict), gap_arrays(other, found.verdict)
     for key in plain:
         if key == "joints":
@@ -137,99 +155,130 @@ def test_joints_keep_one_order_whatever_the_recordings_have(found: Small):
             np.testing.assert_allclose(plain[key], again[key], rtol=1e-9)
 
 
-def test_grounds_are_all_there(found: Small, folder: Path):
-    answer = read_gap(folder).found
-    first = answer["screens"][0]["ranking"]
-    assert first[0]["candidate"] == "hinge_preload at door"
-    assert len({r["candidate"] for r in first}) == len(first) == 3
+def test_grounds_are_all_there(found: Small, answer: dict[str, Any]):
+    first = answer["score_tests"][0]["ranking"]
+    assert PRELOAD_ENTRY.items() <= first[0].items()
+    assert len({(r["effect"], r["location"]) for r in first}) == len(first) == 3
     assert [r["explained"] for r in first] == sorted((r["explained"] for r in first), reverse=True)
-    assert [t["name"] for t in answer["trials"]] == [t.name for t in found.verdict.validation_tests]
-    assert all(t["round"] == 0 and t["passed"] == (not t["reasons"]) for t in answer["trials"])
-    (interval,) = answer["trials"][0]["interval"].values()
+    tests = found.verdict.validation_tests
+    for entry, test in zip(answer["validation_tests"], tests, strict=True):
+        assert entry["parts"] == [{"effect": k.effect, "location": k.location} for k in test.keys]
+        assert entry["parts_before"] == test.before == 0
+        assert entry["passed"] == test.passed == (not entry["reasons"])
+        assert [(r["reason"], r["text"]) for r in entry["reasons"]] == [(r.reason.value, r.text) for r in test.reasons]
+        assert entry["discrepancy_validation"] == test.discrepancy_validation
+        assert list(entry["interval"]) == list(test.interval)
+    (interval,) = answer["validation_tests"][0]["interval"].values()
     assert interval[0] < interval[1]
-    where = [c for c in answer["cells"]["before"] if c["variable"] == "joint x phase"]
-    assert len(where) == 6 and [c["found"] for c in where if c["where"].startswith("door")] == [True, True]
     assert answer["phases"]["train"][1] == {"name": "second", "start": 1.5, "end": pytest.approx(2.998)}
 
 
-def test_shifts_are_in_deviations_of_the_base_fit(folder: Path):
-    answer = read_gap(folder).found
+def test_cells_are_the_verdicts(found: Small, answer: dict[str, Any]):
+    for when, cells in (("before", found.verdict.before), ("after", found.verdict.after)):
+        for entry, cell in zip(answer["cells"][when], cells, strict=True):
+            key = cell.key
+            assert entry == {
+                "axis": key.axis.value, "joint": key.joint, "label": key.label, "low": key.low, "high": key.high,
+                "unit": key.unit, "discrepancy": cell.discrepancy, "p": cell.p, "found": cell.found,
+            }  # fmt: skip
+
+
+def test_trends_are_the_verdicts(found: Small, answer: dict[str, Any]):
+    trend, (entry,) = found.verdict.trend, answer["trends"]
+    assert trend is not None
+    assert (entry["effect"], entry["location"]) == (trend.key.effect, trend.key.location)
+    assert (entry["coefficient"], entry["per_repeat"], entry["p"]) == (trend.coefficient, trend.per_repeat, trend.p)
+    assert entry["unit"] == found.case.full_space[trend.coefficient].unit
+
+
+def test_shifts_are_in_deviations_of_the_base_fit(answer: dict[str, Any]):
     names = ["forearm_mass", "door_damping", "door_stiffness", "torque_offset[elbow]"]
-    assert [s["name"] for s in answer["shifts"]] == names
-    assert all(s["deviation_before"] > 0 for s in answer["shifts"])
-    most = largest_shifts(answer["shifts"])[0]
-    assert most["name"] == "door_stiffness" and abs(deviations(most)) > 1  # a spring had stood in for the preload
+    shifts = {shift["name"]: shift for shift in answer["shifts"]}
+    assert list(shifts) == names and all(s["deviation_before"] > 0 for s in shifts.values())
+    moved = {name: (s["after"] - s["before"]) / s["deviation_before"] for name, s in shifts.items()}
+    most = max(moved, key=lambda name: abs(moved[name]))
+    assert most == "door_stiffness" and abs(moved[most]) > 1  # a spring had served as the preload
     wound = PRELOAD / 5  # N m/rad, what the hidden spring has that a preload has not
     truth = {"door_stiffness": 0.7 + wound, "forearm_mass": 0.9, "door_damping": 0.6}
-    for shift in answer["shifts"][:3]:
-        assert shift["after"] == pytest.approx(truth[shift["name"]], rel=0.15)
+    for name, value in truth.items():
+        assert shifts[name]["after"] == pytest.approx(value, rel=0.15)
 
 
-def test_the_report_reads_it(folder: Path):
-    assert read_gap(folder).roles == ["train", "validation"]
-
-
-def test_ties_experiments_and_cuts_come_along(found: Small):
+def test_alternatives_experiments_and_what_was_not_tried_come_along(found: Small):
     verdict = dataclasses.replace(
-        found.verdict, kind=Conclusion.INDISTINGUISHABLE, indistinguishable=(("drag at door",),),
+        found.verdict, conclusion=Conclusion.INDISTINGUISHABLE,
+        indistinguishable=(((DRAG,), (DRAG, EffectKey("payload", "elbow"))),),
         experiments=(Experiment("open further", 7.5),),
-        not_tried="two candidates were not tried",
+        not_tried=("two candidates were not tried", "pairs of effects not tried"),
     )  # fmt: skip
     answer = gap_json(found.case, verdict)
-    assert set(answer["about"]) == {"hinge_preload", "drag"}
-    assert answer["indistinguishable"] == [["drag at door"]] and answer["cut"] == "two candidates were not tried"
+    assert set(answer["about"]) == {"hinge_preload", "drag", "payload"}
+    payload = {"effect": "payload", "location": "elbow"}
+    assert answer["indistinguishable"] == [[[DRAG_ENTRY], [DRAG_ENTRY, payload]]]
+    assert answer["not_tried"] == "; ".join(verdict.not_tried)
     assert answer["experiments"] == [{"what": "open further", "distance": 7.5, "not_made": ""}]
 
 
-def test_hints_and_the_threshold_that_made_them_are_in_the_file(found: Small):
-    hinted = unnamed(found.case, dataclasses.replace(found.verdict, indistinguishable=(("drag at door",),)))
+def test_hints_are_in_the_file(found: Small):
+    hinted = unnamed(found.case, dataclasses.replace(found.verdict, indistinguishable=(((DRAG,),),)))
     answer = gap_json(found.case, hinted)
     closed = {"validation": found.verdict.closed("validation")}
-    assert answer["hints"] == [
-        {"effects": ("hinge_preload at door",), "indistinguishable": (("drag at door",),), "closed": closed}
-    ]
-    assert answer["thresholds"] == {"least_closed": found.case.config.minimum_closed}
-    assert answer["verdict"] == "unexplained" and answer["effects"] == [] and answer["explained"] is None
+    assert answer["hints"] == [{"effects": [PRELOAD_ENTRY], "indistinguishable": [[[DRAG_ENTRY]]], "closed": closed}]
+    assert answer["verdict"] == Conclusion.UNEXPLAINED.value
+    assert answer["effects"] == [] and answer["explained"] is None
     assert set(answer["about"]) == {"hinge_preload", "drag"}
-    assert all(gap["closed"] == 0.0 and gap["before"] == gap["after"] for gap in answer["gaps"].values())
+    assert all(each["closed"] == 0.0 and each["before"] == each["after"] for each in answer["discrepancies"].values())
+
+
+def test_every_threshold_is_in_the_file(found: Small, answer: dict[str, Any]):
+    """Those of this search, its blocks and its settings too."""
+    config = found.case.config
+    assert set(answer["config"]) == {f.name for f in dataclasses.fields(DiscrepancyConfig)}
+    for name in ("selection", "blocks"):
+        assert answer["config"][name] == dataclasses.asdict(getattr(config, name))
+    assert answer["config"]["max_effects"] == config.max_effects
+    assert answer["config"]["refit"]["iterations"] == config.refit.iterations
+    selection = dataclasses.replace(found.case.config.selection, minimum_closed=0.3, significance=0.02)
+    other = dataclasses.replace(found.case, config=dataclasses.replace(found.case.config, selection=selection))
+    written = gap_json(other, found.verdict)["config"]["selection"]
+    assert (written["minimum_closed"], written["significance"]) == (0.3, 0.02)
 
 
 def test_shapes_come_once_with_their_intervals(found: Small):
-    """An effect's shape is one at all its places; a nuisance plays one here."""
+    """An effect's shape is one at all its locations; a nuisance serves as one here."""
     name, (part,) = "torque_offset[elbow]", found.verdict.model.parts
     shaped = dataclasses.replace(part, shape_parameters={name: 0.0})
     twice = (shaped, dataclasses.replace(shaped, location="elsewhere", coefficients=()))
     model = dataclasses.replace(found.verdict.model, parts=twice)
     answer = gap_json(found.case, dataclasses.replace(found.verdict, model=model))
-    assert [a["name"] for a in answer["amplitudes"]] == list(part.coefficients)
-    (shape,) = answer["shapes"]
-    assert (shape["name"], shape["unit"], shape["effect"]) == (name, "N m", part.name)
+    assert [a["name"] for a in answer["coefficients"]] == list(part.coefficients)
+    (shape,) = answer["shape_parameters"]
+    assert (shape["name"], shape["unit"]) == (name, "N m") and PRELOAD_ENTRY.items() <= shape.items()
     assert shape["low"] < shape["value"] == model.values[found.case.full_space.index(name)] < shape["high"]
 
 
 def test_where_nothing_was_asked_or_found_there_are_no_numbers(found: Small):
-    """An unconverged fit, and a gap below the floor: null, never a made-up share."""
+    """An unconverged fit, and a discrepancy below the discretisation error: null, never a made-up share."""
     nothing = dataclasses.replace(
-        found.verdict, kind=Conclusion.UNCONVERGED, effects=(), indistinguishable=(), model=found.base,
-        score_tests=(), validation_tests=(), discretisation_error=1e4,
-        discrepancies={role: (e.discrepancy_at(found.base.values),) * 2 for role, e in found.case.held_sets.items()},
+        found.verdict, conclusion=Conclusion.UNCONVERGED, effects=(), indistinguishable=(), model=found.base,
+        score_tests=(), validation_tests=(), discretisation_error=1e4, trend=None,
+        discrepancies={
+            role: (e.discrepancy_at(found.base.values),) * 2 for role, e in found.case.residual_sets.items()
+        },
     )  # fmt: skip
     answer = json.loads(json.dumps(gap_json(found.case, nothing), allow_nan=False))
-    assert (
-        answer["about"] == {}
-        and answer["p"] is None
-        and answer["screens"] == answer["trials"] == answer["amplitudes"] == []
-    )
-    assert all(gap["closed"] is None for gap in answer["gaps"].values())
+    assert answer["about"] == {} and answer["p"] is None
+    assert all(answer[name] == [] for name in ("score_tests", "validation_tests", "coefficients", "trends"))
+    assert all(each["closed"] is None for each in answer["discrepancies"].values())
     assert all(s["before"] == s["after"] for s in answer["shifts"])
 
 
-def test_the_sealed_recording_is_a_role_like_the_others(found: Small):
+def test_the_test_recording_is_a_role_like_the_others(found: Small):
     case = dataclasses.replace(found.case, test=found.case.validation)
-    gaps = {**found.verdict.discrepancies, "test": found.verdict.discrepancies["validation"]}
-    verdict = dataclasses.replace(found.verdict, discrepancies=gaps)
+    discrepancies = {**found.verdict.discrepancies, "test": found.verdict.discrepancies["validation"]}
+    verdict = dataclasses.replace(found.verdict, discrepancies=discrepancies)
     answer, arrays = gap_json(case, verdict), gap_arrays(case, verdict)
-    assert tuple(answer["gaps"]) == tuple(answer["phases"]) == ROLES
+    assert tuple(answer["discrepancies"]) == tuple(answer["phases"]) == ROLES
     np.testing.assert_array_equal(arrays["test.after"], arrays["validation.after"])
 
 

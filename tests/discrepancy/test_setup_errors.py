@@ -19,6 +19,7 @@ from droid_jax.discrepancy.case import case_of
 from droid_jax.discrepancy.verdict import Conclusion, Verdict
 from droid_jax.identify.multistart import RefineConfig, refine
 from droid_jax.identify.search import SearchConfig
+from droid_jax.model.effects.candidate import EffectKey
 from droid_jax.model.effects.registry import effect_space, library
 from droid_jax.model.parameter_file import load_parameters
 from droid_jax.model.parameters import Space
@@ -127,7 +128,7 @@ def test_the_effects_are_what_the_robot_hides(compensated: bool, tmp_path: Path)
 @pytest.mark.parametrize("compensated", [False, True], ids=["weight", "compensated"])
 def test_an_encoders_zero_is_named_and_measured(compensated: bool, tmp_path: Path):
     verdict, spans = found_in(compensated, tmp_path, encoder_zero=0.03)
-    assert (verdict.kind, verdict.effects) == (Conclusion.NAMED, ("encoder_offset at elbow",)), verdict
+    assert (verdict.conclusion, verdict.effects) == (Conclusion.NAMED, (EffectKey("encoder_offset", "elbow"),)), verdict
     value, low, high = spans["encoder_offset[elbow]"]
     assert value == pytest.approx(0.03, abs=0.003) and low < 0.03 < high, spans
     assert all(verdict.closed(role) > 0.9 for role in ("train", "validation", "test"))
@@ -137,7 +138,8 @@ def test_an_encoders_zero_is_named_and_measured(compensated: bool, tmp_path: Pat
 @pytest.mark.parametrize("compensated", [False, True], ids=["weight", "compensated"])
 def test_a_base_that_leans_is_named_and_measured(compensated: bool, tmp_path: Path):
     verdict, spans = found_in(compensated, tmp_path, tilted_base=0.03)
-    assert (verdict.kind, verdict.effects) == (Conclusion.NAMED, ("gravity_direction at base",)), verdict
+    assert verdict.conclusion is Conclusion.NAMED, verdict
+    assert verdict.effects == (EffectKey("gravity_direction", "base"),)
     for axis, size in (("x", np.cos(0.6)), ("y", np.sin(0.6))):
         value, low, high = spans[f"gravity_about_{axis}"]
         assert value == pytest.approx(0.03 * size, abs=0.003) and low < 0.03 * size < high, spans

@@ -402,7 +402,7 @@ def test_without_noise_a_recording_keeps_its_scatter_and_gets_another_mean(hinge
 
 def measured(low: float, high: float) -> Any:
     span = {"latch_torque": {"value": 3.0, "interval": [low, high]}}
-    return case("single", "named", ["latch at door"], [["latch at door"]], amplitudes=span)
+    return case("single", "named", ["latch at door"], [["latch at door"]], coefficients=span)
 
 
 def test_intervals_are_compared_with_where_the_model_settles_without_noise():

@@ -30,6 +30,7 @@ from run_kinds import make_tables
 import droid_jax
 from droid_jax.cost import cost as cost_module
 from droid_jax.cost.residuals import CompareConfig
+from droid_jax.discrepancy.config import BlocksConfig, SelectionConfig
 from droid_jax.identify import pipeline
 from droid_jax.identify.gaussian import prior
 from droid_jax.identify.multistart import RefineConfig
@@ -224,6 +225,12 @@ def _of_studies(folder: Path) -> tuple[Call, ...]:
         Call("RefineConfig", lambda **settings: fit(refine=RefineConfig(**settings)), _fields(RefineConfig())),
         Call("find_missing_effects", droid_jax.find_missing_effects, find),
         Call("DiscrepancyConfig", missing, _fields(droid_jax.DiscrepancyConfig())),
+        Call(
+            "SelectionConfig",
+            lambda **settings: missing(selection=SelectionConfig(**settings)),
+            _fields(SelectionConfig()),
+        ),
+        Call("BlocksConfig", lambda **settings: missing(blocks=BlocksConfig(**settings)), _fields(BlocksConfig())),
     )
     return tuple(replace(call, run=_cut_short(call.run)) for call in calls)
 

@@ -13,8 +13,6 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-import jinja2
-import jinja2.bccache
 import numpy as np
 from kinds import ROOT, Kind, use
 from markupsafe import Markup
@@ -51,7 +49,7 @@ from droid_jax.files import (
 )
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.recordings.formats import save_recording
-from droid_jax.report import drawings, gap_drawings, page, policy_drawings, stages
+from droid_jax.report import page, stages, style
 from droid_jax.report.tables import frames
 
 CHOSEN = [0, 2, -1]  # of the made-up fit's parameters
@@ -92,9 +90,9 @@ def _cut(path: Path, how: Callable[[str, np.ndarray], np.ndarray]) -> None:
 
 def make_gap(folder: Path) -> None:
     """The made-up search with one joint and few candidates."""
-    made_up_gap(folder, "named", sealed=False)
+    made_up_gap(folder, "named", test=False)
     found = json.loads((folder / GAP).read_text())
-    found["screens"] = [{**s, "ranking": s["ranking"][:3]} for s in found["screens"]]
+    found["score_tests"] = [{**s, "ranking": s["ranking"][:3]} for s in found["score_tests"]]
     found["cells"] = {key: cells[::40] for key, cells in found["cells"].items()}
     (folder / GAP).write_text(json.dumps(found))
     _cut(folder / GAP_TRACES, lambda key, a: a[:1] if key == "joints" else a[::5, :1] if a.ndim == 2 else a[::5])
@@ -123,35 +121,14 @@ def make_whole(folder: Path) -> None:
         make(folder / stage)
 
 
-class _Templates(jinja2.BytecodeCache):
-    """Compiled templates, kept in memory."""
-
-    def __init__(self) -> None:
-        self.kept: dict[str, bytes] = {}
-
-    def load_bytecode(self, bucket: jinja2.bccache.Bucket) -> None:
-        if bucket.key in self.kept:
-            bucket.bytecode_from_string(self.kept[bucket.key])
-
-    def dump_bytecode(self, bucket: jinja2.bccache.Bucket) -> None:
-        self.kept[bucket.key] = bucket.bytecode_to_string()
-
-
-_TEMPLATES = _Templates()
-
-
 @contextlib.contextmanager
 def undrawn() -> Iterator[None]:
-    """No figure is drawn inside: the page's words alone are made, by templates compiled once."""
+    """No figure is drawn inside: only the text of the page is made."""
 
-    def drawing(folder: Path, stem: str, title: str, caption: str, make: Any, *args: Any) -> drawings.Drawing:
-        return drawings.Drawing(folder / "figures", stem, title, caption, Markup(""), Markup(""))
+    def drawing(folder: Path, stem: str, title: str, make: Any, *args: Any) -> style.Drawing:
+        return style.Drawing(folder / "figures", stem, title, Markup(""), Markup(""))
 
-    with contextlib.ExitStack() as stack:
-        for module in (drawings, gap_drawings, policy_drawings):
-            stack.enter_context(mock.patch.object(module, "drawing", drawing))
-        environment = functools.partial(jinja2.Environment, bytecode_cache=_TEMPLATES)
-        stack.enter_context(mock.patch.object(jinja2, "Environment", environment))
+    with mock.patch.object(style, "drawing", drawing):
         yield
 
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from kinds import Kind
 
-from droid_jax.cost.cost import Cost
-from droid_jax.discrepancy.resume import CachedCost
+from droid_jax.cost.replay_cache import cached
 from droid_jax.files import POLICY
 from droid_jax.identify.checkpoints import Checkpoints
 from droid_jax.policy.control import ACTIONS, FORMAT, LAYOUT, OBSERVED, SHAPES, load_policy
@@ -54,29 +52,22 @@ def use_checkpoints(folder: Path) -> None:
         raise RuntimeError(f"step {step} holds another state")
 
 
-class _Plain:
-    """A cost whose replays are known."""
-
-    def whitened(self, values: Any) -> np.ndarray:
-        return np.arange(8.0).reshape(2, 4) * float(np.sum(values))
-
-
-def remembered(folder: Path) -> Any:
-    of: dict[str, Any] = {f.name: () for f in fields(Cost)}
-    return CachedCost(**of, plain=_Plain(), folder=folder)  # type: ignore[arg-type]
+def _replayed(values: Any) -> np.ndarray:
+    """Replays that are known."""
+    return np.arange(8.0).reshape(2, 4) * float(np.sum(values))
 
 
 _ROWS = np.array([[1.0, 2.0], [3.0, 4.0]])
 
 
 def make_replays(folder: Path) -> None:
-    remembered(folder).whitened(_ROWS)
+    cached(_replayed, folder, "whitened")(_ROWS)
 
 
 def use_replays(folder: Path) -> None:
-    """A damaged file is computed again; what comes back has the shape of what was asked for."""
-    found = remembered(folder).whitened(_ROWS)
-    if found.shape[:1] != (2,) or found.dtype.kind != "f" or found.ndim != 2:
+    """A damaged file is computed again; what comes back is what was computed."""
+    found = cached(_replayed, folder, "whitened")(_ROWS)
+    if not np.array_equal(found, _replayed(_ROWS)) or found.dtype.kind != "f":
         raise RuntimeError(f"replays of shape {found.shape}, {found.dtype}")
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from small_log import COULOMB, elbow, elbow_log, elbow_space
@@ -36,6 +37,7 @@ from droid_jax.identify.search import SearchConfig
 from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Channel
+from droid_jax.report.identify_folder import Fit
 from droid_jax.storage import config_json
 
 QUICK = IdentifyConfig(search=SearchConfig(population=8, parents=None, generations=2), refine=None, samples=2)
@@ -149,13 +151,13 @@ def test_the_command_says_how_it_went_and_what_to_do(found: Identified, tmp_path
     fit["gap"][name]["after"] = fit["gap"][name]["noise_floor"]
     alone = {name: {**fit["gap"][name], "noise_floor": None, "judged": "time"}}
     for changes, repeats, said in (
-        ({"mean_square": 90.0}, [8], "gap` looks for what the model lacks (it takes a second motion, or 16 repeats"),
-        ({"mean_square": 90.0}, [16], "gap` looks for what the model lacks\n"),
-        ({"mean_square": 1.0, "gap": alone}, [1], "one repeat does not tell noise from what the model lacks: let"),
+        ({"mean_square": 90.0}, [8], "gap` searches for what the model lacks (it takes a second motion, or 16 repeats"),
+        ({"mean_square": 90.0}, [16], "gap` searches for what the model lacks\n"),
+        ({"mean_square": 1.0, "gap": alone}, [1], "one repeat does not separate noise from what the model lacks: let"),
     ):
-        _summary(found, {**fit, **changes}, repeats)
+        _summary(found, msgspec.convert({**fit, **changes}, Fit), repeats)
         assert said in capsys.readouterr().out
-        _summary(found, {**fit, "mean_square": 1.0}, repeats)
+        _summary(found, msgspec.convert({**fit, "mean_square": 1.0}, Fit), repeats)
         assert said not in capsys.readouterr().out
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from droid_jax.report import film as module
-from droid_jax.report.film import LONGEST, LOOPS, SIZE, film
+from droid_jax.report import render as module
+from droid_jax.report.render import LONGEST, LOOPS, SIZE, film
 
 MODEL = mujoco.MjModel.from_xml_string(
     "<mujoco><worldbody><body><joint name='hinge'/><geom size='.1'/></body></worldbody></mujoco>"

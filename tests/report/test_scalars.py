@@ -9,7 +9,7 @@ import pytest
 
 from droid_jax.identify.multistart import RefineProgress
 from droid_jax.policy.train import TrainProgress
-from droid_jax.report.scalars import numbers_of, scalars
+from droid_jax.report.progress import numbers_of, scalars
 
 pytest.importorskip("tensorboardX")
 

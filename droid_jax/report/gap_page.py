@@ -1,0 +1,310 @@
+"""The page of a search for a missing effect: its tables, what to doubt, what to do next, and its figures.
+
+templates/gap.html.jinja lays it out, templates/gap_sentences.jinja has the sentences.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from matplotlib.figure import Figure
+from msgspec import structs
+
+from droid_jax.report import gap_figures, style
+from droid_jax.report.gap_folder import (
+    About,
+    Cell,
+    Experiment,
+    Found,
+    Gap,
+    Place,
+    Role,
+    Trend,
+    ValidationTest,
+    largest_shifts,
+)
+from droid_jax.report.style import Drawing
+
+DECISIVE = 6.0  # standardised difference from which ten repeats decide between indistinguishable models
+COARSE = 0.1  # share of U that is the discretisation error, from which the page warns
+UNCERTAIN = 0.8  # share of what is left on the validation recording beyond the fit's uncertainty, from which it is real
+ROLES: dict[Role, str] = {"train": "training", "validation": "validation", "test": "test"}
+UNREAD = ("command", "start", "synthetic_robot", "robot", "hidden")  # options that only the program reads
+
+
+def gap_view(gap: Gap) -> dict[str, Any]:
+    """What the templates show of a search.
+
+    Args:
+        gap: its folder.
+
+    Returns:
+        The context of gap.html.jinja.
+    """
+    return {
+        "gap": gap,
+        "found": gap.found,
+        "roles": ROLES,
+        "decisive": DECISIVE,
+        "significance": gap.found.threshold("significance"),
+        "doubts": doubts(gap),
+        "coarse": coarse_share(gap),
+        "within_fit": within_uncertainty(gap),
+        "trends": trends(gap),
+        "next": next_step(gap),
+        "where": where(gap),
+        "best": best_experiment(gap),
+        "groups": groups(gap.found),
+        "signatures": signatures(gap.found),
+        "drawings": _draw(gap),
+        "options": options(gap),
+        "thresholds": dict(flat(gap.found.config)),
+    }
+
+
+def doubts(gap: Gap) -> list[str]:
+    """What to doubt of a search, by the names that gap_sentences.jinja has for them."""
+    asked = {
+        "validation_chose": "test" not in gap.roles and not gap.lost,
+        "test_lost": gap.lost,
+        "limits": bool(gap.found.split.limits),
+        "coarse": coarse_share(gap) is not None,
+        "step_unknown": gap.found.discretisation_error is None,
+        "within_fit": within_uncertainty(gap) is not None,
+        "trends": bool(trends(gap)),
+        "blown_up": bool(gap.blown_up),
+        "not_tried": bool(gap.found.not_tried),
+        **{name: name in gap.found.missing_amendments for name in ("experiments", "final_refit")},
+    }
+    return [name for name, holds in asked.items() if holds]
+
+
+def coarse_share(gap: Gap) -> float | None:
+    """Share of U of the base model on the train recording that is the discretisation error; None below COARSE."""
+    error, before = gap.discretisation_error, gap.found.discrepancies["train"].before
+    return error / before if error is not None and before and error > COARSE * before > 0 else None
+
+
+def within_uncertainty(gap: Gap) -> float | None:
+    """Share of U left on the validation recording that lies within the uncertainty of the fit; None where little."""
+    left, after = gap.found.remainder, gap.found.discrepancies["validation"].after
+    if left is None or after is None or not gap.extended:
+        return None
+    if after <= max(gap.discretisation_error or 0.0, 0.0) or left > UNCERTAIN * after:
+        return None
+    return 1.0 - max(left, 0.0) / after
+
+
+def trends(gap: Gap) -> list[Trend]:
+    """What changes significantly from repeat to repeat."""
+    return [t for t in gap.found.trends if t.p is not None and t.p < gap.found.threshold("significance")]
+
+
+def next_step(gap: Gap) -> str:
+    """What to do next, by the names that gap_sentences.jinja has for it."""
+    verdict = gap.found.verdict
+    if verdict == "indistinguishable":
+        if gap.timeless:
+            return "record another motion"
+        best = best_experiment(gap)
+        return "no experiment" if best is None else "decisive experiment" if decisive(best) else "weak experiment"
+    if verdict == "partly explained":
+        return "mostly open" if mostly_open(gap) else "keep"
+    if verdict == "unexplained":
+        if gap.found.hints:
+            return "hints"
+        return "none passed clearly" if any(t.passed for t in gap.found.validation_tests) else "none passed"
+    return verdict
+
+
+def best_experiment(gap: Gap) -> Experiment | None:
+    """The candidate experiment of the largest distance."""
+    known = [e for e in gap.found.experiments if e.distance is not None]
+    return max(known, key=lambda e: e.distance or 0.0, default=None)
+
+
+def decisive(experiment: Experiment) -> bool:
+    """Whether ten repeats of an experiment decide."""
+    return (experiment.distance or 0.0) >= DECISIVE
+
+
+def mostly_open(gap: Gap) -> bool:
+    """Whether the effects explain less than half of the discrepancy."""
+    share, enough = gap.found.explained, gap.found.threshold("mostly_explained")
+    return gap.found.verdict == "partly explained" and share is not None and share < enough
+
+
+def untrusted(gap: Gap) -> bool:
+    """Whether nothing should be trained on the model: no fit converged, or most of the discrepancy is open."""
+    return gap.found.verdict in ("unexplained", "fit not converged") or mostly_open(gap)
+
+
+def where(gap: Gap) -> list[Cell]:
+    """The largest cells of what is left, by joint and phase and by the object's state: those that the test finds, or
+    all where there are no repeats to test.
+    """
+    cells = [c for c in gap.found.cells.after if c.discrepancy is not None and (c.found or not gap.repeated)]
+    kinds = [[c for c in cells if c.axis == "phase"], [c for c in cells if c.axis.startswith("object")]]
+    chosen = [kind for kind in kinds if kind] or ([cells] if cells else [])
+    return [max(kind, key=lambda c: c.discrepancy or 0.0) for kind in chosen]
+
+
+@dataclass(frozen=True)
+class Row:
+    """A validation test, with the score test's statistic and explained share where its new effect was ranked.
+
+    outcome: "selected", "selected, indistinguishable", "indistinguishable", "hint", "not converged",
+    "larger discrepancy", "small gain", "simpler", "failed" or "failed alone" (in the model beside others).
+    """
+
+    test: ValidationTest
+    t: float | None
+    explained: float | None
+    outcome: str
+
+
+@dataclass(frozen=True)
+class Group:
+    """Validation tests of models that had as many effects before.
+
+    beside: these effects.  discrepancy_train, discrepancy_validation: U of the model with them.
+    """
+
+    beside: tuple[Place, ...]
+    discrepancy_train: float | None
+    discrepancy_validation: float | None
+    rows: tuple[Row, ...]
+
+
+def groups(found: Found) -> list[Group]:
+    """The validation tests by the number of effects before, the smallest discrepancy first."""
+    counts = sorted({t.parts_before for t in found.validation_tests})
+    return [_group(found, count) for count in counts]
+
+
+def _group(found: Found, count: int) -> Group:
+    tests: dict[tuple[Place, ...], ValidationTest] = {}
+    for t in found.validation_tests:
+        parts = tuple(t.parts)
+        if t.parts_before == count and (parts not in tests or t.passed):  # a pair may be tried twice
+            tests[parts] = t
+    ranked = {r.place: r for r in found.score_tests[count].ranking} if count < len(found.score_tests) else {}
+    beside = Counter(parts[:count] for parts in tests).most_common(1)[0][0]
+    rows = []
+    for parts, t in tests.items():
+        entry = ranked.get(parts[-1]) if parts[:count] == beside else None
+        statistics = (entry.t, entry.explained) if entry else (None, None)
+        rows.append(Row(t, *statistics, outcome(found, t)))
+    order = sorted(rows, key=lambda r: (r.test.discrepancy_validation is None, r.test.discrepancy_validation or 0.0))
+    if not beside:
+        before = (found.discrepancies["train"].before, found.discrepancies["validation"].before)
+    else:
+        model = next((t for t in found.validation_tests if tuple(t.parts) == beside), None)
+        before = (model.discrepancy_train, model.discrepancy_validation) if model else (None, None)
+    return Group(beside, *before, tuple(order))
+
+
+def outcome(found: Found, test: ValidationTest) -> str:
+    """What became of a model after its validation test, see `Row`."""
+    parts, effects = set(test.parts), set(found.effects)
+    if not test.passed:
+        return "failed alone" if parts < effects else "failed"
+    if parts <= effects:
+        pairs = zip(found.effects, found.indistinguishable, strict=True)
+        tied = any(others for effect, others in pairs if effect in parts)
+        return "selected, indistinguishable" if tied else "selected"
+    if parts <= effects | set(alternatives(found)):
+        return "indistinguishable"
+    if any(parts <= set(hint.effects) for hint in found.hints):
+        return "hint"
+    if found.verdict == "fit not converged":
+        return "not converged"
+    left = [found.discrepancies["validation"].after, *(t.discrepancy_validation for t in found.validation_tests)]
+    if (test.discrepancy_validation or 0.0) > min(u for u in left if u is not None):
+        return "larger discrepancy"
+    return "small gain" if len(test.parts) > 1 else "simpler"
+
+
+def alternatives(found: Found) -> list[Place]:
+    """The effects of all alternatives to the answer, each once."""
+    models = (model for others in found.indistinguishable for model in others)
+    return list(dict.fromkeys(place for model in models for place in model))
+
+
+@dataclass(frozen=True)
+class Signature:
+    """Where the signature of an effect of the answer, or of an alternative to it, should appear."""
+
+    places: tuple[Place, ...]
+    alternative: bool
+    about: About
+
+
+def signatures(found: Found) -> list[Signature]:
+    """One for each effect of the answer and of its alternatives, with all its places."""
+    out: dict[tuple[bool, str], Signature] = {}
+    for place in dict.fromkeys([*found.effects, *alternatives(found)]):
+        key = (place not in found.effects, place.effect)
+        about = found.about.get(place.effect)
+        if key in out:
+            out[key] = replace(out[key], places=(*out[key].places, place))
+        elif about and (about.signature or about.confused_with):
+            out[key] = Signature((place,), key[0], about)
+    return list(out.values())
+
+
+def options(gap: Gap) -> dict[str, str]:
+    """What was asked for; what only distinguishes a run from another stays in its file."""
+    return {
+        name.replace("_", " "): ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+        for name, value in gap.options.items()
+        if value not in (None, [], "") and name not in UNREAD and not name.endswith("_sha256")
+    }
+
+
+def flat(config: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+    """Settings of nested objects, each with the names above it: "selection.significance"."""
+    for name, value in config.items():
+        if isinstance(value, Mapping):
+            yield from flat(value, f"{before}{name}.")
+        else:
+            yield f"{before}{name}", value
+
+
+def _draw(gap: Gap) -> dict[str, list[Drawing]]:
+    """Figures by section of the page; PNG and PDF copies go to FOLDER/figures/."""
+    found, extended, unit = gap.found, gap.extended, gap.found.units
+    sections: dict[str, list[Drawing]] = {"size": [], "torque": [], "place": [], "shifts": [], "remainder": []}
+    before, after = (_shown(gap, cells) for cells in (found.cells.before, found.cells.after))
+    cells = (before, after if extended else None)
+
+    def add(section: str, stem: str, title: str, make: Callable[..., Figure], *args: Any) -> None:
+        sections[section].append(style.drawing(gap.folder, f"missing_{stem}", title, make, *args))
+
+    names = [f"{gap.recording(role)}\n{ROLES[role]}" for role in gap.roles]
+    sizes = [found.discrepancies[role] for role in gap.roles]
+    bars = (names, sizes, gap.discretisation_error, unit, extended)
+    add("size", "gap", "Discrepancy and torque distance", gap_figures.discrepancy_bars, *bars)
+    for roles, traces in gap.sheets:
+        title = "Torque over time, " + " and ".join(f"{gap.recording(role)} ({ROLES[role]})" for role in roles)
+        add("torque", f"torque_{roles[0]}", title, gap_figures.torque_overlays, traces, unit, extended)
+    if any(c.axis == "phase" for c in before):
+        add("place", "cells", "Discrepancy by joint and phase", gap_figures.cell_maps, *cells)
+    if any(c.axis != "phase" for c in before):
+        add("place", "state", "Discrepancy over the state of the motion", gap_figures.state_bars, *cells)
+    if extended and largest_shifts(found.shifts):
+        add("shifts", "shifts", "Shifts of the base parameters", gap_figures.base_shifts, found.shifts)
+    if found.verdict in ("unexplained", "partly explained"):
+        curve = (gap.sheets[-1][1], found.cells.after, unit)
+        add("remainder", "remainder", "What is left", gap_figures.remainder, *curve)
+    return sections
+
+
+def _shown(gap: Gap, cells: Sequence[Cell]) -> Sequence[Cell]:
+    """Cells to draw; without repeats no test judges them, and all that hold an instant are shown unchanged."""
+    if gap.repeated:
+        return cells
+    return [structs.replace(c, found=True) for c in cells if c.discrepancy]

@@ -1,0 +1,181 @@
+"""The page of an identification: what to doubt and what to do next by fit.json, and its figures.
+
+templates/identify.html.jinja lays it out, templates/identify_sentences.jinja has the sentences.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from droid_jax.recordings.split import FEWEST_REPEATS, HALVES
+from droid_jax.report import identify_figures, style, torque_figures
+from droid_jax.report.identify_folder import Fit, Parameter, Run, TorqueDistance
+from droid_jax.report.style import Drawing, data_uri
+from droid_jax.report.text import label
+
+FAR = 3.0  # noise floors: a fit that leaves more, and half of the distance, has another fault than a missing effect
+NOISY = 1.5  # noise floors: a fit that leaves more leaves more than noise
+MEAN_SQUARE = 2.0  # of the whitened residuals: the same (0.6 to 1.4 in fits where nothing is missing)
+GROUPS = ("Door", "Robot", "Gripper")  # the order of the paper's Table I
+
+
+def identify_view(run: Run, searched: bool) -> dict[str, Any]:
+    """What the templates show of an identification.
+
+    Args:
+        run: its folder.
+        searched: whether the page holds a search for a missing effect too.
+
+    Returns:
+        The context of identify.html.jinja.
+    """
+    return {
+        "run": run,
+        "doubts": doubts(run.fit),
+        "next": next_steps(run, searched),
+        "needed": needed([r.repeats for r in run.config.recordings]),
+        "unidentifiable": [p for p in run.fit.of_interest if not p.identifiable and not p.moved_far],
+        "moved": [p for p in run.fit.of_interest if p.moved_far],
+        "known": [p for p in run.fit.of_interest if p.truth is not None and p.identifiable],
+        "groups": grouped(run.fit.of_interest),
+        "nuisances": grouped(run.fit.nuisances),
+        "drawings": _draw(run),
+        "frames": frame_rows(run.frames),
+        "replay": data_uri(run.film.read_bytes(), "webp") if run.film else None,
+    }
+
+
+def doubts(fit: Fit) -> list[str]:
+    """What to doubt of a fit, by the names that identify_sentences.jinja has for them."""
+    uncertain = [p for p in fit.of_interest if not p.identifiable]
+    asked = {
+        "worse": any(d.after > d.before for d in fit.gap.values()),
+        "far_off": far_off(fit),
+        "not_converged": fit.converged is False,
+        "not_judged": fit.converged is None,
+        "time_step": any(check.too_coarse for check in fit.checks.values()),
+        "engine": any(check.engines_differ and not check.too_coarse for check in fit.checks.values()),
+        "unidentifiable": fit.converged is not None and any(not p.moved_far for p in uncertain),
+        "moved": fit.converged is not None and any(p.moved_far for p in uncertain),
+        "on_bound": any(p.on_bound for p in fit.parameters),
+        "noisy": lacks_something(fit),
+        "one_repeat": noiseless(fit),
+    }
+    return [name for name, holds in asked.items() if holds]
+
+
+def next_steps(run: Run, searched: bool) -> list[str]:
+    """What to do next, by the names that identify_sentences.jinja has for it, the most urgent first."""
+    fit = run.fit
+    steps = ["time_step"] if any(check.too_coarse for check in fit.checks.values()) else []
+    if any(f.severity == "certain" for f in fit.findings):
+        steps.append("mend")
+    elif far_off(fit):
+        steps.append("set_up")
+    if any(p.on_bound for p in fit.parameters):
+        steps.append("bound")
+    if fit.converged is None:
+        steps.append("preset")
+    elif any(not p.identifiable for p in fit.of_interest):
+        steps.append("motion")
+    if lacks_something(fit):
+        steps.append("search_below" if searched else "search")
+    elif noiseless(fit):
+        steps.append("asked_below" if searched else asked_of(fit))
+    return steps or ["train"]
+
+
+def far_off(fit: Fit) -> bool:
+    """Whether the fit made it worse, or stayed so far from the data that its set-up is in doubt.
+
+    Where no noise floor is known, two parameters at a bound have to say so.
+    """
+    bounds = sum(p.on_bound for p in fit.of_interest)
+
+    def far(gap: TorqueDistance) -> bool:
+        floor = gap.noise_floor
+        most = bounds >= 2 if floor is None else gap.after > FAR * floor
+        return gap.after > gap.before or (most and gap.after > 0.5 * (gap.before + (floor or 0.0)))
+
+    return any(far(gap) for gap in fit.gap.values())
+
+
+def lacks_something(fit: Fit) -> bool:
+    """Whether noise alone does not explain what the fit left, by equation 1 and by its whitened residuals."""
+    far = any(g.noise_floor and g.after > NOISY * g.noise_floor for g in fit.gap.values())
+    return far or (fit.mean_square or 0.0) > MEAN_SQUARE
+
+
+def noiseless(fit: Fit) -> bool:
+    """Whether a fit is of single repeats, from which the noise is not known."""
+    return any(gap.noise_floor is None for gap in fit.gap.values())
+
+
+def asked_of(fit: Fit) -> str:
+    """The step that finds out whether the model of a `noiseless` fit lacks something: "search_log" or "repeats"."""
+    log = len(fit.gap) <= 2 and all(gap.judged == "time" for gap in fit.gap.values())
+    return "search_log" if log else "repeats"
+
+
+def needed(repeats: Sequence[int]) -> tuple[int, int, bool] | None:
+    """What `gap` takes beside recordings of so many repeats: repeats of each of two motions, or of one, and whether a
+    second motion alone will do; None where these are enough.
+    """
+    alone = len(repeats) == 1
+    if (alone and (repeats[0] == 1 or repeats[0] >= HALVES)) or (not alone and min(repeats) >= FEWEST_REPEATS):
+        return None
+    return FEWEST_REPEATS, HALVES, alone and repeats[0] >= FEWEST_REPEATS
+
+
+def grouped(parameters: Iterable[Parameter]) -> dict[str, list[Parameter]]:
+    """Parameters by group, in the order of the paper's Table I, other groups after it."""
+    groups: dict[str, list[Parameter]] = {name: [] for name in GROUPS}
+    for p in parameters:
+        groups.setdefault(p.group, []).append(p)
+    return {g: ps for g, ps in groups.items() if ps}
+
+
+def _draw(run: Run) -> dict[str, list[Drawing]]:
+    """All figures by section of the page; PNG and PDF copies go to RUN/figures/."""
+    fit = run.fit
+    sections: dict[str, list[Drawing]] = {"distance": [], "torque": [], "parameters": [], "search": []}
+
+    def add(section: str, stem: str, title: str, make: Callable[..., Figure], *args: Any) -> None:
+        sections[section].append(style.drawing(run.folder, stem, title, make, *args))
+
+    for i, (name, gap) in enumerate(fit.gap.items()):
+        of = f" ({name})" if len(fit.gap) > 1 else ""
+        traces = run.traces[name]
+        bars = (traces["joints"], gap.per_joint_before, gap.per_joint_after, gap.noise_floor, gap.per_joint_noise_floor)
+        title = f"Torque difference of each joint{of}"
+        add("distance", f"gap_{i}", title, torque_figures.distance_per_joint, *bars, fit.torque_unit)
+        overlay = (traces, traces["phases"], fit.torque_unit)
+        add("torque", f"torque_{i}", f"Torque over time{of}", torque_figures.torque_traces, *overlay)
+    add("parameters", "intervals", "90 % intervals", identify_figures.intervals, fit.of_interest)
+    correlation = (run.correlation["names"], run.correlation["correlation"])
+    add("parameters", "correlation", "Correlation", identify_figures.correlation_map, *correlation)
+    title = "Parameters over generations"
+    add("search", "parameter_history", title, identify_figures.parameter_history, run.history, fit.parameters)
+    add("search", "cost_history", "Cost over generations", identify_figures.cost_history, run.history, fit.cost)
+    if run.distribution is not None:
+        samples = (run.distribution["initial_cost"], run.distribution["fitted_cost"])
+        title = "Cost of samples of both Gaussians"
+        add("search", "cost_distribution", title, identify_figures.cost_histograms, *samples, fit.torque_unit)
+    return sections
+
+
+def frame_rows(paths: Sequence[Path]) -> list[tuple[str, list[tuple[str, str]]]]:
+    """Pictures by the first word of their names: (heading, [(caption, data URI)])."""
+    rows: dict[str, list[tuple[str, str]]] = {}
+    for path in paths:
+        name = re.fullmatch(r"(.*?)_\d+_(-?[\d.]+)s", path.stem)
+        heading, caption = (name[1], f"{name[2]} s") if name else ("", path.stem)
+        rows.setdefault(heading, []).append((caption, data_uri(path.read_bytes())))
+    names = {"before": "Before the fit", "after": "After the fit", "": "The scene"}
+    order = sorted(rows, key=lambda k: (["", "before", "after"].index(k) if k in names else 3, k))
+    return [(names.get(k, label(k)), rows[k]) for k in order]

@@ -1,0 +1,52 @@
+"""A log of one repeat without commands: whitened on the host as its cost would be, and compiled once."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from small_log import ASKED, CONFIG, COULOMB, elbow, elbow_log, elbow_space
+
+from droid_jax.cost.cost import make_cost
+from droid_jax.cost.lone_log import LoneLog, lone_log
+from droid_jax.model.effects.registry import joined, library, ready
+
+
+@pytest.fixture(scope="module")
+def log() -> LoneLog:
+    scene = elbow()
+    effects = library(scene, ASKED)
+    space = joined(elbow_space(scene), effects)
+    return lone_log(ready(scene), space, elbow_log(COULOMB), CONFIG.compare, effects)
+
+
+def test_a_log_is_whitened_as_its_cost_would(log: LoneLog):
+    scene = elbow()
+    cost = make_cost(ready(scene), elbow_space(scene), [elbow_log(COULOMB)], config=CONFIG.compare)
+    values = elbow_space(scene).mean
+    whole = log.space.mean
+    stated = cost.restated(values)
+    deviation = 1 / stated.comparisons[0].channel("torque").noise.whitener[0, 0, 0]
+    everywhere = np.ones(len(log.clock), bool)
+    own = log.with_noise(np.array([deviation]), everywhere)
+    np.testing.assert_allclose(own.whitened(whole[None]), stated.whitened(values[None]), atol=1e-3)
+    some = log.clock < 5.0
+    np.testing.assert_array_equal(log.with_noise(np.ones(1), some).whitened(whole[None])[0] == 0, ~some)
+    fitted = log.with_torques(log.simulated(whole[None])[0])
+    np.testing.assert_allclose(fitted.residual_torque(whole), 0.0, atol=1e-9)
+
+
+def test_distances_are_of_the_instants_that_count(log: LoneLog):
+    values = log.space.mean[None]
+    everywhere, some = np.ones(len(log.clock), bool), log.clock < 10.0
+    whole, part = (log.with_noise(np.ones(1), at).distances(values)[0, 0] for at in (everywhere, some))
+    left = np.abs(log.residual_torque(log.space.mean))
+    assert part / whole == pytest.approx(left[some].mean() / left.mean(), rel=0.1)
+    assert part != pytest.approx(whole, rel=0.01)
+
+
+def test_repeats_and_commands_are_refused(log: LoneLog):
+    scene = elbow()
+    space = elbow_space(scene)
+    with pytest.raises(ValueError, match="'elbow' has 2 repeats: use make_case"):
+        lone_log(scene, space, elbow_log(COULOMB, 8.0, 2), CONFIG.compare)
+    assert log.part("another").comparisons[0].name == "another" and log.comparisons[0].name == "elbow"

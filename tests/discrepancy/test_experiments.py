@@ -1,0 +1,194 @@
+"""Experiments that distinguish indistinguishable models whose difference is known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from small_gap import record, small
+
+from droid_jax.cost.observation import TooLong
+from droid_jax.discrepancy import missing
+from droid_jax.discrepancy.case import Case
+from droid_jax.discrepancy.fitting import FittedModel
+from droid_jax.discrepancy.missing import IN_THE_AIR, WEIGHT, separating_experiments, untouched
+from droid_jax.door.demonstration import PLANS, grasp_pose
+from droid_jax.door.scene import door_scene
+from droid_jax.model.scene import Grip
+from droid_jax.recordings.recording import Recording
+from droid_jax.recordings.time_scaling import TIME_SCALINGS
+from droid_jax.simulate.hand_path import solve_pose
+from droid_jax.simulate.workspace_extrapolation import FURTHER
+
+
+@pytest.fixture(scope="module")
+def demonstration():
+    return record("train")
+
+
+def model(name: str, value: float) -> FittedModel:
+    """The base fit with one effect beside it."""
+    found = small()
+    values = found.base.values.copy()
+    values[found.case.full_space.index(name)] = value
+    return replace(found.base, values=values)
+
+
+def test_a_drag_is_distinguished_from_a_preload_by_another_speed(demonstration, monkeypatch):
+    """Models that differ in a speed-dependent torque: three times slower they come closer, twice as fast they part."""
+    monkeypatch.setattr(missing, "TIME_SCALINGS", TIME_SCALINGS[:2])
+    models = (model("drag", 0.0), model("drag", 0.8))
+    found = {e.what: e.distance or 0.0 for e in separating_experiments(small().case, models, demonstration)}
+    slower, faster = (found[entry.what] for entry in TIME_SCALINGS[:2])
+    assert faster > 3.0 * slower > 0.0
+    weighed = next(apart for what, apart in found.items() if "weighed" in what)
+    assert slower < weighed < faster
+
+
+def test_an_experiment_that_cannot_be_made_says_why_and_ends_nothing(demonstration, monkeypatch):
+    """The search is done by then.  Those that can be made come first."""
+    make, raised = missing.make_cost, [TooLong("needs 9.0 GB"), RuntimeError("RESOURCE_EXHAUSTED\nout of memory")]
+
+    def short_of_memory(scene, space, recordings, **options):
+        if recordings[0].time[-1] > demonstration.time[-1] + 0.1:
+            raise raised.pop(0)
+        return make(scene, space, recordings, **options)
+
+    monkeypatch.setattr(missing, "TIME_SCALINGS", TIME_SCALINGS[:3])
+    monkeypatch.setattr(missing, "make_cost", short_of_memory)
+    found = separating_experiments(small().case, (model("drag", 0.0), model("drag", 0.8)), demonstration)
+    said = {e.what: (e.distance is None, e.not_made) for e in found}
+    assert said[TIME_SCALINGS[0].what] == (True, "needs 9.0 GB")
+    assert said[TIME_SCALINGS[1].what] == (False, "")
+    assert said[TIME_SCALINGS[2].what] == (True, "RuntimeError: RESOURCE_EXHAUSTED")
+    assert [e.distance is None for e in found] == sorted(e.distance is None for e in found)
+
+
+def dropped(recording: Recording, seconds: float) -> Recording:
+    """A recording whose torque sensor gave nothing for a while, in all repeats."""
+    channel = recording.channels["torque"]
+    mask = channel.mask.copy()
+    mask[:, (channel.time > 1.0) & (channel.time < 1.0 + seconds)] = False
+    return replace(recording, channels={**recording.channels, "torque": replace(channel, mask=mask)})
+
+
+def test_a_dropout_that_a_slower_motion_makes_too_long_is_said(demonstration):
+    """60 ms without torques are filled in; three times slower they are too long."""
+    models = (model("drag", 0.0), model("drag", 0.8))
+    found = {e.what: e for e in separating_experiments(small().case, models, dropped(demonstration, 0.06))}
+    slower, faster = (found[entry.what] for entry in TIME_SCALINGS[:2])
+    assert slower.distance is None and "a stretch that no repeat measured" in slower.not_made
+    assert faster.distance is not None and faster.distance > 0.0
+
+
+def test_a_known_weight_distinguishes_only_what_acts_through_it(demonstration, monkeypatch):
+    """Two payloads differ by as much with a weight beside them as without; two preloads likewise."""
+    monkeypatch.setattr(missing, "TIME_SCALINGS", ())
+    case = small().case
+    models = (model("payload_mass", 0.0), model("payload_mass", 0.2))
+    (found,) = separating_experiments(case, models, demonstration)
+    plain = case.train.cost.whitened(np.stack([m.values for m in models])).astype(float)
+    assert f"{WEIGHT:g} kg" in found.what
+    assert found.distance == pytest.approx(np.linalg.norm(plain[0] - plain[1]), rel=0.2)
+
+
+def gripping(case: Case) -> Case:
+    """The small scene as if its hand, which holds nothing, gripped by contact."""
+    cost = replace(case.train.cost, scene=replace(case.train.cost.scene, grip=Grip(())))
+    return replace(case, train=replace(case.train, cost=cost))
+
+
+def test_in_the_air_only_the_robot_counts(demonstration, monkeypatch):
+    """Two payloads part without the held thing, and as in the plain model: the small scene's hand holds nothing."""
+    monkeypatch.setattr(missing, "TIME_SCALINGS", ())
+    case = small().case
+    models = (model("payload_mass", 0.0), model("payload_mass", 0.2))
+    found = {e.what: e.distance or 0.0 for e in separating_experiments(gripping(case), models, demonstration)}
+    plain = case.train.cost.whitened(np.stack([m.values for m in models])).astype(float)
+    assert found[IN_THE_AIR] == pytest.approx(np.linalg.norm(plain[0] - plain[1]), rel=0.2)
+    assert IN_THE_AIR not in {e.what for e in separating_experiments(case, models, demonstration)}
+
+
+def test_a_hand_that_gets_no_further_is_said(demonstration, monkeypatch):
+    monkeypatch.setattr(missing, "TIME_SCALINGS", ())
+    monkeypatch.setattr(missing, "opened_further", lambda *arguments: None)
+    found = {
+        e.what: e
+        for e in separating_experiments(gripping(small().case), (model("drag", 0.0), model("drag", 0.8)), demonstration)
+    }
+    assert found[FURTHER].distance is None and "does not reach further" in found[FURTHER].not_made
+
+
+def test_a_motion_within_reach_is_an_experiment(demonstration, monkeypatch):
+    """Where the hand could go on, what the models do on that motion counts (here the same motion again)."""
+    monkeypatch.setattr(missing, "TIME_SCALINGS", ())
+    monkeypatch.setattr(missing, "opened_further", lambda scene, recording, replayed: replace(recording, name=FURTHER))
+    case = small().case
+    models = (model("drag", 0.0), model("drag", 0.8))
+    found = {e.what: e.distance or 0.0 for e in separating_experiments(gripping(case), models, demonstration)}
+    assert FURTHER not in {e.what for e in separating_experiments(case, models, demonstration)}
+    plain = case.train.cost.whitened(np.stack([m.values for m in models])).astype(float)
+    assert found[FURTHER] == pytest.approx(np.linalg.norm(plain[0] - plain[1]), rel=1e-3)
+
+
+def test_an_untouched_scene_has_no_contact():
+    """The C engine: fingers closed on the knob press and pull with contacts, and pass through it without."""
+    scene, plan = door_scene(springs=1), PLANS["A"]
+    alone = untouched(scene)
+    assert alone.grip is None and scene.grip is not None
+    touching = []
+    for each in (scene, alone):
+        data = mujoco.MjData(each.model)  # fingers shut
+        data.qpos[each.joint_qpos] = solve_pose(each, np.array(plan.pose), *grasp_pose(each, 0.0, 0.0, plan.roll))
+        mujoco.mj_forward(each.model, data)
+        touching.append(data.ncon)
+    assert touching[0] > 0 and touching[1] == 0
+
+
+def weighed(case: Case, whitened: Callable[[np.ndarray], np.ndarray], failed: bool = False) -> Case:
+    """The case with a cost that is known, for the experiment with a weight, which needs no other."""
+    cost: Any = SimpleNamespace(
+        scene=case.train.cost.scene, space=case.full_space, comparisons=case.train.cost.comparisons,
+        whitened=whitened, failed=lambda rows: np.array([failed, *[False] * (len(rows) - 1)]),
+    )  # fmt: skip
+    return replace(case, train=replace(case.train, cost=cost))
+
+
+def test_an_experiment_is_as_good_as_what_it_distinguishes_least(demonstration, monkeypatch):
+    """Of three models the two that are nearest to each other count."""
+    monkeypatch.setattr(missing, "TIME_SCALINGS", ())
+    case, at = small().case, {0.0: 0.0, 0.1: 1.0, 0.2: 6.0}
+    column = case.full_space.index("drag")
+    known = weighed(case, lambda rows: np.array([[at[row[column]], 0.0] for row in rows]))
+    models = tuple(model("drag", drag) for drag in (0.2, 0.0, 0.1))
+    (found,) = separating_experiments(known, models, demonstration)
+    assert (found.distance, found.not_made) == (1.0, "")
+
+
+def test_a_model_that_fails_on_an_experiment_makes_none_of_it(demonstration, monkeypatch):
+    """Its distance would be no number."""
+    monkeypatch.setattr(missing, "TIME_SCALINGS", ())
+    known = weighed(small().case, lambda rows: pytest.fail("one of the models fails"), failed=True)
+    (found,) = separating_experiments(known, (model("drag", 0.0), model("drag", 0.1)), demonstration)
+    assert found.distance is None and "fails on this motion" in found.not_made
+
+
+def test_a_log_without_commands_cannot_be_asked_for_again(demonstration):
+    log = replace(demonstration, command=np.zeros((0, 0)), command_names=())
+    assert separating_experiments(small().case, (model("drag", 0.0), model("drag", 0.8)), log) == ()
+
+
+def test_the_best_experiment_comes_first(demonstration, monkeypatch):
+    monkeypatch.setattr(missing, "TIME_SCALINGS", TIME_SCALINGS[:2])
+    found = separating_experiments(small().case, (model("drag", 0.0), model("drag", 0.8)), demonstration)
+    apart = [e.distance or 0.0 for e in found]
+    assert apart == sorted(apart, reverse=True) and apart[0] > apart[-1]
+
+
+def test_one_model_needs_no_experiment(demonstration):
+    assert separating_experiments(small().case, (model("drag", 0.0),), demonstration) == ()

@@ -1,0 +1,134 @@
+"""Fits that begin at the prior: when a selection step makes them, and what they must not be taken for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from small_gap import PRELOAD, TRUTH, Small, problem_of, quiet, small
+
+from droid_jax.discrepancy import fitting, search
+from droid_jax.discrepancy.fitting import FittedModel, base_fit, fitted_from_prior
+from droid_jax.discrepancy.search import Notes, Problem, SearchState, restart_from_prior, selection_step
+from droid_jax.discrepancy.selection import SelectionStep
+from droid_jax.identify.search import NotReplayed
+from droid_jax.model.effects.candidate import EffectKey, candidates
+
+PRELOAD_KEY = EffectKey("hinge_preload", "door")
+
+
+@pytest.fixture(scope="module")
+def found() -> Small:
+    return small()
+
+
+@pytest.fixture(scope="module")
+def lost(found: Small) -> SelectionStep:
+    """The first step, as if none of its models had passed."""
+    _, info = selection_step(SearchState(found.base), problem_of(found))
+    assert info is not None and info.selected is not None
+    return replace(info, selected=None, chosen=None)
+
+
+def test_an_extended_model_is_fitted_without_what_the_base_fit_found(found: Small) -> None:
+    """The preload, and the base parameters that it had bent."""
+    case = found.case
+    (preload,) = candidates(e for e in case.effects if e.name == "hinge_preload")
+    model = fitted_from_prior(case.train, case.base, (preload,), case.config, quiet)
+    assert model.keys == (PRELOAD_KEY,) and model.discrepancy < 0.1 * found.base.discrepancy
+    fitted = dict(zip(case.full_space.names, model.values, strict=True))
+    assert abs(fitted["hinge_preload"]) == pytest.approx(PRELOAD, rel=0.1)
+    assert fitted["forearm_mass"] == pytest.approx(TRUTH["forearm_mass"], rel=0.05)
+
+
+def test_shapes_are_held_while_the_search_goes_and_free_in_the_refinement(
+    found: Small, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen, case = dict[str, Any](), found.case
+    (drag,) = candidates(e for e in case.effects if e.name == "drag")[:1]
+    shaped = replace(drag, shape_parameters={"hinge_preload": 0.25})  # any parameter may be one
+
+    def searched(cost: Any, space: Any, *rest: Any, **options: Any) -> Any:
+        seen.update(space=space)
+        return SimpleNamespace(best=space.values({"drag": 0.5}))
+
+    monkeypatch.setattr(fitting, "cma_search", searched)
+    monkeypatch.setattr(fitting, "refit", lambda *a, **k: seen.update(parts=a[2], begin=a[3]))
+    fitted_from_prior(case.train, case.base, (shaped,), case.config, quiet)
+    assert "drag" in seen["space"].names and "hinge_preload" not in seen["space"].names
+    assert seen["parts"] == (shaped,) and "hinge_preload" in shaped.free
+    assert np.all(seen["begin"][:, case.full_space.index("hinge_preload")] == 0.25)
+    drags = seen["begin"][:, case.full_space.index("drag")]
+    assert drags[0] == 0.5 and np.all(drags[1:] == case.full_space["drag"].mean)
+
+
+def test_a_base_fit_may_begin_at_an_earlier_one(found: Small, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fitting, "cma_search", lambda *a, **k: pytest.fail("there is a start"))
+    case = found.case
+    start = found.base.values[case.full_space.columns(case.base)]
+    again = base_fit(case.train, case.base, case.config, quiet, start)
+    assert again.discrepancy == pytest.approx(found.base.discrepancy, rel=1e-2)
+
+
+def test_a_step_without_a_winner_has_its_best_model_fitted_from_the_prior_on(found: Small, lost: SelectionStep) -> None:
+    reported = list[tuple[str, Any]]()
+    problem = problem_of(found, progress=lambda stage, value: reported.append((stage, value)))
+    again, notes = restart_from_prior(problem, lost)
+    assert again.selected is not None and again.selected.keys == (PRELOAD_KEY,) and notes == Notes()
+    assert {m.keys for m in again.tried} >= {m.keys for m in lost.tried}
+    values = [value for stage, value in reported if stage == "restart"]
+    assert any(hasattr(v, "generation") for v in values) and any(hasattr(v, "iteration") for v in values)
+
+
+def test_what_the_basin_takes_by_itself_is_no_effects(
+    found: Small, lost: SelectionStep, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The base model is equivalent once it begins where the winner ended: it was the basin, and nothing is named."""
+    best = min(lost.tried, key=lambda m: m.refined.objective)
+    # A worse fit all the same: it is the other motion that counts.
+    worse = replace(best.refined, objective=2 * found.base.refined.objective)
+    there = replace(best, parts=(), space=found.base.space, refined=worse)
+    usual = search.refit
+
+    def refit(residual_set: Any, base: Any, parts: Any, *rest: Any) -> FittedModel:
+        return usual(residual_set, base, parts, *rest) if parts else there
+
+    monkeypatch.setattr(search, "refit", refit)
+    assert restart_from_prior(problem_of(found), lost)[0].selected is None
+
+
+def test_a_basin_in_which_the_base_model_blows_up_has_nothing_to_say(
+    found: Small, lost: SelectionStep, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usual = Problem.discrepancy
+
+    def discrepancy(problem: Problem, model: FittedModel) -> float:
+        if not model.parts and model is not found.base:
+            raise NotReplayed("on the other motion")
+        return usual(problem, model)
+
+    monkeypatch.setattr(Problem, "discrepancy", discrepancy)
+    won = restart_from_prior(problem_of(found), lost)[0].selected
+    assert won is not None and won.keys == (PRELOAD_KEY,)
+
+
+def test_no_fit_from_the_prior_on_where_there_is_a_winner_or_no_time(
+    found: Small, lost: SelectionStep, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(search, "fitted_from_prior", lambda *a: pytest.fail("was not asked for"))
+    won = replace(lost, selected=lost.tried[0])
+    assert restart_from_prior(problem_of(found), won) == (won, Notes())
+    done, notes = restart_from_prior(problem_of(found, deadline=0.0), lost)
+    assert done is lost and notes == Notes(not_tried=("the fit from the prior on",))
+    empty = replace(lost, tried=())
+    for left in (found.base.discrepancy, -0.005):  # U is below zero in half of the cases where nothing is missing
+        problem = replace(problem_of(found), base=replace(found.base, discrepancy=left))
+        assert restart_from_prior(problem, empty) == (empty, Notes())
+    little = replace(lost, tried=tuple(replace(m, discrepancy=0.9 * found.base.discrepancy) for m in lost.tried))
+    assert restart_from_prior(problem_of(found), little) == (little, Notes())
+    train: Any = SimpleNamespace(resampling=SimpleNamespace(repeated=False))
+    log = replace(problem_of(found), case=replace(found.case, train=train))
+    assert restart_from_prior(log, lost) == (lost, Notes())

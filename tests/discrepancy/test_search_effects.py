@@ -1,0 +1,395 @@
+"""The search, step by step and as a whole: what is tried, what is left out, what is taken out again."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_gap import EFFECTS, FLOOR, QUICK, Small, problem_of, quiet, record, small, small_scene
+
+from droid_jax.discrepancy import search
+from droid_jax.discrepancy.candidates import directions_of, proposals, score_test
+from droid_jax.discrepancy.case import Case, make_case, restrained
+from droid_jax.discrepancy.config import DiscrepancyConfig
+from droid_jax.discrepancy.fitting import FittedModel, base_fit
+from droid_jax.discrepancy.search import (
+    Notes,
+    Problem,
+    SearchState,
+    converged_model,
+    open_directions,
+    pair_step,
+    polished,
+    pruned,
+    search_effects,
+    selection_step,
+    staged_refit,
+    target_objective,
+    without,
+)
+from droid_jax.discrepancy.selection import SelectionStep
+from droid_jax.discrepancy.statistics import OUTSIDE, Blocks, Repeats
+from droid_jax.discrepancy.verdict import Conclusion
+from droid_jax.identify.search import NotReplayed
+from droid_jax.model.effect_interface import Effect
+from droid_jax.model.effects.candidate import Candidate, EffectKey, candidates
+from droid_jax.model.effects.registry import library
+from droid_jax.model.parameters import Parameter, Space
+from droid_jax.model.scene import Scene
+
+PRELOAD = EffectKey("hinge_preload", "door")
+
+
+@pytest.fixture(scope="module")
+def found() -> Small:
+    return small()
+
+
+@pytest.fixture(scope="module")
+def first(found: Small) -> tuple[SearchState, SelectionStep]:
+    """After one step."""
+    state, info = selection_step(SearchState(found.base), problem_of(found))
+    assert info is not None
+    return state, info
+
+
+def case_of(scene: Scene, space: Space, effects: tuple[Effect, ...], config: DiscrepancyConfig = QUICK) -> Case:
+    return make_case(scene, space, effects, record("train"), record("validation"), config=config)
+
+
+def searched(case: Case) -> Any:
+    return search_effects(case, base_fit(case.train, case.base, case.config, quiet), FLOOR)
+
+
+# From state to state -----------------------------------------------------------------------
+
+
+def test_a_step_selects_and_leaves_the_state_it_was_given_unchanged(
+    found: Small, first: tuple[SearchState, SelectionStep]
+):
+    begin = SearchState(found.base)
+    before, values = copy.copy(vars(begin)), found.base.values.copy()
+    state, info = selection_step(begin, problem_of(found))
+    assert vars(begin) == before and begin.model is found.base and begin.steps == ()
+    np.testing.assert_array_equal(found.base.values, values)
+    assert info is not None and info.selected is not None and state.model.keys == (PRELOAD,) == info.selected.keys
+    assert state.steps == (info,) and not state.finished and not state.exhausted and state.notes == Notes()
+    again, same = selection_step(begin, problem_of(found))  # the same state, the same step
+    assert same is not None and again.model.keys == state.model.keys
+    np.testing.assert_array_equal(again.model.values, state.model.values)
+    assert same.tests == info.tests == first[1].tests
+
+
+def test_a_step_beyond_the_most_effects_is_none(found: Small, first: tuple[SearchState, SelectionStep]):
+    state, _ = first
+    assert found.case.config.max_effects == 1
+    ended, info = selection_step(state, problem_of(found))
+    assert info is None and ended.finished and not ended.exhausted and ended.model is state.model
+
+
+def test_a_step_with_nothing_left_to_ask_has_exhausted_the_candidates(found: Small):
+    ended, info = selection_step(SearchState(found.base), replace(problem_of(found), directions=()))
+    assert info is None and ended.finished and ended.exhausted and ended.model is found.base
+
+
+def test_a_step_that_finds_nothing_significant_tries_nothing(found: Small):
+    """The test rejects, yet the time step alone would leave as much."""
+    problem = replace(problem_of(found), discretisation_error=2.0 * found.base.discrepancy)
+    ended, info = selection_step(SearchState(found.base), problem)
+    assert info is not None and (info.tried, info.tests, info.selected) == ((), (), None)
+    assert info.score_test.p < found.case.config.selection.significance
+    assert ended.finished and ended.exhausted and ended.steps == (info,)
+
+
+def test_the_significance_is_configured(found: Small):
+    """A p-value of 1/128, the smallest that eight repeats allow."""
+    strict = replace(found.case.config, selection=replace(found.case.config.selection, significance=0.001))
+    problem = replace(problem_of(found), case=replace(found.case, config=strict))
+    ended, info = selection_step(SearchState(found.base), problem)
+    assert info is not None and info.score_test.p == pytest.approx(1 / 128) and info.tried == () and ended.exhausted
+
+
+def test_a_search_without_time_tries_one_candidate_and_says_what_it_left_out(found: Small):
+    state, info = selection_step(SearchState(found.base), problem_of(found, deadline=0.0))
+    assert info is not None and [m.keys for m in info.tried] == [(PRELOAD,)]
+    assert state.notes.not_tried[0] == "2 of 3 candidates not looked at" and state.notes.failed == ()
+    case = replace(found.case, config=replace(found.case.config, budget_minutes=0.0))
+    verdict = search_effects(case, found.base, FLOOR)
+    assert verdict.not_tried == state.notes.not_tried and verdict.effects == (PRELOAD,)
+
+
+def test_refits_stop_when_time_is_up_but_for_the_first(found: Small, monkeypatch: pytest.MonkeyPatch):
+    def refit(train: Any, base: Any, parts: Any, *rest: Any) -> Any:
+        if parts[0].effect == "payload":
+            raise NotReplayed("none of the starts could be replayed")
+        return SimpleNamespace(keys=(parts[0].key,), refined=SimpleNamespace(objective=1.0))
+
+    monkeypatch.setattr(search, "refit", refit)
+    starters = [((part,), found.base.values) for part in candidates(found.case.effects)]
+    names = [str(part.key) for (part,), _ in starters]
+    models, notes = staged_refit(problem_of(found), starters, 1e9, "candidates not refitted")
+    assert notes == Notes(failed=tuple(n for n in names if n.startswith("payload")))
+    assert len(models) == len(starters) - len(notes.failed) == 2
+    hinge = [s for s in starters if s[0][0].effect != "payload"]
+    models, notes = staged_refit(problem_of(found, deadline=0.0), hinge, 1e9, "candidates not refitted")
+    assert len(models) == 1 and notes == Notes(not_tried=("1 of 2 candidates not refitted",))
+    assert notes + Notes(("a",), ("b",)) == Notes(("a",), ("1 of 2 candidates not refitted", "b"))
+
+
+def test_a_refit_aims_at_the_best_so_far(found: Small, monkeypatch: pytest.MonkeyPatch):
+    aims, objectives = list[float](), iter([7.0, 3.0, 5.0])
+
+    def refit(train: Any, base: Any, parts: Any, start: Any, config: Any) -> Any:
+        aims.append(config.target_objective)
+        return SimpleNamespace(refined=SimpleNamespace(objective=next(objectives)))
+
+    monkeypatch.setattr(search, "refit", refit)
+    starters = [((part,), found.base.values) for part in candidates(found.case.effects)][:3]
+    staged_refit(problem_of(found), starters, 6.0, "candidates not refitted")
+    assert aims == [6.0, 6.0, 3.0]
+
+
+@pytest.mark.parametrize("blocks", [False, True])
+def test_the_aim_is_the_objective_of_half_the_share_that_an_effect_must_take(found: Small, blocks: bool):
+    """U of 4, a fifth of which an effect must take away: the objective falls by a tenth of it."""
+    rows = Blocks(np.array([0] * 6 + [1] * 6 + [OUTSIDE] * 18)) if blocks else Repeats(np.zeros((1, 30)))
+    count = 12 if blocks else 30
+    problem = problem_of(found)
+    case = replace(found.case, train=replace(found.case.train, resampling=rows))
+    problem, objective = replace(problem, case=case), 0.5 * count * 4.0
+    fitted: Any = SimpleNamespace(parts=(), discrepancy=4.0, refined=SimpleNamespace(objective=objective))
+    assert target_objective(problem, fitted) == pytest.approx(0.9 * objective)
+    further: Any = SimpleNamespace(**{**vars(fitted), "parts": ("one",)})
+    assert target_objective(problem, further) == pytest.approx(0.8 * objective)
+    selection = replace(found.case.config.selection, least_gain=0.5)
+    strict = replace(problem, case=replace(case, config=replace(case.config, selection=selection)))
+    assert target_objective(strict, fitted) == pytest.approx(0.75 * objective)
+
+
+# Pairs -------------------------------------------------------------------------------------
+
+
+def two_effects(found: Small, **changes: Any) -> Problem:
+    case = replace(found.case, config=replace(found.case.config, max_effects=2))
+    return replace(problem_of(found, **changes), case=case)
+
+
+def test_pairs_are_tried_where_nothing_is_named_and_their_score_test_is_reported_once(
+    found: Small, first: tuple[SearchState, SelectionStep]
+):
+    _, info = first
+    unnamed = SearchState(found.base, (replace(info, selected=None, chosen=None),), finished=True)
+    state = pair_step(unnamed, two_effects(found))
+    assert len(state.steps) == 2 and state.steps[1].score_test is info.score_test
+    assert len(state.steps[1].tried) == 3 and all(len(m.parts) == 2 for m in state.steps[1].tried)
+    assert unnamed.steps == state.steps[:1]
+    for test in state.steps[1].tests:
+        assert test.before == 0 and len(test.keys) == 2
+
+
+def test_no_pairs_where_they_are_not_asked_for_or_not_needed(found: Small, first: tuple[SearchState, SelectionStep]):
+    state, info = first
+    unnamed = SearchState(found.base, (replace(info, selected=None, chosen=None),), finished=True)
+    assert pair_step(unnamed, problem_of(found)) is unnamed  # one effect at most
+    assert pair_step(state, two_effects(found)) is state  # one effect that leaves little
+    for done in (
+        replace(unnamed, exhausted=True),
+        replace(unnamed, steps=()),
+        replace(unnamed, steps=(replace(info, tried=(), tests=(), selected=None, chosen=None),)),
+    ):
+        assert pair_step(done, two_effects(found)) is done
+    late = pair_step(unnamed, two_effects(found, deadline=0.0))
+    assert late.notes == Notes(not_tried=("pairs of effects not tried",)) and late.steps == unnamed.steps
+
+
+# What goes wrong ---------------------------------------------------------------------------
+
+
+def bomb(scene: Scene) -> Effect:
+    """A force that is neutral at zero and not a number beside it."""
+    dof = scene.dof("door")
+
+    def force(theta, state):
+        return jnp.zeros_like(state.qvel).at[dof].set(jnp.where(theta["bomb"] > 0.0, jnp.nan, 0.0))
+
+    return Effect(
+        "bomb",
+        (Parameter("bomb", "N m", 0.0, 1.0, 0.0, 5.0),),
+        force=force,
+        description="a replay that blows up",
+        locations={"door": ("bomb",)},
+        minimum_size=0.1,
+    )
+
+
+def test_an_effect_that_blows_up_is_left_out_and_named():
+    """What is really missing is found all the same."""
+    scene, space = small_scene()
+    verdict = searched(case_of(scene, space, (*library(scene, EFFECTS), bomb(scene))))
+    explosive = EffectKey("bomb", "door")
+    assert verdict.score_tests[0].failed == (explosive,)
+    assert verdict.effects == (PRELOAD,)
+    assert not any(explosive in test.keys for test in verdict.validation_tests if test.passed)
+    row = next(k for k, d in enumerate(verdict.score_tests[0].directions) if d.coefficient == "bomb")
+    assert verdict.score_tests[0].t[row] == verdict.score_tests[0].explained[row] == 0.0
+
+
+def late_bomb(scene: Scene) -> Effect:
+    """A preload that is neutral at its upper bound, and no number at the size that the preload has."""
+    dof = scene.dof("door")
+
+    def force(theta, state):
+        pull = jnp.where(theta["late_bomb"] < -0.3, jnp.nan, theta["late_bomb"])
+        return jnp.zeros_like(state.qvel).at[dof].set(pull)
+
+    return Effect(
+        "late_bomb",
+        (Parameter("late_bomb", "N m", 0.0, 0.5, -5.0, 0.0),),
+        force=force,
+        description="a preload that blows up",
+        locations={"door": ("late_bomb",)},
+        minimum_size=0.1,
+    )
+
+
+def test_a_refit_that_blows_up_where_it_begins_is_left_out_and_named(monkeypatch: pytest.MonkeyPatch):
+    """The score test's small step is replayed, the proposal is not."""
+    monkeypatch.setattr(search, "one_step_fit", lambda train, model, part, raw, proposed: (proposed, -np.inf))
+    scene, space = small_scene()
+    verdict = searched(case_of(scene, space, (late_bomb(scene),)))
+    assert verdict.score_tests[0].failed == () and verdict.score_tests[0].explained[0] > 0.5
+    assert verdict.failed == (str(EffectKey("late_bomb", "door")),) and verdict.validation_tests == ()
+    assert verdict.conclusion is Conclusion.UNEXPLAINED
+
+
+def test_a_search_ends_where_all_that_was_asked_about_is_in_the_model():
+    scene, space = small_scene()
+    verdict = searched(case_of(scene, space, library(scene, ["hinge_preload"]), replace(QUICK, max_effects=2)))
+    assert verdict.effects == (PRELOAD,) and len(verdict.score_tests) == 1
+
+
+@pytest.mark.parametrize("fitted_further", [converged_model, polished])
+def test_what_blows_up_on_the_validation_motion_while_it_is_fitted_further_stays_unchanged(
+    found: Small, monkeypatch: pytest.MonkeyPatch, fitted_further: Any
+):
+    def common(values: np.ndarray) -> np.ndarray:
+        return values[None] * np.where(values[0] > 1.0, np.nan, 1.0)
+
+    validation: Any = SimpleNamespace(common=common)
+    problem = replace(problem_of(found), case=replace(found.case, validation=validation))
+    refined = replace(found.base.refined, converged=False)
+    model = replace(found.verdict.model, values=np.array([0.5]), refined=refined)
+    whole, lost = (replace(model, values=np.array([x])) for x in (0.7, 1.5))
+    monkeypatch.setattr(search, "refit", lambda *arguments: whole)
+    assert fitted_further(problem, model) == (whole, Notes())
+    monkeypatch.setattr(search, "refit", lambda *arguments: lost)
+    kept, notes = fitted_further(problem, model)
+    assert kept is model and len(notes.failed) == 1 and notes.failed[0].startswith(model.name)
+
+
+def test_what_has_converged_is_fitted_no_further(found: Small, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(search, "refit", lambda *arguments: pytest.fail("it has converged"))
+    assert converged_model(problem_of(found), found.verdict.model) == (found.verdict.model, Notes())
+    assert polished(problem_of(found), found.base) == (found.base, Notes())  # no intervals to report
+
+
+def test_effects_without_locations_cannot_be_asked_about(found: Small):
+    nowhere = tuple(replace(e, locations={}) for e in found.case.effects)
+    with pytest.raises(ValueError, match="none of the effects says its locations"):
+        search_effects(replace(found.case, effects=nowhere), found.base, FLOOR)
+
+
+def test_where_nothing_blows_up_nothing_is_left_out(found: Small):
+    asked = directions_of(candidates(found.case.effects))
+    assert score_test(found.case.train, found.base, asked).failed == ()
+
+
+def test_a_nuisance_goes_no_further_than_its_prior_says(found: Small):
+    p = found.case.base["torque_offset[elbow]"]
+    assert (p.low, p.high) == (pytest.approx(-0.3), pytest.approx(0.3))  # of bounds of 2 and a deviation of 0.1
+    assert found.case.config.selection.nuisance_bound == 3.0
+    wider = restrained(small_scene()[1], 5.0)["torque_offset[elbow]"]
+    assert (wider.low, wider.high) == (pytest.approx(-0.5), pytest.approx(0.5))
+
+
+def test_a_parameter_at_its_bound_absorbs_nothing_more(found: Small):
+    asked, refined, train = directions_of(candidates(found.case.effects)), found.base.refined, found.case.train
+    assert refined.free.all()
+    at = refined.space.index("door_stiffness")
+    x = refined.x.copy()
+    x[at] = refined.space.to_search(refined.space.high)[at]
+    stuck = replace(found.base, refined=replace(refined, x=x))
+    assert np.flatnonzero(~stuck.refined.free).tolist() == [at]
+    before, after = (np.linalg.norm(score_test(train, m, asked).sensitivities, axis=1) for m in (found.base, stuck))
+    assert np.all(after >= before - 1e-9)
+    preload = [d.coefficient for d in asked].index("hinge_preload")
+    assert after[preload] > 1.1 * before[preload]  # a spring looks like a preload
+
+
+# Parts ------------------------------------------------------------------------------------
+
+
+def candidate(name: str, location: str = "door", **shapes: float) -> Candidate:
+    return Candidate(name, location, (f"{name}[{location}]",), shapes)
+
+
+def test_an_effect_is_asked_about_elsewhere_with_the_shape_it_has():
+    speeds = [candidate("ripple", place, periods=periods) for place in ("one", "two") for periods in (10.0, 20.0)]
+    asked = directions_of([*speeds, candidate("latch", width=0.1)])
+    model: Any = SimpleNamespace(parts=speeds[:1], coefficients=("ripple[one]",))
+    left = [d.candidate for d in open_directions(asked, model)]
+    assert left == [candidate("ripple", "two"), candidate("latch", width=0.1)]
+
+
+def test_a_shape_stays_where_its_effect_does():
+    """A ripple asked about elsewhere has the count of the one in the model, and keeps it when that one goes."""
+    first = Candidate("ripple", "elbow", ("ripple_elbow",), {"periods": 48.0})
+    second, drag = Candidate("ripple", "wrist", ("ripple_wrist",)), Candidate("drag", "hinge", ("drag",))
+    assert without(first, (first, drag, second)) == (
+        drag,
+        Candidate("ripple", "wrist", ("ripple_wrist",), {"periods": 48.0}),
+    )
+    assert without(second, (first, drag, second)) == (first, drag)
+    assert without(drag, (first, drag)) == (first,)
+
+
+def test_a_part_that_the_replay_cannot_do_without_stays(found: Small, monkeypatch: pytest.MonkeyPatch):
+    """A damper keeps the simulation whole; drag takes next to nothing away and goes."""
+    damper, drag = Candidate("closer", "hinge", ("closer",)), Candidate("drag", "hinge", ("drag",))
+
+    def refit(train: Any, base: Any, parts: Any, starts: Any, config: Any) -> Any:
+        if damper not in parts:
+            raise NotReplayed("none of the starts could be replayed")
+        assert starts[0].tolist() == [2.0, 0.0]  # the drag at neutral
+        return SimpleNamespace(parts=parts, keys=(damper.key,), values=starts[0], left=1.01)
+
+    monkeypatch.setattr(search, "refit", refit)
+    monkeypatch.setattr(Problem, "discrepancy", lambda problem, model: model.left)
+    whole = Space(tuple(Parameter(name, "N m", 0.0, 1.0, -5.0, 5.0) for name in ("closer", "drag")))
+    case: Any = SimpleNamespace(full_space=whole, config=found.case.config, train=None, base=None)
+    problem = replace(problem_of(found), case=case, base_discrepancy=10.0)
+    model: Any = SimpleNamespace(parts=(damper, drag), values=np.array([2.0, 1.0]), left=1.0)
+    assert pruned(problem, model)[0].parts == (damper,)
+    selection = replace(found.case.config.selection, least_share=0.0005)
+    case.config = replace(found.case.config, selection=selection)
+    assert pruned(problem, model)[0] is model  # it takes 0.1 % of the base model's U
+
+
+def test_proposals_of_a_step_begin_at_the_model(found: Small, first: tuple[SearchState, SelectionStep]):
+    _, info = first
+    ranked = proposals(info.score_test, found.base.residuals, found.case.full_space)
+    assert [p.keys for p in ranked] == [p.keys for p in info.ranked]
+    start = ranked[0].start(found.case.full_space, found.base.values)
+    moved = np.flatnonzero(start != found.base.values)
+    assert [found.case.full_space.names[k] for k in moved] == list(ranked[0].sizes)
+
+
+def test_a_model_that_was_selected_has_converged(found: Small, first: tuple[SearchState, SelectionStep]):
+    state, _ = first
+    model: FittedModel = state.model
+    assert model.refined.converged

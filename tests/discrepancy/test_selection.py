@@ -1,0 +1,142 @@
+"""Which of several models is selected."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from droid_jax.discrepancy.config import SelectionConfig
+from droid_jax.discrepancy.selection import (
+    WEAK,
+    Reason,
+    Rejection,
+    ValidationTest,
+    more_general,
+    selected,
+    simplest,
+    without_dominated,
+)
+from droid_jax.model.effects.candidate import Candidate, EffectKey
+
+U0, BASE = 0.1, 1.0  # discretisation error, and U of the base model
+CONFIG = SelectionConfig()
+SIMPLE = SimpleNamespace(name="coulomb", special_cases=())
+GENERAL = SimpleNamespace(name="stribeck", special_cases=("coulomb",))
+EFFECTS: Any = [SIMPLE, GENERAL]
+
+
+def model(
+    effect: str, coefficients: int, shapes: int, left: float, *alike: str, reasons: tuple[Reason, ...] = ()
+) -> Any:
+    """A model of one effect and its test.  alike: effects that are indistinguishable from it."""
+    names = tuple(f"{effect}_{k}" for k in range(coefficients))
+    part = Candidate(effect, "slide", names, {f"{effect}_shape_{k}": 1.0 for k in range(shapes)})
+    others = tuple((EffectKey(name, "slide"),) for name in alike)
+    rejections = tuple(Rejection(reason, "") for reason in reasons)
+    test = ValidationTest((part.key,), 0, 0.0, left, 0.0, {}, 1.0, rejections, others)
+    return SimpleNamespace(parts=(part,), keys=(part.key,)), test
+
+
+def select(tested: list[Any], config: SelectionConfig = CONFIG) -> Any:
+    return selected(tested, U0, BASE, config)
+
+
+@pytest.mark.parametrize(
+    ("reasons", "passed", "weak"),
+    [
+        ((), True, False),
+        ((Reason.NOT_CONFIRMED,), False, True),
+        ((Reason.BELOW_MINIMUM_SIZE, Reason.NOT_CONFIRMED), False, True),
+        ((Reason.BELOW_MINIMUM_SIZE, Reason.SMALL_GAIN), False, False),
+        ((Reason.DOMINATED,), False, False),
+    ],
+)
+def test_weak_is_what_lost_for_its_size_or_significance_alone(
+    reasons: tuple[Reason, ...], passed: bool, weak: bool
+) -> None:
+    _, test = model("drag", 1, 0, 0.2, reasons=reasons)
+    assert (test.passed, test.weak) == (passed, weak)
+    assert {Reason.NOT_CONFIRMED, Reason.BELOW_MINIMUM_SIZE} == WEAK
+
+
+def test_the_fewest_parameters_win_and_among_equals_the_smallest_discrepancy() -> None:
+    stribeck, coulomb, bias = (
+        model(*args) for args in (("stribeck", 1, 2, 0.140), ("coulomb", 1, 0, 0.148), ("bias", 1, 0, 0.15))
+    )
+    assert simplest([stribeck, coulomb, bias]) == coulomb
+    assert simplest([stribeck]) == stribeck
+
+
+def test_one_that_holds_the_winner_as_a_special_case_is_recognised() -> None:
+    """Stribeck's friction holds dry friction at its own joint, and no other; the same in a model of two effects."""
+    effects: Any = [*EFFECTS, SimpleNamespace(name="bias", special_cases=())]
+
+    def of(*parts: tuple[str, str]) -> Any:
+        return SimpleNamespace(parts=[Candidate(effect, location, ()) for effect, location in parts])
+
+    plain = of(("coulomb", "elbow"))
+    others = [plain, of(("stribeck", "elbow")), of(("stribeck", "wrist")), of(("bias", "elbow"))]
+    assert more_general(effects, plain, [*others, of(("stribeck", "elbow"), ("bias", "elbow"))]) == [
+        False, True, False, False, False
+    ]  # fmt: skip
+    both = of(("bias", "hinge"), ("coulomb", "elbow"))
+    assert more_general(effects, both, [of(("bias", "hinge"), ("stribeck", "elbow")), others[1]]) == [True, False]
+    assert more_general(effects, others[1], [plain]) == [False]  # not the other way round
+
+
+def test_which_of_two_at_one_joint_holds_which_does_not_depend_on_their_order() -> None:
+    effects: Any = [
+        SimpleNamespace(name=n, special_cases=h) for n, h in zip("abAB", ((), (), ("a",), ("b",)), strict=True)
+    ]
+
+    def of(*names: str) -> Any:
+        return SimpleNamespace(parts=[Candidate(name, "elbow", ()) for name in names])
+
+    for first, second in (("AB", "ab"), ("BA", "ab"), ("AB", "ba"), ("BA", "ba")):
+        assert more_general(effects, of(*second), [of(*first)]) == [True]
+    assert more_general(effects, of(*"ab"), [of(*"AA")]) == [False]
+
+
+def test_the_one_that_leaves_least_wins_and_a_simpler_one_that_is_equivalent_before_it() -> None:
+    """A quarter more beyond U0, and a hundredth of the base model's U, is equivalent: 0.235 for a best of 0.2."""
+    flexible = model("stribeck", 1, 2, 0.2, "coulomb", "bias")
+    near, far = model("coulomb", 1, 0, 0.234, "stribeck"), model("bias", 1, 0, 0.236, "stribeck")
+    assert select([far, flexible]) == flexible
+    assert select([far, flexible, near]) == near
+    apart = model("drag", 1, 0, 0.234)  # distinguishable from the best
+    assert select([flexible, apart]) == flexible
+    assert select([far, flexible], replace(CONFIG, simplest_factor=1.3)) == far
+    assert select([far, flexible], replace(CONFIG, simplest_share=0.02)) == far
+    assert select([near, flexible], replace(CONFIG, simplest_factor=1.0)) == flexible
+
+
+def test_nothing_wins_where_the_best_is_too_weak_or_all_lost() -> None:
+    weak = model("drag", 1, 0, 0.2, reasons=(Reason.BELOW_MINIMUM_SIZE,))
+    lost, good = model("bias", 1, 0, 0.1, reasons=(Reason.SMALL_GAIN,)), model("coulomb", 1, 0, 0.3)
+    assert select([weak, good]) is None
+    assert select([lost]) is None and select([]) is None
+    assert select([lost, good]) == good
+
+
+@pytest.mark.parametrize(("factor", "least"), [(0.9, 0.19), (0.5, 0.15)])
+def test_what_holds_the_winner_loses_unless_it_leaves_its_share_less(factor: float, least: float) -> None:
+    """Of U beyond U0, which is 0.1 here: a tenth less unless configured otherwise."""
+    winner, config = model("coulomb", 1, 0, 0.2), replace(CONFIG, generality_factor=factor)
+    assert CONFIG.generality_factor == 0.9
+    for left, stays in ((least - 0.005, True), (least + 0.005, False)):
+        for why in ((), (Reason.NOT_CONFIRMED,)):
+            other = model("stribeck", 1, 2, left, reasons=why)
+            first, second = without_dominated([winner, other], winner, EFFECTS, U0, config)
+            assert first == winner[1] and (second == other[1]) is stays
+            assert stays or [r.reason for r in second.reasons] == [Reason.DOMINATED]
+            assert stays or not second.weak
+
+
+def test_where_neither_leaves_anything_what_holds_the_winner_loses() -> None:
+    winner = model("coulomb", 1, 0, 0.5 * U0)
+    for left in (-0.1 * U0, 0.4 * U0, U0):
+        _, judged = without_dominated([winner, model("stribeck", 1, 2, left)], winner, EFFECTS, U0, CONFIG)
+        assert not judged.passed

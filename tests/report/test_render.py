@@ -1,0 +1,74 @@
+"""Pictures of a scene."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from droid_jax.report import render
+
+XML = """<mujoco><visual><global offwidth="64" offheight="48"/></visual><worldbody>
+<light pos="0 0 3"/><camera name="front" pos="0 -2 0" xyaxes="1 0 0 0 0 1"/>
+<body><joint name="slide" type="slide" axis="1 0 0"/><geom type="sphere" size="0.2" rgba="1 0 0 1"/></body>
+</worldbody></mujoco>"""
+
+
+def _backend() -> str:
+    try:
+        return render.working_backend()
+    except render.NoOpenGL as error:
+        pytest.skip(str(error))
+
+
+@pytest.mark.gl
+def test_frames_show_where_the_body_is() -> None:
+    import mujoco
+
+    _backend()
+    model = mujoco.MjModel.from_xml_string(XML)
+    qpos = np.array([[-0.5], [0.0], [0.5]])
+    images = render.frames(model, qpos, [0, 1, -1], size=(48, 64))
+    centres = []
+    for image in images:
+        assert image.shape == (48, 64, 3) and image.dtype == np.uint8
+        red = image[..., 0].astype(int) - image[..., 1] > 60
+        centres.append(np.flatnonzero(red.any(axis=0)).mean())
+    assert centres[0] < centres[1] - 10 and centres[2] > centres[1] + 10
+    assert centres[1] == pytest.approx(31.5, abs=1.5)
+
+
+def test_frames_refuse_what_does_not_fit_the_model() -> None:
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_string(XML)
+    with pytest.raises(ValueError, match=r"\[T, 1\].*\(3, 2\)"):
+        render.frames(model, np.zeros((3, 2)), [0], size=(48, 64))
+    with pytest.raises(ValueError, match="index 3 is outside"):
+        render.frames(model, np.zeros((3, 1)), [3], size=(48, 64))
+    with pytest.raises(ValueError, match="row 1 is not finite"):
+        render.frames(model, np.array([[0.0], [np.nan]]), [0, 1], size=(48, 64))
+    with pytest.raises(ValueError, match="no camera 'back'; this model has: front"):
+        render.frames(model, np.zeros((1, 1)), [0], camera="back", size=(48, 64))
+    with pytest.raises(ValueError, match=r"\(48, 64\), got \(480, 640\)"):
+        render.frames(model, np.zeros((1, 1)), [0])
+
+
+def test_without_opengl_the_message_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+    monkeypatch.setenv("MUJOCO_GL", "none_such")  # what it finds is kept, and no other test asks about this one
+    monkeypatch.setattr(
+        render, "_child", lambda backend, *_: asked.append(backend) or "the process died with signal 11"
+    )
+    for _ in range(2):
+        with pytest.raises(render.NoOpenGL, match=r"egl \(the process died with signal 11\).*libosmesa6"):
+            render.working_backend()
+    assert asked == ["none_such", "egl", "osmesa"]
+    monkeypatch.setenv("MUJOCO_GL", "off")
+    with pytest.raises(render.NoOpenGL, match="turns drawing off"):
+        render.working_backend()
+
+
+def test_a_backend_that_cannot_draw_is_a_message_not_a_crash() -> None:
+    assert "invalid value" in render._child("nonsense", None, 60.0)
+    assert render._candidates("glfw", "linux") == ["glfw", "egl", "osmesa"]
+    assert render._candidates("", "linux") == ["egl", "osmesa"]
