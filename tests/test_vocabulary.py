@@ -26,7 +26,7 @@ RENAMED = {
     r"\bhanded_on\(|\bHandedOn\b": "final_model",
     r"\bwith_own\b|\bown_columns\b|\bown_nuisances\b": "per-recording nuisances",
     r"\bgone_on_with\b|\bplainest\b|\bwithout_idle\b|\bfitted_anew\b": "polished, simplest, without_dominated, ...",
-    r"\bhops=|\bhop_generations=(?<!basin_hop_generations=)|\brough=(?!rough)|\bdoubt=": "basin_hops, misfit_threshold",
+    r"\bhops=|\bhop_generations=(?<!basin_hop_generations=)|\brough=(?!rough)|(?<!data-)\bdoubt=(?!0.6)": "basin_hops, misfit_threshold",
     r"of one's own|worth a name\b|does as well\b": "your own, minimum effect size, equivalent",
 }
 ENDINGS = (".py", ".md", ".jinja", ".ipynb", ".toml", ".css")
