@@ -303,7 +303,7 @@ def _fitted(folder: Path, command: All, recordings: Sequence[Path]) -> bool:
 def told(out: Path) -> list[str]:
     """One line for each stage that has a result."""
     from droid_jax.report.gap_folder import read_answer
-    from droid_jax.report.identify_folder import read_fit
+    from droid_jax.report.identify_folder import Distances, read_fit
     from droid_jax.report.policy_folder import read_rates, read_training
     from droid_jax.report.text import lines
 
@@ -312,7 +312,7 @@ def told(out: Path) -> list[str]:
     return lines(
         "all.txt.jinja",
         old=sorted(old),
-        fit=read_fit(at["identify"]) if (at["identify"] / FIT).is_file() else None,
+        fit=read_fit(at["identify"], Distances) if (at["identify"] / FIT).is_file() else None,
         answer=read_answer(at["gap"]) if "gap" not in old and (at["gap"] / GAP).is_file() else None,
         trials=read_rates(at["train"]) if tried else None,
         another_robot=tried and read_training(at["train"]).another_robot,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from msgspec import Struct, field
@@ -117,15 +117,20 @@ class Check(Struct, frozen=True):
     engines_differ: bool
 
 
-class Fit(Struct, frozen=True):
+class Distances(Struct, frozen=True, kw_only=True):
+    """The torque distances of fit.json, by recording."""
+
+    gap: dict[str, TorqueDistance]
+    torque_unit: str = "N m"
+
+
+class Fit(Distances, frozen=True, kw_only=True):
     """fit.json."""
 
     parameters: list[Parameter]
-    gap: dict[str, TorqueDistance]  # by recording
     cost: Cost
     stop: str
     rule: str
-    torque_unit: str = "N m"
     converged: bool | None = True  # None: a search without refinement, which gives no widths
     mean_square: float | None = None  # of the whitened residuals
     generations: int | None = None
@@ -171,6 +176,7 @@ class RunConfig(Struct, frozen=True):
 
 
 _READ = Reader("identify")
+Of = TypeVar("Of", bound="Distances")
 _ROWS, _TABLES = ("generation", "best_cost", "median_cost"), ("mean", "std")  # of history.npz, [G] and [G, D]
 _TRACE_KEYS = ("time", "measured_mean", "measured_low", "measured_high", "before", "after", "joints")
 
@@ -207,9 +213,9 @@ def has_run(folder: Path) -> bool:
     return (folder / FIT).exists()
 
 
-def read_fit(folder: Path) -> Fit:
-    """fit.json of a folder; ValueError where it is missing or broken."""
-    return _READ.json(folder / FIT, Fit)
+def read_fit(folder: Path, kind: type[Of] = Fit) -> Of:
+    """fit.json of a folder, all of it or its `Distances`; ValueError where it is missing or broken."""
+    return _READ.json(folder / FIT, kind)
 
 
 def read_run(run: Path) -> Run:

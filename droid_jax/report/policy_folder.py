@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypedDict
 
-from msgspec import Struct, field, structs
+from msgspec import Struct, field
 
 from droid_jax.files import FILMS, TRAINING, TRANSFER
 from droid_jax.policy.trials import BLOWN_UP
@@ -24,17 +24,12 @@ class TrainingSetup(Struct, frozen=True):
     fit: str | None  # None: no fit, the prior
 
 
-class TrainingRobot(Struct, frozen=True):
-    """What is known of the synthetic robot that was fitted; nothing where your own recordings were."""
+class TrainingRobot(TypedDict, total=False):
+    """What is known of the synthetic robot that was fitted; empty where your own recordings were."""
 
-    springs: int | None = None
-    seed: int | None = None
-    hide: list[str] | None = None
-
-    @property
-    def known(self) -> dict[str, Any]:
-        """The entries that are known."""
-        return {name: value for name, value in structs.asdict(self).items() if value is not None}
+    springs: int
+    seed: int
+    hide: list[str] | None  # None: what is hidden by default
 
 
 class TrainedTask(Struct, frozen=True):
@@ -72,7 +67,7 @@ class Training(Struct, frozen=True, kw_only=True):
     @property
     def another_robot(self) -> bool:
         """Whether your own recordings were fitted: the synthetic robot is then another robot."""
-        return self.setup.fit is not None and not self.synthetic_robot.known
+        return self.setup.fit is not None and not self.synthetic_robot
 
 
 class Spread(Struct, frozen=True):

@@ -128,7 +128,7 @@ def test_broken_files_are_named(tmp_path: Path, name: str, content: str, fault: 
         (
             "training.json",
             lambda of: of["synthetic_robot"].update(springs="1"),
-            "'springs' must be a whole number or null, got '1'",
+            "'springs' must be a whole number, got '1'",
         ),
         ("transfer.json", lambda of: of["robot"]["hidden"][0].update(joint=["x"]), "'joint' must be text or null"),
         ("transfer.json", lambda of: of["simulation"]["success"].pop(), "'success' has 39 trials, 'trials' says 40"),
