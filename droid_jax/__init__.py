@@ -7,7 +7,7 @@
 
 Each public name is loaded when it is first asked for (PEP 562): importing the package starts neither
 jax nor mujoco, so `tune` can come first, and asking for the cost loads neither evosax nor brax.
-docs/own-robot.md shows the names at work.
+docs/your-robot.md shows the names at work.
 """
 
 from __future__ import annotations

@@ -308,10 +308,10 @@ def test_hiding_is_for_the_synthetic_robot(place: Path, refused):
 
 
 def test_effects_of_ones_own_are_asked_about_like_the_others(place: Path, refused, monkeypatch: pytest.MonkeyPatch):
-    """The one that docs/method-gap.md shows."""
+    """The one that docs/your-effect.md shows."""
     registry.registered()
     monkeypatch.setattr(registry, "_MAKERS", dict(registry._MAKERS))
-    (code,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / "method-gap.md").read_text(), re.M | re.S)
+    (code,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / "your-effect.md").read_text(), re.M | re.S)
     (place / "gasket.py").write_text(code)
     options = ("--user-effects", place / "gasket.py", "--effects", "gasket", "nothing")
     assert "unknown effects nothing; valid:" in (said := refused(*arguments(place, *options))) and "gasket" in said

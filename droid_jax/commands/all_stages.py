@@ -60,7 +60,7 @@ class All:
     scene: Path | None = None
     """Your own MJCF instead of the built-in door: identify and gap, policies are trained at the built-in one."""
     parameters: Path | None = None
-    """JSON list of the parameters of your own scene (docs/own-robot.md)."""
+    """JSON list of the parameters of your own scene (docs/your-robot.md)."""
     joints: tuple[str, ...] = ()
     """Measured joints of your own scene; default: all driven joints."""
     object_joint: str | None = None
@@ -70,7 +70,7 @@ class All:
     effect_scale: float = 1.0
     """Forces and torques of the library's effects, relative to an arm of a Panda's size, as in gap."""
     user_effects: Path | None = None
-    """Python file that registers effects of your own (docs/method-gap.md); it is run."""
+    """Python file that registers effects of your own (docs/your-effect.md); it is run."""
     hide: tuple[str, ...] | None = None
     """What the synthetic robot hides, name=amplitude; none for nothing. Default: magnetic_catch=1.5 (N m)."""
     springs: Literal[0, 1, 2] | None = None

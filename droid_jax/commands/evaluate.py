@@ -48,7 +48,7 @@ class Evaluate:
     film: bool = True
     """Film a good and a bad trial."""
     user_effects: Path | None = None
-    """Python file that registers effects of your own (docs/method-gap.md); it is run."""
+    """Python file that registers effects of your own (docs/your-effect.md); it is run."""
     again: bool = False
     """Try again what was tried already."""
 

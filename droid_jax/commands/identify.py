@@ -48,7 +48,7 @@ class Identify:
     scene: Path | None = None
     """Your own MJCF instead of the built-in door."""
     parameters: Path | None = None
-    """JSON list of the parameters of your own scene (docs/own-robot.md)."""
+    """JSON list of the parameters of your own scene (docs/your-robot.md)."""
     joints: tuple[str, ...] = ()
     """Measured joints of your own scene; default: all driven joints."""
     object_joint: str | None = None
@@ -56,7 +56,7 @@ class Identify:
     extended: Path | None = None
     """extended.json of a gap search: the effects that it named are in the model and fitted too."""
     user_effects: Path | None = None
-    """Python file that registers effects of your own (docs/method-gap.md); it is run."""
+    """Python file that registers effects of your own (docs/your-effect.md); it is run."""
     engine: Literal["mjx", "mujoco"] = "mjx"
     """mjx: compiled, all devices.  mujoco: plain C, all cores; for motor-side torques, without gravity where the
     scene compensates it."""

@@ -1,6 +1,6 @@
 """The folder of a search for a missing effect as typed values: gap.json and gap.npz, checked.
 
-The one module that knows the keys of gap.json; docs/gap-command.md describes them.
+The one module that knows the keys of gap.json; docs/results-folder.md describes them.
 """
 
 from __future__ import annotations
