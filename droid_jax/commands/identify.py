@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from droid_jax.model.parameters import Space
     from droid_jax.model.scene import Scene
     from droid_jax.recordings.recording import Recording
-    from droid_jax.report.identify_folder import Fit
+    from droid_jax.report.identify_folder import FitFile
 
 
 @dataclass(frozen=True)
@@ -280,7 +280,7 @@ def _recordings(
     return list(kept_recordings(paths, command.again, recorded).values()), truth, {}
 
 
-def _summary(found: Identified, fit: Fit, repeats: Sequence[int]) -> None:
+def _summary(found: Identified, fit: FitFile, repeats: Sequence[int]) -> None:
     """A few lines that say how it went; fit: fit.json; repeats: of each recording."""
     from droid_jax.identify.solution_checks import solution_notes
     from droid_jax.report.identify_page import asked_of, far_off, lacks_something, needed, noiseless

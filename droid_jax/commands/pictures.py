@@ -61,7 +61,7 @@ def draw_replay(out: Path, scene: Scene) -> None:
         model = scene.visual_model()
         camera = "front" if "front" in {model.camera(i).name for i in range(model.ncam)} else None
         rows = [int(f * (len(after) - 1)) for f in AT]
-        images = frames(model, after, rows, camera)
+        images = rendered_frames(model, after, rows, camera)
         period = float(time[1]) if len(time) > 1 else 1.0 / RATE
         film(out / FILMS / REPLAY_FILM, model, (before, after), period, camera)
     except (NoOpenGL, ValueError) as error:

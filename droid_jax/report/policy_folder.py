@@ -78,7 +78,7 @@ class Spread(Struct, frozen=True):
     all: list[float]
 
 
-class Grip(Struct, frozen=True):
+class GripEntry(Struct, frozen=True):
     """Mean share of actions with the knob gripped."""
 
     mean: float
@@ -91,7 +91,7 @@ class Rate(Struct, frozen=True):
     interval_95: tuple[float, float]
 
 
-class Trials(Rate, frozen=True):
+class TrialsEntry(Rate, frozen=True):
     """What came of the trials in one place (`policy.trials.Trials.to_json`)."""
 
     trials: int
@@ -99,7 +99,7 @@ class Trials(Rate, frozen=True):
     stopped: dict[str, int]
     angle_deg: Spread
     steps: Spread
-    grip: Grip
+    grip: GripEntry
     stopped_each: list[str] | None = None
 
     @property
@@ -146,8 +146,8 @@ class Rates(Struct, frozen=True):
 class Transfer(Struct, frozen=True):
     """transfer.json."""
 
-    simulation: Trials
-    synthetic_robot: Trials
+    simulation: TrialsEntry
+    synthetic_robot: TrialsEntry
     robot: TransferRobot
     no_films: str | None = None
     setup: dict[str, Any] = field(default_factory=dict)
@@ -166,7 +166,7 @@ class Trained:
     films: Mapping[str, Path]
 
     @property
-    def trials(self) -> dict[str, Trials]:
+    def trials(self) -> dict[str, TrialsEntry]:
         """Where the policy was tried -> what came of it."""
         if self.transfer is None:
             return {}

@@ -50,10 +50,10 @@ def test_every_verdict_has_its_answer_and_what_to_do(made: Callable, verdict: st
     answer = written.ids["gap-answer"]
     assert answer["data-verdict"] == verdict and spaced(gap.found.sentence).split(":")[0] in spaced(answer["text"])
     assert "_" not in answer["text"]
-    assert written.ids["gap-next"]["data-next"] == next_step(gap)
+    assert written.ids["gap-next"]["data-next"] == gap_next_step(gap)
     said = spaced(written.ids["gap-next"]["text"]).strip()
     assert said.startswith("Next: ") and len(said) > 30 and said.endswith(".") and ".." not in said and "_" not in said
-    assert list(written.doubts) == doubts(gap) and all(spaced(t).strip() for t in written.doubts.values())
+    assert list(written.doubts) == gap_doubts(gap) and all(spaced(t).strip() for t in written.doubts.values())
     assert ("limits" in written.doubts) == bool(split)
     assert ("validation_chose" in written.doubts) == (verdict == "none")
     assert ("discrepancy:train", "after") in written.cells or not gap.extended
@@ -183,7 +183,7 @@ def test_no_share_of_nothing(tmp_path: Path, after: float) -> None:
     of = gap_json("named", ROLES)["discrepancies"]
     of["validation"]["after"] = after
     gap = read_gap(make_gap(tmp_path, discrepancies=of, remainder=-0.01))
-    assert "within_fit" not in doubts(gap)
+    assert "within_fit" not in gap_doubts(gap)
 
 
 @pytest.mark.parametrize(
@@ -212,7 +212,7 @@ def test_no_share_of_nothing(tmp_path: Path, after: float) -> None:
 )
 def test_what_to_do_next(made: Callable, verdict: str, changes: dict, step: str, said: str) -> None:
     gap, written = made(verdict, **changes)
-    assert next_step(gap) == step and said in spaced(written.ids["gap-next"]["text"])
+    assert gap_next_step(gap) == step and said in spaced(written.ids["gap-next"]["text"])
     assert untrusted(gap) == (step in ("mostly open", "none passed", "fit not converged"))
 
 
@@ -277,7 +277,7 @@ def test_what_passed_and_was_not_named_says_why(
     found["validation_tests"] = [*found["validation_tests"][1:], passed]
     gap = read_gap(make_gap(tmp_path / "run", **found))
     assert [r.outcome for g in groups(gap.found) for r in g.rows if r.test.passed] == [expected]
-    assert next_step(gap) == ("none passed clearly" if verdict == "unexplained" else verdict)
+    assert gap_next_step(gap) == ("none passed clearly" if verdict == "unexplained" else verdict)
 
 
 def test_pairs_tried_from_scratch_stand_beside_those_that_grew(tmp_path: Path) -> None:
@@ -330,7 +330,7 @@ def test_a_hint_is_no_name(made: Callable) -> None:
     hints = [{"effects": [LATCH], "indistinguishable": [[]], "closed": {"validation": 0.31}}]
     tests = gap_json("partly explained", ROLES[:2])["validation_tests"]
     gap, written = made("unexplained", hints=hints, validation_tests=tests)
-    assert next_step(gap) == "hints" and untrusted(gap)
+    assert gap_next_step(gap) == "hints" and untrusted(gap)
     assert "Latch at door hinge passed, but closes less than 40 %" in spaced(written.ids["gap-next"]["text"])
     assert written.rows[f"test:0:{text(LATCH)}"]["data-outcome"] == "hint"
 
