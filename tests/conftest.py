@@ -51,6 +51,10 @@ def _choose_gl() -> bool:
 
 HAS_GL = _choose_gl()
 runtime.tune(devices=2, cache_dir=os.environ.get(runtime.CACHE_VARIABLE) or CACHE)
+import jax  # noqa: E402  (tuned first)
+
+# s: the processes of pytest-xdist share the cache; many of the tests' programs are small.
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 
 @pytest.fixture(scope="session")

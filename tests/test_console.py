@@ -147,9 +147,14 @@ def stopped(after: float, number: int, *arguments: str, cwd: Path) -> tuple[int,
 
 
 @pytest.mark.parametrize(
-    ("number", "code", "word"), [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated")]
+    ("after", "number", "code", "word"),
+    [
+        (0.0, signal.SIGINT, 130, "interrupted"),
+        (0.2, signal.SIGTERM, 143, "terminated"),
+        (0.5, signal.SIGINT, 130, "interrupted"),
+        (0.8, signal.SIGTERM, 143, "terminated"),  # a quick machine has begun after 2 s
+    ],
 )
-@pytest.mark.parametrize("after", [0.0, 0.2, 0.5, 0.8])  # a quick machine has begun after 2 s
 def test_a_stop_while_everything_is_imported(tmp_path: Path, after: float, number: int, code: int, word: str):
     """One line, whichever import it hits, and no folder."""
     ended, said = stopped(after, number, "identify", "--out", "run", cwd=tmp_path)

@@ -38,36 +38,32 @@ SMALL = dj.IdentifyConfig(
 )
 
 
-def loaded(code: str) -> set[str]:
-    """Which of HEAVY a new Python has loaded after running code."""
-    probe = f"{code}\nimport sys, json; print(json.dumps([m for m in {HEAVY!r} if m in sys.modules]))"
+def loaded(*codes: str) -> list[set[str]]:
+    """Which of HEAVY a new Python has loaded after each piece of code, one after the other."""
+    tell = f"print(json.dumps([m for m in {HEAVY!r} if m in sys.modules]))"
+    probe = "\n".join(["import sys, json", *(f"{code}\n{tell}" for code in codes)])
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
     run = subprocess.run([sys.executable, "-c", probe], env=environment, capture_output=True, text=True, timeout=120)
     assert run.returncode == 0, run.stderr
-    assert "warp" not in run.stdout
-    return set(json.loads(run.stdout.splitlines()[-1]))
+    return [set(json.loads(line)) for line in run.stdout.splitlines()]
 
 
 # ----- what is loaded when
 
 
-@pytest.mark.parametrize(
-    ("code", "expected"),
-    [
-        ("import droid_jax", set()),
-        ("import droid_jax; dir(droid_jax)", set()),
-        ("from droid_jax import Parameter, Space, Scaling, Recording, load_recording, save_recording", set()),
-        ("from droid_jax import identify, Gaussian", set()),
-        ("from droid_jax import load_scene, door_scene, Scene, door_space, door_nuisances", {"mujoco"}),
-        ("from droid_jax import make_cost", {"jax", "mujoco"}),
-        (
-            "from droid_jax import find_missing_effects, DiscrepancyConfig",
-            {"jax", "mujoco", "evosax", "flax"},
-        ),  # evosax needs flax
-    ],
-)
-def test_a_name_loads_no_more_than_it_needs(code: str, expected: set[str]):
-    assert loaded(code) == expected
+LOADED = {  # from little to much: each piece of code runs behind those before it
+    "import droid_jax; dir(droid_jax)": set(),
+    "from droid_jax import Parameter, Space, Scaling, Recording, load_recording, save_recording": set(),
+    "from droid_jax import identify, Gaussian": set(),
+    "from droid_jax import load_scene, door_scene, Scene, door_space, door_nuisances": {"mujoco"},
+    "from droid_jax import make_cost": {"jax", "mujoco"},
+    # evosax needs flax
+    "from droid_jax import find_missing_effects, DiscrepancyConfig": {"jax", "mujoco", "evosax", "flax"},
+}
+
+
+def test_a_name_loads_no_more_than_it_needs():
+    assert dict(zip(LOADED, loaded(*LOADED), strict=True)) == LOADED
 
 
 def test_tune_can_follow_any_import_that_does_not_start_jax():
@@ -77,7 +73,8 @@ def test_tune_can_follow_any_import_that_does_not_start_jax():
         "from droid_jax.recordings.recording import Channel\ndj.load_scene, dj.Space\n"
         "assert dj.tune(devices=2).devices == 2\nimport jax; assert jax.local_device_count() == 2"
     )
-    assert "jax" in loaded(code)
+    (found,) = loaded(code)
+    assert "jax" in found
 
 
 def test_every_public_name_is_there_and_kept():

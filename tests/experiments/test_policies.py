@@ -133,11 +133,11 @@ def test_policies_that_differ_widen_the_interval():
 def test_intervals_of_five_policies_hold_the_truth_as_often_as_they_say():
     """Policies of rates between 0.4 and 1, forty trials each; plain quantiles hold the truth less often than that."""
     rng, held = np.random.default_rng(0), 0
-    for _ in range(200):
+    for _ in range(100):
         rates = rng.beta(8, 2, size=5)
         low, high = rate_interval([(rng.random(40) < r).astype(float) for r in rates])
         held += low <= 0.8 <= high
-    assert 0.9 <= held / 200 <= 0.99
+    assert 0.9 <= held / 100 <= 0.99
 
 
 def test_where_all_succeed_the_interval_has_a_width():
@@ -279,7 +279,9 @@ def test_slippery_pads_are_all_that_differs_from_the_settings_robot():
     assert robots["slippery"].config == robots["synthetic_robot"].config
 
 
-@pytest.mark.parametrize("door", SETTINGS)
+@pytest.mark.parametrize(
+    "door", ["paper", *(pytest.param(d, marks=pytest.mark.slow) for d in SETTINGS if d != "paper")]
+)
 def test_a_trained_policy_opens_by_its_grip(door: str, archived: Callable[[str], Path]):
     """A reported policy of each door, tried again: with slippery pads a hook or a push would still open it."""
     results = archived("policies")

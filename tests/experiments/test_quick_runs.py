@@ -38,6 +38,7 @@ SCRIPTS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(DATA, ()),
     "benchmarks/candidates.py": (),
     "benchmarks/default_run.py": (),
+    "benchmarks/durations.py": (),
     "benchmarks/kills.py": (),
     "benchmarks/robustness.py": (),
     "benchmarks/step_accuracy.py": (),

@@ -1,4 +1,7 @@
-"""The CMA-ES search on toy costs: minima, the CMA equations in numpy, resuming, failed rows."""
+"""The CMA-ES search on toy costs: minima, the CMA equations in numpy, resuming, failed rows.
+
+Rows, dimensions and restarts are few kinds: each other shape compiles for three seconds.
+"""
 
 import dataclasses
 import math
@@ -50,14 +53,14 @@ def endless(**kw):
 
 @pytest.mark.parametrize("parents", [5, None])
 def test_rotated_quadratic(parents):
-    rotation, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(5, 5)))
-    target = np.array([1.0, -2.0, 0.5, 3.0, -1.0])
-    scales = np.logspace(0, 3, 5)
+    rotation, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
+    target = np.array([1.0, -2.0, 0.5])
+    scales = np.logspace(0, 3, 3)
 
     def cost(values):  # a device array, as the replay returns
         return jnp.sum(scales * ((values - target) @ rotation) ** 2, axis=-1)
 
-    fit = cma_search(cost, box(5), endless(parents=parents, generations=250, tol_sigma=1e-4))
+    fit = cma_search(cost, box(3), endless(parents=parents, generations=250, tol_sigma=1e-4))
     assert fit.stop == "tol_sigma"
     np.testing.assert_allclose(fit.best, target, atol=2e-3)
     np.testing.assert_allclose(fit.mean, target, atol=2e-3)
@@ -147,7 +150,7 @@ def test_a_restart_that_could_not_be_replayed_keeps_no_other_off_its_bound():
     def cost(values):
         return np.where(values[:, 1] > 2.5, np.nan, values[:, 0] ** 2 + 0.01 * values[:, 1] ** 2)
 
-    config = endless(population=16, parents=None, generations=25, restarts=2, sigma=0.02)
+    config = endless(parents=None, generations=25, restarts=2, sigma=0.02)
     fit = cma_search(cost, space, config, start=np.array([[1.0, 0.0], [1.0, 4.9]]))
     assert np.isinf(fit.restarts[1].best_cost)
     assert fit.best[0] == 0.0 and fit.on_bound == ("mass",)
@@ -157,8 +160,8 @@ def test_resample_redraws_and_clip_clips():
     """One generation from the paper's kind of prior: damping 0.10 with deviation 0.19, never negative."""
     space = Space((Parameter("d", "N m s/rad", 0.10, 0.19, 0.0, 5.0), Parameter("e", "u", 0, 1, -9, 9)))
     drawn, clipped = Recorder(sphere([1, 1])), Recorder(sphere([1, 1]))
-    cma_search(drawn, space, endless(population=400, generations=1))
-    cma_search(clipped, space, endless(population=400, generations=1, bounds="clip"))
+    cma_search(drawn, space, endless(population=300, generations=1))
+    cma_search(clipped, space, endless(population=300, generations=1, bounds="clip"))
     assert drawn.asked[0][:, 0].min() > 0
     share = (clipped.asked[0][:, 0] == 0).mean()
     assert 0.2 < share < 0.4  # normal.cdf(-0.10 / 0.19) = 0.30
@@ -255,12 +258,12 @@ def numpy_cma(generations, dims, population, mu, active):
 
 @pytest.mark.parametrize(("parents", "active"), [(5, False), (5, True), (None, None)])
 def test_updates_agree_with_the_equations_in_numpy(parents, active):
-    cost = sphere([1.0, -2.0, 0.5, 3.0])
+    cost = sphere([1.0, -2.0, 0.5])
     recorder = Recorder(cost)
-    space = box(4, low=-1e3, high=1e3)
+    space = box(3, low=-1e3, high=1e3)
     fit = cma_search(recorder, space, endless(parents=parents, active=active, generations=6))
     generations = [(rows, cost(rows)) for rows in recorder.asked]
-    oracle = numpy_cma(generations, 4, 30, parents or 15, active is not False)
+    oracle = numpy_cma(generations, 3, 30, parents or 15, active is not False)
     for g, (mean, sigma, cov) in enumerate(oracle):
         np.testing.assert_allclose(fit.history.mean[g], mean, atol=1e-4)
         np.testing.assert_allclose(fit.history.sigma[g], sigma, rtol=1e-4)
@@ -330,17 +333,17 @@ def test_a_restart_without_a_good_row_waits_for_the_next_draw():
 
 
 def test_restarts_in_one_batch_equal_separate_searches():
-    cost = Recorder(sphere([1.0, 2.0, -1.0]))
-    together = cma_search(cost, box(3), endless(restarts=3, generations=12, seed=7))
-    assert {rows.shape for rows in cost.asked} == {(90, 3)}
-    assert together.evaluations == 12 * 90
+    cost = Recorder(sphere([1.0, 2.0]))
+    together = cma_search(cost, box(2), endless(restarts=2, generations=12, seed=7))
+    assert {rows.shape for rows in cost.asked} == {(60, 2)}
+    assert together.evaluations == 12 * 60
     for r, restart in enumerate(together.restarts):
-        alone = cma_search(sphere([1.0, 2.0, -1.0]), box(3), endless(generations=12, seed=7 + r))
+        alone = cma_search(sphere([1.0, 2.0]), box(2), endless(generations=12, seed=7 + r))
         assert restart.seed == 7 + r
         np.testing.assert_allclose(restart.history.costs, alone.history.costs, rtol=1e-3, atol=1e-5)
         np.testing.assert_allclose(restart.best, alone.best, atol=1e-4)
     assert together.best_cost == min(r.best_cost for r in together.restarts)
-    first, second = (r.history.costs for r in together.restarts[:2])
+    first, second = (r.history.costs for r in together.restarts)
     assert not np.allclose(first, second)
 
 

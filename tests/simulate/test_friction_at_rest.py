@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from dataclasses import replace
 
 import jax
@@ -13,7 +15,7 @@ import pytest
 from droid_jax.cost.cost import make_cost
 from droid_jax.identify.pipeline import IdentifyConfig, identify_parameters
 from droid_jax.identify.search import SearchConfig
-from droid_jax.model.effect_interface import Effect
+from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.fields import joint_damping, joint_frictionloss
 from droid_jax.model.joint_friction import joint_friction_effect, joint_friction_space
 from droid_jax.model.parameters import Space
@@ -32,6 +34,7 @@ HINGE = """<mujoco><worldbody><body><joint name="j" axis="0 -1 0" frictionloss="
 <actuator><position joint="j" kp="1"/></actuator></mujoco>"""
 
 
+@functools.cache
 def hinge(loss: float = LOSS) -> Scene:
     return compile_scene(mujoco.MjSpec.from_string(HINGE.format(loss=loss)), "hinge")
 
@@ -46,6 +49,11 @@ def held(measured: float, side: TorqueSide = MOTOR, **changes: object) -> Motion
     return replace(motion, **changes)
 
 
+@functools.cache
+def replay_of(scene: Scene, convention: TorqueConvention, effects: tuple[Effect, ...]) -> Callable[..., Rollout]:
+    return jax.jit(path_replay(scene, convention, effects, ("j",)))
+
+
 def torque(scene: Scene, motion: Motion, effects: tuple[Effect, ...] = (), **theta: float) -> float:
     """N m, the replayed torque of the first row; theta: coulomb."""
     space = Space((joint_frictionloss(scene, "j", std=0.1, high=1.0),)) + joint_friction_space(("j",))
@@ -53,8 +61,8 @@ def torque(scene: Scene, motion: Motion, effects: tuple[Effect, ...] = (), **the
     physics = make_physics(scene, space, np.asarray(values, np.float32))
     if not theta:
         physics = replace(physics, theta={k: v for k, v in physics.theta.items() if "coulomb" not in k})
-    replay = path_replay(scene, motion.torque, effects, motion.joints)
-    return float(jax.jit(replay)(physics, motion_path(scene, motion)).torque[0, 0])
+    replay = replay_of(scene, motion.torque, effects)  # motions of one kind share a program
+    return float(replay(physics, motion_path(scene, motion)).torque[0, 0])
 
 
 @pytest.mark.parametrize(

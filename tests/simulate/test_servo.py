@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -39,10 +39,39 @@ SPACE = Space(
 )
 
 
-def run(scene: Scene, drive: Drive, rows: list[dict[str, float]], **options) -> Rollout:
-    replay = servo_replay(scene, drive, (torque_offset_effect(scene.joints),), **options)
+ROWS = [
+    {},
+    {"time_offset": 0.0137},
+    {"time_offset": -0.0071},
+    {"torque_offset[elbow]": 0.5, "torque_offset[shoulder]": -0.25},
+    {"elbow_damping": 4.0},
+    {"time_offset": 0.014},
+]
+
+
+def weighed_arm(gravcomp: bool, friction: float, motors: bool) -> Scene:
+    """The arm; motors: they compensate its weight (actuatorgravcomp)."""
+    given = dict(gravcomp='gravcomp="1"' if gravcomp else "", friction=f'frictionloss="{friction}"', sensor="")
+    xml = ARM.format(**given).replace('axis="0 1 0"', f'axis="0 1 0" actuatorgravcomp="{str(motors).lower()}"')
+    return compile_scene(mujoco.MjSpec.from_string(xml), "arm", joints=JOINTS)
+
+
+@functools.cache
+def replayed(
+    torque: TorqueConvention = MOTOR,
+    *,
+    gravcomp: bool = True,
+    friction: float = 0.0,
+    motors: bool = False,
+    **options: float,
+) -> Rollout:
+    """ROWS on one arm, in one program: every new program compiles for seconds."""
+    scene = weighed_arm(gravcomp, friction, motors)
+    replay = servo_replay(
+        scene, make_drive(scene, recording(torque=torque)), (torque_offset_effect(JOINTS),), **options
+    )
     batch = over_population(lambda values: replay(make_physics(scene, SPACE, values)))
-    return batch(np.array([SPACE.values(row) for row in rows]))
+    return batch(np.array([SPACE.values(row) for row in ROWS]))
 
 
 @pytest.fixture(scope="module")
@@ -55,18 +84,9 @@ def drive(scene: Scene) -> Drive:
     return make_drive(scene, recording())
 
 
-ROWS = [
-    {},
-    {"time_offset": 0.0137},
-    {"time_offset": -0.0071},
-    {"torque_offset[elbow]": 0.5, "torque_offset[shoulder]": -0.25},
-    {"elbow_damping": 4.0},
-]
-
-
 @pytest.fixture(scope="module")
-def rollout(scene: Scene, drive: Drive) -> Rollout:
-    return run(scene, drive, ROWS)
+def rollout() -> Rollout:
+    return replayed()
 
 
 def servo_torque(position: np.ndarray, delay: float) -> np.ndarray:
@@ -91,8 +111,7 @@ def test_a_time_offset_delays_the_command(rollout: Rollout, row: int):
 
 def test_a_delayed_command_gives_a_delayed_motion(rollout: Rollout):
     """Seven whole steps: the same trajectory, 14 ms later (the arm rests at the start)."""
-    shifted = run(arm(), make_drive(arm(), recording()), [{"time_offset": 0.014}])
-    np.testing.assert_allclose(shifted.position[0, 7:], rollout.position[0, :-7], atol=1e-5)
+    np.testing.assert_allclose(rollout.position[5, 7:], rollout.position[0, :-7], atol=1e-5)
 
 
 def test_torque_offsets_are_added_to_their_own_joint(rollout: Rollout):
@@ -153,7 +172,7 @@ def c_rollout(scene: Scene, drive: Drive, *, delay: float, **options) -> tuple[n
 
 
 def test_parity_replay_is_mj_step(scene: Scene, drive: Drive):
-    got = run(scene, drive, [{}], parity=True)
+    got = replayed(parity=True)
     position, velocity, torque = c_rollout(scene, drive, delay=0.001)
     np.testing.assert_allclose(got.torque[0], torque, atol=5e-5)
     np.testing.assert_allclose(got.position[0], position + 0.001 * velocity, atol=2e-6)
@@ -169,7 +188,7 @@ def test_the_twin_is_mj_step(scene: Scene, drive: Drive):
 
 
 def test_the_twin_tells_what_the_parity_replay_tells(scene: Scene, drive: Drive):
-    twin, parity = c_replay(scene, SPACE, drive)(SPACE.mean[None]), run(scene, drive, [{}], parity=True)
+    twin, parity = c_replay(scene, SPACE, drive)(SPACE.mean[None]), replayed(parity=True)
     for channel in ("torque", "position", "velocity"):
         np.testing.assert_allclose(getattr(twin, channel)[0, :-1], getattr(parity, channel)[0, :-1], atol=5e-5)
 
@@ -177,7 +196,7 @@ def test_the_twin_tells_what_the_parity_replay_tells(scene: Scene, drive: Drive)
 def test_without_delay_both_tell_what_mj_step_logs(scene: Scene, drive: Drive):
     logged = c_rollout(scene, drive, delay=0.0)
     twin = c_replay(scene, SPACE, drive, late=0.0)(SPACE.mean[None])
-    mjx = run(scene, drive, [{}], parity=True, late=0.0)
+    mjx = replayed(parity=True, late=0.0)
     for rollout, atol in ((twin, (1e-12, 1e-12, 1e-12)), (mjx, (2e-6, 1e-4, 5e-5))):
         told = (rollout.position[0], rollout.velocity[0], rollout.torque[0])
         for got, expected, within in zip(told, logged, atol, strict=True):
@@ -192,12 +211,13 @@ def test_a_cost_can_replay_as_mj_step_logs(scene: Scene, drive: Drive, engine: s
     channel = Channel("torque", "N m", JOINTS, drive.time, values, np.ones(values.shape, bool))
     logged = recording(channels={"torque": channel})
 
-    def cost(mj_step: bool) -> float:
+    def cost(engine: str, mj_step: bool) -> float:
         made = make_cost(scene, SPACE, [logged], engine=engine, config=CompareConfig(mj_step=mj_step))
         return float(made(SPACE.mean[None])[0])
 
-    assert cost(True) < 2e-5
-    assert cost(True) < 0.01 * cost(False)
+    as_logged = cost(engine, True)
+    assert as_logged < 2e-5
+    assert as_logged < 0.01 * cost("mujoco", False)
 
 
 IDLE = "parameters time_offset change nothing where no recording holds commands"
@@ -255,15 +275,12 @@ def inverse(scene: Scene, q: np.ndarray, v: np.ndarray, a: np.ndarray, *, armatu
     return out
 
 
-@pytest.mark.parametrize("gravity", [False, True])
-@pytest.mark.parametrize("friction", [0.0, 0.4])
+@pytest.mark.parametrize(("gravity", "friction"), [(False, 0.0), (True, 0.4)])
 def test_link_side_torque_is_what_moves_the_links(gravity: bool, friction: float):
     """Without rotor inertia, joint damping and the joint's dry friction; with gravity where stated."""
     scene = arm(friction=friction)
-    convention = TorqueConvention(TorqueSide.LINK, gravity)
-    drive = make_drive(scene, recording(torque=convention))
-    got = run(scene, drive, [{}])
-    h = drive.timestep
+    got = replayed(TorqueConvention(TorqueSide.LINK, gravity), friction=friction)
+    h = float(scene.model.opt.timestep)
     q = got.position[0].astype(float)
     acceleration = (q[2:] - 2 * q[1:-1] + q[:-2]) / h**2
     velocity = (q[2:] - q[:-2]) / (2 * h)
@@ -271,33 +288,24 @@ def test_link_side_torque_is_what_moves_the_links(gravity: bool, friction: float
     off = got.torque[0, 1:-1] - expected
     # Second differences of float32 positions: 6e-8 / h^2 = 0.015 rad/s^2, on 0.3 kg m^2.
     assert np.sqrt(np.mean(off**2)) < 0.01, np.sqrt(np.mean(off**2, axis=0))
-    motor = run(scene, make_drive(scene, recording()), [{}])
-    assert np.sqrt(np.mean((motor.torque[0, 1:-1] - expected) ** 2)) > 0.3
+    assert np.sqrt(np.mean((servo_torque(q, 0.0)[1:-1] - expected) ** 2)) > 0.3  # what the motor's side reads
 
 
-def test_motor_side_with_gravity_adds_the_compensated_weight(scene: Scene, drive: Drive, rollout: Rollout):
-    heavy = run(scene, make_drive(scene, recording(torque=TorqueConvention(TorqueSide.MOTOR, True))), [{}])
+def test_motor_side_with_gravity_adds_the_compensated_weight(scene: Scene, rollout: Rollout):
+    heavy = replayed(TorqueConvention(TorqueSide.MOTOR, True))
     np.testing.assert_array_equal(heavy.position[0], rollout.position[0])
     q = heavy.position[0].astype(float)
     weight = inverse(scene, q, 0 * q, 0 * q, armature=True, gravity=True)
     np.testing.assert_allclose(heavy.torque[0] - rollout.torque[0], weight, atol=1e-4)
 
 
-def weighed(gravcomp: bool, motors: bool, gravity: bool) -> tuple[Rollout, np.ndarray]:
-    """A replay of the arm, and the weight [T, 2] N m at its poses; motors: actuatorgravcomp on the joints."""
-    xml = ARM.format(gravcomp='gravcomp="1"' if gravcomp else "", friction="", sensor="")
-    xml = xml.replace('axis="0 1 0"', f'axis="0 1 0" actuatorgravcomp="{str(motors).lower()}"')
-    scene = compile_scene(mujoco.MjSpec.from_string(xml), "arm", joints=JOINTS)
-    convention = TorqueConvention(TorqueSide.MOTOR, gravity)
-    got = run(scene, make_drive(scene, recording(torque=convention)), [{}])
-    q = got.position[0].astype(float)
-    return got, inverse(scene, q, 0 * q, 0 * q, armature=True, gravity=True)
-
-
 @pytest.mark.parametrize("gravity", [False, True])
 def test_weight_that_the_motors_compensate_is_counted_once(gravity: bool):
     """With actuatorgravcomp the motors' torque contains the weight, and only then."""
-    (by_motors, weight), (elsewhere, _) = weighed(True, True, gravity), weighed(True, False, gravity)
+    convention = TorqueConvention(TorqueSide.MOTOR, gravity)
+    by_motors, elsewhere = replayed(convention, motors=True), replayed(convention)
+    q = by_motors.position[0].astype(float)
+    weight = inverse(weighed_arm(True, 0.0, True), q, 0 * q, 0 * q, armature=True, gravity=True)
     np.testing.assert_allclose(by_motors.position[0], elsewhere.position[0], atol=1e-5)
     np.testing.assert_allclose(by_motors.torque[0], elsewhere.torque[0], atol=1e-3)
     servo = servo_torque(by_motors.position[0], 0.0) + gravity * weight
@@ -305,12 +313,11 @@ def test_weight_that_the_motors_compensate_is_counted_once(gravity: bool):
     assert np.abs(weight).max() > 3.0
 
 
-def test_weight_that_nothing_compensates_is_refused_where_the_torque_holds_none(tmp_path: Path):
+def test_weight_that_nothing_compensates_is_refused_where_the_torque_holds_none():
     heavy = arm(gravcomp=False)
     with pytest.raises(ValueError, match=r"'wave' says that its torque holds no weight.*shoulder, elbow.*gravcomp"):
         make_drive(heavy, recording())
-    carried = TorqueConvention(TorqueSide.MOTOR, gravity=True)
-    torque = run(heavy, make_drive(heavy, recording(torque=carried)), [{}])
+    torque = replayed(TorqueConvention(TorqueSide.MOTOR, gravity=True), gravcomp=False)
     np.testing.assert_allclose(torque.torque[0], servo_torque(torque.position[0], 0.0), atol=2e-5)
     make_drive(with_options(heavy, gravity=[0, 0, 0]), recording())
     make_drive(arm(), recording())
@@ -324,73 +331,82 @@ def test_upright_axes_feel_no_weight():
 
 # ----- servos with a velocity gain
 
-PENDULUM = """<mujoco><option timestep="{step}" integrator="implicitfast"/><worldbody>
-  <body gravcomp="1"><joint name="j" axis="0 1 0" armature="0.1" damping="0.5" {joint}/>
-    <geom type="capsule" size=".03" fromto="0 0 0 0 0 -.5" mass="2" contype="0" conaffinity="0"/></body>
-</worldbody><actuator><position name="j" joint="j" kp="600" kv="50" {actuator}/></actuator></mujoco>"""
+LIMITS = {"free": ("", ""), "actuator": ("", 'forcerange="-2 2"'), "joint": ('actuatorfrcrange="-2 2"', "")}
+PENDULUM = """<body gravcomp="1" pos="0 {y} 0"><joint name="{name}" axis="0 1 0" armature="0.1" damping="0.5" {joint}/>
+  <geom type="capsule" size=".03" fromto="0 0 0 0 0 -.5" mass="2" contype="0" conaffinity="0"/></body>"""
+SERVO = '<position name="{name}" joint="{name}" kp="600" kv="50" {actuator}/>'
 NOTHING = Space((time_offset(),))
 
 
-def pendulum(step: float = 0.004, *, joint: str = "", actuator: str = "") -> Scene:
-    spec = mujoco.MjSpec.from_string(PENDULUM.format(step=step, joint=joint, actuator=actuator))
-    return compile_scene(spec, "pendulum", joints=("j",))
+def pendulums(*names: str) -> Scene:
+    """One beside the other, each with its force limit."""
+    bodies = [PENDULUM.format(name=n, y=k, joint=LIMITS[n][0]) for k, n in enumerate(names)]
+    servos = [SERVO.format(name=n, actuator=LIMITS[n][1]) for n in names]
+    xml = f"""<mujoco><option timestep="0.004" integrator="implicitfast"/><worldbody>{"".join(bodies)}</worldbody>
+    <actuator>{"".join(servos)}</actuator></mujoco>"""
+    return compile_scene(mujoco.MjSpec.from_string(xml), "pendulums", joints=names)
 
 
-def swung(scene: Scene) -> tuple[Rollout, np.ndarray, np.ndarray]:
-    """The replay at 4 ms, and the torque and position of plain C at 0.05 ms."""
-    time = np.arange(251) * 0.004
-    command = 0.3 * np.sin(6 * time)[:, None] * np.clip(time / 0.3, 0, 1)[:, None]
-    drive = Drive(command, np.zeros(1), 0.004, MOTOR)
-    replay = servo_replay(scene, drive)
-    batch = over_population(lambda values: replay(make_physics(scene, NOTHING, values)))
-    fine = pendulum_c(scene, command, 5e-5)
-    return batch(NOTHING.mean[None]), *fine
+def swung(scene: Scene, command: np.ndarray, **options) -> Rollout:
+    """The replay of one command [T] for all pendulums, at 4 ms."""
+    count = len(scene.joints)
+    drive = Drive(np.tile(command[:, None], (1, count)), np.zeros(count), 0.004, MOTOR)
+    replay = servo_replay(scene, drive, **options)
+    return over_population(lambda values: replay(make_physics(scene, NOTHING, values)))(NOTHING.mean[None])
 
 
-def pendulum_c(scene: Scene, command: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+def pendulums_c(scene: Scene, command: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+    """Torque and position [T, J] of plain C."""
     model = with_options(scene, timestep=step).model
     data, sub = mujoco.MjData(model), round(0.004 / step)
-    out = np.empty((2, len(command)))
+    out = np.empty((2, len(command), model.nv))
     for k in range(len(command) * sub):
-        data.ctrl[:] = np.interp(k * step, np.arange(len(command)) * 0.004, command[:, 0])
-        position = data.qpos[0]
+        data.ctrl[:] = np.interp(k * step, np.arange(len(command)) * 0.004, command)
+        position = data.qpos.copy()
         mujoco.mj_step(model, data)
         if k % sub == 0:
-            out[:, k // sub] = data.qfrc_actuator[0], position
-    return out
+            out[:, k // sub] = data.qfrc_actuator, position
+    return out[0], out[1]
 
 
-def test_a_servos_velocity_gain_acts_at_the_time_of_the_position():
+@pytest.fixture(scope="module")
+def free_and_limited() -> tuple[Rollout, np.ndarray, np.ndarray]:
+    """The replay at 4 ms, and the torque and position of plain C at 0.05 ms."""
+    scene, time = pendulums(*LIMITS), np.arange(251) * 0.004
+    command = 0.3 * np.sin(6 * time) * np.clip(time / 0.3, 0, 1)
+    return swung(scene, command), *pendulums_c(scene, command, 5e-5)
+
+
+def test_a_servos_velocity_gain_acts_at_the_time_of_the_position(free_and_limited):
     """The torque is the servo's at the mean velocity of the step; at the velocity before it, it is 0.1 of it off."""
-    got, torque, _ = swung(pendulum())
-    assert rms(got.torque[0, :, 0] - torque) < 0.02 * rms(torque)
+    got, torque, _ = free_and_limited
+    assert rms(got.torque[0, :, 0] - torque[:, 0]) < 0.02 * rms(torque[:, 0])
 
 
-@pytest.mark.parametrize("limit", [{"actuator": 'forcerange="-2 2"'}, {"joint": 'actuatorfrcrange="-2 2"'}])
-def test_a_servo_at_its_force_limit_damps_nothing(limit: dict[str, str]):
+@pytest.mark.parametrize("limit", ["actuator", "joint"])
+def test_a_servo_at_its_force_limit_damps_nothing(free_and_limited, limit: str):
     """What the limit holds does not follow the velocity: neither its torque nor the motion it makes."""
-    scene = pendulum(**limit)
-    got, torque, position = swung(scene)
-    assert np.mean(np.abs(torque) >= 2.0) > 0.2 and got.torque.max() <= 2.0
-    np.testing.assert_allclose(got.position[0, :, 0], position, atol=0.02 * np.ptp(position))
+    got, torque, position = free_and_limited
+    k = list(LIMITS).index(limit)
+    assert np.mean(np.abs(torque[:, k]) >= 2.0) > 0.2 and got.torque[..., k].max() <= 2.0
+    np.testing.assert_allclose(got.position[0, :, k], position[:, k], atol=0.02 * np.ptp(position[:, k]))
 
 
 def test_parity_with_a_velocity_gain_is_mj_step():
-    scene = pendulum(actuator='forcerange="-2 2"')
-    time = np.arange(251) * 0.004
-    command = 0.3 * np.sin(6 * time)[:, None]
-    replay = servo_replay(scene, Drive(command, np.zeros(1), 0.004, MOTOR), parity=True)
-    got = over_population(lambda values: replay(make_physics(scene, NOTHING, values)))(NOTHING.mean[None])
-    delayed = np.interp(time - 0.002, time, command[:, 0])[:, None]
-    torque, _ = pendulum_c(scene, delayed, 0.004)
-    np.testing.assert_allclose(got.torque[0, :, 0], torque, atol=1e-3)
+    scene, time = pendulums("actuator"), np.arange(251) * 0.004
+    command = 0.3 * np.sin(6 * time)
+    torque, _ = pendulums_c(scene, np.interp(time - 0.002, time, command), 0.004)
+    np.testing.assert_allclose(swung(scene, command, parity=True).torque[0], torque, atol=1e-3)
 
 
 # ----- effects
 
 
-def test_effects_enter_where_they_say(scene: Scene, drive: Drive):
-    """A constant force, a command law and an observation, each against what it must do."""
+def test_effects_enter_where_they_say(scene: Scene, drive: Drive, rollout: Rollout):
+    """A constant force, two command laws and an observation, each against what it must do.
+
+    The second law, a delay of 20 ms, sees what the first makes of the command.
+    """
     seen = {}
 
     def force(theta, state):
@@ -399,28 +415,16 @@ def test_effects_enter_where_they_say(scene: Scene, drive: Drive):
 
     kick = Effect("kick", force=force)
     hold = Effect("hold", command=lambda theta, time, look: 0.5 * (look(time) + look(time - 0.01)))
-    scale = Effect("scale", observe=lambda theta, r: replace(r, torque=2.0 * r.torque))
+    late = Effect("late", command=lambda theta, time, look: look(time - 0.02))
+    double = Effect("double", observe=lambda theta, r: replace(r, torque=2.0 * r.torque))
     physics = make_physics(scene, SPACE, jnp.asarray(SPACE.mean, jnp.float32))
-
-    def compiled(*effects: Effect) -> Rollout:
-        return jax.jit(servo_replay(scene, drive, effects), compiler_options=runtime.compiler_options())(physics)
-
-    plain, kicked, held, scaled = compiled(), compiled(kick), compiled(hold), compiled(scale)
+    replay = servo_replay(scene, drive, (kick, hold, late, double))
+    got = jax.jit(replay, compiler_options=runtime.compiler_options())(physics)
+    torque, position = np.asarray(got.torque) / 2.0, np.asarray(got.position)
     assert seen["shapes"] == ((2,), (2,), (2,))
-    np.testing.assert_array_equal(scaled.torque, 2.0 * plain.torque)
+    np.testing.assert_allclose(torque, 0.5 * (servo_torque(position, 0.02) + servo_torque(position, 0.03)), atol=2e-4)
     # at rest the servo gives way until kp dq = 1.5 N m
-    assert float(kicked.torque[-1, 1] - plain.torque[-1, 1]) < -0.5
-    q = np.asarray(held.position)
-    expected = 0.5 * (servo_torque(q, 0.0) + servo_torque(q, 0.01))
-    np.testing.assert_allclose(held.torque, expected, atol=2e-4)
-
-
-def test_command_effects_act_one_after_the_other(scene: Scene, drive: Drive):
-    """A delay of 10 ms behind a delay of 20 ms is a delay of 30 ms."""
-    late = [Effect(f"{d}", command=lambda theta, time, look, d=d: look(time - d)) for d in (0.01, 0.02)]
-    physics = make_physics(scene, SPACE, jnp.asarray(SPACE.mean, jnp.float32))
-    rollout = jax.jit(servo_replay(scene, drive, late), compiler_options=runtime.compiler_options())(physics)
-    np.testing.assert_allclose(rollout.torque, servo_torque(np.asarray(rollout.position), 0.03), atol=2e-4)
+    assert torque[-1, 1] - rollout.torque[0, -1, 1] < -0.5
 
 
 def test_the_twin_refuses_what_it_cannot_run(scene: Scene, drive: Drive):
@@ -557,7 +561,7 @@ def test_a_rollout_with_a_number_that_is_none_is_not_finite(trace: str):
     assert not apply_sensor_model(replace(still, **{trace: broken}), {}, ()).finite
 
 
-def test_actuators_with_a_state_of_their_own_are_refused(tmp_path: Path):
+def test_actuators_with_a_state_of_their_own_are_refused():
     """The scan does not carry activations: a filtered actuator would be reset at every step."""
     xml = ARM.format(gravcomp='gravcomp="1"', friction="", sensor="").replace(
         '<position name="s" joint="shoulder" kp="60"/>',

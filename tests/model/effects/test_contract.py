@@ -193,13 +193,18 @@ def differing(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> set[str]:
     return {n.split(".")[0] for n in a if not np.array_equal(a[n], b[n], equal_nan=a[n].dtype.kind == "f")}
 
 
-@pytest.fixture
-def apply(scene: Scene, effect: Effect) -> Callable[[np.ndarray], Physics]:
-    """Values [D] of an effect's parameters -> physics."""
-    space = Space(effect.parameters)
+@functools.cache
+def physics_of(scene: Scene, name: str) -> Callable[[np.ndarray], Physics]:
+    """Values [D] of an effect's parameters -> physics; compiled once for all tests."""
+    space = Space(library(scene, [name])[0].parameters)
     make = functools.partial(make_physics, scene, space)
     make = jax.jit(make) if written_fields(space) else make  # op by op, what is derived would take seconds
     return lambda values: make(jnp.asarray(values, jnp.float32))
+
+
+@pytest.fixture
+def apply(scene: Scene, effect: Effect) -> Callable[[np.ndarray], Physics]:
+    return physics_of(scene, effect.name)
 
 
 def test_only_declared_fields_of_the_model_change(effect: Effect, scene: Scene, apply):
