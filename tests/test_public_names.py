@@ -14,12 +14,6 @@ import droid_jax as dj
 PACKAGE = Path(dj.__file__).parent
 # Name that several modules define -> why.
 SHARED = {"run": "every command has one, of one interface: the parsed command, nothing back (`droid_jax.run`)"}
-# Names of report/ that it shares with other layers or has twice itself: to become fewer, and none to come.
-LEFT_IN_REPORT = {
-    *("Cell", "Cost", "Experiment", "FinalModel", "Finding", "Fit", "Grip", "Hint", "Parameter", "Phase", "Place"),
-    *("Reason", "ScoreTest", "Setup", "Split", "TorqueDistance", "Trend", "Trials", "ValidationTest"),
-    *("doubts", "frames", "intervals", "next_step", "number"),
-}
 REWRITTEN = {"find_missing_effects", "DiscrepancyConfig", "load_extended", "frames"}  # discrepancy/ and report/
 
 

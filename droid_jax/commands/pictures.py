@@ -51,7 +51,7 @@ def draw_replay(out: Path, scene: Scene) -> None:
     Where that cannot be done (no OpenGL, a replay that blew up) it is said, and the page has no pictures.
     """
     from droid_jax.report.reading import Reader, read_replay
-    from droid_jax.report.render import NoOpenGL, film, frames, save_frames
+    from droid_jax.report.render import NoOpenGL, film, rendered_frames, save_frames
     from droid_jax.storage import new_folder
 
     if not (out / REPLAY).is_file() or (out / FRAMES).is_dir():

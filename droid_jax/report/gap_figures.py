@@ -85,7 +85,13 @@ def _pairs(
         for at, value in zip(x, row, strict=True):
             foot = max(value, axes.get_ylim()[0]) if np.isfinite(value) else axes.get_ylim()[0]
             axes.annotate(
-                significant(value), (at, foot), (0, 2), textcoords="offset points", ha="center", va="bottom", fontsize=7.5
+                significant(value),
+                (at, foot),
+                (0, 2),
+                textcoords="offset points",
+                ha="center",
+                va="bottom",
+                fontsize=7.5,
             )
     if error is not None:
         text = f"discretisation error {significant(error)}"
@@ -200,7 +206,9 @@ def _map(axes: Axes, values: np.ndarray, norm: Normalize) -> QuadMesh:
             axes.add_patch(Rectangle((f + 0.04, j + 0.04), 0.92, 0.92, **_BLANK))
             continue
         ink = "white" if norm(values[j, f]) > 0.6 else "#111111"
-        axes.text(f + 0.5, j + 0.5, significant(float(values[j, f]), 2), ha="center", va="center", fontsize=7.5, color=ink)
+        axes.text(
+            f + 0.5, j + 0.5, significant(float(values[j, f]), 2), ha="center", va="center", fontsize=7.5, color=ink
+        )
     axes.set_ylim(len(values), 0)
     axes.tick_params(length=0)
     axes.grid(visible=False)

@@ -17,10 +17,10 @@ from droid_jax.report import gap_figures, style
 from droid_jax.report.gap_folder import (
     About,
     CellEntry,
+    EffectPlace,
     ExperimentEntry,
     Found,
     Gap,
-    EffectPlace,
     Role,
     TrendEntry,
     ValidationEntry,

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from droid_jax.recordings.split import FEWEST_REPEATS, HALVES
 from droid_jax.report import identify_figures, style, torque_figures
-from droid_jax.report.identify_folder import FitFile, FittedParameter, Run, DistanceEntry
+from droid_jax.report.identify_folder import DistanceEntry, FitFile, FittedParameter, Run
 from droid_jax.report.style import Drawing, data_uri
 from droid_jax.report.text import label
 
@@ -156,7 +156,7 @@ def _draw(run: Run) -> dict[str, list[Drawing]]:
         add("distance", f"gap_{i}", title, torque_figures.distance_per_joint, *bars, fit.torque_unit)
         overlay = (traces, traces["phases"], fit.torque_unit)
         add("torque", f"torque_{i}", f"Torque over time{of}", torque_figures.torque_traces, *overlay)
-    add("parameters", "intervals", "90 % intervals", identify_figures.intervals, fit.of_interest)
+    add("parameters", "intervals", "90 % intervals", identify_figures.interval_figure, fit.of_interest)
     correlation = (run.correlation["names"], run.correlation["correlation"])
     add("parameters", "correlation", "Correlation", identify_figures.correlation_map, *correlation)
     title = "Parameters over generations"

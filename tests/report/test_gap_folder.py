@@ -82,8 +82,8 @@ def test_what_is_said_agrees_with_the_search() -> None:
     from droid_jax.discrepancy import verdict
     from droid_jax.recordings import split
 
-    assert {s.value for s in split.SplitEntry} == set(get_args(SplitEntry.__annotations__["by"])) or {
-        s.value for s in split.SplitEntry
+    assert {s.value for s in split.Split} == set(get_args(SplitEntry.__annotations__["by"])) or {
+        s.value for s in split.Split
     } == {"recordings", "repeats", "blocks"}
     assert verdict.LOST == LOST
 

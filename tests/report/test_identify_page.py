@@ -18,7 +18,7 @@ from reader import Page, read_page, spaced
 from droid_jax.preflight.findings import Finding
 from droid_jax.report import page
 from droid_jax.report.identify_folder import FittedParameter, Run, read_run
-from droid_jax.report.identify_page import doubts, needed, next_steps
+from droid_jax.report.identify_page import fit_doubts, needed, next_steps
 from droid_jax.report.text import lines
 
 WRONG = Finding("sign", "elbow", -0.99, 1.0, "certain", "recording 'x': the torque of <elbow> runs against its command")

@@ -14,7 +14,7 @@ from droid_jax.policy.trials import BLOWN_UP
 from droid_jax.report import page
 from droid_jax.report.gap_folder import read_gap
 from droid_jax.report.policy_folder import read_policy
-from droid_jax.report.policy_page import doubts, next_step
+from droid_jax.report.policy_page import policy_doubts, policy_next_step
 
 
 @pytest.fixture(scope="module")
