@@ -14,7 +14,6 @@ import droid_jax as dj
 PACKAGE = Path(dj.__file__).parent
 # Name that several modules define -> why.
 SHARED = {"run": "every command has one, of one interface: the parsed command, nothing back (`droid_jax.run`)"}
-REWRITTEN = {"find_missing_effects", "DiscrepancyConfig", "load_extended", "frames"}  # discrepancy/ and report/
 
 
 def defined(source: str) -> list[str]:
@@ -34,9 +33,7 @@ def homes() -> dict[str, list[str]]:
 
 def test_one_name_is_one_thing():
     several = {name: files for name, files in homes().items() if len(files) > 1 and name not in SHARED}
-    others = {name: [f for f in files if not f.startswith("report/")] for name, files in several.items()}
-    assert {name: files for name, files in others.items() if len(files) > 1} == {}
-    assert set(several) <= LEFT_IN_REPORT
+    assert several == {}
     assert len(SHARED) <= 5
 
 
@@ -50,7 +47,7 @@ def test_every_module_says_what_it_holds():
     assert [f.relative_to(PACKAGE).as_posix() for f, line in first.items() if len(line.split()) < 4] == []
 
 
-@pytest.mark.parametrize("name", [n for n in dj.__all__ if n not in REWRITTEN])
+@pytest.mark.parametrize("name", dj.__all__)
 def test_a_public_name_says_what_it_takes_and_gives(name: str):
     """Google style, as pdoc and editors read it: every argument, what comes back, what is refused."""
     public = getattr(dj, name)

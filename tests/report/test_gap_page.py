@@ -36,7 +36,7 @@ def made(tmp_path: Path, quick: None) -> Callable[..., tuple[Gap, Page]]:
     return make
 
 
-def _shown(cell: dict[str, Any], value: float | None, written: Callable[..., str] = number) -> bool:
+def _shown(cell: dict[str, Any], value: float | None, written: Callable[..., str] = significant) -> bool:
     """Whether a cell holds this value, and shows it."""
     if value is None:
         return cell["text"].strip() == "–"
