@@ -41,13 +41,18 @@ def page() -> str:
     return "\n".join([HEAD, *(_command(command) for command in _ACTIONS)])
 
 
+def name_of(command: type) -> str:
+    """What is typed to run it."""
+    return command.__name__.removesuffix("Command").lower()
+
+
 def _command(command: type) -> str:
     """A command's section: what it does, and a row for each option."""
     hints, told = typing.get_type_hints(command, include_extras=True), _meanings(command)
     rows = [_row(field, hints[field.name], told[field.name]) for field in dataclasses.fields(command)]
     what = "\n\n".join(" ".join(part.split()) for part in (command.__doc__ or "").split("\n\n"))
     return "\n".join(
-        [f"## {command.__name__.lower()}\n\n{what}\n", "| option | default | meaning |", "|---|---|---|", *rows, ""]
+        [f"## {name_of(command)}\n\n{what}\n", "| option | default | meaning |", "|---|---|---|", *rows, ""]
     )
 
 

@@ -7,7 +7,7 @@
 
 Each public name is loaded when it is first asked for (PEP 562): importing the package starts neither
 jax nor mujoco, so `tune` can come first, and asking for the cost loads neither evosax nor brax.
-docs/own-robot.md shows the names at work.
+docs/your-robot.md shows the names at work.
 """
 
 from __future__ import annotations
@@ -92,8 +92,8 @@ _HOMES = {
     "load_gaussian": ("identify.gaussian", "load_gaussian"),
     "fitted_mjcf": ("model.mjcf", "fitted_mjcf"),
     "find_missing_effects": ("discrepancy.missing", "find_missing_effects"),
-    "DiscrepancyConfig": ("discrepancy.case", "DiscrepancyConfig"),
-    "load_extended": ("discrepancy.extended", "load_extended"),
+    "DiscrepancyConfig": ("discrepancy.config", "DiscrepancyConfig"),
+    "load_extended": ("identify.extended_model", "load_extended"),
     "randomised": ("policy.randomise", "randomised"),
     "randomised_model": ("policy.randomise", "randomised_model"),
     "frames": ("report.tables", "frames"),

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from droid_jax.quiet import before_jax, import_mjx, quiet_cache
+from droid_jax.quiet import quiet as quiet
 from droid_jax.storage import write_json
 
 if TYPE_CHECKING:

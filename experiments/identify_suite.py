@@ -46,7 +46,7 @@ from droid_jax.synthetic.robot import draw_nuisances, record, synthetic_truth  #
 Part = Literal["doors", "calibration", "pose", "parity"]
 MUST_BE_KNOWN = ("hinge_stiffness", "hinge_frictionloss", "hinge_damping", *JOINT_DAMPING)
 LEVEL = 0.9  # of the intervals in the cases
-TIMESTEP = 0.004  # s: the replay's second-order step is as good here as at 2 ms (docs/architecture.md)
+TIMESTEP = 0.004  # s: the replay's second-order step is as good here as at 2 ms (docs/simulation-step.md)
 
 
 @dataclass(frozen=True)

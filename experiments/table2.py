@@ -10,7 +10,7 @@ command started twice shares the work.  DIR/table2.json sums up all that are the
 policies; table2.md is laid out as in the paper, table2.png and table2.pdf are its histogram.  Where
 hidden_effect_policy.json lies beside them, it is the table's last part.  Pilots take another robot and other seeds
 (--robot 100 --first 100).
-docs/paper.md says what was fixed before the runs.
+docs/history/policy-experiments.md says what was fixed before the runs.
 """
 
 from __future__ import annotations

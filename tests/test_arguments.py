@@ -16,7 +16,7 @@ from droid_jax import arguments
 from droid_jax.arguments import check_fields, number, whole
 from droid_jax.cost.noise import NoiseConfig
 from droid_jax.cost.residuals import CompareConfig
-from droid_jax.discrepancy.config import DiscrepancyConfig
+from droid_jax.discrepancy.config import DiscrepancyConfig, SelectionConfig
 from droid_jax.identify.identifiability import IdentifiabilityConfig
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.identify.pipeline import IdentifyConfig
@@ -74,7 +74,7 @@ GOOD = {"name": "a", "unit": "kg", "mean": 1.0, "std": 0.5, "low": 0.1, "high": 
         (lambda: RefineConfig(target_objective=math.nan), "target_objective must be finite, got nan"),
         (lambda: DiscrepancyConfig(one_step_fits=0), "one_step_fits must be at least 1, got 0"),
         (lambda: DiscrepancyConfig(budget_minutes=-1.0), "budget_minutes must be at least 0, got -1.0"),
-        (lambda: DiscrepancyConfig(minimum_closed="0.4"), "minimum_closed must be a number"),  # pyright: ignore
+        (lambda: SelectionConfig(minimum_closed="0.4"), "minimum_closed must be a number"),  # pyright: ignore
         (lambda: DiscrepancyConfig(refine=None), "refine must be a RefineConfig, got None"),  # pyright: ignore
         (lambda: TrainConfig(learning_rate=-1.0), "learning_rate must be above 0, got -1.0"),
         (lambda: TrainConfig(hidden=(0,)), "hidden, entry 0 must be at least 1, got 0"),

@@ -588,7 +588,8 @@ def test_the_page_of_the_command_line_is_current():
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     assert module.PAGE.read_text(encoding="utf-8") == module.page()
-    assert re.findall(r"^## (\w+)$", module.page(), re.MULTILINE) == [c.__name__.lower() for c in run._ACTIONS]
+    assert re.findall(r"^## (\w+)$", module.page(), re.MULTILINE) == [module.name_of(c) for c in run._ACTIONS]
+    assert "## gap\n" in module.page()
 
 
 def test_a_warning_is_one_line_without_a_place_in_the_code(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):

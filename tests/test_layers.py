@@ -117,7 +117,6 @@ def test_a_name_of_mjx_internals_is_found(source):
 GENERIC = ("model", "recordings", "simulate", "preflight", "cost", "identify", "discrepancy", "policy", "report")
 # Where parameters that a replay or an effect reads, or an encoder has, get their names.
 NAMES_DEFINED = ("model/parameters.py", "model/fields.py", "model/effects/")
-NAMES_LOOKED_UP = {"discrepancy/case.py", "discrepancy/maps.py", "discrepancy/missing.py"}  # to go: `Space.of_role`
 
 
 def parameter_names() -> set[str]:
@@ -152,7 +151,7 @@ def test_generic_layers_know_parameters_by_role():
         and not path.startswith(NAMES_DEFINED)
         and (hits := looked_up(file.read_text(), names))
     }
-    assert {path: hits for path, hits in found.items() if path not in NAMES_LOOKED_UP} == {}
+    assert found == {}
 
 
 @pytest.mark.parametrize("source", ['space["hinge_preload"]', 'n.startswith("torque_offset[")', 'f"viscous[{joint}]"'])

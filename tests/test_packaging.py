@@ -72,7 +72,7 @@ def test_installed_package_finds_its_own_mjcf(built, tmp_path):
 
 def test_the_api_reference_is_built(tmp_path: Path):
     pytest.importorskip("pdoc")
-    (rooms,) = re.findall(r"^python -m pdoc (.*)$", (ROOT / "docs" / "api.md").read_text(), re.MULTILINE)
-    run("-m", "pdoc", *rooms.split(), "-o", str(tmp_path))
+    (modules,) = re.findall(r"^python -m pdoc (.*)$", (ROOT / "docs" / "api.md").read_text(), re.MULTILINE)
+    run("-m", "pdoc", *modules.split(), "-o", str(tmp_path))
     assert "make_cost" in (tmp_path / "droid_jax.html").read_text()
     assert (tmp_path / "droid_jax" / "identify" / "pipeline.html").is_file()

@@ -46,7 +46,7 @@ def test_what_could_not_be_drawn_is_drawn_later_and_once(
             raise render.NoOpenGL("no OpenGL here")
         return [np.zeros((4, 4, 3), np.uint8) for _ in rows]
 
-    monkeypatch.setattr(render, "frames", drawn)
+    monkeypatch.setattr(render, "rendered_frames", drawn)
     monkeypatch.setattr(render, "film", lambda path, model, sides, period, camera: asked.append(period))
     draw_replay(tmp_path, scene)  # nothing to draw
     replay(tmp_path, np.zeros((5, scene.model.nq)))

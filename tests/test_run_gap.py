@@ -18,7 +18,8 @@ from small_gap import EFFECTS, FLOOR, JOINTS, PRELOAD, QUICK, SCENE, record, sma
 
 from droid_jax.commands import gap, report
 from droid_jax.commands.synthetic import hidden_effects, record_synthetic
-from droid_jax.discrepancy import amendments, missing, restart
+from droid_jax.discrepancy import case as cases
+from droid_jax.discrepancy import fitting, missing
 from droid_jax.discrepancy.verdict import Experiment
 from droid_jax.door.scene import door_scene
 from droid_jax.model.effect_interface import Effect
@@ -308,10 +309,10 @@ def test_hiding_is_for_the_synthetic_robot(place: Path, refused):
 
 
 def test_effects_of_ones_own_are_asked_about_like_the_others(place: Path, refused, monkeypatch: pytest.MonkeyPatch):
-    """The one that docs/method-gap.md shows."""
+    """The one that docs/your-effect.md shows."""
     registry.registered()
     monkeypatch.setattr(registry, "_MAKERS", dict(registry._MAKERS))
-    (code,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / "method-gap.md").read_text(), re.M | re.S)
+    (code,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / "your-effect.md").read_text(), re.M | re.S)
     (place / "gasket.py").write_text(code)
     options = ("--user-effects", place / "gasket.py", "--effects", "gasket", "nothing")
     assert "unknown effects nothing; valid:" in (said := refused(*arguments(place, *options))) and "gasket" in said
@@ -375,7 +376,7 @@ def test_the_synthetic_robot_records_each_demonstration_once(tmp_path: Path, mon
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """A case compiled already, of small budgets; no replays at a quarter of the time step, and no page."""
     monkeypatch.setattr(gap, "gap_config", lambda command: QUICK)
-    monkeypatch.setattr(missing, "make_case", lambda *arguments, **roles: small().case)
+    monkeypatch.setattr(cases, "make_case", lambda *arguments, **roles: small().case)
     monkeypatch.setattr(missing, "discretisation_error", lambda *arguments: FLOOR)
     monkeypatch.setattr(report, "write_page", lambda folder: folder / "report.html")
 
@@ -394,14 +395,14 @@ def test_the_base_fit_begins_at_an_earlier_fit(place: Path, quick: None, monkeyp
     The folder may be one of `all`.
     """
     base = small().case.base
-    monkeypatch.setattr(restart, "search", lambda *a, **k: pytest.fail("there is nothing to search for"))
+    monkeypatch.setattr(fitting, "cma_search", lambda *a, **k: pytest.fail("there is nothing to search for"))
     begun = []
 
     def refit(evidence, space, parts, starts, *rest, **more):
         begun.append(starts)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(restart, "refit", refit)
+    monkeypatch.setattr(fitting, "refit", refit)
     known = {p.name: 0.5 * (p.mean + p.high) for p in base.parameters if not p.nuisance}
     first = next(iter(known))
     folder = fit_json(place / "all" / "identify", **{**known, first: 1e9, "of_another_model": 1.0})
@@ -423,7 +424,7 @@ def test_a_fit_that_is_none_or_of_another_model(place: Path, quick: None, refuse
 def test_a_run_goes_on_after_a_stop_and_is_whole(
     place: Path, quick: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], refused
 ):
-    """Killed in the search; then with the base fit gone missing, were it asked for again; then finished."""
+    """Killed in the search; then begun again with every replay of the base fit remembered; then finished."""
     pytest.importorskip("tensorboardX")
     command = arguments(place, "--effects", *EFFECTS, "--tensorboard")
     find = missing.search_effects
@@ -443,7 +444,15 @@ def test_a_run_goes_on_after_a_stop_and_is_whole(
     setup = json.loads((out / "setup.json").read_text())
     (out / "setup.json").write_text(json.dumps({**setup, "versions": {**setup["versions"], "jax": "0.0.1"}}))
     monkeypatch.setattr(missing, "search_effects", find)
-    monkeypatch.setattr(missing, "base_fit", lambda *a: pytest.fail("the base fit was kept"))
+    fit, replays = missing.base_fit, out / "checkpoints" / "replays"
+
+    def remembered(*given):
+        before = sorted(replays.rglob("*.npz"))
+        model = fit(*given)
+        assert before and sorted(replays.rglob("*.npz")) == before  # every replay of it was kept
+        return model
+
+    monkeypatch.setattr(missing, "base_fit", remembered)
     assert main(command) == 0
     said = capsys.readouterr().out
     assert "holds this run unfinished; going on with other code than it was begun with (jax 0.0.1 -> " in said
@@ -499,7 +508,7 @@ def test_ties_come_with_an_experiment(place: Path, quick: None, monkeypatch: pyt
         return (Experiment("the same motion twice as fast", 8.5), Experiment("slower", None, "too long"))
 
     tied(monkeypatch)
-    monkeypatch.setattr(amendments, "separating", apart)
+    monkeypatch.setattr(missing, "separating_experiments", apart)
     assert main(arguments(place, "--effects", *EFFECTS)) == 0
     assert asked == [(["hinge_preload at door", "base"], "train")]
     found = read_gap(place / "run").found
@@ -524,7 +533,7 @@ def test_the_verdict_is_there_whatever_becomes_of_what_is_added_to_it(
         assert read_gap(out).found.verdict == "named"  # it stayed there while the run went on
         raise ValueError("no motion can be asked for")
 
-    monkeypatch.setattr(amendments, "separating", stopped)
+    monkeypatch.setattr(missing, "separating_experiments", stopped)
     assert main(command) == 130
     said = capsys.readouterr()
     assert f"the verdict is in {out / 'gap.json'}: The model lacks: hinge_preload at door." in said.out
@@ -533,7 +542,7 @@ def test_the_verdict_is_there_whatever_becomes_of_what_is_added_to_it(
     assert first.found.verdict == "named" and first.found.final_model.fitted_to == ["train"]
     assert {"gap.npz", "extended.json", "checkpoints"} <= {p.name for p in out.iterdir()}
 
-    monkeypatch.setattr(amendments, "separating", failing)
+    monkeypatch.setattr(missing, "separating_experiments", failing)
     assert main(command) == 0
     said = capsys.readouterr().out
     assert "holds this run unfinished; going on" in said

@@ -68,7 +68,7 @@ def test_halves_are_the_first_and_the_last_repeats():
     np.testing.assert_array_equal(joined, whole.channel("torque").values)
 
 
-LOST = ("Lost are effects of commands, servos and contacts", "U then holds the noise", "docs/own-robot.md")
+LOST = ("Lost are effects of commands, servos and contacts", "U then holds the noise", "docs/your-robot.md")
 
 
 @pytest.mark.parametrize(

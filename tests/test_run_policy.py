@@ -152,7 +152,7 @@ def test_what_is_missing_is_said(arguments: list[str], said: str, capsys: pytest
 def test_the_synthetic_robot_is_the_fitted_one_unless_asked(
     scene, fitted, asked, stiffness: float, hidden: tuple[str, ...]
 ):
-    trained = {"synthetic_robot": fitted, "setup": {"knob": 0}}
+    trained: Any = SimpleNamespace(synthetic_robot=fitted, setup=SimpleNamespace(knob=0))
     robot, truth = _robot(Evaluate(trials=3, **asked), trained, DoorEnv(scene))
     assert truth["hinge_stiffness"] == pytest.approx(stiffness, rel=0.3)
     assert tuple(a.name for a in robot.hidden) == hidden and robot.config.trials == 3
@@ -213,7 +213,7 @@ def test_which_fit_is_trained_on(tmp_path: Path, there: list[str], named: bool, 
         (tmp_path / folder / "gaussian.json").write_text("{}")
     if named:
         (tmp_path / "runs/all/gap/gaussian.json").rename(tmp_path / "runs/all/gap/extended.json")
-        (tmp_path / "runs/all/gap/gap.json").write_text('{"effects": ["latch at door_hinge"]}')
+        (tmp_path / "runs/all/gap/gap.json").write_text('{"effects": [{"effect": "latch", "location": "hinge"}]}')
     asked = dict(zip(options[::2], options[1::2], strict=True))
     fit = Path(asked["--fit"]) if "--fit" in asked else None
     method = "prior" if "--method" in asked else "fitted"

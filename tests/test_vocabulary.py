@@ -26,7 +26,8 @@ RENAMED = {
     r"\bhanded_on\(|\bHandedOn\b": "final_model",
     r"\bwith_own\b|\bown_columns\b|\bown_nuisances\b": "per-recording nuisances",
     r"\bgone_on_with\b|\bplainest\b|\bwithout_idle\b|\bfitted_anew\b": "polished, simplest, without_dominated, ...",
-    r"\bhops=|\bhop_generations=(?<!basin_hop_generations=)|\brough=(?!rough)|\bdoubt=": "basin_hops, misfit_threshold",
+    r"\bhops=|\bhop_generations=(?<!basin_hop_generations=)|\brough=(?!rough)": "basin_hops, coarse tolerance",
+    r"(?<!data-)\bdoubt=(?!0\.6)": "misfit_threshold",  # but of the page's attribute and of the models' comparison
     r"of one's own|worth a name\b|does as well\b": "your own, minimum effect size, equivalent",
 }
 ENDINGS = (".py", ".md", ".jinja", ".ipynb", ".toml", ".css")

@@ -219,7 +219,7 @@ def test_a_page_of_somebody_else_stays(tmp_path: Path):
 
     (tmp_path / "report.html").write_text("<html><title>My own</title></html>")
     assert not _is_page(tmp_path / "report.html")
-    template = (ROOT / "droid_jax" / "report" / "template.html.j2").read_text()
+    template = (ROOT / "droid_jax" / "report" / "templates" / "page.html.jinja").read_text()
     (tmp_path / "report.html").write_text(template[template.index("<!DOCTYPE") :])
     assert _is_page(tmp_path / "report.html")
 

@@ -60,7 +60,7 @@ class All:
     scene: Path | None = None
     """Your own MJCF instead of the built-in door: identify and gap, policies are trained at the built-in one."""
     parameters: Path | None = None
-    """JSON list of the parameters of your own scene (docs/own-robot.md)."""
+    """JSON list of the parameters of your own scene (docs/your-robot.md)."""
     joints: tuple[str, ...] = ()
     """Measured joints of your own scene; default: all driven joints."""
     object_joint: str | None = None
@@ -70,7 +70,7 @@ class All:
     effect_scale: float = 1.0
     """Forces and torques of the library's effects, relative to an arm of a Panda's size, as in gap."""
     user_effects: Path | None = None
-    """Python file that registers effects of your own (docs/method-gap.md); it is run."""
+    """Python file that registers effects of your own (docs/your-effect.md); it is run."""
     hide: tuple[str, ...] | None = None
     """What the synthetic robot hides, name=amplitude; none for nothing. Default: magnetic_catch=1.5 (N m)."""
     springs: Literal[0, 1, 2] | None = None
@@ -303,7 +303,7 @@ def _fitted(folder: Path, command: All, recordings: Sequence[Path]) -> bool:
 def told(out: Path) -> list[str]:
     """One line for each stage that has a result."""
     from droid_jax.report.gap_folder import read_answer
-    from droid_jax.report.identify_folder import read_fit
+    from droid_jax.report.identify_folder import Distances, read_fit
     from droid_jax.report.policy_folder import read_rates, read_training
     from droid_jax.report.text import lines
 
@@ -312,7 +312,7 @@ def told(out: Path) -> list[str]:
     return lines(
         "all.txt.jinja",
         old=sorted(old),
-        fit=read_fit(at["identify"]) if (at["identify"] / FIT).is_file() else None,
+        fit=read_fit(at["identify"], Distances) if (at["identify"] / FIT).is_file() else None,
         answer=read_answer(at["gap"]) if "gap" not in old and (at["gap"] / GAP).is_file() else None,
         trials=read_rates(at["train"]) if tried else None,
         another_robot=tried and read_training(at["train"]).another_robot,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -48,7 +49,7 @@ class Evaluate:
     film: bool = True
     """Film a good and a bad trial."""
     user_effects: Path | None = None
-    """Python file that registers effects of your own (docs/method-gap.md); it is run."""
+    """Python file that registers effects of your own (docs/your-effect.md); it is run."""
     again: bool = False
     """Try again what was tried already."""
 
@@ -81,7 +82,7 @@ def run(command: Evaluate) -> None:
         report.run(report.Report(folder))
         return
     scene, gaussian, effects = source(folder, trained.setup.knob)
-    env = DoorEnv(scene, _task(folder), effects)
+    env = DoorEnv(scene, _task(folder, read_json(folder / TRAINING)["task"]), effects)
     robot, truth = _robot(command, trained, env)
     # All of them are one compiled program, which does not say how far it is.
     with counting("episodes in simulation, a minute of compiling first", command.trials) as count:
@@ -127,11 +128,10 @@ def _done(folder: Path, setup: dict[str, Any]) -> bool:
     return found is not None and not changed(found.setup, setup)
 
 
-def _task(folder: Path) -> Task:
+def _task(folder: Path, known: Mapping[str, Any]) -> Task:
     """The task that a folder's policy was trained for; ValueError where this program knows another one."""
     from droid_jax.door.task import Task
 
-    known = read_json(folder / TRAINING)["task"]
     strange = sorted(set(known) - {f.name for f in dataclasses.fields(Task)})
     if strange:
         raise ValueError(f"{folder}: the policy was trained for a task with {', '.join(strange)}; train it again")
@@ -155,7 +155,8 @@ def _robot(command: Evaluate, trained: Training, env: DoorEnv) -> tuple[PolicyRo
 
     asked = {"springs": command.springs, "seed": command.robot, "hide": command.hide}
     usual = {"springs": 1, "seed": 0, "hide": ()}
-    own = usual | trained.synthetic_robot.known | {name: value for name, value in asked.items() if value is not None}
+    given = {name: value for name, value in asked.items() if value is not None}
+    own: dict[str, Any] = {**usual, **trained.synthetic_robot, **given}
     scene = door_scene(limits=True, knob=trained.setup.knob)
     truth = synthetic_truth(scene, own["springs"], own["seed"])
     config = TransferConfig(trials=command.trials, seed=command.seed)

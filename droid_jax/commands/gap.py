@@ -56,7 +56,7 @@ class GapCommand:
     scene: Path | None = None
     """Your own MJCF instead of the built-in door."""
     parameters: Path | None = None
-    """JSON list of the parameters of your own scene (docs/own-robot.md)."""
+    """JSON list of the parameters of your own scene (docs/your-robot.md)."""
     joints: tuple[str, ...] = ()
     """Measured joints of your own scene; default: all driven joints."""
     object_joint: str | None = None
@@ -71,7 +71,7 @@ class GapCommand:
     """Forces and torques of the library's effects, relative to an arm of a Panda's size: priors, bounds and minimum
     effect sizes are taken times this. An axis that is driven with a kilonewton: 30."""
     user_effects: Path | None = None
-    """Python file that registers effects of your own (docs/method-gap.md); it is run."""
+    """Python file that registers effects of your own (docs/your-effect.md); it is run."""
     budget: float | None = None
     """Minutes after which no further candidate is tried; the report says what was left out."""
     hide: tuple[str, ...] | None = None

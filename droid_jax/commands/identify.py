@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from droid_jax.model.parameters import Space
     from droid_jax.model.scene import Scene
     from droid_jax.recordings.recording import Recording
-    from droid_jax.report.identify_folder import Fit
+    from droid_jax.report.identify_folder import FitFile
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Identify:
     scene: Path | None = None
     """Your own MJCF instead of the built-in door."""
     parameters: Path | None = None
-    """JSON list of the parameters of your own scene (docs/own-robot.md)."""
+    """JSON list of the parameters of your own scene (docs/your-robot.md)."""
     joints: tuple[str, ...] = ()
     """Measured joints of your own scene; default: all driven joints."""
     object_joint: str | None = None
@@ -56,7 +56,7 @@ class Identify:
     extended: Path | None = None
     """extended.json of a gap search: the effects that it named are in the model and fitted too."""
     user_effects: Path | None = None
-    """Python file that registers effects of your own (docs/method-gap.md); it is run."""
+    """Python file that registers effects of your own (docs/your-effect.md); it is run."""
     engine: Literal["mjx", "mujoco"] = "mjx"
     """mjx: compiled, all devices.  mujoco: plain C, all cores; for motor-side torques, without gravity where the
     scene compensates it."""
@@ -280,7 +280,7 @@ def _recordings(
     return list(kept_recordings(paths, command.again, recorded).values()), truth, {}
 
 
-def _summary(found: Identified, fit: Fit, repeats: Sequence[int]) -> None:
+def _summary(found: Identified, fit: FitFile, repeats: Sequence[int]) -> None:
     """A few lines that say how it went; fit: fit.json; repeats: of each recording."""
     from droid_jax.identify.solution_checks import solution_notes
     from droid_jax.report.identify_page import asked_of, far_off, lacks_something, needed, noiseless

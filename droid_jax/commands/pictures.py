@@ -51,7 +51,7 @@ def draw_replay(out: Path, scene: Scene) -> None:
     Where that cannot be done (no OpenGL, a replay that blew up) it is said, and the page has no pictures.
     """
     from droid_jax.report.reading import Reader, read_replay
-    from droid_jax.report.render import NoOpenGL, film, frames, save_frames
+    from droid_jax.report.render import NoOpenGL, film, rendered_frames, save_frames
     from droid_jax.storage import new_folder
 
     if not (out / REPLAY).is_file() or (out / FRAMES).is_dir():
@@ -61,7 +61,7 @@ def draw_replay(out: Path, scene: Scene) -> None:
         model = scene.visual_model()
         camera = "front" if "front" in {model.camera(i).name for i in range(model.ncam)} else None
         rows = [int(f * (len(after) - 1)) for f in AT]
-        images = frames(model, after, rows, camera)
+        images = rendered_frames(model, after, rows, camera)
         period = float(time[1]) if len(time) > 1 else 1.0 / RATE
         film(out / FILMS / REPLAY_FILM, model, (before, after), period, camera)
     except (NoOpenGL, ValueError) as error:

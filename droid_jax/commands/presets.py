@@ -21,7 +21,7 @@ def warn_of_cpu(preset: str) -> None:
 
     if preset == "gpu" and jax.default_backend() == "cpu":
         print(
-            "warning: --preset gpu, but jax finds no GPU: on a CPU it takes hours (README: jax with CUDA)",
+            "warning: --preset gpu, but jax finds no GPU: on a CPU it takes hours (docs/ten-minutes.md: jax with CUDA)",
             file=sys.stderr,
         )
 

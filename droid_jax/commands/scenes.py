@@ -69,7 +69,7 @@ def own_scene(options: OwnScene, *, engine: str = "mjx", mj_step: bool = False) 
     from droid_jax.model.scene import load_scene
 
     if options.scene is None or options.parameters is None:
-        raise ValueError("--scene needs --parameters FILE.json, the list of what to fit (docs/own-robot.md)")
+        raise ValueError("--scene needs --parameters FILE.json, the list of what to fit (docs/your-robot.md)")
     scene = load_scene(
         options.scene,
         joints=options.joints or None,

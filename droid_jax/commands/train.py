@@ -45,7 +45,7 @@ class Train:
     seed: int = 0
     """Seed of the networks and of the environments."""
     user_effects: Path | None = None
-    """Python file that registers effects of your own (docs/method-gap.md); it is run."""
+    """Python file that registers effects of your own (docs/your-effect.md); it is run."""
     tensorboard: bool = False
     """Write scalars for TensorBoard while it runs, to OUT/tensorboard."""
     out: Path = Path("runs/train")

@@ -10,7 +10,7 @@ from droid_jax.report.stages import setup
 
 
 def load_effects(path: Path | None, *folders: Path | None) -> None:
-    """Run a file of effects of your own, which are in the library from then on (docs/method-gap.md).
+    """Run a file of effects of your own, which are in the library from then on (docs/your-effect.md).
 
     folders: of runs that are read: one that was made with such effects needs them.  Its setup.json is not followed to
     the file: results that come from elsewhere run no code.

@@ -126,17 +126,23 @@ class BlocksConfig:
 class DiscrepancyConfig:
     """Settings of the search for a missing effect.
 
-    search, refine: of the base fit.
-    refit: of every extended model.
-    polish: of the selected model, with slopes over the width of its posterior: its intervals are reported.
-    one_step_fits: candidates that get one Levenberg-Marquardt step in each selection step.
-    full_refits: the best of these, refitted in full.
-    pair_refits: pairs of effects refitted.
-    max_effects: in a model.
-    budget_minutes: for all refits, None for no limit; at least one candidate of a selection step is always tried.
-    selection, blocks: the thresholds.
-    compare: how simulation and measurement are compared.
-    seed: of sign flips and resamples.
+    Attributes:
+        search: of the base fit.
+        refine: of the base fit.
+        refit: of every extended model.
+        polish: of the selected model, with slopes over the width of its posterior: its intervals are reported.
+        one_step_fits: candidates that get one Levenberg-Marquardt step in each selection step.
+        full_refits: the best of these, refitted in full.
+        pair_refits: pairs of effects refitted.
+        max_effects: in a model.
+        budget_minutes: for all refits, None for no limit; at least one candidate of a selection step is always tried.
+        selection: thresholds that decide which effects are named.
+        blocks: thresholds for a log without repeats.
+        compare: how simulation and measurement are compared.
+        seed: of sign flips and resamples.
+
+    Raises:
+        ValueError: a setting is of the wrong type or out of its range.
     """
 
     search: SearchConfig = field(default_factory=lambda: SearchConfig(parents=None, generations=20))

@@ -1,7 +1,7 @@
 """What a search for missing effects leaves in its folder: gap.json and gap.npz, the extended model beside them.
 
 The verdict is written when it is known; what is added to it later (`missing.amended`) is written again.
-docs/file-formats.md lists every entry.  No pickle.
+docs/results-folder.md lists every entry.  No pickle.
 """
 
 from __future__ import annotations

@@ -87,9 +87,17 @@ def save_extended(folder: Path, model: Extended) -> None:
 
 
 def load_extended(path: str | Path, scene: Scene) -> Extended:
-    """What `save_extended` wrote, for the scene that it was fitted with (another time step is fine).
+    """Load the extended model that `gap` wrote: base parameters and the effects that were found.
 
-    Raises ValueError that names the file where it is missing or damaged, or belongs to another scene.
+    Args:
+        path: an extended.json.
+        scene: the one that it was fitted with; another time step is fine.
+
+    Returns:
+        The model, ready for `make_cost(model.scene, model.space, ..., effects=model.effects)`.
+
+    Raises:
+        ValueError: the file is missing or damaged, or belongs to another scene; it is named.
     """
     path, scene = path_of(path, "the path of an extended model"), instance(scene, "scene", Scene)
     try:

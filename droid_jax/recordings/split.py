@@ -90,9 +90,9 @@ def _as_log(recording: Recording) -> str:
         return ""
     one = "without its commands" if recording.repeats == 1 else "one repeat of it, without its commands,"
     return (
-        f"; and {one} it can be searched as a log, in blocks of time, if it lasts a minute or more (docs/own-robot.md, "
-        '"Logs without commands"). Lost are effects of commands, servos and contacts (delays, gains, elastic gears, '
-        "the grip), and U then holds the noise"
+        f"; and {one} it can be searched as a log, in blocks of time, if it lasts a minute or more "
+        '(docs/your-robot.md, "Logs without commands"). Lost are effects of commands, servos and contacts '
+        "(delays, gains, elastic gears, the grip), and U then holds the noise"
     )
 
 

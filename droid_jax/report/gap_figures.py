@@ -17,7 +17,7 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
-from droid_jax.report.gap_folder import Cell, Discrepancy, Shift, largest_shifts
+from droid_jax.report.gap_folder import CellEntry, Discrepancy, Shift, largest_shifts
 from droid_jax.report.style import (
     AFTER,
     BEFORE,
@@ -30,7 +30,7 @@ from droid_jax.report.style import (
     panel_grid,
     styled,
 )
-from droid_jax.report.text import label, number, quantity
+from droid_jax.report.text import label, quantity, significant
 from droid_jax.report.torque_figures import residuals, shade, torque_traces
 
 LOGARITHMIC = 20.0  # ratio of largest to smallest from which an axis is logarithmic
@@ -85,10 +85,16 @@ def _pairs(
         for at, value in zip(x, row, strict=True):
             foot = max(value, axes.get_ylim()[0]) if np.isfinite(value) else axes.get_ylim()[0]
             axes.annotate(
-                number(value), (at, foot), (0, 2), textcoords="offset points", ha="center", va="bottom", fontsize=7.5
+                significant(value),
+                (at, foot),
+                (0, 2),
+                textcoords="offset points",
+                ha="center",
+                va="bottom",
+                fontsize=7.5,
             )
     if error is not None:
-        text = f"discretisation error {number(error)}"
+        text = f"discretisation error {significant(error)}"
         axes.axhline(error, color=MEASURED, linestyle=(0, (3, 2)), linewidth=1.1, label=text)
     axes.set_xticks(range(len(names)), names)
     axes.set_xlim(-0.6, len(names) - 0.4)
@@ -130,7 +136,7 @@ def base_shifts(shifts: Sequence[Shift], width: float = WIDE) -> Figure:
         axes.xaxis.set_major_formatter(lambda x, _: f"{x:g}".replace("-", "−"))
         reach *= 1.5
     axes.set(xlim=(-1.12 * reach, 1.12 * reach), ylim=(len(drawn) - 0.4, -0.6))
-    names = [f"{label(s.name)}\n{number(s.before)} → {quantity(s.after, s.unit)}" for s in drawn]
+    names = [f"{label(s.name)}\n{significant(s.before)} → {quantity(s.after, s.unit)}" for s in drawn]
     axes.set_yticks(range(len(drawn)), names)
     axes.set_xlabel("Shift [posterior deviations before]")
     axes.grid(axis="y", visible=False)
@@ -139,7 +145,7 @@ def base_shifts(shifts: Sequence[Shift], width: float = WIDE) -> Figure:
 
 
 @styled
-def cell_maps(before: Sequence[Cell], after: Sequence[Cell] | None, width: float = WIDE) -> Figure:
+def cell_maps(before: Sequence[CellEntry], after: Sequence[CellEntry] | None, width: float = WIDE) -> Figure:
     """U by joint (down) and phase (across), base model and final model on one colour scale.
 
     after: None where no effect entered the model.  A cell that the test does not find is hatched and has no colour.
@@ -173,13 +179,13 @@ def _phase_label(name: str, start: float, between: str) -> str:
     return "whole motion" if name == "all" else f"{name}{between}{start:.1f} s"
 
 
-def joints_and_phases(cells: Sequence[Cell]) -> tuple[list[str], list[tuple[str, float]]]:
+def joints_and_phases(cells: Sequence[CellEntry]) -> tuple[list[str], list[tuple[str, float]]]:
     """Joints [J], and phases [F] as (name, start in s), in the order of the cells."""
     mine = [c for c in cells if c.axis == "phase"]
     return list(dict.fromkeys(c.joint or "" for c in mine)), list(dict.fromkeys(c.phase for c in mine))
 
 
-def cell_table(cells: Sequence[Cell], joints: Sequence[str], phases: Sequence[tuple[str, float]]) -> np.ndarray:
+def cell_table(cells: Sequence[CellEntry], joints: Sequence[str], phases: Sequence[tuple[str, float]]) -> np.ndarray:
     """U [J, F], NaN where the test finds nothing."""
     found = {(c.joint or "", c.phase): c.discrepancy for c in cells if c.axis == "phase" and c.found}
     return as_floats([[found.get((joint, phase)) for phase in phases] for joint in joints])
@@ -200,7 +206,9 @@ def _map(axes: Axes, values: np.ndarray, norm: Normalize) -> QuadMesh:
             axes.add_patch(Rectangle((f + 0.04, j + 0.04), 0.92, 0.92, **_BLANK))
             continue
         ink = "white" if norm(values[j, f]) > 0.6 else "#111111"
-        axes.text(f + 0.5, j + 0.5, number(float(values[j, f]), 2), ha="center", va="center", fontsize=7.5, color=ink)
+        axes.text(
+            f + 0.5, j + 0.5, significant(float(values[j, f]), 2), ha="center", va="center", fontsize=7.5, color=ink
+        )
     axes.set_ylim(len(values), 0)
     axes.tick_params(length=0)
     axes.grid(visible=False)
@@ -218,30 +226,30 @@ class Bins:
     found: np.ndarray
 
 
-def state_bins(cells: Sequence[Cell], joints: Sequence[str] = ()) -> list[Bins]:
+def state_bins(cells: Sequence[CellEntry], joints: Sequence[str] = ()) -> list[Bins]:
     """The axes that are not joint by phase, in order; the directions of all joints are one axis.
 
     joints: whose position and load are shown.
     """
-    groups: dict[tuple[str, str | None], list[Cell]] = {}
+    groups: dict[tuple[str, str | None], list[CellEntry]] = {}
     for cell in cells:
         if cell.axis != "phase" and (cell.axis not in ("position", "load") or cell.joint in joints):
             groups.setdefault((cell.axis, None if cell.axis == "direction" else cell.joint), []).append(cell)
     return [_bins(group) for group in groups.values()]
 
 
-def most_at(cells: Sequence[Cell]) -> str:
+def most_at(cells: Sequence[CellEntry]) -> str:
     """The joint at whose position most is found; empty where there is none."""
     return (best.joint or "") if (best := largest([c for c in cells if c.axis == "position"])) else ""
 
 
-def largest(cells: Sequence[Cell]) -> Cell | None:
+def largest(cells: Sequence[CellEntry]) -> CellEntry | None:
     """The largest cell that the test finds, else the largest at all; None where none has a size."""
     known = [c for c in cells if c.discrepancy is not None]
     return max(known, key=lambda c: (c.found, c.discrepancy), default=None)
 
 
-def _bins(cells: Sequence[Cell]) -> Bins:
+def _bins(cells: Sequence[CellEntry]) -> Bins:
     sizes, found = as_floats([c.discrepancy for c in cells]), np.array([c.found for c in cells])
     if cells[0].axis == "direction":
         signs = {"forward": "+", "back": "−"}
@@ -260,7 +268,7 @@ def _edge(value: float | None) -> str:
 
 
 @styled
-def state_bars(before: Sequence[Cell], after: Sequence[Cell] | None, width: float = WIDE) -> Figure:
+def state_bars(before: Sequence[CellEntry], after: Sequence[CellEntry] | None, width: float = WIDE) -> Figure:
     """U over the object's angle, direction and speed, each joint's direction, and position and load of the joint where
     the base model leaves most; one panel each, one scale.
 
@@ -310,7 +318,7 @@ def _banded(traces: Mapping[str, Any]) -> dict[str, Any]:
 
 
 @styled
-def remainder(traces: Mapping[str, Any], cells: Sequence[Cell], unit: str, width: float = WIDE) -> Figure:
+def remainder(traces: Mapping[str, Any], cells: Sequence[CellEntry], unit: str, width: float = WIDE) -> Figure:
     """Descriptive: what is left where most is left, over time at one joint and over the axis of the largest bin.
 
     traces: of the train recording.  cells: of the final model.
@@ -334,7 +342,7 @@ def remainder(traces: Mapping[str, Any], cells: Sequence[Cell], unit: str, width
     return figure
 
 
-def _curve(axes: Axes, cells: Sequence[Cell]) -> None:
+def _curve(axes: Axes, cells: Sequence[CellEntry]) -> None:
     """The root of U over the bins of one axis."""
     edges = as_floats([cells[0].low, *(c.high for c in cells)])
     values = np.sqrt(np.maximum(as_floats([c.discrepancy for c in cells]), 0.0))
@@ -348,13 +356,13 @@ def _curve(axes: Axes, cells: Sequence[Cell]) -> None:
     axes.set(title=title, xlabel=f"{cells[0].name} [{cells[0].unit}]", ylabel="√U [σ]", ylim=(0, None))
 
 
-def located(cells: Sequence[Cell], joints: Sequence[str]) -> str:
+def located(cells: Sequence[CellEntry], joints: Sequence[str]) -> str:
     """The joint of the largest cell by joint and phase that the test finds, else of the largest at all."""
     best = largest([c for c in cells if c.axis == "phase" and c.joint in joints])
     return (best.joint or joints[0]) if best else joints[0]
 
 
-def located_bins(cells: Sequence[Cell]) -> list[Cell] | None:
+def located_bins(cells: Sequence[CellEntry]) -> list[CellEntry] | None:
     """The bins of the axis that holds the largest found bin; None where none is found."""
     bins = [c for c in cells if c.axis != "phase" and c.high is not None]
     best = largest([c for c in bins if c.found])

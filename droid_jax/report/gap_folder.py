@@ -1,6 +1,6 @@
 """The folder of a search for a missing effect as typed values: gap.json and gap.npz, checked.
 
-The one module that knows the keys of gap.json; docs/gap-command.md describes them.
+The one module that knows the keys of gap.json; docs/results-folder.md describes them.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from msgspec import Struct, field
 
 from droid_jax.files import EXTENDED, GAP, GAP_TRACES, NOT_MADE, TO_BE_MADE
-from droid_jax.report.reading import Finding, Phase, Reader
+from droid_jax.report.reading import FindingEntry, PhaseEntry, Reader
 from droid_jax.report.text import label
 
 Role = Literal["train", "validation", "test"]
@@ -27,7 +27,7 @@ THRESHOLDS = ("significance", "minimum_closed", "mostly_explained")  # of "confi
 LOST = "the fitted model on the test recording"  # among what failed: that recording then has no discrepancy
 
 
-class Place(Struct, frozen=True):
+class EffectPlace(Struct, frozen=True):
     """An effect at a place."""
 
     effect: str
@@ -46,9 +46,9 @@ class Placed(Struct, frozen=True):
     location: str = ""
 
     @property
-    def place(self) -> Place:
+    def place(self) -> EffectPlace:
         """The effect and its place."""
-        return Place(effect=self.effect, location=self.location)
+        return EffectPlace(effect=self.effect, location=self.location)
 
 
 class Discrepancy(Struct, frozen=True):
@@ -62,11 +62,11 @@ class Discrepancy(Struct, frozen=True):
     torque_after: float | None
 
 
-class Hint(Struct, frozen=True):
+class HintEntry(Struct, frozen=True):
     """Effects that passed validation and close too little to be named; closed: by held-out role."""
 
-    effects: list[Place]
-    indistinguishable: list[list[list[Place]]]
+    effects: list[EffectPlace]
+    indistinguishable: list[list[list[EffectPlace]]]
     closed: dict[str, float]
 
 
@@ -85,36 +85,36 @@ class Ranked(Placed, frozen=True, kw_only=True):
     explained: float | None
 
 
-class ScoreTest(Struct, frozen=True):
+class ScoreEntry(Struct, frozen=True):
     """All candidates against what a model leaves."""
 
     p: float | None
     ranking: list[Ranked]
-    failed: list[Place]
+    failed: list[EffectPlace]
 
 
-class Reason(Struct, frozen=True):
+class ReasonEntry(Struct, frozen=True):
     """Why a model failed its validation test."""
 
     reason: str
     text: str
 
 
-class ValidationTest(Struct, frozen=True):
+class ValidationEntry(Struct, frozen=True):
     """A model with effects, refitted on the train recording and judged on the validation recording.
 
     parts_before: how many effects the model had before.  chosen: share of resamples in which it, or one that looks
     like it, wins.
     """
 
-    parts: list[Place]
+    parts: list[EffectPlace]
     parts_before: int
     discrepancy_train: float | None
     discrepancy_validation: float | None
     p: float | None
     chosen: float | None
     passed: bool
-    reasons: list[Reason]
+    reasons: list[ReasonEntry]
 
 
 Axis = Literal[
@@ -122,7 +122,7 @@ Axis = Literal[
 ]
 
 
-class Cell(Struct, frozen=True, kw_only=True):
+class CellEntry(Struct, frozen=True, kw_only=True):
     """U of some instants and joints; what does not apply is None.
 
     axis: what the instants are sorted by.  found: by the sign-flip test, false discoveries 10 %.
@@ -153,8 +153,8 @@ class Cell(Struct, frozen=True, kw_only=True):
 class Cells(Struct, frozen=True):
     """Where the discrepancy is, with the base model and with the final one."""
 
-    before: list[Cell]
-    after: list[Cell]
+    before: list[CellEntry]
+    after: list[CellEntry]
 
 
 class Coefficient(Placed, frozen=True, kw_only=True):
@@ -191,7 +191,7 @@ def largest_shifts(shifts: Sequence[Shift]) -> list[Shift]:
     return sorted((s for s in shifts if math.isfinite(s.deviations)), key=lambda s: -abs(s.deviations))
 
 
-class Experiment(Struct, frozen=True):
+class ExperimentEntry(Struct, frozen=True):
     """A motion to record: distance in standard deviations between indistinguishable models."""
 
     what: str
@@ -199,7 +199,7 @@ class Experiment(Struct, frozen=True):
     not_made: str | None = ""
 
 
-class Trend(Placed, frozen=True, kw_only=True):
+class TrendEntry(Placed, frozen=True, kw_only=True):
     """How a coefficient changes from repeat to repeat."""
 
     coefficient: str
@@ -208,21 +208,21 @@ class Trend(Placed, frozen=True, kw_only=True):
     unit: str
 
 
-class FinalModel(Struct, frozen=True):
+class FinalModelEntry(Struct, frozen=True):
     """The model that is written to extended.json."""
 
     fitted_to: list[str]
     discrepancies: dict[str, float | None]
 
 
-class Split(Struct, frozen=True):
+class SplitEntry(Struct, frozen=True):
     """How the recordings were divided, and what cannot be concluded from that."""
 
     by: Literal["recordings", "repeats", "blocks"] = "recordings"
     limits: str = ""
 
 
-class Setup(Struct, frozen=True):
+class GapSetup(Struct, frozen=True):
     """Options of the command; its other entries are kept in `Gap.options`."""
 
     hidden: str = ""
@@ -234,10 +234,10 @@ class Answer(Struct, frozen=True, kw_only=True):
     """The part of gap.json that answers the question."""
 
     sentence: str
-    effects: list[Place]
+    effects: list[EffectPlace]
     discrepancies: dict[Role, Discrepancy]
     amendments: dict[str, str]
-    setup: Setup
+    setup: GapSetup
 
     @property
     def hidden(self) -> str:
@@ -258,8 +258,8 @@ class Found(Answer, frozen=True, kw_only=True):
     """gap.json."""
 
     verdict: Verdict
-    indistinguishable: list[list[list[Place]]]  # for each effect its alternatives, each a list of effects
-    hints: list[Hint]
+    indistinguishable: list[list[list[EffectPlace]]]  # for each effect its alternatives, each a list of effects
+    hints: list[HintEntry]
     doubts: list[str]
     config: dict[str, Any]
     about: dict[str, About]
@@ -269,20 +269,20 @@ class Found(Answer, frozen=True, kw_only=True):
     not_tried: str
     remainder: float | None
     explained: float | None
-    phases: dict[Role, list[Phase]]
-    score_tests: list[ScoreTest]
+    phases: dict[Role, list[PhaseEntry]]
+    score_tests: list[ScoreEntry]
     failed: list[str]
-    validation_tests: list[ValidationTest]
+    validation_tests: list[ValidationEntry]
     cells: Cells
     coefficients: list[Coefficient]
     shape_parameters: list[Coefficient]
     shifts: list[Shift]
-    experiments: list[Experiment]
-    trends: list[Trend]
+    experiments: list[ExperimentEntry]
+    trends: list[TrendEntry]
     units: str
-    final_model: FinalModel
-    findings: list[Finding] = field(default_factory=list)
-    split: Split = Split()
+    final_model: FinalModelEntry
+    findings: list[FindingEntry] = field(default_factory=list)
+    split: SplitEntry = SplitEntry()
     seconds: dict[str, float]
     versions: dict[str, str]
     device: str

@@ -16,14 +16,14 @@ from msgspec import structs
 from droid_jax.report import gap_figures, style
 from droid_jax.report.gap_folder import (
     About,
-    Cell,
-    Experiment,
+    CellEntry,
+    EffectPlace,
+    ExperimentEntry,
     Found,
     Gap,
-    Place,
     Role,
-    Trend,
-    ValidationTest,
+    TrendEntry,
+    ValidationEntry,
     largest_shifts,
 )
 from droid_jax.report.style import Drawing
@@ -50,11 +50,11 @@ def gap_view(gap: Gap) -> dict[str, Any]:
         "roles": ROLES,
         "decisive": DECISIVE,
         "significance": gap.found.threshold("significance"),
-        "doubts": doubts(gap),
+        "doubts": gap_doubts(gap),
         "coarse": coarse_share(gap),
         "within_fit": within_uncertainty(gap),
         "trends": trends(gap),
-        "next": next_step(gap),
+        "next": gap_next_step(gap),
         "where": where(gap),
         "best": best_experiment(gap),
         "groups": groups(gap.found),
@@ -65,7 +65,7 @@ def gap_view(gap: Gap) -> dict[str, Any]:
     }
 
 
-def doubts(gap: Gap) -> list[str]:
+def gap_doubts(gap: Gap) -> list[str]:
     """What to doubt of a search, by the names that gap_sentences.jinja has for them."""
     asked = {
         "validation_chose": "test" not in gap.roles and not gap.lost,
@@ -98,12 +98,12 @@ def within_uncertainty(gap: Gap) -> float | None:
     return 1.0 - max(left, 0.0) / after
 
 
-def trends(gap: Gap) -> list[Trend]:
+def trends(gap: Gap) -> list[TrendEntry]:
     """What changes significantly from repeat to repeat."""
     return [t for t in gap.found.trends if t.p is not None and t.p < gap.found.threshold("significance")]
 
 
-def next_step(gap: Gap) -> str:
+def gap_next_step(gap: Gap) -> str:
     """What to do next, by the names that gap_sentences.jinja has for it."""
     verdict = gap.found.verdict
     if verdict == "indistinguishable":
@@ -120,13 +120,13 @@ def next_step(gap: Gap) -> str:
     return verdict
 
 
-def best_experiment(gap: Gap) -> Experiment | None:
+def best_experiment(gap: Gap) -> ExperimentEntry | None:
     """The candidate experiment of the largest distance."""
     known = [e for e in gap.found.experiments if e.distance is not None]
     return max(known, key=lambda e: e.distance or 0.0, default=None)
 
 
-def decisive(experiment: Experiment) -> bool:
+def decisive(experiment: ExperimentEntry) -> bool:
     """Whether ten repeats of an experiment decide."""
     return (experiment.distance or 0.0) >= DECISIVE
 
@@ -142,7 +142,7 @@ def untrusted(gap: Gap) -> bool:
     return gap.found.verdict in ("unexplained", "fit not converged") or mostly_open(gap)
 
 
-def where(gap: Gap) -> list[Cell]:
+def where(gap: Gap) -> list[CellEntry]:
     """The largest cells of what is left, by joint and phase and by the object's state: those that the test finds, or
     all where there are no repeats to test.
     """
@@ -160,7 +160,7 @@ class Row:
     "larger discrepancy", "small gain", "simpler", "failed" or "failed alone" (in the model beside others).
     """
 
-    test: ValidationTest
+    test: ValidationEntry
     t: float | None
     explained: float | None
     outcome: str
@@ -173,7 +173,7 @@ class Group:
     beside: these effects.  discrepancy_train, discrepancy_validation: U of the model with them.
     """
 
-    beside: tuple[Place, ...]
+    beside: tuple[EffectPlace, ...]
     discrepancy_train: float | None
     discrepancy_validation: float | None
     rows: tuple[Row, ...]
@@ -186,7 +186,7 @@ def groups(found: Found) -> list[Group]:
 
 
 def _group(found: Found, count: int) -> Group:
-    tests: dict[tuple[Place, ...], ValidationTest] = {}
+    tests: dict[tuple[EffectPlace, ...], ValidationEntry] = {}
     for t in found.validation_tests:
         parts = tuple(t.parts)
         if t.parts_before == count and (parts not in tests or t.passed):  # a pair may be tried twice
@@ -207,7 +207,7 @@ def _group(found: Found, count: int) -> Group:
     return Group(beside, *before, tuple(order))
 
 
-def outcome(found: Found, test: ValidationTest) -> str:
+def outcome(found: Found, test: ValidationEntry) -> str:
     """What became of a model after its validation test, see `Row`."""
     parts, effects = set(test.parts), set(found.effects)
     if not test.passed:
@@ -228,7 +228,7 @@ def outcome(found: Found, test: ValidationTest) -> str:
     return "small gain" if len(test.parts) > 1 else "simpler"
 
 
-def alternatives(found: Found) -> list[Place]:
+def alternatives(found: Found) -> list[EffectPlace]:
     """The effects of all alternatives to the answer, each once."""
     models = (model for others in found.indistinguishable for model in others)
     return list(dict.fromkeys(place for model in models for place in model))
@@ -238,7 +238,7 @@ def alternatives(found: Found) -> list[Place]:
 class Signature:
     """Where the signature of an effect of the answer, or of an alternative to it, should appear."""
 
-    places: tuple[Place, ...]
+    places: tuple[EffectPlace, ...]
     alternative: bool
     about: About
 
@@ -303,7 +303,7 @@ def _draw(gap: Gap) -> dict[str, list[Drawing]]:
     return sections
 
 
-def _shown(gap: Gap, cells: Sequence[Cell]) -> Sequence[Cell]:
+def _shown(gap: Gap, cells: Sequence[CellEntry]) -> Sequence[CellEntry]:
     """Cells to draw; without repeats no test judges them, and all that hold an instant are shown unchanged."""
     if gap.repeated:
         return cells

@@ -10,7 +10,7 @@ import matplotlib.lines
 import numpy as np
 from matplotlib.figure import Figure
 
-from droid_jax.report.identify_folder import Cost, Parameter
+from droid_jax.report.identify_folder import CostEntry, FittedParameter
 from droid_jax.report.style import (
     AFTER,
     BEFORE,
@@ -28,7 +28,7 @@ from droid_jax.report.text import label
 
 
 @styled
-def intervals(parameters: Sequence[Parameter], width: float = WIDE) -> Figure:
+def interval_figure(parameters: Sequence[FittedParameter], width: float = WIDE) -> Figure:
     """Every parameter's 90 % interval in units of its initial deviation, 0 being its initial mean.
 
     A known truth is a green diamond, a parameter that is not identifiable is grey, one on a bound carries a square.
@@ -102,7 +102,7 @@ def correlation_map(names: Sequence[str], correlation: np.ndarray, width: float 
     return figure
 
 
-def _interval_legend(figure: Figure, parameters: Sequence[Parameter], width: float) -> None:
+def _interval_legend(figure: Figure, parameters: Sequence[FittedParameter], width: float) -> None:
     """The forest plot's legend: only what the drawing holds."""
     entries = [("initial 90 %", {"color": BEFORE, "alpha": 0.25, "linewidth": 8})]
     bar = {"linewidth": 3.2, "marker": "o", "markersize": 5}
@@ -123,7 +123,7 @@ def _interval_legend(figure: Figure, parameters: Sequence[Parameter], width: flo
 @styled
 def parameter_history(
     history: Mapping[str, Any],
-    parameters: Sequence[Parameter],
+    parameters: Sequence[FittedParameter],
     names: Sequence[str] | None = None,
     width: float = WIDE,
 ) -> Figure:
@@ -155,7 +155,7 @@ def parameter_history(
 
 
 @styled
-def cost_history(history: Mapping[str, Any], cost: Cost, width: float = WIDE) -> Figure:
+def cost_history(history: Mapping[str, Any], cost: CostEntry, width: float = WIDE) -> Figure:
     """Best and median cost per generation [G] in N m; the axis is logarithmic over more than a decade.
 
     cost: its best value and its noise floor are drawn as lines.
@@ -221,14 +221,14 @@ def cost_histograms(initial: np.ndarray, fitted: np.ndarray, unit: str = "N m", 
     return figure
 
 
-def most_identifiable(parameters: Sequence[Parameter], names: Mapping[str, Any]) -> list[str]:
+def most_identifiable(parameters: Sequence[FittedParameter], names: Mapping[str, Any]) -> list[str]:
     """Three to six names among `names`: the identifiable ones, the most narrowed first.
 
     Nuisances and parameters that are not identifiable come only if fewer than three are left.
     """
     known = [p for p in parameters if p.name in names]
 
-    def rank(p: Parameter) -> tuple[bool, float]:
+    def rank(p: FittedParameter) -> tuple[bool, float]:
         return (p.nuisance or not p.identifiable, p.std / p.initial_std)
 
     ranked = sorted(known, key=rank)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from msgspec import Struct, field
@@ -13,7 +13,7 @@ from msgspec import Struct, field
 from droid_jax.arguments import shown
 from droid_jax.files import CONFIG, CORRELATION, DISTRIBUTION, FILMS, FIT, HISTORY, REPLAY, REPLAY_FILM, TRACES
 from droid_jax.read_json import parse_json
-from droid_jax.report.reading import Finding, Phase, Reader
+from droid_jax.report.reading import FindingEntry, PhaseEntry, Reader
 
 MOVED = 1.0  # prior deviations: a parameter that is not identifiable and moved no less is reported as moved
 
@@ -25,7 +25,7 @@ class Partner(Struct, frozen=True):
     correlation: float
 
 
-class Parameter(Struct, frozen=True, kw_only=True):
+class FittedParameter(Struct, frozen=True, kw_only=True):
     """A fitted parameter in its unit; `moved` in deviations of its prior."""
 
     name: str
@@ -80,7 +80,7 @@ class Parameter(Struct, frozen=True, kw_only=True):
         return self.truth is not None and self.interval[0] <= self.truth <= self.interval[1]
 
 
-class TorqueDistance(Struct, frozen=True, kw_only=True):
+class DistanceEntry(Struct, frozen=True, kw_only=True):
     """Torque distance (equation 1) of one recording before and after the fit, and what repeats differ by."""
 
     before: float
@@ -93,7 +93,7 @@ class TorqueDistance(Struct, frozen=True, kw_only=True):
     per_joint_noise_floor: list[float] | None = None
 
 
-class Cost(Struct, frozen=True):
+class CostEntry(Struct, frozen=True):
     """The cost that the search minimised."""
 
     initial: float | None
@@ -117,31 +117,36 @@ class Check(Struct, frozen=True):
     engines_differ: bool
 
 
-class Fit(Struct, frozen=True):
+class Distances(Struct, frozen=True, kw_only=True):
+    """The torque distances of fit.json, by recording."""
+
+    gap: dict[str, DistanceEntry]
+    torque_unit: str = "N m"
+
+
+class FitFile(Distances, frozen=True, kw_only=True):
     """fit.json."""
 
-    parameters: list[Parameter]
-    gap: dict[str, TorqueDistance]  # by recording
-    cost: Cost
+    parameters: list[FittedParameter]
+    cost: CostEntry
     stop: str
     rule: str
-    torque_unit: str = "N m"
     converged: bool | None = True  # None: a search without refinement, which gives no widths
     mean_square: float | None = None  # of the whitened residuals
     generations: int | None = None
     evaluations: int | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
-    findings: list[Finding] = field(default_factory=list)
+    findings: list[FindingEntry] = field(default_factory=list)
     checks: dict[str, Check] = field(default_factory=dict)
 
     @property
-    def of_interest(self) -> list[Parameter]:
+    def of_interest(self) -> list[FittedParameter]:
         """The parameters, nuisances left out."""
         return [p for p in self.parameters if not p.nuisance]
 
     @property
-    def nuisances(self) -> list[Parameter]:
+    def nuisances(self) -> list[FittedParameter]:
         return [p for p in self.parameters if p.nuisance]
 
 
@@ -171,6 +176,7 @@ class RunConfig(Struct, frozen=True):
 
 
 _READ = Reader("identify")
+Of = TypeVar("Of", bound="Distances")
 _ROWS, _TABLES = ("generation", "best_cost", "median_cost"), ("mean", "std")  # of history.npz, [G] and [G, D]
 _TRACE_KEYS = ("time", "measured_mean", "measured_low", "measured_high", "before", "after", "joints")
 
@@ -187,7 +193,7 @@ class Run:
 
     folder: Path
     config: RunConfig
-    fit: Fit
+    fit: FitFile
     traces: Mapping[str, Mapping[str, Any]]
     history: Mapping[str, np.ndarray]
     correlation: Mapping[str, np.ndarray]
@@ -207,9 +213,9 @@ def has_run(folder: Path) -> bool:
     return (folder / FIT).exists()
 
 
-def read_fit(folder: Path) -> Fit:
-    """fit.json of a folder; ValueError where it is missing or broken."""
-    return _READ.json(folder / FIT, Fit)
+def read_fit(folder: Path, kind: type[Of] = FitFile) -> Of:
+    """fit.json of a folder, all of it or its `Distances`; ValueError where it is missing or broken."""
+    return _READ.json(folder / FIT, kind)
 
 
 def read_run(run: Path) -> Run:
@@ -284,11 +290,11 @@ def _traces(path: Path, recordings: Sequence[str]) -> dict[str, dict[str, Any]]:
     return traces
 
 
-def _phases(text: np.ndarray, where: str) -> list[Phase]:
+def _phases(text: np.ndarray, where: str) -> list[PhaseEntry]:
     """The phases of a recording, which traces.npz keeps as JSON."""
     _READ.shaped(text, (), where)
     try:
         phases = parse_json(str(text), where)
     except ValueError as error:
         raise _READ.fault(str(error)) from None
-    return _READ.typed(phases, list[Phase], where)
+    return _READ.typed(phases, list[PhaseEntry], where)

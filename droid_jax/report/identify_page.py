@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from droid_jax.recordings.split import FEWEST_REPEATS, HALVES
 from droid_jax.report import identify_figures, style, torque_figures
-from droid_jax.report.identify_folder import Fit, Parameter, Run, TorqueDistance
+from droid_jax.report.identify_folder import DistanceEntry, FitFile, FittedParameter, Run
 from droid_jax.report.style import Drawing, data_uri
 from droid_jax.report.text import label
 
@@ -36,7 +36,7 @@ def identify_view(run: Run, searched: bool) -> dict[str, Any]:
     """
     return {
         "run": run,
-        "doubts": doubts(run.fit),
+        "doubts": fit_doubts(run.fit),
         "next": next_steps(run, searched),
         "needed": needed([r.repeats for r in run.config.recordings]),
         "unidentifiable": [p for p in run.fit.of_interest if not p.identifiable and not p.moved_far],
@@ -50,7 +50,7 @@ def identify_view(run: Run, searched: bool) -> dict[str, Any]:
     }
 
 
-def doubts(fit: Fit) -> list[str]:
+def fit_doubts(fit: FitFile) -> list[str]:
     """What to doubt of a fit, by the names that identify_sentences.jinja has for them."""
     uncertain = [p for p in fit.of_interest if not p.identifiable]
     asked = {
@@ -90,14 +90,14 @@ def next_steps(run: Run, searched: bool) -> list[str]:
     return steps or ["train"]
 
 
-def far_off(fit: Fit) -> bool:
+def far_off(fit: FitFile) -> bool:
     """Whether the fit made it worse, or stayed so far from the data that its set-up is in doubt.
 
     Where no noise floor is known, two parameters at a bound have to say so.
     """
     bounds = sum(p.on_bound for p in fit.of_interest)
 
-    def far(gap: TorqueDistance) -> bool:
+    def far(gap: DistanceEntry) -> bool:
         floor = gap.noise_floor
         most = bounds >= 2 if floor is None else gap.after > FAR * floor
         return gap.after > gap.before or (most and gap.after > 0.5 * (gap.before + (floor or 0.0)))
@@ -105,18 +105,18 @@ def far_off(fit: Fit) -> bool:
     return any(far(gap) for gap in fit.gap.values())
 
 
-def lacks_something(fit: Fit) -> bool:
+def lacks_something(fit: FitFile) -> bool:
     """Whether noise alone does not explain what the fit left, by equation 1 and by its whitened residuals."""
     far = any(g.noise_floor and g.after > NOISY * g.noise_floor for g in fit.gap.values())
     return far or (fit.mean_square or 0.0) > MEAN_SQUARE
 
 
-def noiseless(fit: Fit) -> bool:
+def noiseless(fit: FitFile) -> bool:
     """Whether a fit is of single repeats, from which the noise is not known."""
     return any(gap.noise_floor is None for gap in fit.gap.values())
 
 
-def asked_of(fit: Fit) -> str:
+def asked_of(fit: FitFile) -> str:
     """The step that finds out whether the model of a `noiseless` fit lacks something: "search_log" or "repeats"."""
     log = len(fit.gap) <= 2 and all(gap.judged == "time" for gap in fit.gap.values())
     return "search_log" if log else "repeats"
@@ -132,9 +132,9 @@ def needed(repeats: Sequence[int]) -> tuple[int, int, bool] | None:
     return FEWEST_REPEATS, HALVES, alone and repeats[0] >= FEWEST_REPEATS
 
 
-def grouped(parameters: Iterable[Parameter]) -> dict[str, list[Parameter]]:
+def grouped(parameters: Iterable[FittedParameter]) -> dict[str, list[FittedParameter]]:
     """Parameters by group, in the order of the paper's Table I, other groups after it."""
-    groups: dict[str, list[Parameter]] = {name: [] for name in GROUPS}
+    groups: dict[str, list[FittedParameter]] = {name: [] for name in GROUPS}
     for p in parameters:
         groups.setdefault(p.group, []).append(p)
     return {g: ps for g, ps in groups.items() if ps}
@@ -156,7 +156,7 @@ def _draw(run: Run) -> dict[str, list[Drawing]]:
         add("distance", f"gap_{i}", title, torque_figures.distance_per_joint, *bars, fit.torque_unit)
         overlay = (traces, traces["phases"], fit.torque_unit)
         add("torque", f"torque_{i}", f"Torque over time{of}", torque_figures.torque_traces, *overlay)
-    add("parameters", "intervals", "90 % intervals", identify_figures.intervals, fit.of_interest)
+    add("parameters", "intervals", "90 % intervals", identify_figures.interval_figure, fit.of_interest)
     correlation = (run.correlation["names"], run.correlation["correlation"])
     add("parameters", "correlation", "Correlation", identify_figures.correlation_map, *correlation)
     title = "Parameters over generations"

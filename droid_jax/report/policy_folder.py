@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypedDict
 
-from msgspec import Struct, field, structs
+from msgspec import Struct, field
 
 from droid_jax.files import FILMS, TRAINING, TRANSFER
 from droid_jax.policy.trials import BLOWN_UP
@@ -24,17 +24,12 @@ class TrainingSetup(Struct, frozen=True):
     fit: str | None  # None: no fit, the prior
 
 
-class TrainingRobot(Struct, frozen=True):
-    """What is known of the synthetic robot that was fitted; nothing where your own recordings were."""
+class TrainingRobot(TypedDict, total=False):
+    """What is known of the synthetic robot that was fitted; empty where your own recordings were."""
 
-    springs: int | None = None
-    seed: int | None = None
-    hide: list[str] | None = None
-
-    @property
-    def known(self) -> dict[str, Any]:
-        """The entries that are known."""
-        return {name: value for name, value in structs.asdict(self).items() if value is not None}
+    springs: int
+    seed: int
+    hide: list[str] | None  # None: what is hidden by default
 
 
 class TrainedTask(Struct, frozen=True):
@@ -72,7 +67,7 @@ class Training(Struct, frozen=True, kw_only=True):
     @property
     def another_robot(self) -> bool:
         """Whether your own recordings were fitted: the synthetic robot is then another robot."""
-        return self.setup.fit is not None and not self.synthetic_robot.known
+        return self.setup.fit is not None and not self.synthetic_robot
 
 
 class Spread(Struct, frozen=True):
@@ -83,7 +78,7 @@ class Spread(Struct, frozen=True):
     all: list[float]
 
 
-class Grip(Struct, frozen=True):
+class GripEntry(Struct, frozen=True):
     """Mean share of actions with the knob gripped."""
 
     mean: float
@@ -96,7 +91,7 @@ class Rate(Struct, frozen=True):
     interval_95: tuple[float, float]
 
 
-class Trials(Rate, frozen=True):
+class TrialsEntry(Rate, frozen=True):
     """What came of the trials in one place (`policy.trials.Trials.to_json`)."""
 
     trials: int
@@ -104,7 +99,7 @@ class Trials(Rate, frozen=True):
     stopped: dict[str, int]
     angle_deg: Spread
     steps: Spread
-    grip: Grip
+    grip: GripEntry
     stopped_each: list[str] | None = None
 
     @property
@@ -151,8 +146,8 @@ class Rates(Struct, frozen=True):
 class Transfer(Struct, frozen=True):
     """transfer.json."""
 
-    simulation: Trials
-    synthetic_robot: Trials
+    simulation: TrialsEntry
+    synthetic_robot: TrialsEntry
     robot: TransferRobot
     no_films: str | None = None
     setup: dict[str, Any] = field(default_factory=dict)
@@ -171,7 +166,7 @@ class Trained:
     films: Mapping[str, Path]
 
     @property
-    def trials(self) -> dict[str, Trials]:
+    def trials(self) -> dict[str, TrialsEntry]:
         """Where the policy was tried -> what came of it."""
         if self.transfer is None:
             return {}

@@ -17,7 +17,7 @@ from droid_jax.report.gap_folder import Gap
 from droid_jax.report.gap_page import untrusted
 from droid_jax.report.identify_folder import Run
 from droid_jax.report.identify_page import far_off
-from droid_jax.report.policy_folder import Progress, Trained, Training, Trials
+from droid_jax.report.policy_folder import Progress, Trained, Training, TrialsEntry
 from droid_jax.report.style import AFTER, BEFORE, INK, MUTED, WIDE, Drawing, data_uri, legend, styled
 
 ENOUGH = 0.8  # success on the synthetic robot from which the next step is the robot
@@ -39,8 +39,8 @@ def policy_view(trained: Trained, run: Run | None = None, gap: Gap | None = None
     return {
         "policy": trained,
         "wrong": wrong,
-        "doubts": doubts(trained, wrong),
-        "next": "not to a robot" if wrong else next_step(trained, gap),
+        "doubts": policy_doubts(trained, wrong),
+        "next": "not to a robot" if wrong else policy_next_step(trained, gap),
         "gap_folder": gap.folder if gap else "",
         "best": max(trained.training.history, key=lambda now: (now.success, now.reward), default=None),
         "drawings": _draw(trained),
@@ -59,7 +59,7 @@ def wrong_model(training: Training, run: Run | None, gap: Gap | None) -> str:
     return "wrong" if gap and untrusted(gap) else ""
 
 
-def doubts(trained: Trained, wrong: str = "") -> list[str]:
+def policy_doubts(trained: Trained, wrong: str = "") -> list[str]:
     """What to doubt of a policy, by the names that policy_sentences.jinja has for them."""
     history = trained.training.history
     asked = {
@@ -70,7 +70,7 @@ def doubts(trained: Trained, wrong: str = "") -> list[str]:
     return [name for name, holds in asked.items() if holds]
 
 
-def next_step(trained: Trained, gap: Gap | None) -> str:
+def policy_next_step(trained: Trained, gap: Gap | None) -> str:
     """What to do next, by the names that policy_sentences.jinja has for it."""
     transfer, training = trained.transfer, trained.training
     if transfer is None:
@@ -114,7 +114,7 @@ def learning(history: Sequence[Progress], width: float = WIDE) -> Figure:
 
 
 @styled
-def angles(trials: Mapping[str, Trials], opened: float, width: float = WIDE) -> Figure:
+def angles(trials: Mapping[str, TrialsEntry], opened: float, width: float = WIDE) -> Figure:
     """Histogram of the largest angle of each trial that counts, by where it took place.
 
     opened: degrees that success asks for.

@@ -110,7 +110,7 @@ def read_replay(path: Path, read: Reader) -> tuple[np.ndarray, np.ndarray, np.nd
     return time, before, after
 
 
-class Finding(Struct, frozen=True):
+class FindingEntry(Struct, frozen=True):
     """What a check of a recording found (`preflight.findings`)."""
 
     kind: str
@@ -119,7 +119,7 @@ class Finding(Struct, frozen=True):
     sentence: str
 
 
-class Phase(Struct, frozen=True):
+class PhaseEntry(Struct, frozen=True):
     """A part of the motion, s."""
 
     name: str

@@ -40,7 +40,7 @@ class NoOpenGL(RuntimeError):
     """No OpenGL library on this machine can draw without a display."""
 
 
-def frames(
+def rendered_frames(
     model: mujoco.MjModel,
     qpos: np.ndarray,
     indices: Sequence[int],
@@ -113,7 +113,7 @@ def film(
     if any(len(states) != length for states in sides):
         raise ValueError(f"film: all sides must be as long as each other, got {[len(s) for s in sides]} states")
     every = max(1, round(1.0 / (RATE * period)), -(-length // LONGEST))
-    drawn = frames(model, np.concatenate(sides), _rows(length, every, len(sides)), camera, SIZE)
+    drawn = rendered_frames(model, np.concatenate(sides), _rows(length, every, len(sides)), camera, SIZE)
     images = np.concatenate(np.array_split(np.array(drawn), len(sides)), axis=2)
     pictures = [Image.fromarray(image) for image in images]
     shown = [round(1e3 * every * period)] * (len(pictures) - 1) + [round(1e3 * LAST)]

@@ -33,9 +33,17 @@ class Frames:
 
 
 def frames(folder: str | Path) -> Frames:
-    """The tables in a folder of `identify`, or of `all`.
+    """Read the tables of a fit as pandas data frames.
 
-    Raises ImportError where pandas is not installed, ValueError where the folder holds no whole fit.
+    Args:
+        folder: of a finished `identify`, or of `all`.
+
+    Returns:
+        Samples of the Gaussian, each parameter in its unit, and the search's history by generation.
+
+    Raises:
+        ImportError: pandas is not installed.
+        ValueError: the folder holds no whole fit.
     """
     if told := lacking("droid_jax.frames needs", "frames", "pandas"):
         raise ImportError(told)

@@ -39,7 +39,7 @@ def spelled(text: str) -> str:
     return IDENTIFIER.sub(lambda found: label(found[0]).lower(), text)
 
 
-def number(value: float | None, digits: int = 3) -> str:
+def significant(value: float | None, digits: int = 3) -> str:
     """A number with `digits` significant digits, a real minus sign, and a dash where there is none."""
     if value is None or not math.isfinite(value):
         return "–"
@@ -54,10 +54,10 @@ def number(value: float | None, digits: int = 3) -> str:
 def like(value: float | None, deviation: float) -> str:
     """A number with as many decimals as show two significant digits of its deviation."""
     if value is None or not math.isfinite(value) or not math.isfinite(deviation) or deviation <= 0:
-        return number(value)
+        return significant(value)
     decimals = max(0, 1 - math.floor(math.log10(deviation)))
     if decimals > 6 or abs(value) >= 1e6:
-        return number(value)
+        return significant(value)
     return f"{value:.{decimals}f}".replace("-", "−")
 
 
@@ -80,7 +80,7 @@ def unit_text(unit: str) -> str:
 
 def quantity(value: float | None, unit: str, digits: int = 3) -> str:
     """(0.7213, "N m") -> "0.721 N m"."""
-    return f"{number(value, digits)} {unit_text(unit)}".rstrip()
+    return f"{significant(value, digits)} {unit_text(unit)}".rstrip()
 
 
 def listed(names: Sequence[str]) -> str:
@@ -116,7 +116,7 @@ def nested(html: str) -> Markup:
 
 
 FILTERS = {
-    **{"number": number, "like": like, "percent": percent, "label": label, "spelled": spelled, "listed": listed},
+    **{"number": significant, "like": like, "percent": percent, "label": label, "spelled": spelled, "listed": listed},
     **{
         "unit": unit_text,
         "counted": counted,

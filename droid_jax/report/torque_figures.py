@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from droid_jax.report.reading import Phase
+from droid_jax.report.reading import PhaseEntry
 from droid_jax.report.style import (
     AFTER,
     BEFORE,
@@ -40,7 +40,7 @@ _STYLES: dict[str, dict[str, Any]] = {
 @styled
 def torque_traces(
     traces: Mapping[str, Any],
-    phases: Sequence[Phase] = (),
+    phases: Sequence[PhaseEntry] = (),
     unit: str = "N m",
     models: Mapping[str, str] = FITS,
     repeats: str = "5 to 95 % of repeats",
@@ -162,7 +162,7 @@ def fill(
     return True
 
 
-def shade(axes: Axes, phases: Sequence[Phase], named: bool) -> None:
+def shade(axes: Axes, phases: Sequence[PhaseEntry], named: bool) -> None:
     """Every other phase of the motion shaded; names at the top where asked for."""
     for i, phase in enumerate(phases):
         start, end = phase.start, phase.end

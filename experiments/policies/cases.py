@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.common import commits, stem
 from benchmarks.sharing import claimed
+from droid_jax.commands.source import TIMESTEP as TIMESTEP
 from droid_jax.door.environment import DoorEnv
 from droid_jax.door.task import Task
 from droid_jax.files import POLICY

@@ -28,9 +28,9 @@ def with_an_alternative(found: Small) -> Verdict:
     return replace(found.verdict, indistinguishable_models=(found.base,))
 
 
-def of_both(found: Small) -> FinalModel:
+def another_model(found: Small) -> FinalModel:
     """A final model that is not the search's own."""
-    return FinalModel(found.base, (found.case.train, found.case.validation))
+    return FinalModel(found.base, (found.case.train,))
 
 
 def failing(error: BaseException) -> Callable[..., Any]:
@@ -41,9 +41,9 @@ def failing(error: BaseException) -> Callable[..., Any]:
 
 
 def test_the_verdict_comes_first_and_then_each_amendment(found: Small, monkeypatch: pytest.MonkeyPatch):
-    open_verdict, both = with_an_alternative(found), of_both(found)
+    open_verdict, refitted = with_an_alternative(found), another_model(found)
     monkeypatch.setattr(missing, "separating_experiments", lambda case, models, recording: FASTER)
-    monkeypatch.setattr(missing, "final_refit", lambda *arguments: both)
+    monkeypatch.setattr(missing, "final_refit", lambda *arguments: refitted)
     first, second, third = amended(found.case, open_verdict, record("train"))
     assert first.states == {EXPERIMENTS: TO_BE_MADE, REFIT: TO_BE_MADE}
     assert (
@@ -52,7 +52,7 @@ def test_the_verdict_comes_first_and_then_each_amendment(found: Small, monkeypat
         and first.final.fitted_to == (found.case.train,)
     )
     assert second.verdict.experiments == FASTER and second.states == {EXPERIMENTS: MADE, REFIT: TO_BE_MADE}
-    assert third.final is both and third.states == {EXPERIMENTS: MADE, REFIT: MADE}
+    assert third.final is refitted and third.states == {EXPERIMENTS: MADE, REFIT: MADE}
 
 
 @pytest.mark.parametrize(
@@ -66,12 +66,12 @@ def test_the_verdict_comes_first_and_then_each_amendment(found: Small, monkeypat
 def test_what_fails_is_said_and_what_comes_after_it_is_made(
     found: Small, monkeypatch: pytest.MonkeyPatch, error: Exception, said: str
 ):
-    open_verdict, both = with_an_alternative(found), of_both(found)
+    open_verdict, refitted = with_an_alternative(found), another_model(found)
     monkeypatch.setattr(missing, "separating_experiments", failing(error))
-    monkeypatch.setattr(missing, "final_refit", lambda *arguments: both)
+    monkeypatch.setattr(missing, "final_refit", lambda *arguments: refitted)
     *_, last = amended(found.case, open_verdict, record("train"))
     assert last.states[EXPERIMENTS].startswith(f"{NOT_MADE}: {said}") and "\n" not in last.states[EXPERIMENTS]
-    assert last.states[REFIT] == MADE and last.final is both and last.verdict.experiments == ()
+    assert last.states[REFIT] == MADE and last.final is refitted and last.verdict.experiments == ()
     monkeypatch.setattr(missing, "final_refit", failing(error))
     *_, last = amended(found.case, open_verdict, record("train"))
     assert last.states[REFIT].startswith(f"{NOT_MADE}: {said}")
@@ -79,7 +79,7 @@ def test_what_fails_is_said_and_what_comes_after_it_is_made(
 
 
 def test_a_refit_that_cannot_be_written_is_no_final_model(found: Small, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(missing, "final_refit", lambda *arguments: of_both(found))
+    monkeypatch.setattr(missing, "final_refit", lambda *arguments: another_model(found))
     monkeypatch.setattr(missing, "extended", failing(ValueError("its covariance is singular")))
     *_, last = amended(found.case, found.verdict, record("train"))
     assert last.states[REFIT] == f"{NOT_MADE}: its covariance is singular" and last.final.model is found.verdict.model

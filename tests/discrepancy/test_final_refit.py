@@ -99,20 +99,32 @@ def test_the_file_says_what_it_is_fitted_to(found: Small, both: FinalModel, tmp_
 
 
 def test_a_final_model_that_blows_up_has_no_discrepancy_in_the_file(found: Small, both: FinalModel, tmp_path: Path):
-    lost = replace(found.case.validation, whitened=lambda rows: np.nan * found.case.validation.whitened(rows))
-    case = replace(found.case, validation=lost)
+    validation, at = found.case.validation, found.case.full_space.index("hinge_preload")
+
+    def whitened(rows: np.ndarray) -> np.ndarray:
+        return np.where(rows[:, at, None] == both.model.values[at], np.nan, validation.whitened(rows))
+
+    case = replace(found.case, validation=replace(validation, whitened=whitened))
     write_amended(tmp_path, case, found.verdict, both, MORE)
     final = json.loads((tmp_path / GAP).read_text())["final_model"]
     assert final["discrepancies"]["validation"] is None and final["discrepancies"]["train"] > 0
 
 
+def final_model_of(page: str) -> tuple[str, str] | None:
+    """What the page says of a final model of its own: its U as data, and the sentence."""
+    found = re.search(r'<p[^>]*id="final-model" data-value="([^"]*)">(.*?)</p>', page, re.DOTALL)
+    return None if found is None else (found[1], found[2])
+
+
 def test_the_page_says_what_it_is_fitted_to(found: Small, both: FinalModel, tmp_path: Path):
     write_gap(tmp_path, found.case, found.verdict, both, MORE)
-    page = write_report(tmp_path).read_text()
-    assert re.search("was fitted to “train” and “validation” together; on “validation” it leaves U = [0-9.e-]+", page)
+    said = final_model_of(write_report(tmp_path).read_text())
+    assert said is not None and "“train” and “validation”" in said[1]
+    assert float(said[0]) == pytest.approx(found.case.validation.discrepancy_at(both.model.values))
     written = json.loads((tmp_path / GAP).read_text())
     written["final_model"]["discrepancies"]["validation"] = None  # its replay blew up
     (tmp_path / GAP).write_text(json.dumps(written))
-    assert "was fitted to “train” and “validation” together.</p>" in write_report(tmp_path).read_text()
+    said = final_model_of(write_report(tmp_path).read_text())
+    assert said is not None and said[0] == "" and "U =" not in said[1]
     write_gap(tmp_path, found.case, found.verdict, found.own, MORE)
-    assert "together" not in write_report(tmp_path).read_text()
+    assert final_model_of(write_report(tmp_path).read_text()) is None

@@ -44,13 +44,14 @@ def whole(found: Small) -> tuple[Case, FittedModel]:
 def kept(case: Case, model: FittedModel, off: np.ndarray) -> float:
     """Share that stays of what the other recording does otherwise by `off` [M]."""
     validation = case.validation
-    # Less in the simulation is more in the residual, measured minus simulated.
-    whitened = lambda rows: validation.whitened(rows) - off * validation.repeats**0.5  # noqa: E731
-    other = replace(validation, whitened=whitened, nuisances=(), nuisance_columns=None)
-    alone = replace(validation, nuisances=(), nuisance_columns=None)
-    left = np.mean(
-        remaining_residuals(case.train, other, model) - remaining_residuals(case.train, alone, model), axis=0
+    other: Any = SimpleNamespace(
+        cost=validation.cost,
+        repeats=validation.repeats,
+        common=lambda values: validation.common(values) + off,
+        residuals=lambda values: validation.residuals(values) + off,
     )
+    more, usual = (remaining_residuals(case.train, each, model) for each in (other, validation))
+    left = np.mean(more - usual, axis=0)
     return float(np.sum(left**2) / np.sum(off**2))
 
 

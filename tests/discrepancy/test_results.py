@@ -18,6 +18,7 @@ from droid_jax.discrepancy.verdict import Conclusion, Experiment, unnamed
 from droid_jax.files import GAP, GAP_TRACES
 from droid_jax.model.effects.candidate import EffectKey
 from droid_jax.recordings.split import ROLES
+from droid_jax.report.gap_folder import largest_shifts, read_gap
 
 MORE = {"seconds": {"search": 1.0}, "versions": {}, "device": "test", "setup": {"recording": []}}
 PRELOAD_ENTRY = {"effect": "hinge_preload", "location": "door"}
@@ -202,6 +203,12 @@ def test_shifts_are_in_deviations_of_the_base_fit(answer: dict[str, Any]):
     truth = {"door_stiffness": 0.7 + wound, "forearm_mass": 0.9, "door_damping": 0.6}
     for name, value in truth.items():
         assert shifts[name]["after"] == pytest.approx(value, rel=0.15)
+
+
+def test_the_report_reads_it(folder: Path):
+    gap = read_gap(folder)
+    assert gap.roles == ["train", "validation"]
+    assert largest_shifts(gap.found.shifts)[0].name == "door_stiffness"
 
 
 def test_alternatives_experiments_and_what_was_not_tried_come_along(found: Small):

@@ -37,7 +37,9 @@ def repeats(seed: int, **coefficients: float) -> np.ndarray:
     return left + np.random.default_rng(seed).normal(size=(REPEATS, SIZE))
 
 
-def tested(data: np.ndarray, directions: Sequence[ScoreDirection] = DIRECTIONS, raw: np.ndarray = RAW) -> ScoreTest:
+def score_tested(
+    data: np.ndarray, directions: Sequence[ScoreDirection] = DIRECTIONS, raw: np.ndarray = RAW
+) -> ScoreTest:
     return scored(data, directions, raw, project(raw, BASE, LOOSE), largest_t)
 
 
@@ -58,20 +60,20 @@ def test_a_tight_prior_lets_a_base_column_explain_little():
 
 
 def test_the_missing_effect_is_found_with_its_size():
-    found = tested(repeats(1, a3=0.7))
+    found = score_tested(repeats(1, a3=0.7))
     assert found.ranking()[0] == 3 and found.p == pytest.approx(1 / 512)
     assert found.size[3] == pytest.approx(0.7, abs=0.05)
     assert found.explained[3] > 0.5 > 10 * np.delete(found.explained, 3).max()
 
 
 def test_nothing_missing_names_nothing():
-    p = [tested(repeats(seed)).p for seed in range(300)]
+    p = [score_tested(repeats(seed)).p for seed in range(300)]
     assert 0.02 < np.mean(np.array(p) < 0.05) < 0.09
 
 
 def test_what_the_base_can_absorb_is_no_effect():
     raw = np.concatenate([RAW[:4], (BASE @ np.arange(6.0))[None]])
-    found = tested(repeats(2, a1=0.5), raw=raw)
+    found = score_tested(repeats(2, a1=0.5), raw=raw)
     assert found.ranking()[0] == 1
     assert abs(found.explained[4]) < 1e-2
 
@@ -81,7 +83,7 @@ def test_the_ranking_takes_coefficients_together_and_inside_their_bounds():
     both = Candidate("both", "hinge", ("a3", "a4"))
     directions = (*DIRECTIONS[:3], ScoreDirection(both, "a3"), ScoreDirection(both, "a4"))
     data = repeats(3, a1=-0.8, a3=0.5, a4=-0.6)
-    found = tested(data, directions)
+    found = score_tested(data, directions)
     first, *rest = proposals(found, data, space)
     assert first.keys == (both.key,)
     assert first.sizes["a3"] == pytest.approx(0.5, abs=0.08) and first.sizes["a4"] == pytest.approx(-0.6, abs=0.08)
@@ -93,7 +95,7 @@ def test_the_ranking_takes_coefficients_together_and_inside_their_bounds():
 def test_pairs_are_ranked_together():
     space = Space(tuple(Parameter(f"a{k}", "N m", 0.0, 1.0, -5.0, 5.0) for k in range(5)))
     data = repeats(4, a0=0.5, a2=0.5)
-    found = tested(data)
+    found = score_tested(data)
     best = proposals(found, data, space, number=2)
     assert len(best) == 10 and set(best[0].keys) == {key(0), key(2)}
     few = proposals(found, data, space, number=2, among={key(1), key(2), key(3)})
@@ -104,7 +106,7 @@ def test_shapes_are_no_alternatives_of_each_other():
     space = Space((Parameter("a", "N m", 0.0, 1.0, -5.0, 5.0), Parameter("w", "rad", 0.1, 0.1, 0.0, 1.0)))
     shaped = tuple(ScoreDirection(Candidate("latch", "hinge", ("a",), {"w": w}), "a") for w in (0.1, 0.2, 0.3))
     data = repeats(5, a1=0.7)
-    (only,) = proposals(tested(data, shaped, RAW[:3]), data, space)
+    (only,) = proposals(score_tested(data, shaped, RAW[:3]), data, space)
     assert only.parts[0].shape_parameters == {"w": 0.2}
 
 
@@ -117,7 +119,7 @@ def test_directions_are_coefficients_of_candidates():
 def test_collinear_candidates_are_those_of_nearly_the_same_sensitivity():
     """By absolute cosine: one and its opposite are collinear, whatever their size."""
     near = RAW[0] + 0.3 * np.linalg.norm(RAW[0]) / np.linalg.norm(RAW[1]) * RAW[1]  # cosine of about 0.96
-    found = tested(repeats(6), raw=np.stack([RAW[0], -5.0 * RAW[0], near, RAW[3], RAW[4]]))
+    found = score_tested(repeats(6), raw=np.stack([RAW[0], -5.0 * RAW[0], near, RAW[3], RAW[4]]))
     assert collinear(found, {key(0)}, 0.9) == {key(0), key(1), key(2)}
     assert collinear(found, {key(0)}, 0.99) == {key(0), key(1)}
     assert collinear(found, {key(3), key(4)}, 0.9) == {key(3), key(4)}

@@ -183,7 +183,7 @@ def test_the_largest_trend_is_found_with_its_sign_and_size():
 TREND_REPEATS, TREND_SIZE = 10, 400
 
 
-def tested(sensitivities: np.ndarray) -> ScoreTest:
+def with_sensitivities(sensitivities: np.ndarray) -> ScoreTest:
     """A score test with these sensitivities [K, M] and nothing else."""
     names = [f"effect{k}" for k in range(len(sensitivities))]
     directions = tuple(ScoreDirection(Candidate(n, "hinge", (f"{n}_size",), {}), f"{n}_size") for n in names)
@@ -199,7 +199,9 @@ def sensitivities() -> np.ndarray:
 def test_the_slope_that_was_put_in_is_that_of_its_candidate(sensitivities: np.ndarray):
     noise = np.random.default_rng(2).normal(size=(TREND_REPEATS, TREND_SIZE))
     rising = -0.02 * np.arange(TREND_REPEATS)[:, None] * sensitivities[2]
-    found = trend(tested(sensitivities), noise + rising + 5.0 * sensitivities[1])  # what repeats share is no trend
+    found = trend(
+        with_sensitivities(sensitivities), noise + rising + 5.0 * sensitivities[1]
+    )  # what repeats share is no trend
     assert found is not None
     assert (found.key, found.coefficient) == (EffectKey("effect2", "hinge"), "effect2_size")
     assert found.per_repeat == pytest.approx(-0.02, abs=3 / (np.linalg.norm(sensitivities[2]) * np.sqrt(82.5)))
@@ -208,11 +210,14 @@ def test_the_slope_that_was_put_in_is_that_of_its_candidate(sensitivities: np.nd
 
 def test_without_a_trend_the_p_value_is_uniform(sensitivities: np.ndarray):
     rng = np.random.default_rng(3)
-    found = [trend(tested(sensitivities), rng.normal(size=(TREND_REPEATS, TREND_SIZE)), seed=k) for k in range(200)]
+    found = [
+        trend(with_sensitivities(sensitivities), rng.normal(size=(TREND_REPEATS, TREND_SIZE)), seed=k)
+        for k in range(200)
+    ]
     assert scipy.stats.kstest([t.p for t in found if t is not None], "uniform").pvalue > 0.01
     assert None not in found
 
 
 def test_two_repeats_or_no_candidate_have_no_trend(sensitivities: np.ndarray):
-    assert trend(tested(sensitivities), np.zeros((2, TREND_SIZE))) is None
-    assert trend(tested(sensitivities[:0]), np.zeros((TREND_REPEATS, TREND_SIZE))) is None
+    assert trend(with_sensitivities(sensitivities), np.zeros((2, TREND_SIZE))) is None
+    assert trend(with_sensitivities(sensitivities[:0]), np.zeros((TREND_REPEATS, TREND_SIZE))) is None

@@ -37,7 +37,7 @@ def extended(found: Small, key: EffectKey) -> FittedModel:
     return refit(case.train, case.base, (part,), found.base.values[None], case.config.refit)
 
 
-def tested(
+def on_validation(
     found: Small, *models: FittedModel, validation: ResidualSet | None = None, before: FittedModel | None = None,
     u0: float = FLOOR, **minimum_sizes: float,
 ) -> list[ValidationTest]:  # fmt: skip
@@ -58,13 +58,13 @@ def with_config(residual_set: ResidualSet, **thresholds: float) -> ResidualSet:
 
 
 def test_the_missing_effect_passes(found: Small):
-    (test,) = tested(found, extended(found, PRELOAD))
+    (test,) = on_validation(found, extended(found, PRELOAD))
     assert test.keys == (PRELOAD,) and test.before == 0
     assert test.passed and test.p < 0.01 and test.chosen == 1.0 and test.indistinguishable == ()
 
 
 def test_an_effect_below_the_minimum_size_is_weak(found: Small):
-    (test,) = tested(found, extended(found, PRELOAD), hinge_preload=9.0)
+    (test,) = on_validation(found, extended(found, PRELOAD), hinge_preload=9.0)
     assert reasons(test) == [Reason.BELOW_MINIMUM_SIZE] and test.weak
 
 
@@ -78,7 +78,7 @@ def test_a_coefficient_at_its_neutral_bound_may_be_zero(found: Small):
     for factor, zero in ((1.0, True), (2.5, False)):
         values = model.values.copy()
         values[at] = factor * deviation
-        (test,) = tested(found, replace(model, values=values))
+        (test,) = on_validation(found, replace(model, values=values))
         low, high = test.interval[name]
         assert (low <= 0.0 <= high) is zero and low <= values[at] <= high
         texts = [r.text for r in test.reasons if r.reason is Reason.MAY_BE_ZERO]
@@ -146,7 +146,7 @@ def test_a_coefficient_at_its_other_bound_has_run_into_it(found: Small, side: st
     values, p = model.values.copy(), found.case.full_space[name]
     values[found.case.full_space.index(name)] = getattr(p, side)
     stuck = replace(model, values=values)
-    (test,) = tested(found, stuck)
+    (test,) = on_validation(found, stuck)
     (text,) = [r.text for r in test.reasons if r.reason is Reason.AT_BOUND]
     assert text.startswith(name) and f"{getattr(p, side):g} N m" in text
     case = found.case
@@ -161,10 +161,10 @@ def test_what_the_repeats_do_not_agree_on_is_not_confirmed(found: Small):
     validation, model = found.case.validation, extended(found, PRELOAD)
     assert isinstance(validation.resampling, Repeats)
     loud = replace(validation, resampling=Repeats(50 * validation.resampling.deviations))
-    (test,) = tested(found, model, validation=loud, u0=-1e9)
+    (test,) = on_validation(found, model, validation=loud, u0=-1e9)
     assert reasons(test) == [Reason.NOT_CONFIRMED] and test.weak
     assert test.p >= loud.config.confirmation
-    (lenient,) = tested(found, model, validation=with_config(loud, confirmation=1.0), u0=-1e9)
+    (lenient,) = on_validation(found, model, validation=with_config(loud, confirmation=1.0), u0=-1e9)
     assert lenient.passed and lenient.p == test.p
 
 
@@ -179,9 +179,9 @@ def test_a_further_effect_must_take_more_than_the_first(found: Small, monkeypatc
     some = replace(model, values=values)
     assert 0.6 < case.validation.discrepancy_at(values) / case.validation.discrepancy_at(found.base.values) < 0.8
     for parts, rejected in (((), False), ((replace(model.parts[0], coefficients=("drag",)),), True)):
-        (test,) = tested(found, some, before=replace(found.base, parts=parts))
+        (test,) = on_validation(found, some, before=replace(found.base, parts=parts))
         assert (Reason.SMALL_GAIN in reasons(test)) is rejected and test.before == len(parts)
-    (strict,) = tested(found, some, validation=with_config(case.validation, least_gain=0.5))
+    (strict,) = on_validation(found, some, validation=with_config(case.validation, least_gain=0.5))
     assert Reason.SMALL_GAIN in reasons(strict)
 
 
@@ -192,7 +192,7 @@ def test_one_that_another_beats_in_the_resamples_is_not_named(found: Small):
     values[case.full_space.index("hinge_preload")] *= 2 / 3
     wrong = replace(right, values=values)
     unlike = replace(with_config(case.validation, equivalence_doubt=1.0), equivalence_factor=1.0)
-    best, worse = tested(found, right, wrong, validation=unlike)
+    best, worse = on_validation(found, right, wrong, validation=unlike)
     assert best.passed and best.chosen == 1.0 and best.indistinguishable == ()
     assert worse.chosen == 0.0 and reasons(worse) == [Reason.RARELY_BEST] and not worse.weak
     assert right.name in worse.reasons[0].text
@@ -253,7 +253,7 @@ def test_a_model_that_blows_up_on_the_validation_motion_loses(found: Small):
     fragile = replace(case.validation, whitened=whitened)
     with pytest.raises(NotReplayed, match="blows up with parameters that were fitted to another recording"):
         fragile.discrepancy_at(wild.values)
-    worse, best = tested(found, wild, model, validation=fragile)
+    worse, best = on_validation(found, wild, model, validation=fragile)
     assert best.passed and best.indistinguishable == ()
     assert (worse.discrepancy_validation, worse.p, worse.chosen) == (np.inf, 1.0, 0.0)
     assert Reason.REPLAY_FAILED in reasons(worse)

@@ -212,7 +212,7 @@ def made_up(found: Small, names: str) -> FittedModel:
     return replace(found.verdict.model, parts=tuple(Candidate(name, "door", ()) for name in names))
 
 
-def tested(names: str, *alike: str) -> ValidationTest:
+def passing(names: str, *alike: str) -> ValidationTest:
     return ValidationTest(at_door(names), 0, 0.0, 0.1, 0.0, {}, 1.0, (), tuple(map(at_door, alike)))
 
 
@@ -221,8 +221,8 @@ def selecting(found: Small, before: str, winner: str, *alike: str) -> SelectionS
     models = (winner, *alike)
     return SelectionStep(
         found.verdict.score_tests[0], at_door(before), (), tuple(made_up(found, names) for names in models),
-        (tested(winner, *alike), *(tested(names, winner) for names in alike)),
-        made_up(found, winner), tested(winner, *alike),
+        (passing(winner, *alike), *(passing(names, winner) for names in alike)),
+        made_up(found, winner), passing(winner, *alike),
     )  # fmt: skip
 
 

@@ -292,7 +292,7 @@ def test_a_trained_policy_opens_by_its_grip(door: str, archived: Callable[[str],
     assert rates["synthetic_robot"] >= 0.8 and rates["slippery"] < 0.2
 
 
-WITHOUT_A_GRIP = {"paper/mean_4", "paper/fitted_3", "paper/fitted_4"}  # docs/paper.md says how they open it
+WITHOUT_A_GRIP = {"paper/mean_4", "paper/fitted_3", "paper/fitted_4"}  # docs/history/policy-experiments.md
 
 
 def test_which_reported_policies_open_without_a_grip(archived: Callable[[str], Path]):

@@ -273,8 +273,8 @@ def test_half_a_file_is_not_json(saved: Path, tmp_path: Path):
 
 
 def test_the_three_lines_of_the_document_run(found: Small, saved: Path, monkeypatch: pytest.MonkeyPatch):
-    """docs/gap-command.md, as it is printed; runs/gap is this test's folder."""
-    text = (ROOT / "docs" / "gap-command.md").read_text()
+    """docs/gap.md, as it is printed; runs/gap is this test's folder."""
+    text = (ROOT / "docs" / "gap.md").read_text()
     (code,) = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     assert "runs/gap/extended.json" in code
     scene, _ = small_scene()

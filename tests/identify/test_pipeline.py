@@ -37,7 +37,7 @@ from droid_jax.identify.search import SearchConfig
 from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Channel
-from droid_jax.report.identify_folder import Fit
+from droid_jax.report.identify_folder import FitFile
 from droid_jax.storage import config_json
 
 QUICK = IdentifyConfig(search=SearchConfig(population=8, parents=None, generations=2), refine=None, samples=2)
@@ -155,9 +155,9 @@ def test_the_command_says_how_it_went_and_what_to_do(found: Identified, tmp_path
         ({"mean_square": 90.0}, [16], "gap` searches for what the model lacks\n"),
         ({"mean_square": 1.0, "gap": alone}, [1], "one repeat does not separate noise from what the model lacks: let"),
     ):
-        _summary(found, msgspec.convert({**fit, **changes}, Fit), repeats)
+        _summary(found, msgspec.convert({**fit, **changes}, FitFile), repeats)
         assert said in capsys.readouterr().out
-        _summary(found, msgspec.convert({**fit, "mean_square": 1.0}, Fit), repeats)
+        _summary(found, msgspec.convert({**fit, "mean_square": 1.0}, FitFile), repeats)
         assert said not in capsys.readouterr().out
 
 

@@ -26,7 +26,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
         states.append(np.asarray(qpos)[list(indices)])
         return [np.full((*size, 3), int(200 * state[0]), np.uint8) for state in states[-1]]
 
-    monkeypatch.setattr(module, "frames", frames)
+    monkeypatch.setattr(module, "rendered_frames", frames)
     return states
 
 

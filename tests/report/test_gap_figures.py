@@ -6,12 +6,12 @@ import io
 
 import numpy as np
 import pytest
-from droid_jax.report.words import number
 from made_up_gap import make_gap
 from msgspec import structs
 
 from droid_jax.report import gap_figures, style
 from droid_jax.report.gap_folder import Gap, Shift, read_gap
+from droid_jax.report.text import significant
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def test_the_maps_share_one_scale_and_leave_out_what_is_not_found(named: Gap) ->
     np.testing.assert_array_equal(~np.ma.getmaskarray(np.ma.asarray(after.get_array())).ravel(), found)
     largest = max(c.discrepancy or 0.0 for c in cells.before if c.axis == "phase")
     assert np.max(np.asarray(before.get_array())) == largest
-    assert number(largest, 2) in {t.get_text() for t in first.texts}
+    assert significant(largest, 2) in {t.get_text() for t in first.texts}
 
 
 def test_figures_survive_odd_numbers(named: Gap) -> None:

@@ -13,7 +13,7 @@ import pytest
 from made_up_gap import cell, make_gap
 
 from droid_jax.report import page
-from droid_jax.report.gap_folder import LOST, Cell, Shift, Split, largest_shifts, read_answer, read_gap
+from droid_jax.report.gap_folder import LOST, CellEntry, Shift, SplitEntry, largest_shifts, read_answer, read_gap
 from droid_jax.report.gap_page import _shown
 
 BLOCKS = {"by": "blocks", "limits": ""}
@@ -82,7 +82,7 @@ def test_what_is_said_agrees_with_the_search() -> None:
     from droid_jax.discrepancy import verdict
     from droid_jax.recordings import split
 
-    assert {s.value for s in split.Split} == set(get_args(Split.__annotations__["by"])) or {
+    assert {s.value for s in split.Split} == set(get_args(SplitEntry.__annotations__["by"])) or {
         s.value for s in split.Split
     } == {"recordings", "repeats", "blocks"}
     assert verdict.LOST == LOST
@@ -102,8 +102,8 @@ def test_a_log_is_drawn_in_order_of_time(tmp_path: Path) -> None:
     assert (test[0], roles) == (("test",), ("train", "validation"))
     for key, values in whole.items():
         np.testing.assert_array_equal(drawn[key], values)
-    empty = Cell(**cell("phase", 0.0, "elbow", label="later", low=9.0))
-    (shown,) = _shown(gap, [empty, Cell(**cell("phase", 0.01, "elbow"))])
+    empty = CellEntry(**cell("phase", 0.0, "elbow", label="later", low=9.0))
+    (shown,) = _shown(gap, [empty, CellEntry(**cell("phase", 0.01, "elbow"))])
     assert shown.found and shown.discrepancy == 0.01
 
 
@@ -113,7 +113,7 @@ def test_halves_of_the_repeats_are_drawn_apart(tmp_path: Path) -> None:
 
 
 def test_an_object_on_a_slide_has_a_position_and_no_angle() -> None:
-    slide, hinge = (Cell(**cell("object_angle", 1.0, low=0.0, high=0.14, unit=unit)) for unit in ("m", "rad"))
+    slide, hinge = (CellEntry(**cell("object_angle", 1.0, low=0.0, high=0.14, unit=unit)) for unit in ("m", "rad"))
     assert (slide.name, hinge.name) == ("Object position", "Object angle")
 
 

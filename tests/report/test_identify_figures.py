@@ -14,8 +14,8 @@ from made_up_run import JOINTS, make_run, parameters
 from matplotlib.figure import Figure
 
 from droid_jax.report import identify_figures, torque_figures
-from droid_jax.report.identify_folder import Cost, Parameter, read_run
-from droid_jax.report.reading import Phase
+from droid_jax.report.identify_folder import CostEntry, FittedParameter, read_run
+from droid_jax.report.reading import PhaseEntry
 from droid_jax.report.style import BEFORE, NARROW, SVG_LIMIT, WIDE, inline_svg, settled
 from droid_jax.report.text import label
 
@@ -105,7 +105,7 @@ def test_torque_figure_draws_the_given_traces(run: Path) -> None:
 def test_the_name_of_a_short_last_phase_is_not_cut(run: Path) -> None:
     traces = read_run(run).traces["open_close"]
     end = float(traces["time"][-1])
-    phases = [Phase("opening", 0.0, 0.97 * end), Phase("hold", 0.97 * end, end)]
+    phases = [PhaseEntry("opening", 0.0, 0.97 * end), PhaseEntry("hold", 0.97 * end, end)]
     figure = settled(torque_figures.torque_traces(traces, phases))
     name = next(text for text in figure.axes[0].texts if text.get_text() == "hold")
     assert name.get_window_extent().x1 <= figure.axes[0].get_window_extent().x1 + 0.5  # pixels
@@ -120,7 +120,7 @@ def test_a_long_torque_figure_stays_a_drawing_on_the_page(run: Path) -> None:
 
 def test_figures_survive_failed_replays() -> None:
     history = {"generation": np.arange(4), "best_cost": [np.inf, 2.0, 1.0, 0.5], "median_cost": [np.inf] * 4}
-    assert isinstance(identify_figures.cost_history(history, Cost(1.0, 0.5, None)), Figure)
+    assert isinstance(identify_figures.cost_history(history, CostEntry(1.0, 0.5, None)), Figure)
     costs = np.array([np.inf, 1.0, 2.0])
     legend = identify_figures.cost_histograms(costs, costs[1:]).legends[0]
     assert any("1 without a finite cost" in t.get_text() for t in legend.get_texts())
@@ -129,7 +129,7 @@ def test_figures_survive_failed_replays() -> None:
 
 
 def test_the_best_identified_parameters_are_chosen() -> None:
-    made = [msgspec.convert(p, Parameter) for p in parameters()]
+    made = [msgspec.convert(p, FittedParameter) for p in parameters()]
     chosen = identify_figures.most_identifiable(made, {p.name: 0 for p in made})
     ratio = {p.name: p.std / p.initial_std for p in made}
     assert chosen[0] == "hinge_stiffness" and "door_mass" not in chosen and "door_x" not in chosen

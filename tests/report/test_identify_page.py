@@ -17,8 +17,8 @@ from reader import Page, read_page, spaced
 
 from droid_jax.preflight.findings import Finding
 from droid_jax.report import page
-from droid_jax.report.identify_folder import Parameter, Run, read_run
-from droid_jax.report.identify_page import doubts, needed, next_steps
+from droid_jax.report.identify_folder import FittedParameter, Run, read_run
+from droid_jax.report.identify_page import fit_doubts, needed, next_steps
 from droid_jax.report.text import lines
 
 WRONG = Finding("sign", "elbow", -0.99, 1.0, "certain", "recording 'x': the torque of <elbow> runs against its command")
@@ -133,8 +133,8 @@ def test_the_page_says_what_the_fit_was_judged_on(changed: Callable, judged: str
 )
 def test_what_to_doubt_and_what_to_do(changed: Callable, change: Callable, doubt: str, step: str) -> None:
     run, written = changed(change)
-    assert doubt in doubts(run.fit) and written.doubts[doubt].strip()
-    assert list(written.doubts) == doubts(run.fit)
+    assert doubt in fit_doubts(run.fit) and written.doubts[doubt].strip()
+    assert list(written.doubts) == fit_doubts(run.fit)
     steps = next_steps(run, searched=False)
     assert (step in steps or not step) and written.ids["identify-next"]["data-next"].split() == steps
     assert spaced(written.ids["identify-next"]["text"]).count("; ") >= len(steps) - 1
@@ -176,7 +176,7 @@ def test_a_fit_far_from_the_data_doubts_the_set_up_first(
     for k, p in enumerate(fit["parameters"]):
         p["on_bound"] = k < bounds
     (folder / "fit.json").write_text(json.dumps(fit))
-    assert ("far_off" in doubts(read_run(folder).fit)) == doubted
+    assert ("far_off" in fit_doubts(read_run(folder).fit)) == doubted
     assert (next_steps(read_run(folder), searched=False)[0] == "set_up") == doubted
     lead = read_page(page.write_report(make_gap(folder))).ids["lead-next"]  # a search beside it
     said = spaced(lead["text"]).strip()
@@ -268,9 +268,9 @@ def test_a_parameter_that_moved_says_how_far_and_why_it_is_uncertain(changed: Ca
     run, _ = changed(lambda fit: fit["parameters"].append(moved))
     p = run.fit.parameters[-1]
     assert p.moved_far and p.deviations == 5.0 and p.bound == "upper" and p.bound_value == 0.35
-    old = msgspec.convert({**moved, "moved": None}, Parameter)
+    old = msgspec.convert({**moved, "moved": None}, FittedParameter)
     assert old.deviations == pytest.approx(5.0)
-    assert not msgspec.convert({**moved, "moved": 0.2}, Parameter).moved_far
+    assert not msgspec.convert({**moved, "moved": 0.2}, FittedParameter).moved_far
     said = lines(
         "identify.txt.jinja", fit=run.fit, seconds=1.0, asked="", far_off=False, lacks_something=False, needs=None
     )

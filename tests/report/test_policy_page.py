@@ -14,7 +14,7 @@ from droid_jax.policy.trials import BLOWN_UP
 from droid_jax.report import page
 from droid_jax.report.gap_folder import read_gap
 from droid_jax.report.policy_folder import read_policy
-from droid_jax.report.policy_page import doubts, next_step
+from droid_jax.report.policy_page import policy_doubts, policy_next_step
 
 
 @pytest.fixture(scope="module")
@@ -61,23 +61,23 @@ def test_it_says_what_to_do_next(
         content["simulation"]["success_rate"] = simulated
         (made / "transfer.json").write_text(json.dumps(content))
     following = read_page(page.write_report(made)).ids["policy-next"]
-    assert following["data-next"] == next_step(read_policy(made), None) == step
+    assert following["data-next"] == policy_next_step(read_policy(made), None) == step
     assert command in spaced(following["text"])
 
 
 def test_a_search_beside_it_changes_what_to_do(tmp_path: Path, quick: None):
     trained = read_policy(make_policy(tmp_path / "run" / "train", 10))
     gap = make_gap(tmp_path / "run" / "gap", "named")
-    assert next_step(trained, read_gap(gap)) == "train on the extended model"
+    assert policy_next_step(trained, read_gap(gap)) == "train on the extended model"
     assert f"train --fit {gap}" in read_page(page.write_report(tmp_path / "run")).ids["policy-next"]["text"]
-    assert next_step(trained, read_gap(make_gap(tmp_path / "no", "none"))) == "film"
+    assert policy_next_step(trained, read_gap(make_gap(tmp_path / "no", "none"))) == "film"
 
 
 def test_a_training_that_reached_95_percent_in_no_evaluation_is_not_tried_but_made_longer(tmp_path: Path):
     """One evaluation at 95 % is enough: the best policy is kept."""
     for best, step in ((0.94, "train longer"), (0.95, "evaluate")):
         history = [{"step": 1, "seconds": 1.0, "rate": 1.0, "reward": 1.0, "success": s} for s in (0.0, best, 0.5)]
-        assert next_step(read_policy(make_policy(tmp_path / f"{best}", None, history=history)), None) == step
+        assert policy_next_step(read_policy(make_policy(tmp_path / f"{best}", None, history=history)), None) == step
 
 
 def test_a_synthetic_robot_that_was_not_fitted_says_little(tmp_path: Path, quick: None):
@@ -128,7 +128,7 @@ def test_broken_files_are_named(tmp_path: Path, name: str, content: str, fault: 
         (
             "training.json",
             lambda of: of["synthetic_robot"].update(springs="1"),
-            "'springs' must be a whole number or null, got '1'",
+            "'springs' must be a whole number, got '1'",
         ),
         ("transfer.json", lambda of: of["robot"]["hidden"][0].update(joint=["x"]), "'joint' must be text or null"),
         ("transfer.json", lambda of: of["simulation"]["success"].pop(), "'success' has 39 trials, 'trials' says 40"),
@@ -170,6 +170,6 @@ def test_a_training_that_ended_in_nan_says_so(tmp_path: Path, quick: None):
     history = training_json()["history"]
     for last, ended in ((history, False), (history[:3], True)):
         made = make_policy(tmp_path / f"{len(last)}", None, history=last)
-        assert ("ended_early" in doubts(read_policy(made))) is ended
+        assert ("ended_early" in policy_doubts(read_policy(made))) is ended
         said = read_page(page.write_report(made)).doubts.get("ended_early", "")
         assert ("before the 2 million actions" in spaced(said)) is ended

@@ -27,7 +27,7 @@ def test_frames_show_where_the_body_is() -> None:
     _backend()
     model = mujoco.MjModel.from_xml_string(XML)
     qpos = np.array([[-0.5], [0.0], [0.5]])
-    images = render.frames(model, qpos, [0, 1, -1], size=(48, 64))
+    images = render.rendered_frames(model, qpos, [0, 1, -1], size=(48, 64))
     centres = []
     for image in images:
         assert image.shape == (48, 64, 3) and image.dtype == np.uint8
@@ -42,15 +42,15 @@ def test_frames_refuse_what_does_not_fit_the_model() -> None:
 
     model = mujoco.MjModel.from_xml_string(XML)
     with pytest.raises(ValueError, match=r"\[T, 1\].*\(3, 2\)"):
-        render.frames(model, np.zeros((3, 2)), [0], size=(48, 64))
+        render.rendered_frames(model, np.zeros((3, 2)), [0], size=(48, 64))
     with pytest.raises(ValueError, match="index 3 is outside"):
-        render.frames(model, np.zeros((3, 1)), [3], size=(48, 64))
+        render.rendered_frames(model, np.zeros((3, 1)), [3], size=(48, 64))
     with pytest.raises(ValueError, match="row 1 is not finite"):
-        render.frames(model, np.array([[0.0], [np.nan]]), [0, 1], size=(48, 64))
+        render.rendered_frames(model, np.array([[0.0], [np.nan]]), [0, 1], size=(48, 64))
     with pytest.raises(ValueError, match="no camera 'back'; this model has: front"):
-        render.frames(model, np.zeros((1, 1)), [0], camera="back", size=(48, 64))
+        render.rendered_frames(model, np.zeros((1, 1)), [0], camera="back", size=(48, 64))
     with pytest.raises(ValueError, match=r"\(48, 64\), got \(480, 640\)"):
-        render.frames(model, np.zeros((1, 1)), [0])
+        render.rendered_frames(model, np.zeros((1, 1)), [0])
 
 
 def test_without_opengl_the_message_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from markupsafe import Markup
 
-from droid_jax.report.text import label, like, number, percent, quantity, speak, spelled, unbroken, unit_text
+from droid_jax.report.text import label, like, percent, quantity, significant, speak, spelled, unbroken, unit_text
 
 
 @pytest.mark.parametrize(
@@ -27,7 +27,7 @@ def test_joints_of_different_names_have_different_labels(name: str, words: str) 
      (None, "–"), (float("nan"), "–")],
 )  # fmt: skip
 def test_numbers_are_written_with_three_digits(value: float | None, shown: str) -> None:
-    assert number(value) == shown
+    assert significant(value) == shown
 
 
 def test_numbers_follow_their_deviation() -> None:

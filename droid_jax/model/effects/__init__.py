@@ -4,5 +4,5 @@
     effects = library(scene)  # all that the scene can have, each at neutral
 
 An effect of your own is a function Scene -> Effect (or None where the scene cannot have it) with
-the decorator `registry.register`; see docs/method-gap.md.
+the decorator `registry.register`; see docs/your-effect.md.
 """
