@@ -93,7 +93,7 @@ _HOMES = {
     "fitted_mjcf": ("model.mjcf", "fitted_mjcf"),
     "find_missing_effects": ("discrepancy.missing", "find_missing_effects"),
     "DiscrepancyConfig": ("discrepancy.case", "DiscrepancyConfig"),
-    "load_extended": ("discrepancy.extended", "load_extended"),
+    "load_extended": ("identify.extended_model", "load_extended"),
     "randomised": ("policy.randomise", "randomised"),
     "randomised_model": ("policy.randomise", "randomised_model"),
     "frames": ("report.tables", "frames"),
