@@ -37,6 +37,8 @@ from droid_jax.model.parameters import Space
 from droid_jax.preflight.findings import Finding
 from droid_jax.storage import config_json, finite, write_csv, write_json, write_npz, write_text
 
+FORMAT, VERSION = "droid_jax fit", 2
+
 
 def prepare_folder(folder: Path) -> Path:
     """Make a results folder and see that it can be written; OSError becomes one clear ValueError."""
@@ -91,7 +93,7 @@ def write_run(
 
 
 def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) -> dict[str, Any]:
-    """The fit as plain data: parameters with intervals, gaps, costs, why it stopped."""
+    """The fit as plain data: parameters with intervals, torque distances, costs, why it stopped."""
     low, high = found.full_gaussian.interval(0.9)
     initial = np.stack(prior(found.full).interval(0.9), axis=1)
     mean, std = found.full_gaussian.physical_mean, found.full_gaussian.physical_std
@@ -130,6 +132,8 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
     unit = found.scene.torque_unit(found.scene.joints[c] for c in comparison.channel("torque").columns)
     evaluations = found.search.evaluations + (found.refined.evaluations if found.refined else 0)
     return {
+        "format": FORMAT,
+        "version": VERSION,
         "parameters": parameters,
         "cost": {
             "initial": float(costs[0]),
@@ -137,7 +141,7 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
             "noise_floor": None if whitened or None in floors else float(np.mean(floors)),
             "unit": "noise units" if whitened else unit,
         },
-        "gap": {name: asdict(gap) for name, gap in found.torque_distances.items()},
+        "torque_distances": {name: asdict(distance) for name, distance in found.torque_distances.items()},
         "torque_unit": unit,
         "stop": found.search.stop,
         "converged": None if found.refined is None else found.refined.converged,

@@ -15,6 +15,7 @@ from droid_jax.files import CONFIG, CORRELATION, DISTRIBUTION, FILMS, FIT, HISTO
 from droid_jax.read_json import parse_json
 from droid_jax.report.reading import FindingEntry, PhaseEntry, Reader
 
+FIT_VERSION = 2
 MOVED = 1.0  # prior deviations: a parameter that is not identifiable and moved no less is reported as moved
 
 
@@ -120,7 +121,8 @@ class Check(Struct, frozen=True):
 class Distances(Struct, frozen=True, kw_only=True):
     """The torque distances of fit.json, by recording."""
 
-    gap: dict[str, DistanceEntry]
+    torque_distances: dict[str, DistanceEntry] = field(default_factory=dict)
+    version: int = 1
     torque_unit: str = "N m"
 
 
@@ -214,8 +216,11 @@ def has_run(folder: Path) -> bool:
 
 
 def read_fit(folder: Path, kind: type[Of] = FitFile) -> Of:
-    """fit.json of a folder, all of it or its `Distances`; ValueError where it is missing or broken."""
-    return _READ.json(folder / FIT, kind)
+    """fit.json of a folder, all of it or its `Distances`; ValueError where it is missing, broken or of version 1."""
+    fit = _READ.json(folder / FIT, kind)
+    if fit.version != FIT_VERSION:
+        raise _READ.fault(f"{folder / FIT} has version {fit.version}, this program reads version {FIT_VERSION}")
+    return fit
 
 
 def read_run(run: Path) -> Run:
@@ -224,11 +229,13 @@ def read_run(run: Path) -> Run:
     if not run.is_dir():
         raise _READ.fault(f"there is no folder {run}")
     config, fit = _READ.json(run / CONFIG, RunConfig), read_fit(run)
-    for key, content in (("parameters", fit.parameters), ("gap", fit.gap)):
+    for key, content in (("parameters", fit.parameters), ("torque_distances", fit.torque_distances)):
         if not content:
             raise _READ.fault(f"{run / FIT}, {key!r} is empty")
-    if other := [r.name for r in config.recordings if r.name not in fit.gap]:
-        raise _READ.fault(f"{run / CONFIG}, 'recordings' names {shown(other[0])}, of which {FIT} has no 'gap'")
+    if other := [r.name for r in config.recordings if r.name not in fit.torque_distances]:
+        raise _READ.fault(
+            f"{run / CONFIG}, 'recordings' names {shown(other[0])}, of which {FIT} has no 'torque_distances'"
+        )
     names = [p.name for p in fit.parameters]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise _READ.fault(f"{run / FIT}, 'parameters' holds {', '.join(twice)} more than once")
@@ -242,7 +249,7 @@ def read_run(run: Path) -> Run:
         folder=run,
         config=config,
         fit=fit,
-        traces=_traces(run / TRACES, list(fit.gap)),
+        traces=_traces(run / TRACES, list(fit.torque_distances)),
         history=_history(run / HISTORY),
         correlation=_correlation(run / CORRELATION),
         distribution=distribution,

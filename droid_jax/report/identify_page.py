@@ -54,7 +54,7 @@ def fit_doubts(fit: FitFile) -> list[str]:
     """What to doubt of a fit, by the names that identify_sentences.jinja has for them."""
     uncertain = [p for p in fit.of_interest if not p.identifiable]
     asked = {
-        "worse": any(d.after > d.before for d in fit.gap.values()),
+        "worse": any(d.after > d.before for d in fit.torque_distances.values()),
         "far_off": far_off(fit),
         "not_converged": fit.converged is False,
         "not_judged": fit.converged is None,
@@ -102,23 +102,23 @@ def far_off(fit: FitFile) -> bool:
         most = bounds >= 2 if floor is None else gap.after > FAR * floor
         return gap.after > gap.before or (most and gap.after > 0.5 * (gap.before + (floor or 0.0)))
 
-    return any(far(gap) for gap in fit.gap.values())
+    return any(far(gap) for gap in fit.torque_distances.values())
 
 
 def lacks_something(fit: FitFile) -> bool:
     """Whether noise alone does not explain what the fit left, by equation 1 and by its whitened residuals."""
-    far = any(g.noise_floor and g.after > NOISY * g.noise_floor for g in fit.gap.values())
+    far = any(g.noise_floor and g.after > NOISY * g.noise_floor for g in fit.torque_distances.values())
     return far or (fit.mean_square or 0.0) > MEAN_SQUARE
 
 
 def noiseless(fit: FitFile) -> bool:
     """Whether a fit is of single repeats, from which the noise is not known."""
-    return any(gap.noise_floor is None for gap in fit.gap.values())
+    return any(gap.noise_floor is None for gap in fit.torque_distances.values())
 
 
 def asked_of(fit: FitFile) -> str:
     """The step that finds out whether the model of a `noiseless` fit lacks something: "search_log" or "repeats"."""
-    log = len(fit.gap) <= 2 and all(gap.judged == "time" for gap in fit.gap.values())
+    log = len(fit.torque_distances) <= 2 and all(gap.judged == "time" for gap in fit.torque_distances.values())
     return "search_log" if log else "repeats"
 
 
@@ -148,8 +148,8 @@ def _draw(run: Run) -> dict[str, list[Drawing]]:
     def add(section: str, stem: str, title: str, make: Callable[..., Figure], *args: Any) -> None:
         sections[section].append(style.drawing(run.folder, stem, title, make, *args))
 
-    for i, (name, gap) in enumerate(fit.gap.items()):
-        of = f" ({name})" if len(fit.gap) > 1 else ""
+    for i, (name, gap) in enumerate(fit.torque_distances.items()):
+        of = f" ({name})" if len(fit.torque_distances) > 1 else ""
         traces = run.traces[name]
         bars = (traces["joints"], gap.per_joint_before, gap.per_joint_after, gap.noise_floor, gap.per_joint_noise_floor)
         title = f"Torque difference of each joint{of}"

@@ -147,9 +147,9 @@ def test_the_settings_that_decided_are_in_the_result(found: Identified, tmp_path
 def test_the_command_says_how_it_went_and_what_to_do(found: Identified, tmp_path: Path, capsys):
     write_run(tmp_path, found, {"recordings": []})
     fit = json.loads((tmp_path / "fit.json").read_text())
-    (name,) = fit["gap"]
-    fit["gap"][name]["after"] = fit["gap"][name]["noise_floor"]
-    alone = {name: {**fit["gap"][name], "noise_floor": None, "judged": "time"}}
+    (name,) = fit["torque_distances"]
+    fit["torque_distances"][name]["after"] = fit["torque_distances"][name]["noise_floor"]
+    alone = {name: {**fit["torque_distances"][name], "noise_floor": None, "judged": "time"}}
     for changes, repeats, said in (
         ({"mean_square": 90.0}, [8], "gap` searches for what the model lacks (it takes a second motion, or 16 repeats"),
         ({"mean_square": 90.0}, [16], "gap` searches for what the model lacks\n"),
@@ -227,7 +227,7 @@ def test_a_floor_in_newton_metres_stands_beside_no_cost_in_noise_units(found: Id
     write_run(tmp_path, found, {})
     fit = json.loads((tmp_path / "fit.json").read_text())
     assert fit["cost"]["unit"] == "noise units" and fit["cost"]["noise_floor"] is None
-    assert fit["gap"]["elbow"]["noise_floor"] == found.torque_distances["elbow"].noise_floor
+    assert fit["torque_distances"]["elbow"]["noise_floor"] == found.torque_distances["elbow"].noise_floor
 
 
 def test_a_search_of_another_cost_is_not_gone_on_with(scene: Scene, tmp_path: Path):

@@ -55,7 +55,7 @@ def changed(tmp_path: Path, quick: None) -> Callable[..., tuple[Run, Page]]:
 
 
 def gap_of(**values: Any) -> Callable[[dict[str, Any]], Any]:
-    return lambda fit: fit["gap"]["open_close"].update(values)
+    return lambda fit: fit["torque_distances"]["open_close"].update(values)
 
 
 def test_the_table_holds_the_numbers_of_the_fit(written: Page) -> None:
@@ -172,7 +172,7 @@ def test_a_fit_far_from_the_data_doubts_the_set_up_first(
 ) -> None:
     folder = make_run(tmp_path / "run")
     fit = json.loads((folder / "fit.json").read_text())
-    fit["gap"]["open_close"] |= gap
+    fit["torque_distances"]["open_close"] |= gap
     for k, p in enumerate(fit["parameters"]):
         p["on_bound"] = k < bounds
     (folder / "fit.json").write_text(json.dumps(fit))
