@@ -284,7 +284,8 @@ def noise_of(
     least = _least(found, whole, log.space, config)
     noise = least if least @ least < config.blocks.noise_share * (whole @ whole) else whole
     left = (noise.reshape(len(deviation), -1).T * deviation)[inside]
-    return stated_deviation(left, log.moves[inside]), block_length(left, config.blocks)
+    rate = config.compare.noise.rate
+    return stated_deviation(left, log.moves[inside], rate), block_length(left, config.blocks, rate)
 
 
 def _rough_fit(
@@ -296,8 +297,9 @@ def _rough_fit(
     config: DiscrepancyConfig,
 ) -> tuple[Case, FittedModel, np.ndarray]:
     """The base fitted with the noise [C] stated that `values` [D] leave."""
-    left = stated_deviation(log.residual_torque(values)[block >= 0], log.moves[block >= 0])
-    deviation = np.maximum(left, least_noise("torque", log.measured))
+    noise, inside = config.compare.noise, block >= 0
+    left = stated_deviation(log.residual_torque(values)[inside], log.moves[inside], noise.rate)
+    deviation = np.maximum(left, least_noise("torque", log.measured, noise))
     rows = _blocks(log, deviation, block, config)
     case = Case(rows, rows, None, base, tuple(effects), config)
     return case, base_model(case, values), deviation

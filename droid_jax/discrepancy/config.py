@@ -7,6 +7,7 @@ from functools import partial
 
 from droid_jax.arguments import check_fields, instance, number, optional, whole
 from droid_jax.cost.residuals import CompareConfig
+from droid_jax.identify.identifiability import IdentifiabilityConfig
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.identify.search import SearchConfig
 
@@ -137,6 +138,7 @@ class DiscrepancyConfig:
         max_effects: in a model.
         budget_minutes: for all refits, None for no limit; at least one candidate of a selection step is always tried.
         selection: thresholds that decide which effects are named.
+        identifiability: what decides the width of a fit's posterior.
         blocks: thresholds for a log without repeats.
         compare: how simulation and measurement are compared.
         seed: of sign flips and resamples.
@@ -155,6 +157,7 @@ class DiscrepancyConfig:
     max_effects: int = 3
     budget_minutes: float | None = None
     selection: SelectionConfig = field(default_factory=SelectionConfig)
+    identifiability: IdentifiabilityConfig = field(default_factory=IdentifiabilityConfig)
     blocks: BlocksConfig = field(default_factory=BlocksConfig)
     compare: CompareConfig = field(default_factory=CompareConfig)
     seed: int = 0
@@ -167,6 +170,7 @@ class DiscrepancyConfig:
             search=partial(instance, kind=SearchConfig),
             budget_minutes=optional(partial(number, least=0)),
             selection=partial(instance, kind=SelectionConfig),
+            identifiability=partial(instance, kind=IdentifiabilityConfig),
             blocks=partial(instance, kind=BlocksConfig),
             compare=partial(instance, kind=CompareConfig),
             seed=partial(whole, least=0),

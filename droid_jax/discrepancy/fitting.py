@@ -16,6 +16,7 @@ from droid_jax.cost.cost import Cost, make_cost
 from droid_jax.discrepancy.candidates import project
 from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.discrepancy.residual_set import ResidualSet
+from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.identifiability import posterior_of
 from droid_jax.identify.levenberg_marquardt import principal_axes
 from droid_jax.identify.multistart import Hypotheses, RefineConfig, Refined, RefineProgress, chord, refine
@@ -250,6 +251,10 @@ def final_refit(
     return FinalModel(refitted, (train, validation))
 
 
+def _posterior(residual_set: ResidualSet, model: FittedModel) -> Gaussian:
+    return posterior_of(model.refined, residual_set.cost.comparisons, residual_set.identifiability)
+
+
 def consistent_with_zero(residual_set: ResidualSet, model: FittedModel, part: Candidate) -> bool:
     """Whether all coefficients of a part may be zero together, by their posterior covariance, bounds or no bounds.
 
@@ -258,14 +263,14 @@ def consistent_with_zero(residual_set: ResidualSet, model: FittedModel, part: Ca
     """
     at, space = [model.space.index(a) for a in part.coefficients], residual_set.cost.space
     away = [(model.values[space.index(a)] - space[a].mean) / space[a].std for a in part.coefficients]
-    cov = posterior_of(model.refined, residual_set.cost.comparisons).cov[np.ix_(at, at)]
+    cov = _posterior(residual_set, model).cov[np.ix_(at, at)]
     level = residual_set.config.interval_level
     return bool(away @ np.linalg.solve(cov, away) <= scipy.stats.chi2.ppf(level, len(at)))
 
 
 def deviations(residual_set: ResidualSet, model: FittedModel) -> dict[str, float]:
     """Posterior deviation of every free coefficient, in its own unit, bounds or no bounds."""
-    std = np.sqrt(np.diag(posterior_of(model.refined, residual_set.cost.comparisons).cov))
+    std = np.sqrt(np.diag(_posterior(residual_set, model).cov))
     return {a: float(std[model.space.index(a)] * model.space[a].std) for a in model.coefficients}
 
 
@@ -279,7 +284,7 @@ def intervals(
     """
     space = model.space
     values = model.values[residual_set.cost.space.columns(space)]
-    about = replace(posterior_of(model.refined, residual_set.cost.comparisons), mean=space.to_search(values))
+    about = replace(_posterior(residual_set, model), mean=space.to_search(values))
     low, high = about.interval(residual_set.config.interval_level)
     for part in model.parts:
         if part.coefficients and consistent_with_zero(residual_set, model, part):
@@ -371,7 +376,7 @@ def transfer_spread(fitted: ResidualSet, other: ResidualSet, model: FittedModel)
     nothing is allowed for there.
     """
     space, whole, x = model.space, other.cost.space, model.refined.x
-    covariance = posterior_of(model.refined, fitted.cost.comparisons, misfit=False).cov
+    covariance = posterior_of(model.refined, fitted.cost.comparisons, fitted.identifiability, misfit=False).cov
     steps = principal_axes(covariance, LONGEST_STEP).T
     ends = [np.clip(x + sign * steps, *map(space.to_search, (space.low, space.high))) for sign in (1.0, -1.0)]
     up, down = np.split(other.common(whole.embed(space, space.from_search(np.concatenate(ends)), model.values)), 2)

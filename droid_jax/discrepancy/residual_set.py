@@ -11,6 +11,7 @@ from droid_jax.cost.cost import Cost
 from droid_jax.cost.residuals import Comparison
 from droid_jax.discrepancy.config import DiscrepancyConfig, SelectionConfig
 from droid_jax.discrepancy.statistics import Blocks, Repeats, Resampling
+from droid_jax.identify.identifiability import IdentifiabilityConfig
 from droid_jax.identify.search import NotReplayed
 from droid_jax.recordings.split import FEWEST_REPEATS
 
@@ -25,7 +26,7 @@ class ResidualSet:
     whitened: [P, D] -> [P, M], distances: [P, D] -> [P, 1]: the cost's own, or ones that remember their replays.
     resampling: whole repeats, or blocks of time.
     column, time: [M] compared column and instant [s] of each residual.
-    config: thresholds of the search.
+    config, identifiability: thresholds of the search.
     equivalence_factor, prior_slack: those of the config that go with the resampling.
     nuisances: names of nuisances that this recording has for itself; nuisance_columns: [M, len(nuisances)] what one
     prior deviation of each adds to the common residual.  See `with_nuisances`.
@@ -38,6 +39,7 @@ class ResidualSet:
     column: np.ndarray
     time: np.ndarray
     config: SelectionConfig
+    identifiability: IdentifiabilityConfig
     equivalence_factor: float
     prior_slack: float
     nuisances: tuple[str, ...] = field(default=(), kw_only=True)
@@ -128,21 +130,12 @@ def residual_set(cost: Cost, config: DiscrepancyConfig | None = None) -> Residua
     Raises:
         ValueError: several recordings at once, or a single repeat: whole repeats are what the tests flip.
     """
-    comparison, selection = only_comparison(cost), (config or DiscrepancyConfig()).selection
+    comparison, config = only_comparison(cost), config or DiscrepancyConfig()
     if comparison.repeats < 2:
         raise ValueError(f"recording {comparison.name!r} has one repeat; a discrepancy needs repeats, or blocks")
     rows = Repeats(comparison.deviations() / np.sqrt(comparison.repeats))
-    where = residual_locations(comparison)
-    return ResidualSet(
-        cost,
-        cost.whitened,
-        cost.distances,
-        rows,
-        *where,
-        selection,
-        selection.equivalence_factor,
-        selection.prior_slack,
-    )
+    selection = config.selection
+    return _of(cost, rows, config, selection.equivalence_factor, selection.prior_slack)
 
 
 def block_residual_set(cost: Cost, block: np.ndarray, config: DiscrepancyConfig | None = None) -> ResidualSet:
@@ -158,10 +151,23 @@ def block_residual_set(cost: Cost, block: np.ndarray, config: DiscrepancyConfig 
         raise ValueError(
             f"recording {comparison.name!r}: {block.max() + 1} blocks, at least {FEWEST_REPEATS} are needed"
         )
-    column, time = residual_locations(comparison)
+    column, _ = residual_locations(comparison)
     rows, blocks = Blocks(np.tile(block, int(column.max()) + 1)), config.blocks
-    factor, slack = blocks.equivalence_factor, blocks.prior_slack
-    return ResidualSet(cost, cost.whitened, cost.distances, rows, column, time, config.selection, factor, slack)
+    return _of(cost, rows, config, blocks.equivalence_factor, blocks.prior_slack)
+
+
+def _of(cost: Cost, rows: Resampling, config: DiscrepancyConfig, factor: float, slack: float) -> ResidualSet:
+    return ResidualSet(
+        cost,
+        cost.whitened,
+        cost.distances,
+        rows,
+        *residual_locations(only_comparison(cost)),
+        config=config.selection,
+        identifiability=config.identifiability,
+        equivalence_factor=factor,
+        prior_slack=slack,
+    )
 
 
 def only_comparison(cost: Cost) -> Comparison:

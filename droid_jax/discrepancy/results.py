@@ -33,7 +33,11 @@ def extended(case: Case, final: FinalModel) -> Extended:
     """The extended model that a search hands on, as something to save."""
     model = final.model
     values = model.values[case.full_space.columns(model.space)]
-    gaussian = posterior(model.refined, [c for fitted in final.fitted_to for c in fitted.cost.comparisons])
+    gaussian = posterior(
+        model.refined,
+        [c for fitted in final.fitted_to for c in fitted.cost.comparisons],
+        case.config.identifiability,
+    )
     named = {part.effect for part in model.parts}
     effects = tuple(e for e in case.effects if e.name in named)
     return Extended(case.train.cost.scene, model.parts, effects, values, gaussian)
@@ -283,7 +287,9 @@ def _parameters(
 def _shifts(case: Case, verdict: Verdict) -> list[dict[str, Any]]:
     """How the base parameters moved when the effects came in, beside their deviation in the base fit."""
     columns = case.full_space.columns(case.base)
-    deviation = posterior_of(verdict.base.refined, case.train.cost.comparisons).physical_std
+    deviation = posterior_of(
+        verdict.base.refined, case.train.cost.comparisons, case.config.identifiability
+    ).physical_std
     before, after = verdict.base.values[columns], verdict.model.values[columns]
     return [
         {"name": p.name, "unit": p.unit, "before": b, "after": a, "deviation_before": s}

@@ -26,7 +26,7 @@ from typing import Protocol
 import numpy as np
 import scipy.stats
 
-from droid_jax.cost.noise import correlation_time, detrend
+from droid_jax.cost.noise import DEFAULT_NOISE, correlation_time, detrend
 from droid_jax.discrepancy.config import BlocksConfig
 from droid_jax.recordings.split import FEWEST_REPEATS
 
@@ -369,12 +369,12 @@ class Blocks:
         return np.maximum(size - lost, 1e-9 * size)
 
 
-def block_length(residuals: np.ndarray, config: BlocksConfig) -> float:
-    """s, for residuals [K, C] on the coarse clock: some correlation times, the median over the columns.
+def block_length(residuals: np.ndarray, config: BlocksConfig, rate: float = DEFAULT_NOISE.rate) -> float:
+    """s, for residuals [K, C] at `rate` Hz: some correlation times, the median over the columns.
 
     Of a model that lacks something the residual holds that too, and is correlated for longer than its noise.
     """
-    return max(config.shortest, config.correlation_times * float(np.median(correlation_time(residuals))))
+    return max(config.shortest, config.correlation_times * float(np.median(correlation_time(residuals, rate))))
 
 
 def interleaved(
