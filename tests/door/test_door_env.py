@@ -60,8 +60,14 @@ def rolled(env: DoorEnv, script: np.ndarray) -> Callable[[State], dict[str, np.n
 
 
 @pytest.fixture(scope="module")
-def start(env: DoorEnv) -> State:
-    return env.reset(jax.random.key(0))
+def reset(env: DoorEnv) -> Callable[[jax.Array], State]:
+    """Compiled: op by op it takes longer."""
+    return jax.jit(env.reset, compiler_options=runtime.compiler_options())
+
+
+@pytest.fixture(scope="module")
+def start(reset: Callable[[jax.Array], State]) -> State:
+    return reset(jax.random.key(0))
 
 
 @pytest.fixture(scope="module")
@@ -114,10 +120,10 @@ def test_the_reward_rises_as_the_door_opens(trained_on):
     assert np.isfinite(trained_on["reward"]).all()
 
 
-def test_sizes(env: DoorEnv, start: State):
+def test_sizes(env: DoorEnv, reset: Callable[[jax.Array], State], start: State):
     assert start.obs.shape == (env.observation_size,) == (OBSERVED,)
     assert env.action_size == ACTIONS == 9
-    assert not np.allclose(start.obs, env.reset(jax.random.key(2)).obs)
+    assert not np.allclose(start.obs, reset(jax.random.key(2)).obs)
 
 
 @pytest.mark.parametrize("speed", [1e6, np.nan])
