@@ -49,7 +49,7 @@ def fit(generations: int) -> dict[str, Any]:
     from droid_jax.door.demonstration import demonstration_path
     from droid_jax.door.scene import door_scene
     from droid_jax.door.space import door_space
-    from droid_jax.identify.search import SearchConfig, cma_search
+    from droid_jax.identify.search import CmaConfig, cma_search
     from droid_jax.recordings.formats import load_recording
     from droid_jax.synthetic.robot import record, synthetic_truth
 
@@ -57,7 +57,7 @@ def fit(generations: int) -> dict[str, Any]:
     recording = record(scene, load_recording(demonstration_path("A")), synthetic_truth(scene, 1, 1), seed=1, name="A")
     began = time.perf_counter()
     cost = make_cost(scene, door_space(scene), [recording])
-    config = SearchConfig(population=POPULATION, parents=5, generations=generations, tol_cost=0, tol_sigma=0)
+    config = CmaConfig(population=POPULATION, parents=5, generations=generations, tol_cost=0, tol_sigma=0)
     found = cma_search(cost, cost.space, config)
     return {
         "seconds": time.perf_counter() - began,

@@ -33,7 +33,7 @@ from benchmarks.common import origin  # noqa: E402
 from benchmarks.sharing import claimed  # noqa: E402
 from droid_jax.discrepancy.missing import find_missing_effects  # noqa: E402
 from droid_jax.identify.pipeline import IdentifyConfig, identify_parameters  # noqa: E402
-from droid_jax.identify.search import SearchConfig  # noqa: E402
+from droid_jax.identify.search import CmaConfig  # noqa: E402
 from droid_jax.model.fields import joint_damping, joint_frictionloss, model_parameter  # noqa: E402
 from droid_jax.model.parameters import Space  # noqa: E402
 from droid_jax.model.scene import Scene, compile_scene  # noqa: E402
@@ -175,7 +175,7 @@ def one(seed: int, scene: Scene, space: Space) -> dict[str, Any]:
     """What a seed's two logs say."""
     (first, truth), (second, _) = recorded(seed, "a"), recorded(seed, "b")
     # Inverse dynamics is smooth in these parameters: a short search will do, the refinement does the rest.
-    config = IdentifyConfig(search=SearchConfig(population=16, generations=8))
+    config = IdentifyConfig(search=CmaConfig(population=16, generations=8))
     found = identify_parameters(scene, space, [first], config=config)
     low, high = found.full_gaussian.interval(LEVEL)
     verdict, _ = find_missing_effects(scene, space, [first, second])

@@ -46,7 +46,7 @@ from droid_jax.identify.extended_model import load_extended, save_extended  # no
 from droid_jax.identify.gaussian import load_gaussian, prior  # noqa: E402
 from droid_jax.identify.identifiability import posterior  # noqa: E402
 from droid_jax.identify.multistart import RefineConfig  # noqa: E402
-from droid_jax.identify.search import SearchConfig  # noqa: E402
+from droid_jax.identify.search import CmaConfig  # noqa: E402
 from droid_jax.model.effects.registry import library  # noqa: E402
 from droid_jax.recordings.split import Split  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
@@ -110,7 +110,7 @@ def _searched(arguments: Arguments, folder: Path, code: Mapping[str, Any]) -> di
     if arguments.quick:
         small = RefineConfig(iterations=1, basin_hops=0, spreads=0)
         config = DiscrepancyConfig(
-            search=SearchConfig(population=8, parents=None, generations=1),
+            search=CmaConfig(population=8, parents=None, generations=1),
             refine=small,
             refit=small,
             one_step_fits=1,

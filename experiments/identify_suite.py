@@ -37,7 +37,7 @@ from droid_jax.door.space import truth as table_i  # noqa: E402
 from droid_jax.identify.gaussian import prior  # noqa: E402
 from droid_jax.identify.multistart import RefineConfig  # noqa: E402
 from droid_jax.identify.pipeline import Identified, IdentifyConfig, cost_samples, identify_parameters  # noqa: E402
-from droid_jax.identify.search import SearchConfig  # noqa: E402
+from droid_jax.identify.search import CmaConfig  # noqa: E402
 from droid_jax.model.scene import Scene  # noqa: E402
 from droid_jax.recordings.formats import load_recording  # noqa: E402
 from droid_jax.recordings.recording import Recording  # noqa: E402
@@ -65,7 +65,7 @@ class Arguments:
 
 def settings(quick: bool, seed: int) -> IdentifyConfig:
     """The budget of a case."""
-    search = SearchConfig(population=30, parents=None, generations=3 if quick else 20, seed=seed)
+    search = CmaConfig(population=30, parents=None, generations=3 if quick else 20, seed=seed)
     return IdentifyConfig(search=search, refine=RefineConfig(iterations=2 if quick else 30), seed=seed)
 
 

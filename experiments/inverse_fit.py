@@ -31,7 +31,7 @@ from droid_jax.identify.fit import Fit
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.identifiability import calibrated, identifiability, time_blocks
 from droid_jax.identify.multistart import Refined, refine
-from droid_jax.identify.search import SearchConfig, cma_search
+from droid_jax.identify.search import CmaConfig, cma_search
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
@@ -159,7 +159,7 @@ class Estimate:
     refined: Refined
 
 
-def find(cost: Cost, space: Space, config: SearchConfig) -> Fit:
+def find(cost: Cost, space: Space, config: CmaConfig) -> Fit:
     """CMA-ES from the prior, the noise stated from what the prior's mean leaves unexplained."""
     fit = cma_search(cost.restated(space.mean), space, config)
     print(f"  CMA-ES: cost {fit.best_cost:.4f} after {len(fit.history.sigma)} generations ({fit.stop})", flush=True)

@@ -34,7 +34,7 @@ from droid_jax.door.demonstration import demonstration_path  # noqa: E402
 from droid_jax.door.scene import door_scene  # noqa: E402
 from droid_jax.door.space import door_space  # noqa: E402
 from droid_jax.identify.holdout import split_repeats  # noqa: E402
-from droid_jax.identify.search import SearchConfig, cma_search  # noqa: E402
+from droid_jax.identify.search import CmaConfig, cma_search  # noqa: E402
 from droid_jax.recordings.formats import load_recording  # noqa: E402
 from droid_jax.storage import write_bytes  # noqa: E402
 from droid_jax.synthetic.robot import record, synthetic_truth  # noqa: E402
@@ -73,7 +73,7 @@ def curve(cost: Cost, held: Cost, population: int, seconds: float, seed: int) ->
 
     A generation of another search goes first, so that nothing is compiled on the clock.
     """
-    config = SearchConfig(
+    config = CmaConfig(
         population=population, parents=None, generations=100_000, tol_cost=0, tol_sigma=1e-5,
         max_seconds=seconds, seed=seed,
     )  # fmt: skip

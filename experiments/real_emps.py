@@ -52,7 +52,7 @@ from inverse_fit import (
 
 from droid_jax.cost.cost import Cost
 from droid_jax.cost.noise import DEFAULT_NOISE, correlation_time
-from droid_jax.identify.search import SearchConfig
+from droid_jax.identify.search import CmaConfig
 from droid_jax.model.fields import body_mass, joint_damping, joint_frictionloss
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import Scene, load_scene
@@ -174,7 +174,7 @@ def main(config: RealEmps) -> None:
     cost, judge = make_costs(scene, space, config.data)
     print(f"EMPS: {FIT} fitted, {JUDGE} judges", flush=True)
     generations = 10 if config.quick else 120
-    search = find(cost, space, SearchConfig(population=32, parents=None, generations=generations, seed=config.seed))
+    search = find(cost, space, CmaConfig(population=32, parents=None, generations=generations, seed=config.seed))
     found = estimate(cost, space, search.best, BLOCK)
     parameters = against_published(found)
     for name, p in parameters.items():

@@ -68,7 +68,7 @@ from droid_jax.cost.cost import Cost
 from droid_jax.cost.noise import DEFAULT_NOISE, correlation_time
 from droid_jax.door.arm import panda_arm_scene
 from droid_jax.door.builtin import ARM
-from droid_jax.identify.search import SearchConfig
+from droid_jax.identify.search import CmaConfig
 from droid_jax.model.effect_interface import Effect, Rollout, Theta
 from droid_jax.model.fields import body_mass_scale, model_parameter
 from droid_jax.model.joint_friction import SMOOTHING, joint_friction_space
@@ -202,9 +202,7 @@ def fit_models(scene: Scene, parts: tuple[Recording, Recording], config: RealPan
         fitted, judge = (inverse_cost(scene, space, part, MOTION_CUTOFF, [inertia]) for part in parts)
         print(f"{model}: {len(space)} parameters", flush=True)
         if model == "friction":
-            search = SearchConfig(
-                population=64, parents=None, generations=60 if config.quick else 400, seed=config.seed
-            )
+            search = CmaConfig(population=64, parents=None, generations=60 if config.quick else 400, seed=config.seed)
             start = find(fitted, space, search)
             friction = start.best
             out["search"] = {"generations": len(start.history.sigma), "stop": start.stop}

@@ -21,7 +21,7 @@ from droid_jax.discrepancy.search import Problem, search_effects
 from droid_jax.discrepancy.verdict import Verdict
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.identify.pipeline import Progress
-from droid_jax.identify.search import SearchConfig
+from droid_jax.identify.search import CmaConfig
 from droid_jax.model.effects.candidate import candidates
 from droid_jax.model.effects.registry import library
 from droid_jax.model.parameter_file import load_parameters
@@ -46,7 +46,7 @@ PRELOAD = 0.6  # N m
 FLOOR = 0.01
 EFFECTS = ("hinge_preload", "drag", "payload")
 QUICK = DiscrepancyConfig(
-    search=SearchConfig(population=12, parents=None, generations=4),
+    search=CmaConfig(population=12, parents=None, generations=4),
     refine=RefineConfig(iterations=20, basin_hops=0),
     refit=RefineConfig(iterations=6, basin_hops=0),
     max_effects=1,

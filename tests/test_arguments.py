@@ -20,7 +20,7 @@ from droid_jax.discrepancy.config import DiscrepancyConfig, SelectionConfig
 from droid_jax.identify.identifiability import IdentifiabilityConfig
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.identify.pipeline import IdentifyConfig
-from droid_jax.identify.search import SearchConfig
+from droid_jax.identify.search import CmaConfig
 from droid_jax.model.parameters import Mode, Parameter, Scaling, Space, Write
 from droid_jax.policy.train import TrainConfig
 from droid_jax.recordings.recording import TorqueConvention, TorqueSide
@@ -40,7 +40,7 @@ GOOD = {"name": "a", "unit": "kg", "mean": 1.0, "std": 0.5, "low": 0.1, "high": 
         (lambda: IdentifyConfig(heldout="0.3"), "heldout must be a number, got '0.3'"),  # pyright: ignore
         (lambda: IdentifyConfig(heldout=True), "heldout must be a number, got True"),
         (lambda: IdentifyConfig(engine="mjxx"), "engine must be one of mjx, mujoco, got 'mjxx'"),
-        (lambda: IdentifyConfig(search={}), "search must be a SearchConfig, got a dict"),  # pyright: ignore
+        (lambda: IdentifyConfig(search={}), "search must be a CmaConfig, got a dict"),  # pyright: ignore
         (lambda: IdentifyConfig(samples=-1), "samples must be at least 0, got -1"),
         (lambda: CompareConfig(motion_cutoff=0.0), "motion_cutoff must be above 0, got 0.0"),
         (lambda: CompareConfig(motion_cutoff=math.inf), "motion_cutoff must be finite, got inf"),
@@ -57,12 +57,12 @@ GOOD = {"name": "a", "unit": "kg", "mean": 1.0, "std": 0.5, "low": 0.1, "high": 
         (lambda: CompareConfig(noise=8.0), "noise must be a NoiseConfig, got 8.0"),  # pyright: ignore
         (lambda: IdentifiabilityConfig(partner=1.5), "partner must be at most 1, got 1.5"),
         (lambda: IdentifyConfig(checks="yes"), "checks must be True or False, got 'yes'"),  # pyright: ignore
-        (lambda: SearchConfig(redraws=0), "redraws must be at least 1, got 0"),
-        (lambda: SearchConfig(population=2.5), "population must be a whole number, got 2.5"),  # pyright: ignore
-        (lambda: SearchConfig(sigma=math.nan), "sigma must be finite, got nan"),
-        (lambda: SearchConfig(tol_cost=-1.0), "tol_cost must be at least 0, got -1.0"),
-        (lambda: SearchConfig(max_seconds=math.inf), "max_seconds must be finite, got inf"),
-        (lambda: SearchConfig(bounds="bounce"), "bounds must be one of resample, clip"),  # pyright: ignore
+        (lambda: CmaConfig(redraws=0), "redraws must be at least 1, got 0"),
+        (lambda: CmaConfig(population=2.5), "population must be a whole number, got 2.5"),  # pyright: ignore
+        (lambda: CmaConfig(sigma=math.nan), "sigma must be finite, got nan"),
+        (lambda: CmaConfig(tol_cost=-1.0), "tol_cost must be at least 0, got -1.0"),
+        (lambda: CmaConfig(max_seconds=math.inf), "max_seconds must be finite, got inf"),
+        (lambda: CmaConfig(bounds="bounce"), "bounds must be one of resample, clip"),  # pyright: ignore
         (lambda: RefineConfig(iterations=-1), "iterations must be at least 0, got -1"),
         (lambda: RefineConfig(give_up=0.0), "give_up must be above 0, got 0.0"),
         (lambda: RefineConfig(chords=0), "chords must be at least 1, got 0"),
@@ -122,7 +122,7 @@ def test_texts_that_stand_for_a_choice_are_converted() -> None:
 def test_numbers_of_numpy_become_pythons() -> None:
     made = Parameter(**{**GOOD, "mean": np.float32(0.5), "nuisance": np.bool_(True)})
     assert type(made.mean) is float and made.nuisance is True
-    assert type(SearchConfig(population=np.int64(8)).population) is int  # pyright: ignore
+    assert type(CmaConfig(population=np.int64(8)).population) is int  # pyright: ignore
 
 
 def test_two_joints_of_one_name_and_a_text_for_a_list(tmp_path: Path) -> None:

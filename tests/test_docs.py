@@ -15,7 +15,7 @@ import pytest
 from droid_jax.cost.noise import NoiseConfig
 from droid_jax.discrepancy.config import BlocksConfig, DiscrepancyConfig, SelectionConfig
 from droid_jax.identify.multistart import RefineConfig
-from droid_jax.identify.search import SearchConfig
+from droid_jax.identify.search import CmaConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 WRITTEN = ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "experiments/README.md", "benchmarks/README.md")
@@ -154,7 +154,7 @@ def test_every_threshold_is_documented(config: type):
 
 
 @pytest.mark.parametrize(
-    "config", [NoiseConfig, DiscrepancyConfig, RefineConfig, SearchConfig], ids=lambda config: config.__name__
+    "config", [NoiseConfig, DiscrepancyConfig, RefineConfig, CmaConfig], ids=lambda config: config.__name__
 )
 def test_documented_settings_are_the_defaults(config: type):
     rows = {name: value for (of, name), value in documented().items() if of == config.__name__}

@@ -24,7 +24,7 @@ from droid_jax.cost.residuals import CompareConfig
 from droid_jax.door.scene import door_scene
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.identify.pipeline import identify_parameters as identify_function
-from droid_jax.identify.search import SearchConfig
+from droid_jax.identify.search import CmaConfig
 from droid_jax.model.effect_interface import State
 from droid_jax.model.effects import registry
 from droid_jax.model.parameter_file import load_parameters
@@ -34,7 +34,7 @@ ROOT = Path(__file__).resolve().parents[1]
 EXAMPLE = ROOT / "docs" / "examples" / "two_link.py"
 HEAVY = ("jax", "mujoco", "evosax", "brax", "flax", "matplotlib", "tyro")
 SMALL = dj.IdentifyConfig(
-    search=SearchConfig(population=10, parents=None, generations=3), refine=RefineConfig(iterations=8)
+    search=CmaConfig(population=10, parents=None, generations=3), refine=RefineConfig(iterations=8)
 )
 
 

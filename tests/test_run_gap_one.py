@@ -19,14 +19,14 @@ from droid_jax.commands.gap_search import IN_BLOCKS
 from droid_jax.cost.lone_log import LoneLog
 from droid_jax.discrepancy import missing
 from droid_jax.identify.extended_model import load_extended
-from droid_jax.identify.search import SearchConfig
+from droid_jax.identify.search import CmaConfig
 from droid_jax.recordings.formats import save_recording
 from droid_jax.recordings.recording import Recording
 from droid_jax.recordings.split import Split, roles_of, split_of
 from droid_jax.report.gap_folder import Gap, read_gap
 from droid_jax.run import main
 
-SEARCH = replace(CONFIG, search=SearchConfig(population=8, parents=None, generations=2), max_effects=1)
+SEARCH = replace(CONFIG, search=CmaConfig(population=8, parents=None, generations=2), max_effects=1)
 LOG = elbow_log(COULOMB)
 pytestmark = pytest.mark.usefixtures("tuned")
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
     from droid_jax.identify.multistart import RefineConfig
-    from droid_jax.identify.search import SearchConfig
+    from droid_jax.identify.search import CmaConfig
 
 Preset = Literal["quick", "standard", "paper", "gpu"]
 TIMESTEP: dict[Preset, float] = {"quick": 0.004, "standard": 0.002, "paper": 0.002, "gpu": 0.002}  # s, built-in door
@@ -26,9 +26,9 @@ def warn_of_cpu(preset: str) -> None:
         )
 
 
-def search_config(preset: Preset, seed: int, **changes: int | None) -> SearchConfig:
-    """The preset's search; changes: fields of SearchConfig that were asked for, None for those that were not."""
-    from droid_jax.identify.search import SearchConfig
+def search_config(preset: Preset, seed: int, **changes: int | None) -> CmaConfig:
+    """The preset's search; changes: fields of CmaConfig that were asked for, None for those that were not."""
+    from droid_jax.identify.search import CmaConfig
 
     chosen: dict[str, int | None] = {
         "quick": dict(population=30, parents=None, generations=20),
@@ -37,7 +37,7 @@ def search_config(preset: Preset, seed: int, **changes: int | None) -> SearchCon
         "gpu": dict(population=1024, parents=None, generations=60, restarts=2),
     }[preset]
     asked = {name: value for name, value in changes.items() if value is not None}
-    return SearchConfig(**{**chosen, **asked}, seed=seed)  # type: ignore[arg-type]
+    return CmaConfig(**{**chosen, **asked}, seed=seed)  # type: ignore[arg-type]
 
 
 def refine_config(preset: Preset) -> RefineConfig | None:

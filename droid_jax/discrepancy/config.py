@@ -9,7 +9,7 @@ from droid_jax.arguments import check_fields, instance, number, optional, whole
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.identify.identifiability import IdentifiabilityConfig
 from droid_jax.identify.multistart import RefineConfig
-from droid_jax.identify.search import SearchConfig
+from droid_jax.identify.search import CmaConfig
 
 CONVERGE_ITERATIONS = 60  # of a fit that must converge: where something is missing it takes longer
 
@@ -147,7 +147,7 @@ class DiscrepancyConfig:
         ValueError: a setting is of the wrong type or out of its range.
     """
 
-    search: SearchConfig = field(default_factory=lambda: SearchConfig(parents=None, generations=20))
+    search: CmaConfig = field(default_factory=lambda: CmaConfig(parents=None, generations=20))
     refine: RefineConfig = field(default_factory=lambda: RefineConfig(iterations=CONVERGE_ITERATIONS))
     refit: RefineConfig = field(default_factory=lambda: RefineConfig(iterations=20, basin_hops=0, spreads=0))
     polish: RefineConfig = field(default_factory=lambda: RefineConfig(iterations=12, basin_hops=0))
@@ -167,7 +167,7 @@ class DiscrepancyConfig:
             self,
             **dict.fromkeys(("one_step_fits", "full_refits", "pair_refits", "max_effects"), partial(whole, least=1)),
             **dict.fromkeys(("refine", "refit", "polish"), partial(instance, kind=RefineConfig)),
-            search=partial(instance, kind=SearchConfig),
+            search=partial(instance, kind=CmaConfig),
             budget_minutes=optional(partial(number, least=0)),
             selection=partial(instance, kind=SelectionConfig),
             identifiability=partial(instance, kind=IdentifiabilityConfig),

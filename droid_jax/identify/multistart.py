@@ -27,7 +27,7 @@ from droid_jax.identify.levenberg_marquardt import (
     curvature,
     fall,
 )
-from droid_jax.identify.search import NotReplayed, SearchConfig, cma_search
+from droid_jax.identify.search import CmaConfig, NotReplayed, cma_search
 from droid_jax.model.parameters import Parameter, Space
 
 Hypotheses = Sequence[Mapping[str, float]]
@@ -325,7 +325,7 @@ class _Descent(DampedProblem):
             return self.objective(x, self.replay(x))
 
         unit = Space(tuple(Parameter(f"u{i}", "-", 0.0, 1.0, -50.0, 50.0) for i in range(len(self.space))))
-        settings = SearchConfig(
+        settings = CmaConfig(
             population=self.config.basin_hop_population,
             parents=None,
             generations=self.config.basin_hop_generations,

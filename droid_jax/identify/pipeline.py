@@ -27,7 +27,7 @@ from droid_jax.identify.identifiability import (
     posterior,
 )
 from droid_jax.identify.multistart import RefineConfig, Refined, refine
-from droid_jax.identify.search import SearchConfig, cma_search
+from droid_jax.identify.search import CmaConfig, cma_search
 from droid_jax.identify.solution_checks import SolutionCheck, check_solution
 from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.inertia import possible_draws
@@ -62,7 +62,7 @@ class IdentifyConfig:
 
     engine: str = "mjx"
     heldout: float = 0.3
-    search: SearchConfig = field(default_factory=SearchConfig)
+    search: CmaConfig = field(default_factory=CmaConfig)
     refine: RefineConfig | None = field(default_factory=RefineConfig)
     samples: int = 200
     seed: int = 0
@@ -76,7 +76,7 @@ class IdentifyConfig:
             self,
             engine=partial(one_of, valid=ENGINES),
             heldout=partial(number, least=0, below=1),
-            search=partial(instance, kind=SearchConfig),
+            search=partial(instance, kind=CmaConfig),
             refine=optional(partial(instance, kind=RefineConfig)),
             samples=partial(whole, least=0),
             seed=partial(whole, least=0),

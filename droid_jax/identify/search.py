@@ -39,7 +39,7 @@ class NotReplayed(ValueError):
 
 
 @dataclass(frozen=True)
-class SearchConfig:
+class CmaConfig:
     """Settings of a search; the defaults are the paper's population with stated stops.
 
     population: rows per generation and restart.
@@ -112,7 +112,7 @@ class SearchConfig:
 def cma_search(
     cost: Cost,
     space: Space,
-    config: SearchConfig,
+    config: CmaConfig,
     *,
     start: np.ndarray | None = None,
     checkpoint_dir: Path | None = None,
@@ -148,7 +148,7 @@ def cma_search(
     return _fit(run, space, config, asked)
 
 
-def _strategy(space: Space, config: SearchConfig) -> Strategy:
+def _strategy(space: Space, config: CmaConfig) -> Strategy:
     """The CMA-ES that a configuration asks for."""
     active = config.parents is None if config.active is None else config.active
     weights = recombination(config.population, config.elite, len(space), active)
@@ -157,7 +157,7 @@ def _strategy(space: Space, config: SearchConfig) -> Strategy:
     return Strategy(space, weights, sigma=config.sigma, seeds=seeds, redraws=redraws)
 
 
-def _generation(run: CmaState, cost: Cost, strategy: Strategy, config: SearchConfig) -> None:
+def _generation(run: CmaState, cost: Cost, strategy: Strategy, config: CmaConfig) -> None:
     """One generation of every restart: draw, evaluate, update, record, judge."""
     started = time.perf_counter()
     space = strategy.space
@@ -192,7 +192,7 @@ def mirrored(space: Space, x: np.ndarray) -> np.ndarray:
     return np.clip(np.where(x < low, 2 * low - x, np.where(x > high, 2 * high - x, x)), low, high)
 
 
-def _try_bounds(run: CmaState, cost: Cost, space: Space, config: SearchConfig) -> int:
+def _try_bounds(run: CmaState, cost: Cost, space: Space, config: CmaConfig) -> int:
     """Ask once more for every restart's best, moved onto bounds it lies near; how many rows were asked.
 
     Mirrored draws come near a bound and never lie on it.  A row that costs no more becomes the best.  Nothing of this
@@ -231,7 +231,7 @@ def _evaluate(cost: Cost, values: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(costs), costs, np.inf).reshape(values.shape[:2])
 
 
-def _judge(run: CmaState, config: SearchConfig) -> None:
+def _judge(run: CmaState, config: CmaConfig) -> None:
     """Mark the restarts that have converged; a marked one stays as it is from then on."""
     widest = np.sqrt(np.linalg.eigvalsh(run.cov)[:, -1])  # [R]
     narrow = widest < config.tol_sigma
@@ -245,13 +245,13 @@ def _judge(run: CmaState, config: SearchConfig) -> None:
     run.stopped[running & narrow] = REASONS.index("tol_sigma")
 
 
-def _unfinished(run: CmaState, config: SearchConfig) -> bool:
+def _unfinished(run: CmaState, config: CmaConfig) -> bool:
     """Whether another generation is due."""
     in_time = config.max_seconds is None or run.seconds < config.max_seconds
     return bool((run.stopped == 0).any()) and run.generation < config.generations and in_time
 
 
-def _progress(run: CmaState, config: SearchConfig) -> SearchProgress:
+def _progress(run: CmaState, config: CmaConfig) -> SearchProgress:
     """Numbers for a display; the pace is the median of ten generations, so that compilation drops out."""
     pace = float(np.median([s[0] for s in run.records["seconds"][-10:]]))
     left = pace * (config.generations - run.generation) if _unfinished(run, config) else 0.0
@@ -274,7 +274,7 @@ def _history(run: CmaState, restart: int) -> History:
     return History(**records)
 
 
-def _fit(run: CmaState, space: Space, config: SearchConfig, asked: int) -> Fit:
+def _fit(run: CmaState, space: Space, config: CmaConfig, asked: int) -> Fit:
     """The result, led by the restart with the lowest cost; `asked` rows came after the generations."""
     overall = "max_seconds" if run.generation < config.generations else "generations"
     covs, means = run.cov, run.records["mean"][-1]
@@ -306,7 +306,7 @@ def _fit(run: CmaState, space: Space, config: SearchConfig, asked: int) -> Fit:
     )
 
 
-def _start(space: Space, config: SearchConfig, start: np.ndarray | None) -> np.ndarray:
+def _start(space: Space, config: CmaConfig, start: np.ndarray | None) -> np.ndarray:
     """[R, D] physical values that the restarts begin at."""
     values = space.check(space.mean if start is None else start)
     if values.shape not in ((len(space),), (config.restarts, len(space))):
@@ -316,7 +316,7 @@ def _start(space: Space, config: SearchConfig, start: np.ndarray | None) -> np.n
     return np.broadcast_to(values, (config.restarts, len(space))).copy()
 
 
-def _checkpoints(folder: Path | None, space: Space, config: SearchConfig, centre: np.ndarray, fingerprint: str) -> Any:
+def _checkpoints(folder: Path | None, space: Space, config: CmaConfig, centre: np.ndarray, fingerprint: str) -> Any:
     """Checkpoints of this search as a context manager; of None when no folder is given."""
     if folder is None:
         return nullcontext(None)

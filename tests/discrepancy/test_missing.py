@@ -15,7 +15,7 @@ import droid_jax as dj
 from droid_jax.discrepancy import missing
 from droid_jax.discrepancy.candidates import acts_on_commands_only, observable_effects
 from droid_jax.discrepancy.verdict import Conclusion
-from droid_jax.identify.search import SearchConfig
+from droid_jax.identify.search import CmaConfig
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects.candidate import EffectKey
 from droid_jax.model.effects.registry import joined, library
@@ -24,7 +24,7 @@ from droid_jax.model.scene import compile_scene
 from droid_jax.recordings.recording import Recording
 from droid_jax.recordings.split import Split
 
-SEARCH = replace(CONFIG, search=SearchConfig(population=8, parents=None, generations=2), max_effects=1)
+SEARCH = replace(CONFIG, search=CmaConfig(population=8, parents=None, generations=2), max_effects=1)
 COULOMB_KEY = EffectKey("joint_coulomb", "elbow")
 
 LATE = Effect("late", (Parameter("late", "s", 0.0, 0.01, -0.1, 0.1),), command=lambda theta, time, look: look(time),

@@ -18,7 +18,7 @@ from droid_jax.cost.cost import make_cost
 from droid_jax.discrepancy.case import case_of
 from droid_jax.discrepancy.verdict import Conclusion, Verdict
 from droid_jax.identify.multistart import RefineConfig, refine
-from droid_jax.identify.search import SearchConfig
+from droid_jax.identify.search import CmaConfig
 from droid_jax.model.effects.candidate import EffectKey
 from droid_jax.model.effects.registry import effect_space, library
 from droid_jax.model.parameter_file import load_parameters
@@ -53,7 +53,7 @@ WAVES = {
     "validation": ((0.7, 1.6, 1.2), (0.6, 1.2, 2.0), (0.5, 1.9, 0.1)),
     "test": ((0.8, 0.9, 2.1), (0.4, 2.0, 0.9), (0.7, 1.4, 1.7)),
 }
-SEARCH = replace(CONFIG, search=SearchConfig(population=8, parents=None, generations=2), max_effects=1)
+SEARCH = replace(CONFIG, search=CmaConfig(population=8, parents=None, generations=2), max_effects=1)
 
 
 @functools.cache

@@ -34,7 +34,7 @@ from droid_jax.discrepancy.config import BlocksConfig, SelectionConfig
 from droid_jax.identify import pipeline
 from droid_jax.identify.gaussian import prior
 from droid_jax.identify.multistart import RefineConfig
-from droid_jax.identify.search import SearchConfig
+from droid_jax.identify.search import CmaConfig
 from droid_jax.model.parameters import Mode, Parameter, Scaling, Write
 from droid_jax.recordings.recording import Channel, ObjectPose, Phase, ServoGains, TorqueConvention
 
@@ -221,7 +221,7 @@ def _of_studies(folder: Path) -> tuple[Call, ...]:
         Call("CompareConfig", cost, _fields(CompareConfig())),
         Call("identify", droid_jax.identify_parameters, identify),
         Call("IdentifyConfig", fit, _fields(droid_jax.IdentifyConfig())),
-        Call("SearchConfig", lambda **settings: fit(search=SearchConfig(**settings)), _fields(SearchConfig())),
+        Call("CmaConfig", lambda **settings: fit(search=CmaConfig(**settings)), _fields(CmaConfig())),
         Call("RefineConfig", lambda **settings: fit(refine=RefineConfig(**settings)), _fields(RefineConfig())),
         Call("find_missing_effects", droid_jax.find_missing_effects, find),
         Call("DiscrepancyConfig", missing, _fields(droid_jax.DiscrepancyConfig())),

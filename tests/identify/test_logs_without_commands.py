@@ -12,7 +12,7 @@ from droid_jax.cost.cost import Along, make_cost
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.identify.holdout import split_repeats
 from droid_jax.identify.pipeline import Identified, IdentifyConfig, identify_parameters
-from droid_jax.identify.search import SearchConfig
+from droid_jax.identify.search import CmaConfig
 from droid_jax.model.fields import body_mass, joint_damping
 from droid_jax.model.joint_friction import joint_friction_space, sensor_parameter
 from droid_jax.model.parameters import Space
@@ -66,7 +66,7 @@ def space(scene: Scene) -> Space:
 
 @pytest.fixture(scope="module")
 def found(scene: Scene, space: Space) -> Identified:
-    config = IdentifyConfig(search=SearchConfig(population=16, parents=None, generations=10), samples=4)
+    config = IdentifyConfig(search=CmaConfig(population=16, parents=None, generations=10), samples=4)
     return identify_parameters(scene, space, [log(1)], config=config)
 
 
@@ -120,7 +120,7 @@ def test_a_cost_of_two_recordings_is_that_of_each(scene: Scene, space: Space):
 
 
 def test_every_recordings_gap_is_its_own(scene: Scene, space: Space):
-    config = IdentifyConfig(search=SearchConfig(population=8, parents=None, generations=2), samples=4)
+    config = IdentifyConfig(search=CmaConfig(population=8, parents=None, generations=2), samples=4)
     found = identify_parameters(scene, space, [log(3), another()], config=config)
     assert found.refined is not None and len(found.refined.residual) == found.fit.whitened(space.mean[None]).shape[1]
     for recording in (log(3), another()):

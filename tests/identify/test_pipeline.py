@@ -33,14 +33,14 @@ from droid_jax.identify.pipeline import (
     starts,
 )
 from droid_jax.identify.results import traces, write_run
-from droid_jax.identify.search import SearchConfig
+from droid_jax.identify.search import CmaConfig
 from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Channel
 from droid_jax.report.identify_folder import FitFile
 from droid_jax.storage import config_json
 
-QUICK = IdentifyConfig(search=SearchConfig(population=8, parents=None, generations=2), refine=None, samples=2)
+QUICK = IdentifyConfig(search=CmaConfig(population=8, parents=None, generations=2), refine=None, samples=2)
 
 
 def repeats(count: int, seed: int = 0, noise: float = 0.3) -> np.ndarray:

@@ -16,7 +16,7 @@ from evosax.algorithms import CMA_ES
 from droid_jax.identify.checkpoints import Checkpoints
 from droid_jax.identify.cma import recombination
 from droid_jax.identify.gaussian import load_gaussian
-from droid_jax.identify.search import SearchConfig, cma_search
+from droid_jax.identify.search import CmaConfig, cma_search
 from droid_jax.model.parameters import Parameter, Scaling, Space
 
 
@@ -41,7 +41,7 @@ class Recorder:
         return self.cost(values)
 
 
-ENDLESS = SearchConfig(tol_cost=0.0, tol_sigma=0.0)
+ENDLESS = CmaConfig(tol_cost=0.0, tol_sigma=0.0)
 
 
 def endless(**kw):
@@ -437,7 +437,7 @@ def test_the_fit_s_gaussian_is_the_search_distribution(tmp_path):
 )
 def test_impossible_settings_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
-        SearchConfig(**change)
+        CmaConfig(**change)
 
 
 def test_wrong_shapes_are_refused():

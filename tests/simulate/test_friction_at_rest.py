@@ -14,7 +14,7 @@ import pytest
 
 from droid_jax.cost.cost import make_cost
 from droid_jax.identify.pipeline import IdentifyConfig, identify_parameters
-from droid_jax.identify.search import SearchConfig
+from droid_jax.identify.search import CmaConfig
 from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.fields import joint_damping, joint_frictionloss
 from droid_jax.model.joint_friction import joint_friction_effect, joint_friction_space
@@ -148,7 +148,7 @@ def test_friction_and_damping_of_a_hinge_that_holds(seed: int):
     recording, truth = recorded(seed, "a")
     assert truth == drawn(np.random.default_rng([seed, 0]))
     found = identify_parameters(
-        scene, space, [recording], config=IdentifyConfig(search=SearchConfig(population=16, generations=8))
+        scene, space, [recording], config=IdentifyConfig(search=CmaConfig(population=16, generations=8))
     )
     deviations = found.full_gaussian.interval(0.9)
     for k, value in enumerate((truth.damping, truth.friction)):
