@@ -42,7 +42,7 @@ class GapCommand:
 
     recording: tuple[Path, ...] = ()
     """TRAIN VALIDATION [TEST]: two or three motions of the same robot and object, eight repeats or more of each.
-    The fit sees the first, effects are chosen on the second, the third is opened when all is decided.
+    The fit sees the first, effects are selected on the second, the third is opened once they are.
 
     ONE: one motion, sixteen repeats or more; the second half of them confirms.
 

@@ -204,7 +204,7 @@ def make_comparison(
 
     apart: [N, T, J] N m by which the repeats' torques may differ because they moved, or measured their motion,
     differently, with mean zero; it is taken off them where their noise is estimated.
-    rest: [T, J] bool, rows at which a joint is at rest along a prescribed motion (`measure.rest`).
+    rest: [T, J] bool, rows at which a joint is at rest along a prescribed motion (`simulate.rest`).
     Raises ValueError for a channel the recording does not have, one that no replay produces, or a
     constant (dead) channel.
     """

@@ -125,7 +125,7 @@ def make_case(
         effects: to ask about.
         train: parameters are fitted to it.
         validation: moves differently; effects are selected on it.
-        test: judged on once, when everything is decided.
+        test: judged on once, when the effects are selected; `minimum_closed` may then turn names into hints.
         config: of the search.
 
     Raises:

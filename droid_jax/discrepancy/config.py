@@ -52,7 +52,7 @@ class SelectionConfig:
         open_share: share of U left from which the effects explain it only partly.
         minimum_closed: share of U beyond the discretisation error that a model must close on every held-out recording
             for its effects to be named beside an unexplained remainder; with less they are hints.  0.4 turned 9 false
-            names and one right one of the blind run d1a4e04 into hints (docs/discrepancy-search.md).
+            names and one right one of the blind run d1a4e04 into hints.
         mostly_explained: share explained below which the sentence says that most of it is not in the library.
         shape_told: share of a shape parameter's range; where its interval is wider, a bound says nothing of the form.
         false_discovery_rate: of the cells of the residual maps (Benjamini and Hochberg).

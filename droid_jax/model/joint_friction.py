@@ -38,7 +38,7 @@ def direction(velocity: jax.Array) -> jax.Array:
 def joint_friction_effect(joints: Sequence[str], direction: Callable[[jax.Array], jax.Array] = direction) -> Effect:
     """Adds viscous and Coulomb friction to the torque of `joints`, the channel order of the scene.
 
-    direction: of a speed.  Along a prescribed motion jnp.sign, since samples at rest are known there (`measure.rest`);
+    direction: of a speed.  Along a prescribed motion jnp.sign, since samples at rest are known there (`simulate.rest`);
     a servo's simulated joints have none.
 
     Reads `viscous[joint]` and `coulomb[joint]` from theta; absent means zero.  The offset is left to

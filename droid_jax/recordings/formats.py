@@ -1,6 +1,6 @@
 """Recordings on disk: one npz file, or a folder of CSV files that any spreadsheet opens.
 
-`load` also reads ROS bags, through `rosbag.py`, which is imported only then.  The layouts are
+`load_recording` also reads ROS bags, through `rosbag.py`, which is imported only then.  The layouts are
 described in docs/file-formats.md.  Both formats keep every number exactly: a recording that
 was saved and loaded has the same `sha256`.
 """
@@ -88,7 +88,7 @@ def load_recording(
 
 
 def check_target(path: Path) -> None:
-    """ValueError where `save` would not write: another suffix, or what stands there is no recording."""
+    """ValueError where `save_recording` would not write: another suffix, or what stands there is no recording."""
     if path.suffix not in ("", ".npz"):
         raise ValueError(f"{path}: expected the suffix .npz or none (a CSV folder), got {path.suffix!r}")
     if path.suffix == ".npz":

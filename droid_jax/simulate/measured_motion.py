@@ -26,7 +26,7 @@ class Motion:
 
     joints: J names.  time: [T] s, regular.  position, velocity, acceleration: [T, J] rad, rad/s, rad/s^2 (m for
     slides).  torque: convention of the measured torque.  others: joints that stand still -> where, as far as stated.
-    rest: [T, J] bool, samples at rest (`measure.rest`); None: those of speed zero.
+    rest: [T, J] bool, samples at rest (`simulate.rest`); None: those of speed zero.
     measured: [T, J] N m (N), measured torque at these times, NaN where there is none; None: nowhere.
     torque_slack: [J] N m (N), acceleration_slack: [J] rad/s^2 (m/s^2): by how much a torque at rest may leave the
     interval of its friction, because measured torque and acceleration are noisy; None: not at all.
