@@ -7,7 +7,7 @@ without a spring; the program's `identify --preset paper`, which goes on where i
 the paper: docs/paper.md).  Writes
 search_torques, search_parameters and search_cost (.png and .pdf) and search_figure.json into DIR, the run into
 DIR/search_run.  The lines of the truth are the paper's fitted means; search_figure.json holds its deviations beside.
-Some five minutes on two cores.
+A fit of a minute or more on two cores (6.4 minutes at f42592d). Without --out it replaces the committed figures.
 """
 
 from __future__ import annotations

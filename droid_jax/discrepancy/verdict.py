@@ -86,7 +86,7 @@ class Verdict:
     experiments: what would distinguish them, the best first.
     not_tried: what the budget left out, empty for nothing.
     trend: what changes from repeat to repeat, None where nothing was asked.
-    hints: effects that close too little to be named, see `search.unnamed`; the model is without them.
+    hints: effects that close too little to be named, see `unnamed`; the model is without them.
     doubts: what is to be doubted of the effects in the model (`selection.doubts`).
     """
 

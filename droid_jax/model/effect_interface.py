@@ -81,9 +81,8 @@ class Effect:
     For the gap search:
     description, signature:   a sentence each: what it is, and where its mark should appear.
     confused_with: names of effects that look alike on some data.
-    special_cases:        names of those that are special cases of it, or nearly so over the range of a motion: where
-    one of
-                  them is equivalent, this one is no rival of it.
+    special_cases:        names of effects that are special cases of it, or nearly so over the range of a motion:
+                  where one of them is equivalent, this one is dominated.
     locations:       place -> the amplitudes there, e.g. {"joint3": ("joint_coulomb[joint3]",)}; without
                   them the effect is of no interest to the search.
     shape_parameters:       parameters that matter only beside an amplitude, and the values to try.
