@@ -27,7 +27,7 @@ from identify_suite import kept_cases  # noqa: E402
 from benchmarks.common import commits, stem  # noqa: E402
 from droid_jax.door.scene import door_scene  # noqa: E402
 from droid_jax.door.space import door_space  # noqa: E402
-from droid_jax.report.text import label, like, number  # noqa: E402
+from droid_jax.report.text import label, like, significant  # noqa: E402
 from droid_jax.storage import write_json, write_text  # noqa: E402
 
 # Table I of the paper: mean and diag(Sigma), initial and for the doors with 0, 1 and 2 springs.
@@ -108,7 +108,11 @@ def as_markdown(rows: Mapping[str, Any], units: Mapping[str, str], commits: Sequ
             low, high = door["interval"]
             best, *ends = (like(value, 0.5 * (high - low)) for value in (door["best"], low, high))
             found = f"{best} ({' to '.join(ends)})"
-            cells += [_pair(*door["paper"]), number(door["truth"]), found if door["identifiable"] else f"*{found}*"]
+            cells += [
+                _pair(*door["paper"]),
+                significant(door["truth"]),
+                found if door["identifiable"] else f"*{found}*",
+            ]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 

@@ -29,7 +29,7 @@ from droid_jax.storage import write_json
 OF = "of.json"
 SAME = 1e-9  # numbers nearer than that, in shares of themselves, are the same
 NOTHING = 1e-12  # and what is smaller than that is zero
-NAMES = frozenset({"element"})  # what a Gaussian calls the elements it writes to: older ones do not say
+NAMES = frozenset({"element", "role"})  # what a Gaussian says of its parameters for people and code: older ones do not
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,7 @@ SCRIPTS: dict[str, tuple[str, ...]] = {
     "benchmarks/candidates.py": (),
     "benchmarks/default_run.py": (),
     "benchmarks/durations.py": (),
+    "benchmarks/house.py": (),
     "benchmarks/kills.py": (),
     "benchmarks/robustness.py": (),
     "benchmarks/step_accuracy.py": (),

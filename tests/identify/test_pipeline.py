@@ -153,7 +153,11 @@ def test_the_command_says_how_it_went_and_what_to_do(found: Identified, tmp_path
     for changes, repeats, said in (
         ({"mean_square": 90.0}, [8], "gap` searches for what the model lacks (it takes a second motion, or 16 repeats"),
         ({"mean_square": 90.0}, [16], "gap` searches for what the model lacks\n"),
-        ({"mean_square": 1.0, "gap": alone}, [1], "one repeat does not separate noise from what the model lacks: let"),
+        (
+            {"mean_square": 1.0, "torque_distances": alone},
+            [1],
+            "one repeat does not separate noise from what the model lacks: let",
+        ),
     ):
         _summary(found, msgspec.convert({**fit, **changes}, FitFile), repeats)
         assert said in capsys.readouterr().out

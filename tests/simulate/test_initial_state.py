@@ -256,4 +256,4 @@ def test_coupled_joints_follow_the_scatter_of_what_has_them():
     assert np.abs(one.qpos0 - other.qpos0).max() == pytest.approx(0.05)
     assert _start_alike(scene, one, other, DEFAULT_START)
     stated = {"shoulder": 0.2, "elbow": 0.401, "mimic": float(other.qpos0[scene.qpos("mimic")]) + 0.2}
-    assert not _start_alike(scene, one, make_drive(scene, recording(qpos0=stated, **heavy)))
+    assert not _start_alike(scene, one, make_drive(scene, recording(qpos0=stated, **heavy)), DEFAULT_START)
