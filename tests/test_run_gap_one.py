@@ -231,7 +231,7 @@ def test_the_second_half_of_the_repeats_confirms(
     assert answer["coefficients"][0]["value"] == pytest.approx(COULOMB, rel=0.05)
     page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
     assert "acts alike in this motion" in page and "No recording was kept as test data" in page
-    assert "there is no numerical floor" in page and "Discretisation error U0" not in page
+    assert "replayed without a time step" in page and "Discretisation error U0" not in page
 
 
 def test_a_late_repeat_of_the_second_half_keeps_its_number(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

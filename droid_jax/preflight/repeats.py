@@ -54,7 +54,7 @@ def _copies(recording: Recording, where: str) -> list[Finding]:
         Finding(
             "repeats", f"{first[0]} and {first[1]}", float(len(pairs)), 0.0, "likely",
             f"{where}: repeats {named} are identical{what}: are they copies of one? Copies do not tell how noisy the "
-            "measurement is, and intervals, floor and p-values mean nothing then; give each measurement once",
+            "measurement is, and intervals, noise floor and p-values mean nothing then; give each measurement once",
         )
     ]  # fmt: skip
 
