@@ -71,8 +71,8 @@ def searched(
         for now in amended(case, verdict, roles["train"], clock):
             clock.stop()
             keep(case, now, clock.seconds)
-            verdict, handed = now.verdict, now.final
-    return case, verdict, handed, clock.seconds
+            verdict, final = now.verdict, now.final
+    return case, verdict, final, clock.seconds
 
 
 class Clock:

@@ -1,7 +1,7 @@
 """The cost of one log: a recording of one repeat without commands, replayed by inverse dynamics.
 
 Its noise is stated, not estimated, and its residuals are whitened on the host, so that other data, another noise or
-fewer instants compile nothing anew.
+fewer instants compile nothing again.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from droid_jax.cost.cost import Cost, make_cost
-from droid_jax.cost.observation import least_noise
+from droid_jax.cost.observation import Measured, least_noise
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.parameters import Space
@@ -27,12 +27,12 @@ from droid_jax.simulate.measured_motion import Motion
 class LoneLog(Cost):
     """The cost of one recording of one repeat, whitened on the host.
 
-    Other data, another noise or fewer instants then compile nothing anew.
+    Other data, another noise or fewer instants then compile nothing again.
     """
 
     def whitened(self, values: Any) -> np.ndarray:
         """[P, D] -> [P, M] residuals in units of the noise stated, zero at instants left out."""
-        noise = self.comparisons[0].channel("torque").noise
+        noise = self._torque.noise
         weight = np.einsum("ckk->kc", noise.whitener)
         left = (self.simulated(values) - noise.mean) * weight
         return np.swapaxes(left, 1, 2).reshape(len(left), -1)
@@ -45,7 +45,7 @@ class LoneLog(Cost):
         """[P, D] -> [P, 1] equation 1 over the instants that count."""
         (rollout,) = self.rollouts(values)
         comparison = self.comparisons[0]
-        torque = comparison.channel("torque")
+        torque = self._torque
         counts = np.any(np.einsum("ckk->kc", torque.noise.whitener) > 0, axis=1)
         raw = comparison.clock[0] + torque.at * (comparison.clock[1] - comparison.clock[0])
         near = np.abs(raw[:, None] - self.clock).argmin(axis=1)
@@ -59,22 +59,22 @@ class LoneLog(Cost):
     @property
     def columns(self) -> list[int]:
         """[C] measured joint of each torque column."""
-        return self.comparisons[0].channel("torque").columns.tolist()
+        return self._torque.columns.tolist()
 
     @property
     def measured(self) -> np.ndarray:
         """[K, C] measured torques, filtered."""
-        return self.comparisons[0].channel("torque").noise.mean
+        return self._torque.noise.mean
 
     @property
     def clock(self) -> np.ndarray:
         """[K] s."""
-        return self.comparisons[0].channel("torque").clock
+        return self._torque.clock
 
     @property
     def moves(self) -> np.ndarray:
         """[K, C] bool, instants at which each joint moves: at rest friction takes what is left."""
-        return self.comparisons[0].channel("torque").moves
+        return self._torque.moves
 
     def residual_torque(self, values: np.ndarray) -> np.ndarray:
         """[K, C] measured minus simulated torques of one vector [D]."""
@@ -82,22 +82,22 @@ class LoneLog(Cost):
 
     def with_noise(self, deviation: np.ndarray, instants: np.ndarray) -> LoneLog:
         """With noise of a deviation [C], in the channel's unit, at some instants [K] bool; the rest does not count."""
-        noise = self._noise.stated(
+        noise = self._torque.noise.stated(
             np.maximum(deviation, least_noise("torque", self.measured, self.comparisons[0].config.noise))
         )
         return self._with(replace(noise, whitener=noise.whitener * instants[:, None]))
 
     def with_torques(self, torque: np.ndarray) -> LoneLog:
         """With other measured torques [K, C] of the same motion."""
-        return self._with(replace(self._noise, mean=torque, repeats=torque[None]))
+        return self._with(replace(self._torque.noise, mean=torque, repeats=torque[None]))
 
     @property
-    def _noise(self) -> Any:
-        return self.comparisons[0].channel("torque").noise
+    def _torque(self) -> Measured:
+        return self.comparisons[0].channel("torque")
 
     def _with(self, noise: Any) -> LoneLog:
         comparison = self.comparisons[0]
-        torque = replace(comparison.channel("torque"), noise=noise)
+        torque = replace(self._torque, noise=noise)
         return replace(self, comparisons=(replace(comparison, channels=(torque,)),))
 
 

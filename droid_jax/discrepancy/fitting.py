@@ -251,7 +251,8 @@ def final_refit(
     return FinalModel(refitted, (train, validation))
 
 
-def _posterior(residual_set: ResidualSet, model: FittedModel) -> Gaussian:
+def fit_posterior(residual_set: ResidualSet, model: FittedModel) -> Gaussian:
+    """What the fitted recording says of a model's parameters, over its space (`posterior_of`)."""
     return posterior_of(model.refined, residual_set.cost.comparisons, residual_set.identifiability)
 
 
@@ -263,14 +264,14 @@ def consistent_with_zero(residual_set: ResidualSet, model: FittedModel, part: Ca
     """
     at, space = [model.space.index(a) for a in part.coefficients], residual_set.cost.space
     away = [(model.values[space.index(a)] - space[a].mean) / space[a].std for a in part.coefficients]
-    cov = _posterior(residual_set, model).cov[np.ix_(at, at)]
+    cov = fit_posterior(residual_set, model).cov[np.ix_(at, at)]
     level = residual_set.config.interval_level
     return bool(away @ np.linalg.solve(cov, away) <= scipy.stats.chi2.ppf(level, len(at)))
 
 
 def deviations(residual_set: ResidualSet, model: FittedModel) -> dict[str, float]:
     """Posterior deviation of every free coefficient, in its own unit, bounds or no bounds."""
-    std = np.sqrt(np.diag(_posterior(residual_set, model).cov))
+    std = np.sqrt(np.diag(fit_posterior(residual_set, model).cov))
     return {a: float(std[model.space.index(a)] * model.space[a].std) for a in model.coefficients}
 
 
@@ -284,7 +285,7 @@ def intervals(
     """
     space = model.space
     values = model.values[residual_set.cost.space.columns(space)]
-    about = replace(_posterior(residual_set, model), mean=space.to_search(values))
+    about = replace(fit_posterior(residual_set, model), mean=space.to_search(values))
     low, high = about.interval(residual_set.config.interval_level)
     for part in model.parts:
         if part.coefficients and consistent_with_zero(residual_set, model, part):

@@ -184,7 +184,7 @@ def _refitted(now: Amended, case: Case, progress: Progress) -> Amended:
     try:
         final = final_refit(case.train, case.validation, now.verdict.model, case.config.refine, progress)
         extended(case, final)  # what is written of it can be made
-    except Exception as error:  # as above; the search's own model is handed on
+    except Exception as error:  # as above; the search's own model stays
         final = replace(now.final, not_made=reason(error))
     state = f"{NOT_MADE}: {final.not_made}" if final.not_made else MADE
     return _state(replace(now, final=final), REFIT, state)

@@ -15,18 +15,18 @@ import numpy as np
 
 from droid_jax.discrepancy.candidates import ScoreTest
 from droid_jax.discrepancy.case import Case
-from droid_jax.discrepancy.fitting import FinalModel, intervals
+from droid_jax.discrepancy.fitting import FinalModel, fit_posterior, intervals
 from droid_jax.discrepancy.maps import Localisation
 from droid_jax.discrepancy.residual_set import ResidualSet
 from droid_jax.discrepancy.selection import ValidationTest, bound_at
 from droid_jax.discrepancy.verdict import Alternatives, Verdict
-from droid_jax.files import GAP, GAP_TRACES
+from droid_jax.files import GAP, GAP_TRACES, GAP_VERSION
 from droid_jax.identify.extended_model import Extended, save_extended
-from droid_jax.identify.identifiability import posterior, posterior_of
+from droid_jax.identify.identifiability import posterior
 from droid_jax.model.effects.candidate import Candidate, EffectKey, Keys
 from droid_jax.storage import config_json, finite, write_json, write_npz
 
-FORMAT, VERSION = "droid_jax gap", 2
+FORMAT, VERSION = "droid_jax gap", GAP_VERSION
 
 
 def extended(case: Case, final: FinalModel) -> Extended:
@@ -188,8 +188,7 @@ def _final_json(case: Case, verdict: Verdict, final: FinalModel) -> dict[str, An
     """Which recordings the final model is fitted to, and U of each role with it; null where it blows up."""
 
     def of(residual_set: ResidualSet) -> float | None:
-        rows = residual_set.resampling
-        return finite(rows.discrepancy(rows.residuals(residual_set.common(final.model.values)[0])))
+        return finite(residual_set.resampling.discrepancy(residual_set.residuals(final.model.values)))
 
     return {
         "fitted_to": [fitted.comparison.name for fitted in final.fitted_to],
@@ -237,8 +236,7 @@ def _test(test: ValidationTest) -> dict[str, Any]:
 def _cells(found: Localisation) -> list[dict[str, Any]]:
     return [
         {
-            **asdict(cell.key),
-            "axis": cell.key.axis.value,
+            **config_json(cell.key),
             "discrepancy": cell.discrepancy,
             "p": cell.p,
             "found": cell.found,
@@ -287,9 +285,7 @@ def _parameters(
 def _shifts(case: Case, verdict: Verdict) -> list[dict[str, Any]]:
     """How the base parameters moved when the effects came in, beside their deviation in the base fit."""
     columns = case.full_space.columns(case.base)
-    deviation = posterior_of(
-        verdict.base.refined, case.train.cost.comparisons, case.config.identifiability
-    ).physical_std
+    deviation = fit_posterior(case.train, verdict.base).physical_std
     before, after = verdict.base.values[columns], verdict.model.values[columns]
     return [
         {"name": p.name, "unit": p.unit, "before": b, "after": a, "deviation_before": s}

@@ -126,10 +126,10 @@ def search_effects(
     while not state.finished:
         state, _ = selection_step(state, problem)
     state = pair_step(state, problem)
-    model, pruning = pruned(problem, state.model)
+    model = pruned(problem, state.model)
     model, converging = converged_model(problem, model)
     model, polishing = polished(problem, model)
-    notes = state.notes + pruning + converging + polishing
+    notes = state.notes + converging + polishing
     return conclude(
         case,
         base,
@@ -380,7 +380,7 @@ def _pairs(problem: Problem, model: FittedModel, first: SelectionStep) -> tuple[
     return replace(done, selected=None, chosen=None), notes
 
 
-def pruned(problem: Problem, model: FittedModel) -> tuple[FittedModel, Notes]:
+def pruned(problem: Problem, model: FittedModel) -> FittedModel:
     """The model without effects that no longer take their share of U on the validation recording."""
     config = problem.case.config
     least = config.selection.least_share * problem.base_discrepancy
@@ -393,7 +393,7 @@ def pruned(problem: Problem, model: FittedModel) -> tuple[FittedModel, Notes]:
             continue
         if not needed:
             return pruned(problem, less)
-    return model, Notes()
+    return model
 
 
 def without(part: Candidate, parts: Iterable[Candidate]) -> tuple[Candidate, ...]:

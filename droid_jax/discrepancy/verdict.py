@@ -14,12 +14,11 @@ from droid_jax.discrepancy.config import SelectionConfig
 from droid_jax.discrepancy.fitting import FittedModel, beyond_step_error, remaining_residuals
 from droid_jax.discrepancy.maps import Localisation, localise
 from droid_jax.discrepancy.selection import Reason, SelectionStep, ValidationTest, doubts
+from droid_jax.files import LOST
 from droid_jax.identify.search import NotReplayed
 from droid_jax.model.effects.candidate import EffectKey, Keys, names_of
 
 Alternatives = tuple[Keys, ...]  # each may be several effects together
-
-LOST = "the fitted model on the test recording"  # among what failed
 
 
 class Conclusion(enum.Enum):

@@ -21,6 +21,7 @@ from droid_jax.files import (
     CORRELATION,
     DISTRIBUTION,
     FIT,
+    FIT_VERSION,
     FITTED,
     GAUSSIAN,
     HISTORY,
@@ -37,7 +38,7 @@ from droid_jax.model.parameters import Space
 from droid_jax.preflight.findings import Finding
 from droid_jax.storage import config_json, finite, write_csv, write_json, write_npz, write_text
 
-FORMAT, VERSION = "droid_jax fit", 2
+FORMAT = "droid_jax fit"
 
 
 def prepare_folder(folder: Path) -> Path:
@@ -133,7 +134,7 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
     evaluations = found.search.evaluations + (found.refined.evaluations if found.refined else 0)
     return {
         "format": FORMAT,
-        "version": VERSION,
+        "version": FIT_VERSION,
         "parameters": parameters,
         "cost": {
             "initial": float(costs[0]),

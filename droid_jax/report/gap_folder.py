@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from msgspec import Struct, field
 
-from droid_jax.files import EXTENDED, GAP, GAP_TRACES, NOT_MADE, TO_BE_MADE
+from droid_jax.files import EXTENDED, GAP, GAP_TRACES, GAP_VERSION, LOST, NOT_MADE, TO_BE_MADE
 from droid_jax.report.reading import FindingEntry, PhaseEntry, Reader
 from droid_jax.report.text import label
 
@@ -22,9 +22,7 @@ Role = Literal["train", "validation", "test"]
 ROLES: tuple[Role, ...] = ("train", "validation", "test")
 _READ = Reader("gap", "--again")  # gap.json comes last: once it is there, the command takes the run for whole
 _LINES = ("measured", "scatter", "before", "after")
-VERSION = 2
 THRESHOLDS = ("significance", "minimum_closed", "mostly_explained")  # of "config", "selection", that are read
-LOST = "the fitted model on the test recording"  # among what failed: that recording then has no discrepancy
 
 
 class EffectPlace(Struct, frozen=True):
@@ -399,8 +397,8 @@ def read_gap(folder: str | Path) -> Gap:
 def _content(path: Path) -> dict[str, Any]:
     """gap.json as plain values, of the version that this program reads."""
     content = (_READ if path.exists() else Reader("gap")).json(path)
-    if content.get("version") != VERSION:
-        raise _READ.fault(f"{path} has version {content.get('version', 1)!r}, this program reads version {VERSION}")
+    if content.get("version") != GAP_VERSION:
+        raise _READ.fault(f"{path} has version {content.get('version', 1)!r}, this program reads version {GAP_VERSION}")
     return content
 
 

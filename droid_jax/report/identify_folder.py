@@ -11,11 +11,21 @@ import numpy as np
 from msgspec import Struct, field
 
 from droid_jax.arguments import shown
-from droid_jax.files import CONFIG, CORRELATION, DISTRIBUTION, FILMS, FIT, HISTORY, REPLAY, REPLAY_FILM, TRACES
+from droid_jax.files import (
+    CONFIG,
+    CORRELATION,
+    DISTRIBUTION,
+    FILMS,
+    FIT,
+    FIT_VERSION,
+    HISTORY,
+    REPLAY,
+    REPLAY_FILM,
+    TRACES,
+)
 from droid_jax.read_json import parse_json
 from droid_jax.report.reading import FindingEntry, PhaseEntry, Reader
 
-FIT_VERSION = 2
 MOVED = 1.0  # prior deviations: a parameter that is not identifiable and moved no less is reported as moved
 
 

@@ -374,10 +374,10 @@ def test_a_part_that_the_replay_cannot_do_without_stays(found: Small, monkeypatc
     case: Any = SimpleNamespace(full_space=whole, config=found.case.config, train=None, base=None)
     problem = replace(problem_of(found), case=case, base_discrepancy=10.0)
     model: Any = SimpleNamespace(parts=(damper, drag), values=np.array([2.0, 1.0]), left=1.0)
-    assert pruned(problem, model)[0].parts == (damper,)
+    assert pruned(problem, model).parts == (damper,)
     selection = replace(found.case.config.selection, least_share=0.0005)
     case.config = replace(found.case.config, selection=selection)
-    assert pruned(problem, model)[0] is model  # it takes 0.1 % of the base model's U
+    assert pruned(problem, model) is model  # it takes 0.1 % of the base model's U
 
 
 def test_proposals_of_a_step_begin_at_the_model(found: Small, first: tuple[SearchState, SelectionStep]):
