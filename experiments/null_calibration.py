@@ -108,11 +108,11 @@ def run_case(plan: Plan, commit: str, bench: Bench, watch: Stopwatch) -> Iterato
         "best": str(best),
     }
     if screen.p < case.config.selection.significance:
-        floor = watch("discretisation_error", lambda: bench.floor(scene, case, model, recordings["train"]))
+        step_error = watch("discretisation_error", lambda: bench.step_error(scene, case, model, recordings["train"]))
         whole = watch("prepare", lambda: bench.case(scene, recordings))
-        verdict = watch("find", lambda: search_effects(whole, model, floor))
+        verdict = watch("find", lambda: search_effects(whole, model, step_error))
         yield {
-            "discretisation_error": floor,
+            "discretisation_error": step_error,
             "verdict": verdict.conclusion.value,
             "effects": list(map(str, verdict.effects)),
         }

@@ -61,7 +61,7 @@ class Bench:
         kept = {e.name for e in where.effects(without)}
         return replace(known, **of, effects=tuple(e for e in known.effects if e.name in kept))
 
-    def floor(self, scene: str, case: Case, model: FittedModel, recording: Recording) -> float:
+    def step_error(self, scene: str, case: Case, model: FittedModel, recording: Recording) -> float:
         """U0 of a base model; the finer replay is compiled once a scene."""
         if scene not in self.fine:
             self.fine[scene] = with_finer_step(case.train, model.space, recording)
@@ -97,8 +97,10 @@ def search_case(folder: Path, bench: Bench) -> dict[str, Any]:
     try:
         case = watch("prepare", lambda: bench.case(told["scene"], recordings, told["without"]))
         model = watch("base", lambda: base_fit(case.train, case.base, case.config, silent))
-        floor = watch("discretisation_error", lambda: bench.floor(told["scene"], case, model, recordings["train"]))
-        verdict = watch("find", lambda: search_effects(case, model, floor))
+        step_error = watch(
+            "discretisation_error", lambda: bench.step_error(told["scene"], case, model, recordings["train"])
+        )
+        verdict = watch("find", lambda: search_effects(case, model, step_error))
     except FAILED as error:
         return {**result, "verdict": "error", "error": str(error), "seconds": watch.seconds}
     result |= describe(case, verdict)
