@@ -16,7 +16,6 @@ import numpy as np
 from mujoco import mjx
 
 from droid_jax import runtime
-from droid_jax.cost.cost import batch_replay
 from droid_jax.door.demonstration import demonstration_path
 from droid_jax.door.scene import door_scene
 from droid_jax.door.space import door_space
@@ -27,6 +26,7 @@ from droid_jax.recordings.formats import load_recording
 from droid_jax.simulate.batching import over_block, over_population
 from droid_jax.simulate.c_engine import instrument, simulate
 from droid_jax.simulate.c_reference import control_of
+from droid_jax.simulate.compiled import batch_replay
 from droid_jax.simulate.replay import Drive, make_drive, servo_replay
 
 C_CHUNK = 64  # samples of which the C engine holds traces at once

@@ -20,14 +20,14 @@ import pytest
 from small_log import elbow_log, write_elbow
 
 from droid_jax import run
-from droid_jax.commands import convert, folder, presets
+from droid_jax.commands import convert, folder, options
 from droid_jax.commands.all_stages import All
 from droid_jax.commands.folder import OtherRun, changed, finished, setup_of
 from droid_jax.commands.gap import GapCommand
 from droid_jax.commands.identify import Identify
+from droid_jax.commands.options import load_effects
 from droid_jax.commands.synthetic import known_robot, with_robot_options
 from droid_jax.commands.train import Train
-from droid_jax.commands.user_effects import load_effects
 from droid_jax.door.demonstration import demonstration_path
 from droid_jax.identify import pipeline
 from droid_jax.model.effects import registry
@@ -133,11 +133,11 @@ def test_a_gpu_that_is_not_there_is_said_once(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], preset: str, backend: str, warned: int
 ):
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
-    presets.warn_of_cpu.cache_clear()
+    options.warn_of_cpu.cache_clear()
     for _ in range(2):
-        presets.warn_of_cpu(preset)
+        options.warn_of_cpu(preset)
     assert capsys.readouterr().err.count("jax finds no GPU") == warned
-    presets.warn_of_cpu.cache_clear()
+    options.warn_of_cpu.cache_clear()
 
 
 def test_two_recordings_of_one_name(refused, tmp_path: Path):

@@ -15,7 +15,7 @@ from small_log import elbow_log, write_elbow
 
 from droid_jax.commands import all_stages, evaluate, gap, identify, report, synthetic, train
 from droid_jax.commands.folder import OtherRun
-from droid_jax.commands.presets import TIMESTEP
+from droid_jax.commands.options import TIMESTEP
 from droid_jax.commands.source import synthetic_robot_of
 from droid_jax.commands.synthetic import known_robot
 from droid_jax.door.scene import door_scene

@@ -12,10 +12,9 @@ from typing import Any, Literal, NamedTuple
 
 from droid_jax.commands import evaluate, gap, identify, report, train
 from droid_jax.commands.folder import OtherRun, changed, forget, setup_of
-from droid_jax.commands.scenes import needs_log, needs_recording, needs_scene
+from droid_jax.commands.options import load_effects, needs_log, needs_recording, needs_scene
 from droid_jax.commands.source import model_folder, needs_brax
 from droid_jax.commands.synthetic import DEMONSTRATIONS, hidden_effects, kept_at, record_synthetic, with_robot_options
-from droid_jax.commands.user_effects import load_effects
 from droid_jax.commands.writer import writes
 from droid_jax.files import ASKED, FIT, GAP, LAST_FILES, TRANSFER
 from droid_jax.report.stages import left_over, setup, unfinished
@@ -285,7 +284,7 @@ def _plan(
 
 def _fitted(folder: Path, command: All, recordings: Sequence[Path]) -> bool:
     """Whether a folder of `identify` holds the fit of these recordings: made just now, or earlier of the same."""
-    from droid_jax.commands.scenes import recording_at
+    from droid_jax.commands.options import recording_at
 
     if not (folder / FIT).is_file() or unfinished(folder):
         return False
@@ -321,7 +320,7 @@ def told(out: Path) -> list[str]:
 
 def _record(command: All) -> None:
     """Let the synthetic robot record its motions."""
-    from droid_jax.commands.presets import TIMESTEP
+    from droid_jax.commands.options import TIMESTEP
     from droid_jax.door.scene import door_scene
 
     assert command.springs is not None  # settled

@@ -13,9 +13,9 @@ import tyro
 
 from droid_jax.commands import report
 from droid_jax.commands.folder import changed, setup_of, stage_folder
+from droid_jax.commands.options import load_effects
 from droid_jax.commands.source import needs_brax, source
 from droid_jax.commands.synthetic import hidden_effects
-from droid_jax.commands.user_effects import load_effects
 from droid_jax.commands.writer import writes
 from droid_jax.files import FILMS, POLICY, TRAINING, TRANSFER
 from droid_jax.read_json import read_json

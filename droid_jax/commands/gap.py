@@ -12,10 +12,20 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict
 from droid_jax.commands import report
 from droid_jax.commands.folder import begin, fingerprints, finished, setup_of, stage_folder
 from droid_jax.commands.gap_search import searched
-from droid_jax.commands.presets import TIMESTEP, refine_config, search_config, warn_of_cpu
-from droid_jax.commands.scenes import compared, needs_log, needs_recording, needs_scene, own_scene, recording_at
+from droid_jax.commands.options import (
+    TIMESTEP,
+    compared,
+    load_effects,
+    needs_log,
+    needs_recording,
+    needs_scene,
+    own_scene,
+    recording_at,
+    refine_config,
+    search_config,
+    warn_of_cpu,
+)
 from droid_jax.commands.synthetic import hidden_effects, kept_at, known_robot, record_synthetic, with_robot_options
-from droid_jax.commands.user_effects import load_effects
 from droid_jax.commands.writer import writes
 from droid_jax.files import FIT, GAP
 from droid_jax.read_json import read_json, typed

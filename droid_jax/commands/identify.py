@@ -11,11 +11,22 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from droid_jax.commands import report
 from droid_jax.commands.folder import begin, fingerprints, finished, kept_recordings, setup_of
+from droid_jax.commands.options import (
+    TIMESTEP,
+    Preset,
+    compared,
+    load_effects,
+    needs_log,
+    needs_recording,
+    needs_scene,
+    own_scene,
+    recording_at,
+    refine_config,
+    search_config,
+    warn_of_cpu,
+)
 from droid_jax.commands.pictures import draw_replay, keep_replay
-from droid_jax.commands.presets import TIMESTEP, Preset, refine_config, search_config, warn_of_cpu
-from droid_jax.commands.scenes import compared, needs_log, needs_recording, needs_scene, own_scene, recording_at
 from droid_jax.commands.synthetic import known_robot, with_robot_options
-from droid_jax.commands.user_effects import load_effects
 from droid_jax.commands.writer import writes
 from droid_jax.files import EXTENDED
 

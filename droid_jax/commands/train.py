@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from droid_jax.commands import report
 from droid_jax.commands.folder import RUNS, begin, finished, setup_of
-from droid_jax.commands.presets import warn_of_cpu
+from droid_jax.commands.options import load_effects, warn_of_cpu
 from droid_jax.commands.source import has_model, model_folder, needs_brax, source, synthetic_robot_of
-from droid_jax.commands.user_effects import load_effects
 from droid_jax.commands.writer import writes
 from droid_jax.files import EXTENDED, GAUSSIAN, POLICY, TRAINING
 from droid_jax.report.stages import extended_of, fingerprint

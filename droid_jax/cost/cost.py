@@ -8,7 +8,6 @@ cost.rollouts(values)   # [P, D] -> one Rollout per recording
 
 from __future__ import annotations
 
-import functools
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
@@ -23,29 +22,23 @@ from droid_jax.arguments import instance, instances, one_of
 from droid_jax.cost.residuals import CompareConfig, Comparison, make_comparison
 from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.fields import check_space
-from droid_jax.model.inertia import check_inertia, free_inertias, inertia_possible
-from droid_jax.model.joint_friction import direction, joint_friction_effect, torque_gain_effect
+from droid_jax.model.inertia import check_inertia
 from droid_jax.model.parameters import OF_A_JOINT, Role, Space
-from droid_jax.model.physics import make_physics
 from droid_jax.model.scene import Scene
 from droid_jax.preflight.check_log import warn_of_log
 from droid_jax.preflight.preflight import check_range, warn_if_moving, warn_of_commands
 from droid_jax.recordings.checks import validate
 from droid_jax.recordings.recording import Recording, recordings_of
-from droid_jax.simulate.batching import in_blocks, over_block
-from droid_jax.simulate.c_reference import c_replay
+from droid_jax.simulate.batching import in_blocks
+from droid_jax.simulate.compiled import Along, Driven, along_another, compiled_replay
 from droid_jax.simulate.initial_state import StartConfig, following
-from droid_jax.simulate.inverse_dynamics import Path, motion_path, path_replay, prescribed
+from droid_jax.simulate.inverse_dynamics import motion_path, prescribed
 from droid_jax.simulate.measured_motion import Motion, measured_motion
 from droid_jax.simulate.repeat_starts import from_one_start, own_starts
 from droid_jax.simulate.replay import (
-    TORQUE_OFFSETS,
     Drive,
-    Replay,
     check_gains,
     make_drive,
-    servo_replay,
-    torque_offset_effect,
 )
 
 ENGINES = ("mjx", "mujoco")
@@ -135,7 +128,7 @@ class Cost:
                     "measured throughout"
                 )
             drives.append(drive if _start_alike(self.scene, new, drive, (config or old.config).start) else new)
-            replays.append(_along(replay, drives[-1]))
+            replays.append(along_another(replay, drives[-1]))
             made.append(_compared(self.scene, self.space, recording, drives[-1], replays[-1], config or old.config))
         return assemble(self.scene, self.space, made, replays, drives)
 
@@ -195,9 +188,7 @@ def make_cost(
     check_inertia(scene, space)
     if not any(isinstance(drive, Drive) for drive in drives):
         _warn_of_commanded(space)
-    replays = tuple(
-        _engine(engine, scene, space, d, with_sensors(scene, space, d, effects), config.mj_step) for d in drives
-    )
+    replays = tuple(compiled_replay(engine, scene, space, d, effects, config.mj_step) for d in drives)
     comparisons = tuple(
         _compared(scene, space, recording, drive, replay, config)
         for recording, drive, replay in zip(recordings, drives, replays, strict=True)
@@ -258,23 +249,6 @@ def assemble(
     )
 
 
-def batch_replay(scene: Scene, space: Space, replay: Replay) -> Callable[[np.ndarray], Rollout]:
-    """One compiled, sharded block of a per-sample replay: [B, D] -> Rollout [B, ...]."""
-    return over_block(_of_bodies(scene, space, lambda values: replay(make_physics(scene, space, values))))
-
-
-def _of_bodies(scene: Scene, space: Space, replay: Callable[..., Rollout]) -> Callable[..., Rollout]:
-    """The replay of a row of values [D], which gives no numbers where no body can have the row's inertia."""
-    if not free_inertias(scene, space):
-        return replay
-
-    def checked(values: Any, *more: Any) -> Rollout:
-        rollout = replay(values, *more)
-        return replace(rollout, finite=rollout.finite & inertia_possible(scene, space, values))
-
-    return checked
-
-
 def followed(scene: Scene, recording: Recording, config: CompareConfig) -> Drive | Motion:
     """What a replay follows: the recording's commands or, where it holds none, its measured motion."""
     validate(recording, allow_jitter=True)  # one made in Python may not have been
@@ -290,49 +264,6 @@ def followed(scene: Scene, recording: Recording, config: CompareConfig) -> Drive
     return measured_motion(
         recording, prescribed(scene, recording), cutoff=config.motion_cutoff, alike=felt, rest=config.rest
     )
-
-
-@dataclass(frozen=True, eq=False)
-class Along:
-    """A compiled batch of inverse replays along a motion: [B, D] -> Rollout [B, ...].
-
-    torques: the torques [N, T, J] of N paths at the space's means.
-    """
-
-    compiled: Callable[..., Rollout]
-    scene: Scene
-    motion: Motion
-    torques: Callable[[Path], jax.Array]
-
-    def __call__(self, values: np.ndarray) -> Rollout:
-        return self.compiled(values, motion_path(self.scene, self.motion))
-
-
-@dataclass(frozen=True, eq=False)
-class Driven:
-    """A batch of servo replays of a drive: [B, D] -> Rollout [B, ...].
-
-    make: drive -> its batch; one of another start, or of other commands of the same length, compiles nothing anew.
-    """
-
-    make: Callable[[Drive], Callable[[np.ndarray], Rollout]]
-    drive: Drive
-
-    @functools.cached_property
-    def _batch(self) -> Callable[[np.ndarray], Rollout]:
-        return self.make(self.drive)
-
-    def __call__(self, values: np.ndarray) -> Rollout:
-        return self._batch(values)
-
-
-def _along(replay: Callable[[np.ndarray], Rollout], follows: Drive | Motion) -> Callable[[np.ndarray], Rollout]:
-    """The same compiled batch along another motion, or from another start."""
-    if isinstance(replay, Along) and isinstance(follows, Motion):
-        return replace(replay, motion=follows)
-    if isinstance(replay, Driven) and isinstance(follows, Drive):
-        return replay if follows is replay.drive else replace(replay, drive=follows)
-    return replay
 
 
 def _from_one_start(
@@ -412,62 +343,6 @@ def _start_alike(scene: Scene, new: Drive | Motion, old: Drive | Motion, config:
 def _clock(recording: Recording, follows: Drive | Motion) -> np.ndarray:
     """[T] s of a replay's rows, on the recording's clock."""
     return follows.time if isinstance(follows, Motion) else float(recording.time[0]) + follows.time
-
-
-def with_sensors(scene: Scene, space: Space, drive: Drive | Motion, effects: Sequence[Effect]) -> tuple[Effect, ...]:
-    """The effects, and those of the torque sensors that are not among them: what a replay is made with."""
-    given = {e.name for e in effects}
-    return (*effects, *(e for e in _sensor_effects(scene, space, drive) if e.name not in given))
-
-
-def _sensor_effects(scene: Scene, space: Space, drive: Drive | Motion) -> tuple[Effect, ...]:
-    """What the torque sensors add: always the offsets, all else where the space asks for it."""
-
-    sign = jnp.sign if isinstance(drive, Motion) else direction
-    found = [joint_friction_effect(scene.joints, sign)] if space.of_role(Role.VISCOUS, Role.COULOMB) else []
-    found += [torque_gain_effect(scene.joints)] if space.of_role(Role.TORQUE_GAIN) else []
-    return (*found, torque_offset_effect(scene.joints))
-
-
-def _engine(
-    engine: str, scene: Scene, space: Space, drive: Drive | Motion, effects: Sequence[Effect], mj_step: bool
-) -> Callable[[np.ndarray], Rollout]:
-    late = 0.0 if mj_step else 0.5
-    if isinstance(drive, Motion):
-        if mj_step:
-            raise ValueError("mj_step replays commands; this recording has none")
-        if engine != "mjx":
-            raise ValueError("a recording without commands is replayed by inverse dynamics, which needs engine 'mjx'")
-        along = path_replay(scene, drive.torque, effects, drive.joints)
-        means = jnp.asarray(space.mean, jnp.float32)
-        return Along(
-            over_block(_of_bodies(scene, space, lambda values, path: along(make_physics(scene, space, values), path))),
-            scene,
-            drive,
-            _compiled(lambda path: along(make_physics(scene, space, means), path).torque),
-        )
-    if engine == "mjx":
-        replay = servo_replay(scene, drive, effects, parity=mj_step, late=late)
-        compiled = over_block(
-            _of_bodies(scene, space, lambda values, *of_drive: replay(make_physics(scene, space, values), *of_drive))
-        )
-
-        def driven(drive: Drive) -> Callable[[np.ndarray], Rollout]:
-            of_drive = jnp.asarray(drive.command, jnp.float32), jnp.asarray(drive.qpos0, jnp.float32)
-            return lambda values: compiled(values, *of_drive)
-
-        return Driven(driven, drive)
-    known = [e for e in effects if e.name != TORQUE_OFFSETS]
-
-    def twin(drive: Drive) -> Callable[[np.ndarray], Rollout]:
-        checked = _of_bodies(scene, space, c_replay(scene, space, drive, known, late=late))
-        return lambda values: jax.tree.map(_single, checked(values))
-
-    return Driven(twin, drive)
-
-
-def _single(array: np.ndarray) -> jax.Array:
-    return jnp.asarray(array, jnp.float32) if np.issubdtype(array.dtype, np.floating) else jnp.asarray(array)
 
 
 def _compiled(function: Callable[[Any], jax.Array]) -> Callable[[Any], jax.Array]:

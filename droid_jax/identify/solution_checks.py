@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from droid_jax import runtime
-from droid_jax.cost.cost import Cost, with_sensors
+from droid_jax.cost.cost import Cost
 from droid_jax.cost.residuals import Comparison
 from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.parameters import Space
@@ -23,6 +23,7 @@ from droid_jax.model.scene import Scene, with_options
 from droid_jax.preflight.creep import creep_note
 from droid_jax.recordings.recording import Recording
 from droid_jax.simulate.c_reference import c_replay
+from droid_jax.simulate.compiled import with_sensors
 from droid_jax.simulate.replay import TORQUE_OFFSETS, Drive, make_drive, servo_replay
 
 LARGE = 0.1  # share of the remaining error from which on a time step is too coarse, or two engines too far apart

@@ -156,7 +156,8 @@ def servo_replay(
 
     The scan carries only position, velocity and the solver's warm start: everything else in
     mjx.Data is rebuilt each step, so that XLA drops what nobody reads.
-    The replay also takes another command [T, U] and start [nq]: repeats that start apart share one compiled program.
+    The replay also takes another command [T, U] and start [nq], so that recordings share one compiled program; of the
+    drive only its time step and its torque's convention are then used.
     parity: step exactly as the C engine does (see `droid_jax.model.step`), for comparisons with it; then
       `late` steps late (see `_command`).
     """
@@ -204,9 +205,9 @@ def servo_replay(
             return (after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator), out
 
         zero = jnp.zeros(scene.model.nv, jnp.float32)
-        steps = jnp.arange(len(drive.command), dtype=jnp.int32)
+        steps = jnp.arange(len(table), dtype=jnp.int32)
         _, (torque, position, velocity, angle, contact) = jax.lax.scan(step, (start, zero, zero, zero), steps)
-        time = jnp.asarray(drive.time, jnp.float32)
+        time = jnp.asarray(np.arange(len(table)) * drive.timestep, jnp.float32)
         rollout = Rollout(time, torque, position, velocity, angle, contact, jnp.array(True))
         return apply_sensor_model(rollout, theta, effects)
 

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from droid_jax.cost.cost import Along, make_cost
+from droid_jax.cost.cost import make_cost
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.identify.holdout import split_repeats
 from droid_jax.identify.pipeline import Identified, IdentifyConfig, identify_parameters
@@ -18,6 +18,7 @@ from droid_jax.model.joint_friction import joint_friction_space, sensor_paramete
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
+from droid_jax.simulate.compiled import Along
 
 XML = """<mujoco><option gravity="0 0 0"/><worldbody><body name="carriage">
   <joint name="slide" type="slide" axis="1 0 0" damping="10" frictionloss="1e-6"/><geom size=".1" mass="8"/></body>

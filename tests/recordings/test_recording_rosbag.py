@@ -18,7 +18,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from droid_jax.commands.scenes import recording_at
+from droid_jax.commands.options import recording_at
 from droid_jax.recordings import rosbag
 from droid_jax.recordings.formats import load_recording, save_recording
 from droid_jax.recordings.recording import TorqueConvention, TorqueSide

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import importlib
 import pkgutil
 from collections.abc import Callable, Iterable
@@ -110,8 +111,9 @@ def checked(effect: Effect) -> Effect:
     return effect
 
 
+@functools.lru_cache(maxsize=16)
 def ready(scene: Scene) -> Scene:
-    """The scene with a friction row for every joint whose friction an effect may raise.
+    """The scene with a friction row for every joint whose friction an effect may raise; one for one scene.
 
     MJX lays these rows out at compilation (see TINY_FRICTIONLOSS); they cost a little time each.
     """

@@ -1,17 +1,62 @@
-"""A scene of your own and recordings in it, as `identify` and `gap` take them from the command line."""
+"""What options that several commands share stand for: a preset, a scene and recordings of your own, your effects."""
 
 from __future__ import annotations
 
+import functools
+import importlib.util
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
+
+from droid_jax.report.stages import setup
 
 if TYPE_CHECKING:
     from droid_jax.cost.residuals import CompareConfig
+    from droid_jax.identify.multistart import RefineConfig
+    from droid_jax.identify.search import CmaConfig
     from droid_jax.model.parameters import Space
     from droid_jax.model.scene import Scene
     from droid_jax.recordings.recording import Recording
+
+Preset = Literal["quick", "standard", "paper", "gpu"]
+TIMESTEP: dict[Preset, float] = {"quick": 0.004, "standard": 0.002, "paper": 0.002, "gpu": 0.002}  # s, built-in door
+
+
+@functools.cache
+def warn_of_cpu(preset: str) -> None:
+    """Say once where the preset for a GPU runs on a CPU; jax must be tuned already."""
+    import jax
+
+    if preset == "gpu" and jax.default_backend() == "cpu":
+        print(
+            "warning: --preset gpu, but jax finds no GPU: on a CPU it takes hours (docs/ten-minutes.md: jax with CUDA)",
+            file=sys.stderr,
+        )
+
+
+def search_config(preset: Preset, seed: int, **changes: int | None) -> CmaConfig:
+    """The preset's search; changes: fields of CmaConfig that were asked for, None for those that were not."""
+    from droid_jax.identify.search import CmaConfig
+
+    chosen: dict[str, int | None] = {
+        "quick": dict(population=30, parents=None, generations=20),
+        "standard": dict(population=30, parents=None, generations=100),
+        "paper": dict(population=30, parents=5, generations=100),
+        "gpu": dict(population=1024, parents=None, generations=60, restarts=2),
+    }[preset]
+    asked = {name: value for name, value in changes.items() if value is not None}
+    return CmaConfig(**{**chosen, **asked}, seed=seed)  # type: ignore[arg-type]
+
+
+def refine_config(preset: Preset) -> RefineConfig | None:
+    """The preset's refinement; None: the paper has none."""
+    from droid_jax.identify.multistart import RefineConfig
+
+    if preset == "paper":
+        return None
+    return RefineConfig(basin_hop_generations=12) if preset == "quick" else RefineConfig()
 
 
 class OwnScene(Protocol):
@@ -91,3 +136,29 @@ def recording_at(path: Path) -> Recording:
             "`python -m droid_jax.run convert BAGS --joints ... --torque ...` makes a recording of it"
         )
     return load_recording(path)
+
+
+def load_effects(path: Path | None, *folders: Path | None) -> None:
+    """Run a file of effects of your own, which are in the library from then on (docs/your-effect.md).
+
+    folders: of runs that are read: one that was made with such effects needs them.  Its setup.json is not followed to
+    the file: results that come from elsewhere run no code.
+    Raises ValueError where the file is missing, fails, or a folder needs one and none is given.
+    """
+    if path is None:
+        for folder in (f for f in folders if f is not None):
+            if told := setup(folder).get("user_effects"):
+                raise ValueError(f"{folder} was made with effects of your own: give --user-effects {told}")
+        return
+    if not path.is_file():
+        raise ValueError(f"--user-effects: there is no file {path}")
+    # One name for one file: read again by the next stage of `all`, it registers the same effects and no others.
+    name = f"user_effects_{path.stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise ValueError(f"--user-effects takes a Python file (.py), got {path}")
+    sys.modules[name] = module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise ValueError(f"--user-effects {path}: {type(error).__name__}: {error}") from error

@@ -1,0 +1,227 @@
+"""Replays compiled in batches; each program is made once for all that differ in nothing but numbers.
+
+Tracing and compiling a replay takes longer than most fits replay.  A program depends on the scene, on what a row of
+values writes, on the effects and on how many steps there are; commands, starts and measured motions are handed to it.
+So recordings of one length, their held-out repeats and every search over them share one.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from droid_jax import runtime
+from droid_jax.model.effect_interface import Effect, Rollout
+from droid_jax.model.inertia import free_inertias, inertia_possible
+from droid_jax.model.joint_friction import direction, joint_friction_effect, torque_gain_effect
+from droid_jax.model.parameters import Role, Space, Write
+from droid_jax.model.physics import make_physics
+from droid_jax.model.scene import Scene
+from droid_jax.recordings.recording import TorqueConvention
+from droid_jax.simulate.batching import over_block
+from droid_jax.simulate.c_reference import c_replay
+from droid_jax.simulate.inverse_dynamics import Path, motion_path, path_replay
+from droid_jax.simulate.measured_motion import Motion
+from droid_jax.simulate.replay import (
+    TORQUE_OFFSETS,
+    Drive,
+    Replay,
+    check_gains,
+    servo_replay,
+    torque_offset_effect,
+)
+
+PROGRAMS = 16  # of each kind, kept for whoever asks for the same again; each holds its scene
+
+Batch = Callable[[np.ndarray], Rollout]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What a row of values is written to: spaces that differ in means, deviations or bounds alone have the same."""
+
+    entries: tuple[tuple[str, Role, tuple[Write, ...]], ...]
+    space: Space = field(compare=False)
+
+
+@dataclass(frozen=True)
+class Clocked:
+    """What a servo program must know of a drive: the same of all drives on one clock, torques of one convention."""
+
+    timestep: float
+    torque: TorqueConvention
+    drive: Drive = field(compare=False)
+
+
+@dataclass(frozen=True, eq=False)
+class Along:
+    """A compiled batch of inverse replays along a motion: [B, D] -> Rollout [B, ...].
+
+    torques: the torques [N, T, J] of N paths at the space's means.
+    """
+
+    compiled: Callable[..., Rollout]
+    scene: Scene
+    motion: Motion
+    torques: Callable[[Path], jax.Array]
+
+    def __call__(self, values: np.ndarray) -> Rollout:
+        return self.compiled(values, motion_path(self.scene, self.motion))
+
+
+@dataclass(frozen=True, eq=False)
+class Driven:
+    """A batch of servo replays of a drive: [B, D] -> Rollout [B, ...].
+
+    make: drive -> its batch; one of another start, or of other commands of the same length, compiles nothing anew.
+    """
+
+    make: Callable[[Drive], Batch]
+    drive: Drive
+
+    @functools.cached_property
+    def _batch(self) -> Batch:
+        return self.make(self.drive)
+
+    def __call__(self, values: np.ndarray) -> Rollout:
+        return self._batch(values)
+
+
+def along_another(replay: Batch, follows: Drive | Motion) -> Batch:
+    """The same compiled batch along another motion, or of another drive."""
+    if isinstance(replay, Along) and isinstance(follows, Motion):
+        return replace(replay, motion=follows)
+    if isinstance(replay, Driven) and isinstance(follows, Drive):
+        return replay if follows is replay.drive else replace(replay, drive=follows)
+    return replay
+
+
+def compiled_replay(
+    engine: str, scene: Scene, space: Space, follows: Drive | Motion, effects: Sequence[Effect], mj_step: bool = False
+) -> Batch:
+    """Batches [B, D] -> Rollout [B, ...] of what a replay follows.
+
+    Args:
+        engine: "mjx" (compiled, all devices) or "mujoco" (plain C, all cores).
+        scene: what is simulated.
+        space: meaning of the values [D].
+        follows: the commands or the measured motion.
+        effects: in the replay; those of the sensors are added (`with_sensors`).
+        mj_step: step as the C engine does.
+
+    Raises:
+        ValueError: a measured motion with mj_step or in plain C, or gains that the scene does not have.
+    """
+    effects, layout = with_sensors(scene, space, follows, effects), layout_of(space)
+    if isinstance(follows, Motion):
+        if mj_step:
+            raise ValueError("mj_step replays commands; this recording has none")
+        if engine != "mjx":
+            raise ValueError("a recording without commands is replayed by inverse dynamics, which needs engine 'mjx'")
+        batch, torques = _inverse_program(scene, layout, effects, follows.torque, follows.joints)
+        means = jnp.asarray(space.mean, jnp.float32)
+        return Along(batch, scene, follows, lambda paths: torques(means, paths))
+    check_gains(scene, follows)
+    if engine == "mjx":
+        program = _servo_program(scene, layout, effects, Clocked(follows.timestep, follows.torque, follows), mj_step)
+
+        def driven(drive: Drive) -> Batch:
+            of_drive = jnp.asarray(drive.command, jnp.float32), jnp.asarray(drive.qpos0, jnp.float32)
+            return lambda values: program(values, *of_drive)
+
+        return Driven(driven, follows)
+    known = [e for e in effects if e.name != TORQUE_OFFSETS]
+
+    def twin(drive: Drive) -> Batch:
+        checked = _of_bodies(scene, space, c_replay(scene, space, drive, known, late=0.0 if mj_step else 0.5))
+        return lambda values: jax.tree.map(_single, checked(values))
+
+    return Driven(twin, follows)
+
+
+def batch_replay(scene: Scene, space: Space, replay: Replay) -> Batch:
+    """One compiled, sharded block of a per-sample replay of your own: [B, D] -> Rollout [B, ...]."""
+    return over_block(_of_bodies(scene, space, lambda values: replay(make_physics(scene, space, values))))
+
+
+def layout_of(space: Space) -> Layout:
+    """What a program must know of a space."""
+    return Layout(tuple((p.name, p.role, p.writes) for p in space.parameters), space)
+
+
+def with_sensors(scene: Scene, space: Space, drive: Drive | Motion, effects: Sequence[Effect]) -> tuple[Effect, ...]:
+    """The effects, and those of the torque sensors that are not among them: what a replay is made with.
+
+    Offsets always, all else where the space asks for it.
+    """
+    given = {e.name for e in effects}
+    friction, gain = bool(space.of_role(Role.VISCOUS, Role.COULOMB)), bool(space.of_role(Role.TORQUE_GAIN))
+    sensed = _sensor_effects(scene.joints, isinstance(drive, Motion), friction, gain)
+    return (*effects, *(e for e in sensed if e.name not in given))
+
+
+@functools.lru_cache(maxsize=PROGRAMS)
+def _sensor_effects(joints: tuple[str, ...], prescribed: bool, friction: bool, gain: bool) -> tuple[Effect, ...]:
+    """The same effects each time: programs are told apart by theirs."""
+    found = [joint_friction_effect(joints, jnp.sign if prescribed else direction)] if friction else []
+    found += [torque_gain_effect(joints)] if gain else []
+    return (*found, torque_offset_effect(joints))
+
+
+@functools.lru_cache(maxsize=PROGRAMS)
+def _servo_program(
+    scene: Scene,
+    layout: Layout,
+    effects: tuple[Effect, ...],
+    clocked: Clocked,
+    mj_step: bool,
+) -> Callable[..., Rollout]:
+    """(values [B, D], command [T, U], start [nq]) -> Rollout [B, ...]; scene and effects count by identity."""
+    replay = servo_replay(scene, clocked.drive, effects, parity=mj_step, late=0.0 if mj_step else 0.5)
+    space = layout.space
+    return over_block(
+        _of_bodies(scene, space, lambda values, *of_drive: replay(make_physics(scene, space, values), *of_drive))
+    )
+
+
+@functools.lru_cache(maxsize=PROGRAMS)
+def _inverse_program(
+    scene: Scene,
+    layout: Layout,
+    effects: tuple[Effect, ...],
+    torque: TorqueConvention,
+    joints: tuple[str, ...],
+) -> tuple[Callable[..., Rollout], Callable[[jax.Array, Path], jax.Array]]:
+    """(values [B, D], path) -> Rollout [B, ...], and (values [D], N paths) -> torques [N, T, J]."""
+    along, space = path_replay(scene, torque, effects, joints), layout.space
+
+    def replay(values: jax.Array, path: Path) -> Rollout:
+        return along(make_physics(scene, space, values), path)
+
+    torques = jax.jit(
+        jax.vmap(lambda values, path: replay(values, path).torque, in_axes=(None, 0)),
+        compiler_options=runtime.compiler_options(),
+    )
+    return over_block(_of_bodies(scene, space, replay)), torques
+
+
+def _of_bodies(scene: Scene, space: Space, replay: Callable[..., Rollout]) -> Callable[..., Rollout]:
+    """The replay of a row of values [D], which gives no numbers where no body can have the row's inertia."""
+    if not free_inertias(scene, space):
+        return replay
+
+    def checked(values: Any, *more: Any) -> Rollout:
+        rollout = replay(values, *more)
+        return replace(rollout, finite=rollout.finite & inertia_possible(scene, space, values))
+
+    return checked
+
+
+def _single(array: np.ndarray) -> jax.Array:
+    return jnp.asarray(array, jnp.float32) if np.issubdtype(array.dtype, np.floating) else jnp.asarray(array)
