@@ -6,13 +6,17 @@ import functools
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+from markupsafe import Markup
+from matplotlib.figure import Figure
 
 from benchmarks import archive
 from droid_jax import runtime
+from droid_jax.report import style
 
 ROOT = Path(__file__).resolve().parents[1]
 # Kept between sessions: a second run finds its programs compiled.
@@ -88,6 +92,37 @@ def refused(tuned: None, capsys: pytest.CaptureFixture[str]) -> Callable[..., st
         return lines[0]
 
     return run
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures are made, and neither saved nor put into the page, which would take seconds."""
+    monkeypatch.setattr(style, "drawing", _made_only)
+
+
+def _made_only(folder: Path, stem: str, title: str, make: Callable[..., Figure], *args: Any) -> style.Drawing:
+    assert isinstance(make(*args, width=style.WIDE), Figure)
+    return style.Drawing(folder / "figures", stem, title, Markup(""), Markup(""))
+
+
+def _line(width: float) -> Figure:
+    figure = Figure(figsize=(1, 1))
+    figure.subplots().plot([0, 1])
+    return figure
+
+
+@pytest.fixture(scope="module")
+def one_line() -> Iterator[None]:
+    """Figures are made; saved and put into the page is one line in their place."""
+    drawing = style.drawing
+
+    def line_drawing(folder: Path, stem: str, title: str, make: Callable[..., Figure], *args: Any) -> style.Drawing:
+        _made_only(folder, stem, title, make, *args)
+        return drawing(folder, stem, title, _line)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(style, "drawing", line_drawing)
+        yield
 
 
 @pytest.fixture

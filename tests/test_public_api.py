@@ -143,6 +143,7 @@ def test_the_example_is_short(example: ModuleType):
     assert len(lines) < 20
 
 
+@pytest.mark.slow
 def test_the_example_recovers_the_arm(example: ModuleType, recording: dj.Recording):
     """A small budget, far from the truth: the guesses are off by 27, 35, 67 and 71 percent."""
     found = example.fit(recording, SMALL)

@@ -28,7 +28,7 @@ from droid_jax.run import main
 
 SEARCH = replace(CONFIG, search=CmaConfig(population=8, parents=None, generations=2), max_effects=1)
 LOG = elbow_log(COULOMB)
-pytestmark = pytest.mark.usefixtures("tuned")
+pytestmark = pytest.mark.usefixtures("one_line", "tuned")
 
 
 def command(place: Path, recordings: Sequence[Recording], *options: str) -> list[str]:

@@ -28,6 +28,9 @@ from typing import Any, ParamSpec, cast
 import matplotlib
 from markupsafe import Markup
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_pdf import FigureCanvasPdf
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.ticker import ScalarFormatter
@@ -193,9 +196,7 @@ def inline_svg(figure: Figure, prefix: str) -> str:
 
     prefix: put before every id, so that several drawings can share one page.
     """
-    with matplotlib.rc_context(STYLE), io.StringIO() as buffer:
-        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
-        svg = buffer.getvalue()
+    svg = _bytes(figure, "svg").decode()
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.S)
     svg = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{prefix}-", svg)
@@ -222,9 +223,19 @@ def save(figure: Figure, folder: Path, stem: str) -> None:
 
 
 def _bytes(figure: Figure, kind: str) -> bytes:
-    dates = {"pdf": {"CreationDate": None}, "png": {"Software": None}}[kind]
+    """The figure in a format: SVG without a background, the others on white.
+
+    By its canvas, since `savefig` would draw all of a settled figure once more to arrange it.
+    """
+    canvas, background, metadata = {
+        "svg": (FigureCanvasSVG, "none", {"Date": None, "Creator": None}),
+        "pdf": (FigureCanvasPdf, "white", {"CreationDate": None}),
+        "png": (FigureCanvasAgg, "white", {"Software": None}),
+    }[kind]
     with matplotlib.rc_context(STYLE), io.BytesIO() as buffer:
-        figure.savefig(buffer, format=kind, facecolor="white", metadata=dates)
+        figure.set_facecolor(background)
+        figure.set_dpi(STYLE["savefig.dpi"])
+        getattr(canvas(figure), f"print_{kind}")(buffer, metadata=metadata)
         return buffer.getvalue()
 
 

@@ -77,6 +77,7 @@ def dropped(recording: Recording, seconds: float) -> Recording:
     return replace(recording, channels={**recording.channels, "torque": replace(channel, mask=mask)})
 
 
+@pytest.mark.slow
 def test_a_dropout_that_a_slower_motion_makes_too_long_is_said(demonstration):
     """60 ms without torques are filled in; three times slower they are too long."""
     models = (model("drag", 0.0), model("drag", 0.8))

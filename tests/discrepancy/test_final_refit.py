@@ -116,7 +116,7 @@ def final_model_of(page: str) -> tuple[str, str] | None:
     return None if found is None else (found[1], found[2])
 
 
-def test_the_page_says_what_it_is_fitted_to(found: Small, both: FinalModel, tmp_path: Path):
+def test_the_page_says_what_it_is_fitted_to(found: Small, both: FinalModel, tmp_path: Path, quick: None):
     write_gap(tmp_path, found.case, found.verdict, both, MORE)
     said = final_model_of(write_report(tmp_path).read_text())
     assert said is not None and "“train” and “validation”" in said[1]

@@ -101,7 +101,9 @@ def found_in(compensated: bool, folder: Path, **hidden: float) -> tuple[Verdict,
     return verdict, spans
 
 
-@pytest.mark.parametrize("compensated", [False, True], ids=["weight", "compensated"])
+@pytest.mark.parametrize(
+    "compensated", [pytest.param(False, id="weight"), pytest.param(True, id="compensated", marks=pytest.mark.slow)]
+)
 def test_the_effects_are_what_the_robot_hides(compensated: bool, tmp_path: Path):
     """At what was hidden no more is left than where nothing is."""
     scene = arm(compensated)
@@ -146,6 +148,7 @@ def test_a_base_that_leans_is_named_and_measured(compensated: bool, tmp_path: Pa
     assert all(verdict.closed(role) > 0.9 for role in ("train", "validation", "test"))
 
 
+@pytest.mark.slow
 def test_sensors_gains_and_zeros_are_parameters_of_a_file(tmp_path: Path):
     """What was hidden comes back as parameters, and is not asked about where it is one."""
     scene = arm(False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from dataclasses import replace
 
+import pytest
 from small_gap import EFFECTS, FLOOR, PRELOAD, QUICK, quiet, record, small_scene
 
 from droid_jax.discrepancy.case import make_case
@@ -34,6 +35,7 @@ def test_where_nothing_is_hidden_nothing_is_missing():
     assert found.score_tests[0].p > 0.01
 
 
+@pytest.mark.slow
 def test_two_effects_are_both_named_and_nothing_else():
     found = verdict(PRELOAD, FRICTION)
     assert found.conclusion is Conclusion.NAMED

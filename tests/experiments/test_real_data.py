@@ -117,6 +117,7 @@ def test_friction_space_starts_at_no_friction() -> None:
     assert np.all(space.mean == 0) and np.all(space.low < 0) and np.all(space.high > 0)
 
 
+@pytest.mark.slow
 def test_known_friction_comes_back(experiment: Callable[[str], ModuleType], tmp_path: Path) -> None:
     panda, fit = experiment("real_panda"), experiment("inverse_fit")
     write_panda(tmp_path)

@@ -285,7 +285,7 @@ def test_derived_quantities_equal_the_compiler(name: str):
     changed.body_pos[1:, 1] += 0.07
     free = changed.jnt_type == mujoco.mjtJoint.mjJNT_FREE
     changed.qpos0[changed.jnt_qposadr[free] + 1] += 0.07  # where the compiler lets such a body begin
-    model = derive(mjx.put_model(changed))
+    model = jax.jit(derive)(mjx.put_model(changed))
     for field in DERIVED:
         # float32 inverse of an inertia matrix of a few rows
         np.testing.assert_allclose(getattr(model, field), getattr(target, field), rtol=2e-4, atol=1e-5, err_msg=field)

@@ -67,8 +67,9 @@ def test_every_row_is_its_draw(scene, gaussian, keys):
     low, high = gaussian.space["hinge_damping"].low, gaussian.space["hinge_damping"].high
     assert np.all((seen >= low) & (seen <= high))
     values = gaussian.sample(np.random.default_rng(np.asarray(jax.random.key_data(keys)).ravel().tolist()), ENVS)
+    made = jax.jit(lambda row: make_physics(scene, gaussian.space, row))
     for k in range(ENVS):
-        expected, found = make_physics(scene, gaussian.space, values[k]), rows(physics, batched, k)
+        expected, found = made(values[k]), rows(physics, batched, k)
         for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
             np.testing.assert_allclose(a, b, rtol=2e-4, atol=1e-5)
 

@@ -29,7 +29,7 @@ CHECK = {
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(tmp_path_factory: pytest.TempPathFactory, one_line: None) -> Path:
     folder = make_run(tmp_path_factory.mktemp("report") / "run")
     page.write_report(folder)
     return folder
@@ -331,7 +331,7 @@ def test_two_kinds_of_torque_difference_are_distinguished(written: Page) -> None
     assert "RMS difference between the smoothed torques" in written.text and "RMS over all joints" not in written.text
 
 
-def test_several_recordings_each_have_their_own_distance_and_figure(tmp_path: Path) -> None:
+def test_several_recordings_each_have_their_own_distance_and_figure(tmp_path: Path, one_line: None) -> None:
     run = make_run(tmp_path / "run", recordings=("slow", "fast"))
     text = page.write_report(run).read_text(encoding="utf-8")
     assert 'data-recording="slow"' in text and 'data-recording="fast"' in text

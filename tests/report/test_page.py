@@ -18,7 +18,7 @@ from droid_jax.synthetic.hidden_effects import in_words
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory: pytest.TempPathFactory, one_line: None) -> Path:
     whole = tmp_path_factory.mktemp("whole") / "run"
     make_whole(whole)
     page.write_report(whole)

@@ -39,7 +39,7 @@ def plan(name: str) -> tuple[Recording, Rollout]:
     return demonstration, replayed(demonstration)
 
 
-@pytest.mark.parametrize("name", ["A", "C"])
+@pytest.mark.parametrize("name", ["A", pytest.param("C", marks=pytest.mark.slow)])
 def test_the_door_goes_a_third_further_and_comes_back(name: str):
     """C closes again afterwards: what follows the widest opening follows it still, later."""
     demonstration, before = plan(name)

@@ -48,7 +48,18 @@ def check_recovery(bench: Bench, name: str, truth: Mapping[str, float]) -> None:
     assert (deviation < KNOWN * np.abs(true)).all(), (true, deviation)
 
 
-@pytest.mark.parametrize("name", [n for n in ORACLES if n != "soft_friction"])  # which test_soft_friction.py has
+# One of each place where an effect enters a replay; the others are slow.
+QUICK = ("command_delay", "hinge_preload", "joint_coulomb", "latch", "payload", "servo_gain", "torque_bias")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in QUICK else pytest.mark.slow)
+        for name in ORACLES
+        if name != "soft_friction"  # which test_soft_friction.py has
+    ],
+)
 def test_the_effects_parameters_come_back(small: Bench, name: str):
     check_recovery(small, name, ORACLES[name].values)
 
