@@ -16,6 +16,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -72,7 +73,7 @@ def main(arguments: Arguments) -> None:
         "exit_code": run.returncode,
         **found,
     }
-    totals = {key: result[key] for key in ("cache", "tests", "cpu_seconds", "exit_code")}
+    totals = {key: result[key] for key in ("cache", "tests", "minutes", "cpu_seconds", "exit_code")}
     runtime.tune()
     publish(arguments.out, "durations", arguments.quick, 0, result, totals)
 
@@ -117,6 +118,7 @@ class CpuClock:
 
     def __init__(self, config: pytest.Config) -> None:
         self.config, self.last = config, cpu_seconds()
+        self.began = time.monotonic()
         self.tests: Counter[str] = Counter()
         self.workers = 0.0
 
@@ -143,7 +145,9 @@ class CpuClock:
             output[OPTION] = cpu_seconds()
         else:
             total = self.workers or cpu_seconds()
-            self.config.getoption(OPTION).write_text(json.dumps(summary(dict(self.tests), total)))
+            minutes = (time.monotonic() - self.began) / 60
+            found = {"minutes": round(minutes, 1), **summary(dict(self.tests), total)}
+            self.config.getoption(OPTION).write_text(json.dumps(found))
 
 
 if __name__ == "__main__":

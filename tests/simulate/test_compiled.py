@@ -1,0 +1,79 @@
+"""One compiled program serves every replay that differs in numbers alone, and none that differs in more."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from two_link import MOTOR, arm, motion, recording
+
+from droid_jax.cost.cost import Cost, make_cost
+from droid_jax.model.effect_interface import Effect
+from droid_jax.model.fields import joint_damping
+from droid_jax.model.parameters import Space
+from droid_jax.model.scene import Scene
+from droid_jax.recordings.recording import Recording, TorqueSide
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return arm()
+
+
+def space_of(scene: Scene, high: float = 9.0) -> Space:
+    return Space((joint_damping(scene, "elbow", std=0.5, high=high),))
+
+
+def pull(size: float, traced: list[float]) -> Effect:
+    """A constant torque, which notes each time that its program is traced."""
+
+    def force(theta, state):
+        traced.append(size)
+        return jnp.full_like(state.qvel, size)
+
+    return Effect("pull", force=force)
+
+
+def made(scene: Scene, log: Recording, effect: Effect, high: float = 9.0) -> Cost:
+    return make_cost(scene, space_of(scene, high), log, effects=[effect], check=False)
+
+
+def torque(cost: Cost) -> np.ndarray:
+    return cost.rollouts(cost.space.mean[None])[0].torque[0]
+
+
+def test_other_commands_starts_and_bounds_share_a_program(scene: Scene):
+    traced = list[float]()
+    effect = pull(0.0, traced)
+    first = torque(made(scene, recording(), effect))
+    count, command = len(traced), motion()[1]
+    slower = recording(name="slower", command=0.5 * command + 0.5 * command[0])
+    other = torque(made(scene, slower, effect, high=5.0))
+    assert count and len(traced) == count
+    assert np.abs(other - first).max() > 0.1
+    alone = torque(made(arm(), slower, pull(0.0, [])))  # compiled for itself
+    np.testing.assert_array_equal(other, alone)
+
+
+def test_other_effects_scenes_and_conventions_do_not(scene: Scene):
+    traced = list[float]()
+    effect = pull(0.0, traced)
+    first = torque(made(scene, recording(), effect))
+    loaded = torque(made(scene, recording(), pull(1.0, traced)))
+    assert 1.0 in traced and np.abs(loaded - first).max() > 0.1
+    on_the_link = replace(MOTOR, side=TorqueSide.LINK)
+    assert np.abs(torque(made(scene, recording(torque=on_the_link), effect)) - first).max() > 0.01
+    rough = arm(friction=0.5)
+    assert np.abs(torque(made(rough, recording(), effect)) - first).max() > 0.1
+
+
+def test_other_lengths_are_replayed_to_their_own_end(scene: Scene):
+    effect = pull(0.0, [])
+    whole = torque(made(scene, recording(), effect))
+    time, command = motion(0.6)
+    noise = np.random.default_rng(1).normal(size=(2, len(time), 2))
+    seen = replace(recording().channel("torque"), time=time, values=noise, mask=np.ones(noise.shape, bool))
+    short = recording(time=time, command=command, channels={"torque": seen})
+    np.testing.assert_allclose(torque(made(scene, short, effect)), whole[: len(time)], atol=1e-4)
