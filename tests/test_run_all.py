@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from small_log import elbow_log, write_elbow
 
-from droid_jax.commands import all_stages, evaluate, gap, identify, report, synthetic, train
+from droid_jax.commands import all_stages, evaluate, gap, identify, synthetic, train
 from droid_jax.commands.folder import OtherRun
 from droid_jax.commands.options import TIMESTEP
 from droid_jax.commands.source import synthetic_robot_of
@@ -21,6 +21,7 @@ from droid_jax.commands.synthetic import known_robot
 from droid_jax.door.scene import door_scene
 from droid_jax.recordings.formats import load_recording, save_recording
 from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
+from droid_jax.report import page
 from droid_jax.run import main
 from droid_jax.synthetic.robot import SOURCE
 
@@ -35,7 +36,7 @@ def called(tuned: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list
     for module in (identify, gap, train, evaluate):
         monkeypatch.setattr(module, "run", commands.append)
     monkeypatch.setattr(synthetic, "kept_recordings", lambda paths, again, record: dict.fromkeys(paths))
-    monkeypatch.setattr(report, "write_page", lambda folder: folder / "report.html")
+    monkeypatch.setattr(page, "write_report", lambda folder: folder / "report.html")
     return commands
 
 
@@ -478,14 +479,15 @@ def test_presets_reach_the_stages(called, capsys):
 def test_jax_is_tuned_before_the_synthetic_robot_is_recorded(tmp_path: Path):
     """In a process of its own, where nothing has started jax: it could not be tuned afterwards."""
     code = (
-        "from droid_jax.commands import all_stages, identify, report, synthetic\n"
+        "from droid_jax.commands import all_stages, identify, synthetic\n"
+        "from droid_jax.report import page\n"
         "synthetic.kept_recordings = lambda paths, again, record: dict.fromkeys(paths)\n"
         "def fit(command):\n"
         "    from droid_jax import runtime\n"
         "    runtime.tune()\n"
         "    print('tuned twice')\n"
         "identify.run = fit\n"
-        "report.write = lambda folder: folder\n"
+        "page.write_report = lambda folder: folder\n"
         "all_stages.run(all_stages.All(stages=('identify',)))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)},

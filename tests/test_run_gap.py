@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from small_gap import EFFECTS, FLOOR, JOINTS, PRELOAD, QUICK, SCENE, record, small, small_scene, write_parameters
 
-from droid_jax.commands import gap, report
+from droid_jax.commands import gap
 from droid_jax.commands.synthetic import hidden_effects, record_synthetic
 from droid_jax.discrepancy import case as cases
 from droid_jax.discrepancy import fitting, missing
@@ -28,6 +28,7 @@ from droid_jax.model.parameters import Parameter, Scaling
 from droid_jax.preflight.search_inputs import check_recordings, lags
 from droid_jax.recordings.formats import save_recording
 from droid_jax.recordings.recording import Channel, Recording
+from droid_jax.report import page
 from droid_jax.report.gap_folder import read_gap
 from droid_jax.run import main
 
@@ -378,7 +379,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gap, "gap_config", lambda command: QUICK)
     monkeypatch.setattr(cases, "make_case", lambda *arguments, **roles: small().case)
     monkeypatch.setattr(missing, "discretisation_error", lambda *arguments: FLOOR)
-    monkeypatch.setattr(report, "write_page", lambda folder: folder / "report.html")
+    monkeypatch.setattr(page, "write_report", lambda folder: folder / "report.html")
 
 
 def fit_json(folder: Path, **values: float) -> Path:

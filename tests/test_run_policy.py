@@ -12,7 +12,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from droid_jax.commands import report
 from droid_jax.commands.evaluate import Evaluate, _film, _robot, _task, _tell
 from droid_jax.commands.folder import begin, setup_of, stage_folder
 from droid_jax.commands.source import source, synthetic_robot_of
@@ -24,6 +23,7 @@ from droid_jax.door.task import Task
 from droid_jax.identify.gaussian import prior
 from droid_jax.policy.control import load_policy
 from droid_jax.policy.trials import BLOWN_UP, Trials
+from droid_jax.report import page
 from droid_jax.report.policy_folder import Trained, Training, Transfer
 from droid_jax.report.render import NoOpenGL
 from droid_jax.report.stages import extended_of
@@ -181,7 +181,7 @@ def test_a_page_without_a_path_is_that_of_the_run_that_was_finished_last(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     """A folder without a finished run, as a refused command may leave one, does not count."""
-    monkeypatch.setattr(report, "write_page", lambda folder: folder)
+    monkeypatch.setattr(page, "write_report", lambda folder: folder)
     (tmp_path / "runs" / "identify").mkdir(parents=True)
     for age, (file, found) in enumerate((
         ("all/gap/gap.json", "all"), ("gap/gap.json", "gap"), ("train/training.json", "train"),

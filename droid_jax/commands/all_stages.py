@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from droid_jax.commands import evaluate, gap, identify, report, train
+from droid_jax.commands import evaluate, gap, identify, train
 from droid_jax.commands.folder import OtherRun, changed, forget, setup_of
 from droid_jax.commands.options import load_effects, needs_log, needs_recording, needs_scene
 from droid_jax.commands.source import model_folder, needs_brax
@@ -93,6 +93,7 @@ def run(command: All) -> None:
     """Every stage in a folder of its own below OUT, then the page of all of them; where one fails, of those before."""
     started = time.monotonic()
     from droid_jax import runtime
+    from droid_jax.report.page import write_report
     from droid_jax.report.progress import needs_writer
 
     _needs_stages(command)
@@ -120,7 +121,7 @@ def run(command: All) -> None:
         for stage in [stage for stage in command.stages if stage in LAST_FILES][1:]:
             forget(out / stage, stage)
     _run_stages(command, out, roles)
-    page = report.write_page(out)
+    page = write_report(out)
     print(f"\n{command.out}: {(time.monotonic() - started) / 60:.0f} minutes")
     for line in told(out):
         print(line)
@@ -172,6 +173,8 @@ def _run_stages(command: All, out: Path, roles: tuple[str, ...]) -> None:
 
     Where one fails, the page of those before it is written.
     """
+    from droid_jax.report.page import write_report
+
     plan = _plan(command, out, command.recording or kept_at(out), roles)
     if _records(command):
         plan = {"record": lambda: _record(command), **plan}
@@ -183,7 +186,7 @@ def _run_stages(command: All, out: Path, roles: tuple[str, ...]) -> None:
         except Exception:
             if number > 1:
                 with contextlib.suppress(ValueError):  # the recording alone makes no page
-                    print(f"report of what is done: {report.write_page(out)}")
+                    print(f"report of what is done: {write_report(out)}")
             raise
         print(f"[{number}/{len(plan)}] {stage}: {(time.monotonic() - began) / 60:.1f} minutes", flush=True)
 

@@ -22,7 +22,9 @@ class Report:
 
 def run(command: Report) -> None:
     """Write RUN/report.html."""
-    print(f"report: {write_page(command.run or _latest())}")
+    from droid_jax.report.page import write_report
+
+    print(f"report: {write_report(command.run or _latest())}")
 
 
 def _latest() -> Path:
@@ -34,10 +36,3 @@ def _latest() -> Path:
         folders = ", ".join(map(str, dict.fromkeys(files.values())))
         raise ValueError(f"there is no finished run in {folders}: give the folder of one")
     return files[max(whole, key=lambda file: file.stat().st_mtime)]
-
-
-def write_page(folder: Path) -> Path:
-    """Write the page of a run's folder; its path."""
-    from droid_jax.report.page import write_report
-
-    return write_report(folder)
