@@ -89,7 +89,7 @@ def main(arguments: Arguments) -> None:
         "mean_sentence_words": sentence_words(),
         "quick_suite_minutes": kept("durations.json").get("minutes"),
         "ci_minutes": arguments.ci_minutes or kept("house.json").get("ci_minutes"),
-        "newcomer": {task["task"]: len(task["files"]) for task in newcomer.get("tasks", [])},
+        "newcomer": {task["task"]: task["files"] for task in newcomer.get("tasks", [])},
     }
     publish(arguments.out, "house", arguments.quick, 0, found, {k: found[k] for k in found if k != "discrepancy_lines"})
 

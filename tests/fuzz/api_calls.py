@@ -28,7 +28,6 @@ from recording_kinds import make_npz, recording
 from run_kinds import make_tables
 
 import droid_jax
-from droid_jax.cost import cost as cost_module
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.discrepancy.config import BlocksConfig, SelectionConfig
 from droid_jax.identify import pipeline
@@ -37,6 +36,7 @@ from droid_jax.identify.multistart import RefineConfig
 from droid_jax.identify.search import CmaConfig
 from droid_jax.model.parameters import Mode, Parameter, Scaling, Write
 from droid_jax.recordings.recording import Channel, ObjectPose, Phase, ServoGains, TorqueConvention
+from droid_jax.simulate import compiled
 
 DEEP = 100  # levels of nesting, more than numpy has axes
 
@@ -268,7 +268,7 @@ def _cut_short(run: Callable[..., Any]) -> Callable[..., Any]:
 
     def call(**given: Any) -> Any:
         with contextlib.ExitStack() as stack:
-            for module, name in ((cost_module, "over_block"), (pipeline, "_check_start")):
+            for module, name in ((compiled, "over_block"), (pipeline, "_check_start")):
                 stack.enter_context(mock.patch.object(module, name, read))
             return run(**given)
 
