@@ -12,7 +12,7 @@ from droid_jax.commands.identify import Identify
 from droid_jax.commands.pictures import draw_replay, keep_replay
 from droid_jax.model.scene import Scene, load_scene
 from droid_jax.recordings.recording import Recording
-from droid_jax.report import render
+from droid_jax.report import page, render
 from droid_jax.storage import write_npz
 
 OLD = ("frames/after_00_0.0s.png", "films/replay.webp", "replay.npz")
@@ -70,6 +70,6 @@ def test_a_finished_run_is_asked_for_its_pictures(tuned: None, tmp_path: Path, m
     did = list[str]()
     monkeypatch.setattr(identify, "finished", lambda *_: True)
     monkeypatch.setattr(identify, "draw_replay", lambda out, scene: did.append(f"draw {scene.name}"))
-    monkeypatch.setattr(identify.report, "run", lambda command: did.append("report"))
+    monkeypatch.setattr(page, "write_report", lambda folder: did.append("report"))
     identify.run(Identify(out=tmp_path))
     assert len(did) == 2 and did[0].startswith("draw door") and did[1] == "report"
