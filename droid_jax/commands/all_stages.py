@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 from droid_jax.commands import evaluate, gap, identify, train
 from droid_jax.commands.folder import OtherRun, changed, forget, setup_of
-from droid_jax.commands.options import load_effects, needs_log, needs_recording, needs_scene
+from droid_jax.commands.options import TIMESTEP, load_effects, needs_log, needs_recording, needs_scene, recording_at
 from droid_jax.commands.source import model_folder, needs_brax
 from droid_jax.commands.synthetic import DEMONSTRATIONS, hidden_effects, kept_at, record_synthetic, with_robot_options
 from droid_jax.commands.writer import writes
@@ -93,7 +93,6 @@ def run(command: All) -> None:
     """Every stage in a folder of its own below OUT, then the page of all of them; where one fails, of those before."""
     started = time.monotonic()
     from droid_jax import runtime
-    from droid_jax.report.page import write_report
     from droid_jax.report.progress import needs_writer
 
     _needs_stages(command)
@@ -121,6 +120,8 @@ def run(command: All) -> None:
         for stage in [stage for stage in command.stages if stage in LAST_FILES][1:]:
             forget(out / stage, stage)
     _run_stages(command, out, roles)
+    from droid_jax.report.page import write_report  # matplotlib: not before the stages
+
     page = write_report(out)
     print(f"\n{command.out}: {(time.monotonic() - started) / 60:.0f} minutes")
     for line in told(out):
@@ -173,8 +174,6 @@ def _run_stages(command: All, out: Path, roles: tuple[str, ...]) -> None:
 
     Where one fails, the page of those before it is written.
     """
-    from droid_jax.report.page import write_report
-
     plan = _plan(command, out, command.recording or kept_at(out), roles)
     if _records(command):
         plan = {"record": lambda: _record(command), **plan}
@@ -185,6 +184,8 @@ def _run_stages(command: All, out: Path, roles: tuple[str, ...]) -> None:
             run_stage()
         except Exception:
             if number > 1:
+                from droid_jax.report.page import write_report
+
                 with contextlib.suppress(ValueError):  # the recording alone makes no page
                     print(f"report of what is done: {write_report(out)}")
             raise
@@ -287,8 +288,6 @@ def _plan(
 
 def _fitted(folder: Path, command: All, recordings: Sequence[Path]) -> bool:
     """Whether a folder of `identify` holds the fit of these recordings: made just now, or earlier of the same."""
-    from droid_jax.commands.options import recording_at
-
     if not (folder / FIT).is_file() or unfinished(folder):
         return False
     if "identify" in command.stages:
@@ -323,7 +322,6 @@ def told(out: Path) -> list[str]:
 
 def _record(command: All) -> None:
     """Let the synthetic robot record its motions."""
-    from droid_jax.commands.options import TIMESTEP
     from droid_jax.door.scene import door_scene
 
     assert command.springs is not None  # settled

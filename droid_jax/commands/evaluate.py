@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from droid_jax.commands import report
 from droid_jax.commands.folder import changed, setup_of, stage_folder
 from droid_jax.commands.options import load_effects
 from droid_jax.commands.source import needs_brax, source
@@ -65,7 +66,6 @@ def run(command: Evaluate) -> None:
     from droid_jax.policy.control import load_policy
     from droid_jax.policy.evaluate import simulated
     from droid_jax.policy.randomise import of_method
-    from droid_jax.report.page import write_report
     from droid_jax.report.policy_folder import read_policy, read_training
     from droid_jax.report.progress import counting
     from droid_jax.storage import file_sha256, new_folder, write_json
@@ -79,7 +79,7 @@ def run(command: Evaluate) -> None:
     if not command.again and _done(folder, setup_now):
         print(f"{folder} holds these trials already (start over with --again)")
         _tell(read_policy(folder))
-        print(f"report: {write_report(folder)}")
+        report.run(report.Report(folder))
         return
     scene, gaussian, effects = source(folder, trained.setup.knob)
     env = DoorEnv(scene, _task(folder, read_json(folder / TRAINING)["task"]), effects)
@@ -108,7 +108,7 @@ def run(command: Evaluate) -> None:
     }
     write_json(folder / TRANSFER, content)  # last: its presence says that the trials are whole
     _tell(read_policy(folder))
-    print(f"report: {write_report(folder)}")
+    report.run(report.Report(folder))
 
 
 def needs_trials(trials: int) -> None:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from droid_jax.commands import report
 from droid_jax.commands.folder import begin, fingerprints, finished, kept_recordings, setup_of
 from droid_jax.commands.options import (
     TIMESTEP,
@@ -113,7 +114,6 @@ def run(command: Identify) -> None:
     from droid_jax.preflight.check_log import check_log
     from droid_jax.preflight.preflight import command_notes
     from droid_jax.report.identify_folder import read_fit
-    from droid_jax.report.page import write_report
     from droid_jax.report.progress import FOLDER, scalars, stages
     from droid_jax.storage import write_bytes
 
@@ -126,7 +126,7 @@ def run(command: Identify) -> None:
     setup = {**setup_of(command), **fingerprints(scene, space if nuisances is None else space + nuisances, given)}
     if finished(out, setup, command.again):
         draw_replay(out, scene)  # where OpenGL was missing, or drawing was stopped
-        print(f"report: {write_report(out)}")
+        report.run(report.Report(out))
         return
     config = identify_config(command)
     _needs_demonstrations(command, given)
@@ -165,7 +165,7 @@ def run(command: Identify) -> None:
             findings=[finding for recording in recordings for finding in check_log(scene, recording)],
         )  # fmt: skip
     draw_replay(out, scene)
-    print(f"report: {write_report(out)}")
+    report.run(report.Report(out))
     _summary(found, read_fit(out), [r.repeats for r in recordings])
 
 

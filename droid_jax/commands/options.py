@@ -147,8 +147,8 @@ def load_effects(path: Path | None, *folders: Path | None) -> None:
     """
     if path is None:
         for folder in (f for f in folders if f is not None):
-            if told := setup(folder).get("user_effects"):
-                raise ValueError(f"{folder} was made with effects of your own: give --user-effects {told}")
+            if file := setup(folder).get("user_effects"):
+                raise ValueError(f"{folder} was made with effects of your own: give --user-effects {file}")
         return
     if not path.is_file():
         raise ValueError(f"--user-effects: there is no file {path}")

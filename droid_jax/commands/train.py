@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from droid_jax.commands import report
 from droid_jax.commands.folder import RUNS, begin, finished, setup_of
 from droid_jax.commands.options import load_effects, warn_of_cpu
 from droid_jax.commands.source import has_model, model_folder, needs_brax, source, synthetic_robot_of
@@ -67,7 +68,6 @@ def run(command: Train) -> None:
     from droid_jax.policy.network import save_policy
     from droid_jax.policy.randomise import of_method
     from droid_jax.policy.train import train
-    from droid_jax.report.page import write_report
     from droid_jax.storage import write_bytes, write_json
 
     out, fit = command.out, _fit_folder(command)
@@ -81,7 +81,7 @@ def run(command: Train) -> None:
     }
     setup = {**setup_of(command), "command": "train", **origin}
     if finished(out, setup, command.again, TRAINING):
-        print(f"report: {write_report(out)}")
+        report.run(report.Report(out))
         return
     config = train_config(command)
     env, randomise = DoorEnv(scene, effects=effects), of_method(command.method, scene, gaussian)
@@ -107,7 +107,7 @@ def run(command: Train) -> None:
     if (done := found.history[-1].step) < config.steps:
         print(f"training ended after {done} of {config.steps} actions: its weights became NaN or infinite")
     write_json(out / TRAINING, _description(setup, config, env, found))  # last: its presence says that the run is whole
-    print(f"report: {write_report(out)}")
+    report.run(report.Report(out))
 
 
 def _description(setup: dict[str, Any], config: TrainConfig, env: DoorEnv, found: TrainedPolicy) -> dict[str, Any]:

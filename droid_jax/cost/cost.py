@@ -346,5 +346,5 @@ def _clock(recording: Recording, follows: Drive | Motion) -> np.ndarray:
 
 
 def _compiled(function: Callable[[Any], jax.Array]) -> Callable[[Any], jax.Array]:
-    """Of one row of a batch, a Rollout or a Path -> of all, in one compiled piece."""
+    """Of one row of a batch of Rollouts -> of all, in one compiled piece."""
     return jax.jit(jax.vmap(function), compiler_options=runtime.compiler_options())

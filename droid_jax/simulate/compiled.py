@@ -79,7 +79,7 @@ class Along:
 class Driven:
     """A batch of servo replays of a drive: [B, D] -> Rollout [B, ...].
 
-    make: drive -> its batch; one of another start, or of other commands of the same length, compiles nothing anew.
+    make: drive -> its batch; one of another start, or of other commands of the same length, compiles nothing again.
     """
 
     make: Callable[[Drive], Batch]
@@ -138,11 +138,11 @@ def compiled_replay(
         return Driven(driven, follows)
     known = [e for e in effects if e.name != TORQUE_OFFSETS]
 
-    def twin(drive: Drive) -> Batch:
+    def in_c(drive: Drive) -> Batch:
         checked = _of_bodies(scene, space, c_replay(scene, space, drive, known, late=0.0 if mj_step else 0.5))
         return lambda values: jax.tree.map(_single, checked(values))
 
-    return Driven(twin, follows)
+    return Driven(in_c, follows)
 
 
 def batch_replay(scene: Scene, space: Space, replay: Replay) -> Batch:
@@ -168,7 +168,7 @@ def with_sensors(scene: Scene, space: Space, drive: Drive | Motion, effects: Seq
 
 @functools.lru_cache(maxsize=PROGRAMS)
 def _sensor_effects(joints: tuple[str, ...], prescribed: bool, friction: bool, gain: bool) -> tuple[Effect, ...]:
-    """The same effects each time: programs are told apart by theirs."""
+    """The same effects each time: programs are distinguished by theirs."""
     found = [joint_friction_effect(joints, jnp.sign if prescribed else direction)] if friction else []
     found += [torque_gain_effect(joints)] if gain else []
     return (*found, torque_offset_effect(joints))
