@@ -111,8 +111,7 @@ def make_physics(scene: Scene, space: Space, values: jax.Array) -> Physics:
     model = model.replace(**changed)
     if _SOURCES & set(by_field):
         model = derive(model)
-    theta = {p.name: values[i] for i, p in enumerate(space.parameters) if not p.writes}
-    return Physics(model, theta)
+    return Physics(model, theta_of(space, values))
 
 
 def derive(model: Any) -> Any:
@@ -271,6 +270,6 @@ def _bound(model: mujoco.MjModel, geoms: Iterable[int]) -> None:
             model.geom_aabb[geom, 3:], model.geom_rbound[geom] = around
 
 
-def theta_of(space: Space, values: np.ndarray) -> dict[str, float]:
-    """Name -> value for the parameters that live outside the model."""
-    return {p.name: float(values[i]) for i, p in enumerate(space.parameters) if not p.writes}
+def theta_of(space: Space, values: Any) -> dict[str, Any]:
+    """Name -> value, of values [D], for the parameters that live outside the model."""
+    return {p.name: values[i] for i, p in enumerate(space.parameters) if not p.writes}

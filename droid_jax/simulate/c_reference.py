@@ -53,7 +53,7 @@ def c_replay(
 
     def piece(values: np.ndarray) -> Rollout:
         models = [make_c_model(plain, space, row) for row in values]
-        thetas = [theta_of(space, row) for row in values]
+        thetas = [theta_of(space, row.tolist()) for row in values]
         control = np.stack([control_of(drive, t.get(Role.TIME_OFFSET.value, 0.0), late) for t in thetas])
         trace = simulate(plain, models, drive.qpos0[None], control)
         traces = (trace.torque, trace.position, trace.velocity, trace.object_angle[..., None])

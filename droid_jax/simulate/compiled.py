@@ -1,8 +1,9 @@
 """Replays compiled in batches; each program is made once for all that differ in nothing but numbers.
 
 Tracing and compiling a replay takes longer than most fits replay.  A program depends on the scene, on what a row of
-values writes, on the effects and on how many steps there are; commands, starts and measured motions are handed to it.
-So recordings of one length, their held-out repeats and every search over them share one.
+values writes and on the effects; commands, their number, starts and measured motions are handed to it.  So recordings
+of any length, their held-out repeats and every search over them share one.  What the sensors make of a motion is a
+second, small program of the motion's own length.
 """
 
 from __future__ import annotations
@@ -21,10 +22,10 @@ from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.inertia import free_inertias, inertia_possible
 from droid_jax.model.joint_friction import direction, joint_friction_effect, torque_gain_effect
 from droid_jax.model.parameters import Role, Space, Write
-from droid_jax.model.physics import make_physics
+from droid_jax.model.physics import make_physics, theta_of
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import TorqueConvention
-from droid_jax.simulate.batching import over_block
+from droid_jax.simulate.batching import by_row, compiled_block, over_block
 from droid_jax.simulate.c_reference import c_replay
 from droid_jax.simulate.inverse_dynamics import Path, motion_path, path_replay
 from droid_jax.simulate.measured_motion import Motion
@@ -33,11 +34,14 @@ from droid_jax.simulate.replay import (
     Drive,
     Replay,
     check_gains,
-    servo_replay,
+    sensed,
+    servo_motion,
     torque_offset_effect,
 )
 
 PROGRAMS = 16  # of each kind, kept for whoever asks for the same again; each holds its scene
+
+SHORTEST = 8192  # rows that a motion has room for, at least: 16 s at 2 ms
 
 Batch = Callable[[np.ndarray], Rollout]
 
@@ -132,8 +136,11 @@ def compiled_replay(
         program = _servo_program(scene, layout, effects, Clocked(follows.timestep, follows.torque, follows), mj_step)
 
         def driven(drive: Drive) -> Batch:
-            of_drive = jnp.asarray(drive.command, jnp.float32), jnp.asarray(drive.qpos0, jnp.float32)
-            return lambda values: program(values, *of_drive)
+            steps = len(drive.command)
+            sense = _sensors(scene, layout, effects, drive.timestep, steps)
+            table = np.concatenate([drive.command, np.repeat(drive.command[-1:], capacity(steps) - steps, axis=0)])
+            of_drive = jnp.asarray(table, jnp.float32), jnp.asarray(drive.qpos0, jnp.float32), jnp.int32(steps)
+            return lambda values: sense(values, program(values, *of_drive))
 
         return Driven(driven, follows)
     known = [e for e in effects if e.name != TORQUE_OFFSETS]
@@ -148,6 +155,11 @@ def compiled_replay(
 def batch_replay(scene: Scene, space: Space, replay: Replay) -> Batch:
     """One compiled, sharded block of a per-sample replay of your own: [B, D] -> Rollout [B, ...]."""
     return over_block(_of_bodies(scene, space, lambda values: replay(make_physics(scene, space, values))))
+
+
+def capacity(steps: int) -> int:
+    """Rows of a program for that many steps: few different numbers, so that recordings share it."""
+    return max(SHORTEST, 1 << (steps - 1).bit_length())
 
 
 def layout_of(space: Space) -> Layout:
@@ -182,12 +194,28 @@ def _servo_program(
     clocked: Clocked,
     mj_step: bool,
 ) -> Callable[..., Rollout]:
-    """(values [B, D], command [T, U], start [nq]) -> Rollout [B, ...]; scene and effects count by identity."""
-    replay = servo_replay(scene, clocked.drive, effects, parity=mj_step, late=0.0 if mj_step else 0.5)
+    """(values [B, D], command [T, U], start [nq], steps) -> motion [B, T, ...]; scene and effects count by identity."""
+    motion = servo_motion(scene, clocked.drive, effects, parity=mj_step, late=0.0 if mj_step else 0.5)
     space = layout.space
-    return over_block(
-        _of_bodies(scene, space, lambda values, *of_drive: replay(make_physics(scene, space, values), *of_drive))
-    )
+
+    def block(values: jax.Array, *of_drive: Any) -> Rollout:
+        samples, of = by_row(lambda row: motion.prepared(make_physics(scene, space, row)), values)
+        return motion.of_samples(samples, of, *of_drive)
+
+    return compiled_block(block)
+
+
+@functools.lru_cache(maxsize=PROGRAMS)
+def _sensors(
+    scene: Scene, layout: Layout, effects: tuple[Effect, ...], timestep: float, steps: int
+) -> Callable[..., Rollout]:
+    """(values [B, D], motion [B, T, ...]) -> Rollout [B, ...] of the motion's first steps."""
+    space = layout.space
+
+    def sense(values: jax.Array, motion: Rollout) -> Rollout:
+        return sensed(motion, theta_of(space, values), effects, timestep, steps)
+
+    return over_block(_of_bodies(scene, space, sense), alike=False)
 
 
 @functools.lru_cache(maxsize=PROGRAMS)

@@ -1,4 +1,4 @@
-"""Replay one recording in simulation: the servo mode, a scan over time steps.
+"""Replay one recording in simulation: the servo mode, a loop over time steps.
 
 `servo_replay` follows the recorded command through grasp and pull, as the paper does.  Recordings
 without commands are replayed by `compare.inverse`.  Both return a function Physics -> Rollout for
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -152,66 +152,147 @@ def check_stateless(scene: Scene) -> None:
 def servo_replay(
     scene: Scene, drive: Drive, effects: Sequence[Effect] = (), *, parity: bool = False, late: float = 0.5
 ) -> Replay:
-    """The scan over time steps that follows the command. Torques carry the time of the state they act on.
+    """The motion that follows the command (`servo_motion`) and what the sensors make of it.
 
-    The scan carries only position, velocity and the solver's warm start: everything else in
-    mjx.Data is rebuilt each step, so that XLA drops what nobody reads.
-    The replay also takes another command [T, U] and start [nq], so that recordings share one compiled program; of the
-    drive only its time step and its torque's convention are then used.
     parity: step exactly as the C engine does (see `droid_jax.model.step`), for comparisons with it; then
       `late` steps late (see `_command`).
+    """
+    motion = servo_motion(scene, drive, effects, parity=parity, late=late)
+    table, start = jnp.asarray(drive.command, jnp.float32), jnp.asarray(drive.qpos0, jnp.float32)
+
+    def replay(physics: Physics) -> Rollout:
+        moved = motion.along(motion.prepared(physics), table, start, len(table))
+        return sensed(moved, physics.theta, effects, drive.timestep)
+
+    return replay
+
+
+class Prepared(NamedTuple):
+    """What a sample's steps share. error: [nv] by which joints stand further than their encoders say, or None."""
+
+    physics: Physics
+    error: jax.Array | None
+
+
+@dataclass(frozen=True, eq=False)
+class ServoMotion:
+    """The loop over time steps that follows a command.
+
+    prepared: physics -> what the steps of a sample share.
+    step: (prepared, command [T, U], k, state) -> the state after step k.
+    begin: (rows, start [nq]) -> the state before the first step, with room for so many rows.
+    """
+
+    prepared: Callable[[Physics], Prepared]
+    step: Callable[[Prepared, jax.Array, jax.Array, Any], Any]
+    begin: Callable[[int, jax.Array], Any]
+
+    def along(self, sample: Prepared, table: jax.Array, start: jax.Array, steps: Any) -> Rollout:
+        """One sample's motion: a Rollout of as many rows as the command [T, U] has.
+
+        Rows from `steps` on are zero, so that recordings of different lengths share one compiled program; their
+        commands are those of the last step, repeated.
+        """
+        state = _loop(lambda k, state: self.step(sample, table, k, state), self.begin(len(table), start), steps)
+        return _moved(*state[1])
+
+    def of_samples(
+        self, samples: Any, of: Callable[[Any], Prepared], table: jax.Array, start: jax.Array, steps: Any
+    ) -> Rollout:
+        """The same of B samples side by side, [B, T, ...]; `of` makes what is prepared from one entry of `samples`.
+
+        The samples are inside the loop, not the loop inside them: jax then traces a step once and not three times.
+        """
+        rows = len(jax.tree.leaves(samples)[0])
+        begun = jax.tree.map(lambda a: jnp.broadcast_to(a, (rows, *a.shape)), self.begin(len(table), start))
+
+        def step(k: jax.Array, states: Any) -> Any:
+            return jax.vmap(lambda sample, state: self.step(of(sample), table, k, state))(samples, states)
+
+        return jax.vmap(_moved)(*_loop(step, begun, steps)[1])
+
+
+def _loop(step: Callable[[jax.Array, Any], Any], state: Any, steps: Any) -> Any:
+    return jax.lax.fori_loop(jnp.zeros((), jnp.int32), jnp.asarray(steps, jnp.int32), step, state)
+
+
+def _moved(
+    torque: jax.Array, position: jax.Array, velocity: jax.Array, angle: jax.Array, contact: jax.Array
+) -> Rollout:
+    """What the steps left, not yet seen by a sensor."""
+    time = jnp.zeros(len(torque), jnp.float32)
+    return Rollout(time, torque, position, velocity, angle, contact, jnp.array(True))
+
+
+def servo_motion(
+    scene: Scene, drive: Drive, effects: Sequence[Effect] = (), *, parity: bool = False, late: float = 0.5
+) -> ServoMotion:
+    """The motion of a scene with servos. Torques carry the time of the state they act on.
+
+    A state is position, velocity, the solver's warm start and the load: everything else in mjx.Data is rebuilt each
+    step, so that XLA drops what nobody reads.
+    Of the drive only its time step, its gains and its torque's convention are used.
     """
     check_options(scene.model, parity, f"a replay of scene {scene.name!r}")
     check_gains(scene, drive)
     check_stateless(scene)
     template = mjx.make_data(scene.mjx)
     fingers = finger_geoms(scene)
-    own = jnp.asarray(drive.command, jnp.float32), jnp.asarray(drive.qpos0, jnp.float32)
     joints, positions = scene.joint_dofs, scene.joint_qpos
     hinge = scene.qpos(scene.object_joint) if scene.object_joint else None
     shift = late if parity else 0.0  # steps, of the command; of positions in the other direction
     half = late if parity else 0.5  # steps from the velocity before a step to the one that is told
     damping = has_servo_damping(scene.model)
 
-    def replay(physics: Physics, table: jax.Array = own[0], start: jax.Array = own[1]) -> Rollout:
-        model, theta = physics.model, complete(physics.theta, effects)
-        error = encoder_error(scene, model)
+    def prepared(physics: Physics) -> Prepared:
+        return Prepared(Physics(physics.model, complete(physics.theta, effects)), encoder_error(scene, physics.model))
 
-        def step(carry, k):
-            qpos, qvel, warm, load = carry
-            state = State(k * drive.timestep, qpos, qvel, load, model)
-            ctrl = servo_input(_command(table, drive.timestep, k, shift, theta, effects), theta, state, effects)
-            before = template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm, ctrl=ctrl)
-            after = simulate_step(
-                apply_friction(model, theta, state, effects),
-                before,
-                parity=parity,
-                servo_damping=damping,
-                push=apply_forces(theta, state, effects, error),
-            )
-            mean = 0.5 * (qvel + after.qvel)
-            servo = servo_force(model, after, mean) if damping and not parity else after.qfrc_actuator
-            torque = _joint_torque(model, before, after, servo, joints, drive, parity)
-            astray = misplaced_compensation(model, after, error)
-            if astray is not None and drive.torque.gravity:  # a torque with the weight holds what compensates it
-                torque = torque + astray[joints]
-            out = (
-                torque,
-                qpos[positions] + shift * drive.timestep * qvel[joints],
-                (qvel + half * (after.qvel - qvel))[joints],
-                qpos[hinge] + shift * drive.timestep * qvel[hinge] if hinge is not None else jnp.zeros(()),
-                _touching(after, fingers),
-            )
-            return (after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator), out
+    def step(sample: Prepared, table: jax.Array, k: jax.Array, carry: Any) -> Any:
+        model, theta, error = sample.physics.model, sample.physics.theta, sample.error
+        (qpos, qvel, warm, load), kept = carry
+        state = State(k * drive.timestep, qpos, qvel, load, model)
+        ctrl = servo_input(_command(table, drive.timestep, k, shift, theta, effects), theta, state, effects)
+        before = template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm, ctrl=ctrl)
+        after = simulate_step(
+            apply_friction(model, theta, state, effects),
+            before,
+            parity=parity,
+            servo_damping=damping,
+            push=apply_forces(theta, state, effects, error),
+        )
+        mean = 0.5 * (qvel + after.qvel)
+        servo = servo_force(model, after, mean) if damping and not parity else after.qfrc_actuator
+        torque = _joint_torque(model, before, after, servo, joints, drive, parity)
+        astray = misplaced_compensation(model, after, error)
+        if astray is not None and drive.torque.gravity:  # a torque with the weight holds what compensates it
+            torque = torque + astray[joints]
+        now = (
+            torque,
+            qpos[positions] + shift * drive.timestep * qvel[joints],
+            (qvel + half * (after.qvel - qvel))[joints],
+            qpos[hinge] + shift * drive.timestep * qvel[hinge] if hinge is not None else jnp.zeros(()),
+            _touching(after, fingers),
+        )
+        kept = tuple(jax.lax.dynamic_update_index_in_dim(a, b, k, 0) for a, b in zip(kept, now, strict=True))
+        return (after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator), kept
 
+    def begin(rows: int, start: jax.Array) -> Any:
         zero = jnp.zeros(scene.model.nv, jnp.float32)
-        steps = jnp.arange(len(table), dtype=jnp.int32)
-        _, (torque, position, velocity, angle, contact) = jax.lax.scan(step, (start, zero, zero, zero), steps)
-        time = jnp.asarray(np.arange(len(table)) * drive.timestep, jnp.float32)
-        rollout = Rollout(time, torque, position, velocity, angle, contact, jnp.array(True))
-        return apply_sensor_model(rollout, theta, effects)
+        traces = [jnp.zeros((rows, len(joints)), jnp.float32) for _ in range(3)]
+        kept = (*traces, jnp.zeros(rows, jnp.float32), jnp.zeros((rows, len(fingers)), bool))
+        return (start, zero, zero, zero), kept
 
-    return replay
+    return ServoMotion(prepared, step, begin)
+
+
+def sensed(
+    motion: Rollout, theta: Theta, effects: Sequence[Effect], timestep: float, steps: int | None = None
+) -> Rollout:
+    """A motion's first rows (all of them where `steps` is None), as the sensors have them, and whether it is finite."""
+    rows = len(motion.time) if steps is None else steps
+    cut = jax.tree.map(lambda a: a[:rows] if a.ndim else a, motion)
+    time = jnp.asarray(np.arange(rows) * timestep, jnp.float32)
+    return apply_sensor_model(replace(cut, time=time), complete(theta, effects), effects)
 
 
 def _command(

@@ -15,6 +15,7 @@ from droid_jax.model.fields import joint_damping
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording, TorqueSide
+from droid_jax.simulate import compiled
 
 
 @pytest.fixture(scope="module")
@@ -69,11 +70,21 @@ def test_other_effects_scenes_and_conventions_do_not(scene: Scene):
     assert np.abs(torque(made(rough, recording(), effect)) - first).max() > 0.1
 
 
-def test_other_lengths_are_replayed_to_their_own_end(scene: Scene):
-    effect = pull(0.0, [])
+def test_other_lengths_share_a_program_and_are_replayed_to_their_own_end(scene: Scene):
+    traced = list[float]()
+    effect = pull(0.0, traced)
     whole = torque(made(scene, recording(), effect))
+    count = len(traced)
     time, command = motion(0.6)
     noise = np.random.default_rng(1).normal(size=(2, len(time), 2))
     seen = replace(recording().channel("torque"), time=time, values=noise, mask=np.ones(noise.shape, bool))
     short = recording(time=time, command=command, channels={"torque": seen})
     np.testing.assert_allclose(torque(made(scene, short, effect)), whole[: len(time)], atol=1e-4)
+    assert len(traced) == count
+
+
+def test_the_room_of_a_program_changes_no_replay(scene: Scene, monkeypatch: pytest.MonkeyPatch):
+    roomy = torque(made(scene, recording(), pull(0.0, [])))
+    monkeypatch.setattr(compiled, "SHORTEST", 1)
+    assert compiled.capacity(1024) == 1024 and compiled.capacity(1025) == 2048
+    np.testing.assert_array_equal(torque(made(scene, recording(), pull(0.0, []))), roomy)
