@@ -245,7 +245,8 @@ def servo_motion(
     damping = has_servo_damping(scene.model)
 
     def prepared(physics: Physics) -> Prepared:
-        return Prepared(Physics(physics.model, complete(physics.theta, effects)), encoder_error(scene, physics.model))
+        whole = replace(physics, theta=dict(complete(physics.theta, effects)))
+        return Prepared(whole, encoder_error(scene, physics.model))
 
     def step(sample: Prepared, table: jax.Array, k: jax.Array, carry: Any) -> Any:
         model, theta, error = sample.physics.model, sample.physics.theta, sample.error
