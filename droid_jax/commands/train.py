@@ -105,7 +105,9 @@ def run(command: Train) -> None:
         )  # fmt: skip
     save_policy(out / POLICY, found.policy)
     if (done := found.history[-1].step) < config.steps:
-        print(f"training ended after {done} of {config.steps} actions: its weights became NaN or infinite")
+        held = f"{config.held} evaluations in a row had {config.enough:.0%} success or more"
+        why = held if found.held else "its weights became NaN or infinite"
+        print(f"training ended after {done} of {config.steps} actions: {why}")
     write_json(out / TRAINING, _description(setup, config, env, found))  # last: its presence says that the run is whole
     report.run(report.Report(out))
 
@@ -121,6 +123,7 @@ def _description(setup: dict[str, Any], config: TrainConfig, env: DoorEnv, found
         "task": dataclasses.asdict(env.task),
         "scene": env.scene.name,
         "effects": [e.name for e in env.effects],
+        "held": found.held,
         "history": [dataclasses.asdict(now) for now in found.history],
         "versions": runtime.versions(),
         "device": runtime.device(),

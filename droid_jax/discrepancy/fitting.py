@@ -146,10 +146,12 @@ def base_fit(
 ) -> FittedModel:
     """Everything but the effects, fitted to the training recording.
 
-    start: [F] values of the base parameters out of an earlier fit; without it they are searched for.
+    start: [F] values of the base parameters out of an earlier fit; without it they are searched for.  That fit has
+      looked for other basins, and this one does not again.
     """
     if start is None:
         return fitted_from_prior(train, base, (), config, progress)
+    config = replace(config, refine=replace(config.refine, basin_hops=0))
     begin = train.cost.space.embed(base, np.clip(start, base.low, base.high)[None])
     return _refined(train, base, (), begin, config, progress)
 

@@ -64,7 +64,7 @@ class RefineConfig(LevenbergMarquardtConfig):
 
     iterations: int = 30
     tolerance: float = 0.5
-    excess_tolerance: float = 5e-4
+    excess_tolerance: float = 2e-3
     coarse_tolerance: float = 5e-3
     target_objective: float = np.inf
     give_up: float = 30.0

@@ -12,7 +12,7 @@ import contextlib
 import functools
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -46,6 +46,7 @@ class TrainConfig:
     unroll: actions between updates; batch, minibatches: unrolls of a minibatch, and minibatches; epochs: times
     that each is used.
     evaluations: times that the policy is tried (and saved) while it trains; eval_envs: episodes each time.
+    enough, held: training ends where so many evaluations in a row had this success; held 0: never before its steps.
     seed.
     Raises ValueError for settings that do not go together.
     """
@@ -66,6 +67,8 @@ class TrainConfig:
     epochs: int = 6
     evaluations: int = 16
     eval_envs: int = 128
+    enough: float = 0.98
+    held: int = 3
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -78,6 +81,8 @@ class TrainConfig:
             devices=optional(partial(whole, least=1)),
             hidden=several(partial(whole, least=1)),
             entropy=partial(number, least=0),
+            enough=partial(number, above=0, most=1),
+            held=partial(whole, least=0),
             seed=partial(whole, least=0),
         )
         if (self.batch * self.minibatches) % self.envs:
@@ -123,10 +128,12 @@ class TrainedPolicy:
 
     policy: of all that were tried while it trained, the one that succeeded most, and among those the one of largest
     reward: PPO's last update is not always its best.
+    held: training ended before its steps, since it had succeeded often enough.
     """
 
     policy: Policy
     history: tuple[TrainProgress, ...]
+    held: bool = False
 
 
 def train(
@@ -205,12 +212,14 @@ def _brax(
                 history.append(now)
             return
         if not _finite(latest):
-            raise _Diverged
+            raise _Ended
         if best is None or _rank(now) >= max(_rank(h) for h in history if h.step):
             best = latest
         history.append(now)
         rows = np.array([list(asdict(h).values()) for h in history], np.float64)
         save(done + step, {"latest": to_tree(latest), "best": to_tree(best), "history": rows})
+        if _held(history, config):
+            raise _Ended
 
     def keep(step: int, _: Any, params: Any) -> None:
         nonlocal latest
@@ -221,8 +230,8 @@ def _brax(
         if tree is not None:
             blank = _blank(env, config)
             params, best = (from_tree(blank, tree[name]) for name in ("latest", "best"))
-        if done < config.steps:
-            with contextlib.suppress(_Diverged):  # NaN does not go away again: the best so far stays
+        if done < config.steps and not _held(history, config):
+            with contextlib.suppress(_Ended):
                 _ppo(env, randomise, config, done, params, progress_fn=tell, policy_params_fn=keep)
     if best is None:
         raise ValueError(
@@ -230,7 +239,8 @@ def _brax(
             "(in Python, a smaller TrainConfig.learning_rate too)"
         )
     normaliser, actor, _ = best
-    return TrainedPolicy(policy_of(normaliser, actor, layer_sizes(config.hidden), env.interface), tuple(history))
+    policy = policy_of(normaliser, actor, layer_sizes(config.hidden), env.interface)
+    return TrainedPolicy(policy, tuple(history), _held(history, config) and history[-1].step < config.steps)
 
 
 def _ppo(
@@ -267,8 +277,14 @@ def _ppo(
     )
 
 
-class _Diverged(Exception):
-    """The networks' weights are NaN or infinite."""
+class _Ended(Exception):
+    """Training is to end: it succeeds often enough, or weights are NaN or infinite, which does not go away again."""
+
+
+def _held(history: Sequence[TrainProgress], config: TrainConfig) -> bool:
+    """Whether the last evaluations, `held` of them, each had enough success."""
+    last = [now.success for now in history[-config.held :]] if config.held else []
+    return len(last) == config.held > 0 and min(last) >= config.enough
 
 
 def _networks(config: TrainConfig) -> Callable[..., Any]:

@@ -53,7 +53,7 @@ class Progress(Struct, frozen=True):
 
 
 class Training(Struct, frozen=True, kw_only=True):
-    """training.json."""
+    """training.json. held: training ended early since it had succeeded often enough."""
 
     setup: TrainingSetup
     synthetic_robot: TrainingRobot
@@ -63,6 +63,7 @@ class Training(Struct, frozen=True, kw_only=True):
     versions: dict[str, Any]
     device: str
     history: list[Progress]
+    held: bool = False
 
     @property
     def another_robot(self) -> bool:

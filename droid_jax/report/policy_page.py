@@ -62,8 +62,9 @@ def wrong_model(training: Training, run: Run | None, gap: Gap | None) -> str:
 def policy_doubts(trained: Trained, wrong: str = "") -> list[str]:
     """What to doubt of a policy, by the names that policy_sentences.jinja has for them."""
     history = trained.training.history
+    early = bool(history) and history[-1].step < history[-1].of
     asked = {
-        "ended_early": bool(history) and history[-1].step < history[-1].of,  # by weights that are not finite
+        "ended_early": early and not trained.training.held,  # by weights that are not finite
         "another_robot": bool(trained.trials) and trained.training.another_robot,
         "wrong_model": bool(wrong),
     }

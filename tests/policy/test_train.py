@@ -19,6 +19,7 @@ from droid_jax.identify.gaussian import prior
 from droid_jax.policy.control import OBSERVED
 from droid_jax.policy.randomise import randomised
 from droid_jax.policy.train import (
+    _NAMES,
     PRESETS,
     TrainConfig,
     TrainProgress,
@@ -149,6 +150,23 @@ def test_networks_that_are_no_numbers_end_the_training_and_the_best_stays(monkey
     played(monkeypatch, untrained, none)
     with pytest.raises(ValueError, match=r"ended in NaN or infinite weights.*another --seed"):
         _brax(MADE_UP, None, SHORT, None, 0, lambda now: None, lambda step, tree: None)
+
+
+def test_training_ends_once_success_has_held(monkeypatch: pytest.MonkeyPatch):
+    config = replace(SHORT, steps=1000, enough=0.98, held=2)
+    good = [(100, 0.99, 1.0, 1.0), (200, 0.97, 1.0, 2.0), (300, 0.98, 1.0, 3.0), (400, 1.0, 1.0, 4.0)]
+    ran = played(monkeypatch, (0, 0.0, 0.0, 0.0), *good, (500, 1.0, 9.0, 5.0))
+    kept = dict[int, Any]()
+    found = _brax(MADE_UP, None, config, None, 0, lambda now: None, kept.__setitem__)
+    assert found.held and ran == [0, 100, 200, 300, 400] and found.policy == 4.0
+    again = played(monkeypatch, (0, 0.0, 0.0, 0.0))
+    monkeypatch.setattr("droid_jax.policy.train._blank", lambda env, config: None)
+    monkeypatch.setattr("droid_jax.policy.train.from_tree", lambda blank, tree: tuple(map(tree.get, _NAMES)))
+    resumed = _brax(MADE_UP, None, config, kept[400], 400, lambda now: None, kept.__setitem__)
+    assert resumed.held and not again and resumed.policy == 4.0
+    ran = played(monkeypatch, (0, 0.0, 0.0, 0.0), *good, (500, 1.0, 9.0, 5.0))
+    whole = _brax(MADE_UP, None, replace(config, held=0), None, 0, lambda now: None, lambda step, tree: None)
+    assert not whole.held and ran[-1] == 500
 
 
 def made_up(scene: str = "one", effects: tuple[str, ...] = ()) -> Any:

@@ -168,8 +168,8 @@ def test_the_page_says_why_there_are_no_films(tmp_path: Path, quick: None):
 
 def test_a_training_that_ended_in_nan_says_so(tmp_path: Path, quick: None):
     history = training_json()["history"]
-    for last, ended in ((history, False), (history[:3], True)):
-        made = make_policy(tmp_path / f"{len(last)}", None, history=last)
+    for last, held, ended in ((history, False, False), (history[:3], False, True), (history[:3], True, False)):
+        made = make_policy(tmp_path / f"{len(last)}_{held}", None, history=last, held=held)
         assert ("ended_early" in policy_doubts(read_policy(made))) is ended
         said = read_page(page.write_report(made)).doubts.get("ended_early", "")
         assert ("before the 2 million actions" in spaced(said)) is ended
