@@ -37,6 +37,7 @@ from droid_jax.policy.control import ACTIONS, OBSERVED, Safety, limited
 from droid_jax.policy.environment import Environment
 from droid_jax.simulate.hand_path import solve_pose
 from droid_jax.simulate.replay import apply_forces, apply_friction, check_stateless, compose, servo_input
+from droid_jax.simulate.time_loop import time_loop
 
 PAST = 4  # commands remembered: a delay of up to three times Task.control
 FAST = 100.0  # rad/s or m/s: ten times what arm, fingers and door ever do; beyond, the simulation has come apart
@@ -149,9 +150,9 @@ class DoorEnv(Environment):
 
     def _advance(self, physics: Physics, world: World) -> tuple[World, jax.Array]:
         """`Task.control` seconds later; and the force on each finger [2] N in the last of its steps."""
-        model, theta = physics.model, complete(physics.theta, self.effects)
 
-        def substep(carry, number):
+        def substep(sample: Any, number: jax.Array, carry: Any) -> Any:
+            model, theta, error, world = sample
             qpos, qvel, warm, load, _ = carry
             now = State(world.time + number * self._timestep, qpos, qvel, load, model)
             ctrl = self._servo(theta, now, world)
@@ -160,13 +161,15 @@ class DoorEnv(Environment):
                 apply_friction(model, theta, now, self.effects),
                 data,
                 servo_damping=self._servo_damping,
-                push=apply_forces(theta, now, self.effects, encoder_error(self.scene, model)),
+                push=apply_forces(theta, now, self.effects, error),
             )
             force = finger_forces(self._hand, after)
-            return (after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator, force), None
+            return after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator, force
 
+        model, theta = physics.model, complete(physics.theta, self.effects)
+        sample = model, theta, encoder_error(self.scene, model), world
         start = (world.qpos, world.qvel, world.warm, world.load, jnp.zeros(2))
-        (qpos, qvel, warm, load, force), _ = jax.lax.scan(substep, start, jnp.arange(self._substeps))
+        qpos, qvel, warm, load, force = time_loop(substep, sample, start, self._substeps)
         return world._replace(qpos=qpos, qvel=qvel, warm=warm, load=load, time=world.time + self.task.control), force
 
     def _servo(self, theta: Theta, now: State, world: World) -> jax.Array:

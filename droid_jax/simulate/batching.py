@@ -13,7 +13,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jax.sharding import PartitionSpec
 
 from droid_jax import runtime
@@ -49,56 +48,21 @@ def blocks(values: Any) -> Iterator[tuple[np.ndarray, int]]:
 def over_block(function: Callable[..., Any], alike: bool = True) -> Callable[..., Any]:
     """Compile `function` ([D], *more -> pytree) for whole blocks: [B, D], *more -> the same with a leading [B].
 
-    alike: whether what comes after the values is shared by all rows; else each row has its own, with a leading [B].
-    See `compiled_block`.
-    """
-
-    def block(values: jax.Array, *more: Any) -> Any:
-        return jax.vmap(function, in_axes=(0, *[None if alike else 0] * len(more)))(values, *more)
-
-    return compiled_block(block, alike)
-
-
-def compiled_block(block: Callable[..., Any], alike: bool = True) -> Callable[..., Any]:
-    """Compile `block` ([B, D], *more -> pytree with a leading [B]), whose rows are independent, over all devices.
-
     B must be a multiple of the number of devices (see `block_size`).  What comes after the values (pytrees of arrays)
     is no constant of the program: other arrays of the same shapes compile nothing again.  The result lives on the
     devices, sharded by rows.
+    alike: whether what comes after the values is shared by all rows; else each row has its own, with a leading [B].
     """
     rows = PartitionSpec(AXIS)
-    specs = (rows, PartitionSpec() if alike else rows)
+
+    def block(values: jax.Array, more: tuple[Any, ...]) -> Any:
+        return jax.vmap(function, in_axes=(0, *[None if alike else 0] * len(more)))(values, *more)
+
     # check_vma: mjx's own loops mix sharded and constant carries, which the check refuses.
-    mapped = jax.shard_map(
-        lambda values, more: block(values, *more),
-        mesh=runtime.devices_mesh(),
-        in_specs=specs,
-        out_specs=rows,
-        check_vma=False,
-    )
+    specs = rows, PartitionSpec() if alike else rows
+    mapped = jax.shard_map(block, mesh=runtime.devices_mesh(), in_specs=specs, out_specs=rows, check_vma=False)
     compiled = jax.jit(mapped, compiler_options=runtime.compiler_options())
     return lambda values, *more: compiled(jnp.asarray(values, jnp.float32), more)
-
-
-def by_row(function: Callable[[jax.Array], Any], values: jax.Array) -> tuple[list[jax.Array], Callable[[Any], Any]]:
-    """`function` of every row of values [B, D], taken apart: what differs by row, and how a row's result is made of it.
-
-    Returns arrays [B, ...] and a function from one entry of each to the pytree that `function` gives.  Leaves that no
-    value reaches stay constants, as they are in a batch of `function` itself.
-    """
-    fixed, structure = list[Any](), list[Any]()
-
-    def leaves(row: jax.Array) -> list[jax.Array]:
-        found, tree = jax.tree.flatten(function(row))
-        structure.append(tree)
-        fixed.extend(None if isinstance(leaf, Tracer) else leaf for leaf in found)
-        return [leaf for leaf in found if isinstance(leaf, Tracer)]
-
-    def whole(entries: Any) -> Any:
-        own = iter(entries)
-        return jax.tree.unflatten(structure[0], [next(own) if leaf is None else leaf for leaf in fixed])
-
-    return jax.vmap(leaves)(values), whole
 
 
 def over_population(function: Callable[[jax.Array], Any]) -> Callable[[Any], Any]:

@@ -25,7 +25,7 @@ from droid_jax.model.parameters import Role, Space, Write
 from droid_jax.model.physics import make_physics, theta_of
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import TorqueConvention
-from droid_jax.simulate.batching import by_row, compiled_block, over_block
+from droid_jax.simulate.batching import over_block
 from droid_jax.simulate.c_reference import c_replay
 from droid_jax.simulate.inverse_dynamics import Path, motion_path, path_replay
 from droid_jax.simulate.measured_motion import Motion
@@ -197,12 +197,7 @@ def _servo_program(
     """(values [B, D], command [T, U], start [nq], steps) -> motion [B, T, ...]; scene and effects count by identity."""
     motion = servo_motion(scene, clocked.drive, effects, parity=mj_step, late=0.0 if mj_step else 0.5)
     space = layout.space
-
-    def block(values: jax.Array, *of_drive: Any) -> Rollout:
-        samples, of = by_row(lambda row: motion.prepared(make_physics(scene, space, row)), values)
-        return motion.of_samples(samples, of, *of_drive)
-
-    return compiled_block(block)
+    return over_block(lambda values, *of_drive: motion(make_physics(scene, space, values), *of_drive))
 
 
 @functools.lru_cache(maxsize=PROGRAMS)

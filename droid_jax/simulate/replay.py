@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -38,6 +38,7 @@ from droid_jax.simulate.initial_state import (
     start_pose,
     weight_share,
 )
+from droid_jax.simulate.time_loop import time_loop
 
 Replay = Callable[[Physics], Rollout]
 TORQUE_OFFSETS = "torque offset"  # the effect that adds them, which every replay in MJX has
@@ -161,74 +162,18 @@ def servo_replay(
     table, start = jnp.asarray(drive.command, jnp.float32), jnp.asarray(drive.qpos0, jnp.float32)
 
     def replay(physics: Physics) -> Rollout:
-        moved = motion.along(motion.prepared(physics), table, start, len(table))
-        return sensed(moved, physics.theta, effects, drive.timestep)
+        return sensed(motion(physics, table, start, len(table)), physics.theta, effects, drive.timestep)
 
     return replay
 
 
-class Prepared(NamedTuple):
-    """What a sample's steps share. error: [nv] by which joints stand further than their encoders say, or None."""
-
-    physics: Physics
-    error: jax.Array | None
-
-
-@dataclass(frozen=True, eq=False)
-class ServoMotion:
-    """The loop over time steps that follows a command.
-
-    prepared: physics -> what the steps of a sample share.
-    step: (prepared, command [T, U], k, state) -> the state after step k.
-    begin: (rows, start [nq]) -> the state before the first step, with room for so many rows.
-    """
-
-    prepared: Callable[[Physics], Prepared]
-    step: Callable[[Prepared, jax.Array, jax.Array, Any], Any]
-    begin: Callable[[int, jax.Array], Any]
-
-    def along(self, sample: Prepared, table: jax.Array, start: jax.Array, steps: Any) -> Rollout:
-        """One sample's motion: a Rollout of as many rows as the command [T, U] has.
-
-        Rows from `steps` on are zero, so that recordings of different lengths share one compiled program; their
-        commands are those of the last step, repeated.
-        """
-        state = _loop(lambda k, state: self.step(sample, table, k, state), self.begin(len(table), start), steps)
-        return _moved(*state[1])
-
-    def of_samples(
-        self, samples: Any, of: Callable[[Any], Prepared], table: jax.Array, start: jax.Array, steps: Any
-    ) -> Rollout:
-        """The same of B samples side by side, [B, T, ...]; `of` makes what is prepared from one entry of `samples`.
-
-        The samples are inside the loop, not the loop inside them: jax then traces a step once and not three times.
-        """
-        rows = len(jax.tree.leaves(samples)[0])
-        begun = jax.tree.map(lambda a: jnp.broadcast_to(a, (rows, *a.shape)), self.begin(len(table), start))
-
-        def step(k: jax.Array, states: Any) -> Any:
-            return jax.vmap(lambda sample, state: self.step(of(sample), table, k, state))(samples, states)
-
-        return jax.vmap(_moved)(*_loop(step, begun, steps)[1])
-
-
-def _loop(step: Callable[[jax.Array, Any], Any], state: Any, steps: Any) -> Any:
-    return jax.lax.fori_loop(jnp.zeros((), jnp.int32), jnp.asarray(steps, jnp.int32), step, state)
-
-
-def _moved(
-    torque: jax.Array, position: jax.Array, velocity: jax.Array, angle: jax.Array, contact: jax.Array
-) -> Rollout:
-    """What the steps left, not yet seen by a sensor."""
-    time = jnp.zeros(len(torque), jnp.float32)
-    return Rollout(time, torque, position, velocity, angle, contact, jnp.array(True))
-
-
 def servo_motion(
     scene: Scene, drive: Drive, effects: Sequence[Effect] = (), *, parity: bool = False, late: float = 0.5
-) -> ServoMotion:
-    """The motion of a scene with servos. Torques carry the time of the state they act on.
+) -> Callable[[Physics, jax.Array, jax.Array, Any], Rollout]:
+    """The loop over time steps that follows a command: (physics, command [T, U], start [nq], steps) -> T rows.
 
+    Rows from `steps` on are zero, so that recordings of different lengths share one compiled program; their commands
+    are those of the last step, repeated.  Torques carry the time of the state they act on; sensors have not seen them.
     A state is position, velocity, the solver's warm start and the load: everything else in mjx.Data is rebuilt each
     step, so that XLA drops what nobody reads.
     Of the drive only its time step, its gains and its torque's convention are used.
@@ -244,12 +189,8 @@ def servo_motion(
     half = late if parity else 0.5  # steps from the velocity before a step to the one that is told
     damping = has_servo_damping(scene.model)
 
-    def prepared(physics: Physics) -> Prepared:
-        whole = replace(physics, theta=dict(complete(physics.theta, effects)))
-        return Prepared(whole, encoder_error(scene, physics.model))
-
-    def step(sample: Prepared, table: jax.Array, k: jax.Array, carry: Any) -> Any:
-        model, theta, error = sample.physics.model, sample.physics.theta, sample.error
+    def step(sample: Any, k: jax.Array, carry: Any) -> Any:
+        model, theta, error, table = sample
         (qpos, qvel, warm, load), kept = carry
         state = State(k * drive.timestep, qpos, qvel, load, model)
         ctrl = servo_input(_command(table, drive.timestep, k, shift, theta, effects), theta, state, effects)
@@ -277,13 +218,16 @@ def servo_motion(
         kept = tuple(jax.lax.dynamic_update_index_in_dim(a, b, k, 0) for a, b in zip(kept, now, strict=True))
         return (after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator), kept
 
-    def begin(rows: int, start: jax.Array) -> Any:
-        zero = jnp.zeros(scene.model.nv, jnp.float32)
-        traces = [jnp.zeros((rows, len(joints)), jnp.float32) for _ in range(3)]
-        kept = (*traces, jnp.zeros(rows, jnp.float32), jnp.zeros((rows, len(fingers)), bool))
-        return (start, zero, zero, zero), kept
+    def motion(physics: Physics, table: jax.Array, start: jax.Array, steps: Any) -> Rollout:
+        sample = physics.model, complete(physics.theta, effects), encoder_error(scene, physics.model), table
+        zero, traces = jnp.zeros(scene.model.nv, jnp.float32), jnp.zeros((3, len(table), len(joints)), jnp.float32)
+        angle, contact = jnp.zeros(len(table), jnp.float32), jnp.zeros((len(table), len(fingers)), bool)
+        begun = (start, zero, zero, zero), (*traces, angle, contact)
+        _, (torque, position, velocity, angle, contact) = time_loop(step, sample, begun, steps)
+        time = jnp.zeros(len(table), jnp.float32)
+        return Rollout(time, torque, position, velocity, angle, contact, jnp.array(True))
 
-    return ServoMotion(prepared, step, begin)
+    return motion
 
 
 def sensed(
