@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from droid_jax.recordings.alignment import common_clock, one_command, start_positions
 from droid_jax.recordings.bag_topics import FIELDS, Track, read_bag
 from droid_jax.recordings.checks import UNITS, validate
 from droid_jax.recordings.clocks import check_clock, in_gap, interpolate
@@ -110,7 +111,7 @@ def read_bags(
         command_names=command_joints if commands else (),
         channels=channels,
         torque=torque,
-        qpos0={**_initial(channels), **(qpos0 or {})},
+        qpos0={**start_positions(channels), **(qpos0 or {})},
         gains=gains,
         phases=tuple(phases),
         meta={
@@ -250,22 +251,7 @@ def _clock(states: Sequence[_Timed], rate: float | None, bags: Sequence[Path]) -
                 f"{bag}: needs two joint states or more after the first command; there are {len(time)}, from "
                 f"{time[0]:.3f} to {time[-1]:.3f} s of it (are the header stamps of two clocks? then --stamps bag)"
             )
-    if rate is not None and not rate > 0:
-        raise ValueError(f"rate must be positive, got {rate} Hz")
-    step = 1.0 / rate if rate else float(np.median(np.diff(states[0][0])))
-    ends = [float(t[-1]) for t, _ in states]
-    if min(ends) < 0.5 * max(ends):
-        i = int(np.argmin(ends))
-        raise ValueError(
-            f"{bags[i]}: lasts {ends[i]:.3f} s, less than half of the longest repeat's {max(ends):.3f} s; "
-            "was it cut off?"
-        )
-    first = max(0.0, *(float(t[0]) for t, _ in states))
-    # A sample that misses the end by rounding still counts.
-    low, high = int(np.ceil(first / step - 1e-6)), int(np.floor(min(ends) / step + 1e-6))
-    if high - low < 1:
-        raise ValueError(f"the repeats have no common part: {', '.join(str(b) for b in bags)}")
-    return step * np.arange(low, high + 1)
+    return common_clock([time for time, _ in states], rate, bags)
 
 
 def _channels(
@@ -306,22 +292,4 @@ def _command(
         if "position" not in fields:
             raise ValueError(f"{bag}: the command messages hold no positions")
     every = [interpolate(clock, t, fields["position"]) for t, fields in commands]
-    for bag, command in zip(bags[1:], every[1:], strict=True):
-        gap = np.abs(command - every[0])
-        i, j = np.unravel_index(int(np.argmax(gap)), gap.shape)
-        if gap[i, j] > tolerance:
-            raise ValueError(
-                f"{bag}: its command is not that of {bags[0]}, joint {joints[j]!r} differs by "
-                f"{gap[i, j]:.4g} at {clock[i]:.3f} s; repeats must replay one motion, within "
-                f"--command-tolerance {tolerance:g} (command_tolerance)"
-            )
-    return every[0]
-
-
-def _initial(channels: Mapping[str, Channel]) -> dict[str, float]:
-    """Joint -> first measured position, mean over the repeats that measured it; nothing without positions."""
-    if "position" not in channels:
-        return {}
-    position = channels["position"]
-    first, seen = position.values[:, 0], position.mask[:, 0]
-    return {joint: float(first[seen[:, c], c].mean()) for c, joint in enumerate(position.columns) if seen[:, c].any()}
+    return one_command(every, clock, joints, tolerance, bags)

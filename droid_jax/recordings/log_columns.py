@@ -1,0 +1,138 @@
+"""Columns of a log by name, whatever file they come from, and the ones that a map means."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from droid_jax.arguments import shown
+from droid_jax.errors import named
+from droid_jax.recordings.column_map import listed
+
+_PART = re.compile(r"(.*)\[([\d:,\s]+)\]")
+_NUMBER, _JOINT = "{n}", "{joint}"
+
+
+@dataclass(frozen=True, eq=False)
+class LogColumns:
+    """The columns of one log, each read when it is asked for.
+
+    where: file and part of it, begins every message.
+    widths: name -> numbers per row; 0 for text and pictures, which are not read.
+    read: name -> [T] or [T, W].
+    components: name of a column of vectors -> names of its W numbers.
+    units: what the log itself says: channel -> unit, and "time" -> unit.
+    hints: what the log tells of a unit that it does not state, by channel.
+    rate: Hz of the rows, where the log says it.
+    notes: for `meta` of the recording.
+    """
+
+    where: str
+    widths: Mapping[str, int]
+    read: Callable[[str], np.ndarray]
+    components: Mapping[str, tuple[str, ...]] = field(default_factory=dict[str, tuple[str, ...]])
+    units: Mapping[str, str] = field(default_factory=dict[str, str])
+    hints: Mapping[str, str] = field(default_factory=dict[str, str])
+    rate: float | None = None
+    notes: Mapping[str, str] = field(default_factory=dict[str, str])
+
+    def has(self, columns: str | Sequence[str], joints: Sequence[str]) -> bool:
+        """Whether `pick` finds all of them."""
+        try:
+            self._found(columns, joints, "")
+        except ValueError:
+            return False
+        return True
+
+    def pick(self, columns: str | Sequence[str], joints: Sequence[str], what: str) -> np.ndarray:
+        """[T, C] float64 of the columns that a map names, one for each joint.
+
+        Args:
+            columns: as in `ChannelMap`.
+            joints: C names, in the order wanted.
+            what: they are, for messages.
+
+        Raises:
+            ValueError: a column is not there, is no column of numbers, or there are more or fewer than joints.
+        """
+        parts = []
+        for name, index in self._found(columns, joints, what):
+            numbers = self.numbers(name)
+            numbers = numbers[:, None] if numbers.ndim == 1 else numbers
+            parts.append(numbers if index is None else numbers[:, index])
+        if len({len(part) for part in parts}) > 1:
+            raise ValueError(f"{self.where}, {what}: its columns have {_counts(parts)} rows, one number expected")
+        picked = np.concatenate(parts, axis=1).astype(np.float64, copy=False)
+        if picked.shape[1] != len(joints):
+            raise ValueError(
+                f"{self.where}, {what}: {shown(columns)} has {picked.shape[1]} numbers in a row, and there are "
+                f"{len(joints)} joints ({named(joints)}); choose some with {_example(columns)}, or name other joints"
+            )
+        return picked
+
+    def numbers(self, name: str) -> np.ndarray:
+        """[T] or [T, W] of a column in the type that it has; ValueError where it is not there or no numbers."""
+        if name not in self.widths:
+            raise ValueError(f"{self.where}: no column {shown(name)}; it has: {named(self.widths) or 'none'}")
+        if not self.widths[name]:
+            raise ValueError(f"{self.where}: the column {shown(name)} holds no numbers")
+        return self.read(name)
+
+    def _found(
+        self, columns: str | Sequence[str], joints: Sequence[str], what: str
+    ) -> list[tuple[str, list[int] | None]]:
+        """(column, components of it) for every number that a map names; None: all of them."""
+        found: list[tuple[str, list[int] | None]] = []
+        for text in listed(columns):
+            if _NUMBER in text and text not in self.widths:
+                found += [(name, None) for name in self._numbered(text, what)]
+            elif _JOINT in text and text not in self.widths:
+                found += [self._one(text.replace(_JOINT, joint), what) for joint in joints]
+            else:
+                found.append(self._one(text, what))
+        return found
+
+    def _numbered(self, text: str, what: str) -> list[str]:
+        """Columns like q{n}, in the order of their numbers."""
+        pattern = re.compile(re.escape(text).replace(re.escape(_NUMBER), r"(\d+)"))
+        matches = {name: match for name in self.widths if (match := pattern.fullmatch(name))}
+        if not matches:
+            raise ValueError(f"{self.where}, {what}: no column like {shown(text)}; it has: {named(self.widths)}")
+        return sorted(matches, key=lambda name: [int(number) for number in matches[name].groups()])
+
+    def _one(self, text: str, what: str) -> tuple[str, list[int] | None]:
+        if text in self.widths:
+            return text, None
+        for name, components in self.components.items():  # "shoulder.pos" of the vectors in "observation.state"
+            if text.startswith(f"{name}.") and text[len(name) + 1 :] in components:
+                return name, [components.index(text[len(name) + 1 :])]
+        if (match := _PART.fullmatch(text)) and (name := match[1].strip()) in self.widths:
+            return name, _indices(match[2], self.widths[name], f"{self.where}, {what}, {shown(text)}")
+        have = named([*self.widths, *(f"{n}.{c}" for n, all_ in self.components.items() for c in all_)], most=60)
+        raise ValueError(f"{self.where}, {what}: no column {shown(text)}; it has: {have or 'none'}")
+
+
+def _indices(text: str, width: int, where: str) -> list[int]:
+    """ "0:3,5" as numbers below `width`."""
+    out: list[int] = []
+    for word in text.replace(" ", "").split(","):
+        low, colon, high = word.partition(":")
+        try:
+            out += range(int(low or 0), int(high or width)) if colon else [int(low)]
+        except ValueError:
+            raise ValueError(f"{where}: expected numbers like [0:3] or [2,5]") from None
+    if not out or max(out) >= width:
+        raise ValueError(f"{where}: a row of it has {width} numbers, counted from 0")
+    return out
+
+
+def _example(columns: str | Sequence[str]) -> str:
+    name = listed(columns)[0]
+    return f"{shown(f'{name}[0:3]')}" if _NUMBER not in name else "a list of names"
+
+
+def _counts(parts: Sequence[np.ndarray]) -> str:
+    return " and ".join(str(n) for n in sorted({len(part) for part in parts}))
