@@ -16,7 +16,10 @@ if TYPE_CHECKING:
 SHARED = (
     "joints", "slides", "torque", "gravity", "stiffness", "damping", "command_tolerance", "rate", "phases"
 )  # fmt: skip
-OF_BAGS = (*SHARED, "state_topic", "command_topic", "command_joints", "stamps")
+OF_BAGS = (
+    *SHARED, "state_topic", "command_topic", "command_joints", "motors", "velocity_actuators", "effort_actuators",
+    "stamps",
+)  # fmt: skip
 OF_LOGS = (*SHARED, "map", "columns", "units", "episodes")
 
 
@@ -48,15 +51,16 @@ class Convert:
     """Measured joints, in the order wanted."""
     slides: tuple[str, ...] = ()
     """Those of --joints that slide: N, m and m/s instead of N m, rad and rad/s."""
-    torque: Literal["motor", "link"] | None = None
-    """What the torque is: motor (current, actuator force) or link (a sensor behind the gear, a Panda's tau_J)."""
+    torque: Literal["motor", "link", "none"] | None = None
+    """What the torque is: motor (current, actuator force) or link (a sensor behind the gear, a Panda's tau_J). None: of
+    bags, it is not read."""
     gravity: bool = False
     """The torque contains what carries the arm's weight."""
     torque_constant: tuple[float, ...] = ()
     """N m (N) that one unit of the logged torque is, for each torque or one for all: of efforts that are amperes or
     per cent. A negative one turns the sign. (Of columns with a unit it belongs into the map.)"""
     state_topic: str = "/joint_states"
-    """Bags: topic of sensor_msgs/JointState."""
+    """Bags: topic of JointState, or of the state of a controller, of a Franka arm or of unitree's motors."""
     command_topic: str | None = None
     """Bags: topic of the position commands, or of a ros2_control controller's state; without one the log is replayed by
     inverse dynamics."""
@@ -66,6 +70,12 @@ class Convert:
     """Servo damping of the commanded joints, N m s/rad (N s/m for slides)."""
     command_joints: tuple[str, ...] = ()
     """Bags: commanded joints, in the order of commands that carry no names; default: --joints."""
+    motors: tuple[int, ...] = ()
+    """Bags: places of --joints in messages without names that hold more joints (unitree's), counted from 0."""
+    velocity_actuators: tuple[str, ...] = ()
+    """Bags: <velocity> actuators in the MJCF, one per commanded joint, that take the commands' velocities."""
+    effort_actuators: tuple[str, ...] = ()
+    """Bags: <motor> actuators in the MJCF, one per commanded joint, that take the commands' efforts."""
     command_tolerance: float = 5e-3
     """How far the repeats' commands may differ, rad or m."""
     rate: float | None = None
@@ -149,7 +159,7 @@ def _from_log(command: Convert) -> tuple[Recording, Callable[[], None]]:
         allow_jitter=command.allow_jitter,
         joints=command.joints,
         slides=command.slides,
-        side=command.torque,
+        side=None if command.torque == "none" else command.torque,
         gravity=command.gravity or (False if command.torque else None),
         stiffness=command.stiffness,
         damping=command.damping,
@@ -212,11 +222,14 @@ def _bag_options(command: Convert) -> dict[str, Any]:
         "allow_jitter": command.allow_jitter,
         "joints": command.joints,
         "slides": command.slides,
-        "torque": TorqueConvention(TorqueSide(command.torque), command.gravity),
+        "torque": None if command.torque == "none" else TorqueConvention(TorqueSide(command.torque), command.gravity),
         "state_topic": command.state_topic,
         "command_topic": command.command_topic,
         "gains": gains,
         "command_joints": command.command_joints or None,
+        "motors": command.motors or None,
+        "velocity_actuators": command.velocity_actuators,
+        "effort_actuators": command.effort_actuators,
         "command_tolerance": command.command_tolerance,
         "rate": command.rate,
         "phases": [_phase(words) for words in command.phases],

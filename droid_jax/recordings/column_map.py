@@ -149,8 +149,6 @@ def check_map(columns: ColumnMap, where: str) -> ColumnMap:
         )
     if columns.side not in (None, "motor", "link"):
         raise ValueError(f'{where}: side must be "motor" or "link", got {shown(columns.side)}')
-    if columns.time is None and columns.rate is None:
-        raise ValueError(f"{where}: names no column of time: give time, or the rate of the rows in Hz")
     if columns.rate is not None and not 0 < columns.rate < 1e5:
         raise ValueError(f"{where}: rate must be above 0 and below 1e5 Hz, got {columns.rate:g}")
     if strange := [s for s in columns.slides if s not in columns.joints]:

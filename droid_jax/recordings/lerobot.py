@@ -18,13 +18,12 @@ from droid_jax.arguments import number, shown
 from droid_jax.errors import named
 from droid_jax.read_json import read_json
 from droid_jax.recordings.column_map import ChannelMap, ColumnMap, TimeMap, Units
-from droid_jax.recordings.log_columns import LogColumns
+from droid_jax.recordings.log_columns import POSE, LogColumns
 from droid_jax.recordings.table_file import scan_parquet
 
 INFO = Path("meta") / "info.json"
 VERSIONS = ("v2.", "v3.")
 COMMAND, POSITION, TIME = "action", "observation.state", "timestamp"
-POSE = ".pos"  # behind the name of a motor, in names of LeRobot's own robots
 NORMALISED = 100.5  # numbers beyond are none that LeRobot normalised
 
 
@@ -84,7 +83,10 @@ def read_info(path: Path) -> dict[str, Any]:
 
 
 def usual_map(log: LogColumns) -> ColumnMap:
-    """The map of a dataset: actions are commands, the state is the position; joints as the meta names them."""
+    """The map of a dataset: actions are commands, the state is the position; joints as the meta names them.
+
+    A gripper beside joints in degrees is left out: LeRobot logs it as a share of its travel, and that is not stored.
+    """
     if POSITION not in log.widths:
         raise ValueError(f"{log.where}: has no {POSITION!r}, the measured positions; it has: {named(log.widths)}")
     names = log.components.get(COMMAND) or log.components.get(POSITION) or ()
@@ -93,6 +95,8 @@ def usual_map(log: LogColumns) -> ColumnMap:
             f"{log.where}: its meta does not name the {log.widths[POSITION]} joints of {POSITION!r}: give --joints"
         )
     joints = [name.removesuffix(POSE) for name in names]
+    if log.units.get(POSITION) == "deg":  # a gripper is logged as a share of its travel beside them
+        joints = [joint for joint in joints if "gripper" not in joint]
     command = ChannelMap(COMMAND) if log.widths.get(COMMAND) == log.widths[POSITION] else None
     return ColumnMap(joints=joints, command=command, position=POSITION, time=TimeMap(TIME, "s"), units=Units())
 

@@ -14,6 +14,7 @@ from droid_jax.recordings.column_map import listed
 
 _PART = re.compile(r"(.*)\[([\d:,\s]+)\]")
 _NUMBER, _JOINT = "{n}", "{joint}"
+POSE = ".pos"  # behind the name of a motor, in names of LeRobot's own robots
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +60,8 @@ class LogColumns:
             ValueError: a column is not there, is no column of numbers, or there are more or fewer than joints.
         """
         parts = []
+        if isinstance(columns, str) and (by_name := self._by_name(columns, joints)) is not None:
+            columns = by_name
         for name, index in self._found(columns, joints, what):
             numbers = self.numbers(name)
             numbers = numbers[:, None] if numbers.ndim == 1 else numbers
@@ -73,6 +76,13 @@ class LogColumns:
             )
         return picked
 
+    def stated(self, columns: str | Sequence[str], of: Mapping[str, str]) -> str | None:
+        """What `units` or `hints` say of the columns that a map names; None where they say nothing."""
+        for text in listed(columns):
+            for name in (name for name in of if text == name or text.startswith((f"{name}.", f"{name}["))):
+                return of[name]
+        return None
+
     def numbers(self, name: str) -> np.ndarray:
         """[T] or [T, W] of a column in the type that it has; ValueError where it is not there or no numbers."""
         if name not in self.widths:
@@ -80,6 +90,12 @@ class LogColumns:
         if not self.widths[name]:
             raise ValueError(f"{self.where}: the column {shown(name)} holds no numbers")
         return self.read(name)
+
+    def _by_name(self, name: str, joints: Sequence[str]) -> list[str] | None:
+        """Columns of a vector's components that are named as the joints; None where one is not."""
+        known = {part.removesuffix(POSE): f"{name}.{part}" for part in self.components.get(name, ())}
+        found = [known.get(joint.removesuffix(POSE)) for joint in joints]
+        return None if None in found or not found else [text for text in found if text is not None]
 
     def _found(
         self, columns: str | Sequence[str], joints: Sequence[str], what: str

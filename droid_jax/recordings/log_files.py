@@ -16,7 +16,6 @@ from droid_jax.read_npz import NpzFile
 from droid_jax.recordings.column_map import SUFFIX, ColumnMap, layouts, read_map, with_options
 from droid_jax.recordings.log_columns import LogColumns
 from droid_jax.recordings.mapped_log import Opened, fits, read_logs
-from droid_jax.recordings.npz_file import is_npz
 from droid_jax.recordings.recording import Phase, Recording
 
 TABLES = (".csv", ".tsv", ".csv.gz", ".tsv.gz")
@@ -30,7 +29,16 @@ def is_log(path: Path) -> bool:
     if path.is_dir():
         inside = (p.name for p in path.iterdir()) if not (path / "recording.json").exists() else ()
         return (path / INFO).is_file() or any(name.endswith(SUFFIXES) for name in inside)
-    return path.name.endswith(SUFFIXES) and not (path.suffix == ".npz" and is_npz(path))
+    return path.name.endswith(SUFFIXES) and not (path.suffix == ".npz" and _is_recording(path))
+
+
+def _is_recording(path: Path) -> bool:
+    """Whether an npz file is a recording of this program, of another version, or so damaged that it may be one."""
+    try:
+        with NpzFile(path) as file:
+            return "format" in file or "metadata" in file
+    except (OSError, ValueError):
+        return True
 
 
 def read_log(
@@ -83,6 +91,8 @@ def read_log(
             f"position=... command=... time=... (docs/file-formats.md); it has: {_columns_of(paths[0], logs[0])}"
         )
     found = with_options(found, channels or {}, units or {}, **changes)
+    if not found.joints and (names := _named_joints(logs[0], found)):
+        found = with_options(found, {}, {}, joints=names)
     recording = read_logs(
         logs,
         found,
@@ -115,6 +125,14 @@ def _known_map(log: Opened, path: Path, beside: Path | None) -> tuple[ColumnMap 
     return None, ""
 
 
+def _named_joints(log: Opened, columns: ColumnMap) -> tuple[str, ...]:
+    """The joints that a log itself names for the positions, velocities or torques of a map."""
+    for key in ("position", "velocity", "torque"):
+        if (entry := columns.channel(key)) is not None and isinstance(entry.columns, str):
+            return log(entry.file).components.get(entry.columns, ())
+    return ()
+
+
 def _as_many(log: Opened, columns: ColumnMap) -> tuple[str, ...]:
     """Names for as many joints as a layout's positions have."""
     entry = columns.channel("position")
@@ -131,9 +149,8 @@ def _columns_of(path: Path, log: Opened) -> str:
 def _parts(path: Path, episodes: Sequence[str | int]) -> list[Opened]:
     """What opens each repeat of a path."""
     if path.is_dir() and (path / INFO).is_file():
-        return [_once(partial(_dataset, path, _number(path, e))) for e in episodes] or [
-            _once(partial(_dataset, path, None))
-        ]
+        numbers = [_number(path, e) for e in episodes] or [None]
+        return [_once(partial(_dataset, path, number)) for number in numbers]
     if path.name.endswith(HDF5):
         reader = _reader("hdf5_file")
         demonstrations = reader.groups(path)

@@ -55,7 +55,7 @@ def _unit_of_each(entry: ChannelMap, key: str, joints: Sequence[str], columns: C
             raise ValueError(f"{log.where}, {key}: {len(entry.unit)} units for {len(joints)} joints")
         return list(entry.unit)
     kind = KINDS[key]
-    stated = [log.units[name] for name in listed(entry.columns) if name in log.units]
+    stated, hint = log.stated(entry.columns, log.units), log.stated(entry.columns, log.hints)
     out = []
     for joint in joints:
         slides = joint in columns.slides
@@ -65,12 +65,12 @@ def _unit_of_each(entry: ChannelMap, key: str, joints: Sequence[str], columns: C
             "velocity": f"{base}/s" if base is not None and base not in NORMALISED else None,
             "torque": columns.units.force if slides else columns.units.torque,
         }[kind]
-        unit = entry.unit or of_all or (stated[0] if stated else None)
+        unit = entry.unit or of_all or stated
         if unit is None:
             known = named((SLIDES if slides else HINGES)[kind])
-            hint = next((f" ({log.hints[name]})" for name in listed(entry.columns) if name in log.hints), "")
+            why = f" ({hint})" if hint else ""
             raise ValueError(
-                f"{log.where}, {key}: the unit of joint {joint!r} is not stated{hint}: give --units, one of {known}"
+                f"{log.where}, {key}: the unit of joint {joint!r} is not stated{why}: give --units, one of {known}"
             )
         out.append(unit)
     return out

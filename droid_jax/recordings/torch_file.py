@@ -142,14 +142,15 @@ def _rebuild(storage: Any, offset: Any, shape: Any, strides: Any, *_: Any) -> _T
 def _flat(content: Any, path: Path) -> dict[str, Any]:
     """Name -> value of what nested dictionaries hold; ValueError where they hold too much, or themselves."""
     out: dict[str, Any] = {}
-    waiting = [("", content)]
+    waiting, seen = [("", content)], 0
     while waiting:
         name, value = waiting.pop()
+        seen += 1
         if isinstance(value, dict):
             waiting += [(f"{name}/{key}" if name else str(key), inner) for key, inner in value.items()]
         else:
             out[name or "tensor"] = value
-        if len(out) + len(waiting) > MOST_ENTRIES or len(name) > LONGEST_NAME:
+        if seen + len(waiting) > MOST_ENTRIES or len(name) > LONGEST_NAME:
             raise ValueError(f"{path}: its dictionaries hold more than {MOST_ENTRIES} values, or one another too deep")
     return out
 
