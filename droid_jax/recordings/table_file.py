@@ -18,6 +18,7 @@ from droid_jax.recordings.log_columns import LogColumns
 from droid_jax.storage import check_size
 
 MOST_BYTES = 2**31  # of a table: ten minutes of fourteen columns at 1 kHz have 150 MB
+SAMPLE = 10_000  # rows that tell the types of columns
 SEPARATORS = (",", ";", "\t")
 _LIST_SIGNS = r"[\[\]()]"
 
@@ -31,16 +32,21 @@ def open_csv(path: Path) -> LogColumns:
     if check_size(path, MOST_BYTES) == 0:
         raise ValueError(f"{path}: the file is empty")
     with _named(path):
-        separator = _separator(path)
-        frame = pl.read_csv(
-            path, separator=separator, infer_schema_length=None, comment_prefix="#", truncate_ragged_lines=False
-        )
+        try:
+            frame = _read(path, SAMPLE)
+        except pl.exceptions.ComputeError:  # a type that changes further down: all rows are looked at
+            frame = _read(path, None)
         # A space behind the separator makes texts of numbers.
         names = [name.strip() for name in frame.columns]
         if len(set(names)) < len(names) or "" in names:
             raise ValueError(f"{path}, line 1: expected a header of different names, got {shown(names, 200)}")
         frame.columns = names
         return _columns(str(path), frame)
+
+
+def _read(path: Path, sample: int | None) -> pl.DataFrame:
+    """The table, its types as `sample` rows have them; None: as all have."""
+    return pl.read_csv(path, separator=_separator(path), infer_schema_length=sample, comment_prefix="#")
 
 
 def open_parquet(path: Path) -> LogColumns:
