@@ -54,7 +54,7 @@ def one_command(
     """
     for place, command in zip(places[1:], commands[1:], strict=True):
         gap = np.abs(command - commands[0])
-        i, j = np.unravel_index(int(np.argmax(gap)), gap.shape)
+        i, j = map(int, np.unravel_index(int(np.argmax(gap)), gap.shape))
         if gap[i, j] > tolerance:
             raise ValueError(
                 f"{place}: its command is not that of {places[0]}, joint {joints[j]!r} differs by "

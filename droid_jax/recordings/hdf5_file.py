@@ -61,9 +61,8 @@ def groups(path: Path) -> list[str]:
     """Groups of a file that hold one demonstration each, as robomimic's data/demo_0; none in other files."""
     try:
         with h5py.File(path, "r") as file:
-            data = file.get("data")
-            names = [name for name in data if name.startswith("demo_")] if isinstance(data, h5py.Group) else []
-            return [f"data/{name}" for name in sorted(names, key=lambda name: (len(name), name))]
+            names = [name for name in file.get("data", ()) if str(name).startswith("demo_")]
+            return [f"data/{name}" for name in sorted(map(str, names), key=lambda name: (len(name), name))]
     except OSError as error:
         raise ValueError(f"{path}: not a readable HDF5 file: {said(error)}") from None
 

@@ -103,11 +103,12 @@ def usual_map(log: LogColumns) -> ColumnMap:
 
 def _components(feature: Any) -> tuple[str, ...]:
     """Names of a vector's numbers: a list, or a list under one name ("motors")."""
-    names = feature.get("names") if isinstance(feature, dict) else None
+    names: Any = feature.get("names") if isinstance(feature, dict) else None
     if isinstance(names, dict) and len(names) == 1:
         names = next(iter(names.values()))
-    fine = isinstance(names, list) and all(isinstance(name, str) for name in names)
-    return tuple(names) if fine and len(set(names)) == len(names) else ()
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        return ()
+    return tuple(names) if len(set(names)) == len(names) else ()
 
 
 def _units(log: LogColumns) -> tuple[dict[str, str], dict[str, str]]:

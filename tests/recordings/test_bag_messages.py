@@ -1,4 +1,4 @@
-"""States and commands of robots' own ROS messages, in bags written by rosbags and in MCAP written by mcap-ros2-support."""
+"""States and commands of robots' own ROS messages, in bags of rosbags and in MCAP of mcap-ros2-support."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ LEG = ("FL_hip", "FL_thigh", "FL_calf")
 LEG_MOTORS = (3, 4, 5)  # of a Go2, whose front right leg comes first
 KP, KD = 20.0, 1.5
 
-# As published, without fields that stand apart from what is read (other than some, whose bytes have to be stepped over).
+# As published, without most of the fields that are not read.
 FRANKA = """
 std_msgs/Header header
 float64[6] cartesian_collision
@@ -50,7 +50,7 @@ sensor_msgs/JointState desired_joint_state
 sensor_msgs/JointState measured_joint_motor_state
 float64[7] ddq_d
 """
-MOTOR_STATE = "uint8 mode\nfloat32 q\nfloat32 dq\nfloat32 ddq\nfloat32 tau_est\nint8 temperature\nuint32 lost\nuint32[2] reserve\n"
+MOTOR_STATE = "uint8 mode\nfloat32 q\nfloat32 dq\nfloat32 ddq\nfloat32 tau_est\nuint32 lost\n"
 LOW_STATE = "uint8[2] head\nunitree_go/MotorState[20] motor_state\nuint32 tick\nuint32 crc\n"
 MOTOR_CMD = "uint8 mode\nfloat32 q\nfloat32 dq\nfloat32 tau\nfloat32 kp\nfloat32 kd\nuint32[3] reserve\n"
 LOW_CMD = "uint8[2] head\nunitree_go/MotorCmd[20] motor_cmd\nuint32 crc\n"
@@ -174,7 +174,7 @@ def low_state(store: Store) -> tuple[str, Callable[[float], Any]]:
         for i in range(20):
             k = LEG_MOTORS.index(i) if i in LEG_MOTORS else None
             q, dq, tau = (0.0, 0.0, 0.0) if k is None else (x["q"][k], x["v"][k], x["tau"][k])
-            more = {"mode": 1, "ddq": 0.0, "temperature": 30, "lost": 0, "reserve": np.zeros(2, np.uint32)}
+            more = {"mode": 1, "ddq": 0.0, "lost": 0}
             motors.append(store.make("unitree_go/msg/MotorState", q=q, dq=dq, tau_est=tau, **more))
         head = np.zeros(2, np.uint8)
         return store.make("unitree_go/msg/LowState", head=head, motor_state=motors, tick=round(1e3 * t), crc=0)
@@ -289,7 +289,7 @@ def test_dynamic_joint_states(tmp_path: Path):
     )
     holds(read_bags([bag], joints=LEG, torque=TORQUE, state_topic="/dynamic_joint_states"), 3, LEG, commands=False)
     bag = store.write(tmp_path / "b", {"/dynamic_joint_states": dynamic(store, LEG, ("position",))})
-    with pytest.raises(ValueError, match="hold no effort.*--torque none"):
+    with pytest.raises(ValueError, match=r"hold no effort.*--torque none"):
         read_bags([bag], joints=LEG, torque=TORQUE, state_topic="/dynamic_joint_states")
     found = read_bags([bag], joints=LEG, torque=None, state_topic="/dynamic_joint_states")
     assert set(found.channels) == {"position"}
