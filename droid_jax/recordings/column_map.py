@@ -156,13 +156,13 @@ def check_map(columns: ColumnMap, where: str) -> ColumnMap:
     if len(columns.stiffness) != len(columns.damping):
         raise ValueError(f"{where}: got {len(columns.stiffness)} stiffness and {len(columns.damping)} damping")
     stamps = columns.stamps
-    units = [] if stamps is None or stamps.unit is None else listed(stamps.unit)
+    units = [] if stamps is None or stamps.unit is None else as_list(stamps.unit)
     if wrong := [unit for unit in units if unit not in TIMES]:
         raise ValueError(f"{where}: {wrong[0]!r} is no unit of time; known are: {', '.join(TIMES)}")
     return columns
 
 
-def with_options(
+def changed_map(
     columns: ColumnMap | None, channels: Mapping[str, str], units: Mapping[str, str], **changes: Any
 ) -> ColumnMap:
     """A map with what the command line says in place of its own; None: of nothing but that.
@@ -223,6 +223,6 @@ def _is_map(path: Path) -> bool:
         return file.read(len(HEAD)) == HEAD.encode()
 
 
-def listed(value: Any) -> list[Any]:
+def as_list(value: Any) -> list[Any]:
     """A value or a list of values as a list."""
     return list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value]

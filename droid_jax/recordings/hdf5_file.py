@@ -57,11 +57,12 @@ def open_hdf5(path: Path, group: str | None = None) -> LogColumns:
     return LogColumns(inside, widths, read, rate=rate)
 
 
-def groups(path: Path) -> list[str]:
+def demonstrations(path: Path) -> list[str]:
     """Groups of a file that hold one demonstration each, as robomimic's data/demo_0; none in other files."""
     try:
         with h5py.File(path, "r") as file:
-            names = [name for name in file.get("data", ()) if str(name).startswith("demo_")]
+            data: Any = file.get("data", ())
+            names = [name for name in data if str(name).startswith("demo_")]
             return [f"data/{name}" for name in sorted(map(str, names), key=lambda name: (len(name), name))]
     except OSError as error:
         raise ValueError(f"{path}: not a readable HDF5 file: {said(error)}") from None

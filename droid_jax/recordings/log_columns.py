@@ -10,7 +10,7 @@ import numpy as np
 
 from droid_jax.arguments import shown
 from droid_jax.errors import named
-from droid_jax.recordings.column_map import listed
+from droid_jax.recordings.column_map import as_list
 
 _PART = re.compile(r"(.*)\[([\d:,\s]+)\]")
 _NUMBER, _JOINT = "{n}", "{joint}"
@@ -78,7 +78,7 @@ class LogColumns:
 
     def stated(self, columns: str | Sequence[str], of: Mapping[str, str]) -> str | None:
         """What `units` or `hints` say of the columns that a map names; None where they say nothing."""
-        for text in listed(columns):
+        for text in as_list(columns):
             for name in (name for name in of if text == name or text.startswith((f"{name}.", f"{name}["))):
                 return of[name]
         return None
@@ -102,7 +102,7 @@ class LogColumns:
     ) -> list[tuple[str, list[int] | None]]:
         """(column, components of it) for every number that a map names; None: all of them."""
         found: list[tuple[str, list[int] | None]] = []
-        for text in listed(columns):
+        for text in as_list(columns):
             if _NUMBER in text and text not in self.widths:
                 found += [(name, None) for name in self._numbered(text, what)]
             elif _JOINT in text and text not in self.widths:
@@ -146,7 +146,7 @@ def _indices(text: str, width: int, where: str) -> list[int]:
 
 
 def _example(columns: str | Sequence[str]) -> str:
-    name = listed(columns)[0]
+    name = as_list(columns)[0]
     return f"{shown(f'{name}[0:3]')}" if _NUMBER not in name else "a list of names"
 
 

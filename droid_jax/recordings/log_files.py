@@ -13,7 +13,7 @@ import numpy as np
 from droid_jax.arguments import path_of, shown
 from droid_jax.errors import named, needs
 from droid_jax.read_npz import NpzFile
-from droid_jax.recordings.column_map import SUFFIX, ColumnMap, layouts, read_map, with_options
+from droid_jax.recordings.column_map import SUFFIX, ColumnMap, changed_map, layouts, read_map
 from droid_jax.recordings.log_columns import LogColumns
 from droid_jax.recordings.mapped_log import Opened, fits, read_logs
 from droid_jax.recordings.recording import Phase, Recording
@@ -62,7 +62,7 @@ def read_log(
         columns: their map, its file, or the name of a layout.  Without one, it is a map in the folder `beside` that
             names columns which the first log has, or the layout of a format that it is of.
         episodes: of a LeRobot dataset, their numbers; of an HDF5 file, the groups: each is one repeat.
-        channels, units, changes: in place of what the map says, as in `with_options`.
+        channels, units, changes: in place of what the map says, as in `changed_map`.
         beside: folder in which maps of earlier logs are looked for.
         name: of the recording; the first log's by default.
         command_tolerance, phases, allow_jitter: as in `read_logs`.
@@ -90,9 +90,9 @@ def read_log(
             f"{paths[0]}: does not say which of its columns are what: give a map, --map FILE.toml, or --columns "
             f"position=... command=... time=... (docs/file-formats.md); it has: {_columns_of(paths[0], logs[0])}"
         )
-    found = with_options(found, channels or {}, units or {}, **changes)
+    found = changed_map(found, channels or {}, units or {}, **changes)
     if not found.joints and (names := _named_joints(logs[0], found)):
-        found = with_options(found, {}, {}, joints=names)
+        found = changed_map(found, {}, {}, joints=names)
     recording = read_logs(
         logs,
         found,
@@ -119,7 +119,7 @@ def _known_map(log: Opened, path: Path, beside: Path | None) -> tuple[ColumnMap 
     for name in layouts():
         columns = read_map(name)
         # A layout without joints fits by its columns; the joints are asked for.
-        probe = columns if columns.joints else with_options(columns, {}, {}, joints=_as_many(log, columns))
+        probe = columns if columns.joints else changed_map(columns, {}, {}, joints=_as_many(log, columns))
         if fits(log, probe):
             return columns, f"the layout {name!r}"
     return None, ""
@@ -153,13 +153,13 @@ def _parts(path: Path, episodes: Sequence[str | int]) -> list[Opened]:
         return [_once(partial(_dataset, path, number)) for number in numbers]
     if path.name.endswith(HDF5):
         reader = _reader("hdf5_file")
-        demonstrations = reader.groups(path)
-        if not episodes and len(demonstrations) > 1:
+        found = reader.demonstrations(path)
+        if not episodes and len(found) > 1:
             raise ValueError(
-                f"{path}: holds {len(demonstrations)} demonstrations, which are repeats only where one motion was "
-                f"repeated: choose with --episodes, e.g. --episodes {demonstrations[0]}"
+                f"{path}: holds {len(found)} demonstrations, which are repeats only where one motion was "
+                f"repeated: choose with --episodes, e.g. --episodes {found[0]}"
             )
-        chosen = [str(e) for e in episodes] or demonstrations or [None]
+        chosen = [str(e) for e in episodes] or found or [None]
         return [_once(partial(_alone, path, partial(reader.open_hdf5, path, group))) for group in chosen]
     if episodes:
         raise ValueError(f"{path}: --episodes is for LeRobot datasets and HDF5 files")

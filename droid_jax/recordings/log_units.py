@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from droid_jax.errors import named
-from droid_jax.recordings.column_map import ChannelMap, ColumnMap, listed
+from droid_jax.recordings.column_map import ChannelMap, ColumnMap, as_list
 from droid_jax.recordings.log_columns import LogColumns
-from droid_jax.recordings.units import COUNTS, CURRENTS, HINGES, KINDS, NORMALISED, SLIDES, factor
+from droid_jax.recordings.units import COUNTS, CURRENTS, HINGES, KINDS, NORMALISED, SLIDES, unit_factor
 
 
 def in_si(
@@ -18,9 +18,8 @@ def in_si(
     """[T, C] in the units of a recording."""
     where = f"{log.where}, {key}"
     units = _unit_of_each(entry, key, joints, columns, log)
-    factors = np.array(
-        [factor(KINDS[key], unit, joint in columns.slides, where) for unit, joint in zip(units, joints, strict=True)]
-    )
+    pairs = zip(units, joints, strict=True)
+    factors = np.array([unit_factor(KINDS[key], unit, joint in columns.slides, where) for unit, joint in pairs])
     for named_units, field in ((COUNTS, "counts_per_turn"), (CURRENTS, "torque_constant")):
         asked = [unit in named_units for unit in units]
         given = getattr(entry, field)
@@ -77,7 +76,7 @@ def _unit_of_each(entry: ChannelMap, key: str, joints: Sequence[str], columns: C
 
 
 def _each(value: float | list[float], count: int, where: str) -> np.ndarray:
-    numbers = np.asarray(listed(value), np.float64)
+    numbers = np.asarray(as_list(value), np.float64)
     if len(numbers) not in (1, count):
         raise ValueError(f"{where}: expected 1 or {count} numbers, got {len(numbers)}")
     return np.broadcast_to(numbers, (count,))

@@ -13,7 +13,7 @@ from droid_jax.arguments import shown
 from droid_jax.recordings.alignment import common_clock, one_command, start_positions
 from droid_jax.recordings.checks import UNITS, accept
 from droid_jax.recordings.clocks import SLACK, check_clock, in_gap, interpolate, resample
-from droid_jax.recordings.column_map import CHANNELS, ChannelMap, ColumnMap, TimeMap, listed
+from droid_jax.recordings.column_map import CHANNELS, ChannelMap, ColumnMap, TimeMap, as_list
 from droid_jax.recordings.log_columns import LogColumns
 from droid_jax.recordings.log_units import in_si
 from droid_jax.recordings.recording import (
@@ -160,8 +160,8 @@ def _clock(log: LogColumns, stamps: TimeMap | None, rate: float | None, rows: in
         if rate is None:
             raise ValueError(f"{log.where}: no column of time is named, nor the rate of its rows: give time, or rate")
         return np.arange(rows) / rate
-    names = listed(stamps.columns)
-    units = listed(stamps.unit) if stamps.unit is not None else [log.units.get(n) for n in names]
+    names = as_list(stamps.columns)
+    units = as_list(stamps.unit) if stamps.unit is not None else [log.units.get(n) for n in names]
     if len(units) != len(names):
         raise ValueError(f"{log.where}, time: {len(names)} columns and {len(units)} units; give one for each")
     parts = []

@@ -13,7 +13,7 @@ from droid_jax.errors import named
 TURN = 2.0 * math.pi
 COUNTS = ("counts", "counts/s")  # per turn of the encoder: `counts_per_turn`
 NORMALISED = {"normalised": (-100.0, 100.0), "percent": (0.0, 100.0)}  # of the joint's travel: `range`
-CURRENTS = {"A": 1.0, "mA": 1e-3, "%": 1.0}  # what a torque constant makes torques of: `torque_constant`
+CURRENTS = {"A": 1.0, "mA": 1e-3, "V": 1.0, "%": 1.0}  # what a torque constant makes torques of: `torque_constant`
 
 # kind of a channel -> unit -> factor, of hinges and of slides
 _ANGLE = {"rad": 1.0, "mrad": 1e-3, "deg": TURN / 360.0, "turn": TURN, "counts": TURN}
@@ -39,7 +39,7 @@ KINDS = {
 }
 
 
-def factor(kind: str, unit: str, slides: bool, where: str) -> float:
+def unit_factor(kind: str, unit: str, slides: bool, where: str) -> float:
     """What one unit is in the units of a recording, counts and currents without their constant.
 
     Args:

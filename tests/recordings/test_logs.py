@@ -6,6 +6,7 @@ import gzip
 import io
 import json
 import pickle
+import re
 import sys
 import zipfile
 from pathlib import Path
@@ -17,6 +18,7 @@ from droid_jax.recordings.column_map import ChannelMap, ColumnMap, TimeMap, Unit
 from droid_jax.recordings.formats import load_recording
 from droid_jax.recordings.log_files import read_log
 from droid_jax.recordings.recording import Recording, TorqueSide
+from droid_jax.recordings.units import HINGES, SLIDES
 from droid_jax.run import main
 
 TIME = np.arange(0.0, 2.0, 0.01)  # s
@@ -480,3 +482,16 @@ def test_readers_that_are_not_installed_say_so(
     assert f"need {package}: in the checkout, pip install -c constraints.txt -e '.[formats]'" in refused(
         tmp_path / name
     )
+
+
+def test_the_maps_in_the_documentation_are_maps(tmp_path: Path):
+    text = (Path(__file__).parents[2] / "docs" / "file-formats.md").read_text()
+    blocks = re.findall(r"^```toml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    assert len(blocks) == 2
+    for block in blocks:
+        (tmp_path / "a.toml").write_text(block)
+        assert read_map(tmp_path / "a.toml").joints and len(block.splitlines()) <= 10
+    row = next(line for line in text.splitlines() if line.startswith("| `unit` |"))
+    units = {unit for of in (HINGES, SLIDES) for kind in of.values() for unit in kind}
+    stated = {word.strip() for part in row.split("|")[2].split(";") for word in part.partition(":")[2].split(",")}
+    assert {word.partition(" (")[0] for word in stated} == units
