@@ -9,10 +9,10 @@ from typing import Any
 import h5py
 import numpy as np
 
-from droid_jax.arguments import said, shown
+from droid_jax.arguments import shown
 from droid_jax.errors import named
 from droid_jax.read_npz import COMPRESSED, FREE_BYTES
-from droid_jax.recordings.log_columns import LogColumns
+from droid_jax.recordings.log_columns import LogColumns, readable
 
 MOST_DATASETS = 20_000
 
@@ -28,30 +28,26 @@ def open_hdf5(path: Path, group: str | None = None) -> LogColumns:
         ValueError: it is no HDF5 file, or has no such group.
     """
     inside = f"{path}, group {shown(group)}" if group else str(path)
-    try:
-        with h5py.File(path, "r") as file:
-            top = _group(file, group, path)
-            shapes: dict[str, tuple[int, ...]] = {}
+    with readable(path, "HDF5 file"), h5py.File(path, "r") as file:
+        top = _group(file, group, path)
+        shapes: dict[str, tuple[int, ...]] = {}
 
-            def visit(name: str, item: Any) -> None:  # links to other files are not followed
-                if isinstance(item, h5py.Dataset) and len(shapes) < MOST_DATASETS:
-                    shapes[name] = item.shape if item.dtype.kind in "biuf" and item.shape else ()
+        def visit(name: str, item: Any) -> None:  # links to other files are not followed
+            if isinstance(item, h5py.Dataset) and len(shapes) < MOST_DATASETS:
+                shapes[name] = item.shape if item.dtype.kind in "biuf" and item.shape else ()
 
-            top.visititems(visit)
-            rate = _control_rate(file)
-    except OSError as error:
-        raise ValueError(f"{path}: not a readable HDF5 file: {said(error)}") from None
+        top.visititems(visit)
+        rate = _control_rate(file)
 
     def read(name: str) -> np.ndarray:
-        with h5py.File(path, "r") as file:
+        with readable(path, "HDF5 file"), h5py.File(path, "r") as file:
             dataset = _group(file, group, path)[name]
             size, most = dataset.size * dataset.dtype.itemsize, max(FREE_BYTES, COMPRESSED * path.stat().st_size)
             if size > most:
-                raise ValueError(f"{inside}: {shown(name)} declares {size >> 20} MiB, at most {most >> 20} are read")
-            try:
-                return dataset[()]
-            except OSError as error:
-                raise ValueError(f"{inside}: {shown(name)} cannot be read: {said(error)}") from None
+                raise ValueError(
+                    f"{inside}: {shown(name)} declares {size >> 20} MiB, at most {most >> 20} are read from such a file"
+                )
+            return dataset[()]
 
     widths = {name: _width(shape) for name, shape in shapes.items()}
     return LogColumns(inside, widths, read, rate=rate)
@@ -59,13 +55,10 @@ def open_hdf5(path: Path, group: str | None = None) -> LogColumns:
 
 def demonstrations(path: Path) -> list[str]:
     """Groups of a file that hold one demonstration each, as robomimic's data/demo_0; none in other files."""
-    try:
-        with h5py.File(path, "r") as file:
-            data: Any = file.get("data", ())
-            names = [name for name in data if str(name).startswith("demo_")]
-            return [f"data/{name}" for name in sorted(map(str, names), key=lambda name: (len(name), name))]
-    except OSError as error:
-        raise ValueError(f"{path}: not a readable HDF5 file: {said(error)}") from None
+    with readable(path, "HDF5 file"), h5py.File(path, "r") as file:
+        data: Any = file.get("data", ())
+        names = [str(name) for name in data if str(name).startswith("demo_")]
+        return [f"data/{name}" for name in sorted(names, key=lambda name: (len(name), name))]
 
 
 def _group(file: h5py.File, group: str | None, path: Path) -> Any:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
-from droid_jax.arguments import shown
+from droid_jax.arguments import said, shown
 from droid_jax.errors import named
 from droid_jax.recordings.column_map import as_list
 
@@ -129,6 +131,25 @@ class LogColumns:
             return name, _indices(match[2], self.widths[name], f"{self.where}, {what}, {shown(text)}")
         have = named([*self.widths, *(f"{n}.{c}" for n, all_ in self.components.items() for c in all_)], most=60)
         raise ValueError(f"{self.where}, {what}: no column {shown(text)}; it has: {have or 'none'}")
+
+
+@contextlib.contextmanager
+def readable(where: Path | str, what: str) -> Iterator[None]:
+    """Errors of a library that reads a file, as a ValueError that names it: damaged files raise a dozen kinds.
+
+    Args:
+        where: the file, or a part of it; errors that begin with it are ours and go on.
+        what: it should be, "HDF5 file".
+    """
+    try:
+        yield
+    except (KeyboardInterrupt, SystemExit, FileNotFoundError, PermissionError):
+        raise
+    except BaseException as error:  # polars' panics are no Exception
+        if isinstance(error, ValueError) and str(error).startswith(str(where)):
+            raise
+        told = said(error) or type(error).__name__
+        raise ValueError(f"{where}: not a readable {what}, or a damaged one: {told}") from None
 
 
 def _indices(text: str, width: int, where: str) -> list[int]:

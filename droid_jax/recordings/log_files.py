@@ -8,6 +8,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from droid_jax.arguments import path_of, shown
@@ -109,11 +110,11 @@ def _known_map(log: Opened, path: Path, beside: Path | None) -> tuple[ColumnMap 
     near = sorted(beside.glob(f"*{SUFFIX}")) if beside is not None and beside.is_dir() else []
     kept = {file: columns for file in near if fits(log, columns := read_map(file))}
     if kept:
-        first, columns = next(iter(kept.items()))
-        other = next((file for file, another in kept.items() if another != columns), None)
+        newest = max(kept, key=lambda file: file.stat().st_mtime_ns)
+        other = next((file for file, another in kept.items() if not _alike(another, kept[newest])), None)
         if other is not None:
-            raise ValueError(f"{path}: {first} and {other} both map its columns, and differ: choose with --map")
-        return columns, str(first)
+            raise ValueError(f"{path}: {newest} and {other} both map its columns, and differ: choose with --map")
+        return kept[newest], str(newest)
     if path.is_dir() and (path / INFO).is_file():
         return _reader("lerobot").usual_map(log(None)), "its meta"
     for name in layouts():
@@ -123,6 +124,14 @@ def _known_map(log: Opened, path: Path, beside: Path | None) -> tuple[ColumnMap 
         if fits(log, probe):
             return columns, f"the layout {name!r}"
     return None, ""
+
+
+def _alike(one: ColumnMap, other: ColumnMap) -> bool:
+    """Whether two maps read the same numbers, be it onto clocks of another rate."""
+    rate = one.rate if one.stamps is None else None
+    return msgspec.structs.replace(one, rate=rate) == msgspec.structs.replace(
+        other, rate=other.rate if other.stamps is None else None
+    )
 
 
 def _named_joints(log: Opened, columns: ColumnMap) -> tuple[str, ...]:

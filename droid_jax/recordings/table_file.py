@@ -5,16 +5,14 @@ A cell may hold a list: as a list of parquet, or as the text "[0.1, 0.2]" of CSV
 
 from __future__ import annotations
 
-import contextlib
 import gzip
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 
-from droid_jax.arguments import said, shown
-from droid_jax.recordings.log_columns import LogColumns
+from droid_jax.arguments import shown
+from droid_jax.recordings.log_columns import LogColumns, readable
 from droid_jax.storage import check_size
 
 MOST_BYTES = 2**31  # of a table: ten minutes of fourteen columns at 1 kHz have 150 MB
@@ -31,7 +29,7 @@ def open_csv(path: Path) -> LogColumns:
     """
     if check_size(path, MOST_BYTES) == 0:
         raise ValueError(f"{path}: the file is empty")
-    with _named(path):
+    with readable(path, "table"):
         try:
             frame = _read(path, SAMPLE)
         except pl.exceptions.ComputeError:  # a type that changes further down: all rows are looked at
@@ -58,12 +56,12 @@ def open_parquet(path: Path) -> LogColumns:
 
 def scan_parquet(where: str, rows: pl.LazyFrame) -> LogColumns:
     """The columns of some rows of parquet files, each read when it is asked for; where: begins messages."""
-    with _named(where):
+    with readable(where, "table"):
         schema = rows.collect_schema()
         first = rows.select([name for name, kind in schema.items() if _numeric(kind)]).head(1).collect()
 
     def read(name: str) -> np.ndarray:
-        with _named(where):
+        with readable(where, "table"):
             return _array(rows.select(name).collect()[name], f"{where}, column {shown(name)}")
 
     widths = {name: _width(first[name]) if name in first.columns else 0 for name in schema}
@@ -72,7 +70,7 @@ def scan_parquet(where: str, rows: pl.LazyFrame) -> LogColumns:
 
 def _columns(where: str, frame: pl.DataFrame) -> LogColumns:
     def read(name: str) -> np.ndarray:
-        with _named(where):
+        with readable(where, "table"):
             return _array(frame[name], f"{where}, column {shown(name)}")
 
     return LogColumns(where, {name: _width(frame[name]) for name in frame.columns}, read, units=_units(frame.schema))
@@ -151,16 +149,3 @@ def _vectors(column: pl.Series, where: str) -> np.ndarray:
     rows = (~lengths.is_null()).to_numpy()
     out[rows] = column.drop_nulls().explode().fill_null(np.nan).to_numpy().reshape(-1, width)
     return out[:, 0] if width == 1 else out
-
-
-@contextlib.contextmanager
-def _named(path: Path | str) -> Iterator[None]:
-    """Errors of polars as a ValueError that names the file."""
-    try:
-        yield
-    except (pl.exceptions.PolarsError, gzip.BadGzipFile, EOFError) as error:
-        raise ValueError(f"{path}: not a readable table: {said(error)}") from None
-    except BaseException as error:
-        if type(error).__name__ == "PanicException":  # polars on some damaged files
-            raise ValueError(f"{path}: not a readable table: {said(error)}") from None
-        raise

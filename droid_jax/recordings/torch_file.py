@@ -20,7 +20,7 @@ import numpy as np
 
 from droid_jax.arguments import LONGEST_NAME, said, shown
 from droid_jax.read_npz import FREE_BYTES
-from droid_jax.recordings.log_columns import LogColumns
+from droid_jax.recordings.log_columns import LogColumns, readable
 from droid_jax.storage import check_size
 
 MOST_BYTES = 2**31
@@ -67,20 +67,15 @@ def open_torch(path: Path) -> LogColumns:
         ValueError: it is no file of torch.save, or holds more than tensors, numbers, texts, lists and dictionaries.
     """
     check_size(path, MOST_BYTES)
-    try:
-        with zipfile.ZipFile(path) as archive:
-            root, content = _content(path, archive)
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
-        raise ValueError(
-            f"{path}: not a file of torch.save, or one of torch before 1.6 ({said(error)}): save it with a newer one"
-        ) from None
+    with readable(path, "file of torch.save (1.6 or newer)"), zipfile.ZipFile(path) as archive:
+        root, content = _content(path, archive)
     found = _flat(content, path)
     tensors = {name: value for name, value in found.items() if isinstance(value, _Tensor)}
     if not tensors:
         raise ValueError(f"{path}: holds no tensors")
 
     def read(name: str) -> np.ndarray:
-        with zipfile.ZipFile(path) as archive:
+        with readable(path, "file of torch.save"), zipfile.ZipFile(path) as archive:
             return _array(archive, root, tensors[name], f"{path}, tensor {shown(name)}")
 
     widths = {name: 1 if len(t.shape) == 1 else t.shape[1] if len(t.shape) == 2 else 0 for name, t in tensors.items()}
@@ -95,8 +90,8 @@ def _content(path: Path, archive: zipfile.ZipFile) -> tuple[str, Any]:
     if len(members) != 1:
         raise ValueError(f"{path}: not a file of torch.save: it has no data.pkl")
     root = members[0].filename.rpartition("/")[0]
-    order = [m.filename for m in archive.infolist() if m.filename == f"{root}/byteorder"]
-    if order and archive.read(order[0])[:6] != b"little":
+    order = [m for m in archive.infolist() if m.filename == f"{root}/byteorder"]
+    if order and (order[0].file_size > 6 or archive.read(order[0]) != b"little"):
         raise ValueError(f"{path}: its numbers are big-endian, which is not read")
     if members[0].file_size > MOST_PICKLE:
         raise ValueError(f"{path}: its data.pkl has {members[0].file_size} bytes, at most {MOST_PICKLE} are read")

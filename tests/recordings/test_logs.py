@@ -346,7 +346,7 @@ def test_torch_files_run_no_code(tmp_path: Path):
     assert "damaged" in refused(repacked(tmp_path / "d.pt", **{"data/1": b"\0" * 8}))
     assert "its numbers are missing" in refused(repacked(tmp_path / "e.pt", **{"data/1": b""}))
     (tmp_path / "f.pt").write_bytes(b"nothing")
-    assert "not a file of torch.save" in refused(tmp_path / "f.pt")
+    assert "not a readable file of torch.save" in refused(tmp_path / "f.pt")
     (tmp_path / "g.pt").write_bytes(io.BytesIO(b"PK\5\6" + b"\0" * 18).getvalue())
     assert "no data.pkl" in refused(tmp_path / "g.pt")
 
@@ -450,6 +450,11 @@ def test_convert_remembers_the_map_beside_the_output(tmp_path: Path, capsys: pyt
     found = load_recording(out / "two.npz")
     assert found.command == pytest.approx(COMMAND) and found.name == "two"
     assert found.channels["position"].values[0, :, 0] == pytest.approx(POSITION[:, 0] + 0.1)
+    assert main(["convert", str(second), "--rate", "50", "--out", str(out / "slow.npz")]) == 0
+    assert (
+        main(["convert", str(second), "--out", str(out / "four.npz")]) == 0
+    )  # the newest of those that differ in rate
+    assert len(load_recording(out / "four.npz").time) == 100
     wrong = ["--map", str(out / "one.map.toml"), "--units", "angle=deg"]
     assert main(["convert", str(first), *wrong, "--out", str(out / "deg.npz")]) == 0
     assert load_recording(out / "deg.npz").command == pytest.approx(np.radians(COMMAND))
