@@ -451,9 +451,7 @@ def test_convert_remembers_the_map_beside_the_output(tmp_path: Path, capsys: pyt
     assert found.command == pytest.approx(COMMAND) and found.name == "two"
     assert found.channels["position"].values[0, :, 0] == pytest.approx(POSITION[:, 0] + 0.1)
     assert main(["convert", str(second), "--rate", "50", "--out", str(out / "slow.npz")]) == 0
-    assert (
-        main(["convert", str(second), "--out", str(out / "four.npz")]) == 0
-    )  # the newest of those that differ in rate
+    assert main(["convert", str(second), "--out", str(out / "four.npz")]) == 0  # of two maps the newest
     assert len(load_recording(out / "four.npz").time) == 100
     wrong = ["--map", str(out / "one.map.toml"), "--units", "angle=deg"]
     assert main(["convert", str(first), *wrong, "--out", str(out / "deg.npz")]) == 0
