@@ -13,7 +13,9 @@ import weakref
 from droid_jax.model.scene import Scene
 from droid_jax.preflight.clocks import check_clocks
 from droid_jax.preflight.findings import Finding
+from droid_jax.preflight.late_commands import check_delay, check_saturation
 from droid_jax.preflight.repeats import check_repeats
+from droid_jax.preflight.servo_balance import check_servo_balance
 from droid_jax.preflight.signals import log_motion
 from droid_jax.preflight.torques import check_torque
 from droid_jax.preflight.tracking import check_tracking
@@ -36,12 +38,14 @@ def check_log(scene: Scene, recording: Recording) -> tuple[Finding, ...]:
     known = _FOUND.setdefault(recording, weakref.WeakKeyDictionary())
     if scene not in known:
         found = [*check_repeats(recording), *check_clocks(scene, recording), *_unused(recording)]
+        found += check_saturation(recording)
         motion = log_motion(scene, recording)
         if motion is not None:
             tracking = check_tracking(scene, recording, motion)
             found += tracking
             if not tracking:  # else the torque is judged by a motion that is wrong
-                found += check_torque(scene, recording, motion)
+                wrong = check_torque(scene, recording, motion) or check_servo_balance(scene, recording, motion)
+                found += wrong or check_delay(scene, recording, motion)
         known[scene] = tuple(sorted(found, key=lambda finding: ("certain", "likely", "note").index(finding.severity)))
     return known[scene]
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-Kind = Literal["units", "sign", "order", "gravity", "clock", "repeats", "sensor", "unused"]
+Kind = Literal[
+    "units", "sign", "order", "gravity", "gains", "clock", "delay", "repeats", "sensor", "saturation", "unused"
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
