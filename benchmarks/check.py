@@ -51,8 +51,8 @@ class Check:
 
 
 def findings(case: Case) -> tuple[list[Finding], float]:
-    """What is found, a refusal for a unit among it, and the seconds it took."""
-    begin = time.perf_counter()
+    """What is found, a refusal for a unit among it, and the CPU seconds it took."""
+    begin = time.process_time()  # what other programs take of the machine does not count
     found: list[Finding] = []
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
@@ -62,12 +62,12 @@ def findings(case: Case) -> tuple[list[Finding], float]:
             found.append(Finding("units", "", 0.0, 0.0, "certain", str(error)))
         found += check_log(case.scene, case.recording)
     found += [Finding("units", "", 0.0, 0.0, "likely", str(w.message)) for w in said if "are these" in str(w.message)]
-    return found, time.perf_counter() - begin
+    return found, time.process_time() - begin
 
 
 def names(found: list[Finding], error: Error) -> bool:
     """Whether a finding names an error."""
-    return any(f.kind == error.kind and any(word in f.sentence for word in error.words) for f in found)
+    return any(f.kind in error.kinds and any(word in f.sentence for word in error.words) for f in found)
 
 
 def main(command: Check) -> dict[str, Any]:
@@ -85,7 +85,7 @@ def main(command: Check) -> dict[str, Any]:
     hosts = [*right[: min(count, WITH)], *(case for case in measured if case.name in CHOSEN)]
     for error in ERRORS:
         row = collections.Counter[str]()
-        for case in (c for c in hosts if error.applies(c.recording)):
+        for case in (c for c in hosts if error.applies(c)):
             wrong = replace(case, recording=error.put(case.recording), scene=error.scene(case.scene))
             found, seconds = findings(wrong)
             slowest = max(slowest, seconds)

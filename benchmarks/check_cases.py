@@ -177,14 +177,14 @@ def _read(path: Path, columns: ColumnMap) -> Recording:
 class Error:
     """A wrong use of a log.
 
-    kind: of the finding that names it.  words: one of them must stand in its sentence.
+    kinds: of findings that name it.  words: one of them must stand in its sentence.
     applies: whether it can be put into a recording.  put: does it.  scene: changes the scene.
     """
 
     name: str
-    kind: str
+    kinds: tuple[str, ...]
     words: tuple[str, ...]
-    applies: Callable[[Recording], bool]
+    applies: Callable[[Case], bool]
     put: Callable[[Recording], Recording]
     scene: Callable[[Scene], Scene] = lambda scene: scene
 
@@ -211,20 +211,20 @@ def _positions(r: Recording, change: Callable[[np.ndarray], np.ndarray]) -> Reco
     return replace(changed, command=change(r.command)) if r.command.size else changed
 
 
-def _torque(r: Recording) -> bool:
-    return "torque" in r.channels
+def _torque(c: Case) -> bool:
+    return "torque" in c.recording.channels
 
 
-def _command(r: Recording) -> bool:
-    return bool(r.command.size)
+def _command(c: Case) -> bool:
+    return bool(c.recording.command.size)
 
 
-def _several(r: Recording) -> bool:
-    return len(r.channels["position"].columns) > 1
+def _several(c: Case) -> bool:
+    return len(c.recording.channels["position"].columns) > 1
 
 
-def _both(r: Recording) -> bool:
-    return _torque(r) and _command(r)
+def _both(c: Case) -> bool:
+    return _torque(c) and _command(c)
 
 
 def _turned(values: np.ndarray) -> np.ndarray:
@@ -258,7 +258,7 @@ def _gravity(r: Recording) -> Recording:
     return replace(r, torque=replace(r.torque, gravity=not r.torque.gravity))
 
 
-def _always(r: Recording) -> bool:
+def _always(c: Case) -> bool:
     return True
 
 
@@ -266,12 +266,22 @@ def _first_dead(values: np.ndarray) -> np.ndarray:
     return values * np.where(np.arange(values.shape[-1]) == 0, 0.0, 1.0)
 
 
-def _several_torques(r: Recording) -> bool:
-    return _torque(r) and _several(r)
+def _several_torques(c: Case) -> bool:
+    return _torque(c) and _several(c)
 
 
-def _several_commands(r: Recording) -> bool:
-    return _command(r) and _several(r)
+def _heavy(c: Case) -> bool:
+    """Whether the torque can hold a weight."""
+    return _torque(c) and bool(np.any(c.scene.model.opt.gravity))
+
+
+def _in_other_units(r: Recording) -> Callable[[np.ndarray], np.ndarray]:
+    """Degrees, or millimetres of slides."""
+    return np.rad2deg if r.channels["position"].unit == "rad" else lambda v: 1e3 * v
+
+
+def _several_commands(c: Case) -> bool:
+    return _command(c) and _several(c)
 
 
 def of(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Recording], Recording]:
@@ -282,22 +292,22 @@ def of(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Recor
 
 
 ERRORS = (
-    Error("degrees", "units", ("degrees",), _always, lambda r: _positions(r, np.rad2deg)),
-    Error("degrees in positions alone", "units", ("degrees",), _command, of("position", np.rad2deg)),
-    Error("milliamperes", "units", ("milliamperes",), _torque, of("torque", lambda v: 1e3 * v / 1.6)),
-    Error("amperes", "units", ("amperes",), _torque, of("torque", lambda v: v / 9.0)),
-    Error("sign of a torque", "sign", ("sign",), _torque, of("torque", _turned)),
-    Error("sign of all torques", "sign", ("sign",), _torque, of("torque", np.negative)),
-    Error("sign of a command", "sign", ("sign",), _command, of("command", _turned)),
-    Error("sign of a position", "sign", ("sign",), _always, of("position", _turned)),
-    Error("order of torques", "order", ("exchanged", "order"), _several_torques, of("torque", _exchanged)),
-    Error("order of commands", "order", ("exchanged", "order"), _several_commands, of("command", _exchanged)),
-    Error("order of positions", "order", ("exchanged", "order"), _several, of("position", _exchanged)),
-    Error("gravity flag", "gravity", ("weight",), _torque, _gravity),
-    Error("delay of 60 ms", "delay", ("late",), _both, lambda r: _late(r, 0.06)),
-    Error("nominal rate", "clock", ("rate",), _command, _nominal),
-    Error("saturation", "saturation", ("stays at",), _torque, _saturated),
-    Error("copies of a repeat", "repeats", ("identical",), _always, lambda r: r.repeats_subset([0, 0])),
-    Error("dead position", "sensor", ("dead", "does not move"), _always, of("position", _first_dead)),
-    Error("gains of another robot", "gains", ("gains",), _command, lambda r: r, stronger),
+    Error("degrees", ("units",), ("degrees", "millimetres"), _always, lambda r: _positions(r, _in_other_units(r))),
+    Error("degrees in positions alone", ("units",), ("degrees",), _command, of("position", np.rad2deg)),
+    Error("milliamperes", ("units",), ("milliamperes",), _torque, of("torque", lambda v: 1e3 * v / 1.6)),
+    Error("amperes", ("units",), ("amperes",), _torque, of("torque", lambda v: v / 9.0)),
+    Error("sign of a torque", ("sign",), ("sign",), _torque, of("torque", _turned)),
+    Error("sign of all torques", ("sign",), ("sign",), _torque, of("torque", np.negative)),
+    Error("sign of a command", ("sign",), ("sign",), _command, of("command", _turned)),
+    Error("sign of a position", ("sign",), ("sign",), _always, of("position", _turned)),
+    Error("order of torques", ("order",), ("exchanged", "order"), _several_torques, of("torque", _exchanged)),
+    Error("order of commands", ("order",), ("exchanged", "order"), _several_commands, of("command", _exchanged)),
+    Error("order of positions", ("order",), ("exchanged", "order"), _several, of("position", _exchanged)),
+    Error("gravity flag", ("gravity",), ("weight",), _heavy, _gravity),
+    Error("delay of 60 ms", ("delay",), ("late",), _both, lambda r: _late(r, 0.06)),
+    Error("nominal rate", ("clock",), ("rate",), _command, _nominal),
+    Error("saturation", ("saturation",), ("stays at",), _torque, _saturated),
+    Error("copies of a repeat", ("repeats",), ("identical",), _always, lambda r: r.repeats_subset([0, 0])),
+    Error("dead position", ("sensor",), ("dead", "does not move"), _always, of("position", _first_dead)),
+    Error("gains of another robot", ("gains", "units"), ("gains",), _command, lambda r: r, stronger),
 )

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 Kind = Literal[
-    "units", "sign", "order", "gravity", "gains", "clock", "delay", "repeats", "sensor", "saturation", "unused"
+    "units", "sign", "order", "gravity", "gains", "clock", "delay", "repeats", "sensor", "saturation", "unused",
+    "range", "start", "scene",
 ]  # fmt: skip
 
 

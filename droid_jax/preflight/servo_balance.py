@@ -16,9 +16,11 @@ from droid_jax.model.actuators import has_feedback
 from droid_jax.model.scene import Scene
 from droid_jax.preflight.findings import Finding, Kind
 from droid_jax.preflight.signals import Expected, LogMotion, rigid_body, servo_torque
-from droid_jax.preflight.torques import BAD, BOUND, DEGREE, LATE, explains, factor, friction_terms, left_by_body
+from droid_jax.preflight.torques import BAD, DEGREE, GOOD, LATE, explains, factor, friction_terms, left_by_body
 from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSide
 
+FACTOR = 5.0  # by which gains must be off, as the median of the joints
+VISIBLE = 0.1  # of a torque's deviation, that weight and inertia must make up to tell its size
 ROWS = 400  # of the motion at which inverse dynamics is computed, for each alternative anew
 _Balance = tuple[dict[str, float], dict[str, np.ndarray], dict[str, Expected]]  # shares left, torques, bodies
 
@@ -35,7 +37,7 @@ def check_servo_balance(scene: Scene, recording: Recording, motion: LogMotion) -
     stated, torques, bodies = _balance(scene, stated_as, motion)
     bad = [joint for joint, left in stated.items() if left > BAD]
     if not bad:
-        return []
+        return _gains(recording, torques, bodies, gravity, stated)
     where, most = f"recording {recording.name!r}: ", max(bad, key=lambda joint: stated[joint])
     words = "positions and commands are not in the unit that is stated: are these degrees?"
     tried: list[tuple[Kind, str, str, LogMotion]] = [("units", most, words, motion.scaled(DEGREE))]
@@ -48,18 +50,10 @@ def check_servo_balance(scene: Scene, recording: Recording, motion: LogMotion) -
             tried.append(("order", one, words, motion.swapped(one, other)))
     left_by_each = [(kind, joint, words, _balance(scene, stated_as, other)[0]) for kind, joint, words, other in tried]
     right = [f for f in left_by_each if explains(f[3], stated, bad)]
-    gains = {j: g for j in bad if (g := _gain(torques[j], bodies[j], gravity, stated[j])) is not None}
     if right:
         kind, joint, words, left = min(right, key=lambda f: float(np.mean(list(f[3].values()))))
         return [_finding(kind, joint, where + words, stated[most], left[most], most)]
-    found = []
-    for joint, (size, left) in gains.items():
-        words = (
-            f"{where}the servo's torque at {joint}, by its gains in the MJCF and the tracking error, is {size:.2g} "
-            "times what the motion takes: are these gains the robot's?"
-        )
-        found.append(_finding("gains", joint, words, stated[joint], left, joint, size))
-    return found
+    return _gains(recording, torques, bodies, gravity, stated)
 
 
 def _balance(scene: Scene, recording: Recording, motion: LogMotion) -> _Balance:
@@ -84,13 +78,32 @@ def _negated(motion: LogMotion, joint: str) -> LogMotion:
     return replace(motion, command=turned(motion.command), position=turned(motion.position))
 
 
-def _gain(torque: np.ndarray, body: Expected, gravity: bool, stated: float) -> tuple[float, float] | None:
-    """By how much gains are too large at a joint and the share that is then left; None where that explains nothing."""
-    size = factor(torque, body.weight * gravity + body.inertial, *friction_terms(body))
-    if not size > 0 or 1 / BOUND < size < BOUND:
-        return None
-    left = left_by_body(torque / size, body, gravity=gravity, motor=True)
-    return (size, left) if explains({"": left}, {"": stated}, [""]) else None
+def _gains(
+    recording: Recording,
+    torques: Mapping[str, np.ndarray],
+    bodies: Mapping[str, Expected],
+    gravity: bool,
+    stated: Mapping[str, float],
+) -> list[Finding]:
+    """Gains that are several times too large or too small, at the joints where weight and inertia tell it."""
+    told: dict[str, tuple[float, float]] = {}  # size, and the share that is left with it
+    for joint, torque in torques.items():
+        body = bodies[joint]
+        expected = body.weight * gravity + body.inertial
+        size = factor(torque, expected, *friction_terms(body))
+        if size > 0 and size * np.std(expected) > VISIBLE * np.std(torque):
+            left = left_by_body(torque / size, body, gravity=gravity, motor=True)
+            if left < GOOD:
+                told[joint] = size, left
+    size = float(np.median([size for size, _ in told.values()])) if told else 1.0
+    if 1 / FACTOR < size < FACTOR:
+        return []
+    joint = min(told, key=lambda joint: abs(np.log(told[joint][0] / size)))
+    words = (
+        f"recording {recording.name!r}: the servos' torques, by their gains in the MJCF and the tracking errors, are "
+        f"about {size:.2g} times what the motion takes: are these gains the robot's?"
+    )
+    return [_finding("gains", joint, words, stated[joint], told[joint][1], joint, size)]
 
 
 def _finding(kind: Kind, joint: str, words: str, stated: float, left: float, most: str, value: float = 0.0) -> Finding:

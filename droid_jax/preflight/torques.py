@@ -72,8 +72,13 @@ def left_by(torque: np.ndarray, terms: Iterable[tuple[np.ndarray, float, float]]
             columns.append(term[seen] / size)
             low.append(least * size / np.sqrt(power))
             high.append(most * size / np.sqrt(power))
-    found = lsq_linear(np.stack(columns, axis=1), torque[seen] / np.sqrt(power), bounds=(low, high))
-    return min(1.0, 2.0 * float(found.cost) / len(columns[0]))
+    # As many rows as terms hold all that the fit needs of them; the rest of the torque is left in any case.
+    scaled = torque[seen] / np.sqrt(power)
+    basis, small = np.linalg.qr(np.stack(columns, axis=1))
+    inside = basis.T @ scaled
+    found = lsq_linear(small, inside, bounds=(low, high), method="bvls")
+    left = 2.0 * float(found.cost) + max(0.0, float(scaled @ scaled - inside @ inside))
+    return min(1.0, left / len(scaled))
 
 
 def left_by_body(torque: np.ndarray, expected: Expected, *, gravity: bool, motor: bool) -> float:
