@@ -40,7 +40,7 @@ Command = (
     | export.Export
     | record.Record
     | convert.Convert
-    | check.Check
+    | Annotated[check.CheckCommand, tyro.conf.subcommand("check")]
     | report.Report
     | view.View
 )
@@ -53,7 +53,7 @@ _ACTIONS: dict[type, Callable[[Any], None]] = {
     export.Export: export.run,
     record.Record: record.run,
     convert.Convert: convert.run,
-    check.Check: check.run,
+    check.CheckCommand: check.run,
     report.Report: report.run,
     view.View: view.run,
 }

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from droid_jax.preflight.contents import Track
+    from droid_jax.preflight.contents import Signal
     from droid_jax.preflight.findings import Finding
     from droid_jax.recordings.recording import Recording
 
@@ -16,7 +16,7 @@ COLOURS = {"certain": "bold red", "likely": "yellow", "note": "cyan"}
 
 
 @dataclass(frozen=True)
-class Check:
+class CheckCommand:
     """Look at recordings before fitting them: rates, gaps, ranges, and what can hardly be right. No fit, seconds.
 
     With --scene also units, signs, order of joints, weight, gains, delays and limits are judged. A finding is certain
@@ -35,7 +35,7 @@ class Check:
     """Folder of check.html and check.json."""
 
 
-def run(command: Check) -> None:
+def run(command: CheckCommand) -> None:
     """Print the tables, and write page and JSON."""
     from droid_jax.commands.options import recording_at
     from droid_jax.model.scene import load_scene
@@ -70,7 +70,7 @@ def _measured(recording: Recording) -> tuple[str, ...]:
     return tuple(dict.fromkeys(j for key, c in recording.channels.items() if key != "object_angle" for j in c.columns))
 
 
-def _show(recording: Recording, tracks: Sequence[Track], findings: Sequence[Finding]) -> None:
+def _show(recording: Recording, tracks: Sequence[Signal], findings: Sequence[Finding]) -> None:
     """The tables of one recording on the terminal."""
     from rich.console import Console
     from rich.table import Table
@@ -94,7 +94,7 @@ def _show(recording: Recording, tracks: Sequence[Track], findings: Sequence[Find
         console.print(Text.assemble((f"{finding.severity}: ", COLOURS[finding.severity]), finding.sentence))
 
 
-def _json(command: Check, checked: Sequence[tuple[Recording, Sequence[Track], Sequence[Finding]]]) -> bytes:
+def _json(command: CheckCommand, checked: Sequence[tuple[Recording, Sequence[Signal], Sequence[Finding]]]) -> bytes:
     """The content of check.json."""
     import json
 

@@ -26,7 +26,7 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Track:
+class Signal:
     """The command, or a channel, over time.
 
     rows: samples of a repeat.  rate: Hz, usual.  jitter: largest deviation of a step from the usual one, as a share of
@@ -42,7 +42,7 @@ class Track:
     columns: tuple[Column, ...]
 
 
-def contents(recording: Recording) -> tuple[Track, ...]:
+def contents(recording: Recording) -> tuple[Signal, ...]:
     """The command, where there is one, and the channels of a valid recording."""
     tracks = []
     if recording.command.size:
@@ -57,7 +57,7 @@ def contents(recording: Recording) -> tuple[Track, ...]:
 
 def _track(
     name: str, time: np.ndarray, unit: str, names: tuple[str, ...], values: np.ndarray, mask: np.ndarray
-) -> Track:
+) -> Signal:
     columns = []
     for c, column in enumerate(names):
         seen = values[..., c][mask[..., c]]
@@ -65,9 +65,9 @@ def _track(
         columns.append(Column(column, unit, low, high, float(mask[..., c].mean())))
     steps = np.diff(time)
     if not len(steps):
-        return Track(name, len(time), 0.0, 0.0, 0.0, 0, tuple(columns))
+        return Signal(name, len(time), 0.0, 0.0, 0.0, 0, tuple(columns))
     usual = float(np.median(steps))
     jitter = float(np.abs(steps - usual).max() / usual)
-    return Track(
+    return Signal(
         name, len(time), 1.0 / usual, jitter, float(steps.max()), int(np.sum(steps > GAP * usual)), tuple(columns)
     )

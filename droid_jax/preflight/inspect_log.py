@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from droid_jax.model.scene import Scene
 from droid_jax.preflight.check_log import check_alone, check_log
-from droid_jax.preflight.findings import Finding
+from droid_jax.preflight.findings import Finding, Kind
 from droid_jax.preflight.preflight import check_range, command_notes, warn_if_moving
 from droid_jax.recordings.recording import Recording
 
@@ -46,7 +46,7 @@ def _notes(scene: Scene, recording: Recording) -> list[str]:
     return command_notes(scene, recording)
 
 
-def _said(kind: str, check: Callable[[], None]) -> list[Finding]:
+def _said(kind: Kind, check: Callable[[], None]) -> list[Finding]:
     """What a check refuses or warns of, as findings."""
     found = []
     with warnings.catch_warnings(record=True) as said:
@@ -54,8 +54,8 @@ def _said(kind: str, check: Callable[[], None]) -> list[Finding]:
         try:
             check()
         except ValueError as error:
-            found.append(Finding(kind, "", 0.0, 0.0, "certain", str(error)))  # type: ignore[arg-type]
-    found += [Finding(kind, "", 0.0, 0.0, "likely", str(w.message)) for w in said]  # type: ignore[arg-type]
+            found.append(Finding(kind, "", 0.0, 0.0, "certain", str(error)))
+    found += [Finding(kind, "", 0.0, 0.0, "likely", str(w.message)) for w in said]
     return found
 
 

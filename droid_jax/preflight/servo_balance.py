@@ -48,11 +48,12 @@ def check_servo_balance(scene: Scene, recording: Recording, motion: LogMotion) -
         if one in bad or other in bad:
             words = f"{one} and {other} seem to be exchanged in all channels: check the columns' names"
             tried.append(("order", one, words, motion.swapped(one, other)))
-    left_by_each = [(kind, joint, words, _balance(scene, stated_as, other)[0]) for kind, joint, words, other in tried]
-    right = [f for f in left_by_each if explains(f[3], stated, bad)]
+    lefts = [_balance(scene, stated_as, other)[0] for _, _, _, other in tried]
+    right = [i for i, left in enumerate(lefts) if explains(left, stated, bad)]
     if right:
-        kind, joint, words, left = min(right, key=lambda f: float(np.mean(list(f[3].values()))))
-        return [_finding(kind, joint, where + words, stated[most], left[most], most)]
+        best = min(right, key=lambda i: float(np.mean(list(lefts[i].values()))))
+        kind, joint, words, _ = tried[best]
+        return [_finding(kind, joint, where + words, stated[most], lefts[best][most], most)]
     return _gains(recording, torques, bodies, gravity, stated)
 
 

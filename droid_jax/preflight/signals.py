@@ -76,7 +76,8 @@ class LogMotion:
         def exchanged(traces: Traces) -> dict[str, np.ndarray]:
             return {names.get(joint, joint): x for joint, x in traces.items()}
 
-        return LogMotion(self.time, *map(exchanged, (self.command, self.position, self.torque)), self.rows)
+        command, position, torque = map(exchanged, (self.command, self.position, self.torque))
+        return replace(self, command=command, position=position, torque=torque)
 
 
 def log_motion(scene: Scene, recording: Recording) -> LogMotion | None:

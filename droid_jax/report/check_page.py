@@ -9,7 +9,7 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from droid_jax.preflight.contents import Track
+from droid_jax.preflight.contents import Signal
 from droid_jax.preflight.findings import Finding
 from droid_jax.recordings.recording import Recording
 from droid_jax.report.style import (
@@ -30,7 +30,7 @@ DRAWN = 1200  # points of a line at most
 MOST = 12  # joints that are drawn
 
 
-def check_page(recordings: Sequence[tuple[Recording, Sequence[Track], Sequence[Finding]]], scene: str | None) -> str:
+def check_page(recordings: Sequence[tuple[Recording, Sequence[Signal], Sequence[Finding]]], scene: str | None) -> str:
     """HTML of recordings with what they hold and what was found in them; scene: the name of the one they are for."""
     parts: list[dict[str, Any]] = []
     for i, (recording, tracks, findings) in enumerate(recordings):
