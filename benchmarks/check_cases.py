@@ -292,8 +292,10 @@ def of(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Recor
 
 
 ERRORS = (
-    Error("degrees", ("units",), ("degrees", "millimetres"), _always, lambda r: _positions(r, _in_other_units(r))),
-    Error("degrees in positions alone", ("units",), ("degrees",), _command, of("position", np.rad2deg)),
+    Error(
+        "degrees", ("units", "range"), ("degrees", "millimetres"), _always, lambda r: _positions(r, _in_other_units(r))
+    ),
+    Error("degrees in positions alone", ("units", "range"), ("degrees",), _command, of("position", np.rad2deg)),
     Error("milliamperes", ("units",), ("milliamperes",), _torque, of("torque", lambda v: 1e3 * v / 1.6)),
     Error("amperes", ("units",), ("amperes",), _torque, of("torque", lambda v: v / 9.0)),
     Error("sign of a torque", ("sign",), ("sign",), _torque, of("torque", _turned)),
