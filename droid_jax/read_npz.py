@@ -108,6 +108,15 @@ class NpzFile:
         except Exception as error:  # zipfile, zlib and numpy raise a dozen kinds where bytes are changed
             raise ValueError(f"{where}: {_first_line(error)}") from None
 
+    def shape(self, name: str, kinds: str = NUMBERS) -> tuple[int, ...] | None:
+        """Shape that an array's head declares, its numbers not read; None where it is of another kind or damaged."""
+        try:
+            with self._archive.open(self._members[name]) as stream:
+                dtype, shape, _, _ = _head(stream, name)
+        except Exception:  # as in `array`, which says what is wrong
+            return None
+        return shape if dtype.kind in kinds else None
+
     def text(self, name: str) -> str:
         """A text that was stored as an array without axes, of characters that can be printed."""
         array = self.array(name, TEXT)

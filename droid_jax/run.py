@@ -28,7 +28,7 @@ from typing import Annotated, Any
 import tyro
 
 from droid_jax import console
-from droid_jax.commands import all_stages, convert, evaluate, export, gap, identify, record, report, train, view
+from droid_jax.commands import all_stages, check, convert, evaluate, export, gap, identify, record, report, train, view
 from droid_jax.commands.folder import BEGUN
 
 Command = (
@@ -40,6 +40,7 @@ Command = (
     | export.Export
     | record.Record
     | convert.Convert
+    | Annotated[check.CheckCommand, tyro.conf.subcommand("check")]
     | report.Report
     | view.View
 )
@@ -52,6 +53,7 @@ _ACTIONS: dict[type, Callable[[Any], None]] = {
     export.Export: export.run,
     record.Record: record.run,
     convert.Convert: convert.run,
+    check.CheckCommand: check.run,
     report.Report: report.run,
     view.View: view.run,
 }

@@ -498,7 +498,7 @@ def test_an_option_that_does_not_exist(arguments: list[str], capsys: pytest.Capt
     assert arguments[-1] in said.err + said.out and "Traceback" not in said.err
 
 
-COMMANDS = ("all", "identify", "gap", "train", "evaluate", "export", "record", "convert", "report", "view")
+COMMANDS = ("all", "identify", "gap", "train", "evaluate", "export", "record", "convert", "check", "report", "view")
 
 
 @pytest.mark.parametrize("command", ["", *COMMANDS])

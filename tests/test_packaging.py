@@ -40,7 +40,8 @@ def test_wheel_holds_every_module_and_mjcf_file(built):
     scenes = {f"droid_jax/{p.relative_to(ROOT).as_posix()}" for p in (ROOT / "mjcf").rglob("*") if p.is_file()}
     assert modules and "droid_jax/mjcf/panda.xml" in scenes
     templates = {p.relative_to(ROOT).as_posix() for p in (ROOT / "droid_jax/report/templates").iterdir()}
-    assert len(templates) > 10 and modules | scenes | templates | {"droid_jax/py.typed"} <= names
+    layouts = {p.relative_to(ROOT).as_posix() for p in (ROOT / "droid_jax/recordings/layouts").iterdir()}
+    assert len(templates) > 10 and layouts and modules | scenes | templates | layouts | {"droid_jax/py.typed"} <= names
     tops = {name.split("/")[0] for name in names}
     assert {t for t in tops if not t.endswith(".dist-info")} == {"droid_jax"}
 

@@ -9,57 +9,82 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 if TYPE_CHECKING:
-    from droid_jax.recordings.recording import Phase
+    from collections.abc import Callable
 
-OF_BAGS = (
-    "joints", "slides", "torque", "gravity", "state_topic", "command_topic", "stiffness", "damping", "command_joints",
-    "command_tolerance", "rate", "stamps", "phases",
+    from droid_jax.recordings.recording import Phase, Recording
+
+SHARED = (
+    "joints", "slides", "torque", "gravity", "stiffness", "damping", "command_tolerance", "rate", "phases"
 )  # fmt: skip
+OF_BAGS = (
+    *SHARED, "state_topic", "command_topic", "command_joints", "motors", "velocity_actuators", "effort_actuators",
+    "stamps",
+)  # fmt: skip
+OF_LOGS = (*SHARED, "map", "columns", "units", "episodes")
 
 
 @dataclass(frozen=True)
 class Convert:
-    """Read ROS bags or a CSV folder, check them, and write a recording that identify takes.
+    """Read a log, check it, and write a recording that identify takes.
 
-    Bags do not say what their efforts are, nor the servo's gains: say it here.
+    Logs are ROS bags, tables (CSV, parquet), npz and HDF5 files, .pt files of torch.save, LeRobot datasets, and CSV
+    folders.  Most do not say what their columns or efforts are, nor the servo's gains: say it here, or in a map.
     """
 
     source: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """ROS 1 .bag or ROS 2 bags, one per repeat (or folders of them), a CSV folder, or an npz file."""
+    """Bags, tables or other logs, one per repeat (or folders of bags); a CSV folder; or an npz file."""
     out: Path = Path("runs/recording.npz")
     """File (npz) or folder (CSV) to write."""
     name: str | None = None
     """What runs and pages call the recording; default: of bags that of --out, otherwise the name that it has."""
+    map: Path | None = None
+    """Tables, npz, HDF5, .pt, LeRobot: a TOML file that says which columns are what (docs/file-formats.md), or a layout
+    by its name: droid, robomimic, pace. Default: the map of an earlier log beside --out, or a layout that fits."""
+    columns: tuple[str, ...] = ()
+    """The same, or changes of the map, as CHANNEL=COLUMN: time, command, position, velocity, torque, object_angle. E.g.
+    position=q{n}, which takes q1, q2, ..., or position=state[0:6]."""
+    units: tuple[str, ...] = ()
+    """The same: units of those columns as KIND=UNIT, e.g. angle=deg time=ms torque=mA length=mm force=N."""
+    episodes: tuple[str, ...] = ()
+    """LeRobot: numbers of the episodes; HDF5: groups, e.g. data/demo_0. Each is one repeat."""
     joints: tuple[str, ...] = ()
-    """Bags: measured joints, in the order wanted."""
+    """Measured joints, in the order wanted."""
     slides: tuple[str, ...] = ()
-    """Bags: those of --joints that slide: N, m and m/s instead of N m, rad and rad/s."""
-    torque: Literal["motor", "link"] | None = None
-    """Bags: motor (current, actuator force) or link (a sensor behind the gear, a Panda's tau_J)."""
+    """Those of --joints that slide: N, m and m/s instead of N m, rad and rad/s."""
+    torque: Literal["motor", "link", "none"] | None = None
+    """What the torque is: motor (current, actuator force) or link (a sensor behind the gear, a Panda's tau_J). None: of
+    bags, it is not read."""
     gravity: bool = False
-    """Bags: the torque contains what carries the arm's weight."""
+    """The torque contains what carries the arm's weight."""
     torque_constant: tuple[float, ...] = ()
     """N m (N) that one unit of the logged torque is, for each torque or one for all: of efforts that are amperes or
-    per cent. A negative one turns the sign."""
+    per cent. A negative one turns the sign. (Of columns with a unit it belongs into the map.)"""
     state_topic: str = "/joint_states"
-    """Bags: topic of sensor_msgs/JointState."""
+    """Bags: topic of JointState, or of the state of a controller, of a Franka arm or of unitree's motors."""
     command_topic: str | None = None
     """Bags: topic of the position commands, or of a ros2_control controller's state; without one the log is replayed by
     inverse dynamics."""
     stiffness: tuple[float, ...] = ()
-    """Bags: servo gains of the commanded joints, N m/rad (N/m for slides)."""
+    """Servo gains of the commanded joints, N m/rad (N/m for slides)."""
     damping: tuple[float, ...] = ()
-    """Bags: servo damping of the commanded joints, N m s/rad (N s/m for slides)."""
+    """Servo damping of the commanded joints, N m s/rad (N s/m for slides)."""
     command_joints: tuple[str, ...] = ()
     """Bags: commanded joints, in the order of commands that carry no names; default: --joints."""
+    motors: tuple[int, ...] = ()
+    """Bags: places of --joints in messages without names that hold more joints (unitree's), counted from 0."""
+    velocity_actuators: tuple[str, ...] = ()
+    """Bags: <velocity> actuators in the MJCF, one per commanded joint, that take the commands' velocities."""
+    effort_actuators: tuple[str, ...] = ()
+    """Bags: <motor> actuators in the MJCF, one per commanded joint, that take the commands' efforts."""
     command_tolerance: float = 5e-3
-    """Bags: how far the repeats' commands may differ, rad or m."""
+    """How far the repeats' commands may differ, rad or m."""
     rate: float | None = None
-    """Bags: rate of the common clock, Hz; default: the usual rate of the first bag's joint states."""
+    """Rate of the common clock, Hz; default: of bags the usual rate of the first one's joint states, of other logs
+    their own clocks. Of a log without a column of time: the rate of its rows."""
     stamps: Literal["auto", "header", "bag"] = "auto"
     """Bags: stamps that count: header, of the recorder (bag), or header where all messages have one (auto)."""
     phases: tuple[str, ...] = ()
-    """Bags: parts of the motion as NAME=START:END, in s from where the bags begin, e.g. approach=0:1.5 grasp=1.5:2.
+    """Parts of the motion as NAME=START:END, in s from where the log begins, e.g. approach=0:1.5 grasp=1.5:2.
     Pages tell the gap by them; with a phase grasp, one whose grip is lost in the replay counts as failed."""
     allow_jitter: bool = False
     """Accept clocks of an irregular rate."""
@@ -74,26 +99,33 @@ class Convert:
 def run(command: Convert) -> None:
     """Load whatever it is, validate, cut, and save."""
     from droid_jax.recordings.formats import bags_at, check_target, load_recording, rosbag_reader, save_recording
+    from droid_jax.recordings.log_files import is_log
     from droid_jax.recordings.torque_constants import with_torque_constants
 
-    check_target(command.out)  # before bags are read, which may take long
+    check_target(command.out)  # before logs are read, which may take long
     if not command.source:
         raise ValueError("convert needs the files or folders to read")
     path, *others = command.source
-    bags = [bags_at(p) for p in command.source]
-    strange = [p for p, found in zip(command.source, bags, strict=True) if not found]
-    if others and strange:
-        what = "is no ROS bag" if strange[0].exists() else "does not exist"
-        raise ValueError(
-            f"{strange[0]} {what}: of several sources each is a bag or a folder of bags; convert others alone"
-        )
-    _needs_effect(command, bags=not strange)
-    if others:
-        recording = rosbag_reader().read_bags([bag for found in bags for bag in found], **_bag_options(command))
+    if command.map is not None or all(p.exists() and not bags_at(p) and is_log(p) for p in command.source):
+        _needs_effect(command, "a log", OF_LOGS)
+        recording, keep = _from_log(command)
     else:
-        usual = {"name": command.name, "allow_jitter": command.allow_jitter}
-        options = usual if strange else _bag_options(command)
-        recording = load_recording(path, resample=command.resample, **options)
+        keep = None
+        bags = [bags_at(p) for p in command.source]
+        strange = [p for p, found in zip(command.source, bags, strict=True) if not found]
+        if others and strange:
+            what = "is no ROS bag" if strange[0].exists() else "does not exist"
+            raise ValueError(
+                f"{strange[0]} {what}: of several sources each is a bag or a folder of bags, or all are logs of one "
+                "kind; convert others alone"
+            )
+        _needs_effect(command, "" if strange else "ROS bags", () if strange else OF_BAGS)
+        if others:
+            recording = rosbag_reader().read_bags([bag for found in bags for bag in found], **_bag_options(command))
+        else:
+            usual = {"name": command.name, "allow_jitter": command.allow_jitter}
+            options = usual if strange else _bag_options(command)
+            recording = load_recording(path, resample=command.resample, **options)
     if command.torque_constant:
         recording = with_torque_constants(recording, command.torque_constant)
     if command.start is not None or command.end is not None:
@@ -103,19 +135,75 @@ def run(command: Convert) -> None:
     path = save_recording(recording, command.out)
     channels = ", ".join(f"{n} ({len(c.columns)} x {len(c.time)})" for n, c in recording.channels.items())
     print(f"{recording.repeats} repeats of {recording.duration:.1f} s, channels {channels}: {path}")
+    if keep is not None:
+        keep()
 
 
-def _needs_effect(command: Convert, bags: bool) -> None:
-    """ValueError for options that would change nothing; a path that does not exist is told as such."""
-    if bags and command.resample:
-        raise ValueError("--resample is for CSV folders; the repeats of ROS bags have one clock already (--rate)")
-    if command.resample and command.source[0].is_file():
+def _from_log(command: Convert) -> tuple[Recording, Callable[[], None]]:
+    """The recording in logs with a column map, and what keeps that map for the next log."""
+    from droid_jax.recordings.column_map import check_map_target, map_beside, write_map
+    from droid_jax.recordings.log_files import read_log
+
+    beside = map_beside(command.out)
+    check_map_target(beside)
+    recording, columns, origin = read_log(
+        command.source,
+        command.map,
+        episodes=command.episodes,
+        channels=_pairs(command.columns, "--columns CHANNEL=COLUMN, e.g. position=q{n}"),
+        units=_pairs(command.units, "--units KIND=UNIT, e.g. angle=deg"),
+        beside=command.out.parent,
+        name=command.name or command.out.stem,
+        command_tolerance=command.command_tolerance,
+        phases=[_phase(words) for words in command.phases],
+        allow_jitter=command.allow_jitter,
+        joints=command.joints,
+        slides=command.slides,
+        side=None if command.torque == "none" else command.torque,
+        gravity=command.gravity or (False if command.torque else None),
+        stiffness=command.stiffness,
+        damping=command.damping,
+        rate=command.rate,
+    )
+    print(f"columns as in {origin}")
+
+    def keep() -> None:
+        write_map(columns, beside)
+        print(f"the next log of this kind needs no options while {beside} is there")
+
+    return recording, keep
+
+
+def _pairs(words: tuple[str, ...], usage: str) -> dict[str, str]:
+    """ "a=b" each as a mapping; ValueError for other words."""
+    out: dict[str, str] = {}
+    for word in words:
+        key, sign, value = word.partition("=")
+        if not key or not sign or not value or key in out:
+            raise ValueError(f"expected {usage}, each once, got {word!r}")
+        out[key] = value
+    return out
+
+
+def _needs_effect(command: Convert, what: str, known: tuple[str, ...]) -> None:
+    """ValueError for options that would change nothing; a path that does not exist is told as such.
+
+    what: is read, "" a recording.  known: options that it takes.
+    """
+    source = command.source[0]
+    if command.resample and (what or source.is_file()):
         raise ValueError(
-            f"--resample is for CSV folders, and the repeats of {command.source[0]} have one clock already"
+            "--resample is for CSV folders; the repeats of ROS bags have one clock already (--rate)"
+            if what == "ROS bags"
+            else f"--resample is for CSV folders; {source} takes --rate"
+            if what
+            else f"--resample is for CSV folders, and the repeats of {source} have one clock already"
         )
-    given = [f.name for f in fields(Convert) if f.name in OF_BAGS and getattr(command, f.name) != f.default]
-    if given and not bags and command.source[0].exists():
-        raise ValueError(f"--{given[0].replace('_', '-')} is for ROS bags, and {command.source[0]} is none")
+    of_kinds = {**dict.fromkeys(OF_LOGS, "logs with a column map"), **dict.fromkeys(OF_BAGS, "ROS bags")}
+    of_kinds |= dict.fromkeys(SHARED, "ROS bags and logs with a column map")
+    given = [f.name for f in fields(Convert) if f.name in of_kinds and getattr(command, f.name) != f.default]
+    if (strange := [name for name in given if name not in known]) and source.exists():
+        raise ValueError(f"--{strange[0].replace('_', '-')} is for {of_kinds[strange[0]]}, and {source} is none")
 
 
 def _bag_options(command: Convert) -> dict[str, Any]:
@@ -134,11 +222,14 @@ def _bag_options(command: Convert) -> dict[str, Any]:
         "allow_jitter": command.allow_jitter,
         "joints": command.joints,
         "slides": command.slides,
-        "torque": TorqueConvention(TorqueSide(command.torque), command.gravity),
+        "torque": None if command.torque == "none" else TorqueConvention(TorqueSide(command.torque), command.gravity),
         "state_topic": command.state_topic,
         "command_topic": command.command_topic,
         "gains": gains,
         "command_joints": command.command_joints or None,
+        "motors": command.motors or None,
+        "velocity_actuators": command.velocity_actuators,
+        "effort_actuators": command.effort_actuators,
         "command_tolerance": command.command_tolerance,
         "rate": command.rate,
         "phases": [_phase(words) for words in command.phases],

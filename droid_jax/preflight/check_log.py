@@ -11,9 +11,11 @@ import warnings
 import weakref
 
 from droid_jax.model.scene import Scene
-from droid_jax.preflight.clocks import check_clocks
+from droid_jax.preflight.clocks import check_clocks, check_stamps
 from droid_jax.preflight.findings import Finding
+from droid_jax.preflight.late_commands import check_delay, check_saturation
 from droid_jax.preflight.repeats import check_repeats
+from droid_jax.preflight.servo_balance import check_servo_balance
 from droid_jax.preflight.signals import log_motion
 from droid_jax.preflight.torques import check_torque
 from droid_jax.preflight.tracking import check_tracking
@@ -35,15 +37,23 @@ def check_log(scene: Scene, recording: Recording) -> tuple[Finding, ...]:
     """
     known = _FOUND.setdefault(recording, weakref.WeakKeyDictionary())
     if scene not in known:
-        found = [*check_repeats(recording), *check_clocks(scene, recording), *_unused(recording)]
+        found = [*check_alone(recording, clocks=False), *check_clocks(scene, recording)]
         motion = log_motion(scene, recording)
         if motion is not None:
             tracking = check_tracking(scene, recording, motion)
             found += tracking
             if not tracking:  # else the torque is judged by a motion that is wrong
-                found += check_torque(scene, recording, motion)
+                wrong = check_torque(scene, recording, motion) or check_servo_balance(scene, recording, motion)
+                clocks = any(finding.kind == "clock" for finding in found)
+                found += wrong or ([] if clocks else check_delay(scene, recording, motion))
         known[scene] = tuple(sorted(found, key=lambda finding: ("certain", "likely", "note").index(finding.severity)))
     return known[scene]
+
+
+def check_alone(recording: Recording, *, clocks: bool = True) -> list[Finding]:
+    """The same as far as no scene is needed; clocks: whether stamps are compared among each other."""
+    found = [*check_repeats(recording), *_unused(recording), *check_saturation(recording)]
+    return found + (check_stamps(recording) if clocks else [])
 
 
 def _unused(recording: Recording) -> list[Finding]:

@@ -13,13 +13,19 @@ from droid_jax.recordings.recording import Recording
 DRIFT = 0.03  # s by which two clocks may run apart over a recording: a delay, damping and armature hardly take more in
 NEAR = 0.05  # relative deviation within which two rates are meant to be one
 LATEST = 1.0  # s: a drift that is looked for
-WINDOW = 0.25  # share of a recording, at its beginning and end, in which a lag is looked for
+WINDOWS, EVEN = 4, 0.6  # parts in which a lag is looked for; deviation of its steps from a line, of the drift
+WINDOW = 0.25  # share of a recording that each part has
 RATES = ("rate", "rate_hz", "frequency", "frequency_hz", "fps", "hz")  # in `meta`
 
 
 def check_clocks(scene: Scene, recording: Recording) -> list[Finding]:
     """What is wrong with the clocks."""
-    return _rows(recording) or _nominal(recording) or _drift(scene, recording)
+    return check_stamps(recording) or _drift(scene, recording)
+
+
+def check_stamps(recording: Recording) -> list[Finding]:
+    """The same as far as no scene is needed."""
+    return _rows(recording) or _nominal(recording)
 
 
 def _rows(recording: Recording) -> list[Finding]:
@@ -76,9 +82,11 @@ def _drift(scene: Scene, recording: Recording) -> list[Finding]:
     rows = len(motion.time)
     part, most = int(WINDOW * rows), min(round(LATEST / motion.step), int(WINDOW * rows) // 2)
     drifts = []
-    for joint in (j for j in motion.command if j in motion.position):
+    begins = np.linspace(most, rows - part - most, WINDOWS).astype(int)
+    moving = [j for j in motion.command if j in motion.position and np.ptp(motion.command[j]) > MOVES]
+    for joint in moving:
         lags = []
-        for begin in (most, rows - part - most):
+        for begin in begins:
             command, position = motion.command[joint], motion.position[joint][begin : begin + part]
             if np.ptp(position) < MOVES:
                 break
@@ -91,9 +99,18 @@ def _drift(scene: Scene, recording: Recording) -> list[Finding]:
             if best is None or shifted[best] < FOLLOWS + 0.05 or abs(best) == most:
                 break
             lags.append(best * motion.step)
-        if len(lags) == 2:
-            drifts.append(lags[1] - lags[0])
-    if len(drifts) < 1 or abs(np.median(drifts)) < 2 * DRIFT or np.ptp(drifts) > 0.5 * abs(np.median(drifts)):
+        if len(lags) == WINDOWS:
+            slope = float(np.polyfit(np.arange(WINDOWS), lags, 1)[0]) * (WINDOWS - 1)
+            # A clock that runs away does so evenly; a servo's lag changes with the motion.
+            if np.abs(np.diff(lags) * (WINDOWS - 1) - slope).max() < EVEN * abs(slope):
+                drifts.append(slope)
+            else:
+                return []
+    if (
+        len(drifts) < max(1.0, 0.5 * len(moving))
+        or abs(np.median(drifts)) < 2 * DRIFT
+        or np.ptp(drifts) > 0.5 * abs(np.median(drifts))
+    ):
         return []
     drift = float(np.median(drifts)) / (1 - WINDOW)
     return [

@@ -5,7 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-Kind = Literal["units", "sign", "order", "gravity", "clock", "repeats", "sensor", "unused"]
+Kind = Literal[
+    "units", "sign", "order", "gravity", "gains", "clock", "delay", "repeats", "sensor", "saturation", "unused",
+    "range", "start", "scene",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,40 @@ def check_repeats(recording: Recording) -> list[Finding]:
     """What is wrong with the repeats and the sensors."""
     where = f"recording {recording.name!r}"
     sensors = [finding for channel in recording.channels.values() for finding in _sensors(channel, where)]
-    return _copies(recording, where) + sensors + _apart(recording, where)
+    return _copies(recording, where) + sensors + _dead(recording, where) + _apart(recording, where)
+
+
+def _dead(recording: Recording, where: str) -> list[Finding]:
+    """Columns that hold one number throughout while another channel of the same joint moves.
+
+    Positions beside commands are judged by how far they were sent (`tracking`).
+    """
+    moving = {
+        key: {j for c, j in enumerate(channel.columns) if _span(channel, c) > RESTS[key]}
+        for key, channel in recording.channels.items()
+        if key in RESTS
+    }
+    others = {"position": ("velocity", "torque"), "velocity": ("position",), "torque": ("position", "velocity")}
+    found = []
+    for key, channel in ((k, recording.channels[k]) for k in moving):
+        for c, joint in enumerate(channel.columns):
+            by = next((other for other in others[key] if joint in moving.get(other, ())), None)
+            if _span(channel, c) == 0 and by is not None and not (key == "position" and recording.command.size):
+                value = float(channel.values[..., c][channel.mask[..., c]][0])
+                found.append(
+                    Finding(
+                        "sensor", joint, 0.0, 0.0, "likely" if by != "torque" else "note",
+                        f"{where}: the {key} of {joint} does not move, it is {value:g} throughout while its {by} "
+                        "changes: is the column dead, or not measured?",
+                    )
+                )  # fmt: skip
+    return found
+
+
+def _span(channel: Channel, column: int) -> float:
+    """Largest minus smallest measured value of a column."""
+    values = channel.values[..., column][channel.mask[..., column]]
+    return float(np.ptp(values)) if values.size else 0.0
 
 
 def _apart(recording: Recording, where: str) -> list[Finding]:

@@ -33,13 +33,14 @@ class LogMotion:
     """Means of the repeats on one regular clock, low-passed at CUTOFF.
 
     time: [K] s.  command: what position servos are sent to, position: as measured, torque: as measured; each joint ->
-    [K], in rad (m) and N m (N).
+    [K], in rad (m) and N m (N).  rows: at which inverse dynamics is computed, at most.
     """
 
     time: np.ndarray
     command: Traces
     position: Traces
     torque: Traces
+    rows: int = ROWS
 
     @property
     def step(self) -> float:
@@ -52,9 +53,9 @@ class LogMotion:
 
     @property
     def inner(self) -> slice:
-        """Rows whose derivatives can be believed, ROWS of them at most."""
+        """Rows whose derivatives can be believed, `rows` of them at most."""
         edge = max(2, round(EDGE / self.step))
-        return slice(edge, len(self.time) - edge, max(1, (len(self.time) - 2 * edge) // ROWS))
+        return slice(edge, len(self.time) - edge, max(1, (len(self.time) - 2 * edge) // self.rows))
 
     def scaled(self, factor: float) -> LogMotion:
         """The same motion with positions and commands times `factor`."""
@@ -75,7 +76,8 @@ class LogMotion:
         def exchanged(traces: Traces) -> dict[str, np.ndarray]:
             return {names.get(joint, joint): x for joint, x in traces.items()}
 
-        return LogMotion(self.time, *map(exchanged, (self.command, self.position, self.torque)))
+        command, position, torque = map(exchanged, (self.command, self.position, self.torque))
+        return replace(self, command=command, position=position, torque=torque)
 
 
 def log_motion(scene: Scene, recording: Recording) -> LogMotion | None:

@@ -72,8 +72,13 @@ def left_by(torque: np.ndarray, terms: Iterable[tuple[np.ndarray, float, float]]
             columns.append(term[seen] / size)
             low.append(least * size / np.sqrt(power))
             high.append(most * size / np.sqrt(power))
-    found = lsq_linear(np.stack(columns, axis=1), torque[seen] / np.sqrt(power), bounds=(low, high))
-    return min(1.0, 2.0 * float(found.cost) / len(columns[0]))
+    # As many rows as terms hold all that the fit needs of them; the rest of the torque is left in any case.
+    scaled = torque[seen] / np.sqrt(power)
+    basis, small = np.linalg.qr(np.stack(columns, axis=1))
+    inside = basis.T @ scaled
+    found = lsq_linear(small, inside, bounds=(low, high), method="bvls")
+    left = 2.0 * float(found.cost) + max(0.0, float(scaled @ scaled - inside @ inside))
+    return min(1.0, left / len(scaled))
 
 
 def left_by_body(torque: np.ndarray, expected: Expected, *, gravity: bool, motor: bool) -> float:
@@ -81,7 +86,7 @@ def left_by_body(torque: np.ndarray, expected: Expected, *, gravity: bool, motor
 
     gravity: the torque contains the weight.
     """
-    terms = [(expected.inertial, LEAST_INERTIA, BOUND), *((t, 0.0, np.inf) for t in _friction(expected))]
+    terms = [(expected.inertial, LEAST_INERTIA, BOUND), *((t, 0.0, np.inf) for t in friction_terms(expected))]
     if gravity:
         terms.append((expected.weight, 1 / BOUND, BOUND))
     if motor:
@@ -90,7 +95,7 @@ def left_by_body(torque: np.ndarray, expected: Expected, *, gravity: bool, motor
     return left_by(torque, terms)
 
 
-def _friction(expected: Expected) -> list[np.ndarray]:
+def friction_terms(expected: Expected) -> list[np.ndarray]:
     """[K] each: viscous and dry, of a size that is to be found."""
     v = expected.velocity
     return [v, np.tanh(v / max(0.05 * float(np.abs(v).max(initial=0.0)), 1e-3))]
@@ -141,7 +146,7 @@ def _of_bodies(scene: Scene, recording: Recording, motion: LogMotion, bodies: Ma
             whole.append(("order", one, lefts(bodies, swapped, gravity), _order_words(one, other, "torque")))
             tried("order", one, _order_words(one, other, "position"), motion.swapped(one, other), swap=False)
             tried("order", one, _order_words(one, other, "all channels"), motion.swapped(one, other))
-    explained = [w for w in whole if _explains(w[2], stated, bad)]
+    explained = [w for w in whole if explains(w[2], stated, bad)]
     others_right = len(bad) < len(bodies)
     alone = {
         joint: _alone(joint, torques[joint], bodies[joint], gravity, motor, stated[joint], others_right)
@@ -169,7 +174,7 @@ def _of_gravity(
     return [_finding("gravity", most, most, stated[most], other[most], words, by)]
 
 
-def _explains(left: Mapping[str, float], stated: Mapping[str, float], bad: Sequence[str]) -> bool:
+def explains(left: Mapping[str, float], stated: Mapping[str, float], bad: Sequence[str]) -> bool:
     """Whether an alternative explains the torques of the joints where the expectation failed, and spoils no other."""
     spoilt = [j for j in left if left[j] > max(BAD, stated[j] + 0.05)]
     return not spoilt and _better(float(np.mean([left[j] for j in bad])), float(np.mean([stated[j] for j in bad])))
@@ -185,7 +190,7 @@ def _alone(
     """What is wrong with one joint's torque: its sign or its unit; with what it leaves."""
     left = partial(left_by_body, expected=body, gravity=gravity, motor=motor)
     expected = body.weight * gravity + body.inertial
-    size = factor(torque, expected, *_friction(body))
+    size = factor(torque, expected, *friction_terms(body))
     by = "weight, inertia and friction"
     if _better(turned := left(-torque), stated):
         words = f"the torque of {joint} has the wrong sign, or its position has"
@@ -240,7 +245,7 @@ def _of_replay(scene: Scene, recording: Recording, motion: LogMotion) -> list[Fi
         return found
     small = simulated_torques(scene, recording, motion.scaled(DEGREE))
     left = {j: _least(torques[j], [x]) for j, x in small.items()}
-    if _explains(left, stated, bad):
+    if explains(left, stated, bad):
         joint = max(bad, key=lambda j: stated[j])
         words = f"recording {recording.name!r}: the commands are not in the unit that is stated: are these degrees?"
         return [_finding("units", joint, joint, stated[joint], left[joint], words, by)]

@@ -16,11 +16,9 @@ from rosbags.typesys import Stores, get_typestore
 
 from droid_jax.arguments import said
 from droid_jax.errors import named
+from droid_jax.recordings.bag_messages import Wanted, in_nanoseconds, samples
 
 _DAY = 86400 * 10**9  # ns
-
-# channel -> field of sensor_msgs/JointState
-FIELDS = {"torque": "effort", "position": "position", "velocity": "velocity"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,22 +29,24 @@ class Track:
     headers.
     Stamps stay integers: nanoseconds since 1970 do not fit a float64.
     numbers: [M] which message of the topic each row is of; a trajectory has several.
+    topic: its name.
     """
 
     received: np.ndarray
     stamped: np.ndarray | None
     fields: dict[str, np.ndarray]
     numbers: tuple[int, ...]
+    topic: str
 
 
-def read_bag(bag: Path, topics: Mapping[str, tuple[tuple[str, ...], str]]) -> dict[str, Track]:
-    """topic -> track of one bag.  topics: of each its joints, and the field whose numbers must all be finite."""
+def read_bag(bag: Path, asked: Mapping[str, Wanted]) -> dict[str, Track]:
+    """The tracks of one bag, by the keys under which they are asked for."""
     if not bag.exists():
         raise FileNotFoundError(f"no ROS bag at {bag}: there is no such file or folder")
     try:
         # Bags of ROS 2 before Iron in sqlite3 hold no message definitions of their own.
         with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            return {topic: _read_topic(reader, bag, topic, *wanted) for topic, wanted in topics.items()}
+            return {key: _read_topic(reader, bag, wanted.topic, wanted) for key, wanted in asked.items()}
     except Exception as error:  # damaged bags fail in many ways: AssertionError, OverflowError, UnicodeDecodeError, ...
         if isinstance(error, ValueError) and str(error).startswith(str(bag)):
             raise
@@ -54,7 +54,8 @@ def read_bag(bag: Path, topics: Mapping[str, tuple[tuple[str, ...], str]]) -> di
         raise ValueError(f"{bag}: not a readable ROS bag, or one that was cut off ({what})") from error
 
 
-def _read_topic(reader: AnyReader, bag: Path, topic: str, joints: tuple[str, ...], needed: str) -> Track:
+def _read_topic(reader: AnyReader, bag: Path, topic: str, wanted: Wanted) -> Track:
+    joints, needed = wanted.joints, wanted.needed
     connections = [c for c in reader.connections if c.topic == topic]
     if not connections:
         have = named(sorted({c.topic for c in reader.connections})) or "none"
@@ -69,7 +70,7 @@ def _read_topic(reader: AnyReader, bag: Path, topic: str, joints: tuple[str, ...
     for number, (connection, nanoseconds, data) in enumerate(reader.messages(connections)):
         message = reader.deserialize(data, connection.msgtype)
         where = f"{bag}, topic {topic!r}, message {number}"
-        for offset, names, fields in _samples(message, joints, connection.msgtype, where):
+        for offset, names, fields in samples(message, wanted, connection.msgtype, where):
             seen.update(names)
             picked = _pick(fields, names, joints, needed, where)
             if picked is None:
@@ -87,15 +88,15 @@ def _read_topic(reader: AnyReader, bag: Path, topic: str, joints: tuple[str, ...
         raise ValueError(f"{bag}, topic {topic!r}, message {without[0]}: holds no {needed}, as others of the topic do")
     bare = np.full(len(joints), np.nan)  # a field that only some messages leave empty was not measured there
     fields = {key: np.array([row.get(key, bare) for row in rows]) for key in {k: None for row in rows for k in row}}
-    return Track(np.array(received, dtype=np.int64), _header_stamps(stamped), fields, tuple(numbers))
+    return Track(np.array(received, dtype=np.int64), _header_stamps(stamped), fields, tuple(numbers), topic)
 
 
 def _header_stamp(message: Any, offset: int) -> int | None:
     """Nanoseconds of the header's stamp plus offset; None when there is none, or a trajectory's is zero ("now")."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
-    if stamp is None or (hasattr(message, "points") and not _nanoseconds(stamp)):
+    if stamp is None or (hasattr(message, "points") and not in_nanoseconds(stamp)):
         return None
-    return _nanoseconds(stamp) + offset
+    return in_nanoseconds(stamp) + offset
 
 
 def _header_stamps(stamped: Sequence[int | None]) -> np.ndarray | None:
@@ -104,48 +105,6 @@ def _header_stamps(stamped: Sequence[int | None]) -> np.ndarray | None:
     if None in stamped or 0 in others or (first == 0 and not any(n and n < _DAY for n in others[:1])):
         return None
     return np.array(stamped, dtype=np.int64)
-
-
-def _samples(
-    message: Any, joints: tuple[str, ...], kind: str, where: str
-) -> list[tuple[int, tuple[str, ...], dict[str, np.ndarray]]]:
-    """The (offset in ns, joint names, field -> numbers) that one message holds."""
-    if hasattr(message, "name") and hasattr(message, "position"):  # JointState
-        fields = {field: np.asarray(getattr(message, field), dtype=np.float64) for field in FIELDS.values()}
-        return [(0, tuple(message.name), fields)]
-    if hasattr(message, "joint_names") and hasattr(message, "points"):  # JointTrajectory
-        names = tuple(message.joint_names)
-        return [(_nanoseconds(p.time_from_start), names, _setpoints(p)) for p in message.points]
-    if hasattr(message, "joint_names") and (hasattr(message, "reference") or hasattr(message, "desired")):
-        # JointTrajectoryControllerState, in older versions with the second name
-        point = message.reference if hasattr(message, "reference") else message.desired
-        return [(0, tuple(message.joint_names), _setpoints(point))]
-    if hasattr(message, "positions"):  # JointTrajectoryPoint
-        numbers = np.asarray(message.positions, dtype=np.float64)
-    elif hasattr(message, "data") and np.ndim(message.data) == 1:  # Float64MultiArray
-        numbers = np.asarray(message.data, dtype=np.float64)
-    else:
-        raise ValueError(
-            f"{where}: cannot read {named([kind])}; expected JointState, JointTrajectory, JointTrajectoryPoint, "
-            "Float64MultiArray or JointTrajectoryControllerState"
-        )
-    if len(numbers) != len(joints):
-        raise ValueError(f"{where}: expected {len(joints)} numbers ({', '.join(joints)}), got {len(numbers)}")
-    return [(0, joints, {**_setpoints(message), "position": numbers})]
-
-
-def _setpoints(point: Any) -> dict[str, np.ndarray]:
-    """field -> numbers of a trajectory point, or of a message without names: positions, and what stands beside them."""
-    found = {"position": np.asarray(getattr(point, "positions", ()), dtype=np.float64)}
-    for field, of_point in {"velocity": "velocities", "effort": "effort"}.items():
-        numbers = np.asarray(getattr(point, of_point, ()), dtype=np.float64)
-        if len(numbers) == len(found["position"]):
-            found[field] = numbers
-    return found
-
-
-def _nanoseconds(duration: Any) -> int:
-    return duration.sec * 10**9 + duration.nanosec
 
 
 def _pick(

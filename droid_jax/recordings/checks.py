@@ -6,8 +6,10 @@ simulated robot); everything behind it may rely on what it checks.
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,7 @@ from droid_jax.arguments import instance, instances, name, note, number, shown
 from droid_jax.errors import faults
 from droid_jax.recordings.clocks import SLACK, check_clock
 from droid_jax.recordings.recording import (
+    JITTER,
     JOINT_CHANNELS,
     Channel,
     ObjectPose,
@@ -61,6 +64,25 @@ def validate(recording: Recording, *, source: str = "", allow_jitter: bool = Fal
     if recording.object_pose is not None:
         _check_pose(recording.object_pose, where)
     return recording
+
+
+def accept(recording: Recording, source: str, allow_jitter: bool) -> Recording:
+    """The recording, valid; one whose clocks are irregular is accepted where it is asked for, and says so in `meta`.
+
+    Args:
+        recording: as it was read.
+        source: file or folder it came from, for messages.
+        allow_jitter: whether to accept irregular clocks; a recording that was accepted before is so again.
+
+    Raises:
+        ValueError: it is not valid.
+    """
+    if not allow_jitter:
+        return validate(recording, source=source, allow_jitter=JITTER in recording.meta)
+    with contextlib.suppress(ValueError):
+        return validate(recording, source=source)
+    accepted = replace(recording, meta={**recording.meta, JITTER: "accepted when it was read"})
+    return validate(accepted, source=source, allow_jitter=True)
 
 
 def _check_types(recording: Recording, where: str) -> None:

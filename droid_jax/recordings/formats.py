@@ -1,13 +1,12 @@
 """Recordings on disk: one npz file, or a folder of CSV files that any spreadsheet opens.
 
-`load_recording` also reads ROS bags, through `rosbag.py`, which is imported only then.  The layouts are
-described in docs/file-formats.md.  Both formats keep every number exactly: a recording that
-was saved and loaded has the same `sha256`.
+`load_recording` also reads ROS bags, through `rosbag.py`, and logs of any column names, through `log_files.py`; what
+these need is imported only then.  The layouts are described in docs/file-formats.md.  The two formats that are written
+keep every number exactly: a recording that was saved and loaded has the same `sha256`.
 """
 
 from __future__ import annotations
 
-import contextlib
 import importlib
 import os
 import re
@@ -19,15 +18,17 @@ from typing import Any
 
 from droid_jax.arguments import flag, path_of
 from droid_jax.errors import needs
-from droid_jax.recordings.checks import validate
+from droid_jax.recordings import log_files
+from droid_jax.recordings.checks import accept, validate
 from droid_jax.recordings.csv_folder import check_folder, load_csv, save_csv
 from droid_jax.recordings.npz_file import is_npz, load_npz, save_npz
-from droid_jax.recordings.recording import JITTER, Recording
+from droid_jax.recordings.recording import Recording
 from droid_jax.storage import refuse_foreign, refuse_special
 
 SUPPORTED = (
     ".npz, a folder with recording.json and CSV files, a ROS 1 .bag, a ROS 2 .mcap or .db3, "
-    "a ROS 2 bag folder with metadata.yaml, or a folder of such bags, one per repeat"
+    "a ROS 2 bag folder with metadata.yaml, a folder of such bags, one per repeat, and with a column map .csv, .tsv, "
+    ".parquet, .h5, .hdf5, .pt, other .npz and LeRobot datasets"
 )
 _BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 
@@ -38,9 +39,9 @@ def load_recording(
     name: str | None = None,
     resample: bool = False,
     allow_jitter: bool = False,
-    **bag_options: Any,
+    **options: Any,
 ) -> Recording:
-    """Read a recording from an npz file, a CSV folder or ROS bags, and validate it.
+    """Read a recording from an npz file, a CSV folder, ROS bags or a log with a column map, and validate it.
 
     Args:
         path: of the file, or of the folder.
@@ -49,7 +50,8 @@ def load_recording(
             of an npz file share one.
         allow_jitter: accept irregular clocks, see `validate`. A recording that was accepted says so in its `meta`, and
             is read without being asked again once it is saved.
-        bag_options: passed to `rosbag.read_bags`; `joints` and `torque` are required for bags.
+        options: of ROS bags those of `rosbag.read_bags`, of which `joints` and `torque` are required; of other logs
+            (`log_files.is_log`) those of `log_files.read_log`: `columns`, `episodes`, ...
 
     Returns:
         The recording, valid.
@@ -64,9 +66,11 @@ def load_recording(
         raise FileNotFoundError(f"no recording at {path}: there is no such file or folder")
     bags = bags_at(path)
     if bags:
-        return _load_bags(bags, name, allow_jitter, bag_options)
-    if bag_options:
-        raise ValueError(f"{path}: not a ROS bag, it takes no option {', '.join(sorted(bag_options))}")
+        return _load_bags(bags, name, allow_jitter, options)
+    if log_files.is_log(path):
+        return log_files.read_log([path], name=name, allow_jitter=allow_jitter, **options)[0]
+    if options:
+        raise ValueError(f"{path}: a recording already, it takes no option {', '.join(sorted(options))}")
     if resample and path.suffix == ".npz" and not path.is_dir():
         raise ValueError(f"{path}: resample is for CSV folders; the repeats of an npz file share one clock already")
     if path.is_dir():
@@ -79,12 +83,7 @@ def load_recording(
         raise ValueError(f"{path}: unknown suffix {path.suffix!r}; {_supported()}")
     if name is not None:
         recording = replace(recording, name=name)
-    if not allow_jitter:
-        return validate(recording, source=str(path), allow_jitter=JITTER in recording.meta)
-    with contextlib.suppress(ValueError):
-        return validate(recording, source=str(path))
-    accepted = replace(recording, meta={**recording.meta, JITTER: "accepted when it was read"})
-    return validate(accepted, source=str(path), allow_jitter=True)
+    return accept(recording, str(path), allow_jitter)
 
 
 def check_target(path: Path) -> None:

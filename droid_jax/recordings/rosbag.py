@@ -18,10 +18,12 @@ from pathlib import Path
 
 import numpy as np
 
-from droid_jax.recordings.bag_topics import FIELDS, Track, read_bag
+from droid_jax.recordings.alignment import common_clock, one_command, start_positions
+from droid_jax.recordings.bag_messages import FIELDS, GAINS, Wanted
+from droid_jax.recordings.bag_topics import Track, read_bag
 from droid_jax.recordings.checks import UNITS, validate
 from droid_jax.recordings.clocks import check_clock, in_gap, interpolate
-from droid_jax.recordings.recording import Channel, Phase, Recording, ServoGains, TorqueConvention
+from droid_jax.recordings.recording import Channel, Phase, Recording, ServoGains, TorqueConvention, TorqueSide
 
 
 class Stamps(enum.Enum):
@@ -32,6 +34,7 @@ class Stamps(enum.Enum):
     BAG = "bag"  # when the recorder received it
 
 
+STATE, COMMAND = "state", "command"  # keys of what is read of a bag
 UNUSED = "unused_setpoints"  # in `meta`: what the commands held beside positions
 DRIFT = 0.03  # s by which a log at its nominal rate may be off at its end unremarked
 NEAR = 0.05  # relative deviation within which a stated rate is meant to be that of the stamps
@@ -43,10 +46,13 @@ def read_bags(
     *,
     joints: Sequence[str],
     slides: Sequence[str] = (),
-    torque: TorqueConvention,
+    torque: TorqueConvention | None,
     state_topic: str = "/joint_states",
     command_topic: str | None = None,
     command_joints: Sequence[str] | None = None,
+    motors: Sequence[int] | None = None,
+    velocity_actuators: Sequence[str] = (),
+    effort_actuators: Sequence[str] = (),
     rate: float | None = None,
     stamps: Stamps = Stamps.AUTO,
     command_tolerance: float = 5e-3,
@@ -62,13 +68,16 @@ def read_bags(
 
     joints:            measured joints, in the order wanted.
     slides:            those of them that slide; a bag does not say.
-    torque:            what the efforts are; a bag does not say.
-    state_topic:       sensor_msgs/JointState.
-    command_topic:     JointState, JointTrajectory, JointTrajectoryPoint, Float64MultiArray or
-                       JointTrajectoryControllerState, of which the reference counts; None reads
-                       a log without commands.
+    torque:            what the efforts are; a bag does not say.  None: they are not read.
+    state_topic:       of a type in `bag_messages.STATES`.
+    command_topic:     of a type in `bag_messages.COMMANDS`; of a controller's state, the reference
+                       counts.  None reads a log without commands.  It may be the state topic, where
+                       a message holds both.
     command_joints:    commanded joints, and the order of numbers in messages without names;
                        `joints` by default.
+    motors:            places of the joints in messages without names that hold more of them, from 0.
+    velocity_actuators, effort_actuators: names in the MJCF of the actuators, one per commanded joint,
+                       that take the commands' set-points of velocity and effort.
     rate:              Hz of the common clock; the usual rate of the first bag's joint states
                        by default.
     stamps:            which time stamps count.
@@ -83,34 +92,37 @@ def read_bags(
     """
     bags = _bags(paths)
     command_joints = tuple(joints if command_joints is None else command_joints)
-    topics = _topics(joints, slides, state_topic, command_topic, command_joints)
-    tracks = [read_bag(bag, topics) for bag in bags]
-    order = _as_recorded([track[state_topic].received for track in tracks])
+    asked = _asked(joints, slides, torque is not None, state_topic, command_topic, command_joints, motors)
+    extra = {"velocity": tuple(velocity_actuators), "effort": tuple(effort_actuators)}
+    _check_actuators(extra, command_joints, command_topic)
+    tracks = [read_bag(bag, asked) for bag in bags]
+    order = _as_recorded([track[STATE].received for track in tracks])
     bags, tracks = [bags[i] for i in order], [tracks[i] for i in order]
     use_header = _use_header(tracks, stamps, bags)
 
-    timed = [
-        _timed(track, use_header, bag, command_topic or state_topic, state_topic, allow_jitter)
-        for track, bag in zip(tracks, bags, strict=True)
-    ]
-    states = [topics[state_topic] for topics in timed]
-    commands = [] if command_topic is None else [topics[command_topic] for topics in timed]
+    timed = [_timed(track, asked, use_header, bag, allow_jitter) for track, bag in zip(tracks, bags, strict=True)]
+    states = [topics[STATE] for topics in timed]
+    commands = [] if command_topic is None else [topics[COMMAND] for topics in timed]
     clock = _clock(states, rate, bags)
 
-    channels = _channels(states, clock, tuple(joints), slides, bags)
-    command = np.zeros((0, 0))
+    channels = _channels(states, clock, tuple(joints), slides, torque is not None, bags)
+    command, command_names = np.zeros((0, 0)), ()
     _warn_of_rate(states[0][0], rate, bags[0])
-    unused = _unused(commands, command_topic)
+    unused = _unused(commands, command_topic, extra)
     if commands:
         command = _command(commands, clock, command_joints, command_tolerance, bags)
+        command_names = (*command_joints, *extra["velocity"], *extra["effort"])
+        more = [_setpoints(commands[0], clock, field, bags[0]) for field, names in extra.items() if names]
+        command = np.concatenate([command, *more], axis=1)
+        gains = gains or _sent_gains(commands, extra, bags)
     recording = Recording(
         name=name or bags[0].stem,
         time=clock if commands else np.zeros(0),
         command=command,
-        command_names=command_joints if commands else (),
+        command_names=command_names,
         channels=channels,
-        torque=torque,
-        qpos0={**_initial(channels), **(qpos0 or {})},
+        torque=torque or TorqueConvention(TorqueSide.MOTOR, gravity=True),
+        qpos0={**start_positions(channels), **(qpos0 or {})},
         gains=gains,
         phases=tuple(phases),
         meta={
@@ -124,17 +136,64 @@ def read_bags(
     return validate(recording, source=", ".join(str(bag) for bag in bags))
 
 
-def _unused(commands: Sequence[_Timed], topic: str | None) -> list[str]:
+def _check_actuators(
+    extra: Mapping[str, tuple[str, ...]], command_joints: Sequence[str], command_topic: str | None
+) -> None:
+    """ValueError where actuators are named for set-points that no command has."""
+    for field, names in extra.items():
+        if names and command_topic is None:
+            raise ValueError(f"{field}_actuators take set-points of commands: give --command-topic too")
+        if names and len(names) != len(command_joints):
+            raise ValueError(
+                f"{field}_actuators must be {len(command_joints)}, one for each of {', '.join(command_joints)}, got "
+                f"{', '.join(names)}"
+            )
+
+
+def _setpoints(command: _Timed, clock: np.ndarray, field: str, bag: Path) -> np.ndarray:
+    """[T, U] set-points of velocity or effort on a clock [T] s; ValueError where the commands hold none."""
+    time, fields = command
+    if field not in fields or not np.isfinite(fields[field]).all():
+        raise ValueError(f"{bag}: the command messages hold no {field} for the {field} actuators, or not throughout")
+    return interpolate(clock, time, fields[field])
+
+
+def _sent_gains(
+    commands: Sequence[_Timed], extra: Mapping[str, tuple[str, ...]], bags: Sequence[Path]
+) -> ServoGains | None:
+    """Gains that the commands themselves state, as unitree's do, with those of the actuators that take the rest.
+
+    A robot that adds kp (q_d - q), kd (v_d - v) and a torque is a <position>, a <velocity> and a <motor> at the joint.
+    """
+    if not all(gain in fields for _, fields in commands for gain in GAINS):
+        return None
+    first = {gain: commands[0][1][gain][0] for gain in GAINS}
+    for bag, (_, fields) in zip(bags, commands, strict=True):
+        if any(np.any(fields[gain] != first[gain]) for gain in GAINS):
+            warnings.warn(
+                f"{bag}: the commands change their gains kp or kd on the way: the recording states none, and a replay "
+                "has those of the scene throughout; cut it where they stay the same",
+                stacklevel=3,
+            )
+            return None
+    count, velocity, effort = len(first["kp"]), len(extra["velocity"]), len(extra["effort"])
+    stiffness = [*first["kp"], *(first["kd"][:velocity]), *np.ones(effort)]
+    damping = [*(np.zeros(count) if velocity else first["kd"]), *np.zeros(velocity + effort)]
+    return ServoGains(np.array(stiffness), np.array(damping))
+
+
+def _unused(commands: Sequence[_Timed], topic: str | None, extra: Mapping[str, tuple[str, ...]]) -> list[str]:
     """Set-points other than positions that the command messages hold and the recording does not; they are warned of."""
     found = [
         field
         for field in ("velocity", "effort")
-        if any(np.any(np.nan_to_num(fields[field])) for _, fields in commands if field in fields)
+        if not extra[field] and any(np.any(np.nan_to_num(fields[field])) for _, fields in commands if field in fields)
     ]
     if found:
         warnings.warn(
             f"the commands on {topic} have set-points of {' and '.join(found)} beside the positions, and these are "
-            "not used: a servo that follows them lags less than its replay, which looks like damping or a delay",
+            "not used: a servo that follows them lags less than its replay, which looks like damping or a delay; name "
+            "the actuators of the MJCF that take them, --velocity-actuators, --effort-actuators",
             stacklevel=3,
         )
     return found
@@ -164,23 +223,31 @@ def _bags(paths: Sequence[str | os.PathLike[str]]) -> list[Path]:
     return bags
 
 
-def _topics(
+def _asked(
     joints: Sequence[str],
     slides: Sequence[str],
+    torque: bool,
     state_topic: str,
     command_topic: str | None,
     command_joints: tuple[str, ...],
-) -> dict[str, tuple[tuple[str, ...], str]]:
-    """What `read_bag` is asked for: topic -> its joints, and the field that must be finite.
-
-    ValueError where the two topics are one, or slides are no joints.
-    """
-    if command_topic == state_topic:
-        raise ValueError(f"command and joint states need topics of their own, got {state_topic!r} for both")
+    motors: Sequence[int] | None,
+) -> dict[str, Wanted]:
+    """What `read_bag` is asked for; torque: whether efforts are.  ValueError where slides are no joints."""
     if strange := [slide for slide in slides if slide not in joints]:
         raise ValueError(f"slides must be among the joints {', '.join(joints)}, got {', '.join(strange)}")
-    topics = {state_topic: (tuple(joints), "effort")}
-    return topics if command_topic is None else {**topics, command_topic: (command_joints, "position")}
+    if motors is not None and len(motors) != len(joints):
+        raise ValueError(f"motors must be {len(joints)} numbers, one for each joint, got {len(motors)}")
+    place = None if motors is None else dict(zip(joints, motors, strict=True))
+    shared = state_topic == command_topic
+    needed = "effort" if torque else "position"
+    own = None if place is None else tuple(place.values())
+    asked = {STATE: Wanted(state_topic, tuple(joints), needed, "state", own, shared)}
+    if command_topic is None:
+        return asked
+    if place is not None and (unknown := [joint for joint in command_joints if joint not in place]):
+        raise ValueError(f"motors say nothing of the commanded joints {', '.join(unknown)}, which are not measured")
+    sent = None if place is None else tuple(place[joint] for joint in command_joints)
+    return {**asked, COMMAND: Wanted(command_topic, command_joints, "position", "command", sent, shared)}
 
 
 def _as_recorded(received: Sequence[np.ndarray]) -> list[int]:
@@ -195,7 +262,7 @@ def _as_recorded(received: Sequence[np.ndarray]) -> list[int]:
 
 def _use_header(tracks: Sequence[Mapping[str, Track]], stamps: Stamps, bags: Sequence[Path]) -> bool:
     """Whether header stamps count: one choice for all, two clocks would shift the topics."""
-    bare = [(bag, topic) for bag, t in zip(bags, tracks, strict=True) for topic in t if t[topic].stamped is None]
+    bare = [(bag, t[key].topic) for bag, t in zip(bags, tracks, strict=True) for key in t if t[key].stamped is None]
     if stamps is Stamps.HEADER and bare:
         raise ValueError(
             f"{bare[0][0]}, topic {bare[0][1]!r}: messages have no header stamp; use --stamps bag (Stamps.BAG)"
@@ -204,29 +271,24 @@ def _use_header(tracks: Sequence[Mapping[str, Track]], stamps: Stamps, bags: Seq
 
 
 def _timed(
-    tracks: Mapping[str, Track],
-    use_header: bool,
-    bag: Path,
-    first_topic: str,
-    state_topic: str,
-    allow_jitter: bool,
+    tracks: Mapping[str, Track], asked: Mapping[str, Wanted], use_header: bool, bag: Path, allow_jitter: bool
 ) -> dict[str, _Timed]:
-    """topic -> checked stamps [M] s since the first message of first_topic, and the fields."""
+    """Checked stamps [M] s since the first command, or without commands the first state, and the fields."""
 
     def stamps(track: Track) -> np.ndarray:
         return track.stamped if use_header and track.stamped is not None else track.received
 
-    start = stamps(tracks[first_topic])[0]
+    start = stamps(tracks[COMMAND if COMMAND in tracks else STATE])[0]
     timed = {}
-    for topic, track in tracks.items():
+    for key, track in tracks.items():
         time = 1e-9 * (stamps(track) - start)
-        where = f"{bag}, topic {topic!r} ({'header' if use_header else 'bag'} stamps)"
+        where = f"{bag}, topic {asked[key].topic!r} ({'header' if use_header else 'bag'} stamps)"
         _check_trajectories(time, track.numbers, where)
         # Commands may pause while the robot holds still, or be waypoints seconds apart: their rate is not checked.
-        state = topic == state_topic
+        state = key == STATE
         jitter = allow_jitter or not state
         check_clock(time, where, allow_jitter=jitter, seconds=state, label=lambda i, n=track.numbers: f"message {n[i]}")
-        timed[topic] = (time, track.fields)
+        timed[key] = (time, track.fields)
     return timed
 
 
@@ -250,22 +312,7 @@ def _clock(states: Sequence[_Timed], rate: float | None, bags: Sequence[Path]) -
                 f"{bag}: needs two joint states or more after the first command; there are {len(time)}, from "
                 f"{time[0]:.3f} to {time[-1]:.3f} s of it (are the header stamps of two clocks? then --stamps bag)"
             )
-    if rate is not None and not rate > 0:
-        raise ValueError(f"rate must be positive, got {rate} Hz")
-    step = 1.0 / rate if rate else float(np.median(np.diff(states[0][0])))
-    ends = [float(t[-1]) for t, _ in states]
-    if min(ends) < 0.5 * max(ends):
-        i = int(np.argmin(ends))
-        raise ValueError(
-            f"{bags[i]}: lasts {ends[i]:.3f} s, less than half of the longest repeat's {max(ends):.3f} s; "
-            "was it cut off?"
-        )
-    first = max(0.0, *(float(t[0]) for t, _ in states))
-    # A sample that misses the end by rounding still counts.
-    low, high = int(np.ceil(first / step - 1e-6)), int(np.floor(min(ends) / step + 1e-6))
-    if high - low < 1:
-        raise ValueError(f"the repeats have no common part: {', '.join(str(b) for b in bags)}")
-    return step * np.arange(low, high + 1)
+    return common_clock([time for time, _ in states], rate, bags)
 
 
 def _channels(
@@ -273,15 +320,22 @@ def _channels(
     clock: np.ndarray,
     joints: tuple[str, ...],
     slides: Sequence[str],
+    torque: bool,
     bags: Sequence[Path],
 ) -> dict[str, Channel]:
-    """torque, position and velocity on the common clock, those of them that all bags hold and measured."""
+    """torque, position and velocity on the common clock, those of them that all bags hold and measured.
+
+    torque: whether it is read, and must be there.
+    """
     lacking = [bag for bag, (_, fields) in zip(bags, states, strict=True) if "effort" not in fields]
-    if lacking:
-        raise ValueError(f"{lacking[0]}: the joint states hold no effort, so there is no torque to compare")
+    if lacking and torque:
+        raise ValueError(
+            f"{lacking[0]}: the joint states hold no effort, so there is no torque to compare (--torque none reads "
+            "positions alone)"
+        )
     channels = {}
     for name, field in FIELDS.items():
-        if not all(field in fields for _, fields in states):
+        if not all(field in fields for _, fields in states) or (name == "torque" and not torque):
             continue
         values = np.stack([interpolate(clock, t, fields[field]) for t, fields in states])
         seen = np.stack([~in_gap(clock, t) for t, _ in states])
@@ -306,22 +360,4 @@ def _command(
         if "position" not in fields:
             raise ValueError(f"{bag}: the command messages hold no positions")
     every = [interpolate(clock, t, fields["position"]) for t, fields in commands]
-    for bag, command in zip(bags[1:], every[1:], strict=True):
-        gap = np.abs(command - every[0])
-        i, j = np.unravel_index(int(np.argmax(gap)), gap.shape)
-        if gap[i, j] > tolerance:
-            raise ValueError(
-                f"{bag}: its command is not that of {bags[0]}, joint {joints[j]!r} differs by "
-                f"{gap[i, j]:.4g} at {clock[i]:.3f} s; repeats must replay one motion, within "
-                f"--command-tolerance {tolerance:g} (command_tolerance)"
-            )
-    return every[0]
-
-
-def _initial(channels: Mapping[str, Channel]) -> dict[str, float]:
-    """Joint -> first measured position, mean over the repeats that measured it; nothing without positions."""
-    if "position" not in channels:
-        return {}
-    position = channels["position"]
-    first, seen = position.values[:, 0], position.mask[:, 0]
-    return {joint: float(first[seen[:, c], c].mean()) for c, joint in enumerate(position.columns) if seen[:, c].any()}
+    return one_command(every, clock, joints, tolerance, bags)

@@ -15,8 +15,8 @@ from two_link import arm
 from droid_jax.cost.cost import make_cost
 from droid_jax.model.fields import joint_damping
 from droid_jax.model.parameters import Space
-from droid_jax.model.scene import Scene
-from droid_jax.preflight.check_log import check_log
+from droid_jax.model.scene import Scene, compile_scene
+from droid_jax.preflight.check_log import check_alone, check_log
 from droid_jax.recordings.recording import Channel, Recording, ServoGains, TorqueConvention, TorqueSide
 
 JOINTS = ("shoulder", "elbow")
@@ -226,3 +226,56 @@ def test_a_cost_warns_of_it_and_goes_on():
         warnings.simplefilter("error")
         make_cost(scene(), space(), [sign("position", 1)(recording())], check=False)
         make_cost(scene(), space(), [recording()])
+
+
+def positions_alone(r: Recording) -> Recording:
+    """The log without its torques."""
+    return replace(r, channels={"position": r.channels["position"]})
+
+
+@pytest.mark.parametrize("gravcomp", [False, True])
+@pytest.mark.parametrize("size", [SIZE, 5 * SIZE])
+def test_what_is_right_raises_nothing_without_torques(gravcomp: bool, size: float):
+    assert check_log(scene(gravcomp), positions_alone(recording(gravcomp, size=size))) == ()
+
+
+def test_degrees_of_positions_and_commands_without_torques():
+    """The servo's torque at the tracking error would be sixty times what the arm takes."""
+    (finding,) = check_log(scene(), degrees(positions_alone(recording(size=0.3 * SIZE))))
+    assert finding.kind == "units" and "are these degrees?" in finding.sentence
+
+
+@pytest.mark.parametrize("factor", [10.0, 0.1])
+def test_gains_of_another_robot_without_torques(factor: float):
+    spec = scene().spec.copy()
+    for actuator in spec.actuators:
+        actuator.gainprm[0] *= factor
+        actuator.biasprm[1] *= factor
+    other = compile_scene(spec, "other", joints=JOINTS)
+    (finding,) = check_log(other, positions_alone(recording(size=5 * SIZE)))
+    assert finding.kind == "gains" and 0.5 < finding.value / factor < 2.0
+    assert "are these gains the robot's?" in finding.sentence
+
+
+@pytest.mark.parametrize("late", [0.04, 0.08])
+def test_a_delay_is_said(late: float):
+    shifted = {k: replace(c, time=c.time + late) for k, c in recording().channels.items()}
+    (finding,) = check_log(scene(), replace(recording(), channels=shifted))
+    assert (finding.kind, finding.severity) == ("delay", "note") and finding.value == pytest.approx(late, abs=0.01)
+
+
+def test_a_torque_at_its_limit_is_said():
+    limit = 0.6 * float(recording().channels["torque"].values[..., 1].max())
+    cut = of_channel("torque", lambda v: np.clip(v, -np.inf, [np.inf, limit]))(recording())
+    (finding,) = [f for f in check_log(scene(), cut) if f.kind == "saturation"]
+    assert (finding.column, finding.value) == ("elbow", limit) and "stays at" in finding.sentence
+    assert [f for f in check_log(scene(), recording()) if f.kind == "saturation"] == []
+
+
+def test_a_dead_column_of_a_log_without_commands():
+    still = of_channel("position", lambda v: v * np.array([1.0, 0.0]))(recording(commands=False))
+    said = [f for f in check_alone(still) if f.kind == "sensor"]
+    assert [f.column for f in said] == ["elbow"] and "the position of elbow does not move" in said[0].sentence
+    silent = of_channel("torque", lambda v: v * np.array([0.0, 1.0]))(recording(commands=False))
+    (finding,) = check_alone(silent)
+    assert "the torque of shoulder does not move" in finding.sentence and finding.severity == "likely"

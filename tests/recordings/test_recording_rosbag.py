@@ -651,7 +651,7 @@ def test_options_that_would_change_nothing_are_refused(tmp_path: Path, capsys: p
     bag, out = pulled(tmp_path, "ros1", "run0"), tmp_path / "door.npz"
     assert convert(bag, "--joints", *JOINTS, "--torque", "link", "--out", out) == 0
     refused = {
-        (out, "--torque", "link"): f"--torque is for ROS bags, and {out} is none",
+        (out, "--torque", "link"): f"--torque is for ROS bags and logs with a column map, and {out} is none",
         (out, "--command-topic", "/command"): f"--command-topic is for ROS bags, and {out} is none",
         (bag, "--joints", *JOINTS, "--torque", "link", "--resample"): "--resample is for CSV folders",
         (tmp_path / "nowhere", "--torque", "link"): "there is no such file or folder",

@@ -1,0 +1,109 @@
+"""Does the check of a log find the errors that are put into it, and is it silent where a log is right?
+
+    python benchmarks/check.py [--quick] [--real DIR] [--out DIR]
+
+Every error of check_cases.py is put into synthetic logs of a two-link arm and into one real log of each robot, and the
+findings are counted: the one that names the error, others, none.  The same logs, and 100 synthetic ones, are checked as
+they are; then every finding is false.  DIR holds the public logs (so101, bam_xl330, go2_leg, franka_gaz2019, emps),
+which are not part of this repository; without it only synthetic logs are checked.
+"""
+
+from __future__ import annotations
+
+import collections
+import sys
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT)]
+
+# ruff: noqa: E402  (what is imported lies in a folder that is no package)
+# isort: split
+
+import tyro
+
+from benchmarks.check_cases import ERRORS, Case, Error, real, synthetic, two_link
+from benchmarks.common import publish
+from droid_jax.preflight.findings import Finding
+from droid_jax.preflight.inspect_log import inspect_log
+
+RIGHT, QUICK = 100, 4  # synthetic logs without an error
+WITH = 12  # synthetic logs that each error is put into
+CHOSEN = ("so101/multisine", "xl330/sin_sin_kp400", "go2/leg", "panda/exciting", "emps/DATA_EMPS")  # likewise
+
+
+@dataclass(frozen=True)
+class Check:
+    """Put errors into logs and count what the check of a log finds.
+
+    real: folder of public logs.  quick: four synthetic logs.  out: folder for check.json.  seed: of the first log.
+    """
+
+    real: Path | None = None
+    quick: bool = False
+    out: Path = ROOT / "benchmarks" / "results"
+    seed: int = 0
+
+
+def findings(case: Case) -> tuple[list[Finding], float]:
+    """What `check` finds, and the CPU seconds it took."""
+    begin = time.process_time()  # what other programs take of the machine does not count
+    found = list(inspect_log(case.recording, case.scene))
+    return found, time.process_time() - begin
+
+
+def names(found: list[Finding], error: Error) -> bool:
+    """Whether a finding names an error."""
+    return any(f.kind in error.kinds and any(word in f.sentence for word in error.words) for f in found)
+
+
+def main(command: Check) -> dict[str, Any]:
+    """Run all cases; returns what is published."""
+    scene, count = two_link(), QUICK if command.quick else RIGHT
+    right = [synthetic(command.seed + i, scene) for i in range(count)]
+    measured = list(real(command.real)) if command.real is not None else []
+    slowest, false = 0.0, []
+    for case in [*right, *measured]:
+        found, seconds = findings(case)
+        slowest = max(slowest, seconds)
+        doubts = [f for f in found if f.severity != "note" and f.kind not in case.known]
+        false += [(case.name, f.severity, f.sentence) for f in doubts]
+    table: dict[str, dict[str, int]] = {}
+    missed = []
+    hosts = [*right[: min(count, WITH)], *(case for case in measured if case.name in CHOSEN)]
+    for error in ERRORS:
+        row = collections.Counter[str]()
+        for case in (c for c in hosts if error.applies(c)):
+            wrong = replace(case, recording=error.put(case.recording), scene=error.scene(case.scene))
+            found, seconds = findings(wrong)
+            slowest = max(slowest, seconds)
+            if names(found, error):
+                row["found"] += 1
+            else:
+                others = sorted({f.kind for f in found if f.severity != "note"})
+                row["other: " + ", ".join(others) if others else "nothing"] += 1
+                missed.append(f"{error.name} in {case.name}: {', '.join(others) or 'nothing'}")
+        table[error.name] = dict(row)
+        print(f"{error.name:28s} {dict(row)}", file=sys.stderr)
+    total = sum(sum(row.values()) for row in table.values())
+    return {
+        "cases": total,
+        "logs_as_they_are": len(right) + len(measured),
+        "found_rate": sum(row.get("found", 0) for row in table.values()) / max(total, 1),
+        "false_grave": sum(severity == "certain" for _, severity, _ in false),
+        "false_mild_rate": len({n for n, severity, _ in false if severity != "certain"}) / len([*right, *measured]),
+        "slowest_s": slowest,
+        "confusion": table,
+        "missed": missed,
+        "false": [f"{name}: {sentence}" for name, _, sentence in false],
+    }
+
+
+if __name__ == "__main__":
+    given = tyro.cli(Check, description=__doc__)
+    result = main(given)
+    line = {key: result[key] for key in ("found_rate", "false_grave", "false_mild_rate", "slowest_s", "cases")}
+    publish(given.out, "check", given.quick, given.seed, result, line)

@@ -1,0 +1,315 @@
+"""Logs for `check`: synthetic ones of a two-link arm, real public ones, and the errors that are put into them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from droid_jax.door.arm import panda_arm_scene
+from droid_jax.door.builtin import ARM
+from droid_jax.model.scene import Scene, compile_scene, load_scene
+from droid_jax.recordings.column_map import ChannelMap, ColumnMap, TimeMap, Units
+from droid_jax.recordings.log_files import read_log
+from droid_jax.recordings.recording import Channel, Recording, ServoGains, TorqueConvention, TorqueSide
+
+ROOT = Path(__file__).resolve().parents[1]
+JOINTS = ("shoulder", "elbow")
+RATE = 250.0  # Hz, of synthetic logs
+KP = np.array([60.0, 25.0])
+_ARM = """<mujoco><compiler angle="radian"/><option timestep="0.002" integrator="implicitfast"/>
+<worldbody>
+  <body name="upper"><joint name="shoulder" axis="0 1 0" armature="0.12" damping="3"/>
+    <geom type="capsule" size=".03" fromto="0 0 0 .3 0 0" mass="2" contype="0" conaffinity="0"/>
+    <body name="fore" pos=".3 0 0"><joint name="elbow" axis="0 1 0" armature="0.05" damping="1"/>
+      <geom type="capsule" size=".02" fromto="0 0 0 .25 0 0" mass="1" contype="0" conaffinity="0"/></body></body>
+</worldbody>
+<actuator><position joint="shoulder" kp="60"/><position joint="elbow" kp="25"/></actuator></mujoco>"""
+_PENDULUM = """<mujoco><compiler angle="radian"/><option timestep="0.002" integrator="implicitfast"/>
+<worldbody><body><joint name="pendulum" axis="0 1 0" armature="0.0018" damping="{damping}" frictionloss="0.013"/>
+  <inertial pos="0 0 -0.1" mass="0.49" diaginertia="1e-5 1e-5 1e-5"/></body></worldbody>
+<actuator><position joint="pendulum" kp="{kp}" forcerange="-0.7 0.7"/></actuator></mujoco>"""
+_LEG = """<mujoco><compiler angle="radian"/><option timestep="0.002" integrator="implicitfast"/>
+<default><joint armature="0.01" damping="0.6" frictionloss="0.2"/><position kp="20" kv="1.5"/></default>
+<worldbody><body pos="0.1934 0.0465 0"><joint name="hip" axis="1 0 0" range="-1.047 1.047"/>
+ <inertial pos="-0.0054 0.00194 -0.000105" mass="0.678" diaginertia="0.00088403 0.000596 0.00047997"
+  quat="0.49701389 0.49924489 0.50546189 0.49823689"/>
+ <body pos="0 0.0955 0"><joint name="thigh" axis="0 1 0" range="-1.571 3.491"/>
+  <inertial pos="-0.00374 -0.0223 -0.0327" mass="1.152" diaginertia="0.00594973 0.00584149 0.00087879"
+   quat="0.82953287 0.08476349 -0.0200632 0.55162291"/>
+  <body pos="0 0 -0.213"><joint name="calf" axis="0 1 0" range="-2.723 -0.838"/>
+   <inertial pos="0.00629595 -0.00062212 -0.141417" mass="0.241352" diaginertia="1.49010e-3 1.46356e-3 5.31397e-5"
+    quat="0.71067171 0.00154099 -0.00450087 0.70350771"/></body></body></body></worldbody>
+<actuator><position joint="hip"/><position joint="thigh"/><position joint="calf"/></actuator></mujoco>"""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A log with the scene that it is checked in.
+
+    known: kinds of findings that are right about the log as it is.
+    """
+
+    name: str
+    scene: Scene
+    recording: Recording
+    known: tuple[str, ...] = ()
+
+
+def _scene(xml: str, name: str, joints: tuple[str, ...]) -> Scene:
+    return compile_scene(mujoco.MjSpec.from_string(xml), name, joints=joints)
+
+
+def two_link() -> Scene:
+    """The arm at its nominal values."""
+    return _scene(_ARM, "arm", JOINTS)
+
+
+def synthetic(seed: int, scene: Scene) -> Case:
+    """A log of the arm with other masses, damping, friction and delay than the scene's, in C MuJoCo, with noise.
+
+    Motion, repeats, noise, and whether positions, torques and commands are in the log are drawn from the seed.
+    """
+    rng = np.random.default_rng(seed)
+    model = mujoco.MjModel.from_xml_string(scene.spec.to_xml())
+    factors = rng.uniform(0.7, 1.5, 2)
+    model.body_mass[1:] *= factors
+    model.body_inertia[1:] *= factors[:, None]
+    model.dof_damping[:] *= rng.uniform(0.4, 2.0, 2)
+    model.dof_armature[:] *= rng.uniform(0.6, 1.5, 2)
+    model.dof_frictionloss[:] = rng.uniform(0.0, 0.3, 2)
+    model.opt.timestep = 1.0 / (4 * RATE)
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    time = np.arange(0.0, rng.uniform(8.0, 16.0), 1.0 / RATE)
+    waves = rng.uniform(0.15, 0.8, (2, 3, 1)) * time * 2 * np.pi
+    size = rng.uniform(0.1, 0.6, (2, 1)) / 3
+    ease = np.clip(time, 0, 1) ** 2
+    command = rng.uniform(-0.5, 0.5, 2) + (size * ease * np.sin(waves).sum(axis=1)).T
+    late = int(rng.integers(0, 2)) * 4  # ms
+    data, seen = mujoco.MjData(model), np.empty((2, len(time), 2))
+    data.qpos[:] = command[0]
+    for k in range(4 * len(time)):
+        data.ctrl[:] = command[max(0, k - late) // 4]
+        at = data.qpos.copy()
+        mujoco.mj_step(model, data)
+        if k % 4 == 0:
+            seen[:, k // 4] = data.qfrc_actuator, at
+    repeats = int(rng.integers(1, 5))
+    torque = seen[0] + rng.normal(0.0, 0.05, (repeats, *seen[0].shape))
+    position = seen[1] + rng.normal(0.0, 2e-4, (repeats, *seen[1].shape))
+    mask = np.ones(torque.shape, bool)
+    channels = {
+        "torque": Channel("torque", "N m", JOINTS, time, torque, mask),
+        "position": Channel("position", "rad", JOINTS, time, position, mask),
+    }
+    kind = ("whole", "whole", "log", "positions")[seed % 4]
+    if kind == "positions":
+        del channels["torque"]
+    if kind == "log":
+        time, command = np.zeros(0), np.zeros((0, 0))
+    names = JOINTS if kind != "log" else ()
+    gains = ServoGains(KP, np.zeros(2)) if names else None
+    convention = TorqueConvention(TorqueSide.MOTOR, gravity=True)
+    recording = Recording(f"{kind}_{seed}", time, command, names, channels, convention, qpos0={}, gains=gains)
+    return Case(f"synthetic/{recording.name}", scene, recording)
+
+
+def real(folder: Path) -> Iterator[Case]:
+    """The public logs in a folder: so101, bam_xl330, go2_leg, franka_gaz2019, emps, as far as they are there."""
+    rad = Units(angle="rad", torque="N m", time="s")
+    so101 = folder / "so101"
+    if so101.is_dir():
+        names = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
+        scene = load_scene(so101 / "so101_air.xml", joints=names)
+        state = "state_motor.csv*"
+        columns = ColumnMap(
+            joints=list(names), time=TimeMap("timestamp", "us"), command=ChannelMap("positions", file="control.csv*"),
+            position=ChannelMap("positions", file=state), units=Units(angle="rad"),
+        )  # fmt: skip
+        for path in sorted(p for p in so101.iterdir() if p.is_dir()):
+            yield Case(f"so101/{path.name}", scene, _read(path, columns))
+    for path in sorted((folder / "bam_xl330").glob("*.npz")):
+        gain = 0.7028 * 0.002877 * float(path.stem.rpartition("kp")[2])  # kt V / R times duty per rad
+        scene = _scene(_PENDULUM.format(kp=gain, damping=0.041), path.stem, ("pendulum",))
+        columns = ColumnMap(
+            joints=["pendulum"], time="time", command="goal_position", position="position", rate=185.0, units=rad
+        )
+        recording = _read(path, columns)
+        if path.stem.startswith("lift_and_drop"):  # the motor is off after two seconds
+            recording = recording.window(0.0, 1.9)
+        yield Case(f"xl330/{path.stem}", scene, recording)
+    leg = folder / "go2_leg" / "go2_first_12s.npz"
+    if leg.exists():
+        joints = ("hip", "thigh", "calf")
+        columns = ColumnMap(
+            joints=list(joints), time="time", command="desired_position[0:3]", position="position[0:3]", units=rad
+        )
+        yield Case("go2/leg", _scene(_LEG, "leg", joints), _read(leg, columns))
+    panda = folder / "franka_gaz2019" / "panda_exciting_traj1.npz"
+    if panda.exists():
+        columns = ColumnMap(
+            joints=list(ARM), time="t", position="q", torque="tau", side="link", gravity=True, rate=500.0, units=rad
+        )
+        yield Case("panda/exciting", panda_arm_scene(), _read(panda, columns))
+    for path in sorted((folder / "emps").glob("*.npz")):
+        with np.load(path) as file:
+            constant = float(file["gtau"])
+        columns = ColumnMap(
+            joints=["slide"], slides=["slide"], time="t", position="qm", side="motor", gravity=True,
+            torque=ChannelMap("vir", unit="V", torque_constant=constant), units=Units(length="m", time="s"),
+        )  # fmt: skip
+        yield Case(
+            f"emps/{path.stem}", load_scene(ROOT / "experiments" / "emps.xml", joints=["slide"]), _read(path, columns)
+        )
+
+
+def _read(path: Path, columns: ColumnMap) -> Recording:
+    return read_log([path], columns)[0]
+
+
+# Errors ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Error:
+    """A wrong use of a log.
+
+    kinds: of findings that name it.  words: one of them must stand in its sentence.
+    applies: whether it can be put into a recording.  put: does it.  scene: changes the scene.
+    """
+
+    name: str
+    kinds: tuple[str, ...]
+    words: tuple[str, ...]
+    applies: Callable[[Case], bool]
+    put: Callable[[Recording], Recording]
+    scene: Callable[[Scene], Scene] = lambda scene: scene
+
+
+def stronger(scene: Scene) -> Scene:
+    """The scene with ten times its servos' gains."""
+    spec = scene.spec.copy()
+    for actuator in spec.actuators:
+        actuator.gainprm[0] *= 10.0
+        actuator.biasprm[1] *= 10.0
+        actuator.biasprm[2] *= 10.0
+    return compile_scene(spec, scene.name, joints=scene.joints)
+
+
+def _channel(r: Recording, name: str, change: Callable[[np.ndarray], np.ndarray]) -> Recording:
+    if name not in r.channels:
+        return r
+    return replace(r, channels={**r.channels, name: replace(r.channels[name], values=change(r.channels[name].values))})
+
+
+def _positions(r: Recording, change: Callable[[np.ndarray], np.ndarray]) -> Recording:
+    """Positions and commands alike."""
+    changed = _channel(r, "position", change)
+    return replace(changed, command=change(r.command)) if r.command.size else changed
+
+
+def _torque(c: Case) -> bool:
+    return "torque" in c.recording.channels
+
+
+def _command(c: Case) -> bool:
+    return bool(c.recording.command.size)
+
+
+def _several(c: Case) -> bool:
+    return len(c.recording.channels["position"].columns) > 1
+
+
+def _both(c: Case) -> bool:
+    return _torque(c) and _command(c)
+
+
+def _turned(values: np.ndarray) -> np.ndarray:
+    """The last joint's sign turned."""
+    return values * np.where(np.arange(values.shape[-1]) == values.shape[-1] - 1, -1.0, 1.0)
+
+
+def _exchanged(values: np.ndarray) -> np.ndarray:
+    """The first two joints exchanged."""
+    return values[..., [1, 0, *range(2, values.shape[-1])]]
+
+
+def _late(r: Recording, seconds: float) -> Recording:
+    """Measurements that are stamped later than they were taken."""
+    channels = {key: replace(c, time=c.time + seconds) for key, c in r.channels.items()}
+    return replace(r, channels=channels)
+
+
+def _nominal(r: Recording) -> Recording:
+    """Commands by a nominal rate that their stamps do not have."""
+    return replace(r, time=r.time * 0.985)
+
+
+def _saturated(r: Recording) -> Recording:
+    torque = r.channels["torque"]
+    limit = 0.6 * np.abs(np.where(torque.mask, torque.values, 0.0)).max(axis=(0, 1))
+    return _channel(r, "torque", lambda v: np.clip(v, -limit, limit))
+
+
+def _gravity(r: Recording) -> Recording:
+    return replace(r, torque=replace(r.torque, gravity=not r.torque.gravity))
+
+
+def _always(c: Case) -> bool:
+    return True
+
+
+def _first_dead(values: np.ndarray) -> np.ndarray:
+    return values * np.where(np.arange(values.shape[-1]) == 0, 0.0, 1.0)
+
+
+def _several_torques(c: Case) -> bool:
+    return _torque(c) and _several(c)
+
+
+def _heavy(c: Case) -> bool:
+    """Whether the torque can hold a weight."""
+    return _torque(c) and bool(np.any(c.scene.model.opt.gravity))
+
+
+def _in_other_units(r: Recording) -> Callable[[np.ndarray], np.ndarray]:
+    """Degrees, or millimetres of slides."""
+    return np.rad2deg if r.channels["position"].unit == "rad" else lambda v: 1e3 * v
+
+
+def _several_commands(c: Case) -> bool:
+    return _command(c) and _several(c)
+
+
+def of(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Recording], Recording]:
+    """What changes a channel, or the command."""
+    if name == "command":
+        return lambda r: replace(r, command=change(r.command))
+    return lambda r: _channel(r, name, change)
+
+
+ERRORS = (
+    Error(
+        "degrees", ("units", "range"), ("degrees", "millimetres"), _always, lambda r: _positions(r, _in_other_units(r))
+    ),
+    Error("degrees in positions alone", ("units", "range"), ("degrees",), _command, of("position", np.rad2deg)),
+    Error("milliamperes", ("units",), ("milliamperes",), _torque, of("torque", lambda v: 1e3 * v / 1.6)),
+    Error("amperes", ("units",), ("amperes",), _torque, of("torque", lambda v: v / 9.0)),
+    Error("sign of a torque", ("sign",), ("sign",), _torque, of("torque", _turned)),
+    Error("sign of all torques", ("sign",), ("sign",), _torque, of("torque", np.negative)),
+    Error("sign of a command", ("sign",), ("sign",), _command, of("command", _turned)),
+    Error("sign of a position", ("sign",), ("sign",), _always, of("position", _turned)),
+    Error("order of torques", ("order",), ("exchanged", "order"), _several_torques, of("torque", _exchanged)),
+    Error("order of commands", ("order",), ("exchanged", "order"), _several_commands, of("command", _exchanged)),
+    Error("order of positions", ("order",), ("exchanged", "order"), _several, of("position", _exchanged)),
+    Error("gravity flag", ("gravity",), ("weight",), _heavy, _gravity),
+    Error("delay of 60 ms", ("delay",), ("late",), _both, lambda r: _late(r, 0.06)),
+    Error("nominal rate", ("clock",), ("rate",), _command, _nominal),
+    Error("saturation", ("saturation",), ("stays at",), _torque, _saturated),
+    Error("copies of a repeat", ("repeats",), ("identical",), _always, lambda r: r.repeats_subset([0, 0])),
+    Error("dead position", ("sensor",), ("dead", "does not move"), _always, of("position", _first_dead)),
+    Error("gains of another robot", ("gains", "units"), ("gains",), _command, lambda r: r, stronger),
+)

@@ -1,0 +1,63 @@
+"""All that is to be said of a recording before a fit, as findings: with a scene or without, none of it twice."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+
+from droid_jax.model.scene import Scene
+from droid_jax.preflight.check_log import check_alone, check_log
+from droid_jax.preflight.findings import Finding, Kind
+from droid_jax.preflight.preflight import check_range, command_notes, warn_if_moving
+from droid_jax.recordings.recording import Recording
+
+ORDER = ("certain", "likely", "note")
+
+
+def inspect_log(recording: Recording, scene: Scene | None = None) -> tuple[Finding, ...]:
+    """What of a recording can hardly be right, and what has to be known of it, the gravest first.
+
+    Args:
+        recording: a valid one.
+        scene: that it is meant for; without one only what is in the recording itself is judged.
+
+    Returns:
+        The findings. Nothing is refused: what a replay would refuse is a finding that is certain.
+    """
+    if scene is None:
+        return _sorted(check_alone(recording))
+    found: list[Finding] = []
+    found += _said("range", lambda: check_range(scene, recording))
+    found += check_log(scene, recording)
+    if recording.command.size:
+        found += _said("start", lambda: warn_if_moving(recording))
+        found += [Finding("scene", "", 0.0, 0.0, "note", text) for text in _notes(scene, recording)]
+    return _sorted(found)
+
+
+def _notes(scene: Scene, recording: Recording) -> list[str]:
+    """Of the commands; none where the recording lacks some that the scene needs, which a replay says."""
+    missing = [joint for joint in scene.needs_command if joint not in recording.command_names]
+    if missing:
+        return [
+            f"recording {recording.name!r} has no commands for {', '.join(missing)}, and scene {scene.name!r} drives "
+            "them: a replay is refused; check the joints' names"
+        ]
+    return command_notes(scene, recording)
+
+
+def _said(kind: Kind, check: Callable[[], None]) -> list[Finding]:
+    """What a check refuses or warns of, as findings."""
+    found = []
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        try:
+            check()
+        except ValueError as error:
+            found.append(Finding(kind, "", 0.0, 0.0, "certain", str(error)))
+    found += [Finding(kind, "", 0.0, 0.0, "likely", str(w.message)) for w in said]
+    return found
+
+
+def _sorted(found: list[Finding] | tuple[Finding, ...]) -> tuple[Finding, ...]:
+    return tuple(sorted(found, key=lambda finding: ORDER.index(finding.severity)))

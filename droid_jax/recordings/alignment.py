@@ -1,0 +1,73 @@
+"""Repeats of one motion put together: one clock, one command, where the motion starts.  For logs of any kind."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from droid_jax.recordings.recording import Channel
+
+
+def common_clock(times: Sequence[np.ndarray], rate: float | None, places: Sequence[object]) -> np.ndarray:
+    """[T] s, uniform, a multiple of its step, over the part that all repeats cover from 0 on.
+
+    Args:
+        times: stamps [M] s of each repeat.
+        rate: Hz; the usual one of the first repeat by default.
+        places: where each repeat comes from, for messages.
+
+    Raises:
+        ValueError: a repeat ends before 0 or much earlier than others, or they have no part in common.
+    """
+    if rate is not None and not rate > 0:
+        raise ValueError(f"rate must be positive, got {rate} Hz")
+    step = 1.0 / rate if rate else float(np.median(np.diff(times[0])))
+    ends = [float(t[-1]) for t in times]
+    if min(ends) < 0.5 * max(ends):
+        i = int(np.argmin(ends))
+        raise ValueError(
+            f"{places[i]}: lasts {ends[i]:.3f} s, less than half of the longest repeat's {max(ends):.3f} s; "
+            "was it cut off?"
+        )
+    first = max(0.0, *(float(t[0]) for t in times))
+    # A sample that misses the end by rounding still counts.
+    low, high = int(np.ceil(first / step - 1e-6)), int(np.floor(min(ends) / step + 1e-6))
+    if high - low < 1:
+        raise ValueError(f"the repeats have no common part: {', '.join(map(str, places))}")
+    return step * np.arange(low, high + 1)
+
+
+def one_command(
+    commands: Sequence[np.ndarray],
+    clock: np.ndarray,
+    joints: Sequence[str],
+    tolerance: float,
+    places: Sequence[object],
+) -> np.ndarray:
+    """[T, U] the first repeat's command; ValueError when another one differs by more than the tolerance.
+
+    Args:
+        commands: [T, U] of each repeat, rad or m, on one clock [T] s.
+        clock: of them.  joints: U names.  tolerance: rad or m.
+        places: where each repeat comes from, for messages.
+    """
+    for place, command in zip(places[1:], commands[1:], strict=True):
+        gap = np.abs(command - commands[0])
+        i, j = map(int, np.unravel_index(int(np.argmax(gap)), gap.shape))
+        if gap[i, j] > tolerance:
+            raise ValueError(
+                f"{place}: its command is not that of {places[0]}, joint {joints[j]!r} differs by "
+                f"{gap[i, j]:.4g} at {clock[i]:.3f} s; repeats must replay one motion, within "
+                f"--command-tolerance {tolerance:g} (command_tolerance)"
+            )
+    return commands[0]
+
+
+def start_positions(channels: Mapping[str, Channel]) -> dict[str, float]:
+    """Joint -> first measured position, mean over the repeats that measured it; nothing without positions."""
+    if "position" not in channels:
+        return {}
+    position = channels["position"]
+    first, seen = position.values[:, 0], position.mask[:, 0]
+    return {joint: float(first[seen[:, c], c].mean()) for c, joint in enumerate(position.columns) if seen[:, c].any()}

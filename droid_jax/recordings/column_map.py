@@ -1,0 +1,228 @@
+"""Which columns of a log are what: `ColumnMap`, read from and written to a small TOML file.
+
+A map says what a table, an npz, an HDF5 file or a dataset does not say by itself: which columns hold commands and
+measurements, in which units, of which joints.  The same map reads every log of its kind.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import tomli_w
+
+from droid_jax.arguments import shown
+from droid_jax.read_json import typed
+from droid_jax.recordings.units import TIMES
+from droid_jax.storage import read_text, refuse_foreign, write_text
+
+SUFFIX = ".map.toml"
+HEAD = "# Column map of droid_jax: `python -m droid_jax.run convert LOG --map THIS_FILE`"
+MOST_BYTES = 2**18  # of a map
+CHANNELS = ("command", "position", "velocity", "torque", "object_angle")
+LAYOUTS = Path(__file__).parent / "layouts"  # maps of layouts that many use
+
+
+class ChannelMap(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True, frozen=True):
+    """Columns of one channel, or of the command.
+
+    columns: a name, or one name per joint.  `{n}` in a name stands for a number, `{joint}` for the joint's name, and
+        `[0:3]` or `[2,5]` behind a name for some components of a column of vectors.
+    unit: of the numbers, or one per joint (`droid_jax.recordings.units`); that of `ColumnMap.units` otherwise.
+    file: of a log of several files: the file's name in the folder, `*` for any characters.
+    time: the time column of that file, where it has another name.
+    scale: factor on the numbers, e.g. -1 where an axis points the other way.  zero: what the log reads where the model
+        has 0, in the log's unit.
+    counts_per_turn: of an encoder, with the unit "counts".
+    range: lowest and highest position of each joint (or of all), rad or m, with the unit "normalised" or "percent".
+    torque_constant: N m (N) that one A or one % is, with the units "A", "mA", "%".
+    joints: whose numbers these are, where other than `ColumnMap.joints`.
+    """
+
+    columns: str | list[str]
+    unit: str | list[str] | None = None
+    file: str | None = None
+    time: str | None = None
+    scale: float | list[float] = 1.0
+    zero: float | list[float] = 0.0
+    counts_per_turn: float | list[float] | None = None
+    range: list[float | list[float]] | None = None
+    torque_constant: float | list[float] | None = None
+    joints: list[str] | None = None
+
+
+class TimeMap(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True, frozen=True):
+    """The column of time stamps, or several that add up (seconds and nanoseconds), with the unit of each."""
+
+    columns: str | list[str]
+    unit: str | list[str] | None = None
+
+
+class Units(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True, frozen=True):
+    """Units of all channels whose own entry states none; speeds are per second of angle and length."""
+
+    angle: str | None = None
+    length: str | None = None
+    torque: str | None = None
+    force: str | None = None
+    time: str | None = None
+
+
+class ColumnMap(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True, frozen=True):
+    """What the columns of a log are.
+
+    joints: measured joints, named as in the MJCF.  slides: those of them that slide.
+    time: the stamps; without them `rate` is that of the rows.
+    command, position, velocity, torque, object_angle: columns of each; a name stands for a whole `ChannelMap`.
+    side, gravity: of the torque, as in a recording.
+    stiffness, damping: gains of the commanded joints, N m/rad and N m s/rad.
+    rate: Hz; with a column of time, of the common clock that everything is interpolated onto.
+    units: of all channels.
+    """
+
+    joints: list[str] = []
+    slides: list[str] = []
+    time: str | list[str] | TimeMap | None = None
+    command: str | list[str] | ChannelMap | None = None
+    position: str | list[str] | ChannelMap | None = None
+    velocity: str | list[str] | ChannelMap | None = None
+    torque: str | list[str] | ChannelMap | None = None
+    object_angle: str | list[str] | ChannelMap | None = None
+    side: str | None = None
+    gravity: bool | None = None
+    stiffness: list[float] = []
+    damping: list[float] = []
+    rate: float | None = None
+    units: Units = Units()
+
+    def channel(self, name: str) -> ChannelMap | None:
+        """The entry of a channel as a whole one; None where the map has none."""
+        entry = getattr(self, name)
+        return entry if entry is None or isinstance(entry, ChannelMap) else ChannelMap(entry)
+
+    @property
+    def stamps(self) -> TimeMap | None:
+        """The entry of the time; its unit is that of `units` unless it states one."""
+        entry = self.time if self.time is None or isinstance(self.time, TimeMap) else TimeMap(self.time)
+        if entry is None or entry.unit is not None:
+            return entry
+        return TimeMap(entry.columns, self.units.time)
+
+
+def read_map(path: str | Path) -> ColumnMap:
+    """The map in a TOML file, or a layout of this program by its name ("droid").
+
+    Raises:
+        OSError: there is no such file.
+        ValueError: it is no TOML, has unknown keys or values of another kind, or maps nothing.
+    """
+    known = layouts()
+    if str(path) in known:
+        path = known[str(path)]
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"no map at {path}; layouts known by name are: {', '.join(known)}")
+    text = read_text(path, most=MOST_BYTES)
+    try:
+        content = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise ValueError(f"{path}: not a TOML file: {error}") from None
+    return check_map(typed(content, ColumnMap, str(path)), str(path))
+
+
+def layouts() -> dict[str, Path]:
+    """Name -> file of the maps that come with the program."""
+    return {path.stem: path for path in sorted(LAYOUTS.glob("*.toml"))}
+
+
+def check_map(columns: ColumnMap, where: str) -> ColumnMap:
+    """The map itself; ValueError where it says nothing, or contradicts itself."""
+    if not any(columns.channel(name) for name in CHANNELS if name != "command"):
+        raise ValueError(f"{where}: maps no measured channel: give the columns of position, velocity or torque")
+    if columns.torque is not None and (columns.side is None or columns.gravity is None):
+        raise ValueError(
+            f'{where}: maps a torque but does not say which: give side = "motor" or "link" (--torque), and gravity = '
+            "true where it contains the arm's weight (--gravity), false where not"
+        )
+    if columns.side not in (None, "motor", "link"):
+        raise ValueError(f'{where}: side must be "motor" or "link", got {shown(columns.side)}')
+    if columns.rate is not None and not 0 < columns.rate < 1e5:
+        raise ValueError(f"{where}: rate must be above 0 and below 1e5 Hz, got {columns.rate:g}")
+    if strange := [s for s in columns.slides if s not in columns.joints]:
+        raise ValueError(f"{where}: slides must be among the joints, got {', '.join(strange)}")
+    if len(columns.stiffness) != len(columns.damping):
+        raise ValueError(f"{where}: got {len(columns.stiffness)} stiffness and {len(columns.damping)} damping")
+    stamps = columns.stamps
+    units = [] if stamps is None or stamps.unit is None else as_list(stamps.unit)
+    if wrong := [unit for unit in units if unit not in TIMES]:
+        raise ValueError(f"{where}: {wrong[0]!r} is no unit of time; known are: {', '.join(TIMES)}")
+    return columns
+
+
+def changed_map(
+    columns: ColumnMap | None, channels: Mapping[str, str], units: Mapping[str, str], **changes: Any
+) -> ColumnMap:
+    """A map with what the command line says in place of its own; None: of nothing but that.
+
+    Args:
+        columns: the map that is changed.
+        channels: channel or "time" -> columns, several with commas between them.
+        units: "angle", "length", "torque", "force", "time" -> unit.
+        changes: other fields of `ColumnMap`; None and empty ones change nothing.
+    """
+    where = "--columns"
+    content: dict[str, Any] = {} if columns is None else msgspec.to_builtins(columns)
+    if strange := [name for name in channels if name not in (*CHANNELS, "time")]:
+        raise ValueError(f"{where}: {strange[0]!r} is no channel; known are: time, {', '.join(CHANNELS)}")
+    for name, words in channels.items():
+        entry = content.get(name)
+        names = [word.strip() for word in _split(words)]
+        given = names[0] if len(names) == 1 else names
+        content[name] = {**entry, "columns": given} if isinstance(entry, dict) else given
+    if strange := [name for name in units if name not in Units.__struct_fields__]:
+        raise ValueError(f"--units: {strange[0]!r} has no unit; known are: {', '.join(Units.__struct_fields__)}")
+    content["units"] = {**content.get("units", {}), **units}
+    content |= {name: list(v) if isinstance(v, tuple) else v for name, v in changes.items() if v not in (None, ())}
+    return check_map(typed(content, ColumnMap, where), where)
+
+
+def _split(words: str) -> list[str]:
+    """Names at the commas outside of brackets."""
+    out, depth = [""], 0
+    for letter in words:
+        depth += (letter == "[") - (letter == "]")
+        if letter == "," and depth == 0:
+            out.append("")
+        else:
+            out[-1] += letter
+    return out
+
+
+def map_beside(target: Path) -> Path:
+    """Where the map of a converted recording is kept."""
+    return target.with_name(f"{target.stem if target.suffix == '.npz' else target.name}{SUFFIX}")
+
+
+def write_map(columns: ColumnMap, path: Path) -> None:
+    """Write a map; ValueError where something stands there that is no map of this program."""
+    check_map_target(path)
+    text = tomli_w.dumps(msgspec.to_builtins(columns))
+    write_text(path, f"{HEAD}\n{text}")
+
+
+def check_map_target(path: Path) -> None:
+    """ValueError where `write_map` would replace something else."""
+    refuse_foreign(path, "a file", _is_map, "a column map")
+
+
+def _is_map(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(len(HEAD)) == HEAD.encode()
+
+
+def as_list(value: Any) -> list[Any]:
+    """A value or a list of values as a list."""
+    return list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value]

@@ -1,0 +1,130 @@
+"""Datasets of LeRobot, version 2 and 3, as columns: parquet files, and what they mean in meta/info.json.
+
+The meta names the numbers of each vector and the rate.  It does not say whether angles are degrees or normalised to
+-100 .. 100: LeRobot's `use_degrees` is not stored.  So the unit is taken from the numbers where they leave one
+possibility, and is asked for where they do not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from droid_jax.arguments import number, shown
+from droid_jax.errors import named
+from droid_jax.read_json import read_json
+from droid_jax.recordings.column_map import ChannelMap, ColumnMap, TimeMap, Units
+from droid_jax.recordings.log_columns import POSE, LogColumns
+from droid_jax.recordings.table_file import scan_parquet
+
+INFO = Path("meta") / "info.json"
+VERSIONS = ("v2.", "v3.")
+COMMAND, POSITION, TIME = "action", "observation.state", "timestamp"
+NORMALISED = 100.5  # numbers beyond are none that LeRobot normalised
+
+
+def is_dataset(path: Path) -> bool:
+    """Whether a folder is a dataset of LeRobot."""
+    return (path / INFO).is_file()
+
+
+def open_dataset(path: Path, episode: int | None = None) -> LogColumns:
+    """The columns of one episode.
+
+    Args:
+        path: of the dataset's folder.
+        episode: its number; may be left out where there is one.
+
+    Raises:
+        ValueError: the meta is damaged, of another version, or there is no such episode.
+    """
+    info = read_info(path)
+    rows = pl.scan_parquet(path / "data" / "**" / "*.parquet", missing_columns="insert", extra_columns="ignore")
+    if not any((path / "data").rglob("*.parquet")):
+        raise ValueError(f"{path}: holds no parquet files in data/ (are they still to be downloaded?)")
+    where = f"{path}, episode {episode}"
+    probe = scan_parquet(str(path), rows)
+    if "episode_index" not in probe.widths:
+        raise ValueError(f"{path}: its tables have no column 'episode_index'; they have: {named(probe.widths)}")
+    have = np.unique(rows.select("episode_index").collect()["episode_index"].to_numpy())
+    if episode is None and len(have) > 1:
+        raise ValueError(
+            f"{path}: holds {len(have)} episodes, and several are repeats only where one motion was repeated: choose "
+            f"with --episodes, e.g. --episodes {have[0]}"
+        )
+    episode = int(have[0]) if episode is None and len(have) else episode
+    if episode not in have:
+        raise ValueError(f"{path}: has no episode {episode}, it has {named(map(str, have[:10]))}")
+    log = scan_parquet(where, rows.filter(pl.col("episode_index") == episode).sort("frame_index"))
+    features = info["features"]
+    named_parts = {name: _components(features.get(name)) for name in log.widths}
+    components = {name: parts for name, parts in named_parts.items() if parts and len(parts) == log.widths[name]}
+    notes = {"robot_type": str(info.get("robot_type")), "episode": str(episode)}
+    whole = replace(log, components=components, notes=notes, units={TIME: "s"})
+    units, hints = _units(whole)
+    return replace(whole, units={**whole.units, **units}, hints=hints)
+
+
+def read_info(path: Path) -> dict[str, Any]:
+    """meta/info.json of a dataset; ValueError where it is of another version or lacks something."""
+    file = path / INFO
+    info = read_json(file)
+    if not isinstance(info, dict) or not isinstance(info.get("features"), dict):
+        raise ValueError(f"{file}: not the meta of a LeRobot dataset: it has no 'features'")
+    version = info.get("codebase_version")
+    if not isinstance(version, str) or not version.startswith(VERSIONS):
+        raise ValueError(f"{file}: is of version {shown(version)}; versions 2 and 3 are read")
+    number(info.get("fps"), f"{file}: fps", above=0.0)
+    return info
+
+
+def usual_map(log: LogColumns) -> ColumnMap:
+    """The map of a dataset: actions are commands, the state is the position; joints as the meta names them.
+
+    A gripper beside joints in degrees is left out: LeRobot logs it as a share of its travel, and that is not stored.
+    """
+    if POSITION not in log.widths:
+        raise ValueError(f"{log.where}: has no {POSITION!r}, the measured positions; it has: {named(log.widths)}")
+    names = log.components.get(COMMAND) or log.components.get(POSITION) or ()
+    if not names:
+        raise ValueError(
+            f"{log.where}: its meta does not name the {log.widths[POSITION]} joints of {POSITION!r}: give --joints"
+        )
+    joints = [name.removesuffix(POSE) for name in names]
+    if log.units.get(POSITION) == "deg":  # a gripper is logged as a share of its travel beside them
+        joints = [joint for joint in joints if "gripper" not in joint]
+    command = ChannelMap(COMMAND) if log.widths.get(COMMAND) == log.widths[POSITION] else None
+    return ColumnMap(joints=joints, command=command, position=POSITION, time=TimeMap(TIME, "s"), units=Units())
+
+
+def _components(feature: Any) -> tuple[str, ...]:
+    """Names of a vector's numbers: a list, or a list under one name ("motors")."""
+    names: Any = feature.get("names") if isinstance(feature, dict) else None
+    if isinstance(names, dict) and len(names) == 1:
+        names = next(iter(names.values()))
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        return ()
+    return tuple(names) if len(set(names)) == len(names) else ()
+
+
+def _units(log: LogColumns) -> tuple[dict[str, str], dict[str, str]]:
+    """Column -> unit where its numbers can have no other, and what they run between where they can."""
+    units, hints = dict[str, str](), dict[str, str]()
+    both = [log.numbers(name) for name in (COMMAND, POSITION) if log.widths.get(name)]
+    if not both:
+        return units, hints
+    # Of joints that LeRobot normalises, a gripper is 0 .. 100 in either case.
+    size = max(float(np.nanmax(np.abs(numbers), initial=0.0)) for numbers in both)
+    for name in (COMMAND, POSITION):
+        if size > NORMALISED:
+            units[name] = "deg"
+        else:
+            hints[name] = (
+                f"its numbers reach {size:.3g}, and the meta does not say whether LeRobot recorded degrees "
+                "(use_degrees) or -100 .. 100 of the calibrated travel"
+            )
+    return units, hints

@@ -1,0 +1,257 @@
+"""Logs of any column names: which reader opens a file, and which map it is read by."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from droid_jax.arguments import path_of, shown
+from droid_jax.errors import named, needs
+from droid_jax.read_npz import NpzFile
+from droid_jax.recordings.column_map import SUFFIX, ColumnMap, changed_map, layouts, read_map
+from droid_jax.recordings.log_columns import LogColumns
+from droid_jax.recordings.mapped_log import Opened, fits, read_logs
+from droid_jax.recordings.recording import Phase, Recording
+
+TABLES = (".csv", ".tsv", ".csv.gz", ".tsv.gz")
+PARQUET, HDF5, NPZ, TORCH = (".parquet",), (".h5", ".hdf5"), (".npz",), (".pt", ".pth")
+SUFFIXES = (*TABLES, *PARQUET, *HDF5, *NPZ, *TORCH)
+INFO = "meta/info.json"  # in the folder of a LeRobot dataset
+
+
+def is_log(path: Path) -> bool:
+    """Whether a path is a log that needs a column map: a file, a LeRobot dataset, or a folder of such files."""
+    if path.is_dir():
+        inside = (p.name for p in path.iterdir()) if not (path / "recording.json").exists() else ()
+        return (path / INFO).is_file() or any(name.endswith(SUFFIXES) for name in inside)
+    return path.name.endswith(SUFFIXES) and not (path.suffix == ".npz" and _is_recording(path))
+
+
+def _is_recording(path: Path) -> bool:
+    """Whether an npz file is a recording of this program, of another version, or so damaged that it may be one."""
+    try:
+        with NpzFile(path) as file:
+            return "format" in file or "metadata" in file
+    except (OSError, ValueError):
+        return True
+
+
+def read_log(
+    paths: Sequence[str | Path],
+    columns: ColumnMap | str | Path | None = None,
+    *,
+    episodes: Sequence[str | int] = (),
+    channels: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+    beside: Path | None = None,
+    name: str | None = None,
+    command_tolerance: float = 5e-3,
+    phases: Sequence[Phase] = (),
+    allow_jitter: bool = False,
+    **changes: Any,
+) -> tuple[Recording, ColumnMap, str]:
+    """Logs, one per repeat, as a recording.
+
+    Args:
+        paths: files, or folders.
+        columns: their map, its file, or the name of a layout.  Without one, it is a map in the folder `beside` that
+            names columns which the first log has, or the layout of a format that it is of.
+        episodes: of a LeRobot dataset, their numbers; of an HDF5 file, the groups: each is one repeat.
+        channels, units, changes: in place of what the map says, as in `changed_map`.
+        beside: folder in which maps of earlier logs are looked for.
+        name: of the recording; the first log's by default.
+        command_tolerance, phases, allow_jitter: as in `read_logs`.
+
+    Returns:
+        The recording, the map it was read by, and where that is from.
+
+    Raises:
+        FileNotFoundError: a log is not there.
+        ValueError: something in it is not as it should be, or no map is given and none is known.
+    """
+    paths = [path_of(path, "the path of a log") for path in paths]
+    for path in paths:
+        if not path.exists():
+            raise FileNotFoundError(f"no log at {path}: there is no such file or folder")
+    logs = [log for path in paths for log in _parts(path, episodes)]
+    if columns is None:
+        found, origin = _known_map(logs[0], paths[0], beside)
+    elif isinstance(columns, ColumnMap):
+        found, origin = columns, "the given map"
+    else:
+        found, origin = read_map(columns), str(columns)
+    if found is None and not channels:
+        raise ValueError(
+            f"{paths[0]}: does not say which of its columns are what: give a map, --map FILE.toml, or --columns "
+            f"position=... command=... time=... (docs/file-formats.md); it has: {_columns_of(paths[0], logs[0])}"
+        )
+    found = changed_map(found, channels or {}, units or {}, **changes)
+    if not found.joints and (names := _named_joints(logs[0], found)):
+        found = changed_map(found, {}, {}, joints=names)
+    recording = read_logs(
+        logs,
+        found,
+        name=name or paths[0].name.partition(".")[0],
+        command_tolerance=command_tolerance,
+        phases=phases,
+        allow_jitter=allow_jitter,
+    )
+    return recording, found, origin or "--columns"
+
+
+def _known_map(log: Opened, path: Path, beside: Path | None) -> tuple[ColumnMap | None, str]:
+    """A map that a log without one can be read by, and where it is from."""
+    near = sorted(beside.glob(f"*{SUFFIX}")) if beside is not None and beside.is_dir() else []
+    kept = {file: columns for file in near if fits(log, columns := read_map(file))}
+    if kept:
+        newest = max(kept, key=lambda file: file.stat().st_mtime_ns)
+        other = next((file for file, another in kept.items() if not _alike(another, kept[newest])), None)
+        if other is not None:
+            raise ValueError(f"{path}: {newest} and {other} both map its columns, and differ: choose with --map")
+        return kept[newest], str(newest)
+    if path.is_dir() and (path / INFO).is_file():
+        return _reader("lerobot").usual_map(log(None)), "its meta"
+    for name in layouts():
+        columns = read_map(name)
+        # A layout without joints fits by its columns; the joints are asked for.
+        probe = columns if columns.joints else changed_map(columns, {}, {}, joints=_as_many(log, columns))
+        if fits(log, probe):
+            return columns, f"the layout {name!r}"
+    return None, ""
+
+
+def _alike(one: ColumnMap, other: ColumnMap) -> bool:
+    """Whether two maps read the same numbers, be it onto clocks of another rate."""
+    rate = one.rate if one.stamps is None else None
+    return msgspec.structs.replace(one, rate=rate) == msgspec.structs.replace(
+        other, rate=other.rate if other.stamps is None else None
+    )
+
+
+def _named_joints(log: Opened, columns: ColumnMap) -> tuple[str, ...]:
+    """The joints that a log itself names for the positions, velocities or torques of a map."""
+    for key in ("position", "velocity", "torque"):
+        if (entry := columns.channel(key)) is not None and isinstance(entry.columns, str):
+            return log(entry.file).components.get(entry.columns, ())
+    return ()
+
+
+def _as_many(log: Opened, columns: ColumnMap) -> tuple[str, ...]:
+    """Names for as many joints as a layout's positions have."""
+    entry = columns.channel("position")
+    width = 0 if entry is None else log(None).widths.get(str(entry.columns), 0)
+    return tuple(str(i) for i in range(width))
+
+
+def _columns_of(path: Path, log: Opened) -> str:
+    if path.is_dir() and not (path / INFO).is_file():
+        return named(sorted(p.name for p in path.iterdir()))
+    return named(name for name, width in log(None).widths.items() if width) or "no columns of numbers"
+
+
+def _parts(path: Path, episodes: Sequence[str | int]) -> list[Opened]:
+    """What opens each repeat of a path."""
+    if path.is_dir() and (path / INFO).is_file():
+        numbers = [_number(path, e) for e in episodes] or [None]
+        return [_once(partial(_dataset, path, number)) for number in numbers]
+    if path.name.endswith(HDF5):
+        reader = _reader("hdf5_file")
+        found = reader.demonstrations(path)
+        if not episodes and len(found) > 1:
+            raise ValueError(
+                f"{path}: holds {len(found)} demonstrations, which are repeats only where one motion was "
+                f"repeated: choose with --episodes, e.g. --episodes {found[0]}"
+            )
+        chosen = [str(e) for e in episodes] or found or [None]
+        return [_once(partial(_alone, path, partial(reader.open_hdf5, path, group))) for group in chosen]
+    if episodes:
+        raise ValueError(f"{path}: --episodes is for LeRobot datasets and HDF5 files")
+    if path.is_dir():
+        return [_once(partial(_inside, path))]
+    return [_once(partial(_alone, path, partial(open_file, path)))]
+
+
+def _once(opened: Opened) -> Opened:
+    """The same, each file opened once."""
+    return lru_cache(maxsize=None)(opened)
+
+
+def _number(path: Path, episode: str | int) -> int:
+    try:
+        return int(episode)
+    except ValueError:
+        raise ValueError(f"{path}: an episode of a LeRobot dataset is a number, got {shown(episode)}") from None
+
+
+def _dataset(path: Path, episode: int | None = None, file: str | None = None) -> LogColumns:
+    return _alone(path, partial(_reader("lerobot").open_dataset, path, episode), file)
+
+
+def _alone(path: Path, opened: Callable[[], LogColumns], file: str | None = None) -> LogColumns:
+    if file is not None:
+        raise ValueError(
+            f"{path}: the map names the file {shown(file)} of a folder: give the folder, not one of its files"
+        )
+    return opened()
+
+
+def _inside(path: Path, file: str | None = None) -> LogColumns:
+    """One file of a folder, by the name that the map has for it."""
+    have = sorted(p.name for p in path.iterdir())
+    if file is None:
+        raise ValueError(f"{path}: is a folder: give one of its files, or a map that names them (file = ...)")
+    if "/" in file or "\\" in file:
+        raise ValueError(f"{path}: file = {shown(file)} must be a name inside the folder")
+    found = sorted(path.glob(file))
+    if len(found) != 1:
+        what = "several files" if found else "no file"
+        raise ValueError(f"{path}: has {what} like {shown(file)}; it has: {named(have)}")
+    return open_file(found[0])
+
+
+def open_file(path: Path) -> LogColumns:
+    """The columns of a file, by its suffix; ValueError where it is of none of SUFFIXES, or damaged."""
+    if path.name.endswith(TABLES):
+        return _reader("table_file").open_csv(path)
+    if path.name.endswith(PARQUET):
+        return _reader("table_file").open_parquet(path)
+    if path.name.endswith(HDF5):
+        return _reader("hdf5_file").open_hdf5(path)
+    if path.name.endswith(TORCH):
+        return _reader("torch_file").open_torch(path)
+    if path.name.endswith(NPZ):
+        return open_npz(path)
+    raise ValueError(f"{path}: no log that is read; supported are: {', '.join(SUFFIXES)}")
+
+
+def open_npz(path: Path) -> LogColumns:
+    """The arrays of an npz file of any names; ValueError where it is damaged."""
+    with NpzFile(path) as file:
+        shapes = {name: file.shape(name) or () for name in file.names}
+
+    def read(name: str) -> np.ndarray:
+        with NpzFile(path) as file:
+            return file.array(name)
+
+    return LogColumns(str(path), {n: 1 if len(s) == 1 else s[1] if len(s) == 2 else 0 for n, s in shapes.items()}, read)
+
+
+_NEEDS = {
+    "table_file": ("tables (CSV, parquet) need", "polars"),
+    "lerobot": ("LeRobot datasets need", "polars"),
+    "hdf5_file": ("HDF5 files need", "h5py"),
+}
+
+
+def _reader(module: str) -> Any:
+    """A module that needs a package of its own, imported where it is used."""
+    if module in _NEEDS:
+        what, package = _NEEDS[module]
+        needs(what, "formats", package)
+    return importlib.import_module(f"droid_jax.recordings.{module}")

@@ -1,0 +1,58 @@
+"""Units in which logs hold joint angles, speeds and torques, as factors to the units of a recording.
+
+A recording holds rad, rad/s and N m (m, m/s and N of slides).  A log may hold degrees, encoder counts, a share of the
+joint's travel or a motor current.
+"""
+
+from __future__ import annotations
+
+import math
+
+from droid_jax.errors import named
+
+TURN = 2.0 * math.pi
+COUNTS = ("counts", "counts/s")  # per turn of the encoder: `counts_per_turn`
+NORMALISED = {"normalised": (-100.0, 100.0), "percent": (0.0, 100.0)}  # of the joint's travel: `range`
+CURRENTS = {"A": 1.0, "mA": 1e-3, "V": 1.0, "%": 1.0}  # what a torque constant makes torques of: `torque_constant`
+
+# kind of a channel -> unit -> factor, of hinges and of slides
+_ANGLE = {"rad": 1.0, "mrad": 1e-3, "deg": TURN / 360.0, "turn": TURN, "counts": TURN}
+_SPEED = {"rad/s": 1.0, "mrad/s": 1e-3, "deg/s": TURN / 360.0, "turn/s": TURN, "rpm": TURN / 60.0, "counts/s": TURN}
+_TORQUE = {"N m": 1.0, "mN m": 1e-3, "N cm": 1e-2, "kgf cm": 0.0980665}
+HINGES = {
+    "position": {**_ANGLE, **dict.fromkeys(NORMALISED, 1.0)},
+    "velocity": _SPEED,
+    "torque": {**_TORQUE, **CURRENTS},
+}
+SLIDES = {
+    "position": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, **dict.fromkeys(NORMALISED, 1.0)},
+    "velocity": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3},
+    "torque": {"N": 1.0, "mN": 1e-3, "kN": 1e3, **CURRENTS},
+}
+TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+KINDS = {
+    "command": "position",
+    "position": "position",
+    "object_angle": "position",
+    "velocity": "velocity",
+    "torque": "torque",
+}
+
+
+def unit_factor(kind: str, unit: str, slides: bool, where: str) -> float:
+    """What one unit is in the units of a recording, counts and currents without their constant.
+
+    Args:
+        kind: "position", "velocity" or "torque".
+        unit: as a map states it.
+        slides: whether the joint slides.
+        where: begins the message.
+
+    Raises:
+        ValueError: the kind has no such unit.
+    """
+    known = (SLIDES if slides else HINGES)[kind]
+    if unit not in known:
+        of = "a joint that slides" if slides else "a hinge"
+        raise ValueError(f"{where}: {unit!r} is no unit of the {kind} of {of}; known are: {named(known)}")
+    return known[unit]

@@ -1,0 +1,79 @@
+"""The page of `check`: what recordings hold, and what looks wrong; templates/check.html.jinja lays it out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+from matplotlib.figure import Figure
+
+from droid_jax.preflight.contents import Signal
+from droid_jax.preflight.findings import Finding
+from droid_jax.recordings.recording import Recording
+from droid_jax.report.style import (
+    AFTER,
+    BEFORE,
+    MEASURED,
+    WIDE,
+    inline_svg,
+    label_bottom,
+    legend,
+    panel_grid,
+    settled,
+    styled,
+)
+from droid_jax.report.text import html, label
+
+DRAWN = 1200  # points of a line at most
+MOST = 12  # joints that are drawn
+
+
+def check_page(recordings: Sequence[tuple[Recording, Sequence[Signal], Sequence[Finding]]], scene: str | None) -> str:
+    """HTML of recordings with what they hold and what was found in them; scene: the name of the one they are for."""
+    parts: list[dict[str, Any]] = []
+    for i, (recording, tracks, findings) in enumerate(recordings):
+        figure = Markup(inline_svg(settled(signals(recording)), f"f{i}"))
+        parts.append({"recording": recording, "tracks": tracks, "findings": findings, "figure": figure})
+    return html("check.html.jinja", parts=parts, scene=scene)
+
+
+@styled
+def signals(recording: Recording, width: float = WIDE) -> Figure:
+    """Command, position and torque of each joint over time, the mean of the repeats.
+
+    Args:
+        recording: what is drawn; of more than MOST joints the first ones.
+        width: inches.
+    """
+    joints = list(
+        dict.fromkeys([*recording.command_names, *(j for c in recording.channels.values() for j in c.columns)])
+    )
+    figure, panels = panel_grid(min(len(joints), MOST), width, 1.9)
+    for joint, axes in zip(joints[:MOST], panels, strict=True):
+        axes.set_title(label(joint))
+        if joint in recording.command_names:
+            command = recording.command[:, recording.command_names.index(joint)]
+            axes.plot(*_thinned(recording.time, command), color=BEFORE, label="command")
+        for key, colour in {"position": MEASURED, "object_angle": MEASURED, "torque": AFTER}.items():
+            channel = recording.channels.get(key)
+            if channel is None or joint not in channel.columns:
+                continue
+            c = channel.columns.index(joint)
+            seen = channel.mask[..., c].any(axis=0)
+            values = np.where(channel.mask[..., c], channel.values[..., c], np.nan)[:, seen]
+            where = axes.twinx() if key == "torque" and len(recording.channels) > 1 else axes
+            text = f"{key.replace('_', ' ')}, {channel.unit}"
+            where.plot(
+                *_thinned(channel.time[seen], np.nanmean(values, axis=0)), color=colour, label=text, linewidth=0.9
+            )
+    label_bottom(panels, width, "time, s")
+    legend(figure, figure.axes, width, 3)
+    return figure
+
+
+def _thinned(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A line [K] of DRAWN points at most."""
+    step = max(1, len(time) // DRAWN)
+    return time[::step], values[::step]
