@@ -76,6 +76,8 @@ def join() -> None:
     known = os.environ.get(COORDINATOR) and None not in given.values()
     # jax's own would swallow SIGTERM, which is to end the run.
     jax.config.update("jax_enable_preemption_service", False)
+    how = f"under Slurm start them with srun, elsewhere set {COORDINATOR} (HOST:PORT of process 0), {COUNT} and {INDEX}"
+    _guard(f"the processes of this run did not find together in {JOINING} s: {how}")
     try:
         jax.distributed.initialize(
             num_processes=given[COUNT],
@@ -86,11 +88,12 @@ def join() -> None:
             shutdown_timeout_seconds=LEAVING,
         )
     except (ValueError, RuntimeError, OSError) as error:
-        raise ValueError(
-            f"{VARIABLE} is set, and the processes did not find together: {str(error).splitlines()[0]}; under Slurm "
-            f"start them with srun, elsewhere set {COORDINATOR} (HOST:PORT of process 0), {COUNT} and {INDEX}"
-        ) from None
-    _guard(jax.process_index(), jax.process_count())
+        why = str(error).splitlines()[0].rstrip(".")
+        raise ValueError(f"{VARIABLE} is set, and the processes did not find together: {why}; {how}") from None
+    finally:
+        _dismiss()
+    if jax.process_index() == 0:
+        _guard(f"a process of the {jax.process_count()} of this run was lost; {_AGAIN}")
     with _to_null(1):  # the library below says on the standard output that it is connected
         _place[:] = [jax.process_index(), jax.process_count()]
         _gathered(b"-")
@@ -270,15 +273,12 @@ def _to_null(descriptor: int) -> Iterator[None]:
         os.close(null)
 
 
-def _guard(number: int, processes: int) -> None:
-    """Let a shell say what has happened where jax ends process 0 because another one is lost: it aborts the program,
-    with a stack of its own functions.
+def _guard(line: str) -> None:
+    """Let a shell say this error where jax ends the process because another one is lost or does not come: it aborts
+    the program, with a stack of its own functions and without an exception.
     """
-    if number:
-        return
-    line = f"error: a process of the {processes} of this run was lost; {_AGAIN}"
     with contextlib.suppress(OSError):
-        command = ["/bin/sh", "-c", f'read -r done || echo "{line}" >&2']
+        command = ["/bin/sh", "-c", f'read -r done || echo "error: {line}" >&2']
         _guards.append(subprocess.Popen(command, stdin=subprocess.PIPE))
         atexit.register(_dismiss)
 
