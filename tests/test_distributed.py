@@ -57,7 +57,11 @@ def test_two_processes_share_rows_decisions_and_a_folder(tmp_path: Path) -> None
     command = [sys.executable, "-c", PART, str(out), str(tmp_path / "seen")]
     both = [
         subprocess.Popen(
-            command, env={**environment, distributed.INDEX: str(n)}, text=True, stdout=subprocess.PIPE, stderr=-1
+            command,
+            env={**environment, distributed.INDEX: str(n)},
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
         )
         for n in range(2)
     ]
