@@ -54,9 +54,9 @@ class Arguments:
     """One and two processes, a short search: shows that it runs."""
     out: Path = ROOT / "benchmarks" / "results"
     """Folder of distributed.json."""
-    population: int = 256
+    population: int = 128
     """Samples of a generation."""
-    generations: int = 40
+    generations: int = 30
     """Of the search."""
 
 
