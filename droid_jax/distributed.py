@@ -181,7 +181,7 @@ def leave(code: int) -> int:
     return code
 
 
-def told() -> str:
+def speaker() -> str:
     """Begins the line about an error: which process has it; empty in process 0."""
     return "" if first() else f"process {index()} of {count()}: "
 

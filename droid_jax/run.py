@@ -138,7 +138,7 @@ def _given(arguments: list[str]) -> list[str]:
 
 def _ended(error: BaseException, command: Any) -> int | None:
     """The exit code for what ended a command, once it is said; None for an error of the program itself."""
-    told = distributed.told()
+    who = distributed.speaker()
     if isinstance(error, KeyboardInterrupt):  # where main is called by another program: `console` lets none through
         print(console.words(signal.SIGINT), file=sys.stderr)
         return 128 + signal.SIGINT
@@ -151,16 +151,16 @@ def _ended(error: BaseException, command: Any) -> int | None:
         return console.CLOSED
     if isinstance(error, OSError) and error.errno in FULL:
         place = f"{error.filename}: " if error.filename else "what was to be written: "
-        print(f"{told}error: {place}{(error.strerror or str(error)).lower()}{_going_on(command)}", file=sys.stderr)
+        print(f"{who}error: {place}{(error.strerror or str(error)).lower()}{_going_on(command)}", file=sys.stderr)
         return 1
     if isinstance(error, MemoryError):
-        print(f"{told}error: out of memory{_going_on(command)}", file=sys.stderr)
+        print(f"{who}error: out of memory{_going_on(command)}", file=sys.stderr)
         return 1
     if isinstance(error, (ValueError, OSError)):
-        print(f"{told}error: {_one_sentence(error)}", file=sys.stderr)
+        print(f"{who}error: {_one_sentence(error)}", file=sys.stderr)
         return 2
     if isinstance(error, distributed.Lost):
-        print(f"{told}error: {error}", file=sys.stderr)
+        print(f"{who}error: {error}", file=sys.stderr)
         return 1
     return None
 

@@ -96,7 +96,7 @@ def test_one_process_needs_no_jax_and_no_copy(tmp_path: Path) -> None:
     assert distributed.agreed(True) and not distributed.agreed(False)
     with distributed.part(tmp_path) as folder:
         assert folder == tmp_path
-    assert distributed.leave(2) == 2 and distributed.told() == ""
+    assert distributed.leave(2) == 2 and distributed.speaker() == ""
 
 
 @pytest.mark.parametrize(("text", "on"), [("1", True), ("true", True), ("0", False), ("", False), ("no", False)])
@@ -132,3 +132,11 @@ def test_a_process_that_no_longer_answers_ends_the_run(tmp_path: Path) -> None:
     lost = lose(words, tmp_path / "run", tmp_path, 0, signal.SIGSTOP)
     assert lost["seconds"] < 30 and lost["code"] != 0
     assert "was lost" in lost["said"]
+
+
+def test_the_documents_and_the_manifest_name_the_variables() -> None:
+    for document in ("docs/scale.md", "docs/examples/jobset.yaml"):
+        text = (ROOT / document).read_text()
+        for name in (distributed.VARIABLE, distributed.COORDINATOR, distributed.COUNT, distributed.INDEX):
+            assert name in text, (document, name)
+    assert f"given up after {distributed.HEARTBEAT} s" in (ROOT / "docs/scale.md").read_text()
