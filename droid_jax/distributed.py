@@ -33,7 +33,7 @@ VARIABLE = "DROID_JAX_DISTRIBUTED"
 COORDINATOR, COUNT, INDEX = "JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID"
 HEARTBEAT = 15  # s without a sign of life after which a process counts as lost
 JOINING = 300  # s to wait for all processes
-LEAVING = 20  # s that a process waits at its end for the others to end too
+LEAVING = 7 * 24 * 3600  # s that a process waits at its end for the others: process 0 may train meanwhile
 _LEFT_OUT = (LOCK, "films", "figures", "frames", "tensorboard", "report.html")  # of a folder's copy: nobody reads them
 _AGAIN = "the same command goes on from its last checkpoint, with fewer processes too"
 _place = [0, 1]  # index of this process, and how many there are
@@ -142,7 +142,8 @@ def agreed(decision: bool) -> bool:
 
 @contextlib.contextmanager
 def part(folder: Path | None) -> Iterator[Path | None]:
-    """A process's part in a command; at its end all processes wait for each other.
+    """A process's part in a command.  jax lets all processes wait for each other when they end, and not before: one
+    exchange of results (`over_processes`) waits for 30 minutes at most.
 
     Args:
         folder: the results folder; None for none.
@@ -165,7 +166,6 @@ def part(folder: Path | None) -> Iterator[Path | None]:
                 with tarfile.open(fileobj=io.BytesIO(copied)) as archive:
                     archive.extractall(folder, filter="data")
         yield folder
-        _gathered(b"-")
 
 
 def leave(code: int) -> int:
