@@ -147,7 +147,8 @@ def _chain(at: dict[str, Any]) -> tuple[Any, Any, list[Any], tuple[Any, ...]]:
     )
     scene = compile_scene(mujoco.MjSpec.from_string(text), "chain", joints=names)
     time = np.arange(0.0, at["seconds"] or CHAIN_SECONDS, 0.01)
-    command = 0.1 * (1 - np.cos(np.outer(time, 1.0 + 0.2 * np.arange(joints))))  # from rest
+    ease = np.clip(time / 0.5, 0.0, 1.0)[:, None] ** 3  # it begins at rest
+    command = 0.2 * ease * np.sin(np.outer(time, 1.0 + 0.2 * np.arange(joints)))
     convention = TorqueConvention(TorqueSide.MOTOR, gravity=True)
     asked = Recording("chain", time, command, names, {}, convention, qpos0=dict.fromkeys(names, 0.0))
     space = Space(
