@@ -41,8 +41,11 @@ class Arguments:
     """all, or fit: started by it in a process of its own."""
 
 
-def fit(generations: int) -> dict[str, Any]:
-    """The search alone: s of the whole, and of its first generation, which compiles."""
+def fit(generations: int, most: float | None = None) -> dict[str, Any]:
+    """The search alone: s of the whole, and of its first generation, which compiles.
+
+    most: s after which no further generation begins.
+    """
     import tuned  # noqa: F401  (before jax starts)
 
     from droid_jax.cost.cost import make_cost
@@ -57,7 +60,9 @@ def fit(generations: int) -> dict[str, Any]:
     recording = record(scene, load_recording(demonstration_path("A")), synthetic_truth(scene, 1, 1), seed=1, name="A")
     began = time.perf_counter()
     cost = make_cost(scene, door_space(scene), [recording])
-    config = CmaConfig(population=POPULATION, parents=5, generations=generations, tol_cost=0, tol_sigma=0)
+    config = CmaConfig(
+        population=POPULATION, parents=5, generations=generations, tol_cost=0, tol_sigma=0, max_seconds=most
+    )
     found = cma_search(cost, cost.space, config)
     return {
         "seconds": time.perf_counter() - began,

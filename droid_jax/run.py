@@ -18,8 +18,10 @@ if __name__ == "__main__":  # before what is imported below, which takes a while
     sys.exit(program())
 
 import contextlib
+import dataclasses
 import errno
 import importlib.metadata
+import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -27,7 +29,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from droid_jax import console
+from droid_jax import console, distributed
 from droid_jax.commands import all_stages, check, convert, evaluate, export, gap, identify, record, report, train, view
 from droid_jax.commands.folder import BEGUN
 
@@ -69,6 +71,7 @@ RESUMED = (
     gap.GapCommand,
     train.Train,
 )  # commands that go on where they were stopped
+SHARED = (all_stages.All, identify.Identify, gap.GapCommand)  # commands of which several processes do a part each
 WHAT = """From recordings of a robot to a fitted simulation, to what that simulation lacks, and to a policy.
 
 Without a command: `all`, on a synthetic robot.  --version says which version this is."""
@@ -91,14 +94,41 @@ def main(arguments: Sequence[str] | None = None) -> int:
             command = tyro.cli(Command, default=all_stages.All(), args=given, prog=prog, description=WHAT)
             with _plain_warnings():
                 _check_seeds(command)
-                _ACTIONS[type(command)](command)
+                if distributed.asked():
+                    _run_together(command)
+                else:
+                    _ACTIONS[type(command)](command)
             return 0
         except SystemExit:  # --help, and options that do not exist
             raise
         except BaseException as error:
             if (code := _ended(error, command)) is None:
-                raise
-            return code
+                if distributed.count() == 1:
+                    raise
+                traceback.print_exc()
+            return distributed.leave(1 if code is None else code)
+
+
+def _run_together(command: Any) -> None:
+    """Run a command in several processes (`distributed`)."""
+    from droid_jax import runtime
+
+    if not distributed.count() > 1:
+        runtime.tune()
+        distributed.join()
+    with distributed.part(command.out if isinstance(command, SHARED) else None) as folder:
+        if (own := _own_part(command, folder)) is not None:
+            _ACTIONS[type(own)](own)
+
+
+def _own_part(command: Any, folder: Path | None) -> Any:
+    """What this process does of a command: all where batches are replayed, else nothing, unless it is the first."""
+    if distributed.first():
+        return command
+    if isinstance(command, all_stages.All):
+        stages = tuple(stage for stage in command.stages if stage in all_stages.IN_A_SCENE)
+        return dataclasses.replace(command, out=folder, stages=stages) if stages else None
+    return dataclasses.replace(command, out=folder) if isinstance(command, SHARED) else None
 
 
 def _given(arguments: list[str]) -> list[str]:
@@ -110,6 +140,7 @@ def _given(arguments: list[str]) -> list[str]:
 
 def _ended(error: BaseException, command: Any) -> int | None:
     """The exit code for what ended a command, once it is said; None for an error of the program itself."""
+    who = distributed.speaker()
     if isinstance(error, KeyboardInterrupt):  # where main is called by another program: `console` lets none through
         print(console.words(signal.SIGINT), file=sys.stderr)
         return 128 + signal.SIGINT
@@ -122,14 +153,17 @@ def _ended(error: BaseException, command: Any) -> int | None:
         return console.CLOSED
     if isinstance(error, OSError) and error.errno in FULL:
         place = f"{error.filename}: " if error.filename else "what was to be written: "
-        print(f"error: {place}{(error.strerror or str(error)).lower()}{_going_on(command)}", file=sys.stderr)
+        print(f"{who}error: {place}{(error.strerror or str(error)).lower()}{_going_on(command)}", file=sys.stderr)
         return 1
     if isinstance(error, MemoryError):
-        print(f"error: out of memory{_going_on(command)}", file=sys.stderr)
+        print(f"{who}error: out of memory{_going_on(command)}", file=sys.stderr)
         return 1
     if isinstance(error, (ValueError, OSError)):
-        print(f"error: {_one_sentence(error)}", file=sys.stderr)
+        print(f"{who}error: {_one_sentence(error)}", file=sys.stderr)
         return 2
+    if isinstance(error, distributed.Lost):
+        print(f"{who}error: {error}", file=sys.stderr)
+        return 1
     return None
 
 

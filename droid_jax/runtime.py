@@ -25,6 +25,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from droid_jax import distributed
 from droid_jax.quiet import before_jax, import_mjx, quiet_cache
 from droid_jax.quiet import quiet as quiet
 from droid_jax.storage import write_json
@@ -117,6 +118,13 @@ def devices_mesh() -> Mesh:
     return jax.sharding.Mesh(np.array(jax.local_devices()), ("population",), axis_types=auto)
 
 
+def first_device() -> Any:
+    """This process's first device: mjx takes that of process 0 unless it is given one."""
+    import jax
+
+    return jax.local_devices()[0]
+
+
 def versions() -> dict[str, str]:
     """Versions of Python, this package and what computes for it, and the git commit of a checkout.
 
@@ -137,11 +145,12 @@ def device() -> str:
     """What jax computes on, for people: "AMD EPYC, 2 cores" or "2 x NVIDIA H200"."""
     import jax
 
+    each = f"{distributed.count()} processes, each on " if distributed.count() > 1 else ""
     if jax.default_backend() == "cpu":
         count = cores()
-        return f"{_cpu_model()}, {count} core{'s' if count != 1 else ''}"
+        return f"{each}{_cpu_model()}, {count} core{'s' if count != 1 else ''}"
     kinds = [d.device_kind for d in jax.local_devices()]
-    return ", ".join(f"{kinds.count(k)} x {k}" if kinds.count(k) > 1 else k for k in dict.fromkeys(kinds))
+    return each + ", ".join(f"{kinds.count(k)} x {k}" if kinds.count(k) > 1 else k for k in dict.fromkeys(kinds))
 
 
 def cores() -> int:

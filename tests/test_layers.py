@@ -19,7 +19,18 @@ ORDER = (
     *("door", "synthetic"),  # the leaves: of the paper's door and of the synthetic robot no layer above knows anything
     *("commands", "run"),
 )
-FOR_ALL = ("storage", "runtime", "quiet", "console", "errors", "files", "arguments", "read_json", "read_npz")
+FOR_ALL = (
+    "storage",
+    "runtime",
+    "distributed",
+    "quiet",
+    "console",
+    "errors",
+    "files",
+    "arguments",
+    "read_json",
+    "read_npz",
+)
 # Third-party package -> the only files or folders of droid_jax that may import it.
 ONLY_IN = {
     "evosax": ("identify/cma.py",),

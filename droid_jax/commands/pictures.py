@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from droid_jax import distributed
 from droid_jax.files import FILMS, REPLAY, REPLAY_FILM
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ def draw_replay(out: Path, scene: Scene) -> None:
     from droid_jax.report.render import NoOpenGL, film, rendered_frames, save_frames
     from droid_jax.storage import new_folder
 
-    if not (out / REPLAY).is_file() or (out / FRAMES).is_dir():
+    if not distributed.first() or not (out / REPLAY).is_file() or (out / FRAMES).is_dir():
         return
     try:
         time, before, after = read_replay(out / REPLAY, Reader("identify"))

@@ -41,6 +41,7 @@ from droid_jax.discrepancy.selection import (
     without_dominated,
 )
 from droid_jax.discrepancy.verdict import Verdict, conclude, open_share
+from droid_jax.distributed import agreed
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.identify.pipeline import Progress
 from droid_jax.identify.search import NotReplayed
@@ -69,7 +70,7 @@ class Problem:
     @property
     def late(self) -> bool:
         """No time left."""
-        return self.deadline is not None and time.monotonic() > self.deadline
+        return self.deadline is not None and agreed(time.monotonic() > self.deadline)
 
     def discrepancy(self, model: FittedModel) -> float:
         """U on the validation recording."""

@@ -35,6 +35,7 @@ from droid_jax.model.scene import Scene
 from droid_jax.model.step import simulate_step
 from droid_jax.policy.control import ACTIONS, OBSERVED, Safety, limited
 from droid_jax.policy.environment import Environment
+from droid_jax.runtime import first_device
 from droid_jax.simulate.hand_path import solve_pose
 from droid_jax.simulate.replay import apply_forces, apply_friction, check_stateless, compose, servo_input
 from droid_jax.simulate.time_loop import time_loop
@@ -81,7 +82,7 @@ class DoorEnv(Environment):
         self.sys = Physics(self.scene.mjx, {})
         self.start = waiting_pose(self.scene, self.task)
         self.interface = interface_of(self.scene, self.task, self.start)
-        self._hand, self._template = hand_of(self.scene), mjx.make_data(self.scene.mjx)
+        self._hand, self._template = hand_of(self.scene), mjx.make_data(self.scene.mjx, device=first_device())
         self._timestep = float(self.scene.model.opt.timestep)
         self._servo_damping = has_servo_damping(self.scene.model)
         self._substeps = substeps_of(self.task.control, self._timestep, "the scene's")

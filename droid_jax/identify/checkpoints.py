@@ -17,12 +17,15 @@ import math
 import os
 import warnings
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
+
+from droid_jax import distributed
 
 MOST_BYTES = 2**30  # of a checkpoint's arrays, which are read whole; a search with 1024 samples writes 10 MB
 Tree = dict[str, Any]  # nested dictionary whose leaves are numpy arrays, none of them empty
@@ -45,8 +48,7 @@ class Checkpoints:
             raise ValueError(f"keep must be at least 1, got {keep}")
         self.folder = Path(folder).resolve()
         self.fingerprint = dict(fingerprint or {})
-        options = ocp.CheckpointManagerOptions(max_to_keep=keep, enable_async_checkpointing=False)
-        self._manager = ocp.CheckpointManager(self.folder, options=options)
+        self._manager = ocp.CheckpointManager(self.folder, options=_options(self.folder, keep))
 
     def __enter__(self) -> Checkpoints:
         return self
@@ -66,8 +68,11 @@ class Checkpoints:
         """Write the state after `step` steps.
 
         Checkpoints of this step or a later one are removed first: they are damaged ones that a
-        resumed loop has passed over, and would otherwise count as the newest.
+        resumed loop has passed over, and would otherwise count as the newest.  In a run of several processes the
+        first one saves.
         """
+        if not distributed.first():
+            return
         for old in self.steps():
             if old >= step:
                 self._manager.delete(old)
@@ -126,6 +131,19 @@ class Checkpoints:
                 f"checkpoint {self.folder / str(step)} belongs to another run: it differs in "
                 f"{', '.join(other)}; use another folder, or remove this one to start over"
             )
+
+
+def _options(folder: Path, keep: int) -> ocp.CheckpointManagerOptions:
+    """orbax's options, under which each process of a run has its folder to itself."""
+    options = ocp.CheckpointManagerOptions(max_to_keep=keep, enable_async_checkpointing=False)
+    if distributed.count() == 1:
+        return options
+    folder.mkdir(parents=True, exist_ok=True)
+    me = distributed.index()
+    alone = ocp.options.MultiprocessingOptions(
+        primary_host=me, active_processes={me}, barrier_sync_key_prefix=f"process_{me}"
+    )
+    return replace(options, create=False, multiprocessing_options=alone)
 
 
 @contextlib.contextmanager

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from droid_jax.arguments import check_fields, flag, number, one_of, optional, whole
+from droid_jax.distributed import agreed
 from droid_jax.identify.cma import Strategy, recombination
 from droid_jax.identify.fit import Fit, History, Restart, SearchProgress, on_bound
 from droid_jax.identify.gaussian import space_to_json
@@ -247,7 +248,7 @@ def _judge(run: CmaState, config: CmaConfig) -> None:
 
 def _unfinished(run: CmaState, config: CmaConfig) -> bool:
     """Whether another generation is due."""
-    in_time = config.max_seconds is None or run.seconds < config.max_seconds
+    in_time = config.max_seconds is None or agreed(run.seconds < config.max_seconds)
     return bool((run.stopped == 0).any()) and run.generation < config.generations and in_time
 
 

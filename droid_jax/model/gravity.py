@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from droid_jax.model.quiet_mjx import mjx
+from droid_jax.runtime import first_device
 
 
 class Carried(NamedTuple):
@@ -35,7 +36,7 @@ def lean(field: jax.Array, axis: int, angle: jax.Array) -> jax.Array:
 
 def placed(model: Any, qpos: jax.Array) -> Any:
     """mjx.Data with the kinematics of a pose [nq]."""
-    return mjx.com_pos(model, mjx.kinematics(model, mjx.make_data(model).replace(qpos=qpos)))
+    return mjx.com_pos(model, mjx.kinematics(model, mjx.make_data(model, device=first_device()).replace(qpos=qpos)))
 
 
 def field_force(model: Any, pose: Any, mass: jax.Array, field: jax.Array) -> jax.Array:

@@ -23,6 +23,7 @@ from droid_jax.model.parameters import Space, Write
 from droid_jax.model.quiet_mjx import mjx
 from droid_jax.model.scene import Scene
 from droid_jax.model.unsupported_features import IGNORED
+from droid_jax.runtime import first_device
 
 # Writing one of these changes what the compiler derives.
 _SOURCES = {"body_mass", "body_inertia", "body_pos", "body_quat", "body_ipos", "body_iquat", "dof_armature",
@@ -122,7 +123,7 @@ def derive(model: Any) -> Any:
     As in C, free and ball joints average over their degrees of freedom, a lone body on slides counts with its
     mass alone, and dof_M0 alone knows no armature of tendons.
     """
-    data: Any = mjx.make_data(model).replace(qpos=model.qpos0)
+    data: Any = mjx.make_data(model, device=first_device()).replace(qpos=model.qpos0)
     data = mjx.kinematics(model, data)
     data = mjx.com_pos(model, data)
     data = mjx.crb(model, data)

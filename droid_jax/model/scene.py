@@ -22,6 +22,7 @@ from droid_jax.arguments import said
 from droid_jax.model.actuators import actuator_names, drives_joint, of_joint
 from droid_jax.model.unsupported_features import check_options, refuse_ignored, refuse_missing
 from droid_jax.model.visual_geoms import compiled, look_geoms, without_looks
+from droid_jax.runtime import first_device
 
 LONGEST = 900  # characters of what is wrong with a scene, lists of names among it
 PICTURE = (480, 640)  # height, width of the largest picture that is drawn
@@ -169,8 +170,8 @@ class Scene:
 
         try:
             with jax.ensure_compile_time_eval():  # else a first use inside jit would keep that trace's values
-                put = cast(Callable[[mujoco.MjModel], Any], mjx.put_model)  # pyright: ignore[reportUnknownMemberType]
-                return put(self.model)
+                put = cast(Callable[..., Any], mjx.put_model)  # pyright: ignore[reportUnknownMemberType]
+                return put(self.model, device=first_device())
         except NotImplementedError as error:
             raise ValueError(
                 f"scene {self.name!r} uses something that MJX has not: {error}; change it in the MJCF "

@@ -16,7 +16,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from droid_jax import files
+from droid_jax import distributed, files
 from droid_jax.report.gap_folder import Gap, has_gap, read_gap
 from droid_jax.report.gap_page import gap_view
 from droid_jax.report.identify_folder import Run, has_run, read_run
@@ -52,13 +52,15 @@ def write_report(run: Path) -> Path:
         run: the folder of a run.
 
     Returns:
-        Path of the page.
+        Path of the page.  In a run of several processes only the first writes it.
 
     Raises:
         ValueError: a required file is missing or broken; the message names it.
     """
     folder = Path(run)
     path = folder / "report.html"
+    if not distributed.first():
+        return path
     old = left_over(folder)
     places = [folder, *(folder / stage for stage in files.LAST_FILES if stage not in old)]
     gap = read_gap(at) if (at := _part(places, has_gap)) else None

@@ -22,6 +22,7 @@ from droid_jax.model.quiet_mjx import mjx
 from droid_jax.model.scene import Scene
 from droid_jax.model.unsupported_features import refuse_fluid
 from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSide
+from droid_jax.runtime import first_device
 from droid_jax.simulate.closed_loops import coupled_to_others
 from droid_jax.simulate.measured_motion import Motion
 from droid_jax.simulate.replay import apply_sensor_model
@@ -142,7 +143,8 @@ def path_replay(
         def at(time, position, velocity, acceleration):
             full = jnp.zeros(scene.model.nv, jnp.float32)
             velocity = full.at[dofs].set(velocity)
-            data = mjx.make_data(link_model).replace(qpos=path.still.at[positions].set(position), qvel=velocity)
+            data = mjx.make_data(link_model, device=first_device())
+            data = data.replace(qpos=path.still.at[positions].set(position), qvel=velocity)
             data = mjx.fwd_velocity(link_model, mjx.fwd_position(link_model, data))
             inertia = mjx.full_m(link_model, data)
             torque = inertia @ full.at[dofs].set(acceleration) + data.qfrc_bias

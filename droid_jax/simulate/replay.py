@@ -29,6 +29,7 @@ from droid_jax.model.unsupported_features import check_options
 from droid_jax.recordings.checks import check_joints
 from droid_jax.recordings.clocks import interpolate
 from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSide
+from droid_jax.runtime import first_device
 from droid_jax.simulate.floating_base import refuse_floating
 from droid_jax.simulate.initial_state import (
     DEFAULT_START,
@@ -181,7 +182,7 @@ def servo_motion(
     check_options(scene.model, parity, f"a replay of scene {scene.name!r}")
     check_gains(scene, drive)
     check_stateless(scene)
-    template = mjx.make_data(scene.mjx)
+    template = mjx.make_data(scene.mjx, device=first_device())
     fingers = finger_geoms(scene)
     joints, positions = scene.joint_dofs, scene.joint_qpos
     hinge = scene.qpos(scene.object_joint) if scene.object_joint else None

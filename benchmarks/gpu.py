@@ -1,0 +1,400 @@
+"""All that is to be known of a GPU, in one run of at most eight minutes.
+
+    python benchmarks/gpu.py [--quick] [--out DIR] [--only PART ...] [--seconds 480]
+
+Packages, beside this one's own (`pip install -e ".[train]"`): jax[cuda13] (or jax[cuda12], as the driver has it), with
+the version of jaxlib; for the part "warp" also warp-lang.  On a machine without network, bring as wheels: jax, jaxlib,
+jax-cuda13-plugin, jax-cuda13-pjrt and the nvidia-* packages that they name, mujoco, mujoco-mjx, brax, flax, optax,
+orbax-checkpoint, evosax, scipy, msgspec, filelock, tyro, rich, matplotlib, jinja2, markupsafe, pillow, warp-lang.
+
+Parts, each in a process of its own with its own share of the time; one that fails or is stopped leaves what it has
+measured, and the others go on:
+
+| part | measures |
+|---|---|
+| c | physics steps per second of the door in the C engine, on all cores of this machine |
+| jax | the same of this program's replay, populations 32 to 16384 |
+| warp | the same of mjx.step with MuJoCo Warp (`mjx.put_model(impl="warp")`), or why there is none |
+| fit | a CMA-ES search of the paper's size: 30 samples, 100 generations, one opening |
+| ppo | training of the preset "gpu": simulation steps per second, time to 95 % success |
+| gap | a search for the missing effect of one door (a hidden magnetic catch) |
+
+Replay and C engine step the same samples through the same first STEPS steps of demonstration A.  Warp steps one
+model from the same start under the same commands, without parameter samples: what it is compared with is the
+simulation alone.  Writes DIR/gpu.json after every part, and one line of JSON at the end.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks"), str(ROOT / "experiments")]
+
+import tyro  # noqa: E402
+
+from benchmarks.common import CODE, empty_cache, origin, peak_memory_gib, stem  # noqa: E402
+from droid_jax import runtime  # noqa: E402
+from droid_jax.storage import write_json  # noqa: E402
+
+SHARES = {"c": 1.0, "jax": 5.0, "warp": 3.0, "fit": 3.0, "ppo": 4.0, "gap": 4.0}  # of the time, in this order
+POPULATIONS = (1024, 4096, 16384, 32, 256, 8192, 2048, 512, 128, 64)  # the most telling first
+WARP_POPULATIONS = (1024, 4096, 16384, 256)
+STEPS, QUICK_STEPS = 1000, 50  # of 2 ms
+REPEATS = 2  # timed calls, after one that compiles
+LEAVING = 8.0  # s that a part keeps to end by itself
+STARTING = 0.35  # share of a measurement's time that the next one, of the same kind, may take longer
+ENOUGH = 0.95  # success in the evaluations during training
+HIDDEN = {"magnetic_catch": 1.5}  # N m
+CONTACTS = 64  # of a world that Warp has room for
+ROWS = 256  # constraints of a world that Warp has room for
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Options."""
+
+    quick: bool = False
+    """Small sizes on whatever there is: shows that it runs, its numbers mean nothing."""
+    out: Path = ROOT / "benchmarks" / "results"
+    """Folder of gpu.json."""
+    only: tuple[str, ...] = tuple(SHARES)
+    """Parts."""
+    seconds: float | None = None
+    """For all parts together; default: 480, with --quick 220."""
+    seed: int = 0
+    """Of the samples, the search, the robot and the policy."""
+    part: str = ""
+    """Run this part in this process, and write to --kept: how the script calls itself."""
+    kept: Path = Path()
+    """File of a part's results."""
+
+    def __post_init__(self) -> None:
+        if unknown := [part for part in (*self.only, self.part) if part and part not in SHARES]:
+            raise SystemExit(f"error: there is no part {', '.join(unknown)}; there are {', '.join(SHARES)}")
+
+    @property
+    def limit(self) -> float:
+        """s for all parts."""
+        return self.seconds if self.seconds is not None else 220.0 if self.quick else 480.0
+
+
+class Measuring:
+    """What a part has measured so far, on disk after every addition, and how long it may go on."""
+
+    def __init__(self, arguments: Arguments) -> None:
+        self.arguments = arguments
+        self._until = time.monotonic() + arguments.limit - LEAVING
+        self.found: dict[str, Any] = {}
+
+    @property
+    def left(self) -> float:
+        """s."""
+        return self._until - time.monotonic()
+
+    def keep(self, **found: Any) -> None:
+        """Add to what is on disk."""
+        self.found |= found
+        write_json(self.arguments.kept, self.found)
+
+    def while_there_is_time(self, items: Sequence[Any]) -> Iterator[Any]:
+        """The items, as long as the next one should end in time; the rest is noted as left out."""
+        longest = 0.0
+        for number, item in enumerate(items):
+            if longest * (1 + STARTING) > self.left:
+                self.keep(no_time_for=list(items[number:]))
+                return
+            began = time.monotonic()
+            yield item
+            longest = max(longest, time.monotonic() - began)
+
+
+def of_c(now: Measuring) -> None:
+    """The C engine on all cores."""
+    import replays
+    from common import interleave
+
+    case = replays.make_case(now.arguments.seed, _steps(now))
+    rows = []
+    for population in now.while_there_is_time((32,) if now.arguments.quick else (256, 1024)):
+        _, median = interleave({"c": replays.c_engine(case, population)}, REPEATS)
+        rows.append(_row(population, case.steps, median["c"]))
+        now.keep(rows=rows, cores=runtime.cores(), steps_per_s=max(row["steps_per_s"] for row in rows))
+
+
+def of_jax(now: Measuring) -> None:
+    """This program's replay, every population as one block."""
+    import replays
+
+    case = replays.make_case(now.arguments.seed, _steps(now))
+    _throughput(now, case.steps, POPULATIONS, lambda population: replays.as_one_block(case, population))
+
+
+def of_warp(now: Measuring) -> None:
+    """mjx.step with MuJoCo Warp."""
+    try:
+        import mujoco.mjx.third_party.mujoco_warp  # noqa: F401
+        import warp  # noqa: F401  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        now.keep(not_available=f"{type(error).__name__}: {error}")
+        return
+    import replays
+
+    case = replays.make_case(now.arguments.seed, _steps(now))
+    _throughput(now, case.steps, WARP_POPULATIONS, lambda population: _warp(case, population))
+
+
+def _warp(case: Any, population: int) -> Callable[[], Any]:
+    """A run of `population` worlds of one model through a command: it returns their joint torques, [P, T, nu]."""
+    import jax
+    import jax.numpy as jnp
+    from mujoco import mjx
+
+    put, make = mjx.put_model, mjx.make_data
+    model: Any = put(case.scene.model, impl="warp")
+    room = {"naconmax": CONTACTS * population, "njmax": ROWS}
+    command = jnp.asarray(case.drive.command, jnp.float32)
+    start = jnp.asarray(case.drive.qpos0, jnp.float32)
+
+    @jax.jit
+    def run(qpos: jax.Array) -> jax.Array:
+        data: Any = jax.vmap(lambda q: make(case.scene.model, impl="warp", **room).replace(qpos=q))(qpos)
+
+        def step(data: Any, ctrl: jax.Array) -> tuple[Any, jax.Array]:
+            data = jax.vmap(lambda d: mjx.step(model, d.replace(ctrl=ctrl)))(data)
+            return data, data.actuator_force
+
+        return jax.lax.scan(step, data, command)[1]
+
+    many = jnp.tile(start[None], (population, 1))
+    return lambda: jax.block_until_ready(run(many))
+
+
+def _throughput(
+    now: Measuring, steps: int, populations: Sequence[int], make: Callable[[int], Callable[[], Any]]
+) -> None:
+    from common import interleave
+
+    rows = []
+    for population in now.while_there_is_time((32, 64) if now.arguments.quick else populations):
+        try:
+            first, median = interleave({"run": make(population)}, REPEATS)
+        except Exception as error:  # out of memory at the largest: the others stay
+            rows.append({"population": population, "error": f"{type(error).__name__}: {str(error)[:300]}"})
+        else:
+            seconds = median["run"]
+            row = {**_row(population, steps, seconds), "compile_s": max(0.0, first["run"] - seconds)}
+            rows.append({**row, "peak_gib": peak_memory_gib()})
+        whole = [row["steps_per_s"] for row in rows if "steps_per_s" in row]
+        now.keep(rows=sorted(rows, key=lambda row: row["population"]), steps_per_s=max(whole, default=None))
+
+
+def of_fit(now: Measuring) -> None:
+    """CMA-ES of the paper's size; stopped where time is short."""
+    import time_to_fit
+
+    quick = now.arguments.quick
+    found = time_to_fit.fit(2 if quick else time_to_fit.GENERATIONS, most=max(1.0, 0.8 * now.left))
+    took = found["seconds"] - found["first_generation_s"]
+    now.keep(
+        **found,
+        whole=quick or found["generations"] == time_to_fit.GENERATIONS,
+        generation_s=took / max(1, found["generations"] - 1),
+        after_compilation_s=took,
+    )
+
+
+def of_ppo(now: Measuring) -> None:
+    """PPO on doors drawn from the prior, until it succeeds in 95 % of an evaluation or time is short."""
+    from droid_jax.door.environment import DoorEnv
+    from droid_jax.door.scene import door_scene
+    from droid_jax.door.space import door_nuisances, door_space
+    from droid_jax.door.task import Task
+    from droid_jax.identify.gaussian import prior
+    from droid_jax.policy.randomise import randomised
+    from droid_jax.policy.train import PRESETS, TrainProgress, train
+    from experiments.policies.cases import TIMESTEP, Options
+
+    quick = now.arguments.quick
+    scene = door_scene(timestep=TIMESTEP, limits=True)
+    budget = Options(quick=quick, preset="gpu", evaluations=PRESETS["gpu"].evaluations).budget
+    env = DoorEnv(scene, budget.task(Task()))
+    doors = randomised(scene, prior(door_space(scene) + door_nuisances(scene)))
+    physics = round(env.task.control / TIMESTEP)  # steps of the simulation in an action
+    history: list[TrainProgress] = []
+
+    class Enough(Exception):
+        pass
+
+    def tell(at: TrainProgress) -> None:
+        history.append(at)
+        rates = [h.rate for h in history[2:]] or [history[-1].rate]
+        there = [h for h in history if h.success >= ENOUGH]
+        now.keep(
+            actions_per_s=sum(rates) / len(rates),
+            steps_per_s=physics * sum(rates) / len(rates),
+            seconds_to_95=there[0].seconds if there else None,
+            first_evaluation_s=history[0].seconds,
+            history=[asdict(h) for h in history],
+        )
+        longest = max((b.seconds - a.seconds for a, b in itertools.pairwise(history)), default=0.0)
+        if there or longest * (1 + STARTING) > now.left:
+            raise Enough
+
+    with contextlib.suppress(Enough):
+        train(env, doors, replace(budget.config, seed=now.arguments.seed), progress=tell)
+    now.keep(envs=budget.config.envs, whole=now.found["seconds_to_95"] is not None or quick)
+
+
+def of_gap(now: Measuring) -> None:
+    """A whole search on the built-in door with a hidden effect, as the command makes it with its preset."""
+    from droid_jax.commands.synthetic import record_synthetic
+    from droid_jax.discrepancy.config import DiscrepancyConfig
+    from droid_jax.discrepancy.missing import find_missing_effects
+    from droid_jax.door.scene import door_scene
+    from droid_jax.door.space import door_nuisances, door_space
+    from droid_jax.identify.multistart import RefineConfig
+    from droid_jax.identify.search import CmaConfig
+    from droid_jax.model.effects.registry import library
+
+    began = time.monotonic()
+    quick, seed = now.arguments.quick, now.arguments.seed
+    scene = door_scene(timestep=0.004)
+    space = door_space(scene) + door_nuisances(scene)
+    with tempfile.TemporaryDirectory() as folder:
+        roles = record_synthetic(scene, HIDDEN, Path(folder), 1, seed, again=True)
+    recordings = list(roles.values())
+    config, effects = DiscrepancyConfig(seed=seed, budget_minutes=max(0.1, 0.5 * now.left / 60)), None
+    if quick:
+        few = RefineConfig(iterations=1, basin_hops=0, spreads=0)
+        search = CmaConfig(population=8, parents=None, generations=1)
+        config = replace(config, search=search, refine=few, refit=few, polish=few, max_effects=1, full_refits=1)
+        recordings = [r.window(float(r.time[0]), float(r.time[0]) + 1.0) for r in recordings[:2]]
+        effects = library(scene, ("hinge_preload",))
+    stages: dict[str, float] = {"record": time.monotonic() - began}
+    since = [time.monotonic(), "compile"]
+
+    def tell(stage: str, _: Any) -> None:
+        at = time.monotonic()
+        stages[since[1]] = stages.get(since[1], 0.0) + at - since[0]
+        since[:] = [at, stage]
+        now.keep(stages=stages, whole=False)
+
+    verdict, _ = find_missing_effects(scene, space, recordings, effects=effects, config=config, progress=tell)
+    tell("end", None)
+    now.keep(whole=True, seconds=time.monotonic() - began, sentence=verdict.sentence, hidden=HIDDEN)
+
+
+PARTS: dict[str, Callable[[Measuring], None]] = {
+    "c": of_c, "jax": of_jax, "warp": of_warp, "fit": of_fit, "ppo": of_ppo, "gap": of_gap,
+}  # fmt: skip
+
+
+def _steps(now: Measuring) -> int:
+    return QUICK_STEPS if now.arguments.quick else STEPS
+
+
+def _row(population: int, steps: int, seconds: float) -> dict[str, Any]:
+    return {"population": population, "steps": steps, "seconds": seconds, "steps_per_s": population * steps / seconds}
+
+
+def run_part(arguments: Arguments) -> None:
+    """One part, in this process."""
+    if arguments.part == "c":  # its replay's module imports jax: on a GPU it need not take its memory
+        os.environ["JAX_PLATFORMS"] = "cpu"
+    runtime.tune()
+    runtime.import_mjx()
+    now = Measuring(arguments)
+    import jax
+
+    now.keep(platform=jax.default_backend())
+    PARTS[arguments.part](now)
+
+
+def in_own_process(part: str, arguments: Arguments, seconds: float, cache: str) -> dict[str, Any]:
+    """What a part has measured in so many seconds; "error" says why it has not ended."""
+    kept = Path(cache) / f"{part}.json"
+    options = {"part": part, "kept": kept, "seconds": seconds, "seed": arguments.seed}
+    words = [sys.executable, __file__, *(str(word) for k, v in options.items() for word in (f"--{k}", v))]
+    began = time.monotonic()
+    wrong = {}
+    with (Path(cache) / f"{part}.log").open("w+", errors="replace") as log:
+        process = subprocess.Popen(
+            [*words, *(["--quick"] if arguments.quick else [])], env=empty_cache(cache), stdout=log, stderr=log
+        )
+        try:
+            if code := process.wait(seconds):
+                log.seek(0)
+                wrong = {"error": f"exit status {code}", "said": log.read().strip().splitlines()[-12:]}
+        except subprocess.TimeoutExpired:
+            wrong = {"error": f"stopped after {seconds:.0f} s"}
+        finally:
+            process.kill()
+            process.wait()
+    found = json.loads(kept.read_text()) if kept.is_file() else {}
+    return {**found, **wrong, "part_s": time.monotonic() - began}
+
+
+def headline(parts: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """The figures that are asked for; None where they were not measured."""
+
+    def of(part: str, name: str) -> Any:
+        return parts.get(part, {}).get(name)
+
+    jax_rate, c_rate, warp_rate = (of(part, "steps_per_s") for part in ("jax", "c", "warp"))
+    return {
+        "platform": of("jax", "platform"),
+        "jax_steps_per_s": jax_rate,
+        "warp_steps_per_s": warp_rate,
+        "warp_not_available": of("warp", "not_available"),
+        "c_steps_per_s": c_rate,
+        "c_cores": of("c", "cores"),
+        "ratio_to_c": jax_rate / c_rate if jax_rate and c_rate else None,
+        "warp_ratio_to_c": warp_rate / c_rate if warp_rate and c_rate else None,
+        "fit_after_compilation_s": of("fit", "after_compilation_s") if of("fit", "whole") else None,
+        "fit_generation_s": of("fit", "generation_s"),
+        "gap_s": of("gap", "seconds"),
+        "ppo_steps_per_s": of("ppo", "steps_per_s"),
+        "ppo_seconds_to_95": of("ppo", "seconds_to_95"),
+        "errors": {part: found["error"] for part, found in parts.items() if "error" in found},
+    }
+
+
+def main() -> None:
+    arguments = tyro.cli(Arguments, description=__doc__)
+    if arguments.part:
+        run_part(arguments)
+        return
+    began = time.monotonic()
+    parts: dict[str, dict[str, Any]] = {}
+    path = arguments.out / f"{stem('gpu', arguments.quick)}.json"
+    asked = [part for part in SHARES if part in arguments.only]
+    machine = {"quick": arguments.quick, "commit": CODE.get("git"), "seed": arguments.seed}
+    with tempfile.TemporaryDirectory(prefix="gpu_") as cache:
+        for number, part in enumerate(asked):
+            left = arguments.limit - (time.monotonic() - began)
+            share = left * SHARES[part] / sum(SHARES[p] for p in asked[number:])
+            parts[part] = in_own_process(part, arguments, share, cache)
+            write_json(path, {**headline(parts), **machine, "parts": parts}, indent=2)
+            print(
+                f"{part}: {parts[part]['part_s']:.0f} s of {share:.0f}, {parts[part].get('error', 'done')}", flush=True
+            )
+    seconds = time.monotonic() - began  # the device is asked only now: its memory was the parts' own
+    result = {**headline(parts), **machine, **origin(arguments.seed), "seconds": seconds, "parts": parts}
+    write_json(path, result, indent=2)
+    print(json.dumps({**headline(parts), "device": result["device"], "seconds": seconds}))
+
+
+if __name__ == "__main__":
+    main()
