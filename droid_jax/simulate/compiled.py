@@ -32,10 +32,11 @@ from droid_jax.simulate.replay import (
     TORQUE_OFFSETS,
     Drive,
     Replay,
-    check_gains,
     servo_replay,
     torque_offset_effect,
+    traced_part,
 )
+from droid_jax.simulate.servo_gains import check_gains
 
 PROGRAMS = 16  # of each kind, kept for whoever asks for the same again; each holds its scene
 
@@ -79,7 +80,8 @@ class Along:
 class Driven:
     """A batch of servo replays of a drive: [B, D] -> Rollout [B, ...].
 
-    make: drive -> its batch; one of another start, or of other commands of the same length, compiles nothing again.
+    make: drive -> its batch; one of another start, other gains, or other commands of the same length, compiles nothing
+    again.
     """
 
     make: Callable[[Drive], Batch]
@@ -132,7 +134,7 @@ def compiled_replay(
         program = _servo_program(scene, layout, effects, Clocked(follows.timestep, follows.torque, follows), mj_step)
 
         def driven(drive: Drive) -> Batch:
-            of_drive = jnp.asarray(drive.command, jnp.float32), jnp.asarray(drive.qpos0, jnp.float32)
+            of_drive = traced_part(scene, drive)
             return lambda values: program(values, *of_drive)
 
         return Driven(driven, follows)
@@ -182,7 +184,7 @@ def _servo_program(
     clocked: Clocked,
     mj_step: bool,
 ) -> Callable[..., Rollout]:
-    """(values [B, D], command [T, U], start [nq]) -> Rollout [B, ...]; scene and effects count by identity."""
+    """(values [B, D], *`traced_part` of a drive) -> Rollout [B, ...]; scene and effects count by identity."""
     replay = servo_replay(scene, clocked.drive, effects, parity=mj_step, late=0.0 if mj_step else 0.5)
     space = layout.space
     return over_block(

@@ -38,6 +38,7 @@ from droid_jax.simulate.initial_state import (
     start_pose,
     weight_share,
 )
+from droid_jax.simulate.servo_gains import check_gains, servo_factors, stated_gains, with_gains
 
 Replay = Callable[[Physics], Rollout]
 TORQUE_OFFSETS = "torque offset"  # the effect that adds them, which every replay in MJX has
@@ -51,7 +52,7 @@ class Drive:
     qpos0:   [nq] start pose.
     timestep: s.
     torque:  convention of the measured torque.
-    stiffness: [U] servo gains stated by the recording, or None: the scene's own.
+    stiffness, damping: [U] servo gains stated by the recording, or None: the scene's own.
     sent: [U] bool, actuators that the recording commands, the others hold their start; None: all.
     """
 
@@ -60,6 +61,7 @@ class Drive:
     timestep: float
     torque: TorqueConvention
     stiffness: np.ndarray | None = None
+    damping: np.ndarray | None = None
     sent: np.ndarray | None = None
 
     @property
@@ -87,7 +89,6 @@ def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True, config
     start, end = float(recording.time[0]), float(recording.time[-1])
     steps = int(np.floor((end - start) / timestep + 1e-6)) + 1
     clock = start + np.arange(steps) * timestep
-    gains = recording.gains
     qpos0 = start_pose(scene, recording, config)
     held = holding(scene, qpos0)
     refuse_floating(scene, recording, qpos0, held)
@@ -95,9 +96,7 @@ def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True, config
     sent = np.flatnonzero(columns >= 0)
     if sent.size:
         command[:, sent] = interpolate(clock, recording.time, recording.command[:, columns[sent]])
-    stiffness = scene.model.actuator_gainprm[:, 0] * scene.model.actuator_gear[:, 0] ** 2
-    if gains is not None:
-        stiffness[sent] = np.asarray(gains.stiffness, dtype=float)[columns[sent]]
+    stiffness, damping = stated_gains(scene, recording) or (None, None)
     if weigh:
         check_weight(scene, recording, qpos0)
     return Drive(
@@ -105,7 +104,8 @@ def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True, config
         qpos0=qpos0,
         timestep=timestep,
         torque=recording.torque,
-        stiffness=None if gains is None else stiffness,
+        stiffness=stiffness,
+        damping=damping,
         sent=columns >= 0,
     )
 
@@ -123,19 +123,6 @@ def _check_driven(scene: Scene, recording: Recording) -> None:
             f"scene {scene.name!r} has no {lacks}, and recording {recording.name!r} holds commands: give each "
             f"commanded joint a <position> servo in the MJCF{urdf}"
         )
-
-
-def check_gains(scene: Scene, drive: Drive) -> None:
-    """Raise ValueError where the recording states servo gains that the scene does not have."""
-    if drive.stiffness is None:
-        return
-    own = scene.model.actuator_gainprm[:, 0] * scene.model.actuator_gear[:, 0] ** 2  # at the joint
-    servos = scene.model.actuator_biasprm[:, 1] != 0
-    for name, stated, has, servo in zip(scene.command_names, drive.stiffness, own, servos, strict=True):
-        if not np.isclose(stated, has, rtol=1e-3):
-            do = "build the scene with the recording's gains" if servo else "make it a <position> servo in the MJCF"
-            has_it = f"the scene has {has:g}" + ("" if servo else " and its actuator is no position servo")
-            raise ValueError(f"the recording states a servo gain of {stated:g} for {name}, {has_it}; {do}")
 
 
 def check_stateless(scene: Scene) -> None:
@@ -156,8 +143,8 @@ def servo_replay(
 
     The scan carries only position, velocity and the solver's warm start: everything else in
     mjx.Data is rebuilt each step, so that XLA drops what nobody reads.
-    The replay also takes another command [T, U] and start [nq], so that recordings share one compiled program; of the
-    drive only its time step and its torque's convention are then used.
+    The replay also takes another command [T, U], start [nq] and factors on the servos' gains [U, 2], so that recordings
+    share one compiled program; of the drive only its time step and its torque's convention are then used.
     parity: step exactly as the C engine does (see `droid_jax.model.step`), for comparisons with it; then
       `late` steps late (see `_command`).
     """
@@ -166,15 +153,17 @@ def servo_replay(
     check_stateless(scene)
     template = mjx.make_data(scene.mjx)
     fingers = finger_geoms(scene)
-    own = jnp.asarray(drive.command, jnp.float32), jnp.asarray(drive.qpos0, jnp.float32)
+    own = traced_part(scene, drive)
     joints, positions = scene.joint_dofs, scene.joint_qpos
     hinge = scene.qpos(scene.object_joint) if scene.object_joint else None
     shift = late if parity else 0.0  # steps, of the command; of positions in the other direction
     half = late if parity else 0.5  # steps from the velocity before a step to the one that is told
     damping = has_servo_damping(scene.model)
 
-    def replay(physics: Physics, table: jax.Array = own[0], start: jax.Array = own[1]) -> Rollout:
-        model, theta = physics.model, complete(physics.theta, effects)
+    def replay(
+        physics: Physics, table: jax.Array = own[0], start: jax.Array = own[1], gains: jax.Array = own[2]
+    ) -> Rollout:
+        model, theta = with_gains(physics.model, gains), complete(physics.theta, effects)
         error = encoder_error(scene, model)
 
         def step(carry, k):
@@ -212,6 +201,13 @@ def servo_replay(
         return apply_sensor_model(rollout, theta, effects)
 
     return replay
+
+
+def traced_part(scene: Scene, drive: Drive) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """What a replay takes of a drive beside its physics: command [T, U], start [nq], factors on gains [U, 2]."""
+    parts = (drive.command, drive.qpos0, servo_factors(scene, drive))
+    command, start, gains = (jnp.asarray(part, jnp.float32) for part in parts)
+    return command, start, gains
 
 
 def _command(
