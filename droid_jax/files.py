@@ -13,6 +13,7 @@ LOST = "the fitted model on the test recording"  # in "failed" of gap.json: that
 TO_BE_MADE, NOT_MADE = "to be made", "not made"
 EXTENDED, EXTENDED_MJCF = "extended.json", "extended.xml"
 POLICY, TRAINING, TRANSFER, FILMS = "policy.npz", "training.json", "transfer.json", "films"
+EVALUATION, EVALUATION_TRACES = "evaluation.json", "evaluation.npz"  # of a fit on other recordings
 SYNTHETIC_ROBOT = (
     "synthetic_robot.json"  # beside the synthetic robot's recordings: its springs, seed and hidden effects
 )

@@ -245,21 +245,40 @@ def identify_config(command: Identify) -> IdentifyConfig:
 
 def with_effects(command: Identify, scene: Scene, space: Space) -> tuple[Scene, Space, tuple[Effect, ...]]:
     """Scene and space with the effects of --extended and --effects in them, and these."""
-    if command.extended is not None and command.effects:
-        raise ValueError("--extended brings effects of its own: give it or --effects")
+    if command.extended is not None:
+        from droid_jax.identify.extended_model import load_extended
+
+        needs_one(command)
+        model = load_extended(command.extended, scene)
+        return model.scene, space + model.effect_space, model.effects
+    from droid_jax.model.effects.registry import joined
+
+    scene, effects = effects_in(command, scene)
+    return scene, joined(space, effects) if effects else space, effects
+
+
+def effects_in(command: Identify, scene: Scene) -> tuple[Scene, tuple[Effect, ...]]:
+    """The scene as the effects of --extended or --effects need it, and these."""
+    needs_one(command)
     if command.extended is not None:
         from droid_jax.identify.extended_model import load_extended
 
         model = load_extended(command.extended, scene)
-        return model.scene, space + model.effect_space, model.effects
+        return model.scene, model.effects
     if not command.effects:
-        return scene, space, ()
-    from droid_jax.model.effects.registry import joined, library, ready
+        return scene, ()
+    from droid_jax.model.effects.registry import library, ready
 
     effects = library(scene, command.effects)
     if absent := [name for name in command.effects if name not in {e.name for e in effects}]:
         raise ValueError(f"scene {scene.name!r} cannot have the effects {', '.join(absent)} (--effects)")
-    return ready(scene), joined(space, effects), effects
+    return ready(scene), effects
+
+
+def needs_one(command: Identify) -> None:
+    """ValueError where effects come from two places."""
+    if command.extended is not None and command.effects:
+        raise ValueError("--extended brings effects of its own: give it or --effects")
 
 
 def _given(command: Identify) -> tuple[list[Recording], list[Recording]]:

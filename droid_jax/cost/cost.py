@@ -289,7 +289,7 @@ def _compared(
     apart = _apart(replay, scene, recording, config) if isinstance(replay, Along) else None
     recording = _from_one_start(scene, space, recording, follows, replay, config.start)
     rest = follows.rest if isinstance(follows, Motion) else None
-    return make_comparison(scene, recording, _clock(recording, follows), config, apart, rest)
+    return make_comparison(scene, recording, replay_clock(recording, follows), config, apart, rest)
 
 
 def _apart(along: Along, scene: Scene, recording: Recording, config: CompareConfig) -> np.ndarray | None:
@@ -342,7 +342,7 @@ def _start_alike(scene: Scene, new: Drive | Motion, old: Drive | Motion, config:
     return bool(np.all(np.abs(new.qpos0 - old.qpos0) <= apart))
 
 
-def _clock(recording: Recording, follows: Drive | Motion) -> np.ndarray:
+def replay_clock(recording: Recording, follows: Drive | Motion) -> np.ndarray:
     """[T] s of a replay's rows, on the recording's clock."""
     return follows.time if isinstance(follows, Motion) else float(recording.time[0]) + follows.time
 

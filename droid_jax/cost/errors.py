@@ -6,7 +6,7 @@ Open loop over the whole motion, without filter, in physical units: the numbers 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import jax
@@ -16,6 +16,7 @@ from droid_jax.cost.channels import SIMULATED, measured_channels
 from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Channel, Recording
+from droid_jax.storage import finite
 
 
 @dataclass(frozen=True)
@@ -109,6 +110,15 @@ def sample_of(rollouts: Rollout, row: int) -> Rollout:
         return traces[row]
 
     return jax.tree.map(of, rollouts)
+
+
+def errors_json(errors: Mapping[str, ChannelErrors]) -> dict[str, Any]:
+    """Errors by channel as plain data, None where a replay blew up."""
+
+    def plain(value: Any) -> Any:
+        return [finite(v) if isinstance(v, float) else v for v in value] if isinstance(value, tuple) else value
+
+    return {name: {key: plain(value) for key, value in asdict(of).items()} for name, of in errors.items()}
 
 
 def mean_errors(errors: Mapping[str, Mapping[str, ChannelErrors]]) -> dict[str, tuple[float, float]]:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.cost.errors import sample_of
+from droid_jax.cost.errors import errors_json, sample_of
 from droid_jax.cost.observation import Measured
 from droid_jax.files import (
     CONFIG,
@@ -148,7 +148,10 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
             "noise_floor": float(np.mean(floors)) if fitted and not whitened and None not in floors else None,
             "unit": NOISE_UNITS if whitened else unit,
         },
-        "heldout_distances": {name: asdict(distance) for name, distance in found.heldout_distances.items()},
+        "heldout_distances": {
+            name: asdict(distance) | {"errors": errors_json(distance.errors)}
+            for name, distance in found.heldout_distances.items()
+        },
         "distance_unit": unit,
         "compared": dict(comparison.config.channels),
         "stop": found.search.stop,
