@@ -7,8 +7,8 @@ library's load-dependent friction in the model; each log states its own gain.  `
 the third gain open loop, over their whole length.  Three folds.
 
 Data: Rhoban/bam (Apache 2.0), logs of 2026-01-15.  DIR holds MOTION_kpGAIN.npz with time [s], goal_position and
-position [rad] and torque_enable.  They are not part of this repository.  `lift_and_drop` counts up to where the motor is
-switched off.
+position [rad] and torque_enable.  They are not part of this repository.  `lift_and_drop` counts up to where the motor
+is switched off.
 """
 
 from __future__ import annotations
