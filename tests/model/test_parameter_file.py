@@ -96,14 +96,17 @@ def test_a_servos_gain_and_the_commands_delay_have_no_element(tmp_path: Path, sc
         ({"field": "body_pos", "element": "arm"}, 'body_pos has 3 numbers for each body: give "column", 0 to 2'),
         ({"field": "body_pos", "element": "arm", "column": 7}, 'give "column", 0 to 2, got 7'),
         ({"field": "body_inertia", "element": "arm", "column": -1}, 'give "column", 0 to 2, got -1'),
-        ({"field": "geom_size", "element": "bone", "column": "1"}, "'column' must be a whole number, got '1'"),
+        (
+            {"field": "geom_size", "element": "bone", "column": "1"},
+            "'column' must be a whole number or a list, got '1'",
+        ),
         ({"std": "a"}, "'std' must be a number, got 'a'"),
         ({"std": True}, "'std' must be a number, got True"),
         ({"width": "x", "scaling": "log", "log_offset": 0.1}, "'width' must be a number, got 'x'"),
         ({"width": 0, "scaling": "log", "log_offset": 0.1}, "width must be above 0, got 0"),
         ({"nuisance": "false"}, "'nuisance' must be true or false, got 'false'"),
         ({"name": 5}, "'name' must be text, got 5"),
-        ({"element": 3}, "'element' must be text, got 3"),
+        ({"element": 3}, "'element' must be text or a list, got 3"),
         ({"mode": "sett"}, "'mode' must be one of set, negative, scale, divide, add, got 'sett'"),
         ({"scaling": 1}, "'scaling' must be one of linear, log, got 1"),
         ({"field": "actuator_damping", "element": "elbow"}, "'actuator_damping' cannot be a parameter: MJX"),
@@ -144,8 +147,8 @@ def test_the_gravity_compensation_of_a_compensated_scene_is_a_parameter(tmp_path
 TWO = """<mujoco><worldbody><body name="arm"><joint name="elbow" axis="0 1 0" damping="1" armature="0.02"/>
   <geom type="capsule" size=".02 .1"/><body name="hand"><joint name="wrist" axis="0 1 0" damping="2" armature="0.02"/>
   <geom type="capsule" size=".02 .1"/></body></body></worldbody>
-  <actuator><position name="elbow" joint="elbow" kp="20" forcerange="-3 3"/><position name="wrist" joint="wrist" kp="8"/>
-  </actuator></mujoco>"""
+  <actuator><position name="elbow" joint="elbow" kp="20" forcerange="-3 3"/>
+  <position name="wrist" joint="wrist" kp="8"/></actuator></mujoco>"""
 
 
 def test_a_list_of_joints_makes_one_parameter_that_they_share(tmp_path: Path):
