@@ -57,7 +57,7 @@ def channel_errors(
         channel = recording.channels[name]
         kept = of_scene(scene, channel)
         unit = channel_unit(scene, name, kept.columns, channel.unit)
-        left = [simulated(scene, kept, clock, rollout)[None] - kept.values for rollout in (before, after)]
+        left = [simulated_channel(scene, kept, clock, rollout)[None] - kept.values for rollout in (before, after)]
         inside = (kept.time >= clock[0] - 1e-9) & (kept.time <= clock[-1] + 1e-9)
         mask = kept.mask & inside[None, :, None]
         if not mask.any(axis=(0, 1)).all():
@@ -94,7 +94,7 @@ def channel_unit(scene: Scene, name: str, joints: Sequence[str], unit: str) -> s
     return position if name == "position" else " or ".join(f"{part}/s" for part in position.split(" or "))
 
 
-def simulated(scene: Scene, channel: Channel, clock: np.ndarray, rollout: Rollout) -> np.ndarray:
+def simulated_channel(scene: Scene, channel: Channel, clock: np.ndarray, rollout: Rollout) -> np.ndarray:
     """[Tc, C] the simulated counterpart of a channel of `of_scene`, at the channel's times."""
     if channel.name not in SIMULATED:
         raise ValueError(f"channel {channel.name!r} has no simulated counterpart; known: {', '.join(SIMULATED)}")

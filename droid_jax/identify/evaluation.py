@@ -22,7 +22,7 @@ from droid_jax.cost.errors import (
     mean_errors,
     of_scene,
     sample_of,
-    simulated,
+    simulated_channel,
 )
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.model.effect_interface import Effect, Rollout
@@ -126,7 +126,7 @@ def evaluation_traces(scene: Scene, replays: Sequence[Replayed]) -> dict[str, np
     out: dict[str, np.ndarray] = {}
     for replayed in replays:
         for channel in _channels(scene, replayed):
-            lines = [simulated(scene, channel, replayed.clock, r) for r in (replayed.before, replayed.after)]
+            lines = [simulated_channel(scene, channel, replayed.clock, r) for r in (replayed.before, replayed.after)]
             place = f"{replayed.recording.name}/{channel.name}"
             measured = np.where(channel.mask, channel.values, np.nan)
             with np.errstate(all="ignore"):
