@@ -372,3 +372,25 @@ def test_what_to_do_next_begins_with_a_failed_check(changed: Callable) -> None:
     run, written = changed(lambda fit: fit.update(findings=[asdict(WRONG)]))
     assert next_steps(run, searched=False)[0] == "mend"
     assert "mend the sign of the recording" in spaced(written.ids["identify-next"]["text"])
+
+
+def test_a_fit_of_positions_speaks_of_positions(changed: Callable) -> None:
+    errors = {"unit": "rad", "joints": ["joint1"], "mae_before": [0.05], "mae_after": [0.01], "rms_before": [0.06],
+              "rms_after": [None]}  # fmt: skip
+    positions = {"channels": ["position"], "per_joint_unit": "rad", "errors": {"position": errors}}
+
+    def of_positions(fit: dict[str, Any]) -> None:
+        fit["heldout_distances"]["open_close"] |= positions
+        fit |= {"distance_unit": "rad", "compared": {"position": 1.0}}
+
+    run, written = changed(of_positions)
+    answer = spaced(written.ids["identify-answer"]["text"])
+    assert "fitted to the joint positions that" in answer and "position distance fell from 1.22 to 0.119 rad" in answer
+    assert "orque" not in answer and "Positions: simulation against" in written.text
+    assert "simulated minus measured positions" in written.text
+    assert "Joint 1 0.0500 0.0100 0.0600 –" in spaced(written.ids["errors"]["text"])
+    said = lines(
+        "identify.txt.jinja", fit=run.fit, seconds=1.0, asked="", far_off=False, lacks_something=False, needs=None
+    )
+    assert said[0].startswith("open_close: position distance 1.22 -> 0.119 rad")
+    assert said[1].strip() == "position: mean absolute error 0.0500 -> 0.0100 rad"
