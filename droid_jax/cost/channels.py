@@ -14,13 +14,13 @@ import numpy as np
 
 from droid_jax.cost.cost import Cost
 from droid_jax.cost.observation import Measured
-from droid_jax.cost.residuals import Comparison
+from droid_jax.cost.residuals import LEADS, Comparison
 from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Channel, Recording
 
 MOTIONS = ("position", "velocity")  # the first that was measured says how the joints move
-SIMULATED = ("torque", *MOTIONS, "object_angle")  # channels that a replay produces
+SIMULATED = (LEADS, *MOTIONS, "object_angle")  # channels that a replay produces
 
 
 def measured_channels(scene: Scene, recording: Recording) -> tuple[str, ...]:
@@ -41,6 +41,8 @@ def informative_channels(scene: Scene, recordings: Sequence[Recording]) -> tuple
     """
     each = {r.name: measured_channels(scene, r) for r in recordings}
     common = [name for name in SIMULATED if all(name in have for have in each.values())]
+    if not common and all(LEADS in r.channels and _alive(r, LEADS) for r in recordings):
+        return (LEADS,)  # of joints that the scene does not have: what compares them says which
     if not common:
         have = "; ".join(f"{name!r}: {', '.join(channels) or 'none'}" for name, channels in each.items())
         raise ValueError(
@@ -48,8 +50,8 @@ def informative_channels(scene: Scene, recordings: Sequence[Recording]) -> tuple
             f"commands produces {', '.join(SIMULATED)} of the scene's joints, one along a measured motion torques. A "
             "channel that never changes does not count"
         )
-    if "torque" in common:
-        return ("torque",)
+    if LEADS in common:
+        return (LEADS,)
     motion = [name for name in MOTIONS if name in common][:1]
     return (*motion, *(name for name in common if name == "object_angle"))
 
@@ -62,7 +64,7 @@ def check_channels(recordings: Sequence[Recording], names: Iterable[str]) -> Non
                 f"recording {recording.name!r} has no channel {', '.join(absent)} to compare; it has: "
                 f"{', '.join(recording.channels)}"
             )
-        prescribed = [name for name in names if name != SIMULATED[0]]
+        prescribed = [name for name in names if name != LEADS]
         if prescribed and not recording.command.size:
             raise ValueError(
                 f"recording {recording.name!r} holds no commands: along its measured motion only torques are "
