@@ -108,7 +108,7 @@ def results(out: Path) -> dict[str, Any]:
     )
     return {
         "hidden": read_answer(out / "gap").hidden,
-        "torque_distances": fit["torque_distances"],
+        "torque_distances": fit["heldout_distances"],
         "verdict": gap["verdict"],
         "effects": gap["effects"],
         "sentence": gap["sentence"],

@@ -9,6 +9,7 @@ import ast
 import dataclasses
 import inspect
 import itertools
+import re
 import sys
 import types
 import typing
@@ -43,7 +44,8 @@ def page() -> str:
 
 def name_of(command: type) -> str:
     """What is typed to run it."""
-    return command.__name__.removesuffix("Command").lower()
+    name = command.__name__.removesuffix("Command")
+    return "-".join(part.lower() for part in re.findall("[A-Z][a-z]*", name))
 
 
 def _command(command: type) -> str:

@@ -7,12 +7,13 @@ HISTORY, HISTORY_TABLE = "history.npz", "history.csv"
 FITTED, REPLAY, REPLAY_FILM = "fitted.xml", "replay.npz", "replay.webp"
 ASKED = "all.json"  # the options of a run of all stages, beside their folders
 GAP, GAP_TRACES = "gap.json", "gap.npz"
-FIT_VERSION, GAP_VERSION = 2, 2  # of fit.json and gap.json
+FIT_VERSION, GAP_VERSION = 3, 2  # of fit.json and gap.json
 LOST = "the fitted model on the test recording"  # in "failed" of gap.json: that recording has no discrepancies then
 # States in "amendments" of gap.json: the run was stopped before; "not made: " and the reason.
 TO_BE_MADE, NOT_MADE = "to be made", "not made"
 EXTENDED, EXTENDED_MJCF = "extended.json", "extended.xml"
 POLICY, TRAINING, TRANSFER, FILMS = "policy.npz", "training.json", "transfer.json", "films"
+EVALUATION, EVALUATION_TRACES = "evaluation.json", "evaluation.npz"  # of a fit on other recordings
 SYNTHETIC_ROBOT = (
     "synthetic_robot.json"  # beside the synthetic robot's recordings: its springs, seed and hidden effects
 )

@@ -30,7 +30,20 @@ from typing import Annotated, Any
 import tyro
 
 from droid_jax import console, distributed
-from droid_jax.commands import all_stages, check, convert, evaluate, export, gap, identify, record, report, train, view
+from droid_jax.commands import (
+    all_stages,
+    check,
+    convert,
+    evaluate,
+    evaluate_fit,
+    export,
+    gap,
+    identify,
+    record,
+    report,
+    train,
+    view,
+)
 from droid_jax.commands.folder import BEGUN
 
 Command = (
@@ -39,6 +52,7 @@ Command = (
     | Annotated[gap.GapCommand, tyro.conf.subcommand("gap")]
     | train.Train
     | evaluate.Evaluate
+    | evaluate_fit.EvaluateFit
     | export.Export
     | record.Record
     | convert.Convert
@@ -52,6 +66,7 @@ _ACTIONS: dict[type, Callable[[Any], None]] = {
     gap.GapCommand: gap.run,
     train.Train: train.run,
     evaluate.Evaluate: evaluate.run,
+    evaluate_fit.EvaluateFit: evaluate_fit.run,
     export.Export: export.run,
     record.Record: record.run,
     convert.Convert: convert.run,

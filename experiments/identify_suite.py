@@ -103,7 +103,7 @@ def describe(found: Identified, truth: dict[str, float]) -> dict[str, Any]:
     return {
         "gap": {
             n: {"before": g.before, "after": g.after, "floor": g.noise_floor, "closed": g.closed}
-            for n, g in found.torque_distances.items()
+            for n, g in found.heldout_distances.items()
         },
         "parameters": parameters,
         "mean_square": None if refined is None else float(np.mean(refined.residual**2)),

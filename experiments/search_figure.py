@@ -83,7 +83,7 @@ def main() -> None:
         "cost": msgspec.structs.asdict(found.fit.cost),
         "gap": {
             n: {k: getattr(g, k) for k in ("before", "after", "noise_floor", "closed")}
-            for n, g in found.fit.torque_distances.items()
+            for n, g in found.fit.heldout_distances.items()
         },
         "generations": found.fit.generations,
         "seconds": found.fit.seconds,

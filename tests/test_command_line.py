@@ -498,7 +498,20 @@ def test_an_option_that_does_not_exist(arguments: list[str], capsys: pytest.Capt
     assert arguments[-1] in said.err + said.out and "Traceback" not in said.err
 
 
-COMMANDS = ("all", "identify", "gap", "train", "evaluate", "export", "record", "convert", "check", "report", "view")
+COMMANDS = (
+    "all",
+    "identify",
+    "train",
+    "gap",
+    "evaluate",
+    "evaluate-fit",
+    "export",
+    "record",
+    "convert",
+    "check",
+    "report",
+    "view",
+)
 
 
 @pytest.mark.parametrize("command", ["", *COMMANDS])
@@ -588,7 +601,7 @@ def test_the_page_of_the_command_line_is_current():
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     assert module.PAGE.read_text(encoding="utf-8") == module.page()
-    assert re.findall(r"^## (\w+)$", module.page(), re.MULTILINE) == [module.name_of(c) for c in run._ACTIONS]
+    assert re.findall(r"^## ([\w-]+)$", module.page(), re.MULTILINE) == [module.name_of(c) for c in run._ACTIONS]
     assert "## gap\n" in module.page()
 
 

@@ -151,7 +151,7 @@ def test_the_example_recovers_the_arm(example: ModuleType, recording: dj.Recordi
     assert np.abs(found.space.mean / truth - 1).min() > 0.2
     np.testing.assert_allclose(found.best, truth, rtol=0.01)
     assert [t.name for t in found.identifiability if not t.identifiable] == []
-    (gap,) = found.torque_distances.values()
+    (gap,) = found.heldout_distances.values()
     # two joints with 0.02 N m each: sqrt(pi / 2) times that is the mean norm
     assert gap.after == pytest.approx(0.0251, rel=0.05)
     assert gap.before > 0.5

@@ -109,7 +109,7 @@ def test_without_arguments_every_stage_runs_on_one_recording(called, tmp_path: P
 def test_the_search_for_what_is_missing_begins_at_the_fit(called, tmp_path: Path):
     assert main(["all", "--stages", "gap"]) == 0
     (tmp_path / "runs" / "all" / "identify").mkdir(parents=True)
-    (tmp_path / "runs" / "all" / "identify" / "fit.json").write_text('{"version": 2, "torque_distances": {}}')
+    (tmp_path / "runs" / "all" / "identify" / "fit.json").write_text('{"version": 3, "heldout_distances": {}}')
     assert main(["all", "--stages", "identify", "gap"]) == 0
     assert [c.fit for c in (called[0], called[-1])] == [None, Path("runs/all/identify")]
 
@@ -431,7 +431,7 @@ def test_a_sealed_recording_is_not_fitted(
     names = [f"{name}.npz" for name in "abc"[:count]]
     motions(*names, repeats=repeats, commands=commands)
     (tmp_path / "run" / "identify").mkdir(parents=True)
-    (tmp_path / "run" / "identify" / "fit.json").write_text('{"version": 2, "torque_distances": {}}')
+    (tmp_path / "run" / "identify" / "fit.json").write_text('{"version": 3, "heldout_distances": {}}')
     assert main(["all", "--recording", *names, "--stages", "identify", "gap", "--out", "run"]) == 0
     fit, search = called
     assert [str(path) for path in fit.recording] == names[:fitted]

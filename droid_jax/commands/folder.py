@@ -25,7 +25,15 @@ BEGUN = set[Path]()  # folders of the runs that this process began
 HASHED = ("user_effects", "extended")  # options whose file is in no other hash of a setup
 LATER = ("budget",)  # options of which nothing that an unfinished run has kept depends
 CODE = "versions"  # in setup.json: of the code that began the run, which others may go on with
-PATHS = ("recording", "scene", "parameters", "fit", "run", *HASHED)  # beside each a setup holds what the file says
+PATHS = (
+    "recording",
+    "judge_on",
+    "scene",
+    "parameters",
+    "fit",
+    "run",
+    *HASHED,
+)  # beside each a setup holds what the file says
 INPUTS = ("start", "synthetic_robot")  # in a setup: of what a run was given by another, as are all that end in _sha256
 
 

@@ -38,10 +38,12 @@ if TYPE_CHECKING:
     from droid_jax.recordings.recording import Recording
     from droid_jax.report.identify_folder import FitFile
 
+Channel = Literal["torque", "position", "velocity", "object_angle"]
+
 
 @dataclass(frozen=True)
 class Identify:
-    """Fit the physics to recorded torques: recordings in, a Gaussian over the parameters out.
+    """Fit the physics to what was recorded (torques, positions): recordings in, a Gaussian over the parameters out.
 
     Without --recording a synthetic robot (a simulation with hidden physics) is recorded first.
     """
@@ -52,6 +54,12 @@ class Identify:
     recording: tuple[Path, ...] = ()
     """Recordings to fit (npz or CSV folder; ROS bags through convert); several of the same robot and object are
     fitted together."""
+    judge_on: tuple[Path, ...] = ()
+    """Whole recordings to judge the fit on, which it does not see; all of --recording is then fitted. Default: the
+    last repeats judge, or the last part of a log without commands."""
+    compare: tuple[Channel, ...] = ()
+    """Measured channels to fit; several are weighted by their noise. Default: torque, or where no torque was measured
+    position (without it velocity) and the object's angle."""
     demonstrations: tuple[str, ...] | None = None
     """What the synthetic robot repeats when no recording is given (A, B or C). Default: A C, in the paper preset A."""
     springs: Literal[0, 1, 2] | None = None
@@ -66,6 +74,9 @@ class Identify:
     """Joint of the thing that is moved, in your own scene."""
     extended: Path | None = None
     """extended.json of a gap search: the effects that it named are in the model and fitted too."""
+    effects: tuple[str, ...] = ()
+    """Effects of the library (docs/discrepancy-search.md) that are in the model and fitted too, such as
+    load_friction."""
     user_effects: Path | None = None
     """Python file that registers effects of your own (docs/your-effect.md); it is run."""
     engine: Literal["mjx", "mujoco"] = "mjx"
@@ -120,10 +131,11 @@ def run(command: Identify) -> None:
     load_effects(command.user_effects, None if command.extended is None else command.extended.parent)
     out = command.out
     scene, space, nuisances = identify_model(command)
-    scene, space, effects = _extended(command, scene, space)
-    given = _given(command)
+    scene, space, effects = with_effects(command, scene, space)
+    given, judges = _given(command)
     needs_log(command.motion_cutoff, given)
     setup = {**setup_of(command), **fingerprints(scene, space if nuisances is None else space + nuisances, given)}
+    setup |= {"judge_on_sha256": [recording.sha256 for recording in judges]} if judges else {}
     if finished(out, setup, command.again):
         draw_replay(out, scene)  # where OpenGL was missing, or drawing was stopped
         report.run(report.Report(out))
@@ -133,7 +145,7 @@ def run(command: Identify) -> None:
     prepare_folder(out)  # only now, with all input read
     recordings, truth, known = _recordings(command, scene, out, given)
     print("compiling the replay ...", flush=True)
-    problem = prepare(scene, space, recordings, nuisances=nuisances, config=config, **effects)
+    problem = prepare(scene, space, recordings, nuisances=nuisances, config=config, effects=effects, judge_on=judges)
     # The Gaussian's own, whatever becomes of the search that made it; it may lie in this very folder.
     extended = None if command.extended is None else command.extended.read_bytes()
     begin(out, setup, command.again, "identify")  # and only now, with all of it found good
@@ -149,7 +161,7 @@ def run(command: Identify) -> None:
 
         found = run_fit(problem, checkpoints=out / "checkpoints", progress=progress)
         description = {
-            **_description(command, found, recordings),
+            **_description(command, found, recordings, judges),
             "started": started,
             "robot": known,
             "setup": setup,
@@ -169,7 +181,9 @@ def run(command: Identify) -> None:
     _summary(found, read_fit(out), [r.repeats for r in recordings])
 
 
-def _description(command: Identify, found: Identified, recordings: Sequence[Recording]) -> dict[str, Any]:
+def _description(
+    command: Identify, found: Identified, recordings: Sequence[Recording], judges: Sequence[Recording]
+) -> dict[str, Any]:
     """What config.json says of a fit, its setup apart."""
     from droid_jax import runtime
     from droid_jax.synthetic.robot import is_synthetic
@@ -179,21 +193,19 @@ def _description(command: Identify, found: Identified, recordings: Sequence[Reco
         "preset": command.preset,
         "scene": found.scene.name,
         "engine": command.engine,
-        "recordings": [
-            {
-                "name": r.name,
-                "sha256": r.sha256,
-                "repeats": r.repeats,
-                "heldout": list(found.heldout_repeats[r.name]),
-                "duration": r.duration,
-            }
-            for r in recordings
-        ],
+        "recordings": [_entry(r, found.heldout_repeats[r.name]) for r in recordings],
+        "judged_on": [_entry(r) for r in judges],
         "seed": command.seed,
         "versions": runtime.versions(),
         "device": runtime.device(),
         "synthetic_robot": all(is_synthetic(r) for r in recordings),
     }
+
+
+def _entry(recording: Recording, heldout: Sequence[int] = ()) -> dict[str, Any]:
+    """What config.json says of a recording."""
+    named = {"name": recording.name, "sha256": recording.sha256, "repeats": recording.repeats}
+    return {**named, "heldout": list(heldout), "duration": recording.duration}
 
 
 def identify_model(command: Identify) -> tuple[Scene, Space, Space | None]:
@@ -226,33 +238,68 @@ def identify_config(command: Identify) -> IdentifyConfig:
         search=search_config(command.preset, command.seed, **changes),
         refine=refine_config(command.preset),
         seed=command.seed,
+        channels=command.compare or None,
         compare=compared(command.motion_cutoff, whitened=command.whitened, mj_step=command.mj_step),
     )
 
 
-def _extended(command: Identify, scene: Scene, space: Space) -> tuple[Scene, Space, dict[str, tuple[Effect, ...]]]:
-    """Scene and space with the effects of --extended in them, and what `identify` has to be told of these."""
-    if command.extended is None:
-        return scene, space, {}
-    from droid_jax.identify.extended_model import load_extended
+def with_effects(command: Identify, scene: Scene, space: Space) -> tuple[Scene, Space, tuple[Effect, ...]]:
+    """Scene and space with the effects of --extended and --effects in them, and these."""
+    if command.extended is not None:
+        from droid_jax.identify.extended_model import load_extended
 
-    model = load_extended(command.extended, scene)
-    return model.scene, space + model.effect_space, {"effects": model.effects}
+        needs_one(command)
+        model = load_extended(command.extended, scene)
+        return model.scene, space + model.effect_space, model.effects
+    from droid_jax.model.effects.registry import joined
+
+    scene, effects = effects_in(command, scene)
+    return scene, joined(space, effects) if effects else space, effects
 
 
-def _given(command: Identify) -> list[Recording]:
-    """The recordings, none where the synthetic robot shall record; ValueError where two have one name."""
+def effects_in(command: Identify, scene: Scene) -> tuple[Scene, tuple[Effect, ...]]:
+    """The scene as the effects of --extended or --effects need it, and these."""
+    needs_one(command)
+    if command.extended is not None:
+        from droid_jax.identify.extended_model import load_extended
+
+        model = load_extended(command.extended, scene)
+        return model.scene, model.effects
+    if not command.effects:
+        return scene, ()
+    from droid_jax.model.effects.registry import library, ready
+
+    effects = library(scene, command.effects)
+    if absent := [name for name in command.effects if name not in {e.name for e in effects}]:
+        raise ValueError(f"scene {scene.name!r} cannot have the effects {', '.join(absent)} (--effects)")
+    return ready(scene), effects
+
+
+def needs_one(command: Identify) -> None:
+    """ValueError where effects come from two places."""
+    if command.extended is not None and command.effects:
+        raise ValueError("--extended brings effects of its own: give it or --effects")
+
+
+def _given(command: Identify) -> tuple[list[Recording], list[Recording]]:
+    """The recordings to fit, none where the synthetic robot shall record, and those to judge on; ValueError where two
+    have one name.
+    """
     needs_recording(command)
+    if command.judge_on and not command.recording:
+        raise ValueError("--judge-on needs --recording: the synthetic robot is judged on its own repeats")
     files: dict[str, Path] = {}
-    recordings = [recording_at(path) for path in command.recording]
-    for path, recording in zip(command.recording, recordings, strict=True):
+    paths = (*command.recording, *command.judge_on)
+    recordings = [recording_at(path) for path in paths]
+    for path, recording in zip(paths, recordings, strict=True):
         if recording.name in files:
             raise ValueError(
                 f"{files[recording.name]} and {path} are both named {recording.name!r}, and results go by the name: "
                 f"`python -m droid_jax.run convert {path} --name OTHER --out other.npz` gives another"
             )
         files[recording.name] = path
-    return recordings
+    count = len(command.recording)
+    return recordings[:count], recordings[count:]
 
 
 def _needs_demonstrations(command: Identify, given: list[Recording]) -> None:

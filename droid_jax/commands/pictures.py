@@ -31,17 +31,16 @@ def keep_replay(out: Path, found: Identified, recording: Recording) -> None:
     from droid_jax.model.physics import make_c_model
     from droid_jax.simulate.c_engine import poses
     from droid_jax.simulate.replay import make_drive
+    from droid_jax.simulate.servo_gains import scale_gains, servo_factors
     from droid_jax.storage import write_npz
 
     _forget(out)
     if not recording.command.size:
         return
-    drive = make_drive(found.scene, recording)
-    every = max(1, round(1.0 / (RATE * drive.timestep)))
-    before, after = (
-        poses(make_c_model(found.scene, found.full, values), drive.qpos0, drive.command)[::every]
-        for values in (found.start, found.best)
-    )
+    drive = make_drive(found.scene, recording, weigh=False)
+    every, factors = max(1, round(1.0 / (RATE * drive.timestep))), servo_factors(found.scene, drive)
+    models = (scale_gains(make_c_model(found.scene, found.full, v), factors) for v in (found.start, found.best))
+    before, after = (poses(model, drive.qpos0, drive.command)[::every] for model in models)
     time = drive.timestep * every * np.arange(len(after))
     write_npz(out / REPLAY, {"time": time, "before": before, "after": after})
 

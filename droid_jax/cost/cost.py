@@ -35,11 +35,8 @@ from droid_jax.simulate.initial_state import StartConfig, following
 from droid_jax.simulate.inverse_dynamics import motion_path, prescribed
 from droid_jax.simulate.measured_motion import Motion, measured_motion
 from droid_jax.simulate.repeat_starts import from_one_start, own_starts
-from droid_jax.simulate.replay import (
-    Drive,
-    check_gains,
-    make_drive,
-)
+from droid_jax.simulate.replay import Drive, make_drive
+from droid_jax.simulate.servo_gains import check_gains, servo_factors
 
 ENGINES = ("mjx", "mujoco")
 
@@ -85,7 +82,9 @@ class Cost:
         return failed * np.array([c.config.failure_cost for c in self.comparisons])
 
     def smoothed(self, values: Any) -> tuple[np.ndarray, ...]:
-        """[P, D] -> for each recording the torques through the data's filter, [P, K, J] N m."""
+        """[P, D] -> for each recording its leading channel (the torque where compared) through the data's filter,
+        [P, K, C] in the channel's unit.
+        """
         return self._blockwise(values, self._smoothed, tuple)
 
     def rollouts(self, values: Any) -> tuple[Rollout, ...]:
@@ -290,7 +289,7 @@ def _compared(
     apart = _apart(replay, scene, recording, config) if isinstance(replay, Along) else None
     recording = _from_one_start(scene, space, recording, follows, replay, config.start)
     rest = follows.rest if isinstance(follows, Motion) else None
-    return make_comparison(scene, recording, _clock(recording, follows), config, apart, rest)
+    return make_comparison(scene, recording, replay_clock(recording, follows), config, apart, rest)
 
 
 def _apart(along: Along, scene: Scene, recording: Recording, config: CompareConfig) -> np.ndarray | None:
@@ -325,11 +324,14 @@ def _same(scene: Scene, new: Drive | Motion, old: Drive | Motion) -> bool:
 
 
 def _start_alike(scene: Scene, new: Drive | Motion, old: Drive | Motion, config: StartConfig) -> bool:
-    """Whether two drives start at one place, but for `alike`; motions, which are followed as they are, never do.
+    """Whether two drives have the same gains and start at one place, but for `alike`; motions, which are followed as
+    they are, never do.
 
     An object that stands ajar by about `ajar` is put back for some repeats and not for others.
     """
     if isinstance(new, Motion) or isinstance(old, Motion):
+        return False
+    if not np.array_equal(servo_factors(scene, new), servo_factors(scene, old)):
         return False
     apart = np.full(scene.model.nq, config.alike)
     if scene.object_joint and scene.object_joint not in scene.joints:
@@ -340,7 +342,7 @@ def _start_alike(scene: Scene, new: Drive | Motion, old: Drive | Motion, config:
     return bool(np.all(np.abs(new.qpos0 - old.qpos0) <= apart))
 
 
-def _clock(recording: Recording, follows: Drive | Motion) -> np.ndarray:
+def replay_clock(recording: Recording, follows: Drive | Motion) -> np.ndarray:
     """[T] s of a replay's rows, on the recording's clock."""
     return follows.time if isinstance(follows, Motion) else float(recording.time[0]) + follows.time
 

@@ -25,12 +25,15 @@ from droid_jax.simulate.initial_state import StartConfig
 from droid_jax.simulate.measured_motion import CUTOFF
 from droid_jax.simulate.rest import RestConfig
 
+LEADS = "torque"  # the channel that others, which follow from it through the servo, stand behind
+
 
 @dataclass(frozen=True)
 class CompareConfig:
     """How simulation and measurement are compared.
 
-    channels: weight of each compared channel in the distance (per unit of the channel).
+    channels: weight of each compared channel in the distance (per unit of the channel); `channels.in_noise_units`
+      weighs several by their noise.
     failure_cost: c of equation 1, N m, added where the grasp is lost or the door stays shut.
     non_finite_cost: N m, the cost of a replay that blew up.
     shut_angle: rad; a door that moves less than this (or half of what the measured one does) stayed shut; of a slide
@@ -88,7 +91,8 @@ class Comparison:
     config: CompareConfig
 
     def distance(self, rollout: Rollout) -> jax.Array:
-        """[] N m: equation 1, mean over repeats of ||tau_s - tau_r|| + c beta; finite always.
+        """[] N m, or the compared channel's unit: equation 1, mean over repeats of ||tau_s - tau_r|| + c beta; finite
+        always.
 
         The norm is the time mean of the Euclidean norm over the joints.
         """
@@ -150,9 +154,14 @@ class Comparison:
 
         return replace(self, channels=tuple(stated(c) for c in self.channels))
 
-    def smoothed(self, rollout: Rollout) -> jax.Array:
-        """[K, C] the rollout's torque through the filter the data went through."""
-        c = self.channel("torque")
+    @property
+    def leading(self) -> Measured:
+        """The channel that figures and checks are of: the torque where it is compared, else the first one."""
+        return next((c for c in self.channels if c.name == LEADS), self.channels[0])
+
+    def smoothed(self, rollout: Rollout, name: str | None = None) -> jax.Array:
+        """[K, C] a compared channel of the rollout (default: the leading one) through the filter of its data."""
+        c = self.leading if name is None else self.channel(name)
         return _smooth(c, _trace(rollout, c))
 
     def channel(self, name: str) -> Measured:

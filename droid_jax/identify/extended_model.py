@@ -24,7 +24,7 @@ from droid_jax.model.effects.candidate import Candidate, Keys
 from droid_jax.model.effects.registry import effect_space, library, ready
 from droid_jax.model.fields import check_space
 from droid_jax.model.mjcf import WORDS, fitted_mjcf, native
-from droid_jax.model.parameters import Space
+from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene
 from droid_jax.read_json import read_json, typed
@@ -99,18 +99,28 @@ def load_extended(path: str | Path, scene: Scene) -> Extended:
     Raises:
         ValueError: the file is missing or damaged, or belongs to another scene; it is named.
     """
-    path, scene = path_of(path, "the path of an extended model"), instance(scene, "scene", Scene)
+    scene, path = instance(scene, "scene", Scene), path_of(path, "the path of an extended model")
+    try:
+        return _of_file(_read(path), scene)
+    except ValueError as error:
+        raise ValueError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
+
+
+def base_parameters(path: Path) -> tuple[Parameter, ...]:
+    """The parameters in an extended.json that are no effect's; ValueError for a file that is missing or damaged."""
+    file = _read(path)
+    of_effects = {name for effect in file.effects for name in (*effect.coefficients, *effect.shape_parameters)}
+    return tuple(p for p in space_of(file.space).parameters if p.name not in of_effects)
+
+
+def _read(path: Path) -> _File:
     try:
         content = read_json(path)
     except FileNotFoundError:
         raise ValueError(f"{path}: there is no such file; `python -m droid_jax.run gap` writes one") from None
     if not isinstance(content, dict) or (content.get("format"), content.get("version")) != (FORMAT, VERSION):
         raise ValueError(f"{path}: expected a JSON object with format {FORMAT!r}, version {VERSION}")
-    file = typed(content, _File, str(path))
-    try:
-        return _of_file(file, scene)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+    return typed(content, _File, str(path))
 
 
 def _in_mjcf(effect: Effect, free: Space) -> bool:

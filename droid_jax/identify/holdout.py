@@ -3,31 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
 from droid_jax.cost.cost import Cost
+from droid_jax.cost.errors import ChannelErrors, channel_errors, channel_unit, sample_of
+from droid_jax.cost.observation import Measured
 from droid_jax.cost.residuals import Comparison, make_comparison
+from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording
 
 WORTH = 0.1  # share of the noise floor by which the distance before a fit must exceed it, unless a config says else
-Judged = Literal["repeats", "time", "same"]
+NOISE_UNITS = "noise units"
+Judged = Literal["repeats", "time", "same", "recordings"]
 
 
 @dataclass(frozen=True)
-class TorqueDistance:
-    """Disagreement with held-out repeats of one recording, N m, before and after the fit.
+class HeldoutDistance:
+    """Disagreement with what was held out of one recording, before and after the fit.
 
+    channels: what was compared; per-joint numbers are of the first one.  unit: of the distances, that of the channel,
+    or "noise units" where several are compared (`channels.in_noise_units`).
     before, after, noise_floor: equation 1 without penalty terms, all compared channels; floor is what a perfect
     model would leave, estimated from the scatter of all repeats, fitted and held out, about their mean.
     closed: share of the way from before to noise_floor; None where before does not exceed it by the share
     `worth` of it.
     Floors and closed are None where there is one repeat only.
-    per_joint_*: [J] root mean square of the smoothed torques' difference.
-    judged: on what: "repeats" that were held out, the last part in "time" of a log, or the "same" one repeat that was
-    fitted.
+    per_joint_*: [J] root mean square of the smoothed difference, in per_joint_unit.
+    judged: on what: "repeats" that were held out, the last part in "time" of a log, the "same" one repeat that was
+    fitted, or whole "recordings" that the fit did not see.
+    errors: by channel of all that were measured, in physical units.
     """
 
     before: float
@@ -38,6 +45,10 @@ class TorqueDistance:
     per_joint_after: tuple[float, ...]
     per_joint_noise_floor: tuple[float, ...] | None
     judged: Judged
+    channels: tuple[str, ...] = ("torque",)
+    unit: str = "N m"
+    per_joint_unit: str = "N m"
+    errors: dict[str, ChannelErrors] = field(default_factory=dict[str, ChannelErrors])
 
 
 def split_repeats(recording: Recording, share: float) -> tuple[Recording, Recording, tuple[int, ...]]:
@@ -64,29 +75,32 @@ def judged_on(recording: Recording, held: Recording) -> Judged:
     return "time" if recording.repeats == 1 else "repeats"
 
 
-def torque_distances(
+def heldout_distances(
     cost: Cost,
     recordings: Sequence[Recording],
     held: Sequence[Recording],
     before: np.ndarray,
     after: np.ndarray,
     worth: float = WORTH,
-) -> list[TorqueDistance]:
+    apart: bool = False,
+) -> list[HeldoutDistance]:
     """The distance to what was held out of each recording, of which `cost` is, at two parameter vectors [F].
 
     worth: share of the noise floor by which the start must exceed it, else there was nothing to close.
+    apart: the recordings are whole ones that no fit saw.
     """
     penalty_free = cost.distances(np.stack([before, after])) - cost.penalties(np.stack([before, after]))
-    smoothed = cost.smoothed(np.stack([before, after]))
-    out: list[TorqueDistance] = []
+    smoothed, rollouts = cost.smoothed(np.stack([before, after])), cost.rollouts(np.stack([before, after]))
+    out: list[HeldoutDistance] = []
     for i, (one, recording, own) in enumerate(zip(cost.comparisons, recordings, held, strict=True)):
-        rms = np.sqrt(np.mean((smoothed[i] - one.channel("torque").noise.mean) ** 2, axis=1))
+        rms = np.sqrt(np.mean((smoothed[i] - one.leading.noise.mean) ** 2, axis=1))
         alike = cost.from_one_start(i, recording)  # as the held-out repeats that `cost` compares
         everything = make_comparison(cost.scene, alike, one.clock, one.config) if recording.repeats > 1 else None
         floor = None if everything is None else _floor(everything)
+        pair = sample_of(rollouts[i], 0), sample_of(rollouts[i], 1)
         first, last = penalty_free[0, i], penalty_free[1, i]
         out.append(
-            TorqueDistance(
+            HeldoutDistance(
                 before=float(first),
                 after=float(last),
                 noise_floor=floor,
@@ -94,10 +108,26 @@ def torque_distances(
                 per_joint_before=tuple(rms[0].tolist()),
                 per_joint_after=tuple(rms[1].tolist()),
                 per_joint_noise_floor=None if everything is None else _smooth_floor(everything, one.repeats),
-                judged=judged_on(recording, own),
+                judged="recordings" if apart else judged_on(recording, own),
+                channels=tuple(c.name for c in one.channels),
+                unit=distance_unit(cost.scene, one),
+                per_joint_unit=unit_of(cost.scene, one.leading),
+                errors=channel_errors(cost.scene, cost.from_one_start(i, own), one.clock, *pair),
             )
         )
     return out
+
+
+def unit_of(scene: Scene, channel: Measured) -> str:
+    """Unit of a compared channel's columns in this scene."""
+    rows: list[int] = channel.columns.tolist()
+    joints = () if channel.name == "object_angle" else [scene.joints[c] for c in rows]
+    return channel_unit(scene, channel.name, joints, channel.unit)
+
+
+def distance_unit(scene: Scene, comparison: Comparison) -> str:
+    """Unit of equation 1: the compared channel's; of several, which enter by their noise, noise units."""
+    return unit_of(scene, comparison.channels[0]) if len(comparison.channels) == 1 else NOISE_UNITS
 
 
 def _closed(before: float, after: float, floor: float | None, worth: float = WORTH) -> float | None:
@@ -135,7 +165,7 @@ def _scatter(values: np.ndarray, mask: np.ndarray) -> float | None:
 
 def _smooth_floor(everything: Comparison, held: int) -> tuple[float, ...]:
     """[J] N m, what the noise of the mean of `held` repeats leaves of a smoothed difference."""
-    noise = everything.channel("torque").noise
+    noise = everything.leading.noise
     squares = ((noise.repeats - noise.mean) ** 2).sum(axis=0)
     variance = squares.sum(axis=0) / (noise.count - 1).sum(axis=0)
     return tuple(np.sqrt(variance / held).tolist())

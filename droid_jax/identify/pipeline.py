@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.arguments import check_fields, flag, instance, number, one_of, optional, whole
+from droid_jax.arguments import check_fields, flag, instance, number, one_of, optional, several, whole
+from droid_jax.cost.channels import SIMULATED, check_channels, in_noise_units, informative_channels
 from droid_jax.cost.cost import ENGINES, Cost, make_cost
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.identify.divergence import blow_up
 from droid_jax.identify.fit import Fit
 from droid_jax.identify.gaussian import Gaussian, prior, space_to_json
-from droid_jax.identify.holdout import WORTH, TorqueDistance, split_repeats, torque_distances
+from droid_jax.identify.holdout import WORTH, HeldoutDistance, heldout_distances, split_repeats
 from droid_jax.identify.identifiability import (
     Identifiability,
     IdentifiabilityConfig,
@@ -50,9 +51,12 @@ class IdentifyConfig:
         samples: replays drawn from the initial and from the fitted Gaussian to compare their costs.
         seed: of those samples (the search has its own).
         compare: how simulation and measurement are compared.
+        channels: the measured channels to fit. Several are weighted by their noise (`channels.in_noise_units`). None:
+            those of `compare` where it names other ones, or weights, than its default, else what is informative
+            (`channels.informative_channels`): torque, or without it position and the object's angle.
         identifiability: what decides the calibrated width, and when a parameter counts as identifiable.
         worth: share of the noise floor by which the distance before the fit must exceed it, else there was nothing to
-            close and `TorqueDistance.closed` is None.
+            close and `HeldoutDistance.closed` is None.
         checks: measure what the time step and the engine leave at the fitted values (`solution_checks`), which takes
             one more compilation.
 
@@ -67,6 +71,7 @@ class IdentifyConfig:
     samples: int = 200
     seed: int = 0
     compare: CompareConfig = field(default_factory=CompareConfig)
+    channels: tuple[str, ...] | None = None
     identifiability: IdentifiabilityConfig = field(default_factory=IdentifiabilityConfig)
     worth: float = WORTH
     checks: bool = True
@@ -81,6 +86,7 @@ class IdentifyConfig:
             samples=partial(whole, least=0),
             seed=partial(whole, least=0),
             compare=partial(instance, kind=CompareConfig),
+            channels=optional(several(partial(one_of, valid=SIMULATED))),
             identifiability=partial(instance, kind=IdentifiabilityConfig),
             worth=partial(number, least=0),
             checks=flag,
@@ -94,7 +100,8 @@ class Identified:
     space: what was searched; full: with the nuisances (the same where nothing was refined).
     best: [F] physical values over `full`.  gaussian: over `space`, the one to hand on; full_gaussian
     over `full`.  search: the CMA-ES part.  refined: or None.  identifiability: per parameter of `full`.
-    torque_distances: by recording name.  fit, heldout: costs over `full` on the fitted and the held-out repeats.
+    heldout_distances: by name of the recording that judges.  fit, heldout: costs over `full` on what was fitted and on
+    what judges.
     heldout_repeats: by recording name.  seconds: by stage.  checks: by recording name, of those with commands.
     config: the settings it was found with.
     """
@@ -108,7 +115,7 @@ class Identified:
     search: Fit
     refined: Refined | None
     identifiability: tuple[Identifiability, ...]
-    torque_distances: dict[str, TorqueDistance]
+    heldout_distances: dict[str, HeldoutDistance]
     fit: Cost
     heldout: Cost
     heldout_repeats: dict[str, tuple[int, ...]]
@@ -131,8 +138,9 @@ _FIELDS = tuple(Rollout.__dataclass_fields__)
 class Preparation:
     """What is to be identified, checked: costs over `full`, which is `space` with the nuisances that are fitted.
 
-    heldout_count: the repeats of each recording that the fit does not see; heldout_repeats: their numbers.  fit,
-    heldout: costs on the other repeats and on these.  seconds: that this took.
+    heldout_count: the repeats of each recording that the fit does not see; heldout_repeats: their numbers.
+    judges: whole recordings that judge instead; then no repeat is held out.  fit, heldout: costs on what is fitted and
+    on what judges.  seconds: that this took.
     """
 
     scene: Scene
@@ -143,6 +151,7 @@ class Preparation:
     recordings: tuple[Recording, ...]
     heldout_count: tuple[Recording, ...]
     heldout_repeats: tuple[tuple[int, ...], ...]
+    judges: tuple[Recording, ...]
     fit: Cost
     heldout: Cost
     fingerprint: str
@@ -157,6 +166,7 @@ def identify_parameters(
     nuisances: Space | None = None,
     config: IdentifyConfig | None = None,
     effects: Sequence[Effect] = (),
+    judge_on: Sequence[Recording] = (),
     checkpoints: Path | None = None,
     progress: Progress | None = None,
 ) -> Identified:
@@ -169,6 +179,8 @@ def identify_parameters(
         nuisances: fitted and marginalised beside it in the refinement; None for none.
         config: settings; None for the defaults.
         effects: in the model beside what the scene has; their parameters are in `space` or stay at neutral.
+        judge_on: whole recordings to judge the fit; all repeats of `recordings` are then fitted. None: the last repeats
+            judge, or the last part in time of a log; a commanded recording of one repeat is judged on itself.
         checkpoints: folder where the search saves itself and from which it resumes.
         progress: called with a stage's name and its progress value.
 
@@ -176,10 +188,10 @@ def identify_parameters(
         Everything found; its `gaussian` is the distribution to hand on.
 
     Raises:
-        ValueError: recordings of one name, no torque compared, several recordings without the refinement (the search
-            sees the first alone), or initial means that cannot be simulated.
+        ValueError: recordings of one name, no channel to compare, several recordings without the refinement (the
+            search sees the first alone), or initial means that cannot be simulated.
     """
-    problem = prepare(scene, space, recordings, nuisances=nuisances, config=config, effects=effects)
+    problem = prepare(scene, space, recordings, nuisances=nuisances, config=config, effects=effects, judge_on=judge_on)
     return run_fit(problem, checkpoints=checkpoints, progress=progress)
 
 
@@ -191,29 +203,41 @@ def prepare(
     nuisances: Space | None = None,
     config: IdentifyConfig | None = None,
     effects: Sequence[Effect] = (),
+    judge_on: Sequence[Recording] = (),
 ) -> Preparation:
     """The part of `identify_parameters` before the search: whatever is wrong with the input is told here, and
     nothing written.
     """
     began = time.monotonic()
     config = instance(IdentifyConfig() if config is None else config, "config", IdentifyConfig)
-    recordings = recordings_of(recordings)
-    _check_names([r.name for r in recordings], config)
+    recordings, judges = recordings_of(recordings), recordings_of(judge_on) if judge_on else ()
+    _check_names([r.name for r in recordings], [r.name for r in judges], config)
     instance(space, "space", Space)
     if nuisances is not None:
         instance(nuisances, "nuisances", Space)
     recordings = [own_starts(recording, config.compare.start) for recording in recordings]
-    fitted, held, numbers = zip(*(split_repeats(r, config.heldout) for r in recordings), strict=True)
+    judges = tuple(own_starts(recording, config.compare.start) for recording in judges)
+    chosen = _chosen_channels(scene, [*recordings, *judges], config)
+    if chosen:
+        config = replace(config, compare=replace(config.compare, channels=dict.fromkeys(chosen, 1.0)))
+    check_channels([*recordings, *judges], config.compare.channels)
+    if judges:
+        fitted, held, numbers = recordings, judges, tuple(() for _ in recordings)
+    else:
+        fitted, held, numbers = zip(*(split_repeats(r, config.heldout) for r in recordings), strict=True)
     full = space if nuisances is None or config.refine is None else space + nuisances
     base = make_cost(scene, full, fitted, engine=config.engine, config=config.compare, effects=effects, check=False)
-    for recording in recordings:  # whole: copies among its repeats may be fitted and held out
+    if len(chosen) > 1:
+        config = replace(config, compare=replace(config.compare, channels=in_noise_units(base, full.mean)))
+        base = base.against(fitted, config.compare)
+    for recording in (*recordings, *judges):  # whole: copies among its repeats may be fitted and held out
         warn_of_log(scene, recording)
     # now, since what is held out may have faults of its own, and those are to be told before anything long
     plain = replace(config.compare, whitened=False)
     commanded = all(r.command.size for r in recordings)
     heldout = (
         base.against(held, plain)
-        if commanded
+        if commanded and not judges
         else make_cost(scene, full, held, config=plain, effects=effects, check=False)
     )
     _check_start(base, full)
@@ -226,6 +250,7 @@ def prepare(
         recordings=tuple(recordings),
         heldout_count=held,
         heldout_repeats=numbers,
+        judges=judges,
         fit=base,
         heldout=heldout,
         fingerprint=_fingerprint(scene, full, fitted[0], config, effects),
@@ -278,7 +303,8 @@ def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: 
 
     began = time.monotonic()
     report("judge", None)
-    gaps = torque_distances(problem.heldout, problem.recordings, problem.heldout_count, full.mean, best, config.worth)
+    judges, apart = problem.judges or problem.recordings, bool(problem.judges)
+    gaps = heldout_distances(problem.heldout, judges, problem.heldout_count, full.mean, best, config.worth, apart)
     seconds["judge"] = time.monotonic() - began
 
     began = time.monotonic()
@@ -297,7 +323,7 @@ def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: 
         identifiability=(
             not_judged(full_gaussian) if refined is None else identifiability(full_gaussian, refined.prior, judging)
         ),
-        torque_distances=dict(zip(names, gaps, strict=True)),
+        heldout_distances=dict(zip((r.name for r in judges), gaps, strict=True)),
         fit=base,
         heldout=problem.heldout,
         heldout_repeats=dict(zip(names, problem.heldout_repeats, strict=True)),
@@ -311,12 +337,20 @@ def _silent(stage: str, value: Any) -> None:
     """No progress is shown."""
 
 
-def _check_names(names: Sequence[str], config: IdentifyConfig) -> None:
-    """ValueError for recordings that cannot be fitted together, or not to torques."""
-    if len(set(names)) != len(names):
-        raise ValueError(f"recordings need different names, got {', '.join(names)}")
-    if "torque" not in config.compare.channels:
-        raise ValueError(f"an identification compares torques, got the channels {', '.join(config.compare.channels)}")
+def _chosen_channels(scene: Scene, recordings: Sequence[Recording], config: IdentifyConfig) -> tuple[str, ...]:
+    """The channels that this module weighs; none where `compare` states its own."""
+    if config.channels:
+        return config.channels
+    if config.compare.channels != CompareConfig().channels:
+        return ()
+    return informative_channels(scene, recordings)
+
+
+def _check_names(names: Sequence[str], judges: Sequence[str], config: IdentifyConfig) -> None:
+    """ValueError for recordings that cannot be fitted together."""
+    both = [*names, *judges]
+    if len(set(both)) != len(both):
+        raise ValueError(f"recordings need different names, got {', '.join(both)}")
     if config.refine is None and len(names) > 1:
         raise ValueError(
             f"without the refinement (as in preset paper) one recording is fitted, got {len(names)}: "

@@ -16,6 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from droid_jax.cost.errors import errors_json, sample_of
+from droid_jax.cost.observation import Measured
 from droid_jax.files import (
     CONFIG,
     CORRELATION,
@@ -31,10 +33,12 @@ from droid_jax.files import (
 )
 from droid_jax.identify.fit import on_bound
 from droid_jax.identify.gaussian import prior
+from droid_jax.identify.holdout import NOISE_UNITS
 from droid_jax.identify.pipeline import Identified
 from droid_jax.identify.solution_checks import solution_notes
 from droid_jax.model.mjcf import fitted_mjcf, unwritten
 from droid_jax.model.parameters import Space
+from droid_jax.model.scene import Scene
 from droid_jax.preflight.findings import Finding
 from droid_jax.storage import config_json, finite, write_csv, write_json, write_npz, write_text
 
@@ -127,10 +131,12 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
             }
         )
     costs = found.fit(np.stack([found.start, found.best]))
-    floors: list[Any] = [g.noise_floor for g in found.torque_distances.values()]
+    floors: list[Any] = [g.noise_floor for g in found.heldout_distances.values()]
     comparison = found.fit.comparisons[0]
-    whitened = comparison.config.whitened  # the gaps' floors are in the unit of the torque
-    unit = found.scene.torque_unit(found.scene.joints[c] for c in comparison.channel("torque").columns)
+    whitened = comparison.config.whitened  # the distances' floors are in the unit of the channel
+    judges = list(found.heldout_distances.values())
+    unit = judges[0].unit
+    fitted = judges[0].judged != "recordings"  # floors of other recordings are none of this cost
     evaluations = found.search.evaluations + (found.refined.evaluations if found.refined else 0)
     return {
         "format": FORMAT,
@@ -139,11 +145,15 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
         "cost": {
             "initial": float(costs[0]),
             "best": float(costs[1]),
-            "noise_floor": None if whitened or None in floors else float(np.mean(floors)),
-            "unit": "noise units" if whitened else unit,
+            "noise_floor": float(np.mean(floors)) if fitted and not whitened and None not in floors else None,
+            "unit": NOISE_UNITS if whitened else unit,
         },
-        "torque_distances": {name: asdict(distance) for name, distance in found.torque_distances.items()},
-        "torque_unit": unit,
+        "heldout_distances": {
+            name: asdict(distance) | {"errors": errors_json(distance.errors)}
+            for name, distance in found.heldout_distances.items()
+        },
+        "distance_unit": unit,
+        "compared": dict(comparison.config.channels),
         "stop": found.search.stop,
         "converged": None if found.refined is None else found.refined.converged,
         "mean_square": None if found.refined is None else float(np.mean(found.refined.residual**2)),
@@ -186,18 +196,32 @@ def _physical_deviation(space: Space, mean: np.ndarray, std: np.ndarray) -> np.n
 
 
 def traces(found: Identified) -> dict[str, np.ndarray]:
-    """Smoothed joint torques of each recording: held-out repeats, before and after the fit."""
-    both = found.heldout.smoothed(np.stack([found.start, found.best]))
+    """Smoothed channels of each recording that judges, before and after the fit: the leading one under the recording's
+    name, the others under recording/channel.
+    """
+    both, rollouts = np.stack([found.start, found.best]), found.heldout.rollouts(np.stack([found.start, found.best]))
     out: dict[str, np.ndarray] = {}
-    for i, comparison in enumerate(found.heldout.comparisons):
-        channel = comparison.channel("torque")
-        repeats = channel.noise.repeats
-        name = comparison.name
-        out[f"{name}/time"] = channel.clock
-        out[f"{name}/measured_mean"] = channel.noise.mean
-        out[f"{name}/measured_low"] = np.quantile(repeats, 0.05, axis=0)
-        out[f"{name}/measured_high"] = np.quantile(repeats, 0.95, axis=0)
-        out[f"{name}/before"], out[f"{name}/after"] = both[i]
-        out[f"{name}/joints"] = np.array([found.scene.joints[c] for c in channel.columns])
-        out[f"{name}/phases"] = np.array(json.dumps([asdict(phase) for phase in comparison.phases]))
+    for comparison, pair in zip(found.heldout.comparisons, rollouts, strict=True):
+        rows = [sample_of(pair, row) for row in range(len(both))]
+        for channel in comparison.channels:
+            leads = channel is comparison.leading
+            place = comparison.name if leads else f"{comparison.name}/{channel.name}"
+            lines = [np.asarray(comparison.smoothed(row, channel.name)) for row in rows]
+            out |= {f"{place}/{key}": value for key, value in _of_channel(found.scene, channel, *lines).items()}
+        out[f"{comparison.name}/phases"] = np.array(json.dumps([asdict(phase) for phase in comparison.phases]))
     return out
+
+
+def _of_channel(scene: Scene, channel: Measured, before: np.ndarray, after: np.ndarray) -> dict[str, np.ndarray]:
+    """A channel measured, with the spread of its repeats, and simulated [K, C]."""
+    repeats = channel.noise.repeats
+    joints = [scene.joints[c] for c in channel.columns]
+    return {
+        "time": channel.clock,
+        "measured_mean": channel.noise.mean,
+        "measured_low": np.quantile(repeats, 0.05, axis=0),
+        "measured_high": np.quantile(repeats, 0.95, axis=0),
+        "before": before,
+        "after": after,
+        "joints": np.array([scene.object_joint] if channel.name == "object_angle" else joints),
+    }

@@ -16,6 +16,7 @@ import numpy as np
 from droid_jax import runtime
 from droid_jax.cost.cost import Cost
 from droid_jax.cost.residuals import Comparison
+from droid_jax.identify.holdout import unit_of
 from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_c_model, make_physics
@@ -35,14 +36,14 @@ C_STEPS = 400_000  # of the C engine at most, some ten seconds
 
 @dataclass(frozen=True)
 class SolutionCheck:
-    """What was measured of one recording's replay at the fitted values; torques through the data's filter.
+    """What was measured of one recording's replay at the fitted values; of a channel through its data's filter.
 
-    unit: of torques.  time_step: s.  remaining: root mean square over joints and time of simulated less measured
-    torque, and no less than noise can be.
-    parity_torque, parity_rms: largest and root mean square difference of the torque to the other engine (of a fit in
+    channel: the leading one of those compared.  unit: of it.  time_step: s.  remaining: root mean square over joints
+    and time of simulated less measured channel, and no less than noise can be.
+    parity_largest, parity_rms: largest and root mean square difference of the channel to the other engine (of a fit in
     MJX plain C MuJoCo as its time step goes to zero, of one in C MJX); parity_angle: largest difference of a position,
     rad or m; None where it cannot run the replay.
-    discretisation: root mean square by which the torque changes at half the time step; parity_rms where that is small
+    discretisation: root mean square by which the channel changes at half the time step; parity_rms where that is small
     enough already (a difference to C without a time step holds the step's error), None where it was not measured.
     unmeasured: why something was not measured, empty where all was.
     """
@@ -51,14 +52,15 @@ class SolutionCheck:
     time_step: float
     remaining: float
     discretisation: float | None = None
-    parity_torque: float | None = None
+    parity_largest: float | None = None
     parity_rms: float | None = None
     parity_angle: float | None = None
     unmeasured: str = ""
+    channel: str = "torque"
 
     @property
     def too_coarse(self) -> bool:
-        """Whether the time step changes the torque by more than LARGE of what the fit leaves."""
+        """Whether the time step changes the channel by more than LARGE of what the fit leaves."""
         return self.discretisation is not None and self.discretisation > LARGE * self.remaining
 
     @property
@@ -101,18 +103,19 @@ def solution_notes(found: Mapping[str, SolutionCheck], scene: str) -> list[str]:
     """What is to be known of a time step that is too coarse, and of engines that differ."""
     said = []
     for name, check in found.items():
+        channel = check.channel.replace("_", " ")
         left = f"the {check.remaining:.2g} {check.unit} that the fit leaves"
         if check.too_coarse:
             said.append(
                 f"the time step of scene {scene!r} is too coarse: at half of its {1e3 * check.time_step:g} ms the "
-                f"fitted torques of {name!r} change by {check.discretisation:.2g} {check.unit} (root mean square), "
+                f"fitted {channel}s of {name!r} change by {check.discretisation:.2g} {check.unit} (root mean square), "
                 f"{_share(check.discretisation, check.remaining)} of {left}, and the fitted values make up for it: "
                 "give <option> a smaller timestep and fit again"
             )
         if check.engines_differ:
             said.append(
-                f"MJX and plain C MuJoCo differ at the fitted values of scene {scene!r}: torques of {name!r} by "
-                f"{check.parity_rms:.2g} {check.unit} (root mean square; {check.parity_torque:.2g} at most, positions "
+                f"MJX and plain C MuJoCo differ at the fitted values of scene {scene!r}: {channel}s of {name!r} by "
+                f"{check.parity_rms:.2g} {check.unit} (root mean square; {check.parity_largest:.2g} at most, positions "
                 f"by {check.parity_angle:.2g} rad or m), {_share(check.parity_rms, check.remaining)} of {left}: a fit "
                 "or a policy may not carry over from one engine to the other"
             )
@@ -146,11 +149,13 @@ class _Replayed:
 
     def checked(self, engine: str, may_compile: bool) -> tuple[SolutionCheck, bool]:
         """The checks, and whether they took a compilation."""
-        mj_step, torque = self.comparison.config.mj_step, self.comparison.channel("torque")
-        left = _rms(self._torque(self.rollout) - torque.noise.mean)
-        check = SolutionCheck(
-            torque.unit, self.drive.timestep, max(left, self.comparison.config.noise.minimum["torque"])
+        mj_step, channel = self.comparison.config.mj_step, self.comparison.leading
+        left = max(
+            _rms(self._filtered(self.rollout) - channel.noise.mean),
+            self.comparison.config.noise.minimum[channel.name],
         )
+        unit = unit_of(self.cost.scene, channel)
+        check = SolutionCheck(unit, self.drive.timestep, left, channel=channel.name)
         if engine == "mujoco":
             if not mj_step:
                 check = self._with_step(check, self._in_c(2))
@@ -167,16 +172,16 @@ class _Replayed:
     def _with_step(self, check: SolutionCheck, half: Rollout | str) -> SolutionCheck:
         if isinstance(half, str):
             return replace(check, unmeasured="; ".join(filter(None, (check.unmeasured, half))))
-        return replace(check, discretisation=_rms(self._torque(half) - self._torque(self.rollout)))
+        return replace(check, discretisation=_rms(self._filtered(half) - self._filtered(self.rollout)))
 
     def _with_parity(self, check: SolutionCheck, other: Rollout | str) -> SolutionCheck:
         if isinstance(other, str):
             return replace(check, unmeasured="; ".join(filter(None, (check.unmeasured, other))))
-        off = self._torque(other) - self._torque(self.rollout)
+        off = self._filtered(other) - self._filtered(self.rollout)
         largest = float(np.abs(off).max())
-        return replace(check, parity_torque=largest, parity_rms=_rms(off), parity_angle=self._angle(other))
+        return replace(check, parity_largest=largest, parity_rms=_rms(off), parity_angle=self._angle(other))
 
-    def _torque(self, rollout: Rollout) -> np.ndarray:
+    def _filtered(self, rollout: Rollout) -> np.ndarray:
         """[K, C] through the data's filter."""
         return np.asarray(self.comparison.smoothed(rollout), np.float64)
 

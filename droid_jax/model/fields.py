@@ -218,6 +218,31 @@ def _check_frictionloss(scene: Scene, joint: str) -> None:
         )
 
 
+def shared(parameters: Sequence[Parameter], name: str | None = None) -> Parameter:
+    """One parameter that writes what several write: servos of one type have one armature.
+
+    Args:
+        parameters: alike but for what they write, such as `model_parameter` of each joint.
+        name: of the shared one; None joins the names with "+".
+
+    Raises:
+        ValueError: none is given, one of them writes no field of the model, or they start from different numbers of
+            the model, none of which can stand for all.
+    """
+    if not parameters:
+        raise ValueError("a shared parameter needs at least one that it is made of")
+    first = parameters[0]
+    if absent := [p.name for p in parameters if not p.writes]:
+        raise ValueError(f"parameters {', '.join(absent)} write no field of the model, so they cannot be shared")
+    if other := [p for p in parameters if not np.isclose(p.mean, first.mean, rtol=1e-9, atol=0.0)]:
+        raise ValueError(
+            f"{first.name} is {first.mean:g} in the model and {other[0].name} is {other[0].mean:g}: state the mean "
+            'from which both start, or scale each own number ("mode": "scale", as Mode.SCALE)'
+        )
+    joined = "+".join(dict.fromkeys(p.name for p in parameters)) if name is None else name
+    return replace(first, name=joined, writes=tuple(w for p in parameters for w in p.writes))
+
+
 def joint_damping(scene: Scene, joint: str, *, std: float, high: float, **options: Any) -> Parameter:
     """Viscous damping of a joint, N m s/rad; log-scaled unless told otherwise."""
     options = {"unit": "N m s/rad", "scaling": Scaling.LOG, "log_offset": 0.05, **options}

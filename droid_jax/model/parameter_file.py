@@ -18,10 +18,15 @@ and high.
 
 The delay of the commands, s, a nuisance unless it says otherwise, and a factor on the position gain of a joint's
 servo have no element.
+
+    {"field": "dof_armature", "element": ["shoulder", "elbow"], "name": "rotor", "std": 0.01, "high": 0.2}
+
+A list of elements (of joints, for "servo") or of columns makes one parameter that they share.
 """
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from collections.abc import Mapping
 from dataclasses import replace
@@ -32,7 +37,15 @@ import msgspec
 
 from droid_jax.arguments import instance, path_of
 from droid_jax.errors import faults
-from droid_jax.model.fields import ENCODER, body_mass, joint_encoder_offset, model_parameter, servo_scale, time_offset
+from droid_jax.model.fields import (
+    ENCODER,
+    body_mass,
+    joint_encoder_offset,
+    model_parameter,
+    servo_scale,
+    shared,
+    time_offset,
+)
 from droid_jax.model.joint_friction import TERMS, sensor_parameter
 from droid_jax.model.parameters import Mode, Parameter, Role, Scaling, Space
 from droid_jax.model.scene import Scene
@@ -48,8 +61,8 @@ class _Entry(msgspec.Struct, forbid_unknown_fields=True):
 
     field: str | msgspec.UnsetType = msgspec.UNSET
     sensor: str | msgspec.UnsetType = msgspec.UNSET
-    servo: str | msgspec.UnsetType = msgspec.UNSET
-    element: str | msgspec.UnsetType = msgspec.UNSET
+    servo: str | list[str] | msgspec.UnsetType = msgspec.UNSET
+    element: str | list[str] | msgspec.UnsetType = msgspec.UNSET
     name: str | msgspec.UnsetType = msgspec.UNSET
     unit: str | msgspec.UnsetType = msgspec.UNSET
     group: str | msgspec.UnsetType = msgspec.UNSET
@@ -61,7 +74,7 @@ class _Entry(msgspec.Struct, forbid_unknown_fields=True):
     width: float | msgspec.UnsetType = msgspec.UNSET
     mode: Mode | msgspec.UnsetType = msgspec.UNSET
     scaling: Scaling | msgspec.UnsetType = msgspec.UNSET
-    column: int | msgspec.UnsetType = msgspec.UNSET
+    column: int | list[int] | msgspec.UnsetType = msgspec.UNSET
     nuisance: bool | msgspec.UnsetType = msgspec.UNSET
 
 
@@ -102,7 +115,8 @@ def load_parameters(path: str | Path, scene: Scene) -> Space:
 def friction_joints(path: str | Path) -> tuple[str, ...]:
     """Joints whose friction loss the file asks for: the scene must be compiled with a row for them."""
     entries: list[dict[str, Any]] = [e for e in _entries(Path(path)) if isinstance(e, dict)]
-    return tuple(str(e["element"]) for e in entries if e.get("field") == "dof_frictionloss" and "element" in e)
+    asked = [e["element"] for e in entries if e.get("field") == "dof_frictionloss" and "element" in e]
+    return tuple(str(joint) for element in asked for joint in _each(element))
 
 
 def _entries(path: Path) -> list[Any]:
@@ -131,26 +145,52 @@ def _parameter(scene: Scene, given: Any, where: str) -> Parameter:
     read = msgspec.structs.asdict(typed(entry, _Entry, where))
     options: dict[str, Any] = {key: value for key, value in read.items() if value is not msgspec.UNSET}
     try:
-        field, sensor, servo = (options.pop(kind, None) for kind in ("field", "sensor", "servo"))
-        if servo is not None:
-            return servo_scale(scene, servo, **options)
-        if sensor == _TIME:
-            return replace(time_offset(options.pop("std"), options.pop("high")), **options)
-        element = options.pop("element")
-        if sensor is not None and sensor not in (*TERMS, ENCODER):
-            raise ValueError(f"unknown sensor term {sensor!r}; valid: {', '.join((*TERMS, ENCODER))}")
-        if sensor == ENCODER:
-            _check_measured(scene, element)
-            return joint_encoder_offset(scene, element, **options)
-        if sensor is not None:
-            return sensor_parameter(scene.joints, sensor, element, **options)
-        if field == "body_mass" and options.get("mode", Mode.SET) is Mode.SET:
-            options.pop("mode", None)
-            return body_mass(scene, element, **options)
-        options = {"unit": "", **options}
-        return model_parameter(scene, field, element, options.pop("column", None), **options)
+        if isinstance(options.get("element", options.get("servo")), list) or isinstance(options.get("column"), list):
+            return _shared(scene, options)
+        return _single(scene, options)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{where}: {error}") from None
+
+
+def _shared(scene: Scene, options: Mapping[str, Any]) -> Parameter:
+    """One parameter of several elements, of several columns, or both."""
+    which = "servo" if "servo" in options else "element"
+    if "sensor" in options:
+        raise ValueError("a sensor's term belongs to one joint: give each an entry of its own")
+    columns = {"column": _each(options["column"])} if "column" in options else {}
+    keys, choices = (which, *columns), (_each(options[which]), *columns.values())
+    if not all(choices):
+        raise ValueError(f"{which}: an empty list names nothing")
+    combinations = [dict(zip(keys, choice, strict=True)) for choice in itertools.product(*choices)]
+    parts = [_single(scene, {**options, **combination}) for combination in combinations]
+    return shared(parts, name=options.get("name"))
+
+
+def _each(value: Any) -> list[Any]:
+    return cast(list[Any], value) if isinstance(value, list) else [value]
+
+
+def _single(scene: Scene, given: Mapping[str, Any]) -> Parameter:
+    """The parameter of one element."""
+    options: dict[str, Any] = dict(given)
+    field, sensor, servo = (options.pop(kind, None) for kind in ("field", "sensor", "servo"))
+    if servo is not None:
+        return servo_scale(scene, servo, **options)
+    if sensor == _TIME:
+        return replace(time_offset(options.pop("std"), options.pop("high")), **options)
+    element = options.pop("element")
+    if sensor is not None and sensor not in (*TERMS, ENCODER):
+        raise ValueError(f"unknown sensor term {sensor!r}; valid: {', '.join((*TERMS, ENCODER))}")
+    if sensor == ENCODER:
+        _check_measured(scene, element)
+        return joint_encoder_offset(scene, element, **options)
+    if sensor is not None:
+        return sensor_parameter(scene.joints, sensor, element, **options)
+    if field == "body_mass" and options.get("mode", Mode.SET) is Mode.SET:
+        options.pop("mode", None)
+        return body_mass(scene, element, **options)
+    options.setdefault("unit", "")
+    return model_parameter(scene, field, element, options.pop("column", None), **options)
 
 
 def _check_measured(scene: Scene, joint: str) -> None:

@@ -14,6 +14,7 @@ from droid_jax.preflight.limits import clipped_commands, exceeded_torques
 from droid_jax.recordings.recording import Channel, Recording
 from droid_jax.simulate.closed_loops import OPEN, open_loops
 from droid_jax.simulate.initial_state import sent_to, told_start
+from droid_jax.simulate.servo_gains import gains_note
 
 BEGINNING = 0.02  # s (six rows at least), in which the speed at the start is looked at
 MOVING = 0.25  # of the motion's largest speed: a joint that is faster at the start does not begin at rest
@@ -24,12 +25,14 @@ TURNS = 4  # from its zero, that a hinge without a range is believed to make; de
 
 def command_notes(scene: Scene, recording: Recording) -> list[str]:
     """What is to be known of the commands: a <motor> that takes radians for torques, geared servos, actuators that got
-    none, loops that are closed first, commands and torques beyond limits, joints that creep while friction holds them.
+    none, other gains than the scene's, loops that are closed first, commands and torques beyond limits, joints that
+    creep while friction holds them.
     """
     said = (
         open_loop(scene, recording),
         geared(scene, recording),
         left_alone(scene, recording),
+        gains_note(scene, recording),
         closed_loop(scene, recording),
         clipped_commands(scene, recording),
         exceeded_torques(scene, recording),

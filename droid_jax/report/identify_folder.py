@@ -91,17 +91,56 @@ class FittedParameter(Struct, frozen=True, kw_only=True):
         return self.truth is not None and self.interval[0] <= self.truth <= self.interval[1]
 
 
+class ErrorsEntry(Struct, frozen=True, kw_only=True):
+    """Errors of one measured channel, joint by joint [C], in its unit; None where a replay blew up."""
+
+    unit: str
+    joints: list[str]
+    mae_before: list[float | None]
+    mae_after: list[float | None]
+    rms_before: list[float | None]
+    rms_after: list[float | None]
+
+    @property
+    def rows(self) -> list[tuple[str, float | None, float | None, float | None, float | None]]:
+        """Of each joint its name and its errors: mean absolute before and after, RMS before and after."""
+        columns = (self.joints, self.mae_before, self.mae_after, self.rms_before, self.rms_after)
+        return list(zip(*columns, strict=True))
+
+    @property
+    def mean_mae(self) -> tuple[float | None, float | None]:
+        """Mean absolute error over the joints, before and after the fit."""
+        return mean_of(self.mae_before), mean_of(self.mae_after)
+
+
+def mean_of(values: Sequence[float | None]) -> float | None:
+    """The mean; None where a number is missing."""
+    there = [v for v in values if v is not None]
+    return float(np.mean(there)) if values and len(there) == len(values) else None
+
+
 class DistanceEntry(Struct, frozen=True, kw_only=True):
-    """Torque distance (equation 1) of one recording before and after the fit, and what repeats differ by."""
+    """Distance (equation 1) of one recording before and after the fit, and what repeats differ by.
+
+    per_joint_*: [J] root mean square of the first of the compared channels that figures are of, in per_joint_unit.
+    """
 
     before: float
     after: float
     noise_floor: float | None = None
     closed: float | None = None
-    judged: Literal["repeats", "time", "same"] = "repeats"  # held-out repeats, the log's last part, what was fitted
-    per_joint_before: list[float]  # [J] root mean square
+    judged: Literal["repeats", "time", "same", "recordings"] = "repeats"  # or the log's last part, what was fitted
+    per_joint_before: list[float]
     per_joint_after: list[float]
     per_joint_noise_floor: list[float] | None = None
+    per_joint_unit: str = "N m"
+    channels: list[str] = field(default_factory=lambda: ["torque"])
+    errors: dict[str, ErrorsEntry] = field(default_factory=dict)
+
+    @property
+    def leading(self) -> str:
+        """The compared channel that figures and numbers of each joint are of."""
+        return "torque" if "torque" in self.channels else self.channels[0]
 
 
 class CostEntry(Struct, frozen=True):
@@ -121,19 +160,21 @@ class Check(Struct, frozen=True):
     remaining: float
     unmeasured: str
     discretisation: float | None
-    parity_torque: float | None
+    parity_largest: float | None
     parity_rms: float | None
     parity_angle: float | None
     too_coarse: bool
     engines_differ: bool
+    channel: str = "torque"
 
 
 class Distances(Struct, frozen=True, kw_only=True):
-    """The torque distances of fit.json, by recording."""
+    """The distances of fit.json, by the recording that judges."""
 
-    torque_distances: dict[str, DistanceEntry] = field(default_factory=dict)
+    heldout_distances: dict[str, DistanceEntry] = field(default_factory=dict)
     version: int = 1
-    torque_unit: str = "N m"
+    distance_unit: str = "N m"
+    compared: dict[str, float] = field(default_factory=dict)  # weight of each channel
 
 
 class FitFile(Distances, frozen=True, kw_only=True):
@@ -151,6 +192,11 @@ class FitFile(Distances, frozen=True, kw_only=True):
     notes: list[str] = field(default_factory=list)
     findings: list[FindingEntry] = field(default_factory=list)
     checks: dict[str, Check] = field(default_factory=dict)
+
+    @property
+    def channels(self) -> list[str]:
+        """What was compared, the same in all recordings."""
+        return next(iter(self.heldout_distances.values())).channels
 
     @property
     def of_interest(self) -> list[FittedParameter]:
@@ -181,10 +227,16 @@ class RunConfig(Struct, frozen=True):
     recordings: list[RecordingEntry]
     seed: int
     synthetic_robot: bool
+    judged_on: list[RecordingEntry] = field(default_factory=list)  # whole recordings that the fit did not see
     started: str | None = None
     device: str | None = None
     versions: dict[str, str] = field(default_factory=dict)
     setup: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def judges(self) -> list[RecordingEntry]:
+        """The recordings that the fit was judged on, in whole or in part."""
+        return self.judged_on or self.recordings
 
 
 _READ = Reader("identify")
@@ -197,7 +249,7 @@ _TRACE_KEYS = ("time", "measured_mean", "measured_low", "measured_high", "before
 class Run:
     """The folder of an identification.
 
-    config, fit: config.json and fit.json.  traces: per recording the arrays of traces.npz plus
+    config, fit: config.json and fit.json.  traces: by `trace_places` the arrays of traces.npz plus
     "phases", a list.  history, correlation: arrays by name.  distribution: None when missing.
     frames: PNG files.  film: of the replay before and after, None when missing.  replay: whether there is a replay
     to draw.
@@ -239,13 +291,12 @@ def read_run(run: Path) -> Run:
     if not run.is_dir():
         raise _READ.fault(f"there is no folder {run}")
     config, fit = _READ.json(run / CONFIG, RunConfig), read_fit(run)
-    for key, content in (("parameters", fit.parameters), ("torque_distances", fit.torque_distances)):
+    for key, content in (("parameters", fit.parameters), ("heldout_distances", fit.heldout_distances)):
         if not content:
             raise _READ.fault(f"{run / FIT}, {key!r} is empty")
-    if other := [r.name for r in config.recordings if r.name not in fit.torque_distances]:
-        raise _READ.fault(
-            f"{run / CONFIG}, 'recordings' names {shown(other[0])}, of which {FIT} has no 'torque_distances'"
-        )
+    if other := [r.name for r in config.judges if r.name not in fit.heldout_distances]:
+        key = "judged_on" if config.judged_on else "recordings"
+        raise _READ.fault(f"{run / CONFIG}, {key!r} names {shown(other[0])}, of which {FIT} has no 'heldout_distances'")
     names = [p.name for p in fit.parameters]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise _READ.fault(f"{run / FIT}, 'parameters' holds {', '.join(twice)} more than once")
@@ -259,7 +310,7 @@ def read_run(run: Path) -> Run:
         folder=run,
         config=config,
         fit=fit,
-        traces=_traces(run / TRACES, list(fit.torque_distances)),
+        traces=_traces(run / TRACES, trace_places(fit)),
         history=_history(run / HISTORY),
         correlation=_correlation(run / CORRELATION),
         distribution=distribution,
@@ -267,6 +318,15 @@ def read_run(run: Path) -> Run:
         film=film if film.is_file() else None,
         replay=(run / REPLAY).is_file(),
     )
+
+
+def trace_places(fit: Distances) -> list[str]:
+    """Where traces.npz has each compared channel: the leading one under the recording's name, others beneath it."""
+    return [
+        name if channel == distance.leading else f"{name}/{channel}"
+        for name, distance in fit.heldout_distances.items()
+        for channel in distance.channels
+    ]
 
 
 def _history(path: Path) -> dict[str, np.ndarray]:
@@ -290,7 +350,7 @@ def _correlation(path: Path) -> dict[str, np.ndarray]:
 
 
 def _traces(path: Path, recordings: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Arrays per recording, their shapes checked against time [T] and joints [J]."""
+    """Arrays by `trace_places`, their shapes checked against time [T] and joints [J]."""
     keys, phases = [f"{r}/{key}" for r in recordings for key in _TRACE_KEYS], [f"{r}/phases" for r in recordings]
     arrays = _READ.arrays(path, keys, phases, texts=[*(f"{r}/joints" for r in recordings), *phases])
     traces: dict[str, dict[str, Any]] = {}

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,8 @@ def identify_view(run: Run, searched: bool) -> dict[str, Any]:
         "groups": grouped(run.fit.of_interest),
         "nuisances": grouped(run.fit.nuisances),
         "drawings": _draw(run),
+        "titles": [f"{spoken(channel)}s" for channel in run.fit.channels],
+        "judges": [gap.judged for gap in run.fit.heldout_distances.values() for _ in gap.channels],
         "frames": frame_rows(run.frames),
         "replay": data_uri(run.film.read_bytes(), "webp") if run.film else None,
     }
@@ -54,7 +57,7 @@ def fit_doubts(fit: FitFile) -> list[str]:
     """What to doubt of a fit, by the names that identify_sentences.jinja has for them."""
     uncertain = [p for p in fit.of_interest if not p.identifiable]
     asked = {
-        "worse": any(d.after > d.before for d in fit.torque_distances.values()),
+        "worse": any(d.after > d.before for d in fit.heldout_distances.values()),
         "far_off": far_off(fit),
         "not_converged": fit.converged is False,
         "not_judged": fit.converged is None,
@@ -102,23 +105,23 @@ def far_off(fit: FitFile) -> bool:
         most = bounds >= 2 if floor is None else gap.after > FAR * floor
         return gap.after > gap.before or (most and gap.after > 0.5 * (gap.before + (floor or 0.0)))
 
-    return any(far(gap) for gap in fit.torque_distances.values())
+    return any(far(gap) for gap in fit.heldout_distances.values())
 
 
 def lacks_something(fit: FitFile) -> bool:
     """Whether noise alone does not explain what the fit left, by equation 1 and by its whitened residuals."""
-    far = any(g.noise_floor and g.after > NOISY * g.noise_floor for g in fit.torque_distances.values())
+    far = any(g.noise_floor and g.after > NOISY * g.noise_floor for g in fit.heldout_distances.values())
     return far or (fit.mean_square or 0.0) > MEAN_SQUARE
 
 
 def noiseless(fit: FitFile) -> bool:
     """Whether a fit is of single repeats, from which the noise is not known."""
-    return any(gap.noise_floor is None for gap in fit.torque_distances.values())
+    return any(gap.noise_floor is None for gap in fit.heldout_distances.values())
 
 
 def asked_of(fit: FitFile) -> str:
     """The step that finds out whether the model of a `noiseless` fit lacks something: "search_log" or "repeats"."""
-    log = len(fit.torque_distances) <= 2 and all(gap.judged == "time" for gap in fit.torque_distances.values())
+    log = len(fit.heldout_distances) <= 2 and all(gap.judged == "time" for gap in fit.heldout_distances.values())
     return "search_log" if log else "repeats"
 
 
@@ -148,14 +151,28 @@ def _draw(run: Run) -> dict[str, list[Drawing]]:
     def add(section: str, stem: str, title: str, make: Callable[..., Figure], *args: Any) -> None:
         sections[section].append(style.drawing(run.folder, stem, title, make, *args))
 
-    for i, (name, gap) in enumerate(fit.torque_distances.items()):
-        of = f" ({name})" if len(fit.torque_distances) > 1 else ""
-        traces = run.traces[name]
-        bars = (traces["joints"], gap.per_joint_before, gap.per_joint_after, gap.noise_floor, gap.per_joint_noise_floor)
-        title = f"Torque difference of each joint{of}"
-        add("distance", f"gap_{i}", title, torque_figures.distance_per_joint, *bars, fit.torque_unit)
-        overlay = (traces, traces["phases"], fit.torque_unit)
-        add("torque", f"torque_{i}", f"Torque over time{of}", torque_figures.torque_traces, *overlay)
+    several, drawn = len(fit.heldout_distances) > 1, 0
+    for i, (name, gap) in enumerate(fit.heldout_distances.items()):
+        of = f" ({name})" if several else ""
+        traces, what = run.traces[name], spoken(gap.leading)
+        floor = gap.noise_floor if len(gap.channels) == 1 else None  # of several it has another unit
+        bars = (traces["joints"], gap.per_joint_before, gap.per_joint_after, floor, gap.per_joint_noise_floor)
+        title = f"{what} difference of each joint{of}"
+        make = torque_figures.distance_per_joint
+        add("distance", f"gap_{i}", title, make, *bars, gap.per_joint_unit, what.lower())
+        for channel in gap.channels:
+            unit = gap.per_joint_unit if channel == gap.leading else gap.errors[channel].unit
+            lines = traces if channel == gap.leading else run.traces[f"{name}/{channel}"]
+            overlay = (lines, traces["phases"], unit)
+            title = f"{spoken(channel)} over time{of}"
+            add(
+                "torque",
+                f"torque_{drawn}",
+                title,
+                partial(torque_figures.torque_traces, quantity=spoken(channel)),
+                *overlay,
+            )
+            drawn += 1
     add("parameters", "intervals", "90 % intervals", identify_figures.interval_figure, fit.of_interest)
     correlation = (run.correlation["names"], run.correlation["correlation"])
     add("parameters", "correlation", "Correlation", identify_figures.correlation_map, *correlation)
@@ -165,8 +182,13 @@ def _draw(run: Run) -> dict[str, list[Drawing]]:
     if run.distribution is not None:
         samples = (run.distribution["initial_cost"], run.distribution["fitted_cost"])
         title = "Cost of samples of both Gaussians"
-        add("search", "cost_distribution", title, identify_figures.cost_histograms, *samples, fit.torque_unit)
+        add("search", "cost_distribution", title, identify_figures.cost_histograms, *samples, fit.distance_unit)
     return sections
+
+
+def spoken(channel: str) -> str:
+    """A channel's name as a heading has it."""
+    return channel.replace("_", " ").capitalize()
 
 
 def frame_rows(paths: Sequence[Path]) -> list[tuple[str, list[tuple[str, str]]]]:

@@ -5,7 +5,8 @@ nothing loaded from elsewhere) and the figures as PNG and PDF under figures/ of 
 holds an identification, a search for a missing effect, a trained policy, or several of these, in it or in the folders
 of their stages.  Of an identification, config.json, fit.json, history.npz, traces.npz and correlation.npz are
 required; distribution.npz and frames/*.png are optional; where one is missing the page says so in its place.  Of a
-search, gap.json and gap.npz are required; of a policy, training.json.
+search, gap.json and gap.npz are required; of a policy, training.json; of an evaluation, evaluation.json and
+evaluation.npz.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from typing import Any
 from markupsafe import Markup
 
 from droid_jax import distributed, files
+from droid_jax.report.evaluation_folder import Evaluation, has_evaluation, read_evaluation
+from droid_jax.report.evaluation_page import evaluation_view
 from droid_jax.report.gap_folder import Gap, has_gap, read_gap
 from droid_jax.report.gap_page import gap_view
 from droid_jax.report.identify_folder import Run, has_run, read_run
@@ -42,6 +45,8 @@ _DOWNLOADS = (
     (files.TRANSFER, "every trial of the policy"),
     (files.GAP, "the search for a missing effect: every number"),
     (files.GAP_TRACES, "the search for a missing effect: torques over time"),
+    (files.EVALUATION, "the evaluation: every number"),
+    (files.EVALUATION_TRACES, "the evaluation: channels over time"),
 )
 
 
@@ -65,27 +70,31 @@ def write_report(run: Path) -> Path:
     places = [folder, *(folder / stage for stage in files.LAST_FILES if stage not in old)]
     gap = read_gap(at) if (at := _part(places, has_gap)) else None
     policy = read_policy(at) if (at := _part(places, has_policy)) else None
+    evaluation = read_evaluation(folder) if has_evaluation(folder) else None
     at = _part(places, has_run)
-    if not (at or gap or policy):
+    if not (at or gap or policy or evaluation):
         needs_whole(folder)
-    loaded = read_run(at or folder) if at or not (gap or policy) else None
-    text = html("page.html.jinja", **_context(folder, loaded, gap, policy))
+    loaded = read_run(at or folder) if at or not (gap or policy or evaluation) else None
+    text = html("page.html.jinja", **_context(folder, loaded, gap, policy, evaluation))
     refuse_foreign(path, "a file", _is_page, "a page of this program")
     write_text(path, text)
     return path
 
 
-def _context(folder: Path, run: Run | None, gap: Gap | None, policy: Trained | None) -> dict[str, Any]:
+def _context(
+    folder: Path, run: Run | None, gap: Gap | None, policy: Trained | None, evaluation: Evaluation | None
+) -> dict[str, Any]:
     """What page.html.jinja shows: the parts of the page, and what it says above them."""
     views = {
         "identify": identify_view(run, gap is not None) if run else None,
         "gap": gap_view(gap) if gap else None,
         "policy": policy_view(policy, run, gap) if policy else None,
+        "evaluation": evaluation_view(evaluation) if evaluation else None,
     }
     parts = {  # each escaped by its template
         name: Markup(html(f"{name}.html.jinja", folder=folder, **view)) for name, view in views.items() if view
     }
-    downloads = list(_downloads([part.folder for part in (run, gap, policy) if part]))
+    downloads = list(_downloads([part.folder for part in (run, gap, policy, evaluation) if part]))
     setup_first = run is not None and gap is not None and far_off(run.fit)
     return {"folder": folder, "parts": parts, "downloads": downloads, "setup_first": setup_first, **views}
 

@@ -45,20 +45,22 @@ def torque_traces(
     models: Mapping[str, str] = FITS,
     repeats: str = "5 to 95 % of repeats",
     buckets: int = BUCKETS,
+    quantity: str = "Torque",
     width: float = WIDE,
 ) -> Figure:
-    """Every joint's torque over time with, below it, measurement minus simulation.
+    """Every joint's torque, or another quantity, over time with, below it, measurement minus simulation.
 
-    Over a motion that the fit follows well the three lines of a torque are one; the lower panel shows what is left.
+    Over a motion that the fit follows well the three lines are one; the lower panel shows what is left.
 
     Args:
         traces: time [T] s; measured_mean, measured_low, measured_high and the simulations [T, J] in `unit`; joints [J]
             names.
         phases: parts of the motion.
-        unit: of the torques.
+        unit: of the quantity.
         models: which of the simulations "before" and "after" are drawn, and their labels.
         repeats: what lies between measured_low and measured_high.
         buckets: pieces of a drawn line.
+        quantity: what is drawn, for the axis.
         width: inches.
 
     Returns:
@@ -74,7 +76,7 @@ def torque_traces(
         for axes in (upper[j], lower[j]):
             shade(axes, phases, named=j < columns and axes is upper[j])
         upper[j].set(title=label(joint), xlim=(time[0], time[-1]))
-        upper[j].set_ylabel(f"Torque [{unit}]" if j % columns == 0 else "")
+        upper[j].set_ylabel(f"{quantity} [{unit}]" if j % columns == 0 else "")
         lower[j].set_ylabel(f"Residual [{unit}]" if j % columns == 0 else "")
     label_bottom(lower, width, "Time [s]")
     figure.align_ylabels([axes for j in range(0, len(joints), columns) for axes in (upper[j], lower[j])])
@@ -124,9 +126,10 @@ def distance_per_joint(
     floor: float | None,
     floors: Sequence[float] | None = None,
     unit: str = "N m",
+    quantity: str = "torque",
     width: float = WIDE,
 ) -> Figure:
-    """RMS torque difference of each joint [J] in N m, before and after the fit.
+    """RMS difference of each joint's torque, or another quantity, [J] in `unit`, before and after the fit.
 
     floor: what repeats differ among themselves over all joints, N m, a dashed line; floors [J]
     N m, the same joint by joint, small marks, where known.
@@ -146,7 +149,7 @@ def distance_per_joint(
     numbered = width <= 6 and all(re.fullmatch(r"Joint \d+", name) for name in names)
     axes.set_xticks(x, [name.removeprefix("Joint ") for name in names] if numbered else names)
     axes.set_xlabel("Joint" if numbered else "")
-    axes.set_ylabel(f"RMS torque difference [{unit}]" if width > 6 else f"RMS difference [{unit}]")
+    axes.set_ylabel(f"RMS {quantity} difference [{unit}]" if width > 6 else f"RMS difference [{unit}]")
     axes.grid(axis="x", visible=False)
     legend(figure, axes, width, columns=3)
     return figure

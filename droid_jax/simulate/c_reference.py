@@ -19,7 +19,8 @@ from droid_jax.recordings.clocks import interpolate
 from droid_jax.recordings.recording import TorqueSide
 from droid_jax.simulate.c_engine import instrument, simulate
 from droid_jax.simulate.initial_state import weight_share
-from droid_jax.simulate.replay import Drive, check_gains, check_stateless
+from droid_jax.simulate.replay import Drive, check_stateless
+from droid_jax.simulate.servo_gains import check_gains, scale_gains, servo_factors
 
 CHUNK = 64  # samples whose traces of the whole state are held at once
 
@@ -49,10 +50,10 @@ def c_replay(
         )
     if scene.model.body_gravcomp.any() and any(w.field == "qpos0" for p in space.parameters for w in p.writes):
         raise ValueError("the C engine compensates gravity where joints are, not where encoders say: use MJX")
-    plain = replace(scene, model=instrument(scene))
+    plain, factors = replace(scene, model=instrument(scene)), servo_factors(scene, drive)
 
     def piece(values: np.ndarray) -> Rollout:
-        models = [make_c_model(plain, space, row) for row in values]
+        models = [scale_gains(make_c_model(plain, space, row), factors) for row in values]
         thetas = [theta_of(space, row.tolist()) for row in values]
         control = np.stack([control_of(drive, t.get(Role.TIME_OFFSET.value, 0.0), late) for t in thetas])
         trace = simulate(plain, models, drive.qpos0[None], control)

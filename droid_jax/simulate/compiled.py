@@ -33,11 +33,12 @@ from droid_jax.simulate.replay import (
     TORQUE_OFFSETS,
     Drive,
     Replay,
-    check_gains,
     sensed,
     servo_motion,
     torque_offset_effect,
+    traced_part,
 )
+from droid_jax.simulate.servo_gains import check_gains
 
 PROGRAMS = 16  # of each kind, kept for whoever asks for the same again; each holds its scene
 
@@ -83,7 +84,8 @@ class Along:
 class Driven:
     """A batch of servo replays of a drive: [B, D] -> Rollout [B, ...].
 
-    make: drive -> its batch; one of another start, or of other commands of the same length, compiles nothing again.
+    make: drive -> its batch; one of another start, other gains, or other commands of the same length, compiles nothing
+    again.
     """
 
     make: Callable[[Drive], Batch]
@@ -138,8 +140,9 @@ def compiled_replay(
         def driven(drive: Drive) -> Batch:
             steps = len(drive.command)
             sense = _sensors(scene, layout, effects, drive.timestep, steps)
-            table = np.concatenate([drive.command, np.repeat(drive.command[-1:], capacity(steps) - steps, axis=0)])
-            of_drive = jnp.asarray(table, jnp.float32), jnp.asarray(drive.qpos0, jnp.float32), jnp.int32(steps)
+            table, start, gains = traced_part(scene, drive)
+            room = jnp.repeat(table[-1:], capacity(steps) - steps, axis=0)
+            of_drive = jnp.concatenate([table, room]), start, gains, jnp.int32(steps)
             return lambda values: sense(values, program(values, *of_drive))
 
         return Driven(driven, follows)
@@ -194,7 +197,7 @@ def _servo_program(
     clocked: Clocked,
     mj_step: bool,
 ) -> Callable[..., Rollout]:
-    """(values [B, D], command [T, U], start [nq], steps) -> motion [B, T, ...]; scene and effects count by identity."""
+    """(values [B, D], *`traced_part` of a drive, steps) -> motion [B, T, ...]; scene and effects count by identity."""
     motion = servo_motion(scene, clocked.drive, effects, parity=mj_step, late=0.0 if mj_step else 0.5)
     space = layout.space
     return over_block(lambda values, *of_drive: motion(make_physics(scene, space, values), *of_drive))

@@ -39,6 +39,7 @@ from droid_jax.simulate.initial_state import (
     start_pose,
     weight_share,
 )
+from droid_jax.simulate.servo_gains import check_gains, servo_factors, stated_gains, with_gains
 from droid_jax.simulate.time_loop import time_loop
 
 Replay = Callable[[Physics], Rollout]
@@ -53,7 +54,7 @@ class Drive:
     qpos0:   [nq] start pose.
     timestep: s.
     torque:  convention of the measured torque.
-    stiffness: [U] servo gains stated by the recording, or None: the scene's own.
+    stiffness, damping: [U] servo gains stated by the recording, or None: the scene's own.
     sent: [U] bool, actuators that the recording commands, the others hold their start; None: all.
     """
 
@@ -62,6 +63,7 @@ class Drive:
     timestep: float
     torque: TorqueConvention
     stiffness: np.ndarray | None = None
+    damping: np.ndarray | None = None
     sent: np.ndarray | None = None
 
     @property
@@ -89,7 +91,6 @@ def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True, config
     start, end = float(recording.time[0]), float(recording.time[-1])
     steps = int(np.floor((end - start) / timestep + 1e-6)) + 1
     clock = start + np.arange(steps) * timestep
-    gains = recording.gains
     qpos0 = start_pose(scene, recording, config)
     held = holding(scene, qpos0)
     refuse_floating(scene, recording, qpos0, held)
@@ -97,9 +98,7 @@ def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True, config
     sent = np.flatnonzero(columns >= 0)
     if sent.size:
         command[:, sent] = interpolate(clock, recording.time, recording.command[:, columns[sent]])
-    stiffness = scene.model.actuator_gainprm[:, 0] * scene.model.actuator_gear[:, 0] ** 2
-    if gains is not None:
-        stiffness[sent] = np.asarray(gains.stiffness, dtype=float)[columns[sent]]
+    stiffness, damping = stated_gains(scene, recording) or (None, None)
     if weigh:
         check_weight(scene, recording, qpos0)
     return Drive(
@@ -107,7 +106,8 @@ def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True, config
         qpos0=qpos0,
         timestep=timestep,
         torque=recording.torque,
-        stiffness=None if gains is None else stiffness,
+        stiffness=stiffness,
+        damping=damping,
         sent=columns >= 0,
     )
 
@@ -125,19 +125,6 @@ def _check_driven(scene: Scene, recording: Recording) -> None:
             f"scene {scene.name!r} has no {lacks}, and recording {recording.name!r} holds commands: give each "
             f"commanded joint a <position> servo in the MJCF{urdf}"
         )
-
-
-def check_gains(scene: Scene, drive: Drive) -> None:
-    """Raise ValueError where the recording states servo gains that the scene does not have."""
-    if drive.stiffness is None:
-        return
-    own = scene.model.actuator_gainprm[:, 0] * scene.model.actuator_gear[:, 0] ** 2  # at the joint
-    servos = scene.model.actuator_biasprm[:, 1] != 0
-    for name, stated, has, servo in zip(scene.command_names, drive.stiffness, own, servos, strict=True):
-        if not np.isclose(stated, has, rtol=1e-3):
-            do = "build the scene with the recording's gains" if servo else "make it a <position> servo in the MJCF"
-            has_it = f"the scene has {has:g}" + ("" if servo else " and its actuator is no position servo")
-            raise ValueError(f"the recording states a servo gain of {stated:g} for {name}, {has_it}; {do}")
 
 
 def check_stateless(scene: Scene) -> None:
@@ -160,24 +147,24 @@ def servo_replay(
       `late` steps late (see `_command`).
     """
     motion = servo_motion(scene, drive, effects, parity=parity, late=late)
-    table, start = jnp.asarray(drive.command, jnp.float32), jnp.asarray(drive.qpos0, jnp.float32)
+    own = traced_part(scene, drive)
 
     def replay(physics: Physics) -> Rollout:
-        return sensed(motion(physics, table, start, len(table)), physics.theta, effects, drive.timestep)
+        return sensed(motion(physics, *own, len(drive.command)), physics.theta, effects, drive.timestep)
 
     return replay
 
 
 def servo_motion(
     scene: Scene, drive: Drive, effects: Sequence[Effect] = (), *, parity: bool = False, late: float = 0.5
-) -> Callable[[Physics, jax.Array, jax.Array, Any], Rollout]:
-    """The loop over time steps that follows a command: (physics, command [T, U], start [nq], steps) -> T rows.
+) -> Callable[[Physics, jax.Array, jax.Array, jax.Array, Any], Rollout]:
+    """The loop over time steps that follows a command: (physics, *`traced_part` of a drive, steps) -> T rows.
 
     Rows from `steps` on are zero, so that recordings of different lengths share one compiled program; their commands
     are those of the last step, repeated.  Torques carry the time of the state they act on; sensors have not seen them.
     A state is position, velocity, the solver's warm start and the load: everything else in mjx.Data is rebuilt each
     step, so that XLA drops what nobody reads.
-    Of the drive only its time step, its gains and its torque's convention are used.
+    Of the drive only its time step and its torque's convention are used.
     """
     check_options(scene.model, parity, f"a replay of scene {scene.name!r}")
     check_gains(scene, drive)
@@ -219,8 +206,9 @@ def servo_motion(
         kept = tuple(jax.lax.dynamic_update_index_in_dim(a, b, k, 0) for a, b in zip(kept, now, strict=True))
         return (after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator), kept
 
-    def motion(physics: Physics, table: jax.Array, start: jax.Array, steps: Any) -> Rollout:
-        sample = physics.model, complete(physics.theta, effects), encoder_error(scene, physics.model), table
+    def motion(physics: Physics, table: jax.Array, start: jax.Array, gains: jax.Array, steps: Any) -> Rollout:
+        model = with_gains(physics.model, gains)
+        sample = model, complete(physics.theta, effects), encoder_error(scene, model), table
         zero, traces = jnp.zeros(scene.model.nv, jnp.float32), jnp.zeros((3, len(table), len(joints)), jnp.float32)
         angle, contact = jnp.zeros(len(table), jnp.float32), jnp.zeros((len(table), len(fingers)), bool)
         begun = (start, zero, zero, zero), (*traces, angle, contact)
@@ -239,6 +227,13 @@ def sensed(
     cut = jax.tree.map(lambda a: a[:rows] if a.ndim else a, motion)
     time = jnp.asarray(np.arange(rows) * timestep, jnp.float32)
     return apply_sensor_model(replace(cut, time=time), complete(theta, effects), effects)
+
+
+def traced_part(scene: Scene, drive: Drive) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """What a replay takes of a drive beside its physics: command [T, U], start [nq], factors on gains [U, 2]."""
+    parts = (drive.command, drive.qpos0, servo_factors(scene, drive))
+    command, start, gains = (jnp.asarray(part, jnp.float32) for part in parts)
+    return command, start, gains
 
 
 def _command(

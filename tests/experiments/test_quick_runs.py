@@ -20,6 +20,8 @@ DATA = {  # folders of real logs
     "experiments/gap_panda.py": "franka_gaz2019",
     "experiments/real_emps.py": "emps",
     "experiments/real_panda.py": "franka_gaz2019",
+    "experiments/real_so101.py": "so101",
+    "experiments/real_xl330.py": "bam_xl330",
 }
 # Arguments before --quick --out, by script.
 SCRIPTS: dict[str, tuple[str, ...]] = {

@@ -62,7 +62,7 @@ def make_run(folder: Path) -> None:
     made_up_run(folder)
     fit = json.loads((folder / FIT).read_text())
     fit["parameters"] = [fit["parameters"][i] for i in CHOSEN]
-    for of in fit["torque_distances"].values():
+    for of in fit["heldout_distances"].values():
         of |= {key: of[key][:2] for key in ("per_joint_before", "per_joint_after")}
     (folder / FIT).write_text(json.dumps(fit))
     _cut(folder / TRACES, _short_traces)

@@ -84,7 +84,7 @@ def test_mass_and_friction_come_back(found: Identified):
 def test_the_last_third_in_time_is_held_out(found: Identified):
     (fitted,), (held,) = found.fit.comparisons, found.heldout.comparisons
     assert fitted.channel("torque").span[1] < 8.0 < held.channel("torque").span[0]
-    gap = found.torque_distances["log"]
+    gap = found.heldout_distances["log"]
     assert gap.noise_floor is None and gap.closed is None
     assert gap.after < 0.1 * gap.before
     assert found.fit.comparisons[0].channel("torque").unit == "N"
@@ -127,7 +127,7 @@ def test_every_recordings_gap_is_its_own(scene: Scene, space: Space):
     for recording in (log(3), another()):
         held = make_cost(scene, space, [split_repeats(recording, config.heldout)[1]])
         before, after = held.distances(np.stack([space.mean, found.best]))[:, 0]
-        gap = found.torque_distances[recording.name]
+        gap = found.heldout_distances[recording.name]
         assert (gap.before, gap.after) == (pytest.approx(before, rel=1e-5), pytest.approx(after, rel=1e-3))
 
 

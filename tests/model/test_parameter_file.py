@@ -10,8 +10,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from droid_jax.model.parameter_file import load_parameters
-from droid_jax.model.parameters import Mode, Scaling
+from droid_jax.model.parameter_file import friction_joints, load_parameters
+from droid_jax.model.parameters import Mode, Scaling, Space
+from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene, compile_scene
 
 XML = """<mujoco><worldbody><body name="arm"><joint name="elbow" axis="0 1 0" damping="1"/>
@@ -95,14 +96,17 @@ def test_a_servos_gain_and_the_commands_delay_have_no_element(tmp_path: Path, sc
         ({"field": "body_pos", "element": "arm"}, 'body_pos has 3 numbers for each body: give "column", 0 to 2'),
         ({"field": "body_pos", "element": "arm", "column": 7}, 'give "column", 0 to 2, got 7'),
         ({"field": "body_inertia", "element": "arm", "column": -1}, 'give "column", 0 to 2, got -1'),
-        ({"field": "geom_size", "element": "bone", "column": "1"}, "'column' must be a whole number, got '1'"),
+        (
+            {"field": "geom_size", "element": "bone", "column": "1"},
+            "'column' must be a whole number or a list, got '1'",
+        ),
         ({"std": "a"}, "'std' must be a number, got 'a'"),
         ({"std": True}, "'std' must be a number, got True"),
         ({"width": "x", "scaling": "log", "log_offset": 0.1}, "'width' must be a number, got 'x'"),
         ({"width": 0, "scaling": "log", "log_offset": 0.1}, "width must be above 0, got 0"),
         ({"nuisance": "false"}, "'nuisance' must be true or false, got 'false'"),
         ({"name": 5}, "'name' must be text, got 5"),
-        ({"element": 3}, "'element' must be text, got 3"),
+        ({"element": 3}, "'element' must be text or a list, got 3"),
         ({"mode": "sett"}, "'mode' must be one of set, negative, scale, divide, add, got 'sett'"),
         ({"scaling": 1}, "'scaling' must be one of linear, log, got 1"),
         ({"field": "actuator_damping", "element": "elbow"}, "'actuator_damping' cannot be a parameter: MJX"),
@@ -138,3 +142,57 @@ def test_the_gravity_compensation_of_a_compensated_scene_is_a_parameter(tmp_path
     spec = mujoco.MjSpec.from_string(XML.replace('<body name="arm">', '<body name="arm" gravcomp="1">'))
     space = loaded(tmp_path, compile_scene(spec, "arm"), {**GOOD, "field": "body_gravcomp", "element": "arm"})
     np.testing.assert_array_equal(space.mean, [1.0])
+
+
+TWO = """<mujoco><worldbody><body name="arm"><joint name="elbow" axis="0 1 0" damping="1" armature="0.02"/>
+  <geom type="capsule" size=".02 .1"/><body name="hand"><joint name="wrist" axis="0 1 0" damping="2" armature="0.02"/>
+  <geom type="capsule" size=".02 .1"/></body></body></worldbody>
+  <actuator><position name="elbow" joint="elbow" kp="20" forcerange="-3 3"/>
+  <position name="wrist" joint="wrist" kp="8"/></actuator></mujoco>"""
+
+
+def test_a_list_of_joints_makes_one_parameter_that_they_share(tmp_path: Path):
+    scene = compile_scene(mujoco.MjSpec.from_string(TWO), "arm")
+    both, options = ["elbow", "wrist"], {"std": 0.01, "high": 1.0}
+    (rotor,) = loaded(tmp_path, scene, {"field": "dof_armature", "element": both, **options}).parameters
+    assert (rotor.name, rotor.mean) == ("elbow_armature+wrist_armature", pytest.approx(0.02))
+    (gain,) = loaded(tmp_path, scene, {"servo": both, "name": "gain", "std": 0.1}).parameters
+    (limit,) = loaded(
+        tmp_path,
+        scene,
+        {
+            "field": "actuator_forcerange",
+            "element": "elbow",
+            "column": [0, 1],
+            "mode": "scale",
+            "name": "limit",
+            **options,
+        },
+    ).parameters
+    model = make_c_model(scene, Space((rotor, gain, limit)), np.array([0.05, 1.1, 0.5]))
+    np.testing.assert_allclose(model.dof_armature, 0.05)
+    np.testing.assert_allclose(model.actuator_gainprm[:, 0], [22.0, 8.8])
+    np.testing.assert_allclose(model.actuator_biasprm[:, 1], [-22.0, -8.8])
+    np.testing.assert_allclose(model.actuator_forcerange[0], [-1.5, 1.5])
+
+
+@pytest.mark.parametrize(
+    ("entry", "said"),
+    [
+        ({"field": "dof_damping"}, 'elbow_damping is 1 in the model and wrist_damping is 2: state the mean .*"scale"'),
+        ({"sensor": "coulomb"}, "a sensor's term belongs to one joint"),
+        ({"field": "dof_damping", "element": []}, "an empty list names nothing"),
+        ({"field": "dof_damping", "element": ["elbow", "knee"]}, "unknown joint 'knee'"),
+    ],
+)
+def test_what_cannot_be_shared_is_refused(tmp_path: Path, entry: dict[str, Any], said: str):
+    scene = compile_scene(mujoco.MjSpec.from_string(TWO), "arm")
+    with pytest.raises(ValueError, match=r"parameters\.json, entry 1: .*" + said):
+        loaded(tmp_path, scene, {"element": ["elbow", "wrist"], "std": 0.1, "high": 9.0, **entry})
+
+
+def test_joints_that_share_a_friction_loss_each_get_their_row(tmp_path: Path):
+    (tmp_path / "parameters.json").write_text(
+        json.dumps([{"field": "dof_frictionloss", "element": ["elbow", "wrist"], "std": 0.1, "high": 1.0}])
+    )
+    assert friction_joints(tmp_path / "parameters.json") == ("elbow", "wrist")

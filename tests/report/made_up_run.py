@@ -69,9 +69,9 @@ def make_run(folder: Path, synthetic_robot: bool = True, recordings: tuple[str, 
         "started": "2026-11-21T06:00:00Z", "synthetic_robot": synthetic_robot,
     }  # fmt: skip
     fit = {
-        "format": "droid_jax fit", "version": 2,
+        "format": "droid_jax fit", "version": 3,
         "parameters": ps, "cost": {"initial": 1.22, "best": 0.119, "noise_floor": 0.101},
-        "torque_distances": gap,
+        "heldout_distances": gap,
         "stop": "the cost did not change for 20 generations", "generations": 80, "evaluations": 2560,
         "seconds": {"search": 61.2, "refine": 12.5, "total": 90.1},
         "rule": "Gauss-Newton, widened to the held-out gap", "notes": ["the robot was cold <1 h"],

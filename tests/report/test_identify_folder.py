@@ -55,16 +55,16 @@ def test_a_name_too_long_to_draw_is_refused(tmp_path: Path) -> None:
     [
         (lambda fit: fit.update(parameters=-0.0), r"fit\.json: 'parameters' must be a list, got -0\.0"),
         (lambda fit: fit.update(parameters=[]), r"fit\.json, 'parameters' is empty"),
-        (lambda fit: fit.update(torque_distances={}), r"fit\.json, 'torque_distances' is empty"),
+        (lambda fit: fit.update(heldout_distances={}), r"fit\.json, 'heldout_distances' is empty"),
         (
-            lambda fit: fit["torque_distances"].update(other=fit["torque_distances"].pop("open_close")),
-            "of which fit.json has no 'torque_distances'",
+            lambda fit: fit["heldout_distances"].update(other=fit["heldout_distances"].pop("open_close")),
+            "of which fit.json has no 'heldout_distances'",
         ),
-        (lambda fit: fit["torque_distances"]["open_close"].update(judged="x"), "'judged' must be one of"),
+        (lambda fit: fit["heldout_distances"]["open_close"].update(judged="x"), "'judged' must be one of"),
         (lambda fit: fit["cost"].pop("best"), "'cost' lacks 'best'"),
         (
-            lambda fit: fit["torque_distances"].update(open_close=0.1),
-            r"'torque_distances', 'open_close' must be an object, got 0\.1",
+            lambda fit: fit["heldout_distances"].update(open_close=0.1),
+            r"'heldout_distances', 'open_close' must be an object, got 0\.1",
         ),
         (lambda fit: fit["parameters"][2].update(initial_mean=10**400), r"a whole number beyond 2\^63"),
         (lambda fit: fit["parameters"][2].update(low=float("inf")), "Infinity is no number of JSON"),

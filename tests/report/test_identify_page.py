@@ -23,7 +23,7 @@ from droid_jax.report.text import lines
 
 WRONG = Finding("sign", "elbow", -0.99, 1.0, "certain", "recording 'x': the torque of <elbow> runs against its command")
 CHECK = {
-    "unit": "N m", "time_step": 0.1, "remaining": 0.05, "discretisation": 0.041, "parity_torque": 0.9,
+    "unit": "N m", "time_step": 0.1, "remaining": 0.05, "discretisation": 0.041, "parity_largest": 0.9,
     "parity_rms": 0.06, "parity_angle": 0.012, "unmeasured": "", "too_coarse": True, "engines_differ": False,
 }  # fmt: skip
 
@@ -55,7 +55,7 @@ def changed(tmp_path: Path, quick: None) -> Callable[..., tuple[Run, Page]]:
 
 
 def gap_of(**values: Any) -> Callable[[dict[str, Any]], Any]:
-    return lambda fit: fit["torque_distances"]["open_close"].update(values)
+    return lambda fit: fit["heldout_distances"]["open_close"].update(values)
 
 
 def test_the_table_holds_the_numbers_of_the_fit(written: Page) -> None:
@@ -101,15 +101,16 @@ def test_the_first_screen_has_the_answer_and_its_numbers(written: Page) -> None:
     assert (truth["data-known"], truth["data-inside"]) == ("7", "6")
 
 
-@pytest.mark.parametrize("judged", ["repeats", "time", "same"])
+@pytest.mark.parametrize("judged", ["repeats", "time", "same", "recordings"])
 def test_the_page_says_what_the_fit_was_judged_on(changed: Callable, judged: str) -> None:
-    said = {"repeats": "On repeats that", "time": "On the last part of the log", "same": "On its one repeat"}[judged]
+    said = {"repeats": "On repeats that", "time": "On the last part of the log", "same": "On its one repeat",
+            "recordings": "On a recording that"}[judged]  # fmt: skip
     run, written = changed(gap_of(judged=judged))
     assert said in spaced(written.ids["identify-answer"]["text"])
     (line, *_) = lines(
         "identify.txt.jinja", fit=run.fit, seconds=1.0, asked="", far_off=False, lacks_something=False, needs=None
     )
-    assert said[3:] in line and line.startswith("open_close: torque distance 1.223 -> 0.119 N m")
+    assert said[3:] in line and line.startswith("open_close: torque distance 1.22 -> 0.119 N m")
 
 
 @pytest.mark.parametrize(
@@ -172,7 +173,7 @@ def test_a_fit_far_from_the_data_doubts_the_set_up_first(
 ) -> None:
     folder = make_run(tmp_path / "run")
     fit = json.loads((folder / "fit.json").read_text())
-    fit["torque_distances"]["open_close"] |= gap
+    fit["heldout_distances"]["open_close"] |= gap
     for k, p in enumerate(fit["parameters"]):
         p["on_bound"] = k < bounds
     (folder / "fit.json").write_text(json.dumps(fit))
@@ -371,3 +372,25 @@ def test_what_to_do_next_begins_with_a_failed_check(changed: Callable) -> None:
     run, written = changed(lambda fit: fit.update(findings=[asdict(WRONG)]))
     assert next_steps(run, searched=False)[0] == "mend"
     assert "mend the sign of the recording" in spaced(written.ids["identify-next"]["text"])
+
+
+def test_a_fit_of_positions_speaks_of_positions(changed: Callable) -> None:
+    errors = {"unit": "rad", "joints": ["joint1"], "mae_before": [0.05], "mae_after": [0.01], "rms_before": [0.06],
+              "rms_after": [None]}  # fmt: skip
+    positions = {"channels": ["position"], "per_joint_unit": "rad", "errors": {"position": errors}}
+
+    def of_positions(fit: dict[str, Any]) -> None:
+        fit["heldout_distances"]["open_close"] |= positions
+        fit |= {"distance_unit": "rad", "compared": {"position": 1.0}}
+
+    run, written = changed(of_positions)
+    answer = spaced(written.ids["identify-answer"]["text"])
+    assert "fitted to the joint positions that" in answer and "position distance fell from 1.22 to 0.119 rad" in answer
+    assert "orque" not in answer and "Positions: simulation against" in written.text
+    assert "simulated minus measured positions" in written.text
+    assert "Joint 1 0.0500 0.0100 0.0600 –" in spaced(written.ids["errors"]["text"])
+    said = lines(
+        "identify.txt.jinja", fit=run.fit, seconds=1.0, asked="", far_off=False, lacks_something=False, needs=None
+    )
+    assert said[0].startswith("open_close: position distance 1.22 -> 0.119 rad")
+    assert said[1].strip() == "position: mean absolute error 0.0500 -> 0.0100 rad"

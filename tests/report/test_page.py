@@ -116,7 +116,7 @@ def test_a_policy_of_the_extended_model_is_not_of_the_fit_that_is_far_off(tmp_pa
 def _far_off(folder: Path) -> None:
     run = make_run(folder / "identify")
     fit = json.loads((run / "fit.json").read_text())
-    fit["torque_distances"]["open_close"] |= {"before": 1.22, "after": 1.1, "closed": 0.1}
+    fit["heldout_distances"]["open_close"] |= {"before": 1.22, "after": 1.1, "closed": 0.1}
     (run / "fit.json").write_text(json.dumps(fit | {"mean_square": 80.0}))
 
 

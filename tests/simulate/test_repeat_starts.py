@@ -10,7 +10,7 @@ import pytest
 from two_link import JOINTS, arm, motion
 
 from droid_jax.cost.cost import make_cost
-from droid_jax.identify.holdout import torque_distances
+from droid_jax.identify.holdout import heldout_distances
 from droid_jax.model.fields import joint_damping
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
@@ -74,7 +74,7 @@ def test_fit_and_held_out_repeats_that_start_apart(scene: Scene, engine: str):
         assert float(grid[np.argmin(one(grid)), 0]) == pytest.approx(TRUE, abs=0.11)
         left = one(np.array([[TRUE]]))[0]  # C steps of 2 ms are off by 0.05 N m themselves
         assert left == pytest.approx(NOISE * np.sqrt(np.pi / 2), rel=0.1) or (engine == "mujoco" and left < 0.12)
-    (gap,) = torque_distances(other, [whole], [held], known.mean, np.array([TRUE]))
+    (gap,) = heldout_distances(other, [whole], [held], known.mean, np.array([TRUE]))
     assert gap.noise_floor == pytest.approx(NOISE * np.sqrt(np.pi / 2), rel=0.1)
     assert gap.closed is not None and gap.closed > (0.9 if engine == "mjx" else 0.5)
 

@@ -1,0 +1,161 @@
+"""A fitted model on recordings: replays before and after the fit beside what was measured, in physical units.
+
+    replays = evaluate_on(scene, space, recordings, before=space.mean, after=best)
+
+Nothing is fitted, filtered or whitened, so a recording may be long.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from droid_jax.cost.channels import informative_channels, measured_channels
+from droid_jax.cost.cost import check_read, followed, replay_clock
+from droid_jax.cost.errors import (
+    ChannelErrors,
+    channel_errors,
+    errors_json,
+    mean_errors,
+    of_scene,
+    sample_of,
+    simulated_channel,
+)
+from droid_jax.cost.residuals import CompareConfig
+from droid_jax.model.effect_interface import Effect, Rollout
+from droid_jax.model.fields import check_space
+from droid_jax.model.parameters import Space
+from droid_jax.model.scene import Scene
+from droid_jax.recordings.recording import Channel, Recording, recordings_of
+from droid_jax.simulate.batching import in_blocks
+from droid_jax.simulate.compiled import compiled_replay
+from droid_jax.simulate.repeat_starts import own_starts
+from droid_jax.storage import finite
+
+
+@dataclass(frozen=True, eq=False)
+class Replayed:
+    """A recording and its replay at two parameter vectors.
+
+    clock: [T] s, of the replays' rows on the recording's clock.  before, after: host arrays of one sample.
+    """
+
+    recording: Recording
+    clock: np.ndarray
+    before: Rollout
+    after: Rollout
+    errors: dict[str, ChannelErrors]
+
+    @property
+    def blown_up(self) -> list[str]:
+        """Which of "before" and "after" gave no numbers to the end."""
+        return [name for name in ("before", "after") if not bool(np.all(getattr(self, name).finite))]
+
+
+def evaluate_on(
+    scene: Scene,
+    space: Space,
+    recordings: Recording | Sequence[Recording],
+    *,
+    before: np.ndarray,
+    after: np.ndarray,
+    effects: Sequence[Effect] = (),
+    engine: str = "mjx",
+    config: CompareConfig | None = None,
+) -> list[Replayed]:
+    """Replay recordings open loop over their whole length, at two parameter vectors [D].
+
+    Args:
+        scene: what is simulated.
+        space: meaning of the vectors.
+        recordings: with whatever channels were measured.
+        before: the initial means, say.
+        after: the fitted values.
+        effects: in the model beside what the scene has.
+        engine: "mjx" or "mujoco" (plain C).
+        config: how commands are replayed; None for the defaults.
+
+    Raises:
+        ValueError: a recording without any channel that its replay produces, or what `make_cost` refuses.
+    """
+    check_space(scene, space)
+    check_read(scene, space, effects)
+    config, rows = config or CompareConfig(), space.check(np.stack([before, after]))
+    out: list[Replayed] = []
+    for given in recordings_of(recordings):
+        recording = own_starts(given, config.start)
+        informative_channels(scene, [recording])
+        named = dict.fromkeys(measured_channels(scene, recording), 1.0)
+        follows = followed(scene, recording, replace(config, channels=named))
+        replay = compiled_replay(engine, scene, space, follows, effects, config.mj_step)
+        rollouts, clock = in_blocks(replay, rows), replay_clock(recording, follows)
+        pair = sample_of(rollouts, 0), sample_of(rollouts, 1)
+        out.append(Replayed(recording, clock, *pair, channel_errors(scene, recording, clock, *pair)))
+    return out
+
+
+def evaluation_json(replays: Sequence[Replayed], fitted: Sequence[str] = ()) -> dict[str, Any]:
+    """The errors as plain data; fitted: hashes of recordings that the model was fitted to."""
+    mean = mean_errors({r.recording.name: r.errors for r in replays})
+    units = {name: e.unit for r in replays for name, e in r.errors.items()}
+    return {
+        "recordings": [
+            {
+                "name": r.recording.name,
+                "sha256": r.recording.sha256,
+                "repeats": r.recording.repeats,
+                "duration": r.recording.duration,
+                "fitted": r.recording.sha256 in fitted,
+                "blown_up": r.blown_up,
+            }
+            for r in replays
+        ],
+        "errors": {r.recording.name: errors_json(r.errors) for r in replays},
+        "mean_mae": {
+            name: {"unit": units[name], "before": finite(pair[0]), "after": finite(pair[1])}
+            for name, pair in mean.items()
+        },
+    }
+
+
+def evaluation_traces(scene: Scene, replays: Sequence[Replayed]) -> dict[str, np.ndarray]:
+    """Measured and simulated channels over time, for figures: under recording/channel."""
+    out: dict[str, np.ndarray] = {}
+    for replayed in replays:
+        for channel in _channels(scene, replayed):
+            lines = [simulated_channel(scene, channel, replayed.clock, r) for r in (replayed.before, replayed.after)]
+            place = f"{replayed.recording.name}/{channel.name}"
+            measured = np.where(channel.mask, channel.values, np.nan)
+            with np.errstate(all="ignore"):
+                low, high = np.fmin.reduce(measured, axis=0), np.fmax.reduce(measured, axis=0)
+            count = np.maximum(channel.mask.sum(axis=0), 1)
+            mean = np.where(channel.mask, channel.values, 0.0).sum(axis=0) / count
+            seen = channel.mask.any(axis=0)
+            out |= {
+                f"{place}/time": channel.time,
+                f"{place}/measured_mean": np.where(seen, mean, np.nan),
+                f"{place}/measured_low": low,
+                f"{place}/measured_high": high,
+                f"{place}/before": lines[0],
+                f"{place}/after": lines[1],
+                f"{place}/joints": np.array(channel.columns),
+            }
+    return out
+
+
+def _channels(scene: Scene, replayed: Replayed) -> Iterator[Channel]:
+    for name in replayed.errors:
+        channel = of_scene(scene, replayed.recording.channels[name])
+        clock = replayed.clock
+        inside = (channel.time >= clock[0] - 1e-9) & (channel.time <= clock[-1] + 1e-9)
+        yield Channel(
+            name,
+            channel.unit,
+            channel.columns,
+            channel.time[inside],
+            channel.values[:, inside],
+            channel.mask[:, inside],
+        )

@@ -1,0 +1,123 @@
+"""Commanded logs of one repeat, positions alone, at several servo gains: fitted, judged and evaluated by commands."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from pendulum import PARAMETERS, START, TRUE, pendulum, swung, write_pendulum
+
+from droid_jax.cost.channels import in_noise_units
+from droid_jax.cost.cost import make_cost
+from droid_jax.cost.residuals import CompareConfig
+from droid_jax.identify.pipeline import IdentifyConfig, prepare
+from droid_jax.model.parameter_file import load_parameters
+from droid_jax.recordings.formats import save_recording
+from droid_jax.run import main
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    folder = tmp_path_factory.mktemp("logs")
+    options = write_pendulum(folder)
+    paths = {}
+    for name, kp, frequency in (("soft", 1.0, 0.8), ("stiff", 3.0, 1.1), ("judge", 2.0, 0.6)):
+        paths[name] = folder / f"{name}.npz"
+        save_recording(swung(name, kp, frequency), paths[name])
+    return SimpleNamespace(folder=folder, options=options, **paths)
+
+
+@pytest.fixture(scope="module")
+def fitted(logs: SimpleNamespace, one_line: None) -> Path:
+    out = logs.folder / "fit"
+    words = ["identify", *logs.options, "--recording", str(logs.soft), str(logs.stiff), "--judge-on", str(logs.judge)]
+    assert main([*words, "--generations", "4", "--out", str(out)]) == 0
+    return out
+
+
+@pytest.mark.slow
+def test_parameters_come_back_from_positions_at_two_gains(fitted: Path):
+    """The scene has a third gain: replayed with it, no damping and armature would fit both logs."""
+    fit = json.loads((fitted / "fit.json").read_text())
+    assert fit["compared"] == {"position": 1.0} and fit["distance_unit"] == "rad"
+    for parameter in fit["parameters"]:
+        assert parameter["best"] == pytest.approx(TRUE[parameter["name"]], rel=0.03)
+        assert parameter["identifiable"]
+
+
+@pytest.mark.slow
+def test_the_fit_is_judged_on_the_recording_that_it_did_not_see(fitted: Path):
+    fit = json.loads((fitted / "fit.json").read_text())
+    ((name, judged),) = fit["heldout_distances"].items()
+    errors = judged["errors"]["position"]
+    assert name == "judge" and judged["judged"] == "recordings" and errors["unit"] == "rad"
+    assert errors["mae_after"][0] < 1e-3 < 0.03 < errors["mae_before"][0]
+    config = json.loads((fitted / "config.json").read_text())
+    assert [r["name"] for r in config["recordings"]] == ["soft", "stiff"]
+    assert [r["name"] for r in config["judged_on"]] == ["judge"]
+    page = (fitted / "report.html").read_text()
+    assert "fitted to the joint positions" in page and "Position distance before" in page
+    assert 'data-judge="judge"' in page and 'data-channel="position"' in page
+
+
+@pytest.mark.slow
+def test_a_fit_is_evaluated_on_any_recording(logs: SimpleNamespace, fitted: Path, capsys: pytest.CaptureFixture[str]):
+    """The errors of the judge are those of the fit's own file; a fitted recording is said to be one."""
+    out = logs.folder / "evaluation"
+    save_recording(swung("torques", 2.0, 0.6, ("torque", "position")), torques := logs.folder / "torques.npz")
+    given = [str(logs.judge), str(logs.soft), str(torques)]
+    assert main(["evaluate-fit", "--fit", str(fitted), "--recording", *given, "--out", str(out)]) == 0
+    found = json.loads((out / "evaluation.json").read_text())
+    own = json.loads((fitted / "fit.json").read_text())["heldout_distances"]["judge"]["errors"]["position"]
+    assert found["errors"]["judge"]["position"]["mae_after"] == pytest.approx(own["mae_after"], rel=1e-3)
+    assert {r["name"]: r["fitted"] for r in found["recordings"]} == {"judge": False, "soft": True, "torques": False}
+    assert found["errors"]["torques"]["torque"]["unit"] == "N m"
+    assert set(found["mean_mae"]) == {"position", "torque"}
+    assert "judge: mean absolute position error" in capsys.readouterr().out
+    page = (out / "report.html").read_text()
+    assert "Evaluation of a fit: pendulum" in page and 'data-doubt="fitted"' in page
+    assert main(["report", str(out)]) == 0
+
+
+@pytest.mark.slow
+def test_a_scene_that_changed_since_the_fit_is_noticed(
+    logs: SimpleNamespace, fitted: Path, capsys: pytest.CaptureFixture[str]
+):
+    scene = logs.folder / "pendulum.xml"
+    text = scene.read_text()
+    words = ["evaluate-fit", "--fit", str(fitted), "--recording", str(logs.judge), "--out", str(logs.folder / "no")]
+    try:
+        scene.write_text(text.replace('mass="0.5"', 'mass="0.6"'))
+        assert main(words) == 2
+        assert "is another model than" in capsys.readouterr().err
+        scene.unlink()
+        assert main(words) == 2
+        assert "say where it is now (--scene)" in capsys.readouterr().err
+    finally:
+        scene.write_text(text)
+    assert main([*words[:2], str(logs.folder), *words[3:]]) == 2
+    assert "holds no finished fit" in capsys.readouterr().err
+
+
+def test_several_channels_count_in_units_of_their_noise(logs: SimpleNamespace):
+    """Two repeats tell the noise of each channel; one repeat weighs what the start leaves, alike."""
+    scene, noise = pendulum(), 2e-3
+    space = load_parameters(logs.folder / "parameters.json", scene)
+    repeated = swung("ab", 1.0, 0.8, ("torque", "position"), noise, repeats=6)
+    problem = prepare(scene, space, repeated, config=IdentifyConfig(channels=("position", "torque")))
+    weights = problem.fit.comparisons[0].config.channels
+    assert weights["position"] == pytest.approx(1 / noise, rel=0.1)  # of 4 fitted repeats
+    assert weights["torque"] == pytest.approx(1 / 0.01)  # no sensor is believed to be better
+    alone = make_cost(
+        scene, space, repeated.repeats_subset([0]), config=CompareConfig(channels={"position": 1.0, "torque": 1.0})
+    )
+    (start,) = alone.comparisons
+    left = alone.smoothed(space.mean[None])[0][0] - start.channel("torque").noise.mean
+    assert in_noise_units(alone, space.mean)["torque"] == pytest.approx(1 / np.sqrt(np.mean(left**2)), rel=1e-3)
+
+
+def test_the_tests_pendulum_is_another_than_the_scenes():
+    assert {p["name"] for p in PARAMETERS} == set(TRUE) and all(TRUE[n] != START[n] for n in TRUE)

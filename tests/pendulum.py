@@ -1,0 +1,90 @@
+"""A pendulum on a position servo, simulated in plain C with fine steps, for tests of what positions alone tell."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from droid_jax.model.scene import Scene, compile_scene
+from droid_jax.recordings.recording import Channel, Recording, ServoGains, TorqueConvention, TorqueSide
+
+MJCF = """
+<mujoco>
+  <option timestep="0.004" integrator="implicitfast"/>
+  <worldbody>
+    <body>
+      <joint name="swing" axis="0 1 0" damping="{damping}" armature="{armature}"/>
+      <inertial pos="0 0 -0.1" mass="0.5" diaginertia="1e-4 1e-4 1e-4"/>
+    </body>
+  </worldbody>
+  <actuator><position name="swing" joint="swing" kp="{kp}"/></actuator>
+</mujoco>
+"""
+START = {"damping": 0.05, "armature": 0.004, "kp": 1.0}  # of the scene
+TRUE = {"damping": 0.1, "armature": 0.008}
+SECONDS, RATE = 2.0, 125.0
+PARAMETERS = [
+    {"field": "dof_damping", "element": "swing", "name": "damping", "std": 0.05, "low": 0.001, "high": 1.0},
+    {"field": "dof_armature", "element": "swing", "name": "armature", "std": 0.004, "low": 1e-4, "high": 0.1},
+]
+
+
+def pendulum() -> Scene:
+    return compile_scene(mujoco.MjSpec.from_string(MJCF.format(**START)), "pendulum")
+
+
+def write_pendulum(folder: Path) -> tuple[str, ...]:
+    """Scene and parameters as files, and the options that name them."""
+    (folder / "pendulum.xml").write_text(MJCF.format(**START))
+    (folder / "parameters.json").write_text(json.dumps(PARAMETERS))
+    return ("--scene", str(folder / "pendulum.xml"), "--parameters", str(folder / "parameters.json"))
+
+
+def swung(
+    name: str,
+    kp: float,
+    frequency: float,
+    channels: Sequence[str] = ("position",),
+    noise: float = 1e-4,
+    repeats: int = 1,
+) -> Recording:
+    """What the true pendulum does at a servo gain kp [N m/rad] that follows a sine of a frequency [Hz]."""
+    model = mujoco.MjModel.from_xml_string(MJCF.format(**TRUE, kp=kp))
+    model.opt.timestep = 1e-4
+    data = mujoco.MjData(model)
+    time = np.arange(0.0, SECONDS, 1.0 / RATE)
+    fine = np.arange(round(time[-1] / 1e-4) + 1) * 1e-4
+    command = 0.8 * np.sin(2 * np.pi * frequency * time) ** 2 * np.sign(np.sin(2 * np.pi * frequency * time))
+    control = np.interp(fine, time, command)
+    traces = {"position": [], "velocity": [], "torque": []}
+    every = round(1.0 / RATE / 1e-4)
+    for step, ctrl in enumerate(control):
+        data.ctrl[0] = ctrl
+        mujoco.mj_forward(model, data)
+        if step % every == 0:
+            traces["position"].append(data.qpos[0])
+            traces["velocity"].append(data.qvel[0])
+            traces["torque"].append(data.qfrc_actuator[0])
+        mujoco.mj_step(model, data)
+    rng = np.random.default_rng(len(name))
+    units = {"position": "rad", "velocity": "rad/s", "torque": "N m"}
+    shape = (repeats, len(time), 1)
+    measured = {
+        c: Channel(c, units[c], ("swing",), time, np.array(traces[c])[None, :, None] + rng.normal(0, noise, shape),
+                   np.ones(shape, bool))
+        for c in channels
+    }  # fmt: skip
+    return Recording(
+        name=name,
+        time=time,
+        command=command[:, None],
+        command_names=("swing",),
+        channels=measured,
+        torque=TorqueConvention(TorqueSide.MOTOR, gravity=True),
+        qpos0={"swing": 0.0},
+        gains=ServoGains(np.array([kp]), np.zeros(1)),
+    )
