@@ -18,6 +18,7 @@ from droid_jax.simulate.servo_gains import gains_note
 
 BEGINNING = 0.02  # s (six rows at least), in which the speed at the start is looked at
 MOVING = 0.25  # of the motion's largest speed: a joint that is faster at the start does not begin at rest
+AT_ONCE = 0.5  # of the speed at the start, that the first two steps must have
 BEYOND = 0.05  # of its range, by which a joint may be outside of it unremarked
 PERCENT = 100.0  # what drivers of small servos normalise a joint's travel to
 TURNS = 4  # from its zero, that a hinge without a range is believed to make; degrees look like that from 25 on
@@ -130,6 +131,10 @@ def _moves(begin: float, channel: Channel, column: int) -> bool:
     if len(first) < 6:  # a line through two points has no error to be judged by
         return False
     (speed, _), covariance = np.polyfit(time[first], path[first], 1, cov=True)
+    # In a slow log a servo that sets off from rest is fast within six rows; its first two steps are slower.
+    begins = (path[first[2]] - path[first[0]]) / (time[first[2]] - time[first[0]])
+    if begins * np.sign(speed) < AT_ONCE * abs(speed):
+        return False
     steps = rows[:: len(first)]  # as far apart as the beginning is long
     fastest = np.abs(np.diff(path[steps]) / np.diff(time[steps])).max(initial=0.0)
     return bool(abs(speed) > max(MOVING * fastest, 5.0 * np.sqrt(covariance[0, 0])))

@@ -19,7 +19,7 @@ from droid_jax.model.effect_interface import Effect
 from droid_jax.model.fields import joint_damping
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import Scene, compile_scene
-from droid_jax.preflight.preflight import check_range, geared, open_loop
+from droid_jax.preflight.preflight import check_range, geared, open_loop, warn_if_moving
 from droid_jax.recordings.formats import load_recording
 from droid_jax.recordings.recording import Channel, Recording, ServoGains
 from droid_jax.simulate.initial_state import DEFAULT_START
@@ -257,3 +257,17 @@ def test_coupled_joints_follow_the_scatter_of_what_has_them():
     assert _start_alike(scene, one, other, DEFAULT_START)
     stated = {"shoulder": 0.2, "elbow": 0.401, "mimic": float(other.qpos0[scene.qpos("mimic")]) + 0.2}
     assert not _start_alike(scene, one, make_drive(scene, recording(qpos0=stated, **heavy)), DEFAULT_START)
+
+
+@pytest.mark.parametrize(("speed", "warned"), [(0.0, 0), (0.4, 1)])
+def test_a_slow_log_that_sets_off_from_rest_does_not_move_at_once(speed: float, warned: int):
+    """At 50 Hz six rows are a tenth of a second, in which a servo reaches its speed."""
+    time = np.arange(200) * 0.02
+    path = speed * time + 0.4 * np.maximum(time - 0.02, 0.0) ** 2 / (0.05 + np.maximum(time - 0.02, 0.0))
+    values = np.stack([path, 0 * path], axis=1)[None] + np.random.default_rng(0).normal(0, 2e-4, (2, 200, 2))
+    position = Channel("position", "rad", JOINTS, time, values, np.ones(values.shape, bool))
+    slow = recording(time=time, command=values[0], channels={"position": position})
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        warn_if_moving(slow)
+    assert len(said) == warned
