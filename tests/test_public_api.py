@@ -20,7 +20,6 @@ import pytest
 import droid_jax as dj
 from droid_jax import runtime
 from droid_jax.commands.identify import Identify, identify_config, identify_model
-from droid_jax.cost.residuals import CompareConfig
 from droid_jax.door.scene import door_scene
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.identify.pipeline import identify_parameters as identify_function
@@ -111,10 +110,8 @@ def test_a_public_name_is_a_module_or_a_function():
 def test_identify_passes_everything_on():
     with pytest.raises(ValueError, match="different names"):
         dj.identify_parameters(None, None, [TINY, TINY])
-    with pytest.raises(ValueError, match="an identification compares torques"):  # one alone is a list of one
-        dj.identify_parameters(
-            None, None, TINY, config=dj.IdentifyConfig(compare=CompareConfig(channels={"position": 1.0}))
-        )
+    with pytest.raises(ValueError, match="space must be a Space"):  # one alone is a list of one
+        dj.identify_parameters(None, None, TINY)
     with pytest.raises(TypeError, match="colour"):
         dj.identify_parameters(None, None, [TINY], colour="red")
 
