@@ -79,6 +79,8 @@ class Arguments:
     """Run this part in this process, and write to --kept: how the script calls itself."""
     kept: Path = Path()
     """File of a part's results."""
+    until: float = 0.0
+    """When it is stopped, s since 1970."""
 
     def __post_init__(self) -> None:
         if unknown := [part for part in (*self.only, self.part) if part and part not in SHARES]:
@@ -95,13 +97,13 @@ class Measuring:
 
     def __init__(self, arguments: Arguments) -> None:
         self.arguments = arguments
-        self._until = time.monotonic() + arguments.limit - LEAVING
+        self._until = (arguments.until or time.time() + arguments.limit) - LEAVING
         self.found: dict[str, Any] = {}
 
     @property
     def left(self) -> float:
         """s."""
-        return self._until - time.monotonic()
+        return self._until - time.time()
 
     def keep(self, **found: Any) -> None:
         """Add to what is on disk."""
@@ -259,30 +261,38 @@ def of_ppo(now: Measuring) -> None:
 
 def of_gap(now: Measuring) -> None:
     """A whole search on the built-in door with a hidden effect, as the command makes it with its preset."""
-    from droid_jax.commands.synthetic import record_synthetic
+    from droid_jax.commands.synthetic import DEMONSTRATIONS
     from droid_jax.discrepancy.config import DiscrepancyConfig
     from droid_jax.discrepancy.missing import find_missing_effects
+    from droid_jax.door.demonstration import demonstration_path
     from droid_jax.door.scene import door_scene
     from droid_jax.door.space import door_nuisances, door_space
     from droid_jax.identify.multistart import RefineConfig
     from droid_jax.identify.search import CmaConfig
     from droid_jax.model.effects.registry import library
+    from droid_jax.recordings.formats import load_recording
+    from droid_jax.synthetic.hidden_effects import record_hidden
+    from droid_jax.synthetic.robot import synthetic_truth
 
     began = time.monotonic()
     quick, seed = now.arguments.quick, now.arguments.seed
     scene = door_scene(timestep=0.004)
     space = door_space(scene) + door_nuisances(scene)
-    with tempfile.TemporaryDirectory() as folder:
-        roles = record_synthetic(scene, HIDDEN, Path(folder), 1, seed, again=True)
-    recordings = list(roles.values())
+    truth = synthetic_truth(scene, 1, seed)
+    recordings = []
+    for number, name in enumerate(("A", "C") if quick else DEMONSTRATIONS.values()):
+        demonstration = load_recording(demonstration_path(name))
+        if quick:
+            demonstration = demonstration.window(float(demonstration.time[0]), float(demonstration.time[0]) + 1.0)
+        recordings.append(record_hidden(scene, demonstration, truth, HIDDEN, seed=1000 * seed + number, name=name))
+        now.keep(recorded_s=time.monotonic() - began)
     config, effects = DiscrepancyConfig(seed=seed, budget_minutes=max(0.1, 0.5 * now.left / 60)), None
     if quick:
         few = RefineConfig(iterations=1, basin_hops=0, spreads=0)
         search = CmaConfig(population=8, parents=None, generations=1)
         config = replace(config, search=search, refine=few, refit=few, polish=few, max_effects=1, full_refits=1)
-        recordings = [r.window(float(r.time[0]), float(r.time[0]) + 1.0) for r in recordings[:2]]
         effects = library(scene, ("hinge_preload",))
-    stages: dict[str, float] = {"record": time.monotonic() - began}
+    stages: dict[str, float] = {}
     since = [time.monotonic(), "compile"]
 
     def tell(stage: str, _: Any) -> None:
@@ -325,7 +335,7 @@ def run_part(arguments: Arguments) -> None:
 def in_own_process(part: str, arguments: Arguments, seconds: float, cache: str) -> dict[str, Any]:
     """What a part has measured in so many seconds; "error" says why it has not ended."""
     kept = Path(cache) / f"{part}.json"
-    options = {"part": part, "kept": kept, "seconds": seconds, "seed": arguments.seed}
+    options = {"part": part, "kept": kept, "until": time.time() + seconds, "seed": arguments.seed}
     words = [sys.executable, __file__, *(str(word) for k, v in options.items() for word in (f"--{k}", v))]
     began = time.monotonic()
     wrong = {}

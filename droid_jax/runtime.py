@@ -83,6 +83,7 @@ def tune(devices: int | None = None, cache_dir: str | Path | None = None) -> Run
     import jax
 
     quiet_cache()
+    _leave_shardy()
     gc.set_threshold(*COLLECT)
 
     count = devices or _configured_devices() or cores()
@@ -201,6 +202,17 @@ def start() -> None:
     print("starting jax ...", flush=True)
     tune()
     import_mjx()
+
+
+def _leave_shardy() -> None:
+    """Take jax's older partitioner where the newer one crashes: from jax 0.11 on, the compiler dies of a shard_map over
+    several devices whose function closes over an mjx.Model (seen with 0.11.2 on a CPU; not with 0.9 and on one device).
+    """
+    import jax
+
+    if tuple(int(part) for part in jax.__version__.split(".")[:2]) >= (0, 11):
+        with contextlib.suppress(AttributeError):  # a jax that no longer has the choice
+            jax.config.update("jax_use_shardy_partitioner", False)
 
 
 def _setting(name: str) -> Any:
