@@ -52,6 +52,7 @@ SHARES = {"c": 1.0, "jax": 5.0, "warp": 3.0, "fit": 3.0, "ppo": 4.0, "gap": 4.0}
 POPULATIONS = (1024, 4096, 16384, 32, 256, 8192, 2048, 512, 128, 64)  # the most telling first
 WARP_POPULATIONS = (1024, 4096, 16384, 256)
 STEPS, QUICK_STEPS = 1000, 50  # of 2 ms
+QUICK_SECONDS = 5.0  # of a demonstration: the door moves in it
 REPEATS = 2  # timed calls, after one that compiles
 LEAVING = 8.0  # s that a part keeps to end by itself
 STARTING = 0.35  # share of a measurement's time that the next one, of the same kind, may take longer
@@ -283,7 +284,9 @@ def of_gap(now: Measuring) -> None:
     for number, name in enumerate(("A", "C") if quick else DEMONSTRATIONS.values()):
         demonstration = load_recording(demonstration_path(name))
         if quick:
-            demonstration = demonstration.window(float(demonstration.time[0]), float(demonstration.time[0]) + 1.0)
+            demonstration = demonstration.window(
+                float(demonstration.time[0]), float(demonstration.time[0]) + QUICK_SECONDS
+            )
         recordings.append(record_hidden(scene, demonstration, truth, HIDDEN, seed=1000 * seed + number, name=name))
         now.keep(recorded_s=time.monotonic() - began)
     config, effects = DiscrepancyConfig(seed=seed, budget_minutes=max(0.1, 0.5 * now.left / 60)), None
