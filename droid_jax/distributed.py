@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import ctypes
 import hashlib
 import io
 import os
@@ -96,7 +97,7 @@ def join() -> None:
         _guard(f"a process of the {jax.process_count()} of this run was lost; {_AGAIN}")
     with _to_null(1):  # the library below says on the standard output that it is connected
         _place[:] = [jax.process_index(), jax.process_count()]
-        _gathered(b"-")
+        _broadcast(b"-")  # both of its collectives
 
 
 def over_processes(function: Callable[[Any], Any], values: Any) -> Any:
@@ -256,16 +257,23 @@ def _temporary() -> Iterator[str]:
         yield folder
 
 
+def _flush() -> None:
+    """Write out what is buffered for the standard output, by libraries in C too."""
+    sys.stdout.flush()
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).fflush(None)
+
+
 @contextlib.contextmanager
 def _to_null(descriptor: int) -> Iterator[None]:
     """What is written to a stream inside the block, by libraries in C too, goes nowhere."""
-    sys.stdout.flush()
+    _flush()
     kept, null = os.dup(descriptor), os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(null, descriptor)
         yield
     finally:
-        sys.stdout.flush()
+        _flush()
         os.dup2(kept, descriptor)
         os.close(kept)
         os.close(null)

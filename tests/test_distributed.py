@@ -118,9 +118,7 @@ def test_the_same_fit_in_several_processes_and_after_a_kill(tmp_path: Path) -> N
     for name, count in (("two", 2), ("four", 4)):
         finish(count, [*words, "--out", str(tmp_path / name)], tmp_path)
         assert largest_difference(tmp_path / "one", tmp_path / name) < 1e-5, name
-    finish(
-        1, [*words, "--out", str(tmp_path / "devices")], tmp_path, devices=4
-    )  # rounded otherwise
+    finish(1, [*words, "--out", str(tmp_path / "devices")], tmp_path, devices=4)  # rounded otherwise
     assert largest_shift(tmp_path / "one", tmp_path / "devices") < 0.2
     killed = tmp_path / "killed"
     lost = lose([*words, "--out", str(killed)], killed, tmp_path, 0, signal.SIGKILL)
