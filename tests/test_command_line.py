@@ -501,8 +501,8 @@ def test_an_option_that_does_not_exist(arguments: list[str], capsys: pytest.Capt
 COMMANDS = (
     "all",
     "identify",
-    "train",
     "gap",
+    "train",
     "evaluate",
     "evaluate-fit",
     "export",

@@ -222,7 +222,9 @@ def test_the_code_of_your_robot_runs(workplace: Path, capsys: pytest.CaptureFixt
 
 
 def test_the_json_of_your_robot_is_a_space(workplace: Path):
-    (text,) = blocks("docs/your-robot.md", "json")
+    text, shared = blocks("docs/your-robot.md", "json")
+    (workplace / "parameters.json").write_text(shared)
+    assert load_parameters("parameters.json", dj.load_scene("my_robot.xml")).names == ("rotor", "gain")
     (workplace / "parameters.json").write_text(text)
     space = load_parameters("parameters.json", dj.load_scene("my_robot.xml"))
     assert space.names == ("forearm_mass", "shoulder_damping", "elbow_damping", "elbow_frictionloss")
@@ -231,9 +233,9 @@ def test_the_json_of_your_robot_is_a_space(workplace: Path):
 
 @pytest.mark.slow
 def test_the_command_of_your_robot_runs(workplace: Path):
-    (text,) = blocks("docs/your-robot.md", "json")
+    text, _ = blocks("docs/your-robot.md", "json")
     (workplace / "parameters.json").write_text(text)
-    _, command = blocks("docs/your-robot.md", "sh")
+    command = next(c for c in blocks("docs/your-robot.md", "sh") if "run identify" in c)
     words = shlex.split(command)
     assert words[:3] == ["python", "-m", "droid_jax.run"]
     assert main([*words[3:], "--generations", "4", "--population", "10"]) == 0

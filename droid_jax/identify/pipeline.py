@@ -31,6 +31,7 @@ from droid_jax.identify.multistart import RefineConfig, Refined, refine
 from droid_jax.identify.search import CmaConfig, cma_search
 from droid_jax.identify.solution_checks import SolutionCheck, check_solution
 from droid_jax.model.effect_interface import Effect, Rollout
+from droid_jax.model.fields import check_space
 from droid_jax.model.inertia import possible_draws
 from droid_jax.model.parameters import Role, Space
 from droid_jax.model.scene import Scene
@@ -215,6 +216,7 @@ def prepare(
     instance(space, "space", Space)
     if nuisances is not None:
         instance(nuisances, "nuisances", Space)
+    check_space(instance(scene, "scene", Scene), space)
     recordings = [own_starts(recording, config.compare.start) for recording in recordings]
     judges = tuple(own_starts(recording, config.compare.start) for recording in judges)
     chosen = _chosen_channels(scene, [*recordings, *judges], config)

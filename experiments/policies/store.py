@@ -66,6 +66,7 @@ def trained(
 
 def decided_by(env: DoorEnv, doors: Doors, config: TrainConfig) -> dict[str, Any]:
     """All that decides what training comes to, as plain data."""
+    unused = () if config.held else ("enough", "held")
     of = {
         "scene": sha256(_text(env.scene)),
         "effects": [effect.name for effect in env.effects],
@@ -73,7 +74,7 @@ def decided_by(env: DoorEnv, doors: Doors, config: TrainConfig) -> dict[str, Any
         "task": asdict(env.task),
         "doors": "mean" if doors.method == "mean" else "draws",
         "gaussian": doors.gaussian.to_json(),
-        "config": asdict(config),
+        "config": {name: value for name, value in asdict(config).items() if name not in unused},
     }
     return json.loads(json.dumps(of))
 
