@@ -241,7 +241,7 @@ def test_a_search_begins_at_a_fit_of_its_own_recordings_alone(called, tmp_path: 
     fit = tmp_path / "run" / "identify"
     fit.mkdir(parents=True)
     for name in ("fit.json", "config.json"):
-        (fit / name).write_text('{"version": 2}')
+        (fit / name).write_text('{"version": 3}')
     hashes = [load_recording(Path(f"{name}.npz")).sha256 for name in "abc"]
     scene = door_scene(timestep=TIMESTEP["quick"]).sha256
     for made, of in ((hashes[:2], scene), (hashes[1:], scene), ([], scene), (hashes[:2], "another")):
