@@ -174,10 +174,10 @@ def figure(points: list[dict[str, Any]]) -> Figure:
         below.plot(x, [p["gib"] for p in of], "o-", color="#c05621")
         below.set_xlabel(LABELS[axis])
         for plot in (above, below):
-            plot.set_ylim(bottom=0)
+            plot.set_ylim(0.0, 1.1 * max(plot.lines[0].get_ydata()))
             plot.grid(alpha=0.3)
-            if axis in ("population", "effects"):
-                plot.set_xscale("symlog")
+            if axis == "population":
+                plot.set_xscale("log")
     grid[0, 0].set_ylabel("s of a batch")
     grid[1, 0].set_ylabel("peak memory, GiB")
     return made
