@@ -112,10 +112,10 @@ class Measuring:
         write_json(self.arguments.kept, self.found)
 
     def while_there_is_time(self, items: Sequence[Any]) -> Iterator[Any]:
-        """The items, as long as the next one should end in time; the rest is noted as left out."""
+        """The first item, and others as long as the next one should end in time; the rest is noted as left out."""
         longest = 0.0
         for number, item in enumerate(items):
-            if longest * (1 + STARTING) > self.left:
+            if number and longest * (1 + STARTING) > self.left:
                 self.keep(no_time_for=list(items[number:]))
                 return
             began = time.monotonic()

@@ -29,19 +29,25 @@ from droid_jax.report.style import png_bytes  # noqa: E402
 from droid_jax.storage import write_bytes, write_json  # noqa: E402
 
 TIMESTEP = 0.004  # s
-BASE = {"population": 128, "recordings": 1, "seconds": 0.0, "joints": 0, "effects": 0}  # 0 s: whole; 0 joints: the door
+BASE = {
+    "population": 128,
+    "recordings": 1,
+    "duration": 0.0,
+    "joints": 0,
+    "effects": 0,
+}  # 0 s: whole; 0 joints: the door
 AXES: dict[str, tuple[float, ...]] = {
     "population": (1, 32, 128, 512, 2048),
     "recordings": (1, 2, 4, 8),
-    "seconds": (1.0, 2.0, 4.0, 7.7),
+    "duration": (1.0, 2.0, 4.0, 7.7),
     "joints": (1, 2, 4, 8, 16),
     "effects": (0, 1, 4, 16, 64),
 }
 QUICK: dict[str, tuple[float, ...]] = {
-    "population": (1, 32), "recordings": (1, 2), "seconds": (0.2, 0.4), "joints": (1, 2), "effects": (0, 1),
+    "population": (1, 32), "recordings": (1, 2), "duration": (0.2, 0.4), "joints": (1, 2), "effects": (0, 1),
 }  # fmt: skip
 LABELS = {
-    "population": "samples", "recordings": "recordings", "seconds": "recording, s", "joints": "joints of a chain",
+    "population": "samples", "recordings": "recordings", "duration": "recording, s", "joints": "joints of a chain",
     "effects": "effects in the replay",
 }  # fmt: skip
 CHAIN_SECONDS = 4.0
@@ -106,9 +112,9 @@ def _door(at: dict[str, Any]) -> tuple[Any, Any, list[Any], tuple[Any, ...]]:
     from droid_jax.synthetic.robot import SyntheticRobotConfig, record, synthetic_truth
 
     scene, demonstration = ready(door_scene(timestep=TIMESTEP)), load_recording(demonstration_path("A"))
-    if at["seconds"]:
+    if at["duration"]:
         begin = float(demonstration.time[0])
-        demonstration = demonstration.window(begin, begin + at["seconds"])
+        demonstration = demonstration.window(begin, begin + at["duration"])
     truth = synthetic_truth(scene, 1, 0)
     one = record(scene, demonstration, truth, seed=0, config=SyntheticRobotConfig(repeats=2))
     effects = library(scene)[: int(at["effects"])]
@@ -146,7 +152,7 @@ def _chain(at: dict[str, Any]) -> tuple[Any, Any, list[Any], tuple[Any, ...]]:
         f"<actuator>{servos}</actuator></mujoco>"
     )
     scene = compile_scene(mujoco.MjSpec.from_string(text), "chain", joints=names)
-    time = np.arange(0.0, at["seconds"] or CHAIN_SECONDS, 0.01)
+    time = np.arange(0.0, at["duration"] or CHAIN_SECONDS, 0.01)
     ease = np.clip(time / 0.5, 0.0, 1.0)[:, None] ** 3  # it begins at rest
     command = 0.2 * ease * np.sin(np.outer(time, 1.0 + 0.2 * np.arange(joints)))
     convention = TorqueConvention(TorqueSide.MOTOR, gravity=True)
@@ -174,10 +180,10 @@ def figure(points: list[dict[str, Any]]) -> Figure:
         below.plot(x, [p["gib"] for p in of], "o-", color="#c05621")
         below.set_xlabel(LABELS[axis])
         for plot in (above, below):
-            plot.set_ylim(bottom=0)
+            plot.set_ylim(0.0, 1.1 * max(plot.lines[0].get_ydata()))
             plot.grid(alpha=0.3)
-            if axis in ("population", "effects"):
-                plot.set_xscale("symlog")
+            if axis == "population":
+                plot.set_xscale("log")
     grid[0, 0].set_ylabel("s of a batch")
     grid[1, 0].set_ylabel("peak memory, GiB")
     return made
@@ -189,7 +195,7 @@ def main() -> None:
         print(json.dumps(measured(json.loads(arguments.point), arguments.repeats)))
         return
     path = arguments.out / f"{stem('scaling', arguments.quick)}.json"
-    base = {**BASE, "population": 32, "seconds": 0.2} if arguments.quick else BASE
+    base = {**BASE, "population": 32, "duration": 0.2} if arguments.quick else BASE
     points: list[dict[str, Any]] = []
     for axis in arguments.only:
         for value in (QUICK if arguments.quick else AXES)[axis]:

@@ -49,7 +49,7 @@ def test_other_parts_and_axes_are_refused() -> None:
 
 @pytest.mark.parametrize("joints", [1, 3])
 def test_the_chain_has_so_many_joints_and_begins_at_rest(joints: int) -> None:
-    scene, space, (recording,), effects = scaling._chain({**scaling.BASE, "joints": joints, "seconds": 0.3})
+    scene, space, (recording,), effects = scaling._chain({**scaling.BASE, "joints": joints, "duration": 0.3})
     assert len(scene.joints) == joints and len(space) == joints + 1 and effects == ()
     assert recording.channel("torque").values.shape[2] == joints
     assert abs(recording.command[:2]).max() < 1e-5
