@@ -103,11 +103,13 @@ def test_what_is_offered_instead_can_be_done():
     assert "searched as a log" not in str(refused.value)
 
 
+@pytest.mark.slow
 def test_a_second_log_is_another_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert main(command(tmp_path, [LOG, LOG])) == 2
     assert "the train and the test recording are the same ('elbow')" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_log_that_is_too_short_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert main(command(tmp_path, [LOG.window(0.0, 9.0)], "--effects", *ASKED)) == 2
     said = capsys.readouterr().err
@@ -182,6 +184,7 @@ def test_each_role_has_its_own_instants(found: Gap):
         assert size.after < 0.1 * size.before
 
 
+@pytest.mark.slow
 def test_what_a_log_lacks_is_handed_on(run: tuple[Path, str]):
     model = load_extended(run[0] / "extended.json", elbow())
     assert model.space.names[-1] == "joint_coulomb[elbow]" and model.lacking == ()
@@ -205,6 +208,7 @@ def test_the_page_of_a_log_claims_no_repeats(run: tuple[Path, str]):
     assert np.all(np.diff(drawn["time"]) > 0) and drawn["time"][-1] < sealed["time"][0]
 
 
+@pytest.mark.slow
 def test_another_log_is_sealed(tmp_path: Path):
     other = replace(elbow_log(COULOMB, seconds=12.0), name="other")
     assert main(command(tmp_path, [LOG.window(0.0, 24.0), other], "--effects", "joint_coulomb", "cable_pull")) == 0
@@ -216,6 +220,7 @@ def test_another_log_is_sealed(tmp_path: Path):
 # ----- one recording with repeats
 
 
+@pytest.mark.slow
 def test_the_second_half_of_the_repeats_confirms(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -234,6 +239,7 @@ def test_the_second_half_of_the_repeats_confirms(
     assert "replayed without a time step" in page and "Discretisation error U0" not in page
 
 
+@pytest.mark.slow
 def test_a_late_repeat_of_the_second_half_keeps_its_number(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     whole = elbow_log(0.0, 6.0, repeats=16)
     position = whole.channel("position")

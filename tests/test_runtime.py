@@ -321,6 +321,7 @@ assert any(found) is {warm}
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", ["", "import jax", "import jax.numpy; import mujoco", "import droid_jax.model.step"])
 def test_it_prints_nothing_even_with_a_warm_cache(tmp_path: Path, first: str):
     """XLA has 2 kB to say of every program that it loads; whether jax or this package was imported first."""
@@ -348,6 +349,7 @@ os.write(2, b"behind\\n")
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "module", ["cost.cost", "model.step", "policy.train", "policy.parallel", "synthetic.robot", "discrepancy.missing"]
 )

@@ -50,6 +50,7 @@ def test_the_notebook_is_stored_without_outputs():
     assert [c for c in cells if c["cell_type"] == "code" and (c["outputs"] or c["execution_count"])] == []
 
 
+@pytest.mark.slow
 def test_the_arms_that_it_draws_rub_as_was_found(copy: Path):
     """Its last cell, on a Gaussian that needs no search: with theta at zero the same arms fall otherwise."""
     matplotlib.use("agg")

@@ -42,6 +42,7 @@ def test_residuals_of_the_truth_are_of_unit_size(cost: Cost):
     np.testing.assert_allclose(sizes, 1.0, atol=0.3)
 
 
+@pytest.mark.slow
 def test_without_it_they_are_not(cost: Cost):
     """Where one repeat's positions are missing somewhere the repeats do not tell, and all share it."""
     recording = log(TREMBLE, seed=1)

@@ -30,6 +30,7 @@ def shaped(found: Small, value: float) -> FittedModel:
     return replace(model, parts=(replace(part, shape_parameters={SHAPE: value}),), values=values)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("value", "side", "at"), [(-1.0, "lower", "-0.3"), (1.0, "upper", "0.3"), (0.1, "", "")])
 def test_a_shape_at_its_bound_says_that_the_form_does_not_fit(found: Small, value: float, side: str, at: str):
     model = shaped(found, value)
@@ -65,6 +66,7 @@ def test_a_coefficient_past_its_bound_is_larger_than_its_bounds_allow(found: Sma
     assert doubts(found.case.train, replace(model, values=values), natural_bounds=("hinge_preload",)) == ()
 
 
+@pytest.mark.slow
 def test_a_coefficient_that_may_be_zero_is_said(found: Small):
     model, whole = found.verdict.model, found.case.full_space
     values = model.values.copy()
@@ -73,6 +75,7 @@ def test_a_coefficient_that_may_be_zero_is_said(found: Small):
     assert said.startswith("of hinge_preload at door, its coefficient may be zero")
 
 
+@pytest.mark.slow
 def test_the_verdict_carries_its_doubts(found: Small):
     assert found.verdict.doubts == ()
     model = shaped(found, -1.0)

@@ -125,6 +125,7 @@ def test_a_hand_that_gets_no_further_is_said(demonstration, monkeypatch):
     assert found[FURTHER].distance is None and "does not reach further" in found[FURTHER].not_made
 
 
+@pytest.mark.slow
 def test_a_motion_within_reach_is_an_experiment(demonstration, monkeypatch):
     """Where the hand could go on, what the models do on that motion counts (here the same motion again)."""
     monkeypatch.setattr(missing, "TIME_SCALINGS", ())

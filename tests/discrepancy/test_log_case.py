@@ -30,6 +30,7 @@ def log() -> LoneLog:
     return make_log(scene, elbow_space(scene), library(scene, ASKED), elbow_log(COULOMB), CONFIG)
 
 
+@pytest.mark.slow
 def test_dry_friction_is_found_in_one_log(log: LoneLog):
     scene = elbow()
     effects, base = library(scene, ASKED), elbow_space(scene)
@@ -48,6 +49,7 @@ def test_dry_friction_is_found_in_one_log(log: LoneLog):
     assert all(cell.p == 1.0 and not cell.found for cell in verdict.before)
 
 
+@pytest.mark.slow
 def test_nothing_is_named_where_nothing_is_missing(log: LoneLog):
     scene = elbow()
     effects, base = library(scene, ASKED), elbow_space(scene)
@@ -62,6 +64,7 @@ def elbow_torque(log: LoneLog) -> np.ndarray:
     return log.measured - (with_it - without)
 
 
+@pytest.mark.slow
 def test_each_joint_of_a_test_log_has_its_own_noise():
     """Whatever the order of its columns."""
     scene = two_joints()
@@ -116,6 +119,7 @@ def offset_by(recording: Recording, torque: float, name: str) -> Recording:
     return replace(recording, name=name, channels={**recording.channels, "torque": shifted})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("off", [0.0, 0.4, 3.0])
 def test_a_test_log_has_torque_offsets_of_its_own(off: float):
     """Zeroed on another day, by 0 to 10 deviations of the offset's prior: the test data then show no more than noise.

@@ -187,6 +187,7 @@ def found() -> Small:
     return small()
 
 
+@pytest.mark.slow
 def test_the_search_maps_both_models_over_one_motion(found: Small) -> None:
     verdict, train = found.verdict, found.case.train
     assert [c.key for c in verdict.before] == [c.key for c in verdict.after]

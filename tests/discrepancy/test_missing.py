@@ -80,6 +80,7 @@ def test_a_log_without_commands_has_no_servo_to_ask_about():
     )
 
 
+@pytest.mark.slow
 def test_unless_told_it_asks_about_all_that_could_show(monkeypatch: pytest.MonkeyPatch):
     scene, begin = elbow(), np.array([0.6, 0.1])
 

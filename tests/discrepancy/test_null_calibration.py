@@ -57,17 +57,20 @@ def nothing() -> np.ndarray:
     return np.array([case(seed, 0.0)[0] for seed in range(CASES)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("level", "width"), [(0.05, 0.02), (0.25, 0.04), (0.5, 0.045)])
 def test_where_nothing_is_missing_p_values_are_uniform(nothing: np.ndarray, level: float, width: float):
     """Two standard deviations of the counts; with all lags as they are estimated 31 % of 1,000 lay below 0.25."""
     assert np.mean(nothing < level) == pytest.approx(level, abs=width)
 
 
+@pytest.mark.slow
 def test_what_is_missing_is_found():
     found = [case(seed, 0.3) for seed in range(100)]
     assert np.mean([p < 0.01 and best == 2 for p, best in found]) > 0.9
 
 
+@pytest.mark.slow
 def test_a_sensor_that_warms_up_from_repeat_to_repeat_hides_nothing():
     """Its drift is no noise: all that is found without it is found with it, and nothing is found where nothing is."""
     found = [case(seed, 0.3, drift=1.0) for seed in range(100)]

@@ -55,6 +55,7 @@ def kept(case: Case, model: FittedModel, off: np.ndarray) -> float:
     return float(np.sum(left**2) / np.sum(off**2))
 
 
+@pytest.mark.slow
 def test_what_the_fit_does_not_constrain_is_allowed_for_and_nothing_else(whole: tuple[Case, FittedModel]):
     """Two deviations along the axis that the other recording shows best, and something that no axis does."""
     case, model = whole
@@ -66,6 +67,7 @@ def test_what_the_fit_does_not_constrain_is_allowed_for_and_nothing_else(whole: 
     assert kept(case, model, else_) == pytest.approx(1.0, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_the_slopes_are_of_one_deviation(whole: tuple[Case, FittedModel]):
     """One for each axis; together they span what any one parameter does."""
     case, model = whole
@@ -80,6 +82,7 @@ def test_the_slopes_are_of_one_deviation(whole: tuple[Case, FittedModel]):
     assert np.linalg.norm(project(moved[None], slopes, np.full(len(slopes.T), 1e6))[0]) < 0.1 * np.linalg.norm(moved)
 
 
+@pytest.mark.slow
 def test_what_is_really_missing_stays(found: Small):
     """The hidden preload acts on the other motion in a way that no uncertain parameter does."""
     case, base = found.case, found.base
@@ -87,6 +90,7 @@ def test_what_is_really_missing_stays(found: Small):
     assert before > FLOOR and remaining_discrepancy(case.train, case.validation, base) > 0.5 * before
 
 
+@pytest.mark.slow
 def test_the_verdict_says_what_remains(found: Small):
     case, verdict = found.case, found.verdict
     assert verdict.remainder == pytest.approx(remaining_discrepancy(case.train, case.validation, verdict.model))
@@ -94,6 +98,7 @@ def test_the_verdict_says_what_remains(found: Small):
     assert verdict.remainder is not None and verdict.remainder <= 1.1 * verdict.discrepancies["validation"][1]
 
 
+@pytest.mark.slow
 def test_of_noise_alone_nothing_remains_on_average(whole: tuple[Case, FittedModel]):
     """Noise about the model's own replay: U is zero on average, not less for what the projection takes of the mean."""
     case, model = whole
@@ -117,6 +122,7 @@ def test_of_noise_alone_nothing_remains_on_average(whole: tuple[Case, FittedMode
     )
 
 
+@pytest.mark.slow
 def test_more_repeats_of_the_fit_allow_less(found: Small):
     """What is constrained better may be off by less."""
 
@@ -150,6 +156,7 @@ def test_a_bound_does_not_halve_a_slope(whole: tuple[Case, FittedModel]):
     np.testing.assert_allclose(np.abs(along).sum(axis=1), np.minimum(deviation, LONGEST_STEP), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_blocks_of_one_motion_allow_nothing(whole: tuple[Case, FittedModel]):
     case, model = whole
     blocks: Any = SimpleNamespace(resampling=SimpleNamespace(repeated=False))

@@ -33,6 +33,7 @@ def lost(found: Small) -> SelectionStep:
     return replace(info, selected=None, chosen=None)
 
 
+@pytest.mark.slow
 def test_an_extended_model_is_fitted_without_what_the_base_fit_found(found: Small) -> None:
     """The preload, and the base parameters that it had bent."""
     case = found.case
@@ -65,6 +66,7 @@ def test_shapes_are_held_while_the_search_goes_and_free_in_the_refinement(
     assert drags[0] == 0.5 and np.all(drags[1:] == case.full_space["drag"].mean)
 
 
+@pytest.mark.slow
 def test_a_base_fit_may_begin_at_an_earlier_one(found: Small, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fitting, "cma_search", lambda *a, **k: pytest.fail("there is a start"))
     case = found.case
@@ -73,6 +75,7 @@ def test_a_base_fit_may_begin_at_an_earlier_one(found: Small, monkeypatch: pytes
     assert again.discrepancy == pytest.approx(found.base.discrepancy, rel=1e-2)
 
 
+@pytest.mark.slow
 def test_a_step_without_a_winner_has_its_best_model_fitted_from_the_prior_on(found: Small, lost: SelectionStep) -> None:
     reported = list[tuple[str, Any]]()
     problem = problem_of(found, progress=lambda stage, value: reported.append((stage, value)))
@@ -83,6 +86,7 @@ def test_a_step_without_a_winner_has_its_best_model_fitted_from_the_prior_on(fou
     assert any(hasattr(v, "generation") for v in values) and any(hasattr(v, "iteration") for v in values)
 
 
+@pytest.mark.slow
 def test_what_the_basin_takes_by_itself_is_no_effects(
     found: Small, lost: SelectionStep, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -100,6 +104,7 @@ def test_what_the_basin_takes_by_itself_is_no_effects(
     assert restart_from_prior(problem_of(found), lost)[0].selected is None
 
 
+@pytest.mark.slow
 def test_a_basin_in_which_the_base_model_blows_up_has_nothing_to_say(
     found: Small, lost: SelectionStep, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -115,6 +120,7 @@ def test_a_basin_in_which_the_base_model_blows_up_has_nothing_to_say(
     assert won is not None and won.keys == (PRELOAD_KEY,)
 
 
+@pytest.mark.slow
 def test_no_fit_from_the_prior_on_where_there_is_a_winner_or_no_time(
     found: Small, lost: SelectionStep, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -227,6 +227,7 @@ def bomb(scene: Scene) -> Effect:
     )
 
 
+@pytest.mark.slow
 def test_an_effect_that_blows_up_is_left_out_and_named():
     """What is really missing is found all the same."""
     scene, space = small_scene()
@@ -257,6 +258,7 @@ def late_bomb(scene: Scene) -> Effect:
     )
 
 
+@pytest.mark.slow
 def test_a_refit_that_blows_up_where_it_begins_is_left_out_and_named(monkeypatch: pytest.MonkeyPatch):
     """The score test's small step is replayed, the proposal is not."""
     monkeypatch.setattr(search, "one_step_fit", lambda train, model, part, raw, proposed: (proposed, -np.inf))
@@ -267,6 +269,7 @@ def test_a_refit_that_blows_up_where_it_begins_is_left_out_and_named(monkeypatch
     assert verdict.conclusion is Conclusion.UNEXPLAINED
 
 
+@pytest.mark.slow
 def test_a_search_ends_where_all_that_was_asked_about_is_in_the_model():
     scene, space = small_scene()
     verdict = searched(case_of(scene, space, library(scene, ["hinge_preload"]), replace(QUICK, max_effects=2)))

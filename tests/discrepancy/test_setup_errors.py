@@ -101,9 +101,8 @@ def found_in(compensated: bool, folder: Path, **hidden: float) -> tuple[Verdict,
     return verdict, spans
 
 
-@pytest.mark.parametrize(
-    "compensated", [pytest.param(False, id="weight"), pytest.param(True, id="compensated", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("compensated", [False, True], ids=["weight", "compensated"])
 def test_the_effects_are_what_the_robot_hides(compensated: bool, tmp_path: Path):
     """At what was hidden no more is left than where nothing is."""
     scene = arm(compensated)

@@ -215,6 +215,7 @@ def test_a_further_effect_takes_its_share(after: float, beside: float | None, be
     assert much_more(1.0, after, lambda: asked(beside), lambda: asked(beyond), 2.0, SelectionConfig()) is enough
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("left", "base", "u0", "reason"),
     [

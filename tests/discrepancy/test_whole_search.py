@@ -29,6 +29,7 @@ def verdict(preload: float, friction: float) -> Verdict:
     return search_effects(case, base_fit(case.train, case.base, case.config, quiet), FLOOR)
 
 
+@pytest.mark.slow
 def test_where_nothing_is_hidden_nothing_is_missing():
     found = verdict(0.0, 0.0)
     assert found.conclusion is Conclusion.NONE and not found.effects

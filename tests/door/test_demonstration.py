@@ -157,6 +157,7 @@ def test_the_command_leads_so_that_the_servo_stays_on_the_path(scene: Scene):
     assert np.rad2deg(rollout.object_angle.max()) == pytest.approx(50.0, abs=2.0)
 
 
+@pytest.mark.slow
 def test_a_path_too_close_to_a_limit_is_refused(scene: Scene):
     plan = PLANS["A"]
     far = replace(plan, segments=tuple(replace(s, angle=s.angle * 1.9) for s in plan.segments))

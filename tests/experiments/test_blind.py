@@ -262,6 +262,7 @@ def test_bounds_hold_what_the_base_model_absorbs():
     assert free.tolist() == [False, True]
 
 
+@pytest.mark.slow
 def test_what_an_effect_adds_is_taken_on_the_same_robot_with_the_same_noise(hinge: Setting):
     """Of an offset twice as large twice as much, per unit of it the same; a drift differs by repeat."""
     where = ground(hinge, draw_truths(hinge, np.random.default_rng(3))["train"], 7)

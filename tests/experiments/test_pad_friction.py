@@ -79,6 +79,7 @@ def opened(pads: dict[str, float]) -> tuple[Opening, np.ndarray, np.ndarray]:
     return opening, found, engine
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pads", [{}, pads_of(0.05)], ids=["own", "slippery"])
 def test_the_parts_add_up_to_the_torque_of_the_engines_contacts(pads):
     opening, found, engine = opened(pads)

@@ -69,6 +69,7 @@ def run(script: str, *arguments: str) -> dict:
     return json.loads(done.stdout.splitlines()[-1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("script", "part", "case"), [("pose_figure", "pose", "pose_A"), ("table1", "doors", "door_1")])
 def test_a_script_that_lacks_a_case_says_how_to_make_it(tmp_path: Path, script: str, part: str, case: str) -> None:
     command = [sys.executable, f"experiments/{script}.py", "--quick", "--out", str(tmp_path)]

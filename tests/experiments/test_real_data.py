@@ -91,6 +91,7 @@ def write_emps(folder: Path, mass: float, damping: float, friction: float, offse
         np.savez(folder / f"{name}.npz", t=time, qm=x, vir=force / gain, gtau=gain)
 
 
+@pytest.mark.slow
 def test_arm_is_the_panda_without_its_hand() -> None:
     scene = panda_arm_scene()
     assert scene.joints == ARM == scene.command_names
@@ -146,12 +147,14 @@ def test_repeated_rows_are_left_out(experiment: Callable[[str], ModuleType]) -> 
     np.testing.assert_allclose(fit.resampled(time, held, time), time[:, None])
 
 
+@pytest.mark.slow
 def test_where_no_spring_was_named_none_is_asked_for_again(experiment: Callable[[str], ModuleType]) -> None:
     """It would count as not named again, of a search that was the first one once more."""
     door = experiment("gap_door")
     assert door.with_known([], lambda known: pytest.fail("searched")) is None
 
 
+@pytest.mark.slow
 def test_carriage_comes_back(experiment: Callable[[str], ModuleType], tmp_path: Path) -> None:
     emps = experiment("real_emps")
     write_emps(tmp_path, 88.0, 150.0, 25.0, 4.0)
@@ -167,6 +170,7 @@ def test_carriage_comes_back(experiment: Callable[[str], ModuleType], tmp_path: 
     assert (tmp_path / "out" / "real_emps.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("script", ["real_panda", "real_emps"])
 def test_missing_data_ends_in_one_line(
     experiment: Callable[[str], ModuleType], script: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -272,6 +272,7 @@ def test_half_a_file_is_not_json(saved: Path, tmp_path: Path):
 # ----- the document
 
 
+@pytest.mark.slow
 def test_the_three_lines_of_the_document_run(found: Small, saved: Path, monkeypatch: pytest.MonkeyPatch):
     """docs/gap.md, as it is printed; runs/gap is this test's folder."""
     text = (ROOT / "docs" / "gap.md").read_text()

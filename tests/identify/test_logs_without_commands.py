@@ -71,6 +71,7 @@ def found(scene: Scene, space: Space) -> Identified:
     return identify_parameters(scene, space, [log(1)], config=config)
 
 
+@pytest.mark.slow
 def test_mass_and_friction_come_back(found: Identified):
     assert found.best == pytest.approx([MASS, DAMPING, COULOMB], rel=0.02)
     low, high = found.gaussian.interval(0.9)
@@ -96,6 +97,7 @@ def test_the_noise_of_one_repeat_is_what_the_fit_leaves(found: Identified):
     assert 0.02 < np.mean(found.refined.residual**2) < 1.5
 
 
+@pytest.mark.slow
 def test_repeats_are_split_by_number(scene: Scene, space: Space):
     recording = log(4)
     fitted, held, rows = split_repeats(recording, 0.3)
@@ -106,6 +108,7 @@ def test_repeats_are_split_by_number(scene: Scene, space: Space):
     assert near < 0.3 < far
 
 
+@pytest.mark.slow
 def test_a_cost_of_two_recordings_is_that_of_each(scene: Scene, space: Space):
     first, second = log(3), another()
     both = make_cost(scene, space, [first, second])
@@ -120,6 +123,7 @@ def test_a_cost_of_two_recordings_is_that_of_each(scene: Scene, space: Space):
     assert both.first().whitened(rows).shape == each[0].whitened(rows).shape
 
 
+@pytest.mark.slow
 def test_every_recordings_gap_is_its_own(scene: Scene, space: Space):
     config = IdentifyConfig(search=CmaConfig(population=8, parents=None, generations=2), samples=4)
     found = identify_parameters(scene, space, [log(3), another()], config=config)
@@ -131,6 +135,7 @@ def test_every_recordings_gap_is_its_own(scene: Scene, space: Space):
         assert (gap.before, gap.after) == (pytest.approx(before, rel=1e-5), pytest.approx(after, rel=1e-3))
 
 
+@pytest.mark.slow
 def test_another_motion_on_the_same_clock_compiles_no_replay(scene: Scene, space: Space):
     fitted, held, _ = split_repeats(log(4), 0.3)
     cost = make_cost(scene, space, [fitted])
@@ -147,17 +152,20 @@ def test_another_motion_on_the_same_clock_compiles_no_replay(scene: Scene, space
     np.testing.assert_array_equal(cost.whitened(rows), first)
 
 
+@pytest.mark.slow
 def test_a_motion_on_another_clock_is_refused(scene: Scene, space: Space):
     cost = make_cost(scene, space, [log(1)])
     with pytest.raises(ValueError, match="other commands than 'log' had"):
         cost.against([log(1).window(0.0, 8.0)])
 
 
+@pytest.mark.slow
 def test_the_c_engine_has_no_inverse_mode(scene: Scene, space: Space):
     with pytest.raises(ValueError, match="inverse dynamics, which needs engine 'mjx'"):
         make_cost(scene, space, [log(1)], engine="mujoco")
 
 
+@pytest.mark.slow
 def test_the_motion_filter_is_a_setting(scene: Scene, space: Space):
     slow, fast = (make_cost(scene, space, [log(1)], config=CompareConfig(motion_cutoff=c)) for c in (5.0, 30.0))
     assert slow.drives[0].timestep == pytest.approx(6 * fast.drives[0].timestep)

@@ -234,6 +234,7 @@ def test_a_floor_in_newton_metres_stands_beside_no_cost_in_noise_units(found: Id
     assert fit["heldout_distances"]["elbow"]["noise_floor"] == found.heldout_distances["elbow"].noise_floor
 
 
+@pytest.mark.slow
 def test_a_search_of_another_cost_is_not_gone_on_with(scene: Scene, tmp_path: Path):
     """Another scene, what is measured of it, comparison or prior of a nuisance is another cost."""
     recording, space = elbow_log(COULOMB, 10.0, 2), elbow_space(scene)
@@ -324,6 +325,7 @@ def test_without_the_refinement_one_recording_is_fitted(scene: Scene):
         identify_parameters(scene, elbow_space(scene), both, config=dataclasses.replace(QUICK, refine=None))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("repeats", "runs"), [(1, 2), (3, 1)])
 def test_every_replay_of_the_refinement_is_counted(
     scene: Scene, repeats: int, runs: int, monkeypatch: pytest.MonkeyPatch

@@ -53,6 +53,7 @@ def checked(step: float, engine: str = "mjx", side: TorqueSide = TorqueSide.MOTO
     return check_solution(cost, [recording], values, engine)["swing"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("engine", "step"), [("mjx", 0.002), ("mujoco", 0.0002)])
 def test_a_fine_time_step_is_measured_and_nothing_is_said(engine: str, step: float):
     check = checked(step, engine)
@@ -63,6 +64,7 @@ def test_a_fine_time_step_is_measured_and_nothing_is_said(engine: str, step: flo
     assert not solution_notes({"swing": check}, "swing")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["mjx", "mujoco"])
 def test_a_time_step_that_is_too_coarse_is_said(engine: str):
     check = checked(0.1, engine)
@@ -72,12 +74,14 @@ def test_a_time_step_that_is_too_coarse_is_said(engine: str):
     assert "give <option> a smaller timestep" in said[0]
 
 
+@pytest.mark.slow
 def test_half_a_step_is_taken_in_mjx_where_c_cannot_run_the_replay():
     check = checked(0.05, side=TorqueSide.LINK)
     assert check.parity_rms is None and "not compared with plain C MuJoCo: the C engine replays" in check.unmeasured
     assert check.discretisation is not None and 0.01 < check.discretisation < 0.1
 
 
+@pytest.mark.slow
 def test_engines_that_differ_are_said():
     """A polynomial stiffness that loading would have refused: C feels it, MJX does not."""
     scene, recording = hinge(0.002), recorded()
@@ -96,6 +100,7 @@ def test_data_of_mj_step_have_no_error_of_its_step():
     assert check.discretisation is None and check.parity_rms is not None and check.parity_rms < 1e-3
 
 
+@pytest.mark.slow
 def test_a_log_without_commands_has_no_time_step():
     recording = recorded()
     position = replace(recording.channels["torque"], name="position", unit="rad")

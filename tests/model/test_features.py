@@ -201,7 +201,10 @@ KEPT = {
 }
 
 
-@pytest.mark.parametrize("kept", KEPT)
+QUICK = ("joints", "contacts", "limits", "equalities")  # the others are the same test, and compile as long
+
+
+@pytest.mark.parametrize("kept", [k if k in QUICK else pytest.param(k, marks=pytest.mark.slow) for k in KEPT])
 def test_what_is_kept_does_in_a_step_what_it_does_in_c(kept: str):
     slots = {**dict.fromkeys(("option", "floor", "world", "a", "b", "fore", "ball", "more"), ""), "thing": FREE_SPHERE}
     model = mujoco.MjModel.from_xml_string(WORLD.format(**{**slots, **KEPT[kept]}))

@@ -216,6 +216,7 @@ def test_a_first_use_inside_jit_leaves_the_scene_usable():
     np.testing.assert_allclose(np.asarray(fresh.mjx.dof_damping), fresh.model.dof_damping, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_values_outside_the_model_are_handed_on(scene: Scene, space: Space, vectors: np.ndarray, apply):
     expected = {"time_offset", *(f"torque_offset[{j}]" for j in ARM)}
     theta = apply(vectors[0].astype(np.float32)).theta
@@ -276,6 +277,7 @@ def compiled(name: str, *, scale: float = 1.0, move: float = 0.0) -> mujoco.MjMo
     return spec.compile()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MECHANISMS)
 def test_derived_quantities_equal_the_compiler(name: str):
     target = compiled(name, scale=2.5, move=0.07)
@@ -328,6 +330,7 @@ def rests(xml: str, field: str, column: int, value: float) -> tuple[float, float
     return heights[0], float(data.qpos[0]), heights[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("field", "column", "value"), [("geom_pos", 2, -0.1), ("geom_size", 0, 0.15)])
 def test_a_geom_that_was_moved_or_grew_touches_in_both_engines(field: str, column: int, value: float):
     xml = """<mujoco><worldbody><geom type="plane" size="5 5 1"/><body pos="0 0 .3"><joint name="z" type="slide"

@@ -201,6 +201,7 @@ def test_any_warm_start_ends_at_the_same_place(case):
         assert off.max() < QACC_TOLERANCE, f"scale {scale}, worst state {off.argmax()}: {off.max():.1e}"
 
 
+@pytest.mark.slow
 def test_the_warm_start_of_the_answer_stays_there(case):
     _, _, qpos, qvel, run, (qacc, _, _) = case
     assert error(np.asarray(run(qpos, qvel, qacc.astype(np.float32))[0][0]), qacc).max() < QACC_TOLERANCE
@@ -241,6 +242,7 @@ def test_dry_friction_decelerates_by_its_own_torque(parity: bool):
         assert np.abs(velocity[t > 0.3]).max() < 1e-2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parity", [True, False])
 def test_dry_friction_lets_only_the_excess_through(parity: bool):
     _, velocity = run_spinner("", torque=0.8, speed=0.0, steps=200, parity=parity)

@@ -84,6 +84,7 @@ def test_only_what_is_written_is_batched(scene, gaussian, keys):
     assert physics.model.qpos0.shape == scene.mjx.qpos0.shape
 
 
+@pytest.mark.slow
 def test_without_randomisation_all_are_alike(scene, gaussian, keys):
     values = gaussian.space.values({"hinge_damping": 3.3})
     physics, _ = fixed(scene, gaussian.space, values)(Physics(scene.mjx, {}), keys)
@@ -91,6 +92,7 @@ def test_without_randomisation_all_are_alike(scene, gaussian, keys):
     np.testing.assert_allclose(hinge, np.full(ENVS, 3.3), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_three_methods_are_the_prior_the_fits_middle_and_its_draws(scene, gaussian, keys):
     """Of a fit that is far from its prior."""
     at = gaussian.space.index("hinge_damping")
@@ -116,6 +118,7 @@ def test_effects_ride_in_theta(scene, keys):
     assert batched.theta["latch_torque"] == 0
 
 
+@pytest.mark.slow
 def test_an_environment_that_knows_a_model_only_is_told_what_it_lacks(scene, gaussian, keys):
     space = gaussian.space + effect_space(library(scene, ["latch"]))
     with pytest.warns(UserWarning, match=r"cannot vary .*latch_torque, latch_width"):

@@ -43,6 +43,7 @@ def _shown(cell: dict[str, Any], value: float | None, written: Callable[..., str
     return cell["values"] == [value] and cell["text"].strip() == written(value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verdict", VERDICTS)
 @pytest.mark.parametrize("split", [None, BLOCKS, HALVES])
 def test_every_verdict_has_its_answer_and_what_to_do(made: Callable, verdict: str, split: dict | None) -> None:
@@ -148,6 +149,7 @@ def test_a_signature_at_several_places_is_shown_once_and_none_where_nothing_is_k
     assert (one.alternative, one.about.signature) == (False, "a step at every reversal.")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("verdict", "changes", "doubt", "said"),
     [
@@ -191,6 +193,7 @@ def test_no_share_of_nothing(tmp_path: Path, after: float) -> None:
     assert "within_fit" not in gap_doubts(gap)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("verdict", "changes", "step", "said"),
     [

@@ -157,6 +157,7 @@ def test_numbers_of_the_doubts(changed: Callable) -> None:
     assert "2.50" in written.doubts["noisy"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("gap", "bounds", "doubted"),
     [

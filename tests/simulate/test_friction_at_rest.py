@@ -157,6 +157,7 @@ def test_friction_and_damping_of_a_hinge_that_holds(seed: int):
         assert abs(found.best[k] - value) < 1.5 * (high - low)
 
 
+@pytest.mark.slow
 def test_what_is_left_at_rest_tells_nothing_of_noise():
     scene, space = studied()
     recording, _ = recorded(2, "a")

@@ -130,6 +130,7 @@ def check_planar(scene: Scene, side: TorqueSide, gravity: bool) -> None:
     np.testing.assert_allclose(got.torque, expected(scene.model, scene, given), atol=5e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("gravcomp", "side", "gravity"),
     [(False, MOTOR, True), (True, LINK, True), (True, MOTOR, False), (False, LINK, False)],
@@ -139,6 +140,7 @@ def test_gravity_is_the_recordings_choice_not_the_files(gravcomp: bool, side: To
     check_planar(planar(gravcomp=gravcomp), side, gravity)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", [MOTOR, LINK])
 def test_springs_and_tendons_pull_on_either_side_and_dry_friction_on_the_motors(side: TorqueSide):
     """A joint's spring, a tendon's, and a friction loss that opposes the motion."""

@@ -114,6 +114,7 @@ def test_holding_controls_pull_nowhere():
     assert far[1] == 255.0  # its range ends there
 
 
+@pytest.mark.slow
 def test_what_has_no_command_is_held_and_said():
     arm = scene()
     with pytest.warns(UserWarning, match="'wave' has not all commands: grip, thumb held where the motion starts"):

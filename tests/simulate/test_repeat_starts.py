@@ -58,6 +58,7 @@ def repeats(scene: Scene, count: int, apart: float, noise: float = 1e-4) -> Reco
     return Recording("apart", time, command, JOINTS, channels, convention, qpos0={})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["mjx", "mujoco"])
 def test_fit_and_held_out_repeats_that_start_apart(scene: Scene, engine: str):
     whole = repeats(scene, 8, APART)

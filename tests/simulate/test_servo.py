@@ -171,6 +171,7 @@ def c_rollout(scene: Scene, drive: Drive, *, delay: float, **options) -> tuple[n
     return out[0, ::sub], out[1, ::sub], out[2, ::sub]
 
 
+@pytest.mark.slow
 def test_parity_replay_is_mj_step(scene: Scene, drive: Drive):
     got = replayed(parity=True)
     position, velocity, torque = c_rollout(scene, drive, delay=0.001)
@@ -203,6 +204,7 @@ def test_without_delay_both_tell_what_mj_step_logs(scene: Scene, drive: Drive):
             np.testing.assert_allclose(got, expected, atol=within)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["mjx", "mujoco"])
 def test_a_cost_can_replay_as_mj_step_logs(scene: Scene, drive: Drive, engine: str):
     """What MuJoCo itself logged with these steps costs nothing then, a hundred times less than as a robot's log."""
@@ -275,6 +277,7 @@ def inverse(scene: Scene, q: np.ndarray, v: np.ndarray, a: np.ndarray, *, armatu
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("gravity", "friction"), [(False, 0.0), (True, 0.4)])
 def test_link_side_torque_is_what_moves_the_links(gravity: bool, friction: float):
     """Without rotor inertia, joint damping and the joint's dry friction; with gravity where stated."""
@@ -299,6 +302,7 @@ def test_motor_side_with_gravity_adds_the_compensated_weight(scene: Scene, rollo
     np.testing.assert_allclose(heavy.torque[0] - rollout.torque[0], weight, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gravity", [False, True])
 def test_weight_that_the_motors_compensate_is_counted_once(gravity: bool):
     """With actuatorgravcomp the motors' torque contains the weight, and only then."""
@@ -313,6 +317,7 @@ def test_weight_that_the_motors_compensate_is_counted_once(gravity: bool):
     assert np.abs(weight).max() > 3.0
 
 
+@pytest.mark.slow
 def test_weight_that_nothing_compensates_is_refused_where_the_torque_holds_none():
     heavy = arm(gravcomp=False)
     with pytest.raises(ValueError, match=r"'wave' says that its torque holds no weight.*shoulder, elbow.*gravcomp"):
@@ -393,6 +398,7 @@ def test_a_servo_at_its_force_limit_damps_nothing(free_and_limited, limit: str):
     np.testing.assert_allclose(got.position[0, :, k], position[:, k], atol=0.02 * np.ptp(position[:, k]))
 
 
+@pytest.mark.slow
 def test_parity_with_a_velocity_gain_is_mj_step():
     scene, time = pendulums("actuator"), np.arange(251) * 0.004
     command = 0.3 * np.sin(6 * time)
@@ -440,6 +446,7 @@ def test_the_twin_refuses_what_it_cannot_run(scene: Scene, drive: Drive):
 # ----- a cost over such replays
 
 
+@pytest.mark.slow
 def test_a_cost_serves_other_repeats_of_the_same_motion_alone(scene: Scene):
     cost = make_cost(scene, SPACE, [recording()])
     elsewhere = {"shoulder": 0.5, "elbow": -0.3}
@@ -461,6 +468,7 @@ def test_a_cost_serves_other_repeats_of_the_same_motion_alone(scene: Scene):
     np.testing.assert_allclose(moved.torque, anew.torque, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_joint_friction_that_is_given_as_an_effect_counts_once(scene: Scene):
     friction = joint_friction_space(JOINTS).select(["coulomb[elbow]"])
     values = np.array([[0.5]])
@@ -561,6 +569,7 @@ UNSTABLE = Space(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["mjx", "mujoco"])
 def test_a_replay_that_blows_up_costs_the_penalty_and_harms_no_other(engine: str):
     """Negative damping of 1500 N m s/rad flings the arm to infinity within a few steps."""

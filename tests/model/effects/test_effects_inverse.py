@@ -113,6 +113,7 @@ def test_forces_have_to_be_overcome(inverse: Inverse, name: str):
     assert np.abs(push).max() > 100 * TOLERANCE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coulomb", [0.0, COULOMB])
 @pytest.mark.parametrize("name", [n for n, o in ORACLES.items() if o.loss])
 def test_friction_has_to_be_overcome(inverse: Inverse, name: str, coulomb: float):
@@ -132,6 +133,7 @@ def test_friction_has_to_be_overcome(inverse: Inverse, name: str, coulomb: float
     assert np.abs(expected).max() > 100 * TOLERANCE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [n for n, o in ORACLES.items() if o.read])
 def test_sensors_read_what_they_read(inverse: Inverse, name: str):
     oracle = ORACLES[name]

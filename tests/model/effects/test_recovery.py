@@ -49,7 +49,7 @@ def check_recovery(bench: Bench, name: str, truth: Mapping[str, float]) -> None:
 
 
 # One of each place where an effect enters a replay; the others are slow.
-QUICK = ("command_delay", "hinge_preload", "joint_coulomb", "latch", "payload", "servo_gain", "torque_bias")
+QUICK = ("command_delay", "latch", "payload", "torque_bias")
 
 
 @pytest.mark.parametrize(

@@ -72,6 +72,7 @@ def grease_at(*joints: str, name: str = "grease", high: float = 9.0) -> Effect:
     )
 
 
+@pytest.mark.slow
 def test_a_model_that_names_one_place_leaves_the_others_at_neutral():
     """An extended model has the parameters of what was named, and the effect reads all of its own."""
     scene = mechanism()
@@ -235,6 +236,7 @@ def test_the_same_function_may_come_again(own_list: None):
     assert registered() == before
 
 
+@pytest.mark.slow
 def test_an_effect_of_ones_own_is_part_of_the_library(own_list: None, small: Bench):
     """A wind that opens the door: the opposite of a preload."""
 

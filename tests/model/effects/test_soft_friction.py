@@ -41,6 +41,7 @@ def creep(inertia: float, first: float, last: float) -> float:
     return LOAD * (1 - first) / first / (2 / (last * 0.02)) / inertia
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("inertia", [0.03, 0.002])
 def test_the_joint_creeps_by_the_share_that_is_left(inertia: float):
     bench, shares = held(inertia), (0.0, 0.5, 0.9, 1.0)
@@ -85,6 +86,7 @@ def swinging() -> Bench:
     return make_bench(scene, Drive(command, np.zeros(1), 0.002, MOTOR), library(scene, ["soft_friction"]))
 
 
+@pytest.mark.slow
 def test_firm_friction_is_what_c_has_at_the_same_impedance():
     position = swinging().run(np.array([[0.0], [1.0]])).position[:, :, 0]
     soft, firm = (in_c(first, 4.0, 0.4)[1] for first in (0.9, 0.9999))
