@@ -35,7 +35,7 @@ BASE = {
     "duration": 0.0,
     "joints": 0,
     "effects": 0,
-}  # 0 s: whole; 0 joints: the door
+}  # 0 s: all; 0 joints: the door
 AXES: dict[str, tuple[float, ...]] = {
     "population": (1, 32, 128, 512, 2048),
     "recordings": (1, 2, 4, 8),
