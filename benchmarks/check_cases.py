@@ -68,6 +68,38 @@ def two_link() -> Scene:
     return _scene(_ARM, "arm", JOINTS)
 
 
+def played(
+    model: mujoco.MjModel, control: np.ndarray, start: np.ndarray, late: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """[T, J] torques and positions that C MuJoCo logs at RATE, in four steps a row.
+
+    control: [T, U].  start: [J] rad.  late: steps by which commands take effect late.
+    """
+    data = mujoco.MjData(model)
+    torque, position = np.empty((2, len(control), model.nq))
+    data.qpos[:] = start
+    for k in range(4 * len(control)):
+        data.ctrl[:] = control[max(0, k - late) // 4]
+        at = data.qpos.copy()
+        mujoco.mj_step(model, data)
+        if k % 4 == 0:
+            torque[k // 4], position[k // 4] = data.qfrc_actuator, at
+    return torque, position
+
+
+def measured(
+    time: np.ndarray, torque: np.ndarray, position: np.ndarray, repeats: int, rng: np.random.Generator
+) -> dict[str, Channel]:
+    """The channels of so many repeats of torques and positions [T, J], with noise."""
+    torque = torque + rng.normal(0.0, 0.05, (repeats, *torque.shape))
+    position = position + rng.normal(0.0, 2e-4, (repeats, *position.shape))
+    mask = np.ones(torque.shape, bool)
+    return {
+        "torque": Channel("torque", "N m", JOINTS, time, torque, mask),
+        "position": Channel("position", "rad", JOINTS, time, position, mask),
+    }
+
+
 def synthetic(seed: int, scene: Scene) -> Case:
     """A log of the arm with other masses, damping, friction and delay than the scene's, in C MuJoCo, with noise.
 
@@ -89,22 +121,7 @@ def synthetic(seed: int, scene: Scene) -> Case:
     ease = np.clip(time, 0, 1) ** 2
     command = rng.uniform(-0.5, 0.5, 2) + (size * ease * np.sin(waves).sum(axis=1)).T
     late = int(rng.integers(0, 2)) * 4  # ms
-    data, seen = mujoco.MjData(model), np.empty((2, len(time), 2))
-    data.qpos[:] = command[0]
-    for k in range(4 * len(time)):
-        data.ctrl[:] = command[max(0, k - late) // 4]
-        at = data.qpos.copy()
-        mujoco.mj_step(model, data)
-        if k % 4 == 0:
-            seen[:, k // 4] = data.qfrc_actuator, at
-    repeats = int(rng.integers(1, 5))
-    torque = seen[0] + rng.normal(0.0, 0.05, (repeats, *seen[0].shape))
-    position = seen[1] + rng.normal(0.0, 2e-4, (repeats, *seen[1].shape))
-    mask = np.ones(torque.shape, bool)
-    channels = {
-        "torque": Channel("torque", "N m", JOINTS, time, torque, mask),
-        "position": Channel("position", "rad", JOINTS, time, position, mask),
-    }
+    channels = measured(time, *played(model, command, command[0], late), int(rng.integers(1, 5)), rng)
     kind = ("whole", "whole", "log", "positions")[seed % 4]
     if kind == "positions":
         del channels["torque"]

@@ -4,7 +4,7 @@
 
 `python -m droid_jax.run identify` of the tutorial's arm, its processes joined by jax.distributed, one CPU device each;
 and once in one process with four virtual devices.  All numbers of the fit are compared with those of one process.
-A device that gets fewer rows at once rounds differently: of the four devices the shift of the values is told, in
+Fewer rows at once on a device change the rounding: of the four devices the shift of the values is reported, in
 deviations of the fitted Gaussian.
 Then a worker is killed in the middle of the search, in another run it is stopped (as a host that no longer answers),
 and the killed run goes on in one process.  On a machine with fewer cores than processes the seconds say what the

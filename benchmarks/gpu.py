@@ -58,8 +58,8 @@ LEAVING = 8.0  # s that a part keeps to end by itself
 STARTING = 0.35  # share of a measurement's time that the next one, of the same kind, may take longer
 ENOUGH = 0.95  # success in the evaluations during training
 HIDDEN = {"magnetic_catch": 1.5}  # N m
-CONTACTS = 64  # of a world that Warp has room for
-ROWS = 256  # constraints of a world that Warp has room for
+CONTACTS = 64  # of a world that Warp holds
+ROWS = 256  # constraints of a world that Warp holds
 
 
 @dataclass(frozen=True)
@@ -166,13 +166,13 @@ def _warp(case: Any, population: int) -> Callable[[], Any]:
 
     put, make = mjx.put_model, mjx.make_data
     model: Any = put(case.scene.model, impl="warp")
-    room = {"naconmax": CONTACTS * population, "njmax": ROWS}
+    limits = {"naconmax": CONTACTS * population, "njmax": ROWS}
     command = jnp.asarray(case.drive.command, jnp.float32)
     start = jnp.asarray(case.drive.qpos0, jnp.float32)
 
     @jax.jit
     def run(qpos: jax.Array) -> jax.Array:
-        data: Any = jax.vmap(lambda q: make(case.scene.model, impl="warp", **room).replace(qpos=q))(qpos)
+        data: Any = jax.vmap(lambda q: make(case.scene.model, impl="warp", **limits).replace(qpos=q))(qpos)
 
         def step(data: Any, ctrl: jax.Array) -> tuple[Any, jax.Array]:
             data = jax.vmap(lambda d: mjx.step(model, d.replace(ctrl=ctrl)))(data)

@@ -18,17 +18,18 @@ import hashlib
 import io
 import os
 import shutil
-import subprocess
 import sys
-import tarfile
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from droid_jax.console import at_the_end
 from droid_jax.files import LOCK
+
+if TYPE_CHECKING:
+    import subprocess
 
 VARIABLE = "DROID_JAX_DISTRIBUTED"
 COORDINATOR, COUNT, INDEX = "JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID"
@@ -155,6 +156,8 @@ def part(folder: Path | None) -> Iterator[Path | None]:
     if count() == 1:
         yield folder
         return
+    import tarfile  # only here: `--help` waits for what is imported above
+
     with contextlib.ExitStack() as stack:
         stack.enter_context(at_the_end(_dismiss))
         copied = None if folder is None else _broadcast(_packed(folder) if first() else b"")
@@ -241,6 +244,8 @@ def _lost(error: Exception) -> Lost:
 
 def _packed(folder: Path) -> bytes:
     """A folder as tar, without what nobody reads; an empty one where it is missing."""
+    import tarfile
+
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w") as archive:
         if folder.is_dir():
@@ -283,6 +288,8 @@ def _guard(line: str) -> None:
     """Let a shell say this error where jax ends the process because another one is lost or does not come: it aborts
     the program, with a stack of its own functions and without an exception.
     """
+    import subprocess
+
     with contextlib.suppress(OSError):
         command = ["/bin/sh", "-c", f'read -r done || echo "error: {line}" >&2']
         _guards.append(subprocess.Popen(command, stdin=subprocess.PIPE))

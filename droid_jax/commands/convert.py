@@ -186,19 +186,18 @@ def _pairs(words: tuple[str, ...], usage: str) -> dict[str, str]:
 
 
 def _needs_effect(command: Convert, what: str, known: tuple[str, ...]) -> None:
-    """ValueError for options that would change nothing; a path that does not exist is told as such.
+    """ValueError for options that would change nothing; a path that does not exist is reported as such.
 
     what: is read, "" a recording.  known: options that it takes.
     """
     source = command.source[0]
     if command.resample and (what or source.is_file()):
-        raise ValueError(
-            "--resample is for CSV folders; the repeats of ROS bags have one clock already (--rate)"
-            if what == "ROS bags"
-            else f"--resample is for CSV folders; {source} takes --rate"
-            if what
-            else f"--resample is for CSV folders, and the repeats of {source} have one clock already"
-        )
+        why = {
+            "ROS bags": "; the repeats of ROS bags have one clock already (--rate)",
+            "a log": f"; {source} takes --rate",
+            "": f", and the repeats of {source} have one clock already",
+        }
+        raise ValueError(f"--resample is for CSV folders{why[what]}")
     of_kinds = {**dict.fromkeys(OF_LOGS, "logs with a column map"), **dict.fromkeys(OF_BAGS, "ROS bags")}
     of_kinds |= dict.fromkeys(SHARED, "ROS bags and logs with a column map")
     given = [f.name for f in fields(Convert) if f.name in of_kinds and getattr(command, f.name) != f.default]

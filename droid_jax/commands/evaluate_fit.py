@@ -10,9 +10,7 @@ from droid_jax.commands import report
 from droid_jax.commands.fitted import fitted_folder, load_fitted
 from droid_jax.commands.options import load_effects, recording_at
 from droid_jax.commands.writer import writes
-from droid_jax.files import EVALUATION, EVALUATION_TRACES
-
-FORMAT, VERSION = "droid_jax evaluation", 1
+from droid_jax.files import EVALUATION, EVALUATION_FORMAT, EVALUATION_TRACES, EVALUATION_VERSION
 
 
 @dataclass(frozen=True)
@@ -66,8 +64,8 @@ def run(command: EvaluateFit) -> None:
     write_json(
         target,
         {
-            "format": FORMAT,
-            "version": VERSION,
+            "format": EVALUATION_FORMAT,
+            "version": EVALUATION_VERSION,
             "fit": {"folder": str(command.fit), "stage": model.stage},
             "scene": model.scene.name,
             "effects": [effect.name for effect in model.effects],

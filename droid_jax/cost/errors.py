@@ -6,7 +6,7 @@ Open loop over the whole motion, without filter, in physical units: the numbers 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import jax
@@ -55,15 +55,13 @@ def channel_errors(
     found = dict[str, ChannelErrors]()
     for name in measured_channels(scene, recording):
         channel = recording.channels[name]
-        kept = of_scene(scene, channel)
+        kept = within(of_scene(scene, channel), clock)
         unit = channel_unit(scene, name, kept.columns, channel.unit)
         left = [simulated_channel(scene, kept, clock, rollout)[None] - kept.values for rollout in (before, after)]
-        inside = (kept.time >= clock[0] - 1e-9) & (kept.time <= clock[-1] + 1e-9)
-        mask = kept.mask & inside[None, :, None]
-        if not mask.any(axis=(0, 1)).all():
+        if not kept.mask.any(axis=(0, 1)).all():
             continue
-        mae = [_mean(np.abs(e), mask) for e in left]
-        rms = [np.sqrt(_mean(e**2, mask)) for e in left]
+        mae = [_mean(np.abs(e), kept.mask) for e in left]
+        rms = [np.sqrt(_mean(e**2, kept.mask)) for e in left]
         numbers = [tuple(row.tolist()) for row in (*mae, *rms)]
         found[name] = ChannelErrors(unit, kept.columns, *numbers)
     return found
@@ -74,14 +72,19 @@ def of_scene(scene: Scene, channel: Channel) -> Channel:
     if channel.name == "object_angle":
         return channel
     columns = [i for i, joint in enumerate(channel.columns) if joint in scene.joints]
-    return Channel(
-        channel.name,
-        channel.unit,
-        tuple(channel.columns[i] for i in columns),
-        channel.time,
-        channel.values[..., columns],
-        channel.mask[..., columns],
+    return replace(
+        channel,
+        columns=tuple(channel.columns[i] for i in columns),
+        values=channel.values[..., columns],
+        mask=channel.mask[..., columns],
     )
+
+
+def within(channel: Channel, clock: np.ndarray) -> Channel:
+    """A channel's samples inside the time [T] s of a replay."""
+    inside = (channel.time >= clock[0] - 1e-9) & (channel.time <= clock[-1] + 1e-9)
+    cut = {"time": channel.time[inside], "values": channel.values[:, inside], "mask": channel.mask[:, inside]}
+    return replace(channel, **cut)
 
 
 def channel_unit(scene: Scene, name: str, joints: Sequence[str], unit: str) -> str:

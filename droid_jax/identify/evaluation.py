@@ -23,6 +23,7 @@ from droid_jax.cost.errors import (
     of_scene,
     sample_of,
     simulated_channel,
+    within,
 )
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.model.effect_interface import Effect, Rollout
@@ -148,14 +149,4 @@ def evaluation_traces(scene: Scene, replays: Sequence[Replayed]) -> dict[str, np
 
 def _channels(scene: Scene, replayed: Replayed) -> Iterator[Channel]:
     for name in replayed.errors:
-        channel = of_scene(scene, replayed.recording.channels[name])
-        clock = replayed.clock
-        inside = (channel.time >= clock[0] - 1e-9) & (channel.time <= clock[-1] + 1e-9)
-        yield Channel(
-            name,
-            channel.unit,
-            channel.columns,
-            channel.time[inside],
-            channel.values[:, inside],
-            channel.mask[:, inside],
-        )
+        yield within(of_scene(scene, replayed.recording.channels[name]), replayed.clock)

@@ -21,7 +21,7 @@ from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSi
 
 FACTOR = 5.0  # by which gains must be off, as the median of the joints
 VISIBLE = 0.1  # of a torque's deviation, that weight and inertia must make up to tell its size
-ROWS = 400  # of the motion at which inverse dynamics is computed, for each alternative anew
+ROWS = 400  # of the motion at which inverse dynamics is computed, for each alternative
 _Balance = tuple[dict[str, float], dict[str, np.ndarray], dict[str, Expected]]  # shares left, torques, bodies
 
 
@@ -87,7 +87,7 @@ def _gains(
     stated: Mapping[str, float],
 ) -> list[Finding]:
     """Gains that are several times too large or too small, at the joints where weight and inertia tell it."""
-    told: dict[str, tuple[float, float]] = {}  # size, and the share that is left with it
+    visible: dict[str, tuple[float, float]] = {}  # size, and the share that is left with it
     for joint, torque in torques.items():
         body = bodies[joint]
         expected = body.weight * gravity + body.inertial
@@ -95,16 +95,16 @@ def _gains(
         if size > 0 and size * np.std(expected) > VISIBLE * np.std(torque):
             left = left_by_body(torque / size, body, gravity=gravity, motor=True)
             if left < GOOD:
-                told[joint] = size, left
-    size = float(np.median([size for size, _ in told.values()])) if told else 1.0
+                visible[joint] = size, left
+    size = float(np.median([size for size, _ in visible.values()])) if visible else 1.0
     if 1 / FACTOR < size < FACTOR:
         return []
-    joint = min(told, key=lambda joint: abs(np.log(told[joint][0] / size)))
+    joint = min(visible, key=lambda joint: abs(np.log(visible[joint][0] / size)))
     words = (
         f"recording {recording.name!r}: the servos' torques, by their gains in the MJCF and the tracking errors, are "
         f"about {size:.2g} times what the motion takes: are these gains the robot's?"
     )
-    return [_finding("gains", joint, words, stated[joint], told[joint][1], joint, size)]
+    return [_finding("gains", joint, words, stated[joint], visible[joint][1], joint, size)]
 
 
 def _finding(kind: Kind, joint: str, words: str, stated: float, left: float, most: str, value: float = 0.0) -> Finding:

@@ -1,6 +1,6 @@
 """What one ROS message says of joints: their names, and numbers by field, of a state or of a command.
 
-Message types are told by their fields, so that their package and version do not matter.
+Message types are recognised by their fields, so that their package and version do not matter.
 """
 
 from __future__ import annotations

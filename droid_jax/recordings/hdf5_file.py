@@ -12,7 +12,7 @@ import numpy as np
 from droid_jax.arguments import shown
 from droid_jax.errors import named
 from droid_jax.read_npz import COMPRESSED, FREE_BYTES
-from droid_jax.recordings.log_columns import LogColumns, readable
+from droid_jax.recordings.log_columns import LogColumns, readable, width_of
 
 MOST_DATASETS = 20_000
 
@@ -49,7 +49,7 @@ def open_hdf5(path: Path, group: str | None = None) -> LogColumns:
                 )
             return dataset[()]
 
-    widths = {name: _width(shape) for name, shape in shapes.items()}
+    widths = {name: width_of(shape) for name, shape in shapes.items()}
     return LogColumns(inside, widths, read, rate=rate)
 
 
@@ -68,13 +68,6 @@ def _group(file: h5py.File, group: str | None, path: Path) -> Any:
     if not isinstance(found, h5py.Group):
         raise ValueError(f"{path}: no group {shown(group)}; it has: {named(file)}")
     return found
-
-
-def _width(shape: tuple[int, ...]) -> int:
-    """Numbers in a row of a dataset [T] or [T, W], 0 of any other."""
-    if len(shape) == 1:
-        return 1
-    return shape[1] if len(shape) == 2 else 0
 
 
 def _control_rate(file: h5py.File) -> float | None:

@@ -18,18 +18,12 @@ from droid_jax.arguments import number, shown
 from droid_jax.errors import named
 from droid_jax.read_json import read_json
 from droid_jax.recordings.column_map import ChannelMap, ColumnMap, TimeMap, Units
-from droid_jax.recordings.log_columns import POSE, LogColumns
+from droid_jax.recordings.log_columns import INFO, POSE, LogColumns
 from droid_jax.recordings.table_file import scan_parquet
 
-INFO = Path("meta") / "info.json"
 VERSIONS = ("v2.", "v3.")
 COMMAND, POSITION, TIME = "action", "observation.state", "timestamp"
 NORMALISED = 100.5  # numbers beyond are none that LeRobot normalised
-
-
-def is_dataset(path: Path) -> bool:
-    """Whether a folder is a dataset of LeRobot."""
-    return (path / INFO).is_file()
 
 
 def open_dataset(path: Path, episode: int | None = None) -> LogColumns:

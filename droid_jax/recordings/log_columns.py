@@ -16,6 +16,7 @@ from droid_jax.recordings.column_map import as_list
 
 _PART = re.compile(r"(.*)\[([\d:,\s]+)\]")
 _NUMBER, _JOINT = "{n}", "{joint}"
+INFO = Path("meta") / "info.json"  # in the folder of a LeRobot dataset
 POSE = ".pos"  # behind the name of a motor, in names of LeRobot's own robots
 
 
@@ -133,6 +134,11 @@ class LogColumns:
         raise ValueError(f"{self.where}, {what}: no column {shown(text)}; it has: {have or 'none'}")
 
 
+def width_of(shape: Sequence[int]) -> int:
+    """Numbers in a row of an array [T] or [T, W]; 0 of any other, which is no column."""
+    return {1: 1, 2: shape[-1] if shape else 0}.get(len(shape), 0)
+
+
 @contextlib.contextmanager
 def readable(where: Path | str, what: str) -> Iterator[None]:
     """Errors of a library that reads a file, as a ValueError that names it: damaged files raise a dozen kinds.
@@ -148,8 +154,8 @@ def readable(where: Path | str, what: str) -> Iterator[None]:
     except BaseException as error:  # polars' panics are no Exception
         if isinstance(error, ValueError) and str(error).startswith(str(where)):
             raise
-        told = said(error) or type(error).__name__
-        raise ValueError(f"{where}: not a readable {what}, or a damaged one: {told}") from None
+        why = said(error) or type(error).__name__
+        raise ValueError(f"{where}: not a readable {what}, or a damaged one: {why}") from None
 
 
 def _indices(text: str, width: int, where: str) -> list[int]:

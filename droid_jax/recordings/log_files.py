@@ -15,21 +15,25 @@ from droid_jax.arguments import path_of, shown
 from droid_jax.errors import named, needs
 from droid_jax.read_npz import NpzFile
 from droid_jax.recordings.column_map import SUFFIX, ColumnMap, changed_map, layouts, read_map
-from droid_jax.recordings.log_columns import LogColumns
+from droid_jax.recordings.log_columns import INFO, LogColumns, width_of
 from droid_jax.recordings.mapped_log import Opened, fits, read_logs
 from droid_jax.recordings.recording import Phase, Recording
 
 TABLES = (".csv", ".tsv", ".csv.gz", ".tsv.gz")
 PARQUET, HDF5, NPZ, TORCH = (".parquet",), (".h5", ".hdf5"), (".npz",), (".pt", ".pth")
 SUFFIXES = (*TABLES, *PARQUET, *HDF5, *NPZ, *TORCH)
-INFO = "meta/info.json"  # in the folder of a LeRobot dataset
+
+
+def is_dataset(path: Path) -> bool:
+    """Whether a path is the folder of a LeRobot dataset; asked without the package that reads one."""
+    return path.is_dir() and (path / INFO).is_file()
 
 
 def is_log(path: Path) -> bool:
     """Whether a path is a log that needs a column map: a file, a LeRobot dataset, or a folder of such files."""
     if path.is_dir():
         inside = (p.name for p in path.iterdir()) if not (path / "recording.json").exists() else ()
-        return (path / INFO).is_file() or any(name.endswith(SUFFIXES) for name in inside)
+        return is_dataset(path) or any(name.endswith(SUFFIXES) for name in inside)
     return path.name.endswith(SUFFIXES) and not (path.suffix == ".npz" and _is_recording(path))
 
 
@@ -115,7 +119,7 @@ def _known_map(log: Opened, path: Path, beside: Path | None) -> tuple[ColumnMap 
         if other is not None:
             raise ValueError(f"{path}: {newest} and {other} both map its columns, and differ: choose with --map")
         return kept[newest], str(newest)
-    if path.is_dir() and (path / INFO).is_file():
+    if is_dataset(path):
         return _reader("lerobot").usual_map(log(None)), "its meta"
     for name in layouts():
         columns = read_map(name)
@@ -150,14 +154,14 @@ def _as_many(log: Opened, columns: ColumnMap) -> tuple[str, ...]:
 
 
 def _columns_of(path: Path, log: Opened) -> str:
-    if path.is_dir() and not (path / INFO).is_file():
+    if path.is_dir() and not is_dataset(path):
         return named(sorted(p.name for p in path.iterdir()))
     return named(name for name, width in log(None).widths.items() if width) or "no columns of numbers"
 
 
 def _parts(path: Path, episodes: Sequence[str | int]) -> list[Opened]:
     """What opens each repeat of a path."""
-    if path.is_dir() and (path / INFO).is_file():
+    if is_dataset(path):
         numbers = [_number(path, e) for e in episodes] or [None]
         return [_once(partial(_dataset, path, number)) for number in numbers]
     if path.name.endswith(HDF5):
@@ -233,13 +237,13 @@ def open_file(path: Path) -> LogColumns:
 def open_npz(path: Path) -> LogColumns:
     """The arrays of an npz file of any names; ValueError where it is damaged."""
     with NpzFile(path) as file:
-        shapes = {name: file.shape(name) or () for name in file.names}
+        widths = {name: width_of(file.shape(name) or ()) for name in file.names}
 
     def read(name: str) -> np.ndarray:
         with NpzFile(path) as file:
             return file.array(name)
 
-    return LogColumns(str(path), {n: 1 if len(s) == 1 else s[1] if len(s) == 2 else 0 for n, s in shapes.items()}, read)
+    return LogColumns(str(path), widths, read)
 
 
 _NEEDS = {

@@ -20,7 +20,7 @@ import numpy as np
 
 from droid_jax.arguments import LONGEST_NAME, said, shown
 from droid_jax.read_npz import FREE_BYTES
-from droid_jax.recordings.log_columns import LogColumns, readable
+from droid_jax.recordings.log_columns import LogColumns, readable, width_of
 from droid_jax.storage import check_size
 
 MOST_BYTES = 2**31
@@ -78,7 +78,7 @@ def open_torch(path: Path) -> LogColumns:
         with readable(path, "file of torch.save"), zipfile.ZipFile(path) as archive:
             return _array(archive, root, tensors[name], f"{path}, tensor {shown(name)}")
 
-    widths = {name: 1 if len(t.shape) == 1 else t.shape[1] if len(t.shape) == 2 else 0 for name, t in tensors.items()}
+    widths = {name: width_of(t.shape) for name, t in tensors.items()}
     names = _names(content)
     components = {name: names for name, width in widths.items() if names and width == len(names) > 1}
     return LogColumns(str(path), widths, read, components)

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 from msgspec import Struct, field
 
-from droid_jax.files import EVALUATION, EVALUATION_TRACES
+from droid_jax.files import EVALUATION, EVALUATION_FORMAT, EVALUATION_TRACES, EVALUATION_VERSION
 from droid_jax.read_json import read_json
 from droid_jax.report.identify_folder import ErrorsEntry
 from droid_jax.report.reading import Reader
 
-VERSION = 1
 _READ = Reader("evaluate-fit")
 _KEYS = ("time", "measured_mean", "measured_low", "measured_high", "before", "after", "joints")
 
@@ -87,14 +86,16 @@ def is_evaluation(path: Path) -> bool:
         content = read_json(path)
     except (OSError, ValueError):
         return False
-    return isinstance(content, dict) and content.get("format") == "droid_jax evaluation"
+    return isinstance(content, dict) and content.get("format") == EVALUATION_FORMAT
 
 
 def read_evaluation(folder: Path) -> Evaluation:
     """Load and check an evaluation; ValueError names the file that is missing or broken."""
     file = _READ.json(folder / EVALUATION, EvaluationFile)
-    if file.version != VERSION:
-        raise _READ.fault(f"{folder / EVALUATION} has version {file.version}, this program reads version {VERSION}")
+    if file.version != EVALUATION_VERSION:
+        raise _READ.fault(
+            f"{folder / EVALUATION} has version {file.version}, this program reads version {EVALUATION_VERSION}"
+        )
     if absent := [r.name for r in file.recordings if not file.errors.get(r.name)]:
         raise _READ.fault(f"{folder / EVALUATION} has no errors of {', '.join(absent)}")
     places = [f"{name}/{channel}" for name, errors in file.errors.items() for channel in errors]

@@ -41,8 +41,7 @@ from droid_jax.simulate.replay import (
 from droid_jax.simulate.servo_gains import check_gains
 
 PROGRAMS = 16  # of each kind, kept for whoever asks for the same again; each holds its scene
-
-SHORTEST = 8192  # rows that a motion has room for, at least: 16 s at 2 ms
+SHORTEST = 8192  # rows of a motion's program, at least: 16 s at 2 ms
 
 Batch = Callable[[np.ndarray], Rollout]
 
@@ -141,8 +140,8 @@ def compiled_replay(
             steps = len(drive.command)
             sense = _sensors(scene, layout, effects, drive.timestep, steps)
             table, start, gains = traced_part(scene, drive)
-            room = jnp.repeat(table[-1:], capacity(steps) - steps, axis=0)
-            of_drive = jnp.concatenate([table, room]), start, gains, jnp.int32(steps)
+            padding = jnp.repeat(table[-1:], capacity(steps) - steps, axis=0)
+            of_drive = jnp.concatenate([table, padding]), start, gains, jnp.int32(steps)
             return lambda values: sense(values, program(values, *of_drive))
 
         return Driven(driven, follows)

@@ -1,8 +1,8 @@
-"""A loop over time steps that jax traces once, alone and in a batch.
+"""A loop over time steps whose number is an input, and that is cheap to batch.
 
 `jax.vmap` of a loop traces the loop's body, then batches it again and again until it knows which of its values differ
-by row: for a step of MJX that takes longer than many fits replay.  Here the batch goes inside the loop, whose state
-differs by row throughout.
+by row.  Here the batch goes inside the loop, whose state differs by row throughout: the step is traced twice, and
+batched once.
 """
 
 from __future__ import annotations
@@ -23,7 +23,10 @@ def time_loop(step: Callable[[Any, jax.Array, Any], Any], sample: Any, state: An
         step: takes what the steps of a sample share, the step's number and the state before it.
         sample: a pytree; leaves that are no tracers stay constants of the program.
         state: a pytree of arrays, whose shapes and types a step keeps.
-        steps: an integer, or a traced one, of which no program is special.
+        steps: an integer, or a traced one, of which no program is special; the same for all rows of a batch.
+
+    Raises:
+        ValueError: rows of a batch take different numbers of steps.
     """
     leaves, tree = jax.tree.flatten(sample)
     traced = [isinstance(leaf, Tracer) for leaf in leaves]
@@ -43,7 +46,7 @@ def time_loop(step: Callable[[Any, jax.Array, Any], Any], sample: Any, state: An
     def run_rows(rows: int, batched: Any, own: Any, state: Any, count: jax.Array) -> Any:
         of_own, of_state, of_count = batched
         if of_count:
-            raise NotImplementedError("rows of a batch take the same number of steps")
+            raise ValueError("all rows of a batch take the same number of steps")
         begun = jax.tree.map(lambda a, b: a if b else jnp.broadcast_to(a, (rows, *a.shape)), state, of_state)
         axes = jax.tree.map(lambda b: 0 if b else None, of_own)
         one = jax.vmap(lambda own, k, now: step(whole(own), k, now), in_axes=(axes, None, 0))

@@ -12,15 +12,14 @@ import numpy as np
 import pytest
 from two_link import arm
 
+from benchmarks.check_cases import JOINTS, RATE, measured, played
 from droid_jax.cost.cost import make_cost
 from droid_jax.model.fields import joint_damping
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.preflight.check_log import check_alone, check_log
-from droid_jax.recordings.recording import Channel, Recording, ServoGains, TorqueConvention, TorqueSide
+from droid_jax.recordings.recording import Recording, ServoGains, TorqueConvention, TorqueSide
 
-JOINTS = ("shoulder", "elbow")
-RATE = 250.0  # Hz
 REPEATS = 3
 SIZE = 0.12  # rad, of the small motion: seven degrees
 SENT = np.array([[0.21, 0.47], [0.33, 0.59]])  # Hz, of two sines for each joint
@@ -51,22 +50,8 @@ def recording(gravcomp: bool = False, commands: bool = True, size: float = SIZE,
     model.opt.timestep = 1.0 / (RATE * 4)
     mujoco.mj_setConst(model, mujoco.MjData(model))
     time, command = path(seconds, size)
-    data, seen = mujoco.MjData(model), np.empty((2, len(time), 2))
-    data.qpos[:] = command[0]
-    for k in range(4 * len(time)):
-        data.ctrl[:] = command[k // 4][::-1]  # the scene's actuators stand in the other order
-        at = data.qpos.copy()
-        mujoco.mj_step(model, data)
-        if k % 4 == 0:
-            seen[:, k // 4] = data.qfrc_actuator, at
-    rng = np.random.default_rng(4)
-    torque = seen[0] + rng.normal(0.0, 0.05, (REPEATS, *seen[0].shape))
-    position = seen[1] + rng.normal(0.0, 2e-4, (REPEATS, *seen[1].shape))
-    mask = np.ones(torque.shape, bool)
-    channels = {
-        "torque": Channel("torque", "N m", JOINTS, time, torque, mask),
-        "position": Channel("position", "rad", JOINTS, time, position, mask),
-    }
+    control = command[:, ::-1]  # the scene's actuators stand in the other order
+    channels = measured(time, *played(model, control, command[0]), REPEATS, np.random.default_rng(4))
     gains = ServoGains(np.array([60.0, 25.0]), np.zeros(2)) if commands else None
     none = np.zeros((0, 0))
     return Recording(
