@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_robots import ARM, measured, recording
+from two_link import ARM, measured, recording
 
 from droid_jax.preflight.inspect_log import contents
 from droid_jax.recordings.formats import save_recording

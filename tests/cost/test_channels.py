@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pendulum import pendulum, swung
 from small_log import elbow, elbow_log
-from small_robots import pendulum, swung
 
 from droid_jax.cost.channels import check_channels, informative_channels, measured_channels
 from droid_jax.cost.errors import channel_errors, errors_json, mean_errors

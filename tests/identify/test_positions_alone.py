@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from small_robots import PARAMETERS, START, TRUE, pendulum, swung, write_pendulum
+from pendulum import PARAMETERS, START, TRUE, pendulum, swung, write_pendulum
 
 from droid_jax.cost.channels import in_noise_units
 from droid_jax.cost.cost import make_cost

@@ -10,7 +10,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-from small_robots import arm
+from two_link import arm
 
 from benchmarks.check_cases import JOINTS, RATE, measured, played
 from droid_jax.cost.cost import make_cost

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_robots import MOTOR, arm, motion, recording
+from two_link import MOTOR, arm, motion, recording
 
 from droid_jax.cost.cost import Cost, make_cost
 from droid_jax.model.effect_interface import Effect

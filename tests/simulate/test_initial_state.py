@@ -9,7 +9,7 @@ from functools import partial
 import mujoco
 import numpy as np
 import pytest
-from small_robots import ARM, JOINTS, arm, measured, motion, recording
+from two_link import ARM, JOINTS, arm, measured, motion, recording
 
 from droid_jax.cost.cost import _start_alike, followed, make_cost
 from droid_jax.cost.residuals import CompareConfig

@@ -7,7 +7,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-from small_robots import JOINTS, arm, motion
+from two_link import JOINTS, arm, motion
 
 from droid_jax.cost.cost import make_cost
 from droid_jax.identify.holdout import heldout_distances

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from small_robots import ARM, JOINTS, KP, MOTOR, arm, measured, motion, recording
+from two_link import ARM, JOINTS, KP, MOTOR, arm, measured, motion, recording
 
 from droid_jax import runtime
 from droid_jax.cost.cost import make_cost
