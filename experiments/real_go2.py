@@ -15,7 +15,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import tyro
 from commanded_fit import HERE, evaluated, fitted, kept, parameters_of
 from inverse_fit import RESULTS, run
@@ -26,6 +25,7 @@ from droid_jax.recordings.formats import load_recording
 LOG = "go2_first_12s.npz"
 SOURCE = "The log is the first 12 s of traj_0.pt of iit-DLSLab/sim2real-robot-identification, with the trunk in a rig."
 HALF, END = 6.0, 11.995  # s
+WHEN = ("before", "after")
 # Mean absolute position error on a part of the log that is kept back, mrad (hip, thigh, calf): the maker's model, and
 # one fitted to torques that were reconstructed from the servo's law.
 OTHERS = {"maker's model": [10.4, 12.2, 14.9], "fitted to reconstructed torque": [8.4, 5.6, 7.2]}
@@ -47,6 +47,11 @@ class RealGo2:
     seed: int = 0
 
 
+def in_mrad(errors: list[float]) -> list[float]:
+    """[J] rad as mrad, to the microradian."""
+    return [round(1e3 * error, 3) for error in errors]
+
+
 def main(config: RealGo2) -> None:
     """One fit, the error on the other half, one line of JSON."""
     if not (config.data / LOG).is_file():
@@ -63,21 +68,16 @@ def main(config: RealGo2) -> None:
     fit, judge = [paths["first_half"]], [paths["second_half"]]
     found, seconds = fitted(HERE / "go2_leg.xml", HERE / "go2.json", fit, judge, runs / "identify", options)
     errors = evaluated(runs / "identify", [*fit, *judge], runs / "evaluation")["errors"]
-    mae = {
-        name: {
-            when: np.round(1e3 * np.array(of["position"][f"mae_{when}"]), 3).tolist() for when in ("before", "after")
-        }
-        for name, of in errors.items()
-    }
+    mae = {when: {name: in_mrad(of["position"][f"mae_{when}"]) for name, of in errors.items()} for when in WHEN}
     parameters = parameters_of(found)
     result = {
         "experiment": "real_go2",
         "source": SOURCE,
         "recordings": {whole.name: whole.sha256},
         "joints": list(whole.channels["position"].columns),
-        "mae_mrad": mae["second_half"]["after"],
-        "mae_mrad_before": mae["second_half"]["before"],
-        "mae_mrad_fitted_half": mae["first_half"]["after"],
+        "mae_mrad": mae["after"]["second_half"],
+        "mae_mrad_before": mae["before"]["second_half"],
+        "mae_mrad_fitted_half": mae["after"]["first_half"],
         "others_mae_mrad": OTHERS,
         "armature": {name: of for name, of in parameters.items() if name.startswith("armature")},
         "parameters": parameters,

@@ -3,9 +3,8 @@
     python experiments/real_so101.py --data DIR
 
 `identify` fits `chirp_sweep` and `friction_gravity` of six STS3215 servos (`so101.json`: a gain, damping and dry
-friction of each of the first five joints, one armature that they share, and a delay).  `so101.toml` says which columns of
-a log are what.  `evaluate-fit` replays the other
-motions open loop, over their whole length.
+friction of each of the first five joints, one armature that they share, and a delay).  `so101.toml` says which columns
+of a log are what.  `evaluate-fit` replays the other motions open loop, over their whole length.
 
 Data: isaac-sim2real/sage (Apache 2.0), `output/real/so101/custom`.  DIR holds a folder for each motion, with
 control.csv.gz and state_motor.csv.gz, and the arm without meshes, so101_air.xml.  They are not part of this repository.
