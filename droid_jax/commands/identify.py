@@ -79,9 +79,9 @@ class Identify:
     load_friction."""
     user_effects: Path | None = None
     """Python file that registers effects of your own (docs/your-effect.md); it is run."""
-    engine: Literal["mjx", "mujoco"] = "mjx"
+    engine: Literal["auto", "mjx", "mujoco"] = "auto"
     """mjx: compiled, all devices.  mujoco: plain C, all cores; for motor-side torques, without gravity where the
-    scene compensates it."""
+    scene compensates it.  auto: plain C on a CPU where it can, for scenes without contact pairs; else MJX."""
     population: int | None = None
     """Samples per generation; default: the preset's."""
     generations: int | None = None
@@ -146,6 +146,8 @@ def run(command: Identify) -> None:
     recordings, truth, known = _recordings(command, scene, out, given)
     print("compiling the replay ...", flush=True)
     problem = prepare(scene, space, recordings, nuisances=nuisances, config=config, effects=effects, judge_on=judges)
+    engine = {"mjx": "MJX", "mujoco": "plain C MuJoCo"}[problem.engine.engine]
+    print(f"engine: {engine} ({problem.engine.why})", flush=True)
     # The Gaussian's own, whatever becomes of the search that made it; it may lie in this very folder.
     extended = None if command.extended is None else command.extended.read_bytes()
     begin(out, setup, command.again, "identify")  # and only now, with all of it found good
@@ -192,7 +194,7 @@ def _description(
         "command": "identify",
         "preset": command.preset,
         "scene": found.scene.name,
-        "engine": command.engine,
+        "engine": found.engine.engine,
         "recordings": [_entry(r, found.heldout_repeats[r.name]) for r in recordings],
         "judged_on": [_entry(r) for r in judges],
         "seed": command.seed,
@@ -214,7 +216,9 @@ def identify_model(command: Identify) -> tuple[Scene, Space, Space | None]:
     from droid_jax.door.space import door_nuisances, door_space
 
     if command.scene is not None:
-        scene, listed = own_scene(command, engine=command.engine, mj_step=command.mj_step)
+        scene, listed = own_scene(
+            command, engine="mujoco" if command.engine == "mujoco" else "mjx", mj_step=command.mj_step
+        )
         if all(p.nuisance for p in listed.parameters):
             raise ValueError(f"{command.parameters}: every entry is a nuisance; identify fits at least one that is not")
         main = listed.select(p.name for p in listed.parameters if not p.nuisance)
