@@ -39,9 +39,9 @@ class Windows:
         return self.begin[:, None] + np.arange(self.weights.shape[-1])
 
 
-def windows(filters: Sequence[sparse.csr_array]) -> Windows:
-    """Sparse filters [K, T], one for each column or one for all, as windows."""
-    count, length = filters[0].shape
+def windows(filters: Sequence[sparse.csr_array], length: int) -> Windows:
+    """Sparse filters [K, T], one for each column or one for all, as windows; length: T."""
+    count = len(filters[0].indptr) - 1
     rows = [np.repeat(np.arange(count), np.diff(each.indptr)) for each in filters]
     first, last = np.full(count, length), np.zeros(count, int)
     for row, each in zip(rows, filters, strict=True):
@@ -132,7 +132,7 @@ def prepared(
     resampling = _resampling(clock, time)
     off = 0.0 if apart is None else np.stack([resampling @ a[:, columns] for a in apart])
     repeats = smooth(values - off, mask, kernel, config.least_window)
-    seen = _same_filter(kernel, mask, ~np.isnan(repeats), resampling)
+    seen = _same_filter(kernel, mask, ~np.isnan(repeats), resampling, len(clock))
     repeats, measured = _fill(repeats, channel, coarse, config.least_overlap)
     noise = estimate_noise(repeats, minimum=config.minimum[channel.name], measured=measured, config=config)
     step = clock[1] - clock[0]
@@ -192,14 +192,15 @@ def _resampling(clock: np.ndarray, time: np.ndarray) -> sparse.csr_array:
 def _same_filter(kernel: sparse.csr_array, mask: np.ndarray, kept: np.ndarray, resampling: sparse.csr_array) -> Windows:
     """What resampling, smoothing with a mask and averaging over the repeats does to a replay's trace [T].
 
-    kernel [K, Tc]; mask [N, Tc, C]; kept [N, K, C], the outputs that enter the mean; resampling [Tc, T].
+    kernel [K, Tc]; mask [N, Tc, C]; kept [N, K, C], the outputs that enter the mean; resampling [Tc, T];
+    length: T.
     """
     if mask.all():
-        return windows([kernel @ resampling])
+        return windows([kernel @ resampling], length)
     columns = list(zip(mask.transpose(2, 0, 1), kept.transpose(2, 0, 1), strict=True))
     if all(np.array_equal(m, columns[0][0]) and np.array_equal(k, columns[0][1]) for m, k in columns):
         columns = columns[:1]  # a log that was silent for a while was so in all of them
-    return windows([_mean_filter(kernel, *column) @ resampling for column in columns])
+    return windows([_mean_filter(kernel, *column) @ resampling for column in columns], length)
 
 
 def _mean_filter(kernel: sparse.csr_array, mask: np.ndarray, kept: np.ndarray) -> sparse.csr_array:
