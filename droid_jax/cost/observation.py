@@ -189,7 +189,9 @@ def _resampling(clock: np.ndarray, time: np.ndarray) -> sparse.csr_array:
     return sparse.csr_array(entries, shape=(len(time), len(clock)))
 
 
-def _same_filter(kernel: sparse.csr_array, mask: np.ndarray, kept: np.ndarray, resampling: sparse.csr_array) -> Windows:
+def _same_filter(
+    kernel: sparse.csr_array, mask: np.ndarray, kept: np.ndarray, resampling: sparse.csr_array, length: int
+) -> Windows:
     """What resampling, smoothing with a mask and averaging over the repeats does to a replay's trace [T].
 
     kernel [K, Tc]; mask [N, Tc, C]; kept [N, K, C], the outputs that enter the mean; resampling [Tc, T];
