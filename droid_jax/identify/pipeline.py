@@ -420,7 +420,7 @@ def _refined(
     what a first refinement leaves unexplained.
     """
 
-    def run(cost: Cost, rough: Cost, begin: np.ndarray) -> Refined:
+    def run(cost: Cost, rough: Cost, begin: np.ndarray, config: RefineConfig = config) -> Refined:
         hypotheses = grip_hypotheses(cost.space)
         return refine(
             cost.whitened, cost.space, begin, config, first=rough.whitened, hypotheses=hypotheses, progress=report
@@ -432,7 +432,8 @@ def _refined(
     early = early.restated(begin[0])
     first = run(early, early.first(), begin)
     base = base.restated(first.best)
-    last = run(base, base.first() if whole else early.restated(first.best), first.best)
+    settled = replace(config, basin_hops=0)  # the first one has looked for other basins
+    last = run(base, base.first() if whole else early.restated(first.best), first.best, settled)
     return base, replace(last, evaluations=first.evaluations + last.evaluations)
 
 
