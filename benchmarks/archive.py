@@ -1,19 +1,23 @@
-"""Scored runs, one compressed file each: plans, sealed truths, results and oracles of all their cases.
+"""Scored runs, compressed: plans, sealed truths, results and oracles of all their cases.
 
     python benchmarks/archive.py list                     # what is there
     python benchmarks/archive.py unpack NAME [--out DIR]  # as the folder that experiments/ writes and scores
     python benchmarks/archive.py pack NAME --folder DIR   # the other way, with its line in manifest.json
-    python benchmarks/archive.py check                    # every file against its SHA-256 in manifest.json
+    python benchmarks/archive.py check                    # every archive against its SHA-256 in manifest.json
 
-NAME.jsonl.xz holds one line of JSON a file: its `path` in the folder and its `text`, or `base64` where it is no text.
-Files come back byte for byte.
+An archive is an xz stream of one line of JSON a file: its `path` in the folder and its `text`, or `base64` where it is
+no text.  Files come back byte for byte.  Runs of one kind, named KIND_COMMIT, lie one stream after the other in
+KIND.jsonl.xz; manifest.json says where each starts, and its SHA-256.
 """
 
 from __future__ import annotations
 
 import base64
+import hashlib
+import io
 import json
 import lzma
+import re
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -26,7 +30,7 @@ sys.path[:0] = [str(ROOT)]
 # ruff: noqa: E402
 import tyro
 
-from droid_jax.storage import file_sha256, write_bytes, write_json
+from droid_jax.storage import write_bytes, write_json
 
 PLACE = ROOT / "benchmarks" / "results" / "archive"
 ENDING, MANIFEST = ".jsonl.xz", "manifest.json"
@@ -81,29 +85,46 @@ def pack(folder: Path, place: Path, name: str) -> Path:
         raise FileNotFoundError(f"{folder} holds no files to pack")
     lines = [json.dumps(_packed(path.relative_to(folder).as_posix(), path.read_bytes())) for path in files]
     data = lzma.compress("".join(f"{line}\n" for line in lines).encode(), preset=9 | lzma.PRESET_EXTREME)
+    file, known = file_of(name), manifest(place)
+    together = {other: stream(place, entry) for other, entry in known.items() if entry["file"] == file} | {name: data}
     place.mkdir(parents=True, exist_ok=True)
-    path = place / (name + ENDING)
-    write_bytes(path, data)
-    known = manifest(place) | {name: {"files": len(files), "bytes": len(data), "sha256": file_sha256(path)}}
+    write_bytes(place / file, b"".join(together[key] for key in sorted(together)))
+    known[name] = {"file": file, "files": len(files), "sha256": hashlib.sha256(data).hexdigest()}
+    start = 0
+    for key in sorted(together):
+        known[key] |= {"start": start, "bytes": len(together[key])}
+        start += len(together[key])
     write_json(place / MANIFEST, dict(sorted(known.items())))
-    return path
+    return place / file
+
+
+def file_of(name: str) -> str:
+    """The file that an archive lies in: that of its kind where its name ends with a commit, else its own."""
+    return re.sub(r"_[0-9a-f]{7}$", "", name) + ENDING
+
+
+def stream(place: Path, entry: dict[str, Any]) -> bytes:
+    """The compressed bytes of an archive, as the manifest says where they are."""
+    with (place / entry["file"]).open("rb") as file:
+        file.seek(entry["start"])
+        return file.read(entry["bytes"])
 
 
 def unpack(name: str, folder: Path, place: Path = PLACE) -> int:
     """Write the files of an archive into a folder; how many.  ValueError where it is not of `pack`."""
     count = 0
-    for path, content in contents(place / (name + ENDING)):
+    for path, content in contents(stream(place, manifest(place)[name]), name):
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
         write_bytes(folder / path, content)
         count += 1
     return count
 
 
-def contents(archive: Path) -> Iterator[tuple[PurePosixPath, bytes]]:
-    """Path and content of every file in an archive; ValueError where it is not of `pack`."""
+def contents(data: bytes, name: str) -> Iterator[tuple[PurePosixPath, bytes]]:
+    """Path and content of every file in an archive's bytes; ValueError, with its name, where it is not of `pack`."""
     total = 0
     try:
-        with lzma.open(archive, "rt", encoding="utf-8") as lines:
+        with lzma.open(io.BytesIO(data), "rt", encoding="utf-8") as lines:
             for line in lines:
                 entry = json.loads(line)
                 path, text = PurePosixPath(entry["path"]), entry.get("text")
@@ -115,26 +136,34 @@ def contents(archive: Path) -> Iterator[tuple[PurePosixPath, bytes]]:
                     raise ValueError(f"more than {MOST_BYTES >> 20} MiB")
                 yield path, content
     except (lzma.LZMAError, EOFError, KeyError, TypeError, AttributeError, ValueError) as error:
-        raise ValueError(f"{archive} is no archive of benchmarks/archive.py: {error}") from error
+        raise ValueError(f"{name} is no archive of benchmarks/archive.py: {error}") from error
 
 
 def manifest(place: Path) -> dict[str, dict[str, Any]]:
-    """Archive's name -> its files, bytes and sha256."""
+    """Archive's name -> its file, start and bytes in there, how many files it holds, and its sha256."""
     path = place / MANIFEST
     return json.loads(path.read_text()) if path.is_file() else {}
 
 
 def faults(place: Path) -> list[str]:
     """What is wrong with the archives of a folder, a sentence each."""
-    known, found = manifest(place), {p.name.removesuffix(ENDING): p for p in sorted(place.glob(f"*{ENDING}"))}
-    out = [f"{name}: in the manifest, not in the folder" for name in known if name not in found]
-    for name, path in found.items():
-        if name not in known:
-            out.append(f"{name}: not in the manifest")
-        elif file_sha256(path) != known[name]["sha256"]:
-            out.append(f"{name}: not what was packed, by its SHA-256")
-        elif sum(1 for _ in contents(path)) != known[name]["files"]:
-            out.append(f"{name}: another number of files than the manifest says")
+    known, out = manifest(place), []
+    files = sorted({entry["file"] for entry in known.values()} | {p.name for p in place.glob(f"*{ENDING}")})
+    for file in files:
+        within = sorted((entry["start"], name) for name, entry in known.items() if entry["file"] == file)
+        if not (place / file).is_file():
+            out.append(f"{file}: in the manifest, not in the folder")
+            continue
+        end = 0
+        for start, name in within:
+            data = stream(place, known[name])
+            if start != end or hashlib.sha256(data).hexdigest() != known[name]["sha256"]:
+                out.append(f"{name}: not what was packed, by its place or its SHA-256")
+            elif sum(1 for _ in contents(data, name)) != known[name]["files"]:
+                out.append(f"{name}: another number of files than the manifest says")
+            end = start + known[name]["bytes"]
+        if (place / file).stat().st_size != end:
+            out.append(f"{file}: holds bytes that are not in the manifest")
     return out
 
 

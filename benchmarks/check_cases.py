@@ -9,8 +9,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from droid_jax.door.arm import panda_arm_scene
-from droid_jax.door.builtin import ARM
+from droid_jax.door.scene import ARM, panda_arm_scene
 from droid_jax.model.scene import Scene, compile_scene, load_scene
 from droid_jax.recordings.column_map import ChannelMap, ColumnMap, TimeMap, Units
 from droid_jax.recordings.log_files import read_log

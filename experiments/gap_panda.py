@@ -44,8 +44,7 @@ from real_panda import MOTION_CUTOFF, SOURCE, link_nuisances, load_panda, load_p
 
 from benchmarks.common import publish, stem
 from droid_jax.discrepancy.candidates import observable_effects
-from droid_jax.door.arm import panda_arm_scene
-from droid_jax.door.builtin import ARM
+from droid_jax.door.scene import ARM, panda_arm_scene
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.joint_friction import joint_friction_space
 from droid_jax.model.parameters import Space

@@ -66,8 +66,7 @@ from inverse_fit import (
 
 from droid_jax.cost.cost import Cost
 from droid_jax.cost.noise import DEFAULT_NOISE, correlation_time
-from droid_jax.door.arm import panda_arm_scene
-from droid_jax.door.builtin import ARM
+from droid_jax.door.scene import ARM, panda_arm_scene
 from droid_jax.identify.search import CmaConfig
 from droid_jax.model.effect_interface import Effect, Rollout, Theta
 from droid_jax.model.fields import body_mass_scale, model_parameter

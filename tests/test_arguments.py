@@ -17,6 +17,7 @@ from droid_jax.arguments import check_fields, number, whole
 from droid_jax.cost.noise import NoiseConfig
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.discrepancy.config import DiscrepancyConfig, SelectionConfig
+from droid_jax.errors import faults, named
 from droid_jax.identify.identifiability import IdentifiabilityConfig
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.identify.pipeline import IdentifyConfig
@@ -191,3 +192,10 @@ def test_a_path_that_no_file_can_have_is_told_in_one_short_line(text: str) -> No
 def test_what_another_library_says_is_one_printable_line() -> None:
     assert arguments.said(ValueError("line 1\n  line 2\x1b")) == "line 1 line 2?"
     assert len(arguments.said(ValueError("y" * 5000))) == 300
+
+
+def test_names_of_a_file_are_told_printable_and_cut():
+    assert named(["a", "b"]) == "a, b"
+    assert named(map(str, range(25))).endswith("18, 19 and 5 more")
+    told = faults({"unknown:": ["z" * 100_000, "\x1b[31m"], "missing:": []})
+    assert told.startswith("unknown: zzz") and len(told) < 200 and told.isprintable()

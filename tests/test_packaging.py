@@ -60,9 +60,9 @@ def test_installed_package_finds_its_own_mjcf(built, tmp_path):
     run("-m", "pip", "install", "--no-deps", "--no-index", "--target", str(target), str(built[0]))
     code = (
         f"import sys; sys.path.insert(0, {str(target)!r})\n"
-        "import mujoco, droid_jax.door.builtin as builtin\n"
-        "folder = builtin.mjcf_dir()\n"
-        "print(builtin.__file__, folder, mujoco.MjModel.from_xml_path(str(folder / 'panda.xml')).nu, sep='\\n')"
+        "import mujoco, droid_jax.door.scene as scene\n"
+        "folder = scene.mjcf_dir()\n"
+        "print(scene.__file__, folder, mujoco.MjModel.from_xml_path(str(folder / 'panda.xml')).nu, sep='\\n')"
     )
     # Away from the checkout, whose own package and MJCF files would be found first.
     module, folder, actuators = run("-c", code, cwd=tmp_path).splitlines()[-3:]

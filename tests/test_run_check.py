@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from two_link import ARM, measured, recording
 
-from droid_jax.preflight.contents import contents
+from droid_jax.preflight.inspect_log import contents
 from droid_jax.recordings.formats import save_recording
 from droid_jax.recordings.recording import Recording
 from droid_jax.run import main

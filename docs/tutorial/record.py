@@ -1,10 +1,11 @@
-"""The logs of the tutorial: a two-link arm in plain C MuJoCo, a synthetic robot for a robot.
+"""The logs of the tutorial: a two-link arm in plain C MuJoCo in place of a robot.
 
     python docs/tutorial/record.py
 
 It differs from arm.xml in its forearm's mass and its joints' damping, and in something that arm.xml has no number
 for: dry friction in the shoulder, a little less of it while the joint moves fast.  Ten repeats of each of three
-motions, with noise on the motor torques: train as a ROS 2 bag for each repeat, validation and test as CSV folders.
+motions, with noise on the motor torques: train as a ROS 2 bag for each repeat, validation as a CSV folder, test as
+an npz file.
 """
 
 from __future__ import annotations
@@ -85,7 +86,7 @@ def recording(name: str, seed: int) -> dj.Recording:
         torque=TorqueConvention(TorqueSide.MOTOR, gravity=True),
         qpos0=dict.fromkeys(JOINTS, 0.0),
         gains=ServoGains(np.array(STIFFNESS), np.array([0.0, 0.0])),
-        meta={"source": "synthetic robot for a robot (plain C MuJoCo), docs/tutorial/record.py"},
+        meta={"source": "synthetic robot (plain C MuJoCo), docs/tutorial/record.py"},
     )
 
 
@@ -100,7 +101,8 @@ def write_bags(folder: Path, made: dj.Recording) -> None:
     state = types["sensor_msgs/msg/JointState"]
     names, none = list(made.command_names), np.zeros(0)
     for number in range(made.repeats):
-        with Writer(folder / f"repeat_{number:02d}", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        bag = folder / f"repeat_{number:02d}"
+        with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
             joints, command = (
                 writer.add_connection(topic, state.__msgtype__, typestore=store)
                 for topic in ("/joint_states", "/command")
@@ -115,6 +117,8 @@ def write_bags(folder: Path, made: dj.Recording) -> None:
                 )
                 for topic, message in messages:
                     writer.write(topic, nanoseconds, store.serialize_cdr(message, state.__msgtype__))
+        (bag / f"{bag.name}.mcap").rename(folder / f"{bag.name}.mcap")  # it needs no metadata.yaml beside it
+        shutil.rmtree(bag)
 
 
 def main() -> None:
@@ -127,7 +131,7 @@ def main() -> None:
         if name == "train":
             write_bags(data / name, made)
         else:
-            print(dj.save_recording(made, data / name))
+            print(dj.save_recording(made, data / (name if name == "validation" else f"{name}.npz")))
 
 
 if __name__ == "__main__":

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from droid_jax.preflight.contents import Signal
     from droid_jax.preflight.findings import Finding
+    from droid_jax.preflight.inspect_log import Signal
     from droid_jax.recordings.recording import Recording
 
 COLOURS = {"certain": "bold red", "likely": "yellow", "note": "cyan"}
@@ -39,8 +39,7 @@ def run(command: CheckCommand) -> None:
     """Print the tables, and write page and JSON."""
     from droid_jax.commands.options import recording_at
     from droid_jax.model.scene import load_scene
-    from droid_jax.preflight.contents import contents
-    from droid_jax.preflight.inspect_log import inspect_log
+    from droid_jax.preflight.inspect_log import contents, inspect_log
     from droid_jax.report.check_page import check_page
     from droid_jax.storage import refuse_special, write_own
 

@@ -14,8 +14,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from droid_jax.door.builtin import ARM, FINGERS, mjcf_dir
-from droid_jax.door.scene import door_scene
+from droid_jax.door.scene import ARM, FINGERS, door_scene, mjcf_dir
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.checks import validate
 from droid_jax.recordings.recording import (

@@ -1,4 +1,4 @@
-"""The built-in scene, a Panda in front of a cabinet door: room, arm and door composed with MjSpec."""
+"""The built-in scene, a Panda in front of a cabinet door, out of room, arm and door by MjSpec; the arm alone."""
 
 from __future__ import annotations
 
@@ -9,10 +9,13 @@ from pathlib import Path
 import mujoco
 
 from droid_jax.arguments import flag, number, one_of, whole
-from droid_jax.door.builtin import ARM, HINGE, mjcf_dir
 from droid_jax.model.scene import Grip, Scene, compile_scene
 from droid_jax.model.visual_geoms import LOOK_GROUP
 
+ARM = tuple(f"panda_joint{i}" for i in range(1, 8))
+FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
+HAND = "hand"
+HINGE = "hinge"
 LEVERS = (0.30, 0.25, 0.20, 0.15)  # m, knob to hinge axis: four locations 5 cm apart (paper, IV-E)
 
 # Table I of the paper, N m/rad by number of springs: its initial mean, and its fitted means (see also door.truth).
@@ -23,6 +26,18 @@ IMPEDANCE_STIFFNESS = (600.0, 600.0, 600.0, 600.0, 250.0, 150.0, 50.0)  # N m/ra
 IMPEDANCE_DAMPING = (50.0, 50.0, 50.0, 50.0, 20.0, 15.0, 15.0)
 PAPER_STIFFNESS = (4500.0, 4500.0, 3500.0, 3500.0, 2000.0, 2000.0, 2000.0)
 PAPER_DAMPING = (100.0, 100.0, 100.0, 100.0, 100.0, 10.0, 0.4)  # Table I
+
+
+def mjcf_dir() -> Path:
+    """Folder of the built-in MJCF files: inside the installed package, else beside it in a checkout.
+
+    Raises FileNotFoundError when neither is there.
+    """
+    package = Path(__file__).resolve().parents[1]
+    for folder in (package / "mjcf", package.parent / "mjcf"):
+        if (folder / "room.xml").is_file():
+            return folder
+    raise FileNotFoundError(f"the built-in MJCF files are neither in {package / 'mjcf'} nor beside the package")
 
 
 def door_scene(
@@ -74,6 +89,19 @@ def door_scene(
         grip=grip,
         unlimited=() if limits else ARM,
     )
+
+
+def panda_arm_scene() -> Scene:
+    """The seven-joint Panda of `mjcf/panda.xml` with nothing mounted on its flange.
+
+    Joint ranges are not enforced: a replay of a measured motion keeps inside them.
+    """
+    spec = mujoco.MjSpec.from_file(str(mjcf_dir() / "panda.xml"))
+    for finger in FINGERS:  # its actuator would drive a joint that is gone
+        spec.delete(spec.actuator(finger))
+    spec.delete(spec.body(HAND))
+    spec.modelname = "panda_arm"
+    return compile_scene(spec, "Panda arm", joints=ARM, unlimited=ARM)
 
 
 def _attach(spec: mujoco.MjSpec, file: Path, site: str) -> None:

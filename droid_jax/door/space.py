@@ -10,8 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 from droid_jax.arguments import instance, one_of
-from droid_jax.door.builtin import ARM, HINGE
-from droid_jax.door.scene import PAPER_DAMPING
+from droid_jax.door.scene import ARM, HINGE, PAPER_DAMPING
 from droid_jax.model.fields import (
     body_mass,
     body_mass_scale,

@@ -9,8 +9,8 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from droid_jax.preflight.contents import Signal
 from droid_jax.preflight.findings import Finding
+from droid_jax.preflight.inspect_log import Signal
 from droid_jax.recordings.recording import Recording
 from droid_jax.report.style import (
     AFTER,

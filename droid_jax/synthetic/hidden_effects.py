@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from droid_jax import runtime
-from droid_jax.door.builtin import HINGE
+from droid_jax.door.scene import HINGE
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording, TorqueSide

@@ -18,7 +18,7 @@ import numpy as np
 import scipy.signal
 
 from droid_jax.arguments import check_fields, choice, number, several, whole
-from droid_jax.door.builtin import HINGE
+from droid_jax.door.scene import HINGE
 from droid_jax.door.space import JOINT_DAMPING, door_nuisances, door_space, torque_offsets
 from droid_jax.door.space import truth as table_i
 from droid_jax.files import SYNTHETIC_SOURCE as SOURCE

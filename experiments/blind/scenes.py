@@ -20,9 +20,7 @@ import mujoco
 import numpy as np
 
 from droid_jax.discrepancy.candidates import acts_on_commands_only
-from droid_jax.door.arm import panda_arm_scene
-from droid_jax.door.builtin import ARM
-from droid_jax.door.scene import door_scene
+from droid_jax.door.scene import ARM, door_scene, panda_arm_scene
 from droid_jax.door.space import door_nuisances, door_space, torque_offsets
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects.registry import library, ready

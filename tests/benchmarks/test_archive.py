@@ -37,19 +37,32 @@ def test_what_was_changed_is_found(folder: Path, tmp_path: Path):
     place = tmp_path / "archive"
     for name in ("changed", "gone"):
         archive.pack(folder, place, name)
-    (place / f"changed{archive.ENDING}").write_bytes(lzma.compress(b""))
+    changed = place / f"changed{archive.ENDING}"
+    changed.write_bytes(changed.read_bytes()[:-1] + b"x")
     (place / f"gone{archive.ENDING}").rename(place / f"strange{archive.ENDING}")
-    assert {fault.split(":")[0] for fault in archive.faults(place)} == {"changed", "gone", "strange"}
+    wrong = {"changed", f"gone{archive.ENDING}", f"strange{archive.ENDING}"}
+    assert {fault.split(":")[0] for fault in archive.faults(place)} == wrong
+
+
+def test_runs_of_one_kind_lie_in_one_file(folder: Path, tmp_path: Path):
+    """Each comes back by its name, also after another was packed anew."""
+    place = tmp_path / "archive"
+    for name in ("null_22222ab", "null_11111ab", "null_22222ab"):
+        archive.pack(folder, place, name)
+        (folder / "made").write_text(name)
+    assert sorted(p.name for p in place.iterdir()) == [archive.MANIFEST, f"null{archive.ENDING}"]
+    assert archive.faults(place) == []
+    for name, made in (("null_11111ab", "null_22222ab"), ("null_22222ab", "null_11111ab")):
+        assert archive.unpack(name, tmp_path / name, place) == len(CONTENTS)
+        assert (tmp_path / name / "made").read_text() == made
 
 
 @pytest.mark.parametrize(
     "line", ['{"path": "../a", "text": ""}', '{"path": "/a", "text": ""}', '{"path": "a"}', "[]", "no JSON"]
 )
 def test_what_is_no_archive_is_refused(tmp_path: Path, line: str):
-    (tmp_path / f"bad{archive.ENDING}").write_bytes(lzma.compress(line.encode()))
     with pytest.raises(ValueError, match="is no archive of"):
-        archive.unpack("bad", tmp_path / "out", tmp_path)
-    assert not (tmp_path / "a").exists()
+        list(archive.contents(lzma.compress(line.encode()), "bad"))
 
 
 def test_an_empty_folder_is_no_archive(tmp_path: Path):

@@ -8,9 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from droid_jax.door.builtin import ARM, FINGERS
 from droid_jax.door.demonstration import CLOSED, OPEN, PLANS, demonstrate, demonstration_path, grasp_pose
-from droid_jax.door.scene import door_scene
+from droid_jax.door.scene import ARM, FINGERS, door_scene
 from droid_jax.door.space import door_space
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.formats import load_recording

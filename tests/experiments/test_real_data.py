@@ -16,8 +16,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from droid_jax.door.arm import panda_arm_scene
-from droid_jax.door.builtin import ARM, FINGERS
+from droid_jax.door.scene import ARM, FINGERS, panda_arm_scene
 from droid_jax.model.joint_friction import joint_friction_space
 
 EXPERIMENTS = Path(__file__).resolve().parents[2] / "experiments"

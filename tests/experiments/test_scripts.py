@@ -1,4 +1,4 @@
-"""What single scripts make of their cases: nothing undefined is written, and what does not go together is refused."""
+"""What single scripts make of their cases, and what they keep from run to run; what does not go together is refused."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from benchmarks.common import publish
+from benchmarks.sharing import code_name, kept
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -80,3 +81,31 @@ def test_every_script_is_in_the_list_of_its_folder(folder: str):
     assert len(listed) == len(set(listed)) and set(listed) == scripts
     helpers = {p.name for p in (ROOT / folder).glob("*.py")} - scripts
     assert [name for name in sorted(helpers) if f"`{name}`" not in text] == []
+
+
+def test_what_is_kept_is_made_once(tmp_path: Path):
+    made = list[int]()
+
+    def make() -> dict[str, int]:
+        made.append(1)
+        return {"made": len(made)}
+
+    path = tmp_path / "cases" / "a.json"
+    assert kept(path, make) == kept(path, make) == {"made": 1}
+    path.unlink()
+    assert kept(path, make) == {"made": 2}
+
+
+def test_what_fails_is_not_kept(tmp_path: Path):
+    def fail() -> dict[str, int]:
+        raise ValueError("no replay")
+
+    with pytest.raises(ValueError, match="no replay"):
+        kept(tmp_path / "a.json", fail)
+    assert kept(tmp_path / "a.json", lambda: {"made": 1}) == {"made": 1}
+
+
+def test_uncommitted_code_finds_nothing_again():
+    assert code_name("a" * 40) == code_name("a" * 40) == "a" * 40
+    assert code_name("a" * 40 + "-dirty") != code_name("a" * 40 + "-dirty")
+    assert code_name(None) != code_name(None)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import model_kinds
 import recording_kinds
 import run_kinds
-import state_kinds
 from kinds import Kind
 
 KINDS: dict[str, Kind] = {
-    kind.name: kind for kinds in (recording_kinds, model_kinds, run_kinds, state_kinds) for kind in kinds.KINDS
+    kind.name: kind for kinds in (recording_kinds, model_kinds, run_kinds) for kind in kinds.KINDS
 }

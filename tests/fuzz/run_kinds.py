@@ -1,4 +1,4 @@
-"""Folders of runs and the pages made from them, cut down so that they are quick to draw."""
+"""Folders of runs and the pages made from them, quick to draw; policies, and what a run keeps to go on from."""
 
 from __future__ import annotations
 
@@ -18,12 +18,18 @@ from kinds import ROOT, Kind, use
 from markupsafe import Markup
 from recording_kinds import recording
 
+from droid_jax.cost.replay_cache import cached
+from droid_jax.files import POLICY
+from droid_jax.identify.checkpoints import Checkpoints
+from droid_jax.policy.control import ACTIONS, FORMAT, LAYOUT, OBSERVED, SHAPES, load_policy
+from droid_jax.storage import write_npz
+
 sys.path.append(str(ROOT / "tests" / "report"))
 
 # isort: split
 
 from made_up_gap import make_gap as made_up_gap
-from made_up_policy import make_policy as made_up_policy
+from made_up_run import make_policy as made_up_policy
 from made_up_run import make_run as made_up_run
 
 from droid_jax.commands import source
@@ -179,6 +185,64 @@ _FILES = {
     **{f"identify/{CORRELATION}": 1, f"identify/{DISTRIBUTION}": 1, f"*/{SETUP}": 4, f"gap/{GAP}": 5},
     **{f"gap/{GAP_TRACES}": 2, f"train/{TRAINING}": 2, f"train/{TRANSFER}": 2},
 }
+
+
+def make_policy(folder: Path) -> None:
+    rng = np.random.default_rng(0)
+    layers = {
+        "weight_0": rng.normal(size=(OBSERVED, 4)), "weight_1": rng.normal(size=(4, 2 * ACTIONS)),
+        "bias_0": np.zeros(4), "bias_1": np.zeros(2 * ACTIONS),
+    }  # fmt: skip
+    own = {"format": FORMAT, "layout": np.array(LAYOUT), "mean": np.zeros(OBSERVED), "std": np.ones(OBSERVED)}
+    write_npz(folder / POLICY, {**own, **layers, **{name: np.ones(shape) for name, shape in SHAPES.items()}})
+
+
+def use_policy(folder: Path) -> None:
+    action = load_policy(folder / POLICY).act(np.zeros(OBSERVED))
+    if np.shape(action) != (ACTIONS,):
+        raise RuntimeError(f"an action has shape {np.shape(action)}")
+
+
+_TREE = {"state": {"mean": np.arange(6.0).reshape(2, 3), "key": np.arange(4, dtype=np.uint32)}, "best": np.ones(3)}
+_FINGERPRINT = {"config": "a text", "data": "another"}
+
+
+def make_checkpoints(folder: Path) -> None:
+    with Checkpoints(folder, fingerprint=_FINGERPRINT) as checkpoints:
+        for step in (3, 6):
+            checkpoints.save(step, {**_TREE, "best": np.full(3, float(step))})
+
+
+def use_checkpoints(folder: Path) -> None:
+    """What is restored is one of the states that were saved, with the step it was saved at."""
+    with Checkpoints(folder, fingerprint=_FINGERPRINT) as checkpoints:
+        found = checkpoints.restore()
+    if found is None:
+        return
+    step, tree = found
+    if step not in (3, 6) or not np.array_equal(tree["best"], np.full(3, float(step))):
+        raise RuntimeError(f"step {step} holds another state")
+
+
+def _replayed(values: Any) -> np.ndarray:
+    """Replays that are known."""
+    return np.arange(8.0).reshape(2, 4) * float(np.sum(values))
+
+
+_ROWS = np.array([[1.0, 2.0], [3.0, 4.0]])
+
+
+def make_replays(folder: Path) -> None:
+    cached(_replayed, folder, "whitened")(_ROWS)
+
+
+def use_replays(folder: Path) -> None:
+    """A damaged file is computed again; what comes back is what was computed."""
+    found = cached(_replayed, folder, "whitened")(_ROWS)
+    if not np.array_equal(found, _replayed(_ROWS)) or found.dtype.kind != "f":
+        raise RuntimeError(f"replays of shape {found.shape}, {found.dtype}")
+
+
 KINDS = (
     *(_whole(Path(file).name, file, weight=weight) for file, weight in _FILES.items()),
     Kind("fit's files, page drawn", "*.*", make_run, page.write_report, 0.1, drawn=True),
@@ -186,4 +250,7 @@ KINDS = (
     Kind("policy's files, page drawn", "*.json", make_policy_run, page.write_report, 0.1, drawn=True),
     Kind("fit's tables", "*.csv", make_tables, use_tables, 2),
     Kind("synthetic robot's file", SYNTHETIC_ROBOT, make_synthetic, use_synthetic, 1),
+    Kind("policy.npz", POLICY, make_policy, use_policy, 4),
+    Kind("checkpoints", "**/*", make_checkpoints, use_checkpoints, 1.5),
+    Kind("kept replays", "*.npz", make_replays, use_replays, 2),
 )

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
-from droid_jax.door.builtin import ARM
-from droid_jax.door.scene import door_scene
+from droid_jax.door.scene import ARM, door_scene
 from droid_jax.door.space import door_nuisances, door_space
 from droid_jax.model.fields import body_mass, model_parameter, servo_scale
 from droid_jax.model.parameters import Mode, Parameter, Space, Write

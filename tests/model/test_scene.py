@@ -8,8 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from droid_jax.door.builtin import ARM, FINGERS
-from droid_jax.door.scene import LEVERS, door_scene
+from droid_jax.door.scene import ARM, FINGERS, LEVERS, door_scene
 from droid_jax.door.space import door_space, truth
 from droid_jax.model.fields import body_mass, joint_damping, joint_frictionloss, model_parameter, servo_scale
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Grip, Scene, compile_scene, load_scene, with_options

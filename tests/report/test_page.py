@@ -8,9 +8,7 @@ from pathlib import Path
 
 import pytest
 from made_up_gap import make_gap
-from made_up_policy import make_policy
-from made_up_run import make_run
-from made_up_whole import make_whole
+from made_up_run import make_policy, make_run, make_whole
 from reader import Page, read_page, spaced
 
 from droid_jax.report import page

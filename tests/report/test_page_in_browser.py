@@ -17,8 +17,7 @@ from urllib.parse import unquote
 import numpy as np
 import pytest
 from made_up_gap import make_gap
-from made_up_run import make_run
-from made_up_whole import make_whole
+from made_up_run import make_run, make_whole
 
 from droid_jax.report import page
 

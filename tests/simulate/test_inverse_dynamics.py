@@ -14,8 +14,7 @@ import pytest
 
 from droid_jax import runtime
 from droid_jax.cost.cost import make_cost
-from droid_jax.door.builtin import ARM
-from droid_jax.door.scene import door_scene
+from droid_jax.door.scene import ARM, door_scene
 from droid_jax.door.space import torque_offsets
 from droid_jax.identify.holdout import split_repeats
 from droid_jax.model.effect_interface import Effect, Rollout
