@@ -30,7 +30,7 @@ import mujoco
 import numpy as np
 
 FORMAT, VERSION = "droid_jax fitted", 1
-TRIES, SWEEPS = 2000, 200  # rows drawn until one is within the bounds; after that rounds of Gibbs sampling
+TRIES, SWEEPS = 2000, 40  # rows drawn until one is within the bounds; after that rounds of Gibbs sampling
 TINY_FRICTION = 1e-6  # N m: gives a joint the constraint row that a law of friction needs
 _UNIT = ("body_quat", "jnt_axis", "geom_quat")
 _DERIVING = {"body_mass", "body_inertia", "body_pos", "body_quat", "body_ipos", "body_iquat", "dof_armature", "jnt_pos",
@@ -137,9 +137,11 @@ def _gibbs(
                 continue
             std = precision[i, i] ** -0.5
             centre = mean[i] - (precision[i] @ (x - mean) - precision[i, i] * (x[i] - mean[i])) / precision[i, i]
-            ends = [normal.cdf((end - centre) / std) for end in (low[i], high[i])]
-            share = min(max(ends[0] + rng.uniform() * (ends[1] - ends[0]), 1e-15), 1 - 1e-15)
-            x[i] = np.clip(centre + std * normal.inv_cdf(share), low[i], high[i])
+            sign = -1.0 if low[i] > centre else 1.0  # in the tail that has digits
+            ends = sorted(sign * (end - centre) / std for end in (low[i], high[i]))
+            first, last = (0.5 * math.erfc(-end / math.sqrt(2.0)) for end in ends)
+            share = min(max(first + rng.uniform() * (last - first), 1e-300), 1 - 1e-15)
+            x[i] = np.clip(centre + sign * std * normal.inv_cdf(share), low[i], high[i])
     return x
 
 

@@ -6,6 +6,7 @@ docs/results-folder.md lists its entries.  apply_fit.py reads it with numpy and 
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -22,9 +23,9 @@ from droid_jax.model.effect_interface import Effect
 from droid_jax.model.law_tables import LawTable, NoTable, law_tables
 from droid_jax.model.mjcf import FittedFiles, angles, fitted_files, native, spoken, unit_of, unwritten
 from droid_jax.model.parameters import Parameter, Role, Space
-from droid_jax.model.physics import make_c_model, make_physics
+from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene
-from droid_jax.storage import write_bytes, write_json, write_text
+from droid_jax.storage import write_bytes, write_text
 
 DIGITS = 7  # of the tables' numbers
 DRAWS = 1000  # behind the interval of a number that several parameters write
@@ -75,9 +76,21 @@ def write_neutral(
         write_text(folder / name, text)
     if made is not None and made.in_place:
         write_text(patch, made.patch)
-    write_json(folder / FITTED_JSON, neutral_json(scene, gaussian, values, effects, made, error, checks or {}))
+    content = neutral_json(scene, gaussian, values, effects, made, error, checks or {})
+    write_text(folder / FITTED_JSON, _lines(content))
     write_bytes(folder / APPLY_FIT, Path(apply_fit.__file__).read_bytes())
     return error
+
+
+def _lines(content: Mapping[str, Any]) -> str:
+    """JSON with a line for each entry, and for each in a list of objects: tables are long, and diffs are read."""
+
+    def text(value: Any) -> str:
+        if isinstance(value, list) and value and isinstance(value[0], dict):
+            return "[\n  " + ",\n  ".join(text(each) for each in value) + "\n ]"
+        return json.dumps(value, allow_nan=False)
+
+    return "{\n " + ",\n ".join(f"{json.dumps(key)}: {text(value)}" for key, value in content.items()) + "\n}\n"
 
 
 def neutral_json(
@@ -100,8 +113,7 @@ def neutral_json(
         row |= {"value": apply_fit.number_of(row, named), "interval": _interval(row, intervals, drawn)}
         row["prior"] = _interval(row, priors, [])
     deviations = dict(zip(space.names, gaussian.physical_std.tolist(), strict=True))
-    physics = make_physics(scene, space, np.asarray(values, np.float32))
-    tables = list(law_tables(scene, physics, effects, named, deviations))
+    tables = list(law_tables(scene, with_numbers(scene, space, np.asarray(values)), effects, named, deviations))
     at = {(row["field"], *row["own"]): row for row in rows}
     changes = [
         {**asdict(c), "interval": None, "unit": ""} | _of_row(at.get((c.field, *c.entry)), c.before, c.after)
@@ -136,6 +148,13 @@ def neutral_json(
             "cov": gaussian.cov.tolist(),
         },
     }
+
+
+def with_numbers(scene: Scene, space: Space, values: np.ndarray) -> Any:
+    """The mjx.Model with the numbers that parameters write; what MuJoCo derives from them is the scene's."""
+    model = make_c_model(scene, space, values)
+    fields = {w.field for p in space.parameters for w in p.writes}
+    return scene.mjx.replace(**{f: np.asarray(getattr(model, f), np.float32) for f in sorted(fields)})
 
 
 def _check(check: Any) -> dict[str, Any]:
@@ -231,7 +250,7 @@ def _of_row(row: Mapping[str, Any] | None, before: float, after: float) -> dict[
 def _law(law: LawTable) -> dict[str, Any]:
     return {
         "effect": law.effect, "location": law.location, "description": law.description, "acts": law.acts,
-        "joint": law.joint, "unit": law.unit, "error": law.error,
+        "joint": law.joint, "unit": law.unit, "error": law.error, "error_of_draws": law.error_of_draws,
         "axes": [{"name": a.name, "unit": a.unit, "nodes": _short(a.nodes)} for a in law.axes],
         "terms": [{"parameter": name, "table": _short(table)} for name, table in law.terms],
     }  # fmt: skip

@@ -7,8 +7,9 @@ is not level, say) has none, and the reason is given.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -17,13 +18,13 @@ import mujoco
 import numpy as np
 
 from droid_jax.model.effect_interface import Effect, State, complete
-from droid_jax.model.physics import Physics
 from droid_jax.model.scene import Scene
 from droid_jax.model.table_grid import ROUNDING, Axis, error, first_nodes, on_grid, refined
 
 SPEED, TURNS, TRAVEL = 20.0, 2 * np.pi, 2.0  # rad/s or m/s, rad, m: how far tables reach where no limit says it
 LOAD = 20.0  # N m: likewise, where no force limit says it
 RAISED = 64.0  # N m of friction beside a law, so that none of it is cut off at zero; float32 still sees 4e-6
+FEWEST = 2048  # states at once: a program is compiled for each count, so there are few of them
 PROBES, CHANGE = 12, 1e-6  # states at which a dependence is looked for; relative change that counts as one
 VARIABLES = ("position", "speed", "load")
 UNIT = {"position": ("rad", "m"), "speed": ("rad/s", "m/s"), "load": ("N m", "N"), "torque": ("N m", "N")}
@@ -36,7 +37,8 @@ class LawTable:
     acts: "force" (added to qfrc_applied), "frictionloss" (added to the joint's), "servo" (added to the torque of the
     position servo) or "command" (delay of the command, s).  axes: shape parameters
     first, then variables: "position", "speed", "load" or "torque" (the servo's without the law).  terms:
-    (parameter, table over the axes).  error: largest difference to the law between the nodes, `unit`.
+    (parameter, table over the axes).  error, error_of_draws: largest difference to the law
+    between the nodes at the fitted values, and anywhere, `unit`.
     """
 
     effect: str
@@ -48,6 +50,7 @@ class LawTable:
     axes: tuple[Axis, ...]
     terms: tuple[tuple[str | None, np.ndarray], ...]
     error: float
+    error_of_draws: float
 
 
 @dataclass(frozen=True)
@@ -61,13 +64,13 @@ class NoTable:
 
 
 def law_tables(
-    scene: Scene, physics: Physics, effects: Sequence[Effect], values: dict[str, float], spread: dict[str, float]
+    scene: Scene, model: Any, effects: Sequence[Effect], values: dict[str, float], spread: dict[str, float]
 ) -> Iterator[LawTable | NoTable]:
     """Tables of all laws that act in a simulation; sensor models and changed model fields have none.
 
     Args:
         scene: of the fit.
-        physics: at the fitted values, for laws that read the servos' gains.
+        model: mjx.Model with the fitted numbers, for laws that read the servos' gains.
         effects: of the model.
         values: fitted values by parameter.
         spread: deviation by parameter, of those that vary: tables hold shapes up to four of them away.
@@ -76,7 +79,7 @@ def law_tables(
         for location, amplitudes in (effect.locations or {"": tuple(p.name for p in effect.parameters)}).items():
             if not any(values.get(name) for name in amplitudes if name in values):
                 continue
-            yield from _tables(_Law(scene, physics, effect, location, amplitudes, values, spread))
+            yield from _tables(_Law(scene, model, effect, location, amplitudes, values, spread))
 
 
 def _tables(law: _Law) -> Iterator[LawTable | NoTable]:
@@ -95,7 +98,7 @@ class _Law:
     """An effect at a location, at its fitted values."""
 
     scene: Scene
-    physics: Physics
+    model: Any
     effect: Effect
     location: str
     amplitudes: tuple[str, ...]
@@ -134,8 +137,10 @@ class _Law:
         )
         if not straight:
             return self.without("it does more to the command than to delay it")
-        terms = tuple((n, np.array(float(f"{s:.5g}"))) for n, s in zip(names, shares, strict=True) if s)
-        return LawTable(self.effect.name, self.location, self.effect.description, "command", "", "s", (), terms, 0.0)
+        terms = tuple((n, np.array(float(f"{s:.3g}"))) for n, s in zip(names, shares, strict=True) if s)
+        return LawTable(
+            self.effect.name, self.location, self.effect.description, "command", "", "s", (), terms, 0.0, 0.0
+        )
 
     def of_state(self, acts: str) -> Iterator[LawTable | NoTable]:
         """Force or friction, of each joint that it acts on."""
@@ -169,7 +174,7 @@ class _Law:
         joint = self.location
         if joint not in self.scene.driven_joints:
             return self.without("it is no law of one joint's servo")
-        u, model = self.scene.command_names.index(joint), self.physics.model
+        u, model = self.scene.command_names.index(joint), self.model
         gear = float(np.asarray(model.actuator_gear)[u, 0])
         gain, bias = float(model.actuator_gainprm[u, 0]), np.asarray(model.actuator_biasprm)[u]
         servo, scene = self.effect.servo, self.scene
@@ -239,10 +244,19 @@ class _Law:
         every = refined([*shape_axes, *axes], [f for _, f in functions], fitted)
         tables = tuple((n, on_grid(every, f)) for n, f in functions)
         sizes = [abs(values[n]) if n else 1.0 for n, _ in functions]
-        errors = [error(every, f, t) for (_, t), (_, f) in zip(tables, functions, strict=True)]
-        worst = float(np.dot(sizes, errors))
+        pairs = list(zip(tables, functions, strict=True))
+        worst = float(np.dot(sizes, [error(every, f, t) for (_, t), (_, f) in pairs]))
+        here = tuple(int(np.abs(a.nodes - v).argmin()) for a, v in zip(every, fitted, strict=False))
+        fixed = [
+            *(replace(a, nodes=a.nodes[i : i + 1]) for a, i in zip(every, here, strict=False)),
+            *every[len(here) :],
+        ]
+        at_fitted = [error(fixed, f, t[here].reshape([len(a.nodes) for a in fixed])) for (_, t), (_, f) in pairs]
+        own = float(np.dot(sizes, at_fitted))
         effect = self.effect
-        return LawTable(effect.name, self.location, effect.description, acts, joint, unit, tuple(every), tables, worst)
+        return LawTable(
+            effect.name, self.location, effect.description, acts, joint, unit, tuple(every), tables, own, worst
+        )
 
     def _linear(self, name: str, axes: list[Axis], at: Callable[..., np.ndarray]) -> bool:
         """Whether the law is this amplitude times something, beside the others' parts."""
@@ -259,7 +273,7 @@ class _Law:
 
     def _batched(self, acts: str) -> Callable[[dict[str, np.ndarray], np.ndarray], np.ndarray]:
         """(parameters [K] each, states [K, nq + nv + nv]) -> [K, nv]."""
-        nq, nv, model = self.scene.model.nq, self.scene.model.nv, self.physics.model
+        nq, nv, model = self.scene.model.nq, self.scene.model.nv, self.model
         raised = jnp.full(nv, RAISED, jnp.float32)
 
         def one(given: dict[str, Any], row: Any) -> Any:
@@ -311,7 +325,7 @@ def _padded(one: Callable[..., Any]) -> Callable[..., np.ndarray]:
 
     def many(given: dict[str, np.ndarray], *rows: np.ndarray) -> np.ndarray:
         count = len(rows[0])
-        size = 1 << max(count - 1, 255).bit_length()
+        size = FEWEST * 8 ** max(0, math.ceil(math.log(count / FEWEST, 8)))
 
         def filled(x: Any) -> jax.Array:
             return jnp.asarray(np.resize(x, (size, *np.shape(x)[1:])), jnp.float32)

@@ -10,9 +10,10 @@ import numpy as np
 from scipy.interpolate import RegularGridInterpolator  # pyright: ignore[reportMissingTypeStubs]
 
 Function = Callable[[np.ndarray], np.ndarray]  # [K, axes] -> [K]
-FINE, COARSE = 2e-4, 2e-3  # of the function's largest value: error between nodes of variables, and of parameters
+FINE, COARSE = 1e-3, 5e-3  # of the function: error between nodes of variables, and of parameters
+SMALL = 0.02  # of its largest value: what is smaller counts as this
 ROUNDING = 1e-5  # what float32 leaves of a friction
-MOST, MOST_SHAPES = 300, 13  # nodes of a variable, of a parameter
+MOST, MOST_SHAPES = 300, 17  # nodes of a variable, of a parameter
 
 
 @dataclass(frozen=True)
@@ -55,12 +56,14 @@ def refined(axes: Sequence[Axis], functions: Sequence[Function], fitted: Sequenc
 
 
 def _split(nodes: np.ndarray, along: Function, most: int, slack: float) -> np.ndarray:
-    """Nodes and middles between them, until no line misses by more than a share of the largest value."""
+    """Nodes and middles between them, until no line misses by more than a share of what is there."""
     largest = float(np.abs(along(nodes)).max())
     while 1 < len(nodes) < most:
         middle, at = 0.5 * (nodes[1:] + nodes[:-1]), along(nodes)
-        missed = np.abs(along(middle) - 0.5 * (at[1:] + at[:-1])).max(axis=1)
-        bad = np.flatnonzero((missed > slack * largest + ROUNDING) & (np.diff(nodes) > 1e-7 * np.ptp(nodes)))
+        there = along(middle)
+        allowed = slack * (np.abs(there) + SMALL * largest) + ROUNDING
+        missed = (np.abs(there - 0.5 * (at[1:] + at[:-1])) / allowed).max(axis=1)
+        bad = np.flatnonzero((missed > 1.0) & (np.diff(nodes) > 1e-7 * np.ptp(nodes)))
         if not bad.size:
             break
         worst = bad[np.argsort(missed[bad])[::-1][: most - len(nodes)]]
@@ -83,7 +86,7 @@ def error(axes: Sequence[Axis], function: Function, table: np.ndarray, points: i
         x[:, i] = axis.nodes[cell] + rng.uniform(size=points) * width[cell]
     wide = [i for i, a in enumerate(axes) if len(a.nodes) > 1]
     if not wide:
-        return 0.0
+        return float(np.abs(function(x[:1]) - table.reshape(-1)[0]).max())
     narrow = tuple(i for i in range(len(axes)) if i not in wide)
     inner = RegularGridInterpolator([axes[i].nodes for i in wide], np.squeeze(table, narrow))
     return float(np.abs(inner(x[:, wide]) - function(x)).max())
