@@ -171,7 +171,8 @@ def run(command: Identify) -> None:
         progress("sample", None)
         keep_replay(out, found, recordings[0])
         write_run(
-            out, found, description, truth=truth, samples=lambda: cost_samples(found, config.samples, config.seed),
+            out, found, description, truth=truth, effects=effects,
+            samples=lambda: cost_samples(found, config.samples, config.seed),
             notes=[
                 *(text for recording in recordings for text in command_notes(scene, recording)),
                 *creep_of_fit(scene, found.full, found.best, recordings),

@@ -53,6 +53,7 @@ class Scene:
             beside the joint's position servo, its own name.
         object_joint: joint of the thing that is moved (the door's hinge), or None.
         grip: how a lost grasp is seen, or None where there is nothing to grip.
+        path: of the MJCF that it was loaded from, or None where it was not a file alone.
     """
 
     name: str
@@ -62,6 +63,7 @@ class Scene:
     command_names: tuple[str, ...]
     object_joint: str | None = None
     grip: Grip | None = None
+    path: Path | None = None
 
     def id(self, kind: str, name: str) -> int:
         """Id of a named thing; kind is "joint", "body", "geom", "pair", "actuator" or "site"."""
@@ -362,9 +364,10 @@ def load_scene(
             raise ValueError(f"unknown joint {joint!r}; {path} {has}")
         named[joint].frictionloss = max(named[joint].frictionloss, TINY_FRICTIONLOSS)
     try:
-        return compile_scene(spec, path.stem, joints=joints, object_joint=object_joint, engine=engine, mj_step=mj_step)
+        scene = compile_scene(spec, path.stem, joints=joints, object_joint=object_joint, engine=engine, mj_step=mj_step)
     except ValueError as error:
         raise ValueError(f"{path}: {said(error, LONGEST)}") from None
+    return scene if assets else dataclasses.replace(scene, path=path.resolve())
 
 
 def _read(path: Path, assets: Mapping[str, bytes]) -> mujoco.MjSpec:

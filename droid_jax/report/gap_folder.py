@@ -15,6 +15,7 @@ import numpy as np
 from msgspec import Struct, field
 
 from droid_jax.files import EXTENDED, GAP, GAP_TRACES, GAP_VERSION, LOST, NOT_MADE, TO_BE_MADE
+from droid_jax.report.neutral_folder import Neutral, read_neutral
 from droid_jax.report.reading import FindingEntry, PhaseEntry, Reader
 from droid_jax.report.text import label
 
@@ -317,6 +318,11 @@ class Gap:
     def extended(self) -> bool:
         """Whether an effect entered the model: only then is there an "after"."""
         return bool(self.found.effects)
+
+    @property
+    def neutral(self) -> Neutral | None:
+        """The extended model in MuJoCo's own terms."""
+        return read_neutral(self.folder, _READ) if self.extended_file else None
 
     @property
     def extended_file(self) -> bool:

@@ -47,6 +47,7 @@ def gap_view(gap: Gap) -> dict[str, Any]:
     return {
         "gap": gap,
         "found": gap.found,
+        "neutral": gap.neutral,
         "roles": ROLES,
         "decisive": DECISIVE,
         "significance": gap.found.threshold("significance"),
