@@ -98,6 +98,22 @@ def servo_force(model: Any, data: Any, velocity: jax.Array) -> jax.Array:
     return mjx.fwd_actuation(model, at_velocity(data, velocity)).qfrc_actuator
 
 
+def gear_torques(model: Any, data: Any, velocity: jax.Array) -> jax.Array:
+    """[2, nv] N m, of the step that `data` comes from: what motors give to the gears, what the links put onto them.
+
+    Motors: actuators and what compensates gravity.  Links: weight, the motion of the others, springs, contacts, limits
+    and applied forces; all but the joints' own inertia, damping and dry friction.  velocity: [nv] before the step.
+    """
+    rows = constraint_rows(data)
+    dry = slice(rows.equalities, rows.equalities + rows.frictions)
+    held = data.qfrc_constraint - rows.jacobian[dry].T @ rows.force[dry]
+    compensated = (1.0 - model.jnt_actgravcomp[model.dof_jntid]) * data.qfrc_gravcomp
+    links = data.qfrc_passive - compensated - data.qfrc_bias + held + data.qfrc_applied
+    if not model.opt.disableflags & (mujoco.mjtDisableBit.mjDSBL_SPRING | mujoco.mjtDisableBit.mjDSBL_DAMPER):
+        links = links + model.dof_damping * velocity
+    return jnp.stack([data.qfrc_actuator + compensated, links])
+
+
 def _within_range(model: Any, data: Any) -> Any:
     """The data with controls inside their ranges, as the forces took them: mjx's derivative of a damper does not."""
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:

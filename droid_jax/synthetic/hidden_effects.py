@@ -48,6 +48,7 @@ LIBRARY = {
     "stribeck_friction": "joint_stribeck",
     "directional_friction": "joint_directional",
     "load_friction": "load_friction",
+    "mesh_friction": "gear_friction",
     "bristle_friction": "joint_coulomb",
     "warm_up_friction": "joint_coulomb",
     "firm_friction": "soft_friction",

@@ -68,6 +68,9 @@ ANSWERS: dict[str, Answer] = {
     "load_friction": Answer(
         "load_friction", parts=("joint_coulomb",), why="under a steady load it is dry friction"
     ),
+    "mesh_friction": Answer(
+        "gear_friction", ("load_friction",), "where the load does not drive the motor, its shares add up to one"
+    ),
     "bristle_friction": Answer("joint_coulomb", why="bristles bend by milliradians before they slip"),
     "warm_up_friction": Answer("joint_coulomb", why="what its repeats share is dry friction; the rest counts as noise"),
     "payload": Answer("payload", scenes=("arm", "door")),
@@ -105,7 +108,8 @@ ANSWERS: dict[str, Answer] = {
     "torque_drift": Answer("torque_drift", ("torque_bias",), "it warms up mostly between the repeats"),
 }  # fmt: skip
 NO_HINGE = ("cable_pull", "torque_ripple", "dry_friction", "bristle_friction", "warm_up_friction", "load_friction",
-            "joint_elasticity", "backlash", "servo_gains", "firm_friction", "encoder_zero")  # fmt: skip
+            "mesh_friction", "joint_elasticity", "backlash", "servo_gains", "firm_friction",
+            "encoder_zero")  # fmt: skip
 PLACES = {"command_delay": "commands", "sensor_delay": "sensors", "contact_compliance": "grip",
           "gravity_direction": "base"}  # fmt: skip
 OF_HINGE = frozenset({

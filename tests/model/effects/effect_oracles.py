@@ -23,12 +23,17 @@ UPPER_ARM = 1.5 * 0.15 + CARRIED
 
 @dataclass(frozen=True)
 class Now:
-    """One moment: each joint's angle, speed, actuator torque before, and how far its command is ahead of it."""
+    """One moment: each joint's angle, speed, actuator torque before, and how far its command is ahead of it.
+
+    motor, links: what the motor gave to the gear in the step before, less damping at the speed now, and the links.
+    """
 
     q: ByJoint
     w: ByJoint
     load: ByJoint
     ahead: ByJoint
+    motor: ByJoint
+    links: ByJoint
 
 
 @dataclass(frozen=True)
@@ -165,6 +170,13 @@ def stribeck(v: Values, name: str, height: float, speed: float) -> float:
     return height * np.exp(-(abs(speed / v[f"{name}_speed"]) ** v[f"{name}_exponent"]))
 
 
+def geared(v: Values, joint: str, now: Now) -> float:
+    """Shares of what presses on the gear from both sides, and what comes on top while the joint is slow."""
+    motor, links = now.motor[joint], now.links[joint]
+    slow = np.exp(-abs(now.w[joint]) / v["gear_speed"])
+    return abs(v["gear_links"] * links - v["gear_motor"] * motor) + v["gear_at_rest"] * slow * abs(links - motor)
+
+
 def latch(v: Values, phi: float, w: float) -> float:
     """The pull fades in over a tenth of the width; a door beyond shut is not pulled."""
     share = max(phi, 0.0) / v["latch_width"]
@@ -203,6 +215,10 @@ ORACLES = {
     "drag": Oracle({"drag": 1.2}, force=at_door(lambda v, phi, w: -v["drag"] * w**2 * np.sign(w))),
     "encoder_offset": Oracle(
         each(*ARM, encoder_offset=(0.03, -0.05)), edit=turned_encoders, beside=compensated_elsewhere
+    ),
+    "gear_friction": Oracle(
+        {**each(*ARM, gear_motor=(0.1, 0.15), gear_links=(0.05, 0.2), gear_at_rest=(0.1, 0.05)), "gear_speed": 0.4},
+        loss=at_arm(geared),
     ),
     "gravity_direction": Oracle({"gravity_about_y": 0.04}, force=leaning, joints=ARM),
     "hardening_spring": Oracle(

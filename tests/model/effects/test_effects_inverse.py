@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -67,6 +68,15 @@ class Inverse:
         replay = inverse_replay(scene, self.motion, [*effects, joint_friction_effect(JOINTS)])
         self.run = over_population(lambda v: replay(make_physics(scene, self.space, v)))
 
+    @functools.cached_property
+    def links(self) -> np.ndarray:
+        """[T, J] N m that weight, springs and the other joints' motion put onto the gears."""
+        spec = mujoco.MjSpec.from_string(MECHANISM)
+        for joint in spec.joints:
+            joint.damping = 0.0
+        still = replace(self.motion, acceleration=0.0 * self.motion.acceleration)
+        return -mj_inverse(spec, still, self.motion.torque.gravity)
+
     def torque(self, *rows: dict[str, float]) -> np.ndarray:
         """[P, T, J] N m"""
         return self.run(np.array([self.space.values(row) for row in rows])).torque.astype(float)
@@ -74,9 +84,12 @@ class Inverse:
     def by_formula(self, function: Callable, v: dict[str, float], load: np.ndarray) -> np.ndarray:
         """[T, J] of an oracle's force or loss; NaN where it has none."""
         out = np.full(load.shape, np.nan)
-        for k, numbers in enumerate(zip(self.motion.position, self.motion.velocity, load, strict=True)):
-            q, w, torque = (dict(zip(JOINTS, n.tolist(), strict=True)) for n in numbers)
-            for joint, value in function(v, Now(q, w, torque, {})).items():
+        slowed = self.scene.model.dof_damping[self.scene.joint_dofs] * self.motion.velocity
+        motor = load - slowed if self.side is MOTOR else load
+        moments = (self.motion.position, self.motion.velocity, load, motor, self.links)
+        for k, numbers in enumerate(zip(*moments, strict=True)):
+            q, w, torque, motor, links = (dict(zip(JOINTS, n.tolist(), strict=True)) for n in numbers)
+            for joint, value in function(v, Now(q, w, torque, {}, motor, links)).items():
                 out[k, JOINTS.index(joint)] = value
         return out
 
