@@ -55,7 +55,7 @@ XML = """
 """
 ARM = ("shoulder", "elbow")
 CONFIG = SyntheticRobotConfig(repeats=1, timestep=LONGEST_STEP)
-SENSORS = ("sensor_delay", "torque_bias", "torque_gain", "torque_drift")
+SENSORS = ("sensor_delay", "torque_bias", "torque_gain", "torque_drift", "crosstalk")
 
 
 def small_scene(payload: str = "") -> Scene:

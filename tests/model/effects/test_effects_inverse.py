@@ -25,7 +25,7 @@ from droid_jax.simulate.measured_motion import Motion
 from droid_jax.simulate.replay import Replay
 
 MOTOR, LINK = TorqueSide.MOTOR, TorqueSide.LINK
-STEERING = ("command_delay", "joint_backlash", "joint_compliance")
+STEERING = ("clock_rate", "command_delay", "joint_backlash", "joint_compliance", "velocity_feedforward")
 COULOMB = 0.15  # N m: the friction that a link-side sensor sees already, in one row of each comparison
 TOLERANCE = 1e-4  # N m: float32, 6e-8 of inertias times accelerations and of 9 N m of weight, summed
 
@@ -155,8 +155,9 @@ def test_sensors_read_what_they_read(inverse: Inverse, name: str):
     assert np.abs(got - neutral).max() > 100 * TOLERANCE
 
 
-def test_a_payload_is_carried(inverse: Inverse):
-    oracle = ORACLES["payload"]
+@pytest.mark.parametrize("name", ["payload", "free_payload"])
+def test_a_payload_is_carried(inverse: Inverse, name: str):
+    oracle = ORACLES[name]
     neutral, got = inverse.torque({}, dict(oracle.values))
     loaded = mujoco.MjSpec.from_string(MECHANISM)
     oracle.edit(loaded, oracle.values)
@@ -201,7 +202,7 @@ def test_gains_of_servos_that_nobody_asks_change_nothing(inverse: Inverse):
 def test_these_are_all_effects(scene: Scene):
     """Whatever is added to the library has to find its place here."""
     left = {n for n, o in ORACLES.items() if not (o.force or o.loss or o.read)}
-    assert left == {"payload", "servo_gain", "encoder_offset", "soft_friction", *STEERING}
+    assert left == {"payload", "free_payload", "servo_gain", "encoder_offset", "soft_friction", *STEERING}
     assert {e.name for e in library(scene)} == set(ORACLES)
 
 

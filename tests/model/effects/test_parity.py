@@ -42,7 +42,11 @@ def in_c(drive: Drive, oracle: Oracle, *, late: float) -> np.ndarray:
     losses = model.dof_frictionloss.copy()
     by_hand = oracle.edit is None
     at = drive.time - late * drive.timestep - (oracle.late(v) if oracle.late else 0.0)
-    command = np.stack([np.interp(at, drive.time, column) for column in drive.command.T], axis=1)
+
+    def look(time: np.ndarray) -> np.ndarray:
+        return np.stack([np.interp(time, drive.time, column) for column in drive.command.T], axis=1)
+
+    command = oracle.sent(v, at, look, servos) if oracle.sent else look(at)
     torque = np.empty((len(command), len(JOINTS)))
     for k, ctrl in enumerate(command):
         q, w, load = ({j: float(a[d]) for j, d in dofs.items()} for a in (data.qpos, data.qvel, data.qfrc_actuator))
