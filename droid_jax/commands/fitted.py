@@ -137,6 +137,7 @@ def _scene_of(asked: dict[str, Any], given: Path | None, rubbed: tuple[str, ...]
         joints=asked.get("joints") or None,
         object_joint=asked.get("object_joint"),
         friction_joints=rubbed,
+        hold=asked.get("joint_friction") == "held",  # runs from before there was a choice had the scene's own
         engine="mujoco" if asked.get("engine") == "mujoco" else "mjx",
         mj_step=asked.get("mj_step", False),
     )

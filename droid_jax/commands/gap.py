@@ -13,6 +13,7 @@ from droid_jax.commands.folder import begin, fingerprints, finished, setup_of, s
 from droid_jax.commands.gap_search import searched
 from droid_jax.commands.options import (
     TIMESTEP,
+    JointFriction,
     compared,
     load_effects,
     needs_log,
@@ -70,6 +71,9 @@ class GapCommand:
     """Measured joints of your own scene; default: all driven joints."""
     object_joint: str | None = None
     """Joint of the thing that is moved, in your own scene; without it no effect of a door is asked about."""
+    joint_friction: JointFriction = "held"
+    """Dry friction of your own scene's joints. held: it holds a load still, unless the MJCF sets solimpfriction or
+    solreffriction itself. scene: as the MJCF has it, whose default lets joints creep."""
     motion_cutoff: float | None = None
     """Logs without commands: cutoff of the filter of the measured positions, Hz; default: 20."""
     effects: tuple[str, ...] = ()

@@ -13,6 +13,7 @@ from droid_jax.commands import report
 from droid_jax.commands.folder import begin, fingerprints, finished, kept_recordings, setup_of
 from droid_jax.commands.options import (
     TIMESTEP,
+    JointFriction,
     Preset,
     compared,
     load_effects,
@@ -72,6 +73,9 @@ class Identify:
     """Measured joints of your own scene; default: all driven joints."""
     object_joint: str | None = None
     """Joint of the thing that is moved, in your own scene."""
+    joint_friction: JointFriction = "held"
+    """Dry friction of your own scene's joints. held: it holds a load still, unless the MJCF sets solimpfriction or
+    solreffriction itself. scene: as the MJCF has it, whose default lets joints creep."""
     extended: Path | None = None
     """extended.json of a gap search: the effects that it named are in the model and fitted too."""
     effects: tuple[str, ...] = ()
