@@ -52,7 +52,8 @@ class IdentifyConfig:
         refine: refinement settings, or None: the search's own covariance is the distribution, as in the paper.
         beginning: s of long recordings that the search and the first refinement see, and more until every joint has
             moved through half of its range; the last refinement sees all.
-        samples: replays drawn from the initial and from the fitted Gaussian to compare their costs.
+        samples: replays drawn from the initial and from the fitted Gaussian to compare their costs, at most.
+        sample_steps: time steps that these replays may take together; of long recordings there are fewer of them.
         seed: of those samples (the search has its own).
         compare: how simulation and measurement are compared.
         channels: the measured channels to fit. Several are weighted by their noise (`channels.in_noise_units`). None:
@@ -74,6 +75,7 @@ class IdentifyConfig:
     refine: RefineConfig | None = field(default_factory=RefineConfig)
     beginning: float = 20.0
     samples: int = 200
+    sample_steps: int = 5_000_000
     seed: int = 0
     compare: CompareConfig = field(default_factory=CompareConfig)
     channels: tuple[str, ...] | None = None
@@ -90,6 +92,7 @@ class IdentifyConfig:
             refine=optional(partial(instance, kind=RefineConfig)),
             beginning=partial(number, above=0, infinite=True),
             samples=partial(whole, least=0),
+            sample_steps=partial(whole, least=1),
             seed=partial(whole, least=0),
             compare=partial(instance, kind=CompareConfig),
             channels=optional(several(partial(one_of, valid=SIMULATED))),
@@ -139,6 +142,7 @@ class Identified:
 Progress = Callable[[str, Any], None]
 LONG = 1.5  # times the beginning, from which on a recording is long
 FEW = {"dampings": (0.1, 1.0, 10.0, 1e3), "lengths": (1.0,)}  # trials where no block is filled up with copies
+FEWEST = 16  # samples of a Gaussian that show its spread
 FIRM = 4.0  # times its initial mean: the friction of a pad that does not slip
 _FIELDS = tuple(Rollout.__dataclass_fields__)
 
@@ -483,11 +487,13 @@ def _possible(scene: Scene, gaussian: Gaussian, seed: int, count: int) -> np.nda
 
 
 def cost_samples(found: Identified, count: int, seed: int) -> dict[str, np.ndarray]:
-    """Costs on held-out repeats of samples from the initial and from the fitted Gaussian.
+    """Costs on held-out repeats of samples from the initial and from the fitted Gaussian, `count` of them at most.
 
     initial, fitted: [n, D] values; initial_cost, fitted_cost: [n] N m, failed replays carry their penalty;
     names: [D] of the parameters.
     """
+    steps = 2 * sum(len(drive.time) for drive in found.heldout.drives)
+    count = min(count, max(FEWEST, found.config.sample_steps // steps))
     first, last = (_possible(found.scene, g, seed, count) for g in (prior(found.space), found.full_gaussian))
     return {
         "initial": first,
