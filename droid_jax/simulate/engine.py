@@ -1,7 +1,8 @@
 """Which engine replays a fit: plain C where it can, on a CPU, and MJX everywhere else.
 
 On a CPU plain C steps an arm without contacts at least as fast as a compiled batch of MJX, and compiles nothing.  The
-first 30 s of a log of an SO-101 (six joints, 64 samples, one core): MJX 40 s of compilation and 6.1 s, C 4.2 s.
+first 30 s of a log of an SO-101 (six joints, 64 samples, one core): MJX 40 s of compilation and 6.1 s, C 4.2 s.  Its
+steps are of first order, though (docs/simulation-step.md): repeats, whose mean is precise, resolve their error.
 """
 
 from __future__ import annotations
@@ -42,8 +43,8 @@ def choose_engine(
         effects: in the model.
 
     Returns:
-        Plain C ("mujoco") on a CPU, in one process, for commanded motions of a scene without a grip, where C has all
-        that the replay needs; else MJX.
+        Plain C ("mujoco") on a CPU, in one process, for commanded motions of one repeat in a scene without contact
+        pairs, where C has all that the replay needs; else MJX.
     """
     if (backend := jax.default_backend()) != "cpu":
         return EngineChoice("mjx", f"jax runs on {backend}")
@@ -51,6 +52,8 @@ def choose_engine(
         return EngineChoice("mjx", "several processes share the samples")
     if any(not recording.command.size for recording in recordings):
         return EngineChoice("mjx", "a log without commands is replayed by inverse dynamics")
+    if any(recording.repeats > 1 for recording in recordings):
+        return EngineChoice("mjx", "repeats resolve the error of C's steps of first order")
     if scene.grip is not None or scene.model.npair:
         return EngineChoice("mjx", "contact pairs need its second-order step")
     if sensed := space.of_role(Role.VISCOUS, Role.COULOMB, Role.TORQUE_GAIN):
