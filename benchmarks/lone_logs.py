@@ -31,12 +31,21 @@ import tyro  # noqa: E402
 
 from benchmarks.common import CODE, publish  # noqa: E402
 from benchmarks.sharing import claimed  # noqa: E402
-from droid_jax.discrepancy.candidates import observable_effects  # noqa: E402
+from droid_jax.discrepancy.candidates import (  # noqa: E402
+    ScoreDirection,
+    ScoreTest,
+    directions_of,
+    observable_effects,
+    score_test,
+)
 from droid_jax.discrepancy.config import DiscrepancyConfig  # noqa: E402
-from droid_jax.discrepancy.missing import search  # noqa: E402
+from droid_jax.discrepancy.fitting import discretisation_error  # noqa: E402
+from droid_jax.discrepancy.log_case import base_model  # noqa: E402
+from droid_jax.discrepancy.search import search_effects  # noqa: E402
 from droid_jax.discrepancy.windowed_case import case_of  # noqa: E402
 from droid_jax.door.space import torque_offsets  # noqa: E402
 from droid_jax.model.effect_interface import Effect  # noqa: E402
+from droid_jax.model.effects.candidate import candidates, names_of  # noqa: E402
 from droid_jax.model.effects.registry import ready  # noqa: E402
 from droid_jax.model.fields import body_mass, joint_damping, servo_scale, time_offset  # noqa: E402
 from droid_jax.model.parameters import Space  # noqa: E402
@@ -229,33 +238,52 @@ def made(bench: Bench, plan: Plan, seed: int) -> dict[str, Any]:
         roles = roles_of(Split.WINDOWS, [log])
         case = case_of(Split.WINDOWS, bench.scene, bench.base, bench.effects, roles, config)
         result["prepared"] = time.monotonic() - began
-        verdict = search(Split.WINDOWS, case, roles)
+        model = base_model(case)
+        result["fitted"] = time.monotonic() - began
+        screen = score_test(case.train, model, directions_of(candidates(case.effects)), config.seed)
+        result |= {
+            "p": screen.p,
+            "discrepancy": model.discrepancy,
+            "converged": bool(model.refined.converged),
+            "limits": list(case.limits),
+            "blocks": case.train.resampling.units,
+            "ranked": [str(d.candidate.key) for d in _best(screen)],
+            "screened": time.monotonic() - began,
+        }
+        if not model.refined.converged:
+            return {**result, "verdict": "fit not converged", "effects": [], "seconds": time.monotonic() - began}
+        if screen.p >= config.selection.significance:  # where the search ends too
+            return {**result, "verdict": "none", "effects": [], "seconds": time.monotonic() - began} | _judged(
+                bench, hidden, {"verdict": "none"}
+            )
+        step_error = discretisation_error(case.train, model, log)
+        verdict = search_effects(case, model, step_error)
     except FAILED as error:
         return {**result, "verdict": "error", "error": str(error), "seconds": time.monotonic() - began}
     result |= {
         **answer_json(verdict),
-        "p": verdict.score_tests[0].p if verdict.score_tests else None,
         "discrepancies": {role: list(pair) for role, pair in verdict.discrepancies.items()},
         "discretisation_error": verdict.discretisation_error,
         "hints": [list(map(str, hint.effects)) for hint in verdict.hints],
-        "limits": list(case.limits),
-        "blocks": case.train.resampling.units,
-        "ranked": [str(d.candidate.key) for d in _best(verdict.score_tests)],
+        "reasons": [f"{names_of(t.keys)}: {r.text}" for t in verdict.validation_tests for r in t.reasons][:20],
         "seconds": time.monotonic() - began,
     }
-    if hidden is not None:
-        names, beside = [list(right(bench.scene, hidden))], [list(parts(bench.scene, hidden))]
-        judged = answered({"truth": {"kind": "single"}, "result": result, "right": names, "parts": beside})
-        result |= {"right": names, "named": judged["named"], "wrong": judged["wrong_confident"]}
-    return result
+    return result | _judged(bench, hidden, result)
 
 
-def _best(tests: Sequence[Any]) -> list[Any]:
-    """The three best directions of the first score test, of different candidates."""
-    if not tests:
-        return []
-    found = {tests[0].directions[k].candidate.key: tests[0].directions[k] for k in reversed(tests[0].ranking())}
-    return list(found.values())[::-1][:3]
+def _judged(bench: Bench, hidden: Applied | None, result: dict[str, Any]) -> dict[str, Any]:
+    """What of an answer is right where something is hidden."""
+    if hidden is None:
+        return {}
+    names, beside = [list(right(bench.scene, hidden))], [list(parts(bench.scene, hidden))]
+    judged = answered({"truth": {"kind": "single"}, "result": result, "right": names, "parts": beside})
+    return {"right": names, "named": judged["named"], "wrong": judged["wrong_confident"]}
+
+
+def _best(found: ScoreTest) -> list[ScoreDirection]:
+    """The three best directions of a score test, of different candidates."""
+    best = {found.directions[k].candidate.key: found.directions[k] for k in reversed(found.ranking())}
+    return list(best.values())[::-1][:3]
 
 
 def summary(cases: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.discrepancy.fitting import refit
 from droid_jax.discrepancy.log_case import make_log, noise_of, single_case, with_blocks
 from droid_jax.discrepancy.statistics import OUTSIDE, fewest_blocks
+from droid_jax.identify.evaluation import evaluate_on, evaluation_json
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects.registry import beside, joined, ready
 from droid_jax.model.parameters import Space
@@ -28,6 +30,7 @@ from droid_jax.recordings.split import FEWEST_REPEATS, Split, pooled
 PARTS = 2  # training and validation
 DRAWS = 31  # of the base's prior, among which starts are chosen; with its mean a CPU's block
 BEST = 2  # of them
+LEAST_TEST = 4  # units of a test part
 
 
 def case_of(
@@ -105,6 +108,20 @@ def windowed_case(
     return Case(sets[0], sets[1], last, base, tuple(effects), config, noise.values, tuple(limits))
 
 
+def open_loop(case: Case, roles: Mapping[str, Recording], before: np.ndarray, after: np.ndarray) -> dict[str, Any]:
+    """Errors of whole replays of each recording, open loop, at two vectors [D]: what windows by themselves do not tell.
+
+    As plain data (`evaluation.evaluation_json`).
+    """
+    cost = case.train.cost
+    whole = replace(case.config.compare, channels={name: 1.0 for name in case.config.compare.channels})
+    replays = evaluate_on(
+        cost.scene, cost.space, list(roles.values()), before=before, after=after, effects=case.effects, config=whole
+    )
+    found = evaluation_json(replays)
+    return {name: found[name] for name in ("errors", "mean_mae")}
+
+
 def _end_of(log: WindowedLog) -> float:
     """s on the log's clock, before which lies what is fitted and validated."""
     clock, count = log.clock, int(np.sum(log.unit < log.fitted))
@@ -151,6 +168,9 @@ def planned(log: WindowedLog, length: float, shortest: float, with_test: bool) -
     seconds, limits = log.unit_seconds, list[str]()
     fitted, total = log.fitted, int(log.unit.max()) + 1
     tested = with_test and total > fitted
+    needed = PARTS * FEWEST_REPEATS * max(1, math.ceil(shortest / seconds - 1e-6))
+    if tested and fitted < needed <= total - LEAST_TEST:  # a smaller test part rather than none
+        fitted = needed
     each = _each(fitted, length, seconds)
     if each < FEWEST_REPEATS and _each(fitted, shortest, seconds) >= FEWEST_REPEATS:
         each = FEWEST_REPEATS
@@ -160,10 +180,9 @@ def planned(log: WindowedLog, length: float, shortest: float, with_test: bool) -
         fitted, tested = total, False
         each = min(FEWEST_REPEATS, _each(total, shortest, seconds))
     if each < 2:
-        needed = PARTS * FEWEST_REPEATS * max(shortest, seconds)
         raise ValueError(
             f"{log.comparisons[0].name!r}: {total * seconds:.3g} s are compared, too little to train and to validate "
-            f"on; record for {math.ceil(needed)} s or longer, or more recordings"
+            f"on; record for {math.ceil(needed * seconds)} s or longer, or more recordings"
         )
     made = fitted * seconds / (PARTS * each)
     if made < length * (1 - 1e-6):

@@ -206,6 +206,20 @@ class TrendEntry(Placed, frozen=True, kw_only=True):
     unit: str
 
 
+class OpenLoopMean(Struct, frozen=True):
+    """Mean absolute error of one channel over joints and recordings, replayed whole."""
+
+    unit: str
+    before: float | None
+    after: float | None
+
+
+class OpenLoop(Struct, frozen=True):
+    """Errors of whole replays, beside those of windows."""
+
+    mean_mae: dict[str, OpenLoopMean]
+
+
 class FinalModelEntry(Struct, frozen=True):
     """The model that is written to extended.json."""
 
@@ -284,6 +298,7 @@ class Found(Answer, frozen=True, kw_only=True):
     final_model: FinalModelEntry
     findings: list[FindingEntry] = field(default_factory=list)
     split: SplitEntry = SplitEntry()
+    open_loop: OpenLoop | None = None
     seconds: dict[str, float]
     versions: dict[str, str]
     device: str
