@@ -29,7 +29,7 @@ from droid_jax.recordings.split import FEWEST_REPEATS, Split, pooled
 
 PARTS = 2  # training and validation
 DRAWS = 31  # of the base's prior, among which starts are chosen; with its mean a CPU's block
-BEST = 2  # of them
+BEST = 1  # of them
 LEAST_TEST = 4  # units of a test part
 
 
@@ -90,8 +90,8 @@ def windowed_case(
     judged = None
     if test:
         judged = windowed_log(scene, unbounded(whole, own), test, config.compare, config.windows, effects)
-    end = _end_of(log)
-    noise = noise_of(log, base, effects, end, config, _first_values(log, base, effects, end, config))
+    end, rough = _end_of(log), replace(config, refine=replace(config.refine, spreads=0))  # widths are asked for later
+    noise = noise_of(log, base, effects, end, rough, _first_values(log, base, effects, end, rough))
     log = log.about(noise.values)
     plan = planned(log, noise.block, config.blocks.shortest, judged is None)
     sets = [
