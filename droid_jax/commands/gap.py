@@ -118,7 +118,7 @@ def run(command: GapCommand) -> None:
     runtime.start()
     warn_of_cpu(command.preset)
     from droid_jax.discrepancy.results import write_amended, write_gap
-    from droid_jax.discrepancy.windowed_case import case_of, open_loop
+    from droid_jax.discrepancy.windowed_case import case_of, open_loop_errors
     from droid_jax.identify.results import prepare_folder
     from droid_jax.preflight.check_log import check_log
     from droid_jax.preflight.search_inputs import assigned_roles
@@ -177,7 +177,7 @@ def run(command: GapCommand) -> None:
         write = write_amended if written else write_gap
         if split is Split.WINDOWS and not written:
             values = now.verdict.base.values, now.verdict.model.values
-            description["open_loop"] = open_loop(case, roles, *values)
+            description["open_loop"] = open_loop_errors(case, roles, *values)
         write(out, case, now.verdict, now.final, {**description, "seconds": dict(seconds)}, now.states)
         written.append(now.verdict.sentence)
 

@@ -108,7 +108,9 @@ def windowed_case(
     return Case(sets[0], sets[1], last, base, tuple(effects), config, noise.values, tuple(limits))
 
 
-def open_loop(case: Case, roles: Mapping[str, Recording], before: np.ndarray, after: np.ndarray) -> dict[str, Any]:
+def open_loop_errors(
+    case: Case, roles: Mapping[str, Recording], before: np.ndarray, after: np.ndarray
+) -> dict[str, Any]:
     """Errors of whole replays of each recording, open loop, at two vectors [D]: what windows by themselves do not tell.
 
     As plain data (`evaluation.evaluation_json`).
@@ -150,14 +152,14 @@ def _first_values(
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class BlockPlan:
     """Blocks [K] of the training, the validation and perhaps the test part, and what could not be had."""
 
     blocks: tuple[np.ndarray, ...]
     limits: tuple[str, ...]
 
 
-def planned(log: WindowedLog, length: float, shortest: float, with_test: bool) -> Plan:
+def planned(log: WindowedLog, length: float, shortest: float, with_test: bool) -> BlockPlan:
     """How a log's units (windows, stretches) make blocks of `length` s or more, eight in each part at least.
 
     Where it is too short, blocks are first made shorter, then there is no test part, then fewer than eight.
@@ -199,7 +201,7 @@ def planned(log: WindowedLog, length: float, shortest: float, with_test: bool) -
     blocks = [np.where((turns != OUTSIDE) & (turns % PARTS == p), turns // PARTS, OUTSIDE) for p in range(PARTS)]
     if tested:
         blocks.append(_in_groups(log.unit, fitted, total, FEWEST_REPEATS))
-    return Plan(tuple(blocks), tuple(limits))
+    return BlockPlan(tuple(blocks), tuple(limits))
 
 
 def _each(units: int, length: float, seconds: float) -> int:
