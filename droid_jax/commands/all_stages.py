@@ -284,7 +284,9 @@ def _plan(
         scale = command.effect_scale
         _stage(
             gap.run,
-            gap.GapCommand(recordings, fit, presets.identify, effect_scale=scale, out=out / "gap", **board, **own),
+            gap.GapCommand(
+                recordings, fit=fit, preset=presets.identify, effect_scale=scale, out=out / "gap", **board, **own
+            ),
         )
 
     def learn() -> None:

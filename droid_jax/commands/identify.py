@@ -13,6 +13,7 @@ from droid_jax.commands import report
 from droid_jax.commands.folder import begin, fingerprints, finished, kept_recordings, setup_of
 from droid_jax.commands.options import (
     TIMESTEP,
+    Channel,
     JointFriction,
     Preset,
     compared,
@@ -38,8 +39,6 @@ if TYPE_CHECKING:
     from droid_jax.model.scene import Scene
     from droid_jax.recordings.recording import Recording
     from droid_jax.report.identify_folder import FitFile
-
-Channel = Literal["torque", "position", "velocity", "object_angle"]
 
 
 @dataclass(frozen=True)

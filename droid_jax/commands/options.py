@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from droid_jax.model.scene import Scene
     from droid_jax.recordings.recording import Recording
 
+Channel = Literal["torque", "position", "velocity", "object_angle"]
 Preset = Literal["quick", "standard", "paper", "gpu"]
 JointFriction = Literal["held", "scene"]
 TIMESTEP: dict[Preset, float] = {"quick": 0.004, "standard": 0.002, "paper": 0.002, "gpu": 0.002}  # s, built-in door

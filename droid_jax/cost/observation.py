@@ -106,19 +106,7 @@ def prepared(
     Raises ValueError for a channel that no replay produces, unknown columns, a constant one, one outside the motion,
     one with a stretch that nothing measured, and one too long for the memory.
     """
-    if channel.name not in config.minimum:
-        raise ValueError(f"channel {channel.name!r} has no simulated counterpart; known: {', '.join(config.minimum)}")
-    if channel.name == "object_angle":
-        if scene.object_joint is None or len(channel.columns) != 1:
-            raise ValueError(
-                f"channel 'object_angle' needs a scene with an object joint and one column; scene {scene.name!r} has "
-                f"{scene.object_joint or 'none'}, the channel {', '.join(channel.columns)}"
-            )
-        columns = np.zeros(1, dtype=int)
-    else:
-        channel = _of_joints(scene, channel)
-        columns = np.array([scene.joints.index(c) for c in channel.columns], dtype=int)
-    _refuse_constant(channel)
+    channel, columns = compared_columns(scene, channel, config)
     inside = (channel.time >= clock[0] - 1e-9) & (channel.time <= clock[-1] + 1e-9)
     if inside.sum() < 2:
         raise ValueError(
@@ -150,6 +138,41 @@ def prepared(
         weight=weight,
         moves=kernel @ (resampling @ (~still[:, columns]).astype(float)) > config.moving_share,
     )
+
+
+def compared_columns(scene: Scene, channel: Channel, config: NoiseConfig = DEFAULT_NOISE) -> tuple[Channel, np.ndarray]:
+    """A channel's columns that are compared, and theirs [C] in the simulated channel; ValueError as in `prepared`."""
+    if channel.name not in config.minimum:
+        raise ValueError(f"channel {channel.name!r} has no simulated counterpart; known: {', '.join(config.minimum)}")
+    if channel.name == "object_angle":
+        if scene.object_joint is None or len(channel.columns) != 1:
+            raise ValueError(
+                f"channel 'object_angle' needs a scene with an object joint and one column; scene {scene.name!r} has "
+                f"{scene.object_joint or 'none'}, the channel {', '.join(channel.columns)}"
+            )
+        columns = np.zeros(1, dtype=int)
+    else:
+        channel = _of_joints(scene, channel)
+        columns = np.array([scene.joints.index(c) for c in channel.columns], dtype=int)
+    _refuse_constant(channel)
+    return channel, columns
+
+
+def in_window(
+    channel: Channel, repeat: int, clock: np.ndarray, coarse: np.ndarray, config: NoiseConfig = DEFAULT_NOISE
+) -> tuple[np.ndarray, np.ndarray]:
+    """One repeat's values [K, C] at instants `coarse` [K] s within a replay's rows `clock` [T] s, and the same filter
+    for its trace, [C or 1, K, T].
+
+    NaN where too little was measured.  Nothing from outside of the replay's rows enters.
+    """
+    inside = (channel.time >= clock[0] - 1e-9) & (channel.time <= clock[-1] + 1e-9)
+    time, values, mask = channel.time[inside], channel.values[[repeat]][:, inside], channel.mask[[repeat]][:, inside]
+    if len(time) < 2:
+        return np.full((len(coarse), len(channel.columns)), np.nan), np.zeros((1, len(coarse), len(clock)))
+    kernel = lowpass(time, coarse, config)
+    found = smooth(values, mask, kernel, config.least_window)
+    return found[0], _same_filter(kernel, mask, ~np.isnan(found), _resampling(clock, time))
 
 
 def _of_joints(scene: Scene, channel: Channel) -> Channel:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from droid_jax.arguments import check_fields, flag, instance, number, one_of, optional, several, whole
-from droid_jax.cost.channels import SIMULATED, check_channels, in_noise_units, informative_channels
+from droid_jax.cost.channels import SIMULATED, check_channels, chosen_channels, in_noise_units
 from droid_jax.cost.cost import Cost, make_cost
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.identify.divergence import blow_up
@@ -234,7 +234,7 @@ def prepare(
     check_space(instance(scene, "scene", Scene), space)
     recordings = [own_starts(recording, config.compare.start) for recording in recordings]
     judges = tuple(own_starts(recording, config.compare.start) for recording in judges)
-    chosen = _chosen_channels(scene, [*recordings, *judges], config)
+    chosen = chosen_channels(scene, [*recordings, *judges], config.channels, config.compare)
     if chosen:
         config = replace(config, compare=replace(config.compare, channels=dict.fromkeys(chosen, 1.0)))
     check_channels([*recordings, *judges], config.compare.channels)
@@ -368,15 +368,6 @@ def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: 
 
 def _silent(stage: str, value: Any) -> None:
     """No progress is shown."""
-
-
-def _chosen_channels(scene: Scene, recordings: Sequence[Recording], config: IdentifyConfig) -> tuple[str, ...]:
-    """The channels that this module weighs; none where `compare` states its own."""
-    if config.channels:
-        return config.channels
-    if config.compare.channels != CompareConfig().channels:
-        return ()
-    return informative_channels(scene, recordings)
 
 
 def _check_names(names: Sequence[str], judges: Sequence[str], config: IdentifyConfig) -> None:

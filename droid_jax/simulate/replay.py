@@ -156,9 +156,18 @@ def servo_replay(
 
 
 def servo_motion(
-    scene: Scene, drive: Drive, effects: Sequence[Effect] = (), *, parity: bool = False, late: float = 0.5
-) -> Callable[[Physics, jax.Array, jax.Array, jax.Array, Any], Rollout]:
+    scene: Scene,
+    drive: Drive,
+    effects: Sequence[Effect] = (),
+    *,
+    parity: bool = False,
+    late: float = 0.5,
+    earlier: int = 0,
+) -> Callable[..., Rollout]:
     """The loop over time steps that follows a command: (physics, *`traced_part` of a drive, steps) -> T rows.
+
+    A replay that begins within a motion is given more: speed [nv], the time of its first row [s], which laws over time
+    see, and in front of its commands `earlier` rows of those that were sent until then, to which delays reach back.
 
     Rows from `steps` on are zero, so that recordings of different lengths share one compiled program; their commands
     are those of the last step, repeated.  Torques carry the time of the state they act on; sensors have not seen them.
@@ -179,10 +188,12 @@ def servo_motion(
     rubs = rubbing(effects)
 
     def step(sample: Any, k: jax.Array, carry: Any) -> Any:
-        model, theta, error, table = sample
+        model, theta, error, table, origin = sample
         (qpos, qvel, warm, load, gear), kept = carry
-        state = State(k * drive.timestep, qpos, qvel, load, model, gear=gear)
-        ctrl = servo_input(_command(table, drive.timestep, k, shift, theta, effects), theta, state, effects)
+        time = k * drive.timestep
+        state = State(time if origin is None else origin + time, qpos, qvel, load, model, gear=gear)
+        row = k + earlier if earlier else k
+        ctrl = servo_input(_command(table, drive.timestep, row, shift, theta, effects), theta, state, effects)
         before = template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm, ctrl=ctrl)
         after = simulate_step(
             apply_friction(model, theta, state, effects),
@@ -208,26 +219,46 @@ def servo_motion(
         gear = gear_torques(model, after, qvel) if rubs else gear
         return (after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator, gear), kept
 
-    def motion(physics: Physics, table: jax.Array, start: jax.Array, gains: jax.Array, steps: Any) -> Rollout:
-        model = with_gains(physics.model, gains)
-        sample = model, complete(physics.theta, effects), encoder_error(scene, model), table
-        zero, traces = jnp.zeros(scene.model.nv, jnp.float32), jnp.zeros((3, len(table), len(joints)), jnp.float32)
-        angle, contact = jnp.zeros(len(table), jnp.float32), jnp.zeros((len(table), len(fingers)), bool)
-        begun = (start, zero, zero, zero, jnp.stack([zero, zero])), (*traces, angle, contact)
+    def motion(
+        physics: Physics,
+        table: jax.Array,
+        start: jax.Array,
+        gains: jax.Array,
+        steps: Any,
+        speed: jax.Array | None = None,
+        origin: jax.Array | None = None,
+    ) -> Rollout:
+        model, rows = with_gains(physics.model, gains), len(table) - earlier
+        sample = model, complete(physics.theta, effects), encoder_error(scene, model), table, origin
+        zero, traces = jnp.zeros(scene.model.nv, jnp.float32), jnp.zeros((3, rows, len(joints)), jnp.float32)
+        angle, contact = jnp.zeros(rows, jnp.float32), jnp.zeros((rows, len(fingers)), bool)
+        begun = (
+            (start, zero if speed is None else speed, zero, zero, jnp.stack([zero, zero])),
+            (*traces, angle, contact),
+        )
         _, (torque, position, velocity, angle, contact) = time_loop(step, sample, begun, steps)
-        time = jnp.zeros(len(table), jnp.float32)
+        time = jnp.zeros(rows, jnp.float32)
         return Rollout(time, torque, position, velocity, angle, contact, jnp.array(True))
 
     return motion
 
 
 def sensed(
-    motion: Rollout, theta: Theta, effects: Sequence[Effect], timestep: float, steps: int | None = None
+    motion: Rollout,
+    theta: Theta,
+    effects: Sequence[Effect],
+    timestep: float,
+    steps: int | None = None,
+    origin: jax.Array | None = None,
 ) -> Rollout:
-    """A motion's first rows (all of them where `steps` is None), as the sensors have them, and whether it is finite."""
+    """A motion's first rows (all of them where `steps` is None), as the sensors have them, and whether it is finite.
+
+    origin: time of its first row, s; None: 0.
+    """
     rows = len(motion.time) if steps is None else steps
     cut = jax.tree.map(lambda a: a[:rows] if a.ndim else a, motion)
     time = jnp.asarray(np.arange(rows) * timestep, jnp.float32)
+    time = time if origin is None else origin + time
     return apply_sensor_model(replace(cut, time=time), complete(theta, effects), effects)
 
 
