@@ -25,6 +25,8 @@ from collections.abc import Iterator
 from types import ModuleType
 from typing import Any
 
+from droid_jax.installation import check_mujoco
+
 LOG_LEVEL = "TF_CPP_MIN_LOG_LEVEL"  # read once, when jaxlib is loaded
 _NO_WARP = (
     "Failed to import warp: No module named 'warp'",
@@ -69,6 +71,7 @@ def quiet() -> Iterator[None]:
 def import_mjx() -> ModuleType:
     """mujoco.mjx, imported without its two lines about warp, and jax's cache without XLA's errors about it."""
     before_jax()
+    check_mujoco()
     with quiet():
         mjx = importlib.import_module("mujoco.mjx")
     quiet_cache()

@@ -123,9 +123,7 @@ def forces(search: Search, verdict: Verdict, radii: Mapping[str, float]) -> dict
     assert search.sealed is not None
     out = {}
     for name, log in ((FIT, search.log), (JUDGE, search.sealed)):
-        before, after = (
-            float(rms(log.residual_torque(m.values))[0]) / radii[name] for m in (verdict.base, verdict.model)
-        )
+        before, after = (float(rms(log.residual(m.values))[0]) / radii[name] for m in (verdict.base, verdict.model))
         out[name] = {"before_N": round(before, 3), "after_N": round(after, 3), "less": round(1 - after / before, 3)}
     return out
 
@@ -154,7 +152,7 @@ def main(config: GapDoor) -> None:
     if again is not None:
         show("with the spring", again)
     added = {}
-    rest = search.log.simulated(verdict.base.values[None])[0] + search.log.residual_torque(verdict.model.values)
+    rest = search.log.simulated(verdict.base.values[None])[0] + search.log.residual(verdict.model.values)
     for effect, amplitudes in ADDED.items():
         log = adding(search.log.with_torques(rest), verdict.base.values, amplitudes)
         added[effect] = {"added": amplitudes, **answer(search, log)}

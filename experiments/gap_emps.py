@@ -41,7 +41,7 @@ from inverse_fit import RESULTS, rms, rounded, run
 from real_emps import FIT, JUDGE, MOTION_CUTOFF, SLIDE, SOURCE, emps_space, load_emps
 
 from benchmarks.common import publish, stem
-from droid_jax.discrepancy.case import make_log
+from droid_jax.discrepancy.log_case import make_log
 from droid_jax.discrepancy.verdict import Verdict
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects.registry import library
@@ -117,7 +117,7 @@ def searches(config: GapEmps, scene: Scene) -> dict[str, Search]:
 def judged(config: GapEmps, scene: Scene, search: Search, verdict: Verdict) -> dict[str, Any]:
     """RMS on the other file [N] before and after, and relative to the measured force."""
     log = make_log(scene, search.base, search.effects, load_emps(config.data, JUDGE), search.config, search.known)
-    left = [log.residual_torque(model.values) for model in (verdict.base, verdict.model)]
+    left = [log.residual(model.values) for model in (verdict.base, verdict.model)]
     return {
         "rms_N": rounded([rms(x)[0] for x in left], 3),
         "relative": rounded([rms(x)[0] / rms(log.measured)[0] for x in left]),

@@ -31,9 +31,10 @@ from benchmarks.common import CODE
 from benchmarks.sharing import code_name, kept
 from droid_jax.cost.lone_log import LoneLog
 from droid_jax.cost.residuals import CompareConfig
-from droid_jax.discrepancy.case import Case, base_model, make_log, single_case
+from droid_jax.discrepancy.case import Case
 from droid_jax.discrepancy.config import DiscrepancyConfig, SelectionConfig
 from droid_jax.discrepancy.fitting import deviations, intervals
+from droid_jax.discrepancy.log_case import base_model, make_log, single_case
 from droid_jax.discrepancy.residual_set import only_comparison
 from droid_jax.discrepancy.search import search_effects
 from droid_jax.discrepancy.statistics import Blocks
@@ -168,7 +169,7 @@ def false_alarms(search: Search, verdict: Verdict, count: int, seed: int, folder
     folder: what is said of each log is kept there, so that a run that was stopped goes on where it was.
     """
     rng = np.random.default_rng(seed)
-    truth, left = verdict.base.values, search.log.residual_torque(verdict.model.values)
+    truth, left = verdict.base.values, search.log.residual(verdict.model.values)
     simulated = search.log.simulated(truth[None])[0]
     code = code_name(CODE.get("git"))
     missing, named = [], []
@@ -260,10 +261,10 @@ def _block_seconds(case: Case) -> float:
 def _rms_of(case: Case, verdict: Verdict, role: str) -> dict[str, list[float]]:
     """RMS of each column before and after, in its unit, over the instants of a role."""
     evidence = case.residual_sets[role]
-    inside, log = evidence.instants, evidence.cost
+    inside, log = evidence.instants_of(evidence.comparison.leading), evidence.cost
     assert isinstance(log, LoneLog)
     return {
-        when: rounded(rms(log.residual_torque(model.values)[inside]))
+        when: rounded(rms(log.residual(model.values)[inside]))
         for when, model in (("before", verdict.base), ("after", verdict.model))
     }
 

@@ -3,8 +3,8 @@
     python experiments/real_so101.py --data DIR
 
 `identify` fits `chirp_sweep` and `friction_gravity` of six STS3215 servos (`so101.json`: a gain, damping and dry
-friction of each of the first five joints, one armature that they share, and a delay).  `evaluate-fit` replays the other
-motions open loop, over their whole length.
+friction of each of the first five joints, one armature that they share, and a delay).  `so101.toml` says which columns
+of a log are what.  `evaluate-fit` replays the other motions open loop, over their whole length.
 
 Data: isaac-sim2real/sage (Apache 2.0), `output/real/so101/custom`.  DIR holds a folder for each motion, with
 control.csv.gz and state_motor.csv.gz, and the arm without meshes, so101_air.xml.  They are not part of this repository.
@@ -13,9 +13,6 @@ Dry friction is made hard (`solimpfriction`): MuJoCo's own default creeps, and t
 
 from __future__ import annotations
 
-import csv
-import gzip
-import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,18 +23,15 @@ from commanded_fit import HERE, evaluated, fitted, kept, parameters_of
 from inverse_fit import RESULTS, run
 
 from benchmarks import common
-from droid_jax.recordings.checks import validate
-from droid_jax.recordings.clocks import interpolate
-from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
+from droid_jax.recordings.formats import load_recording
+from droid_jax.recordings.recording import Recording
 
-JOINTS = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
-JUDGED = JOINTS[:5]
+JUDGED = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll")
 FIT = ("chirp_sweep", "friction_gravity")
 JUDGES = ("multisine", "velocity_ramp", "step_response", "trapezoidal_profile")
 SOURCE = (
     "Logs of isaac-sim2real/sage of an SO-101: a folder for each motion with control.csv.gz and state_motor.csv.gz."
 )
-RATE = 50.0  # Hz, about the host's 20.06 ms
 SECONDS = 120.0
 HARD = "0.9999 0.9999 0.001 0.5 2"  # solimpfriction
 
@@ -60,41 +54,12 @@ class RealSo101:
     seed: int = 0
 
 
-def table(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """[T] s and [T, 6] positions of one table; ValueError or FileNotFoundError says what is missing."""
-    if not path.is_file():
-        raise FileNotFoundError(f"no file {path}; --data is the folder that holds the motions. {SOURCE}")
-    with gzip.open(path, "rt", encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
-    try:
-        time = np.array([float(row["timestamp"]) for row in rows]) * 1e-6
-        positions = np.array([json.loads(row["positions"]) for row in rows], dtype=float)
-    except (KeyError, ValueError) as error:
-        raise ValueError(f"{path}: expected timestamp and positions in every row ({error})") from None
-    if positions.ndim != 2 or positions.shape[1] != len(JOINTS):
-        raise ValueError(f"{path}: expected {len(JOINTS)} positions in a row, got shape {positions.shape}")
-    return time, positions
-
-
 def so101_log(folder: Path, motion: str, seconds: float) -> Recording:
     """One motion's first seconds on a regular clock, by the stamps of both tables."""
-    sent, goals = table(folder / motion / "control.csv.gz")
-    seen, positions = table(folder / motion / "state_motor.csv.gz")
-    begin = max(sent[0], seen[0])
-    clock = np.arange(0.0, min(seconds, sent[-1] - begin, seen[-1] - begin), 1.0 / RATE)
-    measured = interpolate(clock + begin, seen, positions)
-    channel = Channel("position", "rad", JOINTS, clock, measured[None], np.ones((1, *measured.shape), bool))
-    recording = Recording(
-        name=motion,
-        time=clock,
-        command=interpolate(clock + begin, sent, goals),
-        command_names=JOINTS,
-        channels={"position": channel},
-        torque=TorqueConvention(TorqueSide.MOTOR, gravity=True),
-        meta={"source": SOURCE},
-    )
-    validate(recording)
-    return recording
+    if not (folder / motion).is_dir():
+        raise FileNotFoundError(f"no folder {folder / motion}; --data is the folder that holds the motions. {SOURCE}")
+    recording = load_recording(folder / motion, columns=HERE / "so101.toml", name=motion)
+    return recording.window(0.0, seconds) if seconds < recording.duration else recording
 
 
 def hard_scene(folder: Path, out: Path) -> Path:

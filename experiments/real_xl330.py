@@ -3,8 +3,8 @@
     python experiments/real_xl330.py --data DIR
 
 `identify` fits the eight logs of two gains of a Dynamixel XL330 with a pendulum (`xl330.xml`, `xl330.json`), with the
-library's load-dependent friction in the model; each log states its own gain.  `evaluate-fit` replays the four logs of
-the third gain open loop, over their whole length.  Three folds.
+library's friction of gears (`gear_friction`) in the model; each log states its own gain.  `evaluate-fit` replays the
+four logs of the third gain open loop, over their whole length.  Three folds.
 
 Data: Rhoban/bam (Apache 2.0), logs of 2026-01-15.  DIR holds MOTION_kpGAIN.npz with time [s], goal_position and
 position [rad] and torque_enable.  They are not part of this repository.  `lift_and_drop` counts up to where the motor
@@ -25,7 +25,7 @@ from xl330_logs import GAINS, MOTIONS, SOURCE, log_name, xl330_log
 
 from benchmarks import common
 
-EFFECTS = ("load_friction",)
+EFFECTS = ("gear_friction",)
 PUBLISHED = {"M1": 0.064, "M6": 0.0455}  # rad, mean of the twelve logs, fitted by their authors to all, re-simulated
 
 

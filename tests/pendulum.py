@@ -51,10 +51,12 @@ def swung(
     channels: Sequence[str] = ("position",),
     noise: float = 1e-4,
     repeats: int = 1,
+    friction: float = 0.0,
 ) -> Recording:
     """What the true pendulum does at a servo gain kp [N m/rad] that follows a sine of a frequency [Hz]."""
     model = mujoco.MjModel.from_xml_string(MJCF.format(**TRUE, kp=kp))
     model.opt.timestep = 1e-4
+    model.dof_frictionloss[:], model.dof_solimp[:, :2] = friction, 0.9999  # N m, that holds
     data = mujoco.MjData(model)
     time = np.arange(0.0, SECONDS, 1.0 / RATE)
     fine = np.arange(round(time[-1] / 1e-4) + 1) * 1e-4

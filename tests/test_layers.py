@@ -20,6 +20,7 @@ ORDER = (
     *("commands", "run"),
 )
 FOR_ALL = (
+    "installation",
     "storage",
     "runtime",
     "distributed",

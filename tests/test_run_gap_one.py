@@ -22,7 +22,7 @@ from droid_jax.identify.extended_model import load_extended
 from droid_jax.identify.search import CmaConfig
 from droid_jax.recordings.formats import save_recording
 from droid_jax.recordings.recording import Recording
-from droid_jax.recordings.split import Split, roles_of, split_of
+from droid_jax.recordings.split import Split, pooled, roles_of, split_of
 from droid_jax.report.gap_folder import Gap, read_gap
 from droid_jax.run import main
 
@@ -68,39 +68,46 @@ def test_halves_are_the_first_and_the_last_repeats():
     np.testing.assert_array_equal(joined, whole.channel("torque").values)
 
 
-LOST = ("Lost are effects of commands, servos and contacts", "U then holds the noise", "docs/your-robot.md")
+def blind(count: int) -> Recording:
+    """Commanded, its positions not measured: no window could begin."""
+    recording = with_repeats(count)
+    return replace(recording, channels={"torque": recording.channel("torque")})
+
+
+WINDOWS = "in which positions were measured are searched by windows"
 
 
 @pytest.mark.parametrize(
     ("recordings", "expected"),
     [
-        ([with_repeats(15)], ["is the only one and has 15 repeats", "Record 16 or more", "droid_jax.run identify"]),
-        ([with_repeats(1)], ["is the only one and has 1 repeat:", "another motion, 8 repeats or more of each"]),
-        ([with_repeats(1)], ["without its commands it can be searched as a log", *LOST]),
-        ([with_repeats(3)], ["has 3 repeats:", "one repeat of it, without its commands, it can be searched", *LOST]),
-        ([with_repeats(3)] * 2, ["the train recording 'servo' has 3 repeats:", "searched as a log", *LOST]),
+        ([blind(15)], ["is the only one and has 15 repeats", "Record 16 or more", "droid_jax.run identify", WINDOWS]),
+        ([blind(1)], ["is the only one and has 1 repeat:", "another motion, 8 repeats or more of each"]),
+        ([blind(3)] * 2, ["the train recording 'servo' has 3 repeats:", WINDOWS]),
         ([elbow_log(0.0, 2.0, repeats=2)], ["has 2 repeats", "one repeat alone is searched as a log"]),
         ([LOG, elbow_log(0.0, 2.0, repeats=3)], ["the second recording 'elbow' has 3 repeats", "Leave the second out"]),
         ([LOG, with_repeats(1)], ["the second recording 'servo' has commands", "log without repeats and commands"]),
         ([LOG] * 3, ["the train recording 'elbow' has 1 repeat:", "fewer than 8", "droid_jax.run identify"]),
         ([with_repeats(8), LOG], ["the validation recording 'elbow' has 1 repeat:"]),
+        ([blind(8)] * 4, ["one to three are searched", "got 4"]),
     ],
-)  # fmt: skip
+)
 def test_too_few_repeats_say_what_can_still_be_done(recordings: list[Recording], expected: list[str]):
     with pytest.raises(ValueError) as refused:
         split_of(recordings)
     assert [words for words in expected if words not in str(refused.value)] == []
 
 
-def test_what_is_offered_instead_can_be_done():
-    """One repeat without its commands is a log; without measured positions there is nothing to replay along."""
-    chirp = with_repeats(3)
-    log = replace(chirp.repeats_subset([0]), time=np.zeros(0), command=np.zeros((0, 0)), command_names=())
-    assert split_of([log]) is Split.BLOCKS
-    blind = replace(chirp, channels={"torque": chirp.channel("torque")})
-    with pytest.raises(ValueError) as refused:
-        split_of([blind])
-    assert "searched as a log" not in str(refused.value)
+def test_commanded_logs_with_few_repeats_are_cut_into_windows():
+    """Any number of them, of any number of repeats that is too small to be flipped; others may judge."""
+    one, three = with_repeats(1), with_repeats(3)
+    for recordings in ([one], [three], [with_repeats(15)], [one] * 5, [with_repeats(8), three], [with_repeats(8)] * 4):
+        assert split_of(recordings) is Split.WINDOWS
+    assert split_of([with_repeats(16)], [one]) is Split.WINDOWS
+    roles = roles_of(Split.WINDOWS, [one, three], [with_repeats(2)])
+    assert list(roles) == ["train", "train 2", "test"]
+    assert pooled(roles, "train") == [one, three] and pooled(roles, "test") == [roles["test"]]
+    with pytest.raises(ValueError, match="to judge on are for commanded logs whose positions were measured"):
+        split_of([LOG], [one])
 
 
 @pytest.mark.slow

@@ -197,7 +197,7 @@ def test_versions_name_what_is_installed():
     assert found["python"] == sys.version.split()[0]
     assert found["jax"] == jax.__version__
     assert found["numpy"] == np.__version__
-    assert found["mujoco"] == found["mujoco-mjx"]
+    assert found["mujoco"] == importlib.metadata.version("mujoco")
     assert "no-such-package" not in found
 
 

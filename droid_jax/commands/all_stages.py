@@ -12,7 +12,15 @@ from typing import Any, Literal, NamedTuple
 
 from droid_jax.commands import evaluate, gap, identify, train
 from droid_jax.commands.folder import OtherRun, changed, forget, setup_of
-from droid_jax.commands.options import TIMESTEP, load_effects, needs_log, needs_recording, needs_scene, recording_at
+from droid_jax.commands.options import (
+    TIMESTEP,
+    JointFriction,
+    load_effects,
+    needs_log,
+    needs_recording,
+    needs_scene,
+    recording_at,
+)
 from droid_jax.commands.source import model_folder, needs_brax
 from droid_jax.commands.synthetic import DEMONSTRATIONS, hidden_effects, kept_at, record_synthetic, with_robot_options
 from droid_jax.commands.writer import writes
@@ -64,6 +72,9 @@ class All:
     """Measured joints of your own scene; default: all driven joints."""
     object_joint: str | None = None
     """Joint of the thing that is moved, in your own scene."""
+    joint_friction: JointFriction = "held"
+    """Dry friction of your own scene's joints. held: it holds a load still, unless the MJCF sets solimpfriction or
+    solreffriction itself. scene: as the MJCF has it, whose default lets joints creep."""
     motion_cutoff: float | None = None
     """Logs without commands: cutoff of the filter of the measured positions, Hz; default: 20."""
     effect_scale: float = 1.0
@@ -250,7 +261,7 @@ def _roles(command: All) -> tuple[str, ...]:
 
 def _own(command: All) -> dict[str, Any]:
     """The options of recordings, a scene and effects of your own, which both stages with them take."""
-    names = ("scene", "parameters", "joints", "object_joint", "motion_cutoff", "user_effects")
+    names = ("scene", "parameters", "joints", "object_joint", "joint_friction", "motion_cutoff", "user_effects")
     return {name: getattr(command, name) for name in names}
 
 
@@ -273,7 +284,9 @@ def _plan(
         scale = command.effect_scale
         _stage(
             gap.run,
-            gap.GapCommand(recordings, fit, presets.identify, effect_scale=scale, out=out / "gap", **board, **own),
+            gap.GapCommand(
+                recordings, fit=fit, preset=presets.identify, effect_scale=scale, out=out / "gap", **board, **own
+            ),
         )
 
     def learn() -> None:

@@ -55,7 +55,7 @@ def run(command: CheckCommand) -> None:
         if command.scene is not None:
             # A log without commands may have been measured on a robot that the scene drives with nothing.
             joints = command.joints or (() if recording.command.size else _measured(recording))
-            scene = load_scene(command.scene, joints=joints or None, object_joint=command.object_joint)
+            scene = load_scene(command.scene, joints=joints or None, object_joint=command.object_joint, hold=True)
         checked.append((recording, contents(recording), inspect_log(recording, scene)))
     for recording, tracks, findings in checked:
         _show(recording, tracks, findings)

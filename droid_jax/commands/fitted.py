@@ -112,7 +112,7 @@ def _extended(folder: Path, asked: dict[str, Any], given: Path | None) -> Fitted
         effects=model.effects,
         before=model.space.mean,
         after=model.values,
-        engine="mjx",
+        engine="auto",
         config=compared(asked.get("motion_cutoff")),
         recordings=tuple(asked.get("recordings_sha256", ())),
     )
@@ -137,7 +137,8 @@ def _scene_of(asked: dict[str, Any], given: Path | None, rubbed: tuple[str, ...]
         joints=asked.get("joints") or None,
         object_joint=asked.get("object_joint"),
         friction_joints=rubbed,
-        engine=asked.get("engine", "mjx"),
+        hold=asked.get("joint_friction") == "held",  # runs from before there was a choice had the scene's own
+        engine="mujoco" if asked.get("engine") == "mujoco" else "mjx",
         mj_step=asked.get("mj_step", False),
     )
 

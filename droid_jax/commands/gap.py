@@ -13,6 +13,8 @@ from droid_jax.commands.folder import begin, fingerprints, finished, setup_of, s
 from droid_jax.commands.gap_search import searched
 from droid_jax.commands.options import (
     TIMESTEP,
+    Channel,
+    JointFriction,
     compared,
     load_effects,
     needs_log,
@@ -56,10 +58,17 @@ class GapCommand:
     ONE: one motion, sixteen repeats or more; the second half of them confirms.
 
     LOG [TEST]: without repeats and commands; blocks of time train and validate in turns, the last third or the second
-    log is test data. Of one motion less can be concluded, and the report says what."""
+    log is test data. Of one motion less can be concluded, and the report says what.
+
+    LOG [LOG ...]: commanded, positions measured, with fewer repeats than above; windows of all of them train and
+    validate in turns, and the last third of each is test data, or --judge-on."""
+    judge_on: tuple[Path, ...] = ()
+    """Commanded logs that are test data, beside others in windows."""
     fit: Path | None = None
     """Folder of a finished `identify` (or `all`) of this robot and object: the base fit begins there instead of with a
     search."""
+    compare: tuple[Channel, ...] = ()
+    """Measured channels to compare; several are weighted by their noise. Default: as in identify."""
     preset: Literal["quick", "standard", "gpu"] = "quick"
     """Of the base fit, as in identify."""
     scene: Path | None = None
@@ -70,6 +79,9 @@ class GapCommand:
     """Measured joints of your own scene; default: all driven joints."""
     object_joint: str | None = None
     """Joint of the thing that is moved, in your own scene; without it no effect of a door is asked about."""
+    joint_friction: JointFriction = "held"
+    """Dry friction of your own scene's joints. held: it holds a load still, unless the MJCF sets solimpfriction or
+    solreffriction itself. scene: as the MJCF has it, whose default lets joints creep."""
     motion_cutoff: float | None = None
     """Logs without commands: cutoff of the filter of the measured positions, Hz; default: 20."""
     effects: tuple[str, ...] = ()
@@ -109,8 +121,8 @@ def run(command: GapCommand) -> None:
     needs_writer(command.tensorboard)
     runtime.start()
     warn_of_cpu(command.preset)
-    from droid_jax.discrepancy.case import case_of
     from droid_jax.discrepancy.results import write_amended, write_gap
+    from droid_jax.discrepancy.windowed_case import case_of, open_loop_errors
     from droid_jax.identify.results import prepare_folder
     from droid_jax.preflight.check_log import check_log
     from droid_jax.preflight.search_inputs import assigned_roles
@@ -134,7 +146,9 @@ def run(command: GapCommand) -> None:
         _done(out)
         return
     known = not command.again and to_be_amended(out)  # its verdict is there and stays there
-    split, roles = assigned_roles(scene, given) if given else (Split.RECORDINGS, {})
+    judges = given[len(command.recording) :]
+    fitted = given[: len(command.recording)]
+    split, roles = assigned_roles(scene, fitted, judges) if given else (Split.RECORDINGS, {})
     if split is Split.BLOCKS and start is not None:
         print("a log without repeats is fitted without a search: --fit is not needed")
     config = gap_config(command)
@@ -150,7 +164,7 @@ def run(command: GapCommand) -> None:
     robot = known_robot(command.recording or kept_at(out)) if synthetic_robot else {}
     description = {
         "findings": [asdict(f) for recording in given or roles.values() for f in check_log(scene, recording)],
-        "split": {"by": split.value, "limits": split.limits},
+        "split": {"by": split.value, "limits": " ".join(filter(None, (split.limits, *case.limits)))},
         "versions": runtime.versions(),
         "device": runtime.device(),
         "setup": {
@@ -165,6 +179,9 @@ def run(command: GapCommand) -> None:
     def keep(case: Case, now: Amended, seconds: Mapping[str, float]) -> None:
         """First the verdict, then each amendment to it: a stop or an error between them loses neither."""
         write = write_amended if written else write_gap
+        if split is Split.WINDOWS and not written:
+            values = now.verdict.base.values, now.verdict.model.values
+            description["open_loop"] = open_loop_errors(case, roles, *values)
         write(out, case, now.verdict, now.final, {**description, "seconds": dict(seconds)}, now.states)
         written.append(now.verdict.sentence)
 
@@ -223,10 +240,13 @@ def chosen_effects(command: GapCommand, scene: Scene, recordings: list[Recording
     Raises ValueError for unknown names, for effects that this scene cannot have, and where none is left.
     """
     from droid_jax.discrepancy.candidates import observable_effects
+    from droid_jax.discrepancy.case import comparing
     from droid_jax.model.effects.registry import library
 
     library(scene, command.without)  # names are checked there
-    here = observable_effects(scene, recordings, command.effect_scale)
+    config = gap_config(command)
+    channels = comparing(scene, recordings, config).compare.channels if recordings else command.compare or ("torque",)
+    here = observable_effects(scene, recordings, command.effect_scale, channels)
     asked = {e.name for e in library(scene, command.effects or None)}
     names = {e.name for e in here}
     impossible = [name for name in command.effects if name not in names]
@@ -255,20 +275,18 @@ def gap_config(command: GapCommand) -> DiscrepancyConfig:
         search=search_config(command.preset, command.seed),
         refine=replace(refine_config(command.preset) or RefineConfig(), iterations=CONVERGE_ITERATIONS),
         compare=compared(command.motion_cutoff),
+        channels=command.compare or None,
         seed=command.seed,
         **asked,
     )
 
 
 def given_to(command: GapCommand) -> list[Recording]:
-    """The recordings, none where the synthetic robot shall record."""
+    """The recordings, those of --judge-on last; none where the synthetic robot shall record."""
     needs_recording(command)
-    if len(command.recording) > 3:
-        raise ValueError(
-            f"--recording takes TRAIN VALIDATION [TEST], or ONE with repeats, or LOG [TEST] without, got "
-            f"{len(command.recording)} recordings; `python -m droid_jax.run identify` fits any number"
-        )
-    return [recording_at(path) for path in command.recording]
+    if command.judge_on and not command.recording:
+        raise ValueError("--judge-on needs --recording: the synthetic robot records its own test data")
+    return [recording_at(path) for path in (*command.recording, *command.judge_on)]
 
 
 def _done(out: Path) -> None:

@@ -31,6 +31,14 @@ BARS = (
     "verdict",
     "final_refit",
 )
+IN_WINDOWS = (
+    "refine",
+    "discretisation_error",
+    "score_test",
+    "one_step_fit",
+    "refit",
+    "verdict",
+)  # of commanded logs: several starts in place of a search
 IN_BLOCKS = (
     "refine",
     "score_test",
@@ -56,10 +64,9 @@ def searched(
     keep: called with what there is and the seconds so far once the verdict is known, and after each amendment to it.
     """
     from droid_jax.discrepancy.missing import amended, search
-    from droid_jax.recordings.split import Split
     from droid_jax.report.progress import scalars, stages
 
-    names = IN_BLOCKS if split is Split.BLOCKS else BARS if start is None else BARS[1:]
+    names = _stages(split, start is not None)
     with (
         stages(names, {"one_step_fit": case.config.one_step_fits, "refit": case.config.full_refits}) as show,
         scalars(board) as write,
@@ -73,6 +80,14 @@ def searched(
             keep(case, now, clock.seconds)
             verdict, final = now.verdict, now.final
     return case, verdict, final, clock.seconds
+
+
+def _stages(split: Split, started: bool) -> tuple[str, ...]:
+    """What is shown and timed."""
+    from droid_jax.recordings.split import Split
+
+    known = {Split.BLOCKS: IN_BLOCKS, Split.WINDOWS: IN_WINDOWS}
+    return known.get(split, BARS[1:] if started else BARS)
 
 
 class Clock:

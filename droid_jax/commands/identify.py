@@ -13,6 +13,8 @@ from droid_jax.commands import report
 from droid_jax.commands.folder import begin, fingerprints, finished, kept_recordings, setup_of
 from droid_jax.commands.options import (
     TIMESTEP,
+    Channel,
+    JointFriction,
     Preset,
     compared,
     load_effects,
@@ -37,8 +39,6 @@ if TYPE_CHECKING:
     from droid_jax.model.scene import Scene
     from droid_jax.recordings.recording import Recording
     from droid_jax.report.identify_folder import FitFile
-
-Channel = Literal["torque", "position", "velocity", "object_angle"]
 
 
 @dataclass(frozen=True)
@@ -72,6 +72,9 @@ class Identify:
     """Measured joints of your own scene; default: all driven joints."""
     object_joint: str | None = None
     """Joint of the thing that is moved, in your own scene."""
+    joint_friction: JointFriction = "held"
+    """Dry friction of your own scene's joints. held: it holds a load still, unless the MJCF sets solimpfriction or
+    solreffriction itself. scene: as the MJCF has it, whose default lets joints creep."""
     extended: Path | None = None
     """extended.json of a gap search: the effects that it named are in the model and fitted too."""
     effects: tuple[str, ...] = ()
@@ -79,9 +82,9 @@ class Identify:
     load_friction."""
     user_effects: Path | None = None
     """Python file that registers effects of your own (docs/your-effect.md); it is run."""
-    engine: Literal["mjx", "mujoco"] = "mjx"
+    engine: Literal["auto", "mjx", "mujoco"] = "auto"
     """mjx: compiled, all devices.  mujoco: plain C, all cores; for motor-side torques, without gravity where the
-    scene compensates it."""
+    scene compensates it.  auto: plain C for recordings of one repeat, on a CPU, where C can replay them; else MJX."""
     population: int | None = None
     """Samples per generation; default: the preset's."""
     generations: int | None = None
@@ -146,6 +149,8 @@ def run(command: Identify) -> None:
     recordings, truth, known = _recordings(command, scene, out, given)
     print("compiling the replay ...", flush=True)
     problem = prepare(scene, space, recordings, nuisances=nuisances, config=config, effects=effects, judge_on=judges)
+    engine = {"mjx": "MJX", "mujoco": "plain C MuJoCo"}[problem.engine.engine]
+    print(f"engine: {engine} ({problem.engine.why})", flush=True)
     # The Gaussian's own, whatever becomes of the search that made it; it may lie in this very folder.
     extended = None if command.extended is None else command.extended.read_bytes()
     begin(out, setup, command.again, "identify")  # and only now, with all of it found good
@@ -169,7 +174,8 @@ def run(command: Identify) -> None:
         progress("sample", None)
         keep_replay(out, found, recordings[0])
         write_run(
-            out, found, description, truth=truth, samples=lambda: cost_samples(found, config.samples, config.seed),
+            out, found, description, truth=truth, effects=effects,
+            samples=lambda: cost_samples(found, config.samples, config.seed),
             notes=[
                 *(text for recording in recordings for text in command_notes(scene, recording)),
                 *creep_of_fit(scene, found.full, found.best, recordings),
@@ -192,7 +198,7 @@ def _description(
         "command": "identify",
         "preset": command.preset,
         "scene": found.scene.name,
-        "engine": command.engine,
+        "engine": found.engine.engine,
         "recordings": [_entry(r, found.heldout_repeats[r.name]) for r in recordings],
         "judged_on": [_entry(r) for r in judges],
         "seed": command.seed,
@@ -214,7 +220,9 @@ def identify_model(command: Identify) -> tuple[Scene, Space, Space | None]:
     from droid_jax.door.space import door_nuisances, door_space
 
     if command.scene is not None:
-        scene, listed = own_scene(command, engine=command.engine, mj_step=command.mj_step)
+        scene, listed = own_scene(
+            command, engine="mujoco" if command.engine == "mujoco" else "mjx", mj_step=command.mj_step
+        )
         if all(p.nuisance for p in listed.parameters):
             raise ValueError(f"{command.parameters}: every entry is a nuisance; identify fits at least one that is not")
         main = listed.select(p.name for p in listed.parameters if not p.nuisance)

@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from droid_jax.model.scene import Scene
     from droid_jax.recordings.recording import Recording
 
+Channel = Literal["torque", "position", "velocity", "object_angle"]
 Preset = Literal["quick", "standard", "paper", "gpu"]
+JointFriction = Literal["held", "scene"]
 TIMESTEP: dict[Preset, float] = {"quick": 0.004, "standard": 0.002, "paper": 0.002, "gpu": 0.002}  # s, built-in door
 
 
@@ -72,6 +74,8 @@ class OwnScene(Protocol):
     def joints(self) -> tuple[str, ...]: ...
     @property
     def object_joint(self) -> str | None: ...
+    @property
+    def joint_friction(self) -> JointFriction: ...
 
 
 def needs_scene(options: OwnScene) -> None:
@@ -120,6 +124,7 @@ def own_scene(options: OwnScene, *, engine: str = "mjx", mj_step: bool = False) 
         joints=options.joints or None,
         object_joint=options.object_joint,
         friction_joints=friction_joints(options.parameters),
+        hold=options.joint_friction == "held",
         engine=engine,
         mj_step=mj_step,
     )

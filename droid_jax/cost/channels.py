@@ -14,7 +14,7 @@ import numpy as np
 
 from droid_jax.cost.cost import Cost
 from droid_jax.cost.observation import Measured
-from droid_jax.cost.residuals import LEADS, Comparison
+from droid_jax.cost.residuals import LEADS, CompareConfig, Comparison
 from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Channel, Recording
@@ -54,6 +54,22 @@ def informative_channels(scene: Scene, recordings: Sequence[Recording]) -> tuple
         return (LEADS,)
     motion = [name for name in MOTIONS if name in common][:1]
     return (*motion, *(name for name in common if name == "object_angle"))
+
+
+def chosen_channels(
+    scene: Scene, recordings: Sequence[Recording], asked: Sequence[str] | None, compare: CompareConfig
+) -> tuple[str, ...]:
+    """The channels to compare, whose weights are then to be found (`in_noise_units`); none where `compare` states its
+    own.
+
+    asked: names, in any order; None: those of `compare` where it names other ones, or weights, than its default, else
+    what is informative.
+    """
+    if asked:
+        return tuple(name for name in SIMULATED if name in asked)
+    if compare.channels != CompareConfig().channels:
+        return ()
+    return informative_channels(scene, recordings)
 
 
 def check_channels(recordings: Sequence[Recording], names: Iterable[str]) -> None:

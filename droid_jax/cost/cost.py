@@ -31,14 +31,13 @@ from droid_jax.recordings.checks import validate
 from droid_jax.recordings.recording import Recording, recordings_of
 from droid_jax.simulate.batching import in_blocks
 from droid_jax.simulate.compiled import Along, Driven, along_another, compiled_replay
+from droid_jax.simulate.engine import ENGINES
 from droid_jax.simulate.initial_state import StartConfig, following
 from droid_jax.simulate.inverse_dynamics import motion_path, prescribed
 from droid_jax.simulate.measured_motion import Motion, measured_motion
 from droid_jax.simulate.repeat_starts import from_one_start, own_starts
 from droid_jax.simulate.replay import Drive, make_drive
 from droid_jax.simulate.servo_gains import check_gains, servo_factors
-
-ENGINES = ("mjx", "mujoco")
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -76,15 +76,17 @@ class LoneLog(Cost):
         """[K, C] bool, instants at which each joint moves: at rest friction takes what is left."""
         return self._torque.moves
 
-    def residual_torque(self, values: np.ndarray) -> np.ndarray:
+    def residual(self, values: np.ndarray) -> np.ndarray:
         """[K, C] measured minus simulated torques of one vector [D]."""
         return self.measured - self.simulated(values[None])[0]
 
+    def least_noise(self) -> np.ndarray:
+        """[C] deviation below which the noise is never believed."""
+        return least_noise("torque", self.measured, self.comparisons[0].config.noise)
+
     def with_noise(self, deviation: np.ndarray, instants: np.ndarray) -> LoneLog:
         """With noise of a deviation [C], in the channel's unit, at some instants [K] bool; the rest does not count."""
-        noise = self._torque.noise.stated(
-            np.maximum(deviation, least_noise("torque", self.measured, self.comparisons[0].config.noise))
-        )
+        noise = self._torque.noise.stated(np.maximum(deviation, self.least_noise()))
         return self._with(replace(noise, whitener=noise.whitener * instants[:, None]))
 
     def with_torques(self, torque: np.ndarray) -> LoneLog:

@@ -168,6 +168,9 @@ def estimate_noise(
         variance = max(lags[0], minimum**2)
         lags = (1 - config.shrinkage) * lags
         lags[0] = variance
+        if not (constant or lags[1:].any()):  # white
+            whitener[c] = np.diag(np.sqrt(count[:, c] / variance))
+            continue
         of_mean = (scipy.linalg.toeplitz(lags) + constant) / np.sqrt(np.outer(count[:, c], count[:, c]))
         whitener[c] = np.linalg.inv(np.linalg.cholesky(of_mean))
     return Noise(mean, whitener, repeats, count)

@@ -1,14 +1,14 @@
 """One measured channel made ready to be compared with a replay: its clock, its filter and its noise.
 
 A replay's trace goes through exactly what the data went through: resampling, the low pass with the repeats' masks,
-and the mean over the repeats, all of it one matrix.
+and the mean over the repeats, all of it one matrix, of which each row is a short window.
 """
 
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -20,7 +20,39 @@ from droid_jax.recordings.recording import Channel
 
 
 class TooLong(ValueError):
-    """A recording whose filter and covariance would fill the memory."""
+    """A recording whose covariance of the noise would fill the memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """A filter whose outputs are sums over short windows of T samples.
+
+    begin: [K] first sample of each window.  weights: [C or 1, K, W] of its samples, for each column or for all.
+    """
+
+    begin: np.ndarray
+    weights: np.ndarray
+
+    @property
+    def rows(self) -> np.ndarray:
+        """[K, W] the samples of each window."""
+        return self.begin[:, None] + np.arange(self.weights.shape[-1])
+
+
+def windows(filters: Sequence[sparse.csr_array], length: int) -> Windows:
+    """Sparse filters [K, T], one for each column or one for all, as windows; length: T."""
+    count = len(filters[0].indptr) - 1
+    rows = [np.repeat(np.arange(count), np.diff(each.indptr)) for each in filters]
+    first, last = np.full(count, length), np.zeros(count, int)
+    for row, each in zip(rows, filters, strict=True):
+        np.minimum.at(first, row, each.indices)
+        np.maximum.at(last, row, each.indices + 1)
+    width = int(np.max(last - first, initial=1))
+    begin = np.minimum(first, length - width)
+    weights = np.zeros((len(filters), count, width))
+    for column, row, each in zip(weights, rows, filters, strict=True):
+        column[row, each.indices - begin[row]] = each.data
+    return Windows(begin, weights)
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +60,7 @@ class Measured:
     """One channel ready to be compared.
 
     unit: of the channel.  at: [Tc] fractional rows of the simulated trace; values [N,Tc,C], mask [N,Tc,C]; columns [C]
-    of the simulated channel; kernel [C or 1,K,T] and noise for the whitened form; span [2] s of the
+    of the simulated channel; kernel from the trace to K instants, and noise for the whitened form; span [2] s of the
     coarse clock; weight in the distance; moves [K,C] bool, instants at which a column's joint moves: at rest along a
     prescribed motion friction takes what is left, and what is left tells nothing of noise.
     """
@@ -39,7 +71,7 @@ class Measured:
     values: np.ndarray
     mask: np.ndarray
     columns: np.ndarray
-    kernel: np.ndarray
+    kernel: Windows
     noise: Noise
     span: tuple[float, float]
     weight: float
@@ -74,19 +106,7 @@ def prepared(
     Raises ValueError for a channel that no replay produces, unknown columns, a constant one, one outside the motion,
     one with a stretch that nothing measured, and one too long for the memory.
     """
-    if channel.name not in config.minimum:
-        raise ValueError(f"channel {channel.name!r} has no simulated counterpart; known: {', '.join(config.minimum)}")
-    if channel.name == "object_angle":
-        if scene.object_joint is None or len(channel.columns) != 1:
-            raise ValueError(
-                f"channel 'object_angle' needs a scene with an object joint and one column; scene {scene.name!r} has "
-                f"{scene.object_joint or 'none'}, the channel {', '.join(channel.columns)}"
-            )
-        columns = np.zeros(1, dtype=int)
-    else:
-        channel = _of_joints(scene, channel)
-        columns = np.array([scene.joints.index(c) for c in channel.columns], dtype=int)
-    _refuse_constant(channel)
+    channel, columns = compared_columns(scene, channel, config)
     inside = (channel.time >= clock[0] - 1e-9) & (channel.time <= clock[-1] + 1e-9)
     if inside.sum() < 2:
         raise ValueError(
@@ -95,12 +115,12 @@ def prepared(
         )
     time, values, mask = channel.time[inside], channel.values[:, inside], channel.mask[:, inside]
     coarse = coarse_clock(float(time[0]), float(time[-1]), config.rate)
-    _needs_memory(channel, len(clock), coarse)
+    _needs_memory(channel, coarse)
     kernel = lowpass(time, coarse, config)
     resampling = _resampling(clock, time)
     off = 0.0 if apart is None else np.stack([resampling @ a[:, columns] for a in apart])
     repeats = smooth(values - off, mask, kernel, config.least_window)
-    seen = _same_filter(kernel, mask, ~np.isnan(repeats), resampling)
+    seen = _same_filter(kernel, mask, ~np.isnan(repeats), resampling, len(clock))
     repeats, measured = _fill(repeats, channel, coarse, config.least_overlap)
     noise = estimate_noise(repeats, minimum=config.minimum[channel.name], measured=measured, config=config)
     step = clock[1] - clock[0]
@@ -120,6 +140,41 @@ def prepared(
     )
 
 
+def compared_columns(scene: Scene, channel: Channel, config: NoiseConfig = DEFAULT_NOISE) -> tuple[Channel, np.ndarray]:
+    """A channel's columns that are compared, and theirs [C] in the simulated channel; ValueError as in `prepared`."""
+    if channel.name not in config.minimum:
+        raise ValueError(f"channel {channel.name!r} has no simulated counterpart; known: {', '.join(config.minimum)}")
+    if channel.name == "object_angle":
+        if scene.object_joint is None or len(channel.columns) != 1:
+            raise ValueError(
+                f"channel 'object_angle' needs a scene with an object joint and one column; scene {scene.name!r} has "
+                f"{scene.object_joint or 'none'}, the channel {', '.join(channel.columns)}"
+            )
+        columns = np.zeros(1, dtype=int)
+    else:
+        channel = _of_joints(scene, channel)
+        columns = np.array([scene.joints.index(c) for c in channel.columns], dtype=int)
+    _refuse_constant(channel)
+    return channel, columns
+
+
+def in_window(
+    channel: Channel, repeat: int, clock: np.ndarray, coarse: np.ndarray, config: NoiseConfig = DEFAULT_NOISE
+) -> tuple[np.ndarray, np.ndarray]:
+    """One repeat's values [K, C] at instants `coarse` [K] s within a replay's rows `clock` [T] s, and the same filter
+    for its trace, [C or 1, K, T].
+
+    NaN where too little was measured.  Nothing from outside of the replay's rows enters.
+    """
+    inside = (channel.time >= clock[0] - 1e-9) & (channel.time <= clock[-1] + 1e-9)
+    time, values, mask = channel.time[inside], channel.values[[repeat]][:, inside], channel.mask[[repeat]][:, inside]
+    if len(time) < 2:
+        return np.full((len(coarse), len(channel.columns)), np.nan), np.zeros((1, len(coarse), len(clock)))
+    kernel = lowpass(time, coarse, config)
+    found = smooth(values, mask, kernel, config.least_window)
+    return found[0], _same_filter(kernel, mask, ~np.isnan(found), _resampling(clock, time))
+
+
 def _of_joints(scene: Scene, channel: Channel) -> Channel:
     """The columns of a channel that the scene's measured joints are: others that it has were left out on purpose."""
     joints = [mujoco.mj_id2name(scene.model, mujoco.mjtObj.mjOBJ_JOINT, i) for i in range(scene.model.njnt)]
@@ -134,18 +189,16 @@ def _of_joints(scene: Scene, channel: Channel) -> Channel:
     return replace(channel, columns=columns, values=channel.values[..., kept], mask=channel.mask[..., kept])
 
 
-def _needs_memory(channel: Channel, steps: int, coarse: np.ndarray) -> None:
-    """Raise TooLong where filter and covariance, which grow with the square of the duration, fill the memory."""
-    filters = 1 if channel.mask.all() or np.all(channel.mask == channel.mask[..., :1]) else len(channel.columns)
-    instants = len(coarse)
-    needed = 8.0 * instants * (filters * steps + len(channel.columns) * instants)
+def _needs_memory(channel: Channel, coarse: np.ndarray) -> None:
+    """Raise TooLong where the noise's covariance, which grows with the square of the duration, fills the memory."""
+    needed = 8.0 * len(channel.columns) * len(coarse) ** 2
     if not hasattr(os, "sysconf"):  # elsewhere than on Linux and macOS
         return
     there = float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
-    if 2.0 * needed > there:  # what computes with them needs as much again
+    if 2.0 * needed > there:  # what computes with it needs as much again
         raise TooLong(
-            f"channel {channel.name!r} of {coarse[-1] - coarse[0]:.0f} s needs {needed / 1e9:.1f} GB for its filter "
-            f"and the covariance of its noise, and half of this machine's memory is {there / 2e9:.1f} GB: cut the "
+            f"channel {channel.name!r} of {coarse[-1] - coarse[0]:.0f} s needs {needed / 1e9:.1f} GB for the "
+            f"covariance of its noise, and half of this machine's memory is {there / 2e9:.1f} GB: cut the "
             "recording (`python -m droid_jax.run convert --start S --end S`), or fit its parts as several"
         )
 
@@ -160,23 +213,19 @@ def _resampling(clock: np.ndarray, time: np.ndarray) -> sparse.csr_array:
 
 
 def _same_filter(
-    kernel: sparse.csr_array, mask: np.ndarray, kept: np.ndarray, resampling: sparse.csr_array
-) -> np.ndarray:
-    """[C or 1, K, T] what resampling, smoothing with a mask and averaging over the repeats does to a replay's trace.
+    kernel: sparse.csr_array, mask: np.ndarray, kept: np.ndarray, resampling: sparse.csr_array, length: int
+) -> Windows:
+    """What resampling, smoothing with a mask and averaging over the repeats does to a replay's trace [T].
 
-    kernel [K, Tc]; mask [N, Tc, C]; kept [N, K, C], the outputs that enter the mean; resampling [Tc, T].
+    kernel [K, Tc]; mask [N, Tc, C]; kept [N, K, C], the outputs that enter the mean; resampling [Tc, T];
+    length: T.
     """
     if mask.all():
-        return _dense(kernel @ resampling)[None]
+        return windows([kernel @ resampling], length)
     columns = list(zip(mask.transpose(2, 0, 1), kept.transpose(2, 0, 1), strict=True))
     if all(np.array_equal(m, columns[0][0]) and np.array_equal(k, columns[0][1]) for m, k in columns):
         columns = columns[:1]  # a log that was silent for a while was so in all of them
-    return np.stack([_dense(_mean_filter(kernel, *column) @ resampling) for column in columns])
-
-
-def _dense(matrix: Any) -> np.ndarray:
-    """A sparse array written out; scipy's types say that a product of two may be dense."""
-    return matrix.toarray()
+    return windows([_mean_filter(kernel, *column) @ resampling for column in columns], length)
 
 
 def _mean_filter(kernel: sparse.csr_array, mask: np.ndarray, kept: np.ndarray) -> sparse.csr_array:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from droid_jax.arguments import check_fields, flag, instance, number, weights
-from droid_jax.cost.noise import NoiseConfig, stated_deviation
+from droid_jax.cost.noise import Noise, NoiseConfig, stated_deviation
 from droid_jax.cost.observation import Measured, least_noise, prepared
 from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.scene import Scene
@@ -117,11 +117,7 @@ class Comparison:
     def whitened(self, rollout: Rollout) -> jax.Array:
         """[M] residuals of the repeats' mean in noise units; NaN throughout where the replay blew up."""
         parts = [
-            jnp.einsum(
-                "ckl,lc->ck",
-                jnp.asarray(c.noise.whitener, jnp.float32),
-                _smooth(c, _trace(rollout, c)) - jnp.asarray(c.noise.mean, jnp.float32),
-            ).ravel()
+            _whiten(c.noise, _smooth(c, _trace(rollout, c)) - jnp.asarray(c.noise.mean, jnp.float32)).ravel()
             for c in self.channels
         ]
         residual = jnp.concatenate(parts)
@@ -181,10 +177,16 @@ def _trace(rollout: Rollout, channel: Measured) -> jax.Array:
 
 def _smooth(channel: Measured, trace: jax.Array) -> jax.Array:
     """[K, C] a simulated trace [T, C] through exactly what the channel's data went through."""
-    kernel = jnp.asarray(channel.kernel, jnp.float32)
-    if len(kernel) == 1:
-        return kernel[0] @ trace
-    return jnp.einsum("ckt,tc->kc", kernel, trace)
+    weights = jnp.asarray(channel.kernel.weights, jnp.float32)
+    return jnp.einsum("ckw,kwc->kc" if len(weights) > 1 else "zkw,kwc->kc", weights, trace[channel.kernel.rows])
+
+
+def _whiten(noise: Noise, x: jax.Array) -> jax.Array:
+    """[C, K] deviations [K, C] in units of the noise."""
+    own = np.einsum("ckk->ck", noise.whitener)
+    if np.count_nonzero(noise.whitener) == np.count_nonzero(own):  # white noise: a long log has many instants
+        return jnp.asarray(own, jnp.float32) * x.T
+    return jnp.einsum("ckl,lc->ck", jnp.asarray(noise.whitener, jnp.float32), x)
 
 
 def _distance(channel: Measured, trace: jax.Array) -> jax.Array:

@@ -12,12 +12,13 @@ from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import lsq_linear
 
 from droid_jax.discrepancy.residual_set import ResidualSet
 from droid_jax.discrepancy.statistics import largest_trend
-from droid_jax.model.effect_interface import Effect
+from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.effects.candidate import Candidate, EffectKey, Keys, keys_of
 from droid_jax.model.effects.registry import library
 from droid_jax.model.parameters import Space
@@ -28,11 +29,14 @@ if TYPE_CHECKING:
     from droid_jax.discrepancy.fitting import FittedModel
 
 ACT_ON_COMMANDS = ("actuator_", "dof_sol", "pair_")  # how model fields begin that inverse dynamics does not read
+SAMPLES = 16  # of a made-up motion
 SMALL = 0.3  # prior deviations of a coefficient: large against solver noise, small enough to be linear
 
 
-def observable_effects(scene: Scene, recordings: Iterable[Recording], scale: float = 1.0) -> tuple[Effect, ...]:
-    """The library's effects that could show in these recordings.
+def observable_effects(
+    scene: Scene, recordings: Iterable[Recording], scale: float = 1.0, channels: Iterable[str] = ("torque",)
+) -> tuple[Effect, ...]:
+    """The library's effects that could show in the compared channels of these recordings.
 
     In a recording without commands these are all but the ones that act on commands only.
 
@@ -40,9 +44,29 @@ def observable_effects(scene: Scene, recordings: Iterable[Recording], scale: flo
         scene: which has the effects' joints and bodies.
         recordings: to be searched.
         scale: of the effects' forces and torques, see `library`.
+        channels: names of those compared.
     """
     commanded = all(r.command.size for r in recordings)
-    return tuple(e for e in library(scene, scale=scale) if commanded or not acts_on_commands_only(e))
+    asked = (e for e in library(scene, scale=scale) if commanded or not acts_on_commands_only(e))
+    return tuple(e for e in asked if shows_in(e, scene, channels))
+
+
+def shows_in(effect: Effect, scene: Scene, channels: Iterable[str]) -> bool:
+    """Whether an effect could change a compared channel: one of sensors alone must do so itself, in a made-up motion.
+
+    A torque sensor's offset does not show in positions.
+    """
+    moves = effect.command or effect.servo or effect.force or effect.frictionloss
+    if moves or effect.observe is None or any(p.writes for p in effect.parameters):
+        return True
+    rng = np.random.default_rng(0)
+    torque, position, velocity = rng.normal(size=(3, SAMPLES, len(scene.joints)))
+    made_up = Rollout(
+        np.linspace(0.0, 1.0, SAMPLES), torque, position, velocity, rng.normal(size=SAMPLES),
+        np.zeros((SAMPLES, 0), bool), np.array(True),
+    )  # fmt: skip
+    seen = effect.observe({p.name: jnp.float32(p.mean + p.std) for p in effect.parameters}, made_up)
+    return any(not np.array_equal(getattr(seen, name), getattr(made_up, name)) for name in channels)
 
 
 def acts_on_commands_only(effect: Effect) -> bool:

@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import partial
 
-from droid_jax.arguments import check_fields, instance, number, optional, whole
+from droid_jax.arguments import check_fields, instance, number, one_of, optional, several, whole
+from droid_jax.cost.channels import SIMULATED
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.identify.identifiability import IdentifiabilityConfig
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.identify.search import CmaConfig
+from droid_jax.simulate.windows import WindowConfig
 
 CONVERGE_ITERATIONS = 60  # of a fit that must converge: where something is missing it takes longer
 
@@ -139,8 +141,10 @@ class DiscrepancyConfig:
         budget_minutes: for all refits, None for no limit; at least one candidate of a selection step is always tried.
         selection: thresholds that decide which effects are named.
         identifiability: what decides the width of a fit's posterior.
-        blocks: thresholds for a log without repeats.
+        blocks: thresholds for logs that are cut in time.
+        windows: how commanded logs with few repeats are cut; None: their motions are replayed whole.
         compare: how simulation and measurement are compared.
+        channels: measured ones to compare, as `IdentifyConfig.channels`; of logs without commands torques alone.
         seed: of sign flips and resamples.
 
     Raises:
@@ -159,7 +163,9 @@ class DiscrepancyConfig:
     selection: SelectionConfig = field(default_factory=SelectionConfig)
     identifiability: IdentifiabilityConfig = field(default_factory=IdentifiabilityConfig)
     blocks: BlocksConfig = field(default_factory=BlocksConfig)
+    windows: WindowConfig | None = field(default_factory=WindowConfig)
     compare: CompareConfig = field(default_factory=CompareConfig)
+    channels: tuple[str, ...] | None = None
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -172,9 +178,8 @@ class DiscrepancyConfig:
             selection=partial(instance, kind=SelectionConfig),
             identifiability=partial(instance, kind=IdentifiabilityConfig),
             blocks=partial(instance, kind=BlocksConfig),
+            windows=optional(partial(instance, kind=WindowConfig)),
             compare=partial(instance, kind=CompareConfig),
+            channels=optional(several(partial(one_of, valid=SIMULATED))),
             seed=partial(whole, least=0),
         )
-        if set(self.compare.channels) != {"torque"}:
-            names = ", ".join(self.compare.channels)
-            raise ValueError(f"a search for missing effects compares torques alone, got the channels {names}")

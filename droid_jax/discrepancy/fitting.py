@@ -6,6 +6,7 @@ after everything else has been allowed to move.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -13,6 +14,7 @@ import numpy as np
 import scipy.stats
 
 from droid_jax.cost.cost import Cost, make_cost
+from droid_jax.cost.windowed_log import WindowedLog
 from droid_jax.discrepancy.candidates import project
 from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.discrepancy.residual_set import ResidualSet
@@ -24,7 +26,7 @@ from droid_jax.identify.pipeline import Progress, grip_hypotheses, search_cost, 
 from droid_jax.identify.search import NotReplayed, cma_search
 from droid_jax.model.effects.candidate import Candidate, Keys, keys_of, names_of
 from droid_jax.model.parameters import Space
-from droid_jax.model.scene import with_options
+from droid_jax.model.scene import Scene, with_options
 from droid_jax.recordings.recording import Recording
 from droid_jax.simulate.replay import Drive
 
@@ -302,8 +304,16 @@ def with_finer_step(residual_set: ResidualSet, base: Space, recording: Recording
     cost = residual_set.cost
     if not isinstance(cost.drives[0], Drive):
         return None
-    scene = with_options(cost.scene, timestep=float(cost.scene.model.opt.timestep) / FINER)
+    scene = _finer(cost.scene)
+    if isinstance(cost, WindowedLog):
+        return cost.finer(scene, base)
     return make_cost(scene, base, [recording], config=residual_set.comparison.config, check=False)
+
+
+@functools.lru_cache(maxsize=4)
+def _finer(scene: Scene) -> Scene:
+    """The same scene each time, so that its program is compiled once."""
+    return with_options(scene, timestep=float(scene.model.opt.timestep) / FINER)
 
 
 def discretisation_error(
@@ -335,7 +345,7 @@ def discretisation_error(
     if not np.isfinite(off).all():
         raise NotReplayed(f"the simulation of {recording.name!r} blows up at a quarter of its time step")
     left = project(off[None], model.refined.jacobian / np.sqrt(count), model.refined.prior * np.sqrt(count))[0]
-    return float(left @ left / len(left))
+    return float(left @ left / residual_set.resampling.counted.sum())
 
 
 def beyond_step_error(discrepancy: float, discretisation_error: float) -> bool:

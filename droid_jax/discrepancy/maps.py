@@ -98,6 +98,8 @@ def _hinge_parts(residual_set: ResidualSet, values: np.ndarray, residuals: np.nd
     """
     space, scene, rows = residual_set.cost.space, residual_set.cost.scene, residual_set.resampling
     torques = space.of_role(Role.OBJECT_TORQUE)  # how they show in the measured joints
+    if [c.name for c in residual_set.comparison.channels] != ["torque"]:
+        return ()
     if not torques or scene.object_joint in scene.joints or not rows.repeated:
         return ()
     pushed, at, step = values.copy(), space.index(torques[0].name), 0.5 * torques[0].std
@@ -128,13 +130,12 @@ def _hinge_parts(residual_set: ResidualSet, values: np.ndarray, residuals: np.nd
 def _cells(residual_set: ResidualSet, values: np.ndarray) -> Iterator[tuple[CellKey, np.ndarray]]:
     """Every cell and its residuals, [M] bool."""
     comparison, scene, clock = residual_set.comparison, residual_set.cost.scene, residual_set.time
-    torque_columns = comparison.channel("torque").columns
-    joints = [scene.joints[c] for c in torque_columns]
+    columns = joint_columns(residual_set)
     (rollout,) = residual_set.cost.rollouts(values[None])
     spans = [(p.name, p.start, p.end) for p in comparison.phases] or [("all", clock.min(), clock.max() + 1e-9)]
-    for j, joint in enumerate(joints):
+    for joint, mine in columns.items():
         for name, first, last in spans:
-            inside = (clock >= first) & (clock < last) & (residual_set.column == j)
+            inside = (clock >= first) & (clock < last) & mine
             yield CellKey(Axis.PHASE, joint, name, float(first), float(last), "s"), inside
     at = np.clip(np.searchsorted(comparison.clock, clock), 0, len(comparison.clock) - 1)
     angle = np.asarray(rollout.object_angle[0])
@@ -147,14 +148,28 @@ def _cells(residual_set: ResidualSet, values: np.ndarray) -> Iterator[tuple[Cell
         for label, side in sides.items():
             yield CellKey(Axis.OBJECT_DIRECTION, label=label), side
         yield from _bins(CellKey(Axis.OBJECT_SPEED, unit=f"{length}/s"), np.abs(w))
-    for j, joint in enumerate(joints):
-        mine, column = residual_set.column == j, torque_columns[j]
+    for joint, mine in columns.items():
+        if joint not in scene.joints:
+            continue
+        column = scene.joints.index(joint)
         velocity = np.asarray(rollout.velocity[0])[at, column]
         for label, side in (("forward", velocity > STILL_JOINT), ("back", velocity < -STILL_JOINT)):
             yield CellKey(Axis.DIRECTION, joint, label), mine & side
         position, load = np.asarray(rollout.position[0])[at, column], np.asarray(rollout.torque[0])[at, column]
         yield from _bins(CellKey(Axis.POSITION, joint, unit=_length(scene, joint)), position, mine)
         yield from _bins(CellKey(Axis.LOAD, joint, unit=scene.torque_unit([joint])), load, mine)
+
+
+def joint_columns(residual_set: ResidualSet) -> dict[str, np.ndarray]:
+    """Joint -> residuals [M] bool of it, in whatever channel; the object's angle is its joint's."""
+    scene, names = residual_set.cost.scene, list[str]()
+    for channel in residual_set.comparison.channels:
+        each = (
+            [str(scene.object_joint)] if channel.name == "object_angle" else [scene.joints[c] for c in channel.columns]
+        )
+        names += each
+    of = np.array(names)[residual_set.column]
+    return {joint: of == joint for joint in dict.fromkeys(names)}
 
 
 def _length(scene: Scene, joint: str) -> str:

@@ -19,7 +19,7 @@ import numpy as np
 from droid_jax.arguments import instance, instances
 from droid_jax.cost.cost import Cost, make_cost
 from droid_jax.discrepancy.candidates import observable_effects
-from droid_jax.discrepancy.case import Case, base_model, case_of
+from droid_jax.discrepancy.case import Case, comparing
 from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.discrepancy.fitting import (
     FinalModel,
@@ -29,9 +29,11 @@ from droid_jax.discrepancy.fitting import (
     final_refit,
     final_refit_due,
 )
+from droid_jax.discrepancy.log_case import base_model
 from droid_jax.discrepancy.results import extended
 from droid_jax.discrepancy.search import search_effects
 from droid_jax.discrepancy.verdict import Experiment, Verdict
+from droid_jax.discrepancy.windowed_case import case_of
 from droid_jax.errors import reason
 from droid_jax.files import NOT_MADE, TO_BE_MADE
 from droid_jax.identify.extended_model import Extended
@@ -63,6 +65,7 @@ def find_missing_effects(
     start: np.ndarray | None = None,
     config: DiscrepancyConfig | None = None,
     progress: Progress | None = None,
+    judge_on: Sequence[Recording] = (),
 ) -> tuple[Verdict, Extended]:
     """Find the physical effect that a model lacks, and return the model with it (docs/discrepancy-search.md).
 
@@ -71,13 +74,14 @@ def find_missing_effects(
         space: all that is fitted without any effect, nuisances among it: `found.full` of an identification.
         recordings: train, validation and perhaps test, eight repeats or more of each; or one, sixteen repeats or more,
             whose second half validates; or a log of one repeat without commands, alone or with another one as test
-            data.
+            data; or any number of commanded logs with fewer repeats, whose windows train and validate in turns.
         effects: to ask about; None for all of the library (`droid_jax.model.effects.registry`) that could show in
             these recordings.
         start: [D] physical values over `space`, `found.best`, where the base fit begins instead of with a search; a
             log without repeats needs neither.
         config: all thresholds and settings.
         progress: called with a stage's name and its progress value.
+        judge_on: commanded logs that are test data, beside others of few repeats.
 
     Returns:
         The verdict, whose discrepancies are in squared noise units of one repeat, and the extended model.  Only another
@@ -90,15 +94,18 @@ def find_missing_effects(
     """
     config = instance(DiscrepancyConfig() if config is None else config, "config", DiscrepancyConfig)
     check_space(instance(scene, "scene", Scene), instance(space, "space", Space))
-    recordings = recordings_of(recordings)
-    split, roles = assigned_roles(scene, recordings)
+    recordings, judges = recordings_of(recordings), recordings_of(judge_on) if judge_on else ()
+    split, roles = assigned_roles(scene, recordings, judges)
     given = None if effects is None else instances(effects, "effects", Effect)
-    asked = observable_effects(scene, recordings) if given is None else tuple(map(checked, given))
+    compared = comparing(scene, recordings, config).compare.channels
+    asked = observable_effects(scene, recordings, channels=compared) if given is None else tuple(map(checked, given))
     if not asked:
         raise ValueError("effects: there is none to ask about; None asks about all of the library")
     candidates(asked)  # refused before the base fit, and not after it
     start = None if start is None else space.check(start)
     case = case_of(split, scene, space, asked, roles, config)
+    for limit in case.limits:
+        warnings.warn(limit, stacklevel=2)
     report = progress or (lambda stage, value: None)
     verdict = search(split, case, roles, start, report)
     *_, whole = amended(case, verdict, roles["train"], report)
@@ -126,12 +133,23 @@ def search(
         model = base_model(case, progress=lambda now: report("refine", now))
         step_error = 0.0
     else:
-        model = base_fit(case.train, case.base, case.config, report, start)
+        if split is Split.WINDOWS:
+            model = base_model(case, _begin(case, start), progress=lambda now: report("refine", now))
+        else:
+            model = base_fit(case.train, case.base, case.config, report, start)
         report("discretisation_error", None)
         step_error = discretisation_error(case.train, model, roles["train"])
     verdict = search_effects(case, model, step_error, report)
     report("verdict", None)
     return verdict
+
+
+def _begin(case: Case, start: np.ndarray | None) -> np.ndarray | None:
+    """[D] a start [F] over the whole space."""
+    if start is None:
+        return None
+    inside = np.clip(start, case.base.low, case.base.high)
+    return case.full_space.embed(case.base, inside[None])[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +176,7 @@ def amended(
     recording: what the case was fitted to.
     """
     states = {
-        EXPERIMENTS: TO_BE_MADE if verdict.indistinguishable_models else NOT_NEEDED,
+        EXPERIMENTS: TO_BE_MADE if verdict.indistinguishable_models and case.train.resampling.repeated else NOT_NEEDED,
         REFIT: TO_BE_MADE if final_refit_due(case.train, verdict.model) else NOT_NEEDED,
     }
     now = Amended(verdict, FinalModel(verdict.model, (case.train,)), states)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from droid_jax.cost.cost import Cost
+from droid_jax.cost.observation import Measured
 from droid_jax.cost.residuals import Comparison
 from droid_jax.discrepancy.config import DiscrepancyConfig, SelectionConfig
 from droid_jax.discrepancy.statistics import Blocks, Repeats, Resampling
@@ -55,10 +56,11 @@ class ResidualSet:
         """Of the recording."""
         return self.comparison.repeats
 
-    @property
-    def instants(self) -> np.ndarray:
-        """[K] bool of the coarse clock, those that count."""
-        return self.resampling.counted[self.column == 0]
+    def instants_of(self, channel: Measured) -> np.ndarray:
+        """[K] bool of a channel's coarse clock, those that count."""
+        names = [c.name for c in self.comparison.channels]
+        before = self.comparison.channels[: names.index(channel.name)]
+        return self.resampling.counted[self.column == sum(len(c.columns) for c in before)]
 
     def common(self, values: np.ndarray) -> np.ndarray:
         """[P, D] -> [P, M] mean of the repeats minus simulation, the recording's own nuisances at their best.
@@ -138,19 +140,19 @@ def residual_set(cost: Cost, config: DiscrepancyConfig | None = None) -> Residua
     return _of(cost, rows, config, selection.equivalence_factor, selection.prior_slack)
 
 
-def block_residual_set(cost: Cost, block: np.ndarray, config: DiscrepancyConfig | None = None) -> ResidualSet:
+def block_residual_set(
+    cost: Cost, block: np.ndarray, config: DiscrepancyConfig | None = None, least: int = FEWEST_REPEATS
+) -> ResidualSet:
     """The residual set of a cost over one recording of one repeat; block: [K] of each instant of the coarse clock.
 
-    Raises:
+    least: blocks that there must be.  Raises:
         ValueError: repeats, which need no blocks, or fewer blocks than flips can use.
     """
     config, comparison = config or DiscrepancyConfig(), only_comparison(cost)
     if comparison.repeats > 1:
         raise ValueError(f"recording {comparison.name!r} has {comparison.repeats} repeats: flip these, not blocks")
-    if block.max() + 1 < FEWEST_REPEATS:
-        raise ValueError(
-            f"recording {comparison.name!r}: {block.max() + 1} blocks, at least {FEWEST_REPEATS} are needed"
-        )
+    if block.max() + 1 < least:
+        raise ValueError(f"recording {comparison.name!r}: {block.max() + 1} blocks, at least {least} are needed")
     column, _ = residual_locations(comparison)
     rows, blocks = Blocks(np.tile(block, int(column.max()) + 1)), config.blocks
     return _of(cost, rows, config, blocks.equivalence_factor, blocks.prior_slack)

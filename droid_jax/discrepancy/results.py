@@ -22,6 +22,7 @@ from droid_jax.discrepancy.selection import ValidationTest, bound_at
 from droid_jax.discrepancy.verdict import Alternatives, Verdict
 from droid_jax.files import GAP, GAP_TRACES, GAP_VERSION
 from droid_jax.identify.extended_model import Extended, save_extended
+from droid_jax.identify.holdout import distance_unit, unit_of
 from droid_jax.identify.identifiability import posterior
 from droid_jax.model.effects.candidate import Candidate, EffectKey, Keys
 from droid_jax.storage import config_json, finite, write_json, write_npz
@@ -133,12 +134,16 @@ def gap_json(case: Case, verdict: Verdict) -> dict[str, Any]:
             for t in (verdict.trend,)
             if t is not None
         ],
-        "units": case.train.cost.scene.torque_unit(_joints(case.train)),
+        "units": unit_of(case.train.cost.scene, case.train.comparison.leading),
+        "channel": case.train.comparison.leading.name,
+        "channels": [c.name for c in case.train.comparison.channels],
+        "distance_unit": distance_unit(case.train.cost.scene, case.train.comparison),
     }
 
 
 def gap_arrays(case: Case, verdict: Verdict) -> dict[str, np.ndarray]:
-    """Smoothed joint torques of each recording: the repeats, and the simulation before and after.
+    """The smoothed leading channel (torques, where compared) of each recording: the repeats, and the simulation before
+    and after.
 
     Where one log has several roles, each has the instants of its own blocks.
     """
@@ -147,8 +152,8 @@ def gap_arrays(case: Case, verdict: Verdict) -> dict[str, np.ndarray]:
     for role in verdict.discrepancies:
         residual_set = case.residual_sets[role]
         order = [_joints(residual_set).index(joint) for joint in joints]
-        channel = residual_set.comparison.channel("torque")
-        mine = residual_set.instants
+        channel = residual_set.comparison.leading
+        mine = residual_set.instants_of(channel)
         (simulated,) = residual_set.cost.smoothed(_before_after(residual_set, verdict))
         before, after = simulated[:, mine][:, :, order]
         repeats = channel.noise.repeats[:, mine][:, :, order]
@@ -168,8 +173,9 @@ def _before_after(residual_set: ResidualSet, verdict: Verdict) -> np.ndarray:
 
 
 def _joints(residual_set: ResidualSet) -> list[str]:
-    """Measured joints, in the order of the torque channel's columns."""
-    return [residual_set.cost.scene.joints[c] for c in residual_set.comparison.channel("torque").columns]
+    """Measured joints, in the order of the leading channel's columns."""
+    scene, channel = residual_set.cost.scene, residual_set.comparison.leading
+    return [str(scene.object_joint)] if channel.name == "object_angle" else [scene.joints[c] for c in channel.columns]
 
 
 def _key(key: EffectKey) -> dict[str, str]:
@@ -197,7 +203,10 @@ def _final_json(case: Case, verdict: Verdict, final: FinalModel) -> dict[str, An
 
 
 def _discrepancy(role: str, residual_set: ResidualSet, verdict: Verdict) -> dict[str, Any]:
-    """U and the paper's distance, N m, before and after; closed: None where there was nothing beyond U0."""
+    """U and the paper's distance (equation 1), before and after; closed: None where there was nothing beyond U0.
+
+    The distance is in the compared channel's unit, of several in noise units; its keys are named for torques.
+    """
     before, after = verdict.discrepancies[role]
     both = _before_after(residual_set, verdict)
     distance = (residual_set.distances(both) - residual_set.cost.penalties(both))[:, 0]

@@ -32,12 +32,19 @@ from droid_jax.model.effects.registry import ready
 from droid_jax.model.encoders import encoder_error
 from droid_jax.model.physics import Physics
 from droid_jax.model.scene import Scene
-from droid_jax.model.step import simulate_step
+from droid_jax.model.step import gear_torques, simulate_step
 from droid_jax.policy.control import ACTIONS, OBSERVED, Safety, limited
 from droid_jax.policy.environment import Environment
 from droid_jax.runtime import first_device
 from droid_jax.simulate.hand_path import solve_pose
-from droid_jax.simulate.replay import apply_forces, apply_friction, check_stateless, compose, servo_input
+from droid_jax.simulate.replay import (
+    apply_forces,
+    apply_friction,
+    check_stateless,
+    compose,
+    rubbing,
+    servo_input,
+)
 from droid_jax.simulate.time_loop import time_loop
 
 PAST = 4  # commands remembered: a delay of up to three times Task.control
@@ -47,14 +54,15 @@ FAST = 100.0  # rad/s or m/s: ten times what arm, fingers and door ever do; beyo
 class World(NamedTuple):
     """What the simulation carries from one action to the next.
 
-    qpos [nq], qvel [nv], warm [nv] (solver's start), load [nv] N m; commands [PAST, 9], the latest last; pads [2, 3]
-    m in the knob's frame; time, held, longest: s.
+    qpos [nq], qvel [nv], warm [nv] (solver's start), load [nv] and gear [2, nv] N m (as `State` has them); commands
+    [PAST, 9], the latest last; pads [2, 3] m in the knob's frame; time, held, longest: s.
     """
 
     qpos: jax.Array
     qvel: jax.Array
     warm: jax.Array
     load: jax.Array
+    gear: jax.Array
     commands: jax.Array
     pads: jax.Array
     time: jax.Array
@@ -106,7 +114,8 @@ class DoorEnv(Environment):
         qpos = jnp.asarray(self.start, jnp.float32).at[scene.joint_qpos].add(off)
         still = jnp.concatenate([qpos[scene.joint_qpos], jnp.full(2, OPEN, jnp.float32)])
         nothing = jnp.zeros(())
-        world = World(qpos, zero, zero, zero, jnp.tile(still, (PAST, 1)), jnp.zeros((2, 3)), nothing, nothing, nothing)
+        gear, commands = jnp.stack([zero, zero]), jnp.tile(still, (PAST, 1))
+        world = World(qpos, zero, zero, zero, gear, commands, jnp.zeros((2, 3)), nothing, nothing, nothing)
         seen = self._look(self.sys.model, world, jnp.zeros(2))
         world = world._replace(pads=seen.pads)
         seen = seen._replace(sliding=nothing)
@@ -154,8 +163,8 @@ class DoorEnv(Environment):
 
         def substep(sample: Any, number: jax.Array, carry: Any) -> Any:
             model, theta, error, world = sample
-            qpos, qvel, warm, load, _ = carry
-            now = State(world.time + number * self._timestep, qpos, qvel, load, model)
+            qpos, qvel, warm, load, gear, _ = carry
+            now = State(world.time + number * self._timestep, qpos, qvel, load, model, gear=gear)
             ctrl = self._servo(theta, now, world)
             data = self._template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm, ctrl=ctrl)
             after = simulate_step(
@@ -165,13 +174,15 @@ class DoorEnv(Environment):
                 push=apply_forces(theta, now, self.effects, error),
             )
             force = finger_forces(self._hand, after)
-            return after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator, force
+            gear = gear_torques(model, after, qvel) if rubs else gear
+            return after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator, gear, force
 
         model, theta = physics.model, complete(physics.theta, self.effects)
-        sample = model, theta, encoder_error(self.scene, model), world
-        start = (world.qpos, world.qvel, world.warm, world.load, jnp.zeros(2))
-        qpos, qvel, warm, load, force = time_loop(substep, sample, start, self._substeps)
-        return world._replace(qpos=qpos, qvel=qvel, warm=warm, load=load, time=world.time + self.task.control), force
+        sample, rubs = (model, theta, encoder_error(self.scene, model), world), rubbing(self.effects)
+        start = (world.qpos, world.qvel, world.warm, world.load, world.gear, jnp.zeros(2))
+        qpos, qvel, warm, load, gear, force = time_loop(substep, sample, start, self._substeps)
+        now = world.time + self.task.control
+        return world._replace(qpos=qpos, qvel=qvel, warm=warm, load=load, gear=gear, time=now), force
 
     def _servo(self, theta: Theta, now: State, world: World) -> jax.Array:
         """[9] what the servos are given: the latest command, or what effects make of the latest ones."""

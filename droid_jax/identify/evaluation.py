@@ -33,6 +33,7 @@ from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Channel, Recording, recordings_of
 from droid_jax.simulate.batching import in_blocks
 from droid_jax.simulate.compiled import compiled_replay
+from droid_jax.simulate.engine import choose_engine
 from droid_jax.simulate.repeat_starts import own_starts
 from droid_jax.storage import finite
 
@@ -76,7 +77,7 @@ def evaluate_on(
         before: the initial means, say.
         after: the fitted values.
         effects: in the model beside what the scene has.
-        engine: "mjx" or "mujoco" (plain C).
+        engine: "mjx", "mujoco" (plain C), or "auto": `simulate.engine.choose_engine` chooses.
         config: how commands are replayed; None for the defaults.
 
     Raises:
@@ -86,7 +87,10 @@ def evaluate_on(
     check_read(scene, space, effects)
     config, rows = config or CompareConfig(), space.check(np.stack([before, after]))
     out: list[Replayed] = []
-    for given in recordings_of(recordings):
+    recordings = recordings_of(recordings)
+    if engine == "auto":
+        engine = choose_engine(scene, space, recordings, effects).engine
+    for given in recordings:
         recording = own_starts(given, config.start)
         informative_channels(scene, [recording])
         named = dict.fromkeys(measured_channels(scene, recording), 1.0)

@@ -19,16 +19,17 @@ import numpy as np
 from droid_jax.arguments import instance, path_of, shown
 from droid_jax.files import EXTENDED, EXTENDED_MJCF
 from droid_jax.identify.gaussian import Coordinates, Gaussian, ParameterEntry, matrix, space_of, space_to_json
+from droid_jax.identify.neutral_result import write_neutral
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects.candidate import Candidate, Keys
 from droid_jax.model.effects.registry import effect_space, library, ready
 from droid_jax.model.fields import check_space
-from droid_jax.model.mjcf import WORDS, fitted_mjcf, native
+from droid_jax.model.mjcf import WORDS, native
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene
 from droid_jax.read_json import read_json, typed
-from droid_jax.storage import write_json, write_text
+from droid_jax.storage import write_json
 
 FORMAT, VERSION = "droid_jax extended model", 2
 
@@ -78,11 +79,9 @@ class Extended:
 def save_extended(folder: Path, model: Extended) -> None:
     """Write extended.json and extended.xml into `folder`; extended.json says why where there is no MJCF."""
     mjcf: dict[str, Any] = {"file": EXTENDED_MJCF, "lacks": list(map(str, model.lacking))}
-    try:
-        write_text(folder / EXTENDED_MJCF, fitted_mjcf(model.scene, model.space, model.values, model.effects))
-    except ValueError as error:
-        mjcf |= {"file": None, "error": str(error)}
-        (folder / EXTENDED_MJCF).unlink(missing_ok=True)  # of another run, started over in this folder
+    error = write_neutral(folder, model.scene, model.gaussian, model.values, model.effects, main=EXTENDED_MJCF)
+    if error:
+        mjcf |= {"file": None, "error": error}
     write_json(folder / EXTENDED, _to_json(model) | {"mjcf": mjcf})
 
 

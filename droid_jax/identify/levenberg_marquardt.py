@@ -16,15 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.arguments import check_fields, number, whole
+from droid_jax.arguments import check_fields, number, several, whole
 from droid_jax.model.parameters import Scaling, Space
 
 Residuals = Callable[[np.ndarray], np.ndarray]
 
-# A batch of trials for each start: damping factors x lengths x paths, 32 in all, the block of a CPU.
-_DAMPINGS = 10.0 ** np.arange(-3.0, 5.0)
-_LENGTHS = (1.0, 0.5)
-CANDIDATE_STEPS = 2 * len(_DAMPINGS) * len(_LENGTHS)
+PATHS = 2  # of a trial
 
 
 @dataclass(frozen=True)
@@ -38,6 +35,9 @@ class LevenbergMarquardtConfig:
     main_prior: prior deviation of parameters of interest, search units.
     chord: a Jacobian serves another batch of trials while the last lowered the objective by this share.
     chords: batches of trials at most with one Jacobian.
+    dampings: factors on the last damping that a batch of trials tries; with lengths and both paths 32 trials, the block
+      of a CPU in MJX.
+    lengths: shares of the whole step that it tries.
     spreads: times that the slopes are taken over the width of the posterior at the end; 0 leaves the narrow ones.
     spread_width: half-width of those differences, posterior deviations.
     spread_longest: and their largest component, search units: what the data do not tell is not followed far.
@@ -50,9 +50,16 @@ class LevenbergMarquardtConfig:
     main_prior: float = 4.0
     chord: float = 0.03
     chords: int = 3
+    dampings: tuple[float, ...] = (1e-3, 1e-2, 1e-1, 1e0, 1e1, 1e2, 1e3, 1e4)
+    lengths: tuple[float, ...] = (1.0, 0.5)
     spreads: int = 2
     spread_width: float = 1.5
     spread_longest: float = 1.0
+
+    @property
+    def trials(self) -> int:
+        """Rows of a batch of trials."""
+        return PATHS * len(self.dampings) * len(self.lengths)
 
     def __post_init__(self) -> None:
         check_fields(
@@ -62,6 +69,8 @@ class LevenbergMarquardtConfig:
             least_ratio=partial(number, above=0, most=1),
             chord=partial(number, least=0),
             chords=partial(whole, least=1),
+            dampings=several(partial(number, above=0)),
+            lengths=several(partial(number, above=0, most=1)),
             spreads=partial(whole, least=0),
         )
 
@@ -209,7 +218,7 @@ class DampedProblem:
         objective = self.objective(trials, residual)
         rows, pick = np.arange(starts), np.argmin(objective, axis=1)
         better = objective[rows, pick] < state.objective
-        factor = np.tile(np.repeat(_DAMPINGS, len(_LENGTHS)), len(paths))[pick]
+        factor = np.tile(np.repeat(self._config.dampings, len(self._config.lengths)), PATHS)[pick]
         return Starts(
             x=np.where(better[:, None], trials[rows, pick], state.x),
             residual=np.where(better[:, None], residual[rows, pick], state.residual),
@@ -223,19 +232,19 @@ class DampedProblem:
 
         None from a start that could not be replayed.
         """
-        x = state.x[0]
+        x, dampings, lengths = state.x[0], self._config.dampings, self._config.lengths
         if not np.isfinite(state.objective[0]):
-            return np.zeros((len(_DAMPINGS) * len(_LENGTHS), len(x)))
+            return np.zeros((len(dampings) * len(lengths), len(x)))
         hessian = curvature(jacobian, self.prior)
         slope = jacobian.T @ state.residual[0] + x / self.prior**2
         free = ~(((x <= self.low) & (slope > 0)) | ((x >= self.high) & (slope < 0)))
         free &= True if held is None else ~held[row]
-        out = np.zeros((len(_DAMPINGS), len(_LENGTHS), len(x)))
-        for k, factor in enumerate(_DAMPINGS):
+        out = np.zeros((len(dampings), len(lengths), len(x)))
+        for k, factor in enumerate(dampings):
             damped = hessian + state.damping[0] * factor * np.diag(np.diag(hessian))
             step = -np.linalg.solve(damped[np.ix_(free, free)], slope[free])
             step *= min(1.0, self._config.longest_step / max(np.max(np.abs(step), initial=0.0), 1e-12))
-            out[k][:, free] = np.outer(_LENGTHS, step)
+            out[k][:, free] = np.outer(lengths, step)
         return out.reshape(-1, len(x))
 
     def _straight(self, x: np.ndarray, step: np.ndarray) -> np.ndarray:

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from droid_jax.arguments import check_fields, flag, instance, number, one_of, optional, several, whole
-from droid_jax.cost.channels import SIMULATED, check_channels, in_noise_units, informative_channels
-from droid_jax.cost.cost import ENGINES, Cost, make_cost
+from droid_jax.cost.channels import SIMULATED, check_channels, chosen_channels, in_noise_units
+from droid_jax.cost.cost import Cost, make_cost
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.identify.divergence import blow_up
 from droid_jax.identify.fit import Fit
@@ -37,6 +37,7 @@ from droid_jax.model.parameters import Role, Space
 from droid_jax.model.scene import Scene
 from droid_jax.preflight.check_log import warn_of_log
 from droid_jax.recordings.recording import Recording, recordings_of
+from droid_jax.simulate.engine import CHOICES, EngineChoice, choose_engine
 from droid_jax.simulate.repeat_starts import own_starts
 
 
@@ -45,11 +46,14 @@ class IdentifyConfig:
     """Settings of an identification.
 
     Attributes:
-        engine: "mjx" or "mujoco" (plain C, all cores).
+        engine: "mjx", "mujoco" (plain C, all cores), or "auto": `simulate.engine.choose_engine` chooses.
         heldout: share of each recording's repeats that the fit does not see (at least one where there are two).
         search: CMA-ES settings; it sees the first recording alone, the refinement sees all of them.
         refine: refinement settings, or None: the search's own covariance is the distribution, as in the paper.
-        samples: replays drawn from the initial and from the fitted Gaussian to compare their costs.
+        beginning: s of long recordings that the search and the first refinement see, and more until every joint has
+            moved through half of its range; the last refinement sees all.
+        samples: replays drawn from the initial and from the fitted Gaussian to compare their costs, at most.
+        sample_steps: time steps that these replays may take together; of long recordings there are fewer of them.
         seed: of those samples (the search has its own).
         compare: how simulation and measurement are compared.
         channels: the measured channels to fit. Several are weighted by their noise (`channels.in_noise_units`). None:
@@ -65,11 +69,13 @@ class IdentifyConfig:
         ValueError: a setting is of the wrong type or out of its range.
     """
 
-    engine: str = "mjx"
+    engine: str = "auto"
     heldout: float = 0.3
     search: CmaConfig = field(default_factory=CmaConfig)
     refine: RefineConfig | None = field(default_factory=RefineConfig)
+    beginning: float = 20.0
     samples: int = 200
+    sample_steps: int = 5_000_000
     seed: int = 0
     compare: CompareConfig = field(default_factory=CompareConfig)
     channels: tuple[str, ...] | None = None
@@ -80,11 +86,13 @@ class IdentifyConfig:
     def __post_init__(self) -> None:
         check_fields(
             self,
-            engine=partial(one_of, valid=ENGINES),
+            engine=partial(one_of, valid=CHOICES),
             heldout=partial(number, least=0, below=1),
             search=partial(instance, kind=CmaConfig),
             refine=optional(partial(instance, kind=RefineConfig)),
+            beginning=partial(number, above=0, infinite=True),
             samples=partial(whole, least=0),
+            sample_steps=partial(whole, least=1),
             seed=partial(whole, least=0),
             compare=partial(instance, kind=CompareConfig),
             channels=optional(several(partial(one_of, valid=SIMULATED))),
@@ -104,7 +112,7 @@ class Identified:
     heldout_distances: by name of the recording that judges.  fit, heldout: costs over `full` on what was fitted and on
     what judges.
     heldout_repeats: by recording name.  seconds: by stage.  checks: by recording name, of those with commands.
-    config: the settings it was found with.
+    config: the settings it was found with.  engine: that replayed, and why.
     """
 
     scene: Scene
@@ -123,6 +131,7 @@ class Identified:
     seconds: dict[str, float]
     checks: dict[str, SolutionCheck] = field(default_factory=dict[str, SolutionCheck])
     config: IdentifyConfig = field(default_factory=IdentifyConfig)
+    engine: EngineChoice = field(default_factory=lambda: EngineChoice("mjx", "as asked for"))
 
     @property
     def start(self) -> np.ndarray:
@@ -131,6 +140,9 @@ class Identified:
 
 
 Progress = Callable[[str, Any], None]
+LONG = 1.5  # times the beginning, from which on a recording is long
+FEW = {"dampings": (0.1, 1.0, 10.0, 1e3), "lengths": (1.0,)}  # trials where no block is filled up with copies
+FEWEST = 16  # samples of a Gaussian that show its spread
 FIRM = 4.0  # times its initial mean: the friction of a pad that does not slip
 _FIELDS = tuple(Rollout.__dataclass_fields__)
 
@@ -141,7 +153,8 @@ class Preparation:
 
     heldout_count: the repeats of each recording that the fit does not see; heldout_repeats: their numbers.
     judges: whole recordings that judge instead; then no repeat is held out.  fit, heldout: costs on what is fitted and
-    on what judges.  seconds: that this took.
+    on what judges.
+    early: as fit, of the beginnings of long recordings.  seconds: that this took.  engine: that replays.
     """
 
     scene: Scene
@@ -154,9 +167,11 @@ class Preparation:
     heldout_repeats: tuple[tuple[int, ...], ...]
     judges: tuple[Recording, ...]
     fit: Cost
+    early: Cost
     heldout: Cost
     fingerprint: str
     seconds: float
+    engine: EngineChoice
 
 
 def identify_parameters(
@@ -219,7 +234,7 @@ def prepare(
     check_space(instance(scene, "scene", Scene), space)
     recordings = [own_starts(recording, config.compare.start) for recording in recordings]
     judges = tuple(own_starts(recording, config.compare.start) for recording in judges)
-    chosen = _chosen_channels(scene, [*recordings, *judges], config)
+    chosen = chosen_channels(scene, [*recordings, *judges], config.channels, config.compare)
     if chosen:
         config = replace(config, compare=replace(config.compare, channels=dict.fromkeys(chosen, 1.0)))
     check_channels([*recordings, *judges], config.compare.channels)
@@ -228,7 +243,10 @@ def prepare(
     else:
         fitted, held, numbers = zip(*(split_repeats(r, config.heldout) for r in recordings), strict=True)
     full = space if nuisances is None or config.refine is None else space + nuisances
-    base = make_cost(scene, full, fitted, engine=config.engine, config=config.compare, effects=effects, check=False)
+    engine = EngineChoice(config.engine, "as asked for")
+    if config.engine == "auto":
+        engine = choose_engine(scene, full, [*recordings, *judges], effects)
+    base = make_cost(scene, full, fitted, engine=engine.engine, config=config.compare, effects=effects, check=False)
     if len(chosen) > 1:
         config = replace(config, compare=replace(config.compare, channels=in_noise_units(base, full.mean)))
         base = base.against(fitted, config.compare)
@@ -240,9 +258,14 @@ def prepare(
     heldout = (
         base.against(held, plain)
         if commanded and not judges
-        else make_cost(scene, full, held, config=plain, effects=effects, check=False)
+        else make_cost(scene, full, held, engine=engine.engine, config=plain, effects=effects, check=False)
     )
     _check_start(base, full)
+    begun = [_beginning(recording, config.beginning) for recording in fitted]
+    early = base
+    if any(short is not recording for short, recording in zip(begun, fitted, strict=True)):
+        comparing = base.comparisons[0].config
+        early = make_cost(scene, full, begun, engine=engine.engine, config=comparing, effects=effects, check=False)
     return Preparation(
         scene=scene,
         space=space,
@@ -254,9 +277,11 @@ def prepare(
         heldout_repeats=numbers,
         judges=judges,
         fit=base,
+        early=early,
         heldout=heldout,
-        fingerprint=_fingerprint(scene, full, fitted[0], config, effects),
+        fingerprint=_fingerprint(scene, full, fitted[0], replace(config, engine=engine.engine), effects),
         seconds=time.monotonic() - began,
+        engine=engine,
     )
 
 
@@ -282,7 +307,7 @@ def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: 
     seconds: dict[str, float] = {}
 
     began = time.monotonic() - problem.seconds
-    first = base.first()
+    first = problem.early.first()
 
     found = cma_search(
         search_cost(first, config.compare, full, space),
@@ -297,7 +322,9 @@ def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: 
     began = time.monotonic()
     refined = None
     if config.refine is not None:
-        base, refined = _refined(base, starts(full, space, found), config.refine, lambda p: report("refine", p))
+        settings = config.refine if problem.engine.engine == "mjx" else replace(config.refine, **FEW)
+        begin = starts(full, space, found)
+        base, refined = _refined(base, problem.early, begin, settings, lambda p: report("refine", p))
     best = found.best if refined is None else refined.best
     judging = config.identifiability
     full_gaussian = found.gaussian() if refined is None else posterior(refined, base.comparisons, judging)
@@ -310,7 +337,10 @@ def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: 
     seconds["judge"] = time.monotonic() - began
 
     began = time.monotonic()
-    checks = check_solution(base, problem.recordings, best, config.engine, problem.effects) if config.checks else {}
+    checks = {}
+    if config.checks:  # the other engine is compiled for the comparison only where this one was asked for
+        engine, compiles = problem.engine.engine, config.engine != "auto"
+        checks = check_solution(base, problem.recordings, best, engine, problem.effects, compiles or engine == "mjx")
     seconds["checks"] = time.monotonic() - began
     names = [r.name for r in problem.recordings]
     return Identified(
@@ -332,20 +362,12 @@ def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: 
         seconds=seconds,
         checks=checks,
         config=config,
+        engine=problem.engine,
     )
 
 
 def _silent(stage: str, value: Any) -> None:
     """No progress is shown."""
-
-
-def _chosen_channels(scene: Scene, recordings: Sequence[Recording], config: IdentifyConfig) -> tuple[str, ...]:
-    """The channels that this module weighs; none where `compare` states its own."""
-    if config.channels:
-        return config.channels
-    if config.compare.channels != CompareConfig().channels:
-        return ()
-    return informative_channels(scene, recordings)
 
 
 def _check_names(names: Sequence[str], judges: Sequence[str], config: IdentifyConfig) -> None:
@@ -373,26 +395,40 @@ def _check_start(cost: Cost, space: Space) -> None:
             )
 
 
+def _beginning(recording: Recording, seconds: float) -> Recording:
+    """A long commanded recording's first seconds, and more until its commands have covered half of their range."""
+    begin, end = recording.span
+    if not recording.command.size or end - begin <= LONG * seconds:
+        return recording
+    reach = np.maximum.accumulate(recording.command) - np.minimum.accumulate(recording.command)
+    moved = recording.time[int(np.argmax(np.all(reach >= 0.5 * reach[-1], axis=1)))]
+    until = max(begin + seconds, float(moved))
+    return recording if until > begin + (end - begin) / LONG else recording.window(begin, until)
+
+
 def _refined(
-    base: Cost, begin: np.ndarray, config: RefineConfig, report: Callable[[Any], None]
+    base: Cost, early: Cost, begin: np.ndarray, config: RefineConfig, report: Callable[[Any], None]
 ) -> tuple[Cost, Refined]:
-    """The refinement from starts [S, F], and the cost it ended on.
+    """The refinement from starts [S, F], and the cost it ended on; early: of the recordings' beginnings, or the same.
 
     The noise of a single repeat is not known: it is stated twice, from what the search and then from
     what a first refinement leaves unexplained.
     """
 
-    def run(cost: Cost, begin: np.ndarray) -> Refined:
+    def run(cost: Cost, rough: Cost, begin: np.ndarray, config: RefineConfig = config) -> Refined:
         hypotheses = grip_hypotheses(cost.space)
-        rough = cost.first().whitened
-        return refine(cost.whitened, cost.space, begin, config, first=rough, hypotheses=hypotheses, progress=report)
+        return refine(
+            cost.whitened, cost.space, begin, config, first=rough.whitened, hypotheses=hypotheses, progress=report
+        )
 
+    whole = early is base
     if all(c.repeats > 1 for c in base.comparisons):
-        return base, run(base, begin)
-    base = base.restated(begin[0])
-    first = run(base, begin)
+        return base, run(base, base.first() if whole else early, begin)
+    early = early.restated(begin[0])
+    first = run(early, early.first(), begin)
     base = base.restated(first.best)
-    last = run(base, begin)
+    settled = replace(config, basin_hops=0)  # the first one has looked for other basins
+    last = run(base, base.first() if whole else early.restated(first.best), first.best, settled)
     return base, replace(last, evaluations=first.evaluations + last.evaluations)
 
 
@@ -428,6 +464,7 @@ def _fingerprint(
         "measured": [scene.joints, scene.command_names, scene.object_joint, scene.grip and scene.grip.fingers],
         "space": space_to_json(full),
         "engine": config.engine,
+        "beginning": config.beginning,
         "compare": asdict(config.compare),
         "effects": [[e.name, *([p.name, p.mean, p.low, p.high] for p in e.parameters)] for e in effects],
     }
@@ -441,11 +478,13 @@ def _possible(scene: Scene, gaussian: Gaussian, seed: int, count: int) -> np.nda
 
 
 def cost_samples(found: Identified, count: int, seed: int) -> dict[str, np.ndarray]:
-    """Costs on held-out repeats of samples from the initial and from the fitted Gaussian.
+    """Costs on held-out repeats of samples from the initial and from the fitted Gaussian, `count` of them at most.
 
     initial, fitted: [n, D] values; initial_cost, fitted_cost: [n] N m, failed replays carry their penalty;
     names: [D] of the parameters.
     """
+    steps = 2 * sum(len(drive.time) for drive in found.heldout.drives)
+    count = min(count, max(FEWEST, found.config.sample_steps // steps))
     first, last = (_possible(found.scene, g, seed, count) for g in (prior(found.space), found.full_gaussian))
     return {
         "initial": first,

@@ -1,7 +1,8 @@
 """A run's folder: everything an identification found, as JSON, npz, CSV, MJCF. No pickle.
 
 config.json, fit.json, gaussian.json, history.npz/.csv, samples.csv, traces.npz, distribution.npz,
-correlation.npz, fitted.xml; docs/results-folder.md lists them, `report` turns them into a page.
+correlation.npz, fitted.xml, fitted.json, apply_fit.py; docs/results-folder.md lists them, `report` turns them into
+a page.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import tempfile
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -34,13 +35,15 @@ from droid_jax.files import (
 from droid_jax.identify.fit import on_bound
 from droid_jax.identify.gaussian import prior
 from droid_jax.identify.holdout import NOISE_UNITS
+from droid_jax.identify.neutral_result import write_neutral
 from droid_jax.identify.pipeline import Identified
 from droid_jax.identify.solution_checks import solution_notes
-from droid_jax.model.mjcf import fitted_mjcf, unwritten
+from droid_jax.model.effect_interface import Effect
+from droid_jax.model.mjcf import unwritten
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.preflight.findings import Finding
-from droid_jax.storage import config_json, finite, write_csv, write_json, write_npz, write_text
+from droid_jax.storage import config_json, finite, write_csv, write_json, write_npz
 
 FORMAT = "droid_jax fit"
 
@@ -63,6 +66,7 @@ def write_run(
     *,
     truth: Mapping[str, float] | None = None,
     samples: Callable[[], Mapping[str, np.ndarray]] | None = None,
+    effects: Sequence[Effect] = (),
     notes: Iterable[str] = (),
     findings: Iterable[Finding] = (),
 ) -> None:
@@ -70,13 +74,14 @@ def write_run(
 
     truth: hidden values where they are known (the synthetic robot); samples: draws them (see `cost_samples`), once
       the fit itself is on disk.
+    effects: that were in the model beside what the scene has.
     findings: what the checks of the recordings found.
     """
-    mjcf, notes = None, [*notes, *solution_notes(found.checks, found.scene.name)]
-    try:
-        mjcf = fitted_mjcf(found.scene, found.full, found.best)
-    except ValueError as error:  # the fit itself is whole
-        notes.append(f"fitted.xml is not written: {error}")
+    notes = [*notes, *solution_notes(found.checks, found.scene.name)]
+    error = write_neutral(
+        folder, found.scene, found.full_gaussian, found.best, effects, main=FITTED, checks=found.checks
+    )
+    notes += [f"fitted.xml is not written: {error}"] if error else []
     write_json(folder / FIT, {**fit_json(found, truth or {}, notes), "findings": [asdict(f) for f in findings]})
     found.gaussian.save(folder / GAUSSIAN)
     found.full_gaussian.save(folder / "gaussian_full.json")
@@ -86,10 +91,6 @@ def write_run(
         np.outer(np.diag(found.full_gaussian.cov), np.diag(found.full_gaussian.cov))
     )
     write_npz(folder / CORRELATION, {"names": np.array(found.full.names), "correlation": correlation})
-    if mjcf is not None:
-        write_text(folder / FITTED, mjcf)
-    else:
-        (folder / FITTED).unlink(missing_ok=True)  # of a fit before
     if samples is not None:
         drawn = samples()
         write_npz(folder / DISTRIBUTION, drawn)

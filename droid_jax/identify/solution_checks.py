@@ -73,7 +73,12 @@ class SolutionCheck:
 
 
 def check_solution(
-    cost: Cost, recordings: Sequence[Recording], best: np.ndarray, engine: str, effects: Sequence[Effect] = ()
+    cost: Cost,
+    recordings: Sequence[Recording],
+    best: np.ndarray,
+    engine: str,
+    effects: Sequence[Effect] = (),
+    compiles: bool = True,
 ) -> dict[str, SolutionCheck]:
     """The checks by recording name, of all recordings with commands; MJX is compiled once more at most.
 
@@ -83,11 +88,12 @@ def check_solution(
         best: [D] fitted values over the cost's space.
         engine: "mjx" or "mujoco", that the cost was made with.
         effects: beside the scene's own, as the cost was given them.
+        compiles: whether MJX may be compiled; without, a fit in plain C is not compared with it.
 
     Returns:
         Nothing of logs without commands.
     """
-    found, compiled = dict[str, SolutionCheck](), False
+    found, compiled = dict[str, SolutionCheck](), not compiles
     rollouts = cost.rollouts(best[None])
     parts = zip(cost.comparisons, cost.drives, recordings, rollouts, strict=True)
     for comparison, drive, recording, rollout in parts:

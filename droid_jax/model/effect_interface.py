@@ -29,6 +29,8 @@ class State:
     load: [nv] N m, in a servo replay the actuators' torque in the step before, along a prescribed motion the torque
     of the same instant, without effects.
     model: the sample's mjx.Model, with the values of its parameters (fitted servo gains, say).
+    gear: [2, nv] N m, of the same moment as load: what motors give to the gears (actuators and gravity compensation),
+    and what the links put onto them (`step.gear_torques`); None where no effect changes dry friction.
     pose: mjx.Data with the kinematics of qpos, for forces; None where nobody has worked them out.
     """
 
@@ -38,6 +40,7 @@ class State:
     load: jax.Array
     model: Any = None
     pose: Any = None
+    gear: Any = None
 
 
 @jax.tree_util.register_dataclass

@@ -19,9 +19,14 @@ and high.
 The delay of the commands, s, a nuisance unless it says otherwise, and a factor on the position gain of a joint's
 servo have no element.
 
+    {"motor": "stall_torque", "element": "elbow", "std": 0.2}
+
+A factor on a number of the DC motor of a joint's servo: stall_torque, no_load_speed, torque_constant or resistance
+(model/dc_motor.py).
+
     {"field": "dof_armature", "element": ["shoulder", "elbow"], "name": "rotor", "std": 0.01, "high": 0.2}
 
-A list of elements (of joints, for "servo") or of columns makes one parameter that they share.
+A list of elements (of joints, for "servo" and "motor") or of columns makes one parameter that they share.
 """
 
 from __future__ import annotations
@@ -37,6 +42,7 @@ import msgspec
 
 from droid_jax.arguments import instance, path_of
 from droid_jax.errors import faults
+from droid_jax.model.dc_motor import motor_parameter
 from droid_jax.model.fields import (
     ENCODER,
     body_mass,
@@ -51,6 +57,7 @@ from droid_jax.model.parameters import Mode, Parameter, Role, Scaling, Space
 from droid_jax.model.scene import Scene
 from droid_jax.read_json import read_json, typed
 
+_KINDS = ("field", "sensor", "servo", "motor")
 _NEEDED = ("element", "std", "high")
 _TIME = Role.TIME_OFFSET.value
 SMALL = 1e-3  # of its deviation: a mean (and log_offset) below it is out of reach of a search in the logarithm
@@ -62,6 +69,7 @@ class _Entry(msgspec.Struct, forbid_unknown_fields=True):
     field: str | msgspec.UnsetType = msgspec.UNSET
     sensor: str | msgspec.UnsetType = msgspec.UNSET
     servo: str | list[str] | msgspec.UnsetType = msgspec.UNSET
+    motor: str | msgspec.UnsetType = msgspec.UNSET
     element: str | list[str] | msgspec.UnsetType = msgspec.UNSET
     name: str | msgspec.UnsetType = msgspec.UNSET
     unit: str | msgspec.UnsetType = msgspec.UNSET
@@ -133,10 +141,9 @@ def _parameter(scene: Scene, given: Any, where: str) -> Parameter:
     if not isinstance(given, dict):
         raise ValueError(f"{where}: expected an object, got {type(given).__name__}")
     entry = cast(dict[str, Any], given)
-    needed = ("std",) if "servo" in entry else ("std", "high") if entry.get("sensor") == _TIME else _NEEDED
-    missing = [k for k in needed if k not in entry]
-    if sum(kind in entry for kind in ("field", "sensor", "servo")) != 1:
-        missing.insert(0, "one of field, sensor and servo")
+    missing = [k for k in _needed(entry) if k not in entry]
+    if sum(kind in entry for kind in _KINDS) != 1:
+        missing.insert(0, "one of field, sensor, servo and motor")
     unknown = [k for k in entry if k not in _KNOWN]
     if wrong := faults({"missing": missing, "unknown": unknown}):
         raise ValueError(f"{where}: {wrong}; known keys: {', '.join(_KNOWN)}")
@@ -150,6 +157,14 @@ def _parameter(scene: Scene, given: Any, where: str) -> Parameter:
         return _single(scene, options)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{where}: {error}") from None
+
+
+def _needed(entry: Mapping[str, Any]) -> tuple[str, ...]:
+    if "servo" in entry:
+        return ("std",)
+    if "motor" in entry:
+        return ("element", "std")
+    return ("std", "high") if entry.get("sensor") == _TIME else _NEEDED
 
 
 def _shared(scene: Scene, options: Mapping[str, Any]) -> Parameter:
@@ -173,9 +188,11 @@ def _each(value: Any) -> list[Any]:
 def _single(scene: Scene, given: Mapping[str, Any]) -> Parameter:
     """The parameter of one element."""
     options: dict[str, Any] = dict(given)
-    field, sensor, servo = (options.pop(kind, None) for kind in ("field", "sensor", "servo"))
+    field, sensor, servo, motor = (options.pop(kind, None) for kind in _KINDS)
     if servo is not None:
         return servo_scale(scene, servo, **options)
+    if motor is not None:
+        return motor_parameter(scene, motor, options.pop("element"), **options)
     if sensor == _TIME:
         return replace(time_offset(options.pop("std"), options.pop("high")), **options)
     element = options.pop("element")
@@ -202,6 +219,8 @@ def _useless(entry: Mapping[str, Any]) -> tuple[str, ...]:
     """Keys that an entry of this kind does not have: a sensor's name is the one that the replay looks it up by."""
     if "servo" in entry:
         return ("element", "column", "mode")
+    if "motor" in entry:
+        return ("column", "mode")
     if "sensor" in entry:
         return ("column", "mode", "name", *(["element"] if entry["sensor"] == _TIME else []))
     return ("column",) if entry["field"] == "body_mass" else ()

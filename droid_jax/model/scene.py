@@ -27,6 +27,9 @@ from droid_jax.runtime import first_device
 LONGEST = 900  # characters of what is wrong with a scene, lists of names among it
 PICTURE = (480, 640)  # height, width of the largest picture that is drawn
 TINY_FRICTIONLOSS = 1e-6  # N m: enough to give a joint its friction-loss row
+# MuJoCo's defaults of a joint's friction constraint, and the hardest impedance that there is (mjMAXIMP).
+SOFT_REFERENCE, SOFT_IMPEDANCE = (0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0)
+HARD = 0.9999
 ONE_DEGREE = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
@@ -53,6 +56,8 @@ class Scene:
             beside the joint's position servo, its own name.
         object_joint: joint of the thing that is moved (the door's hinge), or None.
         grip: how a lost grasp is seen, or None where there is nothing to grip.
+        path: of the MJCF that it was loaded from, or None where it was not a file alone.
+        held: joints whose dry friction holds still here, and creeps in the MJCF (`load_scene`).
     """
 
     name: str
@@ -62,6 +67,8 @@ class Scene:
     command_names: tuple[str, ...]
     object_joint: str | None = None
     grip: Grip | None = None
+    path: Path | None = None
+    held: tuple[str, ...] = ()
 
     def id(self, kind: str, name: str) -> int:
         """Id of a named thing; kind is "joint", "body", "geom", "pair", "actuator" or "site"."""
@@ -319,6 +326,7 @@ def load_scene(
     object_joint: str | None = None,
     friction_joints: Sequence[str] = (),
     assets: Mapping[str, bytes] | None = None,
+    hold: bool = False,
     engine: str = "mjx",
     mj_step: bool = False,
 ) -> Scene:
@@ -331,6 +339,8 @@ def load_scene(
         friction_joints: joints whose friction loss will be a parameter though the file gives none.
         assets: contents of files that it names, by name, where they do not lie beside it: `env.model_assets` of
             mujoco_playground. An MJCF that is written of the scene later names them as this one does.
+        hold: dry friction of joints holds still: their friction constraint is as hard as MuJoCo has it, unless the
+            MJCF sets its solver parameters itself (solimpfriction, solreffriction).
         engine, mj_step: as in `compile_scene`.
 
     Returns:
@@ -361,10 +371,26 @@ def load_scene(
             has = f"has: {', '.join(sorted(named))}" if named else "has no joints at all"
             raise ValueError(f"unknown joint {joint!r}; {path} {has}")
         named[joint].frictionloss = max(named[joint].frictionloss, TINY_FRICTIONLOSS)
+    held = _hold(spec) if hold else ()
     try:
-        return compile_scene(spec, path.stem, joints=joints, object_joint=object_joint, engine=engine, mj_step=mj_step)
+        scene = compile_scene(spec, path.stem, joints=joints, object_joint=object_joint, engine=engine, mj_step=mj_step)
     except ValueError as error:
         raise ValueError(f"{path}: {said(error, LONGEST)}") from None
+    return dataclasses.replace(scene, held=held, path=None if assets else path.resolve())
+
+
+def _hold(spec: mujoco.MjSpec) -> tuple[str, ...]:
+    """Make the dry friction of a spec's joints hard where nothing is said of its constraint; names of these joints."""
+    soft = [
+        joint
+        for joint in spec.joints
+        if joint.frictionloss > 0
+        and np.allclose(joint.solref_friction, SOFT_REFERENCE)
+        and np.allclose(joint.solimp_friction, SOFT_IMPEDANCE)
+    ]
+    for joint in soft:
+        joint.solimp_friction[:2] = HARD
+    return tuple(joint.name for joint in soft)
 
 
 def _read(path: Path, assets: Mapping[str, bytes]) -> mujoco.MjSpec:

@@ -37,6 +37,7 @@ from droid_jax.model.unsupported_features import check_options
 ITERATIONS = 8  # at most; two or three are usual from a warm start
 LINE_SEARCH = 6  # corners of the piecewise linear slope followed in one step
 FIRM_LINE_SEARCH = 12  # the same where joint friction is firm: its part of the slope is steep and narrow
+EXACT_ROWS = 16  # constraint rows up to which all corners of firm friction are looked at at once, which is as cheap
 FIRM = 0.95  # impedance of a friction constraint above which it is
 _TOLERANCE = 3e-6  # of the acceleration's scale: what float32 can still tell apart
 _ROUNDING = 1e-5  # of a Newton step: how exactly float32 solves for it
@@ -81,7 +82,7 @@ def simulate_step(
     elif model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
         data = mjx.solve(model, data)
     else:
-        data = solve(inertia, data, FIRM_LINE_SEARCH if _may_be_firm(model) else LINE_SEARCH)
+        data = solve(inertia, data, firm=_may_be_firm(model))
     if not parity:
         return mjx.euler(_undamped(model), data)
     if not _is_euler(model):
@@ -96,6 +97,22 @@ def servo_force(model: Any, data: Any, velocity: jax.Array) -> jax.Array:
     A step integrates velocity gains at its mean velocity, data.qfrc_actuator is at the one before it.
     """
     return mjx.fwd_actuation(model, at_velocity(data, velocity)).qfrc_actuator
+
+
+def gear_torques(model: Any, data: Any, velocity: jax.Array) -> jax.Array:
+    """[2, nv] N m, of the step that `data` comes from: what motors give to the gears, what the links put onto them.
+
+    Motors: actuators and what compensates gravity.  Links: weight, the motion of the others, springs, contacts, limits
+    and applied forces; all but the joints' own inertia, damping and dry friction.  velocity: [nv] before the step.
+    """
+    rows = constraint_rows(data)
+    dry = slice(rows.equalities, rows.equalities + rows.frictions)
+    held = data.qfrc_constraint - rows.jacobian[dry].T @ rows.force[dry]
+    compensated = (1.0 - model.jnt_actgravcomp[model.dof_jntid]) * data.qfrc_gravcomp
+    links = data.qfrc_passive - compensated - data.qfrc_bias + held + data.qfrc_applied
+    if not model.opt.disableflags & (mujoco.mjtDisableBit.mjDSBL_SPRING | mujoco.mjtDisableBit.mjDSBL_DAMPER):
+        links = links + model.dof_damping * velocity
+    return jnp.stack([data.qfrc_actuator + compensated, links])
 
 
 def _within_range(model: Any, data: Any) -> Any:
@@ -146,17 +163,19 @@ def _may_be_firm(model: Any) -> bool:
     return bool(np.any(np.asarray(model.dof_solimp)[np.asarray(friction_dofs(model)), 0] > FIRM))
 
 
-def solve(inertia: jax.Array, data: Any, corners: int = LINE_SEARCH) -> Any:
+def solve(inertia: jax.Array, data: Any, firm: bool = False) -> Any:
     """Newton's method on the primal problem of MuJoCo's solver, from the warm start.
 
     min over a: a^T M a / 2 - a^T f + sum_i s_i(J_i a - aref_i), with the smooth forces f and s_i
     quadratic while a row is active (equality: always; dry friction: inside its bounds; the rest:
-    while negative).  inertia: [nv, nv] M, or what the integrator will use in its place.  corners: followed in a step.
+    while negative).  inertia: [nv, nv] M, or what the integrator will use in its place.  firm: whether joint friction
+    may be: the search along a step must not end early then, what is missing to its end adds up to milliradians.
     Source: MuJoCo documentation, "Computation", section "Solver" (primal problem).
     """
     rows = constraint_rows(data)
     jacobian, weight = rows.jacobian, rows.weight
     low, high = _force_bounds(rows)
+    exact = firm and weight.shape[0] <= EXACT_ROWS
     products = jnp.concatenate([jacobian[:, i:] * jacobian[:, i : i + 1] for i in range(inertia.shape[0])], axis=1)
     entry = _packed_index(inertia.shape[0])
 
@@ -173,9 +192,11 @@ def solve(inertia: jax.Array, data: Any, corners: int = LINE_SEARCH) -> Any:
         factor = jax.lax.linalg.cholesky(hessian, symmetrize_input=False)
         change = _solve_factored(factor, _times(jacobian.T, force) - pull)
         along = _times(jacobian, change)
-        share = _line_search(
-            forces, residual, along, _dot(pull, change), _dot(change, _times(inertia, change)), corners
-        )
+        slopes = _dot(pull, change), _dot(change, _times(inertia, change))
+        if exact:
+            share = _exact_share(forces, residual, along, *slopes, jnp.stack([low, high]) / -weight)
+        else:
+            share = _line_search(forces, residual, along, *slopes, FIRM_LINE_SEARCH if firm else LINE_SEARCH)
         qacc, residual = qacc + share * change, residual + share * along
         force, new_curvature = forces(residual)
         # What is left of the way: all of it, but where no row changed sides the problem was quadratic
@@ -255,3 +276,32 @@ def _line_search(
         inside = (newton > low) & (newton < high) | (newton == share)
         share = jnp.where(inside, newton, middle)
     return share
+
+
+def _exact_share(
+    forces: Callable[[jax.Array], tuple[jax.Array, jax.Array]],
+    residual: jax.Array,
+    along: jax.Array,
+    linear: jax.Array,
+    quadratic: jax.Array,
+    ends: jax.Array,
+) -> jax.Array:
+    """The same root by the slope at all of its corners at once: between two neighbours it is linear.
+
+    ends: [2, rows] of J a - aref, where each row's force reaches its bounds.
+    """
+    moves = along != 0.0
+    at = (ends - residual) / jnp.where(moves, along, 1.0)
+    at = jnp.where(moves & jnp.isfinite(at), at, 0.0).reshape(-1)  # [2 rows]
+
+    def slope(share: jax.Array) -> tuple[jax.Array, jax.Array]:
+        force, curvature = forces(residual + share[:, None] * along)
+        rise = quadratic + jnp.sum(curvature * along * along, axis=-1)
+        return linear + share * quadratic - jnp.sum(force * along, axis=-1), rise
+
+    below = slope(at)[0] < 0.0
+    low = jnp.max(jnp.where(below & (at > 0.0), at, 0.0))
+    high = jnp.min(jnp.where(below | (at <= 0.0), jnp.inf, at))
+    middle = jnp.where(jnp.isinf(high), low + 1.0, 0.5 * (low + high))
+    there, rise = slope(middle[None])
+    return jnp.clip(middle - there[0] / (rise[0] + 1e-30), low, high)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
+from droid_jax.model.scene import SOFT_IMPEDANCE, TINY_FRICTIONLOSS, Scene
 from droid_jax.recordings.recording import Recording, TorqueSide
 from droid_jax.simulate.initial_state import sent_columns, start_pose, weight_share
 
@@ -92,8 +92,9 @@ def creeping(scene: Scene, recording: Recording, model: mujoco.MjModel | None = 
 
 
 def creep_note(scene: Scene, recording: Recording, model: mujoco.MjModel | None = None) -> str:
-    """What is to be known of joints that creep; else empty."""
-    found = creeping(scene, recording, model)
+    """What is to be known of joints that creep, or would where the scene holds them (`Scene.held`); else empty."""
+    held = bool(scene.held) and model is None
+    found = creeping(scene, recording, as_given(scene) if held else model)
     if not found:
         return ""
     said = []
@@ -103,11 +104,25 @@ def creep_note(scene: Scene, recording: Recording, model: mujoco.MjModel | None 
             f"{c.joint} by {1e3 * c.speed:.2g} m{angle}/s at the {c.load:.2g} {torque} that it holds for "
             f"{c.seconds:.2g} s ({1e3 * c.distance:.2g} m{angle} in all; {1e3 * c.mended:.1g} m{angle}/s when mended)"
         )
-    return (
-        f"joints of scene {scene.name!r} that dry friction holds creep in the replay of recording {recording.name!r}, "
-        f"where real ones stand still, since MuJoCo's friction constraint is soft: {'; '.join(said)}; give these "
-        f'joints solimpfriction="{STIFF}" in the MJCF, else gains, damping and friction of a fit make up for it'
+    creep, why = ("would creep", "in its MJCF") if held else ("creep", "in the replay")
+    do = (
+        "the replay holds them, as the fitted MJCF will (--joint-friction scene replays them as they are)"
+        if held
+        else f'give these joints solimpfriction="{STIFF}" in the MJCF, else gains, damping and friction of a fit make '
+        "up for it"
     )
+    return (
+        f"joints of scene {scene.name!r} that dry friction holds {creep} {why} with recording {recording.name!r}, "
+        f"where real ones stand still, since MuJoCo's friction constraint is soft: {'; '.join(said)}; {do}"
+    )
+
+
+def as_given(scene: Scene) -> mujoco.MjModel:
+    """The scene's model with the friction constraints that its MJCF had."""
+    model = scene.model.__copy__()
+    for joint in scene.held:
+        model.dof_solimp[model.dof_jntid == scene.id("joint", joint)] = SOFT_IMPEDANCE
+    return model
 
 
 def _longest_hold(scene: Scene, recording: Recording, joint: str) -> tuple[float, float]:

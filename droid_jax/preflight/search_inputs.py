@@ -9,7 +9,7 @@ import numpy as np
 from droid_jax.model.scene import Scene
 from droid_jax.preflight.check_log import warn_of_log
 from droid_jax.recordings.checks import validate
-from droid_jax.recordings.recording import Channel, Recording
+from droid_jax.recordings.recording import JOINT_CHANNELS, Channel, Recording
 from droid_jax.recordings.split import Split, roles_of, split_of
 
 STILL = 0.01  # rad or m: a robot whose joints all move less stood still
@@ -19,17 +19,20 @@ MISSED = 0.5  # of the usual travel: a repeat that moves the object by less has 
 APART = 0.05  # s: repeats that are further apart in time were not cut alike
 
 
-def assigned_roles(scene: Scene, recordings: Sequence[Recording]) -> tuple[Split, dict[str, Recording]]:
+def assigned_roles(
+    scene: Scene, recordings: Sequence[Recording], judges: Sequence[Recording] = ()
+) -> tuple[Split, dict[str, Recording]]:
     """How recordings share the work, and each by its role; ValueError where a search in them could not end well.
 
-    Warns of what in them can hardly be right (`check_log`).
+    judges: test data of commanded logs with few repeats.  Warns of what in them can hardly be right (`check_log`).
     """
-    for recording in recordings:
+    everything = [*recordings, *judges]
+    for recording in everything:
         validate(recording, allow_jitter=True)  # one made in Python may not have been
-    split = split_of(recordings)
-    roles = roles_of(split, recordings)
+    split = split_of(recordings, judges)
+    roles = roles_of(split, recordings, judges)
     check_recordings(scene, {"only": recordings[0]} if split is Split.REPEATS else roles)
-    for recording in recordings:
+    for recording in everything:
         warn_of_log(scene, recording)
     return split, roles
 
@@ -115,7 +118,8 @@ def _ends(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _check_timing(recording: Recording, where: str) -> None:
-    late = lags(recording.channel("position" if "position" in recording.channels else "torque"))
+    name = next((n for n in ("position", *JOINT_CHANNELS) if n in recording.channels), None)
+    late = np.zeros(1) if name is None else lags(recording.channel(name))
     worst = int(np.argmax(np.abs(late)))
     if abs(late[worst]) > APART:
         raise ValueError(
@@ -152,12 +156,15 @@ def _check_different(roles: Mapping[str, Recording]) -> None:
 
 
 def _check_same_joints(roles: Mapping[str, Recording]) -> None:
-    joints = {role: recording.channel("torque").columns for role, recording in roles.items()}
+    name = next((n for n in JOINT_CHANNELS if all(n in r.channels for r in roles.values())), None)
+    if name is None:  # what compares them says so
+        return
+    joints = {role: recording.channel(name).columns for role, recording in roles.items()}
     first, *others = joints
     for role in others:
         if set(joints[role]) != set(joints[first]):
             raise ValueError(
-                f"the recordings measure torques of different joints: {first} {', '.join(joints[first])}; "
+                f"the recordings measure the {name} of different joints: {first} {', '.join(joints[first])}; "
                 f"{role} {', '.join(joints[role])}"
             )
 

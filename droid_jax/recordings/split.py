@@ -7,7 +7,8 @@ time (`discrepancy.case.single_case`).  Both validate on the training motion; `S
 from __future__ import annotations
 
 import enum
-from collections.abc import Sequence
+import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from droid_jax.recordings.recording import Recording
@@ -19,9 +20,8 @@ ELSE = (
     "What can still be told: `python -m droid_jax.run identify` fits the parameters, and its report shows in which "
     "joint and phase simulation and robot disagree"
 )
-
-
 ALONE = "one repeat alone"  # of a log without commands
+BY_WINDOWS = "; and commanded logs in which positions were measured are searched by windows, with any number of repeats"
 
 
 class Split(enum.Enum):
@@ -29,7 +29,8 @@ class Split(enum.Enum):
 
     RECORDINGS = "recordings"
     REPEATS = "repeats"
-    BLOCKS = "blocks"  # of time, of one log without repeats
+    BLOCKS = "blocks"  # of time, of one log without repeats and commands
+    WINDOWS = "windows"  # of commanded logs with few repeats
 
     @property
     def limits(self) -> str:
@@ -42,14 +43,25 @@ class Split(enum.Enum):
             Split.BLOCKS: "There are no repeats: U holds the noise too, and nothing tells a place from noise. The "
             "validation blocks are of the same motion as the fitted ones, so they tell an effect from noise, but not "
             "from another form of it.",
+            Split.WINDOWS: "There are too few repeats to tell noise from what they share: windows of the motion, each "
+            "replayed from its own measured state, take their place. U holds the noise too, and nothing tells a place "
+            "from noise. The validation windows are of the same motions as the fitted ones, so they tell an effect "
+            "from noise, but not from another form of it.",
         }[self]
 
 
-def split_of(recordings: Sequence[Recording]) -> Split:
-    """How one to three recordings are to be used.
+def split_of(recordings: Sequence[Recording], judges: Sequence[Recording] = ()) -> Split:
+    """How recordings are to be used; judges: test data of commanded logs with few repeats.
 
     Raises ValueError where they are more or fewer, or hold too few repeats for any way; it says what can still be done.
     """
+    if _in_windows([*recordings, *judges]) and (judges or any(r.repeats < _needed(recordings) for r in recordings)):
+        return Split.WINDOWS
+    if judges:
+        raise ValueError(
+            "recordings to judge on are for commanded logs whose positions were measured: give others as a third one, "
+            "or a log without commands as a second one"
+        )
     if not 1 <= len(recordings) <= len(ROLES):
         raise ValueError(f"recordings: one to three are searched ({', '.join(ROLES)}), got {len(recordings)}")
     first, *others = recordings
@@ -65,8 +77,23 @@ def split_of(recordings: Sequence[Recording]) -> Split:
     return Split.RECORDINGS
 
 
-def roles_of(split: Split, recordings: Sequence[Recording]) -> dict[str, Recording]:
-    """Role -> recording.  A log that is cut into blocks is "train" and holds the validation blocks too."""
+def _in_windows(recordings: Sequence[Recording]) -> bool:
+    """Whether all of them hold commands, and positions, from which a replay may begin anywhere."""
+    return bool(recordings) and all(r.command.size and "position" in r.channels for r in recordings)
+
+
+def _needed(recordings: Sequence[Recording]) -> int:
+    """Repeats of each from which on they are what is resampled."""
+    return HALVES if len(recordings) == 1 else FEWEST_REPEATS if len(recordings) <= len(ROLES) else sys.maxsize
+
+
+def roles_of(split: Split, recordings: Sequence[Recording], judges: Sequence[Recording] = ()) -> dict[str, Recording]:
+    """Role -> recording.  A log that is cut into blocks is "train" and holds the validation blocks too; of several
+    that are pooled the others are "train 2", "train 3", ..., and "test 2", ... (`pooled`).
+    """
+    if split is Split.WINDOWS:
+        numbered = ((role, i, r) for role, rs in (("train", recordings), ("test", judges)) for i, r in enumerate(rs, 1))
+        return {role if i == 1 else f"{role} {i}": r for role, i, r in numbered}
     if split is Split.BLOCKS:
         return dict(zip(("train", "test"), recordings, strict=False))
     if split is Split.RECORDINGS:
@@ -81,19 +108,9 @@ def roles_of(split: Split, recordings: Sequence[Recording]) -> dict[str, Recordi
     }
 
 
-def _as_log(recording: Recording) -> str:
-    """How a commanded recording with too few repeats can be searched today, and what that loses; empty where it cannot.
-
-    A log is replayed along its measured positions, so it must hold them.
-    """
-    if not recording.command.size or "position" not in recording.channels:
-        return ""
-    one = "without its commands" if recording.repeats == 1 else "one repeat of it, without its commands,"
-    return (
-        f"; and {one} it can be searched as a log, in blocks of time, if it lasts a minute or more "
-        '(docs/your-robot.md, "Logs without commands"). Lost are effects of commands, servos and contacts '
-        "(delays, gains, elastic gears, the grip), and U then holds the noise"
-    )
+def pooled(roles: Mapping[str, Recording], role: str) -> list[Recording]:
+    """The recordings of a role and of its numbered ones."""
+    return [r for name, r in roles.items() if name.split(" ")[0] == role]
 
 
 def _check_test(first: Recording, other: Recording) -> None:
@@ -115,7 +132,7 @@ def _check_halves(recording: Recording) -> None:
         f"validation, and with fewer than {FEWEST_REPEATS} repeats in a half no effect can be told from chance. Record "
         f"{HALVES} or more, or better another motion, {FEWEST_REPEATS} repeats or more of each: "
         f"--recording TRAIN VALIDATION. {ELSE}"
-        + (_as_log(recording) if recording.command.size else f"; and {ALONE} is searched as a log, in blocks of time")
+        + (BY_WINDOWS if recording.command.size else f"; and {ALONE} is searched as a log, in blocks of time")
     )
 
 
@@ -127,7 +144,7 @@ def _check_repeats(role: str, recording: Recording) -> None:
         f"the {role} recording {recording.name!r} has {_repeats(recording)}: with fewer than {FEWEST_REPEATS} no "
         "effect can be "
         f"told from chance. {ELSE}"
-        + (f"; and {ALONE}, or of each of two logs, is searched in blocks of time" if log else _as_log(recording))
+        + (f"; and {ALONE}, or of each of two logs, is searched in blocks of time" if log else BY_WINDOWS)
     )
 
 

@@ -48,13 +48,13 @@ def discrepancy_bars(
     names: Sequence[str],
     sizes: Sequence[Discrepancy],
     error: float | None,
-    unit: str,
+    distance: tuple[str, str] = ("Torque distance", "N m"),
     extended: bool = True,
     width: float = WIDE,
 ) -> Figure:
-    """U and torque distance of each recording, before and after.
+    """U and the distance of equation 1 of each recording, before and after.
 
-    names, sizes: [G].  error: the discretisation error U0 or None, a dashed line.  unit: of torques.
+    names, sizes: [G].  error: the discretisation error U0 or None, a dashed line.  distance: its name and unit.
     extended: False where no effect entered the model: no "after".
     """
     wide = panel_columns(width) == 2
@@ -63,7 +63,7 @@ def discrepancy_bars(
     _pairs(left, names, [[d.before for d in sizes], [d.after for d in sizes]], extended, error)
     _pairs(right, names, [[d.torque_before for d in sizes], [d.torque_after for d in sizes]], extended)
     left.set_ylabel(U_LABEL)
-    right.set_ylabel(f"Torque distance [{unit}]")
+    right.set_ylabel(f"{distance[0]} [{distance[1]}]")
     legend(figure, left, width, columns=3)
     return figure
 
@@ -302,13 +302,16 @@ def _bars(axes: Axes, x: np.ndarray, bins: Bins, size: float, colour: str) -> No
     axes.bar(x[hidden], heights[hidden], size, facecolor="none", edgecolor=colour, hatch="////", linewidth=0.6)
 
 
-def torque_overlays(traces: Mapping[str, Any], unit: str, extended: bool = True, width: float = WIDE) -> Figure:
-    """Every joint's torque over time: `torque_figures.torque_traces` of the base and the final model.
+def torque_overlays(
+    traces: Mapping[str, Any], unit: str, extended: bool = True, quantity: str = "Torque", width: float = WIDE
+) -> Figure:
+    """Every joint's torque, or another quantity, over time: `torque_figures.torque_traces` of the base and the final
+    model.
 
     traces: of `gap_folder.Gap`.  extended: False where no effect entered the model: no "after".
     """
     models: dict[str, str] = dict(zip(("before", "after")[: 1 + extended], MODELS, strict=False))
-    return torque_traces(_banded(traces), traces["phases"], unit, models, BAND, POINTS, width=width)
+    return torque_traces(_banded(traces), traces["phases"], unit, models, BAND, POINTS, quantity, width=width)
 
 
 def _banded(traces: Mapping[str, Any]) -> dict[str, Any]:

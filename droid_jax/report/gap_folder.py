@@ -15,6 +15,7 @@ import numpy as np
 from msgspec import Struct, field
 
 from droid_jax.files import EXTENDED, GAP, GAP_TRACES, GAP_VERSION, LOST, NOT_MADE, TO_BE_MADE
+from droid_jax.report.neutral_folder import Neutral, read_neutral
 from droid_jax.report.reading import FindingEntry, PhaseEntry, Reader
 from droid_jax.report.text import label
 
@@ -206,6 +207,20 @@ class TrendEntry(Placed, frozen=True, kw_only=True):
     unit: str
 
 
+class OpenLoopMean(Struct, frozen=True):
+    """Mean absolute error of one channel over joints and recordings, replayed whole."""
+
+    unit: str
+    before: float | None
+    after: float | None
+
+
+class OpenLoop(Struct, frozen=True):
+    """Errors of whole replays, beside those of windows."""
+
+    mean_mae: dict[str, OpenLoopMean]
+
+
 class FinalModelEntry(Struct, frozen=True):
     """The model that is written to extended.json."""
 
@@ -216,7 +231,7 @@ class FinalModelEntry(Struct, frozen=True):
 class SplitEntry(Struct, frozen=True):
     """How the recordings were divided, and what cannot be concluded from that."""
 
-    by: Literal["recordings", "repeats", "blocks"] = "recordings"
+    by: Literal["recordings", "repeats", "blocks", "windows"] = "recordings"
     limits: str = ""
 
 
@@ -277,13 +292,30 @@ class Found(Answer, frozen=True, kw_only=True):
     shifts: list[Shift]
     experiments: list[ExperimentEntry]
     trends: list[TrendEntry]
-    units: str
+    units: str  # of the leading channel, and so of the traces
+    channel: str = "torque"
+    channels: list[str] = field(default_factory=lambda: ["torque"])
+    distance_unit: str = ""
     final_model: FinalModelEntry
     findings: list[FindingEntry] = field(default_factory=list)
     split: SplitEntry = SplitEntry()
+    open_loop: OpenLoop | None = None
     seconds: dict[str, float]
     versions: dict[str, str]
     device: str
+
+    @property
+    def quantity(self) -> str:
+        """What the traces show: "Torque", "Position", "Object angle"."""
+        return self.channel.replace("_", " ").capitalize()
+
+    @property
+    def distance(self) -> tuple[str, str]:
+        """What is compared by equation 1, and the unit of that: "Torque distance", "N m"; of several channels
+        "Distance" in noise units.
+        """
+        name = f"{self.quantity} distance" if len(self.channels) == 1 else "Distance"
+        return name, self.distance_unit or self.units
 
     def threshold(self, name: str) -> float:
         """A threshold of the selection, of its "config"."""
@@ -319,6 +351,11 @@ class Gap:
         return bool(self.found.effects)
 
     @property
+    def neutral(self) -> Neutral | None:
+        """The extended model in MuJoCo's own terms."""
+        return read_neutral(self.folder, _READ) if self.extended_file else None
+
+    @property
     def extended_file(self) -> bool:
         """Whether the folder holds the extended model."""
         return (self.folder / EXTENDED).is_file()
@@ -351,8 +388,8 @@ class Gap:
 
     @property
     def repeated(self) -> bool:
-        """Whether there are repeats, from which the noise is known; without them blocks of one log take turns."""
-        return self.found.split.by != "blocks"
+        """Whether there are repeats, from which the noise is known; without them blocks of logs take turns."""
+        return self.found.split.by not in ("blocks", "windows")
 
     @property
     def sheets(self) -> list[tuple[tuple[Role, ...], Mapping[str, Any]]]:

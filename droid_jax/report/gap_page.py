@@ -47,6 +47,7 @@ def gap_view(gap: Gap) -> dict[str, Any]:
     return {
         "gap": gap,
         "found": gap.found,
+        "neutral": gap.neutral,
         "roles": ROLES,
         "decisive": DECISIVE,
         "significance": gap.found.threshold("significance"),
@@ -107,7 +108,7 @@ def gap_next_step(gap: Gap) -> str:
     """What to do next, by the names that gap_sentences.jinja has for it."""
     verdict = gap.found.verdict
     if verdict == "indistinguishable":
-        if gap.timeless:
+        if gap.timeless or not gap.repeated:
             return "record another motion"
         best = best_experiment(gap)
         return "no experiment" if best is None else "decisive experiment" if decisive(best) else "weak experiment"
@@ -286,11 +287,13 @@ def _draw(gap: Gap) -> dict[str, list[Drawing]]:
 
     names = [f"{gap.recording(role)}\n{ROLES[role]}" for role in gap.roles]
     sizes = [found.discrepancies[role] for role in gap.roles]
-    bars = (names, sizes, gap.discretisation_error, unit, extended)
-    add("size", "gap", "Discrepancy and torque distance", gap_figures.discrepancy_bars, *bars)
+    bars = (names, sizes, gap.discretisation_error, found.distance, extended)
+    add("size", "gap", f"Discrepancy and {found.distance[0].lower()}", gap_figures.discrepancy_bars, *bars)
     for roles, traces in gap.sheets:
-        title = "Torque over time, " + " and ".join(f"{gap.recording(role)} ({ROLES[role]})" for role in roles)
-        add("torque", f"torque_{roles[0]}", title, gap_figures.torque_overlays, traces, unit, extended)
+        title = f"{found.quantity} over time, " + " and ".join(
+            f"{gap.recording(role)} ({ROLES[role]})" for role in roles
+        )
+        add("torque", f"torque_{roles[0]}", title, gap_figures.torque_overlays, traces, unit, extended, found.quantity)
     if any(c.axis == "phase" for c in before):
         add("place", "cells", "Discrepancy by joint and phase", gap_figures.cell_maps, *cells)
     if any(c.axis != "phase" for c in before):

@@ -24,6 +24,7 @@ from droid_jax.files import (
     TRACES,
 )
 from droid_jax.read_json import parse_json
+from droid_jax.report.neutral_folder import Neutral, read_neutral
 from droid_jax.report.reading import FindingEntry, PhaseEntry, Reader
 
 MOVED = 1.0  # prior deviations: a parameter that is not identifiable and moved no less is reported as moved
@@ -265,6 +266,11 @@ class Run:
     frames: tuple[Path, ...]
     film: Path | None
     replay: bool
+
+    @property
+    def neutral(self) -> Neutral | None:
+        """The result in MuJoCo's own terms."""
+        return read_neutral(self.folder, _READ)
 
     @property
     def robot(self) -> str:

@@ -37,6 +37,7 @@ def identify_view(run: Run, searched: bool) -> dict[str, Any]:
     """
     return {
         "run": run,
+        "neutral": run.neutral,
         "doubts": fit_doubts(run.fit),
         "next": next_steps(run, searched),
         "needed": needed([r.repeats for r in run.config.recordings]),

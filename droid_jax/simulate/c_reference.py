@@ -16,7 +16,7 @@ from droid_jax.model.parameters import Role, Space
 from droid_jax.model.physics import make_c_model, theta_of
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.clocks import interpolate
-from droid_jax.recordings.recording import TorqueSide
+from droid_jax.recordings.recording import TorqueConvention, TorqueSide
 from droid_jax.simulate.c_engine import instrument, simulate
 from droid_jax.simulate.initial_state import weight_share
 from droid_jax.simulate.replay import Drive, check_stateless
@@ -32,24 +32,12 @@ def c_replay(
 
     late: steps by which commands come late, and positions and velocities are told ahead, which takes most of the
     first-order error of C's steps out; 0 for what mj_step itself logs.
-    Effects with functions of their own raise ValueError, as does a recording whose torque is on the link
-    side, or contains the arm's weight where the actuators do not carry it, or the other way round (the C batch
-    interface returns the actuators' torque alone).
+    Raises ValueError where `why_not_in_c` says something.
     """
     check_gains(scene, drive)
     check_stateless(scene)
-    functions = ("command", "servo", "force", "frictionloss", "observe")
-    active = [e.name for e in effects if any(getattr(e, f) is not None for f in functions)]
-    if active:
-        raise ValueError(f"the C engine cannot run effects that depend on the state: {', '.join(active)}; use MJX")
-    share = weight_share(scene.model, scene.joint_dofs, drive.torque.gravity)
-    if drive.torque.side is TorqueSide.LINK or (scene.model.body_gravcomp.any() and share.any()):
-        raise ValueError(
-            "the C engine replays the actuators' torque alone: motor-side, and without gravity where the scene "
-            "compensates it; use MJX for this recording"
-        )
-    if scene.model.body_gravcomp.any() and any(w.field == "qpos0" for p in space.parameters for w in p.writes):
-        raise ValueError("the C engine compensates gravity where joints are, not where encoders say: use MJX")
+    if why := why_not_in_c(scene, space, drive.torque, effects):
+        raise ValueError(f"the C engine cannot replay this: {why}; use MJX")
     plain, factors = replace(scene, model=instrument(scene)), servo_factors(scene, drive)
 
     def piece(values: np.ndarray) -> Rollout:
@@ -71,11 +59,34 @@ def c_replay(
 
     def replay(values: np.ndarray) -> Rollout:
         values = np.atleast_2d(np.asarray(values, dtype=np.float64))
-        pieces = [piece(values[i : i + CHUNK]) for i in range(0, len(values), CHUNK)]
+        rows, again = np.unique(values, axis=0, return_inverse=True)  # blocks are filled up with copies
+        pieces = [piece(rows[i : i + CHUNK]) for i in range(0, len(rows), CHUNK)]
         fields = Rollout.__dataclass_fields__
-        return Rollout(**{f: np.concatenate([getattr(p, f) for p in pieces]) for f in fields})
+        return Rollout(**{f: np.concatenate([getattr(p, f) for p in pieces])[again.ravel()] for f in fields})
 
     return replay
+
+
+def why_not_in_c(scene: Scene, space: Space, torque: TorqueConvention, effects: Sequence[Effect]) -> str:
+    """Why plain C cannot replay a commanded recording; empty where it can.
+
+    The C batch interface returns the actuators' torque alone, and runs no effect with functions of its own.
+
+    Args:
+        scene: what is simulated.
+        space: the parameters.
+        torque: what the recording's torque is.
+        effects: in the replay, those of the torque offsets apart.
+    """
+    functions = ("command", "servo", "force", "frictionloss", "observe")
+    if active := [e.name for e in effects if any(getattr(e, f) is not None for f in functions)]:
+        return f"effects depend on the state: {', '.join(active)}"
+    weight = scene.model.body_gravcomp.any() and weight_share(scene.model, scene.joint_dofs, torque.gravity).any()
+    if torque.side is TorqueSide.LINK or weight:
+        return "its torque is the actuators': motor-side, and without gravity where the scene compensates it"
+    if scene.model.body_gravcomp.any() and any(w.field == "qpos0" for p in space.parameters for w in p.writes):
+        return "it compensates gravity where joints are, not where encoders say"
+    return ""
 
 
 def _later(velocity: np.ndarray, late: float) -> np.ndarray:

@@ -154,6 +154,35 @@ def compiled_replay(
     return Driven(in_c, follows)
 
 
+def window_program(
+    scene: Scene, space: Space, drive: Drive, effects: Sequence[Effect], earlier: int, steps: int
+) -> Callable[..., Rollout]:
+    """(values [B, D], command [B, earlier + steps, U], start [B, nq], gains [B, U, 2], speed [B, nv], origin [B]) ->
+    Rollout [B, steps, ...]: every row a window of its own, from its own state (`servo_motion`).
+
+    Of the drive only its time step and its torque's convention are used.
+    """
+    check_gains(scene, drive)
+    made_with = with_sensors(scene, space, drive, effects)
+    clocked = Clocked(drive.timestep, drive.torque, drive)
+    return _window_program(scene, layout_of(space), made_with, clocked, earlier, steps)
+
+
+@functools.lru_cache(maxsize=PROGRAMS)
+def _window_program(
+    scene: Scene, layout: Layout, effects: tuple[Effect, ...], clocked: Clocked, earlier: int, steps: int
+) -> Callable[..., Rollout]:
+    motion = servo_motion(scene, clocked.drive, effects, earlier=earlier)
+    space = layout.space
+
+    def replay(values: jax.Array, table: Any, start: Any, gains: Any, speed: Any, origin: Any) -> Rollout:
+        physics = make_physics(scene, space, values)
+        moved = motion(physics, table, start, gains, steps, speed, origin)
+        return sensed(moved, physics.theta, effects, clocked.timestep, origin=origin)
+
+    return over_block(_of_bodies(scene, space, replay), alike=False)
+
+
 def batch_replay(scene: Scene, space: Space, replay: Replay) -> Batch:
     """One compiled, sharded block of a per-sample replay of your own: [B, D] -> Rollout [B, ...]."""
     return over_block(_of_bodies(scene, space, lambda values: replay(make_physics(scene, space, values))))

@@ -148,12 +148,15 @@ def path_replay(
             data = mjx.fwd_velocity(link_model, mjx.fwd_position(link_model, data))
             inertia = mjx.full_m(link_model, data)
             torque = inertia @ full.at[dofs].set(acceleration) + data.qfrc_bias
-            torque = torque - (data.qfrc_passive - compensated * data.qfrc_gravcomp)
+            springs = data.qfrc_passive - compensated * data.qfrc_gravcomp
+            torque = torque - springs
             if error is not None and not convention.gravity:
                 torque = torque + misplaced_weight(model, data, error)
             direction = jnp.sign(velocity)
             felt = torque + model.dof_frictionloss * direction if motor else torque
-            state = State(time, data.qpos, velocity, felt, model, data)
+            links = springs + link_model.dof_damping * velocity - data.qfrc_bias
+            motors = felt + (model.dof_damping - link_model.dof_damping) * velocity  # before the joints' damping
+            state = State(time, data.qpos, velocity, felt, model, data, jnp.stack([motors, links]))
             behind = _behind_the_sensor(scene, theta)
             own = model.dof_frictionloss if motor else behind
             force, loss = _resistance(theta, state, own, effects)

@@ -24,7 +24,7 @@ from droid_jax.model.parameters import Role
 from droid_jax.model.physics import Physics
 from droid_jax.model.quiet_mjx import mjx
 from droid_jax.model.scene import Scene
-from droid_jax.model.step import servo_force, simulate_step
+from droid_jax.model.step import gear_torques, servo_force, simulate_step
 from droid_jax.model.unsupported_features import check_options
 from droid_jax.recordings.checks import check_joints
 from droid_jax.recordings.clocks import interpolate
@@ -156,13 +156,22 @@ def servo_replay(
 
 
 def servo_motion(
-    scene: Scene, drive: Drive, effects: Sequence[Effect] = (), *, parity: bool = False, late: float = 0.5
-) -> Callable[[Physics, jax.Array, jax.Array, jax.Array, Any], Rollout]:
+    scene: Scene,
+    drive: Drive,
+    effects: Sequence[Effect] = (),
+    *,
+    parity: bool = False,
+    late: float = 0.5,
+    earlier: int = 0,
+) -> Callable[..., Rollout]:
     """The loop over time steps that follows a command: (physics, *`traced_part` of a drive, steps) -> T rows.
+
+    A replay that begins within a motion is given more: speed [nv], the time of its first row [s], which laws over time
+    see, and in front of its commands `earlier` rows of those that were sent until then, to which delays reach back.
 
     Rows from `steps` on are zero, so that recordings of different lengths share one compiled program; their commands
     are those of the last step, repeated.  Torques carry the time of the state they act on; sensors have not seen them.
-    A state is position, velocity, the solver's warm start and the load: everything else in mjx.Data is rebuilt each
+    A state is position, velocity, the solver's warm start and the loads: everything else in mjx.Data is rebuilt each
     step, so that XLA drops what nobody reads.
     Of the drive only its time step and its torque's convention are used.
     """
@@ -176,12 +185,15 @@ def servo_motion(
     shift = late if parity else 0.0  # steps, of the command; of positions in the other direction
     half = late if parity else 0.5  # steps from the velocity before a step to the one that is told
     damping = has_servo_damping(scene.model)
+    rubs = rubbing(effects)
 
     def step(sample: Any, k: jax.Array, carry: Any) -> Any:
-        model, theta, error, table = sample
-        (qpos, qvel, warm, load), kept = carry
-        state = State(k * drive.timestep, qpos, qvel, load, model)
-        ctrl = servo_input(_command(table, drive.timestep, k, shift, theta, effects), theta, state, effects)
+        model, theta, error, table, origin = sample
+        (qpos, qvel, warm, load, gear), kept = carry
+        time = k * drive.timestep
+        state = State(time if origin is None else origin + time, qpos, qvel, load, model, gear=gear)
+        row = k + earlier if earlier else k
+        ctrl = servo_input(_command(table, drive.timestep, row, shift, theta, effects), theta, state, effects)
         before = template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm, ctrl=ctrl)
         after = simulate_step(
             apply_friction(model, theta, state, effects),
@@ -204,28 +216,49 @@ def servo_motion(
             _touching(after, fingers),
         )
         kept = tuple(jax.lax.dynamic_update_index_in_dim(a, b, k, 0) for a, b in zip(kept, now, strict=True))
-        return (after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator), kept
+        gear = gear_torques(model, after, qvel) if rubs else gear
+        return (after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator, gear), kept
 
-    def motion(physics: Physics, table: jax.Array, start: jax.Array, gains: jax.Array, steps: Any) -> Rollout:
-        model = with_gains(physics.model, gains)
-        sample = model, complete(physics.theta, effects), encoder_error(scene, model), table
-        zero, traces = jnp.zeros(scene.model.nv, jnp.float32), jnp.zeros((3, len(table), len(joints)), jnp.float32)
-        angle, contact = jnp.zeros(len(table), jnp.float32), jnp.zeros((len(table), len(fingers)), bool)
-        begun = (start, zero, zero, zero), (*traces, angle, contact)
+    def motion(
+        physics: Physics,
+        table: jax.Array,
+        start: jax.Array,
+        gains: jax.Array,
+        steps: Any,
+        speed: jax.Array | None = None,
+        origin: jax.Array | None = None,
+    ) -> Rollout:
+        model, rows = with_gains(physics.model, gains), len(table) - earlier
+        sample = model, complete(physics.theta, effects), encoder_error(scene, model), table, origin
+        zero, traces = jnp.zeros(scene.model.nv, jnp.float32), jnp.zeros((3, rows, len(joints)), jnp.float32)
+        angle, contact = jnp.zeros(rows, jnp.float32), jnp.zeros((rows, len(fingers)), bool)
+        begun = (
+            (start, zero if speed is None else speed, zero, zero, jnp.stack([zero, zero])),
+            (*traces, angle, contact),
+        )
         _, (torque, position, velocity, angle, contact) = time_loop(step, sample, begun, steps)
-        time = jnp.zeros(len(table), jnp.float32)
+        time = jnp.zeros(rows, jnp.float32)
         return Rollout(time, torque, position, velocity, angle, contact, jnp.array(True))
 
     return motion
 
 
 def sensed(
-    motion: Rollout, theta: Theta, effects: Sequence[Effect], timestep: float, steps: int | None = None
+    motion: Rollout,
+    theta: Theta,
+    effects: Sequence[Effect],
+    timestep: float,
+    steps: int | None = None,
+    origin: jax.Array | None = None,
 ) -> Rollout:
-    """A motion's first rows (all of them where `steps` is None), as the sensors have them, and whether it is finite."""
+    """A motion's first rows (all of them where `steps` is None), as the sensors have them, and whether it is finite.
+
+    origin: time of its first row, s; None: 0.
+    """
     rows = len(motion.time) if steps is None else steps
     cut = jax.tree.map(lambda a: a[:rows] if a.ndim else a, motion)
     time = jnp.asarray(np.arange(rows) * timestep, jnp.float32)
+    time = time if origin is None else origin + time
     return apply_sensor_model(replace(cut, time=time), complete(theta, effects), effects)
 
 
@@ -277,6 +310,11 @@ def servo_input(ctrl: jax.Array, theta: Theta, state: State, effects: Sequence[E
         if effect.servo is not None:
             ctrl = effect.servo(theta, state, ctrl)
     return ctrl
+
+
+def rubbing(effects: Sequence[Effect]) -> bool:
+    """Whether any of the effects changes dry friction, which may depend on what the gears carry."""
+    return any(effect.frictionloss is not None for effect in effects)
 
 
 def apply_friction(model, theta: Theta, state: State, effects: Sequence[Effect]):

@@ -8,11 +8,17 @@ import numpy as np
 from droid_jax.synthetic.hooks import Hidden, Influence, Live, Place, Seen
 
 PAYLOAD_AT = np.array([0.03, -0.02, 0.04])  # m from the hand's own centre of mass, in its body's frame
+HELD_AT = np.array([0.06, 0.05, 0.02])  # m, likewise: a thing that is held at its end
 PAYLOAD_GYRATION = 0.03  # m, radius of gyration: a tool, not a point
 TWIST_KNEE = 15.0  # N m, where a harmonic drive's flexspline begins to stiffen
 
 
-def hide_payload(place: Place, a: float) -> Influence:
+def hide_held_thing(place: Place, a: float) -> Influence:
+    """The same of a thing that is held at its end, at `HELD_AT`."""
+    return hide_payload(place, a, HELD_AT)
+
+
+def hide_payload(place: Place, a: float, at: np.ndarray = PAYLOAD_AT) -> Influence:
     """a kg at `PAYLOAD_AT` on the hand: inertia and gravity, which the robot does not compensate.
 
     The hand's body gets mass, centre and inertia of both (parallel axes); the compensation of the
@@ -25,7 +31,7 @@ def hide_payload(place: Place, a: float) -> Influence:
 
     def edit(model: mujoco.MjModel) -> None:
         if a != 0.0:
-            add_mass(model, body, a, own_at + PAYLOAD_AT)
+            add_mass(model, body, a, own_at + at)
             model.body_gravcomp[body] = 0.0
 
     def begin(live: Live) -> None:
@@ -34,8 +40,8 @@ def hide_payload(place: Place, a: float) -> Influence:
 
     def step(live: Live) -> None:
         if a != 0.0 and carried.any():
-            at = live.data.xpos[body] + live.data.xmat[body].reshape(3, 3) @ own_at
-            mujoco.mj_applyFT(live.model, live.data, carried, np.zeros(3), at, body, live.applied)
+            centre = live.data.xpos[body] + live.data.xmat[body].reshape(3, 3) @ own_at
+            mujoco.mj_applyFT(live.model, live.data, carried, np.zeros(3), centre, body, live.applied)
 
     return Influence(edit=edit, begin=begin, step=step)
 
@@ -176,6 +182,7 @@ def hide_grip_compliance(place: Place, a: float) -> Influence:
 
 ARM_EFFECTS = (
     Hidden("payload", "kg", (0.05, 0.6), "hand", hide_payload, "a tool on the hand that the robot does not know"),
+    Hidden("held_thing", "kg", (0.05, 0.6), "hand", hide_held_thing, "a thing held at its end, off the hand's line"),
     Hidden("cable_pull", "N m", (0.1, 1.0), "arm", hide_cable_pull, "a cable that pulls the joint back"),
     Hidden("torque_ripple", "N m", (0.1, 1.0), "arm", hide_torque_ripple, "two harmonics of a gear"),
     Hidden("joint_elasticity", "rad/(N m)", (5e-5, 1e-3), "arm", hide_joint_elasticity, "gears that twist"),

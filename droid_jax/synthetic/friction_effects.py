@@ -39,6 +39,11 @@ def load_loss(a: float, torque: np.ndarray) -> np.ndarray:
     return a * (np.sqrt(torque**2 + 1.5**2) - 1.5)
 
 
+def mesh_loss(a: float, motor: np.ndarray, links: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """a (0.6 abs(motor) + 0.4 abs(links)) (1 + 0.5 / (1 + (v / 0.3)²)): teeth that both press; a without unit."""
+    return a * (0.6 * np.abs(motor) + 0.4 * np.abs(links)) * (1.0 + 0.5 / (1.0 + (v / 0.3) ** 2))
+
+
 def warm_up_loss(a: float, seconds: float) -> float:
     """a exp(-seconds / 45): stiff grease that warms up from the first repeat on; a in N m when cold."""
     return a * float(np.exp(-seconds / 45.0))
@@ -93,6 +98,19 @@ def hide_load_friction(place: Place, a: float) -> Influence:
     return Influence(step=step)
 
 
+def hide_mesh_friction(place: Place, a: float) -> Influence:
+    """Friction loss of `mesh_loss`, of the last step's motor torque and weight, behind a lag of 10 ms."""
+    motor, links = np.zeros(len(place.dofs)), np.zeros(len(place.dofs))
+
+    def step(live: Live) -> None:
+        share = live.timestep / 0.010
+        motor[:] += (live.motor[place.dofs] + live.data.qfrc_gravcomp[place.dofs] - motor) * share
+        links[:] += (live.data.qfrc_bias[place.dofs] - links) * share
+        live.loss[place.dofs] += mesh_loss(a, motor, links, live.velocity[place.dofs])
+
+    return Influence(step=step)
+
+
 def hide_bristle_friction(place: Place, a: float) -> Influence:
     """Torque of `bristle`, applied to the joint."""
     force = np.zeros(len(place.dofs))
@@ -133,6 +151,9 @@ FRICTION = (
     Hidden("stribeck_friction", "N m", (0.3, 2.0), "joint", hide_stribeck_friction, "more friction when slow"),
     Hidden("directional_friction", "N m", (0.3, 2.0), "joint", hide_directional_friction, "friction one way"),
     Hidden("load_friction", "-", (0.03, 0.2), "arm", hide_load_friction, "friction that grows with the load"),
+    Hidden(
+        "mesh_friction", "-", (0.03, 0.2), "arm", hide_mesh_friction, "gear friction of motor and load, more when slow"
+    ),
     Hidden("bristle_friction", "N m", (0.2, 1.0), "joint", hide_bristle_friction, "friction that bends first"),
     Hidden("firm_friction", "-", (0.5, 1.0), "joint", hide_firm_friction, "friction that holds and does not creep"),
     Hidden("warm_up_friction", "N m", (0.2, 1.5), "joint", hide_warm_up_friction, "friction fading by repeats"),

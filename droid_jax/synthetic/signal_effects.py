@@ -25,6 +25,50 @@ def hide_command_delay(place: Place, a: float) -> Influence:
     return Influence(command=command)
 
 
+def hide_clock_rate(place: Place, a: float) -> Influence:
+    """Commands at 1 + a (1 + 0.2 sin(t / 3 s)) of the recorder's rate: two quartzes, one that warms and cools."""
+
+    def command(clock: np.ndarray, control: np.ndarray) -> np.ndarray:
+        run = clock - clock[0]
+        at = clock + a * (run + 0.6 * (1.0 - np.cos(run / 3.0)))
+        control = control.copy()
+        for column in place.actuators:
+            control[:, column] = np.interp(at, clock, control[:, column])
+        return control
+
+    return Influence(command=command)
+
+
+def hide_velocity_feedforward(place: Place, a: float) -> Influence:
+    """The command and a s of its speed, which the servo takes behind a first-order lag of 8 ms."""
+
+    def command(clock: np.ndarray, control: np.ndarray) -> np.ndarray:
+        control = control.copy()
+        own = control[:, place.actuators]
+        speed = np.gradient(own, clock, axis=0)
+        control[:, place.actuators] = own + a * lagged(speed, clock, 0.0, 0.008)
+        return control
+
+    return Influence(command=command)
+
+
+def hide_crosstalk(place: Place, a: float) -> Influence:
+    """A sensor also reads a tau (1 + 0.1 sin(2 q)) of the joint before its own, of the first joint the one behind it.
+
+    It leaks through the bearing, which goes by the joint's own angle q.
+    """
+
+    def sense(seen: Seen) -> Seen:
+        torque = seen.torque.copy()
+        if torque.shape[1] > 1:
+            beside = np.where(place.columns > 0, place.columns - 1, 1)
+            turned = 1.0 + 0.1 * np.sin(2.0 * seen.position[:, place.columns])
+            torque[:, place.columns] += a * turned * seen.torque[:, beside]
+        return Seen(seen.clock, torque, seen.position)
+
+    return Influence(sense=sense)
+
+
 def hide_sensor_delay(place: Place, a: float) -> Influence:
     """The torque arrives a s late: 0.6 a of dead time, then a first-order lag of 0.4 a; positions do not.
 
@@ -85,8 +129,15 @@ def _on_torque(place: Place, formula: Callable[[Seen, np.ndarray, np.ndarray], n
 
 SIGNALS = (
     Hidden("command_delay", "s", (0.002, 0.02), "arm", hide_command_delay, "commands that arrive late"),
+    Hidden(
+        "clock_rate", "-", (0.002, 0.01), "arm", hide_clock_rate, "commands on a clock of another rate", signed=True
+    ),
+    Hidden(
+        "feedforward", "s", (0.005, 0.05), "arm", hide_velocity_feedforward, "a servo that looks ahead", signed=True
+    ),
     Hidden("sensor_delay", "s", (0.002, 0.02), "arm", hide_sensor_delay, "torques that arrive late"),
     Hidden("torque_bias", "N m", (0.1, 1.0), "arm", hide_torque_bias, "a torque sensor off zero", signed=True),
     Hidden("torque_gain", "-", (0.03, 0.2), "arm", hide_torque_gain, "a torque sensor of wrong gain", signed=True),
+    Hidden("crosstalk", "-", (0.02, 0.15), "arm", hide_crosstalk, "a sensor that reads its neighbour", signed=True),
     Hidden("torque_drift", "N m", (0.2, 1.5), "arm", hide_torque_drift, "a torque sensor that warms up", signed=True),
 )

@@ -68,9 +68,13 @@ ANSWERS: dict[str, Answer] = {
     "load_friction": Answer(
         "load_friction", parts=("joint_coulomb",), why="under a steady load it is dry friction"
     ),
+    "mesh_friction": Answer(
+        "gear_friction", ("load_friction",), "where the load does not drive the motor, its shares add up to one"
+    ),
     "bristle_friction": Answer("joint_coulomb", why="bristles bend by milliradians before they slip"),
     "warm_up_friction": Answer("joint_coulomb", why="what its repeats share is dry friction; the rest counts as noise"),
     "payload": Answer("payload", scenes=("arm", "door")),
+    "held_thing": Answer("free_payload", ("payload",), "of a plane arm one moment is all", scenes=("arm", "door")),
     "cable_pull": Answer(
         "cable_pull", parts=("joint_directional", "joint_coulomb", "joint_stribeck"),
         why="it rubs in its clamps with a tenth of its pull, which is friction",
@@ -95,6 +99,9 @@ ANSWERS: dict[str, Answer] = {
     "command_delay": Answer(
         "command_delay", ("sensor_delay",), "positions are not scored", HINGED
     ),
+    "clock_rate": Answer("clock_rate", ("command_delay",), "over a short motion it is a delay", HINGED),
+    "feedforward": Answer("velocity_feedforward", ("servo_gain",), "both track in proportion to the speed", SERVO),
+    "crosstalk": Answer("torque_crosstalk", scenes=("bench", "arm", "door")),
     "sensor_delay": Answer("sensor_delay", ("command_delay",), "positions are not scored"),
     "torque_bias": Answer(
         "torque_bias", ("hinge_preload", "tilted_frame", "cable_pull"),
@@ -105,14 +112,23 @@ ANSWERS: dict[str, Answer] = {
     "torque_drift": Answer("torque_drift", ("torque_bias",), "it warms up mostly between the repeats"),
 }  # fmt: skip
 NO_HINGE = ("cable_pull", "torque_ripple", "dry_friction", "bristle_friction", "warm_up_friction", "load_friction",
-            "joint_elasticity", "backlash", "servo_gains", "firm_friction", "encoder_zero")  # fmt: skip
-PLACES = {"command_delay": "commands", "sensor_delay": "sensors", "contact_compliance": "grip",
-          "gravity_direction": "base"}  # fmt: skip
+            "mesh_friction", "joint_elasticity", "backlash", "servo_gains", "firm_friction",
+            "encoder_zero", "crosstalk", "feedforward")  # fmt: skip
+PLACES = {"command_delay": "commands", "clock_rate": "commands", "sensor_delay": "sensors",
+          "contact_compliance": "grip", "gravity_direction": "base"}  # fmt: skip
 OF_HINGE = frozenset({
     "hinge_preload", "tilted_frame", "hardening_spring", "over_centre_spring", "latch", "door_closer", "opening_check",
     "drag", "angle_friction", "hinge_stribeck", "hinge_directional",
 })  # fmt: skip
-WHOLE = ("command_delay", "sensor_delay", "payload", "grip_compliance", "tilted_base")  # not one joint's
+WHOLE = (
+    "command_delay",
+    "clock_rate",
+    "sensor_delay",
+    "payload",
+    "held_thing",
+    "grip_compliance",
+    "tilted_base",
+)  # not one joint's
 
 
 def inside(name: str) -> bool:

@@ -34,14 +34,14 @@ def test_a_log_is_whitened_as_its_cost_would(log: LoneLog):
     some = log.clock < 5.0
     np.testing.assert_array_equal(log.with_noise(np.ones(1), some).whitened(whole[None])[0] == 0, ~some)
     fitted = log.with_torques(log.simulated(whole[None])[0])
-    np.testing.assert_allclose(fitted.residual_torque(whole), 0.0, atol=1e-9)
+    np.testing.assert_allclose(fitted.residual(whole), 0.0, atol=1e-9)
 
 
 def test_distances_are_of_the_instants_that_count(log: LoneLog):
     """Equation 1 over half of the instants, those at which the residual is small."""
     (comparison,) = log.comparisons
     plain = replace(log, comparisons=(replace(comparison, config=replace(comparison.config, whitened=False)),))
-    left = np.abs(log.residual_torque(log.space.mean))[:, 0]
+    left = np.abs(log.residual(log.space.mean))[:, 0]
     everywhere, some = np.ones(len(left), bool), left < np.median(left)
     values = log.space.mean[None]
     whole, part = (plain.with_noise(np.ones(1), at).distances(values)[0, 0] for at in (everywhere, some))

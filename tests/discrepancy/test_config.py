@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 
 import droid_jax as dj
-from droid_jax.cost.residuals import CompareConfig
 from droid_jax.discrepancy.config import BlocksConfig, SelectionConfig
 
 FROM_ONE = {"nuisance_bound", "prior_slack", "equivalence_factor", "simplest_factor"}  # factors
@@ -67,7 +66,7 @@ def test_blocks_that_no_log_could_have_are_refused(changes: dict[str, Any], said
         ({"selection": 0.01}, "selection"),
         ({"blocks": SelectionConfig()}, "blocks"),
         ({"polish": 12}, "polish"),
-        ({"compare": CompareConfig(channels={"torque": 1.0, "position": 1.0})}, "got the channels torque, position"),
+        ({"channels": ("torque", "current")}, "current"),
     ],
 )
 def test_settings_that_no_search_could_use_are_refused(changes: dict[str, Any], said: str):

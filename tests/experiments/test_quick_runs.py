@@ -19,6 +19,7 @@ DATA = {  # folders of real logs
     "experiments/gap_emps.py": "emps",
     "experiments/gap_panda.py": "franka_gaz2019",
     "experiments/real_emps.py": "emps",
+    "experiments/real_go2.py": "go2_leg",
     "experiments/real_panda.py": "franka_gaz2019",
     "experiments/real_so101.py": "so101",
     "experiments/real_xl330.py": "bam_xl330",

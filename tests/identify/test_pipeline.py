@@ -19,7 +19,7 @@ from droid_jax.commands.identify import _summary
 from droid_jax.cost.residuals import CompareConfig, make_comparison
 from droid_jax.door.scene import door_scene
 from droid_jax.door.space import door_space
-from droid_jax.identify import pipeline, results
+from droid_jax.identify import neutral_result, pipeline
 from droid_jax.identify.fit import on_bound
 from droid_jax.identify.gaussian import prior
 from droid_jax.identify.holdout import WORTH, _closed, _floor, _scatter, judged_on, split_repeats
@@ -217,7 +217,7 @@ def test_a_fit_that_makes_no_mjcf_keeps_everything_else(
     def refuses(*_: object) -> str:
         raise ValueError("the fitted values make no MJCF: inertia must satisfy A + B >= C")
 
-    monkeypatch.setattr(results, "fitted_mjcf", refuses)
+    monkeypatch.setattr(neutral_result, "fitted_files", refuses)
     write_run(tmp_path, found, {}, notes=["a note"])
     fit = json.loads((tmp_path / "fit.json").read_text())
     assert fit["notes"] == [

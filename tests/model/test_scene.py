@@ -491,3 +491,19 @@ def test_what_mujoco_says_of_a_file_is_one_line(tmp_path, text):
     with pytest.raises(ValueError) as refused:
         load_scene(path)
     assert str(refused.value).startswith(f"{path}: ") and len(str(refused.value).splitlines()) == 1
+
+
+def test_dry_friction_is_held_unless_the_mjcf_says_how_hard_it_is(tmp_path: Path):
+    joint = '<joint name="{0}" axis="0 1 0" {1}/><inertial pos="0 0 0.1" mass="1" diaginertia="1 1 1"/>'
+    rubs = 'frictionloss="0.3"'
+    own, slow = f'{rubs} solimpfriction="0.99 0.99"', f'{rubs} solreffriction="0.1 1"'
+    joints = {"plain": rubs, "asked": "", "free": "", "own": own, "slow": slow}
+    bodies = "".join(f"<body>{joint.format(name, with_)}</body>" for name, with_ in joints.items())
+    path = tmp_path / "five.xml"
+    path.write_text(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+    given, held = (load_scene(path, joints=[*joints], friction_joints=["asked"], hold=hold) for hold in (False, True))
+    assert (given.held, held.held) == ((), ("plain", "asked"))
+    first = {name: held.model.dof_solimp[held.dof(name), 0] for name in joints}
+    assert first == {"plain": 0.9999, "asked": 0.9999, "free": 0.9, "own": 0.99, "slow": 0.9}
+    np.testing.assert_array_equal(given.model.dof_solimp[[0, 1, 2, 4], 0], 0.9)
+    assert mujoco.MjSpec.from_string(held.spec.to_xml()).joint("plain").solimp_friction[1] == 0.9999

@@ -64,7 +64,7 @@ def smooth(model: Any, data: Any) -> Any:
     return mjx.fwd_acceleration(model, mjx.fwd_actuation(model, mjx.fwd_velocity(model, data)))
 
 
-def solver(model: mujoco.MjModel) -> Callable[..., tuple[Any, dict[str, jax.Array]]]:
+def solver(model: mujoco.MjModel, firm: bool = False) -> Callable[..., tuple[Any, dict[str, jax.Array]]]:
     """Batched: (qpos, qvel, warm start) -> the solved data, and the problem that was solved."""
     on_device = mjx.put_model(model)
     template = mjx.make_data(on_device)
@@ -72,7 +72,7 @@ def solver(model: mujoco.MjModel) -> Callable[..., tuple[Any, dict[str, jax.Arra
     def one(qpos, qvel, warm):
         data = smooth(on_device, template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm))
         inertia, rows = mjx.full_m(on_device, data), constraint_rows(data)
-        solved = solve(inertia, data)
+        solved = solve(inertia, data, firm)
         problem = dict(M=inertia, f=data.qfrc_smooth, J=rows.jacobian, D=rows.weight, aref=rows.reference,
                        dry=rows.friction)  # fmt: skip
         return (solved.qacc, solved.qfrc_constraint), problem
@@ -206,6 +206,64 @@ def test_any_warm_start_ends_at_the_same_place(case):
 def test_the_warm_start_of_the_answer_stays_there(case):
     _, _, qpos, qvel, run, (qacc, _, _) = case
     assert error(np.asarray(run(qpos, qvel, qacc.astype(np.float32))[0][0]), qacc).max() < QACC_TOLERANCE
+
+
+# ----- firm friction: its part of the slope along a step is steep and narrow, and many rows have such a part
+
+LIGHT = """<mujoco><compiler angle="radian"/>
+<option timestep="0.004" integrator="implicitfast" iterations="100" ls_iterations="50" tolerance="1e-12"/>
+<default><joint axis="0 1 0" frictionloss="0.3" damping="1" armature="0.03" solimpfriction="0.9999 0.9999"/></default>
+<worldbody>{links}</worldbody><actuator>{servos}</actuator></mujoco>"""
+
+
+def light_arm(joints: int, timestep: float = 0.004) -> mujoco.MjModel:
+    """An arm of short, light links, each with a servo."""
+    links = servos = ""
+    for k in reversed(range(joints)):
+        joint = f'<joint name="j{k}"/><inertial pos="0.06 0 0" mass="0.1" diaginertia="1e-4 1e-4 1e-4"/>'
+        links = f'<body pos="{0.12 * (k > 0)} 0 0">{joint}{links}</body>'
+        servos = f'<position joint="j{k}" kp="12"/>{servos}'
+    model = mujoco.MjModel.from_xml_string(LIGHT.format(links=links, servos=servos))
+    model.opt.timestep = timestep
+    return model
+
+
+@pytest.mark.parametrize("joints", [5, pytest.param(20, marks=pytest.mark.slow)])
+def test_firm_friction_of_many_joints_is_that_of_the_c_engine(joints: int):
+    """Below and above the number of rows up to which the corners are looked at at once."""
+    model, rng = light_arm(joints), np.random.default_rng(3)
+    qpos = rng.uniform(-0.5, 0.5, (100, joints)).astype(np.float32).astype(float)
+    qvel = (rng.normal(0, 0.5, qpos.shape) * (rng.random(qpos.shape) > 0.5)).astype(np.float32).astype(float)
+    expected, _, _ = reference(model, qpos, qvel)
+    warm = (expected + rng.normal(0, 3.0, expected.shape)).astype(np.float32)
+    got = np.asarray(solver(model, firm=True)(qpos, qvel, warm)[0][0])
+    assert error(got, expected).max() < QACC_TOLERANCE
+
+
+@pytest.mark.slow
+def test_a_light_arm_that_steps_and_holds_goes_where_c_goes():
+    """Five joints, 6 s of steps, against C at an eighth of the step."""
+    goals = 0.5 * np.random.default_rng(1).uniform(-1, 1, (4, 5))
+
+    def goal(time: float) -> np.ndarray:
+        return goals[min(int(time / 1.5), 3)]
+
+    fine, coarse = light_arm(5, 0.0005), mjx.put_model(light_arm(5))
+    data, expected = mujoco.MjData(fine), []
+    for k in range(12_000):
+        if k % 8 == 0:
+            expected.append(data.qpos.copy())
+        data.ctrl[:] = goal(k * 0.0005)
+        mujoco.mj_step(fine, data)
+    table = jnp.asarray([goal(0.004 * k) for k in range(1500)], jnp.float32)
+
+    def advance(data, ctrl):
+        return simulate_step(coarse, data.replace(ctrl=ctrl), parity=False), data.qpos
+
+    got = jax.jit(lambda d: jax.lax.scan(advance, d, table)[1])(mjx.make_data(coarse))
+    off = np.abs(np.asarray(got) - np.array(expected))
+    assert off.max() < 3e-4, off.max(axis=0)
+    assert np.ptp(expected, axis=0).min() > 0.1
 
 
 # ----- single rows, against what can be written on paper

@@ -119,6 +119,14 @@ def test_a_joint_that_creeps_under_the_load_it_holds_is_said_beforehand():
     assert not creep_note(hinge(), held)  # without friction nothing is held
 
 
+def test_of_a_scene_that_holds_it_is_said_what_its_mjcf_would_do():
+    hard = hinge(f'frictionloss="0.3" solimpfriction="{STIFF}"')
+    still = log(np.full_like(TIME, 0.2), np.full_like(TIME, 0.2), np.zeros_like(TIME))
+    said = creep_note(replace(hard, held=("j",)), still)
+    assert "would creep in its MJCF" in said and "j by 7 mrad/s at the 0.2 N m" in said
+    assert "--joint-friction scene" in said and "0.007 mrad/s when mended" in said
+
+
 def test_a_load_by_weight_counts_and_one_that_the_motor_carries_does_not():
     scene = hinge('frictionloss="0.3" stiffness="2" springref="5.7296"')
     still, moving = np.zeros_like(TIME), np.sin(TIME)

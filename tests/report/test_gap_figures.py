@@ -48,9 +48,9 @@ def test_the_maps_share_one_scale_and_leave_out_what_is_not_found(named: Gap) ->
 def test_figures_survive_odd_numbers(named: Gap) -> None:
     found = named.found
     sizes = [structs.replace(d, after=-0.001, torque_after=None) for d in found.discrepancies.values()]
-    gap_figures.discrepancy_bars(["A", "B", "C"], sizes, 0.0, "N m")
+    gap_figures.discrepancy_bars(["A", "B", "C"], sizes, 0.0, ("Torque distance", "N m"))
     unknown = structs.replace(sizes[0], before=None, after=None, torque_before=None)
-    gap_figures.discrepancy_bars(["A"], [unknown], None, "N m")
+    gap_figures.discrepancy_bars(["A"], [unknown], None, ("Torque distance", "N m"))
     silent = [structs.replace(c, found=False, discrepancy=-0.01) for c in found.cells.before]
     gap_figures.cell_maps(silent, silent)
     gap_figures.state_bars(silent, None)

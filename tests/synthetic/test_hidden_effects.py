@@ -55,7 +55,7 @@ XML = """
 """
 ARM = ("shoulder", "elbow")
 CONFIG = SyntheticRobotConfig(repeats=1, timestep=LONGEST_STEP)
-SENSORS = ("sensor_delay", "torque_bias", "torque_gain", "torque_drift")
+SENSORS = ("sensor_delay", "torque_bias", "torque_gain", "torque_drift", "crosstalk")
 
 
 def small_scene(payload: str = "") -> Scene:
@@ -403,6 +403,14 @@ def test_load_friction_follows_the_motor_with_a_lag(scene: Scene):
     assert loss[1] == pytest.approx(0.1 * (math.hypot(filtered, 1.5) - 1.5))
     _, loss, _ = stepped(influence, live, 4000)
     np.testing.assert_allclose(loss, [0, 0.1, 0.1 * (3.9 - 1.5)], rtol=1e-6)
+
+
+def test_mesh_friction_is_of_motor_and_load_and_more_when_slow(scene: Scene):
+    live = live_at(scene, v=(0.0, 0.3, 30.0))
+    live.motor[:], live.data.qfrc_bias[:] = [0.0, 2.0, -3.0], [0.0, -1.0, -2.0]
+    influence = made(scene, "mesh_friction", 0.1, ARM)
+    _, loss, _ = stepped(influence, live, 4000)
+    np.testing.assert_allclose(loss, [0, 0.1 * (1.2 + 0.4) * 1.25, 0.1 * (1.8 + 0.8)], rtol=1e-4)
 
 
 def test_the_bristle_is_dahls(scene: Scene):

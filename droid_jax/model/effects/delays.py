@@ -1,15 +1,18 @@
-"""Delays: between command and servo, and between the arm and what is recorded."""
+"""Timing: delays of commands and of what is recorded, clocks of another rate, commands that look ahead."""
 
 from dataclasses import replace
 
 import jax.numpy as jnp
 
-from droid_jax.model.effect_interface import Effect
+from droid_jax.model.actuators import has_feedback
+from droid_jax.model.effect_interface import Effect, column
 from droid_jax.model.effects import coefficients as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
 
 COMMAND, SENSOR = "command_delay", "sensor_delay"
+RATE, AHEAD = "clock_rate", "velocity_feedforward"
+SPAN = 0.01  # s, over which the speed of a command is taken: half a period of a host that sends at 50 Hz
 MEASURED = ("torque",)  # what comes late; positions come from other sensors
 
 
@@ -53,4 +56,45 @@ def sensor_delay(scene: Scene) -> Effect | None:
         confused_with=(COMMAND,),
         locations={"sensors": (SENSOR,)},
         minimum_size=0.001,
+    )
+
+
+@register
+def clock_rate(scene: Scene) -> Effect | None:
+    """q_d((1 + r) t): the clock of what is recorded runs slower than the commands' by a share r, from one beginning."""
+    if not scene.command_names:
+        return None
+    return Effect(
+        RATE,
+        (a.amplitude(RATE, "-", 1e-3, 0.02),),
+        command=lambda theta, time, look: look(time * (1.0 + a.value(theta, RATE))),
+        description="commands and measurements on clocks of different rates",
+        signature="a delay of all joints that grows steadily over the recording",
+        confused_with=(COMMAND,),
+        locations={"commands": (RATE,)},
+        minimum_size=1e-4,
+    )
+
+
+@register
+def velocity_feedforward(scene: Scene) -> Effect | None:
+    """q_d + c dq_d/dt of a joint's position servo, c in s, dq_d/dt over `SPAN`; below zero the servo trails."""
+    servos = has_feedback(scene.model)
+    joints = tuple(j for j in a.arm(scene) if j in scene.command_names and servos[scene.command_names.index(j)])
+    if not joints:
+        return None
+
+    def command(theta, time, look):
+        speed = (look(time + 0.5 * SPAN) - look(time - 0.5 * SPAN)) / SPAN
+        return look(time) + column(theta, AHEAD, scene.command_names) * speed
+
+    return Effect(
+        AHEAD,
+        a.of_joints(AHEAD, joints, "s", 0.01, 0.3),
+        command=command,
+        description="a servo that is also given its command's speed, or less of it than the model's",
+        signature="tracking error of one joint in proportion to its commanded speed",
+        confused_with=(COMMAND, "servo_gain"),
+        locations=a.places(joints, AHEAD),
+        minimum_size=1e-3,
     )

@@ -1,13 +1,20 @@
-"""Joint friction that grows with the torque a gear carries."""
+"""Joint friction that grows with the torque a gear carries.
+
+Source of the motor's and the links' shares and of the part that is higher at rest: Duclusaud et al., "Extended Friction
+Models for the Physics Simulation of Servo Actuators", ICRA 2025, models M3 to M5.
+"""
 
 import jax.numpy as jnp
+import numpy as np
 
 from droid_jax.model.effect_interface import Effect, column
 from droid_jax.model.effects import coefficients as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
 
-SHARE = "load_friction"
+SHARE, GEAR = "load_friction", "gear_friction"
+MOTOR, LINKS, AT_REST, SPEED = "gear_motor", "gear_links", "gear_at_rest", "gear_speed"
+SPEEDS = (0.1, 0.7)  # rad/s, over which the part at rest fades
 
 
 @register
@@ -29,4 +36,42 @@ def load_friction(scene: Scene) -> Effect | None:
         confused_with=("joint_coulomb", "torque_gain"),
         locations=a.places(joints, SHARE),
         minimum_size=0.01,
+    )
+
+
+@register
+def gear_friction(scene: Scene) -> Effect | None:
+    """abs(E e - K m) + S exp(-abs(v/vs)) abs(e - m) on top of a joint's friction loss, for joints with an actuator.
+
+    m is what the motor gives to its gear, e what the links put onto it (`State.gear`): where both press on the gear
+    from opposite sides their shares add up, where the load drives the motor they differ.  A joint's damping counts as
+    its motor's (back electromotive force).
+    """
+    joints = tuple(j for j in a.arm(scene) if j in scene.command_names)
+    if not joints:
+        return None
+    dofs = np.array([scene.dof(j) for j in joints], dtype=int)
+
+    def frictionloss(theta, state, base):
+        motor, links = state.gear[:, dofs]
+        speed = state.qvel[dofs]
+        motor = motor - state.model.dof_damping[dofs] * speed
+        carried = jnp.abs(column(theta, LINKS, joints) * links - column(theta, MOTOR, joints) * motor)
+        slow = jnp.exp(-jnp.abs(speed / a.value(theta, SPEED, SPEEDS[-1])))
+        return base.at[dofs].add(carried + column(theta, AT_REST, joints) * slow * jnp.abs(links - motor))
+
+    return Effect(
+        GEAR,
+        (
+            *(p for name in (MOTOR, LINKS, AT_REST) for p in a.of_joints(name, joints, "-", 0.1, 1.0, low=0.0)),
+            a.shape(SPEED, "rad/s", SPEEDS, 0.02, 3.0),
+        ),
+        frictionloss=frictionloss,
+        description="friction of a gear that grows with what its motor and its load press on it",
+        signature="steps at that joint's reversals that grow with its torque, higher where it lifts and at low speed",
+        confused_with=(SHARE, "joint_stribeck", "joint_coulomb", "servo_gain"),
+        special_cases=(SHARE,),
+        locations=a.places(joints, MOTOR, LINKS, AT_REST),
+        shape_parameters={SPEED: SPEEDS},
+        minimum_size=0.02,
     )

@@ -17,6 +17,8 @@ from droid_jax.model.parameters import Mode, Parameter, Role
 from droid_jax.model.scene import Scene
 
 MASS, MOMENT = "payload_mass", "payload_moment"
+POSES, FELT = 20, 1e-3  # poses at which it is looked at whether a moment weighs, m/s^2 that count
+LOAD, MOMENTS = "load_mass", tuple(f"load_moment_{axis}" for axis in "xyz")
 
 
 @register
@@ -27,20 +29,10 @@ def payload(scene: Scene) -> Effect | None:
     by r further out, on the line from the last joint to the body's centre, weighs with a moment m r more (kg m).  That
     moment's inertia is left out: of a hand that turns by 1 rad/s^2 it is a tenth of what it weighs.
     """
-    joints = a.arm(scene)
-    if not joints:
+    if (carried := _carried(scene)) is None:
         return None
-    last = max(joints, key=lambda joint: scene.id("joint", joint))  # in the chain, whatever order the channels have
-    body = _carrier(scene, last)
-    mass = float(scene.model.body_mass[body])
-    if mass <= 0:
-        return None
-    share = dict(gain=1.0 / mass, offset=1.0)
-    writes = [write(scene, "body_mass", (body,), Mode.SCALE, **share)]
-    if scene.model.body_gravcomp[body] != 0:
-        writes.append(write(scene, "body_gravcomp", (body,), Mode.DIVIDE, **share))
-    of_it: dict[str, Any] = dict(group=a.GROUP, role=Role.PAYLOAD_MASS)
-    more = Parameter(MASS, "kg", 0.0, 0.2, -0.9 * min(mass, 1.0), 2.0, writes=tuple(writes), **of_it)
+    last, body = carried
+    more = _more_mass(scene, body, MASS, Role.PAYLOAD_MASS)
     weighs = _weighs(scene, last, body)
     parameters = (more,) if weighs is None else (more, a.amplitude(MOMENT, "kg m", 0.02, 0.3))
     return Effect(
@@ -56,16 +48,88 @@ def payload(scene: Scene) -> Effect | None:
     )
 
 
+@register
+def free_payload(scene: Scene) -> Effect | None:
+    """The same with its own centre anywhere: m r has three coordinates in the body's frame, from the body's centre.
+
+    Of these, those that some pose turns into a torque of a measured joint.
+    """
+    if (carried := _carried(scene)) is None:
+        return None
+    last, body = carried
+    felt = _felt(scene, body)
+    names = tuple(name for name, of in zip(MOMENTS, felt, strict=True) if of)
+    along = jnp.asarray(np.eye(3)[felt], jnp.float32)
+    force = _hangs(scene, body, lambda theta: jnp.stack([a.value(theta, name) for name in names]) @ along)
+    if force is None or len(names) < 2:
+        return None
+    return Effect(
+        "free_payload",
+        (_more_mass(scene, body, LOAD), *(a.amplitude(name, "kg m", 0.02, 0.3) for name in names)),
+        force=force,
+        description="a tool or load with a centre off the hand's own line, that the controller does not know of",
+        signature="free motion: all joints, in proportion to levers that turn with the hand",
+        confused_with=("payload", "gravity_direction", "torque_bias", "cable_pull"),
+        special_cases=("payload",),
+        locations={last: (LOAD, *names)},
+        minimum_size=0.02,
+        native=lambda values, model: None if any(values.get(name) for name in names) else {},
+    )
+
+
+def _carried(scene: Scene) -> tuple[str, int] | None:
+    """The arm's last joint and the body that a load hangs on; None where there is none with a mass."""
+    joints = a.arm(scene)
+    if not joints:
+        return None
+    last = max(joints, key=lambda joint: scene.id("joint", joint))  # in the chain, whatever order the channels have
+    body = _carrier(scene, last)
+    return (last, body) if scene.model.body_mass[body] > 0 else None
+
+
+def _felt(scene: Scene, body: int) -> np.ndarray:
+    """[3] bool, axes of a body's frame along which a moment weighs on a measured joint of the arm in some pose."""
+    model, data = scene.model, mujoco.MjData(scene.model)
+    rng, turning, most = np.random.default_rng(0), np.zeros((3, model.nv)), np.zeros(3)
+    for _ in range(POSES):
+        mujoco.mj_integratePos(model, data.qpos, rng.uniform(-1.0, 1.0, model.nv), 1.0)
+        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_jacBody(model, data, None, turning, body)
+        torques = np.cross(data.xmat[body].reshape(3, 3).T, model.opt.gravity) @ turning[:, a.arm_dofs(scene)]
+        most = np.maximum(most, np.abs(torques).max(axis=1))
+    return most > FELT
+
+
+def _more_mass(scene: Scene, body: int, name: str, role: Role = Role.OTHER) -> Parameter:
+    """Kilograms at a body's centre of mass, which nobody compensates."""
+    mass = float(scene.model.body_mass[body])
+    share = dict(gain=1.0 / mass, offset=1.0)
+    writes = [write(scene, "body_mass", (body,), Mode.SCALE, **share)]
+    if scene.model.body_gravcomp[body] != 0:
+        writes.append(write(scene, "body_gravcomp", (body,), Mode.DIVIDE, **share))
+    of_it: dict[str, Any] = dict(group=a.GROUP, role=role)
+    return Parameter(name, "kg", 0.0, 0.2, -0.9 * min(mass, 1.0), 2.0, writes=tuple(writes), **of_it)
+
+
 def _weighs(scene: Scene, joint: str, body: int) -> Callable[[Theta, State], jax.Array] | None:
     """What the moment of a load weighs on the joints; None where no line leads outwards, or the body flies."""
-    outwards, links = _outwards(scene, joint, body), turned(scene, body)
-    if outwards is None or links is None:
+    outwards = _outwards(scene, joint, body)
+    if outwards is None:
         return None
-    gravity, along = (jnp.asarray(v, jnp.float32) for v in (scene.model.opt.gravity, outwards))
+    along = jnp.asarray(outwards, jnp.float32)
+    return _hangs(scene, body, lambda theta: a.value(theta, MOMENT) * along)
+
+
+def _hangs(scene: Scene, body: int, moment: Callable[[Theta], jax.Array]) -> Callable[[Theta, State], jax.Array] | None:
+    """What a moment [3] kg m in a body's frame weighs on the joints; None where the body flies."""
+    links = turned(scene, body)
+    if links is None:
+        return None
+    gravity = jnp.asarray(scene.model.opt.gravity, jnp.float32)
 
     def force(theta: Theta, state: State) -> jax.Array:
         axes, rotation = links(state.qpos)
-        return axes @ jnp.cross(a.value(theta, MOMENT) * (rotation @ along), gravity)
+        return axes @ jnp.cross(rotation @ moment(theta), gravity)
 
     return force
 

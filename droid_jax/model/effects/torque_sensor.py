@@ -1,6 +1,8 @@
-"""Errors of the torque sensors: an offset, a wrong gain, a drift over the recording."""
+"""Errors of the torque sensors: an offset, a wrong gain, a drift over the recording, a neighbour's torque."""
 
 from dataclasses import replace
+
+import jax.numpy as jnp
 
 from droid_jax.model.effect_interface import Effect, column
 from droid_jax.model.effects import coefficients as a
@@ -9,6 +11,7 @@ from droid_jax.model.joint_friction import GAIN, torque_gain_effect
 from droid_jax.model.scene import Scene
 
 BIAS, DRIFT = "torque_bias", "torque_drift"
+CROSSTALK, BEFORE, AFTER = "torque_crosstalk", "crosstalk_before", "crosstalk_after"
 
 
 @register
@@ -62,4 +65,34 @@ def torque_drift(scene: Scene) -> Effect | None:
         confused_with=("torque_bias", "cable_pull"),
         locations=a.places(scene.joints, DRIFT),
         minimum_size=0.005,
+    )
+
+
+@register
+def torque_crosstalk(scene: Scene) -> Effect | None:
+    """tau_i + b tau_(i-1) + c tau_(i+1): shares of the torques of the channels next to a joint's own."""
+    joints = a.arm(scene)
+    if len(joints) < 2:
+        return None
+
+    def observe(theta, rollout):
+        rows = [scene.joints.index(joint) for joint in joints]
+        own = rollout.torque[:, rows]
+        none = jnp.zeros_like(own[:, :1])
+        before, after = jnp.concatenate([none, own[:, :-1]], axis=1), jnp.concatenate([own[:, 1:], none], axis=1)
+        leaks = column(theta, BEFORE, joints) * before + column(theta, AFTER, joints) * after
+        return replace(rollout, torque=rollout.torque.at[:, rows].add(leaks))
+
+    names = {joint: (f"{BEFORE}[{joint}]", f"{AFTER}[{joint}]") for joint in joints}
+    places = {j: tuple(n for n, there in zip(names[j], (i > 0, i + 1 < len(joints)), strict=True) if there)
+              for i, j in enumerate(joints)}  # fmt: skip
+    return Effect(
+        CROSSTALK,
+        tuple(a.amplitude(name, "-", 0.03, 0.3) for of in places.values() for name in of),
+        observe=observe,
+        description="a joint's torque sensor that also reads its neighbours' torques",
+        signature="one joint, in proportion to the torque of the next or the last",
+        confused_with=("torque_gain", "torque_bias"),
+        locations=places,
+        minimum_size=0.01,
     )

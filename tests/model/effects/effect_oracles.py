@@ -11,6 +11,7 @@ from effect_bench import ARM, JOINTS
 
 Values = Mapping[str, float]
 ByJoint = dict[str, float]
+Look = Callable[[np.ndarray], np.ndarray]
 SLOW = 0.01  # rad/s: the width of smooth signs
 ELBOW_REFERENCE = 0.2  # rad, as in the MJCF
 LEAN = (0.05, -0.08)  # of gravity, to x and to y
@@ -23,12 +24,17 @@ UPPER_ARM = 1.5 * 0.15 + CARRIED
 
 @dataclass(frozen=True)
 class Now:
-    """One moment: each joint's angle, speed, actuator torque before, and how far its command is ahead of it."""
+    """One moment: each joint's angle, speed, actuator torque before, and how far its command is ahead of it.
+
+    motor, links: what the motor gave to the gear in the step before, less damping at the speed now, and the links.
+    """
 
     q: ByJoint
     w: ByJoint
     load: ByJoint
     ahead: ByJoint
+    motor: ByJoint
+    links: ByJoint
 
 
 @dataclass(frozen=True)
@@ -38,7 +44,8 @@ class Oracle:
     edit:  what it is in an MJCF, where MuJoCo has it.
     force: torque on joints; beside: what `edit` has no words for.
     loss:  friction loss on top of theirs, the sum at least zero.
-    late:  s, of the command.  lead: rad by which motors are ahead of their links.
+    late:  s, of the command.  sent: (values, time [T], look, actuator by joint) -> command [T, U] of look(time).
+    lead: rad by which motors are ahead of their links.
     read:  (values, time [T], torque [T,J]) -> [T,J], what the sensor makes of it.
     joints: those to compare.
     """
@@ -49,6 +56,7 @@ class Oracle:
     beside: Callable[[Values, Now], ByJoint] | None = None
     loss: Callable[[Values, Now], ByJoint] | None = None
     late: Callable[[Values], float] | None = None
+    sent: Callable[[Values, np.ndarray, Look, Mapping[str, int]], np.ndarray] | None = None
     lead: Callable[[Values, Now], ByJoint] | None = None
     read: Callable[[Values, np.ndarray, np.ndarray], np.ndarray] | None = None
     joints: tuple[str, ...] = JOINTS
@@ -93,10 +101,10 @@ def more_frictionloss(spec: mujoco.MjSpec, v: Values) -> None:
         spec.joint(joint).frictionloss += v[f"joint_coulomb[{joint}]"]
 
 
-def lump(spec: mujoco.MjSpec, v: Values) -> None:
+def lump(spec: mujoco.MjSpec, v: Values, mass: str = "payload_mass") -> None:
     """A body at the hand's centre of mass, which nobody compensates."""
     spec.body("hand").add_body(name="lump").add_geom(
-        type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-3, 0, 0], mass=v["payload_mass"], contype=0, conaffinity=0
+        type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-3, 0, 0], mass=v[mass], contype=0, conaffinity=0
     )
 
 
@@ -104,6 +112,13 @@ def hangs_further_out(v: Values, now: Now) -> ByJoint:
     """The hand's centre lies straight below the elbow where all angles are zero, and so does what hangs further out."""
     leans = now.q["shoulder"] + now.q["elbow"] - ELBOW_REFERENCE
     return dict.fromkeys(ARM, -GRAVITY * v["payload_moment"] * np.sin(leans))
+
+
+def hangs_anywhere(v: Values, now: Now) -> ByJoint:
+    """A moment in the plane of the links, along the hand's x and z, which are the world's where all angles are zero."""
+    leans = now.q["shoulder"] + now.q["elbow"] - ELBOW_REFERENCE
+    outwards = v["load_moment_x"] * np.cos(leans) + v["load_moment_z"] * np.sin(leans)  # along the world's x
+    return dict.fromkeys(ARM, GRAVITY * outwards)
 
 
 def leaning(v: Values, now: Now) -> ByJoint:
@@ -165,6 +180,28 @@ def stribeck(v: Values, name: str, height: float, speed: float) -> float:
     return height * np.exp(-(abs(speed / v[f"{name}_speed"]) ** v[f"{name}_exponent"]))
 
 
+def geared(v: Values, joint: str, now: Now) -> float:
+    """Shares of what presses on the gear from both sides, and what comes on top while the joint is slow."""
+    motor, links = now.motor[joint], now.links[joint]
+    slow = np.exp(-abs(now.w[joint]) / v["gear_speed"])
+    return abs(v["gear_links"] * links - v["gear_motor"] * motor) + v["gear_at_rest"] * slow * abs(links - motor)
+
+
+def looking_ahead(v: Values, at: np.ndarray, look: Look, servos: Mapping[str, int]) -> np.ndarray:
+    """Each servo is given its command and a share of the command's speed over 10 ms."""
+    command, speed = look(at), (look(at + 0.005) - look(at - 0.005)) / 0.01
+    for joint in ARM:
+        command[:, servos[joint]] += v[f"velocity_feedforward[{joint}]"] * speed[:, servos[joint]]
+    return command
+
+
+def leaking(v: Values, t: np.ndarray, torque: np.ndarray) -> np.ndarray:
+    """Shoulder and elbow, the first two channels, read each other."""
+    shoulder = torque[:, 0] + v["crosstalk_after[shoulder]"] * torque[:, 1]
+    elbow = torque[:, 1] + v["crosstalk_before[elbow]"] * torque[:, 0]
+    return np.stack([shoulder, elbow, torque[:, 2]], axis=1)
+
+
 def latch(v: Values, phi: float, w: float) -> float:
     """The pull fades in over a tenth of the width; a door beyond shut is not pulled."""
     share = max(phi, 0.0) / v["latch_width"]
@@ -198,11 +235,21 @@ ORACLES = {
         each(*ARM, cable_stiffness=(1.5, -0.7), cable_pull=(-0.4, 0.6)),
         force=at_arm(lambda v, j, now: -v["cable_stiffness"] * stretch(j, now) - v["cable_pull"]),
     ),
+    "clock_rate": Oracle({"clock_rate": -0.004}, sent=lambda v, at, look, _: look((1 + v["clock_rate"]) * at)),
     "command_delay": Oracle({"command_delay": 0.0123}, late=lambda v: v["command_delay"]),
     "door_closer": Oracle({"closer_damping": 3.0, "closer_exponent": 1.4}, force=at_door(closer)),
     "drag": Oracle({"drag": 1.2}, force=at_door(lambda v, phi, w: -v["drag"] * w**2 * np.sign(w))),
     "encoder_offset": Oracle(
         each(*ARM, encoder_offset=(0.03, -0.05)), edit=turned_encoders, beside=compensated_elsewhere
+    ),
+    "free_payload": Oracle(
+        {"load_mass": 0.2, "load_moment_x": 0.05, "load_moment_z": -0.02},
+        edit=lambda spec, v: lump(spec, v, "load_mass"),
+        beside=hangs_anywhere,
+    ),
+    "gear_friction": Oracle(
+        {**each(*ARM, gear_motor=(0.1, 0.15), gear_links=(0.05, 0.2), gear_at_rest=(0.1, 0.05)), "gear_speed": 0.4},
+        loss=at_arm(geared),
     ),
     "gravity_direction": Oracle({"gravity_about_y": 0.04}, force=leaning, joints=ARM),
     "hardening_spring": Oracle(
@@ -263,6 +310,7 @@ ORACLES = {
     "torque_bias": Oracle(
         each(*JOINTS, torque_bias=(0.3, -0.2, 0.1)), read=lambda v, t, torque: torque + of_joints(v, "torque_bias")
     ),
+    "torque_crosstalk": Oracle({"crosstalk_after[shoulder]": 0.06, "crosstalk_before[elbow]": -0.04}, read=leaking),
     "torque_drift": Oracle(
         each(*JOINTS, torque_drift=(0.05, -0.02, 0.03)),
         read=lambda v, t, torque: torque + np.outer(t - t.mean(), of_joints(v, "torque_drift")),
@@ -280,4 +328,5 @@ ORACLES = {
             )
         ),
     ),
+    "velocity_feedforward": Oracle(each(*ARM, velocity_feedforward=(0.03, -0.02)), sent=looking_ahead),
 }

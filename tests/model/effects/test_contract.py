@@ -116,7 +116,14 @@ def moments(scene: Scene) -> list[State]:
         return jnp.asarray(scale * rng.normal(size=size), jnp.float32)
 
     return [
-        State(jnp.float32(time), draw(model.nq, 1.0), draw(model.nv, speed), draw(model.nv, 5.0), scene.mjx)
+        State(
+            jnp.float32(time),
+            draw(model.nq, 1.0),
+            draw(model.nv, speed),
+            draw(model.nv, 5.0),
+            scene.mjx,
+            gear=jnp.stack([draw(model.nv, 5.0), draw(model.nv, 5.0)]),
+        )
         for time, speed in ((0.0, 1.0), (0.3, 0.01), (0.6, 0.0))
     ]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -24,7 +25,7 @@ from droid_jax.simulate.measured_motion import Motion
 from droid_jax.simulate.replay import Replay
 
 MOTOR, LINK = TorqueSide.MOTOR, TorqueSide.LINK
-STEERING = ("command_delay", "joint_backlash", "joint_compliance")
+STEERING = ("clock_rate", "command_delay", "joint_backlash", "joint_compliance", "velocity_feedforward")
 COULOMB = 0.15  # N m: the friction that a link-side sensor sees already, in one row of each comparison
 TOLERANCE = 1e-4  # N m: float32, 6e-8 of inertias times accelerations and of 9 N m of weight, summed
 
@@ -67,6 +68,15 @@ class Inverse:
         replay = inverse_replay(scene, self.motion, [*effects, joint_friction_effect(JOINTS)])
         self.run = over_population(lambda v: replay(make_physics(scene, self.space, v)))
 
+    @functools.cached_property
+    def links(self) -> np.ndarray:
+        """[T, J] N m that weight, springs and the other joints' motion put onto the gears."""
+        spec = mujoco.MjSpec.from_string(MECHANISM)
+        for joint in spec.joints:
+            joint.damping = 0.0
+        still = replace(self.motion, acceleration=0.0 * self.motion.acceleration)
+        return -mj_inverse(spec, still, self.motion.torque.gravity)
+
     def torque(self, *rows: dict[str, float]) -> np.ndarray:
         """[P, T, J] N m"""
         return self.run(np.array([self.space.values(row) for row in rows])).torque.astype(float)
@@ -74,9 +84,12 @@ class Inverse:
     def by_formula(self, function: Callable, v: dict[str, float], load: np.ndarray) -> np.ndarray:
         """[T, J] of an oracle's force or loss; NaN where it has none."""
         out = np.full(load.shape, np.nan)
-        for k, numbers in enumerate(zip(self.motion.position, self.motion.velocity, load, strict=True)):
-            q, w, torque = (dict(zip(JOINTS, n.tolist(), strict=True)) for n in numbers)
-            for joint, value in function(v, Now(q, w, torque, {})).items():
+        slowed = self.scene.model.dof_damping[self.scene.joint_dofs] * self.motion.velocity
+        motor = load - slowed if self.side is MOTOR else load
+        moments = (self.motion.position, self.motion.velocity, load, motor, self.links)
+        for k, numbers in enumerate(zip(*moments, strict=True)):
+            q, w, torque, motor, links = (dict(zip(JOINTS, n.tolist(), strict=True)) for n in numbers)
+            for joint, value in function(v, Now(q, w, torque, {}, motor, links)).items():
                 out[k, JOINTS.index(joint)] = value
         return out
 
@@ -144,8 +157,9 @@ def test_sensors_read_what_they_read(inverse: Inverse, name: str):
     assert np.abs(got - neutral).max() > 100 * TOLERANCE
 
 
-def test_a_payload_is_carried(inverse: Inverse):
-    oracle = ORACLES["payload"]
+@pytest.mark.parametrize("name", ["payload", "free_payload"])
+def test_a_payload_is_carried(inverse: Inverse, name: str):
+    oracle = ORACLES[name]
     neutral, got = inverse.torque({}, dict(oracle.values))
     loaded = mujoco.MjSpec.from_string(MECHANISM)
     oracle.edit(loaded, oracle.values)
@@ -190,7 +204,7 @@ def test_gains_of_servos_that_nobody_asks_change_nothing(inverse: Inverse):
 def test_these_are_all_effects(scene: Scene):
     """Whatever is added to the library has to find its place here."""
     left = {n for n, o in ORACLES.items() if not (o.force or o.loss or o.read)}
-    assert left == {"payload", "servo_gain", "encoder_offset", "soft_friction", *STEERING}
+    assert left == {"payload", "free_payload", "servo_gain", "encoder_offset", "soft_friction", *STEERING}
     assert {e.name for e in library(scene)} == set(ORACLES)
 
 

@@ -42,11 +42,18 @@ def in_c(drive: Drive, oracle: Oracle, *, late: float) -> np.ndarray:
     losses = model.dof_frictionloss.copy()
     by_hand = oracle.edit is None
     at = drive.time - late * drive.timestep - (oracle.late(v) if oracle.late else 0.0)
-    command = np.stack([np.interp(at, drive.time, column) for column in drive.command.T], axis=1)
+
+    def look(time: np.ndarray) -> np.ndarray:
+        return np.stack([np.interp(time, drive.time, column) for column in drive.command.T], axis=1)
+
+    command = oracle.sent(v, at, look, servos) if oracle.sent else look(at)
     torque = np.empty((len(command), len(JOINTS)))
     for k, ctrl in enumerate(command):
         q, w, load = ({j: float(a[d]) for j, d in dofs.items()} for a in (data.qpos, data.qvel, data.qfrc_actuator))
-        now = Now(q, w, load, {j: ctrl[row] - q[j] for j, row in servos.items()})
+        motor = data.qfrc_actuator + data.qfrc_gravcomp - model.dof_damping * data.qvel
+        links = data.qfrc_spring - data.qfrc_bias + data.qfrc_applied  # nothing touches, no limit is reached
+        gear = ({j: float(a[d]) for j, d in dofs.items()} for a in (motor, links))
+        now = Now(q, w, load, {j: ctrl[row] - q[j] for j, row in servos.items()}, *gear)
         data.ctrl[:] = ctrl
         for joint, lead in (oracle.lead(v, now) if oracle.lead else {}).items():
             data.ctrl[servos[joint]] -= lead

@@ -22,9 +22,9 @@ from droid_jax.simulate.replay import Drive, servo_replay
 
 OF_HINGES = {"angle_friction", "door_closer", "drag", "hardening_spring", "hinge_directional", "hinge_preload",
              "hinge_stribeck", "latch", "opening_check", "over_centre_spring", "tilted_frame"}  # fmt: skip
-OF_ARMS = {"cable_pull", "encoder_offset", "gravity_direction", "joint_backlash", "joint_compliance", "joint_coulomb",
-           "joint_directional", "joint_stribeck", "load_friction", "payload", "servo_gain", "soft_friction",
-           "torque_ripple"}  # fmt: skip
+OF_ARMS = {"cable_pull", "encoder_offset", "free_payload", "gear_friction", "gravity_direction", "joint_backlash",
+           "joint_compliance", "joint_coulomb", "joint_directional", "joint_stribeck", "load_friction", "payload",
+           "servo_gain", "soft_friction", "torque_crosstalk", "torque_ripple", "velocity_feedforward"}  # fmt: skip
 OF_SERVOS = {"joint_backlash", "joint_compliance"}
 OF_GRIPS = {"contact_compliance"}
 

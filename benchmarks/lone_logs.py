@@ -1,0 +1,346 @@
+"""One commanded log alone: how often does the search raise an alarm where nothing is hidden, and name what is?
+
+    python benchmarks/lone_logs.py [--quick] [--null 50] [--blind 60] [--out DIR] [--runs DIR]
+
+A servo-driven hinge and an arm of three joints, on the synthetic robot: one log of 24 s each, its positions alone or
+its torques too, searched by windows (`Split.WINDOWS`).  Every case draws a robot with all its nuisances.  Hidden
+effects are 3 and 10 times their minimum effect size.  One small JSON a case under RUNS: the run can be stopped and goes
+on where it was, and the same command started twice shares the cases.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
+
+import tuned  # noqa: E402, F401  (before jax starts)
+
+# isort: split
+import json  # noqa: E402
+import time  # noqa: E402
+from collections.abc import Sequence  # noqa: E402
+from dataclasses import asdict, dataclass, replace  # noqa: E402
+from typing import Any  # noqa: E402
+
+import mujoco  # noqa: E402
+import numpy as np  # noqa: E402
+import tyro  # noqa: E402
+
+from benchmarks.common import CODE, publish  # noqa: E402
+from benchmarks.sharing import claimed  # noqa: E402
+from droid_jax.discrepancy.candidates import (  # noqa: E402
+    ScoreDirection,
+    ScoreTest,
+    directions_of,
+    observable_effects,
+    score_test,
+)
+from droid_jax.discrepancy.config import DiscrepancyConfig  # noqa: E402
+from droid_jax.discrepancy.fitting import discretisation_error  # noqa: E402
+from droid_jax.discrepancy.log_case import base_model  # noqa: E402
+from droid_jax.discrepancy.search import search_effects  # noqa: E402
+from droid_jax.discrepancy.windowed_case import case_of  # noqa: E402
+from droid_jax.door.space import torque_offsets  # noqa: E402
+from droid_jax.model.effect_interface import Effect  # noqa: E402
+from droid_jax.model.effects.candidate import candidates, names_of  # noqa: E402
+from droid_jax.model.effects.registry import ready  # noqa: E402
+from droid_jax.model.fields import body_mass, joint_damping, servo_scale, time_offset  # noqa: E402
+from droid_jax.model.parameters import Space  # noqa: E402
+from droid_jax.model.scene import Scene, compile_scene  # noqa: E402
+from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSide  # noqa: E402
+from droid_jax.recordings.split import Split, roles_of  # noqa: E402
+from droid_jax.simulate.c_engine import simulate  # noqa: E402
+from droid_jax.simulate.hand_path import minimum_jerk  # noqa: E402
+from droid_jax.storage import write_json  # noqa: E402
+from droid_jax.synthetic.hidden_effects import LIBRARY, ON_HINGE, Applied, record_hidden  # noqa: E402
+from droid_jax.synthetic.robot import SyntheticRobotConfig, as_recording, sensor_torque, set_up  # noqa: E402
+from experiments.blind.answers import parts, right  # noqa: E402
+from experiments.blind.rates import rate  # noqa: E402
+from experiments.blind.scenes import AJAR, DOOR, setting  # noqa: E402
+from experiments.blind.score import answered  # noqa: E402
+from experiments.blind.search import FAILED  # noqa: E402
+from experiments.trials import answer_json  # noqa: E402
+
+SECONDS = 24.0
+NOISE = 1e-4  # rad, of a position sample
+FACTORS = (3.0, 10.0)  # of the minimum effect size
+STROKES = ((3.0, 0.9), (5.0, 0.9), (4.6, 0.8), (3.4, 0.95), (2.6, 0.75), (5.4, 0.85))  # s and rad, there and back
+ARM = """<mujoco><option timestep="0.005" integrator="implicitfast"/><worldbody>
+  <body name="column"><joint name="yaw" axis="0 0 1" armature="0.05" damping="10"/>
+    <geom size="0.05 0.1" type="cylinder" mass="2" contype="0" conaffinity="0"/>
+    <body name="upper" pos="0 0 0.1"><joint name="shoulder" axis="0 1 0" armature="0.1" damping="20"/>
+      <geom type="capsule" size="0.03" fromto="0 0 0 0.3 0 0" mass="3" contype="0" conaffinity="0"/>
+      <body name="fore" pos="0.3 0 0"><joint name="elbow" axis="0 1 0" armature="0.05" damping="10"/>
+        <geom type="capsule" size="0.02" fromto="0 0 0 0.4 0 0" mass="3" contype="0" conaffinity="0"/></body></body>
+  </body></worldbody>
+  <actuator><position name="yaw" joint="yaw" kp="400"/><position name="shoulder" joint="shoulder" kp="900"/>
+    <position name="elbow" joint="elbow" kp="400"/></actuator></mujoco>"""
+JOINTS = ("yaw", "shoulder", "elbow")
+# rad, rad/s, rad: two sines a joint
+WAVES = (((0.7, 1.1, 0.0), (0.2, 2.9, 1.0)), ((0.5, 1.7, 0.3), (0.15, 3.7, 2.0)), ((0.6, 2.3, 1.0), (0.2, 0.9, 0.5)))
+HIDDEN = {
+    "hinge": (
+        "hinge_preload", "binding_spring", "over_centre", "magnetic_catch", "closer", "opening_check", "air_drag",
+        "floor_friction", "stribeck_friction[door]", "directional_friction[door]", "command_delay",
+    ),
+    "arm": (
+        "dry_friction[shoulder]", "dry_friction[yaw]", "stribeck_friction[elbow]", "directional_friction[yaw]",
+        "load_friction[shoulder]", "payload", "cable_pull[elbow]", "torque_ripple[shoulder]",
+        "joint_elasticity[elbow]", "servo_gains[shoulder]", "command_delay", "encoder_zero[elbow]", "tilted_base",
+    ),
+}  # fmt: skip
+CHANNELS = {"positions": ("position",), "torques": ("torque", "position")}
+COMBINATIONS = [(scene, channels) for scene in HIDDEN for channels in CHANNELS]
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Options."""
+
+    quick: bool = False
+    """One case of each kind on the hinge; its numbers are not for keeping."""
+    null: int = 50
+    """Cases with nothing hidden of each scene and set of channels."""
+    blind: int = 60
+    """Cases with something hidden, over all of them."""
+    only: str = ""
+    """Cases whose name begins so; the others are left for another process."""
+    minutes: float = 0.0
+    """No case is begun after so many; 0: all are made."""
+    sum_only: bool = False
+    """Make no case: sum up those that are there."""
+    seed: int = 0
+    """Of all draws."""
+    runs: Path = ROOT / "runs" / "lone_logs"
+    """Folder of the cases."""
+    out: Path = ROOT / "benchmarks" / "results"
+    """Folder of lone_logs.json."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """A scene with a set of channels: what all its cases share, compiled programs among it."""
+
+    name: str
+    scene: Scene
+    base: Space
+    demonstration: Recording
+    effects: tuple[Effect, ...]
+    channels: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A case: nothing hidden, or a hidden effect ("name" or "name[joint]") times its minimum effect size."""
+
+    name: str
+    scene: str
+    channels: str
+    effect: str = ""
+    factor: float = 0.0
+
+
+def bench(scene: str, channels: str) -> Bench:
+    """Of a scene and a set of channels."""
+    compared, clock = CHANNELS[channels], np.arange(0.0, SECONDS, 0.004)
+    if scene == "hinge":
+        where = setting("hinge")
+        model, base, joints, command = where.scene, where.base, (DOOR,), _strokes(clock)[:, None]
+    else:
+        model = ready(compile_scene(mujoco.MjSpec.from_string(ARM), "arm", joints=JOINTS))
+        base, joints, command = _arm_base(model), JOINTS, _waves(clock)
+    if "torque" not in compared:
+        base = Space(tuple(p for p in base.parameters if not p.name.startswith("torque_offset")))
+    start = dict(zip(joints, command[0].tolist(), strict=True))
+    convention = TorqueConvention(TorqueSide.MOTOR, gravity=True)
+    demonstration = Recording("log", clock, command, joints, {}, convention, qpos0=start)
+    effects = observable_effects(model, [demonstration], channels=compared)
+    return Bench(scene, model, base, demonstration, effects, compared)
+
+
+def _arm_base(scene: Scene) -> Space:
+    damping = (joint_damping(scene, j, std=2.0, high=60.0) for j in JOINTS)
+    servos = (servo_scale(scene, j, nuisance=True) for j in JOINTS)
+    mass = body_mass(scene, "fore", std=0.2, high=9.0)
+    return Space((*damping, mass, *servos, time_offset(), *torque_offsets(JOINTS)))
+
+
+def _strokes(clock: np.ndarray) -> np.ndarray:
+    angle, start = np.full(len(clock), AJAR), 0.0
+    for seconds, reach in STROKES:
+        now = (clock >= start) & (clock < start + seconds)
+        angle[now] += 0.5 * (reach - AJAR) * (1 - np.cos(2 * np.pi * (clock[now] - start) / seconds))
+        start += seconds
+    return angle
+
+
+def _waves(clock: np.ndarray) -> np.ndarray:
+    swings = [sum(size * np.sin(w * clock + phase) for size, w, phase in waves) for waves in WAVES]
+    return minimum_jerk(clock / 1.5)[:, None] * np.stack(swings, axis=1)
+
+
+def plans(arguments: Arguments) -> list[Plan]:
+    """All cases."""
+    null = [Plan(f"null-{scene}-{channels}-{n}", scene, channels) for scene, channels in COMBINATIONS
+            for n in range(1 if arguments.quick else arguments.null)]  # fmt: skip
+    hidden = list[Plan]()
+    count = 1 if arguments.quick else arguments.blind
+    lists = {key: [(e, f) for e in HIDDEN[key[0]] for f in FACTORS] for key in COMBINATIONS}
+    for n in range(count):
+        scene, channels = key = COMBINATIONS[n % len(COMBINATIONS)]
+        each = lists[key]
+        order = np.random.default_rng([arguments.seed, COMBINATIONS.index(key)]).permutation(len(each))
+        effect, factor = each[order[(n // len(COMBINATIONS)) % len(each)]]
+        hidden.append(Plan(f"blind-{scene}-{channels}-{n}", scene, channels, effect, factor))
+    return [p for p in (*null, *hidden) if not arguments.quick or p.scene == "hinge"]
+
+
+def recorded(bench: Bench, plan: Plan, seed: int) -> tuple[Recording, Applied | None]:
+    """One log of a robot that is drawn around the priors."""
+    rng, base = np.random.default_rng(seed), bench.base
+    values = rng.normal(base.mean, np.where(base.nuisance, 1.0, 0.5) * base.std)
+    truth = dict(zip(base.names, np.clip(values, base.low, base.high).tolist(), strict=True))
+    config = SyntheticRobotConfig(repeats=1, position_noise=NOISE)
+    hidden = None
+    if plan.effect:
+        kind, _, joint = plan.effect.rstrip("]").partition("[")
+        hidden = Applied(kind, plan.factor * _minimum(bench, kind, joint), joint)
+        config = replace(config, timestep=0.00025)
+        log = record_hidden(
+            bench.scene, bench.demonstration, truth, [hidden], seed=seed, config=config, name=plan.name, space=base
+        )
+    else:
+        robot = set_up(bench.scene, bench.demonstration, truth, seed=seed, config=config, space=base)
+        trace = simulate(robot.scene, robot.models, robot.qpos0, robot.control[None])
+        log = as_recording(robot, trace, sensor_torque(robot, trace), trace.position, name=plan.name)
+    kept = {name: log.channels[name] for name in ("position", *bench.channels)}
+    return replace(log, channels=kept), hidden
+
+
+def _minimum(bench: Bench, kind: str, joint: str) -> float:
+    """Minimum effect size of what the library calls a hidden effect."""
+    called = LIBRARY[kind]
+    called = ON_HINGE.get(called, called) if joint == DOOR else called
+    return next(e.minimum_size for e in bench.effects if e.name == called)
+
+
+def made(bench: Bench, plan: Plan, seed: int) -> dict[str, Any]:
+    """The result of one case; what fails is a result too."""
+    began = time.monotonic()
+    result: dict[str, Any] = {**asdict(plan), "seed": seed, "code": CODE.get("git")}
+    try:
+        log, hidden = recorded(bench, plan, seed)
+        result["recorded"] = time.monotonic() - began
+        config = DiscrepancyConfig(channels=bench.channels)
+        roles = roles_of(Split.WINDOWS, [log])
+        case = case_of(Split.WINDOWS, bench.scene, bench.base, bench.effects, roles, config)
+        result["prepared"] = time.monotonic() - began
+        model = base_model(case)
+        result["fitted"] = time.monotonic() - began
+        screen = score_test(case.train, model, directions_of(candidates(case.effects)), config.seed)
+        result |= {
+            "p": screen.p,
+            "discrepancy": model.discrepancy,
+            "converged": bool(model.refined.converged),
+            "limits": list(case.limits),
+            "blocks": case.train.resampling.units,
+            "ranked": [str(d.candidate.key) for d in _best(screen)],
+            "screened": time.monotonic() - began,
+        }
+        if not model.refined.converged:
+            return {**result, "verdict": "fit not converged", "effects": [], "seconds": time.monotonic() - began}
+        if screen.p >= config.selection.significance:  # where the search ends too
+            return {**result, "verdict": "none", "effects": [], "seconds": time.monotonic() - began} | _judged(
+                bench, hidden, {"verdict": "none"}
+            )
+        step_error = discretisation_error(case.train, model, log)
+        verdict = search_effects(case, model, step_error)
+    except FAILED as error:
+        return {**result, "verdict": "error", "error": str(error), "seconds": time.monotonic() - began}
+    result |= {
+        **answer_json(verdict),
+        "discrepancies": {role: list(pair) for role, pair in verdict.discrepancies.items()},
+        "discretisation_error": verdict.discretisation_error,
+        "hints": [list(map(str, hint.effects)) for hint in verdict.hints],
+        "reasons": [f"{names_of(t.keys)}: {r.text}" for t in verdict.validation_tests for r in t.reasons][:20],
+        "seconds": time.monotonic() - began,
+    }
+    return result | _judged(bench, hidden, result)
+
+
+def _judged(bench: Bench, hidden: Applied | None, result: dict[str, Any]) -> dict[str, Any]:
+    """What of an answer is right where something is hidden."""
+    if hidden is None:
+        return {}
+    names, beside = [list(right(bench.scene, hidden))], [list(parts(bench.scene, hidden))]
+    judged = answered({"truth": {"kind": "single"}, "result": result, "right": names, "parts": beside})
+    return {"right": names, "named": judged["named"], "wrong": judged["wrong_confident"]}
+
+
+def _best(found: ScoreTest) -> list[ScoreDirection]:
+    """The three best directions of a score test, of different candidates."""
+    best = {found.directions[k].candidate.key: found.directions[k] for k in reversed(found.ranking())}
+    return list(best.values())[::-1][:3]
+
+
+def summary(cases: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Rates with Wilson's 95 % intervals.  Cases that failed are counted, and are no alarm and no name."""
+    null, blind = [c for c in cases if not c["effect"]], [c for c in cases if c["effect"]]
+    silent = ("none", "error", "fit not converged")
+    return {
+        "cases": {"null": len(null), "blind": len(blind), "errors": sum(c["verdict"] == "error" for c in cases)},
+        "score_test_rejects": rate(null, lambda c: (c.get("p") or 1.0) < 0.01),
+        "false_alarm_rate": rate(null, lambda c: c["verdict"] not in silent),
+        "false_name_rate": rate(null, lambda c: bool(c.get("effects"))),
+        "unconverged": rate(cases, lambda c: c["verdict"] == "fit not converged"),
+        "detected": rate(blind, lambda c: c["verdict"] not in silent),
+        "named_up_to_tie": rate(blind, lambda c: bool(c.get("named"))),
+        "wrong_name_rate": rate(blind, lambda c: bool(c.get("wrong"))),
+        "p_below": {f"{a:g}": float(np.mean([(c.get("p") or 1.0) < a for c in null])) for a in (0.01, 0.05, 0.1, 0.5)}
+        if null
+        else {},
+        "seconds_median": float(np.median([c["seconds"] for c in cases])) if cases else None,
+    }
+
+
+def main(arguments: Arguments) -> None:
+    """Make the cases that are not there, and sum up those that are."""
+    began, benches = time.monotonic(), dict[tuple[str, str], Bench]()
+    runs = arguments.runs / ("quick" if arguments.quick else f"seed{arguments.seed}")
+    wanted = plans(arguments)
+    for plan in wanted if not arguments.sum_only else ():
+        late = arguments.minutes and time.monotonic() - began > 60 * arguments.minutes
+        path = runs / f"{plan.name}.json"
+        if late or path.is_file() or not plan.name.startswith(arguments.only):
+            continue
+        with claimed(path, wait=False) as mine:
+            if not mine or path.is_file():
+                continue
+            key = plan.scene, plan.channels
+            benches.setdefault(key, bench(*key))
+            seed = int(np.random.default_rng([arguments.seed, *plan.name.encode()]).integers(1 << 31))
+            found = made(benches[key], plan, seed)
+            write_json(path, found)
+            print(f"{plan.name} {plan.effect} {plan.factor:g}x: {found['verdict']} {found.get('effects', '')} "
+                  f"p = {found.get('p')}, {found['seconds']:.0f} s {found.get('error', '')}", flush=True)  # fmt: skip
+    cases = [json.loads(path.read_text()) for plan in wanted if (path := runs / f"{plan.name}.json").is_file()]
+    groups = {f"{scene}, {channels}": [c for c in cases if (c["scene"], c["channels"]) == (scene, channels)]
+              for scene, channels in COMBINATIONS}  # fmt: skip
+    whole = summary(cases)
+    result = {
+        **whole,
+        "by": {name: summary(some) for name, some in groups.items() if some},
+        "by_factor": {f"{f:g}": summary([c for c in cases if c["factor"] == f]) for f in FACTORS},
+        "codes": sorted({str(c["code"]) for c in cases}),
+        "setting": {"seconds": SECONDS, "position_noise_rad": NOISE, "windows": asdict(DiscrepancyConfig().windows)},
+        "blind_cases": [{k: c.get(k) for k in ("name", "effect", "factor", "verdict", "effects", "indistinguishable",
+                                               "named", "wrong", "p", "ranked")} for c in cases if c["effect"]],
+    }  # fmt: skip
+    publish(arguments.out, "lone_logs", arguments.quick, arguments.seed, result, line=whole)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments, description=__doc__))

@@ -1,0 +1,205 @@
+"""A fitted result applied without jax against the program's own replay, on motions that were not fitted.
+
+    python benchmarks/neutral_result.py --fit door=runs/all/gap --recording door=runs/all/recordings/B.npz
+
+For each fit (a folder of `identify` or `gap`) it writes the neutral result, steps it in plain C MuJoCo in a process
+that cannot import jax (`neutral_replay.py`), and compares positions and motor torques with the replay in MJX.  The
+tolerance is what both engines differ by with the laws left out of both.  It also draws from fitted.json and compares
+mean and covariance with the Gaussian's.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import common
+import numpy as np
+import tyro
+
+HERE = Path(__file__).resolve().parent
+DRAWS = 100
+
+
+@dataclass(frozen=True)
+class NeutralResult:
+    """Compare fitted results in plain MuJoCo with the replay."""
+
+    fit: dict[str, Path] = field(default_factory=dict)
+    """Folders of finished fits by name of the case."""
+    recording: dict[str, Path] = field(default_factory=dict)
+    """A recording by name of the case that its fit did not see."""
+    scene: dict[str, Path] = field(default_factory=dict)
+    """MJCF by name of the case, where it is not where the fit found it."""
+    fine: int = 8
+    """Steps of C in one of the replay's."""
+    seed: int = 0
+    """Of the draws."""
+    out: Path = HERE / "results"
+    """Folder for neutral_result.json."""
+    quick: bool = False
+    """Write neutral_result_quick.json."""
+
+
+def without_laws(effects: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Effects that only change the model's numbers."""
+    bare = dict(command=None, servo=None, force=None, frictionloss=None, observe=None)
+    return tuple(replace(e, **bare) for e in effects)
+
+
+def compare(fit: Path, recording: Path, scene: Path | None, fine: int, seed: int) -> dict[str, Any]:
+    """One case."""
+    from droid_jax.commands.fitted import load_fitted
+    from droid_jax.identify.neutral_result import write_neutral
+    from droid_jax.recordings.formats import load_recording
+    from droid_jax.recordings.recording import TorqueConvention, TorqueSide
+
+    fitted = load_fitted(fit, scene)
+    motor = TorqueConvention(TorqueSide.MOTOR, gravity=False)
+    given = replace(load_recording(recording), torque=motor)
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(made)
+        gaussian = gaussian_of(fit, fitted)
+        write_neutral(folder, fitted.scene, gaussian, fitted.after, fitted.effects, main="fitted.xml")
+        base = without_laws(fitted.effects)
+        with_laws = differences(fitted, given, fitted.effects, folder, fine, laws=True)
+        tolerance = differences(fitted, given, base, folder, fine, laws=False)
+        own_step = differences(fitted, given, fitted.effects, folder, 1, laws=True)
+        return {
+            "recording": given.name,
+            "held_out": given.sha256 not in fitted.recordings,
+            "effects": sorted({law["effect"] for law in content(folder)["laws"]}),
+            "without_table": [e for e in content(folder)["not_in_mjcf"] if "depends on" in e["why"]],
+            "in_place": content(folder)["mjcf"]["in_place"],
+            "table_error": {law["effect"]: law["error"] for law in content(folder)["laws"]},
+            "largest_difference": with_laws,
+            "tolerance": tolerance,
+            "largest_difference_at_own_step": own_step,
+            "effect_of_the_laws": laws_matter(fitted, given, base),
+            "draws": draws_agree(folder, gaussian, seed),
+        }
+
+
+def content(folder: Path) -> dict[str, Any]:
+    from droid_jax.identify import apply_fit
+
+    return apply_fit.load(folder / "fitted.json")
+
+
+def gaussian_of(fit: Path, fitted: Any) -> Any:
+    """Of all fitted parameters."""
+    from droid_jax.commands.fitted import fitted_folder
+    from droid_jax.identify.extended_model import load_extended
+    from droid_jax.identify.gaussian import load_gaussian
+
+    stage, folder = fitted_folder(fit)
+    if stage == "gap":
+        return load_extended(folder / "extended.json", fitted.scene).gaussian
+    return load_gaussian(folder / "gaussian_full.json")
+
+
+def replayed(fitted: Any, recording: Any, effects: tuple[Any, ...]) -> tuple[Any, Any, Any]:
+    """The drive, the replay in MJX at the fitted values, and its physics."""
+    import jax
+    import jax.numpy as jnp
+
+    from droid_jax import runtime
+    from droid_jax.model.physics import make_physics
+    from droid_jax.simulate.replay import make_drive, servo_replay
+
+    drive = make_drive(fitted.scene, recording, weigh=False)
+    seen = without_observers(effects)
+    replay = servo_replay(fitted.scene, drive, seen)
+
+    def run(values: Any) -> Any:
+        return replay(make_physics(fitted.scene, fitted.space, values))
+
+    out = jax.jit(run, compiler_options=runtime.compiler_options())(jnp.asarray(fitted.after, jnp.float32))
+    return drive, jax.tree.map(np.asarray, out), replay
+
+
+def without_observers(effects: tuple[Any, ...]) -> tuple[Any, ...]:
+    """What moves, and not what is read of it."""
+    return tuple(replace(e, observe=None) for e in effects)
+
+
+def differences(
+    fitted: Any, recording: Any, effects: tuple[Any, ...], folder: Path, fine: int, *, laws: bool
+) -> dict[str, float]:
+    """Largest and root mean square difference of positions (rad or m) and motor torques (N m or N) to plain C."""
+    from droid_jax.simulate.servo_gains import servo_factors
+
+    drive, own, _ = replayed(fitted, recording, effects)
+    values = dict(zip(fitted.space.names, fitted.after.tolist(), strict=True))
+    ask = dict(
+        command=drive.command, timestep=drive.timestep, qpos0=drive.qpos0, gains=servo_factors(fitted.scene, drive),
+        fine=fine, time_offset=values.get("time_offset", 0.0), laws=int(laws), spec=0,
+    )  # fmt: skip
+    np.savez(folder / "ask.npz", **ask)
+    paths = (folder, folder / "fitted.xml", folder / "ask.npz", folder / "answer.npz")
+    subprocess.run([sys.executable, HERE / "neutral_replay.py", *paths], check=True)
+    answer = np.load(folder / "answer.npz")
+    assert not len(answer["foreign"]), answer["foreign"]
+    scene = fitted.scene
+    position = np.abs(answer["qpos"][:, scene.joint_qpos] - own.position)
+    torque = np.abs(answer["torque"][:, scene.joint_dofs] - own.torque)
+    out = {
+        "position": float(position.max()), "position_rms": float(np.sqrt(np.mean(position**2))),
+        "torque": float(torque.max()), "torque_rms": float(np.sqrt(np.mean(torque**2))),
+    }  # fmt: skip
+    if scene.object_joint:
+        angle = np.abs(answer["qpos"][:, scene.qpos(scene.object_joint)] - own.object_angle)
+        out |= {"object_angle": float(angle.max()), "object_angle_rms": float(np.sqrt(np.mean(angle**2)))}
+    return out
+
+
+def laws_matter(fitted: Any, recording: Any, base: tuple[Any, ...]) -> dict[str, float]:
+    """Largest change of the replay by the laws: what a comparison would see if they were not applied."""
+    _, one, _ = replayed(fitted, recording, fitted.effects)
+    _, two, _ = replayed(fitted, recording, base)
+    return {name: float(np.abs(getattr(one, name) - getattr(two, name)).max()) for name in ("position", "torque")}
+
+
+def draws_agree(folder: Path, gaussian: Any, seed: int) -> dict[str, float]:
+    """Mean and covariance of draws from fitted.json against those of `Gaussian.sample`, in sampling errors.
+
+    mean: largest |z| over the parameters.  variance: smallest and largest ratio.  correlation: largest |z| of Fisher's
+    transform.  Expected of sampling alone: 2.4 to 3 for the largest |z| of some 30 parameters.
+    """
+    from droid_jax.identify import apply_fit
+
+    few = gaussian.space.to_search(apply_fit.draws(content(folder), range(DRAWS), seed))
+    many = gaussian.space.to_search(gaussian.sample(seed + 1, 20_000))
+    spread = many.std(axis=0)
+    moving = spread > 1e-9
+    z = (few.mean(axis=0) - many.mean(axis=0))[moving] / (spread[moving] / np.sqrt(DRAWS))
+    ratio = few.var(axis=0, ddof=1)[moving] / spread[moving] ** 2
+    one, two = (np.arctanh(np.clip(np.corrcoef(x[:, moving].T), -0.999999, 0.999999)) for x in (few, many))
+    pairs = np.triu_indices(int(moving.sum()), 1)
+    apart = np.abs(one - two)[pairs] * np.sqrt(DRAWS - 3)
+    return {
+        "draws": DRAWS, "parameters": int(moving.sum()), "mean_largest_z": float(np.abs(z).max()),
+        "variance_ratio_low": float(ratio.min()), "variance_ratio_high": float(ratio.max()),
+        "correlation_largest_z": float(apart.max(initial=0.0)), "correlation_rms_z": float(np.sqrt(np.mean(apart**2))),
+    }  # fmt: skip
+
+
+def main(config: NeutralResult) -> None:
+    from droid_jax import runtime
+
+    runtime.start()
+    cases: dict[str, Any] = {}
+    for name, folder in config.fit.items():
+        cases[name] = compare(folder, config.recording[name], config.scene.get(name), config.fine, config.seed)
+        print(name, cases[name], flush=True)
+    largest = {name: case["largest_difference"] for name, case in cases.items()}
+    result = {"benchmark": "neutral_result", "fine": config.fine, "largest_difference": largest, "cases": cases}
+    common.publish(config.out, "neutral_result", config.quick, config.seed, result)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(NeutralResult, description=__doc__))

@@ -1,0 +1,498 @@
+"""The cost of commanded logs with few repeats: their windows, or their motions whole, as one sequence of instants.
+
+Its noise is stated, not estimated, and its residuals are whitened on the host, as those of a `LoneLog`.  Where a window
+begins is measured, and how well enters the noise: what the spread of its state does to the simulation.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+
+from droid_jax import distributed
+from droid_jax.cost.channels import check_channels
+from droid_jax.cost.cost import Cost, check_read, followed
+from droid_jax.cost.noise import Noise, coarse_clock
+from droid_jax.cost.observation import Measured, compared_columns, in_window, least_noise
+from droid_jax.cost.residuals import CompareConfig, Comparison
+from droid_jax.model.effect_interface import Effect, Rollout
+from droid_jax.model.fields import check_space
+from droid_jax.model.inertia import check_inertia
+from droid_jax.model.parameters import Space
+from droid_jax.model.scene import Scene
+from droid_jax.recordings.recording import Phase, Recording
+from droid_jax.simulate.batching import block_size, in_blocks
+from droid_jax.simulate.compiled import compiled_replay, window_program
+from droid_jax.simulate.replay import Drive
+from droid_jax.simulate.windows import WindowConfig, Windows, cut, why_whole
+
+STRETCH = 0.5  # s: what a motion that is replayed whole is divided into, as others are into windows
+TRACES = ("torque", "position", "velocity", "object_angle")
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """One repeat of one recording: W windows, or one that is the whole motion.
+
+    windows: None for a whole motion, of which `whole` makes batches.  program: of the windows.
+    kernels: by channel [W, 1 or C, K, T], what its data went through.  columns: by channel [C] of the simulated one.
+    measured: [W, K, all C].  at: [W, K] s, the instants on the recording's clock.  rows: [W, K] of the replay, nearest.
+    unit: [W, K] window, or stretch of a whole motion, that an instant is in.
+    """
+
+    name: str
+    windows: Windows | None
+    program: Callable[..., Rollout] | None
+    whole: Callable[[np.ndarray], Rollout] | None
+    kernels: dict[str, np.ndarray]
+    columns: dict[str, np.ndarray]
+    measured: np.ndarray
+    at: np.ndarray
+    rows: np.ndarray
+    unit: np.ndarray
+
+    @property
+    def count(self) -> int:
+        """W."""
+        return len(self.at)
+
+    def replayed(
+        self, values: np.ndarray, reduce: Callable[[Rollout, np.ndarray], Any], active: np.ndarray | None = None
+    ) -> Any:
+        """What `reduce` makes of every window's Rollout [R, T, ...] and its number [R], for samples [P, D]: arrays
+        [P, W, ...], of active windows [W] bool alone.
+        """
+        chosen = np.arange(self.count) if active is None else np.flatnonzero(active)
+
+        def samples(rows: np.ndarray) -> Any:
+            which = np.tile(chosen, len(rows))
+            found = self._run(np.repeat(rows, len(chosen), axis=0), which, *self._state(which), reduce)
+            return {key: a.reshape(len(rows), len(chosen), *a.shape[1:]) for key, a in found.items()}
+
+        if self.windows is not None:
+            return distributed.over_processes(samples, values)
+        assert self.whole is not None
+        whole = self.whole
+        found = in_blocks(lambda block: reduce(_host(whole(block)), np.zeros(len(block), int)), values)
+        return {key: a[:, None] for key, a in found.items()}
+
+    def _state(self, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        assert self.windows is not None
+        return self.windows.start[which], self.windows.speed[which]
+
+    def _run(
+        self,
+        values: np.ndarray,
+        which: np.ndarray,
+        start: np.ndarray,
+        speed: np.ndarray,
+        reduce: Callable[[Rollout, np.ndarray], dict[str, np.ndarray]],
+    ) -> dict[str, np.ndarray]:
+        """Rows [R] of windows `which` from states of their own, block by block."""
+        assert self.windows is not None and self.program is not None
+        size, found = block_size(len(values)), list[dict[str, np.ndarray]]()
+        gains = np.repeat(self.windows.gains[None], size, axis=0)
+        for first in range(0, len(values), size):
+            mine = np.minimum(np.arange(first, first + size), len(values) - 1)  # the last block repeats its last row
+            of = which[mine]
+            given = self.windows.table[of], start[mine], gains, speed[mine], self.windows.begin[of]
+            rollout = self.program(values[mine], *(np.asarray(a, np.float32) for a in given))
+            count = min(size, len(values) - first)
+            found.append({k: a[:count] for k, a in reduce(_host(rollout), of).items()})
+        return {key: np.concatenate([part[key] for part in found]) for key in found[0]}
+
+    def smoothed(self, rollout: Rollout, which: np.ndarray) -> dict[str, np.ndarray]:
+        """ "smooth": [R, K, all C] the compared channels through the filter of their data; NaN where it blew up."""
+        parts = []
+        for name, kernel in self.kernels.items():
+            trace = getattr(rollout, name)
+            trace = (trace[..., None] if trace.ndim == 2 else trace)[..., self.columns[name]]
+            own = kernel[which]  # [R, 1 or C, K, T]
+            parts.append(
+                own[:, 0] @ trace if own.shape[1] == 1 else np.einsum("rckt,rtc->rkc", own, trace, optimize=True)
+            )
+        smooth = np.concatenate(parts, axis=2).astype(np.float64)
+        smooth[~rollout.finite.astype(bool)] = np.nan
+        return {"smooth": smooth}
+
+    def traces(self, rollout: Rollout, which: np.ndarray) -> dict[str, np.ndarray]:
+        """The simulated channels at the instants, [R, K, ...], and "finite" [R]."""
+        rows = self.rows[which]
+        of = np.arange(len(rows))[:, None]
+        return {**{name: getattr(rollout, name)[of, rows] for name in TRACES}, "finite": rollout.finite.astype(bool)}
+
+    def spread(self, values: np.ndarray) -> np.ndarray | None:
+        """[W, K, all C, 2 nv] what each column of the states' spread does to the simulation at `values` [D]."""
+        windows = self.windows
+        if windows is None:
+            return None
+        dofs, positions = windows.speed.shape[1], windows.start.shape[1]
+        assert dofs == positions  # joints of one degree, in one order
+        columns = 2 * dofs
+        which = np.repeat(np.arange(self.count), columns)
+        step = np.swapaxes(windows.spread, 1, 2).reshape(-1, columns)  # one row for each column
+        rows = np.repeat(values[None], len(which), axis=0)
+        start, speed = windows.start[which], windows.speed[which]
+        ends = [
+            self._run(rows, which, start + s * step[:, :dofs], speed + s * step[:, dofs:], self.smoothed)["smooth"]
+            for s in (1.0, -1.0)
+        ]
+        found = np.nan_to_num(0.5 * (ends[0] - ends[1])).reshape(self.count, columns, *ends[0].shape[1:])
+        return np.moveaxis(found, 1, -1)
+
+
+def _host(rollout: Rollout) -> Rollout:
+    return Rollout(*(np.asarray(getattr(rollout, f.name)) for f in fields(rollout)))
+
+
+@dataclass(frozen=True, eq=False)
+class PooledComparison(Comparison):
+    """The comparison of a `WindowedLog`: one repeat, which tells nothing of its scatter."""
+
+    def deviations(self) -> np.ndarray:
+        """[1, M] zeros."""
+        return np.zeros((1, sum(c.noise.mean.size for c in self.channels)))
+
+
+@dataclass(frozen=True, eq=False)
+class WindowedLog(Cost):
+    """The cost of pooled logs.
+
+    pieces: repeats of recordings.  order: [K] their instants one after the other, as the log has them.
+    unit: [K] number of the window (or stretch) of each, counted in the log's order.
+    fitted: how many of these units come before those that are kept as test data.  whole: why motions are replayed
+    whole, empty where they are not.
+    instants: [K] bool, those that count.  again: makes the same of another scene and space, with windows on a grid [s]
+    of time steps.  whitener: [windows, K C, K C] of each piece, None: not stated yet.
+    spreads: what the states' spread does, of each piece; see `about`.
+    """
+
+    pieces: tuple[Piece, ...]
+    order: np.ndarray
+    unit: np.ndarray
+    fitted: int
+    whole: str
+    unit_seconds: float
+    instants: np.ndarray
+    again: Callable[[Scene, Space, float], WindowedLog]
+    whitener: tuple[np.ndarray, ...] | None = None
+    spreads: tuple[np.ndarray | None, ...] = field(default=())
+
+    def simulated(self, values: Any) -> np.ndarray:
+        """[P, D] -> [P, K, C] compared channels through the filter of their data, in their units; NaN throughout where
+        a window blew up.  Windows without an instant that counts are not replayed: what was measured stands there."""
+        values, parts = self.space.check(values), list[np.ndarray]()
+        for piece, counts in zip(self.pieces, self._apart(self.instants[None, :, None]), strict=True):
+            active = counts[0, :, :, 0].any(axis=1)
+            part = np.repeat(piece.measured[None], len(values), axis=0)
+            if active.any():
+                part[:, active] = piece.replayed(values, piece.smoothed, active)["smooth"]
+            parts.append(part)
+        found = self._joined(parts)
+        found[np.isnan(found).any(axis=(1, 2))] = np.nan
+        return found
+
+    def _joined(self, parts: Sequence[np.ndarray]) -> np.ndarray:
+        """[P, W, k, ...] of every piece -> [P, K, ...] in the log's order."""
+        flat = [part.reshape(part.shape[0], -1, *part.shape[3:]) for part in parts]
+        return np.concatenate(flat, axis=1)[:, self.order]
+
+    def _apart(self, rows: np.ndarray) -> list[np.ndarray]:
+        """[P, K, C] in the log's order -> [P, W, k, C] of every piece."""
+        natural = np.empty_like(rows)
+        natural[:, self.order] = rows
+        sizes = np.cumsum([piece.at.size for piece in self.pieces])[:-1]
+        parts = np.split(natural, sizes, axis=1)
+        return [part.reshape(len(rows), *piece.at.shape, -1) for part, piece in zip(parts, self.pieces, strict=True)]
+
+    def whitened(self, values: Any) -> np.ndarray:
+        """[P, D] -> [P, M] residuals in units of the noise stated, zero at instants left out."""
+        assert self.whitener is not None
+        left = self.simulated(values) - self.measured
+        white = []
+        for part, matrix in zip(self._apart(left), self.whitener, strict=True):
+            flat = np.swapaxes(part, 2, 3).reshape(*part.shape[:2], -1)  # column by column
+            diagonal = matrix.ndim == 2  # [1, K C]
+            done = flat * matrix if diagonal else np.einsum("wij,pwj->pwi", matrix, flat, optimize=True)
+            white.append(np.swapaxes(done.reshape(*part.shape[:2], part.shape[3], part.shape[2]), 2, 3))
+        rows = self._joined(white) * self.instants[:, None]
+        return np.swapaxes(rows, 1, 2).reshape(len(rows), -1)
+
+    def distances(self, values: Any) -> np.ndarray:
+        """[P, D] -> [P, 1] equation 1 over the instants that count, of filtered channels."""
+        comparison = self.comparisons[0]
+        left, first = (self.simulated(values) - self.measured)[:, self.instants], 0
+        total = np.zeros(len(left))
+        for channel in comparison.channels:
+            columns = slice(first, first + len(channel.columns))
+            total += channel.weight * np.mean(np.linalg.norm(left[..., columns], axis=2), axis=1)
+            first += len(channel.columns)
+        return np.where(np.isfinite(total), total, comparison.config.non_finite_cost)[:, None]
+
+    def smoothed(self, values: Any) -> tuple[np.ndarray, ...]:
+        """[P, D] -> one array [P, K, C], the leading channel."""
+        names = [c.name for c in self.comparisons[0].channels]
+        lead = names.index(self.comparisons[0].leading.name)
+        ends = np.cumsum([0, *(len(c.columns) for c in self.comparisons[0].channels)])
+        return (self.simulated(values)[..., ends[lead] : ends[lead + 1]],)
+
+    def rollouts(self, values: Any) -> tuple[Rollout, ...]:
+        """[P, D] -> one Rollout of the instants, host arrays [P, K, ...]."""
+        values = self.space.check(values)
+        parts = [piece.replayed(values, piece.traces) for piece in self.pieces]
+        traces = {name: self._joined([part[name] for part in parts]) for name in TRACES}
+        finite = np.all(np.concatenate([part["finite"] for part in parts], axis=1), axis=1)
+        count, size = len(values), len(self.order)
+        time = np.repeat(self.comparisons[0].clock[None], count, axis=0)
+        return (Rollout(time, **traces, contact=np.zeros((count, size, 0), bool), finite=finite),)
+
+    def failed(self, values: Any) -> np.ndarray:
+        """[P, D] -> [P] bool: a replay blew up."""
+        return np.isnan(self.simulated(values)).any(axis=(1, 2))
+
+    def penalties(self, values: Any) -> np.ndarray:
+        """[P, D] -> [P, 1] zeros: nothing is gripped in a window."""
+        return np.zeros((len(np.atleast_2d(values)), 1))
+
+    def part(self, name: str) -> WindowedLog:
+        """The same log under a name for one part of it."""
+        return replace(self, comparisons=(replace(self.comparisons[0], name=name),))
+
+    @property
+    def columns(self) -> list[tuple[str, int]]:
+        """[C] channel and simulated column of each compared column."""
+        return [(c.name, column) for c in self.comparisons[0].channels for column in c.columns.tolist()]
+
+    @property
+    def measured(self) -> np.ndarray:
+        """[K, C] measured channels, filtered."""
+        return np.concatenate([c.noise.mean for c in self.comparisons[0].channels], axis=1)
+
+    @property
+    def clock(self) -> np.ndarray:
+        """[K] s: of one log without gaps its own clock, else that of the instants one after the other."""
+        return self.comparisons[0].clock
+
+    @property
+    def moves(self) -> np.ndarray:
+        """[K, C] bool, true: a replay with commands tells at rest too."""
+        return np.ones(self.measured.shape, bool)
+
+    def residual(self, values: np.ndarray) -> np.ndarray:
+        """[K, C] measured minus simulated channels of one vector [D]."""
+        return self.measured - self.simulated(values[None])[0]
+
+    def least_noise(self) -> np.ndarray:
+        """[C] deviation below which the noise is never believed."""
+        comparison = self.comparisons[0]
+        return np.concatenate([least_noise(c.name, c.noise.mean, comparison.config.noise) for c in comparison.channels])
+
+    def about(self, values: np.ndarray) -> WindowedLog:
+        """The same, with what the spread of the windows' first states does to the simulation at `values` [D]."""
+        return replace(self, spreads=tuple(piece.spread(values) for piece in self.pieces))
+
+    def finer(self, scene: Scene, space: Space) -> WindowedLog:
+        """The same instants and noise of a scene with a finer time step, over another space."""
+        made = self.again(scene, space, float(self.scene.model.opt.timestep))
+        assert np.array_equal(made.order, self.order)
+        return replace(made, whitener=self.whitener, instants=self.instants)
+
+    def with_noise(self, deviation: np.ndarray, instants: np.ndarray) -> WindowedLog:
+        """With white noise of a deviation [C], in the columns' units, and the spread of `about`, at some instants [K]
+        bool; the rest does not count."""
+        deviation = np.maximum(deviation, self.least_noise())
+        spreads = self.spreads or (None,) * len(self.pieces)
+        whitener = tuple(_whitener(p.at.shape[1], deviation, s) for p, s in zip(self.pieces, spreads, strict=True))
+        return replace(self, whitener=whitener, instants=instants)
+
+
+def _whitener(count: int, deviation: np.ndarray, spread: np.ndarray | None) -> np.ndarray:
+    """[1, K C] inverse deviations, or of windows with a spread [W, K C, K C] the inverse root of their covariance."""
+    flat = np.repeat(deviation, count)
+    if spread is None:
+        return 1.0 / flat[None]
+    # In units of the white noise: I + s s', whose inverse root differs from I in the span of s alone.
+    s = np.swapaxes(spread, 1, 2).reshape(len(spread), -1, spread.shape[3]) / flat[:, None]
+    left, size, _ = np.linalg.svd(s, full_matrices=False)
+    shrink = 1.0 / np.sqrt(1.0 + size**2) - 1.0
+    root = np.eye(len(flat)) + np.einsum("wik,wk,wjk->wij", left, shrink, left)
+    return root / flat
+
+
+def windowed_log(
+    scene: Scene,
+    space: Space,
+    recordings: Sequence[Recording],
+    config: CompareConfig,
+    windows: WindowConfig | None,
+    effects: Sequence[Effect] = (),
+    fitted_share: float = 1.0,
+    grid: float | None = None,
+) -> WindowedLog:
+    """The cost of the repeats of commanded recordings over a space.
+
+    Args:
+        scene: what is simulated.
+        space: meaning of the vectors [D].
+        recordings: of the same channels and columns, each of one repeat or several.
+        config: how simulation and measurement are compared.
+        windows: None: motions are replayed whole, as they are where `why_whole` says why.
+        effects: in the replays.
+        fitted_share: of each repeat, whose first windows come before all that is kept as test data.
+        grid: s, time steps that windows begin on; None: the scene's.
+
+    Raises:
+        ValueError: what `make_cost` refuses, or no window of which enough was measured.
+    """
+    check_space(scene, space)
+    check_channels(recordings, config.channels)
+    check_read(scene, space, effects)
+    check_inertia(scene, space)
+    reasons = [why_whole(scene, recording) for recording in recordings]
+    why = "motions were asked for whole" if windows is None else next((r for r in reasons if r), "")
+    pieces, drives = list[Piece](), list[Drive]()
+    for recording in recordings:
+        drive = followed(scene, recording, config)
+        assert isinstance(drive, Drive)
+        drives.append(drive)
+        each = functools.partial(
+            _piece, scene, space, recording, drive=drive, config=config, windows=None if why else windows,
+            effects=effects, grid=grid,
+        )  # fmt: skip
+        pieces += [each(repeat=n) for n in range(recording.repeats)]
+    pieces = [piece for piece in pieces if piece.count]
+    if not pieces:
+        raise ValueError(f"recordings {', '.join(r.name for r in recordings)}: no window was measured throughout")
+    order, unit, fitted = _order(pieces, fitted_share)
+    comparison = _comparison(scene, recordings, pieces, order, config)
+    return WindowedLog(
+        scene, space, (comparison,), tuple(drives), (), (), (), (), (), (),
+        tuple(pieces), order, unit, fitted, why, STRETCH if windows is None or why else windows.length,
+        np.ones(len(order), bool),
+        lambda scene, space, grid: windowed_log(scene, space, recordings, config, windows, (), fitted_share, grid),
+    )  # fmt: skip
+
+
+def _piece(
+    scene: Scene,
+    space: Space,
+    recording: Recording,
+    *,
+    repeat: int,
+    drive: Drive,
+    config: CompareConfig,
+    windows: WindowConfig | None,
+    effects: Sequence[Effect],
+    grid: float | None,
+) -> Piece:
+    noise, begin = config.noise, float(recording.time[0])
+    if windows is None:
+        clocks = (begin + drive.time)[None]
+        first, last = clocks[0, 0], min(clocks[0, -1], *(recording.channel(n).time[-1] for n in config.channels))
+        at = coarse_clock(float(first), float(last), noise.rate)[None]
+        made = program = None
+        whole = compiled_replay("mjx", scene, space, drive, effects)
+    else:
+        made, whole = cut(scene, recording, drive, repeat, windows, grid), None
+        program = window_program(scene, space, drive, effects, made.earlier, made.steps)
+        clocks = made.begin[:, None] + np.arange(made.steps) * drive.timestep
+        instants = (np.arange(max(1, round(windows.length * noise.rate))) + 0.5) / noise.rate
+        at = made.begin[:, None] + windows.lead + instants
+    kernels, columns, measured = dict[str, list[np.ndarray]](), dict[str, np.ndarray](), list[np.ndarray]()
+    for name in config.channels:
+        channel, columns[name] = compared_columns(scene, recording.channel(name), noise)
+        each = [in_window(channel, repeat, clock, coarse, noise) for clock, coarse in zip(clocks, at, strict=True)]
+        wide = max(kernel.shape[0] for _, kernel in each)
+        kernels[name] = [np.broadcast_to(kernel, (wide, *kernel.shape[1:])) for _, kernel in each]
+        measured.append(np.stack([values for values, _ in each]))
+    values = np.concatenate(measured, axis=2)
+    seen = ~np.isnan(values).any(axis=(1, 2))
+    if made is not None:
+        made = made.kept(seen)
+    elif not seen.all():
+        raise ValueError(
+            f"recording {recording.name!r} has a stretch in which a compared channel was not measured, and its motion "
+            "must be replayed whole: cut it there (window)"
+        )
+    rows = np.clip(np.rint((at - clocks[:, :1]) / drive.timestep).astype(int), 0, clocks.shape[1] - 1)
+    if made is None:
+        unit = np.floor((at - at[0, 0]) / STRETCH).astype(int)
+        unit = np.minimum(unit, max(int((at[0, -1] - at[0, 0]) / STRETCH) - 1, 0))
+    else:
+        unit = np.repeat(np.arange(len(at))[:, None], at.shape[1], axis=1)
+    kept = {name: np.stack(each)[seen].astype(np.float32) for name, each in kernels.items()}
+    name = recording.name if recording.repeats == 1 else f"{recording.name}, repeat {repeat}"
+    return Piece(name, made, program, whole, kept, columns, values[seen], at[seen], rows[seen], unit[seen])
+
+
+def _order(pieces: Sequence[Piece], share: float) -> tuple[np.ndarray, np.ndarray, int]:
+    """The pieces' instants [K] in the log's order, the unit [K] of each, and how many units come first.
+
+    The first part of every piece, then the rest of every piece.
+    """
+    groups: tuple[list[np.ndarray], list[np.ndarray]] = [], []
+    first = 0
+    for piece in pieces:
+        unit = np.unique(piece.unit.ravel(), return_inverse=True)[1].ravel()
+        count = int(unit.max()) + 1
+        fitted = min(count, max(1, round(share * count)))
+        numbers = np.arange(len(unit)) + first
+        for group, inside in zip(groups, (range(fitted), range(fitted, count)), strict=True):
+            group += [numbers[unit == u] for u in inside]
+        first += len(unit)
+    units = [*groups[0], *groups[1]]
+    unit = np.repeat(np.arange(len(units)), [len(u) for u in units])
+    return np.concatenate(units), unit, len(groups[0])
+
+
+def _comparison(
+    scene: Scene, recordings: Sequence[Recording], pieces: Sequence[Piece], order: np.ndarray, config: CompareConfig
+) -> Comparison:
+    """All instants as one measured motion of one repeat."""
+    values = np.concatenate([piece.measured.reshape(-1, piece.measured.shape[2]) for piece in pieces])[order]
+    at = np.concatenate([piece.at.ravel() for piece in pieces])[order]
+    rate, alone = config.noise.rate, len(pieces) == 1
+    gapless = alone and np.allclose(np.diff(at), np.diff(at).mean(), rtol=0.01)
+    start = float(at[0]) if gapless else 0.0
+    span = (start, float(at[-1]) if gapless else (len(at) - 1) / rate)
+    channels, first = list[Measured](), 0
+    for name, weight in config.channels.items():
+        columns = pieces[0].columns[name]
+        if any(not np.array_equal(piece.columns[name], columns) for piece in pieces):
+            raise ValueError(f"the recordings measure {name} of different joints, or in another order")
+        mean = values[:, first : first + len(columns)]
+        first += len(columns)
+        noise = Noise(mean, np.zeros((len(columns), 0, 0)), mean[None], np.ones(mean.shape))
+        channels.append(
+            Measured(
+                name,
+                recordings[0].channel(name).unit,
+                np.arange(len(mean), dtype=float),
+                mean[None],
+                np.ones((1, *mean.shape), bool),
+                columns,
+                np.zeros((1, 0, 0)),
+                noise,
+                span,
+                weight,
+                np.ones(mean.shape, bool),
+            )
+        )
+    phases = recordings[0].phases if gapless else _phases(pieces, order, rate)
+    names = " and ".join(dict.fromkeys(r.name for r in recordings))
+    return PooledComparison(names, channels[0].clock, tuple(channels), None, None, phases, config)
+
+
+def _phases(pieces: Sequence[Piece], order: np.ndarray, rate: float) -> tuple[Phase, ...]:
+    """The pieces, where they come in the log's order."""
+    of = np.repeat(np.arange(len(pieces)), [piece.at.size for piece in pieces])[order]
+    changes = np.flatnonzero(np.diff(of)) + 1
+    starts, ends = np.r_[0, changes], np.r_[changes, len(of)]
+    return tuple(
+        Phase(pieces[of[a]].name, float(a) / rate, float(b) / rate)
+        for a, b in zip(starts.tolist(), ends.tolist(), strict=True)
+    )

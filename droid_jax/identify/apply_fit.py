@@ -1,0 +1,394 @@
+"""A fit in plain MuJoCo: this one file needs numpy and mujoco, nothing else.
+
+    import mujoco, apply_fit
+
+    fit = apply_fit.load("fitted.json")
+    spec = mujoco.MjSpec.from_file("robot.xml")
+    values = apply_fit.apply(spec, fit)                     # the fitted values; sample=7 takes draw number 7
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    laws = apply_fit.forces(model, fit, values)             # what no MJCF can hold; nothing where there is nothing
+    for command in commands:
+        data.ctrl[:] = laws.control(data, command)          # a delay, a gear that gives way
+        laws(model, data)                                   # a latch, a friction that goes with the load
+        mujoco.mj_step(model, data)
+
+`mujoco.set_mjcb_control(laws)` serves in place of `laws(model, data)`.  fitted.json says what its entries mean
+(docs/results-folder.md of droid_jax).  Draw `k` of a seed is the same wherever and how often it is asked for.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import warnings
+from pathlib import Path
+from statistics import NormalDist
+from typing import Any
+
+import mujoco
+import numpy as np
+
+FORMAT, VERSION = "droid_jax fitted", 1
+TRIES, SWEEPS = 2000, 40  # rows drawn until one is within the bounds; after that rounds of Gibbs sampling
+TINY_FRICTION = 1e-6  # N m: gives a joint the constraint row that a law of friction needs
+_UNIT = ("body_quat", "jnt_axis", "geom_quat")
+_DERIVING = {"body_mass", "body_inertia", "body_pos", "body_quat", "body_ipos", "body_iquat", "dof_armature", "jnt_pos",
+             "jnt_axis", "geom_pos", "geom_quat"}  # fmt: skip
+_WEIGHT = {"body_mass", "body_inertia", "body_ipos", "body_iquat"}
+_PLACE = {"body_pos", "body_quat", "geom_pos", "geom_quat", "geom_size"}
+_SURE = ("body_mass", "body_inertia", "jnt_stiffness", "dof_damping", "dof_frictionloss", "dof_armature",
+         "actuator_gainprm", "actuator_biasprm")  # fmt: skip
+
+
+def load(path: str | Path) -> dict[str, Any]:
+    """The content of a fitted.json; ValueError for another file or version."""
+    content = json.loads(Path(path).read_text(encoding="utf-8"))
+    if not isinstance(content, dict) or (content.get("format"), content.get("version")) != (FORMAT, VERSION):
+        raise ValueError(f"{path}: expected a JSON object with format {FORMAT!r}, version {VERSION}")
+    return content
+
+
+def apply(
+    target: mujoco.MjSpec | mujoco.MjModel, fit: dict[str, Any] | str | Path, sample: int | None = None, seed: int = 0
+) -> dict[str, float]:
+    """Write the fitted values, or a draw, into a spec or a model; whatever an earlier call wrote is replaced.
+
+    Args:
+        target: of the MJCF that was fitted, or of fitted.xml, a compiled model or a spec.
+        fit: content of fitted.json, or its path.
+        sample: None for the fitted values, a number for that draw.
+        seed: of the draws.
+
+    Returns:
+        The values by parameter, for `forces`.
+
+    Raises:
+        ValueError: the target lacks an element of the fit, or cannot say one of its numbers.
+    """
+    fit = fit if isinstance(fit, dict) else load(fit)
+    values = fitted_values(fit) if sample is None else draw(fit, sample, seed)
+    model = target if isinstance(target, mujoco.MjModel) else target.compile()
+    _write(model, fit, values)
+    if isinstance(target, mujoco.MjSpec):
+        _write_spec(target, model, fit)
+    return values
+
+
+def fitted_values(fit: dict[str, Any]) -> dict[str, float]:
+    """The fitted values by parameter."""
+    return {p["name"]: p["value"] for p in fit["parameters"]}
+
+
+def draw(fit: dict[str, Any], sample: int, seed: int = 0) -> dict[str, float]:
+    """Draw number `sample` of the Gaussian, by parameter, within the bounds."""
+    return dict(zip((p["name"] for p in fit["parameters"]), draws(fit, [sample], seed)[0].tolist(), strict=True))
+
+
+def draws(fit: dict[str, Any], samples: Any, seed: int = 0) -> np.ndarray:
+    """[n, D] these draws, physical units, in the order of fit["parameters"]."""
+    gaussian, parameters = fit["gaussian"], fit["parameters"]
+    mean, cov = np.array(gaussian["mean"]), np.array(gaussian["cov"])
+    physical = gaussian["coordinates"] == "physical"
+    low, high = np.array([_box(p, physical) for p in parameters]).T
+    variances, axes = np.linalg.eigh(cov)
+    root = axes * np.sqrt(variances.clip(0.0))
+    out = np.empty((len(samples), len(mean)))
+    for i, sample in enumerate(samples):
+        rng = np.random.default_rng([seed, sample])
+        rows = mean + rng.standard_normal((TRIES, len(mean))) @ root.T
+        inside = np.flatnonzero(np.all((rows >= low) & (rows <= high), axis=1))
+        out[i] = rows[inside[0]] if len(inside) else _gibbs(rng, mean, cov, low, high)
+    return np.stack([_physical(p, out[:, i], physical) for i, p in enumerate(parameters)], axis=1)
+
+
+def _box(p: dict[str, Any], physical: bool) -> tuple[float, float]:
+    """Bounds that a draw must keep, in the Gaussian's coordinates."""
+    if physical:
+        return p["low"], p["high"]
+    if p["scaling"] == "log":  # its map clips
+        return -math.inf, math.inf
+    prior = p["prior"]
+    return (p["low"] - prior["mean"]) / prior["std"], (p["high"] - prior["mean"]) / prior["std"]
+
+
+def _physical(p: dict[str, Any], x: np.ndarray, physical: bool) -> np.ndarray:
+    """Coordinates of the Gaussian -> the parameter's unit."""
+    prior, offset = p["prior"], p["log_offset"]
+    if physical:
+        value = x
+    elif p["scaling"] == "log":
+        width = math.log1p(prior["std"] / (prior["mean"] + offset)) if p["width"] is None else p["width"]
+        value = (prior["mean"] + offset) * np.exp(width * x) - offset
+    else:
+        value = prior["mean"] + prior["std"] * x
+    return np.clip(value, p["low"], p["high"])
+
+
+def _gibbs(
+    rng: np.random.Generator, mean: np.ndarray, cov: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """A draw of a normal of which hardly anything lies within the bounds: one coordinate after the other."""
+    normal, precision = NormalDist(), np.linalg.pinv(cov, hermitian=True)
+    x = np.clip(mean, low, high)
+    for _ in range(SWEEPS):
+        for i in range(len(x)):
+            if precision[i, i] <= 0:
+                continue
+            std = precision[i, i] ** -0.5
+            centre = mean[i] - (precision[i] @ (x - mean) - precision[i, i] * (x[i] - mean[i])) / precision[i, i]
+            sign = -1.0 if low[i] > centre else 1.0  # in the tail that has digits
+            ends = sorted(sign * (end - centre) / std for end in (low[i], high[i]))
+            first, last = (0.5 * math.erfc(-end / math.sqrt(2.0)) for end in ends)
+            share = min(max(first + rng.uniform() * (last - first), 1e-300), 1 - 1e-15)
+            x[i] = np.clip(centre + sign * std * normal.inv_cdf(share), low[i], high[i])
+    return x
+
+
+def _id(model: mujoco.MjModel, row: dict[str, Any]) -> int:
+    """Id of a row's element, by its name where it has one."""
+    if not row["name"]:
+        return int(row["id"])
+    kind = getattr(mujoco.mjtObj, f"mjOBJ_{row['element'].upper()}")
+    found = mujoco.mj_name2id(model, kind, row["name"])
+    if found < 0 and row["element"] == "actuator":  # one without a name goes by its joint's
+        joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, row["name"])
+        drives = np.flatnonzero((model.actuator_trnid[:, 0] == joint) & (model.actuator_trntype == 0))
+        found = int(drives[0]) if joint >= 0 and len(drives) else -1
+    if found < 0:
+        raise ValueError(f"the model has no {row['element']} {row['name']!r}, which was fitted")
+    return found
+
+
+def _entry(model: mujoco.MjModel, row: dict[str, Any]) -> tuple[int, ...]:
+    """Index of a row's number in its field."""
+    number = _id(model, row)
+    if row["field"].startswith("dof_"):
+        number = int(model.jnt_dofadr[number]) + row["offset"]
+    elif row["field"].startswith("qpos"):
+        number = int(model.jnt_qposadr[number])
+    return (number,) if row["column"] is None else (number, row["column"])
+
+
+def number_of(row: dict[str, Any], values: dict[str, float]) -> float:
+    """A row's number for parameter values: its nominal one, changed by each parameter in turn."""
+    number = row["nominal"]
+    for write in row["writes"]:
+        w = write["gain"] * values[write["parameter"]] + write["offset"]
+        mode = write["mode"]
+        number = {"set": w, "negative": -w, "scale": number * w, "add": number + w}.get(mode, number)
+        if mode == "divide":
+            number = number / w
+    return number
+
+
+def _write(model: mujoco.MjModel, fit: dict[str, Any], values: dict[str, float]) -> None:
+    """The numbers of a compiled model, and what MuJoCo derives from them."""
+    fields = set()
+    for row in fit["table"]:
+        getattr(model, row["field"])[_entry(model, row)] = number_of(row, values)
+        fields.add(row["field"])
+    for field in fields.intersection(_UNIT):
+        array = getattr(model, field)
+        array /= np.linalg.norm(array, axis=1, keepdims=True)
+    if fields & _DERIVING:
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+        model.stat.meaninertia = model.dof_M0.mean()
+        model.stat.meanmass = model.body_subtreemass[0] / max(model.nbody - 1, 1)
+    if fields & {"geom_pos", "geom_quat", "geom_size"}:  # boxes around several geoms stay as they were compiled
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
+
+
+def _write_spec(spec: mujoco.MjSpec, model: mujoco.MjModel, fit: dict[str, Any]) -> None:
+    """The elements of a spec, as they are in a compiled model."""
+    weighed = set()
+    if any(row["field"] in _WEIGHT for row in fit["table"]):
+        _settle(spec, model)
+    for row in fit["table"]:
+        number, field = _id(model, row), row["field"]
+        element = _element(spec, row["element"], number)
+        if field in _WEIGHT:
+            weighed.add(number)
+        elif row["spec"]:
+            entry = _entry(model, row)
+            numbers = np.atleast_1d(getattr(model, field)[entry[0]])
+            if field in _PLACE:
+                _unplace(element)
+                for each in ("pos", "quat", "size"):
+                    if hasattr(element, each):
+                        _set(element, each, getattr(model, f"{row['element']}_{each}")[number])
+                continue
+            if row["angle"] and element.type != mujoco.mjtJoint.mjJNT_SLIDE and element.compiler.degree:
+                numbers = np.degrees(numbers)
+            _set(element, row["spec"], numbers)
+    for body in weighed:
+        element = _element(spec, "body", body)
+        element.explicitinertial, element.mass = True, float(model.body_mass[body])
+        element.ipos, element.iquat = model.body_ipos[body].tolist(), model.body_iquat[body].tolist()
+        element.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+        element.inertia, element.fullinertia = model.body_inertia[body].tolist(), [np.nan] * 6
+    made = spec.compile()
+    other = [f for f in _SURE if not np.allclose(getattr(made, f), getattr(model, f), rtol=1e-4, atol=1e-7)]
+    if other:
+        raise ValueError(f"the spec makes another {', '.join(other)} of these numbers: write into its compiled MjModel")
+
+
+def _settle(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
+    """State what a compiler would work out anew from other masses: total mass, damping ratios."""
+    spec.compiler.boundmass, spec.compiler.boundinertia, spec.compiler.settotalmass = 0.0, 0.0, -1.0
+    for actuator in spec.actuators:
+        if actuator.biastype == mujoco.mjtBias.mjBIAS_AFFINE and actuator.biasprm[2] > 0:
+            _set(actuator, "biasprm", model.actuator_biasprm[actuator.id])
+
+
+def _element(spec: mujoco.MjSpec, kind: str, number: int) -> Any:
+    return next(e for e in getattr(spec, "bodies" if kind == "body" else f"{kind}s") if e.id == number)
+
+
+def _unplace(element: Any) -> None:
+    """Take an element out of its frame, and forget every other way in which its place was said."""
+    if element.frame is not None:
+        element.set_frame(element.parent.add_frame())
+    element.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+    if hasattr(element, "fromto"):
+        element.fromto = [np.nan] * 6
+
+
+def _set(element: Any, attribute: str, numbers: np.ndarray) -> None:
+    old = np.array(getattr(element, attribute), dtype=float)
+    if old.ndim == 0:
+        setattr(element, attribute, float(numbers[0]))
+    else:
+        old[: len(numbers)] = numbers
+        setattr(element, attribute, old.tolist())
+
+
+def forces(model: mujoco.MjModel, fit: dict[str, Any] | str | Path, values: dict[str, float] | None = None) -> Laws:
+    """The laws that no MJCF can hold, at these values (default: the fitted ones); call it after `apply`."""
+    fit = fit if isinstance(fit, dict) else load(fit)
+    return Laws(model, fit, fitted_values(fit) if values is None else values)
+
+
+class Laws:
+    """Laws of a fit on a model: `laws(model, data)` before each step, or as MuJoCo's control callback.
+
+    It sets `qfrc_applied` and the friction loss of the joints that have a law; a force of your own on one of them goes
+    into `own` [nv].  `control` gives the controls that the actuators get in place of the commanded ones.
+    """
+
+    def __init__(self, model: mujoco.MjModel, fit: dict[str, Any], values: dict[str, float]) -> None:
+        self.model, self.own = model, np.zeros(model.nv)
+        self._force, self._friction, self._servo, self.delay = [], [], [], 0.0
+        for law in fit["laws"]:
+            tables = [(values[t["parameter"]] if t["parameter"] else 1.0, np.array(t["table"])) for t in law["terms"]]
+            if law["acts"] == "command":
+                self.delay += float(sum(size * table for size, table in tables))
+                continue
+            joint = model.joint(law["joint"]).id
+            shapes = [a for a in law["axes"] if a["name"] in values]
+            table = sum(size * _at(table, shapes, values) for size, table in tables)
+            axes = [(a["name"], np.array(a["nodes"])) for a in law["axes"] if a["name"] not in values]
+            made = _Table(joint, int(model.jnt_dofadr[joint]), int(model.jnt_qposadr[joint]), axes, table)
+            {"force": self._force, "frictionloss": self._friction, "servo": self._servo}[law["acts"]].append(made)
+        if self.delay < 0:
+            warnings.warn(
+                f"the fitted command comes {-self.delay:.4g} s early, which nothing can do: it is not", stacklevel=3
+            )
+            self.delay = 0.0
+        self._rubbed = np.array(sorted({t.dof for t in self._friction}), dtype=int)
+        model.dof_frictionloss[self._rubbed] = np.maximum(model.dof_frictionloss[self._rubbed], TINY_FRICTION)
+        self._base = model.dof_frictionloss.copy()
+        self._pushed = np.array(sorted({t.dof for t in self._force}), dtype=int)
+        self._sent: list[tuple[float, np.ndarray]] = []
+
+    def force(self, data: mujoco.MjData) -> np.ndarray:
+        """[nv] generalised force of the laws in this state."""
+        out = np.zeros(self.model.nv)
+        for table in self._force:
+            out[table.dof] += table(data)
+        return out
+
+    def frictionloss(self, data: mujoco.MjData) -> np.ndarray:
+        """[nv] friction loss with the laws in this state; the load is the actuators' torque of the last step."""
+        out = self._base.copy()
+        for table in self._friction:
+            before = out[table.dof]
+            out[table.dof] = max(before + table(data), min(before, 0.0))
+        return out
+
+    def __call__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        """Set the forces and frictions of this state."""
+        if len(self._pushed):
+            data.qfrc_applied[self._pushed] = (self.force(data) + self.own)[self._pushed]
+        if len(self._rubbed):
+            loss = self.frictionloss(data)
+            model.dof_frictionloss[self._rubbed] = np.maximum(loss[self._rubbed], TINY_FRICTION)
+            rows = np.flatnonzero(data.efc_type == mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF)
+            rows = rows[np.isin(data.efc_id[rows], self._rubbed)]  # as a callback: they stand there already
+            data.efc_frictionloss[rows] = loss[data.efc_id[rows]]
+
+    def control(self, data: mujoco.MjData, command: Any) -> np.ndarray:
+        """[nu] what the actuators get for a command [nu] given at data.time: later by the delay, through the gears."""
+        ctrl = np.array(command, dtype=float)
+        if self.delay > 0:
+            if self._sent and data.time < self._sent[-1][0]:
+                self._sent.clear()  # the simulation started over
+            self._sent.append((float(data.time), ctrl))
+            while len(self._sent) > 2 and self._sent[1][0] <= data.time - self.delay:
+                self._sent.pop(0)
+            ctrl = self._late(data.time - self.delay)
+        return self._geared(data, ctrl) if self._servo else ctrl
+
+    def _late(self, time: float) -> np.ndarray:
+        (t0, first), (t1, second) = self._sent[0], self._sent[min(1, len(self._sent) - 1)]
+        share = 1.0 if t1 == t0 else min(max((time - t0) / (t1 - t0), 0.0), 1.0)
+        return first + share * (second - first) if t1 != t0 else first
+
+    def _geared(self, data: mujoco.MjData, ctrl: np.ndarray) -> np.ndarray:
+        """Controls at which the servos give the torque that a gear which gives way lets through."""
+        m, out = self.model, ctrl.copy()
+        for table in self._servo:
+            u = int(np.flatnonzero((m.actuator_trnid[:, 0] == table.joint) & (m.actuator_trntype == 0))[0])
+            gear, gain, bias = m.actuator_gear[u, 0], m.actuator_gainprm[u, 0], m.actuator_biasprm[u]
+            length, speed = gear * data.qpos[table.qpos], gear * data.qvel[table.dof]
+            rigid = gear * (gain * out[u] + bias[0] + bias[1] * length + bias[2] * speed)
+            out[u] += table.at([rigid]) / (gear * gain)
+        return out
+
+
+class _Table:
+    """A law on one joint, linear between nodes, and as at the last one beyond."""
+
+    def __init__(self, joint: int, dof: int, qpos: int, axes: list[tuple[str, np.ndarray]], table: Any) -> None:
+        self.joint, self.dof, self.qpos, self.axes, self.table = joint, dof, qpos, axes, np.asarray(table)
+
+    def __call__(self, data: mujoco.MjData) -> float:
+        state = {
+            "position": (data.qpos, self.qpos),
+            "speed": (data.qvel, self.dof),
+            "load": (data.qfrc_actuator, self.dof),
+        }
+        return self.at([float(state[name][0][state[name][1]]) for name, _ in self.axes])
+
+    def at(self, x: list[float]) -> float:
+        """The law at values of its variables."""
+        table = self.table
+        for value, (_, nodes) in zip(x, self.axes, strict=True):
+            table = _between(table, nodes, value)
+        return float(table)
+
+
+def _between(table: np.ndarray, nodes: np.ndarray, x: float) -> np.ndarray:
+    """A table at a value of its first axis."""
+    if len(nodes) == 1:
+        return table[0]
+    low = min(max(int(np.searchsorted(nodes, x)) - 1, 0), len(nodes) - 2)
+    share = min(max((x - nodes[low]) / (nodes[low + 1] - nodes[low]), 0.0), 1.0)
+    return table[low] + share * (table[low + 1] - table[low])
+
+
+def _at(table: np.ndarray, shapes: list[dict[str, Any]], values: dict[str, float]) -> np.ndarray:
+    """A table at values of its shape parameters, which are its first axes."""
+    for axis in shapes:
+        table = _between(table, np.array(axis["nodes"]), values[axis["name"]])
+    return table

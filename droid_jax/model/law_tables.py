@@ -1,0 +1,336 @@
+"""Laws of effects as tables over the variable that they depend on, for programs that know nothing of this one.
+
+A law is evaluated as the replay evaluates it: its function is probed for what it depends on, and then tabulated.  So a
+law of a user's own file has a table too.  What depends on more than position, speed and load of one joint (a base that
+is not level, say) has none, and the reason is given.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from droid_jax.model.effect_interface import Effect, State, complete
+from droid_jax.model.scene import Scene
+from droid_jax.model.table_grid import ROUNDING, Axis, error, first_nodes, on_grid, refined
+
+SPEED, TURNS, TRAVEL = 20.0, 2 * np.pi, 2.0  # rad/s or m/s, rad, m: how far tables reach where no limit says it
+LOAD = 20.0  # N m: likewise, where no force limit says it
+RAISED = 64.0  # N m of friction beside a law, so that none of it is cut off at zero; float32 still sees 4e-6
+FEWEST = 2048  # states at once: a program is compiled for each count, so there are few of them
+PROBES, CHANGE = 12, 1e-6  # states at which a dependence is looked for; relative change that counts as one
+VARIABLES = ("position", "speed", "load")
+UNIT = {"position": ("rad", "m"), "speed": ("rad/s", "m/s"), "load": ("N m", "N"), "torque": ("N m", "N")}
+
+
+@dataclass(frozen=True, eq=False)
+class LawTable:
+    """A law on one joint: sum over terms of (parameter, or 1 where it is None) times its table.
+
+    acts: "force" (added to qfrc_applied), "frictionloss" (added to the joint's), "servo" (added to the torque of the
+    position servo) or "command" (delay of the command, s).  axes: shape parameters
+    first, then variables: "position", "speed", "load" or "torque" (the servo's without the law).  terms:
+    (parameter, table over the axes).  error, error_of_draws: largest difference to the law
+    between the nodes at the fitted values, and anywhere, `unit`.
+    """
+
+    effect: str
+    location: str
+    description: str
+    acts: str
+    joint: str
+    unit: str
+    axes: tuple[Axis, ...]
+    terms: tuple[tuple[str | None, np.ndarray], ...]
+    error: float
+    error_of_draws: float
+
+
+@dataclass(frozen=True)
+class NoTable:
+    """A law that has no table, and why."""
+
+    effect: str
+    location: str
+    description: str
+    why: str
+
+
+def law_tables(
+    scene: Scene, model: Any, effects: Sequence[Effect], values: dict[str, float], spread: dict[str, float]
+) -> Iterator[LawTable | NoTable]:
+    """Tables of all laws that act in a simulation; sensor models and changed model fields have none.
+
+    Args:
+        scene: of the fit.
+        model: mjx.Model with the fitted numbers, for laws that read the servos' gains.
+        effects: of the model.
+        values: fitted values by parameter.
+        spread: deviation by parameter, of those that vary: tables hold shapes up to four of them away.
+    """
+    for effect in effects:
+        for location, amplitudes in (effect.locations or {"": tuple(p.name for p in effect.parameters)}).items():
+            if not any(values.get(name) for name in amplitudes if name in values):
+                continue
+            yield from _tables(_Law(scene, model, effect, location, amplitudes, values, spread))
+
+
+def _tables(law: _Law) -> Iterator[LawTable | NoTable]:
+    effect = law.effect
+    if effect.command is not None:
+        yield law.delay()
+    for acts, function in (("force", effect.force), ("frictionloss", effect.frictionloss)):
+        if function is not None:
+            yield from law.of_state(acts)
+    if effect.servo is not None:
+        yield law.of_servo()
+
+
+@dataclass(frozen=True, eq=False)
+class _Law:
+    """An effect at a location, at its fitted values."""
+
+    scene: Scene
+    model: Any
+    effect: Effect
+    location: str
+    amplitudes: tuple[str, ...]
+    values: dict[str, float]
+    spread: dict[str, float]
+
+    @property
+    def parameters(self) -> list[str]:
+        """What of the fit it reads: its amplitudes here, and its shapes."""
+        own = {p.name for p in self.effect.parameters if not p.writes}
+        others = {n for at, names in self.effect.locations.items() if at != self.location for n in names}
+        return [n for n in self.values if n in own and (n in self.amplitudes or n not in others)]
+
+    def without(self, why: str) -> NoTable:
+        """No table."""
+        return NoTable(self.effect.name, self.location, self.effect.description, why)
+
+    def theta(self, given: dict[str, Any]) -> dict[str, Any]:
+        """What the law reads, other locations at neutral."""
+        return dict(complete({n: jnp.float32(given[n]) for n in self.parameters}, [self.effect]))
+
+    def delay(self) -> LawTable | NoTable:
+        """How late the command comes, s."""
+        command = self.effect.command
+        assert command is not None
+
+        def late(given: dict[str, float], power: int) -> float:
+            return float(command(self.theta(given), jnp.float32(1.0), lambda t: t**power))
+
+        names, at = self.parameters, {n: self.values[n] for n in self.parameters}
+        found = [1.0 - late({**dict.fromkeys(names, 0.0), n: 1e-3}, 1) for n in names]
+        whole = 1.0 - late(at, 1)
+        shares = np.array(found) / 1e-3
+        straight = (
+            abs(float(shares @ [at[n] for n in names]) - whole) < 1e-5 and abs((1 - whole) ** 2 - late(at, 2)) < 1e-5
+        )
+        if not straight:
+            return self.without("it does more to the command than to delay it")
+        terms = tuple((n, np.array(float(f"{s:.3g}"))) for n, s in zip(names, shares, strict=True) if s)
+        return LawTable(
+            self.effect.name, self.location, self.effect.description, "command", "", "s", (), terms, 0.0, 0.0
+        )
+
+    def of_state(self, acts: str) -> Iterator[LawTable | NoTable]:
+        """Force or friction, of each joint that it acts on."""
+        scene, nv = self.scene, self.scene.model.nv
+        function = self._batched(acts)
+        rng = np.random.default_rng(0)
+        base = np.concatenate([np.tile(scene.model.qpos0, (PROBES, 1)), np.zeros((PROBES, 2 * nv))], axis=1)
+        base = base + rng.uniform(-0.5, 0.5, base.shape)
+        at = {n: np.full(PROBES, self.values[n]) for n in self.parameters}
+        now = function(at, base)
+        touched: dict[int, set[tuple[str, int]]] = {}
+        for column, variable, row in self._columns():
+            other = base.copy()
+            other[:, column] += rng.uniform(0.1, 0.6, PROBES) * rng.choice([-1, 1], PROBES)
+            moved = np.abs(function(at, other) - now).max(axis=0) > CHANGE * max(np.abs(now).max(), 1e-9)
+            for dof in np.flatnonzero(moved):
+                touched.setdefault(int(dof), set()).add((variable, row))
+        for dof in np.flatnonzero(np.abs(now).max(axis=0) > 0):
+            of = touched.get(int(dof), set())
+            if len({row for _, row in of}) > 1 or len(of) > 2:
+                yield self.without("it depends on the state of several joints")
+                return
+        for dof in np.flatnonzero(np.abs(now).max(axis=0) > 0):
+            of = touched.get(int(dof), set())
+            row = next(iter(of))[1] if of else int(dof)
+            names = [v for v in VARIABLES if (v, row) in of] or ["position"]
+            yield self._table(acts, int(dof), row, names, function)
+
+    def of_servo(self) -> LawTable | NoTable:
+        """What is added to a servo's torque, over that torque."""
+        joint = self.location
+        if joint not in self.scene.driven_joints:
+            return self.without("it is no law of one joint's servo")
+        u, model = self.scene.command_names.index(joint), self.model
+        gear = float(np.asarray(model.actuator_gear)[u, 0])
+        gain, bias = float(model.actuator_gainprm[u, 0]), np.asarray(model.actuator_biasprm)[u]
+        servo, scene = self.effect.servo, self.scene
+        assert servo is not None
+
+        def one(given: dict[str, Any], torque: Any, q: Any, v: Any) -> Any:
+            zero = jnp.zeros(scene.model.nv, jnp.float32)
+            qpos = jnp.asarray(scene.model.qpos0, jnp.float32).at[scene.qpos(joint)].set(q)
+            state = State(jnp.float32(0), qpos, zero.at[scene.dof(joint)].set(v), zero, model)
+            feedback = bias[0] + bias[1] * gear * q + bias[2] * gear * v
+            ctrl = jnp.zeros(scene.model.nu, jnp.float32).at[u].set((torque / gear - feedback) / gain)
+            return gear * (gain * servo(self.theta(given), state, ctrl)[u] + feedback) - torque
+
+        batch = _padded(one)
+
+        def of_torque(given: dict[str, np.ndarray], x: np.ndarray, q: float = 0.0, v: float = 0.0) -> np.ndarray:
+            return batch(given, x, np.full(len(x), q), np.full(len(x), v))
+
+        reach = self._load_reach(joint)
+        probes = np.linspace(-reach, reach, 41)
+        at = {n: np.full(41, self.values[n]) for n in self.parameters}
+        if np.abs(of_torque(at, probes) - of_torque(at, probes, 0.4, 1.0)).max() > 1e-4 * reach:
+            return self.without("it depends on more than the servo's torque")
+        unit = UNIT["torque"][self.scene.slides(joint)]
+        return self._made("servo", joint, unit, [Axis("torque", unit, first_nodes(-reach, reach))],
+                          lambda given, x: of_torque(given, x[:, 0]))  # fmt: skip
+
+    def _table(self, acts: str, dof: int, row: int, names: list[str], function: Callable[..., np.ndarray]) -> LawTable:
+        scene, model = self.scene, self.scene.model
+        acting, of = (model.joint(int(model.dof_jntid[d])).name for d in (dof, row))
+        slides = model.jnt_type[model.dof_jntid[row]] == mujoco.mjtJoint.mjJNT_SLIDE
+        columns = {v: c for c, v, r in self._columns() if r == row}
+        axes = [Axis(v, UNIT[v][slides], first_nodes(*self._reach(of, v))) for v in names]
+        base = np.concatenate([model.qpos0, np.zeros(2 * model.nv)])
+
+        def at(given: dict[str, np.ndarray], x: np.ndarray) -> np.ndarray:
+            states = np.tile(base, (len(x), 1))
+            states[:, [columns[v] for v in names]] = x
+            return function(given, states)[:, dof]
+
+        assert acting == of or acts == "force"
+        return self._made(acts, acting, UNIT["torque"][scene.slides(acting)], axes, at)
+
+    def _made(self, acts: str, joint: str, unit: str, axes: list[Axis], at: Callable[..., np.ndarray]) -> LawTable:
+        """Terms by linear amplitudes; all other parameters are axes of the table."""
+        names, values = self.parameters, self.values
+        linear = [n for n in names if n in self.amplitudes and self._linear(n, axes, at)]
+        shapes = [n for n in names if n not in linear]
+        deviation = {n: 4.0 * self.spread.get(n, 0.0) for n in shapes}
+        bounds = {p.name: (p.low, p.high) for p in self.effect.parameters}
+        shape_axes = [
+            Axis(n, next(p.unit for p in self.effect.parameters if p.name == n),
+                 np.unique(np.clip([values[n] - deviation[n], values[n], values[n] + deviation[n]], *bounds[n])))
+            for n in shapes
+        ]  # fmt: skip
+
+        def term(name: str | None) -> Callable[[np.ndarray], np.ndarray]:
+            def of(x: np.ndarray) -> np.ndarray:  # [K, shapes + variables]
+                given = {n: np.full(len(x), 1.0 if n == name else 0.0) for n in linear}
+                given |= {n: x[:, i] for i, n in enumerate(shapes)}
+                return at(given, x[:, len(shapes) :])
+
+            return of
+
+        functions = [(n, term(n)) for n in linear] or [(None, term(None))]
+        fitted = [values[n] for n in shapes]
+        every = refined([*shape_axes, *axes], [f for _, f in functions], fitted)
+        tables = tuple((n, on_grid(every, f)) for n, f in functions)
+        sizes = [abs(values[n]) if n else 1.0 for n, _ in functions]
+        pairs = list(zip(tables, functions, strict=True))
+        worst = float(np.dot(sizes, [error(every, f, t) for (_, t), (_, f) in pairs]))
+        here = tuple(int(np.abs(a.nodes - v).argmin()) for a, v in zip(every, fitted, strict=False))
+        fixed = [
+            *(replace(a, nodes=a.nodes[i : i + 1]) for a, i in zip(every, here, strict=False)),
+            *every[len(here) :],
+        ]
+        at_fitted = [error(fixed, f, t[here].reshape([len(a.nodes) for a in fixed])) for (_, t), (_, f) in pairs]
+        own = float(np.dot(sizes, at_fitted))
+        effect = self.effect
+        return LawTable(
+            effect.name, self.location, effect.description, acts, joint, unit, tuple(every), tables, own, worst
+        )
+
+    def _linear(self, name: str, axes: list[Axis], at: Callable[..., np.ndarray]) -> bool:
+        """Whether the law is this amplitude times something, beside the others' parts."""
+        x = np.stack(np.meshgrid(*(a.nodes for a in axes), indexing="ij"), axis=-1).reshape(-1, len(axes))
+        count = len(x)
+        given = {n: np.full(count, self.values[n]) for n in self.parameters}
+        zero = {n: (np.zeros(count) if n in self.amplitudes else v) for n, v in given.items()}
+        size = self.values[name] or 1.0
+        none, one, two = (at({**zero, name: np.full(count, k * size)}, x) for k in (0.0, 1.0, 2.0))
+        rest = at({**given, name: np.zeros(count)}, x)
+        slack = 1e-4 * max(np.abs(two).max(), 1e-12) + ROUNDING
+        parts = np.abs(at({**given, name: np.full(count, size)}, x) - rest - one).max()
+        return bool(np.abs(none).max() <= slack and np.abs(two - 2 * one).max() <= slack and parts <= slack)
+
+    def _batched(self, acts: str) -> Callable[[dict[str, np.ndarray], np.ndarray], np.ndarray]:
+        """(parameters [K] each, states [K, nq + nv + nv]) -> [K, nv]."""
+        nq, nv, model = self.scene.model.nq, self.scene.model.nv, self.model
+        raised = jnp.full(nv, RAISED, jnp.float32)
+
+        def one(given: dict[str, Any], row: Any) -> Any:
+            state = State(jnp.float32(0), row[:nq], row[nq : nq + nv], row[nq + nv :], model)
+            theta = self.theta(given)
+            if acts == "force":
+                assert self.effect.force is not None
+                return self.effect.force(theta, state)
+            assert self.effect.frictionloss is not None
+            return self.effect.frictionloss(theta, state, raised) - raised
+
+        return _padded(one)
+
+    def _columns(self) -> Iterator[tuple[int, str, int]]:
+        """(column of a state, variable, degree of freedom), of joints of one degree."""
+        model = self.scene.model
+        single = np.isin(model.jnt_type, (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)))
+        for joint in np.flatnonzero(single):
+            q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+            yield from zip((q, model.nq + v, model.nq + model.nv + v), VARIABLES, (v, v, v), strict=True)
+
+    def _reach(self, joint: str, variable: str) -> tuple[float, float]:
+        """How far a table goes."""
+        model, row = self.scene.model, self.scene.id("joint", joint)
+        if variable == "load":
+            return -self._load_reach(joint), self._load_reach(joint)
+        if variable == "speed":
+            return -SPEED, SPEED
+        low, high = model.jnt_range[row]
+        if low < high:
+            return float(low - 0.1 * (high - low)), float(high + 0.1 * (high - low))
+        far = TRAVEL if self.scene.slides(joint) else TURNS
+        return -far, far
+
+    def _load_reach(self, joint: str) -> float:
+        """Of what the actuators of a joint can do, N m."""
+        model = self.scene.model
+        ends = [model.jnt_actfrcrange[self.scene.id("joint", joint)]]
+        if joint in self.scene.driven_joints:
+            u = self.scene.command_names.index(joint)
+            ends.append(model.actuator_forcerange[u] * abs(model.actuator_gear[u, 0]))
+        most = [float(np.abs(e).max()) for e in ends if np.abs(e).max() > 0]
+        return 1.2 * min(most) if most else LOAD
+
+
+def _padded(one: Callable[..., Any]) -> Callable[..., np.ndarray]:
+    """A function of (parameters, *numbers) for many of them, compiled for a few counts alone."""
+    batch = jax.jit(jax.vmap(one))
+
+    def many(given: dict[str, np.ndarray], *rows: np.ndarray) -> np.ndarray:
+        count = len(rows[0])
+        size = FEWEST * 8 ** max(0, math.ceil(math.log(count / FEWEST, 8)))
+
+        def filled(x: Any) -> jax.Array:
+            return jnp.asarray(np.resize(x, (size, *np.shape(x)[1:])), jnp.float32)
+
+        out = batch({name: filled(v) for name, v in given.items()}, *map(filled, rows))
+        return np.asarray(out, float)[:count]
+
+    return many

@@ -1,0 +1,183 @@
+"""A commanded log in windows, each replayed from the state that was measured where it begins.
+
+All windows of all samples are rows of one batch: parallel in time.  A window cannot know what is inside of an actuator
+(a command on its way, the side of a gear's play).  So it is replayed for a short lead-in that is not compared, and
+delays find the commands that were sent before it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import mujoco
+import numpy as np
+
+from droid_jax.arguments import check_fields, number
+from droid_jax.model.scene import Scene
+from droid_jax.recordings.recording import Channel, Recording
+from droid_jax.simulate.replay import Drive
+from droid_jax.simulate.servo_gains import servo_factors
+
+ORDER = 3  # of the polynomial through measured positions
+SAMPLES = 7  # that it goes through at least
+WIDER = 1.6  # times its reach, for a second one: what both differ by is the error of its form
+
+
+@dataclass(frozen=True)
+class WindowConfig:
+    """How a commanded log is cut into windows.
+
+    length: s, of what is compared of a window.
+    lead: s, replayed before that and not compared.
+    history: s, of commands before the lead-in; the longest delay that it can know.
+    reach: s, to both sides of its beginning, of the measured positions that tell where and how fast it begins.
+    """
+
+    length: float = 1.0
+    lead: float = 0.2
+    history: float = 0.15
+    reach: float = 0.06
+
+    def __post_init__(self) -> None:
+        above, least = partial(number, above=0), partial(number, least=0)
+        check_fields(self, length=above, reach=above, lead=least, history=least)
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """W windows of one repeat of a recording.
+
+    begin: [W] s, of each replay, on the recording's clock.
+    table: [W, earlier + steps, U] commands, `earlier` rows of them sent earlier.  gains: [U, 2] factors on the scene's.
+    start: [W, nq], speed: [W, nv].
+    spread: [W, 2 nv, 2 nv] columns by which positions and speeds (one after the other, by degree of freedom) may be off
+    together: a square root of their covariance.
+    """
+
+    begin: np.ndarray
+    table: np.ndarray
+    gains: np.ndarray
+    start: np.ndarray
+    speed: np.ndarray
+    spread: np.ndarray
+    earlier: int
+    steps: int
+
+    def kept(self, rows: np.ndarray) -> Windows:
+        """Some of them; rows: [W] bool."""
+        return Windows(
+            self.begin[rows],
+            self.table[rows],
+            self.gains,
+            self.start[rows],
+            self.speed[rows],
+            self.spread[rows],
+            self.earlier,
+            self.steps,
+        )
+
+
+def why_whole(scene: Scene, recording: Recording) -> str:
+    """Why a recording's motion must be replayed whole, in words; empty where windows can begin within it."""
+    if scene.grip is not None:
+        return "the hand holds its object by contact, and a window that begins there would not know the grip"
+    model = scene.model
+    measured = recording.channels["position"].columns if "position" in recording.channels else ()
+    names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, i) or f"joint {i}" for i in range(model.njnt)]
+    single = set(scene.single_joints)
+    unknown = [name for name in names if name not in measured or name not in single]
+    if unknown:
+        return f"no position of {', '.join(unknown)} was measured, so a window that begins later would not know it"
+    return ""
+
+
+def cut(
+    scene: Scene, recording: Recording, drive: Drive, repeat: int, config: WindowConfig, grid: float | None = None
+) -> Windows:
+    """Windows of a repeat one after the other, without those whose beginning was not measured (`why_whole` is empty).
+
+    drive: what `make_drive` made of the recording.
+    grid: s, that windows begin on, a whole number of the drive's time steps; None: one.
+    Raises ValueError where the motion is shorter than one window.
+    """
+    channel, timestep = recording.channel("position"), drive.timestep
+    grid = timestep if grid is None else grid
+    finer = round(grid / timestep)
+    stride = finer * max(1, round(config.length / grid))
+    steps = stride + finer * round(config.lead / grid) + 1
+    earlier = finer * round(config.history / grid)
+    reach = reach_of(channel, config)
+    first = finer * int(np.ceil(reach / grid - 1e-6))
+    rows = np.arange(first, len(drive.command) - steps + 1, stride)
+    if not len(rows):
+        raise ValueError(
+            f"recording {recording.name!r} of {recording.duration:.3g} s is shorter than one window of "
+            f"{config.length + config.lead + reach:.3g} s"
+        )
+    begin = float(recording.time[0]) + rows * timestep
+    early = 0.5 * timestep
+    states = {
+        joint: joint_states(channel, repeat, channel.columns.index(joint), begin, reach, early)
+        for joint in scene.single_joints
+    }
+    start, speed = np.tile(drive.qpos0, (len(rows), 1)), np.zeros((len(rows), scene.model.nv))
+    spread = np.zeros((len(rows), 2 * scene.model.nv, 2 * scene.model.nv))
+    for joint, (state, root) in states.items():
+        dof = scene.dof(joint)
+        start[:, scene.qpos(joint)], speed[:, dof] = state.T
+        pair = np.array([dof, scene.model.nv + dof])
+        spread[:, pair[:, None], pair] = root
+    padded = np.concatenate([np.repeat(drive.command[:1], earlier, axis=0), drive.command])
+    table = padded[rows[:, None] + np.arange(earlier + steps)]
+    known = np.isfinite(start).all(axis=1) & np.isfinite(speed).all(axis=1)
+    return Windows(begin, table, servo_factors(scene, drive), start, speed, spread, earlier, steps).kept(known)
+
+
+def reach_of(channel: Channel, config: WindowConfig) -> float:
+    """s, to both sides, that hold enough samples of a channel for the state where a window begins."""
+    return max(config.reach, 0.5 * SAMPLES * float(np.median(np.diff(channel.time))))
+
+
+def joint_states(
+    channel: Channel, repeat: int, column: int, at: np.ndarray, reach: float, early: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Position and speed [W, 2] of a joint at W instants [s], and a square root [W, 2, 2] of their covariance.
+
+    early: s, by which the speed is that of an earlier instant: a replay's lie half a step before its positions.
+
+    A cubic through the samples within `reach`; its covariance is that of the samples' noise (of all instants, or of
+    this one's where it is larger) and of the difference to a wider one.  NaN where too little was measured.
+    """
+    seen = channel.mask[repeat, :, column]
+    time, values = channel.time[seen], channel.values[repeat, seen, column].astype(float)
+    narrow = [_cubic(time, values, t, reach, early) for t in at]
+    wide = [_cubic(time, values, t, WIDER * reach, early) for t in at]
+    variances = [fit[2] for fit in narrow if fit is not None]
+    usual = float(np.mean(variances)) if variances else 0.0
+    state, root = np.full((len(at), 2), np.nan), np.zeros((len(at), 2, 2))
+    for k, (fit, other) in enumerate(zip(narrow, wide, strict=True)):
+        if fit is None or other is None:
+            continue
+        state[k] = fit[0]
+        covariance = max(fit[2], usual) * fit[1] + np.diag((fit[0] - other[0]) ** 2)
+        root[k] = np.linalg.cholesky(covariance + 1e-18 * np.eye(2))
+    return state, root
+
+
+def _cubic(
+    time: np.ndarray, values: np.ndarray, at: float, reach: float, early: float
+) -> tuple[np.ndarray, np.ndarray, float] | None:
+    """Position and speed [2] at an instant, their covariance [2, 2] for noise of one, and the noise's variance."""
+    inside = np.abs(time - at) <= reach + 1e-9
+    x = (time[inside] - at) / reach
+    if len(x) <= ORDER + 1 or not (np.min(x, initial=1.0) < -0.3 and np.max(x, initial=-1.0) > 0.3):
+        return None
+    order = np.arange(ORDER + 1)
+    powers = x[:, None] ** order
+    inverse = np.linalg.pinv(powers)
+    factors = inverse @ values[inside]
+    left = values[inside] - powers @ factors
+    slope = order[1:] * (-early / reach) ** (order[1:] - 1) / reach
+    taken = np.stack([np.eye(ORDER + 1)[0], np.r_[0.0, slope]]) @ inverse
+    return taken @ values[inside], taken @ taken.T, float(left @ left) / (len(x) - ORDER - 1)

@@ -1,0 +1,88 @@
+"""What does a real servo lack, from positions alone?  Its logs at two gains are searched, those of the third judge.
+
+    python experiments/gap_xl330.py --data DIR
+
+`gap` searches logs of a Dynamixel XL330 with a pendulum (`xl330.xml`), started from Coulomb and viscous friction
+(`xl330.json`), by windows.  Its authors' models have friction that grows with the load.  Three folds: each gain judges
+once.  Data as in `real_xl330.py`.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+from commanded_fit import HERE, command, kept
+from inverse_fit import RESULTS, run
+from xl330_logs import GAINS, MOTIONS, SOURCE, log_name, xl330_log
+
+from benchmarks import common
+from droid_jax.files import GAP
+
+
+@dataclass(frozen=True)
+class GapXl330:
+    """Search a real servo's logs for what the model lacks.
+
+    data: folder with the logs.
+    quick: one fold and two motions; its numbers are not for keeping.
+    judges: gains that judge, one a fold.
+    out: folder for gap_xl330.json, and for the runs below `gap_xl330_runs`.
+    seed: of the searches.
+    """
+
+    data: Path
+    quick: bool = False
+    judges: tuple[int, ...] = GAINS
+    out: Path = RESULTS
+    seed: int = 0
+
+
+def fold(config: GapXl330, paths: dict[str, Path], judge: int, motions: tuple[str, ...]) -> dict[str, Any]:
+    """One fold: the search at the other gains, and its answer."""
+    out = config.out / ("gap_xl330_quick_runs" if config.quick else "gap_xl330_runs") / f"kp{judge}"
+    train = [paths[log_name(m, gain)] for gain in GAINS if gain != judge for m in motions]
+    test = [paths[log_name(m, judge)] for m in motions]
+    began = time.monotonic()
+    command(
+        ["gap", "--scene", HERE / "xl330.xml", "--parameters", HERE / "xl330.json", "--recording", *train,
+         "--judge-on", *test, "--seed", str(config.seed), "--out", out]
+    )  # fmt: skip
+    found = json.loads((out / GAP).read_text())
+    return {
+        "judge_kp": judge,
+        "seconds": round(time.monotonic() - began, 1),
+        **{key: found[key] for key in ("verdict", "sentence", "p", "effects", "indistinguishable", "hints", "doubts")},
+        "limits": found["split"]["limits"],
+        "coefficients": found["coefficients"],
+        "discrepancies": found["discrepancies"],
+        "discretisation_error": found["discretisation_error"],
+        "ranking": found["score_tests"][0]["ranking"][:6],
+        "validation_tests": found["validation_tests"],
+    }
+
+
+def main(config: GapXl330) -> None:
+    """A fold for each gain that judges, and one line of JSON."""
+    motions = MOTIONS[:1] + MOTIONS[2:3] if config.quick else MOTIONS
+    judges = config.judges[:1] if config.quick else config.judges
+    logs = [xl330_log(config.data, motion, gain) for motion in motions for gain in GAINS]
+    paths = kept(logs, config.out / "real_xl330_logs")
+    folds = [fold(config, paths, judge, motions) for judge in judges]
+    result = {
+        "experiment": "gap_xl330",
+        "source": SOURCE,
+        "recordings": {r.name: r.sha256 for r in logs},
+        "verdicts": {f"kp{of['judge_kp']}": of["sentence"] for of in folds},
+        "folds": folds,
+        "seconds": round(sum(of["seconds"] for of in folds), 1),
+    }
+    common.publish(config.out, "gap_xl330", config.quick, config.seed, result, line={"verdicts": result["verdicts"]})
+
+
+if __name__ == "__main__":
+    run(lambda: main(tyro.cli(GapXl330, description=__doc__)))

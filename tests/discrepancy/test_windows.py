@@ -1,0 +1,192 @@
+"""Commanded logs with few repeats: where windows begin, what they leave, their blocks, and a search in one log."""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pendulum as made
+import pytest
+from pendulum import TRUE, pendulum, swung
+
+import droid_jax as dj
+from droid_jax.cost.residuals import CompareConfig
+from droid_jax.cost.windowed_log import WindowedLog, _whitener, windowed_log
+from droid_jax.discrepancy.config import BlocksConfig
+from droid_jax.discrepancy.statistics import OUTSIDE
+from droid_jax.discrepancy.verdict import Conclusion
+from droid_jax.discrepancy.windowed_case import planned
+from droid_jax.model.effects.registry import library
+from droid_jax.model.parameter_file import load_parameters
+from droid_jax.model.parameters import Space
+from droid_jax.model.scene import Scene
+from droid_jax.recordings.recording import Channel, Recording
+from droid_jax.simulate.windows import WindowConfig, joint_states, why_whole
+
+SHORT = WindowConfig(length=0.4, lead=0.1, history=0.05)
+NOISE = 1e-4
+
+
+@functools.cache
+def scene() -> Scene:
+    return pendulum()
+
+
+@pytest.fixture(scope="module")
+def space(tmp_path_factory: pytest.TempPathFactory) -> Space:
+    path = tmp_path_factory.mktemp("swing") / "parameters.json"
+    path.write_text(json.dumps(made.PARAMETERS))
+    return load_parameters(path, scene())
+
+
+@pytest.fixture
+def seconds() -> Iterator[None]:
+    """Logs of this test are longer."""
+    before, made.SECONDS = made.SECONDS, 26.0
+    yield
+    made.SECONDS = before
+
+
+# ----- where a window begins
+
+
+def test_the_state_of_a_window_is_that_of_the_motion():
+    """Of a sine, and within the covariance that is stated."""
+    time, rng = np.arange(0.0, 20.0, 0.005), np.random.default_rng(0)
+    at, noise = np.linspace(0.5, 19.5, 400), 1e-3
+    values = np.sin(3.0 * time) + rng.normal(0.0, noise, len(time))
+    channel = Channel("position", "rad", ("j",), time, values[None, :, None], np.ones((1, len(time), 1), bool))
+    state, root = joint_states(channel, 0, 0, at, 0.06)
+    truth = np.stack([np.sin(3.0 * at), 3.0 * np.cos(3.0 * at)], axis=1)
+    off = np.stack([np.linalg.solve(r, e) for r, e in zip(root, state - truth, strict=True)])
+    assert np.mean(off**2) == pytest.approx(0.9, abs=0.4)  # the stated error of form is on the safe side
+    assert np.std((state - truth)[:, 0]) < noise and np.std((state - truth)[:, 1]) < 0.05
+
+
+def test_a_state_that_was_not_measured_is_none():
+    time = np.arange(0.0, 2.0, 0.01)
+    mask = np.ones((1, len(time), 1), bool)
+    mask[0, 50:90] = False
+    channel = Channel("position", "rad", ("j",), time, np.where(mask, 0.3, np.nan), mask)
+    state, _ = joint_states(channel, 0, 0, np.array([0.3, 0.7, 1.2]), 0.06)
+    assert np.isfinite(state[[0, 2]]).all() and np.isnan(state[1]).all()
+    np.testing.assert_allclose(state[0], [0.3, 0.0], atol=1e-12)
+
+
+def test_windows_need_every_joint():
+    recording = swung("a", 1.0, 1.0)
+    assert why_whole(scene(), recording) == ""
+    assert "no position of swing was measured" in why_whole(scene(), swung("a", 1.0, 1.0, ("torque",)))
+
+
+# ----- what windows leave
+
+
+def log_of(space: Space, recordings: list[Recording], **changes: Any) -> WindowedLog:
+    config = CompareConfig(channels={"position": 1.0})
+    return windowed_log(scene(), space, recordings, config, SHORT, **changes)
+
+
+def test_windows_leave_noise_at_the_truth(space: Space):
+    """Whatever the gain of a recording; what the spread of their first states does is in the noise."""
+    log = log_of(space, [swung("a", 1.0, 0.7, noise=NOISE), swung("soft", 0.6, 1.1, noise=NOISE)], fitted_share=0.7)
+    truth = space.values(TRUE)
+    assert log.unit.max() + 1 == 8 and log.fitted == 6 and log.whole == ""
+    left, wrong = log.residual(truth), log.residual(space.mean)
+    assert np.sqrt(np.mean(left**2)) < 2 * NOISE < 0.1 * np.sqrt(np.mean(wrong**2))
+    noise = np.full(1, 0.4 * NOISE)  # about what the low pass leaves of it
+    everywhere = np.ones(len(log.clock), bool)
+    plain, aware = (of.with_noise(noise, everywhere).whitened(truth[None])[0] for of in (log, log.about(truth)))
+    assert np.mean(aware**2) < np.mean(plain**2) and 0.2 < np.mean(aware**2) < 2.0
+    some = log.unit == 2
+    part = log.with_noise(noise, some)
+    np.testing.assert_allclose(part.whitened(truth[None])[0], np.where(some, plain, 0.0), atol=1e-4)
+    assert part.distances(truth[None])[0, 0] == pytest.approx(np.mean(np.abs(left[some])), rel=1e-3)
+    (rollout,) = log.rollouts(truth[None])
+    assert np.abs(rollout.position[0] - log.measured).max() < 0.02 and rollout.position.shape == (1, 64, 1)
+
+
+def test_a_masked_stretch_leaves_its_windows_out(space: Space):
+    whole = swung("a", 1.0, 0.7, noise=NOISE)
+    channel = whole.channel("position")
+    mask = channel.mask.copy()
+    mask[0, 90:120] = False  # 0.72 to 0.96 s
+    gap = replace(whole, channels={"position": replace(channel, mask=mask)})
+    log, full = log_of(space, [gap]), log_of(space, [whole])
+    assert full.unit.max() + 1 == 4 and log.unit.max() + 1 == 2
+    assert set(np.round(log.pieces[0].at.ravel(), 6)) < set(np.round(full.pieces[0].at.ravel(), 6))
+
+
+def test_the_noise_of_a_window_holds_the_spread_of_its_state():
+    rng = np.random.default_rng(1)
+    spread = rng.normal(size=(3, 5, 2, 4))  # windows, instants, columns, directions
+    deviation = np.array([0.3, 2.0])
+    for matrix, s in zip(_whitener(5, deviation, spread), spread, strict=True):
+        flat = np.swapaxes(s, 0, 1).reshape(10, 4)
+        covariance = np.diag(np.repeat(deviation, 5) ** 2) + flat @ flat.T
+        np.testing.assert_allclose(matrix @ covariance @ matrix.T, np.eye(10), atol=1e-9)
+
+
+# ----- blocks of windows
+
+
+def plan_of(units: int, fitted: int, length: float, with_test: bool = True) -> Any:
+    """Of a log whose units last a second and hold four instants each."""
+    log: Any = SimpleNamespace(
+        unit=np.repeat(np.arange(units), 4), fitted=fitted, unit_seconds=1.0, comparisons=[SimpleNamespace(name="log")]
+    )
+    return planned(log, length, BlocksConfig().shortest, with_test)
+
+
+def test_blocks_are_whole_windows_that_take_turns():
+    plan = plan_of(60, 40, 1.9)
+    train, validation, test = plan.blocks
+    assert not plan.limits and train.max() == validation.max() == 9 and test.max() == 7
+    assert not np.any((train != OUTSIDE) & (validation != OUTSIDE))
+    assert np.all((train != OUTSIDE) | (validation != OUTSIDE) == (np.arange(240) < 160))
+    assert np.all((test != OUTSIDE) == (np.arange(240) >= 160))
+    for block in range(10):
+        assert np.all(np.diff(np.flatnonzero(train == block)) == 1) and np.sum(train == block) == 8
+
+
+@pytest.mark.parametrize(
+    ("units", "fitted", "length", "blocks", "said"),
+    [
+        (30, 20, 3.0, [8, 8, 8], ["Blocks of 1.2 s are shorter than the 3 s"]),
+        (23, 15, 1.0, [8, 8, 7], []),
+        (18, 12, 1.0, [8, 8], ["too short to keep a part of it as test data"]),
+        (9, 6, 0.5, [4, 4], ["too short to keep", "Only 4 blocks are in each part", "no effect can be told"]),
+    ],
+)
+def test_a_short_log_gives_up_one_thing_after_the_other(
+    units: int, fitted: int, length: float, blocks: list[int], said: list[str]
+):
+    plan = plan_of(units, fitted, length)
+    assert [int(b.max()) + 1 for b in plan.blocks] == blocks
+    assert all(any(words in limit for limit in plan.limits) for words in said) and bool(plan.limits) == bool(said)
+    with pytest.raises(ValueError, match="record for 16 s or longer"):
+        plan_of(3, 2, 0.5)
+
+
+# ----- a search
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("seconds")
+def test_friction_is_found_in_one_log_of_positions(space: Space):
+    """And nothing where nothing is missing."""
+    name, size = "swing", 0.02
+    effects = library(scene(), ["joint_coulomb", "cable_pull", "command_delay"])
+    log = swung("a", 1.0, 0.31, noise=NOISE)
+    verdict, _ = dj.find_missing_effects(scene(), space, [log], effects=effects)
+    assert verdict.conclusion is Conclusion.NONE
+    stuck = swung("rubs", 1.0, 0.31, noise=NOISE, friction=size)
+    verdict, model = dj.find_missing_effects(scene(), space, [stuck], effects=effects)
+    assert [str(e) for e in verdict.effects] == [f"joint_coulomb at {name}"]
+    value = model.values[model.space.names.index(f"joint_coulomb[{name}]")]
+    assert value == pytest.approx(size, rel=0.2)

@@ -1,0 +1,236 @@
+"""A fit in plain MuJoCo: numbers, draws and laws of fitted.json are the program's own, without jax."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from small_gap import SCENE, demonstration, small_scene
+
+from droid_jax import runtime
+from droid_jax.identify import apply_fit
+from droid_jax.identify.gaussian import Gaussian, prior
+from droid_jax.identify.neutral_result import with_numbers, write_neutral
+from droid_jax.model.effect_interface import Effect, State, complete
+from droid_jax.model.effects.registry import effect_space, library, ready
+from droid_jax.model.parameters import Space
+from droid_jax.model.physics import make_c_model, make_physics, theta_of
+from droid_jax.model.scene import Scene
+from droid_jax.recordings.recording import TorqueConvention, TorqueSide
+from droid_jax.simulate.replay import make_drive, servo_replay
+from droid_jax.simulate.servo_gains import servo_factors
+
+ROOT = Path(__file__).resolve().parents[2]
+FORCES = {"latch_torque": 1.5, "latch_width": 0.05, "latch_exponent": 1.4, "tilt_sine": 0.3, "drag": 0.4}
+FRICTIONS = {"load_friction[elbow]": 0.1, "joint_stribeck[shoulder]": 0.2, "joint_directional[elbow]": -0.05}
+OTHERS = {"command_delay": 0.007, "joint_backlash[shoulder]": 0.004, "torque_bias[elbow]": 0.1, "hinge_preload": 0.4}
+VALUES = {**FORCES, **FRICTIONS, **OTHERS}
+EFFECTS = ("command_delay", "drag", "hinge_preload", "joint_backlash", "joint_directional", "joint_stribeck", "latch",
+           "load_friction", "tilted_frame", "torque_bias")  # fmt: skip
+FIELDS = ("body_mass", "body_inertia", "dof_damping", "jnt_stiffness", "dof_frictionloss", "actuator_gainprm",
+          "actuator_biasprm", "qpos_spring", "body_gravcomp")  # fmt: skip
+
+
+class Made:
+    """A made-up fit of the bench, and its folder."""
+
+    def __init__(self, folder: Path, values: Mapping[str, float]) -> None:
+        scene, base = small_scene()
+        self.effects: tuple[Effect, ...] = library(scene, EFFECTS)
+        self.scene: Scene = ready(scene)
+        self.space: Space = base + effect_space(self.effects).select(values)
+        self.values = self.space.values({"forearm_mass": 1.1, "door_stiffness": 0.65, **values})
+        rng = np.random.default_rng(0)
+        root = 0.2 * np.eye(len(self.space)) + 0.02 * rng.normal(size=(len(self.space),) * 2)
+        self.gaussian = Gaussian(self.space, self.space.to_search(self.values), root @ root.T, "made up")
+        self.folder = folder
+        write_neutral(folder, self.scene, self.gaussian, self.values, self.effects, main="fitted.xml")
+        self.fit = apply_fit.load(folder / "fitted.json")
+
+    def at(self, values: Mapping[str, float]) -> np.ndarray:
+        return np.array([values[name] for name in self.space.names])
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    return Made(tmp_path_factory.mktemp("neutral"), VALUES)
+
+
+def test_the_file_is_the_users_own(made: Made):
+    mjcf = made.fit["mjcf"]
+    assert mjcf["in_place"], mjcf["reason"]
+    own, text = SCENE.read_text().splitlines(), (made.folder / "fitted.xml").read_text().splitlines()
+    assert 1 <= len({*own} - {*text}) <= len(mjcf["changes"])  # all other lines are there
+    assert len(text) <= len(own) + 2  # a mass that geoms made up is a line of its own
+    stiffness = next(c for c in mjcf["changes"] if (c["name"], c["attribute"]) == ("door", "stiffness"))
+    low, high = made.gaussian.interval(0.9)
+    k = made.space.index("door_stiffness")
+    assert stiffness["after"] == pytest.approx(0.65) and stiffness["interval"] == pytest.approx([low[k], high[k]])
+    assert 'name="door"' in own[stiffness["line"] - 1] and own[stiffness["line"] - 1] not in text
+
+
+@pytest.mark.parametrize("sample", [None, 3])
+@pytest.mark.parametrize("file", ["own", "fitted"])
+def test_numbers_are_written_into_spec_and_model(made: Made, sample: int | None, file: str):
+    """Whether the target is the user's file or the fitted one, in which a law may stand as a number already."""
+    path = SCENE if file == "own" else made.folder / "fitted.xml"
+    spec, model = mujoco.MjSpec.from_file(str(path)), mujoco.MjModel.from_xml_path(str(path))
+    values = apply_fit.apply(spec, made.fit, sample)
+    assert apply_fit.apply(model, made.fit, sample) == values
+    assert sample is not None or made.at(values) == pytest.approx(made.values)
+    expected = make_c_model(made.scene, made.space, made.at(values))
+    for name in FIELDS:
+        for written in (model, spec.compile()):
+            np.testing.assert_allclose(
+                getattr(written, name), getattr(expected, name), rtol=1e-6, atol=2e-6, err_msg=name
+            )
+    np.testing.assert_allclose(model.dof_invweight0, expected.dof_invweight0, rtol=1e-6)
+
+
+def test_draws_are_those_of_the_gaussian(made: Made):
+    """Mean and covariance of 100 draws within four sampling errors; draw 7 is draw 7 however it is asked for."""
+    few = made.space.to_search(apply_fit.draws(made.fit, range(100), seed=1))
+    many = made.space.to_search(made.gaussian.sample(0, 20_000))
+    spread = many.std(axis=0)
+    assert np.all(np.abs(few.mean(axis=0) - many.mean(axis=0)) < 4 * spread / 10)
+    assert np.all(np.abs(few.var(axis=0) / spread**2 - 1) < 4 * np.sqrt(2 / 100))
+    apart = np.arctanh(np.corrcoef(few.T) - 1e-9) - np.arctanh(np.corrcoef(many.T) - 1e-9)
+    assert np.all(np.abs(apart[np.triu_indices(len(spread), 1)]) < 4.2 / np.sqrt(97))
+    assert (
+        apply_fit.draw(made.fit, 7, seed=1)["drag"]
+        == apply_fit.draws(made.fit, [3, 7], seed=1)[1][made.space.index("drag")]
+    )
+
+
+def test_a_gaussian_beyond_its_bounds_is_drawn_inside(made: Made):
+    """Where hardly a row of the normal lies within the bounds."""
+    fit = json.loads(json.dumps(made.fit))
+    k, p = made.space.index("drag"), made.space["drag"]
+    fit["gaussian"]["mean"][k] = -9.0 * p.std
+    few, many = apply_fit.draws(fit, range(40)), replace(made.gaussian, mean=np.array(fit["gaussian"]["mean"]))
+    assert np.all((few >= made.space.low) & (few <= made.space.high))
+    assert few[:, k].mean() == pytest.approx(many.sample(0, 200)[:, k].mean(), rel=0.6)
+
+
+def laws_of(made: Made, sample: int | None) -> tuple[apply_fit.Laws, mujoco.MjModel, dict[str, float]]:
+    model = mujoco.MjModel.from_xml_path(str(SCENE))
+    values = apply_fit.apply(model, made.fit, sample)
+    return apply_fit.forces(model, made.fit, values), model, values
+
+
+@pytest.mark.parametrize("sample", [None, 5])
+def test_laws_are_those_of_the_effects(made: Made, sample: int | None):
+    """Forces and frictions at random states, at the fitted values and at a draw."""
+    laws, model, values = laws_of(made, sample)
+    fitted, theta = with_numbers(made.scene, made.space, made.at(values)), theta_of(made.space, made.at(values))
+    theta = complete({name: jnp.float32(value) for name, value in theta.items()}, made.effects)
+    data, rng = mujoco.MjData(model), np.random.default_rng(1)
+    base = jnp.asarray(laws._base, jnp.float32)
+    for _ in range(20):
+        data.qpos[:], data.qvel[:] = rng.uniform(-0.2, 0.5, model.nq), rng.normal(0.0, 0.5, model.nv)
+        data.qfrc_actuator[:] = rng.normal(0.0, 2.0, model.nv)
+        state = State(jnp.float32(0), *map(jnp.float32, (data.qpos, data.qvel, data.qfrc_actuator)), fitted)
+        force, loss = jnp.zeros(model.nv), base
+        for effect in made.effects:
+            force = force if effect.force is None else force + effect.force(theta, state)
+            loss = loss if effect.frictionloss is None else effect.frictionloss(theta, state, loss)
+        np.testing.assert_allclose(laws.force(data), force, atol=5e-3 if sample is None else 0.04)
+        np.testing.assert_allclose(laws.frictionloss(data), loss, atol=2e-3)
+
+
+def test_laws_name_their_variables(made: Made):
+    by = {(law["effect"], law["joint"]): law for law in made.fit["laws"]}
+    axes = {key: [a["name"] for a in law["axes"]] for key, law in by.items()}
+    assert axes["latch", "door"] == ["latch_width", "latch_exponent", "position"]
+    assert axes["drag", "door"] == ["speed"] and axes["load_friction", "elbow"] == ["load"]
+    assert axes["joint_backlash", "shoulder"] == ["joint_backlash[shoulder]", "torque"]
+    assert by["command_delay", ""]["terms"] == [{"parameter": "command_delay", "table": 1.0}]
+    assert "torque_bias" not in {law["effect"] for law in made.fit["laws"]}  # of the sensor
+    lacking = {each["parameter"] for each in made.fit["not_in_mjcf"]}
+    assert {"latch_torque", "torque_bias[elbow]", "torque_offset[elbow]"} <= lacking
+    assert all(law["error"] < 5e-3 for law in made.fit["laws"] if law["effect"] != "drag")
+    drag = made.fit["laws"][[law["effect"] for law in made.fit["laws"]].index("drag")]
+    assert drag["error"] < 1e-3 * made.values[made.space.index("drag")] * drag["axes"][0]["nodes"][-1] ** 2
+
+
+def test_commands_come_late(made: Made):
+    laws, model, _ = laws_of(made, None)
+    data, got = mujoco.MjData(model), []
+    for k in range(40):
+        data.time = 0.002 * k
+        got.append(laws.control(data, np.full(model.nu, data.time))[2])
+    expected = np.maximum(0.002 * np.arange(40) - 0.007, 0.0)
+    np.testing.assert_allclose(got, expected, atol=1e-12)
+
+
+def replayed(made: Made, folder: Path, **ask: Any) -> tuple[Any, Any]:
+    """In plain C, in a process without jax, and the drive."""
+    motor = replace(demonstration("test"), torque=TorqueConvention(TorqueSide.MOTOR, gravity=True))
+    drive = make_drive(made.scene, motor, weigh=False)
+    gains = servo_factors(made.scene, drive)
+    given = dict(command=drive.command, timestep=drive.timestep, qpos0=drive.qpos0, gains=gains, time_offset=0.0)
+    np.savez(folder / "ask.npz", **{**given, "fine": 1, "laws": 1, "spec": 0, **ask})
+    script = ROOT / "benchmarks" / "neutral_replay.py"
+    paths = (made.folder, SCENE, folder / "ask.npz", folder / "answer.npz")
+    subprocess.run([sys.executable, script, *paths], check=True)
+    return dict(np.load(folder / "answer.npz")), drive
+
+
+def test_it_runs_without_jax_and_the_laws_act(made: Made, tmp_path: Path):
+    answer, _ = replayed(made, tmp_path, spec=1)
+    without, _ = replayed(made, tmp_path, laws=0)
+    assert not len(answer["foreign"]) and np.isfinite(answer["qpos"]).all()
+    assert np.abs(answer["qpos"] - without["qpos"]).max() > 0.003
+
+
+@pytest.mark.slow
+def test_it_moves_as_the_replay_does(made: Made, tmp_path: Path):
+    """The replay in MJX by C's own first-order steps, which it agrees with to float32."""
+    answer, drive = replayed(made, tmp_path)
+    seen = tuple(replace(e, observe=None) for e in made.effects)
+    replay = servo_replay(made.scene, drive, seen, parity=True, late=0.0)
+
+    def run(values: Any) -> Any:
+        return replay(make_physics(made.scene, made.space, values))
+
+    own = jax.jit(run, compiler_options=runtime.compiler_options())(jnp.asarray(made.values, jnp.float32))
+    scene = made.scene
+    np.testing.assert_allclose(answer["qpos"][:, scene.joint_qpos], own.position, atol=1e-3)
+    np.testing.assert_allclose(answer["torque"][:, scene.joint_dofs], own.torque, atol=0.05)
+
+
+def test_another_file_is_refused(tmp_path: Path, made: Made):
+    (tmp_path / "other.json").write_text('{"format": "droid_jax fit", "version": 3}')
+    with pytest.raises(ValueError, match="droid_jax fitted"):
+        apply_fit.load(tmp_path / "other.json")
+    other = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+    with pytest.raises(ValueError, match="has no body 'forearm'"):
+        apply_fit.apply(other, made.fit)
+
+
+def test_a_prior_of_the_built_in_door_has_its_table(tmp_path: Path):
+    """A scene that is no file: the whole MJCF, and rows by the ids of its geoms."""
+    from droid_jax.door.scene import door_scene
+    from droid_jax.door.space import door_nuisances, door_space
+
+    scene = door_scene()
+    space = door_space(scene) + door_nuisances(scene)
+    values = np.clip(space.mean + 0.3 * space.std, space.low, space.high)
+    assert write_neutral(tmp_path, scene, prior(space), values, main="fitted.xml") == ""
+    fit = apply_fit.load(tmp_path / "fitted.json")
+    assert not fit["mjcf"]["in_place"] and "memory" in fit["mjcf"]["reason"]
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "fitted.xml"))
+    apply_fit.apply(model, fit)
+    expected = make_c_model(scene, space, values)
+    np.testing.assert_allclose(model.geom_size[scene.geoms_among_looks], expected.geom_size, rtol=1e-4)
+    np.testing.assert_allclose(model.body_mass, expected.body_mass, rtol=1e-6)

@@ -1,0 +1,49 @@
+"""Which engine a fit takes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from two_link import JOINTS, arm, recording
+
+from droid_jax import distributed
+from droid_jax.model.fields import joint_damping
+from droid_jax.model.joint_friction import joint_friction_effect, joint_friction_space
+from droid_jax.model.parameters import Space
+from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSide
+from droid_jax.simulate.engine import choose_engine
+
+ONE = recording().repeats_subset([0])
+SPACE = Space((joint_damping(arm(), "shoulder", std=1.0, high=20.0),))
+
+
+def test_a_log_of_one_repeat_is_replayed_in_c():
+    assert choose_engine(arm(), SPACE, [ONE]).engine == "mujoco"
+
+
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [
+        (recording(), "repeats"),
+        (replace(ONE, torque=TorqueConvention(TorqueSide.LINK, gravity=False)), "motor-side"),
+        (replace(ONE, time=np.zeros(0), command=np.zeros((0, 0)), command_names=()), "inverse dynamics"),
+    ],
+)
+def test_what_c_lacks_is_replayed_in_mjx(given: Recording, why: str):
+    choice = choose_engine(arm(), SPACE, [ONE, given])
+    assert choice.engine == "mjx" and why in choice.why
+
+
+def test_parameters_and_effects_of_sensors_are_replayed_in_mjx():
+    assert choose_engine(arm(), SPACE + joint_friction_space(JOINTS), [ONE]).engine == "mjx"
+    assert choose_engine(arm(), SPACE, [ONE], [joint_friction_effect(JOINTS)]).engine == "mjx"
+
+
+def test_other_machines_are_mjx(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(distributed, "count", lambda: 2)
+    assert choose_engine(arm(), SPACE, [ONE]).engine == "mjx"
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert "gpu" in choose_engine(arm(), SPACE, [ONE]).why
