@@ -357,6 +357,7 @@ def test_a_moved_joint_axis_is_derived_too():
     np.testing.assert_allclose(model.dof_invweight0, expected.dof_invweight0, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_tilted_axis_stays_a_unit_vector():
     """Of (0, 0, 1) with x set to a half: a compiler scales it, and what is applied equals what it compiles."""
     xml = """<mujoco><worldbody><body><joint name="j" axis="0 0 1"/><geom size=".1 .2 .3" type="box" pos=".1 0 0"/>

@@ -350,7 +350,8 @@ def rollout_mjx(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, steps
     return np.asarray(jax.jit(lambda d: jax.lax.scan(advance, d, None, length=steps)[1])(data))
 
 
-@pytest.mark.parametrize("integrator", [pytest.param("Euler", marks=pytest.mark.slow), "implicitfast"])
+@pytest.mark.slow  # quick ones are in tests/simulate: of an arm, of the door
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
 def test_parity_steps_are_those_of_the_c_engine(integrator: str):
     """A second of falling, hitting the post and sliding over it."""
     model = arm("joint")
