@@ -196,12 +196,13 @@ def _row(
     said: Mapping[tuple[str, tuple[int, ...]], tuple[str, int]],
 ) -> dict[str, Any]:
     model, kind = scene.model, field.split("_")[0].rstrip("0")
-    number, column, offset = index[0], (index[1] if len(index) > 1 else None), 0
+    first, rest, offset = index[0], index[1:], 0
+    number, column = first, rest[0] if rest else None
     if kind == "dof":
-        number = int(model.dof_jntid[index[0]])
-        offset = index[0] - int(model.jnt_dofadr[number])
+        number = int(model.dof_jntid[first])
+        offset = first - int(model.jnt_dofadr[number])
     elif kind == "qpos":
-        number = int(np.searchsorted(model.jnt_qposadr, index[0], side="right")) - 1
+        number = int(np.searchsorted(model.jnt_qposadr, first, side="right")) - 1
     element = {"dof": "joint", "jnt": "joint", "qpos": "joint"}.get(kind, kind)
     spec, attribute = spoken(field)
     attribute, place = said.get((field, index), (attribute, column or 0))
@@ -231,10 +232,10 @@ def _interval(
     names = {w["parameter"] for w in row["writes"]}
     if len(names) == 1:
         (name,) = names
-        return sorted(apply_fit.number_of(row, {name: end}) for end in intervals[name])
+        return sorted(apply_fit.number_of(dict(row), {name: end}) for end in intervals[name])
     if not names or not drawn:
         return None
-    return np.quantile([apply_fit.number_of(row, values) for values in drawn], [0.05, 0.95]).tolist()
+    return np.quantile([apply_fit.number_of(dict(row), values) for values in drawn], [0.05, 0.95]).tolist()
 
 
 def _of_row(row: Mapping[str, Any] | None, before: float, after: float) -> dict[str, Any]:

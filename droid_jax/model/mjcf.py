@@ -242,8 +242,8 @@ def _check_files(files: Mapping[str, str], main: str, expected: mujoco.MjModel) 
     for name in dir(expected):
         if not name.startswith(_COMPARED):
             continue
-        one, two = getattr(made, name), getattr(expected, name)
-        if not isinstance(two, np.ndarray) or two.dtype.kind != "f":
+        one, two = np.asarray(getattr(made, name)), np.asarray(getattr(expected, name))
+        if two.dtype.kind != "f" or not two.ndim:
             continue
         if one.shape != two.shape or not np.allclose(one, two, rtol=1e-5, atol=SLACK):
             raise NotInPlace(f"with its numbers changed the file makes another {name}")
