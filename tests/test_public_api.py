@@ -194,6 +194,7 @@ def workplace(tmp_path: Path, recording: dj.Recording, monkeypatch: pytest.Monke
     return tmp_path
 
 
+@pytest.mark.slow
 def test_the_readme_identifies_a_robot_in_ten_lines(workplace: Path, capsys: pytest.CaptureFixture[str]):
     (code,) = blocks("README.md", "python")
     assert len(code.splitlines()) <= 11

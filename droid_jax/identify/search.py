@@ -24,9 +24,8 @@ import numpy as np
 from droid_jax.arguments import check_fields, flag, number, one_of, optional, whole
 from droid_jax.distributed import agreed
 from droid_jax.identify.cma import Strategy, recombination
-from droid_jax.identify.fit import Fit, History, Restart, SearchProgress, on_bound
+from droid_jax.identify.fit import REASONS, CmaState, Fit, History, Restart, SearchProgress, on_bound
 from droid_jax.identify.gaussian import space_to_json
-from droid_jax.identify.search_state import REASONS, CmaState
 from droid_jax.model.parameters import Space
 
 if TYPE_CHECKING:

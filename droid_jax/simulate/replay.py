@@ -30,7 +30,7 @@ from droid_jax.recordings.checks import check_joints
 from droid_jax.recordings.clocks import interpolate
 from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.runtime import first_device
-from droid_jax.simulate.floating_base import refuse_floating
+from droid_jax.simulate.closed_loops import refuse_floating
 from droid_jax.simulate.initial_state import (
     DEFAULT_START,
     StartConfig,

@@ -279,9 +279,8 @@ def test_slippery_pads_are_all_that_differs_from_the_settings_robot():
     assert robots["slippery"].config == robots["synthetic_robot"].config
 
 
-@pytest.mark.parametrize(
-    "door", ["paper", *(pytest.param(d, marks=pytest.mark.slow) for d in SETTINGS if d != "paper")]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("door", SETTINGS)
 def test_a_trained_policy_opens_by_its_grip(door: str, archived: Callable[[str], Path]):
     """A reported policy of each door, tried again: with slippery pads a hook or a push would still open it."""
     results = archived("policies")

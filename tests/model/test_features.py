@@ -201,7 +201,7 @@ KEPT = {
 }
 
 
-QUICK = ("joints", "contacts", "limits", "equalities")  # the others are the same test, and compile as long
+QUICK = ("joints", "equalities")  # the others are the same test, and compile as long; test_step.py has contacts
 
 
 @pytest.mark.parametrize("kept", [k if k in QUICK else pytest.param(k, marks=pytest.mark.slow) for k in KEPT])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -274,18 +275,27 @@ SPINNER = """<mujoco><compiler angle="radian"/>
 </worldbody><actuator><motor joint="j"/></actuator></mujoco>"""
 
 
-def run_spinner(
-    joint: str, *, torque: float, speed: float, steps: int, parity: bool = True
-) -> tuple[np.ndarray, np.ndarray]:
-    model = mujoco.MjModel.from_xml_string(SPINNER.format(joint=joint))
-    on_device = mjx.put_model(model)
-    data = mjx.make_data(on_device).replace(ctrl=jnp.array([torque]), qvel=jnp.array([speed]))
+@functools.cache
+def spinner(joint: str, steps: int, parity: bool) -> Callable[[float, float], tuple[jax.Array, jax.Array]]:
+    """(torque, speed at the start) -> position and velocity [steps], compiled once."""
+    on_device = mjx.put_model(mujoco.MjModel.from_xml_string(SPINNER.format(joint=joint)))
+    start = mjx.make_data(on_device)
 
     def advance(data, _):
         data = simulate_step(on_device, data, parity=parity)
         return data, (data.qpos[0], data.qvel[0])
 
-    _, (position, velocity) = jax.jit(lambda d: jax.lax.scan(advance, d, None, length=steps))(data)
+    def run(torque, speed):
+        begin = start.replace(ctrl=jnp.stack([torque]), qvel=jnp.stack([speed]))
+        return jax.lax.scan(advance, begin, None, length=steps)[1]
+
+    return jax.jit(run)
+
+
+def run_spinner(
+    joint: str, *, torque: float, speed: float, steps: int, parity: bool = True
+) -> tuple[np.ndarray, np.ndarray]:
+    position, velocity = spinner(joint, steps, parity)(torque, speed)
     return np.asarray(position), np.asarray(velocity)
 
 
@@ -360,6 +370,7 @@ def test_the_default_step_is_of_second_order():
       <geom size=".1" contype="0" conaffinity="0"/></body></worldbody></mujoco>"""
     truth = rollout_c(mujoco.MjModel.from_xml_string(xml.format(h=1e-5)), np.array([0.3]), np.zeros(1), 60_000)
 
+    @functools.cache
     def worst(h: float, parity: bool) -> float:
         steps = round(0.6 / h)
         model = mujoco.MjModel.from_xml_string(xml.format(h=h))

@@ -10,8 +10,7 @@ import pytest
 
 from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.preflight.creep import STIFF, creep_note, creep_per_load, creeping
-from droid_jax.preflight.limits import clipped_commands, exceeded_torques
-from droid_jax.preflight.preflight import command_notes
+from droid_jax.preflight.preflight import clipped_commands, command_notes, exceeded_torques
 from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
 
 TIME = np.arange(0.0, 10.0, 0.01)

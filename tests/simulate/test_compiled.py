@@ -48,10 +48,16 @@ def torque(cost: Cost) -> np.ndarray:
     return cost.rollouts(cost.space.mean[None])[0].torque[0]
 
 
-def test_other_commands_starts_and_bounds_share_a_program(scene: Scene):
+@pytest.fixture(scope="module")
+def base(scene: Scene) -> tuple[Effect, list[float], np.ndarray]:
+    """An effect, when its program is traced, and the torque that it gives: compiled once for all tests."""
     traced = list[float]()
     effect = pull(0.0, traced)
-    first = torque(made(scene, recording(), effect))
+    return effect, traced, torque(made(scene, recording(), effect))
+
+
+def test_other_commands_starts_and_bounds_share_a_program(scene: Scene, base: tuple[Effect, list[float], np.ndarray]):
+    effect, traced, first = base
     count, command = len(traced), motion()[1]
     slower = recording(name="slower", command=0.5 * command + 0.5 * command[0])
     other = torque(made(scene, slower, effect, high=5.0))
@@ -61,22 +67,25 @@ def test_other_commands_starts_and_bounds_share_a_program(scene: Scene):
     np.testing.assert_array_equal(other, alone)
 
 
-def test_other_effects_scenes_and_conventions_do_not(scene: Scene):
-    traced = list[float]()
-    effect = pull(0.0, traced)
-    first = torque(made(scene, recording(), effect))
+def test_another_effect_does_not(scene: Scene, base: tuple[Effect, list[float], np.ndarray]):
+    _, traced, first = base
     loaded = torque(made(scene, recording(), pull(1.0, traced)))
     assert 1.0 in traced and np.abs(loaded - first).max() > 0.1
+
+
+@pytest.mark.slow
+def test_other_scenes_and_conventions_do_not(scene: Scene, base: tuple[Effect, list[float], np.ndarray]):
+    effect, _, first = base
     on_the_link = replace(MOTOR, side=TorqueSide.LINK)
     assert np.abs(torque(made(scene, recording(torque=on_the_link), effect)) - first).max() > 0.01
     rough = arm(friction=0.5)
     assert np.abs(torque(made(rough, recording(), effect)) - first).max() > 0.1
 
 
-def test_other_lengths_share_a_program_and_are_replayed_to_their_own_end(scene: Scene):
-    traced = list[float]()
-    effect = pull(0.0, traced)
-    whole = torque(made(scene, recording(), effect))
+def test_other_lengths_share_a_program_and_are_replayed_to_their_own_end(
+    scene: Scene, base: tuple[Effect, list[float], np.ndarray]
+):
+    effect, traced, whole = base
     count = len(traced)
     time, command = motion(0.6)
     noise = np.random.default_rng(1).normal(size=(2, len(time), 2))
@@ -86,8 +95,10 @@ def test_other_lengths_share_a_program_and_are_replayed_to_their_own_end(scene: 
     assert len(traced) == count
 
 
-def test_the_room_of_a_program_changes_no_replay(scene: Scene, monkeypatch: pytest.MonkeyPatch):
-    roomy = torque(made(scene, recording(), pull(0.0, [])))
+def test_the_room_of_a_program_changes_no_replay(
+    scene: Scene, base: tuple[Effect, list[float], np.ndarray], monkeypatch: pytest.MonkeyPatch
+):
+    _, _, roomy = base
     monkeypatch.setattr(compiled, "SHORTEST", 1)
     assert compiled.capacity(1024) == 1024 and compiled.capacity(1025) == 2048
     np.testing.assert_array_equal(torque(made(scene, recording(), pull(0.0, []))), roomy)

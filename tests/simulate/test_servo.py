@@ -194,6 +194,7 @@ def test_the_twin_tells_what_the_parity_replay_tells(scene: Scene, drive: Drive)
         np.testing.assert_allclose(getattr(twin, channel)[0, :-1], getattr(parity, channel)[0, :-1], atol=5e-5)
 
 
+@pytest.mark.slow
 def test_without_delay_both_tell_what_mj_step_logs(scene: Scene, drive: Drive):
     logged = c_rollout(scene, drive, delay=0.0)
     twin = c_replay(scene, SPACE, drive, late=0.0)(SPACE.mean[None])
@@ -477,7 +478,8 @@ def test_joint_friction_that_is_given_as_an_effect_counts_once(scene: Scene):
     np.testing.assert_allclose(given.torque, own.torque, atol=1e-6)
 
 
-def test_a_stated_gain_stands_in_for_the_scenes_in_both_engines():
+@pytest.mark.parametrize("engine", ["mujoco", pytest.param("mjx", marks=pytest.mark.slow)])
+def test_a_stated_gain_stands_in_for_the_scenes(engine: str):
     """As a scene that was written with it: stiffness, and damping where the servo has a velocity gain."""
     kp, kd = np.array([90.0, 10.0]), np.array([3.0, 2.0])  # shoulder, elbow
     spec = arm().spec.copy()
@@ -491,13 +493,12 @@ def test_a_stated_gain_stands_in_for_the_scenes_in_both_engines():
     stated, plain = recording(gains=ServoGains(kp, kd)), recording(gains=None)
     space = Space((servo_scale(scene, "elbow", std=0.1),))
     values = np.array([[1.0], [1.2]])  # a parameter acts on the stated gain
-    for engine in ("mjx", "mujoco"):
-        got = make_cost(scene, space, [stated], engine=engine).rollouts(values)[0]
-        expected = make_cost(written, space, [plain], engine=engine).rollouts(values)[0]
-        unstated = make_cost(scene, space, [plain], engine=engine).rollouts(values)[0]
-        np.testing.assert_allclose(got.position, expected.position, atol=2e-6)
-        np.testing.assert_allclose(got.torque, expected.torque, atol=2e-4)
-        assert np.abs(got.position - unstated.position).max() > 0.05
+    got = make_cost(scene, space, [stated], engine=engine).rollouts(values)[0]
+    expected = make_cost(written, space, [plain], engine=engine).rollouts(values)[0]
+    unstated = make_cost(scene, space, [plain], engine=engine).rollouts(values)[0]
+    np.testing.assert_allclose(got.position, expected.position, atol=2e-6)
+    np.testing.assert_allclose(got.torque, expected.torque, atol=2e-4)
+    assert np.abs(got.position - unstated.position).max() > 0.05
     note = gains_note(scene, stated)
     assert "shoulder 90 in place of 60" in note and "elbow 10 in place of 25" in note and not gains_note(scene, plain)
 

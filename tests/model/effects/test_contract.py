@@ -215,6 +215,11 @@ def apply(scene: Scene, effect: Effect) -> Callable[[np.ndarray], Physics]:
     return physics_of(scene, effect.name)
 
 
+# The door's physics compile for ten seconds each.
+OF_BOTH = pytest.mark.parametrize("scene", ["mechanism", pytest.param("door", marks=pytest.mark.slow)], indirect=True)
+
+
+@OF_BOTH
 def test_only_declared_fields_of_the_model_change(effect: Effect, scene: Scene, apply):
     physics = apply(np.array([typical(p) for p in effect.parameters]))
     named = {w.field for p in effect.parameters for w in p.writes}
@@ -224,6 +229,7 @@ def test_only_declared_fields_of_the_model_change(effect: Effect, scene: Scene, 
     assert {n: float(v) for n, v in physics.theta.items()} == pytest.approx(outside)
 
 
+@OF_BOTH
 def test_applying_twice_is_applying_once(effect: Effect, scene: Scene, apply):
     values = np.array([typical(p) for p in effect.parameters])
     before = numbers(scene.mjx)

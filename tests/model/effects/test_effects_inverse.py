@@ -94,7 +94,9 @@ class Inverse:
         return out
 
 
-@pytest.fixture(scope="module", params=[(MOTOR, True), (LINK, False)], ids=["motor", "link"])
+@pytest.fixture(
+    scope="module", params=[(MOTOR, True), pytest.param((LINK, False), marks=pytest.mark.slow)], ids=["motor", "link"]
+)
 def inverse(request: pytest.FixtureRequest, scene: Scene) -> Inverse:
     return Inverse(scene, *request.param)
 
