@@ -1,15 +1,16 @@
 """A fitted result applied without jax against the program's own replay, on motions that were not fitted.
 
-    python benchmarks/neutral_result.py --fit door=runs/all/gap --recording door=runs/all/recordings/B.npz
+    python benchmarks/neutral_result.py --fit door runs/all/gap --recording door runs/all/recordings/A.npz
 
 For each fit (a folder of `identify` or `gap`) it writes the neutral result, steps it in plain C MuJoCo in a process
 that cannot import jax (`neutral_replay.py`), and compares positions and motor torques with the replay in MJX.  The
 tolerance is what both engines differ by with the laws left out of both.  It also draws from fitted.json and compares
-mean and covariance with the Gaussian's.
+mean and covariance with the Gaussian's.  Cases that are not asked for stay in the file as they were.
 """
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import tempfile
@@ -65,13 +66,17 @@ def compare(fit: Path, recording: Path, scene: Path | None, fine: int, seed: int
         folder = Path(made)
         gaussian = gaussian_of(fit, fitted)
         write_neutral(folder, fitted.scene, gaussian, fitted.after, fitted.effects, main="fitted.xml")
-        base = without_laws(fitted.effects)
-        with_laws = differences(fitted, given, fitted.effects, folder, fine, laws=True)
-        tolerance = differences(fitted, given, base, folder, fine, laws=False)
-        own_step = differences(fitted, given, fitted.effects, folder, 1, laws=True)
+        drive, full = replayed(fitted, given, fitted.effects)
+        _, bare = replayed(fitted, given, without_laws(fitted.effects))
+        with_laws = differences(fitted, drive, full, folder, fine, laws=True)
+        tolerance = differences(fitted, drive, bare, folder, fine, laws=False)
+        own_step = differences(fitted, drive, full, folder, 1, laws=True)
+        matter = {
+            name: float(np.abs(getattr(full, name) - getattr(bare, name)).max()) for name in ("position", "torque")
+        }
         return {
             "recording": given.name,
-            "held_out": given.sha256 not in fitted.recordings,
+            "held_out": held_out(fit, given, fitted),
             "effects": sorted({law["effect"] for law in content(folder)["laws"]}),
             "without_table": [e for e in content(folder)["not_in_mjcf"] if "depends on" in e["why"]],
             "in_place": content(folder)["mjcf"]["in_place"],
@@ -79,7 +84,7 @@ def compare(fit: Path, recording: Path, scene: Path | None, fine: int, seed: int
             "largest_difference": with_laws,
             "tolerance": tolerance,
             "largest_difference_at_own_step": own_step,
-            "effect_of_the_laws": laws_matter(fitted, given, base),
+            "effect_of_the_laws": matter,
             "draws": draws_agree(folder, gaussian, seed),
         }
 
@@ -102,8 +107,18 @@ def gaussian_of(fit: Path, fitted: Any) -> Any:
     return load_gaussian(folder / "gaussian_full.json")
 
 
-def replayed(fitted: Any, recording: Any, effects: tuple[Any, ...]) -> tuple[Any, Any, Any]:
-    """The drive, the replay in MJX at the fitted values, and its physics."""
+def held_out(fit: Path, recording: Any, fitted: Any) -> bool:
+    """Whether the final model was not fitted to a recording; a search's test recording chose nothing either."""
+    from droid_jax.commands.fitted import fitted_folder
+
+    stage, folder = fitted_folder(fit)
+    if stage == "gap":
+        return recording.name not in json.loads((folder / "gap.json").read_text())["final_model"]["fitted_to"]
+    return recording.sha256 not in fitted.recordings
+
+
+def replayed(fitted: Any, recording: Any, effects: tuple[Any, ...]) -> tuple[Any, Any]:
+    """The drive, and the replay in MJX at the fitted values."""
     import jax
     import jax.numpy as jnp
 
@@ -119,7 +134,7 @@ def replayed(fitted: Any, recording: Any, effects: tuple[Any, ...]) -> tuple[Any
         return replay(make_physics(fitted.scene, fitted.space, values))
 
     out = jax.jit(run, compiler_options=runtime.compiler_options())(jnp.asarray(fitted.after, jnp.float32))
-    return drive, jax.tree.map(np.asarray, out), replay
+    return drive, jax.tree.map(np.asarray, out)
 
 
 def without_observers(effects: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -127,13 +142,13 @@ def without_observers(effects: tuple[Any, ...]) -> tuple[Any, ...]:
     return tuple(replace(e, observe=None) for e in effects)
 
 
-def differences(
-    fitted: Any, recording: Any, effects: tuple[Any, ...], folder: Path, fine: int, *, laws: bool
-) -> dict[str, float]:
-    """Largest and root mean square difference of positions (rad or m) and motor torques (N m or N) to plain C."""
+def differences(fitted: Any, drive: Any, own: Any, folder: Path, fine: int, *, laws: bool) -> dict[str, float]:
+    """Largest and root mean square difference of positions (rad or m) and motor torques (N m or N) to plain C.
+
+    own: the replay in MJX.
+    """
     from droid_jax.simulate.servo_gains import servo_factors
 
-    drive, own, _ = replayed(fitted, recording, effects)
     values = dict(zip(fitted.space.names, fitted.after.tolist(), strict=True))
     ask = dict(
         command=drive.command, timestep=drive.timestep, qpos0=drive.qpos0, gains=servo_factors(fitted.scene, drive),
@@ -155,13 +170,6 @@ def differences(
         angle = np.abs(answer["qpos"][:, scene.qpos(scene.object_joint)] - own.object_angle)
         out |= {"object_angle": float(angle.max()), "object_angle_rms": float(np.sqrt(np.mean(angle**2)))}
     return out
-
-
-def laws_matter(fitted: Any, recording: Any, base: tuple[Any, ...]) -> dict[str, float]:
-    """Largest change of the replay by the laws: what a comparison would see if they were not applied."""
-    _, one, _ = replayed(fitted, recording, fitted.effects)
-    _, two, _ = replayed(fitted, recording, base)
-    return {name: float(np.abs(getattr(one, name) - getattr(two, name)).max()) for name in ("position", "torque")}
 
 
 def draws_agree(folder: Path, gaussian: Any, seed: int) -> dict[str, float]:
@@ -192,12 +200,20 @@ def main(config: NeutralResult) -> None:
     from droid_jax import runtime
 
     runtime.start()
-    cases: dict[str, Any] = {}
+    path = config.out / f"{common.stem('neutral_result', config.quick)}.json"
+    cases: dict[str, Any] = json.loads(path.read_text())["cases"] if path.is_file() else {}
     for name, folder in config.fit.items():
-        cases[name] = compare(folder, config.recording[name], config.scene.get(name), config.fine, config.seed)
+        found = compare(folder, config.recording[name], config.scene.get(name), config.fine, config.seed)
+        cases[name] = {"origin": common.origin(config.seed), **found}
         print(name, cases[name], flush=True)
     largest = {name: case["largest_difference"] for name, case in cases.items()}
-    result = {"benchmark": "neutral_result", "fine": config.fine, "largest_difference": largest, "cases": cases}
+    result = {
+        "benchmark": "neutral_result",
+        "commits": common.commits(cases.values()),
+        "fine": config.fine,
+        "largest_difference": largest,
+        "cases": cases,
+    }
     common.publish(config.out, "neutral_result", config.quick, config.seed, result)
 
 

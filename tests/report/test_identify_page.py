@@ -98,7 +98,7 @@ def test_the_result_in_mujocos_own_terms(written: Page) -> None:
     assert "<recording>" in written.ids["identify-not-in-mjcf"]["text"]
     assert written.cells["law:latch:hinge", "axes"]["text"].strip() == "position"
     note = written.ids["identify-mjcf-note"]["text"].replace("\xa0", " ")
-    assert "differ from this fit's replay by 0.01 N m" in note and "at most 0.04" in note
+    assert "differ from this fit's replay by 0.010 N m" in note and "at most 0.040" in note
 
 
 def test_a_fit_of_an_earlier_version_has_no_such_part(tmp_path: Path, quick: None) -> None:
