@@ -148,6 +148,15 @@ def test_laws_are_those_of_the_effects(made: Made, sample: int | None):
         np.testing.assert_allclose(laws.frictionloss(data), loss, atol=2e-3)
 
 
+def test_drives_are_the_servos_at_their_joints(made: Made):
+    model = make_c_model(made.scene, made.space, made.values)
+    for drive in made.fit["drives"]:
+        u, d = made.scene.command_names.index(drive["joint"]), made.scene.dof(drive["joint"])
+        assert drive["stiffness"] == pytest.approx(model.actuator_gainprm[u, 0] * model.actuator_gear[u, 0] ** 2)
+        assert (drive["armature"], drive["friction"]) == (model.dof_armature[d], model.dof_frictionloss[d])
+    assert [drive["joint"] for drive in made.fit["drives"]] == list(made.scene.driven_joints)
+
+
 def test_laws_name_their_variables(made: Made):
     by = {(law["effect"], law["joint"]): law for law in made.fit["laws"]}
     axes = {key: [a["name"] for a in law["axes"]] for key, law in by.items()}
