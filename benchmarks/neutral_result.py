@@ -10,12 +10,14 @@ mean and covariance with the Gaussian's.  Cases that are not asked for stay in t
 
 from __future__ import annotations
 
+import hashlib
 import json
 import subprocess
 import sys
 import tempfile
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import common
@@ -52,7 +54,7 @@ def without_laws(effects: tuple[Any, ...]) -> tuple[Any, ...]:
     return tuple(replace(e, **bare) for e in effects)
 
 
-def compare(fit: Path, recording: Path, scene: Path | None, fine: int, seed: int) -> dict[str, Any]:
+def compare(fit: Path, recording: Path, scene: Path | None, fine: int, seed: int, runs: Path) -> dict[str, Any]:
     """One case."""
     from droid_jax.commands.fitted import load_fitted
     from droid_jax.identify.neutral_result import write_neutral
@@ -66,8 +68,8 @@ def compare(fit: Path, recording: Path, scene: Path | None, fine: int, seed: int
         folder = Path(made)
         gaussian = gaussian_of(fit, fitted)
         write_neutral(folder, fitted.scene, gaussian, fitted.after, fitted.effects, main="fitted.xml")
-        drive, full = replayed(fitted, given, fitted.effects)
-        _, bare = replayed(fitted, given, without_laws(fitted.effects))
+        drive, full = replayed(fitted, given, fitted.effects, runs)
+        _, bare = replayed(fitted, given, without_laws(fitted.effects), runs)
         with_laws = differences(fitted, drive, full, folder, fine, laws=True)
         tolerance = differences(fitted, drive, bare, folder, fine, laws=False)
         own_step = differences(fitted, drive, full, folder, 1, laws=True)
@@ -117,8 +119,8 @@ def held_out(fit: Path, recording: Any, fitted: Any) -> bool:
     return recording.sha256 not in fitted.recordings
 
 
-def replayed(fitted: Any, recording: Any, effects: tuple[Any, ...]) -> tuple[Any, Any]:
-    """The drive, and the replay in MJX at the fitted values."""
+def replayed(fitted: Any, recording: Any, effects: tuple[Any, ...], runs: Path) -> tuple[Any, Any]:
+    """The drive, and the replay in MJX at the fitted values, which is kept in a folder: a program takes a minute."""
     import jax
     import jax.numpy as jnp
 
@@ -127,6 +129,11 @@ def replayed(fitted: Any, recording: Any, effects: tuple[Any, ...]) -> tuple[Any
     from droid_jax.simulate.replay import make_drive, servo_replay
 
     drive = make_drive(fitted.scene, recording, weigh=False)
+    laws = sorted(e.name for e in effects if e.command or e.servo or e.force or e.frictionloss)
+    numbers = hashlib.sha256(np.asarray(fitted.after).tobytes() + recording.sha256.encode() + str(laws).encode())
+    kept = runs / f"{numbers.hexdigest()[:16]}.npz"
+    if kept.is_file():
+        return drive, SimpleNamespace(**np.load(kept))
     seen = without_observers(effects)
     replay = servo_replay(fitted.scene, drive, seen)
 
@@ -134,7 +141,10 @@ def replayed(fitted: Any, recording: Any, effects: tuple[Any, ...]) -> tuple[Any
         return replay(make_physics(fitted.scene, fitted.space, values))
 
     out = jax.jit(run, compiler_options=runtime.compiler_options())(jnp.asarray(fitted.after, jnp.float32))
-    return drive, jax.tree.map(np.asarray, out)
+    arrays = {name: np.asarray(getattr(out, name)) for name in ("position", "torque", "object_angle")}
+    runs.mkdir(parents=True, exist_ok=True)
+    np.savez(kept, **arrays)
+    return drive, SimpleNamespace(**arrays)
 
 
 def without_observers(effects: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -201,9 +211,10 @@ def main(config: NeutralResult) -> None:
 
     runtime.start()
     path = config.out / f"{common.stem('neutral_result', config.quick)}.json"
+    runs = config.out / "neutral_result_runs"
     cases: dict[str, Any] = json.loads(path.read_text())["cases"] if path.is_file() else {}
     for name, folder in config.fit.items():
-        found = compare(folder, config.recording[name], config.scene.get(name), config.fine, config.seed)
+        found = compare(folder, config.recording[name], config.scene.get(name), config.fine, config.seed, runs)
         cases[name] = {"origin": common.origin(config.seed), **found}
         print(name, cases[name], flush=True)
     largest = {name: case["largest_difference"] for name, case in cases.items()}
