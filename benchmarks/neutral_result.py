@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -25,6 +26,8 @@ import numpy as np
 import tyro
 
 HERE = Path(__file__).resolve().parent
+EXPERIMENTS = HERE.parent / "experiments"
+XL330_GAIN, XL330_MOTION = 200, "sin_sin"
 DRAWS = 100
 
 
@@ -38,6 +41,8 @@ class NeutralResult:
     """A recording by name of the case that its fit did not see."""
     scene: dict[str, Path] = field(default_factory=dict)
     """MJCF by name of the case, where it is not where the fit found it."""
+    xl330: Path | None = None
+    """Folder of the logs of Rhoban/bam, for the case xl330, whose fit is experiments/results/real_xl330.json."""
     fine: int = 8
     """Steps of C in one of the replay's."""
     seed: int = 0
@@ -54,19 +59,51 @@ def without_laws(effects: tuple[Any, ...]) -> tuple[Any, ...]:
     return tuple(replace(e, **bare) for e in effects)
 
 
-def compare(fit: Path, recording: Path, scene: Path | None, fine: int, seed: int, runs: Path) -> dict[str, Any]:
-    """One case."""
+def of_folder(fit: Path, recording: Path, scene: Path | None) -> tuple[Any, Any, Any, bool]:
+    """The fitted model of a folder, its Gaussian, a recording, and whether the fit did not see it."""
     from droid_jax.commands.fitted import load_fitted
-    from droid_jax.identify.neutral_result import write_neutral
     from droid_jax.recordings.formats import load_recording
+
+    fitted, given = load_fitted(fit, scene), load_recording(recording)
+    return fitted, gaussian_of(fit, fitted), given, held_out(fit, given, fitted)
+
+
+def of_xl330(data: Path) -> tuple[Any, Any, Any, bool]:
+    """The same of the servo with load-dependent friction, by the values in experiments/results/real_xl330.json.
+
+    The Gaussian is that of the intervals there, without correlations.  The fit saw two gains, the log is of the third.
+    """
+    sys.path.insert(0, str(EXPERIMENTS))
+    from xl330_logs import xl330_log
+
+    from droid_jax.identify.gaussian import Gaussian
+    from droid_jax.model.effects.registry import joined, library, ready
+    from droid_jax.model.parameter_file import load_parameters
+    from droid_jax.model.scene import load_scene
+
+    kept = json.loads((EXPERIMENTS / "results" / "real_xl330.json").read_text())
+    fold = next(fold for fold in kept["folds"] if fold["judge_kp"] == XL330_GAIN)["parameters"]
+    scene = load_scene(EXPERIMENTS / "xl330.xml")
+    effects = library(scene, kept["effects"])
+    space = joined(load_parameters(EXPERIMENTS / "xl330.json", scene), effects)
+    values = space.values({name: fold[name]["best"] for name in space.names if name in fold})
+    half = np.array([np.ptp(fold[name]["interval"]) / 2 if name in fold else 1e-6 for name in space.names])
+    gaussian = Gaussian(space, values, np.diag((half / 1.645) ** 2), "intervals of real_xl330.json", "physical")
+    fitted = SimpleNamespace(scene=ready(scene), space=space, effects=effects, after=values)
+    return fitted, gaussian, xl330_log(data, XL330_MOTION, XL330_GAIN), True
+
+
+def compare(
+    fitted: Any, gaussian: Any, recording: Any, unseen: bool, fine: int, seed: int, runs: Path
+) -> dict[str, Any]:
+    """One case."""
+    from droid_jax.identify.neutral_result import write_neutral
     from droid_jax.recordings.recording import TorqueConvention, TorqueSide
 
-    fitted = load_fitted(fit, scene)
     motor = TorqueConvention(TorqueSide.MOTOR, gravity=False)
-    given = replace(load_recording(recording), torque=motor)
+    given = replace(recording, torque=motor)
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
-        gaussian = gaussian_of(fit, fitted)
         write_neutral(folder, fitted.scene, gaussian, fitted.after, fitted.effects, main="fitted.xml")
         drive, full = replayed(fitted, given, fitted.effects, runs)
         _, bare = replayed(fitted, given, without_laws(fitted.effects), runs)
@@ -78,7 +115,7 @@ def compare(fit: Path, recording: Path, scene: Path | None, fine: int, seed: int
         }
         return {
             "recording": given.name,
-            "held_out": held_out(fit, given, fitted),
+            "held_out": unseen,
             "effects": sorted({law["effect"] for law in content(folder)["laws"]}),
             "without_table": [e for e in content(folder)["not_in_mjcf"] if "depends on" in e["why"]],
             "in_place": content(folder)["mjcf"]["in_place"],
@@ -213,8 +250,14 @@ def main(config: NeutralResult) -> None:
     path = config.out / f"{common.stem('neutral_result', config.quick)}.json"
     runs = config.out / "neutral_result_runs"
     cases: dict[str, Any] = json.loads(path.read_text())["cases"] if path.is_file() else {}
-    for name, folder in config.fit.items():
-        found = compare(folder, config.recording[name], config.scene.get(name), config.fine, config.seed, runs)
+    asked = {
+        name: partial(of_folder, folder, config.recording[name], config.scene.get(name))
+        for name, folder in config.fit.items()
+    }
+    if config.xl330 is not None:
+        asked["xl330"] = partial(of_xl330, config.xl330)
+    for name, case in asked.items():
+        found = compare(*case(), config.fine, config.seed, runs)
         cases[name] = {"origin": common.origin(config.seed), **found}
         print(name, cases[name], flush=True)
     largest = {name: case["largest_difference"] for name, case in cases.items()}

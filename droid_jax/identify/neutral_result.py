@@ -161,7 +161,7 @@ def _drives(scene: Scene, model: mujoco.MjModel) -> list[dict[str, Any]]:
         ends += [np.abs(model.jnt_actfrcrange[j]).max()] if model.jnt_actfrclimited[j] else []
         out.append({
             "joint": joint, "unit": scene.torque_unit([joint]), "stiffness": -float(bias[1]) * gear**2,
-            "damping": -float(bias[2]) * gear**2, "viscous_friction": float(model.dof_damping[d]),
+            "damping": abs(float(bias[2])) * gear**2, "viscous_friction": float(model.dof_damping[d]),
             "friction": float(model.dof_frictionloss[d]), "armature": float(model.dof_armature[d]),
             "effort_limit": float(min(ends)) if ends else None, "velocity_limit": None,
         })  # fmt: skip
