@@ -132,6 +132,7 @@ def neutral_json(
         "parameters": [_parameter(p, named[p.name], intervals[p.name]) for p in space.parameters],
         "table": [{k: v for k, v in row.items() if k != "own"} for row in rows],
         "laws": [_law(law) for law in tables if isinstance(law, LawTable)],
+        "drives": _drives(scene, make_c_model(scene, space, np.asarray(values))),
         "not_in_mjcf": _lacking(scene, space, effects, tables),
         "mjcf": {
             "file": None if made is None else next(iter(made.files)),
@@ -148,6 +149,23 @@ def neutral_json(
             "cov": gaussian.cov.tolist(),
         },
     }
+
+
+def _drives(scene: Scene, model: mujoco.MjModel) -> list[dict[str, Any]]:
+    """The position servo of each driven joint in the terms that Isaac Lab and Newton have for it, all at the joint."""
+    out: list[dict[str, Any]] = []
+    for joint in scene.driven_joints:
+        u, j, d = scene.command_names.index(joint), scene.id("joint", joint), scene.dof(joint)
+        gear, bias = float(model.actuator_gear[u, 0]), model.actuator_biasprm[u]
+        ends = [abs(gear) * np.abs(model.actuator_forcerange[u]).max()] if model.actuator_forcelimited[u] else []
+        ends += [np.abs(model.jnt_actfrcrange[j]).max()] if model.jnt_actfrclimited[j] else []
+        out.append({
+            "joint": joint, "unit": scene.torque_unit([joint]), "stiffness": -float(bias[1]) * gear**2,
+            "damping": abs(float(bias[2])) * gear**2, "viscous_friction": float(model.dof_damping[d]),
+            "friction": float(model.dof_frictionloss[d]), "armature": float(model.dof_armature[d]),
+            "effort_limit": float(min(ends)) if ends else None, "velocity_limit": None,
+        })  # fmt: skip
+    return out
 
 
 def with_numbers(scene: Scene, space: Space, values: np.ndarray) -> Any:

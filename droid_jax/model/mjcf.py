@@ -251,7 +251,7 @@ def _check_files(files: Mapping[str, str], main: str, expected: mujoco.MjModel) 
 
 def _text(fitted: _Fitted) -> str:
     _locate_assets(fitted.spec)
-    return _unwrapped(fitted.spec.to_xml())
+    return unwrapped(fitted.spec.to_xml())
 
 
 def _settle(spec: mujoco.MjSpec, model: mujoco.MjModel) -> list[Any]:
@@ -385,7 +385,7 @@ def _locate_assets(spec: mujoco.MjSpec) -> None:
         spec.texturedir = str((folder / spec.texturedir).resolve())
 
 
-def _unwrapped(xml: str) -> str:
+def unwrapped(xml: str) -> str:
     """MJCF without nameless defaults inside the defaults, which attached files leave and MuJoCo does not read.
 
     Their classes move up; of classes that several files define alike, one stays.
