@@ -4,7 +4,7 @@
 
 The venv holds this package with MuJoCo 4; this script itself runs with MuJoCo 3.17.  It runs the quick tests of model,
 replay and identification there (`passed`, `failed`), and computes the same numbers with both (`differences`): arrays
-of compiled models, plain C rollouts and replays in MJX.
+of compiled models, plain C rollouts and replays in MJX.  What is done is kept in OUT/mujoco4_runs.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import tempfile
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,9 @@ import numpy as np
 import tyro
 
 HERE = Path(__file__).resolve().parent
-TESTS = ("tests/model", "tests/simulate", "tests/identify")
+# Folders, and how many groups of files each is run in, so that a run that is stopped goes on.
+TESTS = {"tests/model": 2, "tests/model/effects": 3, "tests/simulate": 3, "tests/identify": 3}
+QUICK = {"tests/model": 8}
 SCENES = {"bench": HERE.parent / "experiments" / "bench.xml", "hinge": HERE.parent / "experiments" / "hinge.xml"}
 SECONDS = 3.0
 
@@ -45,7 +47,7 @@ class Mujoco4:
     out: Path = HERE / "results"
     """Folder for mujoco4.json."""
     quick: bool = False
-    """Only the tests of model/test_mjcf*.py; writes mujoco4_quick.json."""
+    """Only some tests of model/; writes mujoco4_quick.json."""
 
 
 def compute(path: Path, seed: int) -> None:
@@ -135,15 +137,26 @@ def differences(three: Path, four: Path) -> dict[str, Any]:
     return out
 
 
-def tested(python: Path, processes: int, paths: tuple[str, ...]) -> dict[str, Any]:
-    """How many tests pass with an interpreter, and which fail."""
-    with tempfile.TemporaryDirectory() as folder:
-        report = Path(folder) / "report.xml"
-        many = ["-n", str(processes), "--dist", "worksteal"] if processes > 1 else []
-        command = [python, "-m", "pytest", "-q", "-p", "no:randomly", *many, f"--junit-xml={report}", *paths]
-        environment = {**os.environ, "PYTHONPATH": str(common.ROOT)}
-        subprocess.run(command, cwd=common.ROOT, env=environment, check=False)
-        cases = list(ElementTree.parse(report).getroot().iter("testcase"))
+def groups(tests: Mapping[str, int]) -> dict[str, list[str]]:
+    """Files of each group, by a name for its report."""
+    out: dict[str, list[str]] = {}
+    for folder, count in tests.items():
+        files = sorted(str(p.relative_to(common.ROOT)) for p in (common.ROOT / folder).glob("test_*.py"))
+        out |= {f"{folder.replace('/', '_')}_{k}": files[k::count] for k in range(count)}
+    return out
+
+
+def tested(python: Path, processes: int, asked: Mapping[str, list[str]], runs: Path) -> dict[str, Any]:
+    """How many tests pass with an interpreter, and which fail; reports that are there already are read."""
+    cases: list[ElementTree.Element] = []
+    for name, files in asked.items():
+        report = runs / f"{name}.xml"
+        if not report.is_file():
+            many = ["-n", str(processes), "--dist", "worksteal"] if processes > 1 else []
+            command = [python, "-m", "pytest", "-q", "-p", "no:randomly", *many, f"--junit-xml={report}", *files]
+            environment = {**os.environ, "PYTHONPATH": str(common.ROOT)}
+            subprocess.run(command, cwd=common.ROOT, env=environment, check=False)
+        cases += ElementTree.parse(report).getroot().iter("testcase")
     bad = [c for c in cases if c.find("failure") is not None or c.find("error") is not None]
     skipped = sum(c.find("skipped") is not None for c in cases)
     names = sorted(f"{c.get('classname')}::{c.get('name')}" for c in bad)
@@ -154,18 +167,20 @@ def main(config: Mujoco4) -> None:
     if config.numbers is not None:
         compute(config.numbers, config.seed)
         return
-    paths = ("tests/model/test_mjcf.py", "tests/model/test_mjcf_in_place.py") if config.quick else TESTS
-    with tempfile.TemporaryDirectory() as folder:
-        three, four = Path(folder) / "three.npz", Path(folder) / "four.npz"
-        for python, path in ((Path(sys.executable), three), (config.python, four)):
-            command = [python, __file__, "--numbers", path, "--seed", str(config.seed)]
+    runs = config.out / f"{common.stem('mujoco4', config.quick)}_runs"
+    runs.mkdir(parents=True, exist_ok=True)
+    asked = groups(QUICK if config.quick else TESTS)
+    asked = dict(list(asked.items())[:1]) if config.quick else asked
+    both = {"three": Path(sys.executable), "four": config.python}
+    for name, python in both.items():
+        if not (runs / f"{name}.npz").is_file():
+            command = [python, __file__, "--numbers", runs / f"{name}.npz", "--seed", str(config.seed)]
             subprocess.run(command, env={**os.environ, "PYTHONPATH": str(common.ROOT)}, check=True)
-        found = differences(three, four)
     result = {
         "benchmark": "mujoco4",
-        "tests": list(paths),
-        **(tested(config.python, config.processes, paths) if config.tests else {}),
-        "differences": found,
+        "tests": sorted({file for files in asked.values() for file in files}),
+        **(tested(config.python, config.processes, asked, runs) if config.tests else {}),
+        "differences": differences(runs / "three.npz", runs / "four.npz"),
     }
     common.publish(config.out, "mujoco4", config.quick, config.seed, result)
 

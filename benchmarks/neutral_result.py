@@ -1,20 +1,24 @@
 """A fitted result applied without jax against the program's own replay, on motions that were not fitted.
 
-    python benchmarks/neutral_result.py --fit door=runs/all/gap --recording door=runs/all/recordings/B.npz
+    python benchmarks/neutral_result.py --fit door runs/all/gap --recording door runs/all/recordings/A.npz
 
 For each fit (a folder of `identify` or `gap`) it writes the neutral result, steps it in plain C MuJoCo in a process
 that cannot import jax (`neutral_replay.py`), and compares positions and motor torques with the replay in MJX.  The
 tolerance is what both engines differ by with the laws left out of both.  It also draws from fitted.json and compares
-mean and covariance with the Gaussian's.
+mean and covariance with the Gaussian's.  Cases that are not asked for stay in the file as they were.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import subprocess
 import sys
 import tempfile
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import common
@@ -22,6 +26,8 @@ import numpy as np
 import tyro
 
 HERE = Path(__file__).resolve().parent
+EXPERIMENTS = HERE.parent / "experiments"
+XL330_GAIN, XL330_MOTION = 200, "sin_sin"
 DRAWS = 100
 
 
@@ -35,6 +41,8 @@ class NeutralResult:
     """A recording by name of the case that its fit did not see."""
     scene: dict[str, Path] = field(default_factory=dict)
     """MJCF by name of the case, where it is not where the fit found it."""
+    xl330: Path | None = None
+    """Folder of the logs of Rhoban/bam, for the case xl330, whose fit is experiments/results/real_xl330.json."""
     fine: int = 8
     """Steps of C in one of the replay's."""
     seed: int = 0
@@ -51,27 +59,63 @@ def without_laws(effects: tuple[Any, ...]) -> tuple[Any, ...]:
     return tuple(replace(e, **bare) for e in effects)
 
 
-def compare(fit: Path, recording: Path, scene: Path | None, fine: int, seed: int) -> dict[str, Any]:
-    """One case."""
+def of_folder(fit: Path, recording: Path, scene: Path | None) -> tuple[Any, Any, Any, bool]:
+    """The fitted model of a folder, its Gaussian, a recording, and whether the fit did not see it."""
     from droid_jax.commands.fitted import load_fitted
-    from droid_jax.identify.neutral_result import write_neutral
     from droid_jax.recordings.formats import load_recording
+
+    fitted, given = load_fitted(fit, scene), load_recording(recording)
+    return fitted, gaussian_of(fit, fitted), given, held_out(fit, given, fitted)
+
+
+def of_xl330(data: Path) -> tuple[Any, Any, Any, bool]:
+    """The same of the servo with load-dependent friction, by the values in experiments/results/real_xl330.json.
+
+    The Gaussian is that of the intervals there, without correlations.  The fit saw two gains, the log is of the third.
+    """
+    sys.path.insert(0, str(EXPERIMENTS))
+    from xl330_logs import xl330_log
+
+    from droid_jax.identify.gaussian import Gaussian
+    from droid_jax.model.effects.registry import joined, library, ready
+    from droid_jax.model.parameter_file import load_parameters
+    from droid_jax.model.scene import load_scene
+
+    kept = json.loads((EXPERIMENTS / "results" / "real_xl330.json").read_text())
+    fold = next(fold for fold in kept["folds"] if fold["judge_kp"] == XL330_GAIN)["parameters"]
+    scene = load_scene(EXPERIMENTS / "xl330.xml")
+    effects = library(scene, kept["effects"])
+    space = joined(load_parameters(EXPERIMENTS / "xl330.json", scene), effects)
+    values = space.values({name: fold[name]["best"] for name in space.names if name in fold})
+    half = np.array([np.ptp(fold[name]["interval"]) / 2 if name in fold else 1e-6 for name in space.names])
+    gaussian = Gaussian(space, values, np.diag((half / 1.645) ** 2), "intervals of real_xl330.json", "physical")
+    fitted = SimpleNamespace(scene=ready(scene), space=space, effects=effects, after=values)
+    return fitted, gaussian, xl330_log(data, XL330_MOTION, XL330_GAIN), True
+
+
+def compare(
+    fitted: Any, gaussian: Any, recording: Any, unseen: bool, fine: int, seed: int, runs: Path
+) -> dict[str, Any]:
+    """One case."""
+    from droid_jax.identify.neutral_result import write_neutral
     from droid_jax.recordings.recording import TorqueConvention, TorqueSide
 
-    fitted = load_fitted(fit, scene)
     motor = TorqueConvention(TorqueSide.MOTOR, gravity=False)
-    given = replace(load_recording(recording), torque=motor)
+    given = replace(recording, torque=motor)
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
-        gaussian = gaussian_of(fit, fitted)
         write_neutral(folder, fitted.scene, gaussian, fitted.after, fitted.effects, main="fitted.xml")
-        base = without_laws(fitted.effects)
-        with_laws = differences(fitted, given, fitted.effects, folder, fine, laws=True)
-        tolerance = differences(fitted, given, base, folder, fine, laws=False)
-        own_step = differences(fitted, given, fitted.effects, folder, 1, laws=True)
+        drive, full = replayed(fitted, given, fitted.effects, runs)
+        _, bare = replayed(fitted, given, without_laws(fitted.effects), runs)
+        with_laws = differences(fitted, drive, full, folder, fine, laws=True)
+        tolerance = differences(fitted, drive, bare, folder, fine, laws=False)
+        own_step = differences(fitted, drive, full, folder, 1, laws=True)
+        matter = {
+            name: float(np.abs(getattr(full, name) - getattr(bare, name)).max()) for name in ("position", "torque")
+        }
         return {
             "recording": given.name,
-            "held_out": given.sha256 not in fitted.recordings,
+            "held_out": unseen,
             "effects": sorted({law["effect"] for law in content(folder)["laws"]}),
             "without_table": [e for e in content(folder)["not_in_mjcf"] if "depends on" in e["why"]],
             "in_place": content(folder)["mjcf"]["in_place"],
@@ -79,7 +123,7 @@ def compare(fit: Path, recording: Path, scene: Path | None, fine: int, seed: int
             "largest_difference": with_laws,
             "tolerance": tolerance,
             "largest_difference_at_own_step": own_step,
-            "effect_of_the_laws": laws_matter(fitted, given, base),
+            "effect_of_the_laws": matter,
             "draws": draws_agree(folder, gaussian, seed),
         }
 
@@ -102,8 +146,18 @@ def gaussian_of(fit: Path, fitted: Any) -> Any:
     return load_gaussian(folder / "gaussian_full.json")
 
 
-def replayed(fitted: Any, recording: Any, effects: tuple[Any, ...]) -> tuple[Any, Any, Any]:
-    """The drive, the replay in MJX at the fitted values, and its physics."""
+def held_out(fit: Path, recording: Any, fitted: Any) -> bool:
+    """Whether the final model was not fitted to a recording; a search's test recording chose nothing either."""
+    from droid_jax.commands.fitted import fitted_folder
+
+    stage, folder = fitted_folder(fit)
+    if stage == "gap":
+        return recording.name not in json.loads((folder / "gap.json").read_text())["final_model"]["fitted_to"]
+    return recording.sha256 not in fitted.recordings
+
+
+def replayed(fitted: Any, recording: Any, effects: tuple[Any, ...], runs: Path) -> tuple[Any, Any]:
+    """The drive, and the replay in MJX at the fitted values, which is kept in a folder: a program takes a minute."""
     import jax
     import jax.numpy as jnp
 
@@ -112,6 +166,11 @@ def replayed(fitted: Any, recording: Any, effects: tuple[Any, ...]) -> tuple[Any
     from droid_jax.simulate.replay import make_drive, servo_replay
 
     drive = make_drive(fitted.scene, recording, weigh=False)
+    laws = sorted(e.name for e in effects if e.command or e.servo or e.force or e.frictionloss)
+    numbers = hashlib.sha256(np.asarray(fitted.after).tobytes() + recording.sha256.encode() + str(laws).encode())
+    kept = runs / f"{numbers.hexdigest()[:16]}.npz"
+    if kept.is_file():
+        return drive, SimpleNamespace(**np.load(kept))
     seen = without_observers(effects)
     replay = servo_replay(fitted.scene, drive, seen)
 
@@ -119,7 +178,10 @@ def replayed(fitted: Any, recording: Any, effects: tuple[Any, ...]) -> tuple[Any
         return replay(make_physics(fitted.scene, fitted.space, values))
 
     out = jax.jit(run, compiler_options=runtime.compiler_options())(jnp.asarray(fitted.after, jnp.float32))
-    return drive, jax.tree.map(np.asarray, out), replay
+    arrays = {name: np.asarray(getattr(out, name)) for name in ("position", "torque", "object_angle")}
+    runs.mkdir(parents=True, exist_ok=True)
+    np.savez(kept, **arrays)
+    return drive, SimpleNamespace(**arrays)
 
 
 def without_observers(effects: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -127,13 +189,13 @@ def without_observers(effects: tuple[Any, ...]) -> tuple[Any, ...]:
     return tuple(replace(e, observe=None) for e in effects)
 
 
-def differences(
-    fitted: Any, recording: Any, effects: tuple[Any, ...], folder: Path, fine: int, *, laws: bool
-) -> dict[str, float]:
-    """Largest and root mean square difference of positions (rad or m) and motor torques (N m or N) to plain C."""
+def differences(fitted: Any, drive: Any, own: Any, folder: Path, fine: int, *, laws: bool) -> dict[str, float]:
+    """Largest and root mean square difference of positions (rad or m) and motor torques (N m or N) to plain C.
+
+    own: the replay in MJX.
+    """
     from droid_jax.simulate.servo_gains import servo_factors
 
-    drive, own, _ = replayed(fitted, recording, effects)
     values = dict(zip(fitted.space.names, fitted.after.tolist(), strict=True))
     ask = dict(
         command=drive.command, timestep=drive.timestep, qpos0=drive.qpos0, gains=servo_factors(fitted.scene, drive),
@@ -155,13 +217,6 @@ def differences(
         angle = np.abs(answer["qpos"][:, scene.qpos(scene.object_joint)] - own.object_angle)
         out |= {"object_angle": float(angle.max()), "object_angle_rms": float(np.sqrt(np.mean(angle**2)))}
     return out
-
-
-def laws_matter(fitted: Any, recording: Any, base: tuple[Any, ...]) -> dict[str, float]:
-    """Largest change of the replay by the laws: what a comparison would see if they were not applied."""
-    _, one, _ = replayed(fitted, recording, fitted.effects)
-    _, two, _ = replayed(fitted, recording, base)
-    return {name: float(np.abs(getattr(one, name) - getattr(two, name)).max()) for name in ("position", "torque")}
 
 
 def draws_agree(folder: Path, gaussian: Any, seed: int) -> dict[str, float]:
@@ -192,12 +247,27 @@ def main(config: NeutralResult) -> None:
     from droid_jax import runtime
 
     runtime.start()
-    cases: dict[str, Any] = {}
-    for name, folder in config.fit.items():
-        cases[name] = compare(folder, config.recording[name], config.scene.get(name), config.fine, config.seed)
+    path = config.out / f"{common.stem('neutral_result', config.quick)}.json"
+    runs = config.out / "neutral_result_runs"
+    cases: dict[str, Any] = json.loads(path.read_text())["cases"] if path.is_file() else {}
+    asked = {
+        name: partial(of_folder, folder, config.recording[name], config.scene.get(name))
+        for name, folder in config.fit.items()
+    }
+    if config.xl330 is not None:
+        asked["xl330"] = partial(of_xl330, config.xl330)
+    for name, case in asked.items():
+        found = compare(*case(), config.fine, config.seed, runs)
+        cases[name] = {"origin": common.origin(config.seed), **found}
         print(name, cases[name], flush=True)
     largest = {name: case["largest_difference"] for name, case in cases.items()}
-    result = {"benchmark": "neutral_result", "fine": config.fine, "largest_difference": largest, "cases": cases}
+    result = {
+        "benchmark": "neutral_result",
+        "commits": common.commits(cases.values()),
+        "fine": config.fine,
+        "largest_difference": largest,
+        "cases": cases,
+    }
     common.publish(config.out, "neutral_result", config.quick, config.seed, result)
 
 

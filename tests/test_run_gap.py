@@ -51,6 +51,7 @@ def arguments(
     """A whole command line in the small scene."""
     files = [place / name for name in recordings]
     own = ("--scene", SCENE, "--parameters", place / "parameters.json", "--object-joint", "door")
+    own = (*own, "--joint-friction", "scene")  # what was recorded is the scene's own model in plain C
     return [str(a) for a in ("gap", "--recording", *files, *own, "--out", place / "run", *options)]
 
 
@@ -576,7 +577,8 @@ def test_the_command_as_a_user_runs_it(place: Path):
 
     said = run(*arguments(place, "--effects", *EFFECTS))
     assert "hinge_preload" in said and (place / "run" / "report.html").stat().st_size > 10_000
-    own = ("--scene", SCENE, "--parameters", place / "parameters.json", "--object-joint", "door")
+    own = ("--scene", SCENE, "--parameters", place / "parameters.json", "--object-joint", "door",
+           "--joint-friction", "scene")  # fmt: skip
     again = ("identify", "--recording", place / "train.npz", *own, "--extended", place / "run" / "extended.json",
              "--generations", "4", "--population", "10", "--out", place / "identified")  # fmt: skip
     run(*(str(w) for w in again))

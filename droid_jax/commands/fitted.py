@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
@@ -146,6 +147,12 @@ def _scene_of(asked: dict[str, Any], given: Path | None, rubbed: tuple[str, ...]
 def _check_same(folder: Path, asked: dict[str, Any], scene: Scene, given: Path | None) -> None:
     """ValueError for a scene that was changed after the fit; of one that was given on purpose that is said."""
     if asked.get("scene_sha256") in (None, scene.sha256):
+        return
+    before, now = asked.get("versions", {}).get("mujoco"), importlib.metadata.version("mujoco")
+    if before not in (None, now):  # whose compiled models have other fields
+        warnings.warn(
+            f"{folder} was fitted with MuJoCo {before}, not {now}: its scene is taken for the same", stacklevel=2
+        )
         return
     if given is None:
         raise ValueError(

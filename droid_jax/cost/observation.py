@@ -24,7 +24,7 @@ class TooLong(ValueError):
 
 
 @dataclass(frozen=True, eq=False)
-class Windows:
+class ShortFilter:
     """A filter whose outputs are sums over short windows of T samples.
 
     begin: [K] first sample of each window.  weights: [C or 1, K, W] of its samples, for each column or for all.
@@ -38,9 +38,15 @@ class Windows:
         """[K, W] the samples of each window."""
         return self.begin[:, None] + np.arange(self.weights.shape[-1])
 
+    def dense(self, length: int) -> np.ndarray:
+        """[C or 1, K, T] written out; length: T."""
+        out = np.zeros((*self.weights.shape[:2], length))
+        np.put_along_axis(out, np.broadcast_to(self.rows, self.weights.shape), self.weights, axis=2)
+        return out
 
-def windows(filters: Sequence[sparse.csr_array], length: int) -> Windows:
-    """Sparse filters [K, T], one for each column or one for all, as windows; length: T."""
+
+def short_filter(filters: Sequence[sparse.csr_array], length: int) -> ShortFilter:
+    """Sparse filters [K, T], one for each column or one for all, by their windows; length: T."""
     count = len(filters[0].indptr) - 1
     rows = [np.repeat(np.arange(count), np.diff(each.indptr)) for each in filters]
     first, last = np.full(count, length), np.zeros(count, int)
@@ -52,7 +58,7 @@ def windows(filters: Sequence[sparse.csr_array], length: int) -> Windows:
     weights = np.zeros((len(filters), count, width))
     for column, row, each in zip(weights, rows, filters, strict=True):
         column[row, each.indices - begin[row]] = each.data
-    return Windows(begin, weights)
+    return ShortFilter(begin, weights)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +77,7 @@ class Measured:
     values: np.ndarray
     mask: np.ndarray
     columns: np.ndarray
-    kernel: Windows
+    kernel: ShortFilter
     noise: Noise
     span: tuple[float, float]
     weight: float
@@ -172,7 +178,8 @@ def in_window(
         return np.full((len(coarse), len(channel.columns)), np.nan), np.zeros((1, len(coarse), len(clock)))
     kernel = lowpass(time, coarse, config)
     found = smooth(values, mask, kernel, config.least_window)
-    return found[0], _same_filter(kernel, mask, ~np.isnan(found), _resampling(clock, time))
+    filters = _same_filter(kernel, mask, ~np.isnan(found), _resampling(clock, time), len(clock))
+    return found[0], filters.dense(len(clock))
 
 
 def _of_joints(scene: Scene, channel: Channel) -> Channel:
@@ -214,18 +221,18 @@ def _resampling(clock: np.ndarray, time: np.ndarray) -> sparse.csr_array:
 
 def _same_filter(
     kernel: sparse.csr_array, mask: np.ndarray, kept: np.ndarray, resampling: sparse.csr_array, length: int
-) -> Windows:
+) -> ShortFilter:
     """What resampling, smoothing with a mask and averaging over the repeats does to a replay's trace [T].
 
     kernel [K, Tc]; mask [N, Tc, C]; kept [N, K, C], the outputs that enter the mean; resampling [Tc, T];
     length: T.
     """
     if mask.all():
-        return windows([kernel @ resampling], length)
+        return short_filter([kernel @ resampling], length)
     columns = list(zip(mask.transpose(2, 0, 1), kept.transpose(2, 0, 1), strict=True))
     if all(np.array_equal(m, columns[0][0]) and np.array_equal(k, columns[0][1]) for m, k in columns):
         columns = columns[:1]  # a log that was silent for a while was so in all of them
-    return windows([_mean_filter(kernel, *column) @ resampling for column in columns], length)
+    return short_filter([_mean_filter(kernel, *column) @ resampling for column in columns], length)
 
 
 def _mean_filter(kernel: sparse.csr_array, mask: np.ndarray, kept: np.ndarray) -> sparse.csr_array:

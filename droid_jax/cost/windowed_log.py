@@ -17,7 +17,7 @@ from droid_jax import distributed
 from droid_jax.cost.channels import check_channels
 from droid_jax.cost.cost import Cost, check_read, followed
 from droid_jax.cost.noise import Noise, coarse_clock
-from droid_jax.cost.observation import Measured, compared_columns, in_window, least_noise
+from droid_jax.cost.observation import Measured, ShortFilter, compared_columns, in_window, least_noise
 from droid_jax.cost.residuals import CompareConfig, Comparison
 from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.fields import check_space
@@ -187,7 +187,7 @@ class WindowedLog(Cost):
         a window blew up.  Windows without an instant that counts are not replayed: what was measured stands there."""
         values, parts = self.space.check(values), list[np.ndarray]()
         for piece, counts in zip(self.pieces, self._apart(self.instants[None, :, None]), strict=True):
-            active = counts[0, :, :, 0].any(axis=1)
+            active = np.asarray(counts[0, :, :, 0].any(axis=1))
             part = np.repeat(piece.measured[None], len(values), axis=0)
             if active.any():
                 part[:, active] = piece.replayed(values, piece.smoothed, active)["smooth"]
@@ -252,7 +252,7 @@ class WindowedLog(Cost):
 
     def failed(self, values: Any) -> np.ndarray:
         """[P, D] -> [P] bool: a replay blew up."""
-        return np.isnan(self.simulated(values)).any(axis=(1, 2))
+        return np.asarray(np.isnan(self.simulated(values)).any(axis=(1, 2)))
 
     def penalties(self, values: Any) -> np.ndarray:
         """[P, D] -> [P, 1] zeros: nothing is gripped in a window."""
@@ -410,7 +410,7 @@ def _piece(
         kernels[name] = [np.broadcast_to(kernel, (wide, *kernel.shape[1:])) for _, kernel in each]
         measured.append(np.stack([values for values, _ in each]))
     values = np.concatenate(measured, axis=2)
-    seen = ~np.isnan(values).any(axis=(1, 2))
+    seen = np.asarray(~np.isnan(values).any(axis=(1, 2)))
     if made is not None:
         made = made.kept(seen)
     elif not seen.all():
@@ -475,7 +475,7 @@ def _comparison(
                 mean[None],
                 np.ones((1, *mean.shape), bool),
                 columns,
-                np.zeros((1, 0, 0)),
+                ShortFilter(np.zeros(0, int), np.zeros((1, 0, 0))),
                 noise,
                 span,
                 weight,
@@ -493,6 +493,6 @@ def _phases(pieces: Sequence[Piece], order: np.ndarray, rate: float) -> tuple[Ph
     changes = np.flatnonzero(np.diff(of)) + 1
     starts, ends = np.r_[0, changes], np.r_[changes, len(of)]
     return tuple(
-        Phase(pieces[of[a]].name, float(a) / rate, float(b) / rate)
+        Phase(pieces[int(of[a])].name, float(a) / rate, float(b) / rate)
         for a, b in zip(starts.tolist(), ends.tolist(), strict=True)
     )

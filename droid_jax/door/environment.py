@@ -40,9 +40,9 @@ from droid_jax.simulate.hand_path import solve_pose
 from droid_jax.simulate.replay import (
     apply_forces,
     apply_friction,
+    changes_friction,
     check_stateless,
     compose,
-    rubbing,
     servo_input,
 )
 from droid_jax.simulate.time_loop import time_loop
@@ -174,11 +174,11 @@ class DoorEnv(Environment):
                 push=apply_forces(theta, now, self.effects, error),
             )
             force = finger_forces(self._hand, after)
-            gear = gear_torques(model, after, qvel) if rubs else gear
+            gear = gear_torques(model, after, qvel) if changing else gear
             return after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator, gear, force
 
         model, theta = physics.model, complete(physics.theta, self.effects)
-        sample, rubs = (model, theta, encoder_error(self.scene, model), world), rubbing(self.effects)
+        sample, changing = (model, theta, encoder_error(self.scene, model), world), changes_friction(self.effects)
         start = (world.qpos, world.qvel, world.warm, world.load, world.gear, jnp.zeros(2))
         qpos, qvel, warm, load, gear, force = time_loop(substep, sample, start, self._substeps)
         now = world.time + self.task.control

@@ -132,6 +132,7 @@ def neutral_json(
         "parameters": [_parameter(p, named[p.name], intervals[p.name]) for p in space.parameters],
         "table": [{k: v for k, v in row.items() if k != "own"} for row in rows],
         "laws": [_law(law) for law in tables if isinstance(law, LawTable)],
+        "drives": _drives(scene, make_c_model(scene, space, np.asarray(values))),
         "not_in_mjcf": _lacking(scene, space, effects, tables),
         "mjcf": {
             "file": None if made is None else next(iter(made.files)),
@@ -148,6 +149,23 @@ def neutral_json(
             "cov": gaussian.cov.tolist(),
         },
     }
+
+
+def _drives(scene: Scene, model: mujoco.MjModel) -> list[dict[str, Any]]:
+    """The position servo of each driven joint in the terms that Isaac Lab and Newton have for it, all at the joint."""
+    out: list[dict[str, Any]] = []
+    for joint in scene.driven_joints:
+        u, j, d = scene.command_names.index(joint), scene.id("joint", joint), scene.dof(joint)
+        gear, bias = float(model.actuator_gear[u, 0]), model.actuator_biasprm[u]
+        ends = [abs(gear) * np.abs(model.actuator_forcerange[u]).max()] if model.actuator_forcelimited[u] else []
+        ends += [np.abs(model.jnt_actfrcrange[j]).max()] if model.jnt_actfrclimited[j] else []
+        out.append({
+            "joint": joint, "unit": scene.torque_unit([joint]), "stiffness": -float(bias[1]) * gear**2,
+            "damping": abs(float(bias[2])) * gear**2, "viscous_friction": float(model.dof_damping[d]),
+            "friction": float(model.dof_frictionloss[d]), "armature": float(model.dof_armature[d]),
+            "effort_limit": float(min(ends)) if ends else None, "velocity_limit": None,
+        })  # fmt: skip
+    return out
 
 
 def with_numbers(scene: Scene, space: Space, values: np.ndarray) -> Any:
@@ -196,12 +214,13 @@ def _row(
     said: Mapping[tuple[str, tuple[int, ...]], tuple[str, int]],
 ) -> dict[str, Any]:
     model, kind = scene.model, field.split("_")[0].rstrip("0")
-    number, column, offset = index[0], (index[1] if len(index) > 1 else None), 0
+    first, rest, offset = index[0], index[1:], 0
+    number, column = first, rest[0] if rest else None
     if kind == "dof":
-        number = int(model.dof_jntid[index[0]])
-        offset = index[0] - int(model.jnt_dofadr[number])
+        number = int(model.dof_jntid[first])
+        offset = first - int(model.jnt_dofadr[number])
     elif kind == "qpos":
-        number = int(np.searchsorted(model.jnt_qposadr, index[0], side="right")) - 1
+        number = int(np.searchsorted(model.jnt_qposadr, first, side="right")) - 1
     element = {"dof": "joint", "jnt": "joint", "qpos": "joint"}.get(kind, kind)
     spec, attribute = spoken(field)
     attribute, place = said.get((field, index), (attribute, column or 0))
@@ -231,10 +250,10 @@ def _interval(
     names = {w["parameter"] for w in row["writes"]}
     if len(names) == 1:
         (name,) = names
-        return sorted(apply_fit.number_of(row, {name: end}) for end in intervals[name])
+        return sorted(apply_fit.number_of(dict(row), {name: end}) for end in intervals[name])
     if not names or not drawn:
         return None
-    return np.quantile([apply_fit.number_of(row, values) for values in drawn], [0.05, 0.95]).tolist()
+    return np.quantile([apply_fit.number_of(dict(row), values) for values in drawn], [0.05, 0.95]).tolist()
 
 
 def _of_row(row: Mapping[str, Any] | None, before: float, after: float) -> dict[str, Any]:

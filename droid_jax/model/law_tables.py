@@ -79,7 +79,12 @@ def law_tables(
         for location, amplitudes in (effect.locations or {"": tuple(p.name for p in effect.parameters)}).items():
             if not any(values.get(name) for name in amplitudes if name in values):
                 continue
-            yield from _tables(_Law(scene, model, effect, location, amplitudes, values, spread))
+            law = _Law(scene, model, effect, location, amplitudes, values, spread)
+            try:
+                made = list(_tables(law))
+            except Exception as error:  # of a user's law, which may do anything; the fit itself is whole
+                made = [law.without(f"no table could be made of it ({type(error).__name__}: {error})")]
+            yield from made
 
 
 def _tables(law: _Law) -> Iterator[LawTable | NoTable]:

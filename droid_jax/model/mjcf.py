@@ -242,8 +242,8 @@ def _check_files(files: Mapping[str, str], main: str, expected: mujoco.MjModel) 
     for name in dir(expected):
         if not name.startswith(_COMPARED):
             continue
-        one, two = getattr(made, name), getattr(expected, name)
-        if not isinstance(two, np.ndarray) or two.dtype.kind != "f":
+        one, two = np.asarray(getattr(made, name)), np.asarray(getattr(expected, name))
+        if two.dtype.kind != "f" or not two.ndim:
             continue
         if one.shape != two.shape or not np.allclose(one, two, rtol=1e-5, atol=SLACK):
             raise NotInPlace(f"with its numbers changed the file makes another {name}")
@@ -251,7 +251,7 @@ def _check_files(files: Mapping[str, str], main: str, expected: mujoco.MjModel) 
 
 def _text(fitted: _Fitted) -> str:
     _locate_assets(fitted.spec)
-    return _unwrapped(fitted.spec.to_xml())
+    return unwrapped(fitted.spec.to_xml())
 
 
 def _settle(spec: mujoco.MjSpec, model: mujoco.MjModel) -> list[Any]:
@@ -385,7 +385,7 @@ def _locate_assets(spec: mujoco.MjSpec) -> None:
         spec.texturedir = str((folder / spec.texturedir).resolve())
 
 
-def _unwrapped(xml: str) -> str:
+def unwrapped(xml: str) -> str:
     """MJCF without nameless defaults inside the defaults, which attached files leave and MuJoCo does not read.
 
     Their classes move up; of classes that several files define alike, one stays.

@@ -85,7 +85,11 @@ def read_log(
             raise FileNotFoundError(f"no log at {path}: there is no such file or folder")
     logs = [log for path in paths for log in _parts(path, episodes)]
     if columns is None:
-        found, origin = _known_map(logs[0], paths[0], beside)
+
+        def changed(known: ColumnMap) -> ColumnMap:
+            return changed_map(known, channels or {}, units or {}, **changes)
+
+        found, origin = _known_map(logs[0], paths[0], beside, changed)
     elif isinstance(columns, ColumnMap):
         found, origin = columns, "the given map"
     else:
@@ -109,13 +113,18 @@ def read_log(
     return recording, found, origin or "--columns"
 
 
-def _known_map(log: Opened, path: Path, beside: Path | None) -> tuple[ColumnMap | None, str]:
-    """A map that a log without one can be read by, and where it is from."""
+def _known_map(
+    log: Opened, path: Path, beside: Path | None, changed: Callable[[ColumnMap], ColumnMap]
+) -> tuple[ColumnMap | None, str]:
+    """A map that a log without one can be read by, and where it is from; changed: what the caller makes of it, so that
+    maps are alike which differ in nothing else.
+    """
     near = sorted(beside.glob(f"*{SUFFIX}")) if beside is not None and beside.is_dir() else []
     kept = {file: columns for file in near if fits(log, columns := read_map(file))}
     if kept:
         newest = max(kept, key=lambda file: file.stat().st_mtime_ns)
-        other = next((file for file, another in kept.items() if not _alike(another, kept[newest])), None)
+        own = changed(kept[newest])
+        other = next((file for file, another in kept.items() if not _alike(changed(another), own)), None)
         if other is not None:
             raise ValueError(f"{path}: {newest} and {other} both map its columns, and differ: choose with --map")
         return kept[newest], str(newest)

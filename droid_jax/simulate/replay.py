@@ -185,7 +185,7 @@ def servo_motion(
     shift = late if parity else 0.0  # steps, of the command; of positions in the other direction
     half = late if parity else 0.5  # steps from the velocity before a step to the one that is told
     damping = has_servo_damping(scene.model)
-    rubs = rubbing(effects)
+    changing = changes_friction(effects)
 
     def step(sample: Any, k: jax.Array, carry: Any) -> Any:
         model, theta, error, table, origin = sample
@@ -216,7 +216,7 @@ def servo_motion(
             _touching(after, fingers),
         )
         kept = tuple(jax.lax.dynamic_update_index_in_dim(a, b, k, 0) for a, b in zip(kept, now, strict=True))
-        gear = gear_torques(model, after, qvel) if rubs else gear
+        gear = gear_torques(model, after, qvel) if changing else gear
         return (after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator, gear), kept
 
     def motion(
@@ -312,7 +312,7 @@ def servo_input(ctrl: jax.Array, theta: Theta, state: State, effects: Sequence[E
     return ctrl
 
 
-def rubbing(effects: Sequence[Effect]) -> bool:
+def changes_friction(effects: Sequence[Effect]) -> bool:
     """Whether any of the effects changes dry friction, which may depend on what the gears carry."""
     return any(effect.frictionloss is not None for effect in effects)
 

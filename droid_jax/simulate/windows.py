@@ -130,7 +130,7 @@ def cut(
         spread[:, pair[:, None], pair] = root
     padded = np.concatenate([np.repeat(drive.command[:1], earlier, axis=0), drive.command])
     table = padded[rows[:, None] + np.arange(earlier + steps)]
-    known = np.isfinite(start).all(axis=1) & np.isfinite(speed).all(axis=1)
+    known = np.asarray(np.isfinite(start).all(axis=1) & np.isfinite(speed).all(axis=1))
     return Windows(begin, table, servo_factors(scene, drive), start, speed, spread, earlier, steps).kept(known)
 
 

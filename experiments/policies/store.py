@@ -11,6 +11,7 @@ import hashlib
 import json
 import math
 import warnings
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ from benchmarks.sharing import claimed, code_name
 from droid_jax.door.environment import DoorEnv
 from droid_jax.files import GAUSSIAN, POLICY, TRAINING
 from droid_jax.identify.gaussian import Gaussian
+from droid_jax.model.mjcf import unwrapped
 from droid_jax.model.scene import Scene
 from droid_jax.policy.network import save_policy
 from droid_jax.policy.randomise import of_method
@@ -27,6 +29,12 @@ from droid_jax.policy.train import TrainConfig, train
 from droid_jax.storage import write_json
 
 OF = "of.json"
+# Hash of a scene -> that of the text in which MuJoCo 3.17 wrote it, by which policies in results/archive go.
+AS_STORED = {
+    "8f69a809eeba10c51c48e25214dff62b022579412005fdd8456910299fea18f3": (
+        "f8b901835c8e4140157be3c833b4b8cc387a67c6f8be2170e060c6e254591aee"
+    )
+}
 SAME = 1e-9  # numbers nearer than that, in shares of themselves, are the same
 NOTHING = 1e-12  # and what is smaller than that is zero
 NAMES = frozenset({"element", "role"})  # what a Gaussian says of its parameters for people and code: older ones do not
@@ -68,7 +76,7 @@ def decided_by(env: DoorEnv, doors: Doors, config: TrainConfig) -> dict[str, Any
     """All that decides what training comes to, as plain data."""
     unused = () if config.held else ("enough", "held")
     of = {
-        "scene": sha256(_text(env.scene)),
+        "scene": _scene(env.scene),
         "effects": [effect.name for effect in env.effects],
         "start": env.start.tolist(),
         "task": asdict(env.task),
@@ -97,11 +105,15 @@ def alike(one: Any, other: Any) -> bool:
     return one == other
 
 
-def _text(scene: Scene) -> str:
-    """The scene as MJCF, whose numbers have six digits; the compiled model has them all, machine by machine."""
+def _scene(scene: Scene) -> str:
+    """SHA-256 of the scene as MJCF, whose numbers have six digits; the compiled model has them all, machine by machine.
+
+    Of a form that MuJoCo 3 and 4, which nest defaults otherwise, share; stored policies go by the text of 3.17.
+    """
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Attaching a spec with an empty prefix")  # told of every door
-        return scene.spec.to_xml()
+        text = ElementTree.canonicalize(unwrapped(scene.spec.to_xml()), strip_text=True)
+    return AS_STORED.get(sha256(text), sha256(text))
 
 
 def sha256(text: str) -> str:

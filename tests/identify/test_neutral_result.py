@@ -23,7 +23,8 @@ from droid_jax.identify.gaussian import Gaussian, prior
 from droid_jax.identify.neutral_result import with_numbers, write_neutral
 from droid_jax.model.effect_interface import Effect, State, complete
 from droid_jax.model.effects.registry import effect_space, library, ready
-from droid_jax.model.parameters import Space
+from droid_jax.model.law_tables import NoTable, law_tables
+from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model, make_physics, theta_of
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import TorqueConvention, TorqueSide
@@ -148,6 +149,15 @@ def test_laws_are_those_of_the_effects(made: Made, sample: int | None):
         np.testing.assert_allclose(laws.frictionloss(data), loss, atol=2e-3)
 
 
+def test_drives_are_the_servos_at_their_joints(made: Made):
+    model = make_c_model(made.scene, made.space, made.values)
+    for drive in made.fit["drives"]:
+        u, d = made.scene.command_names.index(drive["joint"]), made.scene.dof(drive["joint"])
+        assert drive["stiffness"] == pytest.approx(model.actuator_gainprm[u, 0] * model.actuator_gear[u, 0] ** 2)
+        assert (drive["armature"], drive["friction"]) == (model.dof_armature[d], model.dof_frictionloss[d])
+    assert [drive["joint"] for drive in made.fit["drives"]] == list(made.scene.driven_joints)
+
+
 def test_laws_name_their_variables(made: Made):
     by = {(law["effect"], law["joint"]): law for law in made.fit["laws"]}
     axes = {key: [a["name"] for a in law["axes"]] for key, law in by.items()}
@@ -161,6 +171,22 @@ def test_laws_name_their_variables(made: Made):
     assert all(law["error"] < 5e-3 for law in made.fit["laws"] if law["effect"] != "drag")
     drag = made.fit["laws"][[law["effect"] for law in made.fit["laws"]].index("drag")]
     assert drag["error"] < 1e-3 * made.values[made.space.index("drag")] * drag["axes"][0]["nodes"][-1] ** 2
+
+
+def test_a_law_that_has_no_table_is_named_and_nothing_is_lost(made: Made):
+    """One that depends on two joints, and one that fails."""
+
+    def of_two(theta: Any, state: Any) -> Any:
+        return jnp.zeros_like(state.qvel).at[0].set(theta["size"] * state.qpos[0] * state.qpos[1])
+
+    def failing(theta: Any, state: Any) -> Any:
+        raise RuntimeError("no such thing")
+
+    parameter = Parameter("size", "N m", 0.0, 1.0, -1.0, 1.0)
+    for force, said in ((of_two, "several joints"), (failing, "RuntimeError: no such thing")):
+        effect = Effect("own", (parameter,), force=force, locations={"elbow": ("size",)})
+        (found,) = law_tables(made.scene, made.scene.mjx, [effect], {"size": 0.5}, {"size": 0.1})
+        assert isinstance(found, NoTable) and said in found.why
 
 
 def test_commands_come_late(made: Made):

@@ -34,7 +34,7 @@ def space_of(scene: Scene, *terms: str) -> Space:
     return Space(tuple(motor_parameter(scene, term, "j") for term in terms))
 
 
-def by_motor(constant: float, resistance: float, goal: np.ndarray, substeps: int = 20) -> np.ndarray:
+def by_motor(constant: float, resistance: float, goal: np.ndarray, substeps: int = 5) -> np.ndarray:
     """[T] rad: duty, voltage, current, torque, in small steps of the classical Runge-Kutta method."""
 
     def slope(state: np.ndarray, target: float) -> np.ndarray:

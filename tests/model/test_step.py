@@ -228,7 +228,7 @@ def light_arm(joints: int, timestep: float = 0.004) -> mujoco.MjModel:
     return model
 
 
-@pytest.mark.parametrize("joints", [5, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("joints", [2, pytest.param(20, marks=pytest.mark.slow)])
 def test_firm_friction_of_many_joints_is_that_of_the_c_engine(joints: int):
     """Below and above the number of rows up to which the corners are looked at at once."""
     model, rng = light_arm(joints), np.random.default_rng(3)

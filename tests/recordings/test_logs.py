@@ -458,6 +458,7 @@ def test_convert_remembers_the_map_beside_the_output(tmp_path: Path, capsys: pyt
     assert load_recording(out / "deg.npz").command == pytest.approx(np.radians(COMMAND))
     assert main(["convert", str(first), "--out", str(out / "three.npz")]) == 2
     assert "both map its columns, and differ: choose with --map" in capsys.readouterr().err
+    assert main(["convert", str(first), "--units", "angle=rad", "--out", str(out / "rad.npz")]) == 0  # not in this
     for words, error in {
         ("--columns", "position"): "expected --columns CHANNEL=COLUMN",
         ("--columns", "pose=q9"): "'pose' is no channel",

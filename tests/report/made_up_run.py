@@ -39,6 +39,27 @@ SPECIAL = {
 }
 
 
+CHANGE = {
+    "element": "joint", "name": "hinge", "attribute": "stiffness", "index": 0, "before": 0.8, "after": 1.049,
+    "interval": [1.017, 1.087], "unit": "N m/rad", "file": "door.xml", "line": 12, "origin": "default class 'soft'",
+}  # fmt: skip
+NEUTRAL = {
+    "format": "droid_jax fitted", "version": 1,
+    "mjcf": {"file": "fitted.xml", "error": "", "in_place": True, "reason": "", "changes": [CHANGE]},
+    "laws": [
+        {"effect": "latch", "description": "a latch", "acts": "force", "joint": "hinge", "unit": "N m", "error": 1e-4,
+         "axes": [{"name": "latch_width", "unit": "rad", "nodes": [0.04]},
+                  {"name": "position", "unit": "rad", "nodes": [0.0, 0.1]}], "terms": []}
+    ],
+    "not_in_mjcf": [{"parameter": "time_offset", "why": "it belongs to the <recording>"}],
+    "engines": {"open_close": {"channel": "torque", "unit": "N m", "parity_rms": 0.01, "parity_largest": 0.04,
+                               "parity_angle": 2e-4}},
+}  # fmt: skip
+PATCH = (
+    '--- a/door.xml\n+++ b/door.xml\n@@ -12 +12 @@\n-<joint name="hinge"/>\n+<joint name="hinge" stiffness="1.049"/>\n'
+)
+
+
 def parameters() -> list[dict]:
     """The synthetic fit's parameters, as fit.json holds them."""
     out = []
@@ -84,6 +105,8 @@ def make_run(folder: Path, synthetic_robot: bool = True, recordings: tuple[str, 
     (folder / "config.json").write_text(json.dumps(config))
     (folder / "fit.json").write_text(json.dumps(fit))
     (folder / "gaussian.json").write_text("{}")
+    (folder / "fitted.json").write_text(json.dumps(NEUTRAL))
+    (folder / "fitted.patch").write_text(PATCH)
     _write_history(folder, ps, rng)
     _write_traces(folder, recordings, rng)
     names = [p["name"] for p in ps]

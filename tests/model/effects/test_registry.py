@@ -163,7 +163,7 @@ def test_the_library_is_in_the_order_of_names_or_as_asked_for():
 
 
 def test_unknown_names_are_listed_with_the_valid_ones():
-    with pytest.raises(ValueError, match=r"unknown effects lath, dragg; valid: angle_friction, .*, torque_ripple$"):
+    with pytest.raises(ValueError, match=r"unknown effects lath, dragg; valid: angle_friction, .*, velocity_f\w+$"):
         library(mechanism(), ["lath", "latch", "dragg"])
 
 
