@@ -22,7 +22,7 @@ from droid_jax.discrepancy.fitting import FittedModel
 from droid_jax.discrepancy.residual_set import ResidualSet
 from droid_jax.recordings.recording import Recording
 from experiments.blind.answers import beside, matched
-from experiments.blind.units import torques, whitened
+from experiments.blind.marks import torques, whitened
 
 MOST = 5  # effects that BIC may name
 WIDTH, LEARNING, DECAY = 32, 3e-3, 1e-3

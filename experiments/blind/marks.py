@@ -28,7 +28,6 @@ from droid_jax.synthetic.robot import SyntheticRobotConfig
 from experiments.blind.draws import Truth
 from experiments.blind.make import Drawn, record
 from experiments.blind.scenes import Setting
-from experiments.blind.units import torques, whitened
 
 REPEATS = 10  # of a case
 NOISY = 80  # repeats from which noise is drawn
@@ -156,3 +155,26 @@ def by_candidate(found: tuple[Candidate, ...]) -> tuple[tuple[ScoreDirection, ..
     for k, question in enumerate(questions):
         rows.setdefault(question.candidate.shaped_key, []).append(k)
     return questions, [rows[c.shaped_key] for c in found]
+
+
+# ----- between N m and units of noise, for evidence of torques alone
+
+
+def whitened(evidence: ResidualSet, torque: np.ndarray) -> np.ndarray:
+    """[K, M] N m, column after column on the coarse clock -> [K, M] in units of one repeat's noise."""
+    whitener = _whitener(evidence)
+    parts = torque.reshape(len(torque), len(whitener), -1)
+    return np.einsum("ckl,ncl->nck", whitener, parts).reshape(torque.shape)
+
+
+def torques(evidence: ResidualSet, columns: np.ndarray) -> np.ndarray:
+    """[K, M] units of one repeat's noise -> [K, M] N m."""
+    whitener = _whitener(evidence)
+    parts = columns.reshape(len(columns), len(whitener), -1)
+    return np.linalg.solve(whitener, parts.transpose(1, 2, 0)).transpose(2, 0, 1).reshape(columns.shape)
+
+
+def _whitener(evidence: ResidualSet) -> np.ndarray:
+    """[C, K, K]."""
+    (channel,) = evidence.cost.comparisons[0].channels
+    return channel.noise.whitener / np.sqrt(evidence.repeats)

@@ -1,6 +1,6 @@
 """The doors on which methods are compared; nothing here changes after a run.
 
-Their reasons: docs/history/pilots.md.
+Their reasons: docs/history/policy-experiments.md.
 """
 
 from __future__ import annotations
