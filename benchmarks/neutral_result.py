@@ -4,8 +4,9 @@
 
 For each fit (a folder of `identify` or `gap`) it writes the neutral result, steps it in plain C MuJoCo in a process
 that cannot import jax (`neutral_replay.py`), and compares positions and motor torques with the replay in MJX.  The
-tolerance is what both engines differ by with the laws left out of both, by C in finer steps and in the replay's own.  It also draws from fitted.json and compares
-mean and covariance with the Gaussian's.  Cases that are not asked for stay in the file as they were.
+tolerance is what both engines differ by with the laws left out of both: with C in finer steps, and in the replay's own.
+It also draws from fitted.json and compares mean and covariance with the Gaussian's.  Cases that are not asked for stay
+in the file as they were.
 """
 
 from __future__ import annotations
