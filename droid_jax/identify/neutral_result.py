@@ -113,7 +113,9 @@ def neutral_json(
         row |= {"value": apply_fit.number_of(row, named), "interval": _interval(row, intervals, drawn)}
         row["prior"] = _interval(row, priors, [])
     deviations = dict(zip(space.names, gaussian.physical_std.tolist(), strict=True))
-    tables = list(law_tables(scene, with_numbers(scene, space, np.asarray(values)), effects, named, deviations))
+    laws = [e for e in effects if e.command or e.servo or e.force or e.frictionloss]
+    fitted = with_numbers(scene, space, np.asarray(values)) if laws else None  # not of a scene that MJX has not
+    tables = list(law_tables(scene, fitted, laws, named, deviations))
     at = {(row["field"], *row["own"]): row for row in rows}
     changes = [
         {**asdict(c), "interval": None, "unit": ""} | _of_row(at.get((c.field, *c.entry)), c.before, c.after)

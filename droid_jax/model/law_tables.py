@@ -77,7 +77,7 @@ def law_tables(
     """
     for effect in effects:
         for location, amplitudes in (effect.locations or {"": tuple(p.name for p in effect.parameters)}).items():
-            if not any(values.get(name) for name in amplitudes if name in values):
+            if not any(values[name] or spread.get(name) for name in amplitudes if name in values):
                 continue
             law = _Law(scene, model, effect, location, amplitudes, values, spread)
             try:
@@ -117,6 +117,10 @@ class _Law:
         others = {n for at, names in self.effect.locations.items() if at != self.location for n in names}
         return [n for n in self.values if n in own and (n in self.amplitudes or n not in others)]
 
+    def probe(self, name: str) -> float:
+        """A value at which the law is there: the fitted one, or what draws may have where that is zero."""
+        return self.values[name] or self.spread.get(name, 0.0)
+
     def without(self, why: str) -> NoTable:
         """No table."""
         return NoTable(self.effect.name, self.location, self.effect.description, why)
@@ -154,7 +158,7 @@ class _Law:
         rng = np.random.default_rng(0)
         base = np.concatenate([np.tile(scene.model.qpos0, (PROBES, 1)), np.zeros((PROBES, 2 * nv))], axis=1)
         base = base + rng.uniform(-0.5, 0.5, base.shape)
-        at = {n: np.full(PROBES, self.values[n]) for n in self.parameters}
+        at = {n: np.full(PROBES, self.probe(n)) for n in self.parameters}
         now = function(at, base)
         touched: dict[int, set[tuple[str, int]]] = {}
         for column, variable, row in self._columns():
@@ -200,7 +204,7 @@ class _Law:
 
         reach = self._load_reach(joint)
         probes = np.linspace(-reach, reach, 41)
-        at = {n: np.full(41, self.values[n]) for n in self.parameters}
+        at = {n: np.full(41, self.probe(n)) for n in self.parameters}
         if np.abs(of_torque(at, probes) - of_torque(at, probes, 0.4, 1.0)).max() > 1e-4 * reach:
             return self.without("it depends on more than the servo's torque")
         unit = UNIT["torque"][self.scene.slides(joint)]
