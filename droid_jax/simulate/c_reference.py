@@ -38,7 +38,7 @@ def c_replay(
     """
     check_gains(scene, drive)
     check_stateless(scene)
-    functions = ("command", "servo", "force", "frictionloss", "observe")
+    functions = ("profile", "command", "servo", "force", "frictionloss", "observe")
     active = [e.name for e in effects if any(getattr(e, f) is not None for f in functions)]
     if active:
         raise ValueError(f"the C engine cannot run effects that depend on the state: {', '.join(active)}; use MJX")

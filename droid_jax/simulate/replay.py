@@ -209,8 +209,8 @@ def servo_motion(
         return (after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator, gear), kept
 
     def motion(physics: Physics, table: jax.Array, start: jax.Array, gains: jax.Array, steps: Any) -> Rollout:
-        model = with_gains(physics.model, gains)
-        sample = model, complete(physics.theta, effects), encoder_error(scene, model), table
+        model, theta = with_gains(physics.model, gains), complete(physics.theta, effects)
+        sample = model, theta, encoder_error(scene, model), profiled(table, drive.timestep, theta, effects)
         zero, traces = jnp.zeros(scene.model.nv, jnp.float32), jnp.zeros((3, len(table), len(joints)), jnp.float32)
         angle, contact = jnp.zeros(len(table), jnp.float32), jnp.zeros((len(table), len(fingers)), bool)
         begun = (start, zero, zero, zero, jnp.stack([zero, zero])), (*traces, angle, contact)
@@ -266,6 +266,14 @@ def _command(
     for law in laws:  # each law sees what the one before it made of the command
         look = compose(law, theta, look)
     return look((k - delay) * timestep) if laws else ctrl
+
+
+def profiled(table: jax.Array, timestep: float, theta: Theta, effects: Sequence[Effect]) -> jax.Array:
+    """[T, U] what the servos' own profiles make of a command [T, U]."""
+    for effect in effects:
+        if effect.profile is not None:
+            table = effect.profile(theta, table, timestep)
+    return table
 
 
 def compose(law: Callable, theta: Theta, look: Callable) -> Callable:
