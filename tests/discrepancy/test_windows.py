@@ -17,6 +17,7 @@ from pendulum import TRUE, pendulum, swung
 import droid_jax as dj
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.cost.windowed_log import WindowedLog, _whitener, windowed_log
+from droid_jax.discrepancy.candidates import observable_effects
 from droid_jax.discrepancy.config import BlocksConfig
 from droid_jax.discrepancy.statistics import OUTSIDE
 from droid_jax.discrepancy.verdict import Conclusion
@@ -130,6 +131,13 @@ def test_the_noise_of_a_window_holds_the_spread_of_its_state():
         flat = np.swapaxes(s, 0, 1).reshape(10, 4)
         covariance = np.diag(np.repeat(deviation, 5) ** 2) + flat @ flat.T
         np.testing.assert_allclose(matrix @ covariance @ matrix.T, np.eye(10), atol=1e-9)
+
+
+def test_what_acts_on_torque_sensors_alone_is_not_asked_about_in_positions():
+    recording = swung("a", 1.0, 1.0, ("position", "torque"))
+    asked = [{e.name for e in observable_effects(scene(), [recording], channels=c)} for c in (["position"], ["torque"])]
+    assert asked[1] - asked[0] == {"torque_bias", "torque_gain", "torque_drift", "sensor_delay"}
+    assert "command_delay" in asked[0] and asked[0] < asked[1]
 
 
 # ----- blocks of windows
