@@ -112,6 +112,18 @@ def test_windows_leave_noise_at_the_truth(space: Space):
     assert np.abs(rollout.position[0] - log.measured).max() < 0.02 and rollout.position.shape == (1, 64, 1)
 
 
+@pytest.mark.slow
+def test_a_motion_that_is_replayed_whole_has_stretches(space: Space):
+    """Which make blocks, as windows do."""
+    config = CompareConfig(channels={"position": 1.0})
+    log = windowed_log(scene(), space, [swung("a", 1.0, 0.7, noise=NOISE)], config, None, fitted_share=0.5)
+    assert log.whole and log.unit.max() + 1 == 3 and log.fitted == 2 and log.unit_seconds == 0.5
+    left = log.residual(space.values(TRUE))
+    assert np.sqrt(np.mean(left**2)) < 2 * NOISE
+    white = log.about(space.mean).with_noise(np.full(1, NOISE), log.unit < 2).whitened(space.values(TRUE)[None])[0]
+    np.testing.assert_allclose(white, np.where(log.unit < 2, -left[:, 0] / NOISE, 0.0), atol=1e-3)
+
+
 def test_a_masked_stretch_leaves_its_windows_out(space: Space):
     whole = swung("a", 1.0, 0.7, noise=NOISE)
     channel = whole.channel("position")
