@@ -21,7 +21,7 @@ from droid_jax.identify import apply_fit
 from droid_jax.identify.gaussian import Gaussian, prior
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.law_tables import LawTable, NoTable, law_tables
-from droid_jax.model.mjcf import FittedFiles, angles, fitted_files, native, spoken, unit_of, unwritten
+from droid_jax.model.mjcf import FittedFiles, field_unit, fitted_files, is_angle, mjcf_attribute, native, unwritten
 from droid_jax.model.parameters import Parameter, Role, Space
 from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene
@@ -224,7 +224,7 @@ def _row(
     elif kind == "qpos":
         number = int(np.searchsorted(model.jnt_qposadr, first, side="right")) - 1
     element = {"dof": "joint", "jnt": "joint", "qpos": "joint"}.get(kind, kind)
-    spec, attribute = spoken(field)
+    spec, attribute = mjcf_attribute(field)
     attribute, place = said.get((field, index), (attribute, column or 0))
     slides = element == "joint" and model.jnt_type[number] == mujoco.mjtJoint.mjJNT_SLIDE
     return {
@@ -233,13 +233,13 @@ def _row(
         "id": int(scene.geoms_among_looks[number]) if element == "geom" else int(number),
         "attribute": attribute,
         "index": place,
-        "unit": unit_of(field, bool(slides)),
+        "unit": field_unit(field, bool(slides)),
         "field": field,
         "column": column,
         "offset": offset,
         "own": tuple(int(i) for i in index),
         "spec": spec,
-        "angle": angles(field),
+        "angle": is_angle(field),
         "nominal": float(getattr(model, field)[index]),
         "writes": writes,
     }
