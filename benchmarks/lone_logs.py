@@ -114,8 +114,8 @@ class Arguments:
     """Make no case: sum up those that are there."""
     seed: int = 0
     """Of all draws."""
-    runs: Path = ROOT / "runs" / "lone_logs"
-    """Folder of the cases."""
+    runs: Path | None = None
+    """Folder of the cases; default: runs/lone_logs, of --quick below OUT."""
     out: Path = ROOT / "benchmarks" / "results"
     """Folder of lone_logs.json."""
 
@@ -309,7 +309,8 @@ def summary(cases: Sequence[dict[str, Any]]) -> dict[str, Any]:
 def main(arguments: Arguments) -> None:
     """Make the cases that are not there, and sum up those that are."""
     began, benches = time.monotonic(), dict[tuple[str, str], Bench]()
-    runs = arguments.runs / ("quick" if arguments.quick else f"seed{arguments.seed}")
+    folder = arguments.runs or (arguments.out if arguments.quick else ROOT / "runs") / "lone_logs"
+    runs = folder / ("quick" if arguments.quick else f"seed{arguments.seed}")
     wanted = plans(arguments)
     for plan in wanted if not arguments.sum_only else ():
         late = arguments.minutes and time.monotonic() - began > 60 * arguments.minutes

@@ -4,8 +4,9 @@
 
 For each fit (a folder of `identify` or `gap`) it writes the neutral result, steps it in plain C MuJoCo in a process
 that cannot import jax (`neutral_replay.py`), and compares positions and motor torques with the replay in MJX.  The
-tolerance is what both engines differ by with the laws left out of both.  It also draws from fitted.json and compares
-mean and covariance with the Gaussian's.  Cases that are not asked for stay in the file as they were.
+tolerance is what both engines differ by with the laws left out of both: with C in finer steps, and in the replay's own.
+It also draws from fitted.json and compares mean and covariance with the Gaussian's.  Cases that are not asked for stay
+in the file as they were.
 """
 
 from __future__ import annotations
@@ -110,6 +111,7 @@ def compare(
         with_laws = differences(fitted, drive, full, folder, fine, laws=True)
         tolerance = differences(fitted, drive, bare, folder, fine, laws=False)
         own_step = differences(fitted, drive, full, folder, 1, laws=True)
+        own_tolerance = differences(fitted, drive, bare, folder, 1, laws=False)
         matter = {
             name: float(np.abs(getattr(full, name) - getattr(bare, name)).max()) for name in ("position", "torque")
         }
@@ -123,6 +125,7 @@ def compare(
             "largest_difference": with_laws,
             "tolerance": tolerance,
             "largest_difference_at_own_step": own_step,
+            "tolerance_at_own_step": own_tolerance,
             "effect_of_the_laws": matter,
             "draws": draws_agree(folder, gaussian, seed),
         }

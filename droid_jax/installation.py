@@ -30,7 +30,7 @@ def check_mujoco() -> None:
     found = importlib.util.find_spec("mujoco")
     if found is None or not found.submodule_search_locations:
         return  # importing it says so
-    check_folder(Path(found.submodule_search_locations[0]), installed())
+    check_files_of(Path(found.submodule_search_locations[0]), installed())
 
 
 def installed() -> dict[str, str]:
@@ -44,7 +44,7 @@ def installed() -> dict[str, str]:
     return out
 
 
-def check_folder(folder: Path, versions: dict[str, str]) -> None:
+def check_files_of(folder: Path, versions: dict[str, str]) -> None:
     """MixedInstallation where distributions differ, or the folder holds a C library of a version that none of them is.
 
     Args:

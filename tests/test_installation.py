@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from droid_jax.installation import MEND, MixedInstallation, check_folder, check_mujoco
+from droid_jax.installation import MEND, MixedInstallation, check_files_of, check_mujoco
 
 ROOT = Path(__file__).resolve().parents[1]
 THREE, FOUR = {"mujoco": "3.17.0"}, {"mujoco": "4.0.0", "mujoco-core": "4.0.0", "mujoco-studio": "4.0.0"}
@@ -26,7 +26,7 @@ def test_this_installation_is_whole():
 def test_one_version_is_fine(tmp_path: Path, versions: dict[str, str], files: list[str]):
     for version in files:
         library(tmp_path, version)
-    check_folder(tmp_path, versions)
+    check_files_of(tmp_path, versions)
 
 
 @pytest.mark.parametrize(
@@ -44,7 +44,7 @@ def test_two_versions_are_named_with_the_command_that_mends_it(
     for version in files:
         library(tmp_path, version)
     with pytest.raises(MixedInstallation, match=said) as error:
-        check_folder(tmp_path, versions)
+        check_files_of(tmp_path, versions)
     assert MEND in str(error.value) and str(tmp_path) in str(error.value)
 
 

@@ -74,7 +74,7 @@ def acts_on_commands_only(effect: Effect) -> bool:
 
     Also one without laws of its own whose parameters write nothing but fields of these (`servo_gain`, `soft_friction`).
     """
-    if effect.command or effect.servo:
+    if effect.profile or effect.command or effect.servo:
         return True
     fields = [w.field for p in effect.parameters for w in p.writes]
     laws = (effect.force, effect.frictionloss, effect.observe)

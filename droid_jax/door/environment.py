@@ -81,6 +81,8 @@ class DoorEnv(Environment):
 
     def __init__(self, scene: Scene, task: Task | None = None, effects: Sequence[Effect] = ()):
         check_stateless(scene)
+        if shaping := [effect.name for effect in effects if effect.profile is not None]:
+            raise ValueError(f"effects {', '.join(shaping)} need a whole command, which a policy has not given yet")
         if scene.command_names != (*scene.joints, *scene.finger_joints):
             raise ValueError(
                 f"commands of a policy are of the arm and then of the fingers, and the actuators of scene "

@@ -124,7 +124,7 @@ def _read(path: Path) -> _File:
 
 def _in_mjcf(effect: Effect, free: Space) -> bool:
     """Whether an effect is nothing but numbers of the model that MJCF has words for; free: its parameters in use."""
-    laws = (effect.command, effect.servo, effect.force, effect.frictionloss, effect.observe)
+    laws = (effect.profile, effect.command, effect.servo, effect.force, effect.frictionloss, effect.observe)
     fields = [{w.field for w in p.writes} for p in free.parameters]
     return not any(laws) and all(written and written <= WORDS for written in fields)
 

@@ -21,7 +21,7 @@ from droid_jax.identify import apply_fit
 from droid_jax.identify.gaussian import Gaussian, prior
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.law_tables import LawTable, NoTable, law_tables
-from droid_jax.model.mjcf import FittedFiles, angles, fitted_files, native, spoken, unit_of, unwritten
+from droid_jax.model.mjcf import FittedFiles, field_unit, fitted_files, is_angle, mjcf_attribute, native, unwritten
 from droid_jax.model.parameters import Parameter, Role, Space
 from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene
@@ -113,7 +113,9 @@ def neutral_json(
         row |= {"value": apply_fit.number_of(row, named), "interval": _interval(row, intervals, drawn)}
         row["prior"] = _interval(row, priors, [])
     deviations = dict(zip(space.names, gaussian.physical_std.tolist(), strict=True))
-    tables = list(law_tables(scene, with_numbers(scene, space, np.asarray(values)), effects, named, deviations))
+    laws = [e for e in effects if e.command or e.servo or e.force or e.frictionloss]
+    fitted = with_numbers(scene, space, np.asarray(values)) if laws else None  # not of a scene that MJX has not
+    tables = list(law_tables(scene, fitted, laws, named, deviations))
     at = {(row["field"], *row["own"]): row for row in rows}
     changes = [
         {**asdict(c), "interval": None, "unit": ""} | _of_row(at.get((c.field, *c.entry)), c.before, c.after)
@@ -222,7 +224,7 @@ def _row(
     elif kind == "qpos":
         number = int(np.searchsorted(model.jnt_qposadr, first, side="right")) - 1
     element = {"dof": "joint", "jnt": "joint", "qpos": "joint"}.get(kind, kind)
-    spec, attribute = spoken(field)
+    spec, attribute = mjcf_attribute(field)
     attribute, place = said.get((field, index), (attribute, column or 0))
     slides = element == "joint" and model.jnt_type[number] == mujoco.mjtJoint.mjJNT_SLIDE
     return {
@@ -231,13 +233,13 @@ def _row(
         "id": int(scene.geoms_among_looks[number]) if element == "geom" else int(number),
         "attribute": attribute,
         "index": place,
-        "unit": unit_of(field, bool(slides)),
+        "unit": field_unit(field, bool(slides)),
         "field": field,
         "column": column,
         "offset": offset,
         "own": tuple(int(i) for i in index),
         "spec": spec,
-        "angle": angles(field),
+        "angle": is_angle(field),
         "nominal": float(getattr(model, field)[index]),
         "writes": writes,
     }

@@ -73,6 +73,8 @@ class Effect:
     name:         "hinge_preload", that of the function that makes it.
     parameters:   what it reads from theta or writes into the model; their means are its neutral values,
                   at which a replay is as without it.
+    profile:      (theta, command [T, U], s between its rows) -> [T, U], what a servo makes of the whole command, before
+                  any law of `command`.
     command:      (theta, time [], look) -> [U]; look(t) gives the command at time t [s].
     servo:        (theta, State, ctrl [U]) -> [U], what the servo is given in place of the command.
     force:        (theta, State) -> [nv] generalised force added to qfrc_applied.
@@ -96,6 +98,7 @@ class Effect:
 
     name: str
     parameters: tuple[Parameter, ...] = ()
+    profile: Callable[[Theta, jax.Array, float], jax.Array] | None = None
     command: Callable[[Theta, jax.Array, Callable], jax.Array] | None = None
     servo: Callable[[Theta, State, jax.Array], jax.Array] | None = None
     force: Callable[[Theta, State], jax.Array] | None = None

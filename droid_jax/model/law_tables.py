@@ -19,7 +19,7 @@ import numpy as np
 
 from droid_jax.model.effect_interface import Effect, State, complete
 from droid_jax.model.scene import Scene
-from droid_jax.model.table_grid import ROUNDING, Axis, error, first_nodes, on_grid, refined
+from droid_jax.model.table_grid import ROUNDING, GridAxis, error, first_nodes, on_grid, refined
 
 SPEED, TURNS, TRAVEL = 20.0, 2 * np.pi, 2.0  # rad/s or m/s, rad, m: how far tables reach where no limit says it
 LOAD = 20.0  # N m: likewise, where no force limit says it
@@ -47,7 +47,7 @@ class LawTable:
     acts: str
     joint: str
     unit: str
-    axes: tuple[Axis, ...]
+    axes: tuple[GridAxis, ...]
     terms: tuple[tuple[str | None, np.ndarray], ...]
     error: float
     error_of_draws: float
@@ -77,7 +77,7 @@ def law_tables(
     """
     for effect in effects:
         for location, amplitudes in (effect.locations or {"": tuple(p.name for p in effect.parameters)}).items():
-            if not any(values.get(name) for name in amplitudes if name in values):
+            if not any(values[name] or spread.get(name) for name in amplitudes if name in values):
                 continue
             law = _Law(scene, model, effect, location, amplitudes, values, spread)
             try:
@@ -117,6 +117,10 @@ class _Law:
         others = {n for at, names in self.effect.locations.items() if at != self.location for n in names}
         return [n for n in self.values if n in own and (n in self.amplitudes or n not in others)]
 
+    def probe(self, name: str) -> float:
+        """A value at which the law is there: the fitted one, or what draws may have where that is zero."""
+        return self.values[name] or self.spread.get(name, 0.0)
+
     def without(self, why: str) -> NoTable:
         """No table."""
         return NoTable(self.effect.name, self.location, self.effect.description, why)
@@ -154,7 +158,7 @@ class _Law:
         rng = np.random.default_rng(0)
         base = np.concatenate([np.tile(scene.model.qpos0, (PROBES, 1)), np.zeros((PROBES, 2 * nv))], axis=1)
         base = base + rng.uniform(-0.5, 0.5, base.shape)
-        at = {n: np.full(PROBES, self.values[n]) for n in self.parameters}
+        at = {n: np.full(PROBES, self.probe(n)) for n in self.parameters}
         now = function(at, base)
         touched: dict[int, set[tuple[str, int]]] = {}
         for column, variable, row in self._columns():
@@ -200,11 +204,11 @@ class _Law:
 
         reach = self._load_reach(joint)
         probes = np.linspace(-reach, reach, 41)
-        at = {n: np.full(41, self.values[n]) for n in self.parameters}
+        at = {n: np.full(41, self.probe(n)) for n in self.parameters}
         if np.abs(of_torque(at, probes) - of_torque(at, probes, 0.4, 1.0)).max() > 1e-4 * reach:
             return self.without("it depends on more than the servo's torque")
         unit = UNIT["torque"][self.scene.slides(joint)]
-        return self._made("servo", joint, unit, [Axis("torque", unit, first_nodes(-reach, reach))],
+        return self._made("servo", joint, unit, [GridAxis("torque", unit, first_nodes(-reach, reach))],
                           lambda given, x: of_torque(given, x[:, 0]))  # fmt: skip
 
     def _table(self, acts: str, dof: int, row: int, names: list[str], function: Callable[..., np.ndarray]) -> LawTable:
@@ -212,7 +216,7 @@ class _Law:
         acting, of = (model.joint(int(model.dof_jntid[d])).name for d in (dof, row))
         slides = model.jnt_type[model.dof_jntid[row]] == mujoco.mjtJoint.mjJNT_SLIDE
         columns = {v: c for c, v, r in self._columns() if r == row}
-        axes = [Axis(v, UNIT[v][slides], first_nodes(*self._reach(of, v))) for v in names]
+        axes = [GridAxis(v, UNIT[v][slides], first_nodes(*self._reach(of, v))) for v in names]
         base = np.concatenate([model.qpos0, np.zeros(2 * model.nv)])
 
         def at(given: dict[str, np.ndarray], x: np.ndarray) -> np.ndarray:
@@ -223,7 +227,7 @@ class _Law:
         assert acting == of or acts == "force"
         return self._made(acts, acting, UNIT["torque"][scene.slides(acting)], axes, at)
 
-    def _made(self, acts: str, joint: str, unit: str, axes: list[Axis], at: Callable[..., np.ndarray]) -> LawTable:
+    def _made(self, acts: str, joint: str, unit: str, axes: list[GridAxis], at: Callable[..., np.ndarray]) -> LawTable:
         """Terms by linear amplitudes; all other parameters are axes of the table."""
         names, values = self.parameters, self.values
         linear = [n for n in names if n in self.amplitudes and self._linear(n, axes, at)]
@@ -231,7 +235,7 @@ class _Law:
         deviation = {n: 4.0 * self.spread.get(n, 0.0) for n in shapes}
         bounds = {p.name: (p.low, p.high) for p in self.effect.parameters}
         shape_axes = [
-            Axis(n, next(p.unit for p in self.effect.parameters if p.name == n),
+            GridAxis(n, next(p.unit for p in self.effect.parameters if p.name == n),
                  np.unique(np.clip([values[n] - deviation[n], values[n], values[n] + deviation[n]], *bounds[n])))
             for n in shapes
         ]  # fmt: skip
@@ -263,7 +267,7 @@ class _Law:
             effect.name, self.location, effect.description, acts, joint, unit, tuple(every), tables, own, worst
         )
 
-    def _linear(self, name: str, axes: list[Axis], at: Callable[..., np.ndarray]) -> bool:
+    def _linear(self, name: str, axes: list[GridAxis], at: Callable[..., np.ndarray]) -> bool:
         """Whether the law is this amplitude times something, beside the others' parts."""
         x = np.stack(np.meshgrid(*(a.nodes for a in axes), indexing="ij"), axis=-1).reshape(-1, len(axes))
         count = len(x)

@@ -15,7 +15,7 @@ import numpy as np
 from droid_jax.arguments import instance, instances, numeric, shown
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.fields import check_space
-from droid_jax.model.mjcf_in_place import Change, Edited, NotInPlace, Placed, Wanted, edit
+from droid_jax.model.mjcf_in_place import Change, Edited, NotInPlace, PlacedNumber, WantedNumber, edit
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene
@@ -140,7 +140,7 @@ class _Fitted:
     before: mujoco.MjSpec
     written: mujoco.MjModel
     model: mujoco.MjModel
-    wanted: tuple[Wanted, ...]
+    wanted: tuple[WantedNumber, ...]
     weighed: dict[int, mujoco.MjModel]
 
 
@@ -185,7 +185,7 @@ def _differ(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def _wanted(
     before: mujoco.MjModel, after: mujoco.MjModel, kind: str, old: Any, new: Any, row: int, field: str
-) -> Wanted:
+) -> WantedNumber:
     attribute = _ATTRIBUTES[field]
     if field in _SHAPE | _PLACE:  # a spec may say them in other words
         numbers = getattr(before, field)[row], getattr(after, field)[row]
@@ -193,7 +193,7 @@ def _wanted(
         numbers = getattr(old, attribute), getattr(new, attribute)
     of = np.atleast_1d(np.array(numbers[0], float)), np.atleast_1d(np.array(numbers[1], float))
     element = "joint" if kind in ("dof", "jnt", "qpos") else kind
-    return Wanted(element, new.id, _SPELLED.get(attribute, attribute), *of, field)
+    return WantedNumber(element, new.id, _SPELLED.get(attribute, attribute), *of, field)
 
 
 def _changes(fitted: _Fitted, made: Edited | None) -> Iterator[Change]:
@@ -201,7 +201,7 @@ def _changes(fitted: _Fitted, made: Edited | None) -> Iterator[Change]:
     model, own = fitted.model, fitted.scene.model
     by_kind = {kind: rows.items() for kind, rows in _elements(fitted.before, model).items()}
     for i, want in enumerate(fitted.wanted):
-        placed = Placed(want.attribute) if made is None else made.placed[i]
+        placed = PlacedNumber(want.attribute) if made is None else made.placed[i]
         row, named = next((r, e.name) for r, e in by_kind[_kind(want.field)] if e.id == want.row)
         width = np.asarray(getattr(model, want.field)).shape[1:]
         short = placed.attribute in ("kp", "kv")  # one number, which is several of the model's
@@ -301,7 +301,7 @@ def _has_words(scene: Scene, parameter: Parameter) -> bool:
     return all(w.field in WORDS for w in parameter.writes) and not shaped
 
 
-def spoken(field: str) -> tuple[str, str]:
+def mjcf_attribute(field: str) -> tuple[str, str]:
     """Attribute of MuJoCo's spec and of MJCF that says a model field; empty where none does."""
     if field in _WEIGHT:
         return "", _INERTIAL[field]
@@ -309,13 +309,13 @@ def spoken(field: str) -> tuple[str, str]:
     return of_spec, _SPELLED.get(of_spec, of_spec)
 
 
-def unit_of(field: str, slides: bool) -> str:
+def field_unit(field: str, slides: bool) -> str:
     """Unit of a model field's numbers, of a joint that turns or slides; empty for one that has none, or no single."""
     unit = _UNITS.get(field, "")
     return unit if isinstance(unit, str) else unit[slides]
 
 
-def angles(field: str) -> bool:
+def is_angle(field: str) -> bool:
     """Whether MJCF has a field of hinges in degrees where its compiler says so."""
     return field in _ANGLES
 

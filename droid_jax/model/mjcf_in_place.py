@@ -16,7 +16,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from droid_jax.model.xml_text import Tag, Tree, edited, read_tree
+from droid_jax.model.xml_text import Tag, Tree, read_tree, with_edits
 
 MAKES_SEVERAL = ("replicate", "composite", "flexcomp", "attach")
 TURNS = ("euler", "axisangle", "xyaxes", "zaxis")
@@ -52,7 +52,7 @@ class Change:
 
 
 @dataclass(frozen=True)
-class Wanted:
+class WantedNumber:
     """New numbers of an attribute of an element, the `row`-th of its kind in the compiled model.
 
     before, after: [n] all its numbers.  field: of the MuJoCo model.
@@ -67,7 +67,7 @@ class Wanted:
 
 
 @dataclass(frozen=True)
-class Placed:
+class PlacedNumber:
     """Where a number stands: the attribute that says it, "" where another one does; file, line and origin as in
     `Change`."""
 
@@ -80,17 +80,17 @@ class Placed:
 @dataclass(frozen=True, eq=False)
 class Edited:
     """files: name -> text, to lie in one folder, the main one first: paths in them are absolute.  patch: the same
-    changes to the user's own files, as a unified diff.  placed: of each `Wanted`.  bodies: file and line of each that
-    was weighed."""
+    changes to the user's own files, as a unified diff.  placed: of each `WantedNumber`.  bodies: file and line of each
+    that was weighed."""
 
     files: dict[str, str]
     patch: str
-    placed: tuple[Placed, ...]
+    placed: tuple[PlacedNumber, ...]
     bodies: dict[int, tuple[str, int]]
 
 
 def edit(
-    path: Path, spec: mujoco.MjSpec, wanted: Sequence[Wanted], weighed: Mapping[int, mujoco.MjModel], main: str
+    path: Path, spec: mujoco.MjSpec, wanted: Sequence[WantedNumber], weighed: Mapping[int, mujoco.MjModel], main: str
 ) -> Edited:
     """The user's file with numbers changed.
 
@@ -111,22 +111,22 @@ def edit(
     places = _elements(tree, spec)
     edits: dict[Tag, dict[str, str | None]] = {}
     inserted: dict[Tag, str] = {}
-    placed: list[Placed] = []
+    placed: list[PlacedNumber] = []
     for want in wanted:
         tag = places[want.element][want.row]
         said = _attribute(tag, want)
         name = next((k for k, v in said.items() if v is not None), "")
         origin = "" if not name or name in tag.attributes else _origin(tree, tag, name)
-        placed.append(Placed(name, tag.file.name, tag.line, origin))
+        placed.append(PlacedNumber(name, tag.file.name, tag.line, origin))
         edits.setdefault(tag, {}).update(said)
     for body, model in weighed.items():
         _weigh(places["body"][body], body, model, edits, inserted)
     bodies = {body: (places["body"][body].file.name, places["body"][body].line) for body in weighed}
-    changed = edited(tree, edits, inserted)
+    changed = with_edits(tree, edits, inserted)
     names = _names(tree, main)
     paths = _absolute(tree, spec, changed, names)
     merged = {tag: {**edits.get(tag, {}), **paths.get(tag, {})} for tag in {**edits, **paths}}
-    standing = edited(tree, merged, inserted)
+    standing = with_edits(tree, merged, inserted)
     texts = {tree.root.file: tree.texts[tree.root.file].decode("utf-8"), **standing}
     files = {names[file]: text for file, text in texts.items()}
     return Edited(files, _patch(tree, changed), tuple(placed), bodies)
@@ -217,7 +217,7 @@ def _origin(tree: Tree, tag: Tag, attribute: str) -> str:
     return "MuJoCo's default"
 
 
-def _attribute(tag: Tag, want: Wanted) -> dict[str, str | None]:
+def _attribute(tag: Tag, want: WantedNumber) -> dict[str, str | None]:
     """Attributes of a tag that say the new numbers."""
     name, before, after = want.attribute, want.before, want.after
     if name in ("gainprm", "biasprm") and tag.name != "general":
@@ -237,7 +237,7 @@ def _attribute(tag: Tag, want: Wanted) -> dict[str, str | None]:
     return out
 
 
-def _servo(tag: Tag, want: Wanted) -> dict[str, str | None]:
+def _servo(tag: Tag, want: WantedNumber) -> dict[str, str | None]:
     """Gains of an actuator that is short for a general one: kp, kv."""
     after, field = want.after, want.attribute
     if tag.name == "position" and field == "gainprm" and not after[1:].any():

@@ -17,7 +17,7 @@ MOST, MOST_SHAPES = 300, 17  # nodes of a variable, of a parameter
 
 
 @dataclass(frozen=True)
-class Axis:
+class GridAxis:
     """nodes: [N] ascending, of a variable, or of a parameter whose fitted value is among them."""
 
     name: str
@@ -32,7 +32,7 @@ def first_nodes(low: float, high: float) -> np.ndarray:
     return np.unique(np.concatenate([np.linspace(low, high, 33), close[(close > low) & (close < high)]]))
 
 
-def refined(axes: Sequence[Axis], functions: Sequence[Function], fitted: Sequence[float]) -> list[Axis]:
+def refined(axes: Sequence[GridAxis], functions: Sequence[Function], fitted: Sequence[float]) -> list[GridAxis]:
     """Axes with nodes put in where straight lines between them miss one of the functions.
 
     fitted: values of the parameters, which are the first axes; variables are refined at these.
@@ -51,7 +51,7 @@ def refined(axes: Sequence[Axis], functions: Sequence[Function], fitted: Sequenc
             grid = np.insert(np.tile(rows, (len(x), 1)), k, np.repeat(x, len(rows)), axis=1)
             return np.concatenate([f(grid).reshape(len(x), -1) for f in functions], axis=1)
 
-        out[k] = Axis(out[k].name, out[k].unit, _split(out[k].nodes, along, most, slack))
+        out[k] = GridAxis(out[k].name, out[k].unit, _split(out[k].nodes, along, most, slack))
     return out
 
 
@@ -71,13 +71,13 @@ def _split(nodes: np.ndarray, along: Function, most: int, slack: float) -> np.nd
     return nodes
 
 
-def on_grid(axes: Sequence[Axis], function: Function) -> np.ndarray:
+def on_grid(axes: Sequence[GridAxis], function: Function) -> np.ndarray:
     """A function on the nodes of all axes."""
     grid = np.stack(np.meshgrid(*(a.nodes for a in axes), indexing="ij"), axis=-1).reshape(-1, len(axes))
     return function(grid).reshape([len(a.nodes) for a in axes])
 
 
-def error(axes: Sequence[Axis], function: Function, table: np.ndarray, points: int = 4000) -> float:
+def error(axes: Sequence[GridAxis], function: Function, table: np.ndarray, points: int = 4000) -> float:
     """Largest difference between a table and its function, at points in random cells."""
     rng, x = np.random.default_rng(0), np.empty((points, len(axes)))
     for i, axis in enumerate(axes):

@@ -1,6 +1,6 @@
 """An MJCF as its author wrote it: every start tag with its place in its file, included files among them.
 
-`read_tree` gives the tags as a tree in which an include stands for what it includes.  `edited` puts new attribute
+`read_tree` gives the tags as a tree in which an include stands for what it includes.  `with_edits` puts new attribute
 values into the text and leaves all else as it is: layout, comments, the order of attributes.
 """
 
@@ -132,7 +132,7 @@ def _parse(path: Path, text: bytes) -> Tag:
 Edits = Mapping[Tag, Mapping[str, str | None]]  # new attribute values; None takes the attribute away
 
 
-def edited(tree: Tree, edits: Edits, inserted: Mapping[Tag, str]) -> dict[Path, str]:
+def with_edits(tree: Tree, edits: Edits, inserted: Mapping[Tag, str]) -> dict[Path, str]:
     """The texts of the files that differ from the tree's: attributes changed, and lines put in behind start tags."""
     replaced: dict[Path, list[tuple[int, int, bytes]]] = {}
     for tag, changes in edits.items():

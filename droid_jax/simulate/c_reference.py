@@ -78,7 +78,7 @@ def why_not_in_c(scene: Scene, space: Space, torque: TorqueConvention, effects: 
         torque: what the recording's torque is.
         effects: in the replay, those of the torque offsets apart.
     """
-    functions = ("command", "servo", "force", "frictionloss", "observe")
+    functions = ("profile", "command", "servo", "force", "frictionloss", "observe")
     if active := [e.name for e in effects if any(getattr(e, f) is not None for f in functions)]:
         return f"effects depend on the state: {', '.join(active)}"
     weight = scene.model.body_gravcomp.any() and weight_share(scene.model, scene.joint_dofs, torque.gravity).any()

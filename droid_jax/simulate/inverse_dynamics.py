@@ -124,7 +124,7 @@ def path_replay(
     Raises ValueError for effects of command and servo, which a prescribed motion has not, and for air or water.
     """
     refuse_fluid(scene.model, f"a replay of scene {scene.name!r}")
-    steering = [e.name for e in effects if e.command or e.servo]
+    steering = [e.name for e in effects if e.profile or e.command or e.servo]
     if steering:
         raise ValueError(f"a prescribed motion has no commands that an effect could change: {', '.join(steering)}")
     joints = joints or scene.joints

@@ -228,8 +228,9 @@ def servo_motion(
         speed: jax.Array | None = None,
         origin: jax.Array | None = None,
     ) -> Rollout:
-        model, rows = with_gains(physics.model, gains), len(table) - earlier
-        sample = model, complete(physics.theta, effects), encoder_error(scene, model), table, origin
+        model, theta, rows = with_gains(physics.model, gains), complete(physics.theta, effects), len(table) - earlier
+        sent = profiled(table, drive.timestep, theta, effects)
+        sample = model, theta, encoder_error(scene, model), sent, origin
         zero, traces = jnp.zeros(scene.model.nv, jnp.float32), jnp.zeros((3, rows, len(joints)), jnp.float32)
         angle, contact = jnp.zeros(rows, jnp.float32), jnp.zeros((rows, len(fingers)), bool)
         begun = (
@@ -297,6 +298,14 @@ def _command(
     for law in laws:  # each law sees what the one before it made of the command
         look = compose(law, theta, look)
     return look((k - delay) * timestep) if laws else ctrl
+
+
+def profiled(table: jax.Array, timestep: float, theta: Theta, effects: Sequence[Effect]) -> jax.Array:
+    """[T, U] what the servos' own profiles make of a command [T, U]."""
+    for effect in effects:
+        if effect.profile is not None:
+            table = effect.profile(theta, table, timestep)
+    return table
 
 
 def compose(law: Callable, theta: Theta, look: Callable) -> Callable:

@@ -64,6 +64,7 @@ LIBRARY = {
     "command_delay": "command_delay",
     "clock_rate": "clock_rate",
     "feedforward": "velocity_feedforward",
+    "inner_profile": "profile_acceleration",
     "sensor_delay": "sensor_delay",
     "crosstalk": "torque_crosstalk",
     "torque_bias": "torque_bias",

@@ -52,6 +52,30 @@ def hide_velocity_feedforward(place: Place, a: float) -> Influence:
     return Influence(command=command)
 
 
+def hide_inner_profile(place: Place, a: float) -> Influence:
+    """The servo's own goal, which speeds up by at most 1 / a and is driven into place within 4 ms; a in s^2/rad.
+
+    It brakes with nine tenths of that, so as not to overshoot.
+    """
+
+    def command(clock: np.ndarray, control: np.ndarray) -> np.ndarray:
+        if a == 0.0:
+            return control
+        control, h = control.copy(), float(clock[1] - clock[0])
+        own = control[:, place.actuators]
+        at, speed = own[0].copy(), np.zeros(own.shape[1])
+        for k, goal in enumerate(own.copy()):
+            way = goal - at
+            wanted = np.sign(way) * np.minimum(np.abs(way) / 0.004, np.sqrt(1.8 / a * np.abs(way)))
+            speed = speed + np.clip(wanted - speed, -h / a, h / a)
+            at = at + h * speed
+            own[k] = at
+        control[:, place.actuators] = own
+        return control
+
+    return Influence(command=command)
+
+
 def hide_crosstalk(place: Place, a: float) -> Influence:
     """A sensor also reads a tau (1 + 0.1 sin(2 q)) of the joint before its own, of the first joint the one behind it.
 
@@ -135,6 +159,7 @@ SIGNALS = (
     Hidden(
         "feedforward", "s", (0.005, 0.05), "arm", hide_velocity_feedforward, "a servo that looks ahead", signed=True
     ),
+    Hidden("inner_profile", "s^2/rad", (0.01, 0.2), "arm", hide_inner_profile, "a servo whose goal speeds up slowly"),
     Hidden("sensor_delay", "s", (0.002, 0.02), "arm", hide_sensor_delay, "torques that arrive late"),
     Hidden("torque_bias", "N m", (0.1, 1.0), "arm", hide_torque_bias, "a torque sensor off zero", signed=True),
     Hidden("torque_gain", "-", (0.03, 0.2), "arm", hide_torque_gain, "a torque sensor of wrong gain", signed=True),

@@ -101,6 +101,9 @@ ANSWERS: dict[str, Answer] = {
     ),
     "clock_rate": Answer("clock_rate", ("command_delay",), "over a short motion it is a delay", HINGED),
     "feedforward": Answer("velocity_feedforward", ("servo_gain",), "both track in proportion to the speed", SERVO),
+    "inner_profile": Answer(
+        "profile_acceleration", ("velocity_feedforward", "command_delay"), "of slow motions a lag is left", SERVO
+    ),
     "crosstalk": Answer("torque_crosstalk", scenes=("bench", "arm", "door")),
     "sensor_delay": Answer("sensor_delay", ("command_delay",), "positions are not scored"),
     "torque_bias": Answer(
@@ -113,7 +116,7 @@ ANSWERS: dict[str, Answer] = {
 }  # fmt: skip
 NO_HINGE = ("cable_pull", "torque_ripple", "dry_friction", "bristle_friction", "warm_up_friction", "load_friction",
             "mesh_friction", "joint_elasticity", "backlash", "servo_gains", "firm_friction",
-            "encoder_zero", "crosstalk", "feedforward")  # fmt: skip
+            "encoder_zero", "crosstalk", "feedforward", "inner_profile")  # fmt: skip
 PLACES = {"command_delay": "commands", "clock_rate": "commands", "sensor_delay": "sensors",
           "contact_compliance": "grip", "gravity_direction": "base"}  # fmt: skip
 OF_HINGE = frozenset({

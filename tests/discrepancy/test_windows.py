@@ -17,6 +17,7 @@ from pendulum import TRUE, pendulum, swung
 import droid_jax as dj
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.cost.windowed_log import WindowedLog, _whitener, windowed_log
+from droid_jax.discrepancy.candidates import observable_effects
 from droid_jax.discrepancy.config import BlocksConfig
 from droid_jax.discrepancy.statistics import OUTSIDE
 from droid_jax.discrepancy.verdict import Conclusion
@@ -111,6 +112,18 @@ def test_windows_leave_noise_at_the_truth(space: Space):
     assert np.abs(rollout.position[0] - log.measured).max() < 0.02 and rollout.position.shape == (1, 64, 1)
 
 
+@pytest.mark.slow
+def test_a_motion_that_is_replayed_whole_has_stretches(space: Space):
+    """Which make blocks, as windows do."""
+    config = CompareConfig(channels={"position": 1.0})
+    log = windowed_log(scene(), space, [swung("a", 1.0, 0.7, noise=NOISE)], config, None, fitted_share=0.5)
+    assert log.whole and log.unit.max() + 1 == 3 and log.fitted == 2 and log.unit_seconds == 0.5
+    left = log.residual(space.values(TRUE))
+    assert np.sqrt(np.mean(left**2)) < 2 * NOISE
+    white = log.about(space.mean).with_noise(np.full(1, NOISE), log.unit < 2).whitened(space.values(TRUE)[None])[0]
+    np.testing.assert_allclose(white, np.where(log.unit < 2, -left[:, 0] / NOISE, 0.0), atol=1e-3)
+
+
 def test_a_masked_stretch_leaves_its_windows_out(space: Space):
     whole = swung("a", 1.0, 0.7, noise=NOISE)
     channel = whole.channel("position")
@@ -130,6 +143,13 @@ def test_the_noise_of_a_window_holds_the_spread_of_its_state():
         flat = np.swapaxes(s, 0, 1).reshape(10, 4)
         covariance = np.diag(np.repeat(deviation, 5) ** 2) + flat @ flat.T
         np.testing.assert_allclose(matrix @ covariance @ matrix.T, np.eye(10), atol=1e-9)
+
+
+def test_what_acts_on_torque_sensors_alone_is_not_asked_about_in_positions():
+    recording = swung("a", 1.0, 1.0, ("position", "torque"))
+    asked = [{e.name for e in observable_effects(scene(), [recording], channels=c)} for c in (["position"], ["torque"])]
+    assert asked[1] - asked[0] == {"torque_bias", "torque_gain", "torque_drift", "sensor_delay"}
+    assert "command_delay" in asked[0] and asked[0] < asked[1]
 
 
 # ----- blocks of windows

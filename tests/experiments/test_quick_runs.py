@@ -15,6 +15,7 @@ from benchmarks.common import commits
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = {  # folders of real logs
+    "experiments/gap_xl330.py": "bam_xl330",
     "experiments/gap_door.py": "door_pr2_ikea",
     "experiments/gap_emps.py": "emps",
     "experiments/gap_panda.py": "franka_gaz2019",
@@ -48,6 +49,7 @@ SCRIPTS: dict[str, tuple[str, ...]] = {
     "benchmarks/durations.py": (),
     "benchmarks/house.py": (),
     "benchmarks/kills.py": (),
+    "benchmarks/lone_logs.py": (),
     "benchmarks/robustness.py": (),
     "benchmarks/step_accuracy.py": (),
     "benchmarks/time_to_fit.py": (),

@@ -23,10 +23,11 @@ from droid_jax.identify.gaussian import Gaussian, prior
 from droid_jax.identify.neutral_result import with_numbers, write_neutral
 from droid_jax.model.effect_interface import Effect, State, complete
 from droid_jax.model.effects.registry import effect_space, library, ready
+from droid_jax.model.fields import joint_damping
 from droid_jax.model.law_tables import NoTable, law_tables
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model, make_physics, theta_of
-from droid_jax.model.scene import Scene
+from droid_jax.model.scene import Scene, load_scene
 from droid_jax.recordings.recording import TorqueConvention, TorqueSide
 from droid_jax.simulate.replay import make_drive, servo_replay
 from droid_jax.simulate.servo_gains import servo_factors
@@ -260,3 +261,15 @@ def test_a_prior_of_the_built_in_door_has_its_table(tmp_path: Path):
     expected = make_c_model(scene, space, values)
     np.testing.assert_allclose(model.geom_size[scene.geoms_among_looks], expected.geom_size, rtol=1e-4)
     np.testing.assert_allclose(model.body_mass, expected.body_mass, rtol=1e-6)
+
+
+def test_a_scene_that_only_the_c_engine_has_is_written_too(tmp_path: Path):
+    """An integrator that MJX lacks."""
+    text = SCENE.read_text().replace('integrator="implicitfast"', 'integrator="RK4" cone="elliptic"')
+    (tmp_path / "bench.xml").write_text(text)
+    scene = load_scene(tmp_path / "bench.xml", object_joint="door", engine="mujoco")
+    space = Space((joint_damping(scene, "door", std=0.3, high=5.0),))
+    assert write_neutral(tmp_path, scene, prior(space), np.array([0.7]), main="fitted.xml") == ""
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "fitted.xml"))
+    assert model.dof_damping[scene.dof("door")] == pytest.approx(0.7)
+    assert apply_fit.load(tmp_path / "fitted.json")["laws"] == []

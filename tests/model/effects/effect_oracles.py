@@ -195,6 +195,25 @@ def looking_ahead(v: Values, at: np.ndarray, look: Look, servos: Mapping[str, in
     return command
 
 
+def in_ramps(v: Values, name: str, at: np.ndarray, look: Look, servos: Mapping[str, int]) -> np.ndarray:
+    """A goal of each joint that follows the command on the replay's clock, within its limit."""
+    h = at[1] - at[0]
+    time = h * np.arange(len(at))
+    command = look(time)
+    for joint in ARM:
+        place, speed, most = command[0, servos[joint]], 0.0, 1.0 / v[f"{name}[{joint}]"]
+        for k, goal in enumerate(command[:, servos[joint]].copy()):
+            way = goal - place
+            if name == "profile_speed":
+                place += min(max(way, -most * h), most * h)
+            else:
+                wanted = np.sign(way) * min(abs(way) / h, np.sqrt(2 * most * abs(way)))
+                speed += min(max(wanted - speed, -most * h), most * h)
+                place += h * speed
+            command[k, servos[joint]] = place
+    return np.stack([np.interp(at, time, column) for column in command.T], axis=1)
+
+
 def leaking(v: Values, t: np.ndarray, torque: np.ndarray) -> np.ndarray:
     """Shoulder and elbow, the first two channels, read each other."""
     shoulder = torque[:, 0] + v["crosstalk_after[shoulder]"] * torque[:, 1]
@@ -292,6 +311,14 @@ ORACLES = {
     "opening_check": Oracle({"check_damping": 2.5, "check_angle": 0.4, "check_exponent": 1.7}, force=at_door(check)),
     "over_centre_spring": Oracle({"over_centre_torque": 1.5, "over_centre_angle": 0.25}, force=at_door(over_centre)),
     "payload": Oracle({"payload_mass": 0.3, "payload_moment": -0.04}, edit=lump, beside=hangs_further_out),
+    "profile_acceleration": Oracle(
+        each(*ARM, profile_acceleration=(0.5, 0.4)),
+        sent=lambda v, at, look, servos: in_ramps(v, "profile_acceleration", at, look, servos),
+    ),
+    "profile_speed": Oracle(
+        each(*ARM, profile_speed=(1.5, 1.2)),
+        sent=lambda v, at, look, servos: in_ramps(v, "profile_speed", at, look, servos),
+    ),
     "sensor_delay": Oracle(
         {"sensor_delay": 0.0077},
         read=lambda v, t, torque: np.stack([np.interp(t - v["sensor_delay"], t, c) for c in torque.T], axis=1),

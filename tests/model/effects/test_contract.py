@@ -100,7 +100,7 @@ def test_what_it_holds_is_among_what_it_may_be_confused_with(effect: Effect):
 
 
 def test_it_does_something(effect: Effect):
-    functions = (effect.command, effect.servo, effect.force, effect.frictionloss, effect.observe)
+    functions = (effect.profile, effect.command, effect.servo, effect.force, effect.frictionloss, effect.observe)
     assert any(functions) or all(p.writes for p in effect.parameters)
 
 
@@ -149,6 +149,9 @@ def test_each_function_changes_nothing_at_neutral(effect: Effect, scene: Scene, 
         if effect.servo:
             ctrl = jnp.cos(jnp.arange(scene.model.nu, dtype=jnp.float32))
             np.testing.assert_array_equal(effect.servo(theta, state, ctrl), ctrl)
+        if effect.profile:
+            given = jnp.sin(jnp.arange(3.0 * scene.model.nu)).reshape(3, -1)
+            np.testing.assert_array_equal(effect.profile(theta, given, 0.002), given)
         if effect.command:
             np.testing.assert_array_equal(effect.command(theta, state.time, jnp.sin), jnp.sin(state.time))
     if effect.observe:

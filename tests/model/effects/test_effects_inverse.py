@@ -25,7 +25,8 @@ from droid_jax.simulate.measured_motion import Motion
 from droid_jax.simulate.replay import Replay
 
 MOTOR, LINK = TorqueSide.MOTOR, TorqueSide.LINK
-STEERING = ("clock_rate", "command_delay", "joint_backlash", "joint_compliance", "velocity_feedforward")
+STEERING = ("clock_rate", "command_delay", "joint_backlash", "joint_compliance", "profile_acceleration",
+            "profile_speed", "velocity_feedforward")  # fmt: skip
 COULOMB = 0.15  # N m: the friction that a link-side sensor sees already, in one row of each comparison
 TOLERANCE = 1e-4  # N m: float32, 6e-8 of inertias times accelerations and of 9 N m of weight, summed
 

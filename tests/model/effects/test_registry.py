@@ -24,7 +24,8 @@ OF_HINGES = {"angle_friction", "door_closer", "drag", "hardening_spring", "hinge
              "hinge_stribeck", "latch", "opening_check", "over_centre_spring", "tilted_frame"}  # fmt: skip
 OF_ARMS = {"cable_pull", "encoder_offset", "free_payload", "gear_friction", "gravity_direction", "joint_backlash",
            "joint_compliance", "joint_coulomb", "joint_directional", "joint_stribeck", "load_friction", "payload",
-           "servo_gain", "soft_friction", "torque_crosstalk", "torque_ripple", "velocity_feedforward"}  # fmt: skip
+           "profile_acceleration", "profile_speed", "servo_gain", "soft_friction", "torque_crosstalk",
+           "torque_ripple", "velocity_feedforward"}  # fmt: skip
 OF_SERVOS = {"joint_backlash", "joint_compliance"}
 OF_GRIPS = {"contact_compliance"}
 

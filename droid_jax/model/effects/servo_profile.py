@@ -1,0 +1,93 @@
+"""The path that a servo draws by itself between two goals: limits of its acceleration and of its speed.
+
+Hobby servos and industrial controllers turn a goal into a ramp before their position loop sees it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+
+from droid_jax.model.actuators import has_feedback
+from droid_jax.model.effect_interface import Effect, Theta, column
+from droid_jax.model.effects import coefficients as a
+from droid_jax.model.effects.registry import register
+from droid_jax.model.scene import Scene
+
+ACCELERATION, SPEED = "profile_acceleration", "profile_speed"
+
+
+@register
+def profile_acceleration(scene: Scene) -> Effect | None:
+    """The servo's own goal accelerates by at most 1/p and brakes in time; p in s^2/rad, none at zero."""
+    joints = _servos(scene)
+    if not joints:
+        return None
+
+    def profile(theta: Theta, command: jax.Array, timestep: float) -> jax.Array:
+        limit = column(theta, ACCELERATION, scene.command_names)
+        most = 1.0 / jnp.where(limit > 0.0, limit, 1.0)
+
+        def follow(state, goal):
+            place, speed = state
+            way = goal - place
+            wanted = jnp.sign(way) * jnp.minimum(jnp.abs(way) / timestep, jnp.sqrt(2.0 * most * jnp.abs(way)))
+            speed = speed + jnp.clip(wanted - speed, -most * timestep, most * timestep)
+            place = place + timestep * speed
+            return (place, speed), place
+
+        return jnp.where(limit > 0.0, _followed(follow, command), command)
+
+    return Effect(
+        ACCELERATION,
+        a.of_joints(ACCELERATION, joints, "s^2/rad", 0.02, 1.0, low=0.0),
+        profile=profile,
+        description="a servo that limits how fast its goal speeds up",
+        signature="fast changes of that joint's command: amplitudes that fall, and lag that grows, with its frequency",
+        confused_with=("velocity_feedforward", "command_delay", "servo_gain", SPEED),
+        locations=a.places(joints, ACCELERATION),
+        minimum_size=0.002,
+    )
+
+
+@register
+def profile_speed(scene: Scene) -> Effect | None:
+    """The servo's own goal moves by at most 1/p; p in s/rad, no limit at zero."""
+    joints = _servos(scene)
+    if not joints:
+        return None
+
+    def profile(theta: Theta, command: jax.Array, timestep: float) -> jax.Array:
+        limit = column(theta, SPEED, scene.command_names)
+        most = timestep / jnp.where(limit > 0.0, limit, 1.0)
+
+        def follow(state, goal):
+            place, speed = state
+            place = place + jnp.clip(goal - place, -most, most)
+            return (place, speed), place
+
+        return jnp.where(limit > 0.0, _followed(follow, command), command)
+
+    return Effect(
+        SPEED,
+        a.of_joints(SPEED, joints, "s/rad", 0.2, 5.0, low=0.0),
+        profile=profile,
+        description="a servo that limits how fast its goal moves",
+        signature="large steps of that joint's command, which become ramps of one slope",
+        confused_with=("command_delay", "servo_gain", ACCELERATION),
+        locations=a.places(joints, SPEED),
+        minimum_size=0.02,
+    )
+
+
+def _followed(follow, command: jax.Array) -> jax.Array:
+    """[T, U] the places of a goal that sets out from rest at the first command [T, U]."""
+    return jax.lax.scan(follow, (command[0], jnp.zeros_like(command[0])), command)[1]
+
+
+def _servos(scene: Scene) -> Sequence[str]:
+    """Joints of the arm with a position servo."""
+    servos = has_feedback(scene.model)
+    return [j for j in a.arm(scene) if j in scene.command_names and servos[scene.command_names.index(j)]]
