@@ -70,7 +70,7 @@ def part(rollout: Rollout, rows: slice, steps: int) -> Rollout:
     return Rollout(**{name: a[:, :steps] if a.ndim > 1 else a for name, a in arrays.items()})
 
 
-@pytest.fixture(scope="module", params=[(slice(1, 5, 3), 2200), pytest.param((slice(6), 3851), marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=[(slice(1, 5, 3), 1900), pytest.param((slice(6), 3851), marks=pytest.mark.slow)])
 def both(
     request, scene: Scene, space: Space, drive: Drive, rows: np.ndarray, in_c: Rollout
 ) -> tuple[Rollout, Rollout, int]:
