@@ -3,7 +3,9 @@
     python experiments/real_so101.py --data DIR
 
 `identify` fits `chirp_sweep` and `friction_gravity` of six STS3215 servos (`so101.json`: a gain, damping and dry
-friction of each of the first five joints, one armature that they share, and a delay).  `so101.toml` says which columns
+friction of each of the first five joints, one armature that they share, and a delay), with the library's limit of the
+acceleration of each servo's own goal: an STS3215 draws ramps between its goals, and LeRobot sets their steepest, 254
+times 100 counts/s^2 or 39 rad/s^2.  `so101.toml` says which columns
 of a log are what.  `evaluate-fit` replays the other motions open loop, over their whole length.
 
 Data: isaac-sim2real/sage (Apache 2.0), `output/real/so101/custom`.  DIR holds a folder for each motion, with
@@ -33,6 +35,7 @@ SOURCE = (
     "Logs of isaac-sim2real/sage of an SO-101: a folder for each motion with control.csv.gz and state_motor.csv.gz."
 )
 SECONDS = 120.0
+EFFECTS = ("profile_acceleration",)
 HARD = "0.9999 0.9999 0.001 0.5 2"  # solimpfriction
 
 
@@ -83,7 +86,15 @@ def main(config: RealSo101) -> None:
     logs = [so101_log(config.data, motion, seconds) for motion in (*fit, *judges)]
     runs = config.out / ("real_so101_quick_runs" if config.quick else "real_so101_runs")
     paths = kept(logs, runs / "logs")
-    options = ["--joints", *JUDGED, "--seed", str(config.seed), *(["--generations", "3"] if config.quick else [])]
+    options = [
+        "--joints",
+        *JUDGED,
+        "--effects",
+        *EFFECTS,
+        "--seed",
+        str(config.seed),
+        *(["--generations", "3"] if config.quick else []),
+    ]
     judge_on = [paths[name] for name in judges]
     scene = hard_scene(config.data, runs)
     found, took = fitted(scene, HERE / "so101.json", [paths[n] for n in fit], judge_on, runs / "identify", options)
@@ -101,7 +112,7 @@ def main(config: RealSo101) -> None:
         "mean_judged_mrad_before": round(float(np.mean([mae["before"][name] for name in judges])), 3),
         "mae_mrad": mae["after"],
         "mae_mrad_before": mae["before"],
-        "effects": [],
+        "effects": list(EFFECTS),
         "tied": [],
         "parameters": parameters_of(found),
         "seconds": round(took, 1),

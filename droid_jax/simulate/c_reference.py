@@ -1,7 +1,7 @@
 """The C twin of the servo replay: the same commands, values and outputs through plain C MuJoCo.
 
 It is the parity oracle, the CPU benchmark, and the engine of `--engine mujoco`.  Of effects it knows those
-that write model fields, and the torque offsets; everything else needs MJX.
+that write model fields, what a servo makes of its whole command, and the torque offsets; everything else needs MJX.
 """
 
 from __future__ import annotations
@@ -9,9 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from droid_jax.model.effect_interface import Effect, Rollout
+from droid_jax.model.effect_interface import Effect, Rollout, complete
 from droid_jax.model.parameters import Role, Space
 from droid_jax.model.physics import make_c_model, theta_of
 from droid_jax.model.scene import Scene
@@ -19,7 +21,7 @@ from droid_jax.recordings.clocks import interpolate
 from droid_jax.recordings.recording import TorqueConvention, TorqueSide
 from droid_jax.simulate.c_engine import instrument, simulate
 from droid_jax.simulate.initial_state import weight_share
-from droid_jax.simulate.replay import Drive, check_stateless
+from droid_jax.simulate.replay import Drive, check_stateless, profiled
 from droid_jax.simulate.servo_gains import check_gains, scale_gains, servo_factors
 
 CHUNK = 64  # samples whose traces of the whole state are held at once
@@ -39,11 +41,18 @@ def c_replay(
     if why := why_not_in_c(scene, space, drive.torque, effects):
         raise ValueError(f"the C engine cannot replay this: {why}; use MJX")
     plain, factors = replace(scene, model=instrument(scene)), servo_factors(scene, drive)
+    sent_by = _profiles(drive, effects)
 
     def piece(values: np.ndarray) -> Rollout:
         models = [scale_gains(make_c_model(plain, space, row), factors) for row in values]
         thetas = [theta_of(space, row.tolist()) for row in values]
-        control = np.stack([control_of(drive, t.get(Role.TIME_OFFSET.value, 0.0), late) for t in thetas])
+        sent = sent_by(thetas)
+        control = np.stack(
+            [
+                control_of(drive, table, t.get(Role.TIME_OFFSET.value, 0.0), late)
+                for t, table in zip(thetas, sent, strict=True)
+            ]
+        )
         trace = simulate(plain, models, drive.qpos0[None], control)
         traces = (trace.torque, trace.position, trace.velocity, trace.object_angle[..., None])
         ahead = late * drive.timestep
@@ -78,7 +87,7 @@ def why_not_in_c(scene: Scene, space: Space, torque: TorqueConvention, effects: 
         torque: what the recording's torque is.
         effects: in the replay, those of the torque offsets apart.
     """
-    functions = ("profile", "command", "servo", "force", "frictionloss", "observe")
+    functions = ("command", "servo", "force", "frictionloss", "observe")
     if active := [e.name for e in effects if any(getattr(e, f) is not None for f in functions)]:
         return f"effects depend on the state: {', '.join(active)}"
     weight = scene.model.body_gravcomp.any() and weight_share(scene.model, scene.joint_dofs, torque.gravity).any()
@@ -95,10 +104,31 @@ def _later(velocity: np.ndarray, late: float) -> np.ndarray:
     return velocity + late * (after - velocity)
 
 
-def control_of(drive: Drive, time_offset: float = 0.0, late: float = 0.5) -> np.ndarray:
-    """[T, U] the command so many steps (and the time offset) late."""
+def control_of(
+    drive: Drive, command: np.ndarray | None = None, time_offset: float = 0.0, late: float = 0.5
+) -> np.ndarray:
+    """[T, U] the command, of the drive unless given, so many steps (and the time offset) late."""
     at = drive.time - late * drive.timestep - time_offset
-    return interpolate(at, drive.time, drive.command)
+    return interpolate(at, drive.time, drive.command if command is None else command)
+
+
+def _profiles(drive: Drive, effects: Sequence[Effect]) -> Callable[[Sequence[dict[str, float]]], Sequence[np.ndarray]]:
+    """Parameters of P samples -> commands [T, U] that their servos make of the drive's."""
+    drawing = [e for e in effects if e.profile is not None]
+    if not drawing:
+        return lambda thetas: [np.asarray(drive.command)] * len(thetas)
+    table = jnp.asarray(drive.command, jnp.float32)
+    each = jax.jit(jax.vmap(lambda theta: profiled(table, drive.timestep, complete(theta, drawing), drawing)))
+    read = {p.name for e in drawing for p in e.parameters}
+
+    def sent(thetas: Sequence[dict[str, float]]) -> Sequence[np.ndarray]:
+        wide = [*thetas, *[thetas[-1]] * (-len(thetas) % CHUNK)]  # compiled for one number of samples
+        given = {name: jnp.array([t[name] for t in wide]) for name in read if name in wide[0]}
+        if not given:
+            return [np.asarray(drive.command)] * len(thetas)
+        return list(np.asarray(each(given), np.float64)[: len(thetas)])
+
+    return sent
 
 
 def _offsets(scene: Scene, thetas: Sequence[dict[str, float]]) -> np.ndarray:

@@ -10,6 +10,9 @@ import pytest
 from two_link import JOINTS, arm, recording
 
 from droid_jax import distributed
+from droid_jax.cost.cost import make_cost
+from droid_jax.cost.residuals import CompareConfig
+from droid_jax.model.effects.registry import effect_space, library
 from droid_jax.model.fields import joint_damping
 from droid_jax.model.joint_friction import joint_friction_effect, joint_friction_space
 from droid_jax.model.parameters import Space
@@ -47,3 +50,19 @@ def test_other_machines_are_mjx(monkeypatch: pytest.MonkeyPatch):
     assert choose_engine(arm(), SPACE, [ONE]).engine == "mjx"
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert "gpu" in choose_engine(arm(), SPACE, [ONE]).why
+
+
+def test_c_draws_a_servos_own_profile():
+    """Both engines replay a goal whose acceleration is limited; MJX is the reference."""
+    scene = arm()
+    effects = library(scene, ["profile_acceleration"])
+    space = SPACE + effect_space(effects)
+    assert choose_engine(scene, space, [ONE], effects).engine == "mujoco"
+    values = np.stack([space.mean, space.values({"profile_acceleration[shoulder]": 0.05})])
+    config = CompareConfig(channels={"torque": 1.0})
+    mjx, c = (
+        make_cost(scene, space, [ONE], engine=engine, config=config, effects=effects).rollouts(values)[0]
+        for engine in ("mjx", "mujoco")
+    )
+    np.testing.assert_allclose(c.position, mjx.position, atol=2e-4)
+    assert np.abs(c.position[1] - c.position[0]).max() > 0.02

@@ -78,15 +78,15 @@ def clock_rate(scene: Scene) -> Effect | None:
 
 @register
 def velocity_feedforward(scene: Scene) -> Effect | None:
-    """q_d + c dq_d/dt of a joint's position servo, c in s, dq_d/dt over `SPAN`; below zero the servo trails."""
+    """q_d + c dq_d/dt of a joint's position servo, c in s, dq_d/dt over the last `SPAN`; below 0 it trails."""
     servos = has_feedback(scene.model)
     joints = tuple(j for j in a.arm(scene) if j in scene.command_names and servos[scene.command_names.index(j)])
     if not joints:
         return None
 
     def command(theta, time, look):
-        speed = (look(time + 0.5 * SPAN) - look(time - 0.5 * SPAN)) / SPAN
-        return look(time) + column(theta, AHEAD, scene.command_names) * speed
+        now = look(time)
+        return now + column(theta, AHEAD, scene.command_names) * (now - look(time - SPAN)) / SPAN
 
     return Effect(
         AHEAD,

@@ -72,7 +72,7 @@ def profile_speed(scene: Scene) -> Effect | None:
 
     return Effect(
         SPEED,
-        a.of_joints(SPEED, joints, "s/rad", 0.2, 5.0, low=0.0),
+        a.of_joints(SPEED, joints, "s/rad", 1.0, 5.0, low=0.0),
         profile=profile,
         description="a servo that limits how fast its goal moves",
         signature="large steps of that joint's command, which become ramps of one slope",

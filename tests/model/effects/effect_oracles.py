@@ -188,8 +188,8 @@ def geared(v: Values, joint: str, now: Now) -> float:
 
 
 def looking_ahead(v: Values, at: np.ndarray, look: Look, servos: Mapping[str, int]) -> np.ndarray:
-    """Each servo is given its command and a share of the command's speed over 10 ms."""
-    command, speed = look(at), (look(at + 0.005) - look(at - 0.005)) / 0.01
+    """Each servo is given its command and a share of the command's speed over the last 10 ms."""
+    command, speed = look(at), (look(at) - look(at - 0.01)) / 0.01
     for joint in ARM:
         command[:, servos[joint]] += v[f"velocity_feedforward[{joint}]"] * speed[:, servos[joint]]
     return command
