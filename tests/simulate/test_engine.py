@@ -64,5 +64,6 @@ def test_c_draws_a_servos_own_profile():
         make_cost(scene, space, [ONE], engine=engine, config=config, effects=effects).rollouts(values)[0]
         for engine in ("mjx", "mujoco")
     )
-    np.testing.assert_allclose(c.position, mjx.position, atol=2e-4)
-    assert np.abs(c.position[1] - c.position[0]).max() > 0.02
+    drawn, expected = (rollout.position[1] - rollout.position[0] for rollout in (c, mjx))
+    np.testing.assert_allclose(drawn, expected, atol=1e-3)  # what the profile changes; C's steps are of first order
+    assert np.abs(expected).max() > 0.1
