@@ -91,7 +91,9 @@ def windowed_case(
     if test:
         judged = windowed_log(scene, unbounded(whole, own), test, config.compare, config.windows, effects)
     end, rough = _end_of(log), replace(config, refine=replace(config.refine, spreads=0))  # widths are asked for later
-    noise = noise_of(log, base, effects, end, rough, _first_values(log, base, effects, end, rough))
+    first = _first_values(log, base, effects, end, rough)
+    # With the spread of their first states known, what windows leave is correlated for as long as the noise is.
+    noise = noise_of(log.about(first), base, effects, end, rough, first)
     log = log.about(noise.values)
     plan = planned(log, noise.block, config.blocks.shortest, judged is None)
     sets = [

@@ -34,7 +34,7 @@ class WindowConfig:
     reach: s, to both sides of its beginning, of the measured positions that tell where and how fast it begins.
     """
 
-    length: float = 1.0
+    length: float = 0.5
     lead: float = 0.2
     history: float = 0.15
     reach: float = 0.06
