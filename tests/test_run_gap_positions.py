@@ -15,7 +15,7 @@ from droid_jax.report.gap_folder import Found, read_gap
 from droid_jax.run import main
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_line", "tuned")]
-FRICTION, NOISE = 0.02, 1e-4  # N m, rad
+FRICTION, NOISE = 0.05, 1e-4  # N m, rad
 ASKED = ("joint_coulomb", "cable_pull", "command_delay")
 
 

@@ -203,3 +203,16 @@ def test_nothing_is_named_in_one_log_of_positions_that_lacks_nothing(space: Spac
     log = swung("a", 1.0, 0.31, noise=NOISE)
     verdict, _ = dj.find_missing_effects(scene(), space, [log], effects=effects)
     assert verdict.conclusion is Conclusion.NONE
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("seconds")
+def test_friction_explains_one_log_of_positions(space: Space):
+    """Of 0.02 N m, which is below the minimum effect size: it explains all, and is not named for its size alone."""
+    effects = library(scene(), ["joint_coulomb", "cable_pull", "command_delay"])
+    stuck = swung("rubs", 1.0, 0.31, noise=NOISE, friction=0.02)
+    verdict, _ = dj.find_missing_effects(scene(), space, [stuck], effects=effects)
+    assert verdict.score_tests[0].p < 0.01 and verdict.conclusion is Conclusion.UNEXPLAINED
+    best = next(t for t in verdict.validation_tests if [k.effect for k in t.keys] == ["joint_coulomb"])
+    assert best.weak and best.discrepancy_validation < 0.01 * verdict.discrepancies["validation"][0]
+    assert "joint_coulomb at swing, below the minimum effect size" in verdict.sentence
