@@ -74,7 +74,7 @@ class Inverse:
         """[T, J] N m that weight, springs and the other joints' motion put onto the gears."""
         spec = mujoco.MjSpec.from_string(MECHANISM)
         for joint in spec.joints:
-            joint.damping = 0.0
+            joint.damping[:] = 0.0
         still = replace(self.motion, acceleration=0.0 * self.motion.acceleration)
         return -mj_inverse(spec, still, self.motion.torque.gravity)
 
