@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -35,6 +36,7 @@ from droid_jax.read_json import typed
 from droid_jax.recordings.formats import load_recording, save_recording
 from droid_jax.report.stages import Setup
 from droid_jax.run import main
+from droid_jax.simulate.engine import EngineChoice
 
 ROOT = Path(__file__).resolve().parents[1]
 XML = ROOT / "docs" / "examples" / "two_link.xml"
@@ -162,7 +164,8 @@ def stopped_in_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
     def stopped(*_, **__) -> None:
         raise ValueError("stopped")
 
-    monkeypatch.setattr(pipeline, "prepare", lambda *_, **__: None)
+    good = SimpleNamespace(engine=EngineChoice("mjx", "as asked for"))
+    monkeypatch.setattr(pipeline, "prepare", lambda *_, **__: good)
     monkeypatch.setattr(pipeline, "run_fit", stopped)
 
 

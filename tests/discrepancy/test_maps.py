@@ -39,14 +39,14 @@ def residual_set(common: Callable[[np.ndarray], np.ndarray], object_joint: str =
     """Of three joints that stand still, whose residuals are known."""
     path = np.zeros((1, INSTANTS, COLUMNS))
     rollout = SimpleNamespace(object_angle=np.zeros((1, INSTANTS)), position=path, velocity=path, torque=path)
-    channel = SimpleNamespace(columns=np.arange(COLUMNS))
+    channel = SimpleNamespace(name="torque", columns=np.arange(COLUMNS))
     scene = SimpleNamespace(
         object_joint=object_joint, joints=("a", "b", "c"), position_unit=lambda joints: "rad",
         torque_unit=lambda joints: "N m",
     )  # fmt: skip
     return SimpleNamespace(
         cost=SimpleNamespace(space=SPACE, scene=scene, rollouts=lambda values: (rollout,)),
-        comparison=SimpleNamespace(clock=CLOCK, phases=(), channel=lambda name: channel),
+        comparison=SimpleNamespace(clock=CLOCK, phases=(), channels=(channel,), channel=lambda name: channel),
         resampling=Repeats(np.zeros((REPEATS, COLUMNS * INSTANTS))), config=SelectionConfig(),
         column=np.repeat(np.arange(COLUMNS), INSTANTS), time=np.tile(CLOCK, COLUMNS), common=common,
     )  # fmt: skip

@@ -50,6 +50,8 @@ SCRIPTS: dict[str, tuple[str, ...]] = {
     "benchmarks/house.py": (),
     "benchmarks/kills.py": (),
     "benchmarks/lone_logs.py": (),
+    "benchmarks/mujoco4.py": (),
+    "benchmarks/neutral_result.py": (),
     "benchmarks/robustness.py": (),
     "benchmarks/step_accuracy.py": (),
     "benchmarks/time_to_fit.py": (),

@@ -81,7 +81,7 @@ def torque_crosstalk(scene: Scene) -> Effect | None:
         none = jnp.zeros_like(own[:, :1])
         before, after = jnp.concatenate([none, own[:, :-1]], axis=1), jnp.concatenate([own[:, 1:], none], axis=1)
         leaks = column(theta, BEFORE, joints) * before + column(theta, AFTER, joints) * after
-        return replace(rollout, torque=rollout.torque.at[:, rows].add(leaks))
+        return replace(rollout, torque=jnp.asarray(rollout.torque).at[:, rows].add(leaks))
 
     names = {joint: (f"{BEFORE}[{joint}]", f"{AFTER}[{joint}]") for joint in joints}
     places = {j: tuple(n for n, there in zip(names[j], (i > 0, i + 1 < len(joints)), strict=True) if there)
