@@ -116,8 +116,8 @@ def moving(path: np.ndarray, noise: float = 1.0, angle: np.ndarray | None = None
     both = np.stack([path, path], axis=1)[None]
     opened = (clock**2 if angle is None else angle)[None]
     rollout = SimpleNamespace(object_angle=opened, position=both, velocity=both, torque=both)
-    channel = SimpleNamespace(columns=np.array([0, 1]), unit="N m")
-    comparison = SimpleNamespace(clock=clock, phases=(), channel=lambda name: channel)
+    channel = SimpleNamespace(name="torque", columns=np.array([0, 1]), unit="N m")
+    comparison = SimpleNamespace(clock=clock, phases=(), channels=(channel,), channel=lambda name: channel)
     cost = SimpleNamespace(scene=scene, space=Space(SPACE.parameters[:1]), rollouts=lambda values: (rollout,))
     deviations = noise * np.random.default_rng(2).normal(size=(REPEATS, 2 * len(path)))
     deviations -= deviations.mean(axis=0)

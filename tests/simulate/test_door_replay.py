@@ -138,7 +138,7 @@ def test_half_a_step_of_delay_serves_the_c_engine_in_free_motion(
     scene: Scene, space: Space, drive: Drive, rows: np.ndarray, in_c: Rollout, fine: Trace, monkeypatch
 ):
     """Up to the grasp its error falls by more than half; after it, the contact's own error is larger."""
-    monkeypatch.setattr(twin, "control_of", lambda drive, offset, late: drive.command)
+    monkeypatch.setattr(twin, "control_of", lambda drive, command, offset, late: command)
     plain = c_replay(scene, space, drive)(rows[:1])
     free = slice(0, 700)
     with_delay = rms(in_c.torque[:1, free], fine.torque[:1, free])
