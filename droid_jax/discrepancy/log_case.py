@@ -148,7 +148,7 @@ def noise_of(
     left, rest = ((of.reshape(len(deviation), -1).T * deviation)[inside] for of in (noise, least))
     rate = config.compare.noise.rate
     stated = stated_deviation(left, log.moves[inside], rate)
-    # Windows begin anew where they are measured, so that what they leave of slow noise is short.
+    # Each window begins at its own measured state, so that what they leave of slow noise is short.
     lasting = rest if isinstance(log, WindowedLog) else left
     return NoiseEstimate(stated, block_length(lasting, config.blocks, rate), model.values)
 

@@ -234,7 +234,7 @@ def _write_spec(spec: mujoco.MjSpec, model: mujoco.MjModel, fit: dict[str, Any])
 
 
 def _settle(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
-    """State what a compiler would work out anew from other masses: total mass, damping ratios."""
+    """State what a compiler would derive from other masses: total mass, damping ratios."""
     spec.compiler.boundmass, spec.compiler.boundinertia, spec.compiler.settotalmass = 0.0, 0.0, -1.0
     for actuator in spec.actuators:
         if actuator.biastype == mujoco.mjtBias.mjBIAS_AFFINE and actuator.biasprm[2] > 0:

@@ -255,7 +255,7 @@ def _text(fitted: _Fitted) -> str:
 
 
 def _settle(spec: mujoco.MjSpec, model: mujoco.MjModel) -> list[Any]:
-    """Say in numbers, as the model has them, what the compiler would work out anew from fitted masses.
+    """Say in numbers, as the model has them, what the compiler would derive from fitted masses.
 
     Returns the actuators whose damping was a ratio and now is a number.
     """

@@ -45,7 +45,7 @@ def test_what_was_changed_is_found(folder: Path, tmp_path: Path):
 
 
 def test_runs_of_one_kind_lie_in_one_file(folder: Path, tmp_path: Path):
-    """Each comes back by its name, also after another was packed anew."""
+    """Each comes back by its name, also after another was packed again."""
     place = tmp_path / "archive"
     for name in ("null_22222ab", "null_11111ab", "null_22222ab"):
         archive.pack(folder, place, name)

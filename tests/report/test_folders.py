@@ -6,7 +6,7 @@ import json
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from made_up_gap import cell, make_gap
 from made_up_run import make_run
 
 from droid_jax.report import page
-from droid_jax.report.gap_folder import LOST, CellEntry, Shift, largest_shifts, read_answer, read_gap
+from droid_jax.report.gap_folder import LOST, CellEntry, Shift, SplitEntry, largest_shifts, read_answer, read_gap
 from droid_jax.report.gap_page import _shown
 from droid_jax.report.identify_folder import read_run
 
@@ -84,7 +84,7 @@ def test_what_is_said_agrees_with_the_search() -> None:
     from droid_jax.discrepancy import verdict
     from droid_jax.recordings import split
 
-    assert {s.value for s in split.Split} == {"recordings", "repeats", "blocks", "windows"}
+    assert {s.value for s in split.Split} == set(get_args(get_type_hints(SplitEntry)["by"]))
     assert verdict.LOST == LOST
 
 
