@@ -20,6 +20,7 @@ import tuned  # noqa: E402, F401  (before jax starts)
 
 # isort: split
 import json  # noqa: E402
+import math  # noqa: E402
 import time  # noqa: E402
 from collections.abc import Sequence  # noqa: E402
 from dataclasses import asdict, dataclass, replace  # noqa: E402
@@ -40,9 +41,8 @@ from droid_jax.discrepancy.candidates import (  # noqa: E402
 )
 from droid_jax.discrepancy.config import DiscrepancyConfig  # noqa: E402
 from droid_jax.discrepancy.fitting import discretisation_error  # noqa: E402
-from droid_jax.discrepancy.log_case import base_model  # noqa: E402
+from droid_jax.discrepancy.log_case import base_model, case_of  # noqa: E402
 from droid_jax.discrepancy.search import search_effects  # noqa: E402
-from droid_jax.discrepancy.windowed_case import case_of  # noqa: E402
 from droid_jax.door.space import torque_offsets  # noqa: E402
 from droid_jax.model.effect_interface import Effect  # noqa: E402
 from droid_jax.model.effects.candidate import candidates, names_of  # noqa: E402
@@ -54,6 +54,7 @@ from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSi
 from droid_jax.recordings.split import Split, roles_of  # noqa: E402
 from droid_jax.simulate.c_engine import simulate  # noqa: E402
 from droid_jax.simulate.hand_path import minimum_jerk  # noqa: E402
+from droid_jax.simulate.windows import WindowConfig  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 from droid_jax.synthetic.hidden_effects import LIBRARY, ON_HINGE, Applied, record_hidden  # noqa: E402
 from droid_jax.synthetic.robot import SyntheticRobotConfig, as_recording, sensor_torque, set_up  # noqa: E402
@@ -108,6 +109,8 @@ class Arguments:
     """Cases with something hidden, over all of them."""
     only: str = ""
     """Cases whose name begins so; the others are left for another process."""
+    windows: float = 0.0
+    """s, of windows that are replayed each from its own measured state; 0: motions are replayed whole."""
     minutes: float = 0.0
     """No case is begun after so many; 0: all are made."""
     sum_only: bool = False
@@ -183,9 +186,9 @@ def _waves(clock: np.ndarray) -> np.ndarray:
 
 
 def plans(arguments: Arguments) -> list[Plan]:
-    """All cases."""
-    null = [Plan(f"null-{scene}-{channels}-{n}", scene, channels) for scene, channels in COMBINATIONS
-            for n in range(1 if arguments.quick else arguments.null)]  # fmt: skip
+    """All cases, in turns, so that a run that is stopped has some of every kind."""
+    null = [Plan(f"null-{scene}-{channels}-{n}", scene, channels)
+            for n in range(1 if arguments.quick else arguments.null) for scene, channels in COMBINATIONS]  # fmt: skip
     hidden = list[Plan]()
     count = 1 if arguments.quick else arguments.blind
     lists = {key: [(e, f) for e in HIDDEN[key[0]] for f in FACTORS] for key in COMBINATIONS}
@@ -195,7 +198,10 @@ def plans(arguments: Arguments) -> list[Plan]:
         order = np.random.default_rng([arguments.seed, COMBINATIONS.index(key)]).permutation(len(each))
         effect, factor = each[order[(n // len(COMBINATIONS)) % len(each)]]
         hidden.append(Plan(f"blind-{scene}-{channels}-{n}", scene, channels, effect, factor))
-    return [p for p in (*null, *hidden) if not arguments.quick or p.scene == "hinge"]
+    some = math.ceil(len(null) / max(len(hidden), 1))
+    mixed = [p for n, one in enumerate(hidden) for p in (*null[n * some : (n + 1) * some], one)]
+    mixed += null[len(hidden) * some :]
+    return [p for p in mixed if not arguments.quick or p.scene == "hinge"]
 
 
 def recorded(bench: Bench, plan: Plan, seed: int) -> tuple[Recording, Applied | None]:
@@ -227,14 +233,19 @@ def _minimum(bench: Bench, kind: str, joint: str) -> float:
     return next(e.minimum_size for e in bench.effects if e.name == called)
 
 
-def made(bench: Bench, plan: Plan, seed: int) -> dict[str, Any]:
+def windows_of(arguments: Arguments) -> WindowConfig | None:
+    """How logs are cut; None: they are replayed whole."""
+    return WindowConfig(length=arguments.windows) if arguments.windows else None
+
+
+def made(bench: Bench, plan: Plan, seed: int, arguments: Arguments) -> dict[str, Any]:
     """The result of one case; what fails is a result too."""
     began = time.monotonic()
     result: dict[str, Any] = {**asdict(plan), "seed": seed, "code": CODE.get("git")}
     try:
         log, hidden = recorded(bench, plan, seed)
         result["recorded"] = time.monotonic() - began
-        config = DiscrepancyConfig(channels=bench.channels)
+        config = DiscrepancyConfig(channels=bench.channels, windows=windows_of(arguments))
         roles = roles_of(Split.WINDOWS, [log])
         case = case_of(Split.WINDOWS, bench.scene, bench.base, bench.effects, roles, config)
         result["prepared"] = time.monotonic() - began
@@ -323,7 +334,7 @@ def main(arguments: Arguments) -> None:
             key = plan.scene, plan.channels
             benches.setdefault(key, bench(*key))
             seed = int(np.random.default_rng([arguments.seed, *plan.name.encode()]).integers(1 << 31))
-            found = made(benches[key], plan, seed)
+            found = made(benches[key], plan, seed, arguments)
             write_json(path, found)
             print(f"{plan.name} {plan.effect} {plan.factor:g}x: {found['verdict']} {found.get('effects', '')} "
                   f"p = {found.get('p')}, {found['seconds']:.0f} s {found.get('error', '')}", flush=True)  # fmt: skip
@@ -336,7 +347,7 @@ def main(arguments: Arguments) -> None:
         "by": {name: summary(some) for name, some in groups.items() if some},
         "by_factor": {f"{f:g}": summary([c for c in cases if c["factor"] == f]) for f in FACTORS},
         "codes": sorted({str(c["code"]) for c in cases}),
-        "setting": {"seconds": SECONDS, "position_noise_rad": NOISE, "windows": asdict(DiscrepancyConfig().windows)},
+        "setting": {"seconds": SECONDS, "position_noise_rad": NOISE, "windows_s": arguments.windows},
         "blind_cases": [{k: c.get(k) for k in ("name", "effect", "factor", "verdict", "effects", "indistinguishable",
                                                "named", "wrong", "p", "ranked")} for c in cases if c["effect"]],
     }  # fmt: skip

@@ -34,9 +34,9 @@ from benchmarks.sharing import claimed, code_name  # noqa: E402
 from droid_jax.commands.gap_search import searched  # noqa: E402
 from droid_jax.commands.synthetic import hidden_effects, record_synthetic  # noqa: E402
 from droid_jax.discrepancy.config import DiscrepancyConfig  # noqa: E402
+from droid_jax.discrepancy.log_case import case_of  # noqa: E402
 from droid_jax.discrepancy.results import extended  # noqa: E402
 from droid_jax.discrepancy.verdict import Conclusion  # noqa: E402
-from droid_jax.discrepancy.windowed_case import case_of  # noqa: E402
 from droid_jax.door.environment import DoorEnv  # noqa: E402
 from droid_jax.door.scene import door_scene  # noqa: E402
 from droid_jax.door.space import door_nuisances, door_space  # noqa: E402

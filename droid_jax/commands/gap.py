@@ -121,8 +121,8 @@ def run(command: GapCommand) -> None:
     needs_writer(command.tensorboard)
     runtime.start()
     warn_of_cpu(command.preset)
+    from droid_jax.discrepancy.log_case import case_of, open_loop_errors
     from droid_jax.discrepancy.results import write_amended, write_gap
-    from droid_jax.discrepancy.windowed_case import case_of, open_loop_errors
     from droid_jax.identify.results import prepare_folder
     from droid_jax.preflight.check_log import check_log
     from droid_jax.preflight.search_inputs import assigned_roles

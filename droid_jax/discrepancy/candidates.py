@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from droid_jax.discrepancy.residual_set import ResidualSet
+from droid_jax.discrepancy.case import ResidualSet
 from droid_jax.discrepancy.statistics import largest_trend
 from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.effects.candidate import Candidate, EffectKey, Keys, keys_of

@@ -16,8 +16,8 @@ import scipy.stats
 from droid_jax.cost.cost import Cost, make_cost
 from droid_jax.cost.windowed_log import WindowedLog
 from droid_jax.discrepancy.candidates import project
+from droid_jax.discrepancy.case import ResidualSet
 from droid_jax.discrepancy.config import DiscrepancyConfig
-from droid_jax.discrepancy.residual_set import ResidualSet
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.identifiability import posterior_of
 from droid_jax.identify.levenberg_marquardt import principal_axes

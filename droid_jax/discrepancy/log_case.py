@@ -1,30 +1,45 @@
-"""A case of one log without commands, or of two: blocks of time in place of repeats, and what counts as noise."""
+"""A case of logs: blocks of time in place of repeats.  And the case of any recordings.
+
+Logs without commands are cut into blocks, commanded logs with few repeats into windows.  How long windows are is a
+setting; how many of them make a block depends on the noise.  Where a log is too short for eight blocks in each part,
+what is given up first is said (`Case.limits`), and what can be told is told.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from droid_jax.cost.lone_log import LoneLog, lone_log
 from droid_jax.cost.noise import stated_deviation
-from droid_jax.cost.windowed_log import WindowedLog
+from droid_jax.cost.windowed_log import WindowedLog, windowed_log
 from droid_jax.discrepancy.candidates import ScoreTest, directions_of, proposals, score_test
-from droid_jax.discrepancy.case import Case, per_recording_nuisances, restrained, unbounded
+from droid_jax.discrepancy.case import (
+    Case,
+    ResidualSet,
+    block_residual_set,
+    comparing,
+    make_case,
+    per_recording_nuisances,
+    restrained,
+    unbounded,
+)
 from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.discrepancy.fitting import FittedModel, refit
-from droid_jax.discrepancy.residual_set import ResidualSet, block_residual_set
 from droid_jax.discrepancy.statistics import OUTSIDE, block_length, fewest_blocks, interleaved
+from droid_jax.identify.evaluation import evaluate_on, evaluation_json
 from droid_jax.identify.multistart import RefineProgress
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects.candidate import candidates
-from droid_jax.model.effects.registry import joined, ready
+from droid_jax.model.effects.registry import beside, joined, ready
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording
-from droid_jax.recordings.split import FEWEST_REPEATS
+from droid_jax.recordings.split import FEWEST_REPEATS, Split, pooled
 
 Log: TypeAlias = LoneLog | WindowedLog
 
@@ -192,3 +207,194 @@ def with_blocks(
 ) -> ResidualSet:
     """Its instants in blocks [K], with noise of a deviation [C]; least: blocks that there must be."""
     return block_residual_set(log.with_noise(deviation, block >= 0), block, config, least)
+
+
+PARTS = 2  # training and validation
+DRAWS = 31  # of the base's prior, among which starts are chosen; with its mean a CPU's block
+BEST = 1  # of them
+LEAST_TEST = 4  # units of a test part
+
+
+def case_of(
+    split: Split,
+    scene: Scene,
+    base: Space,
+    effects: Sequence[Effect],
+    roles: Mapping[str, Recording],
+    config: DiscrepancyConfig,
+) -> Case:
+    """Of recordings by role (see `preflight.search_inputs.assigned_roles`), logs where they are cut in time.
+
+    Sensors' gains and encoders' offsets that the base has as parameters are not asked about there.
+    Raises ValueError for what is wrong with them, does not fit the scene, or a channel that cannot be compared.
+    """
+    effects, config = beside(base, effects), comparing(scene, tuple(roles.values()), config)
+    if split is Split.WINDOWS:
+        return windowed_case(scene, base, effects, pooled(roles, "train"), pooled(roles, "test"), config)
+    if split is not Split.BLOCKS:
+        return make_case(scene, base, effects, **roles, config=config)
+    config = replace(config, refine=replace(config.refine, basin_hops=0, spreads=0))  # inverse dynamics is smooth
+    logs = {role: make_log(scene, base, effects, recording, config) for role, recording in roles.items()}
+    return single_case(logs["train"], base, effects, logs.get("test"), config)
+
+
+def windowed_case(
+    scene: Scene,
+    base: Space,
+    effects: Sequence[Effect],
+    train: Sequence[Recording],
+    test: Sequence[Recording] = (),
+    config: DiscrepancyConfig | None = None,
+) -> Case:
+    """A case of pooled logs: their windows train and validate in turns, block by block.
+
+    The last third of every log is test data, or other recordings are, which have torque offsets of their own.
+
+    Args:
+        scene: the robot.
+        base: all that is fitted without any effect.
+        effects: to ask about.
+        train: commanded recordings of the same channels, of one repeat or several.
+        test: others.
+        config: of the search.
+
+    Raises:
+        ValueError: recordings of different channels or joints, or so short that no two blocks are in each part.
+    """
+    config = config or DiscrepancyConfig()
+    config = replace(config, refine=replace(config.refine, basin_hops=0))  # windows are nearly smooth in parameters
+    base = restrained(base, config.selection.nuisance_bound)
+    scene, whole = ready(scene), joined(base, effects)
+    share = 1.0 if test else config.blocks.fitted_share
+    log = windowed_log(scene, whole, train, config.compare, config.windows, effects, share)
+    log = replace(log, instants=log.unit < log.fitted)  # the rest is not replayed before its time
+    own = per_recording_nuisances(base) if test else []
+    judged = None
+    if test:
+        judged = windowed_log(scene, unbounded(whole, own), test, config.compare, config.windows, effects)
+    end, rough = _end_of(log), replace(config, refine=replace(config.refine, spreads=0))  # widths are asked for later
+    first = _first_values(log, base, effects, end, rough)
+    # With the spread of their first states known, what windows leave is correlated for as long as the noise is.
+    noise = noise_of(log.about(first), base, effects, end, rough, first)
+    log = log.about(noise.values)
+    plan = planned(log, noise.block, config.blocks.shortest, judged is None)
+    sets = [
+        with_blocks(log.part(f"{log.comparisons[0].name}, {which}"), noise.deviation, block, config, 1)
+        for which, block in zip(("every other block", "the blocks between", "last third"), plan.blocks, strict=False)
+    ]
+    if judged is not None:
+        deviation = noise.deviation[[log.columns.index(c) for c in judged.columns]]
+        judged = judged.about(noise.values)
+        everything = _in_groups(judged.unit, 0, int(judged.unit.max()) + 1, FEWEST_REPEATS)
+        sets.append(with_blocks(judged, deviation, everything, config, 1).with_nuisances(own))
+    last = sets[2] if len(sets) > PARTS else None
+    limits = ([f"Motions were replayed whole: {log.whole}."] if log.whole else []) + list(plan.limits)
+    return Case(sets[0], sets[1], last, base, tuple(effects), config, noise.values, tuple(limits))
+
+
+def open_loop_errors(
+    case: Case, roles: Mapping[str, Recording], before: np.ndarray, after: np.ndarray
+) -> dict[str, Any]:
+    """Errors of whole replays of each recording, open loop, at two vectors [D]: what windows by themselves do not tell.
+
+    As plain data (`evaluation.evaluation_json`).
+    """
+    cost = case.train.cost
+    whole = replace(case.config.compare, channels={name: 1.0 for name in case.config.compare.channels})
+    replays = evaluate_on(
+        cost.scene, cost.space, list(roles.values()), before=before, after=after, effects=case.effects, config=whole
+    )
+    found = evaluation_json(replays)
+    return {name: found[name] for name in ("errors", "mean_mae")}
+
+
+def _end_of(log: WindowedLog) -> float:
+    """s on the log's clock, before which lies what is fitted and validated."""
+    clock, count = log.clock, int(np.sum(log.unit < log.fitted))
+    return float(clock[count]) if count < len(clock) else float(clock[-1]) + 1e-6
+
+
+def _first_values(
+    log: WindowedLog, base: Space, effects: Sequence[Effect], end: float, config: DiscrepancyConfig
+) -> np.ndarray:
+    """[D] the base fitted from its mean and from the best of some draws of its prior."""
+    whole, inside = log.space, log.clock < end
+    drawn = np.random.default_rng(config.seed).normal(size=(DRAWS, len(base)))
+    rows = whole.embed(base, np.concatenate([base.mean[None], base.from_search(drawn)]))
+    left = log.residual(whole.mean)[inside]
+    if not np.isfinite(left).all():
+        raise ValueError(
+            f"the simulation of {log.comparisons[0].name!r} blows up at the parameters' initial means: shorten the "
+            "scene's time step, give light joints armature, or begin at other means"
+        )
+    block = fewest_blocks(log.clock[inside], log.clock[0])
+    block = np.r_[block, np.full(len(log.clock) - len(block), OUTSIDE)]
+    rough = with_blocks(log, np.sqrt(np.mean(left**2, axis=0)), block, config, 1)
+    cost = np.nan_to_num(np.sum(rough.whitened(rows) ** 2, axis=1), nan=np.inf)
+    starts = np.concatenate([rows[:1], rows[1:][np.argsort(cost[1:])[:BEST]]])
+    return refit(rough, base, (), starts, config.refine).values
+
+
+@dataclass(frozen=True, eq=False)
+class BlockPlan:
+    """Blocks [K] of the training, the validation and perhaps the test part, and what could not be had."""
+
+    blocks: tuple[np.ndarray, ...]
+    limits: tuple[str, ...]
+
+
+def planned(log: WindowedLog, length: float, shortest: float, with_test: bool) -> BlockPlan:
+    """How a log's units (windows, stretches) make blocks of `length` s or more, eight in each part at least.
+
+    Where it is too short, blocks are first made shorter, then there is no test part, then fewer than eight.
+
+    Raises:
+        ValueError: not even two blocks in each part.
+    """
+    seconds, limits = log.unit_seconds, list[str]()
+    fitted, total = log.fitted, int(log.unit.max()) + 1
+    tested = with_test and total > fitted
+    needed = PARTS * FEWEST_REPEATS * max(1, math.ceil(shortest / seconds - 1e-6))
+    if tested and fitted < needed <= total - LEAST_TEST:  # a smaller test part rather than none
+        fitted = needed
+    each = _each(fitted, length, seconds)
+    if each < FEWEST_REPEATS and _each(fitted, shortest, seconds) >= FEWEST_REPEATS:
+        each = FEWEST_REPEATS
+    elif each < FEWEST_REPEATS:
+        if tested:
+            limits.append("The log is too short to keep a part of it as test data.")
+        fitted, tested = total, False
+        each = min(FEWEST_REPEATS, _each(total, shortest, seconds))
+    if each < 2:
+        raise ValueError(
+            f"{log.comparisons[0].name!r}: {total * seconds:.3g} s are compared, too little to train and to validate "
+            f"on; record for {math.ceil(needed * seconds)} s or longer, or more recordings"
+        )
+    made = fitted * seconds / (PARTS * each)
+    if made < length * (1 - 1e-6):
+        limits.append(
+            f"Blocks of {made:.2g} s are shorter than the {length:.2g} s for which they would count as independent: "
+            "p-values may be too small."
+        )
+    if each < FEWEST_REPEATS:
+        limits.append(
+            f"Only {each} blocks are in each part, and with fewer than {FEWEST_REPEATS} no effect can be told from "
+            "chance, whatever its size: what the score test ranks first is a hint at most. Record for longer."
+        )
+    turns = _in_groups(log.unit, 0, fitted, PARTS * each)
+    blocks = [np.where((turns != OUTSIDE) & (turns % PARTS == p), turns // PARTS, OUTSIDE) for p in range(PARTS)]
+    if tested:
+        blocks.append(_in_groups(log.unit, fitted, total, FEWEST_REPEATS))
+    return BlockPlan(tuple(blocks), tuple(limits))
+
+
+def _each(units: int, length: float, seconds: float) -> int:
+    """Blocks of each part."""
+    return units // max(1, math.ceil(length / seconds - 1e-6)) // PARTS
+
+
+def _in_groups(unit: np.ndarray, first: int, end: int, groups: int) -> np.ndarray:
+    """[K] group of each instant, of about equal numbers of units from `first` to `end`; at most as many as units."""
+    groups = min(groups, end - first)
+    found = (unit - first) * groups // max(end - first, 1)
+    return np.where((unit >= first) & (unit < end), found, OUTSIDE)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from droid_jax.discrepancy.residual_set import ResidualSet
+from droid_jax.discrepancy.case import ResidualSet
 from droid_jax.discrepancy.statistics import benjamini_hochberg
 from droid_jax.model.parameters import Role
 from droid_jax.model.scene import Scene

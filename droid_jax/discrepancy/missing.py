@@ -29,11 +29,10 @@ from droid_jax.discrepancy.fitting import (
     final_refit,
     final_refit_due,
 )
-from droid_jax.discrepancy.log_case import base_model
+from droid_jax.discrepancy.log_case import base_model, case_of
 from droid_jax.discrepancy.results import extended
 from droid_jax.discrepancy.search import search_effects
 from droid_jax.discrepancy.verdict import Experiment, Verdict
-from droid_jax.discrepancy.windowed_case import case_of
 from droid_jax.errors import reason
 from droid_jax.files import NOT_MADE, TO_BE_MADE
 from droid_jax.identify.extended_model import Extended

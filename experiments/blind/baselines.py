@@ -17,9 +17,8 @@ import optax
 
 from droid_jax.cost.noise import lowpass, smooth
 from droid_jax.discrepancy.candidates import ScoreTest, project
-from droid_jax.discrepancy.case import Case
+from droid_jax.discrepancy.case import Case, ResidualSet
 from droid_jax.discrepancy.fitting import FittedModel
-from droid_jax.discrepancy.residual_set import ResidualSet
 from droid_jax.recordings.recording import Recording
 from experiments.blind.answers import beside, matched
 from experiments.blind.marks import torques, whitened

@@ -15,9 +15,8 @@ import scipy.optimize
 
 from droid_jax.cost.noise import lowpass, smooth
 from droid_jax.discrepancy.candidates import ScoreDirection, directions_of, project, sensitivities
-from droid_jax.discrepancy.case import make_case
+from droid_jax.discrepancy.case import ResidualSet, make_case
 from droid_jax.discrepancy.fitting import FittedModel, refit
-from droid_jax.discrepancy.residual_set import ResidualSet
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects.candidate import Candidate, EffectKey, candidates

@@ -15,9 +15,8 @@ from typing import Any
 from benchmarks.common import CODE
 from benchmarks.sharing import claimed
 from droid_jax.cost.cost import Cost
-from droid_jax.discrepancy.case import Case, make_case
+from droid_jax.discrepancy.case import Case, ResidualSet, make_case, residual_set
 from droid_jax.discrepancy.fitting import FittedModel, base_fit, discretisation_error, intervals, with_finer_step
-from droid_jax.discrepancy.residual_set import ResidualSet, residual_set
 from droid_jax.discrepancy.search import search_effects
 from droid_jax.discrepancy.verdict import Verdict
 from droid_jax.model.effects.candidate import names_of

@@ -11,9 +11,8 @@ import pytest
 from small_log import ASKED, CONFIG, COULOMB, MJCF, NOISE, elbow, elbow_log, elbow_space
 
 from droid_jax.cost.lone_log import LoneLog
-from droid_jax.discrepancy.case import make_case
+from droid_jax.discrepancy.case import ResidualSet, block_residual_set, make_case
 from droid_jax.discrepancy.log_case import base_model, make_log, single_case
-from droid_jax.discrepancy.residual_set import ResidualSet, block_residual_set
 from droid_jax.discrepancy.search import search_effects
 from droid_jax.discrepancy.statistics import Blocks
 from droid_jax.discrepancy.verdict import Conclusion

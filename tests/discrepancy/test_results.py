@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from small_gap import FLOOR, JOINTS, PRELOAD, Small, small
 
+from droid_jax.discrepancy.case import ResidualSet
 from droid_jax.discrepancy.config import DiscrepancyConfig
-from droid_jax.discrepancy.residual_set import ResidualSet
 from droid_jax.discrepancy.results import FORMAT, VERSION, gap_arrays, gap_json, write_gap
 from droid_jax.discrepancy.verdict import Conclusion, Experiment, unnamed
 from droid_jax.files import GAP, GAP_TRACES

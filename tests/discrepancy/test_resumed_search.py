@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from small_gap import FLOOR, Small, quiet, small
 
-from droid_jax.discrepancy.case import Case
+from droid_jax.discrepancy.case import Case, ResidualSet
 from droid_jax.discrepancy.fitting import FittedModel, base_fit
-from droid_jax.discrepancy.residual_set import ResidualSet
 from droid_jax.discrepancy.search import search_effects
 
 Wrap = Callable[[Callable[[np.ndarray], np.ndarray]], Callable[[np.ndarray], np.ndarray]]

@@ -15,8 +15,8 @@ from small_log import CONFIG
 
 import droid_jax as dj
 from droid_jax.cost.cost import make_cost
+from droid_jax.discrepancy.log_case import case_of
 from droid_jax.discrepancy.verdict import Conclusion, Verdict
-from droid_jax.discrepancy.windowed_case import case_of
 from droid_jax.identify.multistart import RefineConfig, refine
 from droid_jax.identify.search import CmaConfig
 from droid_jax.model.effects.candidate import EffectKey

@@ -10,9 +10,9 @@ import pytest
 from small_gap import FLOOR, Small, small
 
 from droid_jax.discrepancy import fitting, selection
+from droid_jax.discrepancy.case import ResidualSet
 from droid_jax.discrepancy.config import SelectionConfig
 from droid_jax.discrepancy.fitting import FittedModel, consistent_with_zero, deviations, intervals, refit
-from droid_jax.discrepancy.residual_set import ResidualSet
 from droid_jax.discrepancy.selection import Reason, ValidationTest, much_more, validation_tests, zero_warning
 from droid_jax.discrepancy.statistics import Repeats, detrended
 from droid_jax.identify.identifiability import posterior_of

@@ -19,9 +19,9 @@ from droid_jax.cost.residuals import CompareConfig
 from droid_jax.cost.windowed_log import WindowedLog, _whitener, windowed_log
 from droid_jax.discrepancy.candidates import observable_effects
 from droid_jax.discrepancy.config import BlocksConfig
+from droid_jax.discrepancy.log_case import planned
 from droid_jax.discrepancy.statistics import OUTSIDE
 from droid_jax.discrepancy.verdict import Conclusion
-from droid_jax.discrepancy.windowed_case import planned
 from droid_jax.model.effects.registry import library
 from droid_jax.model.parameter_file import load_parameters
 from droid_jax.model.parameters import Space
