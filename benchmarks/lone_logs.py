@@ -233,9 +233,11 @@ def _minimum(bench: Bench, kind: str, joint: str) -> float:
     return next(e.minimum_size for e in bench.effects if e.name == called)
 
 
-def windows_of(arguments: Arguments) -> WindowConfig | None:
-    """How logs are cut; None: they are replayed whole."""
-    return WindowConfig(length=arguments.windows) if arguments.windows else None
+def configured(channels: tuple[str, ...], windows: float) -> DiscrepancyConfig:
+    """Settings of the search, by windows of so many seconds unless that is 0."""
+    if not windows:
+        return DiscrepancyConfig(channels=channels, replay="whole")
+    return DiscrepancyConfig(channels=channels, replay="windows", windows=WindowConfig(length=windows))
 
 
 def made(bench: Bench, plan: Plan, seed: int, arguments: Arguments) -> dict[str, Any]:
@@ -245,7 +247,7 @@ def made(bench: Bench, plan: Plan, seed: int, arguments: Arguments) -> dict[str,
     try:
         log, hidden = recorded(bench, plan, seed)
         result["recorded"] = time.monotonic() - began
-        config = DiscrepancyConfig(channels=bench.channels, windows=windows_of(arguments))
+        config = configured(bench.channels, arguments.windows)
         roles = roles_of(Split.WINDOWS, [log])
         case = case_of(Split.WINDOWS, bench.scene, bench.base, bench.effects, roles, config)
         result["prepared"] = time.monotonic() - began

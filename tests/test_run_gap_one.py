@@ -74,7 +74,7 @@ def blind(count: int) -> Recording:
     return replace(recording, channels={"torque": recording.channel("torque")})
 
 
-WINDOWS = "in which positions were measured are searched by windows"
+WINDOWS = "in which positions were measured are searched by stretches"
 
 
 @pytest.mark.parametrize(

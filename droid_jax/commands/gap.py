@@ -60,10 +60,13 @@ class GapCommand:
     LOG [TEST]: without repeats and commands; blocks of time train and validate in turns, the last third or the second
     log is test data. Of one motion less can be concluded, and the report says what.
 
-    LOG [LOG ...]: commanded, positions measured, with fewer repeats than above; windows of all of them train and
+    LOG [LOG ...]: commanded, positions measured, with fewer repeats than above; stretches of all of them train and
     validate in turns, and the last third of each is test data, or --judge-on."""
     judge_on: tuple[Path, ...] = ()
-    """Commanded logs that are test data, beside others in windows."""
+    """Commanded logs that are test data, beside others with few repeats."""
+    replay: Literal["auto", "whole", "windows"] = "auto"
+    """Commanded logs with few repeats. windows: replayed from measured states, each half a second long. whole: from
+    their beginnings. auto: whole where a servo holds every joint."""
     fit: Path | None = None
     """Folder of a finished `identify` (or `all`) of this robot and object: the base fit begins there instead of with a
     search."""
@@ -179,8 +182,8 @@ def run(command: GapCommand) -> None:
     def keep(case: Case, now: Amended, seconds: Mapping[str, float]) -> None:
         """First the verdict, then each amendment to it: a stop or an error between them loses neither."""
         write = write_amended if written else write_gap
-        if split is Split.WINDOWS and not written:
-            values = now.verdict.base.values, now.verdict.model.values
+        if split is Split.WINDOWS:
+            values = now.verdict.base.values, now.final.model.values
             description["open_loop"] = open_loop_errors(case, roles, *values)
         write(out, case, now.verdict, now.final, {**description, "seconds": dict(seconds)}, now.states)
         written.append(now.verdict.sentence)
@@ -276,6 +279,7 @@ def gap_config(command: GapCommand) -> DiscrepancyConfig:
         refine=replace(refine_config(command.preset) or RefineConfig(), iterations=CONVERGE_ITERATIONS),
         compare=compared(command.motion_cutoff),
         channels=command.compare or None,
+        replay=command.replay,
         seed=command.seed,
         **asked,
     )

@@ -38,12 +38,6 @@ class ShortFilter:
         """[K, W] the samples of each window."""
         return self.begin[:, None] + np.arange(self.weights.shape[-1])
 
-    def dense(self, length: int) -> np.ndarray:
-        """[C or 1, K, T] written out; length: T."""
-        out = np.zeros((*self.weights.shape[:2], length))
-        np.put_along_axis(out, np.broadcast_to(self.rows, self.weights.shape), self.weights, axis=2)
-        return out
-
 
 def short_filter(filters: Sequence[sparse.csr_array], length: int) -> ShortFilter:
     """Sparse filters [K, T], one for each column or one for all, by their windows; length: T."""
@@ -126,7 +120,7 @@ def prepared(
     resampling = _resampling(clock, time)
     off = 0.0 if apart is None else np.stack([resampling @ a[:, columns] for a in apart])
     repeats = smooth(values - off, mask, kernel, config.least_window)
-    seen = _same_filter(kernel, mask, ~np.isnan(repeats), resampling, len(clock))
+    seen = short_filter(_same_filters(kernel, mask, ~np.isnan(repeats), resampling), len(clock))
     repeats, measured = _fill(repeats, channel, coarse, config.least_overlap)
     noise = estimate_noise(repeats, minimum=config.minimum[channel.name], measured=measured, config=config)
     step = clock[1] - clock[0]
@@ -166,20 +160,19 @@ def compared_columns(scene: Scene, channel: Channel, config: NoiseConfig = DEFAU
 
 def in_window(
     channel: Channel, repeat: int, clock: np.ndarray, coarse: np.ndarray, config: NoiseConfig = DEFAULT_NOISE
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, tuple[sparse.csr_array, ...]]:
     """One repeat's values [K, C] at instants `coarse` [K] s within a replay's rows `clock` [T] s, and the same filter
-    for its trace, [C or 1, K, T].
+    for its trace, C or 1 of [K, T].
 
     NaN where too little was measured.  Nothing from outside of the replay's rows enters.
     """
     inside = (channel.time >= clock[0] - 1e-9) & (channel.time <= clock[-1] + 1e-9)
     time, values, mask = channel.time[inside], channel.values[[repeat]][:, inside], channel.mask[[repeat]][:, inside]
     if len(time) < 2:
-        return np.full((len(coarse), len(channel.columns)), np.nan), np.zeros((1, len(coarse), len(clock)))
+        return np.full((len(coarse), len(channel.columns)), np.nan), (sparse.csr_array((len(coarse), len(clock))),)
     kernel = lowpass(time, coarse, config)
     found = smooth(values, mask, kernel, config.least_window)
-    filters = _same_filter(kernel, mask, ~np.isnan(found), _resampling(clock, time), len(clock))
-    return found[0], filters.dense(len(clock))
+    return found[0], tuple(_same_filters(kernel, mask, ~np.isnan(found), _resampling(clock, time)))
 
 
 def _of_joints(scene: Scene, channel: Channel) -> Channel:
@@ -219,20 +212,19 @@ def _resampling(clock: np.ndarray, time: np.ndarray) -> sparse.csr_array:
     return sparse.csr_array(entries, shape=(len(time), len(clock)))
 
 
-def _same_filter(
-    kernel: sparse.csr_array, mask: np.ndarray, kept: np.ndarray, resampling: sparse.csr_array, length: int
-) -> ShortFilter:
-    """What resampling, smoothing with a mask and averaging over the repeats does to a replay's trace [T].
+def _same_filters(
+    kernel: sparse.csr_array, mask: np.ndarray, kept: np.ndarray, resampling: sparse.csr_array
+) -> list[sparse.csr_array]:
+    """What resampling, smoothing with a mask and averaging over repeats does to a replay's trace [T]: C or 1 of [K, T].
 
-    kernel [K, Tc]; mask [N, Tc, C]; kept [N, K, C], the outputs that enter the mean; resampling [Tc, T];
-    length: T.
+    kernel [K, Tc]; mask [N, Tc, C]; kept [N, K, C], the outputs that enter the mean; resampling [Tc, T].
     """
     if mask.all():
-        return short_filter([kernel @ resampling], length)
+        return [kernel @ resampling]
     columns = list(zip(mask.transpose(2, 0, 1), kept.transpose(2, 0, 1), strict=True))
     if all(np.array_equal(m, columns[0][0]) and np.array_equal(k, columns[0][1]) for m, k in columns):
         columns = columns[:1]  # a log that was silent for a while was so in all of them
-    return short_filter([_mean_filter(kernel, *column) @ resampling for column in columns], length)
+    return [_mean_filter(kernel, *column) @ resampling for column in columns]
 
 
 def _mean_filter(kernel: sparse.csr_array, mask: np.ndarray, kept: np.ndarray) -> sparse.csr_array:

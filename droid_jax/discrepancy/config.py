@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Literal
 
 from droid_jax.arguments import check_fields, instance, number, one_of, optional, several, whole
 from droid_jax.cost.channels import SIMULATED
@@ -142,7 +143,10 @@ class DiscrepancyConfig:
         selection: thresholds that decide which effects are named.
         identifiability: what decides the width of a fit's posterior.
         blocks: thresholds for logs that are cut in time.
-        windows: how commanded logs with few repeats are cut; None: their motions are replayed whole.
+        replay: of commanded logs with few repeats.  "windows", each from its own measured state; "whole", the motions
+            from their beginnings; "auto", whole where a servo holds every joint.  There a window would begin where the
+            robot was measured, and friction that holds it off its command would not show.
+        windows: how these logs are cut.
         compare: how simulation and measurement are compared.
         channels: measured ones to compare, as `IdentifyConfig.channels`; of logs without commands torques alone.
         seed: of sign flips and resamples.
@@ -163,7 +167,8 @@ class DiscrepancyConfig:
     selection: SelectionConfig = field(default_factory=SelectionConfig)
     identifiability: IdentifiabilityConfig = field(default_factory=IdentifiabilityConfig)
     blocks: BlocksConfig = field(default_factory=BlocksConfig)
-    windows: WindowConfig | None = field(default_factory=WindowConfig)
+    replay: Literal["auto", "whole", "windows"] = "auto"
+    windows: WindowConfig = field(default_factory=WindowConfig)
     compare: CompareConfig = field(default_factory=CompareConfig)
     channels: tuple[str, ...] | None = None
     seed: int = 0
@@ -178,7 +183,8 @@ class DiscrepancyConfig:
             selection=partial(instance, kind=SelectionConfig),
             identifiability=partial(instance, kind=IdentifiabilityConfig),
             blocks=partial(instance, kind=BlocksConfig),
-            windows=optional(partial(instance, kind=WindowConfig)),
+            replay=partial(one_of, valid=("auto", "whole", "windows")),
+            windows=partial(instance, kind=WindowConfig),
             compare=partial(instance, kind=CompareConfig),
             channels=optional(several(partial(one_of, valid=SIMULATED))),
             seed=partial(whole, least=0),

@@ -214,7 +214,7 @@ class FinalModel:
 
 def final_refit_due(train: ResidualSet, model: FittedModel) -> bool:
     """Whether a model is to be fitted to both motions once it is selected."""
-    return bool(model.parts) and train.resampling.repeated
+    return bool(model.parts) and (train.resampling.repeated or isinstance(train.cost, WindowedLog))
 
 
 def final_refit(
@@ -232,8 +232,10 @@ def final_refit(
     together by 0.88 and 2.31.  Verdict, sizes and discrepancies stay those of the search; the test motion stays out of
     every fit.
 
+    Of commanded logs with few repeats these are the blocks that trained and those that validated.
+
     Without an effect the model stays unchanged, since `identify` fits a base model to any number of recordings.  So
-    does that of a log in blocks, whose blocks are of one motion, and one whose fit to both does not converge.
+    does that of a log without commands, and one whose fit to both does not converge.
     """
     if not final_refit_due(train, model):
         return FinalModel(model, (train,))

@@ -40,6 +40,7 @@ from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording
 from droid_jax.recordings.split import FEWEST_REPEATS, Split, pooled
+from droid_jax.simulate.windows import held
 
 Log: TypeAlias = LoneLog | WindowedLog
 
@@ -266,12 +267,14 @@ def windowed_case(
     base = restrained(base, config.selection.nuisance_bound)
     scene, whole = ready(scene), joined(base, effects)
     share = 1.0 if test else config.blocks.fitted_share
-    log = windowed_log(scene, whole, train, config.compare, config.windows, effects, share)
+    at_once = config.replay == "whole" or (config.replay == "auto" and held(scene))
+    windows = None if at_once else config.windows
+    log = windowed_log(scene, whole, train, config.compare, windows, effects, share)
     log = replace(log, instants=log.unit < log.fitted)  # the rest is not replayed before its time
     own = per_recording_nuisances(base) if test else []
     judged = None
     if test:
-        judged = windowed_log(scene, unbounded(whole, own), test, config.compare, config.windows, effects)
+        judged = windowed_log(scene, unbounded(whole, own), test, config.compare, windows, effects)
     end, rough = _end_of(log), replace(config, refine=replace(config.refine, spreads=0))  # widths are asked for later
     first = _first_values(log, base, effects, end, rough)
     # With the spread of their first states known, what windows leave is correlated for as long as the noise is.
@@ -288,7 +291,7 @@ def windowed_case(
         everything = _in_groups(judged.unit, 0, int(judged.unit.max()) + 1, FEWEST_REPEATS)
         sets.append(with_blocks(judged, deviation, everything, config, 1).with_nuisances(own))
     last = sets[2] if len(sets) > PARTS else None
-    limits = ([f"Motions were replayed whole: {log.whole}."] if log.whole else []) + list(plan.limits)
+    limits = ([f"Motions were replayed whole: {log.whole}."] if windows and log.whole else []) + list(plan.limits)
     return Case(sets[0], sets[1], last, base, tuple(effects), config, noise.values, tuple(limits))
 
 

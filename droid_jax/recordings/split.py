@@ -21,7 +21,7 @@ ELSE = (
     "joint and phase simulation and robot disagree"
 )
 ALONE = "one repeat alone"  # of a log without commands
-BY_WINDOWS = "; and commanded logs in which positions were measured are searched by windows, with any number of repeats"
+BY_WINDOWS = "; and commanded logs in which positions were measured are searched by stretches of time, with any number of repeats"
 
 
 class Split(enum.Enum):
@@ -43,10 +43,9 @@ class Split(enum.Enum):
             Split.BLOCKS: "There are no repeats: U holds the noise too, and nothing tells a place from noise. The "
             "validation blocks are of the same motion as the fitted ones, so they tell an effect from noise, but not "
             "from another form of it.",
-            Split.WINDOWS: "There are too few repeats to tell noise from what they share: windows of the motion, each "
-            "replayed from its own measured state, take their place. U holds the noise too, and nothing tells a place "
-            "from noise. The validation windows are of the same motions as the fitted ones, so they tell an effect "
-            "from noise, but not from another form of it.",
+            Split.WINDOWS: "There are too few repeats to tell noise from what they share: stretches of time take their "
+            "place. U holds the noise too, and nothing tells a place from noise. The validation stretches are of the "
+            "same motions as the fitted ones, so they tell an effect from noise, but not from another form of it.",
         }[self]
 
 

@@ -216,7 +216,7 @@ class OpenLoopMean(Struct, frozen=True):
 
 
 class OpenLoop(Struct, frozen=True):
-    """Errors of whole replays, beside those of windows."""
+    """Errors of whole replays of commanded logs."""
 
     mean_mae: dict[str, OpenLoopMean]
 

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 
 from droid_jax.arguments import check_fields, number
+from droid_jax.model.actuators import drives_joint, has_feedback
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Channel, Recording
 from droid_jax.simulate.replay import Drive
@@ -76,6 +77,13 @@ class Windows:
             self.earlier,
             self.steps,
         )
+
+
+def held(scene: Scene) -> bool:
+    """Whether a servo holds every joint, so that what a replay misses now is mostly gone some time later."""
+    model = scene.model
+    servos = model.actuator_trnid[drives_joint(model) & has_feedback(model), 0]
+    return set(range(model.njnt)) <= set(servos.tolist())
 
 
 def why_whole(scene: Scene, recording: Recording) -> str:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import json
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -25,9 +27,9 @@ from droid_jax.discrepancy.verdict import Conclusion
 from droid_jax.model.effects.registry import library
 from droid_jax.model.parameter_file import load_parameters
 from droid_jax.model.parameters import Space
-from droid_jax.model.scene import Scene
+from droid_jax.model.scene import Scene, load_scene
 from droid_jax.recordings.recording import Channel, Recording
-from droid_jax.simulate.windows import WindowConfig, joint_states, why_whole
+from droid_jax.simulate.windows import WindowConfig, held, joint_states, why_whole
 
 SHORT = WindowConfig(length=0.4, lead=0.1, history=0.05)
 NOISE = 1e-4
@@ -79,6 +81,14 @@ def test_a_state_that_was_not_measured_is_none():
     np.testing.assert_allclose(state[0], [0.3, 0.0], atol=1e-12)
 
 
+def test_motions_are_replayed_whole_where_a_servo_holds_every_joint():
+    free = load_scene(Path(__file__).resolve().parents[2] / "experiments" / "xl330.xml")
+    assert held(scene()) and held(free)
+    model = copy.copy(free.model)
+    model.actuator_biasprm[:, 1] = 0.0  # a motor's torque, which follows no position
+    assert not held(replace(free, model=model))
+
+
 def test_windows_need_every_joint():
     recording = swung("a", 1.0, 1.0)
     assert why_whole(scene(), recording) == ""
@@ -122,15 +132,22 @@ def test_a_motion_that_is_replayed_whole_has_stretches(space: Space):
     assert np.sqrt(np.mean(left**2)) < 2 * NOISE
     white = log.about(space.mean).with_noise(np.full(1, NOISE), log.unit < 2).whitened(space.values(TRUE)[None])[0]
     np.testing.assert_allclose(white, np.where(log.unit < 2, -left[:, 0] / NOISE, 0.0), atol=1e-3)
+    again = windowed_log(scene(), space, [with_a_gap()], config, None, fitted_share=0.5)
+    instants = [set(np.round(of.pieces[0].at.ravel(), 6)) for of in (again, log)]
+    assert instants[0] < instants[1] and len(instants[0]) > 0.5 * len(instants[1])
+    assert np.sqrt(np.mean(again.residual(space.values(TRUE)) ** 2)) < 2 * NOISE
 
 
-def test_a_masked_stretch_leaves_its_windows_out(space: Space):
+def with_a_gap() -> Recording:
     whole = swung("a", 1.0, 0.7, noise=NOISE)
     channel = whole.channel("position")
     mask = channel.mask.copy()
     mask[0, 90:120] = False  # 0.72 to 0.96 s
-    gap = replace(whole, channels={"position": replace(channel, mask=mask)})
-    log, full = log_of(space, [gap]), log_of(space, [whole])
+    return replace(whole, channels={"position": replace(channel, mask=mask)})
+
+
+def test_a_masked_stretch_leaves_its_windows_out(space: Space):
+    log, full = log_of(space, [with_a_gap()]), log_of(space, [swung("a", 1.0, 0.7, noise=NOISE)])
     assert full.unit.max() + 1 == 4 and log.unit.max() + 1 == 2
     assert set(np.round(log.pieces[0].at.ravel(), 6)) < set(np.round(full.pieces[0].at.ravel(), 6))
 
