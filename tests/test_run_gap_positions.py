@@ -1,4 +1,4 @@
-"""The command `gap` on positions alone: of repeats, and of one commanded log by windows."""
+"""The command `gap` on positions alone: of repeats, and of one commanded log by stretches of time."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_positions_of_one_commanded_log(tmp_path: Path, monkeypatch: pytest.Monk
     judge = swung("judge", 0.8, 0.43, noise=NOISE, friction=FRICTION)
     save_recording(judge, tmp_path / "judge.npz")
     answer = found(tmp_path, logs, "--judge-on", str(tmp_path / "judge.npz"))
-    assert answer.split.by == "windows" and "windows of the motion" in answer.split.limits
+    assert answer.split.by == "windows" and "stretches of time" in answer.split.limits
     assert [d.recording for d in answer.discrepancies.values()] == [
         "log, every other block", "log, the blocks between", "judge",
     ]  # fmt: skip
