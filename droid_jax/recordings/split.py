@@ -21,7 +21,7 @@ ELSE = (
     "joint and phase simulation and robot disagree"
 )
 ALONE = "one repeat alone"  # of a log without commands
-BY_WINDOWS = "; and commanded logs in which positions were measured are searched by stretches, with any number of repeats"
+BY_WINDOWS = "; and commanded logs in which positions were measured are searched by stretches of time, with any number of repeats"
 
 
 class Split(enum.Enum):
