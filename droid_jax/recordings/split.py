@@ -21,7 +21,10 @@ ELSE = (
     "joint and phase simulation and robot disagree"
 )
 ALONE = "one repeat alone"  # of a log without commands
-BY_WINDOWS = "; and commanded logs in which positions were measured are searched by stretches of time, with any number of repeats"
+BY_STRETCHES = (
+    "; and commanded logs in which positions were measured are searched by stretches of time, with any number of "
+    "repeats"
+)
 
 
 class Split(enum.Enum):
@@ -131,7 +134,7 @@ def _check_halves(recording: Recording) -> None:
         f"validation, and with fewer than {FEWEST_REPEATS} repeats in a half no effect can be told from chance. Record "
         f"{HALVES} or more, or better another motion, {FEWEST_REPEATS} repeats or more of each: "
         f"--recording TRAIN VALIDATION. {ELSE}"
-        + (BY_WINDOWS if recording.command.size else f"; and {ALONE} is searched as a log, in blocks of time")
+        + (BY_STRETCHES if recording.command.size else f"; and {ALONE} is searched as a log, in blocks of time")
     )
 
 
@@ -143,7 +146,7 @@ def _check_repeats(role: str, recording: Recording) -> None:
         f"the {role} recording {recording.name!r} has {_repeats(recording)}: with fewer than {FEWEST_REPEATS} no "
         "effect can be "
         f"told from chance. {ELSE}"
-        + (f"; and {ALONE}, or of each of two logs, is searched in blocks of time" if log else BY_WINDOWS)
+        + (f"; and {ALONE}, or of each of two logs, is searched in blocks of time" if log else BY_STRETCHES)
     )
 
 
