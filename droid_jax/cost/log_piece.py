@@ -1,10 +1,13 @@
-"""One repeat of a commanded recording as part of a `WindowedLog`: its windows, or its motion whole."""
+"""One repeat of a commanded recording as part of a `WindowedLog`: its windows, or its motion whole.
+
+A whole motion is one window that lasts as long.  What shares a program is replayed in one batch.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import functools
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -17,12 +20,14 @@ from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording
-from droid_jax.simulate.batching import block_size, in_blocks
-from droid_jax.simulate.compiled import compiled_replay, window_program
+from droid_jax.simulate.batching import block_size
+from droid_jax.simulate.compiled import window_program
 from droid_jax.simulate.replay import Drive
+from droid_jax.simulate.servo_gains import servo_factors
 from droid_jax.simulate.windows import WindowConfig, Windows, cut
 
 STRETCH = 0.5  # s: what a motion that is replayed whole is divided into, as others are into windows
+LONGER = 1.25  # times its own duration that a motion is replayed for, to share a program and a batch with longer ones
 TRACES = ("torque", "position", "velocity", "object_angle")
 
 
@@ -30,7 +35,7 @@ TRACES = ("torque", "position", "velocity", "object_angle")
 class Piece:
     """One repeat of one recording: W windows, or one that is the whole motion.
 
-    windows: None for a whole motion, of which `whole` makes batches.  program: of the windows.
+    program: of the windows (`compiled.window_program`).
     kernels: of windows, by channel [W, 1 or C, K, T], what its data went through.  filters: of a whole motion the same,
     1 or C of [K, T].  columns: by channel [C] of the simulated one.
     measured: [W, K, all C].  at: [W, K] s, the instants on the recording's clock.  rows: [W, K] of the replay, nearest.
@@ -38,9 +43,8 @@ class Piece:
     """
 
     name: str
-    windows: Windows | None
-    program: Callable[..., Rollout] | None
-    whole: Callable[[np.ndarray], Rollout] | None
+    windows: Windows
+    program: Callable[..., Rollout]
     kernels: dict[str, np.ndarray]
     filters: dict[str, tuple[sparse.csr_array, ...]]
     columns: dict[str, np.ndarray]
@@ -54,50 +58,10 @@ class Piece:
         """W."""
         return len(self.at)
 
-    def replayed(
-        self, values: np.ndarray, reduce: Callable[[Rollout, np.ndarray], Any], active: np.ndarray | None = None
-    ) -> Any:
-        """What `reduce` makes of every window's Rollout [R, T, ...] and its number [R], for samples [P, D]: arrays
-        [P, W, ...], of active windows [W] bool alone.
-        """
-        chosen = np.arange(self.count) if active is None else np.flatnonzero(active)
-
-        def samples(rows: np.ndarray) -> Any:
-            which = np.tile(chosen, len(rows))
-            found = self._run(np.repeat(rows, len(chosen), axis=0), which, *self._state(which), reduce)
-            return {key: a.reshape(len(rows), len(chosen), *a.shape[1:]) for key, a in found.items()}
-
-        if self.windows is not None:
-            return distributed.over_processes(samples, values)
-        assert self.whole is not None
-        whole = self.whole
-        found = in_blocks(lambda block: reduce(_host(whole(block)), np.zeros(len(block), int)), values)
-        return {key: a[:, None] for key, a in found.items()}
-
-    def _state(self, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        assert self.windows is not None
-        return self.windows.start[which], self.windows.speed[which]
-
-    def _run(
-        self,
-        values: np.ndarray,
-        which: np.ndarray,
-        start: np.ndarray,
-        speed: np.ndarray,
-        reduce: Callable[[Rollout, np.ndarray], dict[str, np.ndarray]],
-    ) -> dict[str, np.ndarray]:
-        """Rows [R] of windows `which` from states of their own, block by block."""
-        assert self.windows is not None and self.program is not None
-        size, found = block_size(len(values)), list[dict[str, np.ndarray]]()
-        gains = np.repeat(self.windows.gains[None], size, axis=0)
-        for first in range(0, len(values), size):
-            mine = np.minimum(np.arange(first, first + size), len(values) - 1)  # the last block repeats its last row
-            of = which[mine]
-            given = self.windows.table[of], start[mine], gains, speed[mine], self.windows.begin[of]
-            rollout = self.program(values[mine], *(np.asarray(a, np.float32) for a in given))
-            count = min(size, len(values) - first)
-            found.append({k: a[:count] for k, a in reduce(_host(rollout), of).items()})
-        return {key: np.concatenate([part[key] for part in found]) for key in found[0]}
+    @property
+    def whole(self) -> bool:
+        """Whether its motion is replayed from its beginning."""
+        return bool(self.filters)
 
     def smoothed(self, rollout: Rollout, which: np.ndarray) -> dict[str, np.ndarray]:
         """ "smooth": [R, K, all C] the compared channels through the filter of their data; NaN where it blew up."""
@@ -105,7 +69,7 @@ class Piece:
         for name, columns in self.columns.items():
             trace = getattr(rollout, name)
             trace = (trace[..., None] if trace.ndim == 2 else trace)[..., columns]
-            if self.windows is None:
+            if self.whole:
                 each = self.filters[name] * (trace.shape[2] if len(self.filters[name]) == 1 else 1)
                 parts.append(np.stack([(f @ trace[:, :, c].T).T for c, f in enumerate(each)], axis=2))
                 continue
@@ -126,7 +90,7 @@ class Piece:
     def spread(self, values: np.ndarray) -> np.ndarray | None:
         """[W, K, all C, 2 nv] what each column of the states' spread does to the simulation at `values` [D]."""
         windows = self.windows
-        if windows is None:
+        if self.whole:
             return None
         dofs, positions = windows.speed.shape[1], windows.start.shape[1]
         assert dofs == positions  # joints of one degree, in one order
@@ -134,74 +98,165 @@ class Piece:
         which = np.repeat(np.arange(self.count), columns)
         step = np.swapaxes(windows.spread, 1, 2).reshape(-1, columns)  # one row for each column
         rows = np.repeat(values[None], len(which), axis=0)
-        start, speed = windows.start[which], windows.speed[which]
-        ends = [
-            self._run(rows, which, start + s * step[:, :dofs], speed + s * step[:, dofs:], self.smoothed)["smooth"]
-            for s in (1.0, -1.0)
-        ]
+        ends = list[np.ndarray]()
+        for s in (1.0, -1.0):
+            start, speed = windows.start[which] + s * step[:, :dofs], windows.speed[which] + s * step[:, dofs:]
+            given = windows.table[which], start, windows.gains[which], speed, windows.begin[which]
+            parts = [self.smoothed(r, which[of])["smooth"] for r, of in _blocks(self.program, rows, given)]
+            ends.append(np.concatenate(parts))
         found = np.nan_to_num(0.5 * (ends[0] - ends[1])).reshape(self.count, columns, *ends[0].shape[1:])
         return np.moveaxis(found, 1, -1)
 
 
-def _host(rollout: Rollout) -> Rollout:
-    return Rollout(*(np.asarray(getattr(rollout, f.name)) for f in fields(rollout)))
+def replayed(
+    pieces: Sequence[Piece],
+    values: np.ndarray,
+    reduce: Callable[[Piece, Rollout, np.ndarray], dict[str, np.ndarray]],
+    active: Sequence[np.ndarray] | None = None,
+) -> list[dict[str, np.ndarray]]:
+    """What `reduce` makes of a piece's Rollout [R, T, ...] and the windows [R] it is of, for samples [P, D].
+
+    active: by piece, windows [W] bool that are replayed; None: all.  Pieces that share a program share its blocks.
+    Returns, by piece, arrays [P, active windows, ...]; nothing for a piece without any.
+    """
+    shared = dict[int, list[int]]()
+    for i, piece in enumerate(pieces):
+        shared.setdefault(id(piece.program), []).append(i)
+    found = list[dict[str, np.ndarray]]({} for _ in pieces)
+    for members in shared.values():
+        chosen = [np.arange(pieces[i].count) if active is None else np.flatnonzero(active[i]) for i in members]
+        if not sum(map(len, chosen)):
+            continue
+        run = functools.partial(_together, [pieces[i] for i in members], chosen, reduce)
+        for i, part in zip(members, distributed.over_processes(run, values), strict=True):
+            found[i] = part
+    return found
 
 
-def make_piece(
+def _together(
+    pieces: Sequence[Piece],
+    chosen: Sequence[np.ndarray],
+    reduce: Callable[[Piece, Rollout, np.ndarray], dict[str, np.ndarray]],
+    values: np.ndarray,
+) -> list[dict[str, np.ndarray]]:
+    """As `replayed`, of pieces of one program and their chosen windows."""
+    count, each = len(values), sum(map(len, chosen))
+    piece, window = np.repeat(np.arange(len(pieces)), list(map(len, chosen))), np.concatenate(chosen)
+    piece, window = np.tile(piece, count), np.tile(window, count)
+    first = np.cumsum([0, *(p.count for p in pieces)])[:-1]
+    names = ("table", "start", "gains", "speed", "begin")
+    given = [np.concatenate([getattr(p.windows, name) for p in pieces])[first[piece] + window] for name in names]
+    parts = list[list[dict[str, np.ndarray]]]([] for _ in pieces)
+    for rollout, of in _blocks(pieces[0].program, np.repeat(values, each, axis=0), given):
+        for i in np.unique(piece[of]).tolist():
+            mine = piece[of] == i
+            some = rollout if mine.all() else Rollout(*(getattr(rollout, f.name)[mine] for f in fields(rollout)))
+            parts[i].append(reduce(pieces[i], some, window[of][mine]))
+    return [
+        {k: np.concatenate([p[k] for p in part]).reshape(count, len(w), *part[0][k].shape[1:]) for k in part[0]}
+        if part
+        else {}
+        for part, w in zip(parts, chosen, strict=True)
+    ]
+
+
+def _blocks(
+    program: Callable[..., Rollout], values: np.ndarray, given: Sequence[np.ndarray]
+) -> Iterator[tuple[Rollout, np.ndarray]]:
+    """The Rollouts of rows [R, D] and of what else a program takes, block by block, on the host, and which they are."""
+    size = block_size(len(values))
+    for first in range(0, len(values), size):
+        rows = np.minimum(np.arange(first, first + size), len(values) - 1)  # the last block repeats its last row
+        count = min(size, len(values) - first)
+        rollout = program(values[rows], *(np.asarray(a[rows], np.float32) for a in given))
+        yield Rollout(*(np.asarray(getattr(rollout, f.name))[:count] for f in fields(rollout))), rows[:count]
+
+
+def shared_steps(steps: Sequence[int]) -> list[int]:
+    """How long each of some motions is replayed, at least its own steps: few different numbers."""
+    found, longest = [0] * len(steps), 0
+    for i in sorted(range(len(steps)), key=lambda i: -steps[i]):
+        longest = longest if steps[i] <= longest <= LONGER * steps[i] else steps[i]
+        found[i] = longest
+    return found
+
+
+def in_windows(
     scene: Scene,
     space: Space,
     recording: Recording,
-    *,
     repeat: int,
     drive: Drive,
     config: CompareConfig,
-    windows: WindowConfig | None,
+    windows: WindowConfig,
     effects: Sequence[Effect],
     grid: float | None,
 ) -> Piece:
-    """A repeat in windows, or whole (windows: None), without what was not measured; see `windowed_log`."""
-    made = None if windows is None else cut(scene, recording, drive, repeat, windows, grid)
-    clocks, at = _clocks(recording, drive, config, windows, made)
+    """A repeat in windows, without those in which something was not measured; see `windowed_log`."""
+    made = cut(scene, recording, drive, repeat, windows, grid)
+    instants = (np.arange(max(1, round(windows.length * config.noise.rate))) + 0.5) / config.noise.rate
+    clocks, at = made.begin[:, None] + np.arange(made.steps) * drive.timestep, made.begin[:, None] + windows.lead
+    at = at + instants
+    values, passed, columns = _measured(scene, recording, repeat, config, clocks, at)
+    kept = np.asarray(~np.isnan(values).any(axis=(1, 2)))
+    program = window_program(scene, space, drive, effects, made.earlier, made.steps)
+    kernels = {key: _dense(each)[kept] for key, each in passed.items()}
+    unit = np.repeat(np.arange(len(at))[:, None], at.shape[1], axis=1)
+    cut_to = (a[kept] for a in (values, at, _nearest(at, clocks, drive), unit))
+    return Piece(_name(recording, repeat), made.kept(kept), program, kernels, {}, columns, *cut_to)
+
+
+def as_a_whole(
+    scene: Scene,
+    space: Space,
+    recording: Recording,
+    repeat: int,
+    drive: Drive,
+    config: CompareConfig,
+    effects: Sequence[Effect],
+    steps: int,
+) -> Piece:
+    """A repeat from its beginning, without instants that were not measured; steps: as long as it is replayed."""
+    begin = float(recording.time[0])
+    last = min(begin + float(drive.time[-1]), *(float(recording.channel(n).time[-1]) for n in config.channels))
+    clocks, at = begin + np.arange(steps)[None] * drive.timestep, coarse_clock(begin, last, config.noise.rate)[None]
+    values, passed, columns = _measured(scene, recording, repeat, config, clocks, at)
+    kept = ~np.isnan(values[0]).any(axis=1)
+    unit = np.floor((at - at[0, 0]) / STRETCH).astype(int)
+    unit = np.minimum(unit, max(int((at[0, -1] - at[0, 0]) / STRETCH) - 1, 0))
+    filters = {key: tuple(f[kept] for f in each[0]) for key, each in passed.items()}
+    table = np.concatenate([drive.command, np.repeat(drive.command[-1:], steps - len(drive.command), axis=0)])
+    size = scene.model.nv
+    motion = Windows(
+        np.zeros(1), table[None], servo_factors(scene, drive)[None], drive.qpos0[None], np.zeros((1, size)),
+        np.zeros((1, 2 * size, 2 * size)), 0, steps,
+    )  # fmt: skip
+    program = window_program(scene, space, drive, effects, 0, steps)
+    cut_to = (a[:, kept] for a in (values, at, _nearest(at, clocks, drive), unit))
+    return Piece(_name(recording, repeat), motion, program, {}, filters, columns, *cut_to)
+
+
+def _measured(
+    scene: Scene, recording: Recording, repeat: int, config: CompareConfig, clocks: np.ndarray, at: np.ndarray
+) -> tuple[np.ndarray, dict[str, list[tuple[sparse.csr_array, ...]]], dict[str, np.ndarray]]:
+    """[W, K, all C] what was measured at instants `at` [W, K]; its filters for replays with rows `clocks` [W, T], and
+    the simulated columns, by channel.  NaN where too little was measured."""
     columns, measured = dict[str, np.ndarray](), list[np.ndarray]()
     passed = dict[str, list[tuple[sparse.csr_array, ...]]]()
     for name in config.channels:
         channel, columns[name] = compared_columns(scene, recording.channel(name), config.noise)
-        each = [
-            in_window(channel, repeat, clock, coarse, config.noise) for clock, coarse in zip(clocks, at, strict=True)
-        ]
+        each = [in_window(channel, repeat, *both, config.noise) for both in zip(clocks, at, strict=True)]
         measured.append(np.stack([values for values, _ in each]))
         passed[name] = [filters for _, filters in each]
-    values = np.concatenate(measured, axis=2)
-    rows = np.clip(np.rint((at - clocks[:, :1]) / drive.timestep).astype(int), 0, clocks.shape[1] - 1)
-    seen = ~np.isnan(values).any(axis=2)  # [W, K]
-    name = recording.name if recording.repeats == 1 else f"{recording.name}, repeat {repeat}"
-    if made is None:
-        kept = seen[0]
-        unit = np.floor((at - at[0, 0]) / STRETCH).astype(int)
-        unit = np.minimum(unit, max(int((at[0, -1] - at[0, 0]) / STRETCH) - 1, 0))
-        filters = {key: tuple(f[kept] for f in each[0]) for key, each in passed.items()}
-        whole = compiled_replay("mjx", scene, space, drive, effects)
-        cut_to = (a[:, kept] for a in (values, at, rows, unit))
-        return Piece(name, None, None, whole, {}, filters, columns, *cut_to)
-    kept = np.asarray(seen.all(axis=1))
-    program = window_program(scene, space, drive, effects, made.earlier, made.steps)
-    kernels = {key: _dense(each)[kept] for key, each in passed.items()}
-    unit = np.repeat(np.arange(len(at))[:, None], at.shape[1], axis=1)
-    cut_to = (a[kept] for a in (values, at, rows, unit))
-    return Piece(name, made.kept(kept), program, None, kernels, {}, columns, *cut_to)
+    return np.concatenate(measured, axis=2), passed, columns
 
 
-def _clocks(
-    recording: Recording, drive: Drive, config: CompareConfig, windows: WindowConfig | None, made: Windows | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """[W, T] s of the replays' rows, and [W, K] s of the instants that are compared."""
-    rate, begin = config.noise.rate, float(recording.time[0])
-    if windows is None or made is None:
-        clock = begin + drive.time
-        last = min(clock[-1], *(recording.channel(n).time[-1] for n in config.channels))
-        return clock[None], coarse_clock(float(clock[0]), float(last), rate)[None]
-    instants = (np.arange(max(1, round(windows.length * rate))) + 0.5) / rate
-    return made.begin[:, None] + np.arange(made.steps) * drive.timestep, made.begin[:, None] + windows.lead + instants
+def _name(recording: Recording, repeat: int) -> str:
+    return recording.name if recording.repeats == 1 else f"{recording.name}, repeat {repeat}"
+
+
+def _nearest(at: np.ndarray, clocks: np.ndarray, drive: Drive) -> np.ndarray:
+    return np.clip(np.rint((at - clocks[:, :1]) / drive.timestep).astype(int), 0, clocks.shape[1] - 1)
 
 
 def _dense(each: Sequence[tuple[sparse.csr_array, ...]]) -> np.ndarray:

@@ -6,7 +6,6 @@ begins is measured, and how well enters the noise: what the spread of its state 
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -15,7 +14,7 @@ import numpy as np
 
 from droid_jax.cost.channels import check_channels
 from droid_jax.cost.cost import Cost, check_read, followed
-from droid_jax.cost.log_piece import STRETCH, TRACES, Piece, make_piece
+from droid_jax.cost.log_piece import STRETCH, TRACES, Piece, as_a_whole, in_windows, replayed, shared_steps
 from droid_jax.cost.noise import Noise
 from droid_jax.cost.observation import Measured, ShortFilter, least_noise
 from droid_jax.cost.residuals import CompareConfig, Comparison
@@ -66,11 +65,12 @@ class WindowedLog(Cost):
         """[P, D] -> [P, K, C] compared channels through the filter of their data, in their units; NaN throughout where
         a window blew up.  Windows without an instant that counts are not replayed: what was measured stands there."""
         values, parts = self.space.check(values), list[np.ndarray]()
-        for piece, counts in zip(self.pieces, self._apart(self.instants[None, :, None]), strict=True):
-            active = np.asarray(counts[0, :, :, 0].any(axis=1))
+        active = [np.asarray(c[0, :, :, 0].any(axis=1)) for c in self._apart(self.instants[None, :, None])]
+        each = zip(self.pieces, active, replayed(self.pieces, values, Piece.smoothed, active), strict=True)
+        for piece, some, found in each:
             part = np.repeat(piece.measured[None], len(values), axis=0)
-            if active.any():
-                part[:, active] = piece.replayed(values, piece.smoothed, active)["smooth"]
+            if found:
+                part[:, some] = found["smooth"]
             parts.append(part)
         found = self._joined(parts)
         found[np.isnan(found).any(axis=(1, 2))] = np.nan
@@ -123,7 +123,7 @@ class WindowedLog(Cost):
     def rollouts(self, values: Any) -> tuple[Rollout, ...]:
         """[P, D] -> one Rollout of the instants, host arrays [P, K, ...]."""
         values = self.space.check(values)
-        parts = [piece.replayed(values, piece.traces) for piece in self.pieces]
+        parts = replayed(self.pieces, values, Piece.traces)
         traces = {name: self._joined([part[name] for part in parts]) for name in TRACES}
         finite = np.all(np.concatenate([part["finite"] for part in parts], axis=1), axis=1)
         count, size = len(values), len(self.order)
@@ -234,16 +234,20 @@ def windowed_log(
     check_inertia(scene, space)
     reasons = [why_whole(scene, recording) for recording in recordings]
     why = "motions were asked for whole" if windows is None else next((r for r in reasons if r), "")
-    pieces, drives = list[Piece](), list[Drive]()
+    drives = list[Drive]()
     for recording in recordings:
         drive = followed(scene, recording, config)
         assert isinstance(drive, Drive)
         drives.append(drive)
-        each = functools.partial(
-            make_piece, scene, space, recording, drive=drive, config=config, windows=None if why else windows,
-            effects=effects, grid=grid,
-        )  # fmt: skip
-        pieces += [each(repeat=n) for n in range(recording.repeats)]
+    lasting = shared_steps([len(drive.command) for drive in drives])
+    pieces = list[Piece]()
+    for recording, drive, steps in zip(recordings, drives, lasting, strict=True):
+        for repeat in range(recording.repeats):
+            of = scene, space, recording, repeat, drive, config
+            if why or windows is None:
+                pieces.append(as_a_whole(*of, effects, steps))
+            else:
+                pieces.append(in_windows(*of, windows, effects, grid))
     pieces = [piece for piece in pieces if piece.count]
     if not pieces:
         raise ValueError(f"recordings {', '.join(r.name for r in recordings)}: no window was measured throughout")

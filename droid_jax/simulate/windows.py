@@ -50,7 +50,8 @@ class Windows:
     """W windows of one repeat of a recording.
 
     begin: [W] s, of each replay, on the recording's clock.
-    table: [W, earlier + steps, U] commands, `earlier` rows of them sent earlier.  gains: [U, 2] factors on the scene's.
+    table: [W, earlier + steps, U] commands, `earlier` rows of them sent earlier.
+    gains: [W, U, 2] factors on the scene's.
     start: [W, nq], speed: [W, nv].
     spread: [W, 2 nv, 2 nv] columns by which positions and speeds (one after the other, by degree of freedom) may be off
     together: a square root of their covariance.
@@ -70,7 +71,7 @@ class Windows:
         return Windows(
             self.begin[rows],
             self.table[rows],
-            self.gains,
+            self.gains[rows],
             self.start[rows],
             self.speed[rows],
             self.spread[rows],
@@ -139,7 +140,8 @@ def cut(
     padded = np.concatenate([np.repeat(drive.command[:1], earlier, axis=0), drive.command])
     table = padded[rows[:, None] + np.arange(earlier + steps)]
     known = np.asarray(np.isfinite(start).all(axis=1) & np.isfinite(speed).all(axis=1))
-    return Windows(begin, table, servo_factors(scene, drive), start, speed, spread, earlier, steps).kept(known)
+    gains = np.repeat(servo_factors(scene, drive)[None], len(rows), axis=0)
+    return Windows(begin, table, gains, start, speed, spread, earlier, steps).kept(known)
 
 
 def reach_of(channel: Channel, config: WindowConfig) -> float:

@@ -17,6 +17,7 @@ import pytest
 from pendulum import TRUE, pendulum, swung
 
 import droid_jax as dj
+from droid_jax.cost.log_piece import shared_steps
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.cost.windowed_log import WindowedLog, _whitener, windowed_log
 from droid_jax.discrepancy.candidates import observable_effects
@@ -136,6 +137,18 @@ def test_a_motion_that_is_replayed_whole_has_stretches(space: Space):
     instants = [set(np.round(of.pieces[0].at.ravel(), 6)) for of in (again, log)]
     assert instants[0] < instants[1] and len(instants[0]) > 0.5 * len(instants[1])
     assert np.sqrt(np.mean(again.residual(space.values(TRUE)) ** 2)) < 2 * NOISE
+
+
+def test_motions_of_about_one_length_are_replayed_together(space: Space):
+    """In one batch, and each as it is alone; one that is much shorter is no part of it."""
+    assert shared_steps([400, 100, 380, 390]) == [400, 100, 400, 400] and shared_steps([7]) == [7]
+    logs = [swung("a", 1.0, 0.7), swung("soft", 0.6, 1.1)]
+    logs[1] = logs[1].window(0.0, 0.9 * logs[1].duration)
+    config, rows = CompareConfig(channels={"position": 1.0}), np.stack([space.mean, space.values(TRUE)])
+    both = windowed_log(scene(), space, logs, config, None)
+    assert both.pieces[0].program is both.pieces[1].program
+    alone = [windowed_log(scene(), space, [log], config, None).simulated(rows) for log in logs]
+    np.testing.assert_allclose(both.simulated(rows), np.concatenate(alone, axis=1), atol=1e-5)
 
 
 def with_a_gap() -> Recording:
