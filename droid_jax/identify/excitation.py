@@ -1,0 +1,216 @@
+"""Which parameters a motion can tell, before any fit: from the sensitivity of its replay.
+
+The replay is differentiated at the initial means and, since these may be far from the robot, again where one or two
+Gauss-Newton steps from there lead.  The information J^T J and the stated prior give each parameter's width; the
+criterion of a fit (`identifiability`) judges it.  Of one repeat the noise is what the model leaves there, as in a fit.
+Source: Gautier and Khalil, Exciting trajectories for the identification of base inertial parameters, IJRR 1992.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import jax
+import numpy as np
+
+from droid_jax.arguments import check_fields, instance, number, whole
+from droid_jax.cost.channels import check_channels, chosen_channels
+from droid_jax.cost.cost import Cost, make_cost
+from droid_jax.cost.residuals import CompareConfig, Comparison
+from droid_jax.identify.gaussian import Gaussian
+from droid_jax.identify.holdout import beginning
+from droid_jax.identify.identifiability import Identifiability, IdentifiabilityConfig, identifiability
+from droid_jax.model.effect_interface import Rollout
+from droid_jax.model.parameters import Space
+from droid_jax.model.scene import Scene
+from droid_jax.recordings.recording import Recording
+from droid_jax.simulate.c_reference import why_not_in_c
+
+
+@dataclass(frozen=True)
+class ExcitationConfig:
+    """What decides which parameters a motion can tell.
+
+    seconds: of each recording that are replayed; what a longer one tells is taken to grow with its length.
+    step: half-width of the differences, search units.
+    steps: Gauss-Newton steps from the initial means at most.
+    longest_step: of each of their components, search units.
+    compare: how simulation and measurement are compared.
+    identifiability: when a parameter counts as identifiable.
+    """
+
+    seconds: float = 20.0
+    step: float = 0.1
+    steps: int = 2
+    longest_step: float = 1.5
+    compare: CompareConfig = field(default_factory=CompareConfig)
+    identifiability: IdentifiabilityConfig = field(default_factory=IdentifiabilityConfig)
+
+    def __post_init__(self) -> None:
+        check_fields(
+            self,
+            **dict.fromkeys(("seconds", "step", "longest_step"), partial(number, above=0)),
+            steps=partial(whole, least=0),
+            compare=partial(instance, kind=CompareConfig),
+            identifiability=partial(instance, kind=IdentifiabilityConfig),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Excitation:
+    """What recordings tell of the parameters of a space.
+
+    values: [D] where the replay was differentiated.  information: [D, D] of the data, per squared search unit.
+    told: of each parameter.  noise: channel -> column -> white deviation at the noise model's coarse rate.
+    config: with the channels that were compared.  engine: that replayed.  seconds: that this took.
+    """
+
+    space: Space
+    values: np.ndarray
+    information: np.ndarray
+    told: tuple[Identifiability, ...]
+    noise: Mapping[str, Mapping[str, float]]
+    config: ExcitationConfig
+    engine: str
+    seconds: float
+
+    @property
+    def open(self) -> tuple[str, ...]:
+        """Names of the parameters of interest that are not identifiable."""
+        return tuple(
+            t.name for t, p in zip(self.told, self.space.parameters, strict=True) if not (t.identifiable or p.nuisance)
+        )
+
+
+def excitation(
+    scene: Scene, space: Space, recordings: Sequence[Recording], config: ExcitationConfig | None = None
+) -> Excitation:
+    """Which parameters recordings can tell that are fitted together.
+
+    Args:
+        scene: with its nominal values.
+        space: parameters and nuisances, D in all; their means are the nominal values.
+        recordings: valid ones, of the same robot.
+        config: settings; None for the defaults.
+
+    Returns:
+        What they tell.
+
+    Raises:
+        ValueError: recordings or parameters that do not fit the scene, or means that cannot be simulated.
+    """
+    began = time.monotonic()
+    config = ExcitationConfig() if config is None else config
+    chosen = chosen_channels(scene, recordings, None, config.compare)
+    if chosen:
+        config = replace(config, compare=replace(config.compare, channels=dict.fromkeys(chosen, 1.0)))
+    check_channels(recordings, config.compare.channels)
+    short = [beginning(recording, config.seconds) for recording in recordings]
+    engine = engine_for(scene, space, short)
+    with silent():
+        cost = make_cost(scene, space, short, engine=engine, config=config.compare, check=False)
+    x, jacobian, cost = _stepped(cost, space, config)
+    longer = [r.duration / s.duration for r, s in zip(recordings, short, strict=True)]
+    weight = np.concatenate([np.full(_size(c), k) for c, k in zip(cost.comparisons, longer, strict=True)])
+    information = jacobian.T @ (jacobian * weight[:, None])
+    return Excitation(
+        space=space,
+        values=space.from_search(x),
+        information=information,
+        told=told_by(space, information, config.identifiability),
+        noise=_noise_of(scene, cost.comparisons),
+        config=config,
+        engine=engine,
+        seconds=time.monotonic() - began,
+    )
+
+
+def told_by(space: Space, information: np.ndarray, config: IdentifiabilityConfig) -> tuple[Identifiability, ...]:
+    """What data of an information [D, D], per squared search unit, tell of each parameter beside its stated prior."""
+    cov = np.linalg.inv(information + np.eye(len(space)))
+    gaussian = Gaussian(space, np.zeros(len(space)), 0.5 * (cov + cov.T), "sensitivity beside the stated prior")
+    return identifiability(gaussian, np.ones(len(space)), config)
+
+
+def engine_for(scene: Scene, space: Space, recordings: Sequence[Recording]) -> str:
+    """Plain C where it can replay the recordings, which compiles nothing; else MJX."""
+    contacts = scene.grip is not None or scene.model.npair
+    if contacts or any(not r.command.size or why_not_in_c(scene, space, r.torque, ()) for r in recordings):
+        return "mjx"
+    return "mujoco"
+
+
+@contextmanager
+def silent() -> Iterator[None]:
+    """Without the warnings of a replay, which `check` shows as findings."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def slopes(cost: Cost, space: Space, x: np.ndarray, step: float) -> tuple[tuple[Rollout, ...], np.ndarray]:
+    """Replays at search coordinates x [D], row 0, and with each a step further, rows 1 to D; and the steps [D].
+
+    A step goes down where a bound is in the way.
+    """
+    up = np.where(x + step <= space.to_search(space.high), step, -step)
+    return cost.rollouts(space.from_search(np.vstack([x, x + np.diag(up)]))), up
+
+
+def jacobian_of(residuals: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """[M, D] slopes from residuals [1 + D, M] of `slopes`; 0 where a replay failed."""
+    return np.nan_to_num((residuals[1:] - residuals[0]) / steps[:, None]).T
+
+
+def _stepped(cost: Cost, space: Space, config: ExcitationConfig) -> tuple[np.ndarray, np.ndarray, Cost]:
+    """x [D] where one or two Gauss-Newton steps lead, the slopes [M, D] there, and the cost with its noise stated."""
+    x, best = space.to_search(space.mean), np.inf
+    kept: tuple[np.ndarray, np.ndarray, Cost] | None = None
+    for _ in range(config.steps + 1):
+        rollouts, steps = slopes(cost, space, x, config.step)
+        first = [jax.tree.map(lambda a: a[0], rollout) for rollout in rollouts]
+        if not all(bool(np.all(rollout.finite)) for rollout in first):
+            if kept is None:
+                raise ValueError("the simulation blows up at the parameters' initial means: shorten the time step")
+            break
+        before = cost if kept is None else kept[2]
+        reached = float(np.mean(before.whitened_of(rollouts)[0] ** 2)) if kept is not None else np.inf
+        if kept is not None and not reached < best:
+            break
+        stated = [c.restated(r) if c.repeats == 1 else c for c, r in zip(cost.comparisons, first, strict=True)]
+        now = cost.compared_by(stated)
+        residuals = now.whitened_of(rollouts)
+        best = float(np.mean(residuals[0] ** 2))
+        jacobian = jacobian_of(residuals, steps)
+        kept = x, jacobian, now
+        pull = np.linalg.solve(jacobian.T @ jacobian + np.eye(len(x)), jacobian.T @ residuals[0] + x)
+        size = max(1.0, float(np.abs(pull).max(initial=0.0)) / config.longest_step)
+        x = np.clip(x - pull / size, space.to_search(space.low), space.to_search(space.high))
+    assert kept is not None
+    return kept
+
+
+def _size(comparison: Comparison) -> int:
+    """M of one recording."""
+    return sum(c.noise.mean.size for c in comparison.channels)
+
+
+def _noise_of(scene: Scene, comparisons: Sequence[Comparison]) -> dict[str, dict[str, float]]:
+    """Channel -> joint -> deviation of white noise as large as that of the repeats' mean; the smallest one.
+
+    A whitener is triangular, so the product of its diagonal states the volume of its noise.
+    """
+    found: dict[str, dict[str, float]] = {}
+    for channel in (c for comparison in comparisons for c in comparison.channels):
+        mine = found.setdefault(channel.name, {})
+        for whitener, column in zip(channel.noise.whitener, channel.columns.tolist(), strict=True):
+            own = np.abs(np.diagonal(whitener))
+            deviation = float(np.exp(-np.mean(np.log(own[own > 0])))) if np.any(own > 0) else np.inf
+            joint = scene.joints[column] if column < len(scene.joints) else str(scene.object_joint)
+            mine[joint] = min(deviation, mine.get(joint, np.inf))
+    return found
