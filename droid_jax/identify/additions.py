@@ -199,7 +199,7 @@ def _information(
     residuals, out, first = cost.whitened_of(rollouts), dict[int, np.ndarray](), 0
     for k, comparison in enumerate(comparisons):
         size = sum(c.noise.mean.size for c in comparison.channels)
-        jacobian = jacobian_of(residuals[:, first : first + size], steps)
+        jacobian = jacobian_of(residuals[:, first : first + size], steps) / found.widening
         out[k] = jacobian.T @ jacobian
         first += size
     return out

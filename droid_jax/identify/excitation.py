@@ -1,8 +1,8 @@
 """Which parameters a motion can tell, before any fit: from the sensitivity of its replay.
 
 The replay is differentiated at the initial means and, since these may be far from the robot, again where one or two
-Gauss-Newton steps from there lead.  The information J^T J and the stated prior give each parameter's width; the
-criterion of a fit (`identifiability`) judges it.  Of one repeat the noise is what the model leaves there, as in a fit.
+Gauss-Newton steps from there lead.  What the replay leaves there and its slopes are then judged by the rules of a fit:
+the width of its Gaussian (`posterior`), and when a parameter is identifiable.
 Source: Gautier and Khalil, Exciting trajectories for the identification of base inertial parameters, IJRR 1992.
 """
 
@@ -24,7 +24,9 @@ from droid_jax.cost.cost import Cost, make_cost
 from droid_jax.cost.residuals import CompareConfig, Comparison
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.holdout import beginning
-from droid_jax.identify.identifiability import Identifiability, IdentifiabilityConfig, identifiability
+from droid_jax.identify.identifiability import Identifiability, IdentifiabilityConfig, identifiability, posterior
+from droid_jax.identify.levenberg_marquardt import LevenbergMarquardtConfig
+from droid_jax.identify.multistart import Refined
 from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
@@ -65,14 +67,18 @@ class ExcitationConfig:
 class Excitation:
     """What recordings tell of the parameters of a space.
 
-    values: [D] where the replay was differentiated.  information: [D, D] of the data, per squared search unit.
-    told: of each parameter.  noise: channel -> column -> white deviation at the noise model's coarse rate.
+    values: [D] where the replay was differentiated.
+    information: [D, D] of the data, per squared search unit, by the fit's rule of the width.
+    widening: [D] factors by which that rule widens deviations.
+    told: of each parameter.
+    noise: channel -> joint -> white deviation at the noise model's coarse rate.
     config: with the channels that were compared.  engine: that replayed.  seconds: that this took.
     """
 
     space: Space
     values: np.ndarray
     information: np.ndarray
+    widening: np.ndarray
     told: tuple[Identifiability, ...]
     noise: Mapping[str, Mapping[str, float]]
     config: ExcitationConfig
@@ -114,14 +120,17 @@ def excitation(
     engine = engine_for(scene, space, short)
     with silent():
         cost = make_cost(scene, space, short, engine=engine, config=config.compare, check=False)
-    x, jacobian, cost = _stepped(cost, space, config)
-    longer = [r.duration / s.duration for r, s in zip(recordings, short, strict=True)]
-    weight = np.concatenate([np.full(_size(c), k) for c, k in zip(cost.comparisons, longer, strict=True)])
-    information = jacobian.T @ (jacobian * weight[:, None])
+    refined, cost = _stepped(cost, space, config)
+    gaussian = posterior(refined, cost.comparisons, config.identifiability)
+    longer = sum(r.duration for r in recordings) / sum(s.duration for s in short)
+    known = np.linalg.inv(gaussian.cov) - np.eye(len(space))
+    plain = np.linalg.inv(refined.jacobian.T @ refined.jacobian + np.eye(len(space)))
+    information = longer * known
     return Excitation(
         space=space,
-        values=space.from_search(x),
+        values=refined.best,
         information=information,
+        widening=np.sqrt(np.maximum(1.0, np.diag(gaussian.cov) / np.diag(plain))),
         told=told_by(space, information, config.identifiability),
         noise=_noise_of(scene, cost.comparisons),
         config=config,
@@ -167,37 +176,37 @@ def jacobian_of(residuals: np.ndarray, steps: np.ndarray) -> np.ndarray:
     return np.nan_to_num((residuals[1:] - residuals[0]) / steps[:, None]).T
 
 
-def _stepped(cost: Cost, space: Space, config: ExcitationConfig) -> tuple[np.ndarray, np.ndarray, Cost]:
-    """x [D] where one or two Gauss-Newton steps lead, the slopes [M, D] there, and the cost with its noise stated."""
+def _stepped(cost: Cost, space: Space, config: ExcitationConfig) -> tuple[Refined, Cost]:
+    """Where one or two Gauss-Newton steps lead, and the cost with its noise stated from there."""
     x, best = space.to_search(space.mean), np.inf
-    kept: tuple[np.ndarray, np.ndarray, Cost] | None = None
-    for _ in range(config.steps + 1):
+    prior = np.where(space.nuisance, 1.0, LevenbergMarquardtConfig().main_prior)
+    kept: tuple[Refined, Cost] | None = None
+    for count in range(config.steps + 1):
         rollouts, steps = slopes(cost, space, x, config.step)
         first = [jax.tree.map(lambda a: a[0], rollout) for rollout in rollouts]
         if not all(bool(np.all(rollout.finite)) for rollout in first):
             if kept is None:
                 raise ValueError("the simulation blows up at the parameters' initial means: shorten the time step")
             break
-        before = cost if kept is None else kept[2]
-        reached = float(np.mean(before.whitened_of(rollouts)[0] ** 2)) if kept is not None else np.inf
-        if kept is not None and not reached < best:
+        if kept is not None and not float(np.mean(kept[1].whitened_of(rollouts)[0] ** 2)) < best:
             break
         stated = [c.restated(r) if c.repeats == 1 else c for c, r in zip(cost.comparisons, first, strict=True)]
         now = cost.compared_by(stated)
         residuals = now.whitened_of(rollouts)
         best = float(np.mean(residuals[0] ** 2))
         jacobian = jacobian_of(residuals, steps)
-        kept = x, jacobian, now
-        pull = np.linalg.solve(jacobian.T @ jacobian + np.eye(len(x)), jacobian.T @ residuals[0] + x)
+        objective = 0.5 * float(np.sum(residuals[0] ** 2) + np.sum((x / prior) ** 2))
+        refined = Refined(
+            space=space, x=x, best=space.from_search(x), objective=objective, residual=residuals[0], jacobian=jacobian,
+            prior=prior, starts=np.array([objective]), evaluations=(count + 1) * (len(x) + 1), iterations=count,
+            converged=False,
+        )  # fmt: skip
+        kept = refined, now
+        pull = np.linalg.solve(refined.hessian, jacobian.T @ residuals[0] + x / prior**2)
         size = max(1.0, float(np.abs(pull).max(initial=0.0)) / config.longest_step)
         x = np.clip(x - pull / size, space.to_search(space.low), space.to_search(space.high))
     assert kept is not None
     return kept
-
-
-def _size(comparison: Comparison) -> int:
-    """M of one recording."""
-    return sum(c.noise.mean.size for c in comparison.channels)
 
 
 def _noise_of(scene: Scene, comparisons: Sequence[Comparison]) -> dict[str, dict[str, float]]:

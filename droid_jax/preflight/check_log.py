@@ -46,7 +46,7 @@ def check_log(scene: Scene, recording: Recording) -> tuple[Finding, ...]:
             found += tracking
             if not tracking:  # else the torque is judged by a motion that is wrong
                 wrong = check_torque(scene, recording, motion) or check_servo_balance(scene, recording, motion)
-                clocks = any(finding.kind == "clock" for finding in found)
+                clocks = any(f.kind == "clock" and f.severity != "note" for f in found)
                 found += wrong or ([] if clocks else check_delay(scene, recording, motion))
         known[scene] = tuple(sorted(found, key=lambda finding: ("certain", "likely", "note").index(finding.severity)))
     return known[scene]
