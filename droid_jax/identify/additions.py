@@ -15,6 +15,7 @@ import numpy as np
 from droid_jax.cost.cost import make_cost
 from droid_jax.identify.excitation import Excitation, jacobian_of, silent, slopes, told_by
 from droid_jax.identify.identifiability import Identifiability
+from droid_jax.model.actuators import has_feedback
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Channel, Recording
@@ -22,9 +23,9 @@ from droid_jax.simulate.hand_path import minimum_jerk
 
 SECONDS = 6.0  # of each addition
 EASE = 0.5  # s in which a chirp begins and ends
-CHIRP = (0.3, 3.0)  # Hz
+CHIRP = (0.3, 2.0)  # Hz
 # Largest ways, rad, that a joint is sent; a slide goes as many times its own motion in the recording.
-RAMP, STEP, SWING, AWAY = 0.6, 0.3, 0.15, 0.8
+RAMP, STEP, SWING, AWAY = 0.6, 0.3, 0.1, 0.8
 FREE = 0.9  # share of the way to the end of a joint's range that an addition may take
 RATE = 100.0  # Hz of an addition, where a recording has no command
 MARGIN = 0.8  # of the limit of identifiability, that an addition must reach
@@ -98,10 +99,12 @@ def additions(scene: Scene, recording: Recording) -> tuple[Addition, ...]:
     joints, start = _start(scene, recording)
     step = float(np.median(np.diff(recording.time))) if recording.command.size else 1.0 / RATE
     time = np.arange(round(SECONDS / step) + 1) * step
+    jumps = _steps(time)
     found = list[Addition]()
     for joint, q in zip(joints, start, strict=True):
-        down, up, unit = _room(scene, recording, joint, float(q))
-        if max(down, up) <= 0:
+        gear = _gear(scene, recording, joint)
+        down, up, unit = _room(scene, recording, joint, float(q) / gear)
+        if max(down, up) <= 0 or (recording.command.size and joint not in _servos(scene)):
             continue
 
         def both(share: np.ndarray, most: float, down: float = down, up: float = up, unit: float = unit) -> np.ndarray:
@@ -112,13 +115,15 @@ def additions(scene: Scene, recording: Recording) -> tuple[Addition, ...]:
         side = 1.0 if up >= down else -1.0
         for what, share, most in (
             ("a slow ramp", _ramp(time), RAMP),
-            ("steps", _steps(time), STEP),
+            ("steps", jumps, STEP),
             (f"a chirp of {CHIRP[0]:g} to {CHIRP[1]:g} Hz", _chirp(time), SWING),
             ("a hold at another pose", side * _hold(time), AWAY),
         ):
+            if share is jumps and not recording.command.size:
+                continue  # a measured path has no jumps
             path = both(share, most)
             size = f"{np.abs(path).max():.2g} {kind}"
-            found.append(Addition(f"{what} of {joint} ({size})", joint, time, q + path))
+            found.append(Addition(f"{what} of {joint} ({size})", joint, time, q + gear * path))
     return tuple(found)
 
 
@@ -184,24 +189,20 @@ def _information(
     config = found.config
     with silent():
         cost = make_cost(scene, space, motions, engine=found.engine, config=config.compare, check=False)
-    comparisons = []
-    for comparison in cost.comparisons:
-        channels = []
-        for channel in comparison.channels:
-            of = found.noise[channel.name]
-            usual = float(np.median(list(of.values())))
-            names = [scene.joints[c] if c < len(scene.joints) else "" for c in channel.columns.tolist()]
-            deviation = np.array([of.get(name, usual) for name in names])
-            channels.append(replace(channel, noise=channel.noise.stated(deviation)))
-        comparisons.append(replace(comparison, channels=tuple(channels)))
-    cost = cost.compared_by(comparisons)
+    comparison = cost.comparisons[0]  # all have one clock and one filter, and what was measured cancels
+    channels = []
+    for channel in comparison.channels:
+        of = found.noise[channel.name]
+        usual = float(np.median(list(of.values())))
+        names = [scene.joints[c] if c < len(scene.joints) else "" for c in channel.columns.tolist()]
+        deviation = np.array([max(usual, of.get(name, usual)) for name in names])  # at rest a joint shows less of it
+        channels.append(replace(channel, noise=channel.noise.stated(deviation)))
+    one = cost.first().compared_by([replace(comparison, channels=tuple(channels))])
     rollouts, steps = slopes(cost, space, space.to_search(found.values), config.step)
-    residuals, out, first = cost.whitened_of(rollouts), dict[int, np.ndarray](), 0
-    for k, comparison in enumerate(comparisons):
-        size = sum(c.noise.mean.size for c in comparison.channels)
-        jacobian = jacobian_of(residuals[:, first : first + size], steps) / found.widening
+    out = dict[int, np.ndarray]()
+    for k, rollout in enumerate(rollouts):
+        jacobian = jacobian_of(one.whitened_of([rollout]), steps) / found.widening
         out[k] = jacobian.T @ jacobian
-        first += size
     return out
 
 
@@ -222,7 +223,10 @@ def as_recording(scene: Scene, recording: Recording, addition: Addition, name: s
         values = values[..., [joints.index(j) for j in columns]].copy()
         unit = recording.channels[key].unit if key in recording.channels else "rad"
         channels[key] = Channel(key, unit, tuple(columns), addition.time, values, np.ones(values.shape, bool))
-    qpos0 = {**recording.qpos0, **dict(zip(joints, start.tolist(), strict=True))}
+    begin = {
+        j: float(q) / _gear(scene, recording, j) for j, q in zip(joints, start, strict=True) if j in scene.single_joints
+    }
+    qpos0 = {**recording.qpos0, **begin}
     commanded = bool(recording.command.size)
     return Recording(
         name=name,
@@ -245,6 +249,19 @@ def _start(scene: Scene, recording: Recording) -> tuple[tuple[str, ...], np.ndar
     return joints, np.array([measured[j] for j in joints])
 
 
+def _servos(scene: Scene) -> set[str]:
+    """Names of the position servos."""
+    return {scene.command_names[u] for u in np.flatnonzero(has_feedback(scene.model))}
+
+
+def _gear(scene: Scene, recording: Recording, joint: str) -> float:
+    """What a joint's command is times its position."""
+    if not recording.command.size or joint not in scene.command_names:
+        return 1.0
+    u = scene.command_names.index(joint)
+    return float(scene.model.actuator_gear[u, 0]) if scene.of_joint[u] else 1.0
+
+
 def _room(scene: Scene, recording: Recording, joint: str, q: float) -> tuple[float, float, float]:
     """rad or m that a joint can go down and up from q, and what the ways are counted in: 1 rad, or a slide's motion."""
     low, high = -np.inf, np.inf
@@ -255,8 +272,7 @@ def _room(scene: Scene, recording: Recording, joint: str, q: float) -> tuple[flo
     if joint in scene.command_names:
         u = scene.command_names.index(joint)
         if scene.model.actuator_ctrllimited[u]:
-            gear = scene.model.actuator_gear[u, 0] if scene.of_joint[u] else 1.0
-            ends = sorted(scene.model.actuator_ctrlrange[u] / gear)
+            ends = sorted(scene.model.actuator_ctrlrange[u] / _gear(scene, recording, joint))
             low, high = max(low, ends[0]), min(high, ends[1])
     unit = 1.0
     if joint not in scene.single_joints or scene.slides(joint):
