@@ -339,6 +339,11 @@ def _register(values: np.ndarray) -> np.ndarray:
     return -np.round(1000.0 * values / np.nanmax(np.abs(values)))
 
 
+def _per_cent(values: np.ndarray) -> np.ndarray:
+    """Of what each joint's drive can do, a fifth more than its largest torque here."""
+    return 100.0 * values / (1.2 * np.nanmax(np.abs(values), axis=(0, 1)))
+
+
 def _standing(r: Recording) -> Recording:
     """The first instant, throughout; its noise stays."""
 
@@ -473,9 +478,7 @@ ERRORS = (
     ),
     Error("milliseconds", ("clock",), ("millisecond",), _always, lambda r: _whole(r, lambda t: 1e3 * t)),
     Error("load register", ("sign", "units"), ("load register",), _torque, of("torque", _register)),
-    Error(
-        "per cent", ("units",), ("per cent",), _torque, of("torque", lambda v: 100.0 * v / (3.0 * np.nanmax(np.abs(v))))
-    ),
+    Error("per cent", ("units",), ("per cent",), _torque, of("torque", _per_cent)),
     Error("dead torque", ("sensor",), ("dead", "does not move"), _several_torques, of("torque", _first_dead)),
     Error("rotated torques", ("order",), ("order",), _three_torques, of("torque", _turned_round)),
     Error("rotated commands", ("order",), ("order",), _three_commands, of("command", _turned_round)),

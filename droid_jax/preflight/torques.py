@@ -187,6 +187,8 @@ def fitting_order(left: Mapping[str, Mapping[str, float]]) -> dict[str, str]:
     left: joint -> column -> share of the column's torque that the joint's expectation leaves.
     """
     joints = list(left)
+    if not joints:
+        return {}
     rows, columns = linear_sum_assignment([[left[j][k] for k in joints] for j in joints])
     return {joints[i]: joints[k] for i, k in zip(rows, columns, strict=True)}
 
@@ -354,7 +356,7 @@ def _register(found: list[Finding], joints: Sequence[str]) -> list[Finding]:
     A servo's load register states the drive's duty as a share, often of the other sign.
     """
     turned = [f for f in found if f.kind == "sign" and f.value < 0]
-    if 2 * len(turned) < max(len(joints), 2):
+    if 2 * len(turned) <= len(joints):
         return found
     register = (
         "{}; or is this a load register, the share that the drive puts out, and no torque? Leave that column out then, "
